@@ -1,0 +1,60 @@
+"""A progress bar with the time left, for every piece of work that may take more than two seconds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Protocol
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+
+class Advance(Protocol):
+    """What `progress` yields: call it with the number of units done since the last call and, if useful, a remark."""
+
+    def __call__(self, amount: float = 1, remark: str = "") -> None:
+        """Advance the bar by `amount` units."""
+        ...
+
+
+@contextmanager
+def progress(title: str, total: float) -> Iterator[Advance]:
+    """Show a bar on standard error while the block runs.
+
+    Standard output stays free for results. Where standard error is no terminal, one line is printed when the
+    work ends, so that logs stay short.
+
+    Args:
+        title: what is being done.
+        total: number of units of work.
+    """
+    console = Console(stderr=True)
+    bar = Progress(
+        TextColumn("{task.description:<28}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[remark]}"),
+        console=console,
+        disable=not console.is_terminal,
+    )
+    with bar:
+        task = bar.add_task(title, total=total, remark="")
+
+        def advance(amount: float = 1, remark: str = "") -> None:
+            bar.update(task, advance=amount, remark=remark)
+
+        yield advance
+        elapsed = bar.tasks[task].elapsed or 0.0
+    if not console.is_terminal:
+        console.print(f"{title}: done in {elapsed:.1f} s", highlight=False)

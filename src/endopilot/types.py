@@ -1,0 +1,262 @@
+"""The records that cross from one stage to the next, and nothing else.
+
+Symbols of the paper (Kim et al. 2023), once for the whole package:
+
+======  ==============================  ======================================================================
+symbol  name here                       meaning
+======  ==============================  ======================================================================
+Δ       `inserted_length`, mm           length of wire beyond the ostium, measured along the wire
+φ       `rotation`, rad                 rotation of the wire's proximal end about its own axis, unwrapped
+π       `control`, (mm/s, rad/s)        (dΔ/dt, dφ/dt), the mean over one sample period of 0.5 s
+Δtip    `tip_abscissa`, mm              distance from the ostium along the centerline to the tip's projection
+γtip    `tip_offset`, mm                distance from the tip to the centerline
+======  ==============================  ======================================================================
+
+World coordinates are LPS, in mm: +x to the patient's left, +y to the back, +z to the head, as in DICOM. Volumes are
+indexed `voxels[k, j, i]`, where (i, j, k) count voxels along the first, second and third axis of the image.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, Shaped
+
+SAMPLE_PERIOD_S = 0.5
+"""Time between two recorded samples, s: the paper records at 2 Hz."""
+
+
+@dataclass(frozen=True, eq=False)
+class Volume:
+    """A three-dimensional image: CT numbers in HU, or a mask.
+
+    Attributes:
+        voxels: values, indexed [k, j, i].
+        spacing_mm: distance between neighbouring voxel centres along i, j and k, mm.
+        origin_mm: LPS position of the centre of voxel (0, 0, 0), mm.
+        direction: columns are the LPS unit vectors along which i, j and k grow.
+    """
+
+    voxels: Shaped[np.ndarray, "nz ny nx"]
+    spacing_mm: Float[np.ndarray, "3"]
+    origin_mm: Float[np.ndarray, "3"]
+    direction: Float[np.ndarray, "3 3"]
+
+    def index_to_world(self, index: Shaped[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+        """Return the LPS position in mm of continuous voxel indices (i, j, k)."""
+        return self.origin_mm + (index * self.spacing_mm) @ self.direction.T
+
+    def world_to_index(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+        """Return the continuous voxel indices (i, j, k) of LPS positions in mm."""
+        return ((points - self.origin_mm) @ self.direction) / self.spacing_mm
+
+
+@dataclass(frozen=True, eq=False)
+class Insertion:
+    """Where the device enters the vessel: the ostium, and the axis of the guiding catheter that ends there.
+
+    Attributes:
+        position: centre of the ostium, LPS mm.
+        direction: unit vector along the catheter, pointing into the vessel.
+    """
+
+    position: Float[np.ndarray, "3"]
+    direction: Float[np.ndarray, "3"]
+
+
+@dataclass(frozen=True, eq=False)
+class LumenMask:
+    """The segmented inside of one vessel tree.
+
+    Attributes:
+        volume: boolean voxels, true inside the lumen.
+        ostium: where the device enters, if the segmentation found it or the user gave it.
+        method: name of the segmentation method, or where the mask came from.
+    """
+
+    volume: Volume
+    ostium: Insertion | None = None
+    method: str = "given"
+
+
+@dataclass(frozen=True, eq=False)
+class Centerline:
+    """One unbranched line through a vessel, from the ostium outwards.
+
+    Attributes:
+        points: positions, LPS mm.
+        radius: radius of the largest sphere centred at each point that fits in the lumen, mm.
+        abscissa: distance from the ostium along the line, mm, increasing.
+        normals: unit vectors perpendicular to the line, carried along it without twist (parallel transport).
+    """
+
+    points: Float[np.ndarray, "n 3"]
+    radius: Float[np.ndarray, "n"]
+    abscissa: Float[np.ndarray, "n"]
+    normals: Float[np.ndarray, "n 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class Branch:
+    """A piece of the tree between two branching points, or from one to a distal end.
+
+    The first point of a branch is the last point of its parent, so that every path is one connected line.
+
+    Attributes:
+        centerline: its line; the abscissa counts from the ostium, not from the start of the branch.
+        parent: index of the parent in `VesselTree.branches`, -1 for the root.
+        section: for every point, the index of its anatomical section in `VesselTree.section_names`.
+    """
+
+    centerline: Centerline
+    parent: int
+    section: Int[np.ndarray, "n"]
+
+
+@dataclass(frozen=True, eq=False)
+class VesselTree:
+    """The centerline of a vessel with its branches.
+
+    Attributes:
+        branches: parents stand before their children; `branches[0]` starts at the ostium.
+        section_names: names of the anatomical sections, such as the segments of AHA/SCCT.
+    """
+
+    branches: tuple[Branch, ...]
+    section_names: tuple[str, ...]
+
+    def children(self, branch: int) -> tuple[int, ...]:
+        """Return the indices of the branches that leave at the end of `branch`."""
+        return tuple(i for i, candidate in enumerate(self.branches) if candidate.parent == branch)
+
+    def leaves(self) -> tuple[int, ...]:
+        """Return the indices of the branches that end distally."""
+        parents = {branch.parent for branch in self.branches}
+        return tuple(i for i in range(len(self.branches)) if i not in parents)
+
+    def route(self, branch: int) -> tuple[int, ...]:
+        """Return the indices of the branches from the root to `branch`, both included."""
+        route = [branch]
+        while self.branches[route[-1]].parent >= 0:
+            route.append(self.branches[route[-1]].parent)
+        return tuple(reversed(route))
+
+    def path(self, branch: int) -> Centerline:
+        """Return the connected line from the ostium to the end of `branch`."""
+        lines = [self.branches[i].centerline for i in self.route(branch)]
+        pieces = [lines[0], *(_without_first_point(line) for line in lines[1:])]
+        return Centerline(
+            points=np.concatenate([piece.points for piece in pieces]),
+            radius=np.concatenate([piece.radius for piece in pieces]),
+            abscissa=np.concatenate([piece.abscissa for piece in pieces]),
+            normals=np.concatenate([piece.normals for piece in pieces]),
+        )
+
+    def longest_path(self) -> Centerline:
+        """Return the path from the ostium to the farthest distal end."""
+        return self.path(max(self.leaves(), key=lambda leaf: self.branches[leaf].centerline.abscissa[-1]))
+
+
+@dataclass(frozen=True, eq=False)
+class DistanceMap:
+    """Signed distance to the vessel wall on a regular grid along the LPS axes.
+
+    Attributes:
+        values: distance to the wall, mm, positive inside, indexed [k, j, i] along z, y, x; it is cut off at a fixed
+            negative value outside. The guiding catheter that ends at the ostium counts as inside.
+        spacing_mm: distance between grid points, mm, the same along the three axes.
+        origin_mm: LPS position of `values[0, 0, 0]`, mm.
+    """
+
+    values: Float[np.ndarray, "nz ny nx"]
+    spacing_mm: float
+    origin_mm: Float[np.ndarray, "3"]
+
+
+@dataclass(frozen=True, eq=False)
+class Anatomy:
+    """One patient's vessel, ready for simulation.
+
+    Attributes:
+        name: short name, unique within a study; it names the patient in datasets and reports.
+        tree: centerline with branches and section labels.
+        distance_map: signed distance to the wall, guiding catheter included.
+        insertion: the ostium and the catheter's axis.
+        catheter_radius_mm: inner radius of the guiding catheter's tube in the distance map, mm.
+        provenance: what the anatomy was made from, and how (written to `anatomy.json`).
+    """
+
+    name: str
+    tree: VesselTree
+    distance_map: DistanceMap
+    insertion: Insertion
+    catheter_radius_mm: float
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class TipProjection:
+    """Where tips lie with respect to the centerline tree.
+
+    Attributes:
+        abscissa: Δtip, distance from the ostium along the path, mm; negative inside the guiding catheter.
+        offset: γtip, distance from the centerline, mm.
+        branch: index of the branch that the tip lies in.
+        radius: lumen radius at the projection, mm.
+    """
+
+    abscissa: Float[np.ndarray, "*n"]
+    offset: Float[np.ndarray, "*n"]
+    branch: Int[np.ndarray, "*n"]
+    radius: Float[np.ndarray, "*n"]
+
+
+@dataclass(frozen=True, eq=False)
+class Rollout:
+    """What a set of simulated worlds did, one sample every `sample_period_s`.
+
+    Sample t is the state at the end of period t, and `control[:, t]` is the mean control over that period, so that
+    inserted_length[:, t] = initial_inserted_length + sample_period_s · Σ control[:, :t+1, 0], and likewise for the
+    rotation.
+
+    Attributes:
+        sample_period_s: time between samples, s.
+        initial_inserted_length: Δ before the first period, mm.
+        initial_rotation: φ before the first period, rad.
+        control: π = (dΔ/dt mm/s, dφ/dt rad/s).
+        inserted_length: Δ, mm.
+        rotation: φ, rad.
+        tip_position: LPS mm.
+        tip_direction: unit vector along the wire at its tip.
+        tip: Δtip, γtip, branch and lumen radius at each sample.
+        contact_force_max: largest wall force on one node, N.
+        contact_force_sum: sum of the wall forces' magnitudes, N.
+        base_force: axial force that the drive must apply to the wire, N, positive when it pushes.
+        base_torque: torque that the drive must apply about the wire's axis, N·mm.
+        iterations: mean Newton iterations a time step over the period.
+        valid: false from the sample in which a world failed to converge or left the finite numbers.
+        shape: positions of all nodes from tip to base, LPS mm, if asked for.
+    """
+
+    sample_period_s: float
+    initial_inserted_length: Float[np.ndarray, "worlds"]
+    initial_rotation: Float[np.ndarray, "worlds"]
+    control: Float[np.ndarray, "worlds samples 2"]
+    inserted_length: Float[np.ndarray, "worlds samples"]
+    rotation: Float[np.ndarray, "worlds samples"]
+    tip_position: Float[np.ndarray, "worlds samples 3"]
+    tip_direction: Float[np.ndarray, "worlds samples 3"]
+    tip: TipProjection
+    contact_force_max: Float[np.ndarray, "worlds samples"]
+    contact_force_sum: Float[np.ndarray, "worlds samples"]
+    base_force: Float[np.ndarray, "worlds samples"]
+    base_torque: Float[np.ndarray, "worlds samples"]
+    iterations: Float[np.ndarray, "worlds samples"]
+    valid: Bool[np.ndarray, "worlds samples"]
+    shape: Float[np.ndarray, "worlds samples nodes 3"] | None = None
+
+
+def _without_first_point(line: Centerline) -> Centerline:
+    return Centerline(line.points[1:], line.radius[1:], line.abscissa[1:], line.normals[1:])
