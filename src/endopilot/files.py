@@ -51,11 +51,15 @@ def writing(path: Path) -> Iterator[Path]:
             partial.unlink(missing_ok=True)
 
 
+def json_text(content: Any) -> str:
+    """Return `content` as indented JSON. Dataclasses, paths and numpy values are understood."""
+    return json.dumps(content, indent=2, default=_jsonable, ensure_ascii=False)
+
+
 def write_json(path: Path, content: Any) -> None:
-    """Write `content` as indented JSON, whole or not at all. Dataclasses, paths and numpy values are understood."""
-    text = json.dumps(content, indent=2, default=_jsonable, ensure_ascii=False) + "\n"
+    """Write `content` as indented JSON, whole or not at all."""
     with writing(path) as partial:
-        partial.write_text(text, encoding="utf-8")
+        partial.write_text(json_text(content) + "\n", encoding="utf-8")
 
 
 def read_json(path: Path) -> Any:
@@ -76,6 +80,15 @@ def sha256(path: Path) -> str:
     """Return the SHA-256 of a file, as hexadecimal digits."""
     with Path(path).open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def input_hash(path: Path) -> dict[str, str]:
+    """Return the SHA-256 of an input for the manifest: of the file, or of all files of a folder in order of name."""
+    path = Path(path)
+    if path.is_file():
+        return {path.name: sha256(path)}
+    parts = sorted(part for part in path.rglob("*") if part.is_file())
+    return {path.name: hashlib.sha256("".join(sha256(part) for part in parts).encode()).hexdigest()}
 
 
 def manifest(*, config: Any, seed: int | None = None, inputs: Mapping[str, str] | None = None, **facts: Any) -> dict:

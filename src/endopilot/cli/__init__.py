@@ -1,0 +1,93 @@
+"""The command line: one file a command, each a thin wrapper of a stage's entry function.
+
+Only the command that is called is imported, so that `endopilot --help` and `endopilot info` answer at once.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import sys
+from collections.abc import Sequence
+
+from endopilot import __version__
+from endopilot.errors import InputError
+
+COMMANDS = {
+    "demo": "six synthetic patients, the whole way from CTA to report",
+    "run": "one CT angiogram, the whole way to a report",
+    "segment": "CT angiogram -> mask of the vessel lumen",
+    "anatomy": "mask, mesh or centerline -> centerline tree, section labels, distance map",
+    "atlas": "synthetic patients",
+    "phantom": "anatomy -> synthetic CT angiogram",
+    "simulate": "anatomy and proximal controls -> what the wire does",
+    "dataset": "anatomies -> many random navigations on disk",
+    "train": "dataset -> forward and inverse transformers",
+    "evaluate": "trained run -> errors beside the paper's and the baselines'",
+    "verify": "the rod core against closed forms",
+    "bench": "speed of the rod core together with its accuracy",
+    "devices": "the guidewires that endopilot knows",
+    "sample": "fetch a real CT angiogram to try",
+    "info": "versions and machine",
+}
+"""Name of each command and what it turns into what. The module of the same name in this package holds it."""
+
+EXIT_BAD_INPUT = 2
+EXIT_INTERRUPTED = 130
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run `endopilot` with `arguments` (those of the process by default) and leave with its exit code.
+
+    Bad input gives one line on standard error and exit code 2; Ctrl-C gives 130.
+    """
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    name = arguments[0] if arguments else "--help"
+    if name in ("-h", "--help"):
+        print(overview())
+    elif name == "--version":
+        print(f"endopilot {__version__}")
+    elif name in COMMANDS:
+        sys.exit(_run(name, arguments[1:]))
+    else:
+        near = difflib.get_close_matches(name, COMMANDS, n=1)
+        hint = f"did you mean '{near[0]}'?" if near else "`endopilot --help` lists the commands."
+        print(f"endopilot: there is no command '{name}'; {hint}", file=sys.stderr)
+        sys.exit(EXIT_BAD_INPUT)
+
+
+def overview() -> str:
+    """Return the text of `endopilot --help`."""
+    lines = [f"  {name:<9} {summary}" for name, summary in COMMANDS.items()]
+    return "\n".join(
+        [
+            "usage: endopilot COMMAND ...",
+            "",
+            "From a CT angiogram to an agent that drives an endovascular guidewire. For research; no medical device.",
+            "Units are mm, N, s, rad and HU; world coordinates are LPS mm.",
+            "",
+            *lines,
+            "",
+            "`endopilot COMMAND --help` gives each command's options, units and defaults.",
+        ]
+    )
+
+
+def _run(name: str, arguments: Sequence[str]) -> int:
+    import tyro
+
+    module = importlib.import_module(f"endopilot.cli.{name}")
+    try:
+        tyro.cli(
+            module.command,
+            prog=f"endopilot {name}",
+            args=arguments,
+            config=(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes),
+        )
+    except InputError as error:
+        print(f"endopilot {name}: {error}", file=sys.stderr)
+        return EXIT_BAD_INPUT
+    except KeyboardInterrupt:
+        print(f"endopilot {name}: interrupted", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    return 0

@@ -1,0 +1,62 @@
+"""Arguments that several commands share, and how commands print."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+from rich.console import Console
+from rich.table import Table
+from tyro.conf import arg
+
+from endopilot.errors import InputError
+from endopilot.files import json_text
+
+OutputFolder = Annotated[Path, arg(name="output", aliases=("-o",), metavar="DIR")]
+OutputFile = Annotated[Path, arg(name="output", aliases=("-o",), metavar="FILE")]
+Point = tuple[float, float, float]
+
+
+def existing(path: Path) -> Path:
+    """Return `path` if it is there.
+
+    Raises:
+        InputError: there is no such file or folder.
+    """
+    if not path.exists():
+        raise InputError(f"{path}: no such file or folder; check the path")
+    return path
+
+
+def show(figures: Mapping[str, Any], *, as_json: bool) -> None:
+    """Print named figures as JSON or as aligned lines."""
+    if as_json:
+        print(json_text(figures))
+        return
+    width = max((len(name) for name in figures), default=0)
+    for name, value in figures.items():
+        print(f"{name:<{width}}  {_text(value)}")
+
+
+def show_rows(rows: Sequence[Mapping[str, Any]], *, as_json: bool) -> None:
+    """Print rows of the same keys as JSON or as a table."""
+    if as_json:
+        print(json_text(list(rows)))
+        return
+    table = Table(*(rows[0].keys() if rows else ()))
+    for row in rows:
+        table.add_row(*(_text(value) for value in row.values()))
+    Console(width=None if Console().is_terminal else 160).print(table)
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, list | tuple):
+        return ", ".join(_text(item) for item in value)
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {_text(item)}" for key, item in value.items())
+    return str(value)

@@ -1,0 +1,38 @@
+"""`endopilot atlas`: synthetic patients."""
+
+from __future__ import annotations
+
+from endopilot.anatomy.atlas import AtlasConfig, synthesize
+from endopilot.anatomy.io import write_anatomy
+from endopilot.cli.arguments import OutputFolder, show_rows
+from endopilot.progress import progress
+
+
+def command(
+    *,
+    output: OutputFolder,
+    json: bool = False,
+    config: AtlasConfig = AtlasConfig(),  # noqa: B008 (frozen)
+) -> None:
+    """Make synthetic patients whose vessels match published statistics; one folder each.
+
+    Args:
+        output: folder that takes one anatomy folder a patient.
+        json: print the figures as JSON.
+        config: which patients.
+    """
+    rows = []
+    with progress("Synthetic patients", config.count) as advance:
+        for anatomy in synthesize(config):
+            write_anatomy(anatomy, output / anatomy.name)
+            path = anatomy.tree.longest_path()
+            rows.append(
+                {
+                    "patient": anatomy.name,
+                    "branches": len(anatomy.tree.branches),
+                    "length_mm": round(float(path.abscissa[-1]), 1),
+                    "ostium_radius_mm": round(float(path.radius[0]), 2),
+                }
+            )
+            advance()
+    show_rows(rows, as_json=json)

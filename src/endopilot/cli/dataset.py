@@ -1,0 +1,40 @@
+"""`endopilot dataset`: anatomies -> many random navigations on disk."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from endopilot.cli.arguments import OutputFolder, existing, show
+from endopilot.dataset.generate import DatasetConfig, generate_dataset
+from endopilot.files import read_json
+from endopilot.simulation.device import read_device
+
+
+def command(
+    anatomies: Positional[tuple[Path, ...]],
+    /,
+    *,
+    output: OutputFolder,
+    device: str = "workhorse-014",
+    json: bool = False,
+    config: DatasetConfig = DatasetConfig(),  # noqa: B008 (frozen)
+) -> None:
+    """Simulate random navigations of many patients and store them as a LeRobot v3 dataset.
+
+    An interrupted run goes on where it stopped when the same command is given again.
+
+    Args:
+        anatomies: folders made by `endopilot anatomy` or `endopilot atlas`.
+        output: folder of the dataset.
+        device: name of a shipped device (`endopilot devices`) or a YAML file.
+        json: print the figures as JSON.
+        config: how many navigations, how long, and how they are split.
+    """
+    generate_dataset([existing(folder) for folder in anatomies], output, read_device(device), config)
+    info = read_json(output / "meta" / "info.json")
+    show(
+        {"dataset": str(output), "episodes": info["total_episodes"], "samples": info["total_frames"]},
+        as_json=json,
+    )

@@ -1,0 +1,29 @@
+"""`endopilot evaluate`: trained run -> errors beside the paper's and the baselines'."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from endopilot.cli.arguments import OutputFolder, existing, show
+from endopilot.evaluation.evaluate import EvaluateConfig, evaluate
+
+
+def command(
+    run: Positional[Path],
+    /,
+    *,
+    output: OutputFolder,
+    json: bool = False,
+    config: EvaluateConfig = EvaluateConfig(),  # noqa: B008 (frozen)
+) -> None:
+    """Roll the networks of a run out open loop (protocols P1 to P4) and measure their errors.
+
+    Args:
+        run: folder made by `endopilot train`.
+        output: folder of metrics.json, figures and tables.
+        json: print the figures as JSON.
+        config: what to evaluate.
+    """
+    show(evaluate(existing(run), output, config), as_json=json)

@@ -1,0 +1,36 @@
+"""`endopilot phantom`: anatomy -> synthetic CT angiogram."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from endopilot.anatomy.io import read_anatomy
+from endopilot.anatomy.phantom import PhantomConfig, make_phantom
+from endopilot.cli.arguments import OutputFile, existing, show
+from endopilot.imaging.volume import write_volume
+
+
+def command(
+    anatomy: Positional[Path],
+    /,
+    *,
+    output: OutputFile,
+    seed: int = 0,
+    json: bool = False,
+    config: PhantomConfig = PhantomConfig(),  # noqa: B008 (frozen)
+) -> None:
+    """Make the CT angiogram that a scanner would have made of an anatomy.
+
+    Args:
+        anatomy: folder made by `endopilot anatomy` or `endopilot atlas`.
+        output: the volume in HU: .nii.gz, .nrrd or .mha.
+        seed: seed of noise and of the surroundings.
+        json: print the figures as JSON.
+        config: scanner and contrast.
+    """
+    volume = make_phantom(read_anatomy(existing(anatomy)), config, seed)
+    write_volume(volume, output)
+    nz, ny, nx = volume.voxels.shape
+    show({"volume": str(output), "voxels": [nx, ny, nz], "spacing_mm": volume.spacing_mm.tolist()}, as_json=json)

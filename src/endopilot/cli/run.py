@@ -1,0 +1,33 @@
+"""`endopilot run`: one CT angiogram, the whole way to a report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from endopilot.cli.arguments import OutputFolder, existing, show
+from endopilot.pipeline import RunConfig, run_volume
+
+
+def command(
+    volume: Positional[Path],
+    /,
+    *,
+    output: OutputFolder,
+    series: str | None = None,
+    json: bool = False,
+    config: RunConfig = RunConfig(),  # noqa: B008 (frozen)
+) -> None:
+    """Go the whole way with one patient: CT angiogram in, report out.
+
+    An interrupted run goes on where it stopped when the same command is given again.
+
+    Args:
+        volume: DICOM folder or file, NIfTI, NRRD or MHA, in HU.
+        output: folder of everything the run makes; the report is report.html in it.
+        series: series instance UID, where a DICOM folder holds several.
+        json: print the figures as JSON.
+        config: segmentation, device and size of the study.
+    """
+    show(run_volume(existing(volume), output, config, series=series), as_json=json)

@@ -1,0 +1,91 @@
+"""`endopilot simulate`: anatomy and proximal controls -> what the wire does."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from tyro.conf import Positional
+
+from endopilot.anatomy.io import read_anatomy
+from endopilot.cli.arguments import OutputFile, existing, show
+from endopilot.errors import InputError
+from endopilot.simulation.controls import ControlConfig, random_controls, read_controls_csv
+from endopilot.simulation.device import read_device
+from endopilot.simulation.simulator import SimulatorConfig, simulate
+from endopilot.simulation.table import write_rollout
+from endopilot.types import SAMPLE_PERIOD_S
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomConfig:
+    """The random navigations that are simulated where no controls are given."""
+
+    sequences: int = 8
+    """Number of navigations, each in a world of its own."""
+    seconds: float = 60.0
+    """Length of a navigation, s."""
+    seed: int = 0
+    """Seed of the random controls."""
+
+    def __post_init__(self) -> None:
+        if self.sequences < 1:
+            raise InputError(f"--sequences {self.sequences}: must be at least 1")
+        if not self.seconds >= SAMPLE_PERIOD_S:
+            raise InputError(f"--seconds {self.seconds:g}: must be at least one sample period, {SAMPLE_PERIOD_S} s")
+
+
+def command(
+    anatomy: Positional[Path],
+    /,
+    *,
+    output: OutputFile,
+    device: str = "workhorse-014",
+    controls: Path | None = None,
+    shape: bool = False,
+    json: bool = False,
+    random: RandomConfig = RandomConfig(),  # noqa: B008 (frozen)
+    config: SimulatorConfig = SimulatorConfig(),  # noqa: B008 (frozen)
+) -> None:
+    """Drive a guidewire through an anatomy and record it at 2 Hz.
+
+    Args:
+        anatomy: folder made by `endopilot anatomy` or `endopilot atlas`.
+        output: one row a sample as .parquet or .csv, or all arrays as .npz.
+        device: name of a shipped device (`endopilot devices`) or a YAML file.
+        controls: CSV of scripted proximal velocities; random ones by default.
+        shape: record the positions of all nodes too (.npz only).
+        json: print the figures as JSON.
+        random: the random controls.
+        config: the rod core.
+    """
+    patient = read_anatomy(existing(anatomy))
+    wire = read_device(device)
+    if controls is not None:
+        initial, control = read_controls_csv(existing(controls))
+    else:
+        initial, control = random_controls(
+            ControlConfig(),
+            n_sequences=random.sequences,
+            n_samples=round(random.seconds / SAMPLE_PERIOD_S),
+            seed=random.seed,
+            max_inserted_length_mm=float(patient.tree.longest_path().abscissa[-1]),
+        )
+    rollout = simulate(patient, wire, control, initial=initial, config=config, record_shape=shape)
+    write_rollout(rollout, output)
+    valid = rollout.valid
+    figures = {
+        "rollout": str(output),
+        "worlds": int(valid.shape[0]),
+        "samples": int(valid.shape[1]),
+        "valid_worlds": int(valid[:, -1].sum()),
+        "deepest_tip_mm": _largest(rollout.tip.abscissa, valid),
+        "largest_contact_force_n": _largest(rollout.contact_force_max, valid),
+        "largest_base_force_n": _largest(np.abs(rollout.base_force), valid),
+    }
+    show(figures, as_json=json)
+
+
+def _largest(values: np.ndarray, valid: np.ndarray) -> float | None:
+    return round(float(values[valid].max()), 4) if valid.any() else None

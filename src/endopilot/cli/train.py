@@ -1,0 +1,35 @@
+"""`endopilot train`: dataset -> forward and inverse transformers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from endopilot.cli.arguments import OutputFolder, existing, show
+from endopilot.files import read_json
+from endopilot.models.config import TrainConfig
+
+
+def command(
+    dataset: Positional[Path],
+    /,
+    *,
+    output: OutputFolder,
+    json: bool = False,
+    config: TrainConfig = TrainConfig(),  # noqa: B008 (frozen)
+) -> None:
+    """Train the forward and the inverse network on a dataset.
+
+    An interrupted run goes on where it stopped when the same command is given again.
+
+    Args:
+        dataset: folder made by `endopilot dataset`.
+        output: folder of the run.
+        json: print the figures as JSON.
+        config: model and training.
+    """
+    from endopilot.models.train import train  # torch takes seconds to import; --help must not wait for it
+
+    train(existing(dataset), output, config)
+    show({"run": str(output), "training": read_json(output / "training.json")}, as_json=json)
