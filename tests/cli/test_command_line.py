@@ -1,0 +1,99 @@
+"""The command line: help, exit codes, one line for bad input."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from endopilot.cli import COMMANDS, main
+
+
+def run(*arguments: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "endopilot.cli", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        cwd=cwd,
+        timeout=300,
+    )
+
+
+def assert_one_line(result: subprocess.CompletedProcess[str], *fragments: str) -> None:
+    """Bad input: exit code 2, one line on standard error, no traceback, nothing on standard output."""
+    assert result.returncode == 2, result.stderr
+    assert result.stdout == ""
+    assert len(result.stderr.strip().splitlines()) == 1, result.stderr
+    assert "Traceback" not in result.stderr
+    for fragment in fragments:
+        assert fragment in result.stderr
+
+
+def test_the_overview_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
+    main([])
+    printed = capsys.readouterr().out
+    for name, summary in COMMANDS.items():
+        assert name in printed
+        assert summary in printed
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_documents_all_its_options(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as leaving:
+        main([name, "--help"])
+    assert leaving.value.code == 0
+    printed = capsys.readouterr().out
+    assert f"usage: endopilot {name}" in printed
+    undocumented = [
+        line
+        for line in printed.splitlines()
+        if line.strip("│ ").startswith("--") and line.rstrip("│ ").endswith(("INT", "FLOAT", "STR", "PATH"))
+    ]
+    following = printed.splitlines()
+    for line in undocumented:
+        after = following[following.index(line) + 1].strip("│ ")
+        assert after and not after.startswith("-"), f"{name}: no help for {line}"
+
+
+def test_every_command_has_a_module() -> None:
+    for name in COMMANDS:
+        assert callable(importlib.import_module(f"endopilot.cli.{name}").command)
+
+
+def test_an_unknown_command_proposes_a_near_one() -> None:
+    assert_one_line(run("segmnt"), "did you mean 'segment'")
+
+
+def test_info_is_json_and_imports_nothing_heavy() -> None:
+    code = (
+        "import sys; from endopilot.cli import main\n"
+        "try: main(['info', '--json'])\n"
+        "except SystemExit: pass\n"
+        "heavy = {'torch', 'vtk', 'pyvista', 'SimpleITK', 'matplotlib', 'plotly', 'pandas'} & set(sys.modules)\n"
+        "assert not heavy, heavy"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    assert json.loads(result.stdout)["endopilot"]
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("segment", "missing.nii.gz", "-o", "mask.nii.gz"),
+        ("anatomy", "missing.stl", "-o", "out"),
+        ("phantom", "missing", "-o", "ct.nii.gz"),
+        ("simulate", "missing", "-o", "out.parquet"),
+        ("dataset", "missing", "-o", "out"),
+        ("train", "missing", "-o", "out"),
+        ("evaluate", "missing", "-o", "out"),
+        ("run", "missing.nii.gz", "-o", "out"),
+    ],
+)
+def test_a_missing_input_is_told_in_one_line(arguments: tuple[str, ...], tmp_path: Path) -> None:
+    assert_one_line(run(*arguments, cwd=tmp_path), "missing")
+    assert list(tmp_path.iterdir()) == []
