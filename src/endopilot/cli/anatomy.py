@@ -20,7 +20,7 @@ def command(
     name: str | None = None,
     label: int | None = None,
     json: bool = False,
-    config: AnatomyConfig = AnatomyConfig(),  # noqa: B008 (frozen)
+    config: AnatomyConfig = AnatomyConfig(),
 ) -> None:
     """Make an anatomy: centerline tree with section labels, distance map, ostium.
 

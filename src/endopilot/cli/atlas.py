@@ -12,7 +12,7 @@ def command(
     *,
     output: OutputFolder,
     json: bool = False,
-    config: AtlasConfig = AtlasConfig(),  # noqa: B008 (frozen)
+    config: AtlasConfig = AtlasConfig(),
 ) -> None:
     """Make synthetic patients whose vessels match published statistics; one folder each.
 

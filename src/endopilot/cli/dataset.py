@@ -19,7 +19,7 @@ def command(
     output: OutputFolder,
     device: str = "workhorse-014",
     json: bool = False,
-    config: DatasetConfig = DatasetConfig(),  # noqa: B008 (frozen)
+    config: DatasetConfig = DatasetConfig(),
 ) -> None:
     """Simulate random navigations of many patients and store them as a LeRobot v3 dataset.
 

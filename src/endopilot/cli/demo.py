@@ -12,7 +12,7 @@ def command(
     *,
     output: Path = Path("runs/demo"),
     json: bool = False,
-    config: DemoConfig = DemoConfig(),  # noqa: B008 (frozen)
+    config: DemoConfig = DemoConfig(),
 ) -> None:
     """Go the whole way once on synthetic patients: CTA, segmentation, anatomy, simulation, learning, report.
 

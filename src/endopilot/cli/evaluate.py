@@ -16,7 +16,7 @@ def command(
     *,
     output: OutputFolder,
     json: bool = False,
-    config: EvaluateConfig = EvaluateConfig(),  # noqa: B008 (frozen)
+    config: EvaluateConfig = EvaluateConfig(),
 ) -> None:
     """Roll the networks of a run out open loop (protocols P1 to P4) and measure their errors.
 

@@ -19,7 +19,7 @@ def command(
     output: OutputFile,
     seed: int = 0,
     json: bool = False,
-    config: PhantomConfig = PhantomConfig(),  # noqa: B008 (frozen)
+    config: PhantomConfig = PhantomConfig(),
 ) -> None:
     """Make the CT angiogram that a scanner would have made of an anatomy.
 

@@ -17,7 +17,7 @@ def command(
     output: OutputFolder,
     series: str | None = None,
     json: bool = False,
-    config: RunConfig = RunConfig(),  # noqa: B008 (frozen)
+    config: RunConfig = RunConfig(),
 ) -> None:
     """Go the whole way with one patient: CT angiogram in, report out.
 

@@ -19,7 +19,7 @@ def command(
     output: OutputFile,
     series: str | None = None,
     json: bool = False,
-    config: SegmentConfig = SegmentConfig(),  # noqa: B008 (frozen)
+    config: SegmentConfig = SegmentConfig(),
 ) -> None:
     """Segment the lumen of a vessel tree in a CT angiogram.
 

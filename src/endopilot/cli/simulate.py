@@ -45,8 +45,8 @@ def command(
     controls: Path | None = None,
     shape: bool = False,
     json: bool = False,
-    random: RandomConfig = RandomConfig(),  # noqa: B008 (frozen)
-    config: SimulatorConfig = SimulatorConfig(),  # noqa: B008 (frozen)
+    random: RandomConfig = RandomConfig(),
+    config: SimulatorConfig = SimulatorConfig(),
 ) -> None:
     """Drive a guidewire through an anatomy and record it at 2 Hz.
 

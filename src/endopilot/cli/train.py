@@ -17,7 +17,7 @@ def command(
     *,
     output: OutputFolder,
     json: bool = False,
-    config: TrainConfig = TrainConfig(),  # noqa: B008 (frozen)
+    config: TrainConfig = TrainConfig(),
 ) -> None:
     """Train the forward and the inverse network on a dataset.
 
