@@ -1,0 +1,181 @@
+"""An anatomy on disk: one folder that 3D Slicer and ParaView open, and that reads back exactly.
+
+=================  ================================================================================================
+file               content
+=================  ================================================================================================
+`centerline.vtp`   one polyline a branch, LPS mm; point data MaximumInscribedSphereRadius (mm), Abscissa (mm), Normals,
+                   Section (index into the section names); cell data Branch and Parent
+`lumen.nrrd`       signed distance to the wall, mm, positive inside, guiding catheter included; compressed float32
+`anatomy.json`     schema version, name, insertion, catheter radius, section names, provenance, SHA-256 of both files
+=================  ================================================================================================
+"""
+
+from __future__ import annotations
+
+import itertools
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from endopilot import files
+from endopilot.errors import InputError
+from endopilot.types import Anatomy, Branch, Centerline, DistanceMap, Insertion, VesselTree
+
+SCHEMA_VERSION = 1
+
+_CENTERLINE, _LUMEN, _RECORD = "centerline.vtp", "lumen.nrrd", "anatomy.json"
+
+
+def write_anatomy(anatomy: Anatomy, folder: Path) -> None:
+    """Write an anatomy as a folder, whole or not at all; an anatomy that stands there already is replaced.
+
+    Raises:
+        InputError: the folder cannot be written, or holds something that is not an anatomy.
+    """
+    folder = Path(folder)
+    if folder.exists() and not (folder.is_dir() and ((folder / _RECORD).exists() or not any(folder.iterdir()))):
+        raise InputError(f"{folder}: exists and is not an anatomy; choose another output folder")
+    with files.writing(folder) as partial:
+        partial.mkdir()
+        _write_tree(anatomy.tree, partial / _CENTERLINE)
+        _write_distance_map(anatomy.distance_map, partial / _LUMEN)
+        record = {
+            "schema_version": SCHEMA_VERSION,
+            "name": anatomy.name,
+            "insertion": {"position_mm": anatomy.insertion.position, "direction": anatomy.insertion.direction},
+            "catheter_radius_mm": float(anatomy.catheter_radius_mm),
+            "section_names": list(anatomy.tree.section_names),
+            "coordinates": "LPS, mm",
+            "sha256": {name: files.sha256(partial / name) for name in (_CENTERLINE, _LUMEN)},
+            "provenance": anatomy.provenance,
+        }
+        (partial / _RECORD).write_text(files.json_text(record) + "\n", encoding="utf-8")
+        if folder.exists():
+            shutil.rmtree(folder)
+
+
+def read_anatomy(folder: Path) -> Anatomy:
+    """Read an anatomy that `write_anatomy` wrote.
+
+    Raises:
+        InputError: the folder or one of its files is missing, damaged or of another version.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder; give an anatomy made by `endopilot anatomy` or `endopilot atlas`")
+    if not (folder / _RECORD).exists():
+        raise InputError(f"{folder}: holds no {_RECORD}, so it is not an anatomy; make one with `endopilot anatomy`")
+    record = files.read_json(folder / _RECORD)
+    version = record.get("schema_version") if isinstance(record, dict) else None
+    if version != SCHEMA_VERSION:
+        raise InputError(
+            f"{folder / _RECORD}: schema_version is {version}, not {SCHEMA_VERSION}; make the anatomy again"
+        )
+    try:
+        position, direction = (np.array(record["insertion"][key], dtype=float) for key in ("position_mm", "direction"))
+        names, radius = tuple(record["section_names"]), float(record["catheter_radius_mm"])
+        name, provenance, hashes = str(record["name"]), dict(record["provenance"]), dict(record["sha256"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{folder / _RECORD}: damaged ({error!r}); make the anatomy again") from error
+    for file in (_CENTERLINE, _LUMEN):
+        if not (folder / file).exists():
+            raise InputError(f"{folder / file}: is missing; make the anatomy again")
+        if files.sha256(folder / file) != hashes.get(file):
+            raise InputError(f"{folder / file}: differs from what anatomy.json records; make the anatomy again")
+    return Anatomy(
+        name=name,
+        tree=_read_tree(folder / _CENTERLINE, names),
+        distance_map=_read_distance_map(folder / _LUMEN),
+        insertion=Insertion(position=position, direction=direction),
+        catheter_radius_mm=radius,
+        provenance=provenance,
+    )
+
+
+def _write_tree(tree: VesselTree, path: Path) -> None:
+    from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
+    from vtkmodules.vtkCommonCore import vtkPoints
+    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
+
+    lines = [branch.centerline for branch in tree.branches]
+    counts = np.array([len(line.points) for line in lines])
+    polydata, points, cells = vtkPolyData(), vtkPoints(), vtkCellArray()
+    points.SetData(numpy_to_vtk(np.concatenate([line.points for line in lines]).astype(float), deep=True))
+    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    cells.SetData(
+        numpy_to_vtkIdTypeArray(offsets, deep=True),
+        numpy_to_vtkIdTypeArray(np.arange(offsets[-1], dtype=np.int64), deep=True),
+    )
+    polydata.SetPoints(points)
+    polydata.SetLines(cells)
+    columns: dict[str, tuple[Any, np.ndarray]] = {
+        "MaximumInscribedSphereRadius": (polydata.GetPointData(), np.concatenate([line.radius for line in lines])),
+        "Abscissa": (polydata.GetPointData(), np.concatenate([line.abscissa for line in lines])),
+        "Normals": (polydata.GetPointData(), np.concatenate([line.normals for line in lines])),
+        "Section": (polydata.GetPointData(), np.concatenate([branch.section for branch in tree.branches])),
+        "Branch": (polydata.GetCellData(), np.arange(len(lines))),
+        "Parent": (polydata.GetCellData(), np.array([branch.parent for branch in tree.branches])),
+    }
+    for name, (attributes, values) in columns.items():
+        kind = np.int32 if np.issubdtype(values.dtype, np.integer) else np.float64
+        array = numpy_to_vtk(np.ascontiguousarray(values, dtype=kind), deep=True)
+        array.SetName(name)
+        attributes.AddArray(array)
+    writer = vtkXMLPolyDataWriter()
+    writer.SetFileName(str(path))
+    writer.SetInputData(polydata)
+    if not writer.Write():
+        raise OSError(f"{path}: could not be written")
+
+
+def _read_tree(path: Path, section_names: tuple[str, ...]) -> VesselTree:
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
+
+    reader = vtkXMLPolyDataReader()
+    reader.SetFileName(str(path))
+    reader.Update()
+    polydata = reader.GetOutput()
+    try:
+        points = vtk_to_numpy(polydata.GetPoints().GetData()).astype(float)
+        offsets = vtk_to_numpy(polydata.GetLines().GetOffsetsArray())
+        point_data, cell_data = polydata.GetPointData(), polydata.GetCellData()
+        radius, abscissa, normals, section = (
+            vtk_to_numpy(point_data.GetArray(name))
+            for name in ("MaximumInscribedSphereRadius", "Abscissa", "Normals", "Section")
+        )
+        parent = vtk_to_numpy(cell_data.GetArray("Parent"))
+    except AttributeError as error:
+        raise InputError(f"{path}: is not a centerline written by endopilot; make the anatomy again") from error
+    branches = []
+    for index, (start, end) in enumerate(itertools.pairwise(offsets)):
+        part = slice(int(start), int(end))
+        line = Centerline(points[part].copy(), radius[part].copy(), abscissa[part].copy(), normals[part].copy())
+        branches.append(Branch(line, int(parent[index]), section[part].astype(np.int64)))
+    return VesselTree(tuple(branches), section_names)
+
+
+def _write_distance_map(distance_map: DistanceMap, path: Path) -> None:
+    import SimpleITK
+
+    image = SimpleITK.GetImageFromArray(distance_map.values.astype(np.float32))
+    image.SetSpacing([float(distance_map.spacing_mm)] * 3)
+    image.SetOrigin([float(value) for value in distance_map.origin_mm])
+    SimpleITK.WriteImage(image, str(path), useCompression=True)
+
+
+def _read_distance_map(path: Path) -> DistanceMap:
+    import SimpleITK
+
+    try:
+        image = SimpleITK.ReadImage(str(path), SimpleITK.sitkFloat32)
+    except RuntimeError as error:
+        raise InputError(f"{path}: cannot be read as NRRD; make the anatomy again") from error
+    return DistanceMap(
+        values=SimpleITK.GetArrayFromImage(image),
+        spacing_mm=float(image.GetSpacing()[0]),
+        origin_mm=np.array(image.GetOrigin(), dtype=float),
+    )
