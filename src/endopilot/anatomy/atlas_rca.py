@@ -1,0 +1,310 @@
+"""Right coronary arteries: a C around the right atrioventricular groove, drawn from published statistics.
+
+Facts and their sources:
+
+- Mean course: Dodge JT et al., "Intrathoracic spatial location of specified coronary segments on the normal human
+  heart", Circulation 1988;78:1167-80: mean spherical positions of segments R1 to R4 from the right ostium. Around the crux
+  the azimuth was averaged across ±180° and means nothing there (its spread is 64°): R3 distal and R4 proximal are
+  interpolated in azimuth; the posterior descending artery runs from the crux towards the apex.
+- Lumen diameters by dominance: Dodge JT et al., "Lumen diameter of normal human coronary arteries", Circulation
+  1992;86:232-46.
+- Length, tortuosity, curvature, diameter along the way and the branches' origins: sixteen manually segmented right
+  coronary arteries (DESIGN §4 of the project).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.interpolate import PchipInterpolator
+from scipy.optimize import root
+from scipy.spatial.transform import Rotation
+
+from endopilot.anatomy import atlas_shape as shape
+from endopilot.types import VesselTree
+
+SECTION_NAMES = ("1", "2", "3", "4", "16", "conus", "SA", "RV", "AM")
+"""Names of the sections: segments of AHA/SCCT, then the side branches."""
+
+LENGTH_MM, LENGTH_SD_MM, LENGTH_RANGE_MM = 164.0, 30.0, (112.0, 223.0)
+TORTUOSITY, TORTUOSITY_SD = 2.07, 0.23
+CURVATURE, CURVATURE_SD = 0.061, 0.017
+DIAMETER_MM = {0.1: 4.0, 0.2: 3.8, 0.5: 3.5, 0.7: 2.7, 0.9: 2.3}
+"""Lumen diameter, mm, at fractions of the way from the ostium to the farthest tip."""
+
+# From the right ostium to the crux: R1p R1m R1d R2p R2m R2d R3p R3m R3d of Dodge 1988, LPS mm.
+_TO_CRUX = np.array(
+    [
+        [0.0, 0.0, 0.0],
+        [-4.4, -1.5, -1.9],
+        [-14.4, -5.8, -6.9],
+        [-20.6, -9.2, -13.0],
+        [-24.7, -9.5, -21.4],
+        [-29.3, -9.5, -34.2],
+        [-31.3, -7.2, -45.9],
+        [-29.0, -3.0, -54.7],
+        [-22.9, 0.4, -59.7],
+        [-13.5, 12.5, -64.0],
+    ]
+)
+# Beyond the crux, LPS mm: along the inferior interventricular groove to the apex, or R4 and the posterolateral branch.
+_BEYOND_CRUX = {
+    "4": np.array([[-1, 6, -70], [14, -8, -72.5], [32, -25, -71], [50, -43, -66], [66, -60, -58.0]]),
+    "16": np.array([[-1, 25, -58], [7, 34, -53], [17, 39, -55], [29, 37, -64], [43, 30, -72], [58, 20, -76.0]]),
+}
+_RIGHT_SHARE, _BALANCED_SHARE = 0.88, 0.06
+"""Shares of right and balanced dominance; the rest is left. Chosen within the range that the literature reports."""
+_CALIBRE = {"right": 1.025, "balanced": 0.9, "left": 0.74}
+"""Lumen against the average of all patients (Dodge 1992: balanced 0.78, left 0.70 of right dominance)."""
+_FEMALE_CALIBRE = 0.91
+"""Women's lumens against men's (Dodge 1992)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _SideKind:
+    """How a kind of side branch leaves: mean and SD of origin and length, mm; lumen; courses in LPS directions."""
+
+    origin_mm: tuple[float, float]
+    length_mm: tuple[float, float]
+    diameter_mm: float
+    share: float
+    courses: tuple[tuple[float, tuple[float, float, float]], ...]
+
+
+_SIDES = {
+    "conus": _SideKind(
+        origin_mm=(15, 6), length_mm=(26, 6), diameter_mm=1.6, share=0.85,
+        courses=((0, (0.45, -0.85, 0.3)), (8, (0.85, -0.5, 0.0)), (18, (0.8, -0.35, -0.5))),
+    ),
+    "SA": _SideKind(
+        origin_mm=(16, 6), length_mm=(30, 7), diameter_mm=1.5, share=0.6,
+        courses=((0, (-0.25, 0.75, 0.6)), (10, (0.15, 0.85, 0.5)), (20, (-0.5, 0.6, 0.6))),
+    ),
+    "RV": _SideKind(
+        origin_mm=(29, 5), length_mm=(36, 8), diameter_mm=1.7, share=0.8,
+        courses=((0, (0.4, -0.9, -0.1)), (10, (0.75, -0.55, -0.35)), (22, (0.75, -0.2, -0.6))),
+    ),
+    "AM": _SideKind(
+        origin_mm=(42, 8), length_mm=(50, 10), diameter_mm=2.0, share=1.0,
+        courses=((0, (0.3, -0.85, -0.4)), (12, (0.7, -0.5, -0.5)), (30, (0.85, -0.3, -0.4))),
+    ),
+}  # fmt: skip
+_DISTAL_COURSES = {
+    "4": ((0, (0.72, -0.6, -0.35)), (18, (0.73, -0.68, -0.08)), (45, (0.7, -0.65, 0.25))),
+    "16": ((0, (0.68, 0.65, 0.32)), (16, (0.6, 0.7, 0.3)), (26, (0.85, 0.1, -0.5)), (45, (0.85, -0.4, -0.3))),
+}
+
+
+class _NoShape(Exception):
+    """The drawn targets cannot be met together, or lumens collide: draw again."""
+
+
+def synthesize_rca(generator: np.random.Generator, stenosis_share: float) -> tuple[VesselTree, dict[str, Any]]:
+    """Return one right coronary tree and what was drawn for it.
+
+    Args:
+        generator: random stream of this patient.
+        stenosis_share: probability of a stenosis.
+    """
+    for attempt in range(200):
+        try:
+            tree, truth = _draw(generator, stenosis_share)
+        except _NoShape:
+            continue
+        return tree, truth | {"redrawn": attempt}
+    raise RuntimeError("no right coronary artery found in 200 draws")
+
+
+def _draw(generator: np.random.Generator, stenosis_share: float) -> tuple[VesselTree, dict[str, Any]]:
+    dominance = _dominance(generator.random())
+    main, crux, ends_in = _main_vessel(generator, dominance)
+    radius, calibre = _main_radius(generator, dominance, main)
+    stenosis = None
+    if generator.random() < stenosis_share:
+        stenosis, narrowing = _stenosis(generator, main)
+        radius = radius * narrowing
+    sides = _side_branches(generator, main, radius, crux, ends_in, dominance, calibre)
+    section = _main_sections(main, crux, ends_in)
+    tree = shape.build_tree(main, radius, section, sides, SECTION_NAMES)
+    bends = shape.curvature(main)
+    truth = {
+        "dominance": dominance,
+        "length_mm": float(shape.abscissa(main)[-1]),
+        "tortuosity": shape.tortuosity(main),
+        "curvature_mean_per_mm": float(bends.mean()),
+        "curvature_p90_per_mm": float(np.quantile(bends, 0.9)),
+        "stenoses": [] if stenosis is None else [stenosis],
+    }
+    return tree, truth
+
+
+def _dominance(u: float) -> str:
+    return "right" if u < _RIGHT_SHARE else "balanced" if u < _RIGHT_SHARE + _BALANCED_SHARE else "left"
+
+
+def _truncated(generator: np.random.Generator, mean: float, sd: float, low: float, high: float) -> float:
+    while True:
+        value = generator.normal(mean, sd)
+        if low <= value <= high:
+            return float(value)
+
+
+def _main_vessel(generator: np.random.Generator, dominance: str) -> tuple[Float[np.ndarray, "n 3"], int, str]:
+    """Return the way from the ostium to the farthest tip, the index of the crux on it, and its last section.
+
+    Size, closure of the C and amplitude of the wiggles are solved for so that length, tortuosity and mean curvature
+    take the drawn values.
+    """
+    if dominance == "left":
+        # A small right coronary ends before the crux.
+        length, ends_in = 112.0 + abs(generator.normal(0, 10)), "3"
+        waypoints, cut, crux_mm = _TO_CRUX, 0.97, np.inf
+    else:
+        # The mean makes up for the shorter left-dominant arteries.
+        length = _truncated(generator, LENGTH_MM + 2.4, LENGTH_SD_MM, *LENGTH_RANGE_MM)
+        ends_in = "4" if dominance == "balanced" or generator.random() < 0.6 else "16"
+        waypoints = np.concatenate([_TO_CRUX, _BEYOND_CRUX[ends_in]])
+        # Long arteries reach farther beyond the crux rather than belong to huge hearts.
+        crux_mm = 98.0 * (length / LENGTH_MM) ** 0.65 * (1 + 0.03 * generator.normal())
+        cut = None
+    tortuosity = _truncated(generator, TORTUOSITY, TORTUOSITY_SD, TORTUOSITY - 0.45, TORTUOSITY + 0.45)
+    mean_curvature = _truncated(generator, CURVATURE, CURVATURE_SD, CURVATURE - 0.025, CURVATURE + 0.025)
+    template = shape.curve_through(waypoints)
+    template_crux = float(shape.abscissa(shape.curve_through(_TO_CRUX))[-1])
+    along = shape.abscissa(template)
+    keep = cut * along[-1] if cut else min(template_crux * length / crux_mm, along[-1])
+    template = template[along <= keep]
+    wiggle = shape.Wiggle.draw(generator, 13.0, 70.0)
+    turn = Rotation.from_rotvec(np.deg2rad(generator.normal(0, 7, 3)))
+    centred = _TO_CRUX - _TO_CRUX.mean(axis=0)
+    axis = np.linalg.svd(centred)[2][2]
+    axis = axis * np.sign(axis @ np.cross(_TO_CRUX[4] - _TO_CRUX[0], _TO_CRUX[-1] - _TO_CRUX[4]))
+
+    def curve(knobs: Float[np.ndarray, "3"]) -> Float[np.ndarray, "n 3"]:
+        bent = shape.bend(template, axis, float(knobs[1])) * np.exp(knobs[0])
+        return turn.apply(shape.curve_through(wiggle.apply(bent, float(np.exp(knobs[2])), 8.0)))
+
+    def misfit(knobs: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+        points = curve(np.clip(knobs, (-1, -2, -4), (1, 2, 3)))
+        found = (shape.abscissa(points)[-1], shape.tortuosity(points), shape.curvature(points).mean())
+        return np.log(np.array(found) / (length, tortuosity, mean_curvature))
+
+    solution = root(misfit, np.array([np.log(length / keep) - 0.05, 0.0, 0.5]), tol=1e-3, options={"maxfev": 60})
+    points = curve(np.clip(solution.x, (-1, -2, -4), (1, 2, 3)))
+    if np.abs(misfit(solution.x)).max() > 0.01 or shape.curvature(points).max() > 0.28:
+        raise _NoShape
+    crux = len(points) - 1 if ends_in == "3" else round(len(points) * template_crux / keep)
+    return points, crux, ends_in
+
+
+def _main_radius(
+    generator: np.random.Generator, dominance: str, main: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "n"], float]:
+    """Return the lumen radius along the main vessel, mm, and the patient's calibre against the average."""
+    sex = _FEMALE_CALIBRE if generator.random() < 0.5 else 1.0
+    calibre = _CALIBRE[dominance] * sex / (0.5 + 0.5 * _FEMALE_CALIBRE) * (1 + 0.1 * generator.normal())
+    calibre = float(np.clip(calibre, 0.55, 1.4))
+    share = np.linspace(0.0, 1.0, len(main))
+    diameter = PchipInterpolator([0.0, *DIAMETER_MM, 1.0], [4.1, *DIAMETER_MM.values(), 2.15])(share)
+    if dominance == "left":
+        diameter = diameter * (1 - 0.2 * share)
+    along = shape.abscissa(main)
+    wavelength = generator.uniform(15.0, 60.0, 4)
+    waves = np.sin(2 * np.pi * along[:, None] / wavelength + generator.uniform(0, 2 * np.pi, 4)).sum(axis=1)
+    return 0.5 * diameter * calibre * (1 + 0.025 * waves), calibre
+
+
+def _stenosis(
+    generator: np.random.Generator, main: Float[np.ndarray, "n 3"]
+) -> tuple[dict[str, float], Float[np.ndarray, "n"]]:
+    """Return a narrowing of 30 to 65 % of the diameter over 6 to 14 mm, and the factor on the radius."""
+    along = shape.abscissa(main)
+    place, extent = generator.uniform(0.12, 0.75) * along[-1], generator.uniform(6.0, 14.0)
+    degree = generator.uniform(0.3, 0.65)
+    narrowing = 1 - degree * np.exp(-0.5 * ((along - place) / (extent / 4)) ** 2)
+    truth = {"abscissa_mm": float(place), "length_mm": float(extent), "diameter_reduction": float(degree)}
+    return truth, narrowing
+
+
+def _main_sections(main: Float[np.ndarray, "n 3"], crux: int, ends_in: str) -> list[str]:
+    """Label the main vessel: the acute margin lies 64 % of the way to the crux (Dodge 1988, R2 distal)."""
+    margin = round(0.64 * crux)
+    place = np.arange(len(main))
+    names = np.select([place <= margin // 2, place <= margin, place <= crux], ["1", "2", "3"], default=ends_in)
+    return [str(name) for name in names]
+
+
+def _side_branches(
+    generator: np.random.Generator,
+    main: Float[np.ndarray, "n 3"],
+    radius: Float[np.ndarray, "n"],
+    crux: int,
+    ends_in: str,
+    dominance: str,
+    calibre: float,
+) -> list[shape.SideBranch]:
+    """Draw the branches; one that cuts another lumen is drawn again, and the patient with it in the end."""
+    wanted: list[tuple[str, int, float, float, tuple]] = []
+    taken: list[int] = []
+    for name, kind in _SIDES.items():
+        if generator.random() > kind.share:
+            continue
+        origin = _free_origin(generator, kind.origin_mm, taken)
+        taken.append(origin)
+        length = _truncated(generator, *kind.length_mm, 0.5 * kind.length_mm[0], 1.5 * kind.length_mm[0])
+        length = min(length, 0.5 * (len(main) - 1) * 0.95 - origin * 0.5)
+        diameter = kind.diameter_mm * (0.6 + 0.4 * calibre) * (1 + 0.1 * generator.normal())
+        wanted.append((name, origin, length, diameter, kind.courses))
+    if dominance == "right" or (dominance == "balanced" and ends_in == "16"):
+        other = "16" if ends_in == "4" else "4"
+        beyond = 0.5 * (len(main) - 1 - crux)
+        length = max(beyond * generator.uniform(0.6, 0.92), 12.0)
+        wanted.append((other, crux, length, 2 * radius[crux] * generator.uniform(0.68, 0.8), _DISTAL_COURSES[other]))
+    sides: list[shape.SideBranch] = []
+    for name, origin, length, diameter, courses in wanted:
+        for _ in range(12):
+            side = _side_branch(generator, main, radius, name, origin, length, diameter, courses)
+            if not shape.lumens_collide(main, radius, [*sides, side]):
+                sides.append(side)
+                break
+        else:
+            raise _NoShape
+    return sides
+
+
+def _free_origin(generator: np.random.Generator, origin_mm: tuple[float, float], taken: list[int]) -> int:
+    """Draw the index of a branch's origin, 3 mm or more from the ostium and from other origins."""
+    mean, sd = origin_mm
+    while True:
+        origin = round(_truncated(generator, mean, sd, max(mean - 2 * sd, 3.0), mean + 2 * sd) / shape.STEP_MM)
+        if all(abs(origin - other) * shape.STEP_MM >= 3.0 for other in taken):
+            return origin
+
+
+def _side_branch(
+    generator: np.random.Generator,
+    main: Float[np.ndarray, "n 3"],
+    radius: Float[np.ndarray, "n"],
+    name: str,
+    origin: int,
+    length: float,
+    diameter: float,
+    courses: tuple[tuple[float, tuple[float, float, float]], ...],
+) -> shape.SideBranch:
+    turn = Rotation.from_rotvec(np.deg2rad(generator.normal(0, 12, 3)))
+    headed = [(begin, turn.apply(np.array(course) / np.linalg.norm(course))) for begin, course in courses]
+    forward = shape.tangents(main)[origin]
+    across = headed[0][1] - (headed[0][1] @ forward) * forward
+    angle = np.deg2rad(generator.uniform(40, 70))
+    direction = np.cos(angle) * forward + np.sin(angle) * across / np.linalg.norm(across)
+    points = shape.steer(main[origin], direction, headed, length, generator.uniform(7.0, 11.0))
+    points = shape.Wiggle.draw(generator, 13.0, 45.0, 6).apply(points, generator.uniform(0.4, 1.2), 10.0)
+    points = shape.curve_through(points[:: max(len(points) // 24, 1)])
+    points = np.concatenate([main[origin][None], points[1:]])
+    share = np.linspace(0.0, 1.0, len(points))
+    lumen = 0.5 * diameter * (1 - 0.3 * share)
+    lumen = shape.mouth(np.minimum(lumen, 0.9 * radius[origin]), points, forward, float(radius[origin]))
+    return shape.SideBranch(origin, points, lumen, name)
