@@ -17,6 +17,7 @@ import SimpleITK as sitk
 from endopilot.errors import InputError
 from endopilot.files import read_json, write_json, writing
 from endopilot.imaging.dicom import is_dicom, read_series, write_series
+from endopilot.imaging.grid import from_image, to_image
 from endopilot.types import Insertion, LumenMask, Volume
 
 SUFFIXES = (".nii.gz", ".nii", ".nrrd", ".mha")
@@ -74,15 +75,10 @@ def write_volume(volume: Volume, path: str | Path) -> None:
         return
     if _suffix(path) not in SUFFIXES:
         raise InputError(f"{path}: unknown format; name the output with one of {', '.join(SUFFIXES)}")
-    voxels = volume.voxels.astype(np.uint8) if volume.voxels.dtype == bool else volume.voxels
-    image = sitk.GetImageFromArray(voxels)
-    image.SetSpacing(volume.spacing_mm.tolist())
-    image.SetOrigin(volume.origin_mm.tolist())
-    image.SetDirection(volume.direction.ravel().tolist())
     with writing(path) as partial:
         try:
             # Level 1 costs a few percent in size and saves most of the time.
-            sitk.WriteImage(image, partial, useCompression=path.suffix != ".nii", compressionLevel=1)
+            sitk.WriteImage(to_image(volume), partial, useCompression=path.suffix != ".nii", compressionLevel=1)
         except RuntimeError as error:
             raise InputError(
                 f"{path}: cannot be written; see that the folder is writable and the disk is not full"
@@ -175,23 +171,16 @@ def _read_file(path: Path) -> Volume:
             image = sitk.Extract(image, [*size[:3], *(0 for _ in size[3:])])
     except RuntimeError as error:
         raise InputError(f"{path}: truncated or damaged ({_reason(error)}); copy or export it again") from error
-    return _from_image(image)
+    return _compact(from_image(image))
 
 
-def _from_image(image: sitk.Image) -> Volume:
-    voxels = sitk.GetArrayFromImage(image)
-    if voxels.dtype.kind in "iu" and voxels.dtype != np.int16:
-        information = np.iinfo(np.int16)
-        if voxels.min() >= information.min and voxels.max() <= information.max:
-            voxels = voxels.astype(np.int16)
-    if voxels.dtype != np.int16:
-        voxels = voxels.astype(np.float32)
-    return Volume(
-        voxels=voxels,
-        spacing_mm=np.array(image.GetSpacing(), dtype=float),
-        origin_mm=np.array(image.GetOrigin(), dtype=float),
-        direction=np.array(image.GetDirection(), dtype=float).reshape(3, 3),
-    )
+def _compact(volume: Volume) -> Volume:
+    """Hold whole numbers that fit as int16, all others as float32."""
+    voxels = volume.voxels
+    limits = np.iinfo(np.int16)
+    whole = voxels.dtype.kind in "iu" and voxels.min() >= limits.min and voxels.max() <= limits.max
+    voxels = voxels.astype(np.int16 if whole else np.float32)
+    return Volume(voxels, volume.spacing_mm, volume.origin_mm, volume.direction)
 
 
 def _reason(error: RuntimeError) -> str:
