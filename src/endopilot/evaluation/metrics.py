@@ -1,0 +1,209 @@
+"""The numbers that say how good a prediction is. Pure numpy; NaN marks a sample that counts for nothing.
+
+Errors are `predicted − true`. A sample is left out only where the truth is not valid; a prediction that is not
+finite where the truth is counts as lost, and its sequence as diverged, so that failing cannot improve a figure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+SPANS_S: tuple[tuple[float, float], ...] = ((0.0, 10.0), (10.0, 30.0), (30.0, 45.0))
+"""Spans of time after the given states over which errors are reported, s: those of the paper."""
+
+PAPER_ERRORS: Mapping[str, Mapping[str, Mapping[str, float]]] = {
+    "0-10": {"abscissa": {"mae": 0.25, "sd": 0.22}, "offset": {"mae": 0.09, "sd": 0.10}},
+    "10-30": {"abscissa": {"mae": 0.31, "sd": 0.27}, "offset": {"mae": 0.12, "sd": 0.14}},
+    "30-45": {"abscissa": {"mae": 0.62, "sd": 0.60}, "offset": {"mae": 0.14, "sd": 0.16}},
+}
+"""Mean and SD of the absolute tip error, mm, as Kim et al. publish them (Hamlyn 2023, arXiv 2304.09286)."""
+
+DIVERGED_MM = 2.0
+"""A rollout whose |error of Δtip| passes this, mm, once or more, has diverged."""
+
+OFF_WALL_MM = 0.1
+"""A tip with more than this between wire and wall, mm, is off the wall."""
+
+
+def span_name(span: tuple[float, float]) -> str:
+    """Return the key of a span in metrics.json, such as "10-30"."""
+    return f"{span[0]:g}-{span[1]:g}"
+
+
+def span_slices(n_samples: int, sample_period_s: float) -> dict[str, slice]:
+    """Return the samples of each span that a prediction of `n_samples` reaches into.
+
+    Prediction k (from 0) is the state (k + 1) periods after the last given one, and belongs to the span with
+    start < time ≤ end.
+    """
+    slices = {}
+    for span in SPANS_S:
+        start, stop = (round(edge / sample_period_s) for edge in span)
+        if start < n_samples:
+            slices[span_name(span)] = slice(start, min(stop, n_samples))
+    return slices
+
+
+def error_statistics(error: Float[np.ndarray, "episodes samples"]) -> dict[str, float | int | None]:
+    """Return the statistics of the absolute error over all finite samples, in the unit of the error.
+
+    `mae` and `sd` are the mean and the standard deviation of |error| (what the paper publishes), `median` and
+    `p95` its quantiles, `rmse` the root of the mean squared error, `bias` the mean of the signed error, `count`
+    the number of samples. Without any finite sample all but `count` are None.
+    """
+    finite = error[np.isfinite(error)]
+    if finite.size == 0:
+        return dict.fromkeys(("mae", "sd", "median", "p95", "rmse", "bias"), None) | {"count": 0}
+    absolute = np.abs(finite)
+    return {
+        "mae": float(absolute.mean()),
+        "sd": float(absolute.std()),
+        "median": float(np.median(absolute)),
+        "p95": float(np.quantile(absolute, 0.95)),
+        "rmse": float(np.sqrt(np.mean(finite**2))),
+        "bias": float(finite.mean()),
+        "count": int(finite.size),
+    }
+
+
+def skill(
+    error: Float[np.ndarray, "episodes samples"], baseline: Float[np.ndarray, "episodes samples"]
+) -> float | None:
+    """Return 1 − RMSE/RMSE of the baseline, over the samples where both are finite.
+
+    1 is a perfect prediction, 0 is no better than the baseline, and a negative value is worse. None where no
+    sample has both, or where the baseline is without error.
+    """
+    both = np.isfinite(error) & np.isfinite(baseline)
+    reference = float(np.sum(baseline[both] ** 2))
+    if reference == 0.0:
+        return None
+    return 1.0 - float(np.sqrt(np.sum(error[both] ** 2) / reference))
+
+
+def bootstrap_mae(
+    error: Float[np.ndarray, "episodes samples"], anatomy: Int[np.ndarray, "episodes"], *, seed: int, draws: int = 1000
+) -> tuple[float, float] | None:
+    """Return the 95 % percentile interval of the mean absolute error when anatomies are drawn with replacement.
+
+    Sequences of one patient are alike, so the patient is the unit that is drawn (cluster bootstrap: Davison &
+    Hinkley 1997, §3.8). None with fewer than two anatomies, where nothing can be said of other patients.
+    """
+    finite = np.isfinite(error)
+    absolute = np.where(finite, np.abs(error), 0.0).sum(axis=1)
+    names = np.unique(anatomy)
+    total = np.array([absolute[anatomy == name].sum() for name in names])
+    count = np.array([finite[anatomy == name].sum() for name in names])
+    total, count = total[count > 0], count[count > 0]
+    if len(count) < 2:
+        return None
+    drawn = np.random.Generator(np.random.Philox(seed)).integers(len(count), size=(draws, len(count)))
+    means = total[drawn].sum(axis=1) / count[drawn].sum(axis=1)
+    low, high = np.quantile(means, [0.025, 0.975])
+    return float(low), float(high)
+
+
+def diverged_share(error: Float[np.ndarray, "episodes samples"], lost: Bool[np.ndarray, "episodes samples"]) -> float:
+    """Return the share of sequences whose |error of Δtip| passes `DIVERGED_MM`, or that lost a sample."""
+    large = np.abs(np.nan_to_num(error, nan=0.0)) > DIVERGED_MM
+    return float(np.mean((large | lost).any(axis=1)))
+
+
+def safety_ratio(
+    offset: Float[np.ndarray, "*n"], radius: Float[np.ndarray, "*n"], *, wire_radius_mm: float = 0.0
+) -> Float[np.ndarray, "*n"]:
+    """Return γ/(r − r_w): how far the tip has gone from the centerline towards the wall.
+
+    With `wire_radius_mm` 0 this is the paper's ratio γ/r, which a wire that touches the wall holds at 1 − r_w/r.
+    With the wire's radius it is 1 where the wire touches. Where the wire does not fit it is NaN.
+    """
+    clearance = radius - wire_radius_mm
+    return np.divide(offset, clearance, out=np.full_like(offset, np.nan), where=clearance > 0)
+
+
+def quantiles_over_time(values: Float[np.ndarray, "episodes samples"]) -> dict[str, Float[np.ndarray, "samples"]]:
+    """Return q25, median, q75 and p95 over the sequences at each time; NaN where no sequence has a value."""
+    levels = {"q25": 0.25, "median": 0.5, "q75": 0.75, "p95": 0.95}
+    out = {name: np.full(values.shape[1], np.nan) for name in levels}
+    known = np.isfinite(values).any(axis=0)
+    for name, level in levels.items():
+        out[name][known] = np.nanquantile(values[:, known], level, axis=0)
+    return out
+
+
+def mean_over_time(error: Float[np.ndarray, "episodes samples"]) -> Float[np.ndarray, "samples"]:
+    """Return the mean absolute error over the sequences at each time; NaN where no sequence has a value."""
+    finite = np.isfinite(error)
+    count = finite.sum(axis=0)
+    total = np.where(finite, np.abs(error), 0.0).sum(axis=0)
+    return np.divide(total, count, out=np.full(error.shape[1], np.nan), where=count > 0)
+
+
+def control_rmse(
+    predicted: Float[np.ndarray, "episodes samples 2"], true: Float[np.ndarray, "episodes samples 2"]
+) -> Float[np.ndarray, "episodes 2"]:
+    """Return the RMSE of the control of each sequence: translation in mm/s, rotation in deg/s.
+
+    NaN for a sequence without any sample in which both are finite.
+    """
+    error = predicted - true
+    finite = np.isfinite(error)
+    count = finite.sum(axis=1)
+    total = np.where(finite, error**2, 0.0).sum(axis=1)
+    mean = np.divide(total, count, out=np.full(count.shape, np.nan), where=count > 0)
+    return np.sqrt(mean) * np.array([1.0, np.rad2deg(1.0)])
+
+
+def distribution(values: Float[np.ndarray, "n"]) -> dict[str, float | int | None]:
+    """Return median, quartiles, 95 % quantile, mean and count of the finite values."""
+    finite = values[np.isfinite(values)]
+    if finite.size == 0:
+        return dict.fromkeys(("q25", "median", "q75", "p95", "mean"), None) | {"count": 0}
+    q25, median, q75, p95 = (float(q) for q in np.quantile(finite, [0.25, 0.5, 0.75, 0.95]))
+    return {"q25": q25, "median": median, "q75": q75, "p95": p95, "mean": float(finite.mean()), "count": finite.size}
+
+
+def tip_statistics(
+    error: Float[np.ndarray, "episodes samples"],
+    *,
+    radius: Float[np.ndarray, "episodes samples"],
+    baselines: Mapping[str, Float[np.ndarray, "episodes samples"]],
+    anatomy: Int[np.ndarray, "episodes"],
+    sample_period_s: float,
+    seed: int,
+) -> dict[str, dict]:
+    """Return, for each span and for "all" samples, the statistics of one tip coordinate's error.
+
+    Args:
+        error: predicted − true Δtip or γtip, mm; NaN where there is nothing to compare.
+        radius: lumen radius at the true tip, mm; `mae_over_radius` is the mean of |error|/radius.
+        baselines: errors of the baselines on the same samples, mm, by name.
+        anatomy: which anatomy each sequence belongs to.
+        sample_period_s: time between samples, s.
+        seed: seed of the bootstrap.
+    """
+    spans: dict[str, slice] = {**span_slices(error.shape[1], sample_period_s), "all": slice(None)}
+    statistics = {}
+    for name, samples in spans.items():
+        part = error[:, samples]
+        statistics[name] = error_statistics(part) | {
+            "mae_interval": bootstrap_mae(part, anatomy, seed=seed),
+            "mae_over_radius": error_statistics(part / radius[:, samples])["mae"],
+            "skill": {key: skill(part, other[:, samples]) for key, other in baselines.items()},
+        }
+    return statistics
+
+
+def worst_anatomy(
+    error: Float[np.ndarray, "episodes samples"], anatomy: Int[np.ndarray, "episodes"], names: Sequence[str]
+) -> dict[str, str | float] | None:
+    """Return the anatomy with the largest mean absolute error, and that error in mm; None without any sample."""
+    means = {int(index): error_statistics(error[anatomy == index])["mae"] for index in np.unique(anatomy)}
+    known = {index: mae for index, mae in means.items() if mae is not None}
+    if not known:
+        return None
+    worst = max(known, key=lambda index: known[index])
+    return {"name": str(names[worst]), "mae": float(known[worst])}

@@ -1,0 +1,127 @@
+"""From predicted arrays to metrics.json: every number of the report is made here."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from endopilot.evaluation.metrics import (
+    OFF_WALL_MM,
+    control_rmse,
+    distribution,
+    diverged_share,
+    error_statistics,
+    safety_ratio,
+    skill,
+    tip_statistics,
+    worst_anatomy,
+)
+from endopilot.evaluation.results import CONTROL_BASELINES, TIP_BASELINES, SplitResult
+
+
+def summarize(result: SplitResult, *, seed: int) -> dict[str, Any]:
+    """Return the figures of one split: tips, controls, safety ratios and forces of drive, by series."""
+    baselines = [name for names in TIP_BASELINES.values() for name in names]
+    shown = [name for name in dict.fromkeys((*TIP_BASELINES, *baselines, "true_replay")) if name in result.tips]
+    return {
+        "anatomies": list(result.anatomies),
+        "episodes": len(result.anatomy),
+        "tip": {series: _tip(result, series, seed) for series in shown},
+        "control": _control(result),
+        "safety": {series: _safety(result, series) for series in ("true", *shown)},
+        "drive": {series: _drive(result, series) for series in result.base_force if series != "true"},
+    }
+
+
+def _tip(result: SplitResult, series: str, seed: int) -> dict[str, Any]:
+    baselines = [name for name in TIP_BASELINES.get(series, ()) if name in result.tips]
+    lost = result.lost(series)
+    out: dict[str, Any] = {
+        coordinate: tip_statistics(
+            result.error(series, coordinate),
+            radius=result.true.radius,
+            baselines={name: result.error(name, coordinate) for name in baselines},
+            anatomy=result.anatomy,
+            sample_period_s=result.sample_period_s,
+            seed=seed,
+        )
+        for coordinate in ("abscissa", "offset")
+    }
+    clearance = result.true.radius - result.wire_radius_mm - result.true.offset
+    off_wall = clearance > OFF_WALL_MM
+    error = result.error(series, "abscissa")
+    out["offset_off_wall"] = error_statistics(np.where(off_wall, result.error(series, "offset"), np.nan))
+    out["off_wall_share"] = float(off_wall.mean())
+    out["diverged_share"] = diverged_share(error, lost)
+    out["lost_share"] = float(lost.mean())
+    out["worst_anatomy"] = worst_anatomy(error, result.anatomy, result.anatomies)
+    if series in result.tip_distance:
+        out["distance_3d"] = error_statistics(result.tip_distance[series])
+    return out
+
+
+def _control(result: SplitResult) -> dict[str, Any]:
+    """Return the errors of the controls that each series chose, over all samples and as RMSE of each sequence."""
+    scale = np.array([1.0, np.rad2deg(1.0)])
+    errors = {name: (control - result.true_control) * scale for name, control in result.controls.items()}
+    out: dict[str, Any] = {}
+    for name in ("P2", *CONTROL_BASELINES):
+        if name not in errors:
+            continue
+        per_sequence = control_rmse(result.controls[name], result.true_control)
+        out[name] = {}
+        for axis, key in enumerate(("translation_mm_s", "rotation_deg_s")):
+            statistics: dict[str, Any] = dict(error_statistics(errors[name][..., axis]))
+            statistics["rmse_of_sequences"] = distribution(per_sequence[:, axis])
+            if name == "P2":
+                statistics["skill"] = {
+                    other: skill(errors[name][..., axis], errors[other][..., axis])
+                    for other in CONTROL_BASELINES
+                    if other in errors
+                }
+            out[name][key] = statistics
+    return out
+
+
+def _safety(result: SplitResult, series: str) -> dict[str, Any]:
+    tip = result.true if series == "true" else result.tips[series]
+    return {
+        "over_radius": distribution(safety_ratio(tip.offset, tip.radius).ravel()),
+        "over_clearance": distribution(
+            safety_ratio(tip.offset, tip.radius, wire_radius_mm=result.wire_radius_mm).ravel()
+        ),
+    }
+
+
+def _drive(result: SplitResult, series: str) -> dict[str, Any]:
+    return {
+        "force_n": error_statistics(result.base_force[series] - result.base_force["true"]),
+        "torque_nmm": error_statistics(result.base_torque[series] - result.base_torque["true"]),
+    }
+
+
+def findings(metrics: Mapping[str, Any]) -> list[str]:
+    """Return in words, from the numbers alone, where the networks beat their baselines and where they lose."""
+    sentences = []
+    for split in metrics["splits"].values():
+        for series, tip in split["tip"].items():
+            for coordinate, symbol in (("abscissa", "Δtip"), ("offset", "γtip")):
+                skills = {k: v for k, v in tip[coordinate]["all"]["skill"].items() if v is not None}
+                if not skills:
+                    continue
+                hardest = min(skills, key=lambda name: skills[name])
+                sentences.append((split["title"], series, symbol, hardest, skills[hardest]))
+    return [_sentence(*found) for found in sentences]
+
+
+def _sentence(split: str, series: str, symbol: str, baseline: str, value: float) -> str:
+    name = {
+        "hold_slack": "holding slack and offset",
+        "training_mean": "the training mean",
+        "hold_control": "holding the last control",
+        "follow_slack": "driving by the held slack",
+    }[baseline]
+    verdict = "beats every baseline" if value > 0 else "loses to a baseline"
+    return f"{split}: {series} {verdict} for {symbol} (skill {value:+.2f} against {name}, its strongest)."
