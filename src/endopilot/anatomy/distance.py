@@ -12,8 +12,9 @@ import math
 import numpy as np
 from jaxtyping import Float
 
+from endopilot.anatomy.surface import Surface, surface_from_mask
 from endopilot.errors import InputError
-from endopilot.types import Centerline, DistanceMap, Insertion, VesselTree
+from endopilot.types import Centerline, DistanceMap, Insertion, VesselTree, Volume
 
 BAND_MM = 2.5
 """How far outside the wall the distance map reaches, mm; beyond, it holds the constant −`BAND_MM`."""
@@ -68,6 +69,40 @@ def distance_map_from_spheres(
         fillet = FILLET * float(line.radius[min(len(line.radius) - 1, 3)])
         values[window] = smooth_union(values[window], field, spacing_mm=spacing, fillet_mm=fillet)
     return DistanceMap(values=values, spacing_mm=spacing, origin_mm=origin)
+
+
+def distance_map_from_surface(surface: Surface, *, spacing_mm: float, band_mm: float = BAND_MM) -> DistanceMap:
+    """Return the signed distance to a closed triangulated wall.
+
+    Args:
+        surface: closed wall, LPS mm.
+        spacing_mm: grid spacing, mm.
+        band_mm: how far outside the wall distances are kept, mm.
+    """
+    from scipy.ndimage import maximum_filter
+
+    surface = surface.refined(1.5 * spacing_mm)
+    lower = surface.vertices.min(axis=0) - band_mm
+    shape, origin = _grid(lower, surface.vertices.max(axis=0) + band_mm, spacing_mm)
+    inside = surface.inside(shape, origin, spacing_mm)
+    near = maximum_filter(inside, size=2 * math.ceil(band_mm / spacing_mm) + 1)
+    index = np.argwhere(near)
+    distance = surface.distance(origin + spacing_mm * index[:, ::-1])
+    values = np.full(shape, -band_mm, dtype=np.float32)
+    values[near] = np.where(inside[near], distance, np.maximum(-distance, -band_mm))
+    return DistanceMap(values=values, spacing_mm=float(spacing_mm), origin_mm=origin)
+
+
+def distance_map_from_mask(mask: Volume, *, spacing_mm: float | None = None, band_mm: float = BAND_MM) -> DistanceMap:
+    """Return the signed distance to the smooth wall of a mask, with sub-voxel accuracy.
+
+    Args:
+        mask: boolean voxels on any grid, at least one of them true.
+        spacing_mm: grid spacing, mm; the mask's smallest voxel edge if None.
+        band_mm: how far outside the wall distances are kept, mm.
+    """
+    spacing = float(mask.spacing_mm.min()) if spacing_mm is None else spacing_mm
+    return distance_map_from_surface(surface_from_mask(mask), spacing_mm=spacing, band_mm=band_mm)
 
 
 def add_catheter(
