@@ -36,7 +36,7 @@ DIAMETER_MM = {0.1: 4.0, 0.2: 3.8, 0.5: 3.5, 0.7: 2.7, 0.9: 2.3}
 """Lumen diameter, mm, at fractions of the way from the ostium to the farthest tip."""
 
 # From the right ostium to the crux: R1p R1m R1d R2p R2m R2d R3p R3m R3d of Dodge 1988, LPS mm.
-_TO_CRUX = np.array(
+REFERENCE_TO_CRUX = np.array(
     [
         [0.0, 0.0, 0.0],
         [-4.4, -1.5, -1.9],
@@ -161,27 +161,29 @@ def _main_vessel(generator: np.random.Generator, dominance: str) -> tuple[Float[
     if dominance == "left":
         # A small right coronary ends before the crux.
         length, ends_in = 112.0 + abs(generator.normal(0, 10)), "3"
-        waypoints, cut, crux_mm = _TO_CRUX, 0.97, np.inf
+        waypoints, cut, crux_mm = REFERENCE_TO_CRUX, 0.97, np.inf
     else:
         # The mean makes up for the shorter left-dominant arteries.
         length = _truncated(generator, LENGTH_MM + 2.4, LENGTH_SD_MM, *LENGTH_RANGE_MM)
         ends_in = "4" if dominance == "balanced" or generator.random() < 0.6 else "16"
-        waypoints = np.concatenate([_TO_CRUX, _BEYOND_CRUX[ends_in]])
+        waypoints = np.concatenate([REFERENCE_TO_CRUX, _BEYOND_CRUX[ends_in]])
         # Long arteries reach farther beyond the crux rather than belong to huge hearts.
         crux_mm = 98.0 * (length / LENGTH_MM) ** 0.65 * (1 + 0.03 * generator.normal())
         cut = None
     tortuosity = _truncated(generator, TORTUOSITY, TORTUOSITY_SD, TORTUOSITY - 0.45, TORTUOSITY + 0.45)
     mean_curvature = _truncated(generator, CURVATURE, CURVATURE_SD, CURVATURE - 0.025, CURVATURE + 0.025)
     template = shape.curve_through(waypoints)
-    template_crux = float(shape.abscissa(shape.curve_through(_TO_CRUX))[-1])
+    template_crux = float(shape.abscissa(shape.curve_through(REFERENCE_TO_CRUX))[-1])
     along = shape.abscissa(template)
     keep = cut * along[-1] if cut else min(template_crux * length / crux_mm, along[-1])
     template = template[along <= keep]
     wiggle = shape.Wiggle.draw(generator, 13.0, 70.0)
     turn = Rotation.from_rotvec(np.deg2rad(generator.normal(0, 7, 3)))
-    centred = _TO_CRUX - _TO_CRUX.mean(axis=0)
+    centred = REFERENCE_TO_CRUX - REFERENCE_TO_CRUX.mean(axis=0)
     axis = np.linalg.svd(centred)[2][2]
-    axis = axis * np.sign(axis @ np.cross(_TO_CRUX[4] - _TO_CRUX[0], _TO_CRUX[-1] - _TO_CRUX[4]))
+    axis = axis * np.sign(
+        axis @ np.cross(REFERENCE_TO_CRUX[4] - REFERENCE_TO_CRUX[0], REFERENCE_TO_CRUX[-1] - REFERENCE_TO_CRUX[4])
+    )
 
     def curve(knobs: Float[np.ndarray, "3"]) -> Float[np.ndarray, "n 3"]:
         bent = shape.bend(template, axis, float(knobs[1])) * np.exp(knobs[0])

@@ -1,0 +1,309 @@
+"""The phantom: the CT angiogram that a scanner would have made of an anatomy.
+
+Surfaces are rendered from signed distances: a voxel takes the share of each tissue that it holds, then the scanner's
+point-spread function blurs image and noise alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float32
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial import KDTree
+
+from endopilot.anatomy import phantom_heart as heart
+from endopilot.errors import InputError
+from endopilot.types import Anatomy, Centerline, Volume
+
+_COARSE_MM = 2.0
+"""Spacing of the grid on which organs are computed, mm."""
+_REACH_MM = 5.0
+"""Distances to small vessels are computed up to this far, mm."""
+_WALL_MM = 0.5
+"""Thickness of a coronary wall, mm."""
+_SLAB = 8
+"""Slices rendered at once: a slab stays in the processor's cache."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhantomConfig:
+    """Scanner, contrast and disease of a synthetic CT angiogram. Where two numbers stand, a value is drawn between them."""
+
+    in_plane_mm: float = 0.4
+    """Voxel size in the axial plane, mm."""
+    slice_mm: float = 0.5
+    """Distance between slices, mm."""
+    lumen_hu: tuple[float, float] = (300.0, 550.0)
+    """CT number of the contrasted arterial lumen, HU."""
+    noise_hu: tuple[float, float] = (20.0, 50.0)
+    """Standard deviation of the image noise, HU."""
+    psf_mm: tuple[float, float] = (0.5, 0.7)
+    """Width of the point-spread function at half its height, mm."""
+    calcium: float = 2.0
+    """Mean number of calcified plaques."""
+    margin_mm: float = 16.0
+    """Width of surroundings beyond the tree on every side, mm."""
+
+    def __post_init__(self) -> None:
+        for name in ("in_plane_mm", "slice_mm", "margin_mm"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"{name}: {getattr(self, name)} mm; give a length above 0")
+        for name in ("lumen_hu", "noise_hu", "psf_mm"):
+            low, high = getattr(self, name)
+            if not 0 <= low <= high:
+                raise InputError(f"{name}: ({low}, {high}); give two numbers from 0 up, the smaller one first")
+        if self.calcium < 0:
+            raise InputError(f"calcium: {self.calcium} plaques; give 0 or more")
+
+
+@dataclass(frozen=True, eq=False)
+class _Grid:
+    """The voxel centres along x, y and z, mm."""
+
+    x: Float[np.ndarray, "nx"]
+    y: Float[np.ndarray, "ny"]
+    z: Float[np.ndarray, "nz"]
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        return len(self.z), len(self.y), len(self.x)
+
+
+def make_phantom(anatomy: Anatomy, config: PhantomConfig, seed: int) -> Volume:
+    """Return a synthetic CT angiogram of a right coronary anatomy, in HU.
+
+    Args:
+        anatomy: its tree gives the lumen; a stenosis named in its provenance gets a soft plaque.
+        config: scanner, contrast, disease.
+        seed: seed of contrast, noise, plaques and the surroundings' shapes.
+
+    Returns:
+        int16 voxels along the LPS axes.
+    """
+    generator = np.random.Generator(np.random.Philox(key=np.array([seed, 0x7068616E], dtype=np.uint64)))
+    placement = heart.place(anatomy.tree)
+    grid = _field_of_view(anatomy, config)
+    lumen_hu, noise_hu, psf_mm = (
+        generator.uniform(*span) for span in (config.lumen_hu, config.noise_hu, config.psf_mm)
+    )
+    tissue = _tissue_hu(generator, lumen_hu)
+    coronaries = [branch.centerline for branch in anatomy.tree.branches] + list(heart.left_coronary(placement))
+    lumen = _small_vessels(grid, coronaries)
+    veins = _small_vessels(grid, heart.cardiac_veins(placement, anatomy.tree))
+    soft, calcium = _plaques(grid, anatomy, generator, config.calcium)
+    coarse, organs = _organs(grid, placement, coronaries, generator)
+    image = _render(grid, config, coarse, organs, (lumen, veins, soft, calcium), tissue)
+    _scan(image, config, psf_mm, noise_hu, generator)
+    return Volume(
+        voxels=np.clip(np.rint(image), -1024, 3071).astype(np.int16),
+        spacing_mm=np.array([config.in_plane_mm, config.in_plane_mm, config.slice_mm]),
+        origin_mm=np.array([grid.x[0], grid.y[0], grid.z[0]]),
+        direction=np.eye(3),
+    )
+
+
+def _field_of_view(anatomy: Anatomy, config: PhantomConfig) -> _Grid:
+    """Return a grid around the tree with the margin, and twice the margin of aorta above the ostium."""
+    points = np.concatenate([branch.centerline.points for branch in anatomy.tree.branches])
+    low, high = points.min(axis=0) - config.margin_mm, points.max(axis=0) + config.margin_mm
+    high[2] = max(high[2], anatomy.insertion.position[2] + 2 * config.margin_mm)
+    high[:2] = np.maximum(high[:2], anatomy.insertion.position[:2] + (44.0, 36.0))
+    steps = (config.in_plane_mm, config.in_plane_mm, config.slice_mm)
+    axes = [np.arange(a, b, step) for a, b, step in zip(low, high, steps, strict=True)]
+    return _Grid(*axes)
+
+
+def _tissue_hu(generator: np.random.Generator, lumen_hu: float) -> dict[str, float]:
+    """Draw the CT numbers of one scan, HU (DESIGN §4 of the project for those of arteries, muscle, fat, lung, plaque)."""
+    right = generator.uniform(0.35, 0.8)
+    return {
+        "lung": generator.uniform(-830, -780),
+        "chest wall": 45.0,
+        "lung vessels": lumen_hu * 0.9,
+        "liver": generator.uniform(80, 110),
+        "stomach": 30.0,
+        "cortical bone": 620.0,
+        "spongy bone": 230.0,
+        "fat": generator.uniform(-95, -80),
+        "descending aorta": lumen_hu * 0.97,
+        "myocardium": generator.uniform(92, 110),
+        "vessel wall": 45.0,
+        "right atrium": lumen_hu * right * generator.uniform(0.7, 1.0),
+        "vena cava": lumen_hu * generator.uniform(0.4, 1.3),
+        "right ventricle": lumen_hu * right,
+        "left atrium": lumen_hu * generator.uniform(0.93, 1.0),
+        "left ventricle": lumen_hu * generator.uniform(0.93, 1.0),
+        "aorta": lumen_hu,
+        "lumen": lumen_hu,
+        "vein": generator.uniform(120, 200),
+        "coronary wall": 35.0,
+        "soft plaque": generator.uniform(50, 75),
+        "calcium": generator.uniform(700, 1200),
+    }
+
+
+def _small_vessels(grid: _Grid, lines: Sequence[Centerline]) -> Float32[np.ndarray, "nz ny nx"]:
+    """Return the signed distance to the wall of tubes with rounded ends, mm, positive inside, not below -5."""
+    depth = np.full(grid.shape, -_REACH_MM, dtype=np.float32)
+    for line in lines:
+        chosen = np.unique(np.append(np.arange(0, len(line.points), 2), len(line.points) - 1))
+        points, radius = line.points[chosen], line.radius[chosen]
+        for a, b, ra, rb in zip(points[:-1], points[1:], radius[:-1], radius[1:], strict=True):
+            reach = max(ra, rb) + _REACH_MM
+            box, (z, y, x) = _window(grid, np.minimum(a, b) - reach, np.maximum(a, b) + reach)
+            x, y, z, step = x - a[0], y - a[1], z - a[2], b - a
+            share = (x * step[0] + y * step[1] + z * step[2]) * np.float32(1 / (step @ step))
+            np.clip(share, 0, 1, out=share)
+            square = x * x + y * y + z * z - 2 * share * (x * step[0] + y * step[1] + z * step[2])
+            square += share * share * np.float32(step @ step)
+            np.sqrt(np.maximum(square, 0, out=square), out=square)
+            np.maximum(depth[box], ra + share * np.float32(rb - ra) - square, out=depth[box])
+    return depth
+
+
+def _plaques(
+    grid: _Grid, anatomy: Anatomy, generator: np.random.Generator, mean_count: float
+) -> tuple[Float32[np.ndarray, "nz ny nx"], Float32[np.ndarray, "nz ny nx"]]:
+    """Return the signed distances to soft plaques (at stenoses) and calcified ones (in the wall), mm."""
+    soft, calcium = (np.full(grid.shape, -_REACH_MM, dtype=np.float32) for _ in range(2))
+    line = anatomy.tree.longest_path()
+    for stenosis in anatomy.provenance.get("stenoses", ()):
+        half = 0.6 * stenosis["length_mm"]
+        near = int(np.searchsorted(line.abscissa, stenosis["abscissa_mm"]))
+        wall = max(np.interp(stenosis["abscissa_mm"] + np.array([-half, half]), line.abscissa, line.radius)) + 0.4
+        _add_ellipsoid(grid, soft, line, near, 0.0, 0.0, (half, wall, wall))
+    for _ in range(generator.poisson(mean_count)):
+        near = int(generator.integers(4, round(0.75 * len(line.points))))
+        thickness, width, half = generator.uniform(0.4, 0.9), generator.uniform(0.8, 1.4), generator.uniform(1.0, 3.5)
+        away, angle = line.radius[near] + 0.4 * thickness, generator.uniform(0, 2 * np.pi)
+        _add_ellipsoid(grid, calcium, line, near, away, angle, (half, thickness, width))
+    return soft, calcium
+
+
+def _add_ellipsoid(
+    grid: _Grid,
+    depth: Float32[np.ndarray, "nz ny nx"],
+    line: Centerline,
+    index: int,
+    away_mm: float,
+    angle_rad: float,
+    semi_axes: tuple[float, float, float],
+) -> None:
+    """Join an ellipsoid (along the line, away from it, around it) to the signed distances `depth`."""
+    tangent = line.points[index + 1] - line.points[index - 1]
+    tangent = tangent / np.linalg.norm(tangent)
+    side = np.cross(tangent, line.normals[index])
+    outward = np.cos(angle_rad) * line.normals[index] + np.sin(angle_rad) * side
+    frame = np.stack([tangent, outward, np.cross(tangent, outward)])
+    centre, reach = line.points[index] + away_mm * outward, max(semi_axes) + 1.0
+    box, (z, y, x) = _window(grid, centre - reach, centre + reach)
+    local = [(x - centre[0]) * e[0] + (y - centre[1]) * e[1] + (z - centre[2]) * e[2] for e in frame]
+    level = np.sqrt(sum((u / a) ** 2 for u, a in zip(local, semi_axes, strict=True)))
+    slope = np.sqrt(sum((u / a**2) ** 2 for u, a in zip(local, semi_axes, strict=True)))
+    np.maximum(depth[box], (level * (1 - level) / np.maximum(slope, 1e-6)).astype(np.float32), out=depth[box])
+
+
+def _window(
+    grid: _Grid, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]
+) -> tuple[tuple[slice, slice, slice], tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Return the slices (k, j, i) of the voxels in a box, and their z, y and x, ready to broadcast."""
+    spans = [slice(*np.searchsorted(axis, (low[i], high[i]))) for i, axis in enumerate((grid.x, grid.y, grid.z))]
+    x, y, z = (axis[span].astype(np.float32) for axis, span in zip((grid.x, grid.y, grid.z), spans, strict=True))
+    return (spans[2], spans[1], spans[0]), (z[:, None, None], y[:, None], x)
+
+
+def _organs(
+    grid: _Grid, placement: heart.Placement, coronaries: Sequence[Centerline], generator: np.random.Generator
+) -> tuple[_Grid, tuple[heart.Organ, ...]]:
+    """Return the coarse grid and the organs on it; fat wraps the coronaries too."""
+    coarse = _Grid(
+        *(np.arange(axis[0] - _COARSE_MM, axis[-1] + 2 * _COARSE_MM, _COARSE_MM) for axis in (grid.x, grid.y, grid.z))
+    )
+    z, y, x = np.meshgrid(coarse.z, coarse.y, coarse.x, indexing="ij")
+    positions = np.stack([x, y, z], axis=-1)
+    organs = heart.organs(placement, positions, generator)
+    distance, _ = KDTree(np.concatenate([line.points for line in coronaries])).query(
+        positions, distance_upper_bound=14.0
+    )
+    wrapped = 7.0 - np.minimum(distance, 14.0)
+    return coarse, tuple(
+        heart.Organ(organ.name, np.maximum(organ.depth, wrapped)) if organ.name == "fat" else organ for organ in organs
+    )
+
+
+def _interpolation(fine: Float[np.ndarray, "n"], coarse: Float[np.ndarray, "m"]) -> Float32[np.ndarray, "n m"]:
+    """Return the matrix of linear interpolation from coarse to fine positions."""
+    place = (fine - coarse[0]) / _COARSE_MM
+    left = place.astype(int)
+    matrix = np.zeros((len(fine), len(coarse)), dtype=np.float32)
+    matrix[np.arange(len(fine)), left] = 1 - (place - left)
+    matrix[np.arange(len(fine)), left + 1] = place - left
+    return matrix
+
+
+def _render(
+    grid: _Grid,
+    config: PhantomConfig,
+    coarse: _Grid,
+    organs: Sequence[heart.Organ],
+    small: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+    tissue: dict[str, float],
+) -> Float32[np.ndarray, "nz ny nx"]:
+    """Paint the tissues over each other, each voxel by the share that it holds of them."""
+    image = np.full(grid.shape, tissue["lung"], dtype=np.float32)
+    along_x, along_y, along_z = (
+        _interpolation(f, c) for f, c in ((grid.x, coarse.x), (grid.y, coarse.y), (grid.z, coarse.z))
+    )
+    depths = [organ.depth.astype(np.float32) for organ in organs]
+    sharpness = np.float32(3 / (2 * config.in_plane_mm + config.slice_mm))
+
+    def paint(slab: np.ndarray, depth: np.ndarray, hu: float) -> np.ndarray:
+        share = np.clip(depth * sharpness + np.float32(0.5), 0, 1)
+        slab += share * (np.float32(hu) - slab)
+        return share
+
+    for begin in range(0, grid.shape[0], _SLAB):
+        rows = slice(begin, begin + _SLAB)
+        slab = image[rows]
+        lumen, veins, soft, calcium = (depth[rows] for depth in small)
+        weights = along_z[rows]
+        used = np.flatnonzero(weights.any(axis=0))
+        for organ, depth in zip(organs, depths, strict=True):
+            near = depth[used]
+            if near.max() < -1.0:
+                continue
+            fine = along_y @ np.tensordot(weights[:, used], near, axes=1) @ along_x.T
+            if organ.clearance_mm is not None:
+                np.minimum(fine, -lumen - np.float32(organ.clearance_mm), out=fine)
+            if organ.name == "aorta":
+                paint(slab, np.minimum(veins, -lumen - np.float32(1.0)), tissue["vein"])
+                paint(slab, lumen + np.float32(_WALL_MM), tissue["coronary wall"])
+                paint(slab, soft, tissue["soft plaque"])
+            paint(slab, fine, tissue[organ.name])
+        share = paint(slab, lumen, tissue["lumen"])
+        hard = np.clip(calcium * sharpness + np.float32(0.5), 0, 1) * (1 - share)
+        slab += hard * (np.float32(tissue["calcium"]) - slab)
+    return image
+
+
+def _scan(
+    image: Float32[np.ndarray, "nz ny nx"],
+    config: PhantomConfig,
+    psf_mm: float,
+    noise_hu: float,
+    generator: np.random.Generator,
+) -> None:
+    """Add noise and blur, in place: the reconstruction kernel shapes the image and the noise's grain alike."""
+    sigma_mm = psf_mm / np.sqrt(8 * np.log(2))
+    sigmas = [sigma_mm / step for step in (config.slice_mm, config.in_plane_mm, config.in_plane_mm)]
+    impulse = np.zeros(33)
+    impulse[16] = 1.0
+    gain = np.prod([np.linalg.norm(gaussian_filter1d(impulse, sigma, truncate=3.0)) for sigma in sigmas])
+    for begin in range(0, len(image), _SLAB):
+        slab = image[begin : begin + _SLAB]
+        slab += generator.standard_normal(slab.shape, dtype=np.float32) * np.float32(noise_hu / gain)
+    for axis, sigma in enumerate(sigmas):
+        gaussian_filter1d(image, sigma, axis=axis, truncate=3.0, output=image)
