@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Int
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import KDTree
 
@@ -22,6 +22,8 @@ _COARSE_MM = 2.0
 """Spacing of the grid on which organs are computed, mm."""
 _REACH_MM = 5.0
 """Distances to small vessels are computed up to this far, mm."""
+_FAT_MM = 5.5
+"""Fat reaches at least this far from a coronary's axis, mm."""
 _WALL_MM = 0.5
 """Thickness of a coronary wall, mm."""
 _SLAB = 8
@@ -30,7 +32,7 @@ _SLAB = 8
 
 @dataclass(frozen=True, kw_only=True)
 class PhantomConfig:
-    """Scanner, contrast and disease of a synthetic CT angiogram. Where two numbers stand, a value is drawn between them."""
+    """Scanner, contrast and disease of a synthetic CT angiogram. Two numbers: a value is drawn between."""
 
     in_plane_mm: float = 0.4
     """Voxel size in the axial plane, mm."""
@@ -72,6 +74,15 @@ class _Grid:
         return len(self.z), len(self.y), len(self.x)
 
 
+@dataclass(frozen=True, eq=False)
+class _Plaque:
+    """A plaque: its tissue, the voxels around it, and the signed distance to its surface there, mm, positive inside."""
+
+    tissue: str
+    box: tuple[slice, slice, slice]
+    depth: Float32[np.ndarray, "nz ny nx"]
+
+
 def make_phantom(anatomy: Anatomy, config: PhantomConfig, seed: int) -> Volume:
     """Return a synthetic CT angiogram of a right coronary anatomy, in HU.
 
@@ -93,9 +104,11 @@ def make_phantom(anatomy: Anatomy, config: PhantomConfig, seed: int) -> Volume:
     coronaries = [branch.centerline for branch in anatomy.tree.branches] + list(heart.left_coronary(placement))
     lumen = _small_vessels(grid, coronaries)
     veins = _small_vessels(grid, heart.cardiac_veins(placement, anatomy.tree))
-    soft, calcium = _plaques(grid, anatomy, generator, config.calcium)
     coarse, organs = _organs(grid, placement, coronaries, generator)
-    image = _render(grid, config, coarse, organs, (lumen, veins, soft, calcium), tissue)
+    painter = _Painter(grid, coarse, config)
+    image = _render(grid, painter, organs, lumen, veins, tissue)
+    for plaque in _plaques(grid, anatomy, generator, config.calcium):
+        painter.paint(image[plaque.box], np.minimum(plaque.depth, -lumen[plaque.box]), tissue[plaque.tissue])
     _scan(image, config, psf_mm, noise_hu, generator)
     return Volume(
         voxels=np.clip(np.rint(image), -1024, 3071).astype(np.int16),
@@ -164,46 +177,53 @@ def _small_vessels(grid: _Grid, lines: Sequence[Centerline]) -> Float32[np.ndarr
     return depth
 
 
-def _plaques(
-    grid: _Grid, anatomy: Anatomy, generator: np.random.Generator, mean_count: float
-) -> tuple[Float32[np.ndarray, "nz ny nx"], Float32[np.ndarray, "nz ny nx"]]:
-    """Return the signed distances to soft plaques (at stenoses) and calcified ones (in the wall), mm."""
-    soft, calcium = (np.full(grid.shape, -_REACH_MM, dtype=np.float32) for _ in range(2))
+def _plaques(grid: _Grid, anatomy: Anatomy, generator: np.random.Generator, mean_count: float) -> list[_Plaque]:
+    """Return soft plaques around stenoses, and calcified ones in the wall."""
     line = anatomy.tree.longest_path()
+    plaques = []
     for stenosis in anatomy.provenance.get("stenoses", ()):
         half = 0.6 * stenosis["length_mm"]
+        ends = stenosis["abscissa_mm"] + np.array([-half, half])
+        wall = float(np.interp(ends, line.abscissa, line.radius).max()) + 0.4
         near = int(np.searchsorted(line.abscissa, stenosis["abscissa_mm"]))
-        wall = max(np.interp(stenosis["abscissa_mm"] + np.array([-half, half]), line.abscissa, line.radius)) + 0.4
-        _add_ellipsoid(grid, soft, line, near, 0.0, 0.0, (half, wall, wall))
+        plaques.append(_plaque(grid, "soft plaque", line, near, (0.0, 0.0), (half, wall, wall)))
     for _ in range(generator.poisson(mean_count)):
         near = int(generator.integers(4, round(0.75 * len(line.points))))
-        thickness, width, half = generator.uniform(0.4, 0.9), generator.uniform(0.8, 1.4), generator.uniform(1.0, 3.5)
-        away, angle = line.radius[near] + 0.4 * thickness, generator.uniform(0, 2 * np.pi)
-        _add_ellipsoid(grid, calcium, line, near, away, angle, (half, thickness, width))
-    return soft, calcium
+        along, across, around = (float(a) for a in generator.uniform((1.0, 0.4, 0.8), (3.5, 0.9, 1.4)))
+        place = float(line.radius[near]) + 0.4 * across, float(generator.uniform(0, 2 * np.pi))
+        plaques.append(_plaque(grid, "calcium", line, near, place, (along, across, around)))
+    return plaques
 
 
-def _add_ellipsoid(
+def _plaque(
     grid: _Grid,
-    depth: Float32[np.ndarray, "nz ny nx"],
+    tissue: str,
     line: Centerline,
     index: int,
-    away_mm: float,
-    angle_rad: float,
+    place: tuple[float, float],
     semi_axes: tuple[float, float, float],
-) -> None:
-    """Join an ellipsoid (along the line, away from it, around it) to the signed distances `depth`."""
+) -> _Plaque:
+    """Return an ellipsoid beside the line.
+
+    Args:
+        grid: the image's voxels.
+        tissue: what it consists of.
+        line: the vessel's centerline.
+        index: at which of its points.
+        place: how far from the line, mm, and at which angle from the line's normal, rad.
+        semi_axes: along the line, away from it and around it, mm.
+    """
     tangent = line.points[index + 1] - line.points[index - 1]
     tangent = tangent / np.linalg.norm(tangent)
-    side = np.cross(tangent, line.normals[index])
-    outward = np.cos(angle_rad) * line.normals[index] + np.sin(angle_rad) * side
+    outward = np.cos(place[1]) * line.normals[index] + np.sin(place[1]) * np.cross(tangent, line.normals[index])
     frame = np.stack([tangent, outward, np.cross(tangent, outward)])
-    centre, reach = line.points[index] + away_mm * outward, max(semi_axes) + 1.0
+    centre, reach = line.points[index] + place[0] * outward, max(semi_axes) + 1.0
     box, (z, y, x) = _window(grid, centre - reach, centre + reach)
     local = [(x - centre[0]) * e[0] + (y - centre[1]) * e[1] + (z - centre[2]) * e[2] for e in frame]
+    # Distance to an ellipsoid, exact to first order at its surface.
     level = np.sqrt(sum((u / a) ** 2 for u, a in zip(local, semi_axes, strict=True)))
     slope = np.sqrt(sum((u / a**2) ** 2 for u, a in zip(local, semi_axes, strict=True)))
-    np.maximum(depth[box], (level * (1 - level) / np.maximum(slope, 1e-6)).astype(np.float32), out=depth[box])
+    return _Plaque(tissue, box, (level * (1 - level) / np.maximum(slope, 1e-6)).astype(np.float32))
 
 
 def _window(
@@ -219,73 +239,99 @@ def _organs(
     grid: _Grid, placement: heart.Placement, coronaries: Sequence[Centerline], generator: np.random.Generator
 ) -> tuple[_Grid, tuple[heart.Organ, ...]]:
     """Return the coarse grid and the organs on it; fat wraps the coronaries too."""
-    coarse = _Grid(
-        *(np.arange(axis[0] - _COARSE_MM, axis[-1] + 2 * _COARSE_MM, _COARSE_MM) for axis in (grid.x, grid.y, grid.z))
-    )
+    axes = (np.arange(axis[0] - _COARSE_MM, axis[-1] + 2 * _COARSE_MM, _COARSE_MM) for axis in (grid.x, grid.y, grid.z))
+    coarse = _Grid(*axes)
     z, y, x = np.meshgrid(coarse.z, coarse.y, coarse.x, indexing="ij")
-    positions = np.stack([x, y, z], axis=-1)
-    organs = heart.organs(placement, positions, generator)
-    distance, _ = KDTree(np.concatenate([line.points for line in coronaries])).query(
-        positions, distance_upper_bound=14.0
-    )
-    wrapped = 7.0 - np.minimum(distance, 14.0)
-    return coarse, tuple(
-        heart.Organ(organ.name, np.maximum(organ.depth, wrapped)) if organ.name == "fat" else organ for organ in organs
-    )
+    positions = np.stack([x, y, z], axis=-1).astype(np.float32)
+    vessels = KDTree(np.concatenate([line.points[::2] for line in coronaries]))
+    distance, _ = vessels.query(positions, distance_upper_bound=2 * _FAT_MM)
+    return coarse, heart.organs(placement, positions, _FAT_MM - np.minimum(distance, 2 * _FAT_MM), generator)
 
 
-def _interpolation(fine: Float[np.ndarray, "n"], coarse: Float[np.ndarray, "m"]) -> Float32[np.ndarray, "n m"]:
-    """Return the matrix of linear interpolation from coarse to fine positions."""
+class _Painter:
+    """Paints tissues over each other, slab by slab, each voxel by the share that it holds of them."""
+
+    def __init__(self, grid: _Grid, coarse: _Grid, config: PhantomConfig) -> None:
+        self.sharpness = np.float32(3 / (2 * config.in_plane_mm + config.slice_mm))
+        self.x, self.y, self.z = (
+            _interpolation(fine, rough) for fine, rough in ((grid.x, coarse.x), (grid.y, coarse.y), (grid.z, coarse.z))
+        )
+
+    def share(self, depth: np.ndarray) -> np.ndarray:
+        """Return how much of each voxel lies within a surface at signed distance `depth`, mm."""
+        share = depth * self.sharpness
+        share += np.float32(0.5)
+        return np.clip(share, 0, 1, out=share)
+
+    def paint(self, image: np.ndarray, depth: np.ndarray, hu: float) -> None:
+        """Mix `hu` into the image where the depth is positive."""
+        change = np.float32(hu) - image
+        change *= self.share(depth)
+        image += change
+
+    def fine(self, depth: np.ndarray, rows: slice) -> tuple[np.ndarray, tuple[slice, slice]] | None:
+        """Interpolate a coarse depth linearly; return it with the (y, x) box that holds its inside, or None."""
+        (left, share), depth = self.z, depth
+        used = depth[left[rows][0] : left[rows][-1] + 2]
+        _, ys, xs = np.nonzero(used > -1.0)
+        if not len(ys):
+            return None
+        box_y, box_x = _covered(self.y[0], ys), _covered(self.x[0], xs)
+        used = _lerp(used, left[rows] - left[rows][0], share[rows], axis=0)
+        used = _lerp(used, self.y[0][box_y], self.y[1][box_y], axis=1)
+        return _lerp(used, self.x[0][box_x], self.x[1][box_x], axis=2), (box_y, box_x)
+
+
+def _interpolation(
+    fine: Float[np.ndarray, "n"], coarse: Float[np.ndarray, "m"]
+) -> tuple[Int[np.ndarray, "n"], Float32[np.ndarray, "n"]]:
+    """Return, for each fine position, the coarse index to its left and the share of the one to its right."""
     place = (fine - coarse[0]) / _COARSE_MM
     left = place.astype(int)
-    matrix = np.zeros((len(fine), len(coarse)), dtype=np.float32)
-    matrix[np.arange(len(fine)), left] = 1 - (place - left)
-    matrix[np.arange(len(fine)), left + 1] = place - left
-    return matrix
+    return left, (place - left).astype(np.float32)
+
+
+def _lerp(values: np.ndarray, left: np.ndarray, share: np.ndarray, axis: int) -> np.ndarray:
+    shaped = share.reshape([-1 if i == axis else 1 for i in range(3)])
+    low = np.take(values, left, axis=axis)
+    high = np.take(values, left + 1, axis=axis)
+    high -= low
+    high *= shaped
+    high += low
+    return high
+
+
+def _covered(left: Int[np.ndarray, "n"], coarse: Int[np.ndarray, "m"]) -> slice:
+    """Return the fine indices between the outermost of the coarse ones."""
+    return slice(*np.searchsorted(left, (coarse.min() - 1, coarse.max() + 1)))
 
 
 def _render(
     grid: _Grid,
-    config: PhantomConfig,
-    coarse: _Grid,
+    painter: _Painter,
     organs: Sequence[heart.Organ],
-    small: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+    lumen: Float32[np.ndarray, "nz ny nx"],
+    veins: Float32[np.ndarray, "nz ny nx"],
     tissue: dict[str, float],
 ) -> Float32[np.ndarray, "nz ny nx"]:
-    """Paint the tissues over each other, each voxel by the share that it holds of them."""
+    """Paint the organs from the outside in, then veins, coronary walls and lumens."""
     image = np.full(grid.shape, tissue["lung"], dtype=np.float32)
-    along_x, along_y, along_z = (
-        _interpolation(f, c) for f, c in ((grid.x, coarse.x), (grid.y, coarse.y), (grid.z, coarse.z))
-    )
-    depths = [organ.depth.astype(np.float32) for organ in organs]
-    sharpness = np.float32(3 / (2 * config.in_plane_mm + config.slice_mm))
-
-    def paint(slab: np.ndarray, depth: np.ndarray, hu: float) -> np.ndarray:
-        share = np.clip(depth * sharpness + np.float32(0.5), 0, 1)
-        slab += share * (np.float32(hu) - slab)
-        return share
-
     for begin in range(0, grid.shape[0], _SLAB):
         rows = slice(begin, begin + _SLAB)
-        slab = image[rows]
-        lumen, veins, soft, calcium = (depth[rows] for depth in small)
-        weights = along_z[rows]
-        used = np.flatnonzero(weights.any(axis=0))
-        for organ, depth in zip(organs, depths, strict=True):
-            near = depth[used]
-            if near.max() < -1.0:
-                continue
-            fine = along_y @ np.tensordot(weights[:, used], near, axes=1) @ along_x.T
-            if organ.clearance_mm is not None:
-                np.minimum(fine, -lumen - np.float32(organ.clearance_mm), out=fine)
+        slab, vessel = image[rows], lumen[rows]
+        for organ in organs:
             if organ.name == "aorta":
-                paint(slab, np.minimum(veins, -lumen - np.float32(1.0)), tissue["vein"])
-                paint(slab, lumen + np.float32(_WALL_MM), tissue["coronary wall"])
-                paint(slab, soft, tissue["soft plaque"])
-            paint(slab, fine, tissue[organ.name])
-        share = paint(slab, lumen, tissue["lumen"])
-        hard = np.clip(calcium * sharpness + np.float32(0.5), 0, 1) * (1 - share)
-        slab += hard * (np.float32(tissue["calcium"]) - slab)
+                # The aorta's lumen opens the coronary walls at the ostia: they are painted just before it.
+                painter.paint(slab, np.minimum(veins[rows], -vessel - np.float32(1.0)), tissue["vein"])
+                painter.paint(slab, vessel + np.float32(_WALL_MM), tissue["coronary wall"])
+            found = painter.fine(organ.depth, rows)
+            if found is None:
+                continue
+            fine, (box_y, box_x) = found
+            if organ.clearance_mm is not None:
+                np.minimum(fine, -vessel[:, box_y, box_x] - np.float32(organ.clearance_mm), out=fine)
+            painter.paint(slab[:, box_y, box_x], fine, tissue[organ.name])
+        painter.paint(slab, vessel, tissue["lumen"])
     return image
 
 

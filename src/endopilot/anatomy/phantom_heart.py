@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
-from scipy.ndimage import gaussian_filter
+from jaxtyping import Float, Float32
+from scipy.ndimage import distance_transform_edt, gaussian_filter
 from scipy.spatial.transform import Rotation
 
 from endopilot.anatomy import atlas_shape as shape
@@ -70,59 +70,59 @@ def place(tree: VesselTree) -> Placement:
 
 
 def organs(
-    placement: Placement, grid: Float[np.ndarray, "nz ny nx 3"], generator: np.random.Generator
+    placement: Placement,
+    grid: Float32[np.ndarray, "nz ny nx 3"],
+    around_vessels: Float[np.ndarray, "nz ny nx"],
+    generator: np.random.Generator,
 ) -> tuple[Organ, ...]:
     """Return the organs in painting order, from the chest wall to the blood pools.
 
     Args:
         placement: from `place`.
         grid: the patient's positions of the coarse grid, mm.
+        around_vessels: signed distance to the surface of the fat that the coronaries need, mm.
         generator: random stream of the surfaces' unevenness.
     """
-    x = placement.inverse(grid)
-    step = float(np.linalg.norm(x[0, 0, 1] - x[0, 0, 0]))
+    x = placement.inverse(grid).astype(np.float32)
+    spacing_mm = float(grid[0, 0, 1, 0] - grid[0, 0, 0, 0])
 
-    def uneven(amplitude_mm: float, extent_mm: float) -> Float[np.ndarray, "nz ny nx"]:
-        noise = gaussian_filter(generator.standard_normal(x.shape[:3]), extent_mm / step)
+    def uneven(amplitude_mm: float, extent_mm: float) -> Float32[np.ndarray, "nz ny nx"]:
+        noise = gaussian_filter(generator.standard_normal(x.shape[:3], dtype=np.float32), extent_mm / spacing_mm)
         return amplitude_mm * noise / noise.std()
 
     rough, wavy = uneven(0.9, 3.5), uneven(1.0, 10.0)
-    lv_axis, rv_axis = (38.0, -68.0, -22.0), (46.0, -36.0, -16.0)
-    lv_wall = _ellipsoid(x, (44, -21, -37), (47, 28, 28), lv_axis) + wavy
-    lv = _ellipsoid(x, (42, -17, -36), (38, 18.5, 18.5), lv_axis) + rough
-    septum = lv_wall + 1.0
-    rv_wall = np.maximum(_ellipsoid(x, (10, -26, -42), (41, 25, 21), rv_axis), _tube(x, _RVOT, (15, 14, 14))) + wavy
-    rv = np.maximum(_ellipsoid(x, (10, -26, -42), (38, 22, 18), rv_axis), _tube(x, _RVOT, (12, 11, 12))) + rough
-    rv = np.minimum(rv, -septum)
-    ra = _ellipsoid(x, (-18, 19, -28), (25, 18, 20), (0.1, 0.2, 1.0)) + 0.7 * rough
+    lv_wall = _ellipsoid(x, (44, -21, -37), (47, 28, 28), _LV_AXIS) + wavy
+    lv = _ellipsoid(x, (42, -17, -36), (38, 18.5, 18.5), _LV_AXIS) + rough
+    rv_wall = np.maximum(_ellipsoid(x, (10, -25, -42), (41, 25, 22), _RV_AXIS), _tube(x, _RVOT, (15, 14, 14))) + wavy
+    rv = np.maximum(_ellipsoid(x, (10, -25, -42), (38, 22, 19), _RV_AXIS), _tube(x, _RVOT, (12, 11, 12))) + rough
+    ra = _ellipsoid(x, (-19, 18, -29), (27, 21, 22), (0.1, 0.2, 1.0)) + 0.7 * rough
     la = _ellipsoid(x, (24, 41, -9), (27, 17, 22), (1.0, 0.1, 0.1)) + 0.5 * wavy
     aorta, pulmonary = _tube(x, _AORTA, _AORTA_RADIUS), _tube(x, _PULMONARY, (12, 13, 12))
-    cava = _tube(x, [(-16, 20, -12), (-14, 20, 15), (-12, 17, 60)], (8, 8.5, 9))
-    lower_cava = _tube(x, [(-19, 26, -42), (-24, 30, -70), (-26, 31, -110)], (10, 11, 11))
+    cava, lower_cava = _tube(x, _UPPER_CAVA, (8, 8.5, 9)), _tube(x, _LOWER_CAVA, (10, 11, 11))
     veins = np.max([_tube(x, line, (6, 5, 3)) for line in _PULMONARY_VEINS], axis=0)
-    descending = _tube(x, [(38, 64, 80), (36, 65, -10), (28, 66, -120)], (11, 11, 10.5))
-    epicardium = np.max([lv_wall, rv_wall, ra + 2.0, la + 2.0], axis=0)
-    heart = _smooth_max([lv_wall, rv_wall, ra + 2, la + 2, aorta + 2, pulmonary + 2, cava + 1, lower_cava + 1], 9.0)
-    chest = _chest(x) + 0.6 * wavy
+    epicardium = np.max([lv_wall, rv_wall, ra + 2, la + 2], axis=0)
+    large_vessels = np.max([aorta, pulmonary, cava, lower_cava], axis=0)
+    pericardium = _close(np.max([epicardium + 2.5, large_vessels + 3, around_vessels], axis=0), 16.0, spacing_mm)
     bone = _bone(x)
-    return (
-        Organ("chest wall", -chest),
+    found = (
+        Organ("chest wall", 0.6 * wavy - _chest(x)),
         Organ("lung vessels", veins),
         Organ("liver", _ellipsoid(x, (-55, -5, -148), (110, 95, 66), (1.0, 0.0, 0.0)) + wavy),
         Organ("stomach", _ellipsoid(x, (75, -5, -128), (55, 60, 42), (1.0, 0.0, 0.0)) + wavy),
         Organ("cortical bone", bone),
         Organ("spongy bone", bone - 1.6 + 0.4 * rough),
-        Organ("fat", heart + 6.0 + wavy),
-        Organ("descending aorta", descending),
+        Organ("fat", pericardium + 0.5 * wavy),
+        Organ("descending aorta", _tube(x, _DESCENDING_AORTA, (11, 11, 10.5))),
         Organ("myocardium", epicardium, 0.9),
-        Organ("vessel wall", np.max([aorta, pulmonary], axis=0) + 1.3),
-        Organ("right atrium", np.max([ra, lower_cava], axis=0), 2.2),
+        Organ("vessel wall", np.maximum(aorta, pulmonary) + 1.3),
+        Organ("right atrium", np.maximum(ra, lower_cava), 2.2),
         Organ("vena cava", cava, 2.2),
-        Organ("right ventricle", np.max([rv, pulmonary], axis=0), 2.2),
-        Organ("left atrium", np.max([la, veins], axis=0), 2.2),
+        Organ("right ventricle", np.maximum(np.minimum(rv, -1.0 - lv_wall), pulmonary), 2.2),
+        Organ("left atrium", np.maximum(la, veins), 2.2),
         Organ("left ventricle", lv, 2.2),
         Organ("aorta", aorta),
     )
+    return tuple(Organ(o.name, (placement.scale * o.depth).astype(np.float32), o.clearance_mm) for o in found)
 
 
 def left_coronary(placement: Placement) -> tuple[Centerline, ...]:
@@ -173,6 +173,10 @@ def _crux_abscissa(tree: VesselTree) -> float:
     return 0.6 * float(tree.longest_path().abscissa[-1])
 
 
+_LV_AXIS, _RV_AXIS = (38.0, -68.0, -22.0), (46.0, -36.0, -16.0)
+_UPPER_CAVA = [(-16, 20, -12), (-14, 20, 15), (-12, 17, 60)]
+_LOWER_CAVA = [(-19, 26, -42), (-24, 30, -70), (-26, 31, -110)]
+_DESCENDING_AORTA = [(36, 62, 80), (34, 62, -10), (26, 64, -120)]
 _AORTA = [(22, 6, -26), (17, 5.5, -12), (14.5, 5, 0), (12.5, 4, 14), (9, 2, 40), (8, 3, 90)]
 _AORTA_RADIUS = (9.0, 13.0, AORTIC_RADIUS_MM, 14.5, 15.0, 15.0)
 _RVOT = [(8, -28, -30), (16, -29, -12), (24, -27, 4)]
@@ -206,22 +210,28 @@ def _ellipsoid(
 
 
 def _tube(
-    x: Float[np.ndarray, "nz ny nx 3"], waypoints: Sequence[Sequence[float]], radius: Sequence[float]
-) -> Float[np.ndarray, "nz ny nx"]:
+    x: Float32[np.ndarray, "nz ny nx 3"], waypoints: Sequence[Sequence[float]], radius: Sequence[float]
+) -> Float32[np.ndarray, "nz ny nx"]:
     """Signed distance to a tube through the waypoints, with its radius at each."""
-    line, r = np.array(waypoints, dtype=float), np.array(radius, dtype=float)
-    depth = np.full(x.shape[:3], -np.inf)
+    line, r = np.array(waypoints, dtype=np.float32), np.array(radius, dtype=np.float32)
+    square = np.einsum("...i,...i", x, x)
+    depth = np.full(x.shape[:3], -np.inf, dtype=np.float32)
     for a, b, ra, rb in zip(line[:-1], line[1:], r[:-1], r[1:], strict=True):
-        share = np.clip((x - a) @ (b - a) / ((b - a) @ (b - a)), 0.0, 1.0)
-        distance = np.linalg.norm(x - a - share[..., None] * (b - a), axis=-1)
-        np.maximum(depth, ra + share * (rb - ra) - distance, out=depth)
+        step = b - a
+        along = x @ step - a @ step
+        share = np.clip(along / (step @ step), 0, 1)
+        distance = square - 2 * (x @ a) + a @ a + share * (share * (step @ step) - 2 * along)
+        np.maximum(depth, ra + share * (rb - ra) - np.sqrt(np.maximum(distance, 0)), out=depth)
     return depth
 
 
-def _smooth_max(depths: Sequence[Float[np.ndarray, "nz ny nx"]], width_mm: float) -> Float[np.ndarray, "nz ny nx"]:
-    """Return the union of shapes with the grooves between them filled over `width_mm`."""
-    top = np.max(depths, axis=0)
-    return top + 0.25 * width_mm * np.log(sum(np.exp((depth - top) / (0.25 * width_mm)) for depth in depths))
+def _close(depth: Float[np.ndarray, "nz ny nx"], width_mm: float, spacing_mm: float) -> Float[np.ndarray, "nz ny nx"]:
+    """Return a shape with its gaps and grooves filled up to `width_mm` (morphological closing), as signed distance."""
+    half = 0.5 * width_mm
+    grown = np.where(depth > 0, half, half - distance_transform_edt(depth <= 0) * spacing_mm)
+    shrunk = distance_transform_edt(grown > 0) * spacing_mm - half
+    # The transforms count whole voxels: smooth their steps.
+    return gaussian_filter(np.maximum(shrunk, np.clip(depth, -width_mm, width_mm)), 0.8)
 
 
 def _chest(x: Float[np.ndarray, "nz ny nx 3"]) -> Float[np.ndarray, "nz ny nx"]:
@@ -235,7 +245,7 @@ def _bone(x: Float[np.ndarray, "nz ny nx 3"]) -> Float[np.ndarray, "nz ny nx"]:
     sternum = 4.5 - np.linalg.norm(
         np.stack([np.maximum(np.abs(x[..., 0] - 8) - 11, 0), x[..., 1] + 71 + 0.08 * x[..., 2]], axis=-1), axis=-1
     )
-    spine = 19 - np.linalg.norm(x[..., :2] - np.array([8.0, 88.0]), axis=-1)
+    spine = 19 - np.linalg.norm(x[..., :2] - np.array([6.0, 85.0]), axis=-1)
     disc = np.abs((x[..., 2] + 10) % 28 - 14) - 11
     spine = np.minimum(spine, -disc)
     turn = np.linspace(0.15 * np.pi, 0.85 * np.pi, 9)
