@@ -1,0 +1,179 @@
+"""A dataset on disk as arrays in memory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, Shaped
+
+from endopilot.dataset.schema import (
+    INFO_PATH,
+    LEROBOT_VERSION,
+    MANIFEST_PATH,
+    SIGNALS,
+    column_values,
+    paths_of_file,
+    read_table,
+)
+from endopilot.errors import InputError
+from endopilot.files import read_json
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """Episodes of equal length. Sample t is the state at the end of period t; `control[:, t]` is the mean over it.
+
+    Attributes:
+        folder: where it was read from.
+        manifest: how it was made (`meta/manifest.json`).
+        sample_period_s: time between samples, s.
+        anatomy: name of each episode's anatomy.
+        sequence: index of each episode among those of its anatomy.
+        split: "train", "seen_test", "calibrate" or "test".
+        device: name of the device.
+        friction: friction coefficient between wire and wall.
+        initial_inserted_length: Δ before the first period, mm.
+        initial_rotation: φ before the first period, rad.
+        control: π = (dΔ/dt mm/s, dφ/dt rad/s).
+        inserted_length: Δ, mm.
+        rotation: φ, rad, unwrapped.
+        tip_abscissa: Δtip, mm.
+        tip_offset: γtip, mm.
+        tip_position: LPS mm.
+        tip_direction: unit vector along the wire at its tip.
+        branch: index of the branch that the tip lies in.
+        lumen_radius: lumen radius at the tip's projection, mm.
+        contact_force_max: largest wall force on one node, N.
+        contact_force_sum: sum of the wall forces' magnitudes, N.
+        base_force: axial force of the drive, N, positive when it pushes.
+        base_torque: torque of the drive, N·mm.
+        valid: false from the sample in which the simulation of that episode failed.
+    """
+
+    folder: Path
+    manifest: dict[str, Any]
+    sample_period_s: float
+    anatomy: Shaped[np.ndarray, "episodes"]
+    sequence: Int[np.ndarray, "episodes"]
+    split: Shaped[np.ndarray, "episodes"]
+    device: Shaped[np.ndarray, "episodes"]
+    friction: Float[np.ndarray, "episodes"]
+    initial_inserted_length: Float[np.ndarray, "episodes"]
+    initial_rotation: Float[np.ndarray, "episodes"]
+    control: Float[np.ndarray, "episodes samples 2"]
+    inserted_length: Float[np.ndarray, "episodes samples"]
+    rotation: Float[np.ndarray, "episodes samples"]
+    tip_abscissa: Float[np.ndarray, "episodes samples"]
+    tip_offset: Float[np.ndarray, "episodes samples"]
+    tip_position: Float[np.ndarray, "episodes samples 3"]
+    tip_direction: Float[np.ndarray, "episodes samples 3"]
+    branch: Int[np.ndarray, "episodes samples"]
+    lumen_radius: Float[np.ndarray, "episodes samples"]
+    contact_force_max: Float[np.ndarray, "episodes samples"]
+    contact_force_sum: Float[np.ndarray, "episodes samples"]
+    base_force: Float[np.ndarray, "episodes samples"]
+    base_torque: Float[np.ndarray, "episodes samples"]
+    valid: Bool[np.ndarray, "episodes samples"]
+
+    def __len__(self) -> int:
+        """Return the number of episodes."""
+        return len(self.anatomy)
+
+    def select(self, episodes: Shaped[np.ndarray, "chosen"]) -> Dataset:
+        """Return the chosen episodes, given as a mask or as indices."""
+        names = [f.name for f in fields(self) if f.name not in ("folder", "manifest", "sample_period_s")]
+        return replace(self, **{name: getattr(self, name)[episodes] for name in names})
+
+    def of_split(self, split: str) -> Dataset:
+        """Return the episodes of one split that are valid to the end.
+
+        Raises:
+            InputError: there are none.
+        """
+        chosen = (self.split == split) & self.valid.all(axis=1)
+        if not chosen.any():
+            held = ", ".join(sorted(set(self.split.tolist())))
+            raise InputError(
+                f"{self.folder}: no valid episode in split '{split}' (it has {held}); "
+                "make the dataset with more anatomies or sequences"
+            )
+        return self.select(chosen)
+
+    def anatomy_folder(self, name: str) -> Path:
+        """Return the folder of an anatomy of the dataset, as it lay when the dataset was made."""
+        record = next(record for record in self.manifest["anatomies"] if record["name"] == name)
+        return (self.folder / record["folder"]).resolve()
+
+
+def load_dataset(folder: Path) -> Dataset:
+    """Read a whole dataset made by `endopilot dataset`.
+
+    Raises:
+        InputError: the folder holds no finished dataset, or a file of it is missing, damaged or of another version.
+    """
+    folder = Path(folder)
+    if not (folder / MANIFEST_PATH).exists():
+        raise InputError(f"{folder}: no dataset here ({MANIFEST_PATH} is missing); make one with `endopilot dataset`")
+    manifest = read_json(folder / MANIFEST_PATH)
+    if not manifest.get("complete"):
+        raise InputError(f"{folder}: the dataset is unfinished; run the same `endopilot dataset` command again")
+    info = read_json(folder / INFO_PATH)
+    if info.get("codebase_version") != LEROBOT_VERSION:
+        found = info.get("codebase_version")
+        raise InputError(f"{folder / INFO_PATH}: codebase_version is {found}, not {LEROBOT_VERSION}; make it again")
+
+    samples = manifest["samples_per_episode"]
+    episodes: dict[str, list[np.ndarray]] = {}
+    signals: dict[str, list[np.ndarray]] = {name: [] for name in SIGNALS}
+    for number in range(manifest["files"]):
+        data_path, episodes_path = paths_of_file(folder, number)
+        table = read_table(episodes_path, manifest["key"])
+        for name in table.column_names:
+            episodes.setdefault(name, []).append(column_values(table, name))
+        data = read_table(data_path, manifest["key"])
+        if data.num_rows != table.num_rows * samples:
+            raise InputError(
+                f"{data_path}: {data.num_rows} rows where {table.num_rows * samples} belong; "
+                "delete it and run `endopilot dataset` again"
+            )
+        for name in SIGNALS:
+            values = column_values(data, name)
+            signals[name].append(values.reshape(table.num_rows, samples, *values.shape[1:]))
+
+    episode = {name: np.concatenate(parts) for name, parts in episodes.items()}
+    signal = {name: np.concatenate(parts) for name, parts in signals.items()}
+    if len(episode["episode_index"]) != info["total_episodes"]:
+        raise InputError(
+            f"{folder}: {len(episode['episode_index'])} episodes where {INFO_PATH} counts {info['total_episodes']}; "
+            "run `endopilot dataset` again"
+        )
+    state = signal["observation.state"]
+    return Dataset(
+        folder=folder,
+        manifest=manifest,
+        sample_period_s=1 / info["fps"],
+        anatomy=episode["anatomy"].astype(str),
+        sequence=episode["sequence"],
+        split=episode["split"].astype(str),
+        device=episode["device"].astype(str),
+        friction=episode["friction"],
+        initial_inserted_length=episode["initial_inserted_length_mm"],
+        initial_rotation=episode["initial_rotation_rad"],
+        control=signal["action"],
+        inserted_length=state[..., 0],
+        rotation=state[..., 1],
+        tip_abscissa=state[..., 2],
+        tip_offset=state[..., 3],
+        tip_position=signal["tip_position_mm"],
+        tip_direction=signal["tip_direction"],
+        branch=signal["branch"],
+        lumen_radius=signal["lumen_radius_mm"],
+        contact_force_max=signal["contact_force_max_n"],
+        contact_force_sum=signal["contact_force_sum_n"],
+        base_force=signal["base_force_n"],
+        base_torque=signal["base_torque_nmm"],
+        valid=signal["valid"],
+    )

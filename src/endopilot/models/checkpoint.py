@@ -1,0 +1,92 @@
+"""Networks on disk: safetensors with JSON in the header. Nothing is ever unpickled."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from endopilot.errors import InputError
+from endopilot.files import json_text, writing
+from endopilot.models.config import TransformerConfig
+from endopilot.models.transformer import NETWORKS, Network
+
+FORMAT_VERSION = 1
+"""Counts changes of the tensors or of their meaning."""
+
+
+def write_network(path: Path, name: str, network: Network, config: TransformerConfig, facts: Mapping[str, Any]) -> None:
+    """Write weights and scales of a network, whole or not at all.
+
+    Args:
+        path: the file to write.
+        name: "ff" or "if".
+        network: the network.
+        config: its size.
+        facts: what else the header shall say, as JSON values.
+    """
+    write_tensors(path, network.state_dict(), {"network": name, "size": asdict(config), **facts})
+
+
+def read_network(path: Path) -> tuple[Network, dict[str, Any]]:
+    """Return a network and the facts in its header.
+
+    Raises:
+        InputError: the file is missing, damaged or of another version.
+    """
+    tensors, facts = read_tensors(path)
+    try:
+        network = NETWORKS[facts["network"]](TransformerConfig(**facts["size"]))
+        network.load_state_dict(tensors)
+    except (KeyError, TypeError, RuntimeError) as error:
+        raise InputError(f"{path}: holds no network of this version ({error}); train it again") from error
+    return network.eval(), facts
+
+
+def write_tensors(path: Path, tensors: Mapping[str, Tensor], facts: Mapping[str, Any]) -> None:
+    """Write named tensors and JSON facts into one safetensors file, whole or not at all."""
+    header = {"endopilot": json_text({"format_version": FORMAT_VERSION, **facts})}
+    with writing(path) as partial:
+        save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, partial, header)
+
+
+def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Return the tensors and the facts of a file that `write_tensors` wrote.
+
+    Raises:
+        InputError: the file is missing, damaged or of another version.
+    """
+    if not Path(path).exists():
+        raise InputError(f"{path}: no such checkpoint; train one with `endopilot train`")
+    try:
+        with safe_open(path, framework="pt") as stream:
+            facts = json.loads((stream.metadata() or {})["endopilot"])
+            tensors = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118 (not a mapping)
+    except (SafetensorError, KeyError, json.JSONDecodeError, OSError) as error:
+        raise InputError(f"{path}: damaged, or not a checkpoint of endopilot ({error}); train it again") from error
+    if facts["format_version"] != FORMAT_VERSION:
+        raise InputError(f"{path}: format version {facts['format_version']}, not {FORMAT_VERSION}; train it again")
+    return tensors, facts
+
+
+def optimizer_tensors(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
+    """Return an optimizer's state as named tensors."""
+    state = optimizer.state_dict()["state"]
+    return {f"optimizer.{i}.{name}": tensor for i, entry in state.items() for name, tensor in entry.items()}
+
+
+def restore_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tensor]) -> None:
+    """Set an optimizer to the state that `optimizer_tensors` gave."""
+    state: dict[int, dict[str, Tensor]] = {}
+    for key, tensor in tensors.items():
+        prefix, i, name = key.split(".", 2)
+        if prefix == "optimizer":
+            state.setdefault(int(i), {})[name] = tensor
+    optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})

@@ -1,0 +1,137 @@
+"""Open-loop rollouts: the first 30 states are given, then the networks feed back on themselves.
+
+P1, `rollout_forward`: FF with the true controls. P2, `rollout_inverse`: IF with the true tip as desired. P3,
+`rollout_dual`: IF asks for a control, FF foretells what it does, and IF sees that in place of an X-ray image.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from endopilot.dataset.loader import Dataset
+from endopilot.errors import InputError
+from endopilot.files import read_json
+from endopilot.models.checkpoint import read_network
+from endopilot.models.config import WINDOW
+from endopilot.models.transformer import Network
+from endopilot.models.windows import Episodes
+from endopilot.types import SAMPLE_PERIOD_S
+
+Steps2 = Float[np.ndarray, "episodes steps 2"]
+
+
+@dataclass(frozen=True, eq=False)
+class OpenLoop:
+    """What a predictor foretells of each episode for the samples after the 30 given ones.
+
+    Attributes:
+        tip: (Δtip, γtip), mm; the true tip in P2, where none is predicted.
+        proximal: x^prox = (Δ mm, φ rad), the exact integral of `control`; the true one in P1.
+        control: π = (mm/s, rad/s); the true one in P1.
+    """
+
+    tip: Steps2
+    proximal: Steps2
+    control: Steps2
+
+
+class Predictor(Protocol):
+    """Whatever rolls episodes out: the networks of a run, or a baseline."""
+
+    def rollout_forward(self, episodes: Dataset) -> OpenLoop:
+        """P1: predict the tip under the true controls."""
+        ...
+
+    def rollout_inverse(self, episodes: Dataset) -> OpenLoop:
+        """P2: predict the controls that make the tip go the true way."""
+        ...
+
+    def rollout_dual(self, episodes: Dataset) -> OpenLoop:
+        """P3: predict the controls that make the tip go the true way, and the tip that they make."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class TransformerPredictor:
+    """The paper's pair of networks.
+
+    Attributes:
+        forward: FF, if it was trained.
+        inverse: IF, if it was trained.
+        control_limits: largest translation speed, mm/s, and rotation speed, rad/s, that IF may ask for.
+        batch_size: episodes that are rolled out together.
+    """
+
+    forward: Network | None
+    inverse: Network | None
+    control_limits: Float[np.ndarray, "2"]
+    batch_size: int = 256
+
+    def rollout_forward(self, episodes: Dataset) -> OpenLoop:
+        """P1: predict the tip under the true controls."""
+        return self._rollout(episodes, ask=False, foretell=True)
+
+    def rollout_inverse(self, episodes: Dataset) -> OpenLoop:
+        """P2: predict the controls that make the tip go the true way."""
+        return self._rollout(episodes, ask=True, foretell=False)
+
+    def rollout_dual(self, episodes: Dataset) -> OpenLoop:
+        """P3: predict the controls that make the tip go the true way, and the tip that they make."""
+        return self._rollout(episodes, ask=True, foretell=True)
+
+    @torch.inference_mode()
+    def _rollout(self, episodes: Dataset, *, ask: bool, foretell: bool) -> OpenLoop:
+        """Roll out with the controls that IF asks for, or the true ones, and the tip that FF foretells, or the true one."""
+        forward, inverse = self._network("forward", foretell), self._network("inverse", ask)
+        parts = []
+        for first in range(0, len(episodes), self.batch_size):
+            chosen = np.arange(first, min(first + self.batch_size, len(episodes)))
+            parts.append(_rollout_batch(forward, inverse, self.control_limits, Episodes.of(episodes.select(chosen))))
+        tip, proximal, control = (np.concatenate(signal) for signal in zip(*parts, strict=True))
+        return OpenLoop(tip=tip, proximal=proximal, control=control)
+
+    def _network(self, role: str, needed: bool) -> Network | None:
+        network = getattr(self, role)
+        if needed and network is None:
+            raise InputError(f"the run has no {role} network; train it with --network both")
+        return network if needed else None
+
+
+def _rollout_batch(
+    forward: Network | None, inverse: Network | None, limits: Float[np.ndarray, "2"], episodes: Episodes
+) -> tuple[Steps2, Steps2, Steps2]:
+    """Return tip, x^prox and control after the given states of one batch."""
+    desired = episodes.tip
+    tip, control = desired.clone(), episodes.control.clone()
+    proximal = episodes.proximal.double()  # float64, so that x^prox stays the integral of the controls
+    bound = torch.as_tensor(limits, dtype=torch.float32)
+    for k in range(WINDOW, tip.shape[1]):
+        if inverse is not None:
+            asked = torch.cat([tip[:, k - WINDOW + 1 : k], desired[:, k : k + 1]], dim=1)
+            given = slice(k - WINDOW, k)
+            control[:, k] = inverse(asked, proximal[:, given].float(), control[:, given]).clamp(-bound, bound)
+            proximal[:, k] = proximal[:, k - 1] + SAMPLE_PERIOD_S * control[:, k].double()
+        if forward is not None:
+            moved = slice(k - WINDOW + 1, k + 1)
+            tip[:, k] = forward(tip[:, k - WINDOW : k], proximal[:, moved].float(), control[:, moved])
+    return tuple(signal[:, WINDOW:].double().numpy() for signal in (tip, proximal, control))  # pyright: ignore[reportReturnType]
+
+
+def load_run(run_folder: Path) -> TransformerPredictor:
+    """Read the networks of a run made by `endopilot train`.
+
+    Raises:
+        InputError: the run is unfinished, or a file of it is damaged or of another version.
+    """
+    run_folder = Path(run_folder)
+    record = read_json(run_folder / "manifest.json")
+    networks = {name: read_network(run_folder / f"{name}.safetensors")[0] for name in record["networks"]}
+    return TransformerPredictor(
+        forward=networks.get("ff"), inverse=networks.get("if"), control_limits=np.array(record["control_limits"])
+    )

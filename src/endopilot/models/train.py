@@ -1,0 +1,269 @@
+"""Training of the paper's FF and IF on a dataset: `train`.
+
+After every epoch one file, `checkpoints/<network>.safetensors`, is written whole or not at all; it holds weights,
+optimizer and learning curve, and a killed run goes on from it along the same curve. All randomness follows from the
+seed and the epoch, so on one machine a run with a fixed number of steps repeats to the bit.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import os
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from endopilot.dataset.loader import Dataset, load_dataset
+from endopilot.errors import InputError
+from endopilot.files import manifest, read_json, write_json
+from endopilot.models.checkpoint import (
+    optimizer_tensors,
+    read_tensors,
+    restore_optimizer,
+    write_network,
+    write_tensors,
+)
+from endopilot.models.config import TrainConfig, TransformerConfig
+from endopilot.models.transformer import NETWORKS, Network
+from endopilot.models.windows import Episodes
+from endopilot.progress import Advance, progress
+
+VALIDATION_WINDOWS = 1024
+"""Windows of held-out navigations that the loss is checked on after every epoch."""
+WARM_UP_STEPS = 100
+"""Steps over which the learning rate rises to its peak; afterwards it falls to zero along a cosine."""
+_SCALE_WINDOWS = 16384
+_TIMED_STEPS = 10
+_GRADIENT_NORM = 1.0
+
+
+def train(dataset_folder: Path, run_folder: Path, config: TrainConfig) -> None:
+    """Train the forward and the inverse network on the split "train" and write them into a run folder.
+
+    Writes `ff.safetensors` and `if.safetensors` (weights and scales), `config.json`, `training.json` (learning
+    curves) and `manifest.json`. A run that was interrupted goes on where it stopped when it is started again with the
+    same arguments; a finished one returns at once.
+
+    Args:
+        dataset_folder: dataset made by `endopilot dataset`.
+        run_folder: where the result goes.
+        config: what is trained, and how long.
+
+    Raises:
+        InputError: the dataset cannot be used, the run folder was begun with other settings, or the loss left the
+            finite numbers (the last good checkpoint stays).
+    """
+    dataset_folder, run_folder = Path(dataset_folder), Path(run_folder)
+    dataset = load_dataset(dataset_folder)
+    size = TransformerConfig()
+    _begin(run_folder, {"train": asdict(config), "transformer": asdict(size), "dataset": dataset.manifest["key"]})
+    training = Episodes.of(dataset.of_split("train"))
+    validation = Episodes.of(dataset.of_split("seen_test")) if "seen_test" in dataset.split else None
+    start = time.perf_counter()
+    results: dict[str, Any] = {}
+    for name in config.networks:
+        job = _Job(name, config, size, training, validation, run_folder)
+        results[name] = job.run()
+        write_json(run_folder / "training.json", results)
+    record = manifest(
+        config=config,
+        seed=config.seed,
+        inputs={"dataset": dataset.manifest["key"]},
+        dataset=os.path.relpath(dataset_folder.resolve(), run_folder.resolve()),
+        episodes={"train": len(training.tip), "seen_test": 0 if validation is None else len(validation.tip)},
+        rejected={"invalid_episodes": int((~dataset.valid.all(axis=1)).sum())},
+        control_limits=_control_limits(dataset),
+        networks={name: {key: result[key] for key in result if key != "curve"} for name, result in results.items()},
+        threads=torch.get_num_threads(),
+        wall_seconds=time.perf_counter() - start,
+    )
+    write_json(run_folder / "manifest.json", record)
+
+
+def _begin(run_folder: Path, settings: dict[str, Any]) -> None:
+    """Claim the run folder, or check that it was begun with the same settings."""
+    path = run_folder / "config.json"
+    if not path.exists():
+        write_json(path, settings)
+        return
+    before = read_json(path)
+    for part, values in settings.items():
+        then = before.get(part)
+        if then == values:
+            continue
+        changed = next((key for key in values if (then or {}).get(key) != values[key]), part)
+        raise InputError(
+            f"{run_folder}: was begun with another {part} ({changed} differs); "
+            "choose another output folder or go back to the first settings"
+        )
+
+
+def _control_limits(dataset: Dataset) -> list[float]:
+    """Return the largest translation (mm/s) and rotation speed (rad/s) in the training data."""
+    return np.abs(dataset.of_split("train").control).max(axis=(0, 1)).tolist()
+
+
+@dataclass(frozen=True, eq=False)
+class _Job:
+    """The training of one network."""
+
+    name: str
+    config: TrainConfig
+    size: TransformerConfig
+    training: Episodes
+    validation: Episodes | None
+    run_folder: Path
+
+    def run(self) -> dict[str, Any]:
+        """Train, or go on training, until the last epoch; return the learning curve and how the steps were planned."""
+        config = self.config
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(_seed(config.seed, self.name, "weights"))
+            network = NETWORKS[self.name](self.size)
+            self._fit_scales(network)
+            optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate)
+            state = self._resume(network, optimizer) or {
+                "steps_per_epoch": self._plan(network),
+                "seconds": 0.0,
+                "curve": [],
+            }
+            steps = state["steps_per_epoch"]
+            title = f"Training {self.name.upper()}"
+            with progress(title, total=config.epochs * steps) as advance:
+                advance(len(state["curve"]) * steps)
+                while len(state["curve"]) < config.epochs and not self._out_of_time(state):
+                    self._epoch(network, optimizer, state, advance)
+                    self._save(network, optimizer, state)
+        windows = steps * config.batch_size
+        return {"windows_per_epoch": windows, "parameters": sum(p.numel() for p in network.parameters())} | state
+
+    def _epoch(self, network: Network, optimizer: torch.optim.Adam, state: dict[str, Any], advance: Advance) -> None:
+        epoch, steps, start = len(state["curve"]), state["steps_per_epoch"], time.perf_counter()
+        torch.manual_seed(_seed(self.config.seed, self.name, epoch))
+        batches = self._batches(epoch, steps)
+        network.train()
+        total = 0.0
+        for step, targets in enumerate(batches):
+            rate = _learning_rate(self.config.learning_rate, epoch * steps + step, self.config.epochs * steps)
+            loss = self._step(network, optimizer, targets, rate)
+            if not math.isfinite(loss):
+                episodes = sorted(set(targets[:, 0].tolist()))[:8]
+                raise InputError(
+                    f"{self.run_folder}: the loss of {self.name} became {loss} in epoch {epoch + 1}, batch {step + 1} "
+                    f"(train episodes {episodes} and others); the checkpoint of epoch {epoch} is kept; "
+                    "look for bad samples in the dataset or lower learning_rate"
+                )
+            total += loss
+            speed = (step + 1) * self.config.batch_size / (time.perf_counter() - start)
+            advance(1, f"loss {total / (step + 1):.3f}, {speed:.0f} samples/s")
+        seconds = time.perf_counter() - start
+        state["seconds"] += seconds
+        state["curve"].append(
+            {
+                "epoch": epoch + 1,
+                "loss": total / steps,
+                "validation_loss": self._validate(network),
+                "seconds": seconds,
+                "windows_per_second": steps * self.config.batch_size / seconds,
+            }
+        )
+
+    def _step(self, network: Network, optimizer: torch.optim.Adam, targets: torch.Tensor, rate: float) -> float:
+        """Take one step along the gradient and return the loss before it; a loss that is not finite takes no step."""
+        *window, truth = self.training.window(self.name, targets)
+        loss = network.loss(network(*window), truth)
+        value = loss.item()
+        if math.isfinite(value):
+            optimizer.zero_grad()
+            loss.backward()
+            torch.nn.utils.clip_grad_norm_(network.parameters(), _GRADIENT_NORM)
+            optimizer.param_groups[0]["lr"] = rate
+            optimizer.step()
+        return value
+
+    @torch.no_grad()
+    def _validate(self, network: Network) -> float | None:
+        if self.validation is None:
+            return None
+        network.eval()
+        targets = self.validation.targets()
+        chosen = torch.linspace(0, len(targets) - 1, min(len(targets), VALIDATION_WINDOWS)).long()
+        *window, truth = self.validation.window(self.name, targets[chosen])
+        return network.loss(network(*window), truth).item()
+
+    def _batches(self, epoch: int, steps: int) -> list[torch.Tensor]:
+        """Return the targets of every batch of an epoch: all windows in random order, or the first of them."""
+        targets = self.training.targets()
+        generator = torch.Generator().manual_seed(_seed(self.config.seed, self.name, "order", epoch))
+        order = torch.randperm(len(targets), generator=generator)
+        return list(targets[order].split(self.config.batch_size)[:steps])
+
+    def _fit_scales(self, network: Network) -> None:
+        targets = self.training.targets()
+        chosen = torch.linspace(0, len(targets) - 1, min(len(targets), _SCALE_WINDOWS)).long()
+        network.fit_scales(*self.training.window(self.name, targets[chosen]))
+
+    def _plan(self, network: Network) -> int:
+        """Return the steps of an epoch: every window once, or what `windows_per_epoch` or `max_seconds` leave of it."""
+        config = self.config
+        windows = min(len(self.training.targets()), config.windows_per_epoch or 2**62)
+        steps = max(math.ceil(windows / config.batch_size), 1)
+        if config.max_seconds is None:
+            return steps
+        trial = copy.deepcopy(network).train()
+        optimizer = torch.optim.Adam(trial.parameters(), lr=0.0)
+        batches = (self._batches(0, 2 * _TIMED_STEPS) * _TIMED_STEPS)[: 2 * _TIMED_STEPS]
+        for step, targets in enumerate(batches):
+            if step == _TIMED_STEPS:  # the first steps also pay for allocation
+                start = time.perf_counter()
+            self._step(trial, optimizer, targets, 0.0)
+        seconds_per_step = (time.perf_counter() - start) / _TIMED_STEPS
+        # An evaluation of a window costs about a third of a training step on it.
+        validation = 0 if self.validation is None else VALIDATION_WINDOWS / config.batch_size / 3
+        affordable = config.max_seconds / config.epochs / seconds_per_step - validation
+        return max(min(steps, int(affordable)), 1)
+
+    def _out_of_time(self, state: dict[str, Any]) -> bool:
+        """Tell whether the next epoch would end later than a tenth over the time allowed."""
+        if self.config.max_seconds is None or not state["curve"]:
+            return False
+        return state["seconds"] + state["curve"][-1]["seconds"] > 1.1 * self.config.max_seconds
+
+    def _save(self, network: Network, optimizer: torch.optim.Adam, state: dict[str, Any]) -> None:
+        tensors = {f"network.{key}": value for key, value in network.state_dict().items()}
+        write_tensors(self._checkpoint, tensors | optimizer_tensors(optimizer), {"network": self.name, **state})
+        write_network(self.run_folder / f"{self.name}.safetensors", self.name, network, self.size, {})
+
+    def _resume(self, network: Network, optimizer: torch.optim.Adam) -> dict[str, Any] | None:
+        if not self._checkpoint.exists():
+            return None
+        tensors, facts = read_tensors(self._checkpoint)
+        weights = {key.removeprefix("network."): t for key, t in tensors.items() if key.startswith("network.")}
+        network.load_state_dict(weights)
+        restore_optimizer(optimizer, tensors)
+        # A kill between the two files of an epoch leaves the second one behind by an epoch.
+        write_network(self.run_folder / f"{self.name}.safetensors", self.name, network, self.size, {})
+        return {key: facts[key] for key in ("steps_per_epoch", "seconds", "curve")}
+
+    @property
+    def _checkpoint(self) -> Path:
+        return self.run_folder / "checkpoints" / f"{self.name}.safetensors"
+
+
+def _learning_rate(peak: float, step: int, total: int) -> float:
+    """Return the step size: a linear rise over the first steps, then half a cosine down to zero."""
+    warm_up = min(WARM_UP_STEPS, total // 10)
+    if step < warm_up:
+        return peak * (step + 1) / warm_up
+    return peak * 0.5 * (1 + math.cos(math.pi * (step - warm_up) / max(total - warm_up, 1)))
+
+
+def _seed(*parts: int | str) -> int:
+    """Return a 63-bit seed for one purpose, so that streams of different purposes never meet."""
+    words = [part if isinstance(part, int) else int.from_bytes(part.encode(), "little") for part in parts]
+    return int(np.random.SeedSequence(words).generate_state(1, np.uint64)[0] >> 1)
