@@ -17,9 +17,6 @@ from endopilot.errors import InputError
 from endopilot.imaging import methods as method_modules
 from endopilot.types import LumenMask, Volume
 
-LEAST_BLOOD_HU = 130.0
-"""Without contrast, blood measures 30-60 HU; below this value no method here can tell lumen from wall."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class SegmentConfig:

@@ -22,13 +22,14 @@ from skimage.segmentation import watershed
 
 from endopilot.errors import InputError
 from endopilot.imaging.grid import (
+    LEAST_BLOOD_HU,
     connected_components,
     distance_and_nearest,
     distance_to_outside,
     interpolate_like,
     resample,
 )
-from endopilot.imaging.segment import LEAST_BLOOD_HU, SegmentConfig
+from endopilot.imaging.segment import SegmentConfig
 from endopilot.progress import progress
 from endopilot.types import Insertion, LumenMask, Volume
 
@@ -207,7 +208,7 @@ def _at_half_height(
     weight = ndimage.gaussian_filter(inside.astype(np.float32), sigma)
     blood = ndimage.gaussian_filter(np.where(inside, hu, np.float32(0)), sigma) / np.maximum(weight, 1e-3)
     level = np.clip(hu - (blood + _WALL_HU) / 2, -200, 200)
-    level[~np.asarray(ndimage.binary_dilation(inside)) | beyond] = -200
+    level[~ndimage.binary_dilation(inside).astype(bool) | beyond] = -200
     fine = interpolate_like(Volume(level, grid.spacing_mm, grid.origin_mm, grid.direction), volume, outside=-200.0) > 0
     label = connected_components(fine)
     return (label == np.bincount(label.ravel())[1:].argmax() + 1) if fine.any() else fine
