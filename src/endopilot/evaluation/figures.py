@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from typing import Any
 
 import matplotlib
@@ -190,7 +191,7 @@ def volume_figure(volume: Volume, mask: LumenMask, anatomy: Anatomy | None = Non
         )
         axes[0].set_title("Axial slice at the ostium" if ostium is not None else "Axial slice")
         slab = voxels[crop[0], inside[1][0] : inside[1][-1] + 1, crop[2]].max(axis=1)
-        _picture(axes[1], slab, lumen.any(axis=1)[crop[0], crop[2]], spacing[[0, 2]], origin="lower")
+        _picture(axes[1], slab, np.any(lumen, axis=1)[crop[0], crop[2]], spacing[[0, 2]], origin="lower")
         axes[1].set_title("Coronal maximum projection")
         if anatomy is not None:
             draw_tree(axes[2], anatomy)
@@ -297,3 +298,10 @@ def _picture(
         ax.contour(lumen.astype(float), [0.5], colors=[VERMILLION], linewidths=1.1, origin=origin, extent=extent)
     ax.set(xlabel="mm", ylabel="mm")
     ax.grid(False)
+
+
+def png(figure: Figure) -> bytes:
+    """Return a figure as the bytes of a PNG file."""
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", dpi=STYLE["figure.dpi"])
+    return stream.getvalue()

@@ -1,7 +1,7 @@
 """The numbers that say how good a prediction is. Pure numpy; NaN marks a sample that counts for nothing.
 
 Errors are `predicted − true`. A sample is left out only where the truth is not valid; a prediction that is not
-finite where the truth is counts as lost, and its sequence as diverged, so that failing cannot improve a figure.
+finite where the truth is counts as lost, and its sequence as diverged: both shares stand beside the errors.
 """
 
 from __future__ import annotations

@@ -1,0 +1,136 @@
+"""Roll a trained run out by the protocols P1 to P4 and measure it: `evaluate`."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from endopilot.dataset.loader import Dataset, load_dataset
+from endopilot.errors import InputError
+from endopilot.evaluation.metrics import PAPER_ERRORS
+from endopilot.evaluation.results import SPLIT_TITLES, SplitResult, write_results
+from endopilot.evaluation.summary import findings, summarize
+from endopilot.files import manifest, read_json, sha256, write_json, writing
+from endopilot.progress import progress
+
+METRICS_FILE, RESULTS_FILE, FIGURES_FOLDER = "metrics.json", "evaluation.npz", "figures"
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateConfig:
+    """How much is evaluated."""
+
+    sequences: int | None = None
+    """Navigations of each split that are evaluated, spread evenly over its patients; all if not given."""
+    seed: int = 0
+    """Seed of the bootstrap that gives the intervals over patients."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            InputError: a field is out of its range.
+        """
+        if self.sequences is not None and self.sequences < 1:
+            raise InputError(f"sequences: {self.sequences} is not positive; give at least 1")
+        if self.seed < 0:
+            raise InputError(f"seed: {self.seed} is negative; give 0 or more")
+
+
+def evaluate(run_folder: Path, output: Path, config: EvaluateConfig) -> dict[str, Any]:
+    """Evaluate both networks of a run on the navigations and the patients that they never saw.
+
+    Writes `metrics.json` (every figure, and how it was made), `evaluation.npz` (the predictions) and, in `figures/`,
+    the PNG and the CSV of each figure. Every file is written whole or not at all; `metrics.json` comes last, so
+    where it is, everything is.
+
+    Args:
+        run_folder: made by `endopilot train`.
+        output: where the result goes.
+        config: how much is evaluated.
+
+    Returns:
+        The content of `metrics.json`.
+
+    Raises:
+        InputError: the run, its dataset or one of its anatomies is missing or damaged, or nothing was held out.
+    """
+    from endopilot.evaluation.protocols import run_protocols  # brings torch, which takes seconds to import
+    from endopilot.models.rollout import load_run
+
+    start = time.perf_counter()
+    run_folder, output = Path(run_folder), Path(output)
+    dataset = load_dataset((run_folder / read_json(run_folder / "manifest.json")["dataset"]).resolve())
+    predictor = load_run(run_folder)
+    train = dataset.of_split("train")
+    chosen = {
+        split: _chosen(dataset.of_split(split), config.sequences) for split in SPLIT_TITLES if split in dataset.split
+    }
+    if not chosen:
+        raise InputError(
+            f"{dataset.folder}: holds neither of the splits {', '.join(SPLIT_TITLES)}; "
+            "make it with seen_test_share above 0 or with more patients"
+        )
+    results: dict[str, SplitResult] = {}
+    steps = sum(3 + len(np.unique(data.anatomy)) for data in chosen.values())
+    with progress("Evaluating", total=steps) as advance:
+        for split, data in chosen.items():
+            results[split] = run_protocols(predictor, data, train, advance)
+    metrics = _metrics(results, config.seed) | {
+        "manifest": manifest(
+            config=config,
+            seed=config.seed,
+            inputs={path.name: sha256(path) for path in sorted(run_folder.glob("*.safetensors"))}
+            | {"dataset": dataset.manifest["key"]},
+            wall_seconds=time.perf_counter() - start,
+        )
+    }
+    (output / METRICS_FILE).unlink(missing_ok=True)
+    write_results(results, output / RESULTS_FILE)
+    _write_figures(results, output / FIGURES_FOLDER)
+    write_json(output / METRICS_FILE, metrics)
+    return metrics
+
+
+def _chosen(data: Dataset, sequences: int | None) -> Dataset:
+    """Return at most `sequences` episodes, as evenly over the anatomies as they come."""
+    if sequences is None or sequences >= len(data):
+        return data
+    rank = np.empty(len(data), dtype=int)
+    for name in np.unique(data.anatomy):
+        of_anatomy = np.flatnonzero(data.anatomy == name)
+        rank[of_anatomy] = np.arange(len(of_anatomy))
+    return data.select(np.sort(np.lexsort((data.anatomy, rank))[:sequences]))
+
+
+def _metrics(results: Mapping[str, SplitResult], seed: int) -> dict[str, Any]:
+    period = next(iter(results.values())).sample_period_s
+    metrics: dict[str, Any] = {
+        "unit": "mm where no other stands",
+        "sample_period_s": period,
+        "paper": PAPER_ERRORS,
+        "splits": {
+            split: {"title": SPLIT_TITLES[split]} | summarize(result, seed=seed) for split, result in results.items()
+        },
+    }
+    return metrics | {"findings": findings(metrics)}
+
+
+def _write_figures(results: Mapping[str, SplitResult], folder: Path) -> None:
+    from endopilot.evaluation import figures, tables  # matplotlib and pandas, slow to import
+
+    drawn = {
+        "tip_error": (tables.tip_error_table(results), figures.tip_error_figure),
+        "safety_ratio": (tables.safety_table(results), figures.safety_figure),
+        "control_error": (tables.control_error_table(results), figures.control_error_figure),
+    }
+    for name, (table, draw) in drawn.items():
+        with writing(folder / f"{name}.csv") as partial:
+            table.to_csv(partial, index=False)
+        with writing(folder / f"{name}.png") as partial:
+            partial.write_bytes(figures.png(draw(table)))
