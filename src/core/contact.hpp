@@ -1,0 +1,242 @@
+// The lumen: a distance map as a quadratic B-spline, wall contact and friction.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <limits>
+#include <stdexcept>
+#include <vector>
+
+#include "rod.hpp"
+
+namespace endopilot {
+
+// B-spline coefficients of the signed distance to the wall (positive inside, mm), kept in bricks of 8³ cells and only
+// where the wall is near. A brick stores one cell more on each side, so that the 3³ stencil never leaves it.
+class Lumen {
+public:
+    static constexpr int kEdge = 8, kStored = kEdge + 2, kVolume = kStored * kStored * kStored;
+
+    // coefficients: nz × ny × nx, x fastest. Cells whose whole stencil is deeper inside than `near` carry no contact;
+    // cells whose whole stencil is farther outside than `far` count as outside the map.
+    Lumen(const float* coefficients, const int (&size)[3], const double (&origin)[3], double spacing, double near,
+          double far)
+        : inverse_spacing_(1.0 / spacing) {
+        for (int a = 0; a < 3; ++a) {
+            origin_[a] = origin[a];
+            bricks_[a] = (size[a] + kEdge - 1) / kEdge;
+        }
+        pool_.assign(2 * kVolume, float(kDeep));  // brick 0: deep inside, brick 1: outside
+        std::fill(pool_.begin() + kVolume, pool_.end(), std::numeric_limits<float>::quiet_NaN());
+        index_.resize(std::size_t(bricks_[0]) * bricks_[1] * bricks_[2]);
+        std::vector<float> brick(kVolume);
+        std::size_t at = 0;
+        for (int bz = 0; bz < bricks_[2]; ++bz)
+            for (int by = 0; by < bricks_[1]; ++by)
+                for (int bx = 0; bx < bricks_[0]; ++bx, ++at) {
+                    float lowest = std::numeric_limits<float>::max(), highest = -lowest;
+                    for (int z = 0, m = 0; z < kStored; ++z)
+                        for (int y = 0; y < kStored; ++y)
+                            for (int x = 0; x < kStored; ++x, ++m) {
+                                const int gx = std::clamp(bx * kEdge + x - 1, 0, size[0] - 1);
+                                const int gy = std::clamp(by * kEdge + y - 1, 0, size[1] - 1);
+                                const int gz = std::clamp(bz * kEdge + z - 1, 0, size[2] - 1);
+                                const float c = coefficients[(std::size_t(gz) * size[1] + gy) * size[0] + gx];
+                                brick[m] = c;
+                                lowest = std::min(lowest, c);
+                                highest = std::max(highest, c);
+                            }
+                    if (lowest > near) {
+                        index_[at] = 0;
+                    } else if (highest < -far) {
+                        index_[at] = 1;
+                    } else {
+                        index_[at] = std::int32_t(pool_.size() / kVolume);
+                        pool_.insert(pool_.end(), brick.begin(), brick.end());
+                    }
+                }
+    }
+
+    std::size_t bytes() const { return pool_.size() * sizeof(float) + index_.size() * sizeof(std::int32_t); }
+
+    // The first coefficient of the 3³ stencil around a point, and the point's place in the middle cell (-1/2..1/2).
+    const float* stencil(const double (&point)[3], double (&t)[3]) const {
+        int cell[3];
+        bool outside = false;
+        for (int a = 0; a < 3; ++a) {
+            const double u = (point[a] - origin_[a]) * inverse_spacing_;
+            const double nearest = std::floor(u + 0.5);
+            t[a] = u - nearest;
+            // written so that a NaN counts as outside
+            const bool inside = nearest >= 0.0 && nearest < double(bricks_[a] * kEdge);
+            outside = outside || !inside;
+            cell[a] = inside ? int(nearest) : 0;
+        }
+        const std::size_t at = (std::size_t(cell[2] / kEdge) * bricks_[1] + cell[1] / kEdge) * bricks_[0] + cell[0] / kEdge;
+        const std::int32_t brick = outside ? 1 : index_[at];
+        return &pool_[std::size_t(brick) * kVolume +
+                      std::size_t((cell[2] % kEdge) * kStored + cell[1] % kEdge) * kStored + cell[0] % kEdge];
+    }
+
+    bool deep(const float* stencil) const { return stencil < pool_.data() + kVolume; }
+
+    double inverse_spacing() const { return inverse_spacing_; }
+
+    static constexpr double kDeep = 1e3;
+
+private:
+    double origin_[3], inverse_spacing_;
+    int bricks_[3];
+    std::vector<std::int32_t> index_;
+    std::vector<float> pool_;
+};
+
+template <class V>
+struct Distance {
+    V value;         // mm
+    Vec3<V> slope;   // its gradient
+    Sym3<V> curve;   // its Hessian, 1/mm
+};
+
+// The spline, its gradient and its Hessian at one point per lane. Outside the map the value is NaN, which makes the
+// line search step back.
+template <class V>
+inline Distance<V> distance_to_wall(const Lumen& lumen, const Vec3<V>& x) {
+    constexpr int W = kWidth<V>;
+    const float* first[W];
+    Vec3<V> t;
+    bool all_deep = true;
+    for (int lane = 0; lane < W; ++lane) {
+        double place[3];
+        first[lane] = lumen.stencil({get(x.x, lane), get(x.y, lane), get(x.z, lane)}, place);
+        set(t.x, lane, place[0]);
+        set(t.y, lane, place[1]);
+        set(t.z, lane, place[2]);
+        all_deep = all_deep && lumen.deep(first[lane]);
+    }
+    if (all_deep) return {broadcast<V>(Lumen::kDeep), {V{}, V{}, V{}}, {V{}, V{}, V{}, V{}, V{}, V{}}};
+
+    const auto weights = [](const V& s, V (&w)[3], V (&d)[3]) {
+        const V left = 0.5 - s, right = 0.5 + s;
+        w[0] = 0.5 * left * left;
+        w[1] = 0.75 - s * s;
+        w[2] = 0.5 * right * right;
+        d[0] = -left;
+        d[1] = -2.0 * s;
+        d[2] = right;
+    };
+    V wx[3], wy[3], wz[3], dx[3], dy[3], dz[3];
+    weights(t.x, wx, dx);
+    weights(t.y, wy, dy);
+    weights(t.z, wz, dz);
+    constexpr double second[3] = {1.0, -2.0, 1.0};
+
+    V f{}, fx{}, fy{}, fz{}, fxx{}, fyy{}, fzz{}, fxy{}, fxz{}, fyz{};
+    for (int k = 0; k < 3; ++k) {
+        V g{}, gx{}, gy{}, gxx{}, gxy{}, gyy{};
+        for (int j = 0; j < 3; ++j) {
+            V c[3];
+            for (int i = 0; i < 3; ++i)
+                for (int lane = 0; lane < W; ++lane)
+                    set(c[i], lane, double(first[lane][(k * Lumen::kStored + j) * Lumen::kStored + i]));
+            const V h = wx[0] * c[0] + wx[1] * c[1] + wx[2] * c[2];
+            const V hx = dx[0] * c[0] + dx[1] * c[1] + dx[2] * c[2];
+            const V hxx = c[0] - 2.0 * c[1] + c[2];
+            g += wy[j] * h;
+            gx += wy[j] * hx;
+            gxx += wy[j] * hxx;
+            gy += dy[j] * h;
+            gxy += dy[j] * hx;
+            gyy += second[j] * h;
+        }
+        f += wz[k] * g;
+        fx += wz[k] * gx;
+        fxx += wz[k] * gxx;
+        fy += wz[k] * gy;
+        fxy += wz[k] * gxy;
+        fyy += wz[k] * gyy;
+        fz += dz[k] * g;
+        fxz += dz[k] * gx;
+        fyz += dz[k] * gy;
+        fzz += second[k] * g;
+    }
+    const double s = lumen.inverse_spacing(), ss = s * s;
+    return {f, {s * fx, s * fy, s * fz}, {ss * fxx, ss * fyy, ss * fzz, ss * fxy, ss * fxz, ss * fyz}};
+}
+
+// The wall as a node last saw it.
+template <class V>
+struct Wall {
+    V distance;       // mm
+    Vec3<V> slope;    // gradient of the distance
+};
+
+// What friction at a node needs, frozen at the start of a time step.
+template <class V>
+struct Grip {
+    V limit;          // friction coefficient × normal force, N
+    Vec3<V> normal;   // unit normal of the wall, into the lumen
+    Vec3<V> spin;     // displacement of the touching surface for a unit rotation about the wire's axis, mm/rad
+};
+
+// Adds the wall's elastic reaction, energy k/2 (radius - distance)² where positive. Returns the energy.
+template <class V>
+inline V add_wall(double stiffness, double radius, const V& geometric, const Distance<V>& d, Diagonal<V>& own) {
+    const Mask<V> clear = d.value >= radius;  // false for NaN, so that NaN reaches the energy
+    const V depth = select<V>(clear, V{}, radius - d.value);
+    const V k = select<V>(clear, V{}, broadcast<V>(stiffness));
+    const V pressure = stiffness * depth;
+    own.force -= pressure * d.slope;
+    const V bend = geometric * pressure;
+    own.xx.xx += k * d.slope.x * d.slope.x - bend * d.curve.xx;
+    own.xx.yy += k * d.slope.y * d.slope.y - bend * d.curve.yy;
+    own.xx.zz += k * d.slope.z * d.slope.z - bend * d.curve.zz;
+    own.xx.xy += k * d.slope.x * d.slope.y - bend * d.curve.xy;
+    own.xx.xz += k * d.slope.x * d.slope.z - bend * d.curve.xz;
+    own.xx.yz += k * d.slope.y * d.slope.z - bend * d.curve.yz;
+    return 0.5 * pressure * depth;
+}
+
+// Adds smoothed Coulomb friction of the touching surface, energy limit (sqrt(|s|² + eps²) - eps) with s the tangential
+// displacement of that surface since the start of the step: of the node, and by rotation about the wire's own axis.
+// `moved` is the node's displacement, `p` the element's rotation since the start of the step. Returns the energy.
+template <class V>
+inline V add_friction(const Grip<V>& grip, const V& eps, const Vec3<V>& moved, const Quaternion<V>& p, Diagonal<V>& own) {
+    const Vec3<V>& n = grip.normal;
+    const V twist = 2.0 * p.v.z;
+    const Vec3<V> s = moved - dot(moved, n) * n + twist * grip.spin;
+    const V size = square_root(dot(s, s) + eps * eps);
+    const V a = 1.0 / size;
+    const V pull = grip.limit * a;
+    const Vec3<V> force = pull * s;
+    const Vec3<V> turn{-p.v.y, p.v.x, p.w};  // d twist / d theta
+    own.force += force;
+    const V torque = dot(force, grip.spin);
+    own.moment += torque * turn;
+
+    const V c = pull * a * a;
+    own.xx.xx += pull * (1.0 - n.x * n.x) - c * s.x * s.x;
+    own.xx.yy += pull * (1.0 - n.y * n.y) - c * s.y * s.y;
+    own.xx.zz += pull * (1.0 - n.z * n.z) - c * s.z * s.z;
+    own.xx.xy -= pull * n.x * n.y + c * s.x * s.y;
+    own.xx.xz -= pull * n.x * n.z + c * s.x * s.z;
+    own.xx.yz -= pull * n.y * n.z + c * s.y * s.z;
+    const Vec3<V> mixed = pull * grip.spin - (c * dot(s, grip.spin)) * s;  // spin is perpendicular to n
+    const V rotary = dot(mixed, grip.spin);
+    const V t[3] = {turn.x, turn.y, turn.z};
+    for (int r = 0; r < 3; ++r) {
+        own.tx[r][0] += t[r] * mixed.x;
+        own.tx[r][1] += t[r] * mixed.y;
+        own.tx[r][2] += t[r] * mixed.z;
+    }
+    own.tt.xx += rotary * turn.x * turn.x;
+    own.tt.yy += rotary * turn.y * turn.y;
+    own.tt.zz += rotary * turn.z * turn.z;
+    own.tt.xy += rotary * turn.x * turn.y;
+    own.tt.xz += rotary * turn.x * turn.z;
+    own.tt.yz += rotary * turn.y * turn.z;
+    return grip.limit * (size - eps);
+}
+
+}  // namespace endopilot

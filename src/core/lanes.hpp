@@ -1,0 +1,177 @@
+// Lanes: one arithmetic type that carries one world (double) or several worlds side by side (vectors of doubles).
+//
+// All formulas of the core are written once, templated on the lane type V. Operations are element-wise, so what one
+// lane computes never depends on its neighbours; decisions are masks, taken by select().
+#pragma once
+
+#include <cmath>
+#include <cstdint>
+
+namespace endopilot {
+
+typedef double double4 __attribute__((vector_size(32)));
+typedef double double8 __attribute__((vector_size(64)));
+typedef std::int64_t mask4 __attribute__((vector_size(32)));
+typedef std::int64_t mask8 __attribute__((vector_size(64)));
+
+template <class V>
+struct LaneTraits;
+template <>
+struct LaneTraits<double> {
+    static constexpr int width = 1;
+    using Mask = bool;
+};
+template <>
+struct LaneTraits<double4> {
+    static constexpr int width = 4;
+    using Mask = mask4;
+};
+template <>
+struct LaneTraits<double8> {
+    static constexpr int width = 8;
+    using Mask = mask8;
+};
+
+template <class V>
+inline constexpr int kWidth = LaneTraits<V>::width;
+template <class V>
+using Mask = typename LaneTraits<V>::Mask;
+
+template <class V>
+inline double get(const V& v, int lane) {
+    if constexpr (kWidth<V> == 1)
+        return v;
+    else
+        return v[lane];
+}
+
+template <class V>
+inline void set(V& v, int lane, double value) {
+    if constexpr (kWidth<V> == 1)
+        v = value;
+    else
+        v[lane] = value;
+}
+
+template <class V>
+inline void set_mask(Mask<V>& mask, int lane, bool value) {
+    if constexpr (kWidth<V> == 1)
+        mask = value;
+    else
+        mask[lane] = value ? -1 : 0;
+}
+
+template <class V>
+inline V broadcast(double value) {
+    return V{} + value;
+}
+
+template <class V>
+inline V select(Mask<V> mask, V yes, V no) {
+    return mask ? yes : no;
+}
+
+template <class V>
+inline V maximum(V a, V b) {
+    return a > b ? a : b;
+}
+
+template <class V>
+inline V square_root(V a) {
+    if constexpr (kWidth<V> == 1) {
+        return std::sqrt(a);
+    } else {
+        V root;
+        for (int lane = 0; lane < kWidth<V>; ++lane) root[lane] = std::sqrt(a[lane]);
+        return root;
+    }
+}
+
+template <class V>
+struct Vec3 {
+    V x, y, z;
+    friend Vec3 operator+(const Vec3& a, const Vec3& b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
+    friend Vec3 operator-(const Vec3& a, const Vec3& b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
+    friend Vec3 operator*(const V& s, const Vec3& a) { return {s * a.x, s * a.y, s * a.z}; }
+    Vec3& operator+=(const Vec3& b) { return *this = *this + b; }
+    Vec3& operator-=(const Vec3& b) { return *this = *this - b; }
+};
+
+template <class V>
+inline V dot(const Vec3<V>& a, const Vec3<V>& b) {
+    return a.x * b.x + a.y * b.y + a.z * b.z;
+}
+
+template <class V>
+inline Vec3<V> cross(const Vec3<V>& a, const Vec3<V>& b) {
+    return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
+}
+
+template <class V>
+inline Vec3<V> select(Mask<V> mask, const Vec3<V>& yes, const Vec3<V>& no) {
+    return {select<V>(mask, yes.x, no.x), select<V>(mask, yes.y, no.y), select<V>(mask, yes.z, no.z)};
+}
+
+// Symmetric 3×3 matrix.
+template <class V>
+struct Sym3 {
+    V xx, yy, zz, xy, xz, yz;
+};
+
+template <class V>
+inline Vec3<V> operator*(const Sym3<V>& m, const Vec3<V>& a) {
+    return {m.xx * a.x + m.xy * a.y + m.xz * a.z, m.xy * a.x + m.yy * a.y + m.yz * a.z,
+            m.xz * a.x + m.yz * a.y + m.zz * a.z};
+}
+
+// Quaternion w + v, unit length for rotations.
+template <class V>
+struct Quaternion {
+    V w;
+    Vec3<V> v;
+};
+
+template <class V>
+inline Quaternion<V> operator*(const Quaternion<V>& a, const Quaternion<V>& b) {
+    return {a.w * b.w - dot(a.v, b.v), a.w * b.v + b.w * a.v + cross(a.v, b.v)};
+}
+
+// conjugate(a) · b: the rotation from a to b, in the frame of a.
+template <class V>
+inline Quaternion<V> relative(const Quaternion<V>& a, const Quaternion<V>& b) {
+    return {a.w * b.w + dot(a.v, b.v), a.w * b.v - b.w * a.v - cross(a.v, b.v)};
+}
+
+template <class V>
+inline Quaternion<V> select(Mask<V> mask, const Quaternion<V>& yes, const Quaternion<V>& no) {
+    return {select<V>(mask, yes.w, no.w), select(mask, yes.v, no.v)};
+}
+
+// q turned by the rotation vector `angle` (rad, in the frame of q). (1, angle/2) normalised agrees with the
+// exponential map to second order, which is all that Newton's method needs, and has no trigonometry.
+template <class V>
+inline Quaternion<V> turned(const Quaternion<V>& q, const Vec3<V>& angle) {
+    const V half = broadcast<V>(0.5);
+    const Vec3<V> h = half * angle;
+    const Quaternion<V> p = q * Quaternion<V>{broadcast<V>(1.0), h};
+    const V scale = 1.0 / square_root(p.w * p.w + dot(p.v, p.v));
+    return {scale * p.w, scale * p.v};
+}
+
+// Columns of the rotation matrix: the three directors.
+template <class V>
+struct Frame {
+    Vec3<V> d1, d2, d3;
+};
+
+template <class V>
+inline Frame<V> frame(const Quaternion<V>& q) {
+    const V xx = q.v.x * q.v.x, yy = q.v.y * q.v.y, zz = q.v.z * q.v.z;
+    const V xy = q.v.x * q.v.y, xz = q.v.x * q.v.z, yz = q.v.y * q.v.z;
+    const V wx = q.w * q.v.x, wy = q.w * q.v.y, wz = q.w * q.v.z;
+    return {{1.0 - 2.0 * (yy + zz), 2.0 * (xy + wz), 2.0 * (xz - wy)},
+            {2.0 * (xy - wz), 1.0 - 2.0 * (xx + zz), 2.0 * (yz + wx)},
+            {2.0 * (xz + wy), 2.0 * (yz - wx), 1.0 - 2.0 * (xx + yy)}};
+}
+
+}  // namespace endopilot

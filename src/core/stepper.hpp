@@ -1,0 +1,578 @@
+// The time stepper: a few worlds side by side, each taking its own implicit Euler steps at its own pace.
+//
+// A step minimises the incremental potential (elastic energy + wall + friction + drag) by Newton's method with an energy
+// line search. One pass of the loop evaluates every lane at its trial point; each lane then accepts the trial and takes
+// a new direction, halves its last one, or, having converged, begins its next time step.
+#pragma once
+
+#include <algorithm>
+#include <atomic>
+#include <cmath>
+#include <vector>
+
+#include "contact.hpp"
+#include "solve.hpp"
+
+namespace endopilot {
+
+struct Options {
+    double time_step;          // s
+    int steps_per_sample;
+    double stick_velocity;     // slip velocity below which friction falls off, mm/s
+    double wall_stiffness;     // N/mm
+    double tolerance;          // largest displacement of a last Newton step, mm (rotations: rad)
+    double sample_tolerance;   // the same for the step that ends a sample, whose forces are recorded
+    double largest_step;       // displacement that one Newton step is clamped to, mm (rotations: rad)
+    int most_iterations;       // for one step; then the step is halved
+    double free_behind;        // nodes farther behind the ostium than this follow the drive, mm
+    double approach_velocity;  // at which a wire is brought to its first inserted length, mm/s
+};
+
+// The guiding catheter: wire enters at `origin` along the third director of `orientation`.
+struct Base {
+    Vec3<double> origin;
+    Quaternion<double> orientation;
+};
+
+// Dead loads and springs for verification: arrays of one entry a node, or of an element where they act on rotations.
+struct Loads {
+    std::vector<Vec3<double>> force;           // N
+    std::vector<Vec3<double>> moment;          // in the element's axes, N mm
+    std::vector<Vec3<double>> spring;          // N/mm along the world's axes, towards `anchor`
+    std::vector<Vec3<double>> anchor;          // mm
+    std::vector<double> hold;                  // N mm/rad, towards `attitude`
+    std::vector<Quaternion<double>> attitude;
+};
+
+struct Inputs {
+    int worlds, samples;
+    const double* initial;    // worlds × 2: inserted length mm, rotation rad
+    const double* control;    // worlds × samples × 2: mm/s, rad/s
+    const double* friction;   // worlds
+};
+
+enum Reason : std::uint8_t { kFine = 0, kNotFinite = 1, kNotConverged = 2 };
+
+// Arrays of worlds × samples (× 3, × nodes × 3).
+struct Outputs {
+    double *tip_position, *tip_direction, *force_max, *force_sum, *base_force, *base_torque, *iterations;
+    bool* valid;
+    std::uint8_t* reason;     // worlds
+    double* shape;            // may be null
+    double* attitude;         // may be null: worlds × samples × nodes × 4, quaternions w x y z
+};
+
+constexpr int kTicks = 32;     // a step may be halved down to 1/32
+constexpr int kMostHalvings = 12;
+
+template <class V>
+class Stepper {
+public:
+    Stepper(const RodModel& rod, const Lumen* lumen, const Loads* loads, const Base& base, const Options& options,
+            const Inputs& in, const Outputs& out)
+        : rod_(rod), lumen_(lumen), loads_(loads), base_(base), options_(options), in_(in), out_(out),
+          node_(rod.nodes), factor_(rod.nodes) {}
+
+    // Runs worlds taken from `order` by the shared counter `next` until none is left or `stop` is set. `done` counts
+    // finished samples.
+    void run(const std::vector<int>& order, std::atomic<int>& next, std::atomic<long>& done, const std::atomic<bool>& stop) {
+        while (!stop.load(std::memory_order_relaxed)) {
+            bool busy = false;
+            for (int l = 0; l < W; ++l) {
+                if (lane_[l].world < 0) {
+                    const int ticket = next.fetch_add(1);
+                    if (ticket < in_.worlds) start(l, order[ticket]);
+                }
+                busy = busy || lane_[l].world >= 0;
+            }
+            if (!busy) return;
+            done.fetch_add(pass(), std::memory_order_relaxed);
+        }
+    }
+
+private:
+    static constexpr int W = kWidth<V>;
+    enum class Verdict { idle, accept, shorten, repeat, converged, restart };
+
+    struct Node {
+        Vec3<V> x, from, start, step, last;            // trial, accepted, step start; Newton step; last increment
+        Quaternion<V> q, from_q, start_q;
+        Vec3<V> turn, last_turn;
+        Grip<V> grip;
+        Wall<V> wall;
+    };
+
+    struct Lane {
+        int world = -1, sample = 0, tick = 0, stride = 0, active = 0, iterations = 0, halvings = 0, steps = 0;
+        long total_iterations = 0;
+        double inserted = 0, rotation = 0, speed = 0, spin = 0;   // at the start of the sample; mm/s, rad/s
+        double start_inserted = 0, start_rotation = 0, end_inserted = 0, end_rotation = 0;
+        double energy = 0, last_duration = 0;
+        bool first = true, gauss_newton = true, extrapolated = false, finite = true;
+    };
+
+    const RodModel& rod_;
+    const Lumen* lumen_;
+    const Loads* loads_;
+    const Base base_;
+    const Options options_;
+    const Inputs in_;
+    const Outputs out_;
+    std::vector<Node> node_;
+    std::vector<Factor<V>> factor_;
+    Lane lane_[W];
+    // per lane
+    V active_{}, geometric_{}, inverse_dt_{}, eps_{}, friction_{}, energy_{}, pivot_{}, force_max_{}, force_sum_{};
+    V base_force_{}, base_torque_{};
+
+    double duration(const Lane& lane) const { return options_.time_step * lane.stride / kTicks; }
+
+    Vec3<double> base_position(int i, double inserted) const {
+        const Vec3<double> d = frame(base_.orientation).d3;
+        return base_.origin + (inserted - rod_.abscissa[i]) * d;
+    }
+
+    Quaternion<double> base_orientation(double rotation) const {
+        return base_.orientation * Quaternion<double>{std::cos(0.5 * rotation), {0, 0, std::sin(0.5 * rotation)}};
+    }
+
+    static void put(Vec3<V>& to, int l, const Vec3<double>& v) {
+        set(to.x, l, v.x);
+        set(to.y, l, v.y);
+        set(to.z, l, v.z);
+    }
+    static void put(Quaternion<V>& to, int l, const Quaternion<double>& q) {
+        set(to.w, l, q.w);
+        put(to.v, l, q.v);
+    }
+    static Vec3<double> take(const Vec3<V>& v, int l) { return {get(v.x, l), get(v.y, l), get(v.z, l)}; }
+
+    // Places node i of a lane on the catheter's axis as it was at the step's start (start) and is at its end (trial).
+    void place(int l, int i) {
+        const Lane& lane = lane_[l];
+        Node& n = node_[i];
+        put(n.start, l, base_position(i, lane.start_inserted));
+        put(n.start_q, l, base_orientation(lane.start_rotation));
+        put(n.x, l, base_position(i, lane.end_inserted));
+        put(n.q, l, base_orientation(lane.end_rotation));
+        put(n.from, l, take(n.x, l));
+        put(n.from_q, l, base_orientation(lane.end_rotation));
+        put(n.last, l, {0, 0, 0});
+        put(n.last_turn, l, {0, 0, 0});
+        set(n.grip.limit, l, 0);
+        put(n.grip.normal, l, {0, 0, 0});
+        put(n.grip.spin, l, {0, 0, 0});
+    }
+
+    int count_active(double inserted) const {
+        int n = 1;
+        while (n < rod_.nodes - 2 && inserted - rod_.abscissa[n] > -options_.free_behind) ++n;
+        return n;
+    }
+
+    void start(int l, int world) {
+        Lane& lane = lane_[l] = Lane{};
+        lane.world = world;
+        const double depth = in_.initial[2 * world];
+        const double sample = options_.time_step * options_.steps_per_sample;
+        const int approach = options_.approach_velocity > 0 ? int(std::ceil(depth / (options_.approach_velocity * sample))) + 1 : 0;
+        lane.sample = -approach;
+        lane.inserted = approach > 0 ? 0.0 : depth;
+        lane.rotation = in_.initial[2 * world + 1];
+        set(friction_, l, in_.friction[world]);
+        lane.start_inserted = lane.end_inserted = lane.inserted;
+        lane.start_rotation = lane.end_rotation = lane.rotation;
+        for (int i = 0; i < rod_.nodes; ++i) place(l, i);
+        lane.active = count_active(lane.inserted);
+        read_control(l);
+        lane.stride = kTicks;
+        begin(l, true);
+    }
+
+    void read_control(int l) {
+        Lane& lane = lane_[l];
+        double speed, spin;
+        if (lane.sample < 0) {  // the approach: pushed in at one speed, then one sample at rest
+            const double depth = in_.initial[2 * lane.world];
+            const double sample = options_.time_step * options_.steps_per_sample;
+            const int moving = int(std::ceil(depth / (options_.approach_velocity * sample)));
+            speed = lane.sample == -1 || moving == 0 ? 0.0 : depth / (moving * sample);
+            spin = 0.0;
+        } else {
+            const double* control = in_.control + 2 * (std::size_t(lane.world) * in_.samples + lane.sample);
+            speed = control[0];
+            spin = control[1];
+        }
+        if (speed != lane.speed || spin != lane.spin) lane.last_duration = 0;  // the control changed: do not extrapolate
+        lane.speed = speed;
+        lane.spin = spin;
+    }
+
+    double elapsed(int tick) const { return options_.time_step * tick / kTicks; }
+
+    // Begins a step of lane.stride ticks from the lane's start state; nodes ahead of the base already hold a trial.
+    void begin(int l, bool fresh) {
+        Lane& lane = lane_[l];
+        const int before = lane.active;
+        lane.start_inserted = lane.inserted + lane.speed * elapsed(lane.tick);
+        lane.start_rotation = lane.rotation + lane.spin * elapsed(lane.tick);
+        lane.end_inserted = lane.inserted + lane.speed * elapsed(lane.tick + lane.stride);
+        lane.end_rotation = lane.rotation + lane.spin * elapsed(lane.tick + lane.stride);
+        lane.active = count_active(lane.end_inserted);
+        for (int i = std::min(before, lane.active); i <= std::max(before, lane.active); ++i)
+            if (i >= before || i >= lane.active) place(l, i);
+        lane.iterations = lane.halvings = 0;
+        lane.first = lane.gauss_newton = lane.finite = true;
+        lane.extrapolated = !fresh;
+        set(active_, l, lane.active);
+        set(geometric_, l, 0.0);
+        set(inverse_dt_, l, 1.0 / duration(lane));
+        set(eps_, l, options_.stick_velocity * duration(lane));
+    }
+
+    int most_active() const {
+        int n = 0;
+        for (const Lane& lane : lane_)
+            if (lane.world >= 0) n = std::max(n, lane.active);
+        return n;
+    }
+
+    // One evaluation, decision and update of all lanes. Returns the number of samples that ended.
+    int pass() {
+        const int n = most_active();
+        evaluate(n);
+        Verdict verdict[W];
+        for (int l = 0; l < W; ++l) verdict[l] = judge(l);
+        const V largest = solve(n);
+        V factor{};
+        for (int l = 0; l < W; ++l) {
+            Lane& lane = lane_[l];
+            if (verdict[l] != Verdict::accept) continue;
+            const double size = get(largest, l);
+            if (!(size < 1e100)) {  // the direction is not finite
+                verdict[l] = Verdict::restart;
+                continue;
+            }
+            const bool ends_sample = lane.tick + lane.stride == kTicks * options_.steps_per_sample;
+            set(factor, l, std::min(1.0, options_.largest_step / size));
+            if (size <= (ends_sample ? options_.sample_tolerance : options_.tolerance)) verdict[l] = Verdict::converged;
+        }
+        update(n, verdict, factor);
+        return advance(n, verdict);
+    }
+
+    // Energy, gradient and Hessian at the trial point, eliminated on the fly from tip to base.
+    void evaluate(int n);
+    // Adds dead loads and springs. Returns their energy.
+    V add_loads(int i, const Node& node, Diagonal<V>& own) const;
+
+    Verdict judge(int l) {
+        Lane& lane = lane_[l];
+        if (lane.world < 0) return Verdict::idle;
+        ++lane.iterations;
+        ++lane.total_iterations;
+        const double energy = get(energy_, l);
+        lane.finite = std::isfinite(energy);
+        if (lane.iterations > options_.most_iterations) return Verdict::restart;
+        const double slack = 1e-11 * (std::abs(lane.energy) + 1e-3);
+        if (!lane.finite || !(lane.first || energy <= lane.energy + slack)) {
+            if (lane.first || ++lane.halvings > kMostHalvings) return Verdict::restart;
+            lane.gauss_newton = true;
+            set(geometric_, l, 0.0);
+            return Verdict::shorten;
+        }
+        if (!(get(pivot_, l) > 0)) {  // not positive definite
+            if (lane.gauss_newton) return Verdict::restart;
+            lane.gauss_newton = true;
+            set(geometric_, l, 0.0);
+            return Verdict::repeat;
+        }
+        lane.energy = energy;
+        lane.first = false;
+        lane.halvings = 0;
+        lane.gauss_newton = false;
+        set(geometric_, l, 1.0);
+        return Verdict::accept;
+    }
+
+    // Back substitution. Returns the largest displacement (mm) or rotation (rad) of a node; NaN where the solve failed.
+    V solve(int n);
+    // Moves each lane's trial point as its verdict says.
+    void update(int n, const Verdict (&verdict)[W], const V& factor);
+    // Ends the steps that converged, restarts those that failed with half the step. Returns the samples that ended.
+    int advance(int n, const Verdict (&verdict)[W]);
+    void finish_step(int n, Mask<V> mask, Mask<V> restart, const V& weight);
+    bool end_sample(int l);
+    void record(int l, bool valid);
+    void fail(int l);
+};
+
+template <class V>
+V Stepper<V>::add_loads(int i, const Node& node, Diagonal<V>& own) const {
+    const Vec3<double>&f = loads_->force[i], &m = loads_->moment[i], &k = loads_->spring[i], &a = loads_->anchor[i];
+    const Vec3<V> off{node.x.x - a.x, node.x.y - a.y, node.x.z - a.z};
+    own.force += Vec3<V>{k.x * off.x - f.x, k.y * off.y - f.y, k.z * off.z - f.z};
+    own.xx.xx += k.x;
+    own.xx.yy += k.y;
+    own.xx.zz += k.z;
+    V energy = 0.5 * (k.x * off.x * off.x + k.y * off.y * off.y + k.z * off.z * off.z);
+    energy -= f.x * node.x.x + f.y * node.x.y + f.z * node.x.z;
+    // A moment's potential is its work since the start of the step: exact once the rod has come to rest.
+    const Quaternion<V> p = relative(node.start_q, node.q);
+    const Vec3<V> b{broadcast<V>(m.x), broadcast<V>(m.y), broadcast<V>(m.z)};
+    energy -= 2.0 * dot(b, p.v);
+    own.moment -= p.w * b + cross(b, p.v);
+    const double h = loads_->hold[i];
+    const Quaternion<double>& c = loads_->attitude[i];
+    const Quaternion<V> attitude{broadcast<V>(c.w), {broadcast<V>(c.v.x), broadcast<V>(c.v.y), broadcast<V>(c.v.z)}};
+    const Quaternion<V> r = relative(attitude, node.q);
+    energy += 2.0 * h * dot(r.v, r.v);
+    own.moment += (2.0 * h * r.w) * r.v;
+    own.tt.xx += h;
+    own.tt.yy += h;
+    own.tt.zz += h;
+    return energy;
+}
+
+template <class V>
+void Stepper<V>::evaluate(int n) {
+    const V zero{};
+    energy_ = force_max_ = force_sum_ = zero;
+    pivot_ = broadcast<V>(1.0);
+    const Vec3<double> axis = frame(base_.orientation).d3;
+    Diagonal<V> own{}, next;
+    for (int i = 0; i < n; ++i) {
+        Node& node = node_[i];
+        const Mask<V> on = active_ > broadcast<V>(i);
+        const Mask<V> last = active_ == broadcast<V>(i + 1);
+        Coupling<V> coupling;
+        V energy = add_element(rod_, i, geometric_, node.x, node_[i + 1].x, frame(node.q), own, next, coupling);
+        energy += add_joint(rod_, i + 1, geometric_, node.q, node_[i + 1].q, own, next, coupling);
+        const V along = axis.x * next.force.x + axis.y * next.force.y + axis.z * next.force.z;
+        base_force_ = select<V>(last, along, base_force_);
+        base_torque_ = select<V>(last, next.moment.z, base_torque_);
+
+        const Vec3<V> moved = node.x - node.start;
+        const Quaternion<V> turned_by = relative(node.start_q, node.q);
+        if (lumen_) {
+            const Distance<V> d = distance_to_wall(*lumen_, node.x);
+            node.wall = {d.value, d.slope};
+            energy += add_wall(options_.wall_stiffness, rod_.radius[i], geometric_, d, own);
+            const Mask<V> clear = d.value >= rod_.radius[i];
+            const V depth = select<V>(clear, zero, rod_.radius[i] - d.value);
+            const V force = select<V>(on, options_.wall_stiffness * depth * square_root(dot(d.slope, d.slope)), zero);
+            force_max_ = maximum(force_max_, force);
+            force_sum_ += force;
+            energy += add_friction(node.grip, eps_, moved, turned_by, own);
+        }
+        if (loads_) energy += add_loads(i, node, own);
+
+        const V drag = rod_.drag[i] * inverse_dt_, spin_drag = rod_.spin_drag[i] * inverse_dt_;
+        energy += 0.5 * drag * dot(moved, moved) + 2.0 * spin_drag * dot(turned_by.v, turned_by.v);
+        own.force += drag * moved;
+        own.moment += (2.0 * spin_drag * turned_by.w) * turned_by.v;
+        own.xx.xx += drag;
+        own.xx.yy += drag;
+        own.xx.zz += drag;
+        own.tt.xx += spin_drag;
+        own.tt.yy += spin_drag;
+        own.tt.zz += spin_drag;
+
+        energy_ += select<V>(on, energy, zero);
+        const V pivot = eliminate(own, coupling, factor_[i], next);
+        const Mask<V> sound = pivot > zero;
+        pivot_ = select<V>(on, select<V>(sound, pivot_, zero), pivot_);
+        own = next;
+    }
+}
+
+template <class V>
+V Stepper<V>::solve(int n) {
+    const V zero{};
+    Vec3<V> x{zero, zero, zero}, t{zero, zero, zero};
+    V largest{};
+    for (int i = n - 1; i >= 0; --i) {
+        const Mask<V> on = active_ > broadcast<V>(i);
+        substitute(factor_[i], x, t);
+        x = select(on, x, {zero, zero, zero});
+        t = select(on, t, {zero, zero, zero});
+        factor_[i].z[0] = x.x;
+        factor_[i].z[1] = x.y;
+        factor_[i].z[2] = x.z;
+        factor_[i].z[3] = t.x;
+        factor_[i].z[4] = t.y;
+        factor_[i].z[5] = t.z;
+        const V size = dot(x, x), angle = dot(t, t);
+        const V both = size + angle;
+        largest = largest >= both ? largest : both;  // keeps a NaN of `both`; below, of `largest`
+        largest = select<V>(both == both, largest, both);
+    }
+    return square_root(largest);
+}
+
+template <class V>
+void Stepper<V>::update(int n, const Verdict (&verdict)[W], const V& factor) {
+    Mask<V> accept{}, shorten{}, repeat{};
+    for (int l = 0; l < W; ++l) {
+        set_mask<V>(accept, l, verdict[l] == Verdict::accept || verdict[l] == Verdict::converged);
+        set_mask<V>(shorten, l, verdict[l] == Verdict::shorten);
+        set_mask<V>(repeat, l, verdict[l] == Verdict::repeat);
+    }
+    const V half = broadcast<V>(0.5);
+    for (int i = 0; i < n; ++i) {
+        Node& node = node_[i];
+        const Mask<V> on = active_ > broadcast<V>(i);
+        const V* z = factor_[i].z;
+        const Mask<V> take = accept & on, shrink = shorten & on;
+        const Mask<V> moves = take | shrink, keeps = take | (repeat & on);
+        node.from = select(keeps, node.x, node.from);
+        node.from_q = select(keeps, node.q, node.from_q);
+        node.step = select(take, {factor * z[0], factor * z[1], factor * z[2]}, select(shrink, half * node.step, node.step));
+        node.turn = select(take, {factor * z[3], factor * z[4], factor * z[5]}, select(shrink, half * node.turn, node.turn));
+        node.x = select(moves, node.from + node.step, node.x);
+        node.q = select(moves, turned(node.from_q, node.turn), node.q);
+    }
+}
+
+template <class V>
+int Stepper<V>::advance(int n, const Verdict (&verdict)[W]) {
+    Mask<V> finished{}, restarted{};
+    V weight{};
+    bool any_finished = false, failed[W] = {};
+    int ended = 0;
+    for (int l = 0; l < W; ++l) {
+        Lane& lane = lane_[l];
+        if (verdict[l] == Verdict::converged) {
+            set_mask<V>(finished, l, true);
+            any_finished = true;
+            const double took = duration(lane);
+            lane.tick += lane.stride;
+            ++lane.steps;
+            lane.last_duration = took;
+            const bool whole = lane.tick == kTicks * options_.steps_per_sample;
+            if (lane.stride < kTicks && lane.tick % (2 * lane.stride) == 0) lane.stride *= 2;
+            if (whole) {
+                ++ended;
+                if (end_sample(l)) continue;  // the world is done
+                read_control(l);
+            }
+            set(weight, l, lane.last_duration > 0 ? duration(lane) / lane.last_duration : 0.0);
+        } else if (verdict[l] == Verdict::restart) {
+            set_mask<V>(restarted, l, true);
+            any_finished = true;
+            if (lane.extrapolated && lane.iterations == 1) continue;  // only the extrapolation was bad
+            if (lane.stride == 1) {
+                failed[l] = true;
+            } else {
+                lane.stride /= 2;
+            }
+        }
+    }
+    if (!any_finished) return 0;
+    finish_step(n, finished, restarted, weight);
+    for (int l = 0; l < W; ++l) {
+        Lane& lane = lane_[l];
+        if (failed[l]) {
+            ended += std::max(0, in_.samples - std::max(0, lane.sample));
+            fail(l);
+        } else if (lane.world >= 0 && verdict[l] == Verdict::converged) {
+            begin(l, get(weight, l) == 0.0);
+        } else if (verdict[l] == Verdict::restart) {
+            begin(l, true);
+        }
+    }
+    return ended;
+}
+
+// For the lanes in `mask`, makes the converged trial the start of the next step, freezes the walls that friction acts
+// on and sets a new trial by extrapolation; for those in `restart`, goes back to the start of the step.
+template <class V>
+void Stepper<V>::finish_step(int n, Mask<V> mask, Mask<V> restart, const V& weight) {
+    const V zero{}, one = broadcast<V>(1.0);
+    for (int i = 0; i < n; ++i) {
+        Node& node = node_[i];
+        const Mask<V> on = mask & (active_ > broadcast<V>(i));
+        const Mask<V> back = restart & (active_ > broadcast<V>(i));
+        const Quaternion<V> turned_by = relative(node.start_q, node.q);
+        node.last = select(on, node.x - node.start, node.last);
+        node.last_turn = select(on, broadcast<V>(2.0) * turned_by.v, node.last_turn);
+        node.start = select(on, node.x, node.start);
+        node.start_q = select(on, node.q, node.start_q);
+        if (lumen_) {
+            const Vec3<V>& slope = node.wall.slope;
+            const V distance = node.wall.distance + dot(slope, node.step);
+            const V steepness = square_root(dot(slope, slope));
+            const Mask<V> touches = (distance < rod_.radius[i]) & (steepness > 1e-3);
+            const V push = options_.wall_stiffness * (rod_.radius[i] - distance) * steepness;
+            const V inverse = select<V>(touches, one / steepness, zero);
+            const Vec3<V> normal = inverse * slope;
+            const Frame<V> axes = frame(node.start_q);
+            node.grip.limit = select<V>(on, friction_ * select<V>(touches, push, zero), node.grip.limit);
+            node.grip.normal = select(on, normal, node.grip.normal);
+            node.grip.spin = select(on, broadcast<V>(rod_.radius[i]) * cross(normal, axes.d3), node.grip.spin);
+        }
+        node.x = select(on, node.start + weight * node.last, select(back, node.start, node.x));
+        node.q = select(on, turned(node.start_q, weight * node.last_turn), select(back, node.start_q, node.q));
+        node.step = select(on, {zero, zero, zero}, node.step);
+        node.turn = select(on, {zero, zero, zero}, node.turn);
+    }
+}
+
+template <class V>
+bool Stepper<V>::end_sample(int l) {
+    Lane& lane = lane_[l];
+    if (lane.sample >= 0) record(l, true);
+    const double sample = options_.time_step * options_.steps_per_sample;
+    lane.inserted += lane.speed * sample;
+    lane.rotation += lane.spin * sample;
+    if (lane.sample == -1) {  // the approach ends exactly at the asked length
+        lane.inserted = in_.initial[2 * lane.world];
+    }
+    lane.tick = lane.steps = 0;
+    lane.total_iterations = 0;
+    if (++lane.sample < in_.samples) return false;
+    out_.reason[lane.world] = kFine;
+    lane.world = -1;
+    return true;
+}
+
+template <class V>
+void Stepper<V>::record(int l, bool valid) {
+    const Lane& lane = lane_[l];
+    const std::size_t at = std::size_t(lane.world) * in_.samples + lane.sample;
+    const Node& tip = node_[0];
+    const auto write = [](double* to, const Vec3<double>& v) { to[0] = v.x, to[1] = v.y, to[2] = v.z; };
+    const auto orientation = [l](const Quaternion<V>& q) { return Quaternion<double>{get(q.w, l), take(q.v, l)}; };
+    const auto position = [&](const Node& n) { return take(valid ? n.x : n.start, l); };
+    const auto attitude = [&](const Node& n) { return orientation(valid ? n.q : n.start_q); };
+    write(out_.tip_position + 3 * at, position(tip));
+    write(out_.tip_direction + 3 * at, frame(attitude(tip)).d3);
+    out_.force_max[at] = valid ? get(force_max_, l) : 0.0;
+    out_.force_sum[at] = valid ? get(force_sum_, l) : 0.0;
+    out_.base_force[at] = valid ? get(base_force_, l) : 0.0;
+    out_.base_torque[at] = valid ? get(base_torque_, l) : 0.0;
+    out_.iterations[at] = lane.steps > 0 ? double(lane.total_iterations) / lane.steps : 0.0;
+    out_.valid[at] = valid;
+    for (int i = 0; i < rod_.nodes && (out_.shape || out_.attitude); ++i) {
+        const bool free = i < lane.active;
+        if (out_.shape)
+            write(out_.shape + 3 * (at * rod_.nodes + i), free ? position(node_[i]) : base_position(i, lane.end_inserted));
+        if (out_.attitude) {
+            const Quaternion<double> q = free ? attitude(node_[i]) : base_orientation(lane.end_rotation);
+            double* to = out_.attitude + 4 * (at * rod_.nodes + i);
+            to[0] = q.w;
+            write(to + 1, q.v);
+        }
+    }
+}
+
+// Marks the lane's world invalid from this sample on and frees the lane; its pose stays as last converged.
+template <class V>
+void Stepper<V>::fail(int l) {
+    Lane& lane = lane_[l];
+    out_.reason[lane.world] = lane.finite ? kNotConverged : kNotFinite;
+    for (lane.sample = std::max(0, lane.sample); lane.sample < in_.samples; ++lane.sample) record(l, false);
+    lane.world = -1;
+}
+
+}  // namespace endopilot

@@ -1,0 +1,176 @@
+"""Proximal controls: random navigations, and scripted ones from a CSV file.
+
+A control π is the mean velocity (dΔ/dt mm/s, dφ/dt rad/s) over one sample period of 0.5 s.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Float
+
+from endopilot.errors import InputError
+from endopilot.types import SAMPLE_PERIOD_S
+
+_COLUMNS = ("time_s", "translation_mm_s", "rotation_rad_s")
+_KINDS = ("insertion", "retraction", "spin", "pause")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ControlConfig:
+    """Random navigations: manoeuvres of random kind, length and speed, joined smoothly."""
+
+    max_velocity_mm_s: float = 12.0
+    """Fastest translation, mm/s."""
+    max_rotation_rad_s: float = 3.0
+    """Fastest rotation, rad/s."""
+    insertion_share: float = 0.45
+    """Share of the manoeuvres that push."""
+    retraction_share: float = 0.3
+    """Share of the manoeuvres that pull."""
+    spin_share: float = 0.15
+    """Share of the manoeuvres that only rotate; what is left over are pauses."""
+    rotation_share: float = 0.6
+    """Share of the pushing and pulling manoeuvres that rotate too."""
+    shortest_s: float = 1.0
+    """Shortest manoeuvre, s."""
+    longest_s: float = 6.0
+    """Longest manoeuvre, s."""
+    first_inserted_length_mm: float = 5.0
+    """Least inserted length that a navigation starts with, mm."""
+    start_spread: float = 0.6
+    """Starts are spread from there over this share of the largest inserted length."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            InputError: a field is out of its range.
+        """
+        for name in ("max_velocity_mm_s", "max_rotation_rad_s", "first_inserted_length_mm"):
+            if not 0 <= getattr(self, name) < np.inf:
+                raise InputError(f"{name}: {getattr(self, name)}; give a number of 0 or more")
+        for name in ("insertion_share", "retraction_share", "spin_share", "rotation_share", "start_spread"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise InputError(f"{name}: {getattr(self, name)}; give a share from 0 to 1")
+        total = self.insertion_share + self.retraction_share + self.spin_share
+        if total > 1 + 1e-9:
+            raise InputError(f"insertion_share + retraction_share + spin_share: {total:g}; keep their sum at 1 or less")
+        if not SAMPLE_PERIOD_S <= self.shortest_s <= self.longest_s < np.inf:
+            raise InputError(
+                f"shortest_s, longest_s: {self.shortest_s}, {self.longest_s}; give {SAMPLE_PERIOD_S} or more, in order"
+            )
+
+
+def random_controls(
+    config: ControlConfig, *, n_sequences: int, n_samples: int, seed: int, max_inserted_length_mm: float
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n samples 2"]]:
+    """Draw random navigations; sequence i is the same whatever `n_sequences`.
+
+    Args:
+        config: their distribution.
+        n_sequences: number of navigations.
+        n_samples: number of sample periods of each.
+        seed: key of the random streams.
+        max_inserted_length_mm: largest inserted length that a navigation reaches, mm; the smallest is 0.
+
+    Returns:
+        Initial (Δ mm, φ rad), and controls (mm/s, rad/s).
+
+    Raises:
+        InputError: a number that is not positive, or a negative seed.
+    """
+    if n_sequences < 1 or n_samples < 1:
+        raise InputError(f"random controls: {n_sequences} sequences of {n_samples} samples; give at least 1 of 1")
+    if not 0 <= seed < 2**64:
+        raise InputError(f"seed: {seed}; give a whole number from 0 to 2^64 - 1")
+    if not 0 < max_inserted_length_mm < np.inf:
+        raise InputError(f"max_inserted_length_mm: {max_inserted_length_mm}; give a positive length")
+    initial, control = np.empty((n_sequences, 2)), np.empty((n_sequences, n_samples, 2))
+    for index in range(n_sequences):
+        generator = np.random.Generator(np.random.Philox(key=np.array([seed, index], dtype=np.uint64)))
+        initial[index], control[index] = _navigation(config, generator, n_samples, max_inserted_length_mm)
+    return initial, control
+
+
+def _navigation(
+    config: ControlConfig, generator: np.random.Generator, n_samples: int, longest: float
+) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "samples 2"]]:
+    first = min(config.first_inserted_length_mm, longest)
+    inserted = generator.uniform(first, first + config.start_spread * (longest - first))
+    initial = np.array([inserted, generator.uniform(-np.pi, np.pi)])
+    wanted = np.zeros((n_samples + 2, 2))
+    at = 0
+    while at < len(wanted):
+        samples = max(1, round(generator.uniform(config.shortest_s, config.longest_s) / SAMPLE_PERIOD_S))
+        wanted[at : at + samples] = _manoeuvre(config, generator)
+        at += samples
+    smooth = 0.25 * wanted[:-2] + 0.5 * wanted[1:-1] + 0.25 * wanted[2:]  # ramps of one period between manoeuvres
+    for sample in smooth:
+        sample[0] = np.clip(sample[0], -inserted / SAMPLE_PERIOD_S, (longest - inserted) / SAMPLE_PERIOD_S)
+        inserted += sample[0] * SAMPLE_PERIOD_S
+    return initial, smooth
+
+
+def _manoeuvre(config: ControlConfig, generator: np.random.Generator) -> Float[np.ndarray, "2"]:
+    """Return the mean velocities of one manoeuvre; always draws the same number of random numbers."""
+    shares = np.array([config.insertion_share, config.retraction_share, config.spin_share])
+    kind = _KINDS[int(np.searchsorted(np.cumsum(shares), generator.random(), side="right"))]
+    speed, turns, spin = generator.random(), generator.random() < config.rotation_share, generator.uniform(-1, 1)
+    translation = {"insertion": 1.0, "retraction": -1.0}.get(kind, 0.0) * (0.15 + 0.85 * speed)
+    rotation = spin if kind == "spin" or (turns and kind != "pause") else 0.0
+    return np.array([translation * config.max_velocity_mm_s, rotation * config.max_rotation_rad_s])
+
+
+def read_controls_csv(path: Path) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n samples 2"]]:
+    """Read scripted controls.
+
+    The columns are `time_s` (end of each sample period: 0.5, 1.0, ...), `translation_mm_s` and `rotation_rad_s`;
+    optional are `world` (several navigations in one file), and `inserted_length_mm` with `rotation_rad` (state at the
+    end of each period, from which the initial one follows; 0 if they are not there). So a rollout that was written as
+    CSV can be simulated again.
+
+    Returns:
+        Initial (Δ mm, φ rad), and controls (mm/s, rad/s).
+
+    Raises:
+        InputError: not such a table; the line names file, column, row and mend.
+    """
+    try:
+        table = pd.read_csv(path)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read as CSV ({str(error).splitlines()[0]}); check the file") from error
+    missing = [name for name in _COLUMNS if name not in table.columns]
+    if missing:
+        raise InputError(f"{path}: column {missing[0]} is missing; the columns are {', '.join(_COLUMNS)}")
+    if len(table) == 0:
+        raise InputError(f"{path}: has no rows; give one for each {SAMPLE_PERIOD_S} s")
+    state = [name for name in ("inserted_length_mm", "rotation_rad") if name in table.columns]
+    for name in (*_COLUMNS, *state):
+        numbers = pd.to_numeric(table[name], errors="coerce").to_numpy(dtype=float)
+        bad = np.flatnonzero(~np.isfinite(numbers))
+        if len(bad):
+            row = int(bad[0])
+            raise InputError(f"{path}: row {row + 2}: {name} = {table[name].iloc[row]} is no finite number; correct it")
+        table[name] = numbers
+    worlds = [rows for _, rows in table.groupby("world", sort=True)] if "world" in table.columns else [table]
+    samples = len(worlds[0])
+    for rows in worlds:
+        if len(rows) != samples:
+            raise InputError(f"{path}: worlds differ in their number of rows; give each {samples}")
+        late = np.flatnonzero(np.abs(rows["time_s"] - SAMPLE_PERIOD_S * (np.arange(samples) + 1)) > 1e-6)
+        if len(late):
+            row = int(rows.index[late[0]])
+            raise InputError(
+                f"{path}: row {row + 2}: time_s = {table['time_s'].iloc[row]:g}; each world's rows end sample periods "
+                f"and count {SAMPLE_PERIOD_S:g}, {2 * SAMPLE_PERIOD_S:g}, ..."
+            )
+    control = np.stack([rows[list(_COLUMNS[1:])].to_numpy(dtype=float) for rows in worlds])
+    initial = np.zeros((len(worlds), 2))
+    if len(state) == 2:
+        ends = np.stack([rows[state].to_numpy(dtype=float)[0] for rows in worlds])
+        initial = ends - SAMPLE_PERIOD_S * control[:, 0]
+    return initial, control

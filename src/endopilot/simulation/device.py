@@ -1,0 +1,197 @@
+"""Devices as data: stiffness profiles, diameter, tip shape and friction, read from YAML and checked.
+
+In a device's file every constant stands with its source, as `{value: ..., source: ...}`; a file without a source for
+each constant is refused. A profile is piecewise linear between its abscissae, which count from the tip, and constant
+beyond the last one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from jaxtyping import Float
+
+from endopilot.errors import InputError
+from endopilot.types import Anatomy
+
+_FOLDER = Path(__file__).parent / "devices"
+_SCALARS = ("diameter_mm", "friction", "max_velocity_mm_s", "max_rotation_rad_s")
+_PROFILES = ("abscissa_mm", "bend_stiffness_n_mm2", "twist_stiffness_n_mm2")
+_FIELDS = ("name", *_SCALARS, *_PROFILES, "tip_load_n", "tip_bend")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Device:
+    """A guidewire, or another slender device driven at its proximal end.
+
+    Attributes:
+        name: short name.
+        diameter_mm: outer diameter, mm.
+        abscissa_mm: distances from the tip at which the profiles are given, mm, increasing from 0.
+        bend_stiffness_n_mm2: bending stiffness EI at those distances, N·mm².
+        twist_stiffness_n_mm2: torsional stiffness GJ at those distances, N·mm².
+        tip_bend_rad: angle by which the unloaded tip is bent, rad.
+        tip_bend_length_mm: length from the tip over which it is bent, with constant curvature, mm.
+        tip_load_n: load at which the tip buckles, as in catalogues, N; None where the maker states none.
+        friction: Coulomb friction coefficient on the vessel's wall.
+        max_velocity_mm_s: fastest translation of the drive, mm/s.
+        max_rotation_rad_s: fastest rotation of the drive, rad/s.
+        sources: where each constant comes from.
+    """
+
+    name: str
+    diameter_mm: float
+    abscissa_mm: Sequence[float]
+    bend_stiffness_n_mm2: Sequence[float]
+    twist_stiffness_n_mm2: Sequence[float]
+    tip_bend_rad: float
+    tip_bend_length_mm: float
+    tip_load_n: float | None
+    friction: float
+    max_velocity_mm_s: float
+    max_rotation_rad_s: float
+    sources: Mapping[str, str]
+
+    def __post_init__(self) -> None:
+        """Check every constant.
+
+        Raises:
+            InputError: a constant is missing, not finite or out of its range.
+        """
+        for name in _SCALARS:
+            value = getattr(self, name)
+            if not (np.isfinite(value) and (value > 0 or (name == "friction" and value == 0))):
+                raise InputError(f"device {self.name}: {name} = {value} is not a positive number; correct it")
+        self._check_profiles()
+        if self.tip_load_n is not None and not (np.isfinite(self.tip_load_n) and self.tip_load_n > 0):
+            raise InputError(f"device {self.name}: tip_load_n = {self.tip_load_n}; give a positive load in N, or null")
+        bend, length = self.tip_bend_rad, self.tip_bend_length_mm
+        if not (np.isfinite(bend) and abs(bend) <= 2 * np.pi):
+            raise InputError(f"device {self.name}: tip_bend angle_deg = {np.rad2deg(bend):g}; give -360 to 360 degrees")
+        if not (np.isfinite(length) and (length > 0 or bend == 0)):
+            raise InputError(f"device {self.name}: tip_bend length_mm = {length}; a bent tip needs a positive length")
+
+    def _check_profiles(self) -> None:
+        for name in _PROFILES:
+            values = np.asarray(getattr(self, name), dtype=float)
+            if values.ndim != 1 or len(values) != len(self.abscissa_mm) or len(values) == 0:
+                raise InputError(f"device {self.name}: {name} needs one value for each of abscissa_mm's")
+            bad = ~np.isfinite(values) | ((values <= 0) if name != "abscissa_mm" else (values < 0))
+            if bad.any():
+                raise InputError(f"device {self.name}: {name} holds {values[bad][0]:g}; every value must be positive")
+        abscissa = np.asarray(self.abscissa_mm)
+        if abscissa[0] != 0 or (np.diff(abscissa) <= 0).any():
+            raise InputError(f"device {self.name}: abscissa_mm = {list(abscissa)} must begin at 0 and increase")
+
+    @property
+    def tip_radius_mm(self) -> float:
+        """Outer radius, mm, at the tip as everywhere."""
+        return self.diameter_mm / 2
+
+    def bend_stiffness(self, abscissa_mm: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+        """Return EI in N·mm² at distances from the tip."""
+        return np.interp(abscissa_mm, self.abscissa_mm, self.bend_stiffness_n_mm2)
+
+    def twist_stiffness(self, abscissa_mm: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+        """Return GJ in N·mm² at distances from the tip."""
+        return np.interp(abscissa_mm, self.abscissa_mm, self.twist_stiffness_n_mm2)
+
+    def summary(self) -> dict[str, Any]:
+        """Return what a list of devices shows: name, diameter, stiffness at tip and shaft, tip load, tip shape."""
+        return {
+            "name": self.name,
+            "diameter_mm": self.diameter_mm,
+            "tip_bend_stiffness_n_mm2": self.bend_stiffness_n_mm2[0],
+            "shaft_bend_stiffness_n_mm2": self.bend_stiffness_n_mm2[-1],
+            "tip_load_n": self.tip_load_n,
+            "tip_bend_deg": round(float(np.rad2deg(self.tip_bend_rad)), 3),
+            "friction": self.friction,
+        }
+
+
+def list_devices() -> tuple[str, ...]:
+    """Return the names of the shipped devices."""
+    return tuple(sorted(path.stem for path in _FOLDER.glob("*.yaml")))
+
+
+def read_device(name_or_path: str | Path) -> Device:
+    """Read a device by its shipped name, or from a YAML file.
+
+    Raises:
+        InputError: no such device, or a file that is not a device; the line names file, field, value and mend.
+    """
+    shipped = _FOLDER / f"{name_or_path}.yaml"
+    path = shipped if shipped.is_file() else Path(name_or_path)
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        names = ", ".join(list_devices())
+        raise InputError(f"device '{name_or_path}': no such device or file; choose from {names}") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not valid YAML ({str(error).splitlines()[0]}); correct the file") from error
+    try:
+        return _parse(content)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def check_fits(device: Device, anatomy: Anatomy) -> None:
+    """Check that the device passes through the guiding catheter and the ostium.
+
+    Raises:
+        InputError: the device is wider than one of them.
+    """
+    lumen = float(anatomy.tree.branches[0].centerline.radius[0])
+    for what, radius in (("lumen at the ostium", lumen), ("guiding catheter", anatomy.catheter_radius_mm)):
+        if device.tip_radius_mm >= radius:
+            raise InputError(
+                f"device {device.name}: diameter_mm = {device.diameter_mm:g} is wider than the {what} of "
+                f"{anatomy.name}, {2 * radius:.2f} mm; choose a thinner device"
+            )
+
+
+def _parse(content: Any) -> Device:
+    if not isinstance(content, dict):
+        raise InputError("a device is a mapping of fields; see the shipped files")
+    for name in _FIELDS:
+        if name not in content:
+            raise InputError(f"field {name} is missing; add it")
+    unknown = sorted(set(content) - set(_FIELDS))
+    if unknown:
+        raise InputError(f"field {unknown[0]} is unknown; the fields are {', '.join(_FIELDS)}")
+    sources = {name: _source(name, content[name]) for name in _FIELDS[1:]}
+    tip = content["tip_bend"]
+    load = content["tip_load_n"].get("value")
+    profiles = {name: _numbers(name, content[name].get("value")) for name in _PROFILES}
+    return Device(
+        name=str(content["name"]),
+        **{name: _number(name, content[name].get("value")) for name in _SCALARS},
+        **profiles,
+        tip_bend_rad=float(np.deg2rad(_number("tip_bend angle_deg", tip.get("angle_deg")))),
+        tip_bend_length_mm=_number("tip_bend length_mm", tip.get("length_mm")),
+        tip_load_n=None if load is None else _number("tip_load_n", load),
+        sources=sources,
+    )
+
+
+def _source(name: str, entry: Any) -> str:
+    if not isinstance(entry, dict) or not str(entry.get("source") or "").strip():
+        raise InputError(f"field {name} has no source; write it as {{value: ..., source: ...}}")
+    return str(entry["source"])
+
+
+def _number(name: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise InputError(f"{name} = {value!r} is not a number; correct it")
+    return float(value)
+
+
+def _numbers(name: str, values: Any) -> tuple[float, ...]:
+    if not isinstance(values, list):
+        raise InputError(f"{name} = {values!r} is not a list of numbers; correct it")
+    return tuple(_number(name, value) for value in values)

@@ -1,0 +1,327 @@
+"""The simulator: one anatomy, one device, many worlds, each with controls of its own.
+
+Every world is a discrete Cosserat rod that slides out of the guiding catheter into the lumen. The time stepper is the
+C++ core in `src/core`; this module checks its input, lays the rod out and gives the answer as a `Rollout`.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
+from scipy import ndimage
+
+from endopilot import _core
+from endopilot.anatomy.projection import project_tip
+from endopilot.errors import InputError
+from endopilot.progress import progress
+from endopilot.simulation.device import Device, check_fits
+from endopilot.simulation.rod import RodLayout, lay_out
+from endopilot.types import SAMPLE_PERIOD_S, Anatomy, DistanceMap, Insertion, Rollout
+
+_FREE_BEHIND_MM = 3.0
+"""Nodes farther behind the ostium than this follow the drive exactly, mm."""
+_LARGEST_NEWTON_STEP = 0.3
+"""Displacement of a node (mm) that one Newton step is clamped to; larger ones can tangle the wire for good."""
+_MOST_ITERATIONS = 80
+"""Newton iterations after which a time step is halved, down to 1/32."""
+_SAMPLE_TOLERANCE = 1e-6
+"""Newton tolerance of the step that ends a sample, mm: its forces are recorded, and the wire is stiff axially."""
+_LANES = 4
+"""Worlds that one thread steps side by side."""
+_OVERSHOOT_MM = 1e-2
+"""Rounding of controls may carry the inserted length this far below 0, mm."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulatorConfig:
+    """Settings of the rod core."""
+
+    time_step_s: float = 0.02
+    """Time step, s; it must divide the sample period of 0.5 s. The tip's error grows about linearly with it."""
+    tolerance_mm: float = 1e-3
+    """Newton's method stops when its step moves no node farther than this, mm."""
+    elements: int = 100
+    """Elements over the longest path of the anatomy; they are shorter near the tip."""
+    wall_stiffness_n_mm: float = 5.0
+    """Stiffness of the vessel wall at a node, N/mm."""
+    stick_velocity_mm_s: float = 0.05
+    """Slip velocity under which smoothed Coulomb friction falls off, mm/s; a wire at rest creeps more slowly."""
+    approach_velocity_mm_s: float = 20.0
+    """Velocity at which a wire is brought to its first inserted length before the recording, mm/s."""
+    threads: int = 0
+    """Threads; 0 for one a processor core. The results do not depend on it."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            InputError: a field is out of its range.
+        """
+        for name in ("time_step_s", "tolerance_mm", "wall_stiffness_n_mm", "stick_velocity_mm_s"):
+            value = getattr(self, name)
+            if not 0 < value < np.inf:
+                raise InputError(f"{name}: {value}; give a positive number")
+        steps = SAMPLE_PERIOD_S / self.time_step_s
+        if abs(steps - round(steps)) > 1e-6 or steps < 0.5:
+            raise InputError(f"time_step_s: {self.time_step_s} does not divide {SAMPLE_PERIOD_S} s; give e.g. 0.02")
+        if not 0 < self.approach_velocity_mm_s < np.inf:
+            raise InputError(f"approach_velocity_mm_s: {self.approach_velocity_mm_s}; give a positive velocity")
+        if not 10 <= self.elements <= 2000:
+            raise InputError(f"elements: {self.elements}; give 10 to 2000")
+        if self.threads < 0:
+            raise InputError(f"threads: {self.threads}; give 0 for all cores, or a positive number")
+
+
+def simulate(
+    anatomy: Anatomy,
+    device: Device,
+    control: Float[np.ndarray, "worlds samples 2"],
+    *,
+    initial: Float[np.ndarray, "worlds 2"] | None = None,
+    config: SimulatorConfig | None = None,
+    record_shape: bool = False,
+    friction: Float[np.ndarray, "worlds"] | None = None,
+) -> Rollout:
+    """Drive a device through an anatomy and record it every 0.5 s.
+
+    Results are the same to the last bit whatever the number of worlds, their order and the number of threads.
+
+    Args:
+        anatomy: the vessel.
+        device: the wire.
+        control: proximal velocities (mm/s, rad/s), constant over each sample period.
+        initial: inserted length (mm) and rotation (rad) before the first period; zeros if not given. The wire is
+            pushed there from the ostium at `config.approach_velocity_mm_s`, then rests for one period.
+        config: settings of the rod core.
+        record_shape: record the positions of all nodes too.
+        friction: Coulomb friction coefficient of each world; the device's own if not given.
+
+    Raises:
+        InputError: controls that are not finite, too fast for the device or pull the wire out of the catheter; a
+            device that does not fit; a distance map that is not finite, or negative at the ostium.
+    """
+    config = config or SimulatorConfig()
+    worlds, samples = control.shape[:2]
+    initial = np.zeros((worlds, 2)) if initial is None else np.asarray(initial, dtype=float)
+    friction = np.full(worlds, device.friction) if friction is None else np.asarray(friction, dtype=float)
+    control = np.ascontiguousarray(control, dtype=float)
+    inserted = _check_controls(device, control, initial, friction)
+    check_fits(device, anatomy)
+    check_distance_map(anatomy)
+    path_mm = float(anatomy.tree.longest_path().abscissa[-1])
+    rod = lay_out(
+        device,
+        path_mm=path_mm,
+        elements=config.elements,
+        length_mm=float(max(path_mm, inserted.max())) + _FREE_BEHIND_MM,
+    )
+    _check_memory(worlds, samples, len(rod.abscissa_mm) if record_shape else 0)
+    result = run_core(
+        rod,
+        make_lumen(anatomy.distance_map, device),
+        anatomy.insertion,
+        config=config,
+        initial=initial,
+        control=control,
+        friction=friction,
+        record_shape=record_shape,
+    )
+    _report_invalid(result["reason"], result["valid"])
+    start, rate = initial[:, None, :], np.cumsum(control, axis=1) * SAMPLE_PERIOD_S
+    return Rollout(
+        sample_period_s=SAMPLE_PERIOD_S,
+        initial_inserted_length=initial[:, 0].copy(),
+        initial_rotation=initial[:, 1].copy(),
+        control=control,
+        inserted_length=start[..., 0] + rate[..., 0],
+        rotation=start[..., 1] + rate[..., 1],
+        tip=project_tip(anatomy.tree, anatomy.insertion, result["tip_position"]),
+        shape=result.get("shape"),
+        **{name: result[name] for name in _RECORDED},
+    )
+
+
+_RECORDED = (
+    "tip_position",
+    "tip_direction",
+    "contact_force_max",
+    "contact_force_sum",
+    "base_force",
+    "base_torque",
+    "iterations",
+    "valid",
+)
+
+
+def run_core(
+    rod: RodLayout,
+    lumen: _core.Lumen | None,
+    insertion: Insertion,
+    *,
+    config: SimulatorConfig,
+    initial: Float[np.ndarray, "worlds 2"],
+    control: Float[np.ndarray, "worlds samples 2"],
+    friction: Float[np.ndarray, "worlds"],
+    loads: _core.Loads | None = None,
+    record_shape: bool = False,
+    record_attitude: bool = False,
+    lanes: int = _LANES,
+    free_behind_mm: float = _FREE_BEHIND_MM,
+    sample_tolerance: float = _SAMPLE_TOLERANCE,
+) -> dict[str, np.ndarray]:
+    """Run the C++ core on checked input. The simulator and the verification both come through here.
+
+    Args:
+        rod: nodes and stiffnesses.
+        lumen: the wall, or None for a rod in the open.
+        insertion: the point and the direction along which the base slides.
+        config: settings.
+        initial: inserted length (mm) and rotation (rad) of each world before the first period.
+        control: mm/s, rad/s.
+        friction: Coulomb coefficients.
+        loads: dead loads and springs.
+        record_shape: record node positions, mm.
+        record_attitude: record element orientations, quaternions w x y z.
+        lanes: worlds stepped side by side by one thread: 1, 4 or 8.
+        free_behind_mm: nodes farther behind the insertion point follow the drive, mm.
+        sample_tolerance: Newton tolerance at the end of a sample, mm.
+
+    Returns:
+        The arrays of `Rollout` that need no centerline, and `reason`: 0 fine, 1 not finite, 2 not converged.
+    """
+    options = _core.Options()
+    options.time_step = config.time_step_s
+    options.steps_per_sample = round(SAMPLE_PERIOD_S / config.time_step_s)
+    options.stick_velocity = config.stick_velocity_mm_s
+    options.wall_stiffness = config.wall_stiffness_n_mm
+    options.tolerance = config.tolerance_mm
+    options.sample_tolerance = min(sample_tolerance, config.tolerance_mm)
+    options.largest_step = _LARGEST_NEWTON_STEP
+    options.most_iterations = _MOST_ITERATIONS
+    options.free_behind = free_behind_mm
+    options.approach_velocity = config.approach_velocity_mm_s
+    depth = initial[:, 0] + np.cumsum(control[..., 0], axis=1).mean(axis=1)  # worlds of like length run side by side
+    worlds, samples = control.shape[:2]
+    with progress("Simulating the wire", total=worlds * samples) as advance:
+        return _core.simulate(
+            rod=rod.model(),
+            lumen=lumen,
+            loads=loads,
+            origin=np.asarray(insertion.position, dtype=float),
+            orientation=_base_orientation(np.asarray(insertion.direction, dtype=float)),
+            options=options,
+            initial=np.ascontiguousarray(initial, dtype=float),
+            control=np.ascontiguousarray(control, dtype=float),
+            friction=np.ascontiguousarray(friction, dtype=float),
+            order=np.argsort(-depth, kind="stable").astype(float),
+            record_shape=record_shape,
+            record_attitude=record_attitude,
+            threads=min(config.threads or os.cpu_count() or 1, -(-worlds // lanes)),
+            lanes=lanes,
+            progress=advance,
+        )
+
+
+def make_lumen(distance_map: DistanceMap, device: Device) -> _core.Lumen:
+    """Return the wall as the core wants it: coefficients of a quadratic B-spline that interpolates the map."""
+    coefficients: Float32[np.ndarray, "nz ny nx"] = ndimage.spline_filter(
+        np.asarray(distance_map.values, dtype=np.float32), order=2, output=np.float32, mode="nearest"
+    )
+    radius, spacing = device.tip_radius_mm, float(distance_map.spacing_mm)
+    return _core.make_lumen(
+        coefficients=np.ascontiguousarray(coefficients),
+        origin=np.asarray(distance_map.origin_mm, dtype=float),
+        spacing=spacing,
+        near=radius + spacing,
+        far=0.5,
+    )
+
+
+def check_distance_map(anatomy: Anatomy) -> None:
+    """Check that the distance map is finite, and positive at the ostium and around it along the catheter's axis.
+
+    Raises:
+        InputError: it is not.
+    """
+    field, insertion = anatomy.distance_map, anatomy.insertion
+    if not np.isfinite(field.values).all():
+        raise InputError(f"{anatomy.name}: the distance map has values that are not finite; extract it again")
+    if abs(float(np.linalg.norm(insertion.direction)) - 1) > 1e-3:
+        raise InputError(f"{anatomy.name}: insertion.direction = {insertion.direction} is no unit vector; normalise it")
+    for along in (-_FREE_BEHIND_MM, 0.0, 1.0):
+        point = insertion.position + along * insertion.direction
+        index = np.round((point - field.origin_mm) / field.spacing_mm).astype(int)[::-1]
+        inside = (index >= 0).all() and (index < field.values.shape).all()
+        value = float(field.values[tuple(index)]) if inside else -np.inf
+        if value <= 0:
+            raise InputError(
+                f"{anatomy.name}: the distance map is {value:.2f} mm at {along:+g} mm from the ostium along the "
+                "catheter, where it must be positive (inside); check the insertion and the sign of the map"
+            )
+
+
+def _check_controls(
+    device: Device,
+    control: Float[np.ndarray, "worlds samples 2"],
+    initial: Float[np.ndarray, "worlds 2"],
+    friction: Float[np.ndarray, "worlds"],
+) -> Float[np.ndarray, "worlds samples_1"]:
+    """Check controls, initial state and friction, and return the inserted lengths from the first one on."""
+    worlds, samples = control.shape[:2]
+    if worlds == 0 or samples == 0:
+        raise InputError(f"control: {worlds} worlds of {samples} samples; give at least one of one")
+    if len(initial) != worlds or len(friction) != worlds:
+        raise InputError(f"initial, friction: {len(initial)}, {len(friction)} rows for {worlds} worlds; give one each")
+    limits = (("translation", device.max_velocity_mm_s, "mm/s"), ("rotation", device.max_rotation_rad_s, "rad/s"))
+    for axis, (name, limit, unit) in enumerate(limits):
+        _check(~np.isfinite(control[..., axis]), control[..., axis], f"{name} is no finite number; correct it")
+        fast = np.abs(control[..., axis]) > limit * (1 + 1e-6)
+        _check(fast, control[..., axis], f"{name} in {unit} exceeds {device.name}'s limit of {limit:g}; slow down")
+    _check(~np.isfinite(initial), initial, "initial state is no finite number; correct it")
+    _check(~(np.isfinite(friction) & (friction >= 0)), friction, "friction must be a finite number of 0 or more")
+    inserted = np.cumsum(np.column_stack([initial[:, 0], SAMPLE_PERIOD_S * control[..., 0]]), axis=1)
+    _check(inserted < -_OVERSHOOT_MM, inserted, "inserted length in mm is negative; pull less, or start deeper")
+    return inserted
+
+
+def _check(bad: Bool[np.ndarray, "worlds *rest"], values: Float[np.ndarray, "worlds *rest"], what: str) -> None:
+    if bad.any():
+        where = tuple(int(i) for i in np.argwhere(bad)[0])
+        at = f", sample {where[1]}" if len(where) > 1 else ""
+        raise InputError(f"world {where[0]}{at}: {values[where]:g}: {what}")
+
+
+def _check_memory(worlds: int, samples: int, recorded_nodes: int) -> None:
+    needed = 8 * worlds * samples * (20 + 3 * recorded_nodes)
+    available = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if needed > 0.8 * available:
+        raise InputError(
+            f"control: {worlds} worlds of {samples} samples need {needed / 2**30:.1f} GiB of {available / 2**30:.1f}; "
+            "simulate fewer at once"
+        )
+
+
+def _report_invalid(reason: Int[np.ndarray, "worlds"], valid: Bool[np.ndarray, "worlds samples"]) -> None:
+    bad = np.flatnonzero(~valid.all(axis=1))
+    if len(bad) == 0:
+        return
+    import warnings
+
+    names = {1: "left the finite numbers", 2: "did not converge"}
+    first = int(bad[0])
+    seconds = SAMPLE_PERIOD_S * float(np.argmin(valid[first]))
+    warnings.warn(
+        f"{len(bad)} of {len(valid)} worlds are invalid; world {first} {names[int(reason[first])]} after {seconds:g} s",
+        stacklevel=3,
+    )
+
+
+def _base_orientation(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4"]:
+    """Return the quaternion (w x y z) of the shortest turn that takes the third axis to `direction`."""
+    axis = np.array([-direction[1], direction[0], 0.0])
+    quaternion = np.array([1 + direction[2], *axis])
+    norm = np.linalg.norm(quaternion)
+    return quaternion / norm if norm > 1e-6 else np.array([0.0, 1.0, 0.0, 0.0])
