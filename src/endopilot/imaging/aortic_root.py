@@ -58,7 +58,7 @@ def find_aortic_root(grid: Volume) -> AorticRoot:
     Raises:
         InputError: no contrast, or no such vessel in the volume.
     """
-    hu = ndimage.gaussian_filter(grid.voxels, 0.7)
+    hu = np.asarray(ndimage.gaussian_filter(grid.voxels, 0.7))
     spacing = float(grid.spacing_mm[0])
     if (ndimage.minimum_filter(hu, round(9.0 / spacing)) > LEAST_BLOOD_HU).sum() == 0:
         raise InputError(
@@ -67,7 +67,7 @@ def find_aortic_root(grid: Volume) -> AorticRoot:
         )
     best: list[_Disc] = []
     for level in _LEVELS_HU:
-        chain = _best_chain([_discs(plane, k, level, spacing) for k, plane in enumerate(hu)])
+        chain = _best_chain([_discs(hu[k], k, level, spacing) for k in range(len(hu))])
         if _weight(chain) > _weight(best):
             best = chain
     if len(best) * spacing < _FEWEST_SLICES_MM:
@@ -99,19 +99,20 @@ def _discs(plane: Float[np.ndarray, "ny nx"], k: int, level: float, spacing: flo
     angle = np.arange(_DIRECTIONS) * (2 * np.pi / _DIRECTIONS)
     steps = np.arange(0.0, 1.6 * high, 0.5)
     found = []
-    for j, i in np.argwhere(peaks):
+    for peak in np.argwhere(peaks):
+        j, i, radius, roundness = float(peak[0]), float(peak[1]), 0.0, 0.0
         for _ in range(2):  # the second round starts from the centre that the first one found
             y, x = j + np.outer(np.sin(angle), steps), i + np.outer(np.cos(angle), steps)
             outside = ndimage.map_coordinates(plane, [y, x], order=1, cval=-1000.0) < level
-            edge = np.where(outside.any(axis=1), steps[outside.argmax(axis=1)], np.inf)
-            radius = float(np.quantile(edge, 0.4))
-            near = np.abs(edge - radius) < 0.15 * radius + 0.5
-            if not np.isfinite(radius) or near.sum() < 3:
+            edge = np.where(outside.any(axis=1), steps[outside.argmax(axis=1)], 2 * high)
+            typical = float(np.quantile(edge, 0.4))
+            near = np.abs(edge - typical) < 0.15 * typical + 0.5
+            roundness = float(near.mean())
+            if roundness < _ROUND_SHARE / 2:
                 break
             j, i, radius = _fit_circle(j + np.sin(angle[near]) * edge[near], i + np.cos(angle[near]) * edge[near])
-        else:
-            if low <= radius <= high and near.mean() >= _ROUND_SHARE:
-                found.append(_Disc(k, float(j), float(i), float(radius), float(near.mean())))
+        if low <= radius <= high and roundness >= _ROUND_SHARE:
+            found.append(_Disc(k, j, i, radius, roundness))
     return found
 
 

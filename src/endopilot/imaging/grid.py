@@ -88,6 +88,12 @@ def distance_and_nearest(
     return distance.astype(np.float32), tuple(nearest)
 
 
-def connected_components(mask: Bool[np.ndarray, "nz ny nx"]) -> Int[np.ndarray, "nz ny nx"]:
-    """Return a number for each connected part of a mask (through faces), from 1; 0 outside."""
-    return ndimage.label(mask)[0]  # pyright: ignore[reportIndexIssue]
+def connected_components(mask: Bool[np.ndarray, "nz ny nx"], *, corners: bool = False) -> Int[np.ndarray, "nz ny nx"]:
+    """Return a number for each connected part of a mask, from 1; 0 outside.
+
+    Args:
+        mask: the mask.
+        corners: voxels that touch only at an edge or corner are connected too.
+    """
+    structure = ndimage.generate_binary_structure(3, 3 if corners else 1)
+    return ndimage.label(mask, structure)[0]  # pyright: ignore[reportIndexIssue]

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import SimpleITK as sitk
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float32
 
 
 def vesselness(
@@ -17,10 +17,10 @@ def vesselness(
     sigmas_mm: Sequence[float],
     contrast_hu: float,
 ) -> Float32[np.ndarray, "nz ny nx"]:
-    """Return the largest response over scales: 0 where nothing is tube-like, about 1 in the middle of a full-contrast tube.
+    """Return the largest response over scales: 0 where nothing is tube-like, about 1 in the middle of a bright tube.
 
-    Of the Hessian's eigenvalues λ₁ ≤ λ₂ ≤ λ₃ at scale σ, a bright tube has λ₁ ≈ λ₂ ≪ 0; the surface of a chamber has only
-    λ₁ ≪ 0. The response is therefore −σ²λ₂ (Sato et al. 1998), divided by e⁻¹ times the contrast, which is what a
+    Of the Hessian's eigenvalues λ₁ ≤ λ₂ ≤ λ₃ at scale σ, a bright tube has λ₁ ≈ λ₂ ≪ 0; the surface of a chamber has
+    only λ₁ ≪ 0. The response is therefore −σ²λ₂ (Sato et al. 1998), divided by e⁻¹ times the contrast, which is what a
     straight tube of radius √2·σ gives: its profile 1 − exp(−r²/2σ²) has −σ²·d²/dx² = u·exp(−u) with u = r²/2σ².
 
     Args:
@@ -39,7 +39,7 @@ def vesselness(
     best = np.zeros(len(k), dtype=np.float32)
     image = sitk.GetImageFromArray(hu)
     for sigma in sigmas_mm:
-        smooth = sitk.GetArrayFromImage(sitk.SmoothingRecursiveGaussian(image, sigma / spacing_mm))
+        smooth = sitk.GetArrayFromImage(sitk.SmoothingRecursiveGaussian(image, [sigma / spacing_mm] * 3))
         middle = _middle_eigenvalue(*_hessian(smooth, k, j, i))
         response = -middle * np.float32((sigma / spacing_mm) ** 2 * np.e / contrast_hu)
         np.maximum(best, response, out=best)

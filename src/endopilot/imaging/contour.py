@@ -1,0 +1,75 @@
+"""The wall of a vessel at half height: where HU pass half way between the lumen and what lies beside it."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import ndimage
+from scipy.spatial import KDTree
+
+from endopilot.imaging.grid import distance_to_outside
+from endopilot.types import Volume
+
+_SMOOTHING_MM = 0.3
+"""Width of the Gaussian against noise, mm; about the scanner's own blur, so that little detail is lost."""
+_BLUR_MM = 0.4
+"""Width of that Gaussian and of a scanner's point-spread function (0.6 mm at half height) together, mm."""
+_SURROUNDINGS_MM = 1.2
+"""Width of the window in which the surroundings' HU are averaged, mm."""
+_CALCIUM = 1.5
+"""Times the lumen's HU; brighter voxels are calcium or metal."""
+
+
+def lumen_at_half_height(
+    volume: Volume,
+    points: Float[np.ndarray, "n 3"],
+    radius: Float[np.ndarray, "n"],
+    lumen_hu: float,
+    excluded: Bool[np.ndarray, "nz ny nx"],
+) -> Bool[np.ndarray, "nz ny nx"]:
+    """Return the voxels of the lumen around a vessel's paths.
+
+    The surroundings differ from side to side (fat, muscle, lung), and the wall's level with them: a fixed threshold
+    would make a vessel too wide in muscle or too narrow in fat.
+
+    Args:
+        volume: CT in HU, cropped to the vessel.
+        points: dense points along the paths, LPS mm.
+        radius: rough lumen radius at each, mm.
+        lumen_hu: HU of the contrast-filled lumen.
+        excluded: voxels that belong to other blood pools.
+    """
+    spacing = volume.spacing_mm[::-1]
+    hu = ndimage.gaussian_filter(volume.voxels.astype(np.float32), _SMOOTHING_MM / spacing)
+    distance, local_radius = _distance_to_paths(volume, points, radius, margin_mm=4.0)
+    band = (distance <= 1.35 * local_radius + 0.7) & ~excluded
+    rough = band & (hu > 0.5 * lumen_hu)
+    beside = (distance <= 1.35 * local_radius + 4.0) & (hu < 0.6 * lumen_hu)
+    beside &= distance_to_outside(~rough, tuple(spacing)) > 2 * _BLUR_MM
+    window = _SURROUNDINGS_MM / spacing
+    weight = ndimage.gaussian_filter(beside.astype(np.float32), window)
+    surroundings = ndimage.gaussian_filter(np.where(beside, hu, np.float32(0)), window) / np.maximum(weight, 1e-4)
+    surroundings = np.clip(surroundings, -120, 0.5 * lumen_hu)
+    # A blurred disc has less than half its height at its own edge, the less the smaller it is.
+    share = np.clip(0.5 - 0.2 * _BLUR_MM / np.maximum(local_radius, 0.3), 0.3, 0.5)
+    level = surroundings + share * (lumen_hu - surroundings)
+    return band & (hu > level) & (hu < _CALCIUM * lumen_hu)
+
+
+def _distance_to_paths(
+    volume: Volume, points: np.ndarray, radius: np.ndarray, margin_mm: float
+) -> tuple[Float[np.ndarray, "nz ny nx"], Float[np.ndarray, "nz ny nx"]]:
+    """Return the distance to the nearest path point and that point's radius, mm; infinite and 0 far away."""
+    shape = volume.voxels.shape
+    marked = np.ones(shape, dtype=bool)
+    last = np.array(shape) - 1
+    index = np.clip(np.round(volume.world_to_index(points)).astype(int)[:, ::-1], 0, last)
+    marked[tuple(index.T)] = False
+    near = distance_to_outside(marked, tuple(volume.spacing_mm[::-1])) < radius.max() * 1.35 + margin_mm
+    voxels = np.argwhere(near)
+    found, nearest = KDTree(points).query(volume.index_to_world(voxels[:, ::-1].astype(float)))
+    distance = np.full(shape, np.inf, dtype=np.float32)
+    local_radius = np.zeros(shape, dtype=np.float32)
+    distance[near] = found
+    local_radius[near] = radius[nearest]
+    return distance, local_radius

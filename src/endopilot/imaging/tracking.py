@@ -1,0 +1,110 @@
+"""Following a vessel tree through its vesselness, from the ostium to the distal ends."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import KDTree
+
+_SHORTEST_BRANCH_MM = 4.0
+"""Shorter side branches are bumps of the wall."""
+_COST_FLOOR = 0.05
+"""Added to the vesselness, so that a way through a gap has a finite cost."""
+_SMOOTHING_MM = 1.5
+"""Width of the Gaussian that takes the voxel steps out of a path, mm."""
+
+
+def track_tree(
+    response: Float[np.ndarray, "nz ny nx"],
+    passable: Bool[np.ndarray, "nz ny nx"],
+    start: Int[np.ndarray, "3"],
+    ends: list[Int[np.ndarray, "3"]],
+    spacing_mm: float,
+) -> list[Float[np.ndarray, "_ 3"]]:
+    """Return the paths from `start` to every distal end of the tree, each from where it leaves those before it.
+
+    The farthest end is reached first; what its path covers is taken away, and so on until what is left is shorter than
+    a branch (after TEASAR, Sato et al. 2000). A path is the cheapest way; a strong response makes a step cheap.
+
+    Args:
+        response: vesselness.
+        passable: the tree's voxels; paths stay inside.
+        start: passable voxel (k, j, i) nearest the ostium.
+        ends: passable voxels that a path must reach, whatever its length.
+        spacing_mm: distance between voxel centres, mm.
+
+    Returns:
+        Continuous voxel indices (k, j, i), the longest path first.
+    """
+    voxels = np.argwhere(passable)
+    number = np.full(passable.shape, -1, dtype=np.int32)
+    number[passable] = np.arange(len(voxels))
+    root = int(number[tuple(start)])
+    lengths, costs = _graphs(number, voxels, response[passable])
+    _, before = dijkstra(costs, indices=root, return_predecessors=True)
+    length = dijkstra(lengths, indices=root) * spacing_mm
+    # The box around the tree, not the volume, bounds the distance transform.
+    corner, opposite = voxels.min(axis=0), voxels.max(axis=0) + 1
+    box = np.pad(passable[tuple(slice(a, b) for a, b in zip(corner, opposite, strict=True))], 1)
+    depth = np.asarray(ndimage.distance_transform_edt(box))[tuple((voxels - corner + 1).T)] * spacing_mm
+
+    left = np.isfinite(length)
+    on_path = np.zeros(len(voxels), dtype=bool)
+    pending = [int(number[tuple(end)]) for end in ends if np.isfinite(length[number[tuple(end)]])]
+    paths = []
+    while pending or left.any():
+        asked = bool(pending)
+        tip = pending.pop() if asked else int(np.where(left, length, -1.0).argmax())
+        path = _trace(before, tip, on_path)
+        if asked or not paths or length[path[-1]] - length[path[0]] >= _SHORTEST_BRANCH_MM:
+            paths.append(voxels[path])
+            on_path[path] = True
+        # What lies within the lumen around the path is told by it, and so is a bump too short to be a branch.
+        left[tip] = False
+        remaining = np.flatnonzero(left)
+        distance, nearest = KDTree(voxels[path]).query(voxels[remaining])
+        left[remaining[distance * spacing_mm <= 1.5 * depth[path][nearest] + 1.5]] = False
+    return [_smooth(path, _SMOOTHING_MM / spacing_mm) for path in sorted(paths, key=len, reverse=True)]
+
+
+def _graphs(number: np.ndarray, voxels: np.ndarray, response: np.ndarray) -> tuple[csr_matrix, csr_matrix]:
+    """Return the graphs of neighbouring voxels, weighted with the step's length and with its cost."""
+    shape = np.array(number.shape)
+    rows, columns, steps = [], [], []
+    half = [offset for offset in product((-1, 0, 1), repeat=3) if offset > (0, 0, 0)]
+    for offset in half:
+        other = voxels + np.array(offset)
+        exists = np.all((other >= 0) & (other < shape), axis=1)
+        target = np.full(len(voxels), -1)
+        target[exists] = number[tuple(other[exists].T)]
+        linked = np.flatnonzero(target >= 0)
+        rows.append(linked)
+        columns.append(target[linked])
+        steps.append(np.full(len(linked), np.linalg.norm(offset)))
+    a, b, step = np.concatenate(rows), np.concatenate(columns), np.concatenate(steps)
+    price = 1 / (_COST_FLOOR + np.clip(response, 0, 1))
+    cost = step * (price[a] + price[b]) / 2
+    size = (len(voxels), len(voxels))
+    both = (np.concatenate([a, b]), np.concatenate([b, a]))
+    return csr_matrix((np.tile(step, 2), both), shape=size), csr_matrix((np.tile(cost, 2), both), shape=size)
+
+
+def _trace(before: np.ndarray, tip: int, on_path: np.ndarray) -> Int[np.ndarray, "n"]:
+    """Return the voxels from the first one already on a path, or from the root, to the tip."""
+    path = [tip]
+    while before[path[-1]] >= 0 and not on_path[path[-1]]:
+        path.append(int(before[path[-1]]))
+    return np.array(path[::-1])
+
+
+def _smooth(path: Int[np.ndarray, "n 3"], sigma: float) -> Float[np.ndarray, "n 3"]:
+    """Smooth a path with its ends held: it is continued point-symmetrically beyond them."""
+    line = path.astype(float)
+    head, tail = 2 * line[0] - line[:0:-1], 2 * line[-1] - line[-2::-1]
+    smooth = ndimage.gaussian_filter1d(np.concatenate([head, line, tail]), sigma, axis=0)
+    return smooth[len(head) : len(head) + len(line)]
