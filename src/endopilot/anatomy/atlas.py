@@ -55,8 +55,8 @@ def synthesize(config: AtlasConfig) -> Iterator[Anatomy]:
 def synthesize_one(config: AtlasConfig, index: int) -> Anatomy:
     """Return patient `index`, made with the truth of its centerline and radii.
 
-    The random stream is keyed by (seed, index), so that a patient does not depend on the others. `provenance` holds what
-    was drawn: dominance, length, tortuosity, curvature, stenoses.
+    The random stream is keyed by (seed, index), so that a patient does not depend on the others. `provenance` holds
+    what was drawn: dominance, length, tortuosity, curvature, stenoses.
     """
     tree, truth = synthesize_tree(config, index)
     root = tree.branches[0].centerline

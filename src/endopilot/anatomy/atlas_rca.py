@@ -1,15 +1,8 @@
 """Right coronary arteries: a C around the right atrioventricular groove, drawn from published statistics.
 
-Facts and their sources:
-
-- Mean course: Dodge JT et al., "Intrathoracic spatial location of specified coronary segments on the normal human
-  heart", Circulation 1988;78:1167-80: mean spherical positions of segments R1 to R4 from the right ostium. Around the crux
-  the azimuth was averaged across ±180° and means nothing there (its spread is 64°): R3 distal and R4 proximal are
-  interpolated in azimuth; the posterior descending artery runs from the crux towards the apex.
-- Lumen diameters by dominance: Dodge JT et al., "Lumen diameter of normal human coronary arteries", Circulation
-  1992;86:232-46.
-- Length, tortuosity, curvature, diameter along the way and the branches' origins: sixteen manually segmented right
-  coronary arteries (DESIGN §4 of the project).
+Facts and their sources: the course, see `heart_reference`; lumen diameters by dominance, Dodge JT et al., "Lumen
+diameter of normal human coronary arteries", Circulation 1992;86:232-46; length, tortuosity, curvature, diameter along
+the way and the origins of branches, measured on sixteen manually segmented right coronary arteries (docs/atlas.md).
 """
 
 from __future__ import annotations
@@ -24,6 +17,7 @@ from scipy.optimize import root
 from scipy.spatial.transform import Rotation
 
 from endopilot.anatomy import atlas_shape as shape
+from endopilot.anatomy.heart_reference import BEYOND_CRUX, TO_CRUX, HeartFit, fit_heart
 from endopilot.types import VesselTree
 
 SECTION_NAMES = ("1", "2", "3", "4", "16", "conus", "SA", "RV", "AM")
@@ -35,26 +29,6 @@ CURVATURE, CURVATURE_SD = 0.061, 0.017
 DIAMETER_MM = {0.1: 4.0, 0.2: 3.8, 0.5: 3.5, 0.7: 2.7, 0.9: 2.3}
 """Lumen diameter, mm, at fractions of the way from the ostium to the farthest tip."""
 
-# From the right ostium to the crux: R1p R1m R1d R2p R2m R2d R3p R3m R3d of Dodge 1988, LPS mm.
-REFERENCE_TO_CRUX = np.array(
-    [
-        [0.0, 0.0, 0.0],
-        [-4.4, -1.5, -1.9],
-        [-14.4, -5.8, -6.9],
-        [-20.6, -9.2, -13.0],
-        [-24.7, -9.5, -21.4],
-        [-29.3, -9.5, -34.2],
-        [-31.3, -7.2, -45.9],
-        [-29.0, -3.0, -54.7],
-        [-22.9, 0.4, -59.7],
-        [-13.5, 12.5, -64.0],
-    ]
-)
-# Beyond the crux, LPS mm: along the inferior interventricular groove to the apex, or R4 and the posterolateral branch.
-_BEYOND_CRUX = {
-    "4": np.array([[-1, 6, -70], [14, -8, -72.5], [32, -25, -71], [50, -43, -66], [66, -60, -58.0]]),
-    "16": np.array([[-1, 25, -58], [7, 34, -53], [17, 39, -55], [29, 37, -64], [43, 30, -72], [58, 20, -76.0]]),
-}
 _RIGHT_SHARE, _BALANCED_SHARE = 0.88, 0.06
 """Shares of right and balanced dominance; the rest is left. Chosen within the range that the literature reports."""
 _CALIBRE = {"right": 1.025, "balanced": 0.9, "left": 0.74}
@@ -126,7 +100,8 @@ def _draw(generator: np.random.Generator, stenosis_share: float) -> tuple[Vessel
     if generator.random() < stenosis_share:
         stenosis, narrowing = _stenosis(generator, main)
         radius = radius * narrowing
-    sides = _side_branches(generator, main, radius, crux, ends_in, dominance, calibre)
+    heart = fit_heart(main, 0.5 * crux, ends_in)
+    sides = _side_branches(generator, heart, main, radius, crux, ends_in, dominance, calibre)
     section = _main_sections(main, crux, ends_in)
     tree = shape.build_tree(main, radius, section, sides, SECTION_NAMES)
     bends = shape.curvature(main)
@@ -161,29 +136,27 @@ def _main_vessel(generator: np.random.Generator, dominance: str) -> tuple[Float[
     if dominance == "left":
         # A small right coronary ends before the crux.
         length, ends_in = 112.0 + abs(generator.normal(0, 10)), "3"
-        waypoints, cut, crux_mm = REFERENCE_TO_CRUX, 0.97, np.inf
+        waypoints, cut, crux_mm = TO_CRUX, 0.97, np.inf
     else:
         # The mean makes up for the shorter left-dominant arteries.
         length = _truncated(generator, LENGTH_MM + 2.4, LENGTH_SD_MM, *LENGTH_RANGE_MM)
         ends_in = "4" if dominance == "balanced" or generator.random() < 0.6 else "16"
-        waypoints = np.concatenate([REFERENCE_TO_CRUX, _BEYOND_CRUX[ends_in]])
+        waypoints = np.concatenate([TO_CRUX, BEYOND_CRUX[ends_in]])
         # Long arteries reach farther beyond the crux rather than belong to huge hearts.
         crux_mm = 98.0 * (length / LENGTH_MM) ** 0.65 * (1 + 0.03 * generator.normal())
         cut = None
     tortuosity = _truncated(generator, TORTUOSITY, TORTUOSITY_SD, TORTUOSITY - 0.45, TORTUOSITY + 0.45)
     mean_curvature = _truncated(generator, CURVATURE, CURVATURE_SD, CURVATURE - 0.025, CURVATURE + 0.025)
     template = shape.curve_through(waypoints)
-    template_crux = float(shape.abscissa(shape.curve_through(REFERENCE_TO_CRUX))[-1])
+    template_crux = float(shape.abscissa(shape.curve_through(TO_CRUX))[-1])
     along = shape.abscissa(template)
     keep = cut * along[-1] if cut else min(template_crux * length / crux_mm, along[-1])
     template = template[along <= keep]
     wiggle = shape.Wiggle.draw(generator, 13.0, 70.0)
     turn = Rotation.from_rotvec(np.deg2rad(generator.normal(0, 7, 3)))
-    centred = REFERENCE_TO_CRUX - REFERENCE_TO_CRUX.mean(axis=0)
+    centred = TO_CRUX - TO_CRUX.mean(axis=0)
     axis = np.linalg.svd(centred)[2][2]
-    axis = axis * np.sign(
-        axis @ np.cross(REFERENCE_TO_CRUX[4] - REFERENCE_TO_CRUX[0], REFERENCE_TO_CRUX[-1] - REFERENCE_TO_CRUX[4])
-    )
+    axis = axis * np.sign(axis @ np.cross(TO_CRUX[4] - TO_CRUX[0], TO_CRUX[-1] - TO_CRUX[4]))
 
     def curve(knobs: Float[np.ndarray, "3"]) -> Float[np.ndarray, "n 3"]:
         bent = shape.bend(template, axis, float(knobs[1])) * np.exp(knobs[0])
@@ -241,6 +214,7 @@ def _main_sections(main: Float[np.ndarray, "n 3"], crux: int, ends_in: str) -> l
 
 def _side_branches(
     generator: np.random.Generator,
+    heart: HeartFit,
     main: Float[np.ndarray, "n 3"],
     radius: Float[np.ndarray, "n"],
     crux: int,
@@ -268,7 +242,7 @@ def _side_branches(
     sides: list[shape.SideBranch] = []
     for name, origin, length, diameter, courses in wanted:
         for _ in range(12):
-            side = _side_branch(generator, main, radius, name, origin, length, diameter, courses)
+            side = _side_branch(generator, heart, main, radius, name, origin, length, diameter, courses)
             if not shape.lumens_collide(main, radius, [*sides, side]):
                 sides.append(side)
                 break
@@ -288,6 +262,7 @@ def _free_origin(generator: np.random.Generator, origin_mm: tuple[float, float],
 
 def _side_branch(
     generator: np.random.Generator,
+    heart: HeartFit,
     main: Float[np.ndarray, "n 3"],
     radius: Float[np.ndarray, "n"],
     name: str,
@@ -302,8 +277,8 @@ def _side_branch(
     across = headed[0][1] - (headed[0][1] @ forward) * forward
     angle = np.deg2rad(generator.uniform(40, 70))
     direction = np.cos(angle) * forward + np.sin(angle) * across / np.linalg.norm(across)
-    points = shape.steer(main[origin], direction, headed, length, generator.uniform(7.0, 11.0))
-    points = shape.Wiggle.draw(generator, 13.0, 45.0, 6).apply(points, generator.uniform(0.4, 1.2), 10.0)
+    points = shape.steer(main[origin], direction, headed, length, generator.uniform(6.0, 9.0), heart.solid_depth)
+    points = shape.Wiggle.draw(generator, 13.0, 45.0, 6).apply(points, generator.uniform(0.3, 0.8), 10.0)
     points = shape.curve_through(points[:: max(len(points) // 24, 1)])
     points = np.concatenate([main[origin][None], points[1:]])
     share = np.linspace(0.0, 1.0, len(points))

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from endopilot.types import Branch, Centerline, VesselTree
@@ -18,6 +18,10 @@ STEP_MM = 0.5
 
 _CLEARANCE_MM = 0.6
 """Tissue between two lumens that do not belong together, mm: two walls."""
+
+
+_HEIGHT_MM = 3.0
+"""Side branches run this far above the surface that they follow, mm: in epicardial fat."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,8 +137,9 @@ def steer(
     courses: Sequence[tuple[float, Float[np.ndarray, "3"]]],
     length_mm: float,
     relaxation_mm: float,
+    depth: Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n"]],
 ) -> Float[np.ndarray, "n 3"]:
-    """Return a smooth curve that leaves `start` along `direction` and turns towards one course after another.
+    """Return a smooth curve that leaves `start` along `direction` and follows one course after another on a surface.
 
     Args:
         start: first point, LPS mm.
@@ -142,14 +147,21 @@ def steer(
         courses: (abscissa from which it holds, mm; unit direction), in order.
         length_mm: length of the curve.
         relaxation_mm: way over which the direction approaches the course by a factor e.
+        depth: how deep points lie below the surface, mm; the curve seeks a height of `_HEIGHT_MM` above it.
     """
     count = max(round(length_mm / STEP_MM), 8)
     heading, aim = direction, direction
     points = [start]
+    probes = np.concatenate([np.zeros((1, 3)), np.eye(3)])
     for i in range(count):
         course = [vector for begin, vector in courses if i * STEP_MM >= begin][-1]
+        below = depth(points[-1] + 3.0 * heading + probes)
+        outward = below[0] - below[1:]
+        outward = outward / max(float(np.linalg.norm(outward)), 1e-6)
+        rise = np.clip((below[0] + _HEIGHT_MM) / 4.0, -0.6, 1.2)
+        course = course - min(float(course @ outward), 0.0) * outward + rise * outward
         # Two relaxations in a row keep the curvature continuous where the course changes.
-        aim = aim + (course - aim) * (2 * STEP_MM / relaxation_mm)
+        aim = aim + (course / np.linalg.norm(course) - aim) * (2 * STEP_MM / relaxation_mm)
         heading = heading + (aim - heading) * (2 * STEP_MM / relaxation_mm)
         heading = heading / np.linalg.norm(heading)
         points.append(points[-1] + STEP_MM * heading)
@@ -227,7 +239,7 @@ def lumens_collide(main: Float[np.ndarray, "n 3"], radius: Float[np.ndarray, "n"
     main_place = np.concatenate([np.arange(len(main)), *(np.full(len(s.points), s.origin) for s in sides)]) * STEP_MM
     side_place = np.concatenate([np.zeros(len(main)), *(abscissa(s.points) for s in sides)])
     owner = np.repeat(np.arange(len(sides) + 1), [len(main), *(len(s.points) for s in sides)])
-    near = cKDTree(points).query_pairs(2 * radii.max() + _CLEARANCE_MM, output_type="ndarray")
+    near = KDTree(points).query_pairs(2 * radii.max() + _CLEARANCE_MM, output_type="ndarray")
     a, b = near[:, 0], near[:, 1]
     way = np.where(
         owner[a] == owner[b],

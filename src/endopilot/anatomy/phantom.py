@@ -14,7 +14,8 @@ from jaxtyping import Float, Float32, Int
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import KDTree
 
-from endopilot.anatomy import phantom_heart as heart
+from endopilot.anatomy import phantom_heart as chest
+from endopilot.anatomy.heart_reference import HeartFit
 from endopilot.errors import InputError
 from endopilot.types import Anatomy, Centerline, Volume
 
@@ -95,16 +96,16 @@ def make_phantom(anatomy: Anatomy, config: PhantomConfig, seed: int) -> Volume:
         int16 voxels along the LPS axes.
     """
     generator = np.random.Generator(np.random.Philox(key=np.array([seed, 0x7068616E], dtype=np.uint64)))
-    placement = heart.place(anatomy.tree)
+    heart = chest.place(anatomy.tree)
     grid = _field_of_view(anatomy, config)
     lumen_hu, noise_hu, psf_mm = (
         generator.uniform(*span) for span in (config.lumen_hu, config.noise_hu, config.psf_mm)
     )
     tissue = _tissue_hu(generator, lumen_hu)
-    coronaries = [branch.centerline for branch in anatomy.tree.branches] + list(heart.left_coronary(placement))
+    coronaries = [branch.centerline for branch in anatomy.tree.branches] + list(chest.left_coronary(heart))
     lumen = _small_vessels(grid, coronaries)
-    veins = _small_vessels(grid, heart.cardiac_veins(placement, anatomy.tree))
-    coarse, organs = _organs(grid, placement, coronaries, generator)
+    veins = _small_vessels(grid, chest.cardiac_veins(heart, anatomy.tree))
+    coarse, organs = _organs(grid, heart, coronaries, generator)
     painter = _Painter(grid, coarse, config)
     image = _render(grid, painter, organs, lumen, veins, tissue)
     for plaque in _plaques(grid, anatomy, generator, config.calcium):
@@ -123,14 +124,14 @@ def _field_of_view(anatomy: Anatomy, config: PhantomConfig) -> _Grid:
     points = np.concatenate([branch.centerline.points for branch in anatomy.tree.branches])
     low, high = points.min(axis=0) - config.margin_mm, points.max(axis=0) + config.margin_mm
     high[2] = max(high[2], anatomy.insertion.position[2] + 2 * config.margin_mm)
-    high[:2] = np.maximum(high[:2], anatomy.insertion.position[:2] + (44.0, 36.0))
+    high[:2] = np.maximum(high[:2], anatomy.insertion.position[:2] + np.array([44.0, 36.0]))
     steps = (config.in_plane_mm, config.in_plane_mm, config.slice_mm)
     axes = [np.arange(a, b, step) for a, b, step in zip(low, high, steps, strict=True)]
     return _Grid(*axes)
 
 
 def _tissue_hu(generator: np.random.Generator, lumen_hu: float) -> dict[str, float]:
-    """Draw the CT numbers of one scan, HU (DESIGN §4 of the project for those of arteries, muscle, fat, lung, plaque)."""
+    """Draw the CT numbers of one scan, HU (see docs/atlas.md for their ranges)."""
     right = generator.uniform(0.35, 0.8)
     return {
         "lung": generator.uniform(-830, -780),
@@ -236,8 +237,8 @@ def _window(
 
 
 def _organs(
-    grid: _Grid, placement: heart.Placement, coronaries: Sequence[Centerline], generator: np.random.Generator
-) -> tuple[_Grid, tuple[heart.Organ, ...]]:
+    grid: _Grid, heart: HeartFit, coronaries: Sequence[Centerline], generator: np.random.Generator
+) -> tuple[_Grid, tuple[chest.Organ, ...]]:
     """Return the coarse grid and the organs on it; fat wraps the coronaries too."""
     axes = (np.arange(axis[0] - _COARSE_MM, axis[-1] + 2 * _COARSE_MM, _COARSE_MM) for axis in (grid.x, grid.y, grid.z))
     coarse = _Grid(*axes)
@@ -245,7 +246,7 @@ def _organs(
     positions = np.stack([x, y, z], axis=-1).astype(np.float32)
     vessels = KDTree(np.concatenate([line.points[::2] for line in coronaries]))
     distance, _ = vessels.query(positions, distance_upper_bound=2 * _FAT_MM)
-    return coarse, heart.organs(placement, positions, _FAT_MM - np.minimum(distance, 2 * _FAT_MM), generator)
+    return coarse, chest.organs(heart, positions, _FAT_MM - np.minimum(distance, 2 * _FAT_MM), generator)
 
 
 class _Painter:
@@ -301,6 +302,12 @@ def _lerp(values: np.ndarray, left: np.ndarray, share: np.ndarray, axis: int) ->
     return high
 
 
+def _smooth_min(a: np.ndarray, b: np.ndarray, width_mm: float = 2.5) -> np.ndarray:
+    """Return the smaller of two depths with the edge between them rounded (polynomial smooth minimum)."""
+    share = np.clip((b - a) * np.float32(0.5 / width_mm) + np.float32(0.5), 0, 1)
+    return b + (a - b) * share - np.float32(width_mm) * share * (1 - share)
+
+
 def _covered(left: Int[np.ndarray, "n"], coarse: Int[np.ndarray, "m"]) -> slice:
     """Return the fine indices between the outermost of the coarse ones."""
     return slice(*np.searchsorted(left, (coarse.min() - 1, coarse.max() + 1)))
@@ -309,7 +316,7 @@ def _covered(left: Int[np.ndarray, "n"], coarse: Int[np.ndarray, "m"]) -> slice:
 def _render(
     grid: _Grid,
     painter: _Painter,
-    organs: Sequence[heart.Organ],
+    organs: Sequence[chest.Organ],
     lumen: Float32[np.ndarray, "nz ny nx"],
     veins: Float32[np.ndarray, "nz ny nx"],
     tissue: dict[str, float],
@@ -329,7 +336,7 @@ def _render(
                 continue
             fine, (box_y, box_x) = found
             if organ.clearance_mm is not None:
-                np.minimum(fine, -vessel[:, box_y, box_x] - np.float32(organ.clearance_mm), out=fine)
+                fine = _smooth_min(fine, -vessel[:, box_y, box_x] - np.float32(organ.clearance_mm))
             painter.paint(slab[:, box_y, box_x], fine, tissue[organ.name])
         painter.paint(slab, vessel, tissue["lumen"])
     return image
