@@ -48,6 +48,9 @@ OUTFLOW = [(8, -28, -30), (16, -29, -12), (24, -27, 4)]
 PULMONARY = [(24, -27, 4), (32, -19, 22), (36, 0, 36)]
 PULMONARY_RADIUS = (12.0, 13.0, 12.0)
 
+Numbers = Sequence[float | int]
+"""Coordinates or sizes, mm."""
+
 _WARP_WIDTH_MM = 22.0
 _GRID_MM = 2.0
 _GRID_LOW, _GRID_HIGH = np.array([-70.0, -110.0, -110.0]), np.array([110.0, 90.0, 70.0])
@@ -76,9 +79,15 @@ class HeartFit:
     def to_reference(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Return the reference position of the patient's points, mm."""
         aligned = (points - self.origin) @ self.rotation / self.scale
+        # The ostium stays at the origin, on the aorta's surface: the warp fades out around it.
+        fade = np.exp((aligned**2).sum(axis=1, keepdims=True) * (-0.5 / _WARP_WIDTH_MM**2))
+        return aligned + self._warp(aligned) - fade * self._warp(np.zeros((1, 3)))
+
+    def _warp(self, aligned: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Return the mean of the knots' shifts, weighted by nearness; it vanishes far from the artery."""
         square = (aligned**2).sum(axis=1)[:, None] + (self.knots**2).sum(axis=1) - 2 * aligned @ self.knots.T
         weight = np.exp(square * (-0.5 / _WARP_WIDTH_MM**2))
-        return aligned + weight @ self.shifts / (weight.sum(axis=1, keepdims=True) + 0.3)
+        return weight @ self.shifts / (weight.sum(axis=1, keepdims=True) + 0.3)
 
     def from_reference(self, reference: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Return the patient's position of reference points, mm (fixed-point inverse of `to_reference`)."""
@@ -121,7 +130,7 @@ def fit_heart(main: Float[np.ndarray, "n 3"], crux_mm: float, last_section: str)
 
 
 def ellipsoid(
-    x: Float[np.ndarray, "*n 3"], centre: Sequence[float], semi_axes: Sequence[float], long_axis: Sequence[float]
+    x: Float[np.ndarray, "*n 3"], centre: Numbers, semi_axes: Numbers, long_axis: Numbers
 ) -> Float[np.ndarray, "*n"]:
     """Signed distance to an ellipsoid whose first axis is `long_axis`, exact to first order at the surface."""
     turn = Rotation.align_vectors([[1.0, 0.0, 0.0]], [np.array(long_axis) / np.linalg.norm(long_axis)])[0]
@@ -132,9 +141,7 @@ def ellipsoid(
     return level * (1 - level) / np.maximum(slope, 1e-6)
 
 
-def tube(
-    x: Float[np.ndarray, "*n 3"], waypoints: Sequence[Sequence[float]], radius: Sequence[float]
-) -> Float[np.ndarray, "*n"]:
+def tube(x: Float[np.ndarray, "*n 3"], waypoints: Sequence[Numbers], radius: Numbers) -> Float[np.ndarray, "*n"]:
     """Signed distance to a tube through the waypoints, with its radius at each."""
     line, r = np.array(waypoints, dtype=x.dtype), np.array(radius, dtype=x.dtype)
     square = np.einsum("...i,...i", x, x)
