@@ -11,7 +11,7 @@ import hashlib
 import json
 import os
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,13 +22,14 @@ from jaxtyping import Float, Shaped
 from endopilot import __version__
 from endopilot.anatomy.io import read_anatomy
 from endopilot.dataset import schema
+from endopilot.dataset.navigate import navigate
 from endopilot.dataset.splits import assign_splits
 from endopilot.errors import InputError
 from endopilot.files import json_text, manifest, read_json, write_json, writing
 from endopilot.progress import progress
 from endopilot.simulation.controls import ControlConfig, random_controls
 from endopilot.simulation.device import Device
-from endopilot.simulation.simulator import SimulatorConfig, simulate
+from endopilot.simulation.simulator import SimulatorConfig
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, Rollout
 
 FORMAT_VERSION = 1
@@ -214,10 +215,10 @@ def _write_block(plan: _Plan, block: _Block, anatomy: Anatomy) -> None:
     """Simulate one block and write its episodes, then its samples: the sample file says that both are whole."""
     config, sequences = plan.config, block.sequences
     initial, control, friction = _drives(plan, anatomy, sequences)
-    rollout = simulate(anatomy, plan.device, control, initial=initial, config=config.simulator, friction=friction)
+    rollout, stopped = navigate(anatomy, plan.device, initial, control, friction, config.simulator)
     first_episode = block.anatomy * config.sequences + sequences.start
     data_path, episodes_path = schema.paths_of_file(plan.output, block.number)
-    episodes = _episodes(plan, block, rollout, first_episode, friction)
+    episodes = _episodes(plan, block, rollout, first_episode, friction) | {"stopped_short": stopped}
     for path, table in (
         (episodes_path, schema.episode_table(episodes, plan.key)),
         (data_path, schema.sample_table(rollout, first_episode, plan.key)),
@@ -244,14 +245,13 @@ def _drives(
         friction = np.full(config.sequences, plan.device.friction)
     else:
         friction = np.random.Generator(np.random.Philox(friction_seed)).uniform(*config.friction, config.sequences)
-    # The disk keeps controls as float32: simulating the rounded ones makes every episode repeatable from the disk.
     chosen = slice(sequences.start, sequences.stop)
-    return initial[chosen], control[chosen].astype(np.float32).astype(np.float64), friction[chosen]
+    return initial[chosen], control[chosen], friction[chosen]
 
 
 def _episodes(
     plan: _Plan, block: _Block, rollout: Rollout, first_episode: int, friction: Float[np.ndarray, "n"]
-) -> Mapping[str, Any]:
+) -> dict[str, Any]:
     """Return the columns of the episode table; the first seven and the last two are LeRobot's."""
     n, samples = rollout.valid.shape
     episode = first_episode + np.arange(n)
@@ -281,13 +281,10 @@ def _episodes(
 
 def _reasons(rollout: Rollout) -> list[str]:
     """Return why each world is invalid, "" for the valid ones."""
-    finite = np.isfinite(rollout.tip_position).all(axis=(1, 2)) & np.isfinite(rollout.contact_force_sum).all(axis=1)
     first = np.argmin(rollout.valid, axis=1)
     return [
-        ""
-        if valid
-        else f"{'did not converge' if is_finite else 'left the finite numbers'} at {(t + 1) * SAMPLE_PERIOD_S:g} s"
-        for valid, is_finite, t in zip(rollout.valid.all(axis=1), finite, first, strict=True)
+        "" if valid else f"the simulation did not converge or left the finite numbers after {t * SAMPLE_PERIOD_S:g} s"
+        for valid, t in zip(rollout.valid.all(axis=1), first, strict=True)
     ]
 
 
@@ -317,6 +314,7 @@ def _finish(plan: _Plan, blocks: Sequence[_Block], wall_seconds: float) -> None:
         device=asdict(plan.device),
         anatomies=[_anatomy_record(plan, i) for i in range(len(plan.names))],
         splits=episodes["split"].value_counts().to_dict(),
+        stopped_short=int(episodes["stopped_short"].sum()),
         invalid={
             "episodes": len(invalid),
             "which": invalid[["episode_index", "anatomy", "sequence", "invalid_reason"]].to_dict("records"),
