@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from endopilot.anatomy.surface import Surface, surface_from_mask
 from endopilot.errors import InputError
@@ -24,6 +24,9 @@ MAXIMUM_GRID_POINTS = 30_000_000
 
 FILLET = 0.5
 """Strength of the fillet where a branch leaves its parent, in radii of the branch."""
+
+_NEAR_WALL = 2
+"""Outside the lumen, this many grid steps are computed exactly, the rest of the band on every second grid point."""
 
 Grid = tuple[tuple[int, int, int], Float[np.ndarray, "3"]]
 """Shape (nz, ny, nx) and LPS origin of a distance map."""
@@ -81,16 +84,45 @@ def distance_map_from_surface(surface: Surface, *, spacing_mm: float, band_mm: f
     """
     from scipy.ndimage import maximum_filter
 
-    surface = surface.refined(1.5 * spacing_mm)
     lower = surface.vertices.min(axis=0) - band_mm
     shape, origin = _grid(lower, surface.vertices.max(axis=0) + band_mm, spacing_mm)
     inside = surface.inside(shape, origin, spacing_mm)
-    near = maximum_filter(inside, size=2 * math.ceil(band_mm / spacing_mm) + 1)
-    index = np.argwhere(near)
-    distance = surface.distance(origin + spacing_mm * index[:, ::-1])
+    surface = surface.refined(1.5 * spacing_mm)
     values = np.full(shape, -band_mm, dtype=np.float32)
-    values[near] = np.where(inside[near], distance, np.maximum(-distance, -band_mm))
+    coarse = np.argwhere(maximum_filter(inside, size=2 * (math.ceil(band_mm / spacing_mm) + 2) + 1)[::2, ::2, ::2])
+    if len(coarse):
+        _fill_far_field(values, surface, origin, spacing_mm, coarse, band_mm)
+    near = maximum_filter(inside, size=2 * _NEAR_WALL + 1) & ~inside
+    index = np.argwhere(near)
+    values[near] = -surface.distance(origin + spacing_mm * index[:, ::-1], limit_mm=band_mm)
+    index = np.argwhere(inside)
+    values[inside] = surface.distance(origin + spacing_mm * index[:, ::-1])
     return DistanceMap(values=values, spacing_mm=float(spacing_mm), origin_mm=origin)
+
+
+def _fill_far_field(
+    values: Float[np.ndarray, "nz ny nx"],
+    surface: Surface,
+    origin: Float[np.ndarray, "3"],
+    spacing: float,
+    coarse: Int[np.ndarray, "n 3"],
+    band: float,
+) -> None:
+    """Fill the map with outside distances from every second grid point, linear between them.
+
+    Away from the wall the distance is so smooth that this errs by at most h²/2(R + d); the rest is overwritten.
+    """
+    distance = -surface.distance(origin + 2 * spacing * coarse[:, ::-1], limit_mm=band)
+    half = np.full(tuple((np.array(values.shape) + 1) // 2 + 1), -band, dtype=np.float32)
+    half[tuple(coarse.T)] = distance
+    for offset in np.ndindex(2, 2, 2):
+        pieces = [half]
+        for axis, odd in enumerate(offset):
+            if odd:
+                after = [np.roll(piece, -1, axis=axis) for piece in pieces]
+                pieces = [0.5 * (piece + following) for piece, following in zip(pieces, after, strict=True)]
+        target = values[offset[0] :: 2, offset[1] :: 2, offset[2] :: 2]
+        target[...] = pieces[0][: target.shape[0], : target.shape[1], : target.shape[2]]
 
 
 def distance_map_from_mask(mask: Volume, *, spacing_mm: float | None = None, band_mm: float = BAND_MM) -> DistanceMap:

@@ -54,21 +54,23 @@ class Surface:
     def distance(self, points: Float[np.ndarray, "n 3"], *, limit_mm: float = np.inf) -> Float[np.ndarray, "n"]:
         """Return the unsigned distance in mm from points to the wall, `limit_mm` where it is at least that.
 
-        The distance is exact to the nearest few triangles, found by their centroids; the triangles must therefore be
-        about as small as the details that matter (see `refined`).
+        The triangles are found by their centroids: the nearest four for points close to the wall, the nearest one
+        alone for points so far that its neighbours cannot matter. They must therefore be about as small as the
+        details that matter (see `refined`).
         """
-        count = min(_NEAREST_TRIANGLES, len(self.faces))
         result = np.full(len(points), limit_mm)
+        reach = limit_mm + self.longest_edge
         for start in range(0, len(points), 200_000):
-            part = slice(start, start + 200_000)
-            reach = limit_mm + self.longest_edge if np.isfinite(limit_mm) else np.inf
-            gap, nearest = self._centroids.query(points[part], k=range(1, count + 1), distance_upper_bound=reach)
-            found = np.flatnonzero(np.isfinite(gap[:, 0]))
-            if len(found) == 0:
-                continue
-            index = np.where(np.isfinite(gap[found]), nearest[found], nearest[found, :1])
-            squares = _square_distance(points[part][found], self._corners, index)
-            result[part][found] = np.minimum(np.sqrt(squares.min(axis=1)), limit_mm)
+            part = np.ascontiguousarray(points[start : start + 200_000])
+            gap, nearest = self._centroids.query(part, distance_upper_bound=reach)
+            gap, nearest = np.asarray(gap), np.asarray(nearest)
+            near = np.flatnonzero(gap < 3.0 * self.longest_edge)
+            far = np.flatnonzero((gap >= 3.0 * self.longest_edge) & np.isfinite(gap))
+            count = min(_NEAREST_TRIANGLES, len(self.faces))
+            candidates = self._centroids.query(part[near], k=[*range(1, count + 1)])[1]  # pyright: ignore[reportArgumentType]
+            for rows, index in ((near, np.asarray(candidates)), (far, nearest[far, None])):
+                squares = _square_distance(part[rows], self._corners, index)
+                result[start + rows] = np.minimum(np.sqrt(squares.min(axis=1)), limit_mm)
         return result
 
     @cached_property

@@ -1,0 +1,237 @@
+"""★ From a vessel mask, a surface or centerlines to an `Anatomy` that a wire can be simulated in."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from endopilot import __version__
+from endopilot.anatomy import centerline, polylines, repair
+from endopilot.anatomy.distance import (
+    MAXIMUM_GRID_POINTS,
+    add_catheter,
+    automatic_spacing,
+    distance_map_from_spheres,
+    distance_map_from_surface,
+)
+from endopilot.anatomy.labels import label_tree
+from endopilot.anatomy.sources import AnatomySource, Polylines, read_source, transformed
+from endopilot.anatomy.surface import Surface, surface_from_mask
+from endopilot.anatomy.tree import tree_from_lines
+from endopilot.errors import InputError
+from endopilot.progress import progress
+from endopilot.types import Anatomy, DistanceMap, Insertion, LumenMask, VesselTree
+
+__all__ = ["AnatomyConfig", "extract_anatomy", "read_source"]
+
+SMALLEST_MEAN_RADIUS_MM, LARGEST_MEAN_RADIUS_MM = 0.25, 40.0
+"""Vessels that a guidewire enters have mean radii between these; others speak for a wrong unit."""
+
+SHORTEST_IN_DIAMETERS = 1.5
+"""A lumen whose longest path is shorter than this many of its own mean diameters is no vessel."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AnatomyConfig:
+    """How an anatomy is made."""
+
+    vessel: Literal["rca", "lca", "generic"] = "generic"
+    """Section names: AHA/SCCT segments of the right or left coronary artery, or generation and branch order."""
+    ostium_mm: tuple[float, float, float] | None = None
+    """Where the device enters, LPS mm; by default the mask's own ostium, or else the widest open end."""
+    catheter_radius_mm: float | None = None
+    """Inner radius of the guiding catheter, mm; by default the lumen's radius at the ostium."""
+    spacing_mm: float | None = None
+    """Grid spacing of the distance map, mm; by default 0.4 times the narrow vessels' radius, from 0.25 to 1.5 mm."""
+    minimum_branch_length_mm: float = 4.0
+    """Side branches shorter than this beyond their parent's lumen are dropped, mm."""
+    scale: float = 1.0
+    """Factor that turns the file's unit into mm: 10 for cm, 1000 for m."""
+    coordinates: Literal["lps", "ras"] = "lps"
+    """Axes of a surface or VTP file, which cannot say itself; masks and Slicer markups do, and ignore this."""
+
+    def __post_init__(self) -> None:
+        for name in ("catheter_radius_mm", "spacing_mm", "minimum_branch_length_mm", "scale"):
+            value = getattr(self, name)
+            if value is not None and not (np.isfinite(value) and value > 0):
+                raise InputError(f"{name}={value}: must be a positive number")
+        if self.ostium_mm is not None and not np.isfinite(self.ostium_mm).all():
+            raise InputError(f"ostium_mm={self.ostium_mm}: must be three finite numbers, LPS mm")
+        if self.vessel not in ("rca", "lca", "generic"):
+            raise InputError(f"vessel={self.vessel!r}: must be rca, lca or generic")
+        if self.coordinates not in ("lps", "ras"):
+            raise InputError(f"coordinates={self.coordinates!r}: must be lps or ras")
+
+
+def extract_anatomy(
+    source: AnatomySource | LumenMask | Surface | Polylines | VesselTree,
+    *,
+    name: str,
+    config: AnatomyConfig = AnatomyConfig(),
+) -> Anatomy:
+    """Make an anatomy: centerline tree with section labels, distance map with guiding catheter, insertion.
+
+    Args:
+        source: what `read_source` returned, or its content alone.
+        name: short name of the patient.
+        config: how to make it.
+
+    Raises:
+        InputError: the source is empty, is no vessel, is not where the ostium is, or cannot be closed.
+    """
+    wrapped = source if isinstance(source, AnatomySource) else AnatomySource(source)
+    wrapped = transformed(wrapped, scale=config.scale, coordinates=config.coordinates)
+    content, notes = wrapped.content, []
+    given = content.ostium if isinstance(content, LumenMask) else None
+    if config.ostium_mm is not None:
+        given = Insertion(np.array(config.ostium_mm, dtype=float), np.zeros(3))
+    label = wrapped.file or name
+    with progress(f"anatomy {name}", 4) as advance:
+        if isinstance(content, (Polylines, VesselTree)):
+            tree, rule = polylines.tree_from_polylines(content, given, label)
+            advance(2)
+            distance_map = distance_map_from_spheres(tree, spacing_mm=config.spacing_mm)
+        else:
+            if isinstance(content, LumenMask):
+                mask, remarks = repair.connected_mask(content.volume, given, label)
+                surface, finest = surface_from_mask(mask), float(mask.spacing_mm.min())
+            else:
+                surface, remarks = repair.closed_surface(content, given, label)
+                finest = 0.0
+            notes += remarks
+            advance()
+            tree, rule = _tree(surface, finest, given, config, label)
+            advance()
+            distance_map = _final_map(surface, tree, config)
+        advance()
+        tree = label_tree(tree, config.vessel)
+        insertion = _insertion(tree, given)
+        radius = config.catheter_radius_mm or float(np.median(tree.branches[0].centerline.radius[:3]))
+        distance_map = add_catheter(distance_map, insertion, radius)
+        advance()
+    provenance = {
+        "endopilot": __version__,
+        "source": {"file": wrapped.file, "sha256": wrapped.sha256, "kind": type(content).__name__},
+        "config": asdict(config),
+        "ostium_rule": rule,
+        "notes": notes,
+    }
+    return Anatomy(name, tree, distance_map, insertion, radius, provenance)
+
+
+def _tree(
+    surface: Surface, finest_mm: float, given: Insertion | None, config: AnatomyConfig, label: str
+) -> tuple[VesselTree, str]:
+    """Return the centerline tree inside a closed wall, and the rule by which its root was chosen."""
+    mean_radius = 2.0 * surface.volume / surface.area
+    if not SMALLEST_MEAN_RADIUS_MM <= mean_radius <= LARGEST_MEAN_RADIUS_MM:
+        raise InputError(
+            f"{label}: the lumen's mean radius is {mean_radius:.3g} mm, which no vessel has; "
+            "if the file is in m or cm, use --scale 1000 or --scale 10"
+        )
+    extent = np.ptp(surface.vertices, axis=0)
+    spacing = max(mean_radius / 5.0, 0.5 * finest_mm, float(np.prod(extent + 2) / MAXIMUM_GRID_POINTS) ** (1 / 3))
+    distance_map = distance_map_from_surface(surface, spacing_mm=spacing, band_mm=2 * spacing)
+    surface = surface.refined(1.5 * spacing)
+    inside = _component(distance_map, given)
+    points = distance_map.origin_mm + spacing * np.argwhere(inside)[:, ::-1]
+    clearance = distance_map.values[inside].astype(float)
+    if len(points) < 20:
+        raise InputError(f"{label}: the lumen is too small to follow ({len(points)} grid points); check the unit")
+    if given is None:
+        root, rule = _widest_open_end(distance_map, points, clearance, config), "widest open end"
+    else:
+        points, clearance = _in_front(points, clearance, given)
+        root = int(np.linalg.norm(points - given.position, axis=1).argmin())
+        rule = "given" if config.ostium_mm is not None else "segmentation"
+    graph = centerline.lumen_graph(points, clearance, spacing, root)
+    paths = centerline.trace_branches(graph, minimum_length_mm=config.minimum_branch_length_mm)
+    middle = float(np.median(graph.clearance[np.concatenate(paths)]))
+    step = float(np.clip(0.3 * middle, 0.25, 2.0))
+    lines = centerline.refined_lines(surface, distance_map, graph, paths, step)
+    tree = tree_from_lines(lines)
+    longest = tree.longest_path()
+    if longest.abscissa[-1] < SHORTEST_IN_DIAMETERS * 2 * float(longest.radius.mean()):
+        raise InputError(
+            f"{label}: is no vessel: its longest path of {longest.abscissa[-1]:.1f} mm is not much more than its width "
+            f"of {2 * longest.radius.mean():.1f} mm; check the label or the segmentation"
+        )
+    return tree, rule
+
+
+def _component(distance_map: DistanceMap, given: Insertion | None) -> Bool[np.ndarray, "nz ny nx"]:
+    """Return the connected inside at the ostium, or the largest one."""
+    from scipy.ndimage import label
+
+    labels, count = label(distance_map.values > 0, structure=np.ones((3, 3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
+    if count <= 1 or given is None:
+        sizes = np.bincount(labels.ravel())
+        sizes[0] = 0
+        return labels == sizes.argmax()
+    index = np.argwhere(labels > 0)
+    points = distance_map.origin_mm + distance_map.spacing_mm * index[:, ::-1]
+    nearest = index[np.linalg.norm(points - given.position, axis=1).argmin()]
+    return labels == labels[tuple(nearest)]
+
+
+def _in_front(
+    points: Float[np.ndarray, "n 3"], clearance: Float[np.ndarray, "n"], given: Insertion
+) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m"]]:
+    """Leave out what lies just behind a given ostium, so that the tree grows in the catheter's direction only."""
+    relative = points - given.position
+    distance = np.linalg.norm(relative, axis=1)
+    reach = 2.0 * max(float(clearance[distance.argmin()]), float(clearance[distance < 3.0].max(initial=0.0)))
+    keep = (distance > reach) | (relative @ given.direction >= 0)
+    return (points[keep], clearance[keep]) if keep.sum() > 20 else (points, clearance)
+
+
+def _widest_open_end(
+    distance_map: DistanceMap,
+    points: Float[np.ndarray, "n 3"],
+    clearance: Float[np.ndarray, "n"],
+    config: AnatomyConfig,
+) -> int:
+    """Return the grid point at the end that looks most like the inlet: wide, cut open, for coronaries high up."""
+    spacing = distance_map.spacing_mm
+    graph = centerline.lumen_graph(points, clearance, spacing, int(clearance.argmax()))
+    first = int(graph.length.argmax())
+    graph = centerline.lumen_graph(graph.points, graph.clearance, spacing, first)
+    paths = centerline.trace_branches(graph, minimum_length_mm=config.minimum_branch_length_mm)
+    ends = [*paths, paths[0][::-1]]
+    tips = np.array([graph.points[path[-1]] for path in ends])
+    score = np.array([centerline.end_score(distance_map, graph, path) for path in ends])
+    if config.vessel != "generic":  # the coronary ostia lie at the top of their trees
+        score *= 0.5 + (tips[:, 2] - tips[:, 2].min()) / max(float(np.ptp(tips[:, 2])), 1.0)
+    return int(np.linalg.norm(points - tips[score.argmax()], axis=1).argmin())
+
+
+def _final_map(surface: Surface, tree: VesselTree, config: AnatomyConfig) -> DistanceMap:
+    """Return the distance map at its final spacing, without lumens that the tree does not reach."""
+    from scipy.ndimage import label
+
+    radius = np.concatenate([branch.centerline.radius for branch in tree.branches])
+    points = np.concatenate([branch.centerline.points for branch in tree.branches])
+    spacing = config.spacing_mm or automatic_spacing(radius, np.ptp(surface.vertices, axis=0) + 5.0)
+    result = distance_map_from_surface(surface, spacing_mm=spacing)
+    labels, count = label(result.values > 0, structure=np.ones((3, 3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
+    if count > 1:
+        index = np.rint((points - result.origin_mm) / spacing).astype(int)[:, ::-1]
+        index = np.clip(index, 0, np.array(result.values.shape) - 1)
+        reached = np.unique(labels[tuple(index.T)])
+        foreign = (labels > 0) & ~np.isin(labels, reached)
+        result.values[foreign] = result.values.min()
+    return result
+
+
+def _insertion(tree: VesselTree, given: Insertion | None) -> Insertion:
+    """Return the ostium at the tree's start, with the given direction if it agrees with the vessel's."""
+    line = tree.branches[0].centerline
+    reach = min(len(line.points) - 1, max(2, int(np.searchsorted(line.abscissa, line.radius[0]))))
+    direction = line.points[reach] - line.points[0]
+    direction /= np.linalg.norm(direction)
+    if given is not None and float(given.direction @ direction) > 0.5:
+        direction = given.direction / np.linalg.norm(given.direction)
+    return Insertion(position=line.points[0].copy(), direction=direction)

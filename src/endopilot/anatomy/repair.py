@@ -1,0 +1,216 @@
+"""Mending what masks and surfaces of other origins come with: blobs, gaps, cavities, holes, inverted normals.
+
+Every repair returns remarks, which `extract_anatomy` writes into the provenance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Bool
+from scipy.spatial import KDTree
+
+from endopilot.anatomy.surface import Surface, surface_from_mask
+from endopilot.errors import InputError
+from endopilot.types import Insertion, Volume
+
+NEAR_OSTIUM_MM = 5.0
+"""A lumen farther than this from a given ostium does not belong to it."""
+
+LARGEST_GAP_VOXELS = 4.0
+"""Pieces of a mask that are this near each other are taken for one interrupted vessel."""
+
+SMALLEST_PIECE = 30
+"""A piece of fewer voxels is noise."""
+
+
+def connected_mask(mask: Volume, given: Insertion | None, label: str) -> tuple[Volume, list[str]]:
+    """Return the one lumen at the ostium, or the largest: gaps of a few voxels bridged, cavities filled, blobs gone.
+
+    Raises:
+        InputError: the mask is empty, a solid block, noise, or touches nothing near the given ostium.
+    """
+    from scipy.ndimage import binary_fill_holes
+    from scipy.ndimage import label as components
+
+    filled = np.nonzero(mask.voxels)
+    if len(filled[0]) == 0:
+        raise InputError(f"{label}: the mask is empty; check the label or segment again")
+    corner = np.array([index.min() for index in filled])
+    box = tuple(slice(low, index.max() + 1) for low, index in zip(corner, filled, strict=True))
+    voxels = np.asarray(mask.voxels[box], dtype=bool)
+    _refuse_blocks_and_noise(voxels, label)
+    origin = mask.index_to_world(corner[::-1].astype(float))
+    cropped = replace(mask, voxels=voxels, origin_mm=origin)
+    labels, count = components(voxels, structure=np.ones((3, 3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
+    sizes = np.bincount(labels.ravel(), minlength=count + 1)
+    sizes[0] = 0
+    main = int(sizes.argmax()) if given is None else _nearest_piece(cropped, labels, sizes, given, label)
+    remarks = []
+    result = labels == main
+    if count > 1:
+        pieces = [int(piece) for piece in np.argsort(-sizes)[: min(count, 200)] if piece != main]
+        result, joined = _bridged(result, labels, [p for p in pieces if sizes[p] >= SMALLEST_PIECE])
+        left = count - 1 - joined
+        if joined:
+            remarks.append(f"{joined} gaps of up to {LARGEST_GAP_VOXELS:g} voxels bridged")
+        if left:
+            remarks.append(f"{left} pieces apart from the lumen left out ({int(voxels.sum() - result.sum())} voxels)")
+    closed = binary_fill_holes(result)
+    assert closed is not None
+    if closed.sum() > result.sum():
+        remarks.append(f"cavities of {int(closed.sum() - result.sum())} voxels filled")
+    return replace(cropped, voxels=closed), remarks
+
+
+def closed_surface(surface: Surface, given: Insertion | None, label: str) -> tuple[Surface, list[str]]:
+    """Return one closed wall with outward normals: largest piece (or the one at the ostium), holes capped.
+
+    Raises:
+        InputError: the holes cannot be closed, or the surface is nowhere near the given ostium.
+    """
+    import pyvista
+
+    remarks = []
+    faces = np.insert(surface.faces, 0, 3, axis=1).ravel()
+    mesh = pyvista.PolyData(surface.vertices, faces).clean().triangulate()
+    regions = mesh.connectivity(extraction_mode="all")
+    ids = np.asarray(regions.point_data["RegionId"])
+    if ids.max() > 0:
+        if given is None:
+            chosen = _largest_region(regions, ids)
+        else:
+            chosen = int(ids[np.linalg.norm(regions.points - given.position, axis=1).argmin()])
+        mesh = regions.extract_points(ids == chosen, adjacent_cells=False).extract_surface().triangulate().clean()
+        remarks.append(f"{int(ids.max())} separate pieces of the surface left out")
+    if given is not None:
+        gap = float(KDTree(mesh.points).query(given.position)[0])
+        if gap > max(NEAR_OSTIUM_MM, 0.15 * float(np.ptp(mesh.points, axis=0).max())):
+            raise InputError(
+                f"{label}: the surface is {gap:.1f} mm from the ostium at {_told(given)}; check coordinates"
+            )
+    open_edges = mesh.n_open_edges
+    if open_edges:
+        mesh = mesh.fill_holes(1e9).triangulate().clean()
+        remarks.append(f"holes with {open_edges} open edges capped")
+    mesh = mesh.compute_normals(
+        cell_normals=False, point_normals=True, consistent_normals=True, split_vertices=False, auto_orient_normals=False
+    )
+    result = Surface(np.asarray(mesh.points, dtype=float), np.asarray(mesh.faces.reshape(-1, 4)[:, 1:], dtype=np.int64))
+    if mesh.n_open_edges or abs(result.volume) < 1e-9:
+        result = _from_shell(result, label)
+        remarks.append("the surface could not be capped and was closed by filling a voxel shell")
+    if surface.volume < 0 and not open_edges:
+        remarks.append("inverted normals turned outwards")
+    if result.volume < 0:
+        result = Surface(result.vertices, result.faces[:, ::-1])
+    return result, remarks
+
+
+def _refuse_blocks_and_noise(voxels: Bool[np.ndarray, "nz ny nx"], label: str) -> None:
+    share = float(voxels.mean())
+    count = int(voxels.sum())
+    padded = np.pad(voxels, 1)
+    walls = sum(int(np.count_nonzero(np.diff(padded.astype(np.int8), axis=axis))) for axis in range(3))
+    radius = 2.0 * count / walls
+    if count > 500 and share > 0.03 and radius < 0.9:
+        raise InputError(f"{label}: the mask is noise ({share:.0%} of its box, in specks); segment the vessel again")
+    if share > 0.9 and min(voxels.shape) > 3 and max(voxels.shape) < 4 * min(voxels.shape):
+        raise InputError(f"{label}: the mask is a solid block ({share:.0%} of its box); segment the vessel alone")
+
+
+def _nearest_piece(mask: Volume, labels: np.ndarray, sizes: np.ndarray, given: Insertion, label: str) -> int:
+    """Return the label of the piece at the ostium; a speck of noise beside it does not count."""
+    index = np.argwhere(labels > 0)
+    index = index[sizes[labels[tuple(index.T)]] >= min(SMALLEST_PIECE, sizes.max())]
+    gap = np.linalg.norm(mask.index_to_world(index[:, ::-1].astype(float)) - given.position, axis=1)
+    if gap.min() > max(NEAR_OSTIUM_MM, 2.0 * float(mask.spacing_mm.max())):
+        nearest = mask.index_to_world(index[gap.argmin()][::-1].astype(float))
+        place = ", ".join(f"{value:.1f}" for value in nearest)
+        raise InputError(
+            f"{label}: the mask touches nothing near the ostium at {_told(given)}; "
+            f"its nearest voxel is {gap.min():.1f} mm away at ({place})"
+        )
+    return int(labels[tuple(index[gap.argmin()])])
+
+
+def _bridged(
+    result: Bool[np.ndarray, "nz ny nx"], labels: np.ndarray, pieces: list[int]
+) -> tuple[Bool[np.ndarray, "nz ny nx"], int]:
+    """Join pieces that lie within the largest gap by tubes as wide as the vessels at both ends."""
+    from scipy.ndimage import distance_transform_edt
+
+    if not pieces:
+        return result, 0
+    result, joined = result.copy(), 0
+    clearance = np.asarray(distance_transform_edt(np.isin(labels, [0], invert=True)))
+    members = {piece: np.argwhere(labels == piece) for piece in pieces}
+    changed = True
+    while changed:
+        changed = False
+        here = np.argwhere(result)
+        reach = KDTree(here)
+        for piece in list(members):
+            gap, nearest = reach.query(members[piece], distance_upper_bound=LARGEST_GAP_VOXELS)
+            best = int(np.argmin(gap))
+            if not np.isfinite(gap[best]):
+                continue
+            start, end = here[nearest[best]], members.pop(piece)[best]
+            width = min(_widest(clearance, start), _widest(clearance, end))
+            _draw_tube(result, start, end, width)
+            result |= labels == piece
+            joined += 1
+            changed = True
+    return result, joined
+
+
+def _widest(clearance: np.ndarray, place: np.ndarray) -> float:
+    window = tuple(slice(max(0, i - 4), i + 5) for i in place)
+    return float(clearance[window].max())
+
+
+def _draw_tube(voxels: np.ndarray, start: np.ndarray, end: np.ndarray, width: float) -> None:
+    reach = int(np.ceil(width)) + 1
+    lower = np.maximum(np.minimum(start, end) - reach, 0)
+    upper = np.minimum(np.maximum(start, end) + reach + 1, voxels.shape)
+    grid = np.stack(np.meshgrid(*(np.arange(a, b) for a, b in zip(lower, upper, strict=True)), indexing="ij"), axis=-1)
+    along = (end - start).astype(float)
+    share = np.clip((grid - start) @ along / max(float(along @ along), 1e-9), 0.0, 1.0)
+    gap = np.linalg.norm(grid - start - share[..., None] * along, axis=-1)
+    window = tuple(slice(a, b) for a, b in zip(lower, upper, strict=True))
+    voxels[window] |= gap <= max(width, 1.0)
+
+
+def _largest_region(regions, ids: np.ndarray) -> int:
+    sizes = [np.ptp(regions.points[ids == i], axis=0).prod() for i in range(min(int(ids.max()) + 1, 100))]
+    return int(np.argmax(sizes))
+
+
+def _from_shell(surface: Surface, label: str) -> Surface:
+    """Close a surface that no cap closes: voxels that the wall shuts off from outside are inside."""
+    from scipy.ndimage import binary_closing, binary_fill_holes, binary_opening
+
+    extent = np.ptp(surface.vertices, axis=0)
+    spacing = max(float(np.prod(extent) / 8e6) ** (1 / 3), float(extent.max()) / 600)
+    fine = surface.refined(0.7 * spacing)
+    margin = 6
+    origin = fine.vertices.min(axis=0) - margin * spacing
+    shape = np.ceil(extent / spacing).astype(int) + 2 * margin + 1
+    shell = np.zeros(tuple(shape[::-1]), dtype=bool)
+    samples = np.concatenate([fine.vertices, fine.vertices[fine.faces].mean(axis=1)])
+    index = np.rint((samples - origin) / spacing).astype(int)
+    shell[index[:, 2], index[:, 1], index[:, 0]] = True
+    for closing in (0, 2, 4):
+        wall = binary_closing(shell, iterations=closing) if closing else shell
+        inside = binary_fill_holes(wall)
+        assert inside is not None
+        core = binary_opening(inside & ~shell)
+        if core.sum() > 0.5 * shell.sum() / 6:
+            volume = Volume(core | (inside & shell), np.full(3, spacing), origin, np.eye(3))
+            return surface_from_mask(volume)
+    raise InputError(f"{label}: the surface has holes that cannot be closed; cap it or make it watertight")
+
+
+def _told(given: Insertion) -> str:
+    return "(" + ", ".join(f"{value:.1f}" for value in given.position) + ") mm"

@@ -1,0 +1,140 @@
+"""Building a `VesselTree` from single lines, and the differential geometry of a line."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from endopilot.types import Branch, Centerline, VesselTree
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """A line of a tree before it is cut at its branching points.
+
+    Attributes:
+        points: positions, LPS mm; the first one is the parent's point `place`.
+        radius: inscribed-sphere radii, mm.
+        parent: index of the line that it leaves, -1 for the first.
+        place: index of the point of the parent that it leaves from.
+    """
+
+    points: Float[np.ndarray, "n 3"]
+    radius: Float[np.ndarray, "n"]
+    parent: int
+    place: int
+
+
+def tree_from_lines(lines: list[Line]) -> VesselTree:
+    """Return the tree of lines that leave each other, cut into branches, with abscissa and normals.
+
+    Parents stand before their children in `lines`. Sections are not named yet: all points carry section 0, "vessel".
+    """
+    branches: list[Branch] = []
+    ends: dict[tuple[int, int], int] = {}
+    for index, line in enumerate(lines):
+        cuts = sorted({other.place for other in lines if other.parent == index} - {0, len(line.points) - 1})
+        bounds = [0, *cuts, len(line.points) - 1]
+        parent = ends[line.parent, line.place] if line.parent >= 0 else -1
+        for start, end in itertools.pairwise(bounds):
+            points, radius = line.points[start : end + 1].copy(), line.radius[start : end + 1].copy()
+            before = branches[parent].centerline if parent >= 0 else None
+            if before is not None:
+                points[0], radius[0] = before.points[-1], before.radius[-1]
+            first = 0.0 if before is None else float(before.abscissa[-1])
+            centerline = make_centerline(points, radius, first, None if before is None else before.normals[-1])
+            branches.append(Branch(centerline, parent, np.zeros(len(points), dtype=np.int64)))
+            parent = len(branches) - 1
+            ends[index, end] = parent
+    return VesselTree(tuple(branches), ("vessel",))
+
+
+def make_centerline(
+    points: Float[np.ndarray, "n 3"],
+    radius: Float[np.ndarray, "n"],
+    first_abscissa: float = 0.0,
+    first_normal: Float[np.ndarray, "3"] | None = None,
+) -> Centerline:
+    """Return a centerline with abscissa and parallel-transport normals.
+
+    Args:
+        points: positions, LPS mm.
+        radius: inscribed-sphere radii, mm.
+        first_abscissa: abscissa of the first point, mm.
+        first_normal: normal to carry along; any perpendicular one if None.
+    """
+    step = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    abscissa = first_abscissa + np.concatenate([[0.0], np.cumsum(step)])
+    return Centerline(points=points, radius=radius, abscissa=abscissa, normals=parallel_transport(points, first_normal))
+
+
+def parallel_transport(
+    points: Float[np.ndarray, "n 3"], first_normal: Float[np.ndarray, "3"] | None = None
+) -> Float[np.ndarray, "n 3"]:
+    """Return unit normals carried along a line without twist, by double reflection (Wang et al., ACM TOG 27, 2008)."""
+    direction = tangents(points)
+    normal = np.eye(3)[np.abs(direction[0]).argmin()] if first_normal is None else first_normal
+    normal = normal - np.dot(normal, direction[0]) * direction[0]
+    if np.linalg.norm(normal) < 1e-6:
+        normal = np.eye(3)[np.abs(direction[0]).argmin()]
+        normal = normal - np.dot(normal, direction[0]) * direction[0]
+    normals = np.empty_like(points, dtype=float)
+    normals[0] = normal / np.linalg.norm(normal)
+    for i in range(len(points) - 1):
+        chord = points[i + 1] - points[i]
+        square = max(float(chord @ chord), 1e-24)
+        reflected = normals[i] - 2.0 / square * (chord @ normals[i]) * chord
+        turned = direction[i] - 2.0 / square * (chord @ direction[i]) * chord
+        second = direction[i + 1] - turned
+        square = float(second @ second)
+        normal = reflected if square < 1e-24 else reflected - 2.0 / square * (second @ reflected) * second
+        normal = normal - np.dot(normal, direction[i + 1]) * direction[i + 1]
+        normals[i + 1] = normal / np.linalg.norm(normal)
+    return normals
+
+
+def tangents(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Return the unit tangents of a line, by central differences."""
+    direction = np.gradient(points, axis=0)
+    return direction / np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-12)
+
+
+def resampled(points: Float[np.ndarray, "n 3"], step_mm: float) -> Float[np.ndarray, "m 3"]:
+    """Return the line through `points` in equal steps of about `step_mm`, by a monotone cubic in its length."""
+    from scipy.interpolate import PchipInterpolator
+
+    distinct = np.concatenate([[True], np.linalg.norm(np.diff(points, axis=0), axis=1) > 1e-9])
+    points = points[distinct]
+    if len(points) < 2:
+        return points
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    count = max(2, round(length[-1] / step_mm) + 1)
+    return np.asarray(PchipInterpolator(length, points, axis=0)(np.linspace(0.0, length[-1], count)))
+
+
+def curvature_torsion(centerline: Centerline) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+    """Return curvature and torsion along a line, 1/mm.
+
+    They come from the derivatives of a quartic fitted to the nine points around each point:
+    κ = |r′×r″|/|r′|³ and τ = (r′×r″)·r‴/|r′×r″|². Where the line is straight, the torsion is set to zero.
+    """
+    count = len(centerline.points)
+    width = min(9, count)
+    if width < 5:
+        return np.zeros(count), np.zeros(count)
+    start = np.clip(np.arange(count) - width // 2, 0, count - width)
+    window = start[:, None] + np.arange(width)
+    offset = centerline.abscissa[window] - centerline.abscissa[:, None]
+    scale = np.abs(offset).max(axis=1)
+    powers = (offset / scale[:, None])[..., None] ** np.arange(5)
+    fit = np.linalg.pinv(powers) @ centerline.points[window]
+    first, second, third = (fit[:, k] * factor / scale[:, None] ** k for k, factor in ((1, 1.0), (2, 2.0), (3, 6.0)))
+    cross = np.cross(first, second)
+    size = np.linalg.norm(cross, axis=1)
+    speed = np.linalg.norm(first, axis=1)
+    curvature = size / np.maximum(speed, 1e-12) ** 3
+    torsion = np.einsum("ij,ij->i", cross, third) / np.maximum(size, 1e-12) ** 2
+    return curvature, np.where(curvature > 1e-4, torsion, 0.0)
