@@ -34,7 +34,7 @@ def from_image(image: sitk.Image) -> Volume:
 
 
 def resample(volume: Volume, spacing_mm: float) -> Volume:
-    """Return a volume on an isotropic grid with the same axes and the same first voxel, as float32.
+    """Return a volume on an isotropic grid, its axes in the order and sense nearest to LPS, as float32.
 
     Axes that become coarser are smoothed first, so that fine structures are averaged and not skipped.
 
@@ -42,14 +42,16 @@ def resample(volume: Volume, spacing_mm: float) -> Volume:
         volume: the volume.
         spacing_mm: the new distance between voxel centres, mm.
     """
-    if np.allclose(volume.spacing_mm, spacing_mm):
-        return Volume(volume.voxels.astype(np.float32), volume.spacing_mm, volume.origin_mm, volume.direction)
-    image = sitk.Cast(to_image(volume), sitk.sitkFloat32)
+    oriented = from_image(sitk.DICOMOrient(to_image(volume), "LPS"))
+    voxels = oriented.voxels.astype(np.float32)
     # A Gaussian of this width turns one sampling aperture (taken as Gaussian, σ half a voxel) into the other.
-    sigma = 0.5 * np.sqrt(np.maximum(spacing_mm**2 - volume.spacing_mm**2, 0))
-    if sigma.max() > 0:
-        image = sitk.SmoothingRecursiveGaussian(image, np.maximum(sigma, 1e-3 * volume.spacing_mm).tolist())
-    extent = (np.array(image.GetSize()) - 1) * volume.spacing_mm
+    sigma = 0.5 * np.sqrt(np.maximum(spacing_mm**2 - oriented.spacing_mm**2, 0)) / oriented.spacing_mm
+    if sigma.max() > 0.2:
+        voxels = ndimage.gaussian_filter(voxels, sigma[::-1], truncate=3.0)
+    image = to_image(Volume(voxels, oriented.spacing_mm, oriented.origin_mm, oriented.direction))
+    if np.allclose(oriented.spacing_mm, spacing_mm):
+        return from_image(image)
+    extent = (np.array(image.GetSize()) - 1) * oriented.spacing_mm
     size = (np.floor(extent / spacing_mm + 1e-6).astype(int) + 1).tolist()
     return from_image(
         sitk.Resample(

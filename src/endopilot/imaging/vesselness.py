@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import SimpleITK as sitk
 from jaxtyping import Bool, Float32
+from scipy.ndimage import gaussian_filter
 
 
 def vesselness(
@@ -37,9 +37,8 @@ def vesselness(
         where[tuple(border)] = False
     k, j, i = np.nonzero(where)
     best = np.zeros(len(k), dtype=np.float32)
-    image = sitk.GetImageFromArray(hu)
     for sigma in sigmas_mm:
-        smooth = sitk.GetArrayFromImage(sitk.SmoothingRecursiveGaussian(image, [sigma / spacing_mm] * 3))
+        smooth = np.asarray(gaussian_filter(hu, sigma / spacing_mm, truncate=3.0))
         middle = _middle_eigenvalue(*_hessian(smooth, k, j, i))
         response = -middle * np.float32((sigma / spacing_mm) ** 2 * np.e / contrast_hu)
         np.maximum(best, response, out=best)

@@ -22,6 +22,7 @@ from endopilot.errors import InputError
 from endopilot.imaging.aortic_root import AorticRoot, find_aortic_root
 from endopilot.imaging.contour import lumen_at_half_height
 from endopilot.imaging.grid import connected_components, distance_to_outside, interpolate_like, resample
+from endopilot.imaging.ostium import find_ostium
 from endopilot.imaging.segment import SegmentConfig
 from endopilot.imaging.tracking import track_tree
 from endopilot.imaging.vesselness import vesselness
@@ -50,14 +51,14 @@ _SEED_MM = 5.0
 """A seed belongs to the vessel within this distance."""
 _LEAST_TREE_MM3 = 40.0
 """A smaller connected vessel is no coronary tree."""
-_AXIS_MM = 5.0
-"""Length of the vessel's beginning that gives its axis at the ostium, mm."""
 _WALL_HU = 50.0
 """The aortic wall."""
-_WALL_BALL_MM = 7.0
-"""Ball that opens the aorta to find its surface under the artery's mouth."""
-_OSTIUM_BOX = 40
-"""Half the edge of the box around the ostium in which the aortic wall is sought, voxels of the vessels' grid."""
+_MOUTH_MM = 4.0
+"""Length of the artery's beginning where the aorta's blood hides its radius, mm."""
+_WIDEST_MM = 3.0
+"""Largest radius expected of a coronary artery, mm."""
+_MARGIN_MM = 8.0
+"""Width of surroundings kept around the tree for the contour, mm."""
 _OSTIUM_REACH_MM = 8.0
 """Around the ostium, the plane across the vessel cuts, and nothing else."""
 _SIDE = {"rca": (-0.64, -0.77), "lca": (0.77, 0.64)}
@@ -108,7 +109,8 @@ def segment_lumen(volume: Volume, config: SegmentConfig) -> LumenMask:
             scan.grid.index_to_world(path[:, ::-1]) for path in track_tree(scan.response, tree, start, ends, _GRID_MM)
         ]
         advance()
-        ostium = _ostium(paths[0], scan, aorta)
+        blood = scan.hu > 0.5 * (scan.lumen_hu + _WALL_HU)
+        ostium, paths[0] = find_ostium(paths[0], blood, aorta, scan.grid)
         mask = _refine(volume, scan, paths, ostium)
         advance()
     return LumenMask(Volume(mask, volume.spacing_mm, volume.origin_mm, volume.direction), ostium)
@@ -117,13 +119,13 @@ def segment_lumen(volume: Volume, config: SegmentConfig) -> LumenMask:
 def _find_vessels(volume: Volume, lumen_hu: float) -> _Scan:
     """Tell blood pools and thin vessels apart."""
     low = _MUSCLE_HU + _LOW_SHARE * (lumen_hu - _MUSCLE_HU)
-    body = resample(volume, _BODY_GRID_MM)
-    depth = distance_to_outside(ndimage.gaussian_filter(body.voxels, 0.35) > low, _BODY_GRID_MM)
+    grid = resample(volume, _GRID_MM)
+    body = resample(grid, _BODY_GRID_MM)
+    depth = distance_to_outside(body.voxels > low, _BODY_GRID_MM)
     # Opening by a ball, and half a voxel of the body's grid more, so that no rim of a pool is left.
     beyond = distance_to_outside(depth < _POOL_RADIUS_MM, _BODY_GRID_MM) - _POOL_RADIUS_MM - _BODY_GRID_MM / 2
-    grid = resample(volume, _GRID_MM)
     pools = interpolate_like(Volume(beyond, body.spacing_mm, body.origin_mm, body.direction), grid, outside=1.0) <= 0
-    hu = ndimage.gaussian_filter(grid.voxels, 0.35 / _GRID_MM)
+    hu = np.asarray(ndimage.gaussian_filter(grid.voxels, 0.35 / _GRID_MM))
     thin = (hu > low) & ~pools
     response = vesselness(
         np.clip(grid.voxels, 0.0, 1.1 * lumen_hu),
@@ -135,19 +137,19 @@ def _find_vessels(volume: Volume, lumen_hu: float) -> _Scan:
     tubes = response > _RESPONSE
     # Short dark or shapeless gaps, such as at a bifurcation, are bridged through bright voxels.
     reach = round(_GAP_MM / _GRID_MM / 2)
-    vessels = thin & ndimage.maximum_filter(tubes, 2 * reach + 1)
+    vessels = thin & np.asarray(ndimage.maximum_filter(tubes, 2 * reach + 1))
     return _Scan(grid, hu, lumen_hu, pools, vessels, response)
 
 
 def _aorta(scan: _Scan, root: AorticRoot) -> Bool[np.ndarray, "nz ny nx"]:
     """Return the pool voxels around the aorta's axis."""
-    voxels = np.argwhere(scan.pools)
+    reach = 1.15 * root.radius + 1.0
+    box = _box(scan.grid.world_to_index(root.centres)[:, ::-1], np.full(3, reach.max() / _GRID_MM), scan.pools.shape)
+    voxels = np.argwhere(scan.pools[box]) + [part.start for part in box]
     points = scan.grid.index_to_world(voxels[:, ::-1].astype(float))
-    distance, disc = KDTree(root.centres).query(points, distance_upper_bound=1.3 * root.radius.max())
-    mine = np.isfinite(distance)
-    mine[mine] = distance[mine] < 1.15 * root.radius[disc[mine]] + 1.0
+    distance, disc = KDTree(root.centres).query(points)
     aorta = np.zeros(scan.pools.shape, dtype=bool)
-    aorta[tuple(voxels[mine].T)] = True
+    aorta[tuple(voxels[distance < reach[disc]].T)] = True
     return aorta
 
 
@@ -160,9 +162,7 @@ def _choose_tree(
         seed = _vessel_near(scan, scan.vessels, config.seeds[0])
         tree = label == label[tuple(seed)]
         return tree, seed
-    corner, opposite = np.argwhere(aorta).min(axis=0), np.argwhere(aorta).max(axis=0) + 1
-    reach = round(_TO_WALL_MM / _GRID_MM) + 1
-    box = tuple(slice(max(a - reach, 0), b + reach) for a, b in zip(corner, opposite, strict=True))
+    box = _box(np.argwhere(aorta), np.full(3, _TO_WALL_MM / _GRID_MM + 1), aorta.shape)
     gap = distance_to_outside(~aorta[box], _GRID_MM)
     touching = np.argwhere((gap <= _TO_WALL_MM) & (label[box] > 0))
     sizes = np.bincount(label.ravel())
@@ -195,71 +195,57 @@ def _vessel_near(scan: _Scan, vessels: np.ndarray, seed: tuple[float, float, flo
     return voxels[nearest]
 
 
-def _ostium(path: Float[np.ndarray, "n 3"], scan: _Scan, aorta: np.ndarray) -> Insertion:
-    """Return where the vessel's axis, drawn back from its first millimetres, meets the aortic wall."""
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
-    first = path[along <= _AXIS_MM]
-    centre = first.mean(axis=0)
-    axis = np.linalg.svd(first - centre)[2][0]
-    axis = axis * np.sign(axis @ (first[-1] - first[0]))
-    begin = centre + axis * float((path[0] - centre) @ axis)
-    corner = np.round(scan.grid.world_to_index(begin)).astype(int)[::-1] - _OSTIUM_BOX
-    box = tuple(slice(max(c, 0), max(c, 0) + 2 * _OSTIUM_BOX) for c in corner)
-    # The opening by a large ball takes the artery's mouth away from the aorta's surface.
-    blood = scan.hu[box] > 0.5 * (scan.lumen_hu + _WALL_HU)
-    deep = (distance_to_outside(blood, _GRID_MM) >= _WALL_BALL_MM) & aorta[box]
-    if not deep.any():
-        return Insertion(begin, axis)
-    inside = _WALL_BALL_MM - distance_to_outside(~deep, _GRID_MM)
-    steps = np.arange(3.0, -8.0, -0.1)
-    track = begin + steps[:, None] * axis
-    index = scan.grid.world_to_index(track)[:, ::-1] - [part.start for part in box]
-    met = np.flatnonzero(ndimage.map_coordinates(inside, index.T, order=1, cval=-1.0) > 0)
-    return Insertion(track[met[0]] if met.size else begin, axis)
-
-
-def _refine(volume: Volume, scan: _Scan, paths: list[np.ndarray], ostium: Insertion) -> Bool[np.ndarray, "nz ny nx"]:
+def _refine(volume: Volume, scan: _Scan, lines: list[np.ndarray], ostium: Insertion) -> Bool[np.ndarray, "nz ny nx"]:
     """Return the lumen around the paths on the volume's own grid, cut at the ostium."""
-    gap = paths[0][0] - ostium.position
-    steps = np.arange(0.0, 1.0, _GRID_MM / max(np.linalg.norm(gap), _GRID_MM))[:, None]
-    lines = [np.concatenate([ostium.position + steps * gap, paths[0]]), *paths[1:]]
-    half = scan.hu > 0.5 * (scan.lumen_hu + _WALL_HU)
-    radius = np.concatenate([_radius_along(line, scan, half, i == 0) for i, line in enumerate(lines)])
     points = np.concatenate(lines)
-    index = volume.world_to_index(points)[:, ::-1]
-    margin = 8.0 / volume.spacing_mm[::-1]
-    low = np.maximum(np.floor(index.min(axis=0) - margin).astype(int), 0)
-    high = np.minimum(np.ceil(index.max(axis=0) + margin).astype(int) + 1, volume.voxels.shape)
-    box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+    radius = _rough_radius(lines, scan)
+    box = _box(volume.world_to_index(points)[:, ::-1], _MARGIN_MM / volume.spacing_mm[::-1], volume.voxels.shape)
+    corner = np.array([part.start for part in box])
     crop = Volume(
-        volume.voxels[box], volume.spacing_mm, volume.index_to_world(low[::-1].astype(float)), volume.direction
+        volume.voxels[box], volume.spacing_mm, volume.index_to_world(corner[::-1].astype(float)), volume.direction
     )
-    others = Volume(scan.pools.astype(np.float32), scan.grid.spacing_mm, scan.grid.origin_mm, scan.grid.direction)
-    excluded = interpolate_like(others, crop, outside=0.0) > 0.5
-    k, j, i = np.indices(excluded.shape, dtype=np.float32)
-    world = crop.index_to_world(np.stack([i, j, k], axis=-1)) - ostium.position
-    near = np.linalg.norm(world, axis=-1) < _OSTIUM_REACH_MM
-    excluded = np.where(near, world @ ostium.direction < 0, excluded)
+    pools = Volume(scan.pools.astype(np.float32), scan.grid.spacing_mm, scan.grid.origin_mm, scan.grid.direction)
+    excluded = interpolate_like(pools, crop, outside=0.0) > 0.5
+    _cut(excluded, crop, ostium)
     lumen = lumen_at_half_height(crop, points, radius, scan.lumen_hu, excluded)
-    label = connected_components(lumen)
     mask = np.zeros(volume.voxels.shape, dtype=bool)
     if lumen.any():
+        label = connected_components(lumen)
         mask[box] = label == np.bincount(label.ravel())[1:].argmax() + 1
     return mask
 
 
-def _radius_along(line: np.ndarray, scan: _Scan, half: np.ndarray, first: bool) -> Float[np.ndarray, "n"]:
-    """Return the rough lumen radius along a path, mm, from the distance to voxels below half height."""
-    index = np.round(scan.grid.world_to_index(line)).astype(int)[:, ::-1]
-    reach = round(4.0 / _GRID_MM)
-    low, high = np.maximum(index.min(axis=0) - reach, 0), index.max(axis=0) + reach + 1
-    box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-    depth = ndimage.maximum_filter(distance_to_outside(half[box], _GRID_MM), 3)
-    at = np.clip(index - low, 0, np.array(depth.shape) - 1)
-    radius = np.clip(depth[tuple(at.T)] - _GRID_MM / 2, 0.4, _POOL_RADIUS_MM)
-    if first:  # at its mouth the artery has no wall of its own: take what it has a little farther on
+def _cut(excluded: np.ndarray, crop: Volume, ostium: Insertion) -> None:
+    """Around the ostium, let the plane across the vessel exclude what lies behind it, and nothing else."""
+    centre = crop.world_to_index(ostium.position)[::-1]
+    box = _box(centre[None], _OSTIUM_REACH_MM / crop.spacing_mm[::-1], excluded.shape)
+    k, j, i = np.meshgrid(*(np.arange(part.start, part.stop) for part in box), indexing="ij")
+    offset = crop.index_to_world(np.stack([i, j, k], axis=-1).astype(float)) - ostium.position
+    near = np.linalg.norm(offset, axis=-1) < _OSTIUM_REACH_MM
+    excluded[box] = np.where(near, offset @ ostium.direction < 0, excluded[box])
+
+
+def _box(index: np.ndarray, margin: np.ndarray, shape: tuple[int, ...]) -> tuple[slice, ...]:
+    """Return the slices (k, j, i) around some voxel indices with a margin, clipped to the volume."""
+    low = np.maximum(np.floor(index.min(axis=0) - margin).astype(int), 0)
+    high = np.minimum(np.ceil(index.max(axis=0) + margin).astype(int) + 1, shape)
+    return tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
+
+
+def _rough_radius(lines: list[np.ndarray], scan: _Scan) -> Float[np.ndarray, "n"]:
+    """Return the lumen radius along each path, mm, from the distance to voxels below half height."""
+    index = np.round(scan.grid.world_to_index(np.concatenate(lines))).astype(int)[:, ::-1]
+    box = _box(index, np.full(3, 4.0 / _GRID_MM), scan.hu.shape)
+    blood = scan.hu[box] > 0.5 * (scan.lumen_hu + _WALL_HU)
+    depth = np.asarray(ndimage.maximum_filter(distance_to_outside(blood, _GRID_MM), 3)) - _GRID_MM / 2
+    pieces = []
+    for number, line in enumerate(lines):
+        at = np.round(scan.grid.world_to_index(line)).astype(int)[:, ::-1] - [part.start for part in box]
+        radius = np.clip(depth[tuple(np.clip(at, 0, np.array(depth.shape) - 1).T)], 0.4, _WIDEST_MM)
         along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
-        beyond = (along > 5.0) & (along < 9.0)
-        if beyond.any():
-            radius[along <= 5.0] = np.median(radius[beyond])
-    return ndimage.median_filter(radius, 9, mode="nearest")
+        beyond = (along > _MOUTH_MM) & (along < 2 * _MOUTH_MM)
+        if number == 0 and beyond.any():
+            # At its mouth the artery has no wall of its own: take what it has a little farther on.
+            radius[along <= _MOUTH_MM] = np.median(radius[beyond])
+        pieces.append(ndimage.median_filter(radius, 9, mode="nearest"))
+    return np.concatenate(pieces)

@@ -1,0 +1,95 @@
+"""Where a coronary artery leaves the aorta."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import ndimage
+from scipy.spatial import KDTree
+
+from endopilot.imaging.grid import connected_components, distance_to_outside
+from endopilot.types import Insertion, Volume
+
+_BALL_MM = 7.0
+"""Ball that opens the aorta: its surface goes on under the artery's mouth."""
+_BOX_MM = 18.0
+"""Half the edge of the box around the artery's beginning that is looked at, mm."""
+_SECTIONS_MM = np.arange(1.0, 6.01, 0.5)
+"""Heights above the aortic wall at which the artery's middle is measured, mm."""
+_NEAR_MM = 4.5
+"""Blood farther than this from the tracked path is not this artery's."""
+
+
+def find_ostium(
+    path: Float[np.ndarray, "n 3"],
+    blood: Bool[np.ndarray, "nz ny nx"],
+    aorta: Bool[np.ndarray, "nz ny nx"],
+    grid: Volume,
+) -> tuple[Insertion, Float[np.ndarray, "m 3"]]:
+    """Return the ostium, and the path begun anew from there.
+
+    The artery's middle is the centroid of its blood at several heights above the aortic wall; a parabola through the
+    lowest of them is carried on to height 0.
+
+    Args:
+        path: LPS mm, the first point within a few mm of the aortic wall, or anywhere if no aorta is near.
+        blood: voxels above half the lumen's HU.
+        aorta: voxels of the aorta, roughly.
+        grid: the isotropic grid of both masks.
+    """
+    spacing = float(grid.spacing_mm[0])
+    half = round(_BOX_MM / spacing)
+    centre = np.round(grid.world_to_index(path[0])).astype(int)[::-1]
+    corner = np.clip(centre - half, 0, None)
+    box = tuple(slice(a, b) for a, b in zip(corner, centre + half + 1, strict=True))
+    deep = (distance_to_outside(blood[box], spacing) >= _BALL_MM) & aorta[box]
+    if not deep.any():
+        return Insertion(path[0], _heading(path)), path
+    height = distance_to_outside(~deep, spacing) - _BALL_MM
+    middles = _middles(path, blood[box], height, corner, grid)
+    if len(middles) < 3:
+        return Insertion(path[0], _heading(path)), path
+    heights = np.array(sorted(middles))[:6]
+    points = np.array([middles[h] for h in heights])
+    fit = np.polynomial.Polynomial.fit
+    curves = [fit(heights, points[:, axis], 2 if len(heights) >= 5 else 1) for axis in range(3)]
+    position = np.array([curve(0.0) for curve in curves])
+    slope = np.array([curve.deriv()(0.5) for curve in curves])
+    beginning = np.array([[curve(h) for curve in curves] for h in np.arange(0.0, heights[-1] + 0.01, 0.25)])
+    kept = np.linalg.norm(path - position, axis=1) > np.linalg.norm(beginning[-1] - position) + 1.0
+    first = int(np.argmax(kept)) if kept.any() else len(path) - 1
+    return Insertion(position, slope / np.linalg.norm(slope)), np.concatenate([beginning, path[first:]])
+
+
+def _middles(
+    path: np.ndarray, blood: np.ndarray, height: np.ndarray, corner: np.ndarray, grid: Volume
+) -> dict[float, Float[np.ndarray, "3"]]:
+    """Return the centroid of the artery's blood by height above the wall, mm, from the wall to where it is lost."""
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    near = path[along < 12.0]
+    back = near[0] - np.arange(0.5, 4.0, 0.5)[:, None] * _heading(path)
+    outside = blood & (height > _SECTIONS_MM[0] - 0.5)
+    label = connected_components(outside)
+    at = np.round(grid.world_to_index(near)).astype(int)[:, ::-1] - corner
+    at = at[np.all((at >= 0) & (at < blood.shape), axis=1)]
+    names = label[tuple(at.T)]
+    if not (names > 0).any():
+        return {}
+    voxels = np.argwhere(label == np.bincount(names[names > 0]).argmax())
+    points = grid.index_to_world((voxels + corner)[:, ::-1].astype(float))
+    distance, _ = KDTree(np.concatenate([back, near])).query(points)
+    points, level = points[distance < _NEAR_MM], height[tuple(voxels[distance < _NEAR_MM].T)]
+    middles = {}
+    for h in _SECTIONS_MM:
+        section = points[np.abs(level - h) < 0.5]
+        if len(section) < 8:
+            break
+        middles[float(h)] = section.mean(axis=0)
+    return middles
+
+
+def _heading(path: np.ndarray) -> Float[np.ndarray, "3"]:
+    """Return the unit direction of the first millimetres of a path."""
+    smooth = ndimage.gaussian_filter1d(path, 3.0, axis=0, mode="nearest")
+    step = smooth[min(8, len(path) - 1)] - smooth[0]
+    return step / max(float(np.linalg.norm(step)), 1e-9)
