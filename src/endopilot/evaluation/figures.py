@@ -199,6 +199,14 @@ def volume_figure(volume: Volume, mask: LumenMask, anatomy: Anatomy | None = Non
     return figure
 
 
+def tree_figure(anatomy: Anatomy) -> Figure:
+    """Draw the extracted tree alone, where there is no CT."""
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(6.0, 4.2), layout="constrained")
+        draw_tree(figure.subplots(), anatomy)
+    return figure
+
+
 def draw_tree(ax: Axes, anatomy: Anatomy) -> None:
     """Draw the centerline tree seen from the front, coloured by section, as thick as the lumen."""
     tree = anatomy.tree

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -38,7 +39,7 @@ def run_protocols(predictor: Predictor, data: Dataset, train: Dataset, advance: 
     """
     names, anatomy_of = np.unique(data.anatomy, return_inverse=True)
     anatomies = [read_anatomy(data.anatomy_folder(str(name))) for name in names]
-    device = Device(**data.manifest["device"])
+    device = _device(data)
     predicted = {}
     for protocol in ("forward", "inverse", "dual"):
         predicted[protocol] = getattr(predictor, f"rollout_{protocol}")(data)
@@ -59,7 +60,9 @@ def run_protocols(predictor: Predictor, data: Dataset, train: Dataset, advance: 
     tips = {name: _series(tip, [a.tree for a in anatomies], anatomy_of, data.branch) for name, tip in foretold.items()}
     replayed = {"P4": "P3", "P2_replayed": "P2", "hold_control": "hold_control", "follow_slack": "follow_slack"}
     recorded = data.control[:, WINDOW:].astype(float)
-    simulated = {name: controls[source] for name, source in replayed.items()} | {"true_replay": recorded}
+    reach_mm = np.array([a.tree.longest_path().abscissa[-1] for a in anatomies])[anatomy_of]
+    simulated = {name: _drivable(data, controls[source], device, reach_mm) for name, source in replayed.items()}
+    simulated["true_replay"] = recorded
     replays = _replay(data, anatomies, anatomy_of, device, simulated, advance)
     return SplitResult(
         sample_period_s=data.sample_period_s,
@@ -75,6 +78,29 @@ def run_protocols(predictor: Predictor, data: Dataset, train: Dataset, advance: 
         base_torque={"true": _after_given(data.base_torque)} | {name: r.base_torque for name, r in replays.items()},
         tip_distance={name: r.distance for name, r in replays.items()},
     )
+
+
+def _device(data: Dataset) -> Device:
+    """Return the device of a dataset as it was when the dataset was made."""
+    stored = data.manifest["device"].items()
+    constants: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in stored}
+    return Device(**constants)
+
+
+def _drivable(data: Dataset, control: Control, device: Device, reach_mm: Float[np.ndarray, "episodes"]) -> Control:
+    """Return what a drive makes of controls: no faster than it can, nor out of the catheter or beyond the vessel.
+
+    Controls that are not finite stay so.
+    """
+    limits = np.array([device.max_velocity_mm_s, device.max_rotation_rad_s])
+    driven = np.clip(control, -limits, limits)
+    inserted = data.inserted_length[:, WINDOW - 1].astype(float)
+    reach_mm = np.maximum(reach_mm, inserted)
+    for sample in range(driven.shape[1]):
+        after = np.clip(inserted + data.sample_period_s * driven[:, sample, 0], 0.0, reach_mm)
+        driven[:, sample, 0] = (after - inserted) / data.sample_period_s
+        inserted = after
+    return driven
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,14 +138,8 @@ def _replay(
         )
         usable = (rollout.valid & np.isfinite(driven).all(axis=-1).cumprod(axis=1).astype(bool))[:, WINDOW:]
         distance = np.linalg.norm(rollout.tip_position - data.tip_position[worlds], axis=-1)
-        signals = (
-            rollout.tip.abscissa,
-            rollout.tip.offset,
-            rollout.tip.radius,
-            rollout.base_force,
-            rollout.base_torque,
-        )
-        for key, signal in zip(_REPLAYED, (*signals, distance), strict=True):
+        tip = (rollout.tip.abscissa, rollout.tip.offset, rollout.tip.radius)
+        for key, signal in zip(_REPLAYED, (*tip, rollout.base_force, rollout.base_torque, distance), strict=True):
             values = np.where(usable, signal[:, WINDOW:], np.nan)
             for name, part in zip(controls, values.reshape(len(controls), len(episodes), -1), strict=True):
                 out[name][key][episodes] = part

@@ -157,9 +157,8 @@ def _add_navigation(figure: go.Figure, anatomy: Anatomy, rollout: Rollout, world
 def _moving(rollout: Rollout, world: int, sample: int) -> list[go.Scatter3d]:
     """Return what changes from frame to frame: wire, tip and the tip's trail."""
     wire = np.round(visible_wire(rollout, world, sample), 2).astype(np.float32)
-    trail = np.round(
-        rollout.tip_position[world, max(0, sample - round(TRAIL_S / rollout.sample_period_s)) : sample + 1], 2
-    ).astype(np.float32)
+    begin = max(0, sample - round(TRAIL_S / rollout.sample_period_s))
+    trail = np.round(rollout.tip_position[world, begin : sample + 1], 2).astype(np.float32)
     tip = trail[-1:]
     told = (
         f"Δ = {rollout.inserted_length[world, sample]:.1f} mm<br>"
@@ -176,9 +175,7 @@ def _moving(rollout: Rollout, world: int, sample: int) -> list[go.Scatter3d]:
 
     return [
         trace(wire, mode="lines", line={"color": WIRE, "width": 7}, name="Guidewire", hovertemplate=hover),
-        trace(
-            trail, mode="lines", line={"color": TRAIL, "width": 2}, name="Tip, last 20 s", hoverinfo="skip", opacity=0.6
-        ),
+        trace(trail, mode="lines", line={"color": TIP, "width": 2}, name=f"Tip, last {TRAIL_S:g} s", hoverinfo="skip"),
         trace(tip, mode="markers", marker={"color": TIP, "size": 5}, name="Tip", hovertemplate=hover),
     ]
 
@@ -200,13 +197,7 @@ def _layout() -> dict:
         "scene": {"aspectmode": "data", **axes, "camera": {"eye": {"x": 0.35, "y": -1.75, "z": 0.45}}},
         "paper_bgcolor": BACKGROUND,
         "font": {"color": INK, "family": "system-ui, sans-serif"},
-        "legend": {
-            "font": {"color": INK, "size": 11},
-            "x": 0.99,
-            "xanchor": "right",
-            "y": 0.93,
-            "bgcolor": "#0d142499",
-        },
+        "legend": {"font": {"size": 11}, "x": 0.99, "xanchor": "right", "y": 0.93, "bgcolor": BACKGROUND},
         "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
         "height": 680,
         "uirevision": "keep",

@@ -1,0 +1,226 @@
+"""What the report says in words and in tables, made from the numbers alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from endopilot.evaluation.metrics import DIVERGED_MM, SPANS_S, span_name
+from endopilot.evaluation.results import SERIES_TITLES, TIP_BASELINES
+from endopilot.types import Anatomy
+
+EVALUATION_FIGURES: Mapping[str, str] = {
+    "tip_error": "Mean tip error against time, networks beside baselines",
+    "safety_ratio": "Safety ratio against time: recorded, predicted and simulated",
+    "control_error": "Histograms of the control error of each navigation",
+}
+"""Figures of an evaluation that the report shows, and what each is to someone who cannot see it."""
+
+NETWORK_TITLES: Mapping[str, str] = {"ff": "Forward network", "if": "Inverse network"}
+
+SPANS: tuple[str, ...] = tuple(span_name(span) for span in SPANS_S)
+COORDINATES: Mapping[str, str] = {"abscissa": "Δtip", "offset": "γtip"}
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One number of a table: what is shown, and where in metrics.json it stands ("/" between keys)."""
+
+    text: str
+    key: str = ""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of a table; `kind` is "network", "baseline" or "paper"."""
+
+    title: str
+    kind: str
+    cells: tuple[Cell, ...]
+
+
+def headline_split(metrics: Mapping[str, Any]) -> str:
+    """Return the split that the headline is about: new patients where there are any."""
+    return "test" if "test" in metrics["splits"] else next(iter(metrics["splits"]))
+
+
+def summary(metrics: Mapping[str, Any]) -> str:
+    """Return the key result as a paragraph."""
+    split = metrics["splits"][headline_split(metrics)]
+    tip = split["tip"]
+    patients = _count(len(split["anatomies"]), "patient")
+    whose = "that neither network has seen" if headline_split(metrics) == "test" else "that the networks know"
+    parts = [
+        f"On {_count(split['episodes'], 'new navigation')} in {patients} {whose}, after 15 s of given states:",
+        f"knowing the drive's motion, the forward network foretells the tip's way along the vessel with a mean error "
+        f"of {_mm(tip['P1'], 'abscissa')} over the next 45 s ({_mm(tip['P1'], 'offset')} across the vessel);",
+        f"holding the slack, which needs no learning, errs by {_mm(tip['hold_slack'], 'abscissa')} "
+        f"({_mm(tip['hold_slack'], 'offset')}).",
+        f"When the inverse network chooses the controls and they are simulated, the tip misses its desired way by "
+        f"{_mm(tip['P4'], 'abscissa')} on average; driving by the held slack misses it by "
+        f"{_mm(tip['follow_slack'], 'abscissa')}.",
+    ]
+    return " ".join(parts)
+
+
+def tiles(metrics: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """Return the key numbers: value, what it is, and what to compare it with."""
+    split = metrics["splits"][headline_split(metrics)]
+    tip = split["tip"]
+    skill = tip["P1"]["abscissa"]["all"]["skill"].get("hold_slack")
+    return [
+        (
+            _mm(tip["P1"], "abscissa"),
+            "forward network's mean error of Δtip (P1)",
+            f"baseline {_mm(tip['hold_slack'], 'abscissa')}",
+        ),
+        (
+            _mm(tip["P4"], "abscissa"),
+            "miss of the desired Δtip, controls simulated (P4)",
+            f"baseline {_mm(tip['follow_slack'], 'abscissa')}",
+        ),
+        (_signed(skill), "skill for Δtip over holding the slack (P1)", "1 is perfect, 0 no better, below 0 worse"),
+        (
+            f"{100 * tip['P4']['diverged_share']:.0f} %",
+            f"of simulated navigations miss by over {DIVERGED_MM:g} mm once (P4)",
+            f"baseline {100 * tip['follow_slack']['diverged_share']:.0f} %",
+        ),
+    ]
+
+
+def tip_rows(metrics: Mapping[str, Any], split: str) -> list[Row]:
+    """Return the table of tip errors of one split: protocols, each followed by its baselines, and the paper."""
+    tip = metrics["splits"][split]["tip"]
+    rows, shown = [], set()
+    for series, baselines in TIP_BASELINES.items():
+        for name in (series, *baselines):
+            if name in tip and name not in shown:
+                shown.add(name)
+                kind = "network" if name in TIP_BASELINES else "baseline"
+                rows.append(Row(SERIES_TITLES[name], kind, _tip_cells(tip, split, name)))
+    paper = tuple(
+        Cell(_mean_sd(metrics["paper"].get(span, {}).get(coordinate, {})), f"paper/{span}/{coordinate}/mae")
+        for coordinate in COORDINATES
+        for span in SPANS
+    )
+    blank = Cell("–")
+    rows.append(Row("Kim et al. 2023, on data of their own", "paper", (*paper[:3], blank, *paper[3:], blank, blank)))
+    return rows
+
+
+def _tip_cells(tip: Mapping[str, Any], split: str, series: str) -> tuple[Cell, ...]:
+    cells: list[Cell] = []
+    for coordinate in COORDINATES:
+        where = f"splits/{split}/tip/{series}/{coordinate}"
+        for span in SPANS:
+            cells.append(Cell(_mean_sd(tip[series][coordinate].get(span, {})), f"{where}/{span}/mae"))
+        skills = {k: v for k, v in tip[series][coordinate]["all"]["skill"].items() if v is not None}
+        hardest = min(skills, key=lambda name: skills[name]) if skills else None
+        cells.append(Cell(_signed(skills[hardest]), f"{where}/all/skill/{hardest}") if hardest else Cell("–"))
+    cells.append(Cell(f"{100 * tip[series]['diverged_share']:.0f} %", f"splits/{split}/tip/{series}/diverged_share"))
+    return tuple(cells)
+
+
+def replay_remark(metrics: Mapping[str, Any], split: str) -> str:
+    """Return how far the recorded navigations repeat when they are simulated again: the floor of P4."""
+    distance = metrics["splits"][split]["tip"].get("true_replay", {}).get("distance_3d", {})
+    if distance.get("mae") is None:
+        return ""
+    return (
+        f"Simulated again with the recorded controls, the tips return to where they were recorded within "
+        f"{distance['mae']:.2g} mm on average: the floor under P4."
+    )
+
+
+def interval_remark(metrics: Mapping[str, Any], split: str) -> str:
+    """Return the interval of the headline error over patients, or why there is none."""
+    record = metrics["splits"][split]
+    interval = record["tip"]["P1"]["abscissa"]["all"]["mae_interval"]
+    if interval is None:
+        return f"With {_count(len(record['anatomies']), 'patient')} nothing can be said of the spread between patients."
+    return (
+        f"Drawing the {len(record['anatomies'])} patients again (bootstrap), the mean error of Δtip in P1 lies between "
+        f"{interval[0]:.2f} and {interval[1]:.2f} mm in 95 % of draws; so few patients bound it only roughly."
+    )
+
+
+def safety_remark(metrics: Mapping[str, Any], split: str) -> str:
+    """Return median and 95 % quantile of the safety ratio γ/(r − r_w), by series, as a sentence."""
+    safety = metrics["splits"][split]["safety"]
+    names = {"true": "recorded", "P3": "predicted (P3)", "P4": "simulated (P4)"}
+    parts = [
+        f"{title} {safety[key]['over_clearance']['median']:.2f} ({safety[key]['over_clearance']['p95']:.2f})"
+        for key, title in names.items()
+        if key in safety and safety[key]["over_clearance"]["median"] is not None
+    ]
+    return f"{metrics['splits'][split]['title']}: median (95 % quantile) {', '.join(parts)}."
+
+
+def control_remark(metrics: Mapping[str, Any], split: str) -> str:
+    """Return the median control error of a navigation, the network's beside the baselines', as a sentence."""
+    control = metrics["splits"][split]["control"]
+    parts = [
+        f"{SERIES_TITLES[name].removeprefix('Baseline: ').lower().replace('(p2)', '(P2)')} "
+        f"{record['translation_mm_s']['rmse_of_sequences']['median']:.2f} mm/s and "
+        f"{record['rotation_deg_s']['rmse_of_sequences']['median']:.0f} deg/s"
+        for name, record in control.items()
+        if record["translation_mm_s"]["rmse_of_sequences"]["median"] is not None
+    ]
+    return f"{metrics['splits'][split]['title']}: median RMSE of a navigation: {'; '.join(parts)}."
+
+
+def anatomy_facts(anatomy: Anatomy) -> list[tuple[str, str]]:
+    """Return what a reader wants to know of a vessel at a glance."""
+    tree = anatomy.tree
+    longest = tree.longest_path()
+    present = {int(section) for branch in tree.branches for section in np.unique(branch.section)}
+    chord = float(np.linalg.norm(longest.points[-1] - longest.points[0]))
+    return [
+        ("longest way", f"{longest.abscissa[-1]:.0f} mm"),
+        ("branches", f"{len(tree.branches)}"),
+        ("lumen radius", f"{np.median(longest.radius):.1f} mm (median on that way)"),
+        ("tortuosity", f"{longest.abscissa[-1] / max(chord, 1e-6):.2f}"),
+        ("sections", ", ".join(tree.section_names[section] for section in sorted(present))),
+    ]
+
+
+def training_budget(record: Mapping[str, Any]) -> str:
+    """Return how long the networks were trained, as a sentence."""
+    parts = [
+        f"{NETWORK_TITLES[network].lower()} {_count(len(result['curve']), 'epoch')} of "
+        f"{result['windows_per_epoch']:,} windows in {result['seconds']:.0f} s"
+        for network, result in record.items()
+    ]
+    return f"Training: {'; '.join(parts)}. The paper trained for 20 epochs on 80,000 navigations."
+
+
+def score_columns(patients: list[dict[str, Any]]) -> list[str]:
+    """Return the names of all scores that any patient has."""
+    return list(dict.fromkeys(name for patient in patients for name in patient["scores"]))
+
+
+def score_title(name: str) -> str:
+    """Return a score's name as a heading: `radius_mae_mm` becomes "radius mae, mm"."""
+    return f"{name.removesuffix('_mm').replace('_', ' ')}, mm" if name.endswith("_mm") else name.replace("_", " ")
+
+
+def _mm(series: Mapping[str, Any], coordinate: str) -> str:
+    mae = series[coordinate]["all"]["mae"]
+    return "–" if mae is None else f"{mae:.2f} mm"
+
+
+def _mean_sd(statistics: Mapping[str, Any]) -> str:
+    if statistics.get("mae") is None:
+        return "–"
+    return f"{statistics['mae']:.2f} ± {statistics['sd']:.2f}"
+
+
+def _signed(value: float | None) -> str:
+    return "–" if value is None else f"{value:+.2f}".replace("-", "−")
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
