@@ -21,13 +21,13 @@ from rich.progress import (
 class Advance(Protocol):
     """What `progress` yields: call it with the number of units done since the last call and, if useful, a remark."""
 
-    def __call__(self, amount: float = 1, remark: str = "") -> None:
+    def __call__(self, amount: int | float = 1, remark: str = "") -> None:
         """Advance the bar by `amount` units."""
         ...
 
 
 @contextmanager
-def progress(title: str, total: float) -> Iterator[Advance]:
+def progress(title: str, total: int | float) -> Iterator[Advance]:
     """Show a bar on standard error while the block runs.
 
     Standard output stays free for results. Where standard error is no terminal, one line is printed when the
@@ -52,7 +52,7 @@ def progress(title: str, total: float) -> Iterator[Advance]:
     with bar:
         task = bar.add_task(title, total=total, remark="")
 
-        def advance(amount: float = 1, remark: str = "") -> None:
+        def advance(amount: int | float = 1, remark: str = "") -> None:
             bar.update(task, advance=amount, remark=remark)
 
         yield advance
