@@ -6,17 +6,48 @@ The slack s = Δ − Δtip follows a play operator: it grows with insertion and 
 
 from __future__ import annotations
 
+from pathlib import Path
+from unittest.mock import patch
+
 import numpy as np
 
-from endopilot.types import SAMPLE_PERIOD_S, Anatomy, Rollout, TipProjection
+from endopilot.anatomy.io import write_anatomy
+from endopilot.dataset.generate import DatasetConfig, generate_dataset
+from endopilot.simulation.device import read_device
+from endopilot.types import (
+    SAMPLE_PERIOD_S,
+    Anatomy,
+    Branch,
+    Centerline,
+    DistanceMap,
+    Insertion,
+    Rollout,
+    TipProjection,
+    VesselTree,
+)
 
 GRIP = 0.6
+LENGTH_MM = 100.0
 
 
-def toy_simulate(anatomy: Anatomy, device, control, *, initial=None, config=None, friction=None) -> Rollout:
+def toy_anatomy(name: str) -> Anatomy:
+    """Return a straight vessel, 100 mm long and 1.5 mm in radius, whose distance map the toy wire does not need."""
+    along = np.linspace(0, LENGTH_MM, 41)
+    points = np.stack([along, np.zeros(41), np.zeros(41)], axis=-1)
+    normals = np.tile([0.0, 1.0, 0.0], (41, 1))
+    line = Centerline(points=points, radius=np.full(41, 1.5), abscissa=along, normals=normals)
+    return Anatomy(
+        name=name,
+        tree=VesselTree((Branch(line, -1, np.zeros(41, dtype=int)),), ("1",)),
+        distance_map=DistanceMap(np.ones((3, 3, 3)), 1.0, np.zeros(3)),
+        insertion=Insertion(np.zeros(3), np.array([1.0, 0.0, 0.0])),
+        catheter_radius_mm=1.5,
+    )
+
+
+def toy_simulate(anatomy: Anatomy, device, control, *, initial, config, friction) -> Rollout:
     """Return what the toy wire does under the controls; takes what `simulate` takes."""
     worlds, samples, _ = control.shape
-    initial = np.zeros((worlds, 2)) if initial is None else initial
     proximal = initial[:, None] + SAMPLE_PERIOD_S * np.cumsum(control, axis=1)
     advance = np.diff(proximal[..., 0], axis=1, prepend=initial[:, :1])
     curliness = 0.02 + 0.005 * (len(anatomy.name) % 3)
@@ -28,7 +59,6 @@ def toy_simulate(anatomy: Anatomy, device, control, *, initial=None, config=None
         slack[:, t] = now
     abscissa = proximal[..., 0] - slack
     offset = 0.8 + 0.5 * np.sin(0.1 * abscissa + proximal[..., 1])
-    direction = np.broadcast_to([1.0, 0.0, 0.0], (worlds, samples, 3)).copy()
     force = 0.01 * slack
     return Rollout(
         sample_period_s=SAMPLE_PERIOD_S,
@@ -38,7 +68,7 @@ def toy_simulate(anatomy: Anatomy, device, control, *, initial=None, config=None
         inserted_length=proximal[..., 0],
         rotation=proximal[..., 1],
         tip_position=np.stack([abscissa, offset, np.zeros_like(offset)], axis=-1),
-        tip_direction=direction,
+        tip_direction=np.tile([1.0, 0.0, 0.0], (worlds, samples, 1)),
         tip=TipProjection(
             abscissa=abscissa,
             offset=offset,
@@ -47,8 +77,26 @@ def toy_simulate(anatomy: Anatomy, device, control, *, initial=None, config=None
         ),
         contact_force_max=force,
         contact_force_sum=2 * force,
-        base_force=force,
+        base_force=force.copy(),
         base_torque=0.1 * force,
         iterations=np.ones((worlds, samples)),
         valid=np.ones((worlds, samples), dtype=bool),
     )
+
+
+def write_toy_anatomies(folder: Path, patients: int) -> list[Path]:
+    """Write straight vessels with names of different length, and return their folders."""
+    folders = [folder / f"patient-{i}" for i in range(patients)]
+    for i, where in enumerate(folders):
+        if not where.exists():
+            write_anatomy(toy_anatomy(f"patient-{i}{'x' * i}"), where)
+    return folders
+
+
+def make_toy_dataset(folder: Path, *, patients: int, sequences: int, simulate=toy_simulate, **settings) -> None:
+    """Generate a dataset with the toy wire in place of the rod; two thirds of the patients train, the others test."""
+    shares = (2 / 3, 0.0, 1 / 3) if patients > 1 else None
+    config = DatasetConfig(**({"sequences": sequences, "anatomy_shares": shares} | settings))
+    with patch("endopilot.dataset.navigate.simulate", simulate):
+        anatomies = write_toy_anatomies(folder.parent / "anatomies", patients)
+        generate_dataset(anatomies, folder, read_device("workhorse-014"), config)

@@ -66,7 +66,7 @@ def navigate(
         if len(again) == 0:
             break
         stopped[again] = True
-        limit[again] = np.minimum(limit[again], depth - STOP_SHORT_MM)
+        limit[again] = np.minimum(limit[again], depth) - STOP_SHORT_MM
     assert rollout is not None
     return rollout, stopped
 

@@ -1,0 +1,314 @@
+"""The dataset on disk: layout, content, resumption, and what is refused."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from endopilot.anatomy.io import write_anatomy
+from endopilot.dataset.generate import DatasetConfig
+from endopilot.dataset.loader import load_dataset
+from endopilot.dataset.navigate import END_MM, STOP_SHORT_MM, navigate, stop_short
+from endopilot.errors import InputError
+from endopilot.files import read_json, sha256
+from endopilot.simulation.device import read_device
+from endopilot.simulation.simulator import SimulatorConfig
+from toy_navigation import LENGTH_MM, make_toy_dataset, toy_anatomy, toy_simulate
+
+
+def data_hashes(folder: Path) -> dict[str, str]:
+    """Return the hashes of everything that must not depend on how often a run was interrupted."""
+    files = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.name != "manifest.json"]
+    return {str(path.relative_to(folder)): sha256(path) for path in files}
+
+
+def test_pandas_reads_the_layout_of_lerobot(toy_dataset):
+    info = read_json(toy_dataset / "meta/info.json")
+    assert info["codebase_version"] == "v3.0"
+    assert (info["total_episodes"], info["total_frames"], info["fps"]) == (144, 144 * 120, 2)
+    episodes = pd.concat(pd.read_parquet(p) for p in sorted((toy_dataset / "meta/episodes").glob("*/*.parquet")))
+    assert episodes["episode_index"].tolist() == list(range(144))
+    last = episodes.iloc[-1]
+    where = {"chunk_index": last["data/chunk_index"], "file_index": last["data/file_index"]}
+    samples = pd.read_parquet(toy_dataset / info["data_path"].format(**where))
+    rows = samples[(samples["index"] >= last["dataset_from_index"]) & (samples["index"] < last["dataset_to_index"])]
+    assert (rows["episode_index"] == 143).all()
+    assert rows["frame_index"].tolist() == list(range(120))
+    np.testing.assert_allclose(rows["timestamp"], np.arange(120) / 2)
+    assert set(samples.columns) == set(info["features"])
+    for name, feature in info["features"].items():
+        assert np.atleast_1d(samples[name].iloc[0]).shape == tuple(feature["shape"]), name
+        assert np.atleast_1d(samples[name].iloc[0]).dtype == feature["dtype"], name
+    tasks = pd.read_parquet(toy_dataset / "meta/tasks.parquet")
+    assert tasks.loc[last["tasks"][0], "task_index"] == samples["task_index"].iloc[0]
+
+
+def test_motion_is_the_integral_of_the_control(toy_dataset):
+    data = load_dataset(toy_dataset)
+    travel = data.sample_period_s * np.cumsum(data.control.astype(float), axis=1)
+    np.testing.assert_allclose(data.inserted_length, data.initial_inserted_length[:, None] + travel[..., 0], atol=1e-5)
+    np.testing.assert_allclose(data.rotation, data.initial_rotation[:, None] + travel[..., 1], atol=1e-5)
+
+
+def test_an_episode_repeats_exactly_from_the_disk(toy_dataset):
+    data = load_dataset(toy_dataset)
+    chosen = data.select(data.anatomy == data.anatomy[0])
+    initial = np.stack([chosen.initial_inserted_length, chosen.initial_rotation], axis=-1)
+    anatomy = toy_anatomy(str(chosen.anatomy[0]))
+    again = toy_simulate(
+        anatomy, None, chosen.control.astype(float), initial=initial, config=None, friction=chosen.friction
+    )
+    assert (again.tip.abscissa.astype(np.float32) == chosen.tip_abscissa).all()
+    assert (again.tip.offset.astype(np.float32) == chosen.tip_offset).all()
+
+
+def test_statistics_are_those_of_the_samples(toy_dataset):
+    data, stats = load_dataset(toy_dataset), read_json(toy_dataset / "meta/stats.json")
+    flat = data.control.reshape(-1, 2).astype(float)
+    np.testing.assert_allclose(stats["action"]["mean"], flat.mean(axis=0), atol=1e-9)
+    np.testing.assert_allclose(stats["action"]["std"], flat.std(axis=0), rtol=1e-9)
+    assert stats["action"]["min"] == flat.min(axis=0).tolist()
+    assert stats["action"]["count"] == [144 * 120]
+
+
+def test_no_anatomy_of_test_is_trained_on(toy_dataset):
+    data = load_dataset(toy_dataset)
+    assert not set(data.of_split("train").anatomy) & set(data.of_split("test").anatomy)
+    assert set(data.of_split("seen_test").anatomy) == set(data.of_split("train").anatomy)
+    pairs = {(a, s) for split in ("train", "seen_test") for a, s in _keys(data.of_split(split))}
+    assert len(pairs) == len(data.of_split("train")) + len(data.of_split("seen_test"))
+
+
+def test_bits_do_not_depend_on_how_sequences_are_put_into_files(tmp_path, toy_dataset):
+    make_toy_dataset(tmp_path / "small-files", patients=6, sequences=24, sequences_per_file=7)
+    whole, split = load_dataset(toy_dataset), load_dataset(tmp_path / "small-files")
+    assert split.manifest["files"] == 6 * 4
+    for name in ("control", "tip_abscissa", "friction", "initial_rotation", "split", "anatomy"):
+        assert (getattr(whole, name) == getattr(split, name)).all(), name
+
+
+def test_friction_is_drawn_from_its_range(tmp_path):
+    make_toy_dataset(tmp_path / "d", patients=1, sequences=40, friction=(0.05, 0.2), seconds=2.0)
+    friction = load_dataset(tmp_path / "d").friction
+    assert 0.05 <= friction.min() < 0.08 < 0.17 < friction.max() <= 0.2
+
+
+def test_killed_and_resumed_gives_the_same_bits(tmp_path):
+    settings = {"patients": 3, "sequences": 20, "sequences_per_file": 5}
+    make_toy_dataset(tmp_path / "whole", **settings)
+    script = (
+        f"import sys, time; sys.path[:0] = {sys.path!r}\n"
+        "from pathlib import Path\n"
+        "from toy_navigation import make_toy_dataset, toy_simulate\n"
+        "def slowly(*args, **kwargs):\n"
+        "    time.sleep(0.2)\n"
+        "    return toy_simulate(*args, **kwargs)\n"
+        f"make_toy_dataset(Path({str(tmp_path / 'killed')!r}), simulate=slowly, **{settings!r})\n"
+    )
+    for files_before_the_kill in (1, 4):
+        process = subprocess.Popen([sys.executable, "-c", script], stderr=subprocess.DEVNULL)
+        try:
+            deadline = time.monotonic() + 60
+            while len(list((tmp_path / "killed").glob("data/*/file-*.parquet"))) < files_before_the_kill:
+                assert process.poll() is None and time.monotonic() < deadline
+                time.sleep(0.02)
+        finally:
+            process.send_signal(signal.SIGKILL)
+            process.wait()
+    assert not read_json(tmp_path / "killed/meta/manifest.json")["complete"]
+    with pytest.raises(InputError, match="unfinished"):
+        load_dataset(tmp_path / "killed")
+    (tmp_path / "killed/data/chunk-000/.part-1-file-007.parquet").write_bytes(b"cut off by the kill")
+    make_toy_dataset(tmp_path / "killed", **settings)
+    assert data_hashes(tmp_path / "killed") == data_hashes(tmp_path / "whole")
+
+
+def test_a_finished_dataset_is_left_alone(tmp_path):
+    make_toy_dataset(tmp_path / "d", patients=1, sequences=4)
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "d").rglob("*")}
+    make_toy_dataset(tmp_path / "d", patients=1, sequences=4)
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "d").rglob("*")} == before
+
+
+def test_a_lost_file_is_made_again(tmp_path):
+    make_toy_dataset(tmp_path / "d", patients=1, sequences=4, sequences_per_file=2)
+    before = data_hashes(tmp_path / "d")
+    (tmp_path / "d/data/chunk-000/file-001.parquet").unlink()
+    with pytest.raises(InputError, match=r"file-001\.parquet: missing"):
+        load_dataset(tmp_path / "d")
+    make_toy_dataset(tmp_path / "d", patients=1, sequences=4, sequences_per_file=2)
+    assert data_hashes(tmp_path / "d") == before
+
+
+def test_other_settings_are_refused_by_name(tmp_path):
+    make_toy_dataset(tmp_path / "d", patients=1, sequences=4)
+    with pytest.raises(InputError, match=r"config\.sequences = 4, now it is 5"):
+        make_toy_dataset(tmp_path / "d", patients=1, sequences=5)
+    write_anatomy(replace(toy_anatomy("patient-0"), catheter_radius_mm=1.0), tmp_path / "anatomies/patient-0")
+    with pytest.raises(InputError, match=r"anatomies\.patient-0 ="):
+        make_toy_dataset(tmp_path / "d", patients=1, sequences=4)
+
+
+def test_a_folder_of_other_things_is_refused(tmp_path):
+    (tmp_path / "d").mkdir()
+    (tmp_path / "d/notes.txt").write_text("mine")
+    with pytest.raises(InputError, match="is not empty and holds no dataset"):
+        make_toy_dataset(tmp_path / "d", patients=1, sequences=4)
+    assert [path.name for path in (tmp_path / "d").iterdir()] == ["notes.txt"]
+
+
+def test_two_anatomies_of_one_name_are_refused(tmp_path):
+    for folder in ("patient-0", "patient-1"):
+        write_anatomy(toy_anatomy("twin"), tmp_path / "anatomies" / folder)
+    with pytest.raises(InputError, match="2 are named 'twin'"):
+        make_toy_dataset(tmp_path / "d", patients=2, sequences=4)
+    assert not (tmp_path / "d").exists()
+
+
+def test_a_full_disk_is_one_line_and_can_be_resumed(tmp_path, monkeypatch):
+    settings = {"patients": 1, "sequences": 4, "sequences_per_file": 2}
+    make_toy_dataset(tmp_path / "whole", **settings)
+    write, written = Path.write_bytes, []
+
+    def full(path: Path, content: bytes) -> int:
+        written.append(path)
+        if len(written) == 4:
+            write(path, content[: len(content) // 2])
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return write(path, content)
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(InputError, match="the disk is full; free some space and run the same command again"):
+        make_toy_dataset(tmp_path / "full", **settings)
+    assert not (tmp_path / "full/data/chunk-000/file-001.parquet").exists()
+    monkeypatch.undo()
+    make_toy_dataset(tmp_path / "full", **settings)
+    assert data_hashes(tmp_path / "full") == data_hashes(tmp_path / "whole")
+
+
+def test_invalid_worlds_are_listed_and_never_trained_on(tmp_path):
+    def failing(*args, **kwargs):
+        rollout = toy_simulate(*args, **kwargs)
+        rollout.valid[3, 50:] = False
+        rollout.tip.abscissa[3, 50:] = np.nan
+        return rollout
+
+    make_toy_dataset(tmp_path / "d", patients=1, sequences=10, simulate=failing)
+    record = read_json(tmp_path / "d/meta/manifest.json")["invalid"]
+    assert record["episodes"] == 1
+    assert record["which"][0]["sequence"] == 3
+    assert "after 25 s" in record["which"][0]["invalid_reason"]
+    data = load_dataset(tmp_path / "d")
+    assert not data.valid[3].all()
+    for split in ("train", "seen_test"):
+        assert 3 not in data.of_split(split).sequence
+        assert np.isfinite(data.of_split(split).tip_abscissa).all()
+    stats = read_json(tmp_path / "d/meta/stats.json")["observation.state"]
+    assert np.isfinite(stats["mean"]).all()
+    assert stats["count"] == [10 * 120 - 70]
+
+
+def test_the_drive_stops_short_of_the_end_of_the_vessel(tmp_path):
+    control = np.zeros((3, 40, 2))
+    control[:, :, 0] = np.array([[10.0], [1.0], [-3.0]])
+    control[:, :, 1] = 0.3
+    initial = np.array([[5.0, 0.0], [5.0, 0.0], [LENGTH_MM, 0.0]])
+
+    def without_slack(anatomy, device, control, *, initial, config, friction):
+        rollout = toy_simulate(anatomy, device, control, initial=initial, config=config, friction=friction)
+        ahead = rollout.inserted_length + 4.5  # a wire that cuts corners: its tip is ahead of its length
+        return replace(rollout, tip=replace(rollout.tip, abscissa=ahead))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("endopilot.dataset.navigate.simulate", without_slack)
+        rollout, stopped = navigate(
+            toy_anatomy("p"), read_device("workhorse-014"), initial, control, np.full(3, 0.1), SimulatorConfig()
+        )
+    assert (rollout.inserted_length <= LENGTH_MM - STOP_SHORT_MM + 1e-4).all()
+    assert (rollout.tip.abscissa <= LENGTH_MM - END_MM).all()
+    assert stopped.tolist() == [True, False, False]
+    free = rollout.inserted_length[0] < LENGTH_MM - 2 * STOP_SHORT_MM - 5.0
+    assert free.sum() == 16
+    np.testing.assert_allclose(rollout.control[0, free, 0], 10.0)
+    np.testing.assert_allclose(rollout.control[..., 1], np.float32(0.3))
+
+
+def test_stopping_short_keeps_the_inserted_length_within_its_limit():
+    generator = np.random.default_rng(3)
+    control = generator.normal(0, 30, (50, 60, 2))
+    limit = generator.uniform(5, 40, 50)
+    initial, driven = stop_short(generator.uniform(0, 60, (50, 2)), control, limit)
+    inserted = initial[:, :1] + 0.5 * np.cumsum(driven[..., 0], axis=1)
+    assert (inserted >= -1e-4).all()
+    assert (inserted <= limit[:, None] + 1e-4).all()
+    assert (driven == driven.astype(np.float32)).all()
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("sequences", 0),
+        ("seconds", 0.7),
+        ("seconds", float("nan")),
+        ("seed", -1),
+        ("friction", (0.2, 0.1)),
+        ("anatomy_shares", (0.0, 0.5, 0.5)),
+        ("anatomy_shares", (0.5, 0.1, 0.1)),
+        ("seen_test_share", 1.0),
+        ("sequences_per_file", 0),
+    ],
+)
+def test_bad_settings_are_named(field, value):
+    with pytest.raises(InputError, match=f"^{field}: "):
+        DatasetConfig(**{field: value})
+
+
+def _keys(data):
+    return zip(data.anatomy.tolist(), data.sequence.tolist(), strict=True)
+
+
+def test_loader_names_what_is_damaged(tmp_path):
+    with pytest.raises(InputError, match="no dataset here"):
+        load_dataset(tmp_path)
+    make_toy_dataset(tmp_path / "d", patients=1, sequences=4, sequences_per_file=2)
+    make_toy_dataset(tmp_path / "other", patients=1, sequences=4, sequences_per_file=2, seed=9)
+    file = tmp_path / "d/data/chunk-000/file-001.parquet"
+    whole = file.read_bytes()
+
+    file.write_bytes(whole[:-40])
+    with pytest.raises(InputError, match=r"file-001\.parquet: damaged"):
+        load_dataset(tmp_path / "d")
+    file.write_bytes((tmp_path / "other/data/chunk-000/file-001.parquet").read_bytes())
+    with pytest.raises(InputError, match=r"file-001\.parquet: written by another version or with other settings"):
+        load_dataset(tmp_path / "d")
+    file.write_bytes(whole)
+    info = read_json(tmp_path / "d/meta/info.json")
+    (tmp_path / "d/meta/info.json").write_text(json.dumps(info | {"codebase_version": "v2.1"}))
+    with pytest.raises(InputError, match=r"codebase_version is v2\.1"):
+        load_dataset(tmp_path / "d")
+    (tmp_path / "d/meta/info.json").unlink()
+    with pytest.raises(InputError, match=r"info\.json: no such file"):
+        load_dataset(tmp_path / "d")
+
+
+def test_an_absent_split_is_named(tmp_path):
+    make_toy_dataset(tmp_path / "d", patients=1, sequences=4)
+    with pytest.raises(InputError, match=r"no valid episode in split 'test' \(it has seen_test, train\)"):
+        load_dataset(tmp_path / "d").of_split("test")
+
+
+def test_importing_needs_no_torch():
+    code = "import sys, endopilot.dataset.generate, endopilot.dataset.loader, endopilot.models.config; "
+    code += "assert not {'torch', 'vtk', 'pyvista', 'matplotlib', 'plotly'} & set(sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
