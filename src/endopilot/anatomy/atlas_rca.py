@@ -143,11 +143,11 @@ def _main_vessel(generator: np.random.Generator, dominance: str) -> tuple[Float[
         ends_in = "4" if dominance == "balanced" or generator.random() < 0.6 else "16"
         waypoints = np.concatenate([TO_CRUX, BEYOND_CRUX[ends_in]])
         # Long arteries reach farther beyond the crux rather than belong to huge hearts.
-        crux_mm = 98.0 * (length / LENGTH_MM) ** 0.65 * (1 + 0.03 * generator.normal())
+        crux_mm = 106.0 * (length / LENGTH_MM) ** 0.65 * (1 + 0.03 * generator.normal())
         cut = None
     tortuosity = _truncated(generator, TORTUOSITY, TORTUOSITY_SD, TORTUOSITY - 0.45, TORTUOSITY + 0.45)
     mean_curvature = _truncated(generator, CURVATURE, CURVATURE_SD, CURVATURE - 0.025, CURVATURE + 0.025)
-    template = shape.curve_through(waypoints)
+    template = shape.curve_through(waypoints, 1.0)
     template_crux = float(shape.abscissa(shape.curve_through(TO_CRUX))[-1])
     along = shape.abscissa(template)
     keep = cut * along[-1] if cut else min(template_crux * length / crux_mm, along[-1])
@@ -158,9 +158,12 @@ def _main_vessel(generator: np.random.Generator, dominance: str) -> tuple[Float[
     axis = np.linalg.svd(centred)[2][2]
     axis = axis * np.sign(axis @ np.cross(TO_CRUX[4] - TO_CRUX[0], TO_CRUX[-1] - TO_CRUX[4]))
 
+    normals = shape.parallel_normals(shape.tangents(template))
+
     def curve(knobs: Float[np.ndarray, "3"]) -> Float[np.ndarray, "n 3"]:
         bent = shape.bend(template, axis, float(knobs[1])) * np.exp(knobs[0])
-        return turn.apply(shape.curve_through(wiggle.apply(bent, float(np.exp(knobs[2])), 8.0)))
+        across = Rotation.from_rotvec(np.linspace(0, knobs[1], len(normals))[:, None] * axis).apply(normals)
+        return turn.apply(shape.curve_through(wiggle.apply(bent, across, float(np.exp(knobs[2])), 8.0)))
 
     def misfit(knobs: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
         points = curve(np.clip(knobs, (-1, -2, -4), (1, 2, 3)))
@@ -278,7 +281,8 @@ def _side_branch(
     angle = np.deg2rad(generator.uniform(40, 70))
     direction = np.cos(angle) * forward + np.sin(angle) * across / np.linalg.norm(across)
     points = shape.steer(main[origin], direction, headed, length, generator.uniform(6.0, 9.0), heart.solid_depth)
-    points = shape.Wiggle.draw(generator, 13.0, 45.0, 6).apply(points, generator.uniform(0.3, 0.8), 10.0)
+    across = shape.parallel_normals(shape.tangents(points))
+    points = shape.Wiggle.draw(generator, 13.0, 45.0, 6).apply(points, across, generator.uniform(0.3, 0.8), 10.0)
     points = shape.curve_through(points[:: max(len(points) // 24, 1)])
     points = np.concatenate([main[origin][None], points[1:]])
     share = np.linspace(0.0, 1.0, len(points))

@@ -119,10 +119,14 @@ class Wiggle:
         weight = generator.normal(size=(modes, 2)) * ((wavelength / longest_mm) ** 1.5)[:, None]
         return cls(2 * np.pi / wavelength, generator.uniform(0, 2 * np.pi, (modes, 2)), weight)
 
-    def apply(self, points: Float[np.ndarray, "n 3"], amplitude: float, quiet_mm: float) -> Float[np.ndarray, "n 3"]:
-        """Displace a curve across its direction; the first `quiet_mm` mm fade in, so that the start keeps its place."""
+    def apply(
+        self, points: Float[np.ndarray, "n 3"], normal: Float[np.ndarray, "n 3"], amplitude: float, quiet_mm: float
+    ) -> Float[np.ndarray, "n 3"]:
+        """Displace a curve across its direction; the first `quiet_mm` mm fade in, so that the start keeps its place.
+
+        `normal` holds unit vectors across the curve that turn smoothly along it.
+        """
         tangent = tangents(points)
-        normal = parallel_normals(tangent)
         along = abscissa(points)
         sines = np.sin(along[:, None, None] * self.wave_number[:, None] + self.phase)
         offset = amplitude * np.sum(self.weight * sines, axis=1)
@@ -150,15 +154,16 @@ def steer(
         depth: how deep points lie below the surface, mm; the curve seeks a height of `_HEIGHT_MM` above it.
     """
     count = max(round(length_mm / STEP_MM), 8)
-    heading, aim = direction, direction
+    heading, aim, rise, outward = direction, direction, 0.0, direction
     points = [start]
     probes = np.concatenate([np.zeros((1, 3)), np.eye(3)])
     for i in range(count):
         course = [vector for begin, vector in courses if i * STEP_MM >= begin][-1]
-        below = depth(points[-1] + 3.0 * heading + probes)
-        outward = below[0] - below[1:]
-        outward = outward / max(float(np.linalg.norm(outward)), 1e-6)
-        rise = np.clip((below[0] + _HEIGHT_MM) / 4.0, -0.6, 1.2)
+        if i % 2 == 0:
+            below = depth(points[-1] + 3.0 * heading + probes)
+            outward = below[0] - below[1:]
+            outward = outward / max(float(np.linalg.norm(outward)), 1e-6)
+            rise = np.clip((below[0] + _HEIGHT_MM) / 4.0, -0.6, 1.2)
         course = course - min(float(course @ outward), 0.0) * outward + rise * outward
         # Two relaxations in a row keep the curvature continuous where the course changes.
         aim = aim + (course / np.linalg.norm(course) - aim) * (2 * STEP_MM / relaxation_mm)

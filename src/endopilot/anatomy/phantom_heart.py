@@ -94,7 +94,7 @@ def left_coronary(heart: HeartFit) -> tuple[Centerline, ...]:
     """Return the left main with the beginnings of LAD and LCx (diameters after Dodge 1992: 4.5, 3.7, 3.4 mm)."""
     lines = []
     for waypoints, begin, end in _LEFT_CORONARY:
-        points = heart.from_reference(shape.curve_through(np.array(waypoints)))
+        points = heart.from_reference(shape.curve_through(np.array(waypoints, dtype=float)))
         along = shape.abscissa(points)
         radius = np.interp(along, [0.0, along[-1]], [begin, end])
         lines.append(Centerline(points, radius, along, shape.parallel_normals(shape.tangents(points))))
@@ -117,7 +117,7 @@ def cardiac_veins(heart: HeartFit, tree: VesselTree) -> tuple[Centerline, ...]:
         across = np.cos(angle) * line.normals[inside] + np.sin(angle) * side
         points = points + (line.radius[inside] + radius + gap)[:, None] * across
         lines.append(_vein(points, radius, radius))
-    sinus = heart.from_reference(shape.curve_through(np.array(_CORONARY_SINUS)))
+    sinus = heart.from_reference(shape.curve_through(np.array(_CORONARY_SINUS, dtype=float)))
     lines.append(_vein(sinus, 4.2, 2.2))
     return tuple(lines)
 
