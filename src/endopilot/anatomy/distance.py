@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float
 
 from endopilot.anatomy.surface import Surface, surface_from_mask
 from endopilot.errors import InputError
@@ -19,14 +19,14 @@ from endopilot.types import Centerline, DistanceMap, Insertion, VesselTree, Volu
 BAND_MM = 2.5
 """How far outside the wall the distance map reaches, mm; beyond, it holds the constant −`BAND_MM`."""
 
-MAXIMUM_GRID_POINTS = 30_000_000
-"""A distance map holds at most this many grid points (120 MB of float32); the spacing grows until it fits."""
+MAXIMUM_GRID_POINTS = 20_000_000
+"""A distance map holds at most this many grid points (80 MB of float32); the spacing grows until it fits."""
 
 FILLET = 0.5
 """Strength of the fillet where a branch leaves its parent, in radii of the branch."""
 
-_NEAR_WALL = 2
-"""Outside the lumen, this many grid steps are computed exactly, the rest of the band on every second grid point."""
+_NEAR_WALL = (2, 5)
+"""This many grid steps outside and inside the wall are computed exactly, the rest on every second grid point."""
 
 Grid = tuple[tuple[int, int, int], Float[np.ndarray, "3"]]
 """Shape (nz, ny, nx) and LPS origin of a distance map."""
@@ -35,14 +35,14 @@ Grid = tuple[tuple[int, int, int], Float[np.ndarray, "3"]]
 def automatic_spacing(radius: Float[np.ndarray, "n"], extent_mm: Float[np.ndarray, "3"]) -> float:
     """Return a grid spacing in mm that resolves the lumen and keeps the map small.
 
-    It is 0.4 times the radius that all but the narrowest twentieth of the centerline exceeds, from 0.25 to 1.5 mm,
+    It is 0.45 times the radius that all but the narrowest twentieth of the centerline exceeds, from 0.25 to 1.5 mm,
     and no smaller than `MAXIMUM_GRID_POINTS` allows over `extent_mm`.
 
     Args:
         radius: inscribed-sphere radii along the centerline, mm.
         extent_mm: edges of the box that the map must cover, mm.
     """
-    spacing = float(np.clip(0.4 * np.quantile(radius, 0.05), 0.25, 1.5))
+    spacing = float(np.clip(0.45 * np.quantile(radius, 0.05), 0.25, 1.5))
     smallest = float(np.prod(np.maximum(extent_mm, 1.0)) / MAXIMUM_GRID_POINTS) ** (1 / 3)
     return round(max(spacing, smallest), 3)
 
@@ -82,39 +82,41 @@ def distance_map_from_surface(surface: Surface, *, spacing_mm: float, band_mm: f
         spacing_mm: grid spacing, mm.
         band_mm: how far outside the wall distances are kept, mm.
     """
-    from scipy.ndimage import maximum_filter
+    from scipy.ndimage import maximum_filter, minimum_filter
 
     lower = surface.vertices.min(axis=0) - band_mm
     shape, origin = _grid(lower, surface.vertices.max(axis=0) + band_mm, spacing_mm)
     inside = surface.inside(shape, origin, spacing_mm)
-    surface = surface.refined(1.5 * spacing_mm)
-    values = np.full(shape, -band_mm, dtype=np.float32)
-    coarse = np.argwhere(maximum_filter(inside, size=2 * (math.ceil(band_mm / spacing_mm) + 2) + 1)[::2, ::2, ::2])
-    if len(coarse):
-        _fill_far_field(values, surface, origin, spacing_mm, coarse, band_mm)
-    near = maximum_filter(inside, size=2 * _NEAR_WALL + 1) & ~inside
-    index = np.argwhere(near)
-    values[near] = -surface.distance(origin + spacing_mm * index[:, ::-1], limit_mm=band_mm)
-    index = np.argwhere(inside)
-    values[inside] = surface.distance(origin + spacing_mm * index[:, ::-1])
+    surface = surface.refined(3.0 * spacing_mm)
+    reach = 2 * (math.ceil(band_mm / spacing_mm) + 2) + 1
+    values = _far_field(surface, inside, maximum_filter(inside, size=reach), origin, spacing_mm, band_mm)
+    outside = maximum_filter(inside, size=2 * _NEAR_WALL[0] + 1) & ~inside
+    index = np.argwhere(outside)
+    values[outside] = -surface.distance(origin + spacing_mm * index[:, ::-1], limit_mm=band_mm)
+    shallow = inside & ~minimum_filter(inside, size=2 * _NEAR_WALL[1] + 1)
+    index = np.argwhere(shallow)
+    values[shallow] = surface.distance(origin + spacing_mm * index[:, ::-1])
     return DistanceMap(values=values, spacing_mm=float(spacing_mm), origin_mm=origin)
 
 
-def _fill_far_field(
-    values: Float[np.ndarray, "nz ny nx"],
+def _far_field(
     surface: Surface,
+    inside: Bool[np.ndarray, "nz ny nx"],
+    wanted: Bool[np.ndarray, "nz ny nx"],
     origin: Float[np.ndarray, "3"],
     spacing: float,
-    coarse: Int[np.ndarray, "n 3"],
     band: float,
-) -> None:
-    """Fill the map with outside distances from every second grid point, linear between them.
+) -> Float[np.ndarray, "nz ny nx"]:
+    """Return signed distances from every second grid point, linear between them.
 
-    Away from the wall the distance is so smooth that this errs by at most h²/2(R + d); the rest is overwritten.
+    At a distance ρ from the medial axis this errs by at most h²/2ρ, so it serves away from the wall.
     """
-    distance = -surface.distance(origin + 2 * spacing * coarse[:, ::-1], limit_mm=band)
-    half = np.full(tuple((np.array(values.shape) + 1) // 2 + 1), -band, dtype=np.float32)
-    half[tuple(coarse.T)] = distance
+    values = np.empty(inside.shape, dtype=np.float32)
+    half = np.full(tuple((np.array(inside.shape) + 1) // 2 + 1), -band, dtype=np.float32)
+    coarse = np.argwhere(wanted[::2, ::2, ::2])
+    within = inside[::2, ::2, ::2][tuple(coarse.T)]
+    for part, sign, limit in ((coarse[within], 1.0, np.inf), (coarse[~within], -1.0, band)):
+        half[tuple(part.T)] = sign * surface.distance(origin + 2 * spacing * part[:, ::-1], limit_mm=limit)
     for offset in np.ndindex(2, 2, 2):
         pieces = [half]
         for axis, odd in enumerate(offset):
@@ -123,6 +125,7 @@ def _fill_far_field(
                 pieces = [0.5 * (piece + following) for piece, following in zip(pieces, after, strict=True)]
         target = values[offset[0] :: 2, offset[1] :: 2, offset[2] :: 2]
         target[...] = pieces[0][: target.shape[0], : target.shape[1], : target.shape[2]]
+    return values
 
 
 def distance_map_from_mask(mask: Volume, *, spacing_mm: float | None = None, band_mm: float = BAND_MM) -> DistanceMap:

@@ -45,7 +45,7 @@ class AnatomyConfig:
     catheter_radius_mm: float | None = None
     """Inner radius of the guiding catheter, mm; by default the lumen's radius at the ostium."""
     spacing_mm: float | None = None
-    """Grid spacing of the distance map, mm; by default 0.4 times the narrow vessels' radius, from 0.25 to 1.5 mm."""
+    """Grid spacing of the distance map, mm; by default 0.45 times the narrow vessels' radius, from 0.25 to 1.5 mm."""
     minimum_branch_length_mm: float = 4.0
     """Side branches shorter than this beyond their parent's lumen are dropped, mm."""
     scale: float = 1.0
@@ -135,7 +135,7 @@ def _tree(
     extent = np.ptp(surface.vertices, axis=0)
     spacing = max(mean_radius / 5.0, 0.5 * finest_mm, float(np.prod(extent + 2) / MAXIMUM_GRID_POINTS) ** (1 / 3))
     distance_map = distance_map_from_surface(surface, spacing_mm=spacing, band_mm=2 * spacing)
-    surface = surface.refined(1.5 * spacing)
+    surface = surface.refined(3.0 * spacing)
     inside = _component(distance_map, given)
     points = distance_map.origin_mm + spacing * np.argwhere(inside)[:, ::-1]
     clearance = distance_map.values[inside].astype(float)

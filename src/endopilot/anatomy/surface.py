@@ -62,12 +62,12 @@ class Surface:
         reach = limit_mm + self.longest_edge
         for start in range(0, len(points), 200_000):
             part = np.ascontiguousarray(points[start : start + 200_000])
-            gap, nearest = self._centroids.query(part, distance_upper_bound=reach)
+            gap, nearest = self._centroids.query(part, distance_upper_bound=reach, workers=-1)
             gap, nearest = np.asarray(gap), np.asarray(nearest)
             near = np.flatnonzero(gap < 3.0 * self.longest_edge)
             far = np.flatnonzero((gap >= 3.0 * self.longest_edge) & np.isfinite(gap))
             count = min(_NEAREST_TRIANGLES, len(self.faces))
-            candidates = self._centroids.query(part[near], k=[*range(1, count + 1)])[1]  # pyright: ignore[reportArgumentType]
+            candidates = self._centroids.query(part[near], k=[*range(1, count + 1)], workers=-1)[1]  # pyright: ignore[reportArgumentType]
             for rows, index in ((near, np.asarray(candidates)), (far, nearest[far, None])):
                 squares = _square_distance(part[rows], self._corners, index)
                 result[start + rows] = np.minimum(np.sqrt(squares.min(axis=1)), limit_mm)
