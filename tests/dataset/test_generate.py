@@ -239,7 +239,7 @@ def test_the_drive_stops_short_of_the_end_of_the_vessel(tmp_path):
     assert (rollout.tip.abscissa <= LENGTH_MM - END_MM).all()
     assert stopped.tolist() == [True, False, False]
     free = rollout.inserted_length[0] < LENGTH_MM - 2 * STOP_SHORT_MM - 5.0
-    assert free.sum() == 16
+    assert free.sum() == 15
     np.testing.assert_allclose(rollout.control[0, free, 0], 10.0)
     np.testing.assert_allclose(rollout.control[..., 1], np.float32(0.3))
 

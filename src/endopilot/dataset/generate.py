@@ -11,6 +11,7 @@ import hashlib
 import json
 import os
 import time
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -281,10 +282,11 @@ def _episodes(
 
 def _reasons(rollout: Rollout) -> list[str]:
     """Return why each world is invalid, "" for the valid ones."""
-    first = np.argmin(rollout.valid, axis=1)
     return [
-        "" if valid else f"the simulation did not converge or left the finite numbers after {t * SAMPLE_PERIOD_S:g} s"
-        for valid, t in zip(rollout.valid.all(axis=1), first, strict=True)
+        ""
+        if valid.all()
+        else f"did not converge or left the finite numbers after {np.argmin(valid) * SAMPLE_PERIOD_S:g} s"
+        for valid in rollout.valid
     ]
 
 
@@ -293,7 +295,7 @@ def _finish(plan: _Plan, blocks: Sequence[_Block], wall_seconds: float) -> None:
     import pandas as pd  # slow to import, and only needed here
 
     files = [schema.paths_of_file(plan.output, block.number) for block in blocks]
-    episodes = pd.concat([schema.read_table(path, plan.key).to_pandas() for _, path in files], ignore_index=True)
+    episodes = [row for _, path in files for row in schema.read_table(path, plan.key).to_pylist()]
     with progress("Describing the dataset", total=len(files)) as advance:
         write_json(plan.output / schema.STATS_PATH, schema.statistics([path for path, _ in files], plan.key, advance))
     tasks = pd.DataFrame({"task_index": [0]}, index=pd.Index([schema.TASK], name="task"))
@@ -301,7 +303,8 @@ def _finish(plan: _Plan, blocks: Sequence[_Block], wall_seconds: float) -> None:
         tasks.to_parquet(partial)
     samples = plan.config.samples
     write_json(plan.output / schema.INFO_PATH, schema.info(len(episodes), samples))
-    invalid = episodes[~episodes["valid"]]
+    told = ("episode_index", "anatomy", "sequence", "invalid_reason")
+    invalid = [{name: row[name] for name in told} for row in episodes if not row["valid"]]
     record = manifest(
         config=plan.config,
         seed=plan.config.seed,
@@ -313,12 +316,9 @@ def _finish(plan: _Plan, blocks: Sequence[_Block], wall_seconds: float) -> None:
         samples_per_episode=samples,
         device=asdict(plan.device),
         anatomies=[_anatomy_record(plan, i) for i in range(len(plan.names))],
-        splits=episodes["split"].value_counts().to_dict(),
-        stopped_short=int(episodes["stopped_short"].sum()),
-        invalid={
-            "episodes": len(invalid),
-            "which": invalid[["episode_index", "anatomy", "sequence", "invalid_reason"]].to_dict("records"),
-        },
+        splits=dict(Counter(row["split"] for row in episodes)),
+        stopped_short=sum(row["stopped_short"] for row in episodes),
+        invalid={"episodes": len(invalid), "which": invalid},
         wall_seconds=wall_seconds,
     )
     write_json(plan.output / schema.MANIFEST_PATH, record)

@@ -116,7 +116,7 @@ def read_table(path: Path, key: str) -> pa.Table:
         InputError: the file is missing or damaged, or belongs to another dataset or version.
     """
     try:
-        table = pq.read_table(path, partitioning=None)
+        table = pq.ParquetFile(path).read()
     except FileNotFoundError as error:
         raise InputError(f"{path}: missing from the dataset; run the same `endopilot dataset` command again") from error
     except (pa.ArrowInvalid, OSError) as error:

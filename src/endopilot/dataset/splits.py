@@ -48,13 +48,14 @@ def assign_splits(
     counts = _counts(len(names), anatomy_shares)
     order = sorted(range(len(names)), key=lambda i: _digest(names[i]))
     by_anatomy = np.empty(len(names), dtype="<U9")
-    by_anatomy[order] = np.repeat(["train", "calibrate", "test"], counts)
+    by_anatomy[order] = np.repeat(np.array(["train", "calibrate", "test"]), counts)
 
     splits = np.repeat(by_anatomy[:, None], n_sequences, axis=1)
     held_out = _held_out(n_sequences, seen_test_share)
-    for row in np.flatnonzero(by_anatomy == "train"):
-        ranked = sorted(range(n_sequences), key=lambda i: _digest(f"{names[row]}/{i}"))
-        splits[row, ranked[:held_out]] = "seen_test"
+    for row, name in enumerate(names):
+        if by_anatomy[row] == "train":
+            ranked = sorted(range(n_sequences), key=lambda i: _digest(f"{name}/{i}"))
+            splits[row, ranked[:held_out]] = "seen_test"
     return splits
 
 
@@ -69,7 +70,7 @@ def _counts(n: int, shares: tuple[float, float, float]) -> list[int]:
     counts = [int(is_asked) for is_asked in asked]
     while sum(counts) < n:
         shortfall = [n * share - count for share, count in zip(shares, counts, strict=True)]
-        counts[int(np.argmax(shortfall))] += 1
+        counts[shortfall.index(max(shortfall))] += 1
     return counts
 
 

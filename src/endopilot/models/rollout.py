@@ -64,7 +64,8 @@ class TransformerPredictor:
     Attributes:
         forward: FF, if it was trained.
         inverse: IF, if it was trained.
-        control_limits: largest translation speed, mm/s, and rotation speed, rad/s, that IF may ask for.
+        control_limits: the device's largest translation speed, mm/s, and rotation speed, rad/s; IF's controls are
+            clipped to them, and to a wire that is not pulled out of the catheter.
         batch_size: episodes that are rolled out together.
     """
 
@@ -87,7 +88,7 @@ class TransformerPredictor:
 
     @torch.inference_mode()
     def _rollout(self, episodes: Dataset, *, ask: bool, foretell: bool) -> OpenLoop:
-        """Roll out with the controls that IF asks for, or the true ones, and the tip that FF foretells, or the true one."""
+        """Roll out with the controls that IF asks for or the true ones; likewise the tip that FF foretells."""
         forward, inverse = self._network("forward", foretell), self._network("inverse", ask)
         parts = []
         for first in range(0, len(episodes), self.batch_size):
@@ -116,6 +117,8 @@ def _rollout_batch(
             asked = torch.cat([tip[:, k - WINDOW + 1 : k], desired[:, k : k + 1]], dim=1)
             given = slice(k - WINDOW, k)
             control[:, k] = inverse(asked, proximal[:, given].float(), control[:, given]).clamp(-bound, bound)
+            out_of_the_catheter = -proximal[:, k - 1, 0].float() / SAMPLE_PERIOD_S
+            control[:, k, 0] = torch.maximum(control[:, k, 0], out_of_the_catheter)
             proximal[:, k] = proximal[:, k - 1] + SAMPLE_PERIOD_S * control[:, k].double()
         if forward is not None:
             moved = slice(k - WINDOW + 1, k + 1)

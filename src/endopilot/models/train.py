@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from endopilot.dataset.loader import Dataset, load_dataset
+from endopilot.dataset.loader import load_dataset
 from endopilot.errors import InputError
 from endopilot.files import manifest, read_json, write_json
 from endopilot.models.checkpoint import (
@@ -35,10 +35,10 @@ from endopilot.progress import Advance, progress
 
 VALIDATION_WINDOWS = 1024
 """Windows of held-out navigations that the loss is checked on after every epoch."""
-WARM_UP_STEPS = 100
-"""Steps over which the learning rate rises to its peak; afterwards it falls to zero along a cosine."""
+WARM_UP_EPOCHS = 0.5
+"""Epochs over which the learning rate rises to its peak; afterwards it falls to zero along a cosine."""
 _SCALE_WINDOWS = 16384
-_TIMED_STEPS = 10
+_TIMED_STEPS = 12
 _GRADIENT_NORM = 1.0
 
 
@@ -77,7 +77,7 @@ def train(dataset_folder: Path, run_folder: Path, config: TrainConfig) -> None:
         dataset=os.path.relpath(dataset_folder.resolve(), run_folder.resolve()),
         episodes={"train": len(training.tip), "seen_test": 0 if validation is None else len(validation.tip)},
         rejected={"invalid_episodes": int((~dataset.valid.all(axis=1)).sum())},
-        control_limits=_control_limits(dataset),
+        control_limits=[dataset.manifest["device"][name] for name in ("max_velocity_mm_s", "max_rotation_rad_s")],
         networks={name: {key: result[key] for key in result if key != "curve"} for name, result in results.items()},
         threads=torch.get_num_threads(),
         wall_seconds=time.perf_counter() - start,
@@ -103,11 +103,6 @@ def _begin(run_folder: Path, settings: dict[str, Any]) -> None:
         )
 
 
-def _control_limits(dataset: Dataset) -> list[float]:
-    """Return the largest translation (mm/s) and rotation speed (rad/s) in the training data."""
-    return np.abs(dataset.of_split("train").control).max(axis=(0, 1)).tolist()
-
-
 @dataclass(frozen=True, eq=False)
 class _Job:
     """The training of one network."""
@@ -126,30 +121,24 @@ class _Job:
             torch.manual_seed(_seed(config.seed, self.name, "weights"))
             network = NETWORKS[self.name](self.size)
             self._fit_scales(network)
-            optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate)
-            state = self._resume(network, optimizer) or {
-                "steps_per_epoch": self._plan(network),
-                "seconds": 0.0,
-                "curve": [],
-            }
-            steps = state["steps_per_epoch"]
-            title = f"Training {self.name.upper()}"
-            with progress(title, total=config.epochs * steps) as advance:
-                advance(len(state["curve"]) * steps)
-                while len(state["curve"]) < config.epochs and not self._out_of_time(state):
+            optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate, fused=True)
+            state = self._resume(network, optimizer) or {"seconds": 0.0, "curve": []}
+            with progress(f"Training {self.name.upper()}", total=config.epochs) as advance:
+                advance(len(state["curve"]))
+                while len(state["curve"]) < config.epochs:
                     self._epoch(network, optimizer, state, advance)
                     self._save(network, optimizer, state)
-        windows = steps * config.batch_size
-        return {"windows_per_epoch": windows, "parameters": sum(p.numel() for p in network.parameters())} | state
+        return {"parameters": sum(p.numel() for p in network.parameters())} | state
 
     def _epoch(self, network: Network, optimizer: torch.optim.Adam, state: dict[str, Any], advance: Advance) -> None:
-        epoch, steps, start = len(state["curve"]), state["steps_per_epoch"], time.perf_counter()
+        """Go through one epoch, check the loss on held-out navigations, and add both to the state's curve."""
+        epoch, epochs, start = len(state["curve"]), self.config.epochs, time.perf_counter()
+        batches = self._batches(epoch, self._steps(network, state))
         torch.manual_seed(_seed(self.config.seed, self.name, epoch))
-        batches = self._batches(epoch, steps)
         network.train()
-        total = 0.0
+        total, steps, first = 0.0, len(batches), time.perf_counter()
         for step, targets in enumerate(batches):
-            rate = _learning_rate(self.config.learning_rate, epoch * steps + step, self.config.epochs * steps)
+            rate = self.config.learning_rate * _schedule(epoch + step / steps, epochs)
             loss = self._step(network, optimizer, targets, rate)
             if not math.isfinite(loss):
                 episodes = sorted(set(targets[:, 0].tolist()))[:8]
@@ -159,19 +148,19 @@ class _Job:
                     "look for bad samples in the dataset or lower learning_rate"
                 )
             total += loss
-            speed = (step + 1) * self.config.batch_size / (time.perf_counter() - start)
-            advance(1, f"loss {total / (step + 1):.3f}, {speed:.0f} samples/s")
-        seconds = time.perf_counter() - start
-        state["seconds"] += seconds
+            speed = (step + 1) * self.config.batch_size / (time.perf_counter() - first)
+            advance(1 / steps, f"loss {total / (step + 1):.3f}, {speed:.0f} samples/s")
+        training_seconds = time.perf_counter() - first
         state["curve"].append(
             {
                 "epoch": epoch + 1,
+                "steps": steps,
                 "loss": total / steps,
                 "validation_loss": self._validate(network),
-                "seconds": seconds,
-                "windows_per_second": steps * self.config.batch_size / seconds,
+                "samples_per_second": sum(map(len, batches)) / training_seconds,
             }
         )
+        state["seconds"] += time.perf_counter() - start
 
     def _step(self, network: Network, optimizer: torch.optim.Adam, targets: torch.Tensor, rate: float) -> float:
         """Take one step along the gradient and return the loss before it; a loss that is not finite takes no step."""
@@ -208,31 +197,29 @@ class _Job:
         chosen = torch.linspace(0, len(targets) - 1, min(len(targets), _SCALE_WINDOWS)).long()
         network.fit_scales(*self.training.window(self.name, targets[chosen]))
 
-    def _plan(self, network: Network) -> int:
-        """Return the steps of an epoch: every window once, or what `windows_per_epoch` or `max_seconds` leave of it."""
+    def _steps(self, network: Network, state: dict[str, Any]) -> int:
+        """Return the steps of the next epoch: every window once, or what `windows_per_epoch` or the time allow."""
         config = self.config
         windows = min(len(self.training.targets()), config.windows_per_epoch or 2**62)
-        steps = max(math.ceil(windows / config.batch_size), 1)
+        steps = math.ceil(windows / config.batch_size)
         if config.max_seconds is None:
             return steps
-        trial = copy.deepcopy(network).train()
-        optimizer = torch.optim.Adam(trial.parameters(), lr=0.0)
-        batches = (self._batches(0, 2 * _TIMED_STEPS) * _TIMED_STEPS)[: 2 * _TIMED_STEPS]
-        for step, targets in enumerate(batches):
-            if step == _TIMED_STEPS:  # the first steps also pay for allocation
-                start = time.perf_counter()
-            self._step(trial, optimizer, targets, 0.0)
-        seconds_per_step = (time.perf_counter() - start) / _TIMED_STEPS
-        # An evaluation of a window costs about a third of a training step on it.
-        validation = 0 if self.validation is None else VALIDATION_WINDOWS / config.batch_size / 3
-        affordable = config.max_seconds / config.epochs / seconds_per_step - validation
-        return max(min(steps, int(affordable)), 1)
+        curve = state["curve"]
+        seconds_left = (config.max_seconds - state["seconds"]) / (config.epochs - len(curve))
+        seconds_a_step = state["seconds"] / sum(e["steps"] for e in curve) if curve else self._time_a_step(network)
+        return max(min(steps, int(seconds_left / seconds_a_step)), 1)
 
-    def _out_of_time(self, state: dict[str, Any]) -> bool:
-        """Tell whether the next epoch would end later than a tenth over the time allowed."""
-        if self.config.max_seconds is None or not state["curve"]:
-            return False
-        return state["seconds"] + state["curve"][-1]["seconds"] > 1.1 * self.config.max_seconds
+    def _time_a_step(self, network: Network) -> float:
+        """Return how long a training step takes, s, tried out on a copy of the network."""
+        trial = copy.deepcopy(network).train()
+        optimizer = torch.optim.Adam(trial.parameters(), fused=True)
+        targets = self._batches(0, 1)[0]
+        times = []
+        for _ in range(_TIMED_STEPS):
+            start = time.perf_counter()
+            self._step(trial, optimizer, targets, 0.0)
+            times.append(time.perf_counter() - start)
+        return float(np.median(times))
 
     def _save(self, network: Network, optimizer: torch.optim.Adam, state: dict[str, Any]) -> None:
         tensors = {f"network.{key}": value for key, value in network.state_dict().items()}
@@ -248,19 +235,19 @@ class _Job:
         restore_optimizer(optimizer, tensors)
         # A kill between the two files of an epoch leaves the second one behind by an epoch.
         write_network(self.run_folder / f"{self.name}.safetensors", self.name, network, self.size, {})
-        return {key: facts[key] for key in ("steps_per_epoch", "seconds", "curve")}
+        return {key: facts[key] for key in ("seconds", "curve")}
 
     @property
     def _checkpoint(self) -> Path:
         return self.run_folder / "checkpoints" / f"{self.name}.safetensors"
 
 
-def _learning_rate(peak: float, step: int, total: int) -> float:
-    """Return the step size: a linear rise over the first steps, then half a cosine down to zero."""
-    warm_up = min(WARM_UP_STEPS, total // 10)
-    if step < warm_up:
-        return peak * (step + 1) / warm_up
-    return peak * 0.5 * (1 + math.cos(math.pi * (step - warm_up) / max(total - warm_up, 1)))
+def _schedule(epoch: float, epochs: int) -> float:
+    """Return the learning rate's share of its peak: a linear rise, then half a cosine down to zero."""
+    warm_up = min(WARM_UP_EPOCHS, epochs / 10)
+    if epoch < warm_up:
+        return (epoch + 0.01) / (warm_up + 0.01)
+    return 0.5 * (1 + math.cos(math.pi * (epoch - warm_up) / (epochs - warm_up)))
 
 
 def _seed(*parts: int | str) -> int:
