@@ -1,0 +1,327 @@
+"""All stages in a row: a CT angiogram goes in, a report comes out.
+
+`run_demo` makes its own patients first; `run_volume` takes one volume of yours. Both keep a ledger of finished stages,
+so that an interrupted run goes on where it stopped, and both end with report.html, metrics.json and manifest.json.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from endopilot.anatomy.atlas import AtlasConfig, synthesize_one
+from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
+from endopilot.anatomy.io import read_anatomy, write_anatomy
+from endopilot.anatomy.phantom import PhantomConfig, make_phantom
+from endopilot.dataset.generate import DatasetConfig, generate_dataset
+from endopilot.dataset.loader import load_dataset
+from endopilot.errors import InputError
+from endopilot.evaluation.anatomy_score import score_anatomy
+from endopilot.files import input_hash, json_text, manifest, read_json, write_json
+from endopilot.imaging.segment import SegmentConfig, segment
+from endopilot.imaging.volume import read_mask, read_volume, write_mask, write_volume
+from endopilot.models.config import TrainConfig
+from endopilot.progress import progress
+from endopilot.simulation.device import Device, read_device
+from endopilot.simulation.simulator import simulate
+from endopilot.types import Rollout
+
+VOLUME_SUFFIX = ".nii.gz"
+REPORT_FILE = "report.html"
+DEMO_ORIGIN = (
+    "The patients are synthetic: right coronary arteries drawn from published statistics, and a CT angiogram of each, "
+    "made with noise, blur, calcium, chambers and veins. Everything after the CT is made from it alone."
+)
+RUN_ORIGIN = "One CT angiogram, given by the user; everything is made from it alone."
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyConfig:
+    """What happens to patients once their volumes are there."""
+
+    device: str = "workhorse-014"
+    """Name of a shipped device (`endopilot devices`) or a YAML file."""
+    sequences: int = 60
+    """Random navigations simulated in each patient."""
+    seconds: float = 60.0
+    """Length of a navigation, s."""
+    training_seconds: float = 110.0
+    """Training time of each of the two networks, s."""
+    seed: int = 1
+    """Seed of everything random."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoConfig(StudyConfig):
+    """The demo: synthetic right-coronary patients, a third of them never trained on."""
+
+    patients: int = 6
+    """Number of patients, at least 3."""
+
+    def __post_init__(self) -> None:
+        if self.patients < 3:
+            raise InputError(f"--patients {self.patients}: at least 3 are needed, so that one can be kept unseen")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunConfig(StudyConfig):
+    """One patient's volume."""
+
+    segmentation: SegmentConfig = field(default_factory=SegmentConfig)
+    """How to segment."""
+
+
+class Ledger:
+    """What a run has behind it, kept in `stages.json`: finished stages, their seconds, rejected patients.
+
+    Args:
+        folder: the run's folder.
+        config: the run's configuration; a folder begun with another one is refused.
+
+    Raises:
+        InputError: the folder holds a run with another configuration.
+    """
+
+    def __init__(self, folder: Path, config: Any) -> None:
+        self.path = folder / "stages.json"
+        self.config = json.loads(json_text(asdict(config)))
+        self.finished: list[str] = []
+        self.seconds: dict[str, float] = {}
+        self.rejected: dict[str, str] = {}
+        self.inputs: dict[str, str] = {}
+        if self.path.exists():
+            record = read_json(self.path)
+            different = [key for key, value in self.config.items() if record["config"].get(key) != value]
+            if different:
+                raise InputError(
+                    f"{folder}: holds a run with another {', '.join(different)}; remove it or choose another --output"
+                )
+            self.finished, self.seconds, self.rejected = (record[key] for key in ("finished", "seconds", "rejected"))
+
+    def stage(self, name: str, work: Callable[[], None]) -> None:
+        """Do the work of a stage unless it is finished; time spent before an interruption counts too."""
+        if name in self.finished:
+            return
+        start = time.perf_counter()
+        try:
+            work()
+            self.finished.append(name)
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+            write_json(self.path, {key: value for key, value in vars(self).items() if key != "path"})
+
+    def each(self, title: str, items: Sequence[Path], work: Callable[[Path], None]) -> None:
+        """Do a stage's work for every item under one progress bar; an item whose input is bad is rejected, and told."""
+        with progress(title, len(items)) as advance:
+            for item in items:
+                try:
+                    work(item)
+                except InputError as error:
+                    if len(items) == 1:
+                        raise
+                    self.rejected[item.name] = str(error)
+                advance(remark=item.name)
+
+
+def run_demo(output: Path, config: DemoConfig) -> dict[str, Any]:
+    """Go the whole way with synthetic patients and write `output`/report.html.
+
+    Everything after the CT volumes is made from them alone; the generator's truth only scores the result.
+
+    Args:
+        output: folder of everything the demo makes.
+        config: size of the demo.
+
+    Returns:
+        The report's path and the figures of its summary.
+
+    Raises:
+        InputError: the folder holds a demo with other settings, or too few patients could be segmented.
+    """
+    ledger = Ledger(output, config)
+    atlas = AtlasConfig(anatomy="rca", count=config.patients, seed=config.seed)
+    truths = [output / "truth" / f"patient-{index + 1}" for index in range(config.patients)]
+
+    def make_patient(folder: Path) -> None:
+        if not folder.exists():
+            write_anatomy(synthesize_one(atlas, truths.index(folder)), folder)
+
+    def make_volume(folder: Path) -> None:
+        path = output / "ct" / f"{folder.name}{VOLUME_SUFFIX}"
+        if not path.exists():
+            seed = config.seed * len(truths) + truths.index(folder)
+            write_volume(make_phantom(read_anatomy(folder), PhantomConfig(), seed), path)
+
+    ledger.stage("atlas", lambda: ledger.each("Synthetic patients", truths, make_patient))
+    ledger.stage("phantom", lambda: ledger.each("Synthetic CT angiograms", truths, make_volume))
+    volumes = [output / "ct" / f"{folder.name}{VOLUME_SUFFIX}" for folder in truths]
+    segmentation = SegmentConfig(method="coronary", vessel="rca")
+    return _study(output, volumes, config, segmentation, ledger, origin=DEMO_ORIGIN, command="endopilot demo")
+
+
+def run_volume(volume: Path, output: Path, config: RunConfig, *, series: str | None = None) -> dict[str, Any]:
+    """Go the whole way with one CT angiogram and write `output`/report.html.
+
+    Args:
+        volume: DICOM folder or file, NIfTI, NRRD or MHA, in HU.
+        output: folder of everything the run makes.
+        config: segmentation, device and size of the study.
+        series: series instance UID, where a DICOM folder holds several.
+
+    Returns:
+        The report's path and the figures of its summary.
+
+    Raises:
+        InputError: the volume cannot be read or segmented, or the folder holds another run.
+    """
+    ledger = Ledger(output, config)
+    copy = output / "ct" / f"patient{VOLUME_SUFFIX}"
+    ledger.stage("read", lambda: write_volume(read_volume(volume, series=series), copy))
+    ledger.inputs = input_hash(volume)
+    command = f"endopilot run {volume} -o {output}"
+    return _study(output, [copy], config, config.segmentation, ledger, origin=RUN_ORIGIN, command=command)
+
+
+def _study(
+    output: Path,
+    volumes: Sequence[Path],
+    config: StudyConfig,
+    segmentation: SegmentConfig,
+    ledger: Ledger,
+    *,
+    origin: str,
+    command: str,
+) -> dict[str, Any]:
+    """Take volumes to a report: the part that synthetic and real patients share."""
+    scheme = segmentation.vessel if segmentation.method == "coronary" else "generic"
+
+    def make_mask(volume: Path) -> None:
+        path = output / "masks" / volume.name
+        if not path.exists():
+            mask = segment(read_volume(volume), segmentation)
+            write_mask(mask, path, manifest=manifest(config=segmentation, inputs=input_hash(volume)))
+
+    def make_anatomy(volume: Path) -> None:
+        name = volume.name.removesuffix(VOLUME_SUFFIX)
+        mask, folder = output / "masks" / volume.name, output / "anatomies" / name
+        if mask.exists() and not folder.exists():
+            write_anatomy(extract_anatomy(read_mask(mask), name=name, config=AnatomyConfig(vessel=scheme)), folder)
+
+    ledger.stage("segmentation", lambda: ledger.each("Segmentation", volumes, make_mask))
+    ledger.stage("anatomy", lambda: ledger.each("Centerlines and distance maps", volumes, make_anatomy))
+    names = [volume.name.removesuffix(VOLUME_SUFFIX) for volume in volumes]
+    names = [name for name in names if (output / "anatomies" / name).exists()]
+    _learn(output, [output / "anatomies" / name for name in names], config, ledger)
+    ledger.stage("report", lambda: _report(output, names, origin, command, ledger))
+    return _finish(output, config, ledger)
+
+
+def _learn(output: Path, anatomies: Sequence[Path], config: StudyConfig, ledger: Ledger) -> None:
+    """Simulate navigations, train both networks on them and evaluate these."""
+    from endopilot.evaluation.evaluate import EvaluateConfig, evaluate
+    from endopilot.models.train import train  # torch takes seconds to import
+
+    unseen = len(anatomies) // 3
+    shares = (1 - unseen / len(anatomies), 0.0, unseen / len(anatomies)) if unseen else None
+    dataset = DatasetConfig(sequences=config.sequences, seconds=config.seconds, seed=config.seed, anatomy_shares=shares)
+    training = TrainConfig(model="paper", max_seconds=config.training_seconds, seed=config.seed)
+    device = read_device(config.device)
+    ledger.stage("dataset", lambda: generate_dataset(anatomies, output / "dataset", device, dataset))
+    ledger.stage("training", lambda: train(output / "dataset", output / "training", training))
+
+    def measure() -> None:
+        evaluate(output / "training", output / "evaluation", EvaluateConfig(seed=config.seed))
+
+    ledger.stage("evaluation", measure)
+
+
+def _report(output: Path, names: Sequence[str], origin: str, command: str, ledger: Ledger) -> None:
+    """Write report.html from what the other stages left in `output`."""
+    from endopilot.evaluation.report import PatientContent, ReportContent, write_report  # matplotlib and plotly
+
+    anatomy, replay = _replay(output, read_device(ledger.config["device"]))
+    scores = _scores(output, names)
+    patients = tuple(
+        PatientContent(
+            name=name,
+            anatomy=output / "anatomies" / name,
+            volume=output / "ct" / f"{name}{VOLUME_SUFFIX}",
+            mask=output / "masks" / f"{name}{VOLUME_SUFFIX}",
+            scores=scores.get(name, {}),
+        )
+        for name in names
+    )
+    content = ReportContent(
+        title="endopilot: from a CT angiogram to guidewire control",
+        origin=origin,
+        command=command,
+        patients=patients,
+        evaluation=output / "evaluation",
+        run=output / "training",
+        replay=replay,
+        replay_anatomy=anatomy,
+        stage_seconds=ledger.seconds,
+        manifest=manifest(config=ledger.config, seed=ledger.config["seed"], rejected=ledger.rejected),
+    )
+    for remark in write_report(output / REPORT_FILE, content):
+        print(remark, file=sys.stderr)
+
+
+def _scores(output: Path, names: Sequence[str]) -> dict[str, dict[str, float]]:
+    """Return how well each patient's anatomy matches the truth that its volume was made of, where there is one."""
+    path = output / "scores.json"
+    if path.exists():
+        return read_json(path)
+    scores = {}
+    known = [name for name in names if (output / "truth" / name).exists()]
+    with progress("Comparing with the truth", len(known)) as advance:
+        for name in known:
+            mask = read_mask(output / "masks" / f"{name}{VOLUME_SUFFIX}")
+            extracted, truth = (read_anatomy(output / folder / name) for folder in ("anatomies", "truth"))
+            scores[name] = asdict(score_anatomy(mask, extracted, truth))
+            advance()
+    write_json(path, scores)
+    return scores
+
+
+def _replay(output: Path, device: Device) -> tuple[Path, Rollout]:
+    """Simulate again, wire shapes recorded, the navigation not trained on whose tip travelled farthest."""
+    dataset = load_dataset(output / "dataset")
+    held_out = dataset.of_split("test" if "test" in dataset.split else "seen_test")
+    best = int(np.ptp(held_out.tip_abscissa, axis=1).argmax())
+    one = held_out.select(np.array([best]))
+    folder = dataset.anatomy_folder(str(one.anatomy[0]))
+    initial = np.stack([one.initial_inserted_length, one.initial_rotation], axis=-1)
+    anatomy = read_anatomy(folder)
+    return folder, simulate(anatomy, device, one.control, initial=initial, friction=one.friction, record_shape=True)
+
+
+def _finish(output: Path, config: StudyConfig, ledger: Ledger) -> dict[str, Any]:
+    """Write metrics.json and manifest.json, and return what the command prints."""
+    metrics = read_json(output / "evaluation" / "metrics.json")
+    write_json(output / "metrics.json", {**metrics, "anatomy_scores": read_json(output / "scores.json")})
+    wall_seconds = sum(ledger.seconds.values())
+    write_json(
+        output / "manifest.json",
+        manifest(
+            config=config,
+            seed=config.seed,
+            inputs=ledger.inputs,
+            wall_seconds=wall_seconds,
+            stages=ledger.seconds,
+            rejected=ledger.rejected,
+        ),
+    )
+    return {
+        "report": str(output / REPORT_FILE),
+        "wall_seconds": round(wall_seconds, 1),
+        "rejected": ledger.rejected,
+        "findings": metrics["findings"],
+    }
