@@ -21,6 +21,8 @@ _ROUND_SHARE = 0.6
 _FEWEST_SLICES_MM = 10.0
 """Length over which the disc must persist, mm."""
 _DIRECTIONS = 32
+_BRIGHTEST_HU = 600.0
+"""Undiluted contrast in the superior vena cava is brighter than this, and no more likely to be the aorta."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,13 +42,14 @@ class AorticRoot:
 
 @dataclass(frozen=True)
 class _Disc:
-    """A round bright disc in slice `k`, centre and radius in voxels."""
+    """A round bright disc in slice `k`: centre and radius in voxels, share of round edge, mean HU (capped)."""
 
     k: int
     j: float
     i: float
     radius: float
     roundness: float
+    hu: float
 
 
 def find_aortic_root(grid: Volume) -> AorticRoot:
@@ -82,8 +85,8 @@ def find_aortic_root(grid: Volume) -> AorticRoot:
 
 
 def _weight(chain: list[_Disc]) -> float:
-    """Rank chains: long, wide and round."""
-    return sum(disc.radius * disc.roundness for disc in chain)
+    """Rank chains: long, wide, round and bright; the right heart is often as round, and dimmer."""
+    return sum(disc.radius * disc.roundness * disc.hu for disc in chain)
 
 
 def _within(plane: np.ndarray, j: float, i: float, radius: float) -> np.ndarray:
@@ -112,7 +115,8 @@ def _discs(plane: Float[np.ndarray, "ny nx"], k: int, level: float, spacing: flo
                 break
             j, i, radius = _fit_circle(j + np.sin(angle[near]) * edge[near], i + np.cos(angle[near]) * edge[near])
         if low <= radius <= high and roundness >= _ROUND_SHARE:
-            found.append(_Disc(k, j, i, radius, roundness))
+            hu = min(float(_within(plane, j, i, 0.7 * radius).mean()), _BRIGHTEST_HU)
+            found.append(_Disc(k, j, i, radius, roundness, hu))
     return found
 
 
@@ -134,7 +138,7 @@ def _best_chain(slices: list[list[_Disc]]) -> list[_Disc]:
                 tail
                 for tail in tails
                 if np.hypot(disc.j - tail[-1].j, disc.i - tail[-1].i) < 0.2 * disc.radius
-                and abs(disc.radius - tail[-1].radius) < 0.15 * disc.radius
+                and abs(disc.radius - tail[-1].radius) < 0.06 * disc.radius
             ]
             grown.append([*max(before, key=_weight, default=[]), disc])
         best = max([best, *grown], key=_weight)

@@ -16,6 +16,8 @@ _BLUR_MM = 0.4
 """Width of that Gaussian and of a scanner's point-spread function (0.6 mm at half height) together, mm."""
 _SURROUNDINGS_MM = 1.2
 """Width of the window in which the surroundings' HU are averaged, mm."""
+_WALL_HU = 0.0
+"""Even in fat and lung, the vessel's own wall lies next to the lumen: half a millimetre of soft tissue, blurred."""
 _CALCIUM = 1.5
 """Times the lumen's HU; brighter voxels are calcium or metal."""
 
@@ -49,9 +51,9 @@ def lumen_at_half_height(
     window = _SURROUNDINGS_MM / spacing
     weight = ndimage.gaussian_filter(beside.astype(np.float32), window)
     surroundings = ndimage.gaussian_filter(np.where(beside, hu, np.float32(0)), window) / np.maximum(weight, 1e-4)
-    surroundings = np.clip(surroundings, -120, 0.5 * lumen_hu)
-    # A blurred disc has less than half its height at its own edge, the less the smaller it is.
-    share = np.clip(0.5 - 0.2 * _BLUR_MM / np.maximum(local_radius, 0.3), 0.3, 0.5)
+    surroundings = np.clip(surroundings, _WALL_HU, 0.5 * lumen_hu)
+    # A blurred disc has less than half its height at its own edge, the less the smaller it is (to first order in σ/r).
+    share = 0.5 - 0.2 * np.minimum(_BLUR_MM / np.maximum(local_radius, 0.1), 1.0)
     level = surroundings + share * (lumen_hu - surroundings)
     return band & (hu > level) & (hu < _CALCIUM * lumen_hu)
 

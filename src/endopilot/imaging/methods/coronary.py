@@ -35,8 +35,10 @@ _GRID_MM = 0.5
 """Grids on which the aorta, the large blood pools and the vessels are sought."""
 _MUSCLE_HU = 100.0
 """Myocardium in the arterial phase."""
+_FAT_HU = -90.0
+"""Epicardial fat."""
 _LOW_SHARE = 0.25
-"""A vessel's voxels rise this share of the way from muscle to lumen; small vessels are dimmed by the scanner's blur."""
+"""A vessel's voxels rise this share of the way from what surrounds them to lumen; the blur dims small vessels."""
 _POOL_RADIUS_MM = 3.5
 """A ball of this radius fits in chambers and great vessels, and in no coronary artery."""
 _RESPONSE = 0.15
@@ -118,27 +120,33 @@ def segment_lumen(volume: Volume, config: SegmentConfig) -> LumenMask:
 
 def _find_vessels(volume: Volume, lumen_hu: float) -> _Scan:
     """Tell blood pools and thin vessels apart."""
-    low = _MUSCLE_HU + _LOW_SHARE * (lumen_hu - _MUSCLE_HU)
     grid = resample(volume, _GRID_MM)
-    body = resample(grid, _BODY_GRID_MM)
-    depth = distance_to_outside(body.voxels > low, _BODY_GRID_MM)
-    # Opening by a ball, and half a voxel of the body's grid more, so that no rim of a pool is left.
-    beyond = distance_to_outside(depth < _POOL_RADIUS_MM, _BODY_GRID_MM) - _POOL_RADIUS_MM - _BODY_GRID_MM / 2
-    pools = interpolate_like(Volume(beyond, body.spacing_mm, body.origin_mm, body.direction), grid, outside=1.0) <= 0
     hu = np.asarray(ndimage.gaussian_filter(grid.voxels, 0.35 / _GRID_MM))
-    thin = (hu > low) & ~pools
+    body = resample(grid, _BODY_GRID_MM)
+    above_muscle = _MUSCLE_HU + _LOW_SHARE * (lumen_hu - _MUSCLE_HU)
+    above_fat = _FAT_HU + _LOW_SHARE * (lumen_hu - _FAT_HU)
+    pools = _thick(body, above_muscle, grid)
+    # A small vessel in fat is dimmer than muscle, and seen all the same, where no thick tissue is.
+    thin = ((hu > above_muscle) & ~pools) | ((hu > above_fat) & ~_thick(body, above_fat, grid))
     response = vesselness(
-        np.clip(grid.voxels, 0.0, 1.1 * lumen_hu),
+        np.clip(grid.voxels, _FAT_HU / 2, 1.1 * lumen_hu),
         thin,
         spacing_mm=_GRID_MM,
         sigmas_mm=_SCALES_MM,
         contrast_hu=lumen_hu,
     )
-    tubes = response > _RESPONSE
-    # Short dark or shapeless gaps, such as at a bifurcation, are bridged through bright voxels.
+    # Short shapeless gaps, such as at a bifurcation, are bridged through bright voxels.
     reach = round(_GAP_MM / _GRID_MM / 2)
-    vessels = thin & np.asarray(ndimage.maximum_filter(tubes, 2 * reach + 1))
+    vessels = thin & np.asarray(ndimage.maximum_filter(response > _RESPONSE, 2 * reach + 1), dtype=bool)
     return _Scan(grid, hu, lumen_hu, pools, vessels, response)
+
+
+def _thick(body: Volume, level_hu: float, grid: Volume) -> Bool[np.ndarray, "nz ny nx"]:
+    """Return where the tissue above a level is thick: the opening by a ball wider than a coronary artery."""
+    depth = distance_to_outside(body.voxels > level_hu, _BODY_GRID_MM)
+    # Half a voxel of the body's grid more, so that no rim is left.
+    beyond = distance_to_outside(depth < _POOL_RADIUS_MM, _BODY_GRID_MM) - _POOL_RADIUS_MM - _BODY_GRID_MM / 2
+    return interpolate_like(Volume(beyond, body.spacing_mm, body.origin_mm, body.direction), grid, outside=1.0) <= 0
 
 
 def _aorta(scan: _Scan, root: AorticRoot) -> Bool[np.ndarray, "nz ny nx"]:
