@@ -126,7 +126,8 @@ def test_anatomy_holds_lumen_and_catheter():
     # Linear interpolation on the grid rounds off the ridge on the axis.
     assert 0 < np.median(path.radius - depth) < 0.2
     behind = anatomy.insertion.position - np.outer(np.arange(2.0, 18.0), anatomy.insertion.direction)
-    np.testing.assert_allclose(sample(anatomy.distance_map, behind), anatomy.catheter_radius_mm, atol=0.12)
+    tube = sample(anatomy.distance_map, behind)
+    assert anatomy.catheter_radius_mm - 0.25 < tube.min() and tube.max() < anatomy.catheter_radius_mm + 0.02
     assert anatomy.insertion.direction @ (path.points[4] - path.points[0]) > 0
     (stenosis,) = anatomy.provenance["stenoses"]
     here = np.interp(stenosis["abscissa_mm"], path.abscissa, path.radius)

@@ -76,37 +76,72 @@ class _NoShape(Exception):
     """The drawn targets cannot be met together, or lumens collide: draw again."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Targets:
+    """What a patient's main vessel must have: length in mm, mean curvature in 1/mm, the section its tip lies in."""
+
+    dominance: str
+    length_mm: float
+    tortuosity: float
+    curvature_per_mm: float
+    ends_in: str
+
+
 def synthesize_rca(generator: np.random.Generator, stenosis_share: float) -> tuple[VesselTree, dict[str, Any]]:
     """Return one right coronary tree and what was drawn for it.
+
+    Targets outlive failed draws of the shape, lest the failures bias the statistics.
 
     Args:
         generator: random stream of this patient.
         stenosis_share: probability of a stenosis.
     """
-    for attempt in range(200):
-        try:
-            tree, truth = _draw(generator, stenosis_share)
-        except _NoShape:
-            continue
-        return tree, truth | {"redrawn": attempt}
-    raise RuntimeError("no right coronary artery found in 200 draws")
+    for _ in range(10):
+        targets = _targets(generator)
+        for attempt in range(60):
+            try:
+                tree, truth = _draw(generator, targets, stenosis_share)
+            except _NoShape:
+                continue
+            return tree, truth | {"redrawn": attempt}
+    raise RuntimeError("no right coronary artery found in 600 draws")
 
 
-def _draw(generator: np.random.Generator, stenosis_share: float) -> tuple[VesselTree, dict[str, Any]]:
+def _targets(generator: np.random.Generator) -> _Targets:
     dominance = _dominance(generator.random())
-    main, crux, ends_in = _main_vessel(generator, dominance)
-    radius, calibre = _main_radius(generator, dominance, main)
-    stenosis = None
+    if dominance == "left":
+        # A small right coronary ends before the crux.
+        length, ends_in = 112.0 + abs(float(generator.normal(0, 10))), "3"
+    else:
+        # The mean makes up for the shorter left-dominant arteries.
+        length = _truncated(generator, LENGTH_MM + 2.4, LENGTH_SD_MM, *LENGTH_RANGE_MM)
+        ends_in = "4" if dominance == "balanced" or generator.random() < 0.6 else "16"
+    return _Targets(
+        dominance=dominance,
+        length_mm=length,
+        tortuosity=_truncated(generator, TORTUOSITY, TORTUOSITY_SD, TORTUOSITY - 0.45, TORTUOSITY + 0.45),
+        curvature_per_mm=_truncated(generator, CURVATURE, CURVATURE_SD, CURVATURE - 0.025, CURVATURE + 0.025),
+        ends_in=ends_in,
+    )
+
+
+def _draw(
+    generator: np.random.Generator, targets: _Targets, stenosis_share: float
+) -> tuple[VesselTree, dict[str, Any]]:
+    main, crux = _main_vessel(generator, targets)
+    healthy, calibre = _main_radius(generator, targets.dominance, main)
+    radius, stenosis = healthy, None
     if generator.random() < stenosis_share:
         stenosis, narrowing = _stenosis(generator, main)
-        radius = radius * narrowing
-    heart = fit_heart(main, 0.5 * crux, ends_in)
-    sides = _side_branches(generator, heart, main, radius, crux, ends_in, dominance, calibre)
-    section = _main_sections(main, crux, ends_in)
+        radius = healthy * narrowing
+    heart = fit_heart(main, 0.5 * crux, targets.ends_in)
+    plans = _plan_branches(generator, healthy, crux, targets, calibre)
+    sides = _side_branches(generator, heart, main, radius, plans)
+    section = _main_sections(main, crux, targets.ends_in)
     tree = shape.build_tree(main, radius, section, sides, SECTION_NAMES)
     bends = shape.curvature(main)
     truth = {
-        "dominance": dominance,
+        "dominance": targets.dominance,
         "length_mm": float(shape.abscissa(main)[-1]),
         "tortuosity": shape.tortuosity(main),
         "curvature_mean_per_mm": float(bends.mean()),
@@ -127,30 +162,23 @@ def _truncated(generator: np.random.Generator, mean: float, sd: float, low: floa
             return float(value)
 
 
-def _main_vessel(generator: np.random.Generator, dominance: str) -> tuple[Float[np.ndarray, "n 3"], int, str]:
-    """Return the way from the ostium to the farthest tip, the index of the crux on it, and its last section.
+def _main_vessel(generator: np.random.Generator, targets: _Targets) -> tuple[Float[np.ndarray, "n 3"], int]:
+    """Return the way from the ostium to the farthest tip, and the index of the crux on it.
 
     Size, closure of the C and amplitude of the wiggles are solved for so that length, tortuosity and mean curvature
     take the drawn values.
     """
-    if dominance == "left":
-        # A small right coronary ends before the crux.
-        length, ends_in = 112.0 + abs(generator.normal(0, 10)), "3"
-        waypoints, cut, crux_mm = TO_CRUX, 0.97, np.inf
-    else:
-        # The mean makes up for the shorter left-dominant arteries.
-        length = _truncated(generator, LENGTH_MM + 2.4, LENGTH_SD_MM, *LENGTH_RANGE_MM)
-        ends_in = "4" if dominance == "balanced" or generator.random() < 0.6 else "16"
-        waypoints = np.concatenate([TO_CRUX, BEYOND_CRUX[ends_in]])
-        # Long arteries reach farther beyond the crux rather than belong to huge hearts.
-        crux_mm = 106.0 * (length / LENGTH_MM) ** 0.65 * (1 + 0.03 * generator.normal())
-        cut = None
-    tortuosity = _truncated(generator, TORTUOSITY, TORTUOSITY_SD, TORTUOSITY - 0.45, TORTUOSITY + 0.45)
-    mean_curvature = _truncated(generator, CURVATURE, CURVATURE_SD, CURVATURE - 0.025, CURVATURE + 0.025)
+    length, ends_in = targets.length_mm, targets.ends_in
+    waypoints = TO_CRUX if ends_in == "3" else np.concatenate([TO_CRUX, BEYOND_CRUX[ends_in]])
     template = shape.curve_through(waypoints, 1.0)
     template_crux = float(shape.abscissa(shape.curve_through(TO_CRUX))[-1])
     along = shape.abscissa(template)
-    keep = cut * along[-1] if cut else min(template_crux * length / crux_mm, along[-1])
+    if ends_in == "3":
+        keep = 0.97 * along[-1]
+    else:
+        # Long arteries reach farther beyond the crux rather than belong to huge hearts.
+        crux_mm = 106.0 * (length / LENGTH_MM) ** 0.65 * (1 + 0.03 * generator.normal())
+        keep = min(template_crux * length / crux_mm, along[-1])
     template = template[along <= keep]
     wiggle = shape.Wiggle.draw(generator, 13.0, 70.0)
     turn = Rotation.from_rotvec(np.deg2rad(generator.normal(0, 7, 3)))
@@ -159,6 +187,7 @@ def _main_vessel(generator: np.random.Generator, dominance: str) -> tuple[Float[
     axis = axis * np.sign(axis @ np.cross(TO_CRUX[4] - TO_CRUX[0], TO_CRUX[-1] - TO_CRUX[4]))
 
     normals = shape.parallel_normals(shape.tangents(template))
+    wanted = (length, targets.tortuosity, targets.curvature_per_mm)
 
     def curve(knobs: Float[np.ndarray, "3"]) -> Float[np.ndarray, "n 3"]:
         bent = shape.bend(template, axis, float(knobs[1])) * np.exp(knobs[0])
@@ -168,14 +197,14 @@ def _main_vessel(generator: np.random.Generator, dominance: str) -> tuple[Float[
     def misfit(knobs: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
         points = curve(np.clip(knobs, (-1, -2, -4), (1, 2, 3)))
         found = (shape.abscissa(points)[-1], shape.tortuosity(points), shape.curvature(points).mean())
-        return np.log(np.array(found) / (length, tortuosity, mean_curvature))
+        return np.log(np.array(found) / wanted)
 
     solution = root(misfit, np.array([np.log(length / keep) - 0.05, 0.0, 0.5]), tol=1e-3, options={"maxfev": 60})
     points = curve(np.clip(solution.x, (-1, -2, -4), (1, 2, 3)))
     if np.abs(misfit(solution.x)).max() > 0.01 or shape.curvature(points).max() > 0.28:
         raise _NoShape
     crux = len(points) - 1 if ends_in == "3" else round(len(points) * template_crux / keep)
-    return points, crux, ends_in
+    return points, crux
 
 
 def _main_radius(
@@ -215,37 +244,52 @@ def _main_sections(main: Float[np.ndarray, "n 3"], crux: int, ends_in: str) -> l
     return [str(name) for name in names]
 
 
+@dataclass(frozen=True, eq=False)
+class _Plan:
+    """A side branch to be drawn: section, index of its origin, length and diameter in mm, courses."""
+
+    section: str
+    origin: int
+    length_mm: float
+    diameter_mm: float
+    courses: tuple[tuple[float, tuple[float, float, float]], ...]
+
+
+def _plan_branches(
+    generator: np.random.Generator, radius: Float[np.ndarray, "n"], crux: int, targets: _Targets, calibre: float
+) -> list[_Plan]:
+    """Draw which branches there are, where they leave, how long and how wide they are."""
+    plans: list[_Plan] = []
+    end_mm = (len(radius) - 1) * shape.STEP_MM
+    for section, kind in _SIDES.items():
+        if generator.random() > kind.share:
+            continue
+        origin = _free_origin(generator, kind.origin_mm, [plan.origin for plan in plans])
+        length = _truncated(generator, *kind.length_mm, 0.5 * kind.length_mm[0], 1.5 * kind.length_mm[0])
+        # The main vessel's tip stays the farthest.
+        length = min(length, 0.95 * end_mm - origin * shape.STEP_MM)
+        diameter = kind.diameter_mm * (0.6 + 0.4 * calibre) * (1 + 0.1 * float(generator.normal()))
+        plans.append(_Plan(section, origin, length, diameter, kind.courses))
+    if targets.dominance == "right":
+        other = "16" if targets.ends_in == "4" else "4"
+        length = max((end_mm - crux * shape.STEP_MM) * float(generator.uniform(0.6, 0.92)), 12.0)
+        diameter = 2 * float(radius[crux]) * float(generator.uniform(0.68, 0.8))
+        plans.append(_Plan(other, crux, length, diameter, _DISTAL_COURSES[other]))
+    return plans
+
+
 def _side_branches(
     generator: np.random.Generator,
     heart: HeartFit,
     main: Float[np.ndarray, "n 3"],
     radius: Float[np.ndarray, "n"],
-    crux: int,
-    ends_in: str,
-    dominance: str,
-    calibre: float,
+    plans: list[_Plan],
 ) -> list[shape.SideBranch]:
-    """Draw the branches; one that cuts another lumen is drawn again, and the patient with it in the end."""
-    wanted: list[tuple[str, int, float, float, tuple]] = []
-    taken: list[int] = []
-    for name, kind in _SIDES.items():
-        if generator.random() > kind.share:
-            continue
-        origin = _free_origin(generator, kind.origin_mm, taken)
-        taken.append(origin)
-        length = _truncated(generator, *kind.length_mm, 0.5 * kind.length_mm[0], 1.5 * kind.length_mm[0])
-        length = min(length, 0.5 * (len(main) - 1) * 0.95 - origin * 0.5)
-        diameter = kind.diameter_mm * (0.6 + 0.4 * calibre) * (1 + 0.1 * generator.normal())
-        wanted.append((name, origin, length, diameter, kind.courses))
-    if dominance == "right" or (dominance == "balanced" and ends_in == "16"):
-        other = "16" if ends_in == "4" else "4"
-        beyond = 0.5 * (len(main) - 1 - crux)
-        length = max(beyond * generator.uniform(0.6, 0.92), 12.0)
-        wanted.append((other, crux, length, 2 * radius[crux] * generator.uniform(0.68, 0.8), _DISTAL_COURSES[other]))
+    """Draw the branches; one that cuts another lumen is drawn again, and the patient's shape with it in the end."""
     sides: list[shape.SideBranch] = []
-    for name, origin, length, diameter, courses in wanted:
+    for plan in plans:
         for _ in range(12):
-            side = _side_branch(generator, heart, main, radius, name, origin, length, diameter, courses)
+            side = _side_branch(generator, heart, main, radius, plan)
             if not shape.lumens_collide(main, radius, [*sides, side]):
                 sides.append(side)
                 break
@@ -268,24 +312,23 @@ def _side_branch(
     heart: HeartFit,
     main: Float[np.ndarray, "n 3"],
     radius: Float[np.ndarray, "n"],
-    name: str,
-    origin: int,
-    length: float,
-    diameter: float,
-    courses: tuple[tuple[float, tuple[float, float, float]], ...],
+    plan: _Plan,
 ) -> shape.SideBranch:
+    origin = plan.origin
     turn = Rotation.from_rotvec(np.deg2rad(generator.normal(0, 12, 3)))
-    headed = [(begin, turn.apply(np.array(course) / np.linalg.norm(course))) for begin, course in courses]
+    headed = [(begin, turn.apply(np.array(course) / np.linalg.norm(course))) for begin, course in plan.courses]
     forward = shape.tangents(main)[origin]
     across = headed[0][1] - (headed[0][1] @ forward) * forward
     angle = np.deg2rad(generator.uniform(40, 70))
     direction = np.cos(angle) * forward + np.sin(angle) * across / np.linalg.norm(across)
-    points = shape.steer(main[origin], direction, headed, length, generator.uniform(6.0, 9.0), heart.solid_depth)
+    points = shape.steer(
+        main[origin], direction, headed, plan.length_mm, generator.uniform(6.0, 9.0), heart.solid_depth
+    )
     across = shape.parallel_normals(shape.tangents(points))
     points = shape.Wiggle.draw(generator, 13.0, 45.0, 6).apply(points, across, generator.uniform(0.3, 0.8), 10.0)
     points = shape.curve_through(points[:: max(len(points) // 24, 1)])
     points = np.concatenate([main[origin][None], points[1:]])
     share = np.linspace(0.0, 1.0, len(points))
-    lumen = 0.5 * diameter * (1 - 0.3 * share)
+    lumen = 0.5 * plan.diameter_mm * (1 - 0.3 * share)
     lumen = shape.mouth(np.minimum(lumen, 0.9 * radius[origin]), points, forward, float(radius[origin]))
-    return shape.SideBranch(origin, points, lumen, name)
+    return shape.SideBranch(origin, points, lumen, plan.section)
