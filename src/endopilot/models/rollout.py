@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -41,6 +41,7 @@ class OpenLoop:
     control: Steps2
 
 
+@runtime_checkable
 class Predictor(Protocol):
     """Whatever rolls episodes out: the networks of a run, or a baseline."""
 
