@@ -180,12 +180,17 @@ struct Grip {
     Vec3<V> spin;     // displacement of the touching surface for a unit rotation about the wire's axis, mm/rad
 };
 
-// Adds the wall's elastic reaction, energy k/2 (radius - distance)² where positive. Returns the energy.
+// Adds the wall's elastic reaction, energy k/2 (radius - distance)² where positive. Returns the energy. Where `sticky`,
+// gradient and Hessian are those of a wall that can also pull: a node that has just lost touch would otherwise set off
+// freely and hit the wall behind the next Newton step.
 template <class V>
-inline V add_wall(double stiffness, double radius, const V& geometric, const Distance<V>& d, Diagonal<V>& own) {
+inline V add_wall(double stiffness, double radius, const V& geometric, Mask<V> sticky, const Distance<V>& d,
+                  Diagonal<V>& own) {
     const Mask<V> clear = d.value >= radius;  // false for NaN, so that NaN reaches the energy
-    const V depth = select<V>(clear, V{}, radius - d.value);
-    const V k = select<V>(clear, V{}, broadcast<V>(stiffness));
+    const V gap = radius - d.value;
+    const V touch = select<V>(clear, V{}, gap);
+    const V depth = select<V>(sticky, gap, touch);
+    const V k = select<V>(clear, select<V>(sticky, broadcast<V>(stiffness), V{}), broadcast<V>(stiffness));
     const V pressure = stiffness * depth;
     own.force -= pressure * d.slope;
     const V bend = geometric * pressure;
@@ -195,7 +200,7 @@ inline V add_wall(double stiffness, double radius, const V& geometric, const Dis
     own.xx.xy += k * d.slope.x * d.slope.y - bend * d.curve.xy;
     own.xx.xz += k * d.slope.x * d.slope.z - bend * d.curve.xz;
     own.xx.yz += k * d.slope.y * d.slope.z - bend * d.curve.yz;
-    return 0.5 * pressure * depth;
+    return 0.5 * stiffness * touch * touch;
 }
 
 // Adds smoothed Coulomb friction of the touching surface, energy limit (sqrt(|s|² + eps²) - eps) with s the tangential

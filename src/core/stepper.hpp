@@ -2,7 +2,7 @@
 //
 // A step minimises the incremental potential (elastic energy + wall + friction + drag) by Newton's method with an energy
 // line search. One pass of the loop evaluates every lane at its trial point; each lane then accepts the trial and takes
-// a new direction, halves its last one, or, having converged, begins its next time step.
+// a new direction, shortens its last one, or, having converged, begins its next time step.
 #pragma once
 
 #include <algorithm>
@@ -23,7 +23,7 @@ struct Options {
     double tolerance;          // largest displacement of a last Newton step, mm (rotations: rad)
     double sample_tolerance;   // the same for the step that ends a sample, whose forces are recorded
     double largest_step;       // displacement that one Newton step is clamped to, mm (rotations: rad)
-    int most_iterations;       // for one step; then the step is halved
+    int most_iterations;       // for one step; then the step is halved, and the shortest may take kPatience times as many
     double free_behind;        // nodes farther behind the ostium than this follow the drive, mm
     double approach_velocity;  // at which a wire is brought to its first inserted length, mm/s
 };
@@ -62,8 +62,14 @@ struct Outputs {
     double* attitude;         // may be null: worlds × samples × nodes × 4, quaternions w x y z
 };
 
-constexpr int kTicks = 32;     // a step may be halved down to 1/32
-constexpr int kMostHalvings = 12;
+constexpr int kTicks = 64;     // a step may be halved down to 1/64
+constexpr int kMostRejections = 12;
+constexpr int kPatience = 20;   // a snap from one shape to another is not shortened by a shorter step
+constexpr double kReach = 0.1;           // mm within which a wall that was touched counts as touched, at first
+constexpr double kFirstDamping = 1e-3;   // N/mm (rotations: N mm/rad), tried where the Hessian is not positive definite
+constexpr double kMostDamping = 1e3;
+constexpr double kMostBoost = 64;
+constexpr double kAtRest = 1e-5;         // N that a damped solution may be out of balance
 
 template <class V>
 class Stepper {
@@ -103,12 +109,12 @@ private:
     };
 
     struct Lane {
-        int world = -1, sample = 0, tick = 0, stride = 0, active = 0, iterations = 0, halvings = 0, steps = 0;
+        int world = -1, sample = 0, tick = 0, stride = 0, active = 0, iterations = 0, rejections = 0, steps = 0;
         long total_iterations = 0;
         double inserted = 0, rotation = 0, speed = 0, spin = 0;   // at the start of the sample; mm/s, rad/s
         double start_inserted = 0, start_rotation = 0, end_inserted = 0, end_rotation = 0;
-        double energy = 0, last_duration = 0;
-        bool first = true, gauss_newton = true, extrapolated = false, finite = true;
+        double energy = 0, slope = 0, scale = 1, shorten = 1, boost = 1, damping = 0, last_duration = 0;
+        bool first = true, extrapolated = false, finite = true;
     };
 
     const RodModel& rod_;
@@ -122,7 +128,7 @@ private:
     std::vector<Factor<V>> factor_;
     Lane lane_[W];
     // per lane
-    V active_{}, geometric_{}, inverse_dt_{}, eps_{}, friction_{}, energy_{}, pivot_{}, force_max_{}, force_sum_{};
+    V active_{}, geometric_{}, inverse_dt_{}, eps_{}, first_{}, damping_{}, descent_{}, friction_{}, energy_{}, pivot_{}, force_max_{}, force_sum_{};
     V base_force_{}, base_torque_{};
 
     double duration(const Lane& lane) const { return options_.time_step * lane.stride / kTicks; }
@@ -221,13 +227,16 @@ private:
         lane.active = count_active(lane.end_inserted);
         for (int i = std::min(before, lane.active); i <= std::max(before, lane.active); ++i)
             if (i >= before || i >= lane.active) place(l, i);
-        lane.iterations = lane.halvings = 0;
-        lane.first = lane.gauss_newton = lane.finite = true;
+        lane.iterations = lane.rejections = 0;
+        lane.boost = 1;
+        lane.first = lane.finite = true;
         lane.extrapolated = !fresh;
         set(active_, l, lane.active);
         set(geometric_, l, 0.0);
+        set(first_, l, 1.0);
+        set(damping_, l, 0.0);
         set(inverse_dt_, l, 1.0 / duration(lane));
-        set(eps_, l, options_.stick_velocity * duration(lane));
+        set(eps_, l, options_.stick_velocity * options_.time_step);
     }
 
     int most_active() const {
@@ -245,6 +254,8 @@ private:
         for (int l = 0; l < W; ++l) verdict[l] = judge(l);
         const V largest = solve(n);
         V factor{};
+        for (int l = 0; l < W; ++l)
+            if (verdict[l] == Verdict::shorten) set(factor, l, lane_[l].shorten);
         for (int l = 0; l < W; ++l) {
             Lane& lane = lane_[l];
             if (verdict[l] != Verdict::accept) continue;
@@ -254,8 +265,14 @@ private:
                 continue;
             }
             const bool ends_sample = lane.tick + lane.stride == kTicks * options_.steps_per_sample;
-            set(factor, l, std::min(1.0, options_.largest_step / size));
-            if (size <= (ends_sample ? options_.sample_tolerance : options_.tolerance)) verdict[l] = Verdict::converged;
+            lane.scale = std::min(lane.boost, options_.largest_step / size);
+            set(factor, l, lane.scale);
+            const double tolerance = ends_sample ? options_.sample_tolerance : options_.tolerance;
+            const bool at_rest = size <= options_.tolerance && lane.damping * size <= kAtRest;
+            if (lane.damping > 0 ? at_rest : size <= tolerance) {
+                verdict[l] = Verdict::converged;
+                set(factor, l, 1.0);
+            }
         }
         update(n, verdict, factor);
         return advance(n, verdict);
@@ -273,24 +290,33 @@ private:
         ++lane.total_iterations;
         const double energy = get(energy_, l);
         lane.finite = std::isfinite(energy);
-        if (lane.iterations > options_.most_iterations) return Verdict::restart;
+        if (lane.iterations > options_.most_iterations * (lane.stride == 1 ? kPatience : 1)) return Verdict::restart;
         const double slack = 1e-11 * (std::abs(lane.energy) + 1e-3);
         if (!lane.finite || !(lane.first || energy <= lane.energy + slack)) {
-            if (lane.first || ++lane.halvings > kMostHalvings) return Verdict::restart;
-            lane.gauss_newton = true;
-            set(geometric_, l, 0.0);
+            if (lane.first || ++lane.rejections > kMostRejections) return Verdict::restart;
+            // the minimum of the parabola through the accepted energy, its slope and the energy just found
+            const double slope = lane.scale * lane.slope;
+            const double best = lane.finite ? 0.5 * slope / (slope + energy - lane.energy) : 0.0;
+            lane.shorten = std::clamp(best, 0.02, 0.5);
+            lane.scale *= lane.shorten;
             return Verdict::shorten;
         }
         if (!(get(pivot_, l) > 0)) {  // not positive definite
-            if (lane.gauss_newton) return Verdict::restart;
-            lane.gauss_newton = true;
-            set(geometric_, l, 0.0);
+            const double damping = get(damping_, l);
+            if (damping >= kMostDamping) return Verdict::restart;
+            set(damping_, l, std::max(kFirstDamping, 10 * damping));
+            lane.energy = energy;
             return Verdict::repeat;
         }
         lane.energy = energy;
+        lane.slope = get(descent_, l);
+        // Where the energy is not convex the damped steps are short: lengthen them as long as they succeed.
+        const double damping = lane.damping = get(damping_, l);
+        lane.boost = damping > 0 && lane.rejections == 0 ? std::min(2 * lane.boost, kMostBoost) : 1.0;
+        set(damping_, l, damping > kFirstDamping ? 0.25 * damping : 0.0);
+        lane.rejections = 0;
         lane.first = false;
-        lane.halvings = 0;
-        lane.gauss_newton = false;
+        set(first_, l, 0.0);
         set(geometric_, l, 1.0);
         return Verdict::accept;
     }
@@ -337,7 +363,7 @@ V Stepper<V>::add_loads(int i, const Node& node, Diagonal<V>& own) const {
 template <class V>
 void Stepper<V>::evaluate(int n) {
     const V zero{};
-    energy_ = force_max_ = force_sum_ = zero;
+    energy_ = descent_ = force_max_ = force_sum_ = zero;
     pivot_ = broadcast<V>(1.0);
     const Vec3<double> axis = frame(base_.orientation).d3;
     Diagonal<V> own{}, next;
@@ -357,7 +383,8 @@ void Stepper<V>::evaluate(int n) {
         if (lumen_) {
             const Distance<V> d = distance_to_wall(*lumen_, node.x);
             node.wall = {d.value, d.slope};
-            energy += add_wall(options_.wall_stiffness, rod_.radius[i], geometric_, d, own);
+            const Mask<V> sticky = (first_ > zero) & (node.grip.limit > zero) & (d.value < rod_.radius[i] + kReach);
+            energy += add_wall<V>(options_.wall_stiffness, rod_.radius[i], geometric_, sticky, d, own);
             const Mask<V> clear = d.value >= rod_.radius[i];
             const V depth = select<V>(clear, zero, rod_.radius[i] - d.value);
             const V force = select<V>(on, options_.wall_stiffness * depth * square_root(dot(d.slope, d.slope)), zero);
@@ -369,17 +396,20 @@ void Stepper<V>::evaluate(int n) {
 
         const V drag = rod_.drag[i] * inverse_dt_, spin_drag = rod_.spin_drag[i] * inverse_dt_;
         energy += 0.5 * drag * dot(moved, moved) + 2.0 * spin_drag * dot(turned_by.v, turned_by.v);
+        const V stiffen = drag + damping_, spin_stiffen = spin_drag + damping_;
         own.force += drag * moved;
         own.moment += (2.0 * spin_drag * turned_by.w) * turned_by.v;
-        own.xx.xx += drag;
-        own.xx.yy += drag;
-        own.xx.zz += drag;
-        own.tt.xx += spin_drag;
-        own.tt.yy += spin_drag;
-        own.tt.zz += spin_drag;
+        own.xx.xx += stiffen;
+        own.xx.yy += stiffen;
+        own.xx.zz += stiffen;
+        own.tt.xx += spin_stiffen;
+        own.tt.yy += spin_stiffen;
+        own.tt.zz += spin_stiffen;
 
         energy_ += select<V>(on, energy, zero);
         const V pivot = eliminate(own, coupling, factor_[i], next);
+        const V* z = factor_[i].z;
+        descent_ += select<V>(on, z[0] * z[0] + z[1] * z[1] + z[2] * z[2] + z[3] * z[3] + z[4] * z[4] + z[5] * z[5], zero);
         const Mask<V> sound = pivot > zero;
         pivot_ = select<V>(on, select<V>(sound, pivot_, zero), pivot_);
         own = next;
@@ -418,7 +448,6 @@ void Stepper<V>::update(int n, const Verdict (&verdict)[W], const V& factor) {
         set_mask<V>(shorten, l, verdict[l] == Verdict::shorten);
         set_mask<V>(repeat, l, verdict[l] == Verdict::repeat);
     }
-    const V half = broadcast<V>(0.5);
     for (int i = 0; i < n; ++i) {
         Node& node = node_[i];
         const Mask<V> on = active_ > broadcast<V>(i);
@@ -427,8 +456,8 @@ void Stepper<V>::update(int n, const Verdict (&verdict)[W], const V& factor) {
         const Mask<V> moves = take | shrink, keeps = take | (repeat & on);
         node.from = select(keeps, node.x, node.from);
         node.from_q = select(keeps, node.q, node.from_q);
-        node.step = select(take, {factor * z[0], factor * z[1], factor * z[2]}, select(shrink, half * node.step, node.step));
-        node.turn = select(take, {factor * z[3], factor * z[4], factor * z[5]}, select(shrink, half * node.turn, node.turn));
+        node.step = select(take, {factor * z[0], factor * z[1], factor * z[2]}, select(shrink, factor * node.step, node.step));
+        node.turn = select(take, {factor * z[3], factor * z[4], factor * z[5]}, select(shrink, factor * node.turn, node.turn));
         node.x = select(moves, node.from + node.step, node.x);
         node.q = select(moves, turned(node.from_q, node.turn), node.q);
     }

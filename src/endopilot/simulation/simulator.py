@@ -25,8 +25,8 @@ _FREE_BEHIND_MM = 3.0
 """Nodes farther behind the ostium than this follow the drive exactly, mm."""
 _LARGEST_NEWTON_STEP = 0.3
 """Displacement of a node (mm) that one Newton step is clamped to; larger ones can tangle the wire for good."""
-_MOST_ITERATIONS = 80
-"""Newton iterations after which a time step is halved, down to 1/32."""
+_MOST_ITERATIONS = 60
+"""Newton iterations after which a time step is halved, down to 1/64."""
 _SAMPLE_TOLERANCE = 1e-6
 """Newton tolerance of the step that ends a sample, mm: its forces are recorded, and the wire is stiff axially."""
 _LANES = 4
