@@ -86,7 +86,7 @@ def restore_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Te
     """Set an optimizer to the state that `optimizer_tensors` gave."""
     state: dict[int, dict[str, Tensor]] = {}
     for key, tensor in tensors.items():
-        prefix, i, name = key.split(".", 2)
-        if prefix == "optimizer":
+        if key.startswith("optimizer."):
+            _, i, name = key.split(".")
             state.setdefault(int(i), {})[name] = tensor
     optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})

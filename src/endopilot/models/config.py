@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 from endopilot.errors import InputError
@@ -55,7 +55,7 @@ class TrainConfig:
     """Passes over the training windows."""
     learning_rate: float = 1e-3
     """Adam's peak step size."""
-    batch_size: int = 64
+    batch_size: int = 32
     """Windows of 30 states in one step."""
     windows_per_epoch: int | None = None
     """Windows drawn in one epoch; all of the training split if not given."""
@@ -63,6 +63,8 @@ class TrainConfig:
     """Wall time that each network may train for, s; the epochs are shortened to fit, by the speed measured first."""
     seed: int = 0
     """Seed of the initial weights, the order of the windows, and dropout."""
+    size: TransformerConfig = field(default_factory=TransformerConfig)
+    """Size of the networks; the paper's if not given."""
 
     def __post_init__(self) -> None:
         """Check every field.

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from endopilot.dataset.loader import load_dataset
+from endopilot.dataset.loader import Dataset, load_dataset
 from endopilot.errors import InputError
 from endopilot.files import manifest, read_json, write_json
 from endopilot.models.checkpoint import (
@@ -28,7 +28,7 @@ from endopilot.models.checkpoint import (
     write_network,
     write_tensors,
 )
-from endopilot.models.config import TrainConfig, TransformerConfig
+from endopilot.models.config import TrainConfig
 from endopilot.models.transformer import NETWORKS, Network
 from endopilot.models.windows import Episodes
 from endopilot.progress import Advance, progress
@@ -60,14 +60,13 @@ def train(dataset_folder: Path, run_folder: Path, config: TrainConfig) -> None:
     """
     dataset_folder, run_folder = Path(dataset_folder), Path(run_folder)
     dataset = load_dataset(dataset_folder)
-    size = TransformerConfig()
-    _begin(run_folder, {"train": asdict(config), "transformer": asdict(size), "dataset": dataset.manifest["key"]})
-    training = Episodes.of(dataset.of_split("train"))
-    validation = Episodes.of(dataset.of_split("seen_test")) if "seen_test" in dataset.split else None
+    _begin(run_folder, {"train": asdict(config), "dataset": dataset.manifest["key"]})
+    training = _episodes(dataset, "train")
+    validation = _episodes(dataset, "seen_test") if "seen_test" in dataset.split else None
     start = time.perf_counter()
     results: dict[str, Any] = {}
     for name in config.networks:
-        job = _Job(name, config, size, training, validation, run_folder)
+        job = _Job(name, config, training, validation, run_folder)
         results[name] = job.run()
         write_json(run_folder / "training.json", results)
     record = manifest(
@@ -96,11 +95,27 @@ def _begin(run_folder: Path, settings: dict[str, Any]) -> None:
         then = before.get(part)
         if then == values:
             continue
-        changed = next((key for key in values if (then or {}).get(key) != values[key]), part)
+        if isinstance(then, dict):
+            part = next(key for key in values if then.get(key) != values[key])
+            then, values = then.get(part), values[part]
         raise InputError(
-            f"{run_folder}: was begun with another {part} ({changed} differs); "
+            f"{run_folder}: was begun with {part} = {then}, now it is {values}; "
             "choose another output folder or go back to the first settings"
         )
+
+
+def _episodes(dataset: Dataset, split: str) -> Episodes:
+    """Return the episodes of a split, which must be finite: one bad sample would spoil the scales of all."""
+    chosen = dataset.of_split(split)
+    for name in ("tip_abscissa", "tip_offset", "inserted_length", "rotation", "control"):
+        finite = np.isfinite(getattr(chosen, name)).reshape(len(chosen), -1).all(axis=1)
+        if not finite.all():
+            bad = int(np.argmin(finite))
+            raise InputError(
+                f"{dataset.folder}: {name} of {chosen.anatomy[bad]}, sequence {chosen.sequence[bad]}, is not finite "
+                "though the episode is marked valid; make the dataset again"
+            )
+    return Episodes.of(chosen)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +124,6 @@ class _Job:
 
     name: str
     config: TrainConfig
-    size: TransformerConfig
     training: Episodes
     validation: Episodes | None
     run_folder: Path
@@ -119,7 +133,7 @@ class _Job:
         config = self.config
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(_seed(config.seed, self.name, "weights"))
-            network = NETWORKS[self.name](self.size)
+            network = NETWORKS[self.name](self.config.size)
             self._fit_scales(network)
             optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate, fused=True)
             state = self._resume(network, optimizer) or {"seconds": 0.0, "curve": []}
@@ -224,7 +238,7 @@ class _Job:
     def _save(self, network: Network, optimizer: torch.optim.Adam, state: dict[str, Any]) -> None:
         tensors = {f"network.{key}": value for key, value in network.state_dict().items()}
         write_tensors(self._checkpoint, tensors | optimizer_tensors(optimizer), {"network": self.name, **state})
-        write_network(self.run_folder / f"{self.name}.safetensors", self.name, network, self.size, {})
+        write_network(self.run_folder / f"{self.name}.safetensors", self.name, network, self.config.size, {})
 
     def _resume(self, network: Network, optimizer: torch.optim.Adam) -> dict[str, Any] | None:
         if not self._checkpoint.exists():
@@ -234,7 +248,7 @@ class _Job:
         network.load_state_dict(weights)
         restore_optimizer(optimizer, tensors)
         # A kill between the two files of an epoch leaves the second one behind by an epoch.
-        write_network(self.run_folder / f"{self.name}.safetensors", self.name, network, self.size, {})
+        write_network(self.run_folder / f"{self.name}.safetensors", self.name, network, self.config.size, {})
         return {key: facts[key] for key in ("seconds", "curve")}
 
     @property

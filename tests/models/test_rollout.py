@@ -1,0 +1,153 @@
+"""Open-loop rollouts: what is given, what is fed back, and that something was learnt."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from endopilot.dataset.loader import load_dataset
+from endopilot.errors import InputError
+from endopilot.models.config import TrainConfig, TransformerConfig
+from endopilot.models.rollout import TransformerPredictor, load_run
+from endopilot.models.train import train
+from endopilot.models.transformer import ForwardNetwork, InverseNetwork
+
+GIVEN = 30
+SMALL = TransformerConfig(d_model=24, heads=2, encoder_layers=1, decoder_layers=1, feedforward=32)
+
+
+@pytest.fixture(scope="module")
+def learnt(toy_dataset, tmp_path_factory):
+    """Return a predictor trained for some seconds on the toy wire."""
+    run = tmp_path_factory.mktemp("learnt") / "run"
+    train(
+        toy_dataset, run, TrainConfig(epochs=6, windows_per_epoch=4000, batch_size=32, learning_rate=3e-3, size=SMALL)
+    )
+    return load_run(run)
+
+
+@pytest.fixture(scope="module")
+def unseen(toy_dataset):
+    """Return navigations of patients that were not trained on."""
+    return load_dataset(toy_dataset).of_split("test").select(np.arange(16))
+
+
+def untrained(limits=(1e9, 1e9)) -> TransformerPredictor:
+    torch.manual_seed(1)
+    networks = ForwardNetwork(SMALL).eval(), InverseNetwork(SMALL).eval()
+    for network in networks:
+        torch.nn.init.normal_(network.transformer.head.weight, std=0.1)
+    return TransformerPredictor(*networks, control_limits=np.array(limits))
+
+
+def true_tip(data):
+    return np.stack([data.tip_abscissa, data.tip_offset], axis=-1)[:, GIVEN:].astype(float)
+
+
+def test_shapes(unseen):
+    predictor = untrained()
+    for rollout in (predictor.rollout_forward, predictor.rollout_inverse, predictor.rollout_dual):
+        result = rollout(unseen)
+        assert result.tip.shape == result.proximal.shape == result.control.shape == (16, 90, 2)
+        assert all(np.isfinite(signal).all() for signal in (result.tip, result.proximal, result.control))
+
+
+def test_forward_sees_no_tip_after_the_given_ones(unseen):
+    blind = replace(unseen, tip_abscissa=unseen.tip_abscissa.copy(), tip_offset=unseen.tip_offset.copy())
+    blind.tip_abscissa[:, GIVEN:] = np.nan
+    blind.tip_offset[:, GIVEN:] = np.nan
+    predictor = untrained()
+    np.testing.assert_array_equal(predictor.rollout_forward(unseen).tip, predictor.rollout_forward(blind).tip)
+
+
+@pytest.mark.parametrize("k", [30, 31, 77, 118])
+def test_predictions_do_not_depend_on_later_controls(unseen, k):
+    control, length, rotation = unseen.control.copy(), unseen.inserted_length.copy(), unseen.rotation.copy()
+    for later in (control, length, rotation):
+        later[:, k + 1 :] = np.nan
+    cut = replace(unseen, control=control, inserted_length=length, rotation=rotation)
+    predictor = untrained()
+    whole, partial = predictor.rollout_forward(unseen).tip, predictor.rollout_forward(cut).tip
+    np.testing.assert_array_equal(whole[:, : k + 1 - GIVEN], partial[:, : k + 1 - GIVEN])
+    assert np.isnan(partial[:, k + 1 - GIVEN :]).all()
+
+
+@pytest.mark.parametrize("protocol", ["rollout_inverse", "rollout_dual"])
+def test_inverse_sees_no_motion_after_the_given_ones(unseen, protocol):
+    control, length, rotation = unseen.control.copy(), unseen.inserted_length.copy(), unseen.rotation.copy()
+    for later in (control, length, rotation):
+        later[:, GIVEN:] = np.nan
+    blind = replace(unseen, control=control, inserted_length=length, rotation=rotation)
+    rollout = getattr(untrained(), protocol)
+    np.testing.assert_array_equal(rollout(unseen).control, rollout(blind).control)
+
+
+@pytest.mark.parametrize("k", [30, 60, 118])
+def test_inverse_does_not_see_beyond_the_desired_tip(unseen, k):
+    cut = replace(unseen, tip_abscissa=unseen.tip_abscissa.copy(), tip_offset=unseen.tip_offset.copy())
+    cut.tip_abscissa[:, k + 1 :] = np.nan
+    cut.tip_offset[:, k + 1 :] = np.nan
+    predictor = untrained()
+    whole, partial = predictor.rollout_inverse(unseen).control, predictor.rollout_inverse(cut).control
+    np.testing.assert_array_equal(whole[:, : k + 1 - GIVEN], partial[:, : k + 1 - GIVEN])
+
+
+@pytest.mark.parametrize("protocol", ["rollout_inverse", "rollout_dual"])
+def test_motion_is_the_exact_integral_of_the_control(unseen, protocol):
+    result = getattr(untrained(), protocol)(unseen)
+    start = np.stack([unseen.inserted_length, unseen.rotation], axis=-1)[:, GIVEN - 1 : GIVEN].astype(float)
+    np.testing.assert_allclose(result.proximal, start + 0.5 * np.cumsum(result.control, axis=1), atol=1e-10)
+
+
+def test_dual_feeds_the_foretold_tip_back(unseen):
+    predictor = untrained()
+    dual, inverse = predictor.rollout_dual(unseen), predictor.rollout_inverse(unseen)
+    np.testing.assert_array_equal(dual.control[:, 0], inverse.control[:, 0])
+    assert np.abs(dual.control[:, 5:] - inverse.control[:, 5:]).max() > 1e-4
+    along = replace(
+        unseen,
+        control=np.concatenate([unseen.control[:, :GIVEN], dual.control], axis=1),
+        inserted_length=np.concatenate([unseen.inserted_length[:, :GIVEN], dual.proximal[..., 0]], axis=1),
+        rotation=np.concatenate([unseen.rotation[:, :GIVEN], dual.proximal[..., 1]], axis=1),
+    )
+    np.testing.assert_allclose(predictor.rollout_forward(along).tip, dual.tip, atol=1e-3)
+
+
+def test_controls_stay_within_the_device_s_limits_and_in_the_catheter(unseen):
+    result = untrained((0.7, 0.2)).rollout_inverse(unseen)
+    assert np.abs(result.control[..., 0]).max() == pytest.approx(0.7)
+    assert np.abs(result.control[..., 1]).max() == pytest.approx(0.2)
+    away = replace(unseen, tip_abscissa=unseen.tip_abscissa - np.float32(3.0) * np.arange(120, dtype=np.float32))
+    result = untrained().rollout_inverse(away)
+    assert result.proximal[..., 0].min() > -1e-4
+    assert (result.proximal[..., 0] < 1e-3).any()
+
+
+def test_batches_do_not_matter(unseen):
+    predictor = untrained()
+    small = replace(predictor, batch_size=5)
+    np.testing.assert_allclose(predictor.rollout_dual(unseen).tip, small.rollout_dual(unseen).tip, atol=1e-3)
+
+
+def test_a_missing_network_is_named(unseen):
+    with pytest.raises(InputError, match="no inverse network; train it with --network both"):
+        replace(untrained(), inverse=None).rollout_dual(unseen)
+
+
+def test_forward_beats_holding_the_slack_on_unseen_patients(learnt, unseen):
+    slack = unseen.inserted_length - unseen.tip_abscissa
+    held = unseen.inserted_length[:, GIVEN:] - slack[:, GIVEN - 1 : GIVEN]
+    truth = true_tip(unseen)
+    error = np.abs(learnt.rollout_forward(unseen).tip - truth)
+    assert error[..., 0].mean() < 0.7 * np.abs(held - truth[..., 0]).mean()
+
+
+def test_inverse_beats_the_mean_and_the_held_control_on_unseen_patients(learnt, unseen, toy_dataset):
+    truth = unseen.control[:, GIVEN:, 0]
+    error = np.abs(learnt.rollout_inverse(unseen).control[..., 0] - truth).mean()
+    mean = load_dataset(toy_dataset).of_split("train").control[..., 0].mean()
+    assert error < 0.5 * np.abs(unseen.control[:, GIVEN - 1 : GIVEN, 0] - truth).mean()
+    assert error < 0.5 * np.abs(mean - truth).mean()

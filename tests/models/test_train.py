@@ -1,0 +1,182 @@
+"""Training: it learns, repeats to the bit, survives a kill and stops at the first bad loss."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from endopilot.dataset.loader import load_dataset
+from endopilot.errors import InputError
+from endopilot.files import read_json, sha256
+from endopilot.models.checkpoint import read_network, read_tensors
+from endopilot.models.config import TrainConfig, TransformerConfig
+from endopilot.models.rollout import load_run
+from endopilot.models.train import train
+from endopilot.models.transformer import NETWORKS
+from endopilot.models.windows import Episodes
+from toy_navigation import make_toy_dataset
+
+SMALL = TransformerConfig(d_model=24, heads=2, encoder_layers=1, decoder_layers=1, feedforward=32)
+SHORT = {"epochs": 3, "windows_per_epoch": 64, "batch_size": 16, "size": SMALL}
+
+
+@pytest.fixture(scope="module")
+def short_run(toy_dataset, tmp_path_factory):
+    """Return a run of both networks, three short epochs each."""
+    run = tmp_path_factory.mktemp("short") / "run"
+    train(toy_dataset, run, TrainConfig(**SHORT))
+    return run
+
+
+@pytest.mark.parametrize("name", ["ff", "if"])
+def test_windows_hold_what_the_paper_says(toy_dataset, name):
+    data = load_dataset(toy_dataset).of_split("train")
+    tip, proximal, control, truth = Episodes.of(data).window(name, torch.tensor([[2, 30], [5, 119]]))
+    first = slice(0, 30) if name == "ff" else slice(1, 31)
+    np.testing.assert_array_equal(tip[0, :, 0], data.tip_abscissa[2, first])
+    first = slice(1, 31) if name == "ff" else slice(0, 30)
+    np.testing.assert_array_equal(proximal[0, :, 1], data.rotation[2, first])
+    np.testing.assert_array_equal(control[0], data.control[2, first])
+    expected = (data.tip_abscissa[5, 119], data.tip_offset[5, 119]) if name == "ff" else data.control[5, 119]
+    np.testing.assert_array_equal(truth[1], expected)
+
+
+@pytest.mark.parametrize("name", ["ff", "if"])
+def test_overfits_one_batch(toy_dataset, name):
+    episodes = Episodes.of(load_dataset(toy_dataset).of_split("train"))
+    *window, truth = episodes.window(name, episodes.targets()[:: len(episodes.targets()) // 16][:16])
+    torch.manual_seed(0)
+    network = NETWORKS[name](replace(SMALL, dropout=0.0))
+    network.fit_scales(*window, truth)
+    optimizer = torch.optim.Adam(network.parameters(), 3e-3)
+    for _ in range(400):
+        optimizer.zero_grad()
+        loss = network.loss(network(*window), truth)
+        loss.backward()
+        optimizer.step()
+    assert loss.item() < 0.02
+
+
+def test_writes_what_a_run_holds(short_run, toy_dataset):
+    names = {path.name for path in short_run.iterdir()}
+    assert names == {"ff.safetensors", "if.safetensors", "config.json", "training.json", "manifest.json", "checkpoints"}
+    record = read_json(short_run / "manifest.json")
+    assert (short_run / record["dataset"]).resolve() == toy_dataset.resolve()
+    assert record["networks"]["ff"]["parameters"] == sum(p.numel() for p in NETWORKS["ff"](SMALL).parameters())
+    curve = read_json(short_run / "training.json")["if"]["curve"]
+    assert [entry["steps"] for entry in curve] == [4, 4, 4]
+    assert all(np.isfinite(entry["validation_loss"]) for entry in curve)
+
+
+def test_a_seed_repeats_to_the_bit(short_run, toy_dataset, tmp_path):
+    train(toy_dataset, tmp_path / "again", TrainConfig(**SHORT, network="ff"))
+    assert sha256(tmp_path / "again/ff.safetensors") == sha256(short_run / "ff.safetensors")
+    train(toy_dataset, tmp_path / "other", TrainConfig(**SHORT, network="ff", seed=1))
+    assert sha256(tmp_path / "other/ff.safetensors") != sha256(short_run / "ff.safetensors")
+
+
+def test_killed_and_resumed_continues_the_same_curve(short_run, toy_dataset, tmp_path):
+    run = tmp_path / "run"
+    script = (
+        f"import sys; sys.path[:0] = {sys.path!r}\n"
+        "from pathlib import Path\n"
+        "import torch; torch.set_num_threads(1)\n"
+        "from endopilot.models.config import TrainConfig, TransformerConfig\n"
+        "from endopilot.models.train import train\n"
+        f"train(Path({str(toy_dataset)!r}), Path({str(run)!r}), TrainConfig(**{SHORT!r}))\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", script], stderr=subprocess.DEVNULL)
+    try:
+        deadline = time.monotonic() + 120
+        while not (run / "ff.safetensors").exists():
+            assert process.poll() is None and time.monotonic() < deadline
+            time.sleep(0.01)
+    finally:
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    assert not (run / "manifest.json").exists()
+    train(toy_dataset, run, TrainConfig(**SHORT))
+    for name in ("ff", "if"):
+        assert sha256(run / f"{name}.safetensors") == sha256(short_run / f"{name}.safetensors")
+        curves = [read_json(folder / "training.json")[name]["curve"] for folder in (run, short_run)]
+        losses = [[(entry["loss"], entry["validation_loss"]) for entry in curve] for curve in curves]
+        assert losses[0] == losses[1]
+
+
+def test_a_finished_run_returns_at_once(short_run, toy_dataset):
+    before = sha256(short_run / "checkpoints/ff.safetensors")
+    train(toy_dataset, short_run, TrainConfig(**SHORT))
+    assert sha256(short_run / "checkpoints/ff.safetensors") == before
+
+
+def test_other_settings_are_refused(short_run, toy_dataset):
+    with pytest.raises(InputError, match="begun with epochs = 3, now it is 4"):
+        train(toy_dataset, short_run, TrainConfig(**(SHORT | {"epochs": 4})))
+
+
+def test_the_first_bad_loss_stops_and_the_last_good_checkpoint_stays(toy_dataset, tmp_path, monkeypatch):
+    config = TrainConfig(**SHORT, network="ff")
+    real = Episodes.window
+    drawn = []
+
+    def window(self, name, target):
+        *given, truth = real(self, name, target)
+        drawn.append(target)
+        if len(drawn) == 8:  # scales, four steps of epoch 1, its validation, two steps of epoch 2
+            truth = truth * torch.nan
+        return (*given, truth)
+
+    monkeypatch.setattr(Episodes, "window", window)
+    with pytest.raises(InputError, match=r"loss of ff became nan in epoch 2, batch 2 .* checkpoint of epoch 1 is kept"):
+        train(toy_dataset, tmp_path / "run", config)
+    monkeypatch.undo()
+    _, facts = read_tensors(tmp_path / "run/checkpoints/ff.safetensors")
+    assert [entry["epoch"] for entry in facts["curve"]] == [1]
+    network, _ = read_network(tmp_path / "run/ff.safetensors")
+    assert all(torch.isfinite(tensor).all() for tensor in network.state_dict().values())
+
+
+def test_samples_that_are_not_finite_are_named(toy_dataset, tmp_path, monkeypatch):
+    data = load_dataset(toy_dataset)
+    poisoned = replace(data, tip_abscissa=data.tip_abscissa.copy())
+    episode = int(np.flatnonzero(data.split == "train")[5])
+    poisoned.tip_abscissa[episode, 60] = np.nan
+    monkeypatch.setattr("endopilot.models.train.load_dataset", lambda folder: poisoned)
+    where = f"tip_abscissa of {data.anatomy[episode]}, sequence {data.sequence[episode]}, is not finite"
+    with pytest.raises(InputError, match=where):
+        train(toy_dataset, tmp_path / "run", TrainConfig(**SHORT))
+
+
+def test_the_time_allowed_is_kept(toy_dataset, tmp_path):
+    config = TrainConfig(network="ff", epochs=2, batch_size=16, max_seconds=2.0)
+    train(toy_dataset, tmp_path / "run", config)
+    result = read_json(tmp_path / "run/training.json")["ff"]
+    assert result["parameters"] == 650_754
+    everything = 77 * 90 / 16
+    assert len(result["curve"]) == 2
+    assert all(1 <= entry["steps"] < everything for entry in result["curve"])
+
+
+def test_damaged_checkpoints_are_named(short_run, tmp_path):
+    shutil.copytree(short_run, tmp_path / "run")
+    file = tmp_path / "run/ff.safetensors"
+    file.write_bytes(file.read_bytes()[:1000])
+    with pytest.raises(InputError, match=r"ff\.safetensors: damaged"):
+        load_run(tmp_path / "run")
+    file.unlink()
+    with pytest.raises(InputError, match=r"ff\.safetensors: no such checkpoint"):
+        load_run(tmp_path / "run")
+
+
+def test_episodes_without_a_future_are_refused(tmp_path):
+    make_toy_dataset(tmp_path / "d", patients=1, sequences=4, seconds=15.0)
+    with pytest.raises(InputError, match=r"seconds of 15\.5 or more"):
+        train(tmp_path / "d", tmp_path / "run", TrainConfig(**SHORT))
