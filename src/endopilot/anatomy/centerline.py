@@ -85,7 +85,7 @@ def lumen_graph(
     reached = np.isfinite(cost)
     renumber = np.cumsum(reached) - 1
     parent = predecessor[reached].astype(np.int64)
-    parent = np.where(parent >= 0, renumber[parent], -1)
+    parent = np.where(parent >= 0, renumber[np.maximum(parent, 0)], -1)
     kept = points[reached]
     return LumenGraph(kept, clearance[reached], parent, _length_to_root(kept, parent), spacing_mm)
 
@@ -209,7 +209,7 @@ def _is_branch(graph: LumenGraph, nodes: Int[np.ndarray, "_"], minimum_length_mm
         return False
     length = graph.length[nodes[-1]] - graph.length[nodes[beyond[0]]]
     own_radius = float(np.median(graph.clearance[nodes[beyond]]))
-    return length >= max(minimum_length_mm, SLENDERNESS * own_radius, 0.5 * parent_radius)
+    return bool(length >= max(minimum_length_mm, SLENDERNESS * own_radius, 0.5 * parent_radius))
 
 
 def _to_axis(

@@ -35,14 +35,14 @@ Grid = tuple[tuple[int, int, int], Float[np.ndarray, "3"]]
 def automatic_spacing(radius: Float[np.ndarray, "n"], extent_mm: Float[np.ndarray, "3"]) -> float:
     """Return a grid spacing in mm that resolves the lumen and keeps the map small.
 
-    It is 0.45 times the radius that all but the narrowest twentieth of the centerline exceeds, from 0.25 to 1.5 mm,
+    It is 0.45 times the radius that all but the narrowest twentieth of the centerline exceeds, from 0.3 to 1.5 mm,
     and no smaller than `MAXIMUM_GRID_POINTS` allows over `extent_mm`.
 
     Args:
         radius: inscribed-sphere radii along the centerline, mm.
         extent_mm: edges of the box that the map must cover, mm.
     """
-    spacing = float(np.clip(0.45 * np.quantile(radius, 0.05), 0.25, 1.5))
+    spacing = float(np.clip(0.45 * np.quantile(radius, 0.05), 0.3, 1.5))
     smallest = float(np.prod(np.maximum(extent_mm, 1.0)) / MAXIMUM_GRID_POINTS) ** (1 / 3)
     return round(max(spacing, smallest), 3)
 

@@ -17,7 +17,7 @@ from endopilot.anatomy.distance import (
     distance_map_from_spheres,
     distance_map_from_surface,
 )
-from endopilot.anatomy.labels import label_tree
+from endopilot.anatomy.labels import dominance, label_tree
 from endopilot.anatomy.sources import AnatomySource, Polylines, read_source, transformed
 from endopilot.anatomy.surface import Surface, surface_from_mask
 from endopilot.anatomy.tree import tree_from_lines
@@ -45,7 +45,7 @@ class AnatomyConfig:
     catheter_radius_mm: float | None = None
     """Inner radius of the guiding catheter, mm; by default the lumen's radius at the ostium."""
     spacing_mm: float | None = None
-    """Grid spacing of the distance map, mm; by default 0.45 times the narrow vessels' radius, from 0.25 to 1.5 mm."""
+    """Grid spacing of the distance map, mm; by default 0.45 times the narrow vessels' radius, from 0.3 to 1.5 mm."""
     minimum_branch_length_mm: float = 4.0
     """Side branches shorter than this beyond their parent's lumen are dropped, mm."""
     scale: float = 1.0
@@ -117,6 +117,7 @@ def extract_anatomy(
         "source": {"file": wrapped.file, "sha256": wrapped.sha256, "kind": type(content).__name__},
         "config": asdict(config),
         "ostium_rule": rule,
+        "dominance": dominance(tree),
         "notes": notes,
     }
     return Anatomy(name, tree, distance_map, insertion, radius, provenance)

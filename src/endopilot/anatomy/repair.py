@@ -21,7 +21,7 @@ NEAR_OSTIUM_MM = 5.0
 LARGEST_GAP_VOXELS = 4.0
 """Pieces of a mask that are this near each other are taken for one interrupted vessel."""
 
-SMALLEST_PIECE = 30
+SMALLEST_PIECE = 12
 """A piece of fewer voxels is noise."""
 
 
