@@ -243,12 +243,12 @@ def _style(series: str) -> dict[str, Any]:
 
 
 def _upper(table: pd.DataFrame, column: str) -> float:
-    """Return an upper limit that shows every series whole unless one runs away from all others."""
+    """Return an upper limit that shows every series whole, unless one runs away from all others."""
     series = [values(rows(table, series=name), column) for name in distinct(table, "series")]
-    highest = [float(np.nanmax(line)) for line in series if np.isfinite(line).any()]
+    highest = sorted(float(np.nanmax(line)) for line in series if np.isfinite(line).any())
     if not highest:
         return 1.0
-    return 1.08 * min(max(highest), 6.0 * float(np.median(highest))) + 1e-6
+    return 1.08 * min(highest[-1], 1.5 * highest[max(len(highest) - 2, 0)]) + 1e-6
 
 
 def _legend_below(figure: Figure, axes: Shaped[np.ndarray, "rows columns"]) -> None:

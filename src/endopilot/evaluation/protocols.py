@@ -29,7 +29,7 @@ def run_protocols(predictor: Predictor, data: Dataset, train: Dataset, advance: 
 
     P1 is the forward network under the true controls; P2 the inverse network with the true tip as desired; P3 the
     paper's loop of both; P4 the controls of P3 simulated again from the start of the episode, in the anatomy and with
-    the device and friction that it was recorded with.
+    the device and friction that it was recorded with; what the drive cannot do it does as far as it can.
 
     Args:
         predictor: the networks of a run.
@@ -158,7 +158,7 @@ def _replay(
 _REPLAYED = ("abscissa", "offset", "radius", "base_force", "base_torque", "distance")
 
 
-def _whole(data: Dataset, control: Control) -> Control:
+def _whole(data: Dataset, control: Control) -> Float[np.ndarray, "episodes all_samples 2"]:
     """Return the recorded controls while states are given, followed by `control`."""
     return np.concatenate([data.control[:, :WINDOW].astype(float), control], axis=1)
 

@@ -123,7 +123,7 @@ def _add_navigation(figure: go.Figure, anatomy: Anatomy, rollout: Rollout, world
                 "xanchor": "left",
                 "y": 0.0,
                 "yanchor": "top",
-                "pad": {"t": 32, "r": 8},
+                "pad": {"t": 32, "l": 12},
                 "bgcolor": "#1d2a44",
                 "bordercolor": FAINT,
                 "font": {"color": INK},

@@ -102,26 +102,36 @@ def _drive(result: SplitResult, series: str) -> dict[str, Any]:
     }
 
 
+BASELINE_WORDS: Mapping[str, str] = {
+    "hold_slack": "holding slack and offset",
+    "training_mean": "the training mean",
+    "hold_control": "holding the last control",
+    "follow_slack": "driving by the held slack",
+}
+
+
 def findings(metrics: Mapping[str, Any]) -> list[str]:
     """Return in words, from the numbers alone, where the networks beat their baselines and where they lose."""
     sentences = []
     for split in metrics["splits"].values():
-        for series, tip in split["tip"].items():
-            for coordinate, symbol in (("abscissa", "Δtip"), ("offset", "γtip")):
-                skills = {k: v for k, v in tip[coordinate]["all"]["skill"].items() if v is not None}
-                if not skills:
-                    continue
-                hardest = min(skills, key=lambda name: skills[name])
-                sentences.append((split["title"], series, symbol, hardest, skills[hardest]))
-    return [_sentence(*found) for found in sentences]
+        for series in TIP_BASELINES:
+            if series not in split["tip"]:
+                continue
+            parts = [
+                _verdict(split["tip"][series][coordinate]["all"]["skill"], symbol)
+                for coordinate, symbol in (("abscissa", "Δtip"), ("offset", "γtip"))
+            ]
+            told = "; ".join(part for part in parts if part)
+            if told:
+                sentences.append(f"{split['title']}, {series.replace('_', ' ')}: {told}.")
+    return sentences
 
 
-def _sentence(split: str, series: str, symbol: str, baseline: str, value: float) -> str:
-    name = {
-        "hold_slack": "holding slack and offset",
-        "training_mean": "the training mean",
-        "hold_control": "holding the last control",
-        "follow_slack": "driving by the held slack",
-    }[baseline]
-    verdict = "beats every baseline" if value > 0 else "loses to a baseline"
-    return f"{split}: {series} {verdict} for {symbol} (skill {value:+.2f} against {name}, its strongest)."
+def _verdict(skills: Mapping[str, float | None], symbol: str) -> str:
+    """Return whether the hardest baseline is beaten in one coordinate; empty where there is none."""
+    known = {name: value for name, value in skills.items() if value is not None}
+    if not known:
+        return ""
+    hardest = min(known, key=lambda name: known[name])
+    verdict = "beats every baseline" if known[hardest] > 0 else "loses to a baseline"
+    return f"{symbol} {verdict} (skill {known[hardest]:+.2f} against {BASELINE_WORDS[hardest]})"

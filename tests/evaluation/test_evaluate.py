@@ -1,0 +1,133 @@
+from __future__ import annotations
+
+import json
+import os
+from unittest.mock import patch
+
+import numpy as np
+import pandas as pd
+import pytest
+from toy_navigation import toy_simulate
+
+from endopilot.dataset.loader import load_dataset
+from endopilot.errors import InputError
+from endopilot.evaluation.evaluate import EvaluateConfig, evaluate
+from endopilot.evaluation.results import read_results
+from endopilot.files import read_json, write_json
+
+
+def make_untrained_run(dataset_folder, run_folder):
+    """Write a run whose networks are their simple guesses: slack and offset stay; the drive moves as the tip is to."""
+    from endopilot.models.checkpoint import write_network
+    from endopilot.models.config import TransformerConfig
+    from endopilot.models.transformer import NETWORKS
+
+    size = TransformerConfig(d_model=24, encoder_layers=1, decoder_layers=1)
+    for name, network in NETWORKS.items():
+        write_network(run_folder / f"{name}.safetensors", name, network(size), size, {})
+    record = {
+        "dataset": os.path.relpath(dataset_folder, run_folder),
+        "networks": {"ff": {}, "if": {}},
+        "control_limits": [1e3, 1e3],
+    }
+    write_json(run_folder / "manifest.json", record)
+
+
+@pytest.fixture(scope="module")
+def evaluated(toy_dataset, tmp_path_factory):
+    import torch
+
+    folder = tmp_path_factory.mktemp("evaluated")
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # small batches gain nothing from two, and lose much where cores are shared
+    make_untrained_run(toy_dataset, folder / "run")
+    with patch("endopilot.evaluation.protocols.simulate", toy_simulate):
+        metrics = evaluate(folder / "run", folder / "evaluation", EvaluateConfig(sequences=8))
+    torch.set_num_threads(threads)
+    return folder, metrics
+
+
+def test_metrics_are_on_disk_as_returned(evaluated):
+    folder, metrics = evaluated
+    text = (folder / "evaluation" / "metrics.json").read_text()
+    assert "NaN" not in text
+    assert json.loads(text)["splits"]["test"]["tip"]["P1"]["abscissa"]["all"]["mae"] == pytest.approx(
+        metrics["splits"]["test"]["tip"]["P1"]["abscissa"]["all"]["mae"]
+    )
+
+
+def test_both_splits_are_evaluated_on_episodes_that_no_network_saw(evaluated, toy_dataset):
+    folder, metrics = evaluated
+    dataset = load_dataset(toy_dataset)
+    assert list(metrics["splits"]) == ["seen_test", "test"]
+    trained = set(dataset.anatomy[dataset.split == "train"].tolist())
+    assert not trained & set(metrics["splits"]["test"]["anatomies"])
+    assert set(metrics["splits"]["seen_test"]["anatomies"]) <= trained
+    for name, result in read_results(folder / "evaluation" / "evaluation.npz").items():
+        for anatomy, sequence in zip(np.array(result.anatomies)[result.anatomy], result.sequence, strict=True):
+            episode = (dataset.anatomy == anatomy) & (dataset.sequence == sequence)
+            assert dataset.split[episode].tolist() == [name]
+
+
+def test_sequences_are_spread_over_the_patients(evaluated):
+    _, metrics = evaluated
+    assert metrics["splits"]["test"]["episodes"] == 8
+    assert len(metrics["splits"]["test"]["anatomies"]) == 2
+
+
+def test_an_untrained_forward_network_is_the_baseline_it_corrects(evaluated):
+    # Its guess is that slack and offset stay, so P1 must equal that baseline sample by sample.
+    result = read_results(evaluated[0] / "evaluation" / "evaluation.npz")["test"]
+    np.testing.assert_allclose(result.tips["P1"].abscissa, result.tips["hold_slack"].abscissa, atol=1e-3)
+    np.testing.assert_allclose(result.tips["P1"].offset, result.tips["hold_slack"].offset, atol=1e-4)
+    assert evaluated[1]["splits"]["test"]["tip"]["P1"]["abscissa"]["all"]["skill"]["hold_slack"] == pytest.approx(
+        0.0, abs=1e-3
+    )
+
+
+def test_an_untrained_inverse_network_drives_as_the_tip_is_to_move(evaluated):
+    result = read_results(evaluated[0] / "evaluation" / "evaluation.npz")["test"]
+    np.testing.assert_allclose(result.controls["P2"], result.controls["follow_slack"], atol=1e-3)
+
+
+def test_recorded_controls_lead_back_to_the_recorded_tips(evaluated):
+    result = read_results(evaluated[0] / "evaluation" / "evaluation.npz")["seen_test"]
+    assert np.abs(result.error("true_replay", "abscissa")).max() < 1e-3
+    assert result.tip_distance["true_replay"].max() < 1e-3
+
+
+def test_replayed_controls_are_simulated_from_the_start_of_the_episode(evaluated, toy_dataset):
+    # The toy wire in closed form: Δtip = Δ − slack, with the slack of a play operator over the whole history.
+    result = read_results(evaluated[0] / "evaluation" / "evaluation.npz")["test"]
+    data = load_dataset(toy_dataset)
+    name, sequence = result.anatomies[result.anatomy[0]], result.sequence[0]
+    episode = data.select(np.flatnonzero((data.anatomy == name) & (data.sequence == sequence)))
+    held = np.repeat(episode.control[:, 29:30], 90, axis=1)
+    inserted = episode.inserted_length[:, 29, None] + 0.5 * np.cumsum(held[..., 0], axis=1)
+    inserted = np.minimum(np.maximum(inserted, 0.0), np.maximum(100.0, episode.inserted_length[:, 29]))
+    slack = inserted - result.tips["hold_control"].abscissa[:1]
+    curliness = 0.02 + 0.005 * (len(name) % 3)
+    assert (slack >= curliness * inserted - 1e-3).all()
+    assert (slack <= curliness * inserted + 1.5 + 1e-3).all()
+
+
+@pytest.mark.parametrize("name", ["tip_error", "safety_ratio", "control_error"])
+def test_every_figure_has_its_table(evaluated, name):
+    folder = evaluated[0] / "evaluation" / "figures"
+    assert (folder / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+    assert set(pd.read_csv(folder / f"{name}.csv")["split"]) == {"seen_test", "test"}
+
+
+def test_a_run_without_its_dataset_is_told(evaluated, tmp_path):
+    folder = evaluated[0]
+    record = read_json(folder / "run" / "manifest.json")
+    write_json(tmp_path / "manifest.json", record | {"dataset": "elsewhere"})
+    with pytest.raises(InputError, match="no dataset here"):
+        evaluate(tmp_path, tmp_path / "out", EvaluateConfig())
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("field", "value"), [("sequences", 0), ("seed", -1)])
+def test_bad_settings_are_named(field, value):
+    with pytest.raises(InputError, match=field):
+        EvaluateConfig(**{field: value})

@@ -1,0 +1,66 @@
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from endopilot.errors import InputError
+from endopilot.evaluation import tables
+from endopilot.evaluation.results import read_results, write_results
+from endopilot.evaluation.summary import findings, summarize
+
+
+def test_results_read_back_as_written(results, tmp_path):
+    write_results(results, tmp_path / "evaluation.npz")
+    read = read_results(tmp_path / "evaluation.npz")
+    assert list(read) == ["seen_test", "test"]
+    before, after = results["test"], read["test"]
+    assert after.anatomies == before.anatomies
+    assert set(after.tips) == set(before.tips)
+    np.testing.assert_array_equal(after.tips["P4"].offset, before.tips["P4"].offset)
+    np.testing.assert_array_equal(after.base_force["true"], before.base_force["true"])
+
+
+def test_damaged_results_are_told_in_one_line(tmp_path):
+    path = tmp_path / "evaluation.npz"
+    path.write_bytes(b"nothing")
+    with pytest.raises(InputError, match=r"evaluation\.npz: damaged"):
+        read_results(path)
+
+
+def test_summary_is_plain_json_without_nan(results):
+    json.dumps(summarize(results["test"], seed=0), allow_nan=False)
+
+
+def test_lost_samples_make_a_sequence_diverged(results):
+    result = results["test"]
+    result.tips["P1"].abscissa[0, 5:] = np.nan
+    try:
+        tip = summarize(result, seed=0)["tip"]["P1"]
+    finally:
+        result.tips["P1"].abscissa[0, 5:] = result.true.abscissa[0, 5:]
+    assert tip["diverged_share"] == pytest.approx(1 / 6)
+    assert tip["lost_share"] == pytest.approx(85 / (6 * 90))
+
+
+def test_findings_say_where_a_baseline_wins(results):
+    metrics = {"splits": {"test": {"title": "New patients"} | summarize(results["test"], seed=0)}}
+    told = {sentence.split(":")[0]: sentence for sentence in findings(metrics)}
+    assert "Δtip beats every baseline" in told["New patients, P1"]
+    assert "Δtip loses to a baseline" in told["New patients, P4"]
+    assert "driving by the held slack" in told["New patients, P4"]
+
+
+def test_tip_error_table_holds_the_mean_over_sequences(results):
+    table = tables.rows(tables.tip_error_table(results), split="test", series="P4")
+    expected = np.abs(results["test"].error("P4", "abscissa")).mean(axis=0)
+    np.testing.assert_allclose(tables.values(table, "abscissa_mae_mm"), expected)
+    np.testing.assert_allclose(tables.values(table, "time_s")[[0, -1]], [0.5, 45.0])
+
+
+def test_safety_table_holds_both_ratios(results):
+    table = tables.rows(tables.safety_table(results), split="test", series="true")
+    over_radius = tables.values(tables.rows(table, ratio="radius"), "median")
+    over_clearance = tables.values(tables.rows(table, ratio="clearance"), "median")
+    np.testing.assert_allclose(over_radius * 1.5, over_clearance * 1.32)
