@@ -164,7 +164,7 @@ def end_score(distance_map: DistanceMap, graph: LumenGraph, path: Int[np.ndarray
     along = np.arange(0.0, 3 * radius, 0.5 * graph.spacing_mm)
     blind = sample(distance_map, drawn[-1] + along[:, None] * axis) > 0
     remaining = along[np.argmin(blind)] if not blind.all() else along[-1]
-    if remaining < 0.3 * radius + graph.spacing_mm:
+    if remaining < 0.35 * radius + 0.5 * graph.spacing_mm:
         return radius
     gap = np.linalg.norm(graph.points[kept] - graph.points[kept[-1]], axis=1)
     neck = graph.clearance[kept[gap < 4 * radius]].min()
@@ -261,7 +261,7 @@ def _frame(direction: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n 3"
     return one, np.cross(direction, one)
 
 
-def _smooth(points: Float[np.ndarray, "n 3"], width: float) -> Float[np.ndarray, "n 3"]:
+def _smooth(points: Float[np.ndarray, "n d"], width: float) -> Float[np.ndarray, "n d"]:
     """Blur a line with a Gaussian of `width` samples that leaves its ends in place."""
     from scipy.ndimage import gaussian_filter1d
 

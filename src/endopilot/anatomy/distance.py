@@ -203,6 +203,7 @@ def smooth_union(
     gradients = [np.stack([g[inside] for g in np.gradient(field, spacing_mm)], axis=-1) for field in (one, two)]
     lengths = [np.maximum(np.linalg.norm(gradient, axis=-1), 1e-3) for gradient in gradients]
     cosine = np.sum(gradients[0] * gradients[1], axis=-1) / (lengths[0] * lengths[1])
+    cosine[np.minimum(*lengths) < 0.5] = 1.0  # on a medial axis there is no direction, and no wall to round
     width = np.maximum(fillet_mm * (1.0 - np.clip(cosine, -1.0, 1.0)), 1e-6)
     lift = np.maximum(width - np.abs(one[inside] - two[inside]), 0.0) ** 2 / (4.0 * width)
     result = highest[box]

@@ -57,6 +57,8 @@ def connected_mask(mask: Volume, given: Insertion | None, label: str) -> tuple[V
             remarks.append(f"{joined} gaps of up to {LARGEST_GAP_VOXELS:g} voxels bridged")
         if left:
             remarks.append(f"{left} pieces apart from the lumen left out ({int(voxels.sum() - result.sum())} voxels)")
+    if result.sum() < SMALLEST_PIECE:
+        raise InputError(f"{label}: the lumen has only {int(result.sum())} voxels; check the label or segment again")
     closed = binary_fill_holes(result)
     assert closed is not None
     if closed.sum() > result.sum():

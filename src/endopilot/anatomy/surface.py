@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
+from endopilot.errors import InputError
 from endopilot.types import Volume
 
 SMOOTHING_VOXELS = 1.5
@@ -170,6 +171,11 @@ def surface_from_mask(mask: Volume) -> Surface:
     for _ in range(_FIT_ITERATIONS):
         share = np.clip(level + np.float32(0.5), 0.0, 1.0)
         level[band] += gain * (target - gaussian_filter(share, sigma, truncate=3.0))[band]
+    if level.max() <= 0:
+        raise InputError(
+            f"the mask is nowhere thick enough to hold a lumen ({int(mask.voxels.sum())} voxels of "
+            f"{mask.spacing_mm.round(2).tolist()} mm); segment on a finer grid"
+        )
     ratio = mask.spacing_mm[::-1] / mask.spacing_mm.min()
     factor = np.where(ratio > 1.5, np.ceil(ratio / 1.5), 1.0)
     if (factor > 1).any():

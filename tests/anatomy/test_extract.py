@@ -1,0 +1,266 @@
+"""Extraction on analytic lumens, on the real patient's centerlines, and on every bad input."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from analytic_shapes import BEND_MM, forked_tree, mask_of, torus_distance, tree_distance
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+from endopilot.anatomy.distance import distance_map_from_spheres, sample
+from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy, read_source
+from endopilot.anatomy.sources import Polylines
+from endopilot.anatomy.surface import Surface, surface_from_mask
+from endopilot.errors import InputError
+from endopilot.types import LumenMask, Volume
+
+REAL = Path(__file__).parents[3] / "shared" / "data" / "coronary_centerlines"
+
+
+def bent_tube(points, radius=1.5):
+    """Five sixths of a torus, cut flat."""
+    angle = np.arctan2(points[..., 1], points[..., 0])
+    return np.where(np.abs(angle) > np.pi / 6, torus_distance(points, radius), -1.0)
+
+
+FORK_MM = np.array([0.0, 0.0, 20.0])
+
+
+def fork(points):
+    tree = forked_tree()
+    return tree_distance(tree, points + FORK_MM)
+
+
+@pytest.fixture(scope="module")
+def fork_mask():
+    return mask_of(fork, (22, 4, 24), (0.5, 0.5, 0.5))
+
+
+def is_sound(anatomy):
+    """Every centerline point lies in the lumen, the catheter is open, branches join their parents."""
+    for branch in anatomy.tree.branches:
+        line = branch.centerline
+        assert sample(anatomy.distance_map, line.points).min() > 0
+        assert np.all(np.diff(line.abscissa) > 0) and np.all(line.radius > 0)
+        assert np.allclose(np.linalg.norm(line.normals, axis=1), 1)
+        if branch.parent >= 0:
+            parent = anatomy.tree.branches[branch.parent].centerline
+            assert np.array_equal(line.points[0], parent.points[-1]) and line.abscissa[0] == parent.abscissa[-1]
+    way = anatomy.insertion.position + np.outer(np.linspace(-15, 2, 60), anatomy.insertion.direction)
+    assert sample(anatomy.distance_map, way).min() > 0.5 * anatomy.catheter_radius_mm
+    return True
+
+
+@pytest.mark.parametrize("rotation", [None, Rotation.from_rotvec([0.5, -0.3, 0.8]).as_matrix() @ np.diag([-1, -1, 1])])
+def test_bent_tube_axis_and_radius(rotation):
+    mask = mask_of(bent_tube, (22, 22, 22), (0.6, 0.6, 0.6), rotation)
+    anatomy = extract_anatomy(mask, name="torus")
+    line = anatomy.tree.longest_path()
+    assert len(anatomy.tree.branches) == 1 and is_sound(anatomy)
+    off_axis = np.hypot(np.hypot(line.points[:, 0], line.points[:, 1]) - BEND_MM, line.points[:, 2])
+    assert off_axis.mean() < 0.1 * 0.6 + 0.02
+    assert np.abs(line.radius - 1.5).mean() < 0.1 * 0.6
+    assert abs(line.abscissa[-1] - BEND_MM * 2 * np.pi * 5 / 6) < 2.5
+
+
+def test_fork_is_found_with_its_root(fork_mask):
+    anatomy = extract_anatomy(fork_mask, name="fork")
+    assert len(anatomy.tree.leaves()) == 2 and is_sound(anatomy)
+    tips = np.array([anatomy.tree.branches[i].centerline.points[-1] for i in anatomy.tree.leaves()])
+    truth = np.array([b.centerline.points[-1] for b in forked_tree().branches[1:]]) - [0, 0, 20]
+    assert KDTree(tips).query(truth)[0].max() < 1.5
+    place = anatomy.tree.branches[0].centerline.points[-1]
+    assert np.linalg.norm(place) < 1.5
+
+
+def test_given_ostium_is_the_root_and_mid_vessel_ostium_looks_onwards(fork_mask):
+    side_tip = forked_tree().branches[2].centerline.points[-1] - [0, 0, 20]
+    anatomy = extract_anatomy(fork_mask, name="x", config=AnatomyConfig(ostium_mm=tuple(side_tip)))
+    assert np.linalg.norm(anatomy.insertion.position - side_tip) < 2.0
+    assert anatomy.provenance["ostium_rule"] == "given"
+
+
+def test_flaws_of_masks_are_mended(fork_mask):
+    rng = np.random.default_rng(1)
+    voxels = fork_mask.volume.voxels.copy()
+    voxels[20:22] = False  # a gap across the root vessel
+    voxels[rng.random(voxels.shape) < 0.0005] = True  # specks
+    inside = np.argwhere(fork_mask.volume.voxels)
+    voxels[tuple(inside[rng.integers(0, len(inside), 60)].T)] = False  # holes
+    volume = fork_mask.volume
+    anatomy = extract_anatomy(
+        LumenMask(Volume(voxels, volume.spacing_mm, volume.origin_mm, volume.direction)), name="flawed"
+    )
+    assert len(anatomy.tree.leaves()) == 2 and is_sound(anatomy)
+    assert any("bridged" in note for note in anatomy.provenance["notes"])
+    assert any("left out" in note for note in anatomy.provenance["notes"])
+
+
+def test_loop_becomes_a_tree():
+    def ring_with_stem(points):
+        stem = 2.0 - np.hypot(points[..., 0], points[..., 1] - BEND_MM - 15)
+        stem = np.where(np.abs(points[..., 2]) < 0, stem, -1.0)
+        axis = np.clip(points[..., 1], BEND_MM, BEND_MM + 14)
+        handle = 2.5 - np.sqrt(points[..., 0] ** 2 + (points[..., 1] - axis) ** 2 + points[..., 2] ** 2)
+        return np.maximum(torus_distance(points, 1.5), handle)
+
+    anatomy = extract_anatomy(mask_of(ring_with_stem, (24, 38, 4), (0.6, 0.6, 0.6)), name="loop")
+    assert is_sound(anatomy)
+    total = sum(b.centerline.abscissa[-1] - b.centerline.abscissa[0] for b in anatomy.tree.branches)
+    assert total > 0.85 * (2 * np.pi * BEND_MM + 14)
+
+
+def save_stl(surface, path):
+    import pyvista
+
+    pyvista.PolyData(surface.vertices, np.insert(surface.faces, 0, 3, axis=1).ravel()).save(path)
+
+
+def test_surface_with_holes_and_inverted_normals(fork_mask, tmp_path):
+    wall = surface_from_mask(fork_mask.volume)
+    height = wall.vertices[wall.faces].mean(axis=1)[:, 2]
+    opened = Surface(wall.vertices, wall.faces[(height > -19.0) & (height < 19.0)][:, ::-1])
+    save_stl(opened, tmp_path / "open.stl")
+    anatomy = extract_anatomy(read_source(tmp_path / "open.stl"), name="mesh")
+    assert len(anatomy.tree.leaves()) == 2 and is_sound(anatomy)
+    assert any("capped" in note for note in anatomy.provenance["notes"])
+    assert len(anatomy.provenance["source"]["sha256"]) == 64
+
+
+def test_units_and_axes_of_surfaces(fork_mask, tmp_path):
+    wall = surface_from_mask(fork_mask.volume)
+    save_stl(Surface(wall.vertices * [-0.001, -0.001, 0.001], wall.faces), tmp_path / "metres.stl")
+    source = read_source(tmp_path / "metres.stl")
+    with pytest.raises(InputError, match="--scale 1000"):
+        extract_anatomy(source, name="m")
+    anatomy = extract_anatomy(source, name="m", config=AnatomyConfig(scale=1000.0, coordinates="ras"))
+    tips = np.array([anatomy.tree.branches[i].centerline.points[-1] for i in anatomy.tree.leaves()])
+    assert tips[:, 0].max() > 14
+
+
+def save_lines(path, lines, radii):
+    import pyvista
+
+    data = pyvista.PolyData(np.concatenate(lines))
+    start, cells = 0, []
+    for line in lines:
+        cells += [len(line), *range(start, start + len(line))]
+        start += len(line)
+    data.lines = np.array(cells)
+    if radii is not None:
+        data.point_data["MaximumInscribedSphereRadius"] = np.concatenate(radii)
+    data.save(path)
+
+
+def test_overlapping_centerlines_become_one_tree(tmp_path):
+    tree = forked_tree()
+    paths = [tree.path(1), tree.path(2)]
+    save_lines(tmp_path / "cl.vtp", [p.points for p in paths], [p.radius for p in paths])
+    anatomy = extract_anatomy(read_source(tmp_path / "cl.vtp"), name="cl")
+    assert len(anatomy.tree.branches) == 3 and is_sound(anatomy)
+    assert abs(anatomy.tree.branches[0].centerline.abscissa[-1] - 20) < 2.0
+
+
+def test_slicer_markups(tmp_path):
+    tree = forked_tree()
+    markups = [
+        {
+            "type": "Curve", "coordinateSystem": "RAS",
+            "controlPoints": [{"position": (p * [-1, -1, 1]).tolist()} for p in branch.centerline.points],
+            "measurements": [{"name": "Radius", "controlPointValues": branch.centerline.radius.tolist()}],
+        }
+        for branch in tree.branches
+    ]  # fmt: skip
+    (tmp_path / "cl.mrk.json").write_text(json.dumps({"markups": markups}))
+    anatomy = extract_anatomy(read_source(tmp_path / "cl.mrk.json"), name="cl")
+    assert len(anatomy.tree.leaves()) == 2
+    tips = np.array([anatomy.tree.branches[i].centerline.points[-1] for i in anatomy.tree.leaves()])
+    assert tips[:, 0].max() > 14
+    del markups[1]["measurements"]
+    (tmp_path / "cl.mrk.json").write_text(json.dumps({"markups": markups}))
+    with pytest.raises(InputError, match="no radius measurement"):
+        read_source(tmp_path / "cl.mrk.json")
+
+
+def empty(volume):
+    return np.zeros_like(volume.voxels)
+
+
+def block(volume):
+    return np.ones((40, 40, 40), dtype=bool)
+
+
+def ball(volume):
+    return np.linalg.norm(np.indices((50, 50, 50)) - 25, axis=0) < 20
+
+
+def noise(volume):
+    return np.random.default_rng(0).random((50, 50, 50)) < 0.4
+
+
+@pytest.mark.parametrize(
+    ("make", "told"), [(empty, "empty"), (block, "solid block"), (ball, "no vessel"), (noise, "noise")]
+)
+def test_what_is_no_vessel_is_refused(fork_mask, make, told):
+    volume = fork_mask.volume
+    mask = LumenMask(Volume(make(volume), volume.spacing_mm, volume.origin_mm, volume.direction))
+    with pytest.raises(InputError, match=told) as error:
+        extract_anatomy(mask, name="bad")
+    assert "\n" not in str(error.value)
+
+
+def test_mask_away_from_the_ostium_is_refused(fork_mask):
+    with pytest.raises(InputError, match="touches nothing near the ostium"):
+        extract_anatomy(fork_mask, name="far", config=AnatomyConfig(ostium_mm=(90.0, 0.0, 0.0)))
+
+
+def test_bad_files_are_told_in_one_line(tmp_path):
+    points = forked_tree().path(1).points
+    save_lines(tmp_path / "bare.vtp", [points], None)
+    for name, content in (("empty.stl", b""), ("text.ply", b"hello, world, this is no mesh\n"), ("x.dat", b"1")):
+        (tmp_path / name).write_bytes(content)
+    (tmp_path / "cl.mrk.json").write_text("{}")
+    cases = {"bare.vtp": "without radii", "empty.stl": "empty", "text.ply": "text.ply", "x.dat": "unknown kind",
+             "cl.mrk.json": "no Slicer markups", "missing.stl": "no such file"}  # fmt: skip
+    for name, told in cases.items():
+        with pytest.raises(InputError, match=told) as error:
+            read_source(tmp_path / name)
+        assert "\n" not in str(error.value)
+
+
+def test_spheres_that_do_not_touch_are_refused():
+    points = np.outer(np.arange(0, 40, 4.0), [0, 0, 1])
+    with pytest.raises(InputError, match="do not touch"):
+        extract_anatomy(Polylines((points,), (np.full(10, 1.5),)), name="beads")
+
+
+@pytest.mark.parametrize("field", ["catheter_radius_mm", "spacing_mm", "minimum_branch_length_mm", "scale"])
+def test_config_names_field_and_value(field):
+    with pytest.raises(InputError, match=f"{field}=-1"):
+        AnatomyConfig(**{field: -1.0})
+
+
+@pytest.mark.skipif(not REAL.exists(), reason="the real patient's centerlines are not at hand")
+def test_real_patient_comes_back_from_the_rebuilt_lumen():
+    truth = extract_anatomy(read_source(REAL / "rca_cl.vtp"), name="rca", config=AnatomyConfig(vessel="rca"))
+    assert len(truth.tree.leaves()) == 4 and is_sound(truth)
+    assert truth.tree.branches[0].centerline.radius.max() < 4  # cut at the ostium, where the aorta ends
+    lumen = distance_map_from_spheres(truth.tree, spacing_mm=0.4)
+    mask = LumenMask(Volume(lumen.values > 0, np.full(3, 0.4), lumen.origin_mm, np.eye(3)), truth.insertion)
+    found = extract_anatomy(mask, name="again", config=AnatomyConfig(vessel="rca"))
+    assert is_sound(found)
+    one, two = (
+        np.concatenate([np.column_stack([b.centerline.points, b.centerline.radius]) for b in anatomy.tree.branches])
+        for anatomy in (truth, found)
+    )
+    gap, nearest = KDTree(two[:, :3]).query(one[:, :3])
+    back, nearest_back = KDTree(one[:, :3]).query(two[:, :3])
+    hits = (gap < one[:, 3]).sum() + (back < one[nearest_back, 3]).sum()
+    assert hits / (len(one) + len(two)) >= 0.98
+    inside = gap < one[:, 3]
+    assert gap[inside].mean() <= 0.15
+    assert np.abs(two[nearest, 3] - one[:, 3])[inside].mean() <= 0.1

@@ -1,0 +1,89 @@
+"""An anatomy on disk: exact round trip, and one line for every damage."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from analytic_shapes import forked_tree
+
+from endopilot.anatomy.distance import add_catheter, distance_map_from_spheres
+from endopilot.anatomy.io import read_anatomy, write_anatomy
+from endopilot.errors import InputError
+from endopilot.types import Anatomy, Insertion
+
+
+@pytest.fixture
+def anatomy():
+    tree = forked_tree()
+    insertion = Insertion(tree.branches[0].centerline.points[0], np.array([0.1, 0.2, np.sqrt(0.95)]))
+    lumen = add_catheter(distance_map_from_spheres(tree, spacing_mm=0.7 / 1.3), insertion, 1.5, 8.0)
+    return Anatomy("patient", tree, lumen, insertion, 1.5, {"source": {"file": "x.nii.gz"}, "notes": []})
+
+
+def test_round_trip_is_exact(anatomy, tmp_path):
+    write_anatomy(anatomy, tmp_path / "a")
+    back = read_anatomy(tmp_path / "a")
+    assert back.name == anatomy.name and back.catheter_radius_mm == 1.5 and back.provenance == anatomy.provenance
+    assert np.array_equal(back.insertion.direction, anatomy.insertion.direction)
+    assert np.array_equal(back.distance_map.values, anatomy.distance_map.values)
+    assert np.array_equal(back.distance_map.origin_mm, anatomy.distance_map.origin_mm)
+    assert back.distance_map.spacing_mm == anatomy.distance_map.spacing_mm
+    assert back.tree.section_names == anatomy.tree.section_names
+    for one, two in zip(back.tree.branches, anatomy.tree.branches, strict=True):
+        assert one.parent == two.parent and np.array_equal(one.section, two.section)
+        for name in ("points", "radius", "abscissa", "normals"):
+            assert np.array_equal(getattr(one.centerline, name), getattr(two.centerline, name))
+
+
+def test_other_programs_read_it(anatomy, tmp_path):
+    import pyvista
+    import SimpleITK
+
+    write_anatomy(anatomy, tmp_path / "a")
+    lines = pyvista.read(tmp_path / "a" / "centerline.vtp")
+    assert lines.n_lines == 3 and "MaximumInscribedSphereRadius" in lines.point_data
+    image = SimpleITK.ReadImage(str(tmp_path / "a" / "lumen.nrrd"))
+    assert np.allclose(image.GetOrigin(), anatomy.distance_map.origin_mm)
+    assert "left-posterior-superior" in (tmp_path / "a" / "lumen.nrrd").read_bytes()[:500].decode("latin-1")
+
+
+def test_writing_again_replaces_an_anatomy_but_nothing_else(anatomy, tmp_path):
+    write_anatomy(anatomy, tmp_path / "a")
+    write_anatomy(anatomy, tmp_path / "a")
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "thesis.txt").write_text("dear")
+    with pytest.raises(InputError, match="not an anatomy"):
+        write_anatomy(anatomy, other)
+    assert (other / "thesis.txt").read_text() == "dear"
+
+
+@pytest.mark.parametrize("file", ["centerline.vtp", "lumen.nrrd", "anatomy.json"])
+@pytest.mark.parametrize("damage", ["missing", "truncated"])
+def test_damage_is_told_in_one_line(anatomy, tmp_path, file, damage):
+    write_anatomy(anatomy, tmp_path / "a")
+    path = tmp_path / "a" / file
+    content = path.read_bytes()
+    path.unlink()
+    if damage == "truncated":
+        path.write_bytes(content[: len(content) // 2])
+    with pytest.raises(InputError, match="anatomy") as told:
+        read_anatomy(tmp_path / "a")
+    assert "\n" not in str(told.value) and "a" in str(told.value)
+
+
+def test_other_versions_and_missing_fields_are_refused(anatomy, tmp_path):
+    write_anatomy(anatomy, tmp_path / "a")
+    path = tmp_path / "a" / "anatomy.json"
+    record = json.loads(path.read_text())
+    path.write_text(json.dumps(record | {"schema_version": 99}))
+    with pytest.raises(InputError, match="schema_version is 99"):
+        read_anatomy(tmp_path / "a")
+    del record["insertion"]
+    path.write_text(json.dumps(record))
+    with pytest.raises(InputError, match="insertion"):
+        read_anatomy(tmp_path / "a")
+    with pytest.raises(InputError, match="no such folder"):
+        read_anatomy(tmp_path / "nowhere")
