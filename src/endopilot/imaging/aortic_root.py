@@ -86,7 +86,7 @@ def find_aortic_root(grid: Volume) -> AorticRoot:
 
 def _weight(chain: list[_Disc]) -> float:
     """Rank chains: long, wide, round and bright; the right heart is often as round, and dimmer."""
-    return sum(disc.radius * disc.roundness * disc.hu for disc in chain)
+    return sum((disc.radius * disc.roundness * disc.hu for disc in chain), start=0.0)
 
 
 def _within(plane: np.ndarray, j: float, i: float, radius: float) -> np.ndarray:

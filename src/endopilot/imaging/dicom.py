@@ -248,7 +248,7 @@ def _read_pixels(slices: Sequence[_Slice], folder: Path) -> np.ndarray:
         for slice_, plane in zip(slices, voxels, strict=True):
             reader.SetFileName(str(slice_.path))
             try:
-                plane[:] = sitk.GetArrayViewFromImage(reader.Execute()).reshape(rows, columns)
+                plane[:] = sitk.GetArrayFromImage(reader.Execute()).reshape(rows, columns)
             except (RuntimeError, ValueError):
                 # GDCM's message may quote the header: it ends here.
                 raise InputError(

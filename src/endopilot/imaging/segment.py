@@ -33,10 +33,8 @@ class SegmentConfig:
         """Refuse what no method could use."""
         if self.method not in available_methods():
             raise InputError(f"method={self.method!r} is unknown; choose one of {', '.join(available_methods())}")
-        if self.vessel not in ("rca", "lca"):
-            raise InputError(f"vessel={self.vessel!r} is unknown; choose rca or lca")
         for seed in self.seeds:
-            if len(seed) != 3 or not np.isfinite(seed).all():
+            if not np.isfinite(seed).all():
                 raise InputError(f"seeds: {seed} is no point; give three finite numbers x y z in LPS mm")
 
 

@@ -7,6 +7,10 @@ one plain three-dimensional CT is refused here in one line.
 
 from __future__ import annotations
 
+import gzip
+import math
+import struct
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -165,6 +169,8 @@ def _read_file(path: Path) -> Volume:
         raise InputError(f"{path}: {len(size)}-D ({shape}); give a single 3-D volume, such as one cardiac phase")
     if len(size) < 3 or min(size[:3]) < _SMALLEST_SIZE:
         raise InputError(f"{path}: {shape} voxels are no volume; give at least {_SMALLEST_SIZE} along each axis")
+    if path.name.lower().endswith((".nii", ".nii.gz")):
+        _refuse_truncated_nifti(path)
     try:
         image = reader.Execute()
         if len(size) > 3:
@@ -172,6 +178,33 @@ def _read_file(path: Path) -> Volume:
     except RuntimeError as error:
         raise InputError(f"{path}: truncated or damaged ({_reason(error)}); copy or export it again") from error
     return _compact(from_image(image))
+
+
+def _refuse_truncated_nifti(path: Path) -> None:
+    """Refuse a NIfTI file that ends before its voxels do: ITK would fill the rest with whatever is in memory.
+
+    Offsets are those of the NIfTI-1 and NIfTI-2 headers (https://nifti.nimh.nih.gov).
+    """
+    opener = gzip.open if path.name.lower().endswith(".gz") else open
+    try:
+        with opener(path, "rb") as stream:
+            header = stream.read(540)
+            order = "<" if header[:4] in (b"\x5c\x01\0\0", b"\x1c\x02\0\0") else ">"
+            if struct.unpack_from(f"{order}i", header)[0] == 540:
+                (bits,) = struct.unpack_from(f"{order}h", header, 14)
+                dimensions = struct.unpack_from(f"{order}8q", header, 16)
+                (offset,) = struct.unpack_from(f"{order}q", header, 168)
+            else:
+                (bits,) = struct.unpack_from(f"{order}h", header, 72)
+                dimensions = struct.unpack_from(f"{order}8h", header, 40)
+                (offset,) = struct.unpack_from(f"{order}f", header, 108)
+            missing = int(offset) + math.prod(dimensions[1 : 1 + dimensions[0]]) * bits // 8 - len(header)
+            while missing > 0 and (chunk := stream.read(1 << 22)):
+                missing -= len(chunk)
+    except (EOFError, OSError, zlib.error, struct.error):
+        missing = 1
+    if missing > 0:
+        raise InputError(f"{path}: truncated or damaged (its voxels are incomplete); copy or export it again")
 
 
 def _compact(volume: Volume) -> Volume:

@@ -191,7 +191,7 @@ def _trim(inside: np.ndarray, path: np.ndarray, radius: np.ndarray) -> Bool[np.n
     core = distance_to_outside(inside, _GRID_MM) >= _THINNEST_MM
     opened = inside & (distance_to_outside(~core, _GRID_MM) <= _THINNEST_MM)
     # A true lumen squeezed flat is thinner than the opening: keep the spheres around the path.
-    for centre, sphere in zip(path, radius, strict=True):
+    for centre, sphere in zip(path.tolist(), radius.tolist(), strict=True):
         cube = _around(inside.shape, tuple(centre), sphere)
         z, y, x = np.ogrid[cube]
         ball = (z - centre[0]) ** 2 + (y - centre[1]) ** 2 + (x - centre[2]) ** 2 <= (sphere / _GRID_MM) ** 2

@@ -21,7 +21,7 @@ from scipy.spatial import KDTree
 from endopilot.errors import InputError
 from endopilot.imaging.aortic_root import AorticRoot, find_aortic_root
 from endopilot.imaging.contour import lumen_at_half_height
-from endopilot.imaging.grid import connected_components, distance_to_outside, interpolate_like, resample
+from endopilot.imaging.grid import LEAST_BLOOD_HU, connected_components, distance_to_outside, interpolate_like, resample
 from endopilot.imaging.ostium import find_ostium
 from endopilot.imaging.segment import SegmentConfig
 from endopilot.imaging.tracking import track_tree
@@ -99,12 +99,16 @@ def segment_lumen(volume: Volume, config: SegmentConfig) -> LumenMask:
         InputError: there is no contrast, no aorta, no such vessel at its wall, or no vessel at a seed.
     """
     with progress("Segmenting the coronary tree", 5) as advance:
-        root = find_aortic_root(resample(volume, _ROOT_GRID_MM))
+        root = _find_root(volume, config)
         advance()
-        scan = _find_vessels(volume, root.blood_hu)
+        scan = _find_vessels(volume, root.blood_hu if root else _hu_at(volume, config.seeds[0]))
         advance()
-        aorta = _aorta(scan, root)
-        tree, start = _choose_tree(scan, root, aorta, config)
+        aorta = _aorta(scan, root) if root else np.zeros(scan.pools.shape, dtype=bool)
+        tree, start = (
+            _tree_at_seed(scan, aorta, config.seeds[0])
+            if root is None or config.seeds
+            else _tree_at_aorta(scan, root, aorta, config.vessel)
+        )
         advance()
         ends = [_vessel_near(scan, tree, seed) for seed in config.seeds[1:]]
         paths = [
@@ -116,6 +120,29 @@ def segment_lumen(volume: Volume, config: SegmentConfig) -> LumenMask:
         mask = _refine(volume, scan, paths, ostium)
         advance()
     return LumenMask(Volume(mask, volume.spacing_mm, volume.origin_mm, volume.direction), ostium)
+
+
+def _find_root(volume: Volume, config: SegmentConfig) -> AorticRoot | None:
+    """Return the ascending aorta; None where it is not in the volume and a seed tells what it would."""
+    try:
+        return find_aortic_root(resample(volume, _ROOT_GRID_MM))
+    except InputError:
+        if config.seeds:
+            return None
+        raise
+
+
+def _hu_at(volume: Volume, seed: tuple[float, float, float]) -> float:
+    """Return the brightest smoothed HU within 2 mm of a seed."""
+    index = volume.world_to_index(np.array(seed, dtype=float))[::-1]
+    box = _box(index[None], 2.0 / volume.spacing_mm[::-1], volume.voxels.shape)
+    found = float(np.max(ndimage.gaussian_filter(volume.voxels[box].astype(np.float32), 0.7)))
+    if found < LEAST_BLOOD_HU:
+        raise InputError(
+            f"seeds: {found:.0f} HU at most within 2 mm of {tuple(seed)}, where blood with contrast has "
+            f"{LEAST_BLOOD_HU:.0f} or more; move the seed into the vessel, or give a CT with contrast"
+        )
+    return found
 
 
 def _find_vessels(volume: Volume, lumen_hu: float) -> _Scan:
@@ -161,15 +188,26 @@ def _aorta(scan: _Scan, root: AorticRoot) -> Bool[np.ndarray, "nz ny nx"]:
     return aorta
 
 
-def _choose_tree(
-    scan: _Scan, root: AorticRoot, aorta: np.ndarray, config: SegmentConfig
+def _tree_at_seed(
+    scan: _Scan, aorta: np.ndarray, seed: tuple[float, float, float]
+) -> tuple[Bool[np.ndarray, "nz ny nx"], Int[np.ndarray, "3"]]:
+    """Return the connected vessel at a seed, and where it begins: at the aortic wall, if the seed is near, or there."""
+    at = _vessel_near(scan, scan.vessels, seed)
+    label = connected_components(scan.vessels, corners=True)
+    tree = label == label[tuple(at)]
+    box = _box(at[None], np.full(3, 2 * _SEED_MM / _GRID_MM), tree.shape)
+    gap = distance_to_outside(~aorta[box], _GRID_MM)
+    voxels = np.argwhere(tree[box] & (gap <= _TO_WALL_MM)) if aorta[box].any() else np.zeros((0, 3), dtype=int)
+    if len(voxels):
+        at = voxels[gap[tuple(voxels.T)].argmin()] + [part.start for part in box]
+    return tree, at
+
+
+def _tree_at_aorta(
+    scan: _Scan, root: AorticRoot, aorta: np.ndarray, vessel: str
 ) -> tuple[Bool[np.ndarray, "nz ny nx"], Int[np.ndarray, "3"]]:
     """Return the connected vessel that belongs to the ostium wanted, and its voxel nearest the aortic wall."""
     label = connected_components(scan.vessels, corners=True)
-    if config.seeds:
-        seed = _vessel_near(scan, scan.vessels, config.seeds[0])
-        tree = label == label[tuple(seed)]
-        return tree, seed
     box = _box(np.argwhere(aorta), np.full(3, _TO_WALL_MM / _GRID_MM + 1), aorta.shape)
     gap = distance_to_outside(~aorta[box], _GRID_MM)
     touching = np.argwhere((gap <= _TO_WALL_MM) & (label[box] > 0))
@@ -181,11 +219,11 @@ def _choose_tree(
         point = scan.grid.index_to_world(nearest[::-1].astype(float))
         disc = int(np.abs(root.centres[:, 2] - point[2]).argmin())
         outward = point[:2] - root.centres[disc, :2]
-        if outward @ np.array(_SIDE[config.vessel]) > 0 and sizes[name] > sizes[best] * (best > 0):
+        if outward @ np.array(_SIDE[vessel]) > 0 and sizes[name] > sizes[best] * (best > 0):
             best, start = int(name), nearest
     if start is None or sizes[best] * _GRID_MM**3 < _LEAST_TREE_MM3:
         raise InputError(
-            f"vessel={config.vessel!r}: no such artery comes to the aorta's wall in this volume; "
+            f"vessel={vessel!r}: no such artery comes to the aorta's wall in this volume; "
             "give seeds: the ostium first, then points along the vessel (LPS mm)"
         )
     return label == best, start
@@ -194,10 +232,12 @@ def _choose_tree(
 def _vessel_near(scan: _Scan, vessels: np.ndarray, seed: tuple[float, float, float]) -> Int[np.ndarray, "3"]:
     """Return the vessel voxel nearest a seed."""
     voxels = np.argwhere(vessels)
+    if len(voxels) == 0:
+        raise InputError("seeds: the volume holds no vessel-like structure; give a CT angiogram in HU")
     distance, nearest = KDTree(voxels).query(scan.grid.world_to_index(np.array(seed, dtype=float))[::-1])
     if distance * _GRID_MM > _SEED_MM:
         raise InputError(
-            f"seeds: no vessel of this tree within {_SEED_MM:g} mm of {tuple(seed)}, the nearest is "
+            f"seeds: no vessel (of this tree) within {_SEED_MM:g} mm of {tuple(seed)}, the nearest is "
             f"{distance * _GRID_MM:.0f} mm away; move the seed into the vessel (LPS mm)"
         )
     return voxels[nearest]

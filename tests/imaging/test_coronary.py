@@ -1,0 +1,119 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial import KDTree
+from shapes import BLOOD_HU, FAT_HU, dice, empty_grid, inside_tube, positions, scan
+
+from endopilot.errors import InputError
+from endopilot.imaging.segment import SegmentConfig, segment
+from endopilot.types import Volume
+
+AORTA_RADIUS_MM, ARC_MM = 13.0, 18.0
+
+
+def _axis() -> np.ndarray:
+    """Return a right coronary: from the ostium at 0 to the front and right, then down by a quarter turn."""
+    turn = np.linspace(0, np.pi / 2, 120)
+    outward = np.array([-0.6, -0.8, 0.0])
+    bend = ARC_MM * (np.sin(turn)[:, None] * outward + (np.cos(turn) - 1)[:, None] * [0.0, 0.0, 1.0])
+    down = np.linspace(0.0, 22.0, 80)[1:, None] * [0.0, 0.0, -1.0]
+    return np.concatenate([bend, bend[-1] + down])
+
+
+def _branch() -> np.ndarray:
+    start = _axis()[100]
+    return start + np.linspace(0, 20, 80)[:, None] * np.array([0.8, -0.6, -0.1])
+
+
+@pytest.fixture(scope="module")
+def heart():
+    """Return the scan of an aorta with two coronary arteries, a dim vein and a chamber close by, and the right tree."""
+    grid = empty_grid((120, 100, 110), (0.5, 0.5, 0.6), (-25.0, -28.0, -46.0))
+    x = positions(grid)
+    centre = np.array([0.6, 0.8]) * AORTA_RADIUS_MM
+    aorta = np.hypot(x[..., 0] - centre[0], x[..., 1] - centre[1]) < AORTA_RADIUS_MM
+    axis, branch = _axis(), _branch()
+    tree = inside_tube(grid, axis, np.linspace(1.9, 1.2, len(axis))) | inside_tube(grid, branch, 1.0)
+    across = np.array([centre[0], centre[1], 4.0]) + np.linspace(AORTA_RADIUS_MM - 2, 40, 90)[:, None] * [0.9, 0.44, 0]
+    vein = inside_tube(grid, _axis()[110:] + np.array([-0.6, -3.8, 0.0]), 1.0)
+    chamber = np.linalg.norm(x - [10.0, -16.0, -32.0], axis=-1) < 13.0
+    hu = np.full(grid.voxels.shape, FAT_HU)
+    hu[np.linalg.norm(x - [10.0, -16.0, -32.0], axis=-1) < 15.0] = 100.0
+    hu[chamber] = 300.0
+    hu[vein] = 150.0
+    hu[inside_tube(grid, np.concatenate([axis, branch]), 1.9 + 0.9)] = FAT_HU
+    hu[(np.hypot(x[..., 0] - centre[0], x[..., 1] - centre[1]) < AORTA_RADIUS_MM + 1.2)] = 50.0
+    hu[inside_tube(grid, across, 1.8) | tree | aorta] = BLOOD_HU
+    return scan(grid, hu, blur_mm=0.26, noise_hu=60.0), tree & ~aorta
+
+
+@pytest.fixture(scope="module")
+def right_tree(heart):
+    return segment(heart[0], SegmentConfig(vessel="rca"))
+
+
+def test_the_right_coronary_tree_is_found(heart, right_tree):
+    volume, tree = heart
+    found = right_tree.volume.voxels
+    assert dice(found, tree) > 0.88
+    points = positions(volume)[found]
+    reached, _ = KDTree(points).query(np.concatenate([_axis()[4:-3], _branch()[4:-3]]))
+    assert np.mean(reached < 1.0) > 0.98
+    stray, _ = KDTree(np.concatenate([_axis(), _branch()])).query(points)
+    assert stray.max() < 3.5
+
+
+def test_the_ostium_is_within_a_millimetre_and_the_mask_ends_there(heart, right_tree):
+    ostium = right_tree.ostium
+    assert np.linalg.norm(ostium.position) < 1.0
+    assert ostium.direction @ [-0.6, -0.8, 0.0] > 0.95
+    behind = (positions(heart[0])[right_tree.volume.voxels] - ostium.position) @ ostium.direction
+    assert behind.min() > -0.5
+
+
+def test_the_left_tree_is_another_one(heart):
+    left = segment(heart[0], SegmentConfig(vessel="lca"))
+    assert left.ostium is not None
+    assert left.ostium.position[0] > 15.0
+    assert positions(heart[0])[left.volume.voxels][:, 0].min() > 14.0
+
+
+def test_seeds_choose_the_vessel(heart, right_tree):
+    by_seed = segment(heart[0], SegmentConfig(vessel="lca", seeds=(tuple(_axis()[20]), tuple(_branch()[-4]))))
+    assert dice(by_seed.volume.voxels, right_tree.volume.voxels) > 0.9
+
+
+def test_a_seed_serves_where_the_aorta_is_not_in_the_volume(heart, right_tree):
+    volume, _ = heart
+    bottom = Volume(volume.voxels[:70], volume.spacing_mm, volume.origin_mm, volume.direction)
+    lower = segment(bottom, SegmentConfig(seeds=(tuple(_axis()[70]),)))
+    assert lower.ostium is not None
+    assert np.linalg.norm(lower.ostium.position - _axis()[70]) < 2.5
+    seen = (positions(bottom) - lower.ostium.position) @ lower.ostium.direction > 1.0
+    assert dice(lower.volume.voxels & seen, right_tree.volume.voxels[:70] & seen) > 0.85
+
+
+def test_a_volume_without_contrast_is_told(heart):
+    volume, _ = heart
+    plain = Volume(np.minimum(volume.voxels, 60), volume.spacing_mm, volume.origin_mm, volume.direction)
+    with pytest.raises(InputError, match="no contrast-filled blood pool"):
+        segment(plain, SegmentConfig())
+
+
+def test_a_volume_without_aorta_is_told():
+    grid = empty_grid((60, 60, 60), 1.0, (0.0, 0.0, 0.0))
+    ball = np.linalg.norm(positions(grid) - 30.0, axis=-1) < 28.0
+    with pytest.raises(InputError, match="ascending aorta was not found"):
+        segment(scan(grid, np.where(ball, BLOOD_HU, FAT_HU)), SegmentConfig())
+
+
+def test_an_aorta_without_artery_is_told():
+    grid = empty_grid((50, 60, 60), 1.0, (0.0, 0.0, 0.0))
+    x = positions(grid)
+    tube = np.hypot(x[..., 0] - 30, x[..., 1] - 30) < AORTA_RADIUS_MM
+    volume = scan(grid, np.where(tube, BLOOD_HU, FAT_HU))
+    with pytest.raises(InputError, match="vessel='rca': no such artery"):
+        segment(volume, SegmentConfig())
+    with pytest.raises(InputError, match="no vessel"):
+        segment(volume, SegmentConfig(seeds=((10.0, 10.0, 10.0),)))
