@@ -7,13 +7,13 @@ from unittest.mock import patch
 import numpy as np
 import pandas as pd
 import pytest
-from toy_navigation import toy_simulate
 
 from endopilot.dataset.loader import load_dataset
 from endopilot.errors import InputError
 from endopilot.evaluation.evaluate import EvaluateConfig, evaluate
 from endopilot.evaluation.results import read_results
 from endopilot.files import read_json, write_json
+from toy_navigation import toy_simulate
 
 
 def make_untrained_run(dataset_folder, run_folder):

@@ -38,7 +38,11 @@ def test_the_wire_is_shown_from_its_tip_to_just_behind_the_ostium(rollout):
     wire = visible_wire(rollout, 0, 3)
     np.testing.assert_array_equal(wire[0], rollout.tip_position[0, 3])
     length = np.linalg.norm(np.diff(wire, axis=0), axis=1).sum()
-    assert rollout.inserted_length[0, 3] + SHOWN_BEHIND_MM - 2.0 < length <= rollout.inserted_length[0, 3] + SHOWN_BEHIND_MM
+    assert (
+        rollout.inserted_length[0, 3] + SHOWN_BEHIND_MM - 2.0
+        < length
+        <= rollout.inserted_length[0, 3] + SHOWN_BEHIND_MM
+    )
 
 
 def test_a_rollout_without_shapes_is_refused(rollout):
