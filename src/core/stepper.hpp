@@ -290,7 +290,7 @@ private:
         ++lane.total_iterations;
         const double energy = get(energy_, l);
         lane.finite = std::isfinite(energy);
-        if (lane.iterations > options_.most_iterations * (lane.stride == 1 ? kPatience : 1)) return Verdict::restart;
+        if (lane.iterations > options_.most_iterations * (lane.stride == 1 && !lane.extrapolated ? kPatience : 1)) return Verdict::restart;
         const double slack = 1e-11 * (std::abs(lane.energy) + 1e-3);
         if (!lane.finite || !(lane.first || energy <= lane.energy + slack)) {
             if (lane.first || ++lane.rejections > kMostRejections) return Verdict::restart;
@@ -348,6 +348,10 @@ V Stepper<V>::add_loads(int i, const Node& node, Diagonal<V>& own) const {
     const Vec3<V> b{broadcast<V>(m.x), broadcast<V>(m.y), broadcast<V>(m.z)};
     energy -= 2.0 * dot(b, p.v);
     own.moment -= p.w * b + cross(b, p.v);
+    const V bent = 0.5 * dot(b, p.v);
+    own.tt.xx += bent;
+    own.tt.yy += bent;
+    own.tt.zz += bent;
     const double h = loads_->hold[i];
     const Quaternion<double>& c = loads_->attitude[i];
     const Quaternion<V> attitude{broadcast<V>(c.w), {broadcast<V>(c.v.x), broadcast<V>(c.v.y), broadcast<V>(c.v.z)}};
@@ -489,7 +493,7 @@ int Stepper<V>::advance(int n, const Verdict (&verdict)[W]) {
         } else if (verdict[l] == Verdict::restart) {
             set_mask<V>(restarted, l, true);
             any_finished = true;
-            if (lane.extrapolated && lane.iterations == 1) continue;  // only the extrapolation was bad
+            if (lane.extrapolated) continue;  // perhaps only the extrapolation was bad
             if (lane.stride == 1) {
                 failed[l] = true;
             } else {

@@ -121,7 +121,7 @@ def simulate(
     _check_memory(worlds, samples, len(rod.abscissa_mm) if record_shape else 0)
     result = run_core(
         rod,
-        make_lumen(anatomy.distance_map, device),
+        make_lumen(anatomy.distance_map, device.tip_radius_mm),
         anatomy.insertion,
         config=config,
         initial=initial,
@@ -169,6 +169,7 @@ def run_core(
     record_shape: bool = False,
     record_attitude: bool = False,
     lanes: int = _LANES,
+    approach: bool = True,
     free_behind_mm: float = _FREE_BEHIND_MM,
     sample_tolerance: float = _SAMPLE_TOLERANCE,
 ) -> dict[str, np.ndarray]:
@@ -186,6 +187,7 @@ def run_core(
         record_shape: record node positions, mm.
         record_attitude: record element orientations, quaternions w x y z.
         lanes: worlds stepped side by side by one thread: 1, 4 or 8.
+        approach: bring the wire to its first inserted length from the ostium; else it starts there, straight.
         free_behind_mm: nodes farther behind the insertion point follow the drive, mm.
         sample_tolerance: Newton tolerance at the end of a sample, mm.
 
@@ -202,7 +204,7 @@ def run_core(
     options.largest_step = _LARGEST_NEWTON_STEP
     options.most_iterations = _MOST_ITERATIONS
     options.free_behind = free_behind_mm
-    options.approach_velocity = config.approach_velocity_mm_s
+    options.approach_velocity = config.approach_velocity_mm_s if approach else 0.0
     depth = initial[:, 0] + np.cumsum(control[..., 0], axis=1).mean(axis=1)  # worlds of like length run side by side
     worlds, samples = control.shape[:2]
     with progress("Simulating the wire", total=worlds * samples) as advance:
@@ -225,17 +227,17 @@ def run_core(
         )
 
 
-def make_lumen(distance_map: DistanceMap, device: Device) -> _core.Lumen:
-    """Return the wall as the core wants it: coefficients of a quadratic B-spline that interpolates the map."""
+def make_lumen(distance_map: DistanceMap, radius_mm: float) -> _core.Lumen:
+    """Return the wall as the core wants it: a quadratic B-spline that interpolates the map, for a wire of some radius."""
     coefficients: Float32[np.ndarray, "nz ny nx"] = ndimage.spline_filter(
         np.asarray(distance_map.values, dtype=np.float32), order=2, output=np.float32, mode="nearest"
     )
-    radius, spacing = device.tip_radius_mm, float(distance_map.spacing_mm)
+    spacing = float(distance_map.spacing_mm)
     return _core.make_lumen(
         coefficients=np.ascontiguousarray(coefficients),
         origin=np.asarray(distance_map.origin_mm, dtype=float),
         spacing=spacing,
-        near=radius + spacing,
+        near=radius_mm + spacing,
         far=0.5,
     )
 
