@@ -60,7 +60,7 @@ class TrainConfig:
     windows_per_epoch: int | None = None
     """Windows drawn in one epoch; all of the training split if not given."""
     max_seconds: float | None = None
-    """Wall time that each network may train for, s; the epochs are shortened to fit, by the speed measured first."""
+    """Wall time that each network may train for, s; epochs are shortened to what is left of it."""
     seed: int = 0
     """Seed of the initial weights, the order of the windows, and dropout."""
     size: TransformerConfig = field(default_factory=TransformerConfig)

@@ -33,7 +33,7 @@ from endopilot.models.transformer import NETWORKS, Network
 from endopilot.models.windows import Episodes
 from endopilot.progress import Advance, progress
 
-VALIDATION_WINDOWS = 1024
+VALIDATION_WINDOWS = 512
 """Windows of held-out navigations that the loss is checked on after every epoch."""
 WARM_UP_EPOCHS = 0.5
 """Epochs over which the learning rate rises to its peak; afterwards it falls to zero along a cosine."""
@@ -164,14 +164,17 @@ class _Job:
             total += loss
             speed = (step + 1) * self.config.batch_size / (time.perf_counter() - first)
             advance(1 / steps, f"loss {total / (step + 1):.3f}, {speed:.0f} samples/s")
-        training_seconds = time.perf_counter() - first
+        seconds = time.perf_counter() - first
+        validation_loss = self._validate(network)
         state["curve"].append(
             {
                 "epoch": epoch + 1,
                 "steps": steps,
                 "loss": total / steps,
-                "validation_loss": self._validate(network),
-                "samples_per_second": sum(map(len, batches)) / training_seconds,
+                "validation_loss": validation_loss,
+                "samples_per_second": sum(map(len, batches)) / seconds,
+                "seconds": seconds,
+                "validation_seconds": time.perf_counter() - first - seconds,
             }
         )
         state["seconds"] += time.perf_counter() - start
@@ -219,12 +222,16 @@ class _Job:
         if config.max_seconds is None:
             return steps
         curve = state["curve"]
-        seconds_left = (config.max_seconds - state["seconds"]) / (config.epochs - len(curve))
-        seconds_a_step = state["seconds"] / sum(e["steps"] for e in curve) if curve else self._time_a_step(network)
-        return max(min(steps, int(seconds_left / seconds_a_step)), 1)
+        if curve:
+            a_step = sum(entry["seconds"] for entry in curve) / sum(entry["steps"] for entry in curve)
+            validation = curve[-1]["validation_seconds"]
+        else:
+            a_step, validation = self._time(network)
+        seconds_left = (config.max_seconds - state["seconds"]) / (config.epochs - len(curve)) - validation
+        return max(min(steps, int(seconds_left / a_step)), 1)
 
-    def _time_a_step(self, network: Network) -> float:
-        """Return how long a training step takes, s, tried out on a copy of the network."""
+    def _time(self, network: Network) -> tuple[float, float]:
+        """Return how long a training step and a validation take, s, tried out on a copy of the network."""
         trial = copy.deepcopy(network).train()
         optimizer = torch.optim.Adam(trial.parameters(), fused=True)
         targets = self._batches(0, 1)[0]
@@ -233,7 +240,9 @@ class _Job:
             start = time.perf_counter()
             self._step(trial, optimizer, targets, 0.0)
             times.append(time.perf_counter() - start)
-        return float(np.median(times))
+        start = time.perf_counter()
+        self._validate(trial)
+        return float(np.median(times)), time.perf_counter() - start
 
     def _save(self, network: Network, optimizer: torch.optim.Adam, state: dict[str, Any]) -> None:
         tensors = {f"network.{key}": value for key, value in network.state_dict().items()}
