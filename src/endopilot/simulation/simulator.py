@@ -10,7 +10,7 @@ import os
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Float32, Integer
 from scipy import ndimage
 
 from endopilot import _core
@@ -228,7 +228,7 @@ def run_core(
 
 
 def make_lumen(distance_map: DistanceMap, radius_mm: float) -> _core.Lumen:
-    """Return the wall as the core wants it: a quadratic B-spline that interpolates the map, for a wire of some radius."""
+    """Return the wall as the core wants it, for a wire of some radius: a quadratic B-spline that interpolates the map."""
     coefficients: Float32[np.ndarray, "nz ny nx"] = ndimage.spline_filter(
         np.asarray(distance_map.values, dtype=np.float32), order=2, output=np.float32, mode="nearest"
     )
@@ -306,7 +306,7 @@ def _check_memory(worlds: int, samples: int, recorded_nodes: int) -> None:
         )
 
 
-def _report_invalid(reason: Int[np.ndarray, "worlds"], valid: Bool[np.ndarray, "worlds samples"]) -> None:
+def _report_invalid(reason: Integer[np.ndarray, "worlds"], valid: Bool[np.ndarray, "worlds samples"]) -> None:
     bad = np.flatnonzero(~valid.all(axis=1))
     if len(bad) == 0:
         return

@@ -16,7 +16,7 @@ ROLL_UP_SAMPLES = 100
 
 
 def elastica_tip(alpha: float, elements: int) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "n 3"]]:
-    """Return sideways and axial displacement of the tip (w/L, u/L) of a clamped rod under F = α EI/L², and its shape."""
+    """Return tip displacements (w/L sideways, u/L axially) of a clamped rod under F = α EI/L², and its shape."""
     rod = straight_rod(elements=elements, length_mm=1.0, bend=1.0, twist=1.0)
     loading = Loading.none(len(rod.abscissa_mm))
     loading.force_n[0] = [0.0, alpha, 0.0]
@@ -29,13 +29,18 @@ def elastica() -> list[Case]:
 
     K. Mattiasson, Int. J. Numer. Meth. Eng. 17 (1981) 145-153.
     """
-    table = {1: (0.301721, 0.056433), 2: (0.493457, 0.160642), 5: (0.713792, 0.387628), 10: (0.810609, 0.554996)}
+    table = {
+        1.0: (0.301721, 0.056433),
+        2.0: (0.493457, 0.160642),
+        5.0: (0.713792, 0.387628),
+        10.0: (0.810609, 0.554996),
+    }
     cases = []
     for alpha, reference in table.items():
         tip, shape = elastica_tip(alpha, ELEMENTS)
         curve = ("x/L", "y/L", shape[:, 0], shape[:, 1])
         for name, expected, value in zip(("w/L", "u/L"), reference, tip, strict=True):
-            cases.append(compare(f"elastica α={alpha} {name}", expected, value, 1e-3, curve=curve))
+            cases.append(compare(f"elastica α={alpha:g} {name}", expected, value, 1e-3, curve=curve))
     return cases
 
 
@@ -69,7 +74,7 @@ def timoshenko() -> list[Case]:
 def euler_column() -> list[Case]:
     """Compare the load under which a clamped-free column loses its sideways stiffness with π² EI/(2L)².
 
-    A small sideways load f moves the tip by δ; f/δ falls to zero about linearly as the load comes near the critical one.
+    A small sideways load f moves the tip by δ; f/δ falls to zero about linearly towards the critical load.
     """
     critical = np.pi**2 / 4
     loads = critical * np.array([0.9, 0.94, 0.98])
@@ -133,7 +138,7 @@ def rod_energy(rod: RodLayout, shape: Float[np.ndarray, "n 3"], attitude: Float[
 
 
 def objectivity() -> list[Case]:
-    """Turn a curved rod once about its base: unloaded it keeps no energy, under a dead load it gets back what it had."""
+    """Turn a curved rod once about its base: unloaded it gains no energy, under a dead load it ends as it began."""
     cases = []
     for name, load in (("unloaded", 0.0), ("closed load loop", 1.0)):
         rod = straight_rod(elements=40, length_mm=1.0, bend=1.0, twist=0.8)
