@@ -21,8 +21,12 @@ from endopilot.types import LumenMask, Volume
 REAL = Path(__file__).parents[3] / "shared" / "data" / "coronary_centerlines"
 
 
+SHIFT = np.array([0.0, 0.0, 0.17])
+
+
 def bent_tube(points, radius=1.5):
-    """Five sixths of a torus, cut flat."""
+    """Five sixths of a torus, cut flat, off the voxels' own symmetry."""
+    points = points + SHIFT
     angle = np.arctan2(points[..., 1], points[..., 0])
     return np.where(np.abs(angle) > np.pi / 6, torus_distance(points, radius), -1.0)
 
@@ -50,7 +54,7 @@ def is_sound(anatomy):
         if branch.parent >= 0:
             parent = anatomy.tree.branches[branch.parent].centerline
             assert np.array_equal(line.points[0], parent.points[-1]) and line.abscissa[0] == parent.abscissa[-1]
-    way = anatomy.insertion.position + np.outer(np.linspace(-15, 2, 60), anatomy.insertion.direction)
+    way = anatomy.insertion.position + np.outer(np.linspace(-15, 0, 60), anatomy.insertion.direction)
     assert sample(anatomy.distance_map, way).min() > 0.5 * anatomy.catheter_radius_mm
     return True
 
@@ -61,7 +65,8 @@ def test_bent_tube_axis_and_radius(rotation):
     anatomy = extract_anatomy(mask, name="torus")
     line = anatomy.tree.longest_path()
     assert len(anatomy.tree.branches) == 1 and is_sound(anatomy)
-    off_axis = np.hypot(np.hypot(line.points[:, 0], line.points[:, 1]) - BEND_MM, line.points[:, 2])
+    points = line.points + SHIFT
+    off_axis = np.hypot(np.hypot(points[:, 0], points[:, 1]) - BEND_MM, points[:, 2])
     assert off_axis.mean() < 0.1 * 0.6 + 0.02
     assert np.abs(line.radius - 1.5).mean() < 0.1 * 0.6
     assert abs(line.abscissa[-1] - BEND_MM * 2 * np.pi * 5 / 6) < 2.5

@@ -9,6 +9,8 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from endopilot.anatomy.surface import Surface, surface_from_mask
@@ -94,7 +96,7 @@ def closed_surface(surface: Surface, given: Insertion | None, label: str) -> tup
             )
     open_edges = mesh.n_open_edges
     if open_edges:
-        mesh = mesh.fill_holes(1e9).triangulate().clean()
+        mesh = _capped(mesh)
         remarks.append(f"holes with {open_edges} open edges capped")
     mesh = mesh.compute_normals(
         cell_normals=False, point_normals=True, consistent_normals=True, split_vertices=False, auto_orient_normals=False
@@ -189,12 +191,29 @@ def _largest_region(regions, ids: np.ndarray) -> int:
     return int(np.argmax(sizes))
 
 
+def _capped(mesh):
+    """Close every hole by a fan of triangles from the centre of its rim to the rim's edges."""
+    import pyvista
+
+    points, faces = np.asarray(mesh.points, dtype=float), np.asarray(mesh.faces.reshape(-1, 4)[:, 1:])
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    _, inverse, uses = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
+    rim = edges[uses[inverse.reshape(-1)] == 1]
+    size = len(points)
+    _, hole = connected_components(coo_matrix((np.ones(len(rim)), (rim[:, 0], rim[:, 1])), shape=(size, size)))
+    numbers, own = np.unique(hole[rim[:, 0]], return_inverse=True)
+    centres = np.stack([points[np.unique(rim[own == i])].mean(axis=0) for i in range(len(numbers))])
+    fans = np.column_stack([rim[:, 1], rim[:, 0], size + own.reshape(-1)])
+    closed = np.concatenate([faces, fans])
+    return pyvista.PolyData(np.concatenate([points, centres]), np.insert(closed, 0, 3, axis=1).ravel())
+
+
 def _from_shell(surface: Surface, label: str) -> Surface:
     """Close a surface that no cap closes: voxels that the wall shuts off from outside are inside."""
     from scipy.ndimage import binary_closing, binary_fill_holes, binary_opening
 
     extent = np.ptp(surface.vertices, axis=0)
-    spacing = max(float(np.prod(extent) / 8e6) ** (1 / 3), float(extent.max()) / 600)
+    spacing = max(float(np.prod(extent) / 3e6) ** (1 / 3), float(extent.max()) / 600)
     fine = surface.refined(0.7 * spacing)
     margin = 6
     origin = fine.vertices.min(axis=0) - margin * spacing
