@@ -62,7 +62,7 @@ def test_no_network_is_told_in_one_line_and_leaves_nothing(index, tmp_path):
 
 def test_another_content_is_refused_and_leaves_nothing(index, tmp_path):
     index["files"] = {"tests/ct.nii.gz": b"something else"}
-    with pytest.raises(InputError, match="does not hold ct.nii.gz"):
+    with pytest.raises(InputError, match=r"does not hold ct\.nii\.gz"):
         fetch_sample()
     assert not list((tmp_path / "cache" / "endopilot" / "samples").iterdir())
 

@@ -39,7 +39,7 @@ def draw_overlay(
     outlines = [(_on_grid(mask, volume), "lime")]
     if reference is not None:
         outlines.append((_on_grid(reference, volume), "red"))
-    figure, axes = plt.subplots(1, 3, figsize=(15, 5.5), facecolor="black")
+    figure, axes = plt.subplots(1, 3, figsize=(15, 5.5), facecolor="black", layout="constrained")
     for plot, (name, axis) in zip(axes, _PLANES, strict=True):
         array_axis = 2 - axis
         if through is not None:
@@ -62,7 +62,6 @@ def draw_overlay(
         place = volume.index_to_world(np.full(3, position, dtype=float))[axis]
         plot.set_title(f"{name}, {'xyz'[axis]} = {place:.0f} mm", color="white")
         plot.axis("off")
-    figure.tight_layout()
     with writing(Path(path)) as partial:
         figure.savefig(partial, dpi=110, facecolor="black")
     plt.close(figure)

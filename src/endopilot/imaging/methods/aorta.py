@@ -60,7 +60,7 @@ def segment_lumen(volume: Volume, config: SegmentConfig) -> LumenMask:
         InputError: there is no seed, no contrast at a seed, or no contrast-filled way between seeds.
     """
     if not config.seeds:
-        raise InputError("seeds: the aorta method needs one or two points in the lumen, LPS mm; give --config.seeds")
+        raise InputError("seeds: the aorta method needs one or two points in the lumen, LPS mm; give --seeds x y z")
     with progress("Segmenting the aorta", 4) as advance:
         grid = resample(volume, _GRID_MM)
         hu = ndimage.gaussian_filter(grid.voxels, 0.6)
