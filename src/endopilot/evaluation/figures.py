@@ -179,7 +179,7 @@ def volume_figure(volume: Volume, mask: LumenMask, anatomy: Anatomy | None = Non
     ostium = mask.ostium or (anatomy.insertion if anatomy is not None else None)
     voxels, lumen = _along_lps(volume, volume.voxels), _along_lps(volume, mask.volume.voxels).astype(bool)
     spacing = _along_lps_spacing(volume)
-    inside = [np.unique(index) for index in np.nonzero(lumen)]
+    inside = [np.flatnonzero(np.any(lumen, axis=others)) for others in ((1, 2), (0, 2), (0, 1))]
     margin = np.ceil(CROP_MARGIN_MM / spacing[::-1]).astype(int)
     crop = tuple(slice(max(0, at[0] - m), at[-1] + m + 1) for at, m in zip(inside, margin, strict=True))
     level = int(np.median(inside[0])) if ostium is None else _level(volume, ostium.position, voxels.shape[0])

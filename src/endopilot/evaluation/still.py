@@ -80,8 +80,8 @@ def _render(scene: Path, path: Path) -> None:
     if len(arrays["wire"]) > 1:
         # Drawn thicker than it is, or it would not show at this scale.
         wire: Any = pv.Spline(arrays["wire"], 4 * len(arrays["wire"]))
-        plotter.add_mesh(wire.tube(radius=0.0026 * size), color="white", ambient=0.65, smooth_shading=True)
-        tip = pv.Sphere(radius=0.0062 * size, center=arrays["wire"][0])
+        plotter.add_mesh(wire.tube(radius=0.0017 * size), color="white", ambient=0.65, smooth_shading=True)
+        tip = pv.Sphere(radius=0.005 * size, center=arrays["wire"][0])
         plotter.add_mesh(tip, color="#ffd34d", ambient=0.5, smooth_shading=True)
     plotter.enable_depth_peeling(8)
     plotter.enable_anti_aliasing("ssaa")

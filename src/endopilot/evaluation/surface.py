@@ -56,11 +56,11 @@ def _march(
 
 def _cropped(distance_map: DistanceMap) -> tuple[Float[np.ndarray, "nz ny nx"], Float[np.ndarray, "3"]]:
     """Return the part of the map around the lumen with one layer of outside about it, and its origin, LPS mm."""
-    values = np.asarray(distance_map.values, dtype=float)
-    inside = [np.unique(index) for index in np.nonzero(values > 0)]
-    start = np.array([max(index[0] - 2, 0) for index in inside])
-    stop = np.array([index[-1] + 3 for index in inside])
-    box = values[tuple(slice(a, b) for a, b in zip(start, stop, strict=True))]
+    inside = np.asarray(distance_map.values) > 0
+    found = [np.flatnonzero(inside.any(axis=others)) for others in ((1, 2), (0, 2), (0, 1))]
+    start = np.array([max(index[0] - 2, 0) for index in found])
+    stop = np.array([index[-1] + 3 for index in found])
+    box = np.asarray(distance_map.values[tuple(slice(a, b) for a, b in zip(start, stop, strict=True))], dtype=float)
     # A lumen that reaches the edge of the map is closed there.
     padded = np.pad(box, 1, constant_values=-distance_map.spacing_mm)
     return padded, distance_map.origin_mm + (start[::-1] - 1) * distance_map.spacing_mm
