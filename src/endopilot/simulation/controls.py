@@ -150,7 +150,7 @@ def read_controls_csv(path: Path) -> tuple[Float[np.ndarray, "n 2"], Float[np.nd
         raise InputError(f"{path}: has no rows; give one for each {SAMPLE_PERIOD_S} s")
     state = [name for name in ("inserted_length_mm", "rotation_rad") if name in table.columns]
     for name in (*_COLUMNS, *state):
-        numbers = pd.to_numeric(table[name], errors="coerce").to_numpy(dtype=float)
+        numbers = np.asarray(pd.to_numeric(table[name], errors="coerce"), dtype=float)
         bad = np.flatnonzero(~np.isfinite(numbers))
         if len(bad):
             row = int(bad[0])

@@ -167,11 +167,11 @@ def _parse(content: Any) -> Device:
     sources = {name: _source(name, content[name]) for name in _FIELDS[1:]}
     tip = content["tip_bend"]
     load = content["tip_load_n"].get("value")
-    profiles = {name: _numbers(name, content[name].get("value")) for name in _PROFILES}
+    constants: dict[str, Any] = {name: _number(name, content[name].get("value")) for name in _SCALARS}
+    constants |= {name: _numbers(name, content[name].get("value")) for name in _PROFILES}
     return Device(
         name=str(content["name"]),
-        **{name: _number(name, content[name].get("value")) for name in _SCALARS},
-        **profiles,
+        **constants,
         tip_bend_rad=float(np.deg2rad(_number("tip_bend angle_deg", tip.get("angle_deg")))),
         tip_bend_length_mm=_number("tip_bend length_mm", tip.get("length_mm")),
         tip_load_n=None if load is None else _number("tip_load_n", load),

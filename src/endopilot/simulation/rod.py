@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -114,7 +115,7 @@ def _nodes(path_mm: float, elements: int, length_mm: float) -> Float[np.ndarray,
         growth = (full - finest) * finest / _RAMP_MM  # about linear in the abscissa until `full` is reached
         return np.minimum(finest + growth * count, full)
 
-    full = float(brentq(lambda full: lengths(full).sum() - path_mm, finest, 1e3 * path_mm))
+    full: Any = brentq(lambda full: lengths(full).sum() - path_mm, finest, 1e3 * path_mm)
     nodes = np.append(0.0, np.cumsum(lengths(full)))
     extra = max(0, int(np.ceil((length_mm - nodes[-1]) / full))) + 2
     return np.append(nodes, nodes[-1] + full * (1 + np.arange(extra)))

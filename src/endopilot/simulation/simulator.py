@@ -228,9 +228,12 @@ def run_core(
 
 
 def make_lumen(distance_map: DistanceMap, radius_mm: float) -> _core.Lumen:
-    """Return the wall as the core wants it, for a wire of some radius: a quadratic B-spline that interpolates the map."""
+    """Return the wall as the core wants it, a quadratic B-spline through the map, for a wire of some radius."""
     coefficients: Float32[np.ndarray, "nz ny nx"] = ndimage.spline_filter(
-        np.asarray(distance_map.values, dtype=np.float32), order=2, output=np.float32, mode="nearest"
+        np.asarray(distance_map.values, dtype=np.float32),
+        order=2,
+        output=np.float32,
+        mode="nearest",  # pyright: ignore[reportArgumentType]
     )
     spacing = float(distance_map.spacing_mm)
     return _core.make_lumen(
@@ -291,9 +294,9 @@ def _check_controls(
 
 def _check(bad: Bool[np.ndarray, "worlds *rest"], values: Float[np.ndarray, "worlds *rest"], what: str) -> None:
     if bad.any():
-        where = tuple(int(i) for i in np.argwhere(bad)[0])
+        where = [int(i) for i in np.argwhere(bad)[0]]
         at = f", sample {where[1]}" if len(where) > 1 else ""
-        raise InputError(f"world {where[0]}{at}: {values[where]:g}: {what}")
+        raise InputError(f"world {where[0]}{at}: {values[tuple(where)]:g}: {what}")
 
 
 def _check_memory(worlds: int, samples: int, recorded_nodes: int) -> None:

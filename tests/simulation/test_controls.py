@@ -1,0 +1,54 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from endopilot.errors import InputError
+from endopilot.simulation.controls import ControlConfig, random_controls, read_controls_csv
+
+
+def test_a_sequence_does_not_depend_on_the_others() -> None:
+    few = random_controls(ControlConfig(), n_sequences=3, n_samples=50, seed=4, max_inserted_length_mm=100.0)
+    many = random_controls(ControlConfig(), n_sequences=9, n_samples=50, seed=4, max_inserted_length_mm=100.0)
+    other = random_controls(ControlConfig(), n_sequences=3, n_samples=50, seed=5, max_inserted_length_mm=100.0)
+    assert np.array_equal(few[0], many[0][:3])
+    assert np.array_equal(few[1], many[1][:3])
+    assert not np.array_equal(few[1], other[1])
+
+
+def test_insertion_stays_in_its_range() -> None:
+    config = ControlConfig()
+    initial, control = random_controls(config, n_sequences=200, n_samples=120, seed=0, max_inserted_length_mm=80.0)
+    inserted = initial[:, :1] + 0.5 * np.cumsum(control[..., 0], axis=1)
+    assert inserted.min() > -1e-9
+    assert inserted.max() < 80 + 1e-9
+    assert np.abs(control[..., 0]).max() <= config.max_velocity_mm_s
+    assert np.abs(control[..., 1]).max() <= config.max_rotation_rad_s
+    assert np.abs(control[..., 1]).max() > 0.8 * config.max_rotation_rad_s
+
+
+def test_controls_from_csv(tmp_path: Path) -> None:
+    path = tmp_path / "c.csv"
+    path.write_text("time_s,translation_mm_s,rotation_rad_s\n0.5,2,0\n1.0,-1,0.5\n")
+    initial, control = read_controls_csv(path)
+    np.testing.assert_array_equal(initial, [[0, 0]])
+    np.testing.assert_array_equal(control, [[[2, 0], [-1, 0.5]]])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("time_s,translation_mm_s\n0.5,1\n", "rotation_rad_s is missing"),
+        ("time_s,translation_mm_s,rotation_rad_s\n0.5,1,0\n1.0,nan,0\n", "row 3: translation_mm_s"),
+        ("time_s,translation_mm_s,rotation_rad_s\n0.5,1,0\n2.0,1,0\n", "row 3: time_s"),
+        ("time_s,translation_mm_s,rotation_rad_s\n", "no rows"),
+        ("", "cannot be read"),
+    ],
+)
+def test_bad_csv_is_refused(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "c.csv"
+    path.write_text(text)
+    with pytest.raises(InputError, match=message):
+        read_controls_csv(path)

@@ -1,0 +1,139 @@
+"""The simulator in analytic vessels: kinematics, determinism, forces, refusal of bad input."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from jaxtyping import Float
+
+from endopilot.errors import InputError
+from endopilot.simulation.device import read_device
+from endopilot.simulation.simulator import SimulatorConfig, simulate
+from endopilot.simulation.verify_contact import bent_tube
+from endopilot.types import Anatomy, Branch, Centerline, DistanceMap, Insertion, VesselTree
+
+RADIUS, BEND, LEAD = 1.5, 20.0, 35.0
+WORLDS, SAMPLES = 6, 16
+DEVICE = read_device("workhorse-014")
+
+
+def vessel(angle: float = np.pi / 2) -> Anatomy:
+    """Return a tube that goes straight, bends and goes on, with a blind end; the ostium is 5 mm before the bend."""
+    s = np.linspace(0, 1, 80)
+    arc = BEND * np.column_stack([np.sin(angle * s), 1 - np.cos(angle * s), 0 * s])
+    out = np.array([np.cos(angle), np.sin(angle), 0.0])
+    points = np.concatenate([np.linspace([-5, 0, 0], [-0.1, 0, 0], 20), arc, arc[-1] + np.outer(np.arange(1, 30), out)])
+    abscissa = np.append(0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
+    line = Centerline(points, np.full(len(points), RADIUS), abscissa, np.tile([0.0, 0.0, 1.0], (len(points), 1)))
+    field = bent_tube(angle, radius_mm=RADIUS, bend_radius_mm=BEND, lead_mm=LEAD, spacing_mm=0.3)
+    k, j, i = np.indices(field.values.shape)
+    grid = field.origin_mm + field.spacing_mm * np.stack([i, j, k], axis=-1)
+    end = arc[-1] + 30 * out
+    blind = np.minimum(field.values, np.maximum((end - grid) @ out, -1.0))
+    return Anatomy(
+        name="bend",
+        tree=VesselTree((Branch(line, -1, np.zeros(len(points), dtype=int)),), ("all",)),
+        distance_map=DistanceMap(blind, field.spacing_mm, field.origin_mm),
+        insertion=Insertion(points[0], np.array([1.0, 0.0, 0.0])),
+        catheter_radius_mm=RADIUS,
+    )
+
+
+@pytest.fixture(scope="module")
+def anatomy() -> Anatomy:
+    return vessel()
+
+
+def drive(worlds: int = WORLDS) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n samples 2"]]:
+    random = np.random.default_rng(5)
+    initial = np.column_stack([random.uniform(5, 30, worlds), random.uniform(-3, 3, worlds)])
+    return initial, np.stack(
+        [random.uniform(1, 8, (worlds, SAMPLES)), random.uniform(-3, 3, (worlds, SAMPLES))], axis=-1
+    )
+
+
+def same(a, b, rows) -> None:
+    for name in ("tip_position", "tip_direction", "contact_force_sum", "base_force", "base_torque", "iterations"):
+        assert np.array_equal(getattr(a, name), getattr(b, name)[rows]), name
+
+
+def test_bitwise_equal_whatever_the_company(anatomy: Anatomy) -> None:
+    initial, control = drive()
+    one = simulate(anatomy, DEVICE, control, initial=initial, config=SimulatorConfig(threads=1))
+    two = simulate(anatomy, DEVICE, control, initial=initial, config=SimulatorConfig(threads=2))
+    order = np.array([3, 0, 5, 1, 4, 2])
+    shuffled = simulate(anatomy, DEVICE, control[order], initial=initial[order])
+    alone = simulate(anatomy, DEVICE, control[[4]], initial=initial[[4]])
+    assert one.valid.all()
+    same(two, one, slice(None))
+    same(shuffled, one, order)
+    same(alone, one, [4])
+
+
+def test_kinematics_and_forces(anatomy: Anatomy) -> None:
+    initial, control = drive()
+    rollout = simulate(anatomy, DEVICE, control, initial=initial, record_shape=True)
+    expected = initial[:, None] + 0.5 * np.cumsum(control, axis=1)
+    np.testing.assert_allclose(rollout.inserted_length, expected[..., 0])
+    np.testing.assert_allclose(rollout.rotation, expected[..., 1])
+    assert rollout.shape is not None
+    along = np.linalg.norm(np.diff(rollout.shape, axis=2), axis=-1).sum(axis=-1)
+    np.testing.assert_allclose(along, along[0, 0], rtol=2e-3)  # the wire does not stretch
+    behind = rollout.shape[..., -1, :] - anatomy.insertion.position
+    np.testing.assert_allclose(behind[..., 0], rollout.inserted_length - along[0, 0], atol=0.2)
+    assert (rollout.contact_force_max <= rollout.contact_force_sum + 1e-12).all()
+    assert (rollout.tip.abscissa < rollout.inserted_length + 3).all()
+    assert rollout.contact_force_max.max() / 5.0 < 0.05  # penetration, mm
+
+
+def test_pushes_and_pulls_with_friction(anatomy: Anatomy) -> None:
+    control = np.zeros((1, 24, 2))
+    control[0, :16, 0], control[0, 16:, 0] = 4.0, -1.0
+    rough = simulate(anatomy, DEVICE, control, initial=np.array([[5.0, 0.0]]), friction=np.array([0.3]))
+    smooth = simulate(anatomy, DEVICE, control, initial=np.array([[5.0, 0.0]]), friction=np.array([0.0]))
+    assert rough.base_force[0, 15] > smooth.base_force[0, 15]
+    assert rough.base_force[0, -1] < smooth.base_force[0, -1]
+
+
+def test_survives_the_blind_end_and_full_retraction(anatomy: Anatomy) -> None:
+    control = np.zeros((2, 40, 2))
+    control[0, :10, 0], control[0, 30:, 0] = 2.0, -8.5
+    control[1, :, 0] = -1.0
+    rollout = simulate(anatomy, DEVICE, control, initial=np.array([[66.0, 0.0], [20.0, 1.0]]))
+    assert rollout.valid.all()
+    assert np.isfinite(rollout.tip_position).all()
+    assert rollout.base_force[0, 9] > 0.05
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda c, i: (np.full_like(c, np.nan), i), "finite"),
+        (lambda c, i: (c * 100, i), "exceeds"),
+        (lambda c, i: (-c, i), "negative"),
+        (lambda c, i: (c[:0], i[:0]), "at least one"),
+        (lambda c, i: (c, i * np.inf), "finite"),
+    ],
+)
+def test_refuses_bad_controls(anatomy: Anatomy, change, message: str) -> None:
+    initial, control = drive()
+    control, initial = change(control, initial)
+    with pytest.raises(InputError, match=message):
+        simulate(anatomy, DEVICE, control, initial=initial)
+
+
+def test_refuses_bad_anatomies(anatomy: Anatomy) -> None:
+    initial, control = drive(1)
+    field = anatomy.distance_map
+    broken = replace(field, values=np.where(field.values > 1, np.nan, field.values))
+    for bad, message in (
+        (replace(anatomy, distance_map=broken), "not finite"),
+        (replace(anatomy, distance_map=replace(field, values=-field.values)), "positive"),
+        (replace(anatomy, insertion=Insertion(np.array([500.0, 0, 0]), np.array([1.0, 0, 0]))), "positive"),
+        (replace(anatomy, insertion=Insertion(np.array([-5.0, 0, 0]), np.array([2.0, 0, 0]))), "unit vector"),
+        (replace(anatomy, catheter_radius_mm=0.1), "wider"),
+    ):
+        with pytest.raises(InputError, match=message):
+            simulate(bad, DEVICE, control, initial=initial)
