@@ -155,13 +155,14 @@ nb::dict simulate(const RodModel& rod, const Lumen* lumen, const Loads* loads, c
         require(index >= 0 && index < double(worlds), "order must name existing worlds");
         sequence.push_back(int(index));
     }
-    Result<double> tip(3 * n), direction(3 * n), force_max(n), force_sum(n), base_force(n), base_torque(n), iterations(n);
+    Result<double> tip(3 * n), direction(3 * n), force_max(n), force_sum(n), base_force(n), base_torque(n), iterations(n),
+        slip(n), approach_slip(worlds);
     Result<bool> valid(n);
     Result<std::uint8_t> reason(worlds);
     Result<double> shape(record_shape ? 3 * n * nodes : 0), attitude(record_attitude ? 4 * n * nodes : 0);
     const Inputs in{int(worlds), int(samples), initial.data(), control.data(), friction.data()};
     const Outputs out{tip.data,         direction.data, force_max.data, force_sum.data,
-                      base_force.data,  base_torque.data, iterations.data, valid.data, reason.data,
+                      base_force.data,  base_torque.data, iterations.data, slip.data, valid.data, approach_slip.data, reason.data,
                       record_shape ? shape.data : nullptr, record_attitude ? attitude.data : nullptr};
     const Base base{vec3(origin.data()), quaternion(orientation.data())};
     nb::dict result;
@@ -172,6 +173,8 @@ nb::dict simulate(const RodModel& rod, const Lumen* lumen, const Loads* loads, c
     result["base_force"] = base_force.array(worlds, samples);
     result["base_torque"] = base_torque.array(worlds, samples);
     result["iterations"] = iterations.array(worlds, samples);
+    result["slip"] = slip.array(worlds, samples);
+    result["approach_slip"] = approach_slip.array(worlds);
     result["valid"] = valid.array(worlds, samples);
     result["reason"] = reason.array(worlds);
     nb::object shapes = shape.array(record_shape ? worlds : 0, samples, nodes, 3);
@@ -223,7 +226,8 @@ NB_MODULE(_core, module) {
         .def_rw("largest_step", &Options::largest_step)
         .def_rw("most_iterations", &Options::most_iterations)
         .def_rw("free_behind", &Options::free_behind)
-        .def_rw("approach_velocity", &Options::approach_velocity);
+        .def_rw("approach_velocity", &Options::approach_velocity)
+        .def_rw("push_limit", &Options::push_limit);
     module.def("simulate", &simulate, nb::kw_only(), nb::arg("rod"), nb::arg("lumen").none(), nb::arg("loads").none(),
                nb::arg("origin"), nb::arg("orientation"), nb::arg("options"), nb::arg("initial"), nb::arg("control"),
                nb::arg("friction"), nb::arg("order"), nb::arg("record_shape"), nb::arg("record_attitude"),

@@ -99,6 +99,18 @@ struct Distance {
     Sym3<V> curve;   // its Hessian, 1/mm
 };
 
+// One coefficient per lane.
+template <class V>
+inline V gather(const float* const (&from)[kWidth<V>], int offset) {
+    if constexpr (kWidth<V> == 1)
+        return from[0][offset];
+    else if constexpr (kWidth<V> == 4)
+        return V{from[0][offset], from[1][offset], from[2][offset], from[3][offset]};
+    else
+        return V{from[0][offset], from[1][offset], from[2][offset], from[3][offset],
+                 from[4][offset], from[5][offset], from[6][offset], from[7][offset]};
+}
+
 // The spline, its gradient and its Hessian at one point per lane. Outside the map the value is NaN, which makes the
 // line search step back.
 template <class V>
@@ -137,9 +149,7 @@ inline Distance<V> distance_to_wall(const Lumen& lumen, const Vec3<V>& x) {
         V g{}, gx{}, gy{}, gxx{}, gxy{}, gyy{};
         for (int j = 0; j < 3; ++j) {
             V c[3];
-            for (int i = 0; i < 3; ++i)
-                for (int lane = 0; lane < W; ++lane)
-                    set(c[i], lane, double(first[lane][(k * Lumen::kStored + j) * Lumen::kStored + i]));
+            for (int i = 0; i < 3; ++i) c[i] = gather<V>(first, (k * Lumen::kStored + j) * Lumen::kStored + i);
             const V h = wx[0] * c[0] + wx[1] * c[1] + wx[2] * c[2];
             const V hx = dx[0] * c[0] + dx[1] * c[1] + dx[2] * c[2];
             const V hxx = c[0] - 2.0 * c[1] + c[2];

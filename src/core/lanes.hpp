@@ -80,6 +80,10 @@ template <class V>
 inline V square_root(V a) {
     if constexpr (kWidth<V> == 1) {
         return std::sqrt(a);
+#ifdef __AVX__
+    } else if constexpr (kWidth<V> == 4) {
+        return __builtin_ia32_sqrtpd256(a);
+#endif
     } else {
         V root;
         for (int lane = 0; lane < kWidth<V>; ++lane) root[lane] = std::sqrt(a[lane]);

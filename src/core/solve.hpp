@@ -1,9 +1,20 @@
 // Block-tridiagonal Cholesky factorisation, one block row at a time, from tip to base.
 #pragma once
 
+#include <type_traits>
+
 #include "rod.hpp"
 
 namespace endopilot {
+
+// Calls f with each integer from Begin to End - 1 as a compile-time constant: 6×6 blocks then live in registers.
+template <int Begin, int End, class F>
+[[gnu::always_inline]] inline void unroll(const F& f) {
+    if constexpr (Begin < End) {
+        f(std::integral_constant<int, Begin>{});
+        unroll<Begin + 1, End>(f);
+    }
+}
 
 // What back substitution needs of one block row: D = L L^T, W = L^-1 C (C the coupling to the next block; its upper
 // right 3×3 part is zero and so is W's) and z = -L^-1 gradient.
@@ -36,26 +47,33 @@ inline V eliminate(const Diagonal<V>& own, const Coupling<V>& coupling, Factor<V
     d[5][5] = own.tt.zz;
 
     V smallest = d[0][0];
-#pragma GCC unroll 6
-    for (int c = 0; c < 6; ++c) {
+    unroll<0, 6>([&](auto c_) {
+        constexpr int c = decltype(c_)::value;
         V pivot = d[c][c];
-#pragma GCC unroll 6
-        for (int k = 0; k < c; ++k) pivot -= d[c][k] * d[c][k];
+        unroll<0, c>([&](auto k_) {
+            constexpr int k = decltype(k_)::value;
+            pivot -= d[c][k] * d[c][k];
+        });
         smallest = pivot < smallest ? pivot : smallest;
         const V inverse = 1.0 / square_root(pivot);
         d[c][c] = inverse;
-#pragma GCC unroll 6
-        for (int r = c + 1; r < 6; ++r) {
+        unroll<c + 1, 6>([&](auto r_) {
+            constexpr int r = decltype(r_)::value;
             V s = d[r][c];
-#pragma GCC unroll 6
-            for (int k = 0; k < c; ++k) s -= d[r][k] * d[c][k];
+            unroll<0, c>([&](auto k_) {
+                constexpr int k = decltype(k_)::value;
+                s -= d[r][k] * d[c][k];
+            });
             d[r][c] = s * inverse;
-        }
-    }
-#pragma GCC unroll 6
-    for (int r = 0; r < 6; ++r)
-#pragma GCC unroll 6
-        for (int c = 0; c <= r; ++c) f.lower[r][c] = d[r][c];
+        });
+    });
+    unroll<0, 6>([&](auto r_) {
+        constexpr int r = decltype(r_)::value;
+        unroll<0, r + 1>([&](auto c_) {
+            constexpr int c = decltype(c_)::value;
+            f.lower[r][c] = d[r][c];
+        });
+    });
 
     const V cx[6][3] = {{coupling.xx.xx, coupling.xx.xy, coupling.xx.xz},
                         {coupling.xx.xy, coupling.xx.yy, coupling.xx.yz},
@@ -65,41 +83,52 @@ inline V eliminate(const Diagonal<V>& own, const Coupling<V>& coupling, Factor<V
                         {coupling.tx[2][0], coupling.tx[2][1], coupling.tx[2][2]}};
     V wx[6][3], wt[3][3], z[6];
     const V rhs[6] = {-own.force.x, -own.force.y, -own.force.z, -own.moment.x, -own.moment.y, -own.moment.z};
-#pragma GCC unroll 6
-    for (int r = 0; r < 6; ++r) {
-#pragma GCC unroll 3
-        for (int c = 0; c < 3; ++c) {
+    unroll<0, 6>([&](auto r_) {
+        constexpr int r = decltype(r_)::value;
+        unroll<0, 3>([&](auto c_) {
+            constexpr int c = decltype(c_)::value;
             V s = cx[r][c];
-#pragma GCC unroll 6
-            for (int k = 0; k < r; ++k) s -= d[r][k] * wx[k][c];
+            unroll<0, r>([&](auto k_) {
+                constexpr int k = decltype(k_)::value;
+                s -= d[r][k] * wx[k][c];
+            });
             wx[r][c] = s * d[r][r];
-        }
+        });
         V s = rhs[r];
-#pragma GCC unroll 6
-        for (int k = 0; k < r; ++k) s -= d[r][k] * z[k];
+        unroll<0, r>([&](auto k_) {
+            constexpr int k = decltype(k_)::value;
+            s -= d[r][k] * z[k];
+        });
         z[r] = s * d[r][r];
-    }
-#pragma GCC unroll 3
-    for (int r = 0; r < 3; ++r)
-#pragma GCC unroll 3
-        for (int c = 0; c < 3; ++c) {
+    });
+    unroll<0, 3>([&](auto r_) {
+        constexpr int r = decltype(r_)::value;
+        unroll<0, 3>([&](auto c_) {
+            constexpr int c = decltype(c_)::value;
             V s = coupling.tt[r][c];
-#pragma GCC unroll 3
-            for (int k = 0; k < r; ++k) s -= d[3 + r][3 + k] * wt[k][c];
+            unroll<0, r>([&](auto k_) {
+                constexpr int k = decltype(k_)::value;
+                s -= d[3 + r][3 + k] * wt[k][c];
+            });
             wt[r][c] = s * d[3 + r][3 + r];
-        }
+        });
+    });
 
     const auto xx = [&](int a, int b) {
         V s = wx[0][a] * wx[0][b];
-#pragma GCC unroll 6
-        for (int k = 1; k < 6; ++k) s += wx[k][a] * wx[k][b];
+        unroll<1, 6>([&](auto k_) {
+            constexpr int k = decltype(k_)::value;
+            s += wx[k][a] * wx[k][b];
+        });
         return s;
     };
     const auto tt = [&](int a, int b) { return wt[0][a] * wt[0][b] + wt[1][a] * wt[1][b] + wt[2][a] * wt[2][b]; };
     const auto xz = [&](int a) {
         V s = wx[0][a] * z[0];
-#pragma GCC unroll 6
-        for (int k = 1; k < 6; ++k) s += wx[k][a] * z[k];
+        unroll<1, 6>([&](auto k_) {
+            constexpr int k = decltype(k_)::value;
+            s += wx[k][a] * z[k];
+        });
         return s;
     };
     const auto tz = [&](int a) { return wt[0][a] * z[3] + wt[1][a] * z[4] + wt[2][a] * z[5]; };
@@ -134,16 +163,22 @@ inline V eliminate(const Diagonal<V>& own, const Coupling<V>& coupling, Factor<V
 template <class V>
 inline void substitute(const Factor<V>& f, Vec3<V>& x, Vec3<V>& t) {
     V s[6];
-#pragma GCC unroll 6
-    for (int r = 0; r < 6; ++r) s[r] = f.z[r] - f.wx[r][0] * x.x - f.wx[r][1] * x.y - f.wx[r][2] * x.z;
-#pragma GCC unroll 3
-    for (int r = 0; r < 3; ++r) s[3 + r] -= f.wt[r][0] * t.x + f.wt[r][1] * t.y + f.wt[r][2] * t.z;
-#pragma GCC unroll 6
-    for (int r = 5; r >= 0; --r) {
-#pragma GCC unroll 6
-        for (int k = r + 1; k < 6; ++k) s[r] -= f.lower[k][r] * s[k];
+    unroll<0, 6>([&](auto r_) {
+        constexpr int r = decltype(r_)::value;
+        s[r] = f.z[r] - f.wx[r][0] * x.x - f.wx[r][1] * x.y - f.wx[r][2] * x.z;
+    });
+    unroll<0, 3>([&](auto r_) {
+        constexpr int r = decltype(r_)::value;
+        s[3 + r] -= f.wt[r][0] * t.x + f.wt[r][1] * t.y + f.wt[r][2] * t.z;
+    });
+    unroll<0, 5 + 1>([&](auto r_) {
+        constexpr int r = 5 - decltype(r_)::value;
+        unroll<r + 1, 6>([&](auto k_) {
+            constexpr int k = decltype(k_)::value;
+            s[r] -= f.lower[k][r] * s[k];
+        });
         s[r] *= f.lower[r][r];
-    }
+    });
     x = {s[0], s[1], s[2]};
     t = {s[3], s[4], s[5]};
 }

@@ -26,6 +26,7 @@ struct Options {
     int most_iterations;       // for one step; then the step is halved, and the shortest may take kPatience times as many
     double free_behind;        // nodes farther behind the ostium than this follow the drive, mm
     double approach_velocity;  // at which a wire is brought to its first inserted length, mm/s
+    double push_limit;         // the drive slips rather than push the wire harder than this, N
 };
 
 // The guiding catheter: wire enters at `origin` along the third director of `orientation`.
@@ -53,10 +54,12 @@ struct Inputs {
 
 enum Reason : std::uint8_t { kFine = 0, kNotFinite = 1, kNotConverged = 2 };
 
-// Arrays of worlds × samples (× 3, × nodes × 3).
+// Arrays of worlds × samples (× 3, × nodes × 3). `slip` is the advance (mm) that was asked for and not made, and
+// `approach_slip` that before the first sample.
 struct Outputs {
-    double *tip_position, *tip_direction, *force_max, *force_sum, *base_force, *base_torque, *iterations;
+    double *tip_position, *tip_direction, *force_max, *force_sum, *base_force, *base_torque, *iterations, *slip;
     bool* valid;
+    double* approach_slip;    // worlds
     std::uint8_t* reason;     // worlds
     double* shape;            // may be null
     double* attitude;         // may be null: worlds × samples × nodes × 4, quaternions w x y z
@@ -64,7 +67,8 @@ struct Outputs {
 
 constexpr int kTicks = 64;     // a step may be halved down to 1/64
 constexpr int kMostRejections = 12;
-constexpr int kPatience = 20;   // a snap from one shape to another is not shortened by a shorter step
+constexpr int kPatience = 5;   // a snap from one shape to another is not shortened by a shorter step
+constexpr double kOvershoot = 0.02;      // mm that rounded controls may pull the wire behind the ostium
 constexpr double kReach = 0.1;           // mm within which a wall that was touched counts as touched, at first
 constexpr double kFirstDamping = 1e-3;   // N/mm (rotations: N mm/rad), tried where the Hessian is not positive definite
 constexpr double kMostDamping = 1e3;
@@ -112,9 +116,11 @@ private:
         int world = -1, sample = 0, tick = 0, stride = 0, active = 0, iterations = 0, rejections = 0, steps = 0;
         long total_iterations = 0;
         double inserted = 0, rotation = 0, speed = 0, spin = 0;   // at the start of the sample; mm/s, rad/s
+        double slip = 0, refused = 0, approach_slip = 0;   // mm in this sample: forwards, backwards; mm before the first
+        double push = 0;                                  // N, at the end of the last step
         double start_inserted = 0, start_rotation = 0, end_inserted = 0, end_rotation = 0;
         double energy = 0, slope = 0, scale = 1, shorten = 1, boost = 1, damping = 0, last_duration = 0;
-        bool first = true, extrapolated = false, finite = true;
+        bool slips = false, first = true, extrapolated = false, finite = true;
     };
 
     const RodModel& rod_;
@@ -209,6 +215,12 @@ private:
             speed = control[0];
             spin = control[1];
         }
+        const double sample = options_.time_step * options_.steps_per_sample;
+        lane.refused = 0;
+        if (lane.inserted + speed * sample < -kOvershoot) {  // after a slip there is less wire to pull back
+            lane.refused = lane.inserted + speed * sample;
+            speed = -lane.inserted / sample;
+        }
         if (speed != lane.speed || spin != lane.spin) lane.last_duration = 0;  // the control changed: do not extrapolate
         lane.speed = speed;
         lane.spin = spin;
@@ -220,9 +232,10 @@ private:
     void begin(int l, bool fresh) {
         Lane& lane = lane_[l];
         const int before = lane.active;
-        lane.start_inserted = lane.inserted + lane.speed * elapsed(lane.tick);
+        lane.start_inserted = lane.inserted - lane.slip + lane.speed * elapsed(lane.tick);
         lane.start_rotation = lane.rotation + lane.spin * elapsed(lane.tick);
-        lane.end_inserted = lane.inserted + lane.speed * elapsed(lane.tick + lane.stride);
+        lane.end_inserted =
+            lane.slips ? lane.start_inserted : lane.inserted - lane.slip + lane.speed * elapsed(lane.tick + lane.stride);
         lane.end_rotation = lane.rotation + lane.spin * elapsed(lane.tick + lane.stride);
         lane.active = count_active(lane.end_inserted);
         for (int i = std::min(before, lane.active); i <= std::max(before, lane.active); ++i)
@@ -482,6 +495,8 @@ int Stepper<V>::advance(int n, const Verdict (&verdict)[W]) {
             lane.tick += lane.stride;
             ++lane.steps;
             lane.last_duration = took;
+            lane.push = get(base_force_, l);
+            if (lane.slips) lane.slip += lane.speed * took;
             const bool whole = lane.tick == kTicks * options_.steps_per_sample;
             if (lane.stride < kTicks && lane.tick % (2 * lane.stride) == 0) lane.stride *= 2;
             if (whole) {
@@ -489,6 +504,9 @@ int Stepper<V>::advance(int n, const Verdict (&verdict)[W]) {
                 if (end_sample(l)) continue;  // the world is done
                 read_control(l);
             }
+            const bool slips = lane.speed > 0 && lane.push > options_.push_limit;
+            if (slips != lane.slips) lane.last_duration = 0;
+            lane.slips = slips;
             set(weight, l, lane.last_duration > 0 ? duration(lane) / lane.last_duration : 0.0);
         } else if (verdict[l] == Verdict::restart) {
             set_mask<V>(restarted, l, true);
@@ -556,11 +574,14 @@ bool Stepper<V>::end_sample(int l) {
     Lane& lane = lane_[l];
     if (lane.sample >= 0) record(l, true);
     const double sample = options_.time_step * options_.steps_per_sample;
-    lane.inserted += lane.speed * sample;
+    lane.inserted += lane.speed * sample - lane.slip;
     lane.rotation += lane.spin * sample;
+    if (lane.sample < 0) lane.approach_slip += lane.slip;
     if (lane.sample == -1) {  // the approach ends exactly at the asked length
-        lane.inserted = in_.initial[2 * lane.world];
+        lane.inserted = in_.initial[2 * lane.world] - lane.approach_slip;
+        out_.approach_slip[lane.world] = lane.approach_slip;
     }
+    lane.slip = 0;
     lane.tick = lane.steps = 0;
     lane.total_iterations = 0;
     if (++lane.sample < in_.samples) return false;
@@ -585,6 +606,7 @@ void Stepper<V>::record(int l, bool valid) {
     out_.base_force[at] = valid ? get(base_force_, l) : 0.0;
     out_.base_torque[at] = valid ? get(base_torque_, l) : 0.0;
     out_.iterations[at] = lane.steps > 0 ? double(lane.total_iterations) / lane.steps : 0.0;
+    out_.slip[at] = valid ? lane.slip + lane.refused : 0.0;
     out_.valid[at] = valid;
     for (int i = 0; i < rod_.nodes && (out_.shape || out_.attitude); ++i) {
         const bool free = i < lane.active;
