@@ -79,6 +79,7 @@ def toy_simulate(anatomy: Anatomy, device, control, *, initial, config, friction
         contact_force_sum=2 * force,
         base_force=force.copy(),
         base_torque=0.1 * force,
+        slip=np.zeros((worlds, samples)),
         iterations=np.ones((worlds, samples)),
         valid=np.ones((worlds, samples), dtype=bool),
     )

@@ -120,7 +120,7 @@ private:
         double push = 0;                                  // N, at the end of the last step
         double start_inserted = 0, start_rotation = 0, end_inserted = 0, end_rotation = 0;
         double energy = 0, slope = 0, scale = 1, shorten = 1, boost = 1, damping = 0, last_duration = 0;
-        bool slips = false, first = true, extrapolated = false, finite = true;
+        bool reduced = false, slips = false, first = true, extrapolated = false, finite = true;
     };
 
     const RodModel& rod_;
@@ -282,7 +282,7 @@ private:
             set(factor, l, lane.scale);
             const double tolerance = ends_sample ? options_.sample_tolerance : options_.tolerance;
             const bool at_rest = size <= options_.tolerance && lane.damping * size <= kAtRest;
-            if (lane.damping > 0 ? at_rest : size <= tolerance) {
+            if (lane.reduced || lane.damping > 0 ? at_rest : size <= tolerance) {
                 verdict[l] = Verdict::converged;
                 set(factor, l, 1.0);
             }
@@ -314,11 +314,15 @@ private:
             lane.scale *= lane.shorten;
             return Verdict::shorten;
         }
-        if (!(get(pivot_, l) > 0)) {  // not positive definite
-            const double damping = get(damping_, l);
+        if (!(get(pivot_, l) > 0)) {  // not positive definite: fewer of the geometric terms
+            const double g = get(geometric_, l), damping = get(damping_, l);
+            lane.energy = energy;
+            if (g > 0) {
+                set(geometric_, l, g > 0.05 ? 0.5 * g : 0.0);
+                return Verdict::repeat;
+            }
             if (damping >= kMostDamping) return Verdict::restart;
             set(damping_, l, std::max(kFirstDamping, 10 * damping));
-            lane.energy = energy;
             return Verdict::repeat;
         }
         lane.energy = energy;
@@ -328,9 +332,10 @@ private:
         lane.boost = damping > 0 && lane.rejections == 0 ? std::min(2 * lane.boost, kMostBoost) : 1.0;
         set(damping_, l, damping > kFirstDamping ? 0.25 * damping : 0.0);
         lane.rejections = 0;
-        lane.first = false;
         set(first_, l, 0.0);
-        set(geometric_, l, 1.0);
+        lane.reduced = get(geometric_, l) < 1.0 && !lane.first;
+        set(geometric_, l, lane.first ? 1.0 : std::min(1.0, std::max(0.25, 2 * get(geometric_, l))));
+        lane.first = false;
         return Verdict::accept;
     }
 

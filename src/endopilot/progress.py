@@ -26,18 +26,24 @@ class Advance(Protocol):
         ...
 
 
+_shown = False
+"""Whether a bar is on the screen."""
+
+
 @contextmanager
 def progress(title: str, total: int | float) -> Iterator[Advance]:
     """Show a bar on standard error while the block runs.
 
-    Standard output stays free for results. Where standard error is no terminal, one line is printed when the
-    work ends, so that logs stay short.
+    Standard output stays free for results. Where standard error is no terminal, one line is printed when work of more
+    than two seconds ends, so that logs stay short. A bar within a bar is not shown.
 
     Args:
         title: what is being done.
         total: number of units of work.
     """
+    global _shown
     console = Console(stderr=True)
+    outermost, _shown = not _shown, True
     bar = Progress(
         TextColumn("{task.description:<28}"),
         BarColumn(),
@@ -47,15 +53,18 @@ def progress(title: str, total: int | float) -> Iterator[Advance]:
         TimeRemainingColumn(),
         TextColumn("{task.fields[remark]}"),
         console=console,
-        disable=not console.is_terminal,
+        disable=not (outermost and console.is_terminal),
     )
-    with bar:
-        task = bar.add_task(title, total=total, remark="")
+    try:
+        with bar:
+            task = bar.add_task(title, total=total, remark="")
 
-        def advance(amount: int | float = 1, remark: str = "") -> None:
-            bar.update(task, advance=amount, remark=remark)
+            def advance(amount: int | float = 1, remark: str = "") -> None:
+                bar.update(task, advance=amount, remark=remark)
 
-        yield advance
-        elapsed = bar.tasks[task].elapsed or 0.0
-    if not console.is_terminal:
+            yield advance
+            elapsed = bar.tasks[task].elapsed or 0.0
+    finally:
+        _shown = not outermost
+    if outermost and not console.is_terminal and elapsed > 2:
         console.print(f"{title}: done in {elapsed:.1f} s", highlight=False)

@@ -61,8 +61,8 @@ def material(tmp_path_factory, anatomy, results):
     write_mask(LumenMask(Volume(inside, *grid), anatomy.insertion), folder / "mask.nii.gz", manifest={})
     write_json(folder / "evaluation" / "metrics.json", evaluate._metrics(results, 0))
     evaluate._write_figures(results, folder / "evaluation" / "figures")
-    curve = [{"epoch": n, "loss": 1.0 / n, "validation_loss": None} for n in (1, 2, 3)]
-    record = {"windows_per_epoch": 640, "seconds": 12.0, "curve": curve}
+    curve = [{"epoch": n, "steps": 20, "loss": 1.0 / n, "validation_loss": None} for n in (1, 2, 3)]
+    record = {"seconds": 12.0, "curve": curve}
     write_json(folder / "run" / "training.json", {"ff": record, "if": record})
     return folder
 

@@ -1,8 +1,9 @@
 """Random navigations of one anatomy that stay inside the vessel that was imaged.
 
 A segmented vessel ends where the scan no longer shows it, not where blood stops: a wire that is pushed against that end
-buckles against a wall that is not there. So where a tip comes to the end of its branch, the drive is stopped short of
-that depth and the navigation is simulated again; its beginning, and so the branch that it takes, stays the same.
+buckles against a wall that is not there. So where a tip comes to the end of its branch, or is caught so firmly that the
+drive slips, the drive is stopped short of that depth and the navigation is simulated again; its beginning, and so the
+branch that it takes, stays the same.
 """
 
 from __future__ import annotations
@@ -99,11 +100,13 @@ def _ends(tree: VesselTree) -> Float[np.ndarray, "branches"]:
 
 
 def _depth_of_end(rollout: Rollout, ends: Float[np.ndarray, "branches"]) -> Float[np.ndarray, "worlds"]:
-    """Return the abscissa of the first end that each world's tip came to, mm; infinity if it came to none."""
+    """Return how deep each world's wire came, mm: the abscissa of the first end that its tip came to, or the inserted
+    length at which the drive first slipped; infinity if it did neither."""
     end: Float[np.ndarray, "worlds samples"] = ends[rollout.tip.branch]
-    came = rollout.tip.abscissa > end - END_MM
-    first = np.argmax(came, axis=1)
-    return np.where(came.any(axis=1), end[np.arange(len(end)), first], np.inf)
+    came, slipped = rollout.tip.abscissa > end - END_MM, rollout.slip != 0
+    depth = np.where(came, end, rollout.inserted_length)
+    first = np.argmax(came | slipped, axis=1)
+    return np.where((came | slipped).any(axis=1), depth[np.arange(len(end)), first], np.inf)
 
 
 def _overwrite(rollout: Any, worlds: Int[np.ndarray, "chosen"], part: Any) -> None:

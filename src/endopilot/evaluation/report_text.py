@@ -190,8 +190,8 @@ def anatomy_facts(anatomy: Anatomy) -> list[tuple[str, str]]:
 def training_budget(record: Mapping[str, Any]) -> str:
     """Return how long the networks were trained, as a sentence."""
     parts = [
-        f"{NETWORK_TITLES[network].lower()} {_count(len(result['curve']), 'epoch')} of "
-        f"{result['windows_per_epoch']:,} windows in {result['seconds']:.0f} s"
+        f"{NETWORK_TITLES[network].lower()} {_count(len(result['curve']), 'epoch')}, in all "
+        f"{sum(epoch['steps'] for epoch in result['curve']):,} steps in {result['seconds']:.0f} s"
         for network, result in record.items()
     ]
     return f"Training: {'; '.join(parts)}. The paper trained for 20 epochs on 80,000 navigations."
