@@ -6,12 +6,10 @@ run is not there stays as it is.
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 
 from endopilot.cli import COMMANDS
-from endopilot.evaluation.metrics import PAPER_ERRORS
 
 ROOT = Path(__file__).parents[1]
 IMAGES = ROOT / "docs" / "images"

@@ -8,12 +8,11 @@ import numpy as np
 
 from endopilot.anatomy.atlas import AtlasConfig, synthesize_one
 from endopilot.anatomy.phantom import PhantomConfig, make_phantom
-from endopilot.imaging.grid import interpolate_like
+from endopilot.imaging.overlap import compare_masks, mask_like
 from endopilot.imaging.picture import draw_overlay
 from endopilot.imaging.sample import fetch_sample
 from endopilot.imaging.segment import SegmentConfig, segment
 from endopilot.imaging.volume import read_mask, read_volume
-from endopilot.types import Volume
 
 IMAGES = Path(__file__).parents[1] / "images"
 SEEDS = ((2.0, -143.0, 543.0), (2.0, -184.0, 657.0))
@@ -28,15 +27,14 @@ def main() -> None:
     draw_overlay(
         volume, mask, IMAGES / "imaging-aorta.png", reference=reference, through=np.array([25.0, -110.0, 700.0])
     )
-    given = reference.volume
-    values = Volume(given.voxels.astype(np.float32), given.spacing_mm, given.origin_mm, given.direction)
-    theirs, ours = interpolate_like(values, volume, outside=0.0) > 0.5, mask.volume.voxels
-    missed, millilitres = theirs & ~ours, float(volume.spacing_mm.prod()) / 1000
-    print(f"Dice {2 * (ours & theirs).sum() / (ours.sum() + theirs.sum()):.3f}")
-    extra = (ours & ~theirs).sum() * millilitres
-    print(f"ours inside theirs {(ours & theirs).sum() / ours.sum():.3f}, the rest {extra:.0f} ml")
+    theirs, ours = mask_like(reference, volume), mask.volume.voxels
+    missed, zs = theirs & ~ours, np.flatnonzero((theirs & ~ours).sum(axis=(1, 2)) > 150)
+    heights = [volume.index_to_world(np.array([0.0, 0.0, z]))[2] for z in (zs[0], zs[-1])]
     low = (volume.voxels[missed] < 130).mean()
-    print(f"cut off {missed.sum() * millilitres:.0f} ml, of which below 130 HU {low:.2f}")
+    print(compare_masks(mask, reference))
+    print(
+        f"of what is cut off {low:.2f} is below 130 HU; most of it lies between z {heights[0]:.0f} and {heights[1]:.0f}"
+    )
     patient = synthesize_one(AtlasConfig(seed=1003), 0)
     phantom = make_phantom(patient, PhantomConfig(), 1003)
     draw_overlay(phantom, segment(phantom, SegmentConfig()), IMAGES / "imaging-coronary.png")

@@ -173,7 +173,7 @@ def run_volume(volume: Path, output: Path, config: RunConfig, *, series: str | N
         volume: DICOM folder or file, NIfTI, NRRD or MHA, in HU.
         output: folder of everything the run makes.
         config: segmentation, device and size of the study.
-        series: series instance UID, where a DICOM folder holds several.
+        series: number or instance UID of the series, where a DICOM folder holds several.
 
     Returns:
         The report's path and the figures of its summary.

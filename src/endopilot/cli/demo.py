@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from endopilot.cli.arguments import show
+from endopilot.cli.arguments import OutputFolder, show
 from endopilot.pipeline import DemoConfig, run_demo
 
 
 def command(
     *,
-    output: Path = Path("runs/demo"),
+    output: OutputFolder = Path("runs/demo"),
     json: bool = False,
     config: DemoConfig = DemoConfig(),
 ) -> None:

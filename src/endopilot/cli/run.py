@@ -26,7 +26,7 @@ def command(
     Args:
         volume: DICOM folder or file, NIfTI, NRRD or MHA, in HU.
         output: folder of everything the run makes; the report is report.html in it.
-        series: series instance UID, where a DICOM folder holds several.
+        series: number or instance UID of the series, where a DICOM folder holds several.
         json: print the figures as JSON.
         config: segmentation, device and size of the study.
     """

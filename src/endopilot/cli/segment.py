@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 
 from tyro.conf import Positional
 
 from endopilot.cli.arguments import OutputFile, existing, show
 from endopilot.files import input_hash, manifest
+from endopilot.imaging.overlap import compare_masks
 from endopilot.imaging.segment import SegmentConfig, segment
-from endopilot.imaging.volume import read_volume, write_mask
+from endopilot.imaging.volume import read_mask, read_volume, write_mask
 
 
 def command(
@@ -18,6 +20,8 @@ def command(
     *,
     output: OutputFile,
     series: str | None = None,
+    reference: Path | None = None,
+    picture: Path | None = None,
     json: bool = False,
     config: SegmentConfig = SegmentConfig(),
 ) -> None:
@@ -28,16 +32,24 @@ def command(
     Args:
         volume: DICOM folder or file, NIfTI, NRRD or MHA, in HU.
         output: the mask: .nii.gz, .nrrd or .mha.
-        series: series instance UID, where a DICOM folder holds several.
+        series: number or instance UID of the series, where a DICOM folder holds several.
+        reference: another mask of the same vessel; how far both agree is printed, and it is red in the picture.
+        picture: PNG of three slices with the mask's outline in green.
         json: print the figures as JSON.
         config: how to segment.
     """
+    other = read_mask(existing(reference)) if reference is not None else None
     ct = read_volume(existing(volume), series=series)
     mask = segment(ct, config)
     write_mask(mask, output, manifest=manifest(config=config, inputs=input_hash(volume)))
     volume_ml = float(mask.volume.voxels.sum() * mask.volume.spacing_mm.prod() / 1000)
     ostium = mask.ostium.position.round(2).tolist() if mask.ostium is not None else None
-    show(
-        {"mask": str(output), "method": mask.method, "lumen_ml": round(volume_ml, 3), "ostium_lps_mm": ostium},
-        as_json=json,
-    )
+    figures = {"mask": str(output), "method": mask.method, "lumen_ml": round(volume_ml, 3), "ostium_lps_mm": ostium}
+    if other is not None:
+        figures |= {name: round(value, 4) for name, value in asdict(compare_masks(mask, other)).items()}
+    if picture is not None:
+        from endopilot.imaging.picture import draw_overlay  # matplotlib is slow to import
+
+        draw_overlay(ct, mask, picture, reference=other)
+        figures["picture"] = str(picture)
+    show(figures, as_json=json)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import sys
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -44,6 +45,7 @@ def command(
     device: str = "workhorse-014",
     controls: Path | None = None,
     shape: bool = False,
+    picture: Path | None = None,
     json: bool = False,
     random: RandomConfig = RandomConfig(),
     config: SimulatorConfig = SimulatorConfig(),
@@ -56,6 +58,7 @@ def command(
         device: name of a shipped device (`endopilot devices`) or a YAML file.
         controls: CSV of scripted proximal velocities; random ones by default.
         shape: record the positions of all nodes too (.npz only).
+        picture: PNG of the vessel and of the first world's wire at the end.
         json: print the figures as JSON.
         random: the random controls.
         config: the rod core.
@@ -72,18 +75,30 @@ def command(
             seed=random.seed,
             max_inserted_length_mm=float(patient.tree.longest_path().abscissa[-1]),
         )
-    rollout = simulate(patient, wire, control, initial=initial, config=config, record_shape=shape)
-    write_rollout(rollout, output)
+    rollout = simulate(
+        patient, wire, control, initial=initial, config=config, record_shape=shape or picture is not None
+    )
+    write_rollout(rollout if shape else replace(rollout, shape=None), output)
     valid = rollout.valid
     figures = {
         "rollout": str(output),
         "worlds": int(valid.shape[0]),
         "samples": int(valid.shape[1]),
         "valid_worlds": int(valid[:, -1].sum()),
+        "slipped_worlds": int((rollout.slip != 0).any(axis=1).sum()),
         "deepest_tip_mm": _largest(rollout.tip.abscissa, valid),
         "largest_contact_force_n": _largest(rollout.contact_force_max, valid),
         "largest_base_force_n": _largest(np.abs(rollout.base_force), valid),
     }
+    if picture is not None:
+        from endopilot.evaluation.scene import visible_wire  # plotly is slow to import
+        from endopilot.evaluation.still import render_still
+
+        missing = render_still(patient, visible_wire(rollout, 0, -1), picture)
+        if missing is None:
+            figures["picture"] = str(picture)
+        else:
+            print(missing, file=sys.stderr)
     show(figures, as_json=json)
 
 

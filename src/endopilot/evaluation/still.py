@@ -89,9 +89,22 @@ def _render(scene: Path, path: Path) -> None:
     centre = np.mean([arrays["vertices"].min(axis=0), arrays["vertices"].max(axis=0)], axis=0)
     plotter.camera_position = [centre + np.array([0.35, -1.0, 0.22]) * size, centre, (0.0, 0.0, 1.0)]
     plotter.reset_camera()
-    plotter.camera.zoom(1.25)
+    plotter.camera.zoom(0.94 / _filled(plotter.camera, np.concatenate([arrays["vertices"], arrays["wire"]])))
     plotter.screenshot(str(path))
     plotter.close()
+
+
+def _filled(camera: Any, points: Float[np.ndarray, "n 3"]) -> float:
+    """Return the share of half the picture's height or width that the farthest of some points takes up."""
+    place, focus = np.array(camera.position), np.array(camera.focal_point)
+    forward = (focus - place) / np.linalg.norm(focus - place)
+    right = np.cross(forward, camera.up)
+    right /= np.linalg.norm(right)
+    offset = points - place
+    depth = offset @ forward
+    height = np.abs(offset @ np.cross(right, forward)) / depth
+    width = np.abs(offset @ right) / depth * SIZE[1] / SIZE[0]
+    return float(max(height.max(), width.max())) / np.tan(np.radians(camera.view_angle) / 2)
 
 
 if __name__ == "__main__":

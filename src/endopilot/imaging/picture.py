@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.files import writing
-from endopilot.imaging.grid import interpolate_like
+from endopilot.imaging.overlap import mask_like
 from endopilot.types import LumenMask, Volume
 
 _WINDOW_HU = (-150.0, 650.0)
@@ -36,9 +36,9 @@ def draw_overlay(
         reference: another mask to compare with, on any grid.
         through: LPS position that the slices pass, mm; by default each passes where the mask's section is largest.
     """
-    outlines = [(_on_grid(mask, volume), "lime")]
+    outlines = [(mask_like(mask, volume), "lime")]
     if reference is not None:
-        outlines.append((_on_grid(reference, volume), "red"))
+        outlines.append((mask_like(reference, volume), "red"))
     figure, axes = plt.subplots(1, 3, figsize=(15, 5.5), facecolor="black", layout="constrained")
     for plot, (name, axis) in zip(axes, _PLANES, strict=True):
         array_axis = 2 - axis
@@ -65,9 +65,3 @@ def draw_overlay(
     with writing(Path(path)) as partial:
         figure.savefig(partial, dpi=110, facecolor="black")
     plt.close(figure)
-
-
-def _on_grid(mask: LumenMask, volume: Volume) -> np.ndarray:
-    inside = mask.volume
-    values = Volume(inside.voxels.astype(np.float32), inside.spacing_mm, inside.origin_mm, inside.direction)
-    return interpolate_like(values, volume, outside=0.0) > 0.5
