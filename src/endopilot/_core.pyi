@@ -24,6 +24,7 @@ class Options:
     most_iterations: int
     free_behind: float
     approach_velocity: float
+    push_limit: float
 
 def make_rod(
     *,

@@ -65,8 +65,8 @@ def lumen_graph(
 
     index = np.rint((points - points.min(axis=0)) / spacing_mm).astype(np.int64) + 1
     shape = index.max(axis=0) + 2
-    key = np.ravel_multi_index(tuple(index.T), tuple(shape))
-    order = np.argsort(key)
+    key = np.asarray(np.ravel_multi_index(tuple(index.T), tuple(shape)))
+    order = np.asarray(np.argsort(key))
     ordered = key[order]
     weight = 1.0 / np.maximum(clearance, 0.1 * spacing_mm) ** 2
     rows, columns, costs = [], [], []

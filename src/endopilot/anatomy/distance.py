@@ -93,7 +93,7 @@ def distance_map_from_surface(surface: Surface, *, spacing_mm: float, band_mm: f
     outside = maximum_filter(inside, size=2 * _NEAR_WALL[0] + 1) & ~inside
     index = np.argwhere(outside)
     values[outside] = -surface.distance(origin + spacing_mm * index[:, ::-1], limit_mm=band_mm)
-    shallow = inside & ~minimum_filter(inside, size=2 * _NEAR_WALL[1] + 1)
+    shallow = inside & ~np.asarray(minimum_filter(inside, size=2 * _NEAR_WALL[1] + 1), dtype=bool)
     index = np.argwhere(shallow)
     values[shallow] = surface.distance(origin + spacing_mm * index[:, ::-1])
     return DistanceMap(values=values, spacing_mm=float(spacing_mm), origin_mm=origin)

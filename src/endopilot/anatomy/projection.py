@@ -47,7 +47,7 @@ def _project(
     first = np.concatenate([[0], np.cumsum([len(line.points) for line in lines])])
     everything = Centerline(*(np.concatenate([getattr(line, name) for line in lines]) for name in _FIELDS))
     owner = np.repeat(np.arange(len(lines)), np.diff(first))
-    _, nearest = KDTree(everything.points).query(points)
+    nearest = np.asarray(KDTree(everything.points).query(points)[1])
     branch = owner[nearest]
     abscissa, offset, radius = _onto_polyline(everything, first[branch], first[branch + 1] - 1, nearest, points)
     contested = _contested(lines, everything, owner)[nearest]
@@ -57,7 +57,7 @@ def _project(
         if len(others) == 0:
             continue
         line, asked = lines[index], points[others]
-        _, start = KDTree(line.points).query(asked)
+        start = np.asarray(KDTree(line.points).query(asked)[1])
         zero = np.zeros(len(others), dtype=int)
         candidate = _onto_polyline(line, zero, zero + len(line.points) - 1, start, asked)
         better = candidate[1] * radius[others] < offset[others] * candidate[2]

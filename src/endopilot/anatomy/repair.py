@@ -6,6 +6,7 @@ Every repair returns remarks, which `extract_anatomy` writes into the provenance
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool
@@ -78,7 +79,7 @@ def closed_surface(surface: Surface, given: Insertion | None, label: str) -> tup
 
     remarks = []
     faces = np.insert(surface.faces, 0, 3, axis=1).ravel()
-    mesh = pyvista.PolyData(surface.vertices, faces).clean().triangulate()
+    mesh: Any = pyvista.PolyData(surface.vertices, faces).clean().triangulate()
     regions = mesh.connectivity(extraction_mode="all")
     ids = np.asarray(regions.point_data["RegionId"])
     if ids.max() > 0:
@@ -156,7 +157,7 @@ def _bridged(
         here = np.argwhere(result)
         reach = KDTree(here)
         for piece in list(members):
-            gap, nearest = reach.query(members[piece], distance_upper_bound=LARGEST_GAP_VOXELS)
+            gap, nearest = map(np.asarray, reach.query(members[piece], distance_upper_bound=LARGEST_GAP_VOXELS))
             best = int(np.argmin(gap))
             if not np.isfinite(gap[best]):
                 continue
@@ -226,7 +227,7 @@ def _from_shell(surface: Surface, label: str) -> Surface:
         wall = binary_closing(shell, iterations=closing) if closing else shell
         inside = binary_fill_holes(wall)
         assert inside is not None
-        core = binary_opening(inside & ~shell)
+        core = np.asarray(binary_opening(inside & ~shell), dtype=bool)
         if core.sum() > 0.5 * shell.sum() / 6:
             volume = Volume(core | (inside & shell), np.full(3, spacing), origin, np.eye(3))
             return surface_from_mask(volume)

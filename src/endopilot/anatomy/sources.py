@@ -112,6 +112,7 @@ def _read_polydata(path: Path) -> Surface | Polylines:
     # Some readers crash or hang on an empty or foreign file; the first bytes tell.
     if path.stat().st_size < 16:
         raise InputError(f"{path}: is empty or truncated; export it again")
+    data: Any
     try:
         with _quiet_vtk():
             data = pyvista.read(path)
@@ -124,7 +125,8 @@ def _read_polydata(path: Path) -> Surface | Polylines:
     if not np.isfinite(data.points).all():
         raise InputError(f"{path}: some coordinates are not finite numbers; export it again")
     if data.n_faces > 0 or data.n_strips > 0:
-        mesh = data.triangulate().clean(lines_to_points=False, polys_to_lines=False, strips_to_polys=False)
+        mesh: Any = data.triangulate()
+        mesh = mesh.clean(lines_to_points=False, polys_to_lines=False, strips_to_polys=False)
         faces = mesh.faces.reshape(-1, 4)[:, 1:] if mesh.n_faces else np.empty((0, 3), dtype=np.int64)
         if len(faces) < 4:
             raise InputError(f"{path}: holds {len(faces)} triangles, too few for a vessel; export it again")

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import SimpleITK as sitk
 from jaxtyping import Float
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from endopilot.anatomy.projection import project_tip
 from endopilot.types import Anatomy, DistanceMap, LumenMask, VesselTree, Volume
@@ -45,11 +45,11 @@ def score_anatomy(mask: LumenMask, extracted: Anatomy, truth: Anatomy) -> Anatom
     """Compare a mask and the anatomy extracted from it with the anatomy that the volume was made of."""
     true_points, true_radius = _sample(truth.tree)
     points, radius = _sample(extracted.tree)
-    distance, nearest = cKDTree(true_points).query(points)
+    distance, nearest = KDTree(true_points).query(points)
     follows = distance <= true_radius[nearest]
     scored = true_radius[nearest] >= SMALLEST_RADIUS_MM
     large = true_radius >= SMALLEST_RADIUS_MM
-    reached = cKDTree(points).query(true_points[large])[0] <= true_radius[large]
+    reached = KDTree(points).query(true_points[large])[0] <= true_radius[large]
     found, missed = reached.sum() + (follows & scored).sum(), (~reached).sum() + (~follows & scored).sum()
     inside = follows & scored
     return AnatomyScore(

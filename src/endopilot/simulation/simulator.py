@@ -243,7 +243,7 @@ def make_lumen(distance_map: DistanceMap, radius_mm: float) -> _core.Lumen:
     coefficients: Float32[np.ndarray, "nz ny nx"] = ndimage.spline_filter(
         np.asarray(distance_map.values, dtype=np.float32),
         order=2,
-        output=np.float32,
+        output=np.float32,  # pyright: ignore[reportArgumentType]
         mode="nearest",  # pyright: ignore[reportArgumentType]
     )
     spacing = float(distance_map.spacing_mm)

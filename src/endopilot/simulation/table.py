@@ -57,7 +57,7 @@ def write_rollout(rollout: Rollout, path: Path) -> None:
         elif path.suffix == ".csv":
             rollout_table(rollout).to_csv(partial, index=False)
         else:
-            columns = {name: column.to_numpy() for name, column in rollout_table(rollout).items()}
+            columns = {str(name): column.to_numpy() for name, column in rollout_table(rollout).items()}
             shapes = {} if rollout.shape is None else {"shape_mm": rollout.shape}
             with partial.open("wb") as stream:
-                np.savez_compressed(stream, **columns, **shapes)
+                np.savez_compressed(stream, **columns, **shapes)  # pyright: ignore[reportArgumentType]
