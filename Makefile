@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
-.PHONY: demo test check docs clean
+.PHONY: demo test check cta readme docs clean
 
 demo: $(INSTALLED)
 	$(BIN)/endopilot demo
@@ -17,6 +17,20 @@ check: $(INSTALLED)
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 	$(BIN)/lint-imports
+
+# The real CT angiogram of the README: segmented from two points, and a J wire driven over the arch.
+CTA := runs/cta-thorax
+cta: $(INSTALLED)
+	mkdir -p $(CTA)
+	volume=$$($(BIN)/endopilot sample cta-thorax) && \
+	$(BIN)/endopilot segment $$volume --method aorta --seeds 2 -143 543 2 -184 657 -o $(CTA)/mask.nii.gz \
+	  --reference $$(dirname $$volume)/seg_aorta.nii.gz --picture $(CTA)/mask.png --json > $(CTA)/segment.json
+	$(BIN)/endopilot anatomy $(CTA)/mask.nii.gz --vessel generic -o $(CTA)/anatomy
+	$(BIN)/endopilot simulate $(CTA)/anatomy --device j-035 --controls docs/examples/over-the-arch.csv \
+	  -o $(CTA)/rollout.csv --picture $(CTA)/wire.png --json > $(CTA)/simulate.json
+
+readme: $(INSTALLED)
+	$(BIN)/python docs/readme.py
 
 docs: $(INSTALLED)
 	$(BIN)/pip install -q -c constraints.txt -e '.[docs]'

@@ -138,7 +138,7 @@ def test_the_papers_errors_stand_beside_ours(page):
 
 def test_losses_are_told_in_words(page):
     assert "New patients, P4: Δtip loses to a baseline" in page.words
-    assert "forward network 3 epochs of 640 windows in 12 s" in page.words
+    assert "forward network 3 epochs, in all 60 steps in 12 s" in page.words
 
 
 def test_how_to_repeat_it(page):

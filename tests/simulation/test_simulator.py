@@ -107,6 +107,26 @@ def test_survives_the_blind_end_and_full_retraction(anatomy: Anatomy) -> None:
     assert rollout.base_force[0, 9] > 0.05
 
 
+def test_the_drive_slips_at_its_push_limit_and_cannot_pull_back_what_it_did_not_push(anatomy: Anatomy) -> None:
+    control = np.zeros((2, 50, 2))
+    control[:, :20, 0], control[:, 25:, 0] = 4.0, -8.0  # 20 s of pushing against the blind end, then out again
+    control[1, 30:, 0] = -0.1
+    initial = np.array([[60.0, 0.0], [60.0, 0.0]])
+    limit_n = 0.5
+    rollout = simulate(anatomy, DEVICE, control, initial=initial, config=SimulatorConfig(push_limit_n=limit_n))
+    assert rollout.valid.all()
+    assert (rollout.slip[:, 12:20] > 0).all()
+    # One step of 0.02 s at 4 mm/s is 0.08 mm, which adds little to the limit; far beyond lies what is not limited.
+    assert limit_n < rollout.base_force.max() < 1.3 * limit_n
+    assert simulate(anatomy, DEVICE, control, initial=initial).base_force.max() > 1.6 * limit_n
+    # Δ is the integral of the control that was made, and what was asked is that and the slip.
+    made = 60.0 + 0.5 * np.cumsum(rollout.control[..., 0], axis=1)
+    np.testing.assert_allclose(rollout.inserted_length, made, atol=1e-9)
+    np.testing.assert_allclose(0.5 * rollout.control[..., 0] + rollout.slip, 0.5 * control[..., 0], atol=1e-12)
+    assert rollout.inserted_length.min() > -1e-9
+    assert rollout.inserted_length[0, -1] == pytest.approx(0.0, abs=1e-9) and (rollout.slip[0, -5:] < 0).all()
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -1,0 +1,33 @@
+"""Runs `endopilot` commands in this process and checks how they end."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from endopilot.cli import main
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> dict[str, Any]:
+    """Run a command with --json and return its figures."""
+    with pytest.raises(SystemExit) as leaving:
+        main([*map(str, arguments), "--json"])
+    captured = capsys.readouterr()
+    assert leaving.value.code == 0, captured.err
+    return json.loads(captured.out)
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
+    """Run a command with bad input: exit code 2, one line on standard error, which is returned, nothing printed."""
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as leaving:
+        main([str(argument) for argument in arguments])
+    captured = capsys.readouterr()
+    assert leaving.value.code == 2, captured.err
+    assert captured.out == ""
+    lines = captured.err.strip().splitlines()
+    assert len(lines) == 1, captured.err
+    return lines[0]

@@ -1,0 +1,112 @@
+"""Bad input at the command line: one line, exit code 2, nothing half-written."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import SimpleITK as sitk
+from command import refused
+
+from endopilot.anatomy.atlas import AtlasConfig, synthesize_one
+from endopilot.anatomy.io import write_anatomy
+from endopilot.imaging.volume import write_mask, write_volume
+from endopilot.types import Insertion, LumenMask, Volume
+
+
+@pytest.fixture(scope="module")
+def patient(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("patient") / "rca"
+    write_anatomy(synthesize_one(AtlasConfig(seed=7), 0), folder)
+    return folder
+
+
+def write_image(array: np.ndarray, path: Path, *, vector: bool = False) -> Path:
+    sitk.WriteImage(sitk.GetImageFromArray(array, isVector=vector), str(path))
+    return path
+
+
+def write_slices(folder: Path, series: str, first: int) -> None:
+    image = sitk.GetImageFromArray(np.zeros((4, 8, 8), dtype=np.int16))
+    writer = sitk.ImageFileWriter()
+    writer.KeepOriginalImageUIDOn()
+    for k in range(4):
+        cut = image[:, :, k]
+        tags = {"0008|0060": "CT", "0020|000e": series, "0020|0013": str(k), "0008|0018": f"{series}.{k}"}
+        tags |= {"0020|0032": f"0\\0\\{k}", "0020|0037": "1\\0\\0\\0\\1\\0", "0028|1052": "-1024", "0028|1053": "1"}
+        for tag, value in tags.items():
+            cut.SetMetaData(tag, value)
+        writer.SetFileName(str(folder / f"{first + k}.dcm"))
+        writer.Execute(cut)
+
+
+def test_volumes(tmp_path, capsys):
+    series = tmp_path / "dicom"
+    series.mkdir()
+    write_slices(series, "1.2.3.1", 0)
+    write_slices(series, "1.2.3.2", 4)
+    four = write_image(np.zeros((3, 6, 6, 6), dtype=np.int16), tmp_path / "four.nii.gz")
+    colour = write_image(np.zeros((6, 6, 6, 3), dtype=np.uint8), tmp_path / "colour.nrrd", vector=True)
+    whole = write_image(np.arange(8000, dtype=np.int16).reshape(20, 20, 20), tmp_path / "whole.nii")
+    truncated = tmp_path / "truncated.nii"
+    truncated.write_bytes(whole.read_bytes()[:9000])
+    for volume, fragment in ((series, "series"), (four, "4"), (colour, "colour"), (truncated, "truncated")):
+        line = refused(capsys, "segment", volume, "-o", tmp_path / "mask.nii.gz")
+        assert volume.name in line and fragment in line.lower(), line
+        assert not list(tmp_path.glob("*mask*"))
+
+
+def test_masks(tmp_path, capsys):
+    grid = (np.ones(3), np.zeros(3), np.eye(3))
+    voxels = np.zeros((30, 30, 30), dtype=bool)
+    write_mask(LumenMask(Volume(voxels, *grid), None), tmp_path / "empty.nrrd", manifest={})
+    voxels[5:25, 10:14, 10:14] = voxels[5:9, 10:25, 10:14] = True
+    ostium = Insertion(np.array([200.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0]))
+    write_mask(LumenMask(Volume(voxels, *grid), ostium), tmp_path / "far.nrrd", manifest={})
+    assert "empty" in refused(capsys, "anatomy", tmp_path / "empty.nrrd", "-o", tmp_path / "anatomy")
+    line = refused(capsys, "anatomy", tmp_path / "far.nrrd", "-o", tmp_path / "anatomy")
+    assert "ostium" in line and "mm" in line
+    assert not (tmp_path / "anatomy").exists()
+
+
+def test_nothing_near_the_seed(tmp_path, capsys):
+    dark = Volume(np.full((40, 40, 40), -80, dtype=np.int16), np.ones(3), np.zeros(3), np.eye(3))
+    write_volume(dark, tmp_path / "dark.nii.gz")
+    seeds = ("--method", "aorta", "--seeds", "20", "20", "20")
+    line = refused(capsys, "segment", tmp_path / "dark.nii.gz", "-o", tmp_path / "mask.nii.gz", *seeds)
+    assert "seed" in line.lower()
+    assert not (tmp_path / "mask.nii.gz").exists()
+
+
+def test_centerline_without_radii(tmp_path, capsys):
+    import pyvista
+
+    line = pyvista.lines_from_points(np.linspace([0, 0, 0], [0, 0, 50.0], 51))
+    line.save(tmp_path / "bare.vtp")
+    assert "radi" in refused(capsys, "anatomy", tmp_path / "bare.vtp", "-o", tmp_path / "anatomy")
+    assert not (tmp_path / "anatomy").exists()
+
+
+def test_wire_and_controls(tmp_path, capsys, patient):
+    device = (Path(__file__).parents[2] / "src/endopilot/simulation/devices/workhorse-014.yaml").read_text()
+    assert "value: 0.36" in device
+    (tmp_path / "thick.yaml").write_text(device.replace("value: 0.36", "value: 9.0", 1))
+    header = "time_s,translation_mm_s,rotation_rad_s\n"
+    (tmp_path / "nan.csv").write_text(header + "0.5,5,0\n1.0,nan,0\n")
+    (tmp_path / "fast.csv").write_text(header + "0.5,5000,0\n")
+    output = ("-o", tmp_path / "rollout.parquet")
+    assert "lumen" in refused(capsys, "simulate", patient, *output, "--device", tmp_path / "thick.yaml")
+    line = refused(capsys, "simulate", patient, *output, "--controls", tmp_path / "nan.csv")
+    assert "nan.csv" in line and "row 3" in line and "translation_mm_s" in line
+    assert "limit" in refused(capsys, "simulate", patient, *output, "--controls", tmp_path / "fast.csv")
+    assert "--sequences" in refused(capsys, "simulate", patient, *output, "--sequences", "0")
+    assert not (tmp_path / "rollout.parquet").exists()
+
+
+def test_a_lumen_too_narrow_for_the_wire(tmp_path, capsys, patient):
+    anatomy = synthesize_one(AtlasConfig(seed=7), 0)
+    narrow = replace(anatomy, catheter_radius_mm=0.1, name="narrow")
+    write_anatomy(narrow, tmp_path / "narrow")
+    assert "catheter" in refused(capsys, "simulate", tmp_path / "narrow", "-o", tmp_path / "rollout.csv")

@@ -1,0 +1,61 @@
+"""The demo, small: killed after its first stages, continued to the report, and then left alone."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+
+SIZE = ("--patients", "3", "--sequences", "6", "--seconds", "25", "--training-seconds", "4")
+STAGES = ["atlas", "phantom", "segmentation", "anatomy", "dataset", "training", "evaluation", "report"]
+
+
+def test_killed_and_started_again_it_ends_with_a_report(tmp_path):
+    folder = tmp_path / "demo"
+    command = [sys.executable, "-m", "endopilot.cli", "demo", "-o", str(folder), *SIZE]
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as first:
+        deadline = time.monotonic() + 300
+        while not (folder / "stages.json").exists():  # written as the first stage ends
+            assert first.poll() is None and time.monotonic() < deadline
+            time.sleep(0.1)
+        time.sleep(2.0)  # in the midst of the second
+        first.send_signal(signal.SIGKILL)
+    assert not (folder / "report.html").exists()
+    before = {path: path.stat().st_mtime_ns for path in (folder / "truth").rglob("*.json")}
+
+    again = subprocess.run([*command, "--json"], capture_output=True, encoding="utf-8", timeout=600)
+    assert again.returncode == 0, again.stderr
+    assert {path: path.stat().st_mtime_ns for path in before} == before  # finished work is not done twice
+
+    report = (folder / "report.html").read_text(encoding="utf-8")
+    for part in ("data:image/png;base64,", "Plotly.newPlot", "Kim et al. 2023", "Safety ratio", "patient-3"):
+        assert part in report
+    manifest = json.loads((folder / "manifest.json").read_text())
+    assert list(manifest["stages"]) == STAGES and min(manifest["stages"].values()) > 0
+    assert abs(manifest["wall_seconds"] - sum(manifest["stages"].values())) < 1e-6
+    metrics = json.loads((folder / "metrics.json").read_text())
+    unseen = metrics["splits"]["test"]
+    assert len(unseen["anatomies"]) == 1 and unseen["episodes"] == 6
+    for series in ("P1", "P3", "P4", "hold_slack", "training_mean"):
+        assert unseen["tip"][series]["abscissa"]["all"]["count"] > 0
+    assert min(score["dice"] for score in metrics["anatomy_scores"].values()) > 0.85
+    partial = [path for path in folder.rglob("*") if path.name.startswith(".part")]
+    assert partial == []
+
+    finished = (folder / "report.html").stat().st_mtime_ns
+    third = subprocess.run([*command, "--json"], capture_output=True, encoding="utf-8", timeout=120)
+    assert third.returncode == 0, third.stderr
+    assert json.loads(third.stdout) == json.loads(again.stdout)
+    assert (folder / "report.html").stat().st_mtime_ns == finished
+
+
+def test_another_size_in_the_same_folder_is_refused(tmp_path):
+    (tmp_path / "stages.json").write_text(
+        json.dumps({"config": {"patients": 6}, "finished": [], "seconds": {}, "rejected": {}})
+    )
+    command = [sys.executable, "-m", "endopilot.cli", "demo", "-o", str(tmp_path), *SIZE]
+    result = subprocess.run(command, capture_output=True, text=True)
+    assert result.returncode == 2
+    assert len(result.stderr.strip().splitlines()) == 1 and "patients" in result.stderr
