@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from endopilot.files import input_hash, json_text, manifest, read_json, write_js
 from endopilot.imaging.segment import SegmentConfig, segment
 from endopilot.imaging.volume import read_mask, read_volume, write_mask, write_volume
 from endopilot.models.config import TrainConfig
+from endopilot.parallel import each
 from endopilot.progress import progress
 from endopilot.simulation.device import Device, read_device
 from endopilot.simulation.simulator import simulate
@@ -120,16 +122,11 @@ class Ledger:
             write_json(self.path, {key: value for key, value in vars(self).items() if key != "path"})
 
     def each(self, title: str, items: Sequence[Path], work: Callable[[Path], None]) -> None:
-        """Do a stage's work for every item under one progress bar; an item whose input is bad is rejected, and told."""
-        with progress(title, len(items)) as advance:
-            for item in items:
-                try:
-                    work(item)
-                except InputError as error:
-                    if len(items) == 1:
-                        raise
-                    self.rejected[item.name] = str(error)
-                advance(remark=item.name)
+        """Do a stage's work for every item; one whose input is bad is rejected, and told, unless it is the only one."""
+        bad = each(title, items, work)
+        if len(items) == 1 and bad:
+            raise bad[items[0]]
+        self.rejected.update({item.name: str(error) for item, error in bad.items()})
 
 
 def run_demo(output: Path, config: DemoConfig) -> dict[str, Any]:
@@ -151,16 +148,8 @@ def run_demo(output: Path, config: DemoConfig) -> dict[str, Any]:
     atlas = AtlasConfig(anatomy="rca", count=config.patients, seed=config.seed)
     truths = [output / "truth" / f"patient-{index + 1}" for index in range(config.patients)]
 
-    def make_patient(folder: Path) -> None:
-        if not folder.exists():
-            write_anatomy(synthesize_one(atlas, truths.index(folder)), folder)
-
-    def make_volume(folder: Path) -> None:
-        path = output / "ct" / f"{folder.name}{VOLUME_SUFFIX}"
-        if not path.exists():
-            seed = config.seed * len(truths) + truths.index(folder)
-            write_volume(make_phantom(read_anatomy(folder), PhantomConfig(), seed), path)
-
+    make_patient = partial(_make_patient, config=atlas, truths=truths)
+    make_volume = partial(_make_volume, output=output, seed=config.seed, truths=truths)
     ledger.stage("atlas", lambda: ledger.each("Synthetic patients", truths, make_patient))
     ledger.stage("phantom", lambda: ledger.each("Synthetic CT angiograms", truths, make_volume))
     volumes = [output / "ct" / f"{folder.name}{VOLUME_SUFFIX}" for folder in truths]
@@ -191,6 +180,32 @@ def run_volume(volume: Path, output: Path, config: RunConfig, *, series: str | N
     return _study(output, [copy], config, config.segmentation, ledger, origin=RUN_ORIGIN, command=command)
 
 
+def _make_patient(folder: Path, *, config: AtlasConfig, truths: Sequence[Path]) -> None:
+    if not folder.exists():
+        write_anatomy(synthesize_one(config, truths.index(folder)), folder)
+
+
+def _make_volume(folder: Path, *, output: Path, seed: int, truths: Sequence[Path]) -> None:
+    path = output / "ct" / f"{folder.name}{VOLUME_SUFFIX}"
+    if not path.exists():
+        seed = seed * len(truths) + truths.index(folder)
+        write_volume(make_phantom(read_anatomy(folder), PhantomConfig(), seed), path)
+
+
+def _make_mask(volume: Path, *, output: Path, config: SegmentConfig) -> None:
+    path = output / "masks" / volume.name
+    if not path.exists():
+        mask = segment(read_volume(volume), config)
+        write_mask(mask, path, manifest=manifest(config=config, inputs=input_hash(volume)))
+
+
+def _make_anatomy(volume: Path, *, output: Path, config: AnatomyConfig) -> None:
+    name = volume.name.removesuffix(VOLUME_SUFFIX)
+    mask, folder = output / "masks" / volume.name, output / "anatomies" / name
+    if mask.exists() and not folder.exists():
+        write_anatomy(extract_anatomy(read_mask(mask), name=name, config=config), folder)
+
+
 def _study(
     output: Path,
     volumes: Sequence[Path],
@@ -204,18 +219,8 @@ def _study(
     """Take volumes to a report: the part that synthetic and real patients share."""
     scheme = segmentation.vessel if segmentation.method == "coronary" else "generic"
 
-    def make_mask(volume: Path) -> None:
-        path = output / "masks" / volume.name
-        if not path.exists():
-            mask = segment(read_volume(volume), segmentation)
-            write_mask(mask, path, manifest=manifest(config=segmentation, inputs=input_hash(volume)))
-
-    def make_anatomy(volume: Path) -> None:
-        name = volume.name.removesuffix(VOLUME_SUFFIX)
-        mask, folder = output / "masks" / volume.name, output / "anatomies" / name
-        if mask.exists() and not folder.exists():
-            write_anatomy(extract_anatomy(read_mask(mask), name=name, config=AnatomyConfig(vessel=scheme)), folder)
-
+    make_mask = partial(_make_mask, output=output, config=segmentation)
+    make_anatomy = partial(_make_anatomy, output=output, config=AnatomyConfig(vessel=scheme))
     ledger.stage("segmentation", lambda: ledger.each("Segmentation", volumes, make_mask))
     ledger.stage("anatomy", lambda: ledger.each("Centerlines and distance maps", volumes, make_anatomy))
     names = [volume.name.removesuffix(VOLUME_SUFFIX) for volume in volumes]

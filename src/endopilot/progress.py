@@ -68,3 +68,9 @@ def progress(title: str, total: int | float) -> Iterator[Advance]:
         _shown = not outermost
     if outermost and not console.is_terminal and elapsed > 2:
         console.print(f"{title}: done in {elapsed:.1f} s", highlight=False)
+
+
+def silence() -> None:
+    """Show no bar from now on: for processes that work under another one's bar."""
+    global _shown
+    _shown = True

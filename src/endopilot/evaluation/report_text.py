@@ -202,9 +202,20 @@ def score_columns(patients: list[dict[str, Any]]) -> list[str]:
     return list(dict.fromkeys(name for patient in patients for name in patient["scores"]))
 
 
+SCORE_TITLES: Mapping[str, str] = {
+    "dice": "Dice",
+    "overlap": "centerline overlap",
+    "inside_accuracy_mm": "centerline error, mm",
+    "radius_mae_mm": "radius error, mm",
+    "ostium_error_mm": "ostium error, mm",
+    "false_length_mm": "false branches, mm",
+}
+"""Headings of the anatomy's scores; others are shown by their names."""
+
+
 def score_title(name: str) -> str:
-    """Return a score's name as a heading: `radius_mae_mm` becomes "radius mae, mm"."""
-    return f"{name.removesuffix('_mm').replace('_', ' ')}, mm" if name.endswith("_mm") else name.replace("_", " ")
+    """Return a score's heading."""
+    return SCORE_TITLES.get(name, name.replace("_", " "))
 
 
 def _mm(series: Mapping[str, Any], coordinate: str) -> str:

@@ -1,0 +1,44 @@
+"""Work on several items at once: bad input is collected, defects are raised, and no process is left behind."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import time
+from pathlib import Path
+
+import pytest
+
+from endopilot.errors import InputError
+from endopilot.parallel import each
+
+
+def write_process(item: Path) -> None:
+    if item.name == "bad":
+        raise InputError(f"{item}: bad; mend it")
+    if item.name == "defect":
+        raise RuntimeError("a defect")
+    item.write_text(str(os.getpid()))
+
+
+def test_every_item_is_worked_on_and_bad_ones_are_told(tmp_path):
+    items = [tmp_path / name for name in ("a", "bad", "c")]
+    bad = each("Test", items, write_process)
+    assert list(bad) == [items[1]] and str(bad[items[1]]).endswith("mend it")
+    assert {item.name for item in tmp_path.iterdir()} == {"a", "c"}
+    if (os.cpu_count() or 1) > 1:
+        assert str(os.getpid()) not in {item.read_text() for item in tmp_path.iterdir()}
+
+
+def test_one_item_is_worked_on_here(tmp_path):
+    assert each("Test", [tmp_path / "a"], write_process) == {}
+    assert (tmp_path / "a").read_text() == str(os.getpid())
+
+
+def test_a_defect_ends_the_work(tmp_path):
+    with pytest.raises(RuntimeError, match="a defect"):
+        each("Test", [tmp_path / "defect", tmp_path / "b"], write_process)
+    deadline = time.monotonic() + 20
+    while multiprocessing.active_children() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not multiprocessing.active_children()
