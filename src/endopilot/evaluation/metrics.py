@@ -22,7 +22,7 @@ PAPER_ERRORS: Mapping[str, Mapping[str, Mapping[str, float]]] = {
 """Mean and SD of the absolute tip error, mm, as Kim et al. publish them (Hamlyn 2023, arXiv 2304.09286)."""
 
 DIVERGED_MM = 2.0
-"""A rollout whose |error of Δtip| passes this, mm, once or more, has diverged."""
+"""A rollout whose absolute error of Δtip passes this, mm, once or more, has diverged."""
 
 OFF_WALL_MM = 0.1
 """A tip with more than this between wire and wall, mm, is off the wall."""
@@ -50,7 +50,7 @@ def span_slices(n_samples: int, sample_period_s: float) -> dict[str, slice]:
 def error_statistics(error: Float[np.ndarray, "episodes samples"]) -> dict[str, float | int | None]:
     """Return the statistics of the absolute error over all finite samples, in the unit of the error.
 
-    `mae` and `sd` are the mean and the standard deviation of |error| (what the paper publishes), `median` and
+    `mae` and `sd` are the mean and the standard deviation of absolute error (what the paper publishes), `median` and
     `p95` its quantiles, `rmse` the root of the mean squared error, `bias` the mean of the signed error, `count`
     the number of samples. Without any finite sample all but `count` are None.
     """
@@ -107,7 +107,7 @@ def bootstrap_mae(
 
 
 def diverged_share(error: Float[np.ndarray, "episodes samples"], lost: Bool[np.ndarray, "episodes samples"]) -> float:
-    """Return the share of sequences whose |error of Δtip| passes `DIVERGED_MM`, or that lost a sample."""
+    """Return the share of sequences whose absolute error of Δtip passes `DIVERGED_MM`, or that lost a sample."""
     large = np.abs(np.nan_to_num(error, nan=0.0)) > DIVERGED_MM
     return float(np.mean((large | lost).any(axis=1)))
 
@@ -179,7 +179,7 @@ def tip_statistics(
 
     Args:
         error: predicted − true Δtip or γtip, mm; NaN where there is nothing to compare.
-        radius: lumen radius at the true tip, mm; `mae_over_radius` is the mean of |error|/radius.
+        radius: lumen radius at the true tip, mm; `mae_over_radius` is the mean of absolute error/radius.
         baselines: errors of the baselines on the same samples, mm, by name.
         anatomy: which anatomy each sequence belongs to.
         sample_period_s: time between samples, s.
