@@ -207,10 +207,10 @@ class TipProjection:
         radius: lumen radius at the projection, mm.
     """
 
-    abscissa: Float[np.ndarray, "*n"]
-    offset: Float[np.ndarray, "*n"]
-    branch: Int[np.ndarray, "*n"]
-    radius: Float[np.ndarray, "*n"]
+    abscissa: Float[np.ndarray, "..."]
+    offset: Float[np.ndarray, "..."]
+    branch: Int[np.ndarray, "..."]
+    radius: Float[np.ndarray, "..."]
 
 
 @dataclass(frozen=True, eq=False)

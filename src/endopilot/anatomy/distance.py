@@ -188,7 +188,7 @@ def smooth_union(
 ) -> Float[np.ndarray, "nz ny nx"]:
     """Return the union of two signed distances (positive inside), with a fillet where their walls cross.
 
-    It is the polynomial smooth maximum max(a, b) + (k − |a − b|)₊² / 4k. Its width k falls with the angle θ between
+    It is the polynomial smooth maximum ``max(a, b) + (k − |a − b|)₊² / 4k``. Its width k falls with the angle θ between
     the two gradients as k = fillet · (1 − cos θ), so that two tubes that carry on into each other do not bulge.
     """
     highest = np.maximum(first, second)

@@ -50,7 +50,7 @@ def span_slices(n_samples: int, sample_period_s: float) -> dict[str, slice]:
 def error_statistics(error: Float[np.ndarray, "episodes samples"]) -> dict[str, float | int | None]:
     """Return the statistics of the absolute error over all finite samples, in the unit of the error.
 
-    `mae` and `sd` are the mean and the standard deviation of absolute error (what the paper publishes), `median` and
+    `mae` and `sd` are mean and standard deviation of the absolute error (what the paper publishes), `median` and
     `p95` its quantiles, `rmse` the root of the mean squared error, `bias` the mean of the signed error, `count`
     the number of samples. Without any finite sample all but `count` are None.
     """
@@ -179,7 +179,7 @@ def tip_statistics(
 
     Args:
         error: predicted − true Δtip or γtip, mm; NaN where there is nothing to compare.
-        radius: lumen radius at the true tip, mm; `mae_over_radius` is the mean of absolute error/radius.
+        radius: lumen radius at the true tip, mm; `mae_over_radius` is the mean of its absolute value over the radius.
         baselines: errors of the baselines on the same samples, mm, by name.
         anatomy: which anatomy each sequence belongs to.
         sample_period_s: time between samples, s.
