@@ -1,0 +1,177 @@
+// The stepper's sweeps over the nodes of all lanes at once: evaluation with elimination, back substitution, update, and
+// the passage to the next step.
+#pragma once
+
+#include "stepper.hpp"
+
+namespace endopilot {
+
+template <class V>
+V Stepper<V>::add_loads(int i, const Node& node, Diagonal<V>& own) const {
+    const Vec3<double>&f = loads_->force[i], &m = loads_->moment[i], &k = loads_->spring[i], &a = loads_->anchor[i];
+    const Vec3<V> off{node.x.x - a.x, node.x.y - a.y, node.x.z - a.z};
+    own.force += Vec3<V>{k.x * off.x - f.x, k.y * off.y - f.y, k.z * off.z - f.z};
+    own.xx.xx += k.x;
+    own.xx.yy += k.y;
+    own.xx.zz += k.z;
+    V energy = 0.5 * (k.x * off.x * off.x + k.y * off.y * off.y + k.z * off.z * off.z);
+    energy -= f.x * node.x.x + f.y * node.x.y + f.z * node.x.z;
+    // A moment's potential is its work since the start of the step: exact once the rod has come to rest.
+    const Quaternion<V> p = relative(node.start_q, node.q);
+    const Vec3<V> b{broadcast<V>(m.x), broadcast<V>(m.y), broadcast<V>(m.z)};
+    energy -= 2.0 * dot(b, p.v);
+    own.moment -= p.w * b + cross(b, p.v);
+    const V bent = 0.5 * dot(b, p.v);
+    own.tt.xx += bent;
+    own.tt.yy += bent;
+    own.tt.zz += bent;
+    const double h = loads_->hold[i];
+    const Quaternion<double>& c = loads_->attitude[i];
+    const Quaternion<V> attitude{broadcast<V>(c.w), {broadcast<V>(c.v.x), broadcast<V>(c.v.y), broadcast<V>(c.v.z)}};
+    const Quaternion<V> r = relative(attitude, node.q);
+    energy += 2.0 * h * dot(r.v, r.v);
+    own.moment += (2.0 * h * r.w) * r.v;
+    own.tt.xx += h;
+    own.tt.yy += h;
+    own.tt.zz += h;
+    return energy;
+}
+
+template <class V>
+void Stepper<V>::evaluate(int n) {
+    const V zero{};
+    energy_ = descent_ = force_max_ = force_sum_ = zero;
+    pivot_ = broadcast<V>(1.0);
+    const Vec3<double> axis = frame(base_.orientation).d3;
+    Diagonal<V> own{}, next;
+    for (int i = 0; i < n; ++i) {
+        Node& node = node_[i];
+        const Mask<V> on = active_ > broadcast<V>(i);
+        const Mask<V> last = active_ == broadcast<V>(i + 1);
+        Coupling<V> coupling;
+        V energy = add_element(rod_, i, geometric_, node.x, node_[i + 1].x, frame(node.q), own, next, coupling);
+        energy += add_joint(rod_, i + 1, geometric_, node.q, node_[i + 1].q, own, next, coupling);
+        const V along = axis.x * next.force.x + axis.y * next.force.y + axis.z * next.force.z;
+        base_force_ = select<V>(last, along, base_force_);
+        base_torque_ = select<V>(last, next.moment.z, base_torque_);
+
+        const Vec3<V> moved = node.x - node.start;
+        const Quaternion<V> turned_by = relative(node.start_q, node.q);
+        if (lumen_) {
+            const Distance<V> d = distance_to_wall(*lumen_, node.x);
+            node.wall = {d.value, d.slope};
+            const Mask<V> sticky = (first_ > zero) & (node.grip.limit > zero) & (d.value < rod_.radius[i] + kReach);
+            energy += add_wall<V>(options_.wall_stiffness, rod_.radius[i], geometric_, sticky, d, own);
+            const Mask<V> clear = d.value >= rod_.radius[i];
+            const V depth = select<V>(clear, zero, rod_.radius[i] - d.value);
+            const V force = select<V>(on, options_.wall_stiffness * depth * square_root(dot(d.slope, d.slope)), zero);
+            force_max_ = maximum(force_max_, force);
+            force_sum_ += force;
+            energy += add_friction(node.grip, eps_, moved, turned_by, own);
+        }
+        if (loads_) energy += add_loads(i, node, own);
+
+        const V drag = rod_.drag[i] * inverse_dt_, spin_drag = rod_.spin_drag[i] * inverse_dt_;
+        energy += 0.5 * drag * dot(moved, moved) + 2.0 * spin_drag * dot(turned_by.v, turned_by.v);
+        const V stiffen = drag + damping_, spin_stiffen = spin_drag + damping_;
+        own.force += drag * moved;
+        own.moment += (2.0 * spin_drag * turned_by.w) * turned_by.v;
+        own.xx.xx += stiffen;
+        own.xx.yy += stiffen;
+        own.xx.zz += stiffen;
+        own.tt.xx += spin_stiffen;
+        own.tt.yy += spin_stiffen;
+        own.tt.zz += spin_stiffen;
+
+        energy_ += select<V>(on, energy, zero);
+        const V pivot = eliminate(own, coupling, factor_[i], next);
+        const V* z = factor_[i].z;
+        descent_ += select<V>(on, z[0] * z[0] + z[1] * z[1] + z[2] * z[2] + z[3] * z[3] + z[4] * z[4] + z[5] * z[5], zero);
+        const Mask<V> sound = pivot > zero;
+        pivot_ = select<V>(on, select<V>(sound, pivot_, zero), pivot_);
+        own = next;
+    }
+}
+
+template <class V>
+V Stepper<V>::solve(int n) {
+    const V zero{};
+    Vec3<V> x{zero, zero, zero}, t{zero, zero, zero};
+    V largest{};
+    for (int i = n - 1; i >= 0; --i) {
+        const Mask<V> on = active_ > broadcast<V>(i);
+        substitute(factor_[i], x, t);
+        x = select(on, x, {zero, zero, zero});
+        t = select(on, t, {zero, zero, zero});
+        factor_[i].z[0] = x.x;
+        factor_[i].z[1] = x.y;
+        factor_[i].z[2] = x.z;
+        factor_[i].z[3] = t.x;
+        factor_[i].z[4] = t.y;
+        factor_[i].z[5] = t.z;
+        const V size = dot(x, x), angle = dot(t, t);
+        const V both = size + angle;
+        largest = largest >= both ? largest : both;  // keeps a NaN of `both`; below, of `largest`
+        largest = select<V>(both == both, largest, both);
+    }
+    return square_root(largest);
+}
+
+template <class V>
+void Stepper<V>::update(int n, const Verdict (&verdict)[W], const V& factor) {
+    Mask<V> accept{}, shorten{}, repeat{};
+    for (int l = 0; l < W; ++l) {
+        set_mask<V>(accept, l, verdict[l] == Verdict::accept || verdict[l] == Verdict::converged);
+        set_mask<V>(shorten, l, verdict[l] == Verdict::shorten);
+        set_mask<V>(repeat, l, verdict[l] == Verdict::repeat);
+    }
+    for (int i = 0; i < n; ++i) {
+        Node& node = node_[i];
+        const Mask<V> on = active_ > broadcast<V>(i);
+        const V* z = factor_[i].z;
+        const Mask<V> take = accept & on, shrink = shorten & on;
+        const Mask<V> moves = take | shrink, keeps = take | (repeat & on);
+        node.from = select(keeps, node.x, node.from);
+        node.from_q = select(keeps, node.q, node.from_q);
+        node.step = select(take, {factor * z[0], factor * z[1], factor * z[2]}, select(shrink, factor * node.step, node.step));
+        node.turn = select(take, {factor * z[3], factor * z[4], factor * z[5]}, select(shrink, factor * node.turn, node.turn));
+        node.x = select(moves, node.from + node.step, node.x);
+        node.q = select(moves, turned(node.from_q, node.turn), node.q);
+    }
+}
+
+// For the lanes in `mask`, makes the converged trial the start of the next step, freezes the walls that friction acts
+// on and sets a new trial by extrapolation; for those in `restart`, goes back to the start of the step.
+template <class V>
+void Stepper<V>::finish_step(int n, Mask<V> mask, Mask<V> restart, const V& weight) {
+    const V zero{}, one = broadcast<V>(1.0);
+    for (int i = 0; i < n; ++i) {
+        Node& node = node_[i];
+        const Mask<V> on = mask & (active_ > broadcast<V>(i));
+        const Mask<V> back = restart & (active_ > broadcast<V>(i));
+        const Quaternion<V> turned_by = relative(node.start_q, node.q);
+        node.last = select(on, node.x - node.start, node.last);
+        node.last_turn = select(on, broadcast<V>(2.0) * turned_by.v, node.last_turn);
+        node.start = select(on, node.x, node.start);
+        node.start_q = select(on, node.q, node.start_q);
+        if (lumen_) {
+            const Vec3<V>& slope = node.wall.slope;
+            const V distance = node.wall.distance + dot(slope, node.step);
+            const V steepness = square_root(dot(slope, slope));
+            const Mask<V> touches = (distance < rod_.radius[i]) & (steepness > 1e-3);
+            const V push = options_.wall_stiffness * (rod_.radius[i] - distance) * steepness;
+            const V inverse = select<V>(touches, one / steepness, zero);
+            const Vec3<V> normal = inverse * slope;
+            const Frame<V> axes = frame(node.start_q);
+            node.grip.limit = select<V>(on, friction_ * select<V>(touches, push, zero), node.grip.limit);
+            node.grip.normal = select(on, normal, node.grip.normal);
+            node.grip.spin = select(on, broadcast<V>(rod_.radius[i]) * cross(normal, axes.d3), node.grip.spin);
+        }
+        node.x = select(on, node.start + weight * node.last, select(back, node.start, node.x));
+        node.q = select(on, turned(node.start_q, weight * node.last_turn), select(back, node.start_q, node.q));
+        node.step = select(on, {zero, zero, zero}, node.step);
+        node.turn = select(on, {zero, zero, zero}, node.turn);
+    }
+}
+
+}  // namespace endopilot
