@@ -8,6 +8,8 @@ import subprocess
 import sys
 import time
 
+from endopilot.files import read_json
+
 SIZE = ("--patients", "3", "--sequences", "6", "--seconds", "25", "--training-seconds", "4")
 STAGES = ["atlas", "phantom", "segmentation", "anatomy", "dataset", "training", "evaluation", "report"]
 
@@ -32,10 +34,10 @@ def test_killed_and_started_again_it_ends_with_a_report(tmp_path):
     report = (folder / "report.html").read_text(encoding="utf-8")
     for part in ("data:image/png;base64,", "Plotly.newPlot", "Kim et al. 2023", "Safety ratio", "patient-3"):
         assert part in report
-    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest = read_json(folder / "manifest.json")
     assert list(manifest["stages"]) == STAGES and min(manifest["stages"].values()) > 0
     assert abs(manifest["wall_seconds"] - sum(manifest["stages"].values())) < 1e-6
-    metrics = json.loads((folder / "metrics.json").read_text())
+    metrics = read_json(folder / "metrics.json")
     unseen = metrics["splits"]["test"]
     assert len(unseen["anatomies"]) == 1 and unseen["episodes"] == 6
     for series in ("P1", "P3", "P4", "hold_slack", "training_mean"):

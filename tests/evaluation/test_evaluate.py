@@ -49,7 +49,7 @@ def evaluated(toy_dataset, tmp_path_factory):
 
 def test_metrics_are_on_disk_as_returned(evaluated):
     folder, metrics = evaluated
-    text = (folder / "evaluation" / "metrics.json").read_text()
+    text = (folder / "evaluation" / "metrics.json").read_text(encoding="utf-8")
     assert "NaN" not in text
     assert json.loads(text)["splits"]["test"]["tip"]["P1"]["abscissa"]["all"]["mae"] == pytest.approx(
         metrics["splits"]["test"]["tip"]["P1"]["abscissa"]["all"]["mae"]

@@ -194,7 +194,11 @@ def _layout() -> dict:
     axes = {f"{name}axis": axis | {"title": {"text": title}} for name, title in zip("xyz", titles, strict=True)}
     return {
         # Seen from the front, as a surgeon stands before the patient: the patient's left is on the right.
-        "scene": {"aspectmode": "data", **axes, "camera": {"eye": {"x": 0.35, "y": -1.75, "z": 0.45}}},
+        "scene": {
+            "aspectmode": "data",
+            **axes,
+            "camera": {"eye": {"x": 0.4, "y": -2.0, "z": 0.5}, "center": {"x": 0, "y": 0, "z": -0.12}},
+        },
         "paper_bgcolor": BACKGROUND,
         "font": {"color": INK, "family": "system-ui, sans-serif"},
         "legend": {"font": {"size": 11}, "x": 0.99, "xanchor": "right", "y": 0.93, "bgcolor": BACKGROUND},
