@@ -36,7 +36,10 @@ def show(figures: Mapping[str, Any], *, as_json: bool) -> None:
         return
     width = max((len(name) for name in figures), default=0)
     for name, value in figures.items():
-        print(f"{name:<{width}}  {_text(value)}")
+        sentences = isinstance(value, list) and any(" " in str(item) for item in value)
+        lines = [str(item) for item in value] if sentences else [_text(value)]
+        for title, line in zip([name, *[""] * len(lines)], lines, strict=False):
+            print(f"{title:<{width}}  {line}")
 
 
 def show_rows(rows: Sequence[Mapping[str, Any]], *, as_json: bool) -> None:
