@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from endopilot import __version__
-from endopilot.anatomy import centerline, polylines, repair
+from endopilot.anatomy import centerline, parent_vessel, polylines, repair
 from endopilot.anatomy.distance import (
     MAXIMUM_GRID_POINTS,
     add_catheter,
@@ -29,6 +29,9 @@ __all__ = ["AnatomyConfig", "extract_anatomy", "read_source"]
 
 SMALLEST_MEAN_RADIUS_MM, LARGEST_MEAN_RADIUS_MM = 0.25, 40.0
 """Vessels that a guidewire enters have mean radii between these; others speak for a wrong unit."""
+
+CORONARY_RADIUS_MM = 1.6
+"""Mean radius of a coronary tree at most: what counts for the grid where a lumen holds a piece of the aorta too."""
 
 SHORTEST_IN_DIAMETERS = 1.5
 """A lumen whose longest path is shorter than this many of its own mean diameters is no vessel."""
@@ -96,10 +99,10 @@ def extract_anatomy(
             distance_map = distance_map_from_spheres(tree, spacing_mm=config.spacing_mm)
         else:
             if isinstance(content, LumenMask):
-                mask, remarks = repair.connected_mask(content.volume, given, label)
+                mask, remarks = repair.connected_mask(content.volume, given, label, config.vessel)
                 surface, finest = surface_from_mask(mask), float(mask.spacing_mm.min())
             else:
-                surface, remarks = repair.closed_surface(content, given, label)
+                surface, remarks = repair.closed_surface(content, given, label, config.vessel)
                 finest = 0.0
             notes += remarks
             advance()
@@ -133,21 +136,27 @@ def _tree(
             f"{label}: the lumen's mean radius is {mean_radius:.3g} mm, which no vessel has; "
             "if the file is in m or cm, use --scale 1000 or --scale 10"
         )
+    if config.vessel != "generic":  # a piece of the aorta in the lumen must not set the scale
+        mean_radius = min(mean_radius, CORONARY_RADIUS_MM)
     extent = np.ptp(surface.vertices, axis=0)
     spacing = max(mean_radius / 5.0, 0.5 * finest_mm, float(np.prod(extent + 2) / MAXIMUM_GRID_POINTS) ** (1 / 3))
     distance_map = distance_map_from_surface(surface, spacing_mm=spacing, band_mm=2 * spacing)
     surface = surface.refined(3.0 * spacing)
     inside = _component(distance_map, given)
-    points = distance_map.origin_mm + spacing * np.argwhere(inside)[:, ::-1]
-    clearance = distance_map.values[inside].astype(float)
+    rule = "widest open end"
+    if given is not None:
+        rule = "given" if config.ostium_mm is not None else "segmentation"
+    elif config.vessel != "generic":
+        given, inside = _beyond_parent(surface, distance_map, inside, config)
+        rule = rule if given is None else "where the vessel leaves the aorta"
+    points, clearance = _grid_points(distance_map, inside)
     if len(points) < 20:
         raise InputError(f"{label}: the lumen is too small to follow ({len(points)} grid points); check the unit")
     if given is None:
-        root, rule = _widest_open_end(distance_map, points, clearance, config), "widest open end"
+        root = _widest_open_end(distance_map, points, clearance, config)
     else:
         points, clearance = _in_front(points, clearance, given)
         root = int(np.linalg.norm(points - given.position, axis=1).argmin())
-        rule = "given" if config.ostium_mm is not None else "segmentation"
     graph = centerline.lumen_graph(points, clearance, spacing, root)
     paths = centerline.trace_branches(graph, minimum_length_mm=config.minimum_branch_length_mm)
     middle = float(np.median(graph.clearance[np.concatenate(paths)]))
@@ -172,9 +181,62 @@ def _component(distance_map: DistanceMap, given: Insertion | None) -> Bool[np.nd
         sizes = np.bincount(labels.ravel())
         sizes[0] = 0
         return labels == sizes.argmax()
-    index = np.argwhere(labels > 0)
+    return _component_at(distance_map, labels > 0, given)
+
+
+def _grid_points(
+    distance_map: DistanceMap, inside: Bool[np.ndarray, "nz ny nx"]
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]:
+    """Return the positions of the grid points of a lumen and their distances to the wall, both in mm."""
+    points = distance_map.origin_mm + distance_map.spacing_mm * np.argwhere(inside)[:, ::-1]
+    return points, distance_map.values[inside].astype(float)
+
+
+def _beyond_parent(
+    surface: Surface, distance_map: DistanceMap, inside: Bool[np.ndarray, "nz ny nx"], config: AnatomyConfig
+) -> tuple[Insertion | None, Bool[np.ndarray, "nz ny nx"]]:
+    """Return the ostium and the lumen beyond it where the lumen holds a piece of the aorta; else None and the lumen.
+
+    The aorta is looked for on a coarser grid: on that of the coronary artery it has millions of points.
+    """
+    if distance_map.values[inside].max(initial=0.0) < parent_vessel.PARENT_RADIUS_MM[0]:
+        return None, inside
+    coarse = distance_map
+    if distance_map.spacing_mm < parent_vessel.GRID_MM:
+        coarse = distance_map_from_surface(surface, spacing_mm=parent_vessel.GRID_MM, band_mm=2 * parent_vessel.GRID_MM)
+    within = _component(coarse, None)
+    points, clearance = _grid_points(coarse, within)
+    usual, root = 0.0, int(clearance.argmax())
+    aorta = clearance.max() > parent_vessel.AORTA_RADIUS_MM
+    if not aorta:  # a bulge: the aorta's stub if it is at the inlet, else an aneurysm
+        root = _widest_open_end(coarse, points, clearance, config)
+    graph = centerline.lumen_graph(points, clearance, coarse.spacing_mm, root)
+    if not aorta:
+        paths = centerline.trace_branches(graph, minimum_length_mm=config.minimum_branch_length_mm)
+        usual = float(np.median(graph.clearance[np.concatenate(paths)]))
+    parent = parent_vessel.parent_region(coarse, within, graph, usual)
+    ostium = None if parent is None else parent_vessel.ostium_beyond(coarse, within, parent, graph, config.vessel)
+    if parent is None or ostium is None:
+        return None, inside
+    index = np.argwhere(inside)
+    places = distance_map.origin_mm + distance_map.spacing_mm * index[:, ::-1]
+    nearest = np.rint((places - coarse.origin_mm) / coarse.spacing_mm).astype(int)[:, ::-1]
+    nearest = np.clip(nearest, 0, np.array(parent.shape) - 1)
+    beyond = inside.copy()
+    beyond[tuple(index.T)] = ~parent[tuple(nearest.T)]
+    return ostium, _component_at(distance_map, beyond, ostium)
+
+
+def _component_at(
+    distance_map: DistanceMap, inside: Bool[np.ndarray, "nz ny nx"], place: Insertion
+) -> Bool[np.ndarray, "nz ny nx"]:
+    """Return the connected part of a lumen nearest to a place."""
+    from scipy.ndimage import label
+
+    labels, _ = label(inside, structure=np.ones((3, 3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
+    index = np.argwhere(inside)
     points = distance_map.origin_mm + distance_map.spacing_mm * index[:, ::-1]
-    nearest = index[np.linalg.norm(points - given.position, axis=1).argmin()]
+    nearest = index[np.linalg.norm(points - place.position, axis=1).argmin()]
     return labels == labels[tuple(nearest)]
 
 

@@ -14,6 +14,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
+from endopilot.anatomy.parent_vessel import COMPARABLE, Vessel, piece_on_side
 from endopilot.anatomy.surface import Surface, surface_from_mask
 from endopilot.errors import InputError
 from endopilot.types import Insertion, Volume
@@ -28,8 +29,12 @@ SMALLEST_PIECE = 12
 """A piece of fewer voxels is noise."""
 
 
-def connected_mask(mask: Volume, given: Insertion | None, label: str) -> tuple[Volume, list[str]]:
+def connected_mask(
+    mask: Volume, given: Insertion | None, label: str, vessel: Vessel = "generic"
+) -> tuple[Volume, list[str]]:
     """Return the one lumen at the ostium, or the largest: gaps of a few voxels bridged, cavities filled, blobs gone.
+
+    Where a mask holds both coronary arteries and no ostium is given, `vessel` decides by the patient's side.
 
     Raises:
         InputError: the mask is empty, a solid block, noise, or touches nothing near the given ostium.
@@ -49,13 +54,19 @@ def connected_mask(mask: Volume, given: Insertion | None, label: str) -> tuple[V
     labels, count = components(voxels, structure=np.ones((3, 3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
     sizes = np.bincount(labels.ravel(), minlength=count + 1)
     sizes[0] = 0
-    main = int(sizes.argmax()) if given is None else _nearest_piece(cropped, labels, sizes, given, label)
     remarks = []
+    if given is None:
+        main, others = _piece_on_side(cropped, labels, sizes, vessel)
+    else:
+        main, others = _nearest_piece(cropped, labels, sizes, given, label), []
     result = labels == main
     if count > 1:
         pieces = [int(piece) for piece in np.argsort(-sizes)[: min(count, 200)] if piece != main]
         result, joined = _bridged(result, labels, [p for p in pieces if sizes[p] >= SMALLEST_PIECE])
         left = count - 1 - joined
+        apart = [piece for piece in others if not result[labels == piece].any()]
+        if apart:
+            remarks.append(_other_pieces(vessel, len(apart)))
         if joined:
             remarks.append(f"{joined} gaps of up to {LARGEST_GAP_VOXELS:g} voxels bridged")
         if left:
@@ -69,8 +80,12 @@ def connected_mask(mask: Volume, given: Insertion | None, label: str) -> tuple[V
     return replace(cropped, voxels=closed), remarks
 
 
-def closed_surface(surface: Surface, given: Insertion | None, label: str) -> tuple[Surface, list[str]]:
+def closed_surface(
+    surface: Surface, given: Insertion | None, label: str, vessel: Vessel = "generic"
+) -> tuple[Surface, list[str]]:
     """Return one closed wall with outward normals: largest piece (or the one at the ostium), holes capped.
+
+    Where a file holds both coronary arteries and no ostium is given, `vessel` decides by the patient's side.
 
     Raises:
         InputError: the holes cannot be closed, or the surface is nowhere near the given ostium.
@@ -79,12 +94,14 @@ def closed_surface(surface: Surface, given: Insertion | None, label: str) -> tup
 
     remarks = []
     faces = np.insert(surface.faces, 0, 3, axis=1).ravel()
-    mesh: Any = pyvista.PolyData(surface.vertices, faces).clean().triangulate()
+    mesh: Any = _without_duplicates(pyvista.PolyData(surface.vertices, faces).clean().triangulate())
     regions = mesh.connectivity(extraction_mode="all")
     ids = np.asarray(regions.point_data["RegionId"])
     if ids.max() > 0:
         if given is None:
-            chosen = _largest_region(regions, ids)
+            chosen, others = _region_on_side(regions, ids, vessel)
+            if others:
+                remarks.append(_other_pieces(vessel, len(others)))
         else:
             chosen = int(ids[np.linalg.norm(regions.points - given.position, axis=1).argmin()])
         mesh = regions.extract_points(ids == chosen, adjacent_cells=False).extract_surface().triangulate().clean()
@@ -187,9 +204,41 @@ def _draw_tube(voxels: np.ndarray, start: np.ndarray, end: np.ndarray, width: fl
     voxels[window] |= gap <= max(width, 1.0)
 
 
-def _largest_region(regions, ids: np.ndarray) -> int:
-    sizes = [np.ptp(regions.points[ids == i], axis=0).prod() for i in range(min(int(ids.max()) + 1, 100))]
-    return int(np.argmax(sizes))
+def _region_on_side(regions, ids: np.ndarray, vessel: Vessel) -> tuple[int, list[int]]:
+    """Return the wanted piece of a surface and the others that are nearly as large, by their boxes' diagonals."""
+    pieces = [regions.points[ids == i] for i in range(min(int(ids.max()) + 1, 100))]
+    sizes = np.array([np.linalg.norm(np.ptp(points, axis=0)) * len(points) ** 0.5 for points in pieces])
+    return piece_on_side(sizes, np.array([points.mean(axis=0) for points in pieces]), vessel)
+
+
+def _piece_on_side(mask: Volume, labels: np.ndarray, sizes: np.ndarray, vessel: Vessel) -> tuple[int, list[int]]:
+    """Return the label of the wanted piece of a mask, and those of the others that are nearly as large."""
+    from scipy.ndimage import center_of_mass
+
+    large = np.flatnonzero(sizes >= COMPARABLE * sizes.max())
+    index = np.array(center_of_mass(labels > 0, labels, large))[:, ::-1]
+    chosen, others = piece_on_side(sizes[large].astype(float), mask.index_to_world(index), vessel)
+    return int(large[chosen]), [int(large[other]) for other in others]
+
+
+def _other_pieces(vessel: Vessel, count: int) -> str:
+    choice = (
+        "the largest was taken: for coronary arteries give --vessel rca or lca"
+        if vessel == "generic"
+        else f"the one on the {vessel.upper()}'s side was taken"
+    )
+    return f"{count} other large pieces lie apart and {choice}; --ostium-mm chooses another"
+
+
+def _without_duplicates(mesh):
+    """Drop triangles that are there twice, as where a surface was exported together with its own copy."""
+    import pyvista
+
+    faces = np.asarray(mesh.faces.reshape(-1, 4)[:, 1:])
+    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    if len(first) == len(faces):
+        return mesh
+    return pyvista.PolyData(np.asarray(mesh.points), np.insert(faces[np.sort(first)], 0, 3, axis=1).ravel())
 
 
 def _capped(mesh):
@@ -200,6 +249,8 @@ def _capped(mesh):
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     _, inverse, uses = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
     rim = edges[uses[inverse.reshape(-1)] == 1]
+    if len(rim) == 0:  # edges that more than two triangles share: no hole, but nothing that a cap closes
+        return mesh
     size = len(points)
     _, hole = connected_components(coo_matrix((np.ones(len(rim)), (rim[:, 0], rim[:, 1])), shape=(size, size)))
     numbers, own = np.unique(hole[rim[:, 0]], return_inverse=True)
