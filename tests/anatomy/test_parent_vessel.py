@@ -59,3 +59,12 @@ def test_surface_exported_twice_is_read_once():
     wall = surface_from_mask(mask.volume)
     anatomy = extract_anatomy(Surface(wall.vertices, np.concatenate([wall.faces, wall.faces])), name="twice")
     assert abs(anatomy.tree.longest_path().abscissa[-1] - 60.0) < 4.0
+
+
+def test_aneurysm_low_in_the_tree_is_not_taken_for_the_aorta():
+    def with_aneurysm(points):
+        return np.maximum(upright(points, 0.0, -24.0), 5.0 - np.linalg.norm(points - [0.0, 0.0, -24.0], axis=-1))
+
+    mask = mask_of(with_aneurysm, HALF_MM, (0.6, 0.6, 0.6))
+    anatomy = extract_anatomy(mask, name="sac", config=AnatomyConfig(vessel="rca"))
+    assert anatomy.provenance["ostium_rule"] == "widest open end"

@@ -210,6 +210,9 @@ def _beyond_parent(
     aorta = clearance.max() > parent_vessel.AORTA_RADIUS_MM
     if not aorta:  # a bulge: the aorta's stub if it is at the inlet, else an aneurysm
         root = _widest_open_end(coarse, points, clearance, config)
+        height = points[:, 2]
+        if height[root] < height.max() - float(np.ptp(height)) / 3:  # the coronary ostia lie high in their trees
+            return None, inside
     graph = centerline.lumen_graph(points, clearance, coarse.spacing_mm, root)
     if not aorta:
         paths = centerline.trace_branches(graph, minimum_length_mm=config.minimum_branch_length_mm)
