@@ -66,7 +66,7 @@ def read_source(path: str | Path, *, label: int | None = None) -> AnatomySource:
         raise InputError(f"{path}: no such file; give a mask, a surface or a centerline")
     lower = path.name.lower()
     if label is not None and not lower.endswith(MASK_SUFFIXES):
-        raise InputError(f"{path}: label={label} was given, but only masks have labels; leave the option out")
+        raise InputError(f"{path}: --label {label} was given, but only masks have labels; leave the option out")
     coordinates: str | None = None
     if lower.endswith(MASK_SUFFIXES):
         from endopilot.imaging.volume import read_mask

@@ -42,8 +42,9 @@ def command(
 
 
 def describe(anatomy: Anatomy) -> dict[str, object]:
-    """Return the figures by which an anatomy is recognised: extent, calibre, ostium."""
-    path = anatomy.tree.longest_path()
+    """Return the figures by which an anatomy is recognised: extent, calibre, ostium, and what was repaired."""
+    path, found = anatomy.tree.longest_path(), anatomy.provenance
+    told = {name: found[name] for name in ("ostium_rule", "notes") if found.get(name)}
     return {
         "branches": len(anatomy.tree.branches),
         "longest_path_mm": round(float(path.abscissa[-1]), 1),
@@ -56,4 +57,5 @@ def describe(anatomy: Anatomy) -> dict[str, object]:
         "ostium_lps_mm": anatomy.insertion.position.round(2).tolist(),
         "insertion_direction": anatomy.insertion.direction.round(3).tolist(),
         "map_spacing_mm": round(anatomy.distance_map.spacing_mm, 3),
+        **told,
     }
