@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Integer
 
 from endopilot import __version__
 from endopilot.anatomy import centerline, parent_vessel, polylines, repair
@@ -181,7 +181,7 @@ def _component(distance_map: DistanceMap, given: Insertion | None) -> Bool[np.nd
         sizes = np.bincount(labels.ravel())
         sizes[0] = 0
         return labels == sizes.argmax()
-    return _component_at(distance_map, labels > 0, given)
+    return _part_at(distance_map, labels, given)
 
 
 def _grid_points(
@@ -199,6 +199,8 @@ def _beyond_parent(
 
     The aorta is looked for on a coarser grid: on that of the coronary artery it has millions of points.
     """
+    from scipy.ndimage import label
+
     if distance_map.values[inside].max(initial=0.0) < parent_vessel.PARENT_RADIUS_MM[0]:
         return None, inside
     coarse = distance_map
@@ -227,17 +229,15 @@ def _beyond_parent(
     nearest = np.clip(nearest, 0, np.array(parent.shape) - 1)
     beyond = inside.copy()
     beyond[tuple(index.T)] = ~parent[tuple(nearest.T)]
-    return ostium, _component_at(distance_map, beyond, ostium)
+    labels, _ = label(beyond, structure=np.ones((3, 3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
+    return ostium, _part_at(distance_map, labels, ostium)
 
 
-def _component_at(
-    distance_map: DistanceMap, inside: Bool[np.ndarray, "nz ny nx"], place: Insertion
+def _part_at(
+    distance_map: DistanceMap, labels: Integer[np.ndarray, "nz ny nx"], place: Insertion
 ) -> Bool[np.ndarray, "nz ny nx"]:
-    """Return the connected part of a lumen nearest to a place."""
-    from scipy.ndimage import label
-
-    labels, _ = label(inside, structure=np.ones((3, 3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
-    index = np.argwhere(inside)
+    """Return the labelled part of a lumen that is nearest to a place."""
+    index = np.argwhere(labels > 0)
     points = distance_map.origin_mm + distance_map.spacing_mm * index[:, ::-1]
     nearest = index[np.linalg.norm(points - place.position, axis=1).argmin()]
     return labels == labels[tuple(nearest)]
