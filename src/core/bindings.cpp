@@ -1,6 +1,7 @@
 // Python bindings: numpy in, numpy out; worlds spread over threads with the interpreter lock released.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/shared_ptr.h>
 
 #include <chrono>
 #include <memory>
@@ -15,6 +16,7 @@ namespace {
 
 template <int Dims>
 using Array = nb::ndarray<const double, nb::ndim<Dims>, nb::c_contig, nb::device::cpu>;
+using Indices = nb::ndarray<const std::int64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Image = nb::ndarray<const float, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
 
 std::vector<double> values(const Array<1>& a) { return {a.data(), a.data() + a.size()}; }
@@ -138,68 +140,188 @@ void run_threads(int threads, const nb::object& progress, const std::atomic<long
     if (interrupted) throw nb::python_error();
 }
 
-nb::dict simulate(const RodModel& rod, const Lumen* lumen, const Loads* loads, const Array<1>& origin,
-                  const Array<1>& orientation, const Options& options, const Array<2>& initial, const Array<3>& control,
-                  const Array<1>& friction, const Array<1>& order, bool record_shape, bool record_attitude, int threads,
-                  int lanes, const nb::object& progress) {
-    const std::size_t worlds = control.shape(0), samples = control.shape(1), n = worlds * samples, nodes = rod.nodes;
-    require(initial.shape(0) == worlds && initial.shape(1) == 2 && control.shape(2) == 2 && friction.size() == worlds &&
-                order.size() == worlds,
-            "initial, control, friction and order must agree in the number of worlds");
-    require(origin.size() == 3 && orientation.size() == 4, "the base needs a position and a quaternion");
-    require(!loads || loads->force.size() == nodes, "loads need one entry a node of the rod");
-    require(options.steps_per_sample >= 1 && options.time_step > 0, "time step and steps per sample must be positive");
-    std::vector<int> sequence;
-    for (std::size_t w = 0; w < worlds; ++w) {
-        const double index = order.data()[w];
-        require(index >= 0 && index < double(worlds), "order must name existing worlds");
-        sequence.push_back(int(index));
+// Many worlds of one device in one lumen.
+class Simulation {
+public:
+    Simulation(RodModel rod, std::shared_ptr<Lumen> lumen, std::shared_ptr<Loads> loads, const Array<1>& origin,
+               const Array<1>& orientation, const Options& options, int worlds)
+        : rod_(std::move(rod)), lumen_(std::move(lumen)), loads_(std::move(loads)), options_(options) {
+        require(worlds >= 1, "a simulation needs at least one world");
+        require(origin.size() == 3 && orientation.size() == 4, "the base needs a position and a quaternion");
+        require(!loads_ || int(loads_->force.size()) == rod_.nodes, "loads need one entry a node of the rod");
+        base_ = {vec3(origin.data()), quaternion(orientation.data())};
+        worlds_.assign(std::size_t(worlds), World(rod_.nodes));
     }
-    Result<double> tip(3 * n), direction(3 * n), force_max(n), force_sum(n), base_force(n), base_torque(n), iterations(n),
-        slip(n), approach_slip(worlds);
-    Result<bool> valid(n);
-    Result<std::uint8_t> reason(worlds);
-    Result<double> shape(record_shape ? 3 * n * nodes : 0), attitude(record_attitude ? 4 * n * nodes : 0);
-    const Inputs in{int(worlds), int(samples), initial.data(), control.data(), friction.data()};
-    const Outputs out{tip.data,         direction.data, force_max.data, force_sum.data,
-                      base_force.data,  base_torque.data, iterations.data, slip.data, valid.data, approach_slip.data, reason.data,
-                      record_shape ? shape.data : nullptr, record_attitude ? attitude.data : nullptr};
-    const Base base{vec3(origin.data()), quaternion(orientation.data())};
-    nb::dict result;
-    result["tip_position"] = tip.array(worlds, samples, 3);
-    result["tip_direction"] = direction.array(worlds, samples, 3);
-    result["contact_force_max"] = force_max.array(worlds, samples);
-    result["contact_force_sum"] = force_sum.array(worlds, samples);
-    result["base_force"] = base_force.array(worlds, samples);
-    result["base_torque"] = base_torque.array(worlds, samples);
-    result["iterations"] = iterations.array(worlds, samples);
-    result["slip"] = slip.array(worlds, samples);
-    result["approach_slip"] = approach_slip.array(worlds);
-    result["valid"] = valid.array(worlds, samples);
-    result["reason"] = reason.array(worlds);
-    nb::object shapes = shape.array(record_shape ? worlds : 0, samples, nodes, 3);
-    nb::object attitudes = attitude.array(record_attitude ? worlds : 0, samples, nodes, 4);
-    if (record_shape) result["shape"] = shapes;
-    if (record_attitude) result["attitude"] = attitudes;
 
-    std::atomic<int> next{0};
-    std::atomic<long> done{0};
-    std::atomic<bool> stop{false};
-    const auto work = [&](auto lane) {
-        using V = decltype(lane);
-        const auto stepper = std::make_unique<Stepper<V>>(rod, lumen, loads, base, options, in, out);
-        stepper->run(sequence, next, done, stop);
-    };
-    run_threads(std::max(1, threads), progress, done, stop, [&] {
-        if (lanes == 1)
-            work(double{});
-        else if (lanes == 8)
-            work(double8{});
-        else
-            work(double4{});
-    });
-    return result;
-}
+    // Puts worlds at the ostium, ready to be pushed to their first inserted length by the next run.
+    void reset(const Indices& index, const Array<2>& initial, const Array<1>& friction, double sample_period) {
+        const std::size_t n = index.size();
+        require(initial.shape(0) == n && initial.shape(1) == 2 && friction.size() == n, "reset needs one row a world");
+        for (std::size_t k = 0; k < n; ++k) {
+            require(index.data()[k] >= 0 && std::size_t(index.data()[k]) < worlds_.size(), "reset names no such world");
+            World& w = worlds_[std::size_t(index.data()[k])];
+            const double depth = initial.data()[2 * k], speed = options_.approach_velocity;
+            std::fill(w.values.begin(), w.values.end(), 0.0);
+            w[World::kInserted] = speed > 0 ? 0.0 : depth;
+            w[World::kRotation] = initial.data()[2 * k + 1];
+            w[World::kApproach] = speed > 0 ? std::ceil(depth / (speed * sample_period)) + 1 : 0.0;
+            w[World::kDepth] = depth;
+            w[World::kFriction] = friction.data()[k];
+            w[World::kStride] = kTicks;
+            lay_straight(w);
+        }
+    }
+
+    nb::dict run(const Array<3>& control, bool force_driven, double time_step, int steps_per_sample, bool record_shape,
+                 bool record_attitude, int threads, int lanes, const nb::object& progress) {
+        const std::size_t worlds = worlds_.size(), samples = control.shape(1), n = worlds * samples, nodes = std::size_t(rod_.nodes);
+        require(control.shape(0) == worlds && control.shape(2) == 2, "control needs two numbers a world and sample");
+        require(steps_per_sample >= 1 && time_step > 0, "time step and steps per sample must be positive");
+        Result<double> inserted(n), rotation(n), tip(3 * n), direction(3 * n), force_max(n), force_sum(n), base_force(n),
+            base_torque(n), drive_force(n), drive_torque(n), iterations(n), slip(n), approach_slip(worlds);
+        Result<bool> valid(n);
+        Result<double> shape(record_shape ? 3 * n * nodes : 0), attitude(record_attitude ? 4 * n * nodes : 0);
+        nb::dict result;
+        result["inserted_length"] = inserted.array(worlds, samples);
+        result["rotation"] = rotation.array(worlds, samples);
+        result["tip_position"] = tip.array(worlds, samples, 3);
+        result["tip_direction"] = direction.array(worlds, samples, 3);
+        result["contact_force_max"] = force_max.array(worlds, samples);
+        result["contact_force_sum"] = force_sum.array(worlds, samples);
+        result["base_force"] = base_force.array(worlds, samples);
+        result["base_torque"] = base_torque.array(worlds, samples);
+        result["drive_force"] = drive_force.array(worlds, samples);
+        result["drive_torque"] = drive_torque.array(worlds, samples);
+        result["iterations"] = iterations.array(worlds, samples);
+        result["slip"] = slip.array(worlds, samples);
+        result["approach_slip"] = approach_slip.array(worlds);
+        result["valid"] = valid.array(worlds, samples);
+        nb::object shapes = shape.array(record_shape ? worlds : 0, samples, nodes, 3);
+        nb::object attitudes = attitude.array(record_attitude ? worlds : 0, samples, nodes, 4);
+        if (record_shape) result["shape"] = shapes;
+        if (record_attitude) result["attitude"] = attitudes;
+
+        const Inputs in{int(samples), steps_per_sample, time_step, force_driven, control.data()};
+        const Outputs out{inserted.data,    rotation.data,    tip.data,          direction.data,    force_max.data,
+                          force_sum.data,   base_force.data,  base_torque.data,  drive_force.data,  drive_torque.data,
+                          iterations.data,  slip.data,        valid.data,        approach_slip.data,
+                          record_shape ? shape.data : nullptr, record_attitude ? attitude.data : nullptr};
+        Crew crew = assemble(in, threads);
+        std::atomic<long> done{0};
+        std::atomic<bool> stop{false};
+        const auto work = [&](auto lane) {
+            using V = decltype(lane);
+            const auto stepper =
+                std::make_unique<Stepper<V>>(rod_, lumen_.get(), loads_.get(), base_, options_, in, out, worlds_);
+            stepper->run(crew, done, stop);
+        };
+        run_threads(std::max(1, threads), progress, done, stop, [&] {
+            if (lanes == 1)
+                work(double{});
+            else
+                work(double4{});
+        });
+        return result;
+    }
+
+    nb::object state() const {
+        const std::size_t width = worlds_[0].values.size();
+        Result<double> all(worlds_.size() * width);
+        for (std::size_t w = 0; w < worlds_.size(); ++w)
+            std::copy(worlds_[w].values.begin(), worlds_[w].values.end(), all.data + w * width);
+        return all.array(worlds_.size(), width);
+    }
+
+    void set_state(const Array<2>& all) {
+        const std::size_t width = worlds_[0].values.size();
+        require(all.shape(0) == worlds_.size() && all.shape(1) == width, "the state has another shape");
+        for (std::size_t w = 0; w < worlds_.size(); ++w)
+            std::copy_n(all.data() + w * width, width, worlds_[w].values.begin());
+    }
+
+    // A number of each world.
+    nb::object scalar(World::Scalar which) const {
+        Result<double> out(worlds_.size());
+        for (std::size_t w = 0; w < worlds_.size(); ++w) out.data[w] = worlds_[w][which];
+        return out.array(worlds_.size());
+    }
+
+    // `size` numbers of each node, from `offset` on; those of nodes that follow the drive from `behind(world, node)`.
+    template <class Behind>
+    nb::object per_node(int offset, int size, const Behind& behind) const {
+        const std::size_t nodes = std::size_t(rod_.nodes);
+        Result<double> out(worlds_.size() * nodes * std::size_t(size));
+        double* to = out.data;
+        for (const World& w : worlds_)
+            for (int i = 0; i < rod_.nodes; ++i, to += size) {
+                if (i < int(w[World::kActive]))
+                    std::copy_n(w.node(i) + offset, size, to);
+                else
+                    behind(w, i, to);
+            }
+        return size == 1 ? out.array(worlds_.size(), nodes) : out.array(worlds_.size(), nodes, size);
+    }
+
+    nb::object positions() const {
+        return per_node(World::kX, 3, [this](const World& w, int i, double* to) {
+            const Vec3<double> x = base_.position(rod_, i, w[World::kInserted]);
+            to[0] = x.x, to[1] = x.y, to[2] = x.z;
+        });
+    }
+
+    nb::object attitudes() const {
+        return per_node(World::kQ, 4, [this](const World& w, int, double* to) {
+            const Quaternion<double> q = base_.attitude(w[World::kRotation]);
+            to[0] = q.w, to[1] = q.v.x, to[2] = q.v.y, to[3] = q.v.z;
+        });
+    }
+
+    nb::object contacts() const {
+        return per_node(World::kForce, 1, [](const World&, int, double* to) { *to = 0.0; });
+    }
+
+    int nodes() const { return rod_.nodes; }
+
+private:
+    RodModel rod_;
+    std::shared_ptr<Lumen> lumen_;
+    std::shared_ptr<Loads> loads_;
+    Base base_;
+    Options options_;
+    std::vector<World> worlds_;
+
+    void lay_straight(World& w) const {
+        const double inserted = w[World::kInserted];
+        const Quaternion<double> q = base_.attitude(w[World::kRotation]);
+        const int active = base_.count_active(rod_, inserted, options_.free_behind);
+        w[World::kActive] = active;
+        for (int i = 0; i < active; ++i) {
+            const Vec3<double> x = base_.position(rod_, i, inserted);
+            double* p = w.node(i);
+            p[World::kX] = x.x, p[World::kX + 1] = x.y, p[World::kX + 2] = x.z;
+            p[World::kQ] = q.w, p[World::kQ + 1] = q.v.x, p[World::kQ + 2] = q.v.y, p[World::kQ + 3] = q.v.z;
+        }
+    }
+
+    // Worlds in the order of their mean inserted length, so that those under way together are of like length.
+    Crew assemble(const Inputs& in, int threads) const {
+        std::vector<double> length, depth;
+        std::vector<int> order;
+        for (std::size_t w = 0; w < worlds_.size(); ++w) {
+            double inserted = worlds_[w][World::kApproach] > 0 ? worlds_[w][World::kDepth] : worlds_[w][World::kInserted], sum = inserted;
+            for (int s = 0; s < in.samples && !in.force_driven; ++s) {
+                inserted += in.control[2 * (w * std::size_t(in.samples) + std::size_t(s))] * in.time_step * in.steps_per_sample;
+                sum += inserted;
+            }
+            depth.push_back(sum);
+            length.push_back(worlds_[w][World::kActive]);
+            order.push_back(int(w));
+        }
+        std::stable_sort(order.begin(), order.end(), [&](int a, int b) { return depth[std::size_t(a)] > depth[std::size_t(b)]; });
+        return Crew(std::move(order), std::move(length), kCrew * std::max(1, threads));
+    }
+    static constexpr int kCrew = 16;  // worlds under way for each thread
+};
 
 }  // namespace
 
@@ -217,19 +339,37 @@ NB_MODULE(_core, module) {
                nb::arg("anchor"), nb::arg("hold"), nb::arg("attitude"));
     nb::class_<Options>(module, "Options")
         .def(nb::init<>())
-        .def_rw("time_step", &Options::time_step)
-        .def_rw("steps_per_sample", &Options::steps_per_sample)
         .def_rw("stick_velocity", &Options::stick_velocity)
         .def_rw("wall_stiffness", &Options::wall_stiffness)
         .def_rw("tolerance", &Options::tolerance)
         .def_rw("sample_tolerance", &Options::sample_tolerance)
         .def_rw("largest_step", &Options::largest_step)
+        .def_rw("largest_jump", &Options::largest_jump)
         .def_rw("most_iterations", &Options::most_iterations)
         .def_rw("free_behind", &Options::free_behind)
         .def_rw("approach_velocity", &Options::approach_velocity)
-        .def_rw("push_limit", &Options::push_limit);
-    module.def("simulate", &simulate, nb::kw_only(), nb::arg("rod"), nb::arg("lumen").none(), nb::arg("loads").none(),
-               nb::arg("origin"), nb::arg("orientation"), nb::arg("options"), nb::arg("initial"), nb::arg("control"),
-               nb::arg("friction"), nb::arg("order"), nb::arg("record_shape"), nb::arg("record_attitude"),
-               nb::arg("threads"), nb::arg("lanes"), nb::arg("progress").none());
+        .def_rw("push_limit", &Options::push_limit)
+        .def_rw("introducer_friction", &Options::introducer_friction)
+        .def_rw("introducer_drag", &Options::introducer_drag);
+    nb::class_<Simulation>(module, "Simulation")
+        .def(nb::init<RodModel, std::shared_ptr<Lumen>, std::shared_ptr<Loads>, const Array<1>&, const Array<1>&, const Options&, int>(),
+             nb::kw_only(), nb::arg("rod"), nb::arg("lumen").none(), nb::arg("loads").none(), nb::arg("origin"),
+             nb::arg("orientation"), nb::arg("options"), nb::arg("worlds"))
+        .def("reset", &Simulation::reset, nb::kw_only(), nb::arg("index"), nb::arg("initial"), nb::arg("friction"), nb::arg("sample_period"))
+        .def("run", &Simulation::run, nb::kw_only(), nb::arg("control"), nb::arg("force_driven"), nb::arg("time_step"),
+             nb::arg("steps_per_sample"), nb::arg("record_shape"), nb::arg("record_attitude"), nb::arg("threads"),
+             nb::arg("lanes"), nb::arg("progress").none())
+        .def("state", &Simulation::state)
+        .def("set_state", &Simulation::set_state, nb::arg("all"))
+        .def("positions", &Simulation::positions)
+        .def("attitudes", &Simulation::attitudes)
+        .def("contacts", &Simulation::contacts)
+        .def_prop_ro("nodes", &Simulation::nodes)
+        .def("inserted_length", [](const Simulation& s) { return s.scalar(World::kInserted); })
+        .def("rotation", [](const Simulation& s) { return s.scalar(World::kRotation); })
+        .def("reason", [](const Simulation& s) { return s.scalar(World::kReason); })
+        .def("base_force", [](const Simulation& s) { return s.scalar(World::kBaseForce); })
+        .def("base_torque", [](const Simulation& s) { return s.scalar(World::kBaseTorque); })
+        .def("drive_force", [](const Simulation& s) { return s.scalar(World::kDriveForce); })
+        .def("drive_torque", [](const Simulation& s) { return s.scalar(World::kDriveTorque); });
 }

@@ -4,11 +4,13 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <cstring>
 #include <limits>
 #include <stdexcept>
 #include <vector>
 
 #include "rod.hpp"
+#include "solve.hpp"
 
 namespace endopilot {
 
@@ -26,6 +28,7 @@ public:
         for (int a = 0; a < 3; ++a) {
             origin_[a] = origin[a];
             bricks_[a] = (size[a] + kEdge - 1) / kEdge;
+            cells_[a] = bricks_[a] * kEdge;
         }
         pool_.assign(2 * kVolume, float(kDeep));  // brick 0: deep inside, brick 1: outside
         std::fill(pool_.begin() + kVolume, pool_.end(), std::numeric_limits<float>::quiet_NaN());
@@ -56,37 +59,30 @@ public:
                         pool_.insert(pool_.end(), brick.begin(), brick.end());
                     }
                 }
+        pool_.push_back(0.0f);  // rows are read four at a time
     }
 
     std::size_t bytes() const { return pool_.size() * sizeof(float) + index_.size() * sizeof(std::int32_t); }
 
-    // The first coefficient of the 3³ stencil around a point, and the point's place in the middle cell (-1/2..1/2).
-    const float* stencil(const double (&point)[3], double (&t)[3]) const {
-        int cell[3];
-        bool outside = false;
-        for (int a = 0; a < 3; ++a) {
-            const double u = (point[a] - origin_[a]) * inverse_spacing_;
-            const double nearest = std::floor(u + 0.5);
-            t[a] = u - nearest;
-            // written so that a NaN counts as outside
-            const bool inside = nearest >= 0.0 && nearest < double(bricks_[a] * kEdge);
-            outside = outside || !inside;
-            cell[a] = inside ? int(nearest) : 0;
-        }
-        const std::size_t at = (std::size_t(cell[2] / kEdge) * bricks_[1] + cell[1] / kEdge) * bricks_[0] + cell[0] / kEdge;
-        const std::int32_t brick = outside ? 1 : index_[at];
-        return &pool_[std::size_t(brick) * kVolume +
-                      std::size_t((cell[2] % kEdge) * kStored + cell[1] % kEdge) * kStored + cell[0] % kEdge];
+    // The first coefficient of the 3³ stencil around the cell with whole-numbered coordinates (x, y, z).
+    const float* stencil(double x, double y, double z) const {
+        // written so that a NaN counts as outside
+        const bool inside = x >= 0.0 && x < cells_[0] && y >= 0.0 && y < cells_[1] && z >= 0.0 && z < cells_[2];
+        if (!inside) return &pool_[kVolume];
+        const unsigned i = unsigned(int(x)), j = unsigned(int(y)), k = unsigned(int(z));
+        const std::size_t at = (std::size_t(k / kEdge) * bricks_[1] + j / kEdge) * bricks_[0] + i / kEdge;
+        return &pool_[std::size_t(index_[at]) * kVolume + ((k % kEdge) * kStored + j % kEdge) * kStored + i % kEdge];
     }
 
     bool deep(const float* stencil) const { return stencil < pool_.data() + kVolume; }
 
     double inverse_spacing() const { return inverse_spacing_; }
+    double origin(int axis) const { return origin_[axis]; }
 
     static constexpr double kDeep = 1e3;
 
 private:
-    double origin_[3], inverse_spacing_;
+    double origin_[3], inverse_spacing_, cells_[3];
     int bricks_[3];
     std::vector<std::int32_t> index_;
     std::vector<float> pool_;
@@ -99,79 +95,87 @@ struct Distance {
     Sym3<V> curve;   // its Hessian, 1/mm
 };
 
-// One coefficient per lane.
+// Three neighbouring coefficients per lane, starting at `offset`.
 template <class V>
-inline V gather(const float* const (&from)[kWidth<V>], int offset) {
-    if constexpr (kWidth<V> == 1)
-        return from[0][offset];
-    else if constexpr (kWidth<V> == 4)
-        return V{from[0][offset], from[1][offset], from[2][offset], from[3][offset]};
-    else
-        return V{from[0][offset], from[1][offset], from[2][offset], from[3][offset],
-                 from[4][offset], from[5][offset], from[6][offset], from[7][offset]};
+[[gnu::always_inline]] inline void gather(const float* const (&from)[kWidth<V>], int offset, V (&c)[3]) {
+    if constexpr (kWidth<V> == 4) {  // four rows of four floats, transposed
+        typedef float float4 __attribute__((vector_size(16)));
+        float4 row[4];
+        for (int lane = 0; lane < 4; ++lane) std::memcpy(&row[lane], from[lane] + offset, sizeof(float4));
+        const float4 low01 = __builtin_shufflevector(row[0], row[1], 0, 4, 1, 5);
+        const float4 low23 = __builtin_shufflevector(row[2], row[3], 0, 4, 1, 5);
+        const float4 high01 = __builtin_shufflevector(row[0], row[1], 2, 6, 3, 7);
+        const float4 high23 = __builtin_shufflevector(row[2], row[3], 2, 6, 3, 7);
+        c[0] = __builtin_convertvector(__builtin_shufflevector(low01, low23, 0, 1, 4, 5), V);
+        c[1] = __builtin_convertvector(__builtin_shufflevector(low01, low23, 2, 3, 6, 7), V);
+        c[2] = __builtin_convertvector(__builtin_shufflevector(high01, high23, 0, 1, 4, 5), V);
+    } else {
+        for (int i = 0; i < 3; ++i)
+            for (int lane = 0; lane < kWidth<V>; ++lane) set(c[i], lane, double(from[lane][offset + i]));
+    }
 }
 
 // The spline, its gradient and its Hessian at one point per lane. Outside the map the value is NaN, which makes the
 // line search step back.
 template <class V>
-inline Distance<V> distance_to_wall(const Lumen& lumen, const Vec3<V>& x) {
+[[gnu::noinline]] Distance<V> distance_to_wall(const Lumen& lumen, const Vec3<V>& x) {
     constexpr int W = kWidth<V>;
+    // Adding 1.5 · 2^52 rounds to whole numbers: the stencil's middle cell, and the place in it (-1/2..1/2).
+    constexpr double kRound = 6755399441055744.0;
+    const double s = lumen.inverse_spacing(), ss = s * s;
+    const Vec3<V> u{s * (x.x - lumen.origin(0)), s * (x.y - lumen.origin(1)), s * (x.z - lumen.origin(2))};
+    const Vec3<V> cell{(u.x + kRound) - kRound, (u.y + kRound) - kRound, (u.z + kRound) - kRound};
+    const Vec3<V> t = u - cell;
     const float* first[W];
-    Vec3<V> t;
     bool all_deep = true;
     for (int lane = 0; lane < W; ++lane) {
-        double place[3];
-        first[lane] = lumen.stencil({get(x.x, lane), get(x.y, lane), get(x.z, lane)}, place);
-        set(t.x, lane, place[0]);
-        set(t.y, lane, place[1]);
-        set(t.z, lane, place[2]);
+        first[lane] = lumen.stencil(get(cell.x, lane), get(cell.y, lane), get(cell.z, lane));
         all_deep = all_deep && lumen.deep(first[lane]);
     }
     if (all_deep) return {broadcast<V>(Lumen::kDeep), {V{}, V{}, V{}}, {V{}, V{}, V{}, V{}, V{}, V{}}};
 
-    const auto weights = [](const V& s, V (&w)[3], V (&d)[3]) {
-        const V left = 0.5 - s, right = 0.5 + s;
+    const auto weights = [](const V& p, V (&w)[3], V (&d)[3]) {
+        const V left = 0.5 - p, right = 0.5 + p;
         w[0] = 0.5 * left * left;
-        w[1] = 0.75 - s * s;
+        w[1] = 0.75 - p * p;
         w[2] = 0.5 * right * right;
         d[0] = -left;
-        d[1] = -2.0 * s;
+        d[1] = -2.0 * p;
         d[2] = right;
     };
     V wx[3], wy[3], wz[3], dx[3], dy[3], dz[3];
     weights(t.x, wx, dx);
     weights(t.y, wy, dy);
     weights(t.z, wz, dz);
-    constexpr double second[3] = {1.0, -2.0, 1.0};
 
     V f{}, fx{}, fy{}, fz{}, fxx{}, fyy{}, fzz{}, fxy{}, fxz{}, fyz{};
-    for (int k = 0; k < 3; ++k) {
-        V g{}, gx{}, gy{}, gxx{}, gxy{}, gyy{};
-        for (int j = 0; j < 3; ++j) {
+    unroll<0, 3>([&](auto k_) {
+        constexpr int k = decltype(k_)::value;
+        V h[3], hx[3], hxx[3];
+        unroll<0, 3>([&](auto j_) {
+            constexpr int j = decltype(j_)::value;
             V c[3];
-            for (int i = 0; i < 3; ++i) c[i] = gather<V>(first, (k * Lumen::kStored + j) * Lumen::kStored + i);
-            const V h = wx[0] * c[0] + wx[1] * c[1] + wx[2] * c[2];
-            const V hx = dx[0] * c[0] + dx[1] * c[1] + dx[2] * c[2];
-            const V hxx = c[0] - 2.0 * c[1] + c[2];
-            g += wy[j] * h;
-            gx += wy[j] * hx;
-            gxx += wy[j] * hxx;
-            gy += dy[j] * h;
-            gxy += dy[j] * hx;
-            gyy += second[j] * h;
-        }
+            gather<V>(first, (k * Lumen::kStored + j) * Lumen::kStored, c);
+            h[j] = wx[0] * c[0] + wx[1] * c[1] + wx[2] * c[2];
+            hx[j] = dx[0] * c[0] + dx[1] * c[1] + dx[2] * c[2];
+            hxx[j] = (c[0] + c[2]) - 2.0 * c[1];
+        });
+        const auto along = [](const V (&w)[3], const V (&v)[3]) { return w[0] * v[0] + w[1] * v[1] + w[2] * v[2]; };
+        const V g = along(wy, h), gx = along(wy, hx), gy = along(dy, h);
         f += wz[k] * g;
-        fx += wz[k] * gx;
-        fxx += wz[k] * gxx;
-        fy += wz[k] * gy;
-        fxy += wz[k] * gxy;
-        fyy += wz[k] * gyy;
         fz += dz[k] * g;
+        fx += wz[k] * gx;
         fxz += dz[k] * gx;
+        fy += wz[k] * gy;
         fyz += dz[k] * gy;
-        fzz += second[k] * g;
-    }
-    const double s = lumen.inverse_spacing(), ss = s * s;
+        fxx += wz[k] * along(wy, hxx);
+        fxy += wz[k] * along(dy, hx);
+        fyy += wz[k] * ((h[0] + h[2]) - 2.0 * h[1]);
+        if constexpr (k == 1)
+            fzz -= 2.0 * g;
+        else
+            fzz += g;
+    });
     return {f, {s * fx, s * fy, s * fz}, {ss * fxx, ss * fyy, ss * fzz, ss * fxy, ss * fxz, ss * fyz}};
 }
 

@@ -9,23 +9,41 @@
 namespace endopilot {
 
 struct Options {
-    double time_step;          // s
-    int steps_per_sample;
     double stick_velocity;     // slip velocity below which friction falls off, mm/s
     double wall_stiffness;     // N/mm
     double tolerance;          // largest displacement of a last Newton step, mm (rotations: rad)
     double sample_tolerance;   // the same for the step that ends a sample, whose forces are recorded
     double largest_step;       // displacement that one Newton step is clamped to, mm (rotations: rad)
+    double largest_jump;       // motion of a node in a time step beyond the drive's, mm (rotations: rad); the step is shortened
     int most_iterations;       // for one step; then the step is halved, and the shortest may take kPatience times as many
     double free_behind;        // nodes farther behind the ostium than this follow the drive, mm
-    double approach_velocity;  // at which a wire is brought to its first inserted length, mm/s
+    double approach_velocity;  // at which a wire is brought to its first inserted length, mm/s; 0: it is put there, straight
     double push_limit;         // the drive slips rather than push the wire harder than this, N
+    double introducer_friction;  // Coulomb friction of the introducer's valve, N
+    double introducer_drag;      // its viscous drag, N s/mm
 };
 
-// The guiding catheter: wire enters at `origin` along the third director of `orientation`.
+// The guiding catheter: wire enters at `origin` along the third director of `orientation`. Nodes more than a little
+// behind the origin follow the drive exactly.
 struct Base {
     Vec3<double> origin;
     Quaternion<double> orientation;
+
+    // Where node i of a wire of some inserted length lies if it follows the drive.
+    Vec3<double> position(const RodModel& rod, int i, double inserted) const {
+        return origin + (inserted - rod.abscissa[i]) * frame(orientation).d3;
+    }
+
+    Quaternion<double> attitude(double rotation) const {
+        return orientation * Quaternion<double>{std::cos(0.5 * rotation), {0, 0, std::sin(0.5 * rotation)}};
+    }
+
+    // Nodes that do not follow the drive: those from the tip to `free_behind` mm behind the origin.
+    static int count_active(const RodModel& rod, double inserted, double free_behind) {
+        int n = 1;
+        while (n < rod.nodes - 2 && inserted - rod.abscissa[n] > -free_behind) ++n;
+        return n;
+    }
 };
 
 // Dead loads and springs for verification: arrays of one entry a node, or of an element where they act on rotations.
@@ -38,11 +56,12 @@ struct Loads {
     std::vector<Quaternion<double>> attitude;
 };
 
+// What one call asks of all worlds: samples of equal length, each with one control a world.
 struct Inputs {
-    int worlds, samples;
-    const double* initial;    // worlds × 2: inserted length mm, rotation rad
-    const double* control;    // worlds × samples × 2: mm/s, rad/s
-    const double* friction;   // worlds
+    int samples, steps_per_sample;
+    double time_step;         // s
+    bool force_driven;        // controls are an axial force and a torque on the wire, not velocities
+    const double* control;    // worlds × samples × 2: mm/s and rad/s, or N and N mm
 };
 
 enum Reason : std::uint8_t { kFine = 0, kNotFinite = 1, kNotConverged = 2 };
@@ -50,10 +69,14 @@ enum Reason : std::uint8_t { kFine = 0, kNotFinite = 1, kNotConverged = 2 };
 // Arrays of worlds × samples (× 3, × nodes × 3). `slip` is the advance (mm) that was asked for and not made, and
 // `approach_slip` that before the first sample.
 struct Outputs {
-    double *tip_position, *tip_direction, *force_max, *force_sum, *base_force, *base_torque, *iterations, *slip;
+    double *inserted, *rotation;                 // mm, rad
+    double *tip_position, *tip_direction;        // mm, unit vector
+    double *force_max, *force_sum;               // of the wall on a node, N
+    double *base_force, *base_torque;            // of the wire on the drive's side of the catheter, N, N mm
+    double *drive_force, *drive_torque;          // of the drive, which also moves the wire through the introducer, N, N mm
+    double *iterations, *slip;
     bool* valid;
     double* approach_slip;    // worlds
-    std::uint8_t* reason;     // worlds
     double* shape;            // may be null
     double* attitude;         // may be null: worlds × samples × nodes × 4, quaternions w x y z
 };

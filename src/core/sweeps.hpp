@@ -40,7 +40,7 @@ V Stepper<V>::add_loads(int i, const Node& node, Diagonal<V>& own) const {
 template <class V>
 void Stepper<V>::evaluate(int n) {
     const V zero{};
-    energy_ = descent_ = force_max_ = force_sum_ = zero;
+    energy_ = descent_ = jump_ = zero;
     pivot_ = broadcast<V>(1.0);
     const Vec3<double> axis = frame(base_.orientation).d3;
     Diagonal<V> own{}, next;
@@ -57,22 +57,19 @@ void Stepper<V>::evaluate(int n) {
 
         const Vec3<V> moved = node.x - node.start;
         const Quaternion<V> turned_by = relative(node.start_q, node.q);
+        const V way = dot(moved, moved), swing = dot(turned_by.v, turned_by.v);
+        jump_ = select<V>(on, maximum<V>(jump_, maximum<V>(way_ * way, swing_ * swing)), jump_);
         if (lumen_) {
             const Distance<V> d = distance_to_wall(*lumen_, node.x);
             node.wall = {d.value, d.slope};
             const Mask<V> sticky = (first_ > zero) & (node.grip.limit > zero) & (d.value < rod_.radius[i] + kReach);
             energy += add_wall<V>(options_.wall_stiffness, rod_.radius[i], geometric_, sticky, d, own);
-            const Mask<V> clear = d.value >= rod_.radius[i];
-            const V depth = select<V>(clear, zero, rod_.radius[i] - d.value);
-            const V force = select<V>(on, options_.wall_stiffness * depth * square_root(dot(d.slope, d.slope)), zero);
-            force_max_ = maximum(force_max_, force);
-            force_sum_ += force;
             energy += add_friction(node.grip, eps_, moved, turned_by, own);
         }
         if (loads_) energy += add_loads(i, node, own);
 
         const V drag = rod_.drag[i] * inverse_dt_, spin_drag = rod_.spin_drag[i] * inverse_dt_;
-        energy += 0.5 * drag * dot(moved, moved) + 2.0 * spin_drag * dot(turned_by.v, turned_by.v);
+        energy += 0.5 * drag * way + 2.0 * spin_drag * swing;
         const V stiffen = drag + damping_, spin_stiffen = spin_drag + damping_;
         own.force += drag * moved;
         own.moment += (2.0 * spin_drag * turned_by.w) * turned_by.v;
@@ -84,39 +81,51 @@ void Stepper<V>::evaluate(int n) {
         own.tt.zz += spin_stiffen;
 
         energy_ += select<V>(on, energy, zero);
-        const V pivot = eliminate(own, coupling, factor_[i], next);
-        const V* z = factor_[i].z;
-        descent_ += select<V>(on, z[0] * z[0] + z[1] * z[1] + z[2] * z[2] + z[3] * z[3] + z[4] * z[4] + z[5] * z[5], zero);
-        const Mask<V> sound = pivot > zero;
+        const Elimination<V> eliminated = eliminate(own, coupling, factor_[i], next);
+        descent_ += select<V>(on, eliminated.descent, zero);
+        const Mask<V> sound = eliminated.smallest_pivot > zero;
         pivot_ = select<V>(on, select<V>(sound, pivot_, zero), pivot_);
+        if (in_.force_driven) {
+            const V pull = axis.x * next.force.x + axis.y * next.force.y + axis.z * next.force.z;
+            const Vec3<V> stiff = next.xx * Vec3<V>{broadcast<V>(axis.x), broadcast<V>(axis.y), broadcast<V>(axis.z)};
+            pull_a_ = select<V>(last, pull, pull_a_);
+            pull_r_ = select<V>(last, next.moment.z, pull_r_);
+            stiff_aa_ = select<V>(last, axis.x * stiff.x + axis.y * stiff.y + axis.z * stiff.z, stiff_aa_);
+            stiff_ar_ = select<V>(last, axis.x * next.tx[2][0] + axis.y * next.tx[2][1] + axis.z * next.tx[2][2], stiff_ar_);
+            stiff_rr_ = select<V>(last, next.tt.zz, stiff_rr_);
+        }
         own = next;
     }
 }
 
+// Back substitution. Returns the largest displacement (mm) or rotation (rad) of a node; NaN where the solve failed.
 template <class V>
 V Stepper<V>::solve(int n) {
     const V zero{};
-    Vec3<V> x{zero, zero, zero}, t{zero, zero, zero};
-    V largest{};
+    const Vec3<double> axis = frame(base_.orientation).d3;
+    const Vec3<V> drive_x{axis.x * drive_a_, axis.y * drive_a_, axis.z * drive_a_}, drive_t{zero, zero, drive_r_};
+    Vec3<V> x = drive_x, t = drive_t;
+    V largest = drive_a_ * drive_a_ + drive_r_ * drive_r_;
     for (int i = n - 1; i >= 0; --i) {
         const Mask<V> on = active_ > broadcast<V>(i);
         substitute(factor_[i], x, t);
-        x = select(on, x, {zero, zero, zero});
-        t = select(on, t, {zero, zero, zero});
+        x = select(on, x, drive_x);  // the base of a shorter wire follows its drive
+        t = select(on, t, drive_t);
         factor_[i].z[0] = x.x;
         factor_[i].z[1] = x.y;
         factor_[i].z[2] = x.z;
         factor_[i].z[3] = t.x;
         factor_[i].z[4] = t.y;
         factor_[i].z[5] = t.z;
-        const V size = dot(x, x), angle = dot(t, t);
-        const V both = size + angle;
+        const V both = dot(x, x) + dot(t, t);
         largest = largest >= both ? largest : both;  // keeps a NaN of `both`; below, of `largest`
         largest = select<V>(both == both, largest, both);
     }
     return square_root(largest);
 }
 
+// Moves each lane's trial point as its verdict says: by `factor` times Newton's step where that is accepted, back to
+// `factor` times its last move where that is shortened.
 template <class V>
 void Stepper<V>::update(int n, const Verdict (&verdict)[W], const V& factor) {
     Mask<V> accept{}, shorten{}, repeat{};
@@ -137,6 +146,18 @@ void Stepper<V>::update(int n, const Verdict (&verdict)[W], const V& factor) {
         node.turn = select(take, {factor * z[3], factor * z[4], factor * z[5]}, select(shrink, factor * node.turn, node.turn));
         node.x = select(moves, node.from + node.step, node.x);
         node.q = select(moves, turned(node.from_q, node.turn), node.q);
+    }
+    for (int l = 0; l < W; ++l) {
+        Lane& lane = lane_[l];
+        if (!lane.by_force || lane.world < 0) continue;
+        const double f = get(factor, l);
+        const bool takes = verdict[l] == Verdict::accept || verdict[l] == Verdict::converged;
+        if (takes || verdict[l] == Verdict::repeat) lane.from = lane.end;
+        if (takes) lane.move = {f * get(drive_a_, l), f * get(drive_r_, l)};
+        if (verdict[l] == Verdict::shorten) lane.move = {f * lane.move.advance, f * lane.move.rotation};
+        if (!takes && verdict[l] != Verdict::shorten) continue;
+        lane.end = {lane.from.advance + lane.move.advance, lane.from.rotation + lane.move.rotation};
+        place_base(l, lane.active);
     }
 }
 
@@ -159,11 +180,16 @@ void Stepper<V>::finish_step(int n, Mask<V> mask, Mask<V> restart, const V& weig
             const V distance = node.wall.distance + dot(slope, node.step);
             const V steepness = square_root(dot(slope, slope));
             const Mask<V> touches = (distance < rod_.radius[i]) & (steepness > 1e-3);
-            const V push = options_.wall_stiffness * (rod_.radius[i] - distance) * steepness;
+            const V push = select<V>(touches, options_.wall_stiffness * (rod_.radius[i] - distance) * steepness, zero);
+            // friction in the coming step acts with the normal force at its middle, extrapolated
+            V ahead = push + select<V>(node.force > zero, 0.5 * weight * (push - node.force), zero);
+            ahead = select<V>(ahead > 2.0 * push, 2.0 * push, ahead);
+            ahead = select<V>(ahead > zero, ahead, zero);
+            node.force = select<V>(on, push, node.force);
             const V inverse = select<V>(touches, one / steepness, zero);
             const Vec3<V> normal = inverse * slope;
             const Frame<V> axes = frame(node.start_q);
-            node.grip.limit = select<V>(on, friction_ * select<V>(touches, push, zero), node.grip.limit);
+            node.grip.limit = select<V>(on, friction_ * ahead, node.grip.limit);
             node.grip.normal = select(on, normal, node.grip.normal);
             node.grip.spin = select(on, broadcast<V>(rod_.radius[i]) * cross(normal, axes.d3), node.grip.spin);
         }

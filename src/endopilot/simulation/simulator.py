@@ -51,6 +51,13 @@ class SimulatorConfig:
     """Slip velocity under which smoothed Coulomb friction falls off, mm/s; a wire at rest creeps more slowly."""
     approach_velocity_mm_s: float = 20.0
     """Velocity at which a wire is brought to its first inserted length before the recording, mm/s."""
+    largest_jump: float = 0.1
+    """Motion of a node in a time step beyond the drive's own, mm (rotations: rad), above which the step is shortened:
+    a wire that snaps over is followed in steps of down to 1/64 of `time_step_s`."""
+    introducer_friction_n: float = 0.05
+    """Coulomb friction of the introducer's valve, N; the drive feels it, the wire ahead of the valve does not."""
+    introducer_drag_n_s_mm: float = 0.002
+    """Viscous drag of the introducer's valve, N·s/mm."""
     push_limit_n: float = 2.0
     """The drive slips rather than push the wire harder than this, N. Far above what an advance through open vessels
     takes (some 0.1 N for a coronary wire), it keeps a wire whose tip is caught from being folded up in the vessel."""
@@ -204,38 +211,51 @@ def run_core(
     Returns:
         The arrays of `Rollout` that need no centerline, and `reason`: 0 fine, 1 not finite, 2 not converged.
     """
+    simulation = _core.Simulation(
+        rod=rod.model(),
+        lumen=lumen,
+        loads=loads,
+        origin=np.asarray(insertion.position, dtype=float),
+        orientation=_base_orientation(np.asarray(insertion.direction, dtype=float)),
+        options=_options(config, approach=approach, free_behind_mm=free_behind_mm, sample_tolerance=sample_tolerance),
+        worlds=len(control),
+    )
+    simulation.reset(
+        index=np.arange(len(control)),
+        initial=np.ascontiguousarray(initial, dtype=float),
+        friction=np.ascontiguousarray(friction, dtype=float),
+        sample_period=SAMPLE_PERIOD_S,
+    )
+    with progress("Simulating the wire", total=control.shape[0] * control.shape[1]) as advance:
+        result = simulation.run(
+            control=np.ascontiguousarray(control, dtype=float),
+            force_driven=False,
+            time_step=config.time_step_s,
+            steps_per_sample=round(SAMPLE_PERIOD_S / config.time_step_s),
+            record_shape=record_shape,
+            record_attitude=record_attitude,
+            threads=min(config.threads or os.cpu_count() or 1, -(-len(control) // lanes)),
+            lanes=lanes,
+            progress=advance,
+        )
+    return {**result, "reason": simulation.reason().astype(int)}
+
+
+def _options(config: SimulatorConfig, *, approach: bool, free_behind_mm: float, sample_tolerance: float) -> _core.Options:
     options = _core.Options()
-    options.time_step = config.time_step_s
-    options.steps_per_sample = round(SAMPLE_PERIOD_S / config.time_step_s)
     options.stick_velocity = config.stick_velocity_mm_s
     options.wall_stiffness = config.wall_stiffness_n_mm
     options.tolerance = config.tolerance_mm
     options.sample_tolerance = min(sample_tolerance, config.tolerance_mm)
     options.largest_step = _LARGEST_NEWTON_STEP
+    options.largest_jump = config.largest_jump
     options.most_iterations = _MOST_ITERATIONS
     options.free_behind = free_behind_mm
     options.push_limit = config.push_limit_n
     options.approach_velocity = config.approach_velocity_mm_s if approach else 0.0
-    depth = initial[:, 0] + np.cumsum(control[..., 0], axis=1).mean(axis=1)  # worlds of like length run side by side
-    worlds, samples = control.shape[:2]
-    with progress("Simulating the wire", total=worlds * samples) as advance:
-        return _core.simulate(
-            rod=rod.model(),
-            lumen=lumen,
-            loads=loads,
-            origin=np.asarray(insertion.position, dtype=float),
-            orientation=_base_orientation(np.asarray(insertion.direction, dtype=float)),
-            options=options,
-            initial=np.ascontiguousarray(initial, dtype=float),
-            control=np.ascontiguousarray(control, dtype=float),
-            friction=np.ascontiguousarray(friction, dtype=float),
-            order=np.argsort(-depth, kind="stable").astype(float),
-            record_shape=record_shape,
-            record_attitude=record_attitude,
-            threads=min(config.threads or os.cpu_count() or 1, -(-worlds // lanes)),
-            lanes=lanes,
-            progress=advance,
-        )
+    options.introducer_friction = config.introducer_friction_n
+    options.introducer_drag = config.introducer_drag_n_s_mm
+    return options
 
 
 def make_lumen(distance_map: DistanceMap, radius_mm: float) -> _core.Lumen:

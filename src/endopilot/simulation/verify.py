@@ -21,7 +21,7 @@ from endopilot.types import Insertion
 
 X_AXIS = Insertion(position=np.zeros(3), direction=np.array([1.0, 0.0, 0.0]))
 """Free rods are clamped at the origin and point along x."""
-STATIC = SimulatorConfig(time_step_s=0.5, tolerance_mm=1e-8, threads=1)
+STATIC = SimulatorConfig(time_step_s=0.5, tolerance_mm=1e-8, largest_jump=1e6, threads=1)
 """One time step a sample: with drag of next to nothing, each sample is a static equilibrium."""
 
 

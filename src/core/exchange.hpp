@@ -1,0 +1,246 @@
+// Between lanes and worlds: a lane takes a parked world, steps it for a sample, records it and parks it again.
+#pragma once
+
+#include "stepper.hpp"
+
+namespace endopilot {
+
+constexpr double kOvershoot = 0.02;  // mm that rounded controls may pull the wire behind the ostium
+
+template <class V>
+void Stepper<V>::take(int l, Crew& crew) {
+    double length = 0;
+    int others = 0;
+    for (const Lane& lane : lane_)
+        if (lane.world >= 0) length += lane.active, ++others;
+    Lane& lane = lane_[l];
+    for (;;) {
+        int sample = 0;
+        const int world = crew.take(others > 0 ? length / others : -1.0, sample);
+        if (world < 0) return;
+        World& w = world_[world];
+        if (w[World::kApproach] > 0) sample = -int(w[World::kApproach]);
+        if (w.valid() && sample < in_.samples) {
+            lane = Lane{};
+            lane.world = world;
+            lane.sample = sample;
+            load(l);
+            return;
+        }
+        for (sample = std::max(0, sample); sample < in_.samples; ++sample) record(world, sample, 0.0, 0.0);
+        crew.finish();
+    }
+}
+
+// Places node i of a lane on the catheter's axis as it was at the step's start (start) and is at its end (trial).
+template <class V>
+void Stepper<V>::place(int l, int i) {
+    const Lane& lane = lane_[l];
+    Node& n = node_[i];
+    put(n.start, l, base_.position(rod_, i, lane.start.advance));
+    put(n.start_q, l, base_.attitude(lane.start.rotation));
+    put(n.last, l, {0, 0, 0});
+    put(n.last_turn, l, {0, 0, 0});
+    set(n.grip.limit, l, 0);
+    put(n.grip.normal, l, {0, 0, 0});
+    put(n.grip.spin, l, {0, 0, 0});
+    set(n.force, l, 0);
+    place_base(l, i);
+}
+
+// Places the trial of a node that follows the drive.
+template <class V>
+void Stepper<V>::place_base(int l, int i) {
+    const Drive& end = lane_[l].end;
+    Node& n = node_[i];
+    put(n.x, l, base_.position(rod_, i, end.advance));
+    put(n.q, l, base_.attitude(end.rotation));
+    put(n.from, l, take(n.x, l));
+    put(n.from_q, l, take(n.q, l));
+}
+
+template <class V>
+void Stepper<V>::load(int l) {
+    Lane& lane = lane_[l];
+    const World& w = world_[lane.world];
+    lane.inserted = lane.start.advance = lane.end.advance = w[World::kInserted];
+    lane.rotation = lane.start.rotation = lane.end.rotation = w[World::kRotation];
+    lane.last_duration = w[World::kLastDuration];
+    lane.stride = int(w[World::kStride]);
+    lane.active = int(w[World::kActive]);
+    lane.slips = w[World::kSlips] != 0;
+    lane.push = w[World::kPush];
+    set(friction_, l, w[World::kFriction]);
+    read_control(l);
+    const double weight = lane.last_duration > 0 ? duration(lane) / lane.last_duration : 0.0;
+    lane.last = {weight > 0 ? w[World::kLastAdvance] : 0.0, weight > 0 ? w[World::kLastTurned] : 0.0};
+    const auto vec = [](const double* p) { return Vec3<double>{p[0], p[1], p[2]}; };
+    for (int i = 0; i < lane.active; ++i) {
+        const double* p = w.node(i);
+        Node& n = node_[i];
+        const Vec3<double> x = vec(p + World::kX), last = vec(p + World::kLast), turn = vec(p + World::kLastTurn);
+        const Quaternion<double> q{p[World::kQ], vec(p + World::kQ + 1)};
+        put(n.start, l, x);
+        put(n.start_q, l, q);
+        put(n.last, l, last);
+        put(n.last_turn, l, turn);
+        put(n.x, l, x + weight * last);
+        put(n.q, l, turned(q, weight * turn));
+        put(n.from, l, take(n.x, l));
+        put(n.from_q, l, take(n.q, l));
+        put(n.step, l, {0, 0, 0});
+        put(n.turn, l, {0, 0, 0});
+        set(n.grip.limit, l, p[World::kLimit]);
+        put(n.grip.normal, l, vec(p + World::kNormal));
+        put(n.grip.spin, l, vec(p + World::kSpinArm));
+        set(n.force, l, p[World::kForce]);
+    }
+    begin(l, weight == 0.0);
+}
+
+// Keeps the lane's world as it was at the end of the last step that converged.
+template <class V>
+void Stepper<V>::park(int l) {
+    const Lane& lane = lane_[l];
+    World& w = world_[lane.world];
+    w[World::kInserted] = lane.inserted;
+    w[World::kRotation] = lane.rotation;
+    w[World::kSpeed] = lane.speed;
+    w[World::kSpin] = lane.spin;
+    w[World::kByForce] = lane.by_force;
+    w[World::kLastDuration] = lane.last_duration;
+    w[World::kLastAdvance] = lane.last.advance;
+    w[World::kLastTurned] = lane.last.rotation;
+    w[World::kStride] = lane.stride;
+    w[World::kActive] = lane.active;
+    w[World::kSlips] = lane.slips;
+    w[World::kPush] = lane.push;
+    const auto write = [](double* to, const Vec3<double>& v) { to[0] = v.x, to[1] = v.y, to[2] = v.z; };
+    for (int i = 0; i < lane.active; ++i) {
+        double* p = w.node(i);
+        const Node& n = node_[i];
+        write(p + World::kX, take(n.start, l));
+        p[World::kQ] = get(n.start_q.w, l);
+        write(p + World::kQ + 1, take(n.start_q.v, l));
+        write(p + World::kLast, take(n.last, l));
+        write(p + World::kLastTurn, take(n.last_turn, l));
+        p[World::kLimit] = get(n.grip.limit, l);
+        write(p + World::kNormal, take(n.grip.normal, l));
+        write(p + World::kSpinArm, take(n.grip.spin, l));
+        p[World::kForce] = get(n.force, l);
+    }
+}
+
+template <class V>
+void Stepper<V>::read_control(int l) {
+    Lane& lane = lane_[l];
+    const World& w = world_[lane.world];
+    if (lane.sample < 0) {  // the approach: pushed in at one speed, then one sample at rest
+        const double left = w[World::kDepth] - lane.inserted;
+        lane.speed = lane.sample == -1 ? 0.0 : left / ((-lane.sample - 1) * sample_period());
+        lane.spin = 0.0;
+    } else {
+        const double* control = in_.control + 2 * (std::size_t(lane.world) * in_.samples + lane.sample);
+        lane.speed = control[0];
+        lane.spin = control[1];
+        lane.by_force = in_.force_driven;
+    }
+    if (!lane.by_force && lane.inserted + lane.speed * sample_period() < -kOvershoot) {
+        lane.refused = lane.inserted + lane.speed * sample_period();  // after a slip there is less wire to pull back
+        lane.speed = -lane.inserted / sample_period();
+    }
+    const bool slips = !lane.by_force && lane.speed > 0 && lane.push > options_.push_limit;
+    const bool same = lane.speed == w[World::kSpeed] && lane.spin == w[World::kSpin] && double(lane.by_force) == w[World::kByForce];
+    if (!same || slips != lane.slips) lane.last_duration = 0;  // do not extrapolate
+    lane.slips = slips;
+}
+
+template <class V>
+void Stepper<V>::end_sample(int l, Crew& crew) {
+    Lane& lane = lane_[l];
+    World& w = world_[lane.world];
+    if (lane.by_force) {
+        lane.inserted = lane.end.advance;
+        lane.rotation = lane.end.rotation;
+    } else {
+        lane.inserted += lane.speed * sample_period() - lane.slip;
+        lane.rotation += lane.spin * sample_period();
+    }
+    if (lane.sample < 0) {
+        out_.approach_slip[lane.world] += lane.slip;
+        w[World::kApproach] = -lane.sample - 1;
+        w[World::kDepth] -= lane.slip;
+        if (lane.sample == -1) lane.inserted = w[World::kDepth];  // exactly
+    }
+    park(l);
+    const DriveTerms valve = introducer(lane.last, l);
+    w[World::kBaseForce] = get(base_force_, l);
+    w[World::kBaseTorque] = get(base_torque_, l);
+    w[World::kDriveForce] = lane.by_force ? lane.speed : w[World::kBaseForce] + valve.pull_a;
+    w[World::kDriveTorque] = lane.by_force ? lane.spin : w[World::kBaseTorque] + valve.pull_r;
+    if (lane.sample >= 0) record(lane.world, lane.sample, double(lane.total_iterations) / lane.steps, lane.slip + lane.refused);
+    if (lane.sample + 1 < in_.samples)
+        crew.give_back(lane.world, lane.sample + 1, lane.active);
+    else
+        crew.finish();
+    lane.world = -1;
+}
+
+// Marks the lane's world invalid from this sample on and frees the lane; its pose stays as last converged.
+template <class V>
+void Stepper<V>::fail(int l) {
+    Lane& lane = lane_[l];
+    lane.inserted = lane.start.advance;
+    lane.rotation = lane.start.rotation;
+    park(l);
+    world_[lane.world][World::kReason] = lane.finite ? kNotConverged : kNotFinite;
+    for (int sample = std::max(0, lane.sample); sample < in_.samples; ++sample) record(lane.world, sample, 0.0, 0.0);
+    lane.world = -1;
+}
+
+template <class V>
+void Stepper<V>::record(int world, int sample, double iterations, double slip) const {
+    const World& w = world_[world];
+    const std::size_t at = std::size_t(world) * in_.samples + sample;
+    const int active = int(w[World::kActive]);
+    out_.inserted[at] = w[World::kInserted];
+    out_.rotation[at] = w[World::kRotation];
+    double largest = 0, sum = 0;
+    for (int i = 0; i < active; ++i) {
+        const double force = w.node(i)[World::kForce];
+        largest = std::max(largest, force);
+        sum += force;
+    }
+    out_.force_max[at] = largest;
+    out_.force_sum[at] = sum;
+    out_.base_force[at] = w[World::kBaseForce];
+    out_.base_torque[at] = w[World::kBaseTorque];
+    out_.drive_force[at] = w[World::kDriveForce];
+    out_.drive_torque[at] = w[World::kDriveTorque];
+    out_.iterations[at] = iterations;
+    out_.slip[at] = slip;
+    out_.valid[at] = w.valid();
+    const auto write = [](double* to, const Vec3<double>& v) { to[0] = v.x, to[1] = v.y, to[2] = v.z; };
+    const double* tip = w.node(0);
+    const double* q = tip + World::kQ;
+    std::copy(tip, tip + 3, out_.tip_position + 3 * at);
+    write(out_.tip_direction + 3 * at, frame(Quaternion<double>{q[0], {q[1], q[2], q[3]}}).d3);
+    for (int i = 0; i < rod_.nodes && (out_.shape || out_.attitude); ++i) {
+        const double* p = w.node(i);
+        if (out_.shape) {
+            double* to = out_.shape + 3 * (at * rod_.nodes + i);
+            if (i < active)
+                std::copy(p, p + 3, to);
+            else
+                write(to, base_.position(rod_, i, w[World::kInserted]));
+        }
+        if (out_.attitude) {
+            double* to = out_.attitude + 4 * (at * rod_.nodes + i);
+            const Quaternion<double> turn = base_.attitude(w[World::kRotation]);
+            const double kept[4] = {turn.w, turn.v.x, turn.v.y, turn.v.z};
+            std::copy_n(i < active ? p + World::kQ : kept, 4, to);
+        }
+    }
+}
+
+}  // namespace endopilot

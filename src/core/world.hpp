@@ -1,0 +1,102 @@
+// Worlds at rest between samples, and who is stepped next.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <mutex>
+#include <vector>
+
+#include "interface.hpp"
+
+namespace endopilot {
+
+// All that a world's future depends on, as plain numbers: saved and restored bit by bit. Positions and attitudes are
+// those at the end of the last step; node quantities are meaningful for the `active` nodes ahead of the base.
+struct World {
+    enum Scalar {
+        kInserted, kRotation,          // mm, rad
+        kSpeed, kSpin, kByForce,       // the last control: mm/s and rad/s, or N and N mm
+        kLastDuration, kLastAdvance, kLastTurned,  // of the last step, s, mm, rad
+        kFriction, kStride, kActive, kSlips, kPush, kReason,
+        kBaseForce, kBaseTorque, kDriveForce, kDriveTorque,  // N, N mm
+        kApproach, kDepth,             // samples left of the approach, and the inserted length it ends at, mm
+        kScalars
+    };
+    // last increments of position and rotation; friction limit, wall normal, spin arm; normal force, N
+    enum NodeQuantity { kX = 0, kQ = 3, kLast = 7, kLastTurn = 10, kLimit = 13, kNormal = 14, kSpinArm = 17, kForce = 20, kNodeSize = 21 };
+
+    std::vector<double> values;
+
+    explicit World(int nodes) : values(kScalars + std::size_t(nodes) * kNodeSize) {}
+    double& operator[](Scalar s) { return values[s]; }
+    double operator[](Scalar s) const { return values[s]; }
+    double* node(int i) { return &values[kScalars + std::size_t(i) * kNodeSize]; }
+    const double* node(int i) const { return &values[kScalars + std::size_t(i) * kNodeSize]; }
+    bool valid() const { return values[kReason] == double(kFine); }
+};
+
+// Hands worlds to lanes, one sample at a time. Lanes of a stepper sweep over the nodes of the longest wire among them, so
+// they are given worlds of like length. Which lane steps a world changes nothing in its result.
+class Crew {
+public:
+    // `order`: the worlds, those of like length next to each other, and `length` their active nodes. At most `size` of
+    // them are under way.
+    Crew(std::vector<int> order, std::vector<double> length, int size)
+        : order_(std::move(order)), length_(std::move(length)), size_(size) {}
+
+    // Takes a world whose number of active nodes is near `length` (any, if negative); -1 where none is ready. `sample` is
+    // the one that comes next.
+    int take(double length, int& sample) {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        while (under_way_ < size_ && next_ < order_.size()) {
+            const int world = order_[next_++];
+            ready_.push_back({world, 0, length_[std::size_t(world)]});
+            ++under_way_;
+        }
+        if (ready_.empty()) return -1;
+        int first = std::numeric_limits<int>::max();
+        for (const Ready& r : ready_) first = std::min(first, r.sample);
+        std::size_t best = ready_.size();
+        double least = 0;
+        for (std::size_t i = 0; i < ready_.size(); ++i) {
+            if (ready_[i].sample > first + kLead) continue;  // so that all end at about the same time
+            const double off = length < 0 ? double(ready_[i].sample) : std::abs(ready_[i].length - length);
+            if (best == ready_.size() || off < least) best = i, least = off;
+        }
+        const Ready taken = ready_[best];
+        ready_.erase(ready_.begin() + std::ptrdiff_t(best));
+        sample = taken.sample;
+        return taken.world;
+    }
+
+    void give_back(int world, int sample, double length) {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        ready_.push_back({world, sample, length});
+    }
+
+    void finish() {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        --under_way_;
+    }
+
+    bool done() {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        return under_way_ == 0 && next_ == order_.size();
+    }
+
+private:
+    static constexpr int kLead = 8;  // samples
+    struct Ready {
+        int world, sample;
+        double length;
+    };
+    std::mutex mutex_;
+    std::vector<int> order_;
+    std::vector<double> length_;
+    std::size_t next_ = 0;
+    int size_, under_way_ = 0;
+    std::vector<Ready> ready_;
+};
+
+}  // namespace endopilot
