@@ -172,7 +172,7 @@ void Stepper<V>::begin(int l, bool fresh) {
         lane.end.rotation = lane.rotation + lane.spin * elapsed(lane.tick + lane.stride);
     }
     lane.from = lane.end;
-    lane.active = Base::count_active(rod_, lane.by_force ? lane.start.advance : lane.end.advance, options_.free_behind);
+    lane.active = Base::count_active(rod_, lane.start.advance, options_.free_behind);
     for (int i = std::min(before, lane.active); i <= std::max(before, lane.active); ++i)
         if (i >= before || i >= lane.active) place(l, i);
     lane.iterations = lane.rejections = 0;

@@ -21,15 +21,15 @@ from endopilot.simulation.device import Device, check_fits
 from endopilot.simulation.rod import RodLayout, lay_out
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, DistanceMap, Insertion, Rollout
 
-_FREE_BEHIND_MM = 3.0
+FREE_BEHIND_MM = 3.0
 """Nodes farther behind the ostium than this follow the drive exactly, mm."""
 _LARGEST_NEWTON_STEP = 0.3
 """Displacement of a node (mm) that one Newton step is clamped to; larger ones can tangle the wire for good."""
 _MOST_ITERATIONS = 400
 """Newton iterations after which a time step is halved, down to 1/64; a wire that snaps over needs some hundred."""
-_SAMPLE_TOLERANCE = 1e-6
+SAMPLE_TOLERANCE = 1e-6
 """Newton tolerance of the step that ends a sample, mm: its forces are recorded, and the wire is stiff axially."""
-_LANES = 4
+LANES = 4
 """Worlds that one thread steps side by side."""
 _OVERSHOOT_MM = 1e-2
 """Rounding of controls may carry the inserted length this far below 0, mm."""
@@ -129,7 +129,7 @@ def simulate(
         device,
         path_mm=path_mm,
         elements=config.elements,
-        length_mm=float(max(path_mm, inserted.max())) + _FREE_BEHIND_MM,
+        length_mm=float(max(path_mm, inserted.max())) + FREE_BEHIND_MM,
     )
     _check_memory(worlds, samples, len(rod.abscissa_mm) if record_shape else 0)
     result = run_core(
@@ -185,10 +185,10 @@ def run_core(
     loads: _core.Loads | None = None,
     record_shape: bool = False,
     record_attitude: bool = False,
-    lanes: int = _LANES,
+    lanes: int = LANES,
     approach: bool = True,
-    free_behind_mm: float = _FREE_BEHIND_MM,
-    sample_tolerance: float = _SAMPLE_TOLERANCE,
+    free_behind_mm: float = FREE_BEHIND_MM,
+    sample_tolerance: float = SAMPLE_TOLERANCE,
 ) -> dict[str, np.ndarray]:
     """Run the C++ core on checked input. The simulator and the verification both come through here.
 
@@ -215,9 +215,8 @@ def run_core(
         rod=rod.model(),
         lumen=lumen,
         loads=loads,
-        origin=np.asarray(insertion.position, dtype=float),
-        orientation=_base_orientation(np.asarray(insertion.direction, dtype=float)),
-        options=_options(config, approach=approach, free_behind_mm=free_behind_mm, sample_tolerance=sample_tolerance),
+        **insertion_arguments(insertion),
+        options=core_options(config, approach=approach, free_behind_mm=free_behind_mm, sample_tolerance=sample_tolerance),
         worlds=len(control),
     )
     simulation.reset(
@@ -241,7 +240,18 @@ def run_core(
     return {**result, "reason": simulation.reason().astype(int)}
 
 
-def _options(config: SimulatorConfig, *, approach: bool, free_behind_mm: float, sample_tolerance: float) -> _core.Options:
+def insertion_arguments(insertion: Insertion) -> dict[str, np.ndarray]:
+    """Return an insertion as the core wants it: `origin`, mm, and `orientation`, a quaternion w x y z."""
+    return {
+        "origin": np.asarray(insertion.position, dtype=float),
+        "orientation": _base_orientation(np.asarray(insertion.direction, dtype=float)),
+    }
+
+
+def core_options(
+    config: SimulatorConfig, *, free_behind_mm: float, sample_tolerance: float, approach: bool = True
+) -> _core.Options:
+    """Return the settings as the core wants them."""
     options = _core.Options()
     options.stick_velocity = config.stick_velocity_mm_s
     options.wall_stiffness = config.wall_stiffness_n_mm
@@ -287,7 +297,7 @@ def check_distance_map(anatomy: Anatomy) -> None:
         raise InputError(f"{anatomy.name}: the distance map has values that are not finite; extract it again")
     if abs(float(np.linalg.norm(insertion.direction)) - 1) > 1e-3:
         raise InputError(f"{anatomy.name}: insertion.direction = {insertion.direction} is no unit vector; normalise it")
-    for along in (-_FREE_BEHIND_MM, 0.0, 1.0):
+    for along in (-FREE_BEHIND_MM, 0.0, 1.0):
         point = insertion.position + along * insertion.direction
         index = np.round((point - field.origin_mm) / field.spacing_mm).astype(int)[::-1]
         inside = (index >= 0).all() and (index < field.values.shape).all()

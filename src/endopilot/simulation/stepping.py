@@ -1,0 +1,450 @@
+"""Many worlds, driven step by step: for controllers, planners and learning environments.
+
+`Simulator` keeps the state of its worlds between calls; `simulate` runs whole control sequences at once. Both drive the
+same C++ core and give the same answer to the last bit.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Bool, Float, Integer
+from numpy.typing import ArrayLike
+
+from endopilot import _core
+from endopilot.anatomy.projection import project_tip
+from endopilot.errors import InputError
+from endopilot.files import writing
+from endopilot.simulation.device import Device, check_fits
+from endopilot.simulation.rod import RodLayout, lay_out
+from endopilot.simulation.simulator import (
+    FREE_BEHIND_MM,
+    LANES,
+    SAMPLE_TOLERANCE,
+    SimulatorConfig,
+    check_distance_map,
+    core_options,
+    insertion_arguments,
+    make_lumen,
+)
+from endopilot.types import SAMPLE_PERIOD_S, Anatomy, TipProjection
+
+_SPARE_MM = 20.0
+"""Length that the wire can be pushed beyond the end of the vessel's longest path, mm."""
+_DEEPEST_START = 0.8
+"""Share of the longest path that a random start may lie at."""
+
+
+@runtime_checkable
+class SupportsDLPack(Protocol):
+    """An array of another library that numpy can look into without a copy."""
+
+    def __dlpack__(self, **arguments: Any) -> Any: ...
+    def __dlpack_device__(self) -> tuple[int, int]: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """What all worlds did in one call of `Simulator.step`; row i belongs to world i.
+
+    Attributes:
+        inserted_length: Δ at the end of the step, mm.
+        rotation: φ at its end, rad.
+        tip_position: LPS mm.
+        tip_direction: unit vector along the wire at its tip.
+        contact_force_max: largest wall force on one node, N.
+        contact_force_sum: sum of the wall forces' magnitudes, N.
+        slip: advance that was asked of the drive and not made, mm.
+        valid: false for a world that has failed; it stays as it was.
+    """
+
+    inserted_length: Float[np.ndarray, "worlds"]
+    rotation: Float[np.ndarray, "worlds"]
+    tip_position: Float[np.ndarray, "worlds 3"]
+    tip_direction: Float[np.ndarray, "worlds 3"]
+    contact_force_max: Float[np.ndarray, "worlds"]
+    contact_force_sum: Float[np.ndarray, "worlds"]
+    slip: Float[np.ndarray, "worlds"]
+    valid: Bool[np.ndarray, "worlds"]
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatorState:
+    """All that the worlds' future depends on. Restored, also in another process, they go on with the same bits.
+
+    Attributes:
+        values: one array of float64 for each pair of anatomy and device, a row a world.
+        fingerprint: hash of the anatomies, devices and settings that the state belongs to.
+    """
+
+    values: tuple[Float[np.ndarray, "_ _"], ...]
+    fingerprint: str
+
+    def save(self, path: Path) -> None:
+        """Write the state to an .npz file, whole or not at all."""
+        arrays = {f"values_{k}": v for k, v in enumerate(self.values)}
+        with writing(path) as temporary, temporary.open("wb") as file:
+            np.savez(file, fingerprint=np.array(self.fingerprint), **arrays)  # pyright: ignore[reportArgumentType]
+
+    @staticmethod
+    def load(path: Path) -> SimulatorState:
+        """Read a state.
+
+        Raises:
+            InputError: the file is missing or is no saved state.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as stored:
+                count = len(stored.files) - 1
+                return SimulatorState(tuple(stored[f"values_{k}"] for k in range(count)), str(stored["fingerprint"]))
+        except (OSError, ValueError, KeyError) as error:
+            raise InputError(f"{path}: no saved state of a simulator ({error}); save one with SimulatorState.save") from None
+
+
+@dataclass(frozen=True, eq=False)
+class _Group:
+    """The worlds that share an anatomy and a device."""
+
+    anatomy: Anatomy
+    device: Device
+    rod: RodLayout
+    simulation: _core.Simulation
+    index: Integer[np.ndarray, "members"]
+    path_mm: float
+    longest_mm: float
+
+
+class Simulator:
+    """Many worlds at once, each with an anatomy, a device and controls of its own.
+
+    A world's result does not depend on the others: neither on their number nor on the threads that step them.
+
+    Example:
+        >>> simulator = Simulator(anatomy, device, worlds=256)
+        >>> simulator.reset(seed=0)
+        >>> step = simulator.step(np.tile([5.0, 0.5], (256, 1)), duration=0.1)
+        >>> step.tip_position.shape
+        (256, 3)
+    """
+
+    def __init__(
+        self,
+        anatomy: Anatomy | Sequence[Anatomy],
+        device: Device | Sequence[Device],
+        *,
+        worlds: int = 1,
+        actuation: Literal["velocity", "force"] = "velocity",
+        config: SimulatorConfig | None = None,
+    ) -> None:
+        """Lay the wires out; every world starts with its tip at the ostium.
+
+        Args:
+            anatomy: the vessel of all worlds, or one for each.
+            device: the wire of all worlds, or one for each.
+            worlds: their number, where neither of the above says it.
+            actuation: what `step` takes: "velocity" (mm/s, rad/s; the drive makes exactly that motion, except that it
+                slips rather than push harder than `config.push_limit_n`) or "force" (axial force N and torque N·mm on
+                the wire; advance and rotation follow, against the friction and drag of the introducer).
+            config: settings of the rod core.
+
+        Raises:
+            InputError: a device that does not fit its anatomy; a distance map that is not finite, or negative at the
+                ostium; lists of different lengths; more worlds than the memory holds.
+        """
+        if actuation not in ("velocity", "force"):
+            raise InputError(f"actuation: {actuation!r}; give 'velocity' or 'force'")
+        self._config = config or SimulatorConfig()
+        self._by_force = actuation == "force"
+        anatomies = [anatomy] * worlds if isinstance(anatomy, Anatomy) else list(anatomy)
+        devices = [device] * len(anatomies) if isinstance(device, Device) else list(device)
+        if isinstance(anatomy, Anatomy) and not isinstance(device, Device):
+            anatomies = [anatomy] * len(devices)
+        if not anatomies or len(anatomies) != len(devices):
+            raise InputError(f"anatomy, device: {len(anatomies)} and {len(devices)}; give at least one, and as many of each")
+        self._groups = self._make_groups(anatomies, devices)
+        self._device = devices
+        self.reset(inserted_length=np.zeros(len(devices)), rotation=np.zeros(len(devices)))
+
+    def _make_groups(self, anatomies: list[Anatomy], devices: list[Device]) -> list[_Group]:
+        members: dict[tuple[int, int], list[int]] = {}
+        for world, pair in enumerate(zip(anatomies, devices, strict=True)):
+            members.setdefault((id(pair[0]), id(pair[1])), []).append(world)
+        groups, lumens = [], {}
+        for worlds in members.values():
+            anatomy, device = anatomies[worlds[0]], devices[worlds[0]]
+            check_fits(device, anatomy)
+            check_distance_map(anatomy)
+            path_mm = float(anatomy.tree.longest_path().abscissa[-1])
+            longest_mm = path_mm + _SPARE_MM
+            rod = lay_out(device, path_mm=path_mm, elements=self._config.elements, length_mm=longest_mm + FREE_BEHIND_MM)
+            _check_memory(len(worlds), len(rod.abscissa_mm))
+            key = (id(anatomy), device.tip_radius_mm)
+            if key not in lumens:
+                lumens[key] = make_lumen(anatomy.distance_map, device.tip_radius_mm)
+            simulation = _core.Simulation(
+                rod=rod.model(),
+                lumen=lumens[key],
+                loads=None,
+                **insertion_arguments(anatomy.insertion),
+                options=core_options(self._config, free_behind_mm=FREE_BEHIND_MM, sample_tolerance=SAMPLE_TOLERANCE),
+                worlds=len(worlds),
+            )
+            groups.append(_Group(anatomy, device, rod, simulation, np.array(worlds), path_mm, longest_mm))
+        return groups
+
+    @property
+    def worlds(self) -> int:
+        """Number of worlds."""
+        return len(self._device)
+
+    @property
+    def nodes(self) -> int:
+        """Nodes of the longest wire; arrays with a row a node are padded to this."""
+        return max(group.simulation.nodes for group in self._groups)
+
+    def reset(
+        self,
+        seed: int | None = None,
+        *,
+        inserted_length: ArrayLike | None = None,
+        rotation: ArrayLike | None = None,
+        friction: ArrayLike | None = None,
+        worlds: Sequence[int] | None = None,
+    ) -> None:
+        """Put worlds back to the ostium and push them to their first inserted length.
+
+        What is not given is drawn from `seed` (which is then needed): inserted lengths evenly up to 0.8 of the longest
+        path, rotations over a full turn; friction is the device's own if not given. A world's draw depends on the seed
+        and its own number alone.
+
+        Args:
+            seed: of the random start.
+            inserted_length: mm, a number for every world.
+            rotation: rad, likewise.
+            friction: Coulomb friction coefficient, likewise.
+            worlds: the worlds to reset; all if not given. The arrays still hold a number for every world.
+
+        Raises:
+            InputError: a number that is not finite or out of range; neither a seed nor a start.
+        """
+        chosen = np.arange(self.worlds) if worlds is None else np.array(worlds, dtype=int)
+        if ((chosen < 0) | (chosen >= self.worlds)).any():
+            raise InputError(f"worlds: {chosen.max()} or {chosen.min()} is no world; there are {self.worlds}")
+        if seed is None and (inserted_length is None or rotation is None):
+            raise InputError("seed: none given; give one, or inserted_length and rotation of every world")
+        start, turn = self._random_start(seed)
+        start = start if inserted_length is None else self._per_world("inserted_length", inserted_length)
+        turn = turn if rotation is None else self._per_world("rotation", rotation)
+        own = np.array([device.friction for device in self._device])
+        grip = own if friction is None else self._per_world("friction", friction)
+        if (grip < 0).any():
+            raise InputError(f"friction: world {int(np.argmin(grip))}: {grip.min():g}; give 0 or more")
+        for group in self._groups:
+            bad = (start[group.index] < 0) | (start[group.index] > group.longest_mm)
+            if bad.any():
+                world = int(group.index[np.argmax(bad)])
+                raise InputError(
+                    f"inserted_length: world {world}: {start[world]:g} mm; give 0 to {group.longest_mm:.1f} mm"
+                )
+            mine = np.isin(group.index, chosen)
+            index = group.index[mine]
+            group.simulation.reset(
+                index=np.flatnonzero(mine),
+                initial=np.column_stack([start, turn])[index],
+                friction=np.ascontiguousarray(grip[index]),
+                sample_period=SAMPLE_PERIOD_S,
+            )
+            steps = round(SAMPLE_PERIOD_S / self._config.time_step_s)
+            self._run(group, np.zeros((len(group.index), 0, 2)), self._config.time_step_s, steps, by_force=False)
+
+    def _random_start(self, seed: int | None) -> tuple[np.ndarray, np.ndarray]:
+        if seed is None:
+            return np.zeros(self.worlds), np.zeros(self.worlds)
+        draw = np.array([np.random.default_rng([seed, world]).random(2) for world in range(self.worlds)])
+        deepest = np.empty(self.worlds)
+        for group in self._groups:
+            deepest[group.index] = _DEEPEST_START * group.path_mm
+        return draw[:, 0] * deepest, draw[:, 1] * 2 * np.pi
+
+    def step(self, control: ArrayLike | SupportsDLPack, duration: float) -> Step:
+        """Drive every world for some time with a constant control.
+
+        Args:
+            control: a row a world, of translation (mm/s) and rotation (rad/s), or axial force (N) and torque (N·mm); numpy, or anything
+                that speaks DLPack, such as a torch tensor on the CPU.
+            duration: s; it is cut into equal time steps of at most `config.time_step_s`.
+
+        Returns:
+            The worlds at the end of the step. The drive stops where the wire is pulled out to the ostium.
+
+        Raises:
+            InputError: a control of another shape, that is not finite, above the device's velocity limit or beyond
+                the length of the wire; a duration that is not positive. No world is moved then.
+        """
+        array = control if isinstance(control, np.ndarray) or not hasattr(control, "__dlpack__") else np.from_dlpack(control)
+        array = np.ascontiguousarray(array, dtype=float)
+        self._check_control(array, duration)
+        steps = max(1, int(np.ceil(duration / self._config.time_step_s - 1e-9)))
+        first: dict[str, np.ndarray] = {}
+        for group in self._groups:
+            rows = np.ascontiguousarray(array[group.index][:, None, :])
+            result = self._run(group, rows, duration / steps, steps, by_force=self._by_force)
+            for name in Step.__dataclass_fields__:
+                values = result[name][:, 0]
+                first.setdefault(name, np.empty((self.worlds, *values.shape[1:]), dtype=values.dtype))
+                first[name][group.index] = values
+        return Step(**first)
+
+    def _run(self, group: _Group, control: np.ndarray, time_step: float, steps: int, *, by_force: bool) -> dict[str, Any]:
+        return group.simulation.run(
+            control=control,
+            force_driven=by_force,
+            time_step=time_step,
+            steps_per_sample=steps,
+            record_shape=False,
+            record_attitude=False,
+            threads=min(self._config.threads or os.cpu_count() or 1, -(-len(group.index) // LANES)),
+            lanes=LANES,
+            progress=None,
+        )
+
+    def _per_world(self, name: str, values: Any) -> Float[np.ndarray, "worlds"]:
+        array = np.asarray(values, dtype=float)
+        if array.shape != (self.worlds,):
+            raise InputError(f"{name}: shape {array.shape}; give one number for each of the {self.worlds} worlds")
+        if not np.isfinite(array).all():
+            raise InputError(f"{name}: world {int(np.argmin(np.isfinite(array)))}: not a finite number; correct it")
+        return array
+
+    def _check_control(self, control: np.ndarray, duration: float) -> None:
+        if control.shape != (self.worlds, 2):
+            raise InputError(f"control: shape {control.shape}; give ({self.worlds}, 2), a row a world")
+        if not (np.isfinite(duration) and duration > 0):
+            raise InputError(f"duration: {duration}; give a positive number of seconds")
+        if not np.isfinite(control).all():
+            world = int(np.argwhere(~np.isfinite(control))[0, 0])
+            raise InputError(f"control: world {world}: {control[world]} is not finite; correct it")
+        if self._by_force:
+            return
+        for world, device in enumerate(self._device):
+            speed, spin = np.abs(control[world])
+            if speed > device.max_velocity_mm_s * (1 + 1e-6) or spin > device.max_rotation_rad_s * (1 + 1e-6):
+                raise InputError(
+                    f"control: world {world}: {control[world, 0]:g} mm/s, {control[world, 1]:g} rad/s exceed {device.name}'s "
+                    f"limits of {device.max_velocity_mm_s:g} mm/s and {device.max_rotation_rad_s:g} rad/s; slow down"
+                )
+        for group in self._groups:
+            end = group.simulation.inserted_length() + control[group.index, 0] * duration
+            if (end > group.longest_mm).any():
+                world = int(group.index[np.argmax(end)])
+                raise InputError(
+                    f"control: world {world}: would insert {end.max():.1f} mm, and the wire is laid out for "
+                    f"{group.longest_mm:.1f} mm, {_SPARE_MM:g} mm more than the vessel's longest path; push less"
+                )
+
+    def _gather(self, name: str) -> Float[np.ndarray, "worlds"]:
+        out = np.empty(self.worlds)
+        for group in self._groups:
+            out[group.index] = getattr(group.simulation, name)()
+        return out
+
+    def _per_node(self, name: str, pad: float) -> np.ndarray:
+        parts = [getattr(group.simulation, name)() for group in self._groups]
+        out = np.full((self.worlds, self.nodes, *parts[0].shape[2:]), pad)
+        for group, part in zip(self._groups, parts, strict=True):
+            out[group.index, : part.shape[1]] = part
+        return out
+
+    @property
+    def inserted_length(self) -> Float[np.ndarray, "worlds"]:
+        """Inserted lengths Δ, mm."""
+        return self._gather("inserted_length")
+
+    @property
+    def rotation(self) -> Float[np.ndarray, "worlds"]:
+        """Rotations φ of the drive, rad."""
+        return self._gather("rotation")
+
+    @property
+    def position(self) -> Float[np.ndarray, "worlds nodes 3"]:
+        """Positions of the nodes from the tip to the base, LPS mm; NaN beyond the nodes of a shorter wire."""
+        return self._per_node("positions", np.nan)
+
+    @property
+    def orientation(self) -> Float[np.ndarray, "worlds nodes 4"]:
+        """Orientations of the elements as quaternions w x y z; the third director points along the wire to its tip."""
+        return self._per_node("attitudes", np.nan)
+
+    @property
+    def contacts(self) -> Float[np.ndarray, "worlds nodes"]:
+        """Force of the wall on each node, N."""
+        return self._per_node("contacts", 0.0)
+
+    @property
+    def base_load(self) -> Float[np.ndarray, "worlds 2"]:
+        """Axial force (N, positive when it pushes) and torque (N·mm) that hold the wire where it enters the catheter."""
+        return np.column_stack([self._gather("base_force"), self._gather("base_torque")])
+
+    @property
+    def drive_load(self) -> Float[np.ndarray, "worlds 2"]:
+        """Force (N) and torque (N·mm) of the drive: `base_load` and what the introducer's valve takes.
+
+        As controls of a force-driven simulator they make the same motion.
+        """
+        return np.column_stack([self._gather("drive_force"), self._gather("drive_torque")])
+
+    @property
+    def valid(self) -> Bool[np.ndarray, "worlds"]:
+        """False for a world that left the finite numbers or did not converge; it stays as it was until it is reset."""
+        return self._gather("reason") == 0
+
+    def project(self) -> TipProjection:
+        """Project the tips to the centerline: Δtip (mm), γtip (mm), branch and lumen radius (mm), a row a world."""
+        fields: dict[str, np.ndarray] = {}
+        for group in self._groups:
+            tip = project_tip(group.anatomy.tree, group.anatomy.insertion, group.simulation.positions()[:, 0])
+            for name in TipProjection.__dataclass_fields__:
+                part = np.asarray(getattr(tip, name))
+                fields.setdefault(name, np.empty(self.worlds, dtype=part.dtype))[group.index] = part
+        return TipProjection(**fields)
+
+    @property
+    def state(self) -> SimulatorState:
+        """The worlds' state, to be kept and given to `set_state`."""
+        return SimulatorState(tuple(group.simulation.state() for group in self._groups), self._fingerprint())
+
+    def set_state(self, state: SimulatorState) -> None:
+        """Restore all worlds, bit by bit.
+
+        Raises:
+            InputError: the state is that of other anatomies, devices or settings, or of another number of worlds.
+        """
+        if state.fingerprint != self._fingerprint():
+            raise InputError("state: made with other anatomies, devices or settings; restore it in a simulator like its own")
+        for group, values in zip(self._groups, state.values, strict=True):
+            group.simulation.set_state(np.ascontiguousarray(values))
+
+    def _fingerprint(self) -> str:
+        digest = hashlib.sha256(repr((self._by_force, _settings(self._config))).encode())
+        for group in self._groups:
+            for array in (group.index, *vars(group.rod).values(), *vars(group.anatomy.distance_map).values()):
+                digest.update(np.ascontiguousarray(array).tobytes())
+        return digest.hexdigest()
+
+
+def _settings(config: SimulatorConfig) -> tuple[Any, ...]:
+    """Return the settings that results depend on: all but the threads."""
+    return tuple((name, getattr(config, name)) for name in SimulatorConfig.__dataclass_fields__ if name != "threads")
+
+
+def _check_memory(worlds: int, nodes: int) -> None:
+    needed = 8 * worlds * (25 * nodes + 40)
+    available = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if needed > 0.8 * available:
+        raise InputError(f"worlds: {worlds} need {needed / 2**30:.1f} GiB of {available / 2**30:.1f}; give fewer")

@@ -1,0 +1,281 @@
+"""The stepping interface: the same bits as `simulate`, saved state, force drive, balance of loads, refusal of bad input."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bend import vessel
+from scipy.spatial.transform import Rotation
+
+from endopilot.errors import InputError
+from endopilot.simulation.device import read_device
+from endopilot.simulation.simulator import SimulatorConfig, simulate
+from endopilot.simulation.stepping import Simulator, SimulatorState
+from endopilot.types import Anatomy
+
+DEVICE = read_device("workhorse-014")
+STIFF = read_device("stiff-014")
+PERIOD = 0.5
+
+
+@pytest.fixture(scope="module")
+def anatomy() -> Anatomy:
+    return vessel()
+
+
+@pytest.fixture(scope="module")
+def wider() -> Anatomy:
+    return vessel(np.pi / 3)
+
+
+def start(worlds: int) -> np.ndarray:
+    random = np.random.default_rng(3)
+    return np.column_stack([random.uniform(5, 30, worlds), random.uniform(-3, 3, worlds)])
+
+
+def controls(samples: int, worlds: int) -> np.ndarray:
+    random = np.random.default_rng(4)
+    return np.stack([random.uniform(-2, 6, (samples, worlds)), random.uniform(-3, 3, (samples, worlds))], axis=-1)
+
+
+def begun(simulator: Simulator, worlds: int) -> Simulator:
+    first = start(worlds)
+    simulator.reset(inserted_length=first[:, 0], rotation=first[:, 1])
+    return simulator
+
+
+def test_steps_are_those_of_simulate_to_the_bit(anatomy: Anatomy) -> None:
+    control = controls(4, 3)
+    whole = simulate(anatomy, DEVICE, control.transpose(1, 0, 2).copy(), initial=start(3))
+    simulator = begun(Simulator(anatomy, DEVICE, worlds=3), 3)
+    for t in range(4):
+        step = simulator.step(control[t], PERIOD)
+        assert np.array_equal(step.tip_position, whole.tip_position[:, t])
+        assert np.array_equal(simulator.base_load[:, 0], whole.base_force[:, t])
+        assert np.array_equal(simulator.contacts.max(axis=1), whole.contact_force_max[:, t])
+        assert np.array_equal(simulator.project().abscissa, whole.tip.abscissa[:, t])
+    assert np.allclose(simulator.inserted_length, whole.inserted_length[:, -1], atol=1e-12)
+
+
+def test_every_world_has_its_own_anatomy_and_device(anatomy: Anatomy, wider: Anatomy) -> None:
+    anatomies, devices = [anatomy, wider, anatomy, wider], [DEVICE, DEVICE, STIFF, STIFF]
+    control = controls(3, 4)
+    together = begun(Simulator(anatomies, devices), 4)
+    for t in range(3):
+        step = together.step(control[t], 0.3)
+    assert together.position.shape == (4, together.nodes, 3)
+    for world in range(4):
+        alone = Simulator(anatomies[world], devices[world])
+        first = start(4)[world]
+        alone.reset(inserted_length=first[:1], rotation=first[1:])
+        for t in range(3):
+            single = alone.step(control[t, world][None], 0.3)
+        assert np.array_equal(step.tip_position[world], single.tip_position[0])
+        nodes = alone.nodes
+        assert np.array_equal(together.position[world, :nodes], alone.position[0])
+        assert np.isnan(together.position[world, nodes:]).all()
+        assert np.array_equal(together.contacts[world, :nodes], alone.contacts[0])
+    assert len({tuple(tip) for tip in step.tip_position}) == 4
+
+
+def test_threads_change_no_bit(anatomy: Anatomy) -> None:
+    tips = []
+    for threads in (1, 2):
+        simulator = begun(Simulator(anatomy, DEVICE, worlds=9, config=SimulatorConfig(threads=threads)), 9)
+        for control in controls(3, 9):
+            step = simulator.step(control, 0.25)
+        tips.append(step.tip_position)
+    assert np.array_equal(*tips)
+
+
+def test_restored_state_goes_on_with_the_same_bits(anatomy: Anatomy, tmp_path: Path) -> None:
+    control = controls(6, 3)
+    simulator = begun(Simulator(anatomy, DEVICE, worlds=3), 3)
+    for t in range(3):
+        simulator.step(control[t], 0.2)
+    state = simulator.state
+    state.save(tmp_path / "state.npz")
+    for t in range(3, 6):
+        step = simulator.step(control[t], 0.2)
+    after = simulator.state.values[0]
+
+    simulator.set_state(state)
+    for t in range(3, 6):
+        again = simulator.step(control[t], 0.2)
+    assert np.array_equal(step.tip_position, again.tip_position)
+
+    np.save(tmp_path / "control.npy", control)
+    script = f"""
+import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})
+import numpy as np
+from bend import vessel
+from endopilot.simulation.device import read_device
+from endopilot.simulation.stepping import Simulator, SimulatorState
+from pathlib import Path
+simulator = Simulator(vessel(), read_device("workhorse-014"), worlds=3)
+simulator.set_state(SimulatorState.load(Path("state.npz")))
+for row in np.load("control.npy")[3:]:
+    simulator.step(row, 0.2)
+np.save("after.npy", simulator.state.values[0])
+"""
+    subprocess.run([sys.executable, "-c", script], cwd=tmp_path, check=True)
+    assert np.load(tmp_path / "after.npy").tobytes() == after.tobytes()
+
+
+def test_a_seed_draws_the_same_start_whatever_the_number_of_worlds(anatomy: Anatomy) -> None:
+    few, many = Simulator(anatomy, DEVICE, worlds=2), Simulator(anatomy, DEVICE, worlds=5)
+    few.reset(seed=7)
+    many.reset(seed=7)
+    assert np.array_equal(few.position, many.position[:2])
+    assert len(set(many.inserted_length)) == 5
+    kept = many.position[[0, 2, 4]]
+    many.reset(seed=8, worlds=[1, 3])
+    assert np.array_equal(many.position[[0, 2, 4]], kept)
+    assert not np.array_equal(many.position[1], few.position[1])
+
+
+def test_forces_replay_a_velocity_run(anatomy: Anatomy) -> None:
+    # The drive's force and torque are the gradient of the step's potential in the drive's motion; taken as loads,
+    # they make that motion the minimum.
+    config, dt = SimulatorConfig(tolerance_mm=1e-9, largest_jump=1e6), 0.02
+    leading = begun(Simulator(anatomy, DEVICE, worlds=4, config=config), 4)
+    led = begun(Simulator(anatomy, DEVICE, worlds=4, config=config, actuation="force"), 4)
+    random = np.random.default_rng(8)
+    velocity = np.repeat(np.column_stack([random.uniform(1, 8, 8), random.uniform(-3, 3, 8)]).reshape(2, 4, 2), 40, axis=0)
+    apart, torques = [], []
+    for control in velocity:
+        step = leading.step(control, dt)
+        follower = led.step(leading.drive_load, dt)
+        apart.append(np.linalg.norm(step.tip_position - follower.tip_position, axis=-1))
+        torques.append(leading.drive_load)
+    assert leading.valid.all() and led.valid.all()
+    travelled = np.abs(velocity[..., 0]).sum(axis=0) * dt
+    assert (travelled > 3).all()
+    assert np.max(apart) < 1e-3
+    assert np.abs(led.inserted_length - leading.inserted_length).max() < 1e-3
+    assert np.abs(led.rotation - leading.rotation).max() < 1e-3
+    assert np.array_equal(led.drive_load, leading.drive_load)
+
+
+def test_no_force_moves_nothing_and_more_force_moves_more(anatomy: Anatomy) -> None:
+    simulator = Simulator(anatomy, DEVICE, worlds=3, actuation="force")
+    simulator.reset(inserted_length=np.full(3, 10.0), rotation=np.zeros(3))
+    for _ in range(10):
+        simulator.step(np.array([[0.0, 0.0], [0.09, 0.0], [0.12, 0.0]]), 0.1)
+    still, slow, fast = simulator.inserted_length - 10
+    assert abs(still) < 0.1  # the bent tip may push itself back a little against the valve's friction
+    assert 1.0 < slow < fast
+
+
+def test_force_drive_stops_where_the_wire_is_out(anatomy: Anatomy) -> None:
+    simulator = Simulator(anatomy, DEVICE, worlds=1, actuation="force")
+    simulator.reset(inserted_length=np.array([3.0]), rotation=np.array([0.0]))
+    for _ in range(20):
+        simulator.step(np.array([[-0.5, 0.0]]), 0.1)
+    assert simulator.valid.all()
+    # 0.5 N less the valve's 0.05 N on a stop of 100 N/mm
+    assert simulator.inserted_length[0] == pytest.approx(-0.0045, abs=1e-3)
+
+
+def test_base_load_balances_contact_friction_and_drag(anatomy: Anatomy) -> None:
+    """Σ F = 0 along the catheter and Σ M = 0 about it, for the free part of the wire, in a random navigation.
+
+    Forces on node i: the wall's N_i n_i; friction -µN s/√(s² + ε²), with s the displacement of the touching surface in
+    the step; drag -c dx/dt. The couple of friction and spin drag acts on element i.
+    """
+    config = SimulatorConfig(tolerance_mm=1e-9)
+    simulator = begun(Simulator(anatomy, DEVICE, worlds=5, config=config), 5)
+    rod, insertion = simulator._groups[0].rod, anatomy.insertion
+    dt = config.time_step_s
+    axis, checked = insertion.direction, 0
+    for control in controls(6, 5):
+        simulator.step(control, PERIOD)  # the control changes with each period
+        for _ in range(2):
+            before = simulator.state.values[0][:, -21 * simulator.nodes :].reshape(5, -1, 21)
+            simulator.step(control, dt)
+            after = simulator.state.values[0][:, -21 * simulator.nodes :].reshape(5, -1, 21)
+            for world in range(5):
+                active = int((after[world, :, 3:7] != 0).any(axis=1).sum())
+                n = min(active, int((before[world, :, 3:7] != 0).any(axis=1).sum()))
+                x, q, moved, turned = (after[world, :n, a:b] for a, b in ((0, 3), (3, 7), (7, 10), (10, 13)))
+                limit, normal, arm = before[world, :n, 13], before[world, :n, 14:17], before[world, :n, 17:20]
+                wall = after[world, :n, 20, None] * after[world, :n, 14:17]
+                slip = moved - (moved * normal).sum(axis=1, keepdims=True) * normal + turned[:, 2:] * arm
+                size = np.sqrt((slip**2).sum(axis=1) + (config.stick_velocity_mm_s * dt) ** 2)
+                friction = -(limit / size)[:, None] * slip
+                drag = -rod.drag_n_s_mm[:n, None] / dt * moved
+                total = wall + friction + drag
+                half = 0.5 * turned
+                w = np.sqrt(1 - (half**2).sum(axis=1))
+                couple = (friction * arm).sum(axis=1)[:, None] * np.column_stack([-half[:, 1], half[:, 0], w])
+                couple -= (2 * rod.spin_drag_n_mm_s[:n] / dt * w)[:, None] * half
+                about = Rotation.from_quat(q[:, [1, 2, 3, 0]]).apply(couple).sum(axis=0)
+                moment = np.cross(x - insertion.position, total).sum(axis=0) + about
+                force, torque = simulator.base_load[world]
+                # what is left is a Newton step of 1e-9 mm against an axial stiffness of up to 5e4 N/mm
+                assert force + total.sum(axis=0) @ axis == pytest.approx(0, abs=5e-5)
+                assert torque + moment @ axis == pytest.approx(0, abs=5e-5)
+                checked += np.abs(friction).max() > 1e-4 and abs(force) > 1e-3 and abs(torque) > 1e-4
+    assert checked > 10
+
+
+def test_torch_tensors_go_in_and_out(anatomy: Anatomy) -> None:
+    import torch
+
+    simulator = begun(Simulator(anatomy, DEVICE, worlds=2), 2)
+    step = simulator.step(torch.tensor([[1.0, 0.5], [2.0, 0.0]]), 0.1)
+    assert torch.from_dlpack(step.tip_position).shape == (2, 3)
+
+
+def test_pulling_out_stops_at_the_ostium(anatomy: Anatomy) -> None:
+    simulator = Simulator(anatomy, DEVICE)
+    simulator.reset(inserted_length=np.array([2.0]), rotation=np.array([0.0]))
+    for _ in range(4):
+        step = simulator.step(np.array([[-6.0, 0.0]]), PERIOD)
+    assert simulator.inserted_length[0] == pytest.approx(0, abs=0.03)
+    assert step.slip[0] < -2.9 and simulator.valid.all()
+
+
+@pytest.mark.parametrize(
+    ("control", "duration", "message"),
+    [
+        (np.zeros((1, 2)), 0.1, r"shape \(1, 2\); give \(2, 2\)"),
+        (np.array([[1, 0], [np.nan, 0]]), 0.1, "world 1: .* not finite"),
+        (np.array([[1, 0], [1e3, 0]]), 0.1, "world 1: 1000 mm/s.* limits of"),
+        (np.array([[40.0, 0], [0, 0]]), 60.0, "world 0: would insert .* push less"),
+        (np.zeros((2, 2)), 0.0, "duration: 0.0; give a positive"),
+    ],
+)
+def test_bad_controls_move_no_world(anatomy: Anatomy, control: np.ndarray, duration: float, message: str) -> None:
+    simulator = begun(Simulator(anatomy, DEVICE, worlds=2), 2)
+    before = simulator.state.values[0]
+    with pytest.raises(InputError, match=message):
+        simulator.step(control, duration)
+    assert np.array_equal(simulator.state.values[0], before)
+    simulator.step(np.zeros((2, 2)), 0.1)
+
+
+def test_bad_starts_and_states_are_refused(anatomy: Anatomy, wider: Anatomy, tmp_path: Path) -> None:
+    simulator = Simulator(anatomy, DEVICE, worlds=2)
+    for arguments, message in (
+        ({}, "seed: none given"),
+        ({"seed": 1, "friction": [0.1, -0.1]}, "friction: world 1"),
+        ({"seed": 1, "inserted_length": [1.0, 1e4]}, "inserted_length: world 1: 10000 mm"),
+        ({"seed": 1, "rotation": [0.0]}, "rotation: shape"),
+        ({"seed": 1, "worlds": [2]}, "there are 2"),
+    ):
+        with pytest.raises(InputError, match=message):
+            simulator.reset(**arguments)
+    with pytest.raises(InputError, match="made with other anatomies"):
+        simulator.set_state(Simulator(wider, DEVICE, worlds=2).state)
+    with pytest.raises(InputError, match=r"no such file|no saved state"):
+        SimulatorState.load(tmp_path / "absent.npz")
+    with pytest.raises(InputError, match="give fewer"):
+        Simulator(anatomy, DEVICE, worlds=100_000_000)
+    with pytest.raises(InputError, match="wider"):
+        Simulator(replace(anatomy, catheter_radius_mm=0.1), DEVICE)
