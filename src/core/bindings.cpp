@@ -7,6 +7,7 @@
 #include <memory>
 #include <thread>
 
+#include "spline.hpp"
 #include "stepper.hpp"
 
 namespace nb = nanobind;
@@ -63,12 +64,12 @@ RodModel make_rod(const Array<1>& abscissa, const Array<1>& shear, const Array<1
     return rod;
 }
 
-Lumen make_lumen(const Image& coefficients, const Array<1>& origin, double spacing, double near, double far) {
+Lumen make_lumen(const Image& values, const Array<1>& origin, double spacing, double near, double far) {
     require(origin.size() == 3 && spacing > 0, "a lumen needs an origin of three numbers and a positive spacing");
-    const int size[3] = {int(coefficients.shape(2)), int(coefficients.shape(1)), int(coefficients.shape(0))};
+    const int size[3] = {int(values.shape(2)), int(values.shape(1)), int(values.shape(0))};
     require(size[0] > 0 && size[1] > 0 && size[2] > 0, "a lumen needs at least one cell");
     const double o[3] = {origin.data()[0], origin.data()[1], origin.data()[2]};
-    return Lumen(coefficients.data(), size, o, spacing, near, far);
+    return Lumen(spline_coefficients(values.data(), size).data(), size, o, spacing, near, far);
 }
 
 Loads make_loads(const Array<2>& force, const Array<2>& moment, const Array<2>& spring, const Array<2>& anchor,
@@ -218,6 +219,8 @@ public:
         run_threads(std::max(1, threads), progress, done, stop, [&] {
             if (lanes == 1)
                 work(double{});
+            else if (lanes == 8)
+                work(double8{});
             else
                 work(double4{});
         });
@@ -327,12 +330,13 @@ private:
 
 NB_MODULE(_core, module) {
     module.doc() = "The Cosserat rod core of endopilot.";
+    module.attr("LANES") = kLanes;
     nb::class_<RodModel>(module, "RodModel")
         .def_ro("nodes", &RodModel::nodes);
     module.def("make_rod", &make_rod, nb::kw_only(), nb::arg("abscissa"), nb::arg("shear"), nb::arg("stretch"),
                nb::arg("bend"), nb::arg("twist"), nb::arg("rest"), nb::arg("radius"), nb::arg("drag"), nb::arg("spin_drag"));
     nb::class_<Lumen>(module, "Lumen").def_prop_ro("bytes", &Lumen::bytes);
-    module.def("make_lumen", &make_lumen, nb::kw_only(), nb::arg("coefficients"), nb::arg("origin"), nb::arg("spacing"),
+    module.def("make_lumen", &make_lumen, nb::kw_only(), nb::arg("values"), nb::arg("origin"), nb::arg("spacing"),
                nb::arg("near"), nb::arg("far"));
     nb::class_<Loads>(module, "Loads");
     module.def("make_loads", &make_loads, nb::kw_only(), nb::arg("force"), nb::arg("moment"), nb::arg("spring"),

@@ -109,6 +109,12 @@ template <class V>
         c[0] = __builtin_convertvector(__builtin_shufflevector(low01, low23, 0, 1, 4, 5), V);
         c[1] = __builtin_convertvector(__builtin_shufflevector(low01, low23, 2, 3, 6, 7), V);
         c[2] = __builtin_convertvector(__builtin_shufflevector(high01, high23, 0, 1, 4, 5), V);
+    } else if constexpr (kWidth<V> == 8) {
+        const float* const half[2][4] = {{from[0], from[1], from[2], from[3]}, {from[4], from[5], from[6], from[7]}};
+        double4 low[3], high[3];
+        gather<double4>(half[0], offset, low);
+        gather<double4>(half[1], offset, high);
+        for (int i = 0; i < 3; ++i) c[i] = __builtin_shufflevector(low[i], high[i], 0, 1, 2, 3, 4, 5, 6, 7);
     } else {
         for (int i = 0; i < 3; ++i)
             for (int lane = 0; lane < kWidth<V>; ++lane) set(c[i], lane, double(from[lane][offset + i]));

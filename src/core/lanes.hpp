@@ -6,6 +6,9 @@
 
 #include <cmath>
 #include <cstdint>
+#ifdef __AVX512F__
+#include <immintrin.h>
+#endif
 
 namespace endopilot {
 
@@ -31,6 +34,13 @@ struct LaneTraits<double8> {
     static constexpr int width = 8;
     using Mask = mask8;
 };
+
+// What suits the processor that this is compiled for.
+#ifdef __AVX512F__
+inline constexpr int kLanes = 8;
+#else
+inline constexpr int kLanes = 4;
+#endif
 
 template <class V>
 inline constexpr int kWidth = LaneTraits<V>::width;
@@ -83,6 +93,10 @@ inline V square_root(V a) {
 #ifdef __AVX__
     } else if constexpr (kWidth<V> == 4) {
         return __builtin_ia32_sqrtpd256(a);
+#endif
+#ifdef __AVX512F__
+    } else if constexpr (kWidth<V> == 8) {
+        return V{_mm512_sqrt_pd(__m512d(a))};
 #endif
     } else {
         V root;

@@ -14,17 +14,20 @@ class Lumen:
 class Loads: ...
 
 class Options:
-    time_step: float
-    steps_per_sample: int
     stick_velocity: float
     wall_stiffness: float
     tolerance: float
     sample_tolerance: float
     largest_step: float
+    largest_jump: float
     most_iterations: int
     free_behind: float
     approach_velocity: float
     push_limit: float
+    introducer_friction: float
+    introducer_drag: float
+
+LANES: int
 
 def make_rod(
     *,
@@ -38,7 +41,7 @@ def make_rod(
     drag: np.ndarray,
     spin_drag: np.ndarray,
 ) -> RodModel: ...
-def make_lumen(*, coefficients: np.ndarray, origin: np.ndarray, spacing: float, near: float, far: float) -> Lumen: ...
+def make_lumen(*, values: np.ndarray, origin: np.ndarray, spacing: float, near: float, far: float) -> Lumen: ...
 def make_loads(
     *,
     force: np.ndarray,
@@ -48,21 +51,44 @@ def make_loads(
     hold: np.ndarray,
     attitude: np.ndarray,
 ) -> Loads: ...
-def simulate(
-    *,
-    rod: RodModel,
-    lumen: Lumen | None,
-    loads: Loads | None,
-    origin: np.ndarray,
-    orientation: np.ndarray,
-    options: Options,
-    initial: np.ndarray,
-    control: np.ndarray,
-    friction: np.ndarray,
-    order: np.ndarray,
-    record_shape: bool,
-    record_attitude: bool,
-    threads: int,
-    lanes: int,
-    progress: Callable[[int], Any] | None,
-) -> dict[str, np.ndarray]: ...
+
+class Simulation:
+    nodes: int
+
+    def __init__(
+        self,
+        *,
+        rod: RodModel,
+        lumen: Lumen | None,
+        loads: Loads | None,
+        origin: np.ndarray,
+        orientation: np.ndarray,
+        options: Options,
+        worlds: int,
+    ) -> None: ...
+    def reset(self, *, index: np.ndarray, initial: np.ndarray, friction: np.ndarray, sample_period: float) -> None: ...
+    def run(
+        self,
+        *,
+        control: np.ndarray,
+        force_driven: bool,
+        time_step: float,
+        steps_per_sample: int,
+        record_shape: bool,
+        record_attitude: bool,
+        threads: int,
+        lanes: int,
+        progress: Callable[[int], Any] | None,
+    ) -> dict[str, np.ndarray]: ...
+    def state(self) -> np.ndarray: ...
+    def set_state(self, all: np.ndarray) -> None: ...
+    def positions(self) -> np.ndarray: ...
+    def attitudes(self) -> np.ndarray: ...
+    def contacts(self) -> np.ndarray: ...
+    def inserted_length(self) -> np.ndarray: ...
+    def rotation(self) -> np.ndarray: ...
+    def reason(self) -> np.ndarray: ...
+    def base_force(self) -> np.ndarray: ...
+    def base_torque(self) -> np.ndarray: ...
+    def drive_force(self) -> np.ndarray: ...
+    def drive_torque(self) -> np.ndarray: ...

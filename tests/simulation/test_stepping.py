@@ -1,4 +1,4 @@
-"""The stepping interface: the same bits as `simulate`, saved state, force drive, balance of loads, refusal of bad input."""
+"""Stepping many worlds: the same bits as `simulate`, saved state, force drive, balance of loads, bad input."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 from endopilot.errors import InputError
 from endopilot.simulation.device import read_device
 from endopilot.simulation.simulator import SimulatorConfig, simulate
-from endopilot.simulation.stepping import Simulator, SimulatorState
+from endopilot.simulation.state import SimulatorState
+from endopilot.simulation.stepping import Simulator
 from endopilot.types import Anatomy
 
 DEVICE = read_device("workhorse-014")
@@ -115,7 +116,9 @@ import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})
 import numpy as np
 from bend import vessel
 from endopilot.simulation.device import read_device
-from endopilot.simulation.stepping import Simulator, SimulatorState
+from endopilot.simulation.state import SimulatorState
+from endopilot.simulation.stepping import Simulator
+from endopilot.simulation.state import SimulatorState
 from pathlib import Path
 simulator = Simulator(vessel(), read_device("workhorse-014"), worlds=3)
 simulator.set_state(SimulatorState.load(Path("state.npz")))
@@ -146,7 +149,9 @@ def test_forces_replay_a_velocity_run(anatomy: Anatomy) -> None:
     leading = begun(Simulator(anatomy, DEVICE, worlds=4, config=config), 4)
     led = begun(Simulator(anatomy, DEVICE, worlds=4, config=config, actuation="force"), 4)
     random = np.random.default_rng(8)
-    velocity = np.repeat(np.column_stack([random.uniform(1, 8, 8), random.uniform(-3, 3, 8)]).reshape(2, 4, 2), 40, axis=0)
+    velocity = np.repeat(
+        np.column_stack([random.uniform(1, 8, 8), random.uniform(-3, 3, 8)]).reshape(2, 4, 2), 40, axis=0
+    )
     apart, torques = [], []
     for control in velocity:
         step = leading.step(control, dt)

@@ -10,8 +10,7 @@ import os
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Integer
-from scipy import ndimage
+from jaxtyping import Bool, Float, Integer
 
 from endopilot import _core
 from endopilot.anatomy.projection import project_tip
@@ -29,7 +28,7 @@ _MOST_ITERATIONS = 400
 """Newton iterations after which a time step is halved, down to 1/64; a wire that snaps over needs some hundred."""
 SAMPLE_TOLERANCE = 1e-6
 """Newton tolerance of the step that ends a sample, mm: its forces are recorded, and the wire is stiff axially."""
-LANES = 4
+LANES = _core.LANES
 """Worlds that one thread steps side by side."""
 _OVERSHOOT_MM = 1e-2
 """Rounding of controls may carry the inserted length this far below 0, mm."""
@@ -216,7 +215,9 @@ def run_core(
         lumen=lumen,
         loads=loads,
         **insertion_arguments(insertion),
-        options=core_options(config, approach=approach, free_behind_mm=free_behind_mm, sample_tolerance=sample_tolerance),
+        options=core_options(
+            config, approach=approach, free_behind_mm=free_behind_mm, sample_tolerance=sample_tolerance
+        ),
         worlds=len(control),
     )
     simulation.reset(
@@ -270,15 +271,9 @@ def core_options(
 
 def make_lumen(distance_map: DistanceMap, radius_mm: float) -> _core.Lumen:
     """Return the wall as the core wants it, a quadratic B-spline through the map, for a wire of some radius."""
-    coefficients: Float32[np.ndarray, "nz ny nx"] = ndimage.spline_filter(
-        np.asarray(distance_map.values, dtype=np.float32),
-        order=2,
-        output=np.float32,  # pyright: ignore[reportArgumentType]
-        mode="nearest",  # pyright: ignore[reportArgumentType]
-    )
     spacing = float(distance_map.spacing_mm)
     return _core.make_lumen(
-        coefficients=np.ascontiguousarray(coefficients),
+        values=np.ascontiguousarray(distance_map.values, dtype=np.float32),
         origin=np.asarray(distance_map.origin_mm, dtype=float),
         spacing=spacing,
         near=radius_mm + spacing,

@@ -10,8 +10,7 @@ import hashlib
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Integer
@@ -20,7 +19,6 @@ from numpy.typing import ArrayLike
 from endopilot import _core
 from endopilot.anatomy.projection import project_tip
 from endopilot.errors import InputError
-from endopilot.files import writing
 from endopilot.simulation.device import Device, check_fits
 from endopilot.simulation.rod import RodLayout, lay_out
 from endopilot.simulation.simulator import (
@@ -33,78 +31,13 @@ from endopilot.simulation.simulator import (
     insertion_arguments,
     make_lumen,
 )
+from endopilot.simulation.state import SimulatorState, Step, SupportsDLPack
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, TipProjection
 
 _SPARE_MM = 20.0
 """Length that the wire can be pushed beyond the end of the vessel's longest path, mm."""
 _DEEPEST_START = 0.8
 """Share of the longest path that a random start may lie at."""
-
-
-@runtime_checkable
-class SupportsDLPack(Protocol):
-    """An array of another library that numpy can look into without a copy."""
-
-    def __dlpack__(self, **arguments: Any) -> Any: ...
-    def __dlpack_device__(self) -> tuple[int, int]: ...
-
-
-@dataclass(frozen=True, eq=False)
-class Step:
-    """What all worlds did in one call of `Simulator.step`; row i belongs to world i.
-
-    Attributes:
-        inserted_length: Δ at the end of the step, mm.
-        rotation: φ at its end, rad.
-        tip_position: LPS mm.
-        tip_direction: unit vector along the wire at its tip.
-        contact_force_max: largest wall force on one node, N.
-        contact_force_sum: sum of the wall forces' magnitudes, N.
-        slip: advance that was asked of the drive and not made, mm.
-        valid: false for a world that has failed; it stays as it was.
-    """
-
-    inserted_length: Float[np.ndarray, "worlds"]
-    rotation: Float[np.ndarray, "worlds"]
-    tip_position: Float[np.ndarray, "worlds 3"]
-    tip_direction: Float[np.ndarray, "worlds 3"]
-    contact_force_max: Float[np.ndarray, "worlds"]
-    contact_force_sum: Float[np.ndarray, "worlds"]
-    slip: Float[np.ndarray, "worlds"]
-    valid: Bool[np.ndarray, "worlds"]
-
-
-@dataclass(frozen=True, eq=False)
-class SimulatorState:
-    """All that the worlds' future depends on. Restored, also in another process, they go on with the same bits.
-
-    Attributes:
-        values: one array of float64 for each pair of anatomy and device, a row a world.
-        fingerprint: hash of the anatomies, devices and settings that the state belongs to.
-    """
-
-    values: tuple[Float[np.ndarray, "_ _"], ...]
-    fingerprint: str
-
-    def save(self, path: Path) -> None:
-        """Write the state to an .npz file, whole or not at all."""
-        arrays = {f"values_{k}": v for k, v in enumerate(self.values)}
-        with writing(path) as temporary, temporary.open("wb") as file:
-            np.savez(file, fingerprint=np.array(self.fingerprint), **arrays)  # pyright: ignore[reportArgumentType]
-
-    @staticmethod
-    def load(path: Path) -> SimulatorState:
-        """Read a state.
-
-        Raises:
-            InputError: the file is missing or is no saved state.
-        """
-        try:
-            with np.load(path, allow_pickle=False) as stored:
-                count = len(stored.files) - 1
-                return SimulatorState(tuple(stored[f"values_{k}"] for k in range(count)), str(stored["fingerprint"]))
-        except (OSError, ValueError, KeyError) as error:
-            raise InputError(f"{path}: no saved state of a simulator ({error}); save one with SimulatorState.save") from None
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +99,9 @@ class Simulator:
         if isinstance(anatomy, Anatomy) and not isinstance(device, Device):
             anatomies = [anatomy] * len(devices)
         if not anatomies or len(anatomies) != len(devices):
-            raise InputError(f"anatomy, device: {len(anatomies)} and {len(devices)}; give at least one, and as many of each")
+            raise InputError(
+                f"anatomy, device: {len(anatomies)} and {len(devices)}; give at least one, and as many of each"
+            )
         self._groups = self._make_groups(anatomies, devices)
         self._device = devices
         self.reset(inserted_length=np.zeros(len(devices)), rotation=np.zeros(len(devices)))
@@ -182,7 +117,9 @@ class Simulator:
             check_distance_map(anatomy)
             path_mm = float(anatomy.tree.longest_path().abscissa[-1])
             longest_mm = path_mm + _SPARE_MM
-            rod = lay_out(device, path_mm=path_mm, elements=self._config.elements, length_mm=longest_mm + FREE_BEHIND_MM)
+            rod = lay_out(
+                device, path_mm=path_mm, elements=self._config.elements, length_mm=longest_mm + FREE_BEHIND_MM
+            )
             _check_memory(len(worlds), len(rod.abscissa_mm))
             key = (id(anatomy), device.tip_radius_mm)
             if key not in lumens:
@@ -276,8 +213,8 @@ class Simulator:
         """Drive every world for some time with a constant control.
 
         Args:
-            control: a row a world, of translation (mm/s) and rotation (rad/s), or axial force (N) and torque (N·mm); numpy, or anything
-                that speaks DLPack, such as a torch tensor on the CPU.
+            control: a row a world, of translation (mm/s) and rotation (rad/s), or of axial force (N) and torque
+                (N·mm); numpy, or anything that speaks DLPack, such as a torch tensor on the CPU.
             duration: s; it is cut into equal time steps of at most `config.time_step_s`.
 
         Returns:
@@ -287,7 +224,9 @@ class Simulator:
             InputError: a control of another shape, that is not finite, above the device's velocity limit or beyond
                 the length of the wire; a duration that is not positive. No world is moved then.
         """
-        array = control if isinstance(control, np.ndarray) or not hasattr(control, "__dlpack__") else np.from_dlpack(control)
+        array: Any = control
+        if not isinstance(array, np.ndarray) and hasattr(array, "__dlpack__"):
+            array = np.from_dlpack(array)
         array = np.ascontiguousarray(array, dtype=float)
         self._check_control(array, duration)
         steps = max(1, int(np.ceil(duration / self._config.time_step_s - 1e-9)))
@@ -301,7 +240,9 @@ class Simulator:
                 first[name][group.index] = values
         return Step(**first)
 
-    def _run(self, group: _Group, control: np.ndarray, time_step: float, steps: int, *, by_force: bool) -> dict[str, Any]:
+    def _run(
+        self, group: _Group, control: np.ndarray, time_step: float, steps: int, *, by_force: bool
+    ) -> dict[str, Any]:
         return group.simulation.run(
             control=control,
             force_driven=by_force,
@@ -336,8 +277,8 @@ class Simulator:
             speed, spin = np.abs(control[world])
             if speed > device.max_velocity_mm_s * (1 + 1e-6) or spin > device.max_rotation_rad_s * (1 + 1e-6):
                 raise InputError(
-                    f"control: world {world}: {control[world, 0]:g} mm/s, {control[world, 1]:g} rad/s exceed {device.name}'s "
-                    f"limits of {device.max_velocity_mm_s:g} mm/s and {device.max_rotation_rad_s:g} rad/s; slow down"
+                    f"control: world {world}: {control[world, 0]:g} mm/s, {control[world, 1]:g} rad/s exceed the limits "
+                    f"of {device.name}, {device.max_velocity_mm_s:g} mm/s and {device.max_rotation_rad_s:g} rad/s; slow down"
                 )
         for group in self._groups:
             end = group.simulation.inserted_length() + control[group.index, 0] * duration
@@ -388,7 +329,7 @@ class Simulator:
 
     @property
     def base_load(self) -> Float[np.ndarray, "worlds 2"]:
-        """Axial force (N, positive when it pushes) and torque (N·mm) that hold the wire where it enters the catheter."""
+        """Axial force (N, positive when it pushes) and torque (N·mm) that hold the wire in the catheter."""
         return np.column_stack([self._gather("base_force"), self._gather("base_torque")])
 
     @property
@@ -426,7 +367,9 @@ class Simulator:
             InputError: the state is that of other anatomies, devices or settings, or of another number of worlds.
         """
         if state.fingerprint != self._fingerprint():
-            raise InputError("state: made with other anatomies, devices or settings; restore it in a simulator like its own")
+            raise InputError(
+                "state: made with other anatomies, devices or settings; restore it in a simulator like its own"
+            )
         for group, values in zip(self._groups, state.values, strict=True):
             group.simulation.set_state(np.ascontiguousarray(values))
 

@@ -1,0 +1,81 @@
+"""What goes into and comes out of the stepping simulator."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from endopilot.errors import InputError
+from endopilot.files import writing
+
+
+@runtime_checkable
+class SupportsDLPack(Protocol):
+    """An array of another library that numpy can look into without a copy."""
+
+    def __dlpack__(self, **arguments: Any) -> Any: ...
+    def __dlpack_device__(self) -> tuple[int, int]: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """What all worlds did in one call of `Simulator.step`; row i belongs to world i.
+
+    Attributes:
+        inserted_length: Δ at the end of the step, mm.
+        rotation: φ at its end, rad.
+        tip_position: LPS mm.
+        tip_direction: unit vector along the wire at its tip.
+        contact_force_max: largest wall force on one node, N.
+        contact_force_sum: sum of the wall forces' magnitudes, N.
+        slip: advance that was asked of the drive and not made, mm.
+        valid: false for a world that has failed; it stays as it was.
+    """
+
+    inserted_length: Float[np.ndarray, "worlds"]
+    rotation: Float[np.ndarray, "worlds"]
+    tip_position: Float[np.ndarray, "worlds 3"]
+    tip_direction: Float[np.ndarray, "worlds 3"]
+    contact_force_max: Float[np.ndarray, "worlds"]
+    contact_force_sum: Float[np.ndarray, "worlds"]
+    slip: Float[np.ndarray, "worlds"]
+    valid: Bool[np.ndarray, "worlds"]
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatorState:
+    """All that the worlds' future depends on. Restored, also in another process, they go on with the same bits.
+
+    Attributes:
+        values: one array of float64 for each pair of anatomy and device, a row a world.
+        fingerprint: hash of the anatomies, devices and settings that the state belongs to.
+    """
+
+    values: tuple[Float[np.ndarray, "_ _"], ...]
+    fingerprint: str
+
+    def save(self, path: Path) -> None:
+        """Write the state to an .npz file, whole or not at all."""
+        arrays = {f"values_{k}": v for k, v in enumerate(self.values)}
+        with writing(path) as temporary, temporary.open("wb") as file:
+            np.savez(file, fingerprint=np.array(self.fingerprint), **arrays)  # pyright: ignore[reportArgumentType]
+
+    @staticmethod
+    def load(path: Path) -> SimulatorState:
+        """Read a state.
+
+        Raises:
+            InputError: the file is missing or is no saved state.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as stored:
+                count = len(stored.files) - 1
+                return SimulatorState(tuple(stored[f"values_{k}"] for k in range(count)), str(stored["fingerprint"]))
+        except (OSError, ValueError, KeyError) as error:
+            raise InputError(
+                f"{path}: no saved state of a simulator ({error}); save one with SimulatorState.save"
+            ) from None
