@@ -251,7 +251,7 @@ def test_pulling_out_stops_at_the_ostium(anatomy: Anatomy) -> None:
     [
         (np.zeros((1, 2)), 0.1, r"shape \(1, 2\); give \(2, 2\)"),
         (np.array([[1, 0], [np.nan, 0]]), 0.1, "world 1: .* not finite"),
-        (np.array([[1, 0], [1e3, 0]]), 0.1, "world 1: 1000 mm/s.* limits of"),
+        (np.array([[1, 0], [1e3, 0]]), 0.1, "world 1: 1000 mm/s.* the limits of"),
         (np.array([[40.0, 0], [0, 0]]), 60.0, "world 0: would insert .* push less"),
         (np.zeros((2, 2)), 0.0, "duration: 0.0; give a positive"),
     ],

@@ -277,8 +277,9 @@ class Simulator:
             speed, spin = np.abs(control[world])
             if speed > device.max_velocity_mm_s * (1 + 1e-6) or spin > device.max_rotation_rad_s * (1 + 1e-6):
                 raise InputError(
-                    f"control: world {world}: {control[world, 0]:g} mm/s, {control[world, 1]:g} rad/s exceed the limits "
-                    f"of {device.name}, {device.max_velocity_mm_s:g} mm/s and {device.max_rotation_rad_s:g} rad/s; slow down"
+                    f"control: world {world}: {control[world, 0]:g} mm/s, {control[world, 1]:g} rad/s exceed "
+                    f"{device.max_velocity_mm_s:g} mm/s, {device.max_rotation_rad_s:g} rad/s, the limits of "
+                    f"{device.name}; slow down"
                 )
         for group in self._groups:
             end = group.simulation.inserted_length() + control[group.index, 0] * duration
