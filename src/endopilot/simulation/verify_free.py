@@ -15,9 +15,17 @@ ROLL_UP_DRAG = 0.02
 ROLL_UP_SAMPLES = 100
 
 
-def elastica_tip(alpha: float, elements: int) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "n 3"]]:
-    """Return tip displacements (w/L sideways, u/L axially) of a clamped rod under F = α EI/L², and its shape."""
-    rod = straight_rod(elements=elements, length_mm=1.0, bend=1.0, twist=1.0)
+def elastica_tip(
+    alpha: float, elements: int, *, stiffness: float = 1e5
+) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "n 3"]]:
+    """Return tip displacements (w/L sideways, u/L axially) of a clamped rod under F = α EI/L², and its shape.
+
+    Args:
+        alpha: the load.
+        elements: number of elements.
+        stiffness: κGA and EA in units of EI/L²; the elastica's are infinite.
+    """
+    rod = straight_rod(elements=elements, length_mm=1.0, bend=1.0, twist=1.0, shear=stiffness, stretch=stiffness)
     loading = Loading.none(len(rod.abscissa_mm))
     loading.force_n[0] = [0.0, alpha, 0.0]
     shape = equilibrium(rod, loading)["shape"][-1]
