@@ -148,7 +148,16 @@ def pushed_into_a_bend() -> list[Case]:
     )
     push, theirs = bend_mujoco()
     ours = result["shape"][-1][:elements][::-1]
-    picture = Picture(
+    time = 0.5 * (1 + np.arange(len(control)))
+    pushed = Picture(
+        "time, s",
+        "push, N",
+        (
+            Curve("MuJoCo, at rest", time[[0, -1]], np.full(2, push), "reference"),
+            Curve("core, pushed in for 35 s, then at rest", time, result["base_force"]),
+        ),
+    )
+    lain = Picture(
         "x, mm",
         "y, mm",
         (Curve("MuJoCo", theirs[:, 0], theirs[:, 1], "reference"), Curve("core", ours[:, 0], ours[:, 1])),
@@ -156,8 +165,8 @@ def pushed_into_a_bend() -> list[Case]:
     )
     apart = float(np.linalg.norm(ours - theirs, axis=1).max()) / (TUBE_RADIUS_MM - WIRE_RADIUS_MM)
     return [
-        compare(names[0], push, result["base_force"][-1], BAR, picture),
-        Case(names[1], 0.0, apart, apart, BAR, picture),
+        compare(names[0], push, result["base_force"][-1], BAR, pushed),
+        Case(names[1], 0.0, apart, apart, BAR, lain),
     ]
 
 

@@ -14,12 +14,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _STYLES: dict[str, dict[str, Any]] = {
-    "reference": {"color": "0.55", "lw": 3.0, "zorder": 1},
-    "core": {"color": "tab:blue", "marker": "o", "ms": 3.5, "lw": 0.8, "zorder": 2},
+    "reference": {"color": "0.55", "lw": 3.5, "zorder": 1},
+    "core": {"color": "tab:blue", "marker": "o", "ms": 3.5, "lw": 0.7, "zorder": 2},
     "mark": {"color": "tab:red", "marker": "x", "ms": 9, "mew": 2, "ls": "", "zorder": 3},
 }
 _SHADES = {"reference": ("0.5", "0.75"), "core": ("tab:blue", "tab:orange"), "mark": ("tab:red", "tab:green")}
-_MOST_MARKERS = 60
+_MOST_MARKERS = 24
 _FEW_POINTS = 12
 
 
@@ -58,7 +58,7 @@ def _fill(axes: Axes, picture: Picture) -> None:
         style = dict(_STYLES[curve.style])
         style["color"] = _SHADES[curve.style][number % 2]
         if curve.style == "core":
-            style["markevery"] = max(1, len(curve.x) // _MOST_MARKERS)
+            style["markevery"] = max(1, len(curve.x) // _MOST_MARKERS)  # else they hide the reference
             style["ls"] = "-" if len(curve.x) > _FEW_POINTS else ""
         axes.plot(np.asarray(curve.x), np.asarray(curve.y), label=curve.name, **style)
     axes.set(xlabel=picture.horizontal, ylabel=picture.vertical)
