@@ -15,7 +15,7 @@ needs_mujoco = pytest.mark.skipif(importlib.util.find_spec("mujoco") is None, re
 @pytest.mark.parametrize("group", verify_engine.CASES, ids=lambda group: group.__name__)
 def test_agrees(group) -> None:
     # A chain of rigid links with joints of stiffness EI/l rests where the rod rests: a curved cantilever under a load
-    # across its plane (F L²/EI = 8), and a rod pushed 75° far into a bend of 90° without friction.
+    # across its plane (F L²/EI = 2), and a rod pushed 75° far into a bend of 90° without friction.
     for case in group():
         assert case.error <= 0.02, case.case
 

@@ -1,4 +1,4 @@
-"""The rod against closed forms, without a wall. Equations and sources stand in `endopilot.simulation.verify_free` too."""
+"""The rod against closed forms, without a wall. Derivations stand in `endopilot.simulation.verify_free`."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ def test_second_order_in_element_length() -> None:
 
 
 def test_first_order_in_time_step() -> None:
-    # c dδ/dt = F - 3 EI δ/L³: implicit Euler errs by h/(2 e τ) of F L³/3EI after one time constant, in the leading order.
+    # c dδ/dt = F - 3 EI δ/L³: after one time constant implicit Euler errs by h/(2 e τ) of F L³/3EI, to leading order.
     (case,) = verify_order.order_in_time_step()
     assert 0.95 <= case.value <= 1.05
     assert case.picture is not None

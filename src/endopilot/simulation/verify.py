@@ -27,7 +27,7 @@ STATIC = SimulatorConfig(time_step_s=0.5, tolerance_mm=1e-8, threads=1)
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """One curve of a picture: its name in the legend, its points, and how it is drawn: `core`, `reference` or `mark`."""
+    """One curve of a picture: its name in the legend, its points, and its style: `core`, `reference` or `mark`."""
 
     name: str
     x: Float[np.ndarray, "n"]
@@ -119,9 +119,7 @@ def compare(case: str, reference: float, value: float, bar: float, picture: Pict
     return Case(case, float(reference), float(value), abs(float(value) / float(reference) - 1), bar, picture)
 
 
-def extrapolate_to_zero(
-    stiffness: Float[np.ndarray, "n"], load: Float[np.ndarray, "n"], *, degree: int = 2
-) -> float:
+def extrapolate_to_zero(stiffness: Float[np.ndarray, "n"], load: Float[np.ndarray, "n"], *, degree: int = 2) -> float:
     """Return the load at which a stiffness that falls smoothly with it reaches zero, by a polynomial through both."""
     return float(np.polynomial.Polynomial.fit(stiffness, load, degree)(0.0))
 

@@ -66,7 +66,8 @@ def elastica() -> list[Case]:
     cases = []
     for alpha, reference in table.items():
         tip, shape = elastica_tip(alpha, ELEMENTS)
-        exact = Curve("elastica", *elastica_curve(alpha), "reference")
+        line = elastica_curve(alpha)
+        exact = Curve("elastica", line[0], line[1], "reference")
         table_tip = Curve("Mattiasson's tip", np.array([1 - reference[1]]), np.array([reference[0]]), "mark")
         curves = (exact, Curve("core", *_ahead(shape)), table_tip)
         picture = Picture("x/L", "y/L", curves, equal=True)

@@ -67,7 +67,16 @@ def relaxation_error(step_s: float) -> float:
 def order_in_time_step() -> list[Case]:
     """Measure the order of the error of a dragged tip as the time step shrinks: implicit Euler is of first order."""
     error = np.array([abs(relaxation_error(step)) for step in RELAXATION_STEPS_S])
-    return [_order("order in time step, relaxation", 1.0, RELAXATION_STEPS_S, error, ("time step, s", "relative error"), ORDER_BAR)]
+    return [
+        _order(
+            "order in time step, relaxation",
+            1.0,
+            RELAXATION_STEPS_S,
+            error,
+            ("time step, s", "relative error"),
+            ORDER_BAR,
+        )
+    ]
 
 
 def navigation_error() -> Float[np.ndarray, "steps"]:
