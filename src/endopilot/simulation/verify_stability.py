@@ -153,7 +153,7 @@ def michell_ring() -> list[Case]:
     line = critical * np.linspace(0, 1, 101)
     picture = Picture(
         "twist, rad",
-        "stiffness against the mode, share of the untwisted",
+        "stiffness / that of the untwisted ring",
         (
             Curve("1 − (Tw / 2π√3 EI/GJ)²", line, 1 - (line / critical) ** 2, "reference"),
             Curve("core", twists, stiffness / stiffness[0]),

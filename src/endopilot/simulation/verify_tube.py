@@ -26,7 +26,7 @@ BEND_N_MM2 = 100.0
 WEIGHT_N_MM = 1e-3
 CLEARANCE_MM = 1.0
 WIRE_RADIUS_MM = 0.2
-WALL_N_MM = 50.0
+WALL_N_MM = 20.0
 """Stiffness of the tube's wall at a node."""
 WAVES = 10
 """Natural wavelengths 2π (EI r/w)^¼ that the rod is long."""
@@ -181,8 +181,8 @@ def helical_buckling() -> list[Case]:
 
     Y.-C. Chen, Y.-H. Lin and J. B. Cheatham, J. Petroleum Technology 42 (1990) 214-220. A helix of wave number k has
     the energy EI r² k⁴/2 - F r² k²/2 + w r over the straight rod's, per length, which is w r - F² r²/(8 EI) at its
-    best k² = F/(2 EI) and vanishes at that load. Below 3.75 sqrt(EI w/r) the snaking rod is stable too: so the helix
-    is measured where the rod goes there by itself, and continued. The weight makes the turns uneven, which lowers the
+    best k² = F/(2 EI) and vanishes at that load. For some way above it the snaking rod is stable too: so the helix
+    is measured where the rod coils up by itself, and continued. The weight makes the turns uneven, which lowers the
     load by 1.3 %. The energy hardly feels a wrong balance of forces, so the wall's force is compared too: it is
     r k² (F - EI k²) per length, F² r/(4 EI) at that wave number (A. Lubinski, W. S. Althouse and J. L. Logan, J.
     Petroleum Technology 14 (1962) 655-670).
