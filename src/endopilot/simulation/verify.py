@@ -26,16 +26,38 @@ STATIC = SimulatorConfig(time_step_s=0.5, tolerance_mm=1e-8, largest_jump=1e6, t
 
 
 @dataclass(frozen=True, eq=False)
+class Curve:
+    """One curve of a picture: its name in the legend, its points, and its style: `core`, `reference` or `mark`."""
+
+    name: str
+    x: Float[np.ndarray, "n"]
+    y: Float[np.ndarray, "n"]
+    style: str = "core"
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """What the figure of a case shows: names and units of the axes, curves, and the kind of its scales."""
+
+    horizontal: str
+    vertical: str
+    curves: tuple[Curve, ...]
+    equal: bool = False
+    logarithmic: bool = False
+
+
+@dataclass(frozen=True, eq=False)
 class Case:
     """One comparison.
 
     Attributes:
         case: what is compared.
-        reference: value of the closed form.
+        reference: value of the closed form, or of the other engine.
         value: value of the core.
         error: relative error, or absolute where the reference is 0.
         bar: largest error that passes.
-        curve: abscissa and ordinate of a picture, with their names, if there is one.
+        picture: the case's figure.
+        skipped: why the comparison could not be made; empty if it was.
     """
 
     case: str
@@ -43,10 +65,14 @@ class Case:
     value: float
     error: float
     bar: float
-    curve: tuple[str, str, Float[np.ndarray, "n"], Float[np.ndarray, "n"]] | None = None
+    picture: Picture | None = None
+    skipped: str = ""
 
     def row(self) -> dict[str, Any]:
-        """Return the row that `endopilot verify` prints."""
+        """Return the row that `endopilot verify` prints; `passed` is None where the case was skipped."""
+        if self.skipped:
+            figures = dict.fromkeys(("reference", "value", "error"))
+            return {"case": f"{self.case} (skipped: {self.skipped})", **figures, "bar": self.bar, "passed": None}
         return {
             "case": self.case,
             "reference": self.reference,
@@ -61,27 +87,41 @@ def run_verification(plots: Path | None = None) -> list[dict[str, Any]]:
     """Run every case.
 
     Args:
-        plots: folder for a figure of each case that has a curve.
+        plots: folder for a figure of each case.
 
     Returns:
-        One row a comparison: case, reference, value, error, bar, passed.
+        One row a comparison: case, reference, value, error, bar, passed (None if it was skipped).
     """
-    from endopilot.simulation import verify_contact, verify_free
+    from endopilot.simulation import (
+        verify_contact,
+        verify_engine,
+        verify_free,
+        verify_order,
+        verify_stability,
+        verify_tube,
+    )
+    from endopilot.simulation.verify_plots import draw
 
-    groups: list[Callable[[], list[Case]]] = [*verify_free.CASES, *verify_contact.CASES]
+    modules = (verify_free, verify_stability, verify_contact, verify_tube, verify_engine, verify_order)
+    groups: list[Callable[[], list[Case]]] = [group for module in modules for group in module.CASES]
     cases: list[Case] = []
     with progress("Verifying the rod core", total=len(groups)) as advance:
         for group in groups:
             cases.extend(group())
             advance()
     if plots is not None:
-        _draw(cases, Path(plots))
+        draw(cases, Path(plots))
     return [case.row() for case in cases]
 
 
-def compare(case: str, reference: float, value: float, bar: float, **curve: Any) -> Case:
+def compare(case: str, reference: float, value: float, bar: float, picture: Picture | None = None) -> Case:
     """Return the comparison of a value with its reference, which is not 0."""
-    return Case(case, float(reference), float(value), abs(float(value) / float(reference) - 1), bar, **curve)
+    return Case(case, float(reference), float(value), abs(float(value) / float(reference) - 1), bar, picture)
+
+
+def extrapolate_to_zero(stiffness: Float[np.ndarray, "n"], load: Float[np.ndarray, "n"], *, degree: int = 2) -> float:
+    """Return the load at which a stiffness that falls smoothly with it reaches zero, by a polynomial through both."""
+    return float(np.polynomial.Polynomial.fit(stiffness, load, degree)(0.0))
 
 
 def straight_rod(
@@ -208,24 +248,3 @@ def equilibrium(
     if not result["valid"].all():
         raise RuntimeError("a verification case did not converge")
     return {name: values[0] for name, values in result.items()}
-
-
-def _draw(cases: list[Case], folder: Path) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    folder.mkdir(parents=True, exist_ok=True)
-    for case in cases:
-        figure, axes = plt.subplots(figsize=(5, 3.4), layout="constrained")
-        if case.curve is None:
-            axes.bar(["closed form", "core"], [case.reference, case.value], color=["0.7", "tab:blue"])
-        else:
-            horizontal, vertical, x, y = case.curve
-            axes.plot(x, y, ".-", ms=3)
-            axes.set(xlabel=horizontal, ylabel=vertical)
-        axes.set_title(f"{case.case}\nerror {case.error:.2g}, bar {case.bar:.2g}", fontsize=9)
-        name = "".join(c if c.isalnum() else "-" for c in case.case).strip("-")
-        figure.savefig(folder / f"{name}.png", dpi=110)
-        plt.close(figure)

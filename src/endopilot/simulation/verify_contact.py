@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.simulation.simulator import SimulatorConfig, make_lumen
-from endopilot.simulation.verify import Case, Loading, compare, equilibrium, straight_rod
+from endopilot.simulation.verify import Case, Curve, Loading, Picture, compare, equilibrium, straight_rod
 from endopilot.types import DistanceMap, Insertion
 
 LEAD_MM = 30.0
@@ -92,7 +92,17 @@ def capstan() -> list[Case]:
     tension = -result["base_force"]
     time = 0.5 * np.arange(len(tension))
     reference = float(np.exp(friction * wrapped))
-    return [compare("capstan T2/T1", reference, tension[-1] / load, 0.02, curve=("time, s", "pull, N", time, tension))]
+    pulled = time > 0.5 * (push_samples - 6)
+    picture = Picture(
+        "time, s",
+        "pull at the base, N",
+        (
+            Curve("T1 exp(µθ)", time[pulled][[0, -1]], np.full(2, load * reference), "reference"),
+            Curve("T1 exp(−µθ)", time[pulled][[0, -1]], np.full(2, load / reference), "reference"),
+            Curve("core, pushed in, then pulled", time[pulled], tension[pulled]),
+        ),
+    )
+    return [compare("capstan T2/T1", reference, tension[-1] / load, 0.02, picture)]
 
 
 CASES = (capstan,)

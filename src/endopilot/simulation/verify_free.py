@@ -2,12 +2,25 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from endopilot.simulation.rod import RodLayout
-from endopilot.simulation.verify import Case, Loading, compare, equilibrium, straight_rod
+from endopilot.simulation.verify import (
+    Case,
+    Curve,
+    Loading,
+    Picture,
+    compare,
+    equilibrium,
+    extrapolate_to_zero,
+    straight_rod,
+)
 from endopilot.types import Insertion
 
 ELEMENTS = 100
@@ -24,6 +37,21 @@ def elastica_tip(alpha: float, elements: int) -> tuple[Float[np.ndarray, "2"], F
     return np.array([shape[0, 1], 1.0 - shape[0, 0]]), shape
 
 
+def elastica_curve(alpha: float) -> Float[np.ndarray, "2 n"]:
+    """Return x/L and y/L along the elastica θ'' = -α cos θ, θ(0) = 0, θ'(1) = 0, from the wall on."""
+
+    def shoot(curvature: float) -> Any:
+        def slope(_: float, state: Float[np.ndarray, "4"]) -> list[float]:
+            angle, turn = state[:2]
+            return [turn, -alpha * np.cos(angle), np.cos(angle), np.sin(angle)]
+
+        start = [0.0, curvature, 0.0, 0.0]
+        return solve_ivp(slope, (0.0, 1.0), start, rtol=1e-9, atol=1e-10, t_eval=np.linspace(0, 1, 101)).y
+
+    most = np.sqrt(2 * alpha)  # of a rod whose tip has turned by a quarter
+    return shoot(brentq(lambda curvature: shoot(curvature)[1, -1], 0.1 * most, most))[2:]  # pyright: ignore
+
+
 def elastica() -> list[Case]:
     """Compare a cantilever under a dead tip load, α = F L²/EI, with Mattiasson's elliptic integrals.
 
@@ -38,9 +66,13 @@ def elastica() -> list[Case]:
     cases = []
     for alpha, reference in table.items():
         tip, shape = elastica_tip(alpha, ELEMENTS)
-        curve = ("x/L", "y/L", shape[:, 0], shape[:, 1])
+        line = elastica_curve(alpha)
+        exact = Curve("elastica", line[0], line[1], "reference")
+        table_tip = Curve("Mattiasson's tip", np.array([1 - reference[1]]), np.array([reference[0]]), "mark")
+        curves = (exact, Curve("core", *_ahead(shape)), table_tip)
+        picture = Picture("x/L", "y/L", curves, equal=True)
         for name, expected, value in zip(("w/L", "u/L"), reference, tip, strict=True):
-            cases.append(compare(f"elastica α={alpha:g} {name}", expected, value, 1e-3, curve=curve))
+            cases.append(compare(f"elastica α={alpha:g} {name}", expected, value, 1e-3, picture))
     return cases
 
 
@@ -57,7 +89,10 @@ def roll_up() -> list[Case]:
     loading.moment_n_mm[0] = [2 * np.pi / length, 0.0, 0.0]
     shape = equilibrium(rod, loading, samples=ROLL_UP_SAMPLES)["shape"][-1]
     gap = float(np.linalg.norm(0.5 * (shape[0] + shape[1]))) / length
-    return [Case("roll-up gap/L", 0.0, gap, gap, 1e-6, ("x/L", "y/L", shape[:, 0], shape[:, 1]))]
+    angle = np.linspace(0, 2 * np.pi, 201)
+    circle = Curve("circle", np.sin(angle) / (2 * np.pi), -(1 - np.cos(angle)) / (2 * np.pi), "reference")
+    picture = Picture("x/L", "y/L", (circle, Curve("core", *_ahead(shape))), equal=True)
+    return [Case("roll-up gap/L", 0.0, gap, gap, 1e-6, picture)]
 
 
 def timoshenko() -> list[Case]:
@@ -68,7 +103,10 @@ def timoshenko() -> list[Case]:
     loading.force_n[0] = [0.0, force, 0.0]
     shape = equilibrium(rod, loading)["shape"][-1]
     expected = force / (3 * bend) + force / shear
-    return [compare("Timoshenko tip", expected, shape[0, 1], 1e-3, curve=("x/L", "y/L", shape[:, 0], shape[:, 1]))]
+    x = np.linspace(0, 1, 101)
+    exact = force * (x**2 * (3 - x) / (6 * bend) + x / shear)
+    curves = (Curve("F x² (3L − x)/6EI + F x/κGA", x, exact, "reference"), Curve("core", *_ahead(shape)))
+    return [compare("Timoshenko tip", expected, shape[0, 1], 1e-3, Picture("x/L", "deflection/L", curves))]
 
 
 def euler_column() -> list[Case]:
@@ -84,9 +122,19 @@ def euler_column() -> list[Case]:
         loading = Loading.none(len(rod.abscissa_mm))
         loading.force_n[0] = [-load, 1e-6, 0.0]
         stiffness.append(1e-6 / equilibrium(rod, loading)["shape"][-1][0, 1])
-    value = np.polynomial.Polynomial.fit(stiffness, loads, 2)(0.0)
-    curve = ("load, EI/L²", "sideways stiffness, EI/L³", loads, np.array(stiffness))
-    return [compare("Euler column", critical, value, 5e-3, curve=curve)]
+    value = extrapolate_to_zero(np.array(stiffness), loads)
+    line = np.linspace(0.85, 0.9999, 100) * critical
+    root = np.sqrt(line)
+    picture = Picture(
+        "load P, EI/L²",
+        "sideways stiffness of the tip, EI/L³",
+        (
+            Curve("P k/(tan kL − kL), k = √(P/EI)", line, line * root / (np.tan(root) - root), "reference"),
+            Curve("core", loads, np.array(stiffness)),
+            Curve("core, continued to 0", np.array([value]), np.zeros(1), "mark"),
+        ),
+    )
+    return [compare("Euler column", critical, value, 5e-3, picture)]
 
 
 def bend_of_45_degrees() -> list[Case]:
@@ -116,8 +164,14 @@ def bend_of_45_degrees() -> list[Case]:
         moved = scale * (shape[0] - unloaded[0])
         size = float(np.linalg.norm(reference))
         error = float(np.linalg.norm(moved - reference)) / size
-        curve = ("y", "z", scale * shape[:, 1], scale * shape[:, 2])
-        cases.append(Case(f"45° bend P={force:g}", size, float(np.linalg.norm(moved)), error, 3e-3, curve))
+        goal = scale * unloaded[0] + reference
+        curves = (
+            Curve("unloaded", scale * unloaded[:ELEMENTS, 1], scale * unloaded[:ELEMENTS, 2], "reference"),
+            Curve("core", scale * shape[:ELEMENTS, 1], scale * shape[:ELEMENTS, 2]),
+            Curve("converged solution's tip", goal[1:2], goal[2:3], "mark"),
+        )
+        picture = Picture("y (radius 100)", "z", curves, equal=True)
+        cases.append(Case(f"45° bend P={force:g}", size, float(np.linalg.norm(moved)), error, 3e-3, picture))
     return cases
 
 
@@ -154,10 +208,19 @@ def objectivity() -> list[Case]:
         reference = 0.5  # EI κ² L / 2
         change = float(np.abs(energy[3:]).max() if load == 0 else abs(energy[-1] - energy[2])) / reference
         turned = np.cumsum(control[:, 1]) * 0.5
-        cases.append(
-            Case(f"energy, {name}", 0.0, change, change, 1e-10, ("turned, rad", "energy, N mm", turned, energy))
+        start = np.full(2, energy[2])
+        curves = (
+            Curve("energy before the turn", turned[[0, -1]], start, "reference"),
+            Curve("core", turned, energy),
         )
+        picture = Picture("turned, rad", "elastic energy, N mm", curves)
+        cases.append(Case(f"energy, {name}", 0.0, change, change, 1e-10, picture))
     return cases
+
+
+def _ahead(shape: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "2 m"]:
+    """Return x and y of the nodes in front of the wall."""
+    return shape[:ELEMENTS, :2].T
 
 
 CASES = (elastica, roll_up, timoshenko, euler_column, bend_of_45_degrees, objectivity)

@@ -1,0 +1,51 @@
+"""Runs every case of the verification, draws the picture of docs/verification.md and writes its table."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from endopilot.simulation.verify import run_verification
+from endopilot.simulation.verify_plots import file_name
+
+DOCS = Path(__file__).parents[1]
+BEGIN, END = "<!-- table:begin -->", "<!-- table:end -->"
+SHOWN = (
+    "elastica α=10 w/L",
+    "Greenhill twist buckling M",
+    "Michell ring Tw",
+    "rod in a horizontal tube, helical F",
+    "torque whip, snap length, mm",
+    "MuJoCo, rod pushed into a bend, push, N",
+)
+COLUMNS = 3
+
+
+def main() -> None:
+    """Write docs/images/verification.png and the table between its markers in docs/verification.md."""
+    with tempfile.TemporaryDirectory() as folder:
+        rows = run_verification(Path(folder))
+        pictures = [np.asarray(Image.open(Path(folder) / f"{file_name(name)}.png").convert("RGB")) for name in SHOWN]
+    lines = [np.hstack(pictures[start : start + COLUMNS]) for start in range(0, len(pictures), COLUMNS)]
+    whole = Image.fromarray(np.vstack(lines)).quantize(64)
+    whole.save(DOCS / "images" / "verification.png", optimize=True)
+    page = DOCS / "verification.md"
+    head, rest = page.read_text(encoding="utf-8").split(BEGIN)
+    table = "\n".join([BEGIN, "| case | reference | value | error | bar | passed |", "|---|---|---|---|---|---|"])
+    table += "\n" + "\n".join(_line(row) for row in rows) + "\n" + END
+    page.write_text(head + table + rest.split(END)[1], encoding="utf-8")
+
+
+def _line(row: dict[str, Any]) -> str:
+    if row["passed"] is None:
+        return f"| {row['case']} | | | | {row['bar']:g} | skipped |"
+    figures = f"{row['reference']:.6g} | {row['value']:.6g} | {row['error']:.2g} | {row['bar']:g}"
+    return f"| {row['case']} | {figures} | {'yes' if row['passed'] else '**no**'} |"
+
+
+if __name__ == "__main__":
+    main()

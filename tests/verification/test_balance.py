@@ -1,0 +1,44 @@
+"""Balance of forces in a random navigation, from the recorded shapes alone."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import map_coordinates
+
+from endopilot.anatomy.atlas import AtlasConfig, synthesize_one
+from endopilot.simulation.controls import ControlConfig, random_controls
+from endopilot.simulation.device import read_device
+from endopilot.simulation.simulator import SimulatorConfig, simulate
+
+
+def test_the_push_balances_the_wall() -> None:
+    # At rest and without friction the drive's push along the catheter's axis d and the wall's forces on the wire
+    # cancel: push = -d · Σ k (r - φ) ∇φ over the nodes with φ < r, φ being the quadratic spline of the distance map.
+    anatomy, device = synthesize_one(AtlasConfig(), 0), read_device("workhorse-014")
+    longest = float(anatomy.tree.longest_path().abscissa[-1])
+    initial, control = random_controls(
+        ControlConfig(), n_sequences=6, n_samples=24, seed=3, max_inserted_length_mm=longest
+    )
+    control[:, -4:] = 0.0  # at rest, where drag has gone
+    config = SimulatorConfig(tolerance_mm=1e-7, threads=1)
+    rollout = simulate(
+        anatomy, device, control, initial=initial, config=config, record_shape=True, friction=np.zeros(len(control))
+    )
+    assert rollout.valid.all() and rollout.shape is not None
+    nodes, field = rollout.shape[:, -1].astype(float), anatomy.distance_map
+
+    def distance(points: np.ndarray) -> np.ndarray:
+        index = ((points - field.origin_mm) / field.spacing_mm)[..., ::-1]
+        return map_coordinates(field.values.astype(float), np.moveaxis(index, -1, 0), order=2, mode="nearest")
+
+    small = 1e-3 * np.eye(3)
+    slope = np.stack([(distance(nodes + step) - distance(nodes - step)) / 2e-3 for step in small], axis=-1)
+    depth = np.maximum(device.tip_radius_mm - distance(nodes), 0.0)
+    behind = (nodes - anatomy.insertion.position) @ anatomy.insertion.direction
+    held = (np.cumsum(behind[:, ::-1] > -3.0, axis=1) == 0)[:, ::-1]  # by the drive, in the catheter
+    pressed = np.where(held, 0.0, config.wall_stiffness_n_mm * depth)
+    wall = (pressed[..., None] * slope).sum(axis=1) @ anatomy.insertion.direction
+    push = rollout.base_force[:, -1]
+    assert np.abs(pressed.sum(axis=1) - rollout.contact_force_sum[:, -1]).max() < 0.05 * rollout.contact_force_sum.max()
+    assert np.abs(push).max() > 5e-3
+    assert np.abs(push + wall).max() < 0.01 * np.abs(push).max() + 1e-4, (push, wall)
