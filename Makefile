@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
-.PHONY: demo test check cta readme docs clean
+.PHONY: demo test check cta readme docs roofline clean
 
 demo: $(INSTALLED)
 	$(BIN)/endopilot demo
@@ -31,6 +31,13 @@ cta: $(INSTALLED)
 
 readme: $(INSTALLED)
 	$(BIN)/python docs/readme.py
+
+# What the rod core's arithmetic could cost on this processor, and what it does cost.
+roofline:
+	mkdir -p build
+	$(CXX) -std=gnu++20 -O3 -march=native -fno-math-errno -fno-trapping-math -fschedule-insns -fsched-pressure -Wno-psabi \
+	  -I src/core benchmarks/roofline.cpp -o build/roofline
+	build/roofline
 
 docs: $(INSTALLED)
 	$(BIN)/pip install -q -c constraints.txt -e '.[docs]'

@@ -370,6 +370,7 @@ NB_MODULE(_core, module) {
         .def("contacts", &Simulation::contacts)
         .def_prop_ro("nodes", &Simulation::nodes)
         .def("inserted_length", [](const Simulation& s) { return s.scalar(World::kInserted); })
+        .def("active", [](const Simulation& s) { return s.scalar(World::kActive); })
         .def("rotation", [](const Simulation& s) { return s.scalar(World::kRotation); })
         .def("reason", [](const Simulation& s) { return s.scalar(World::kReason); })
         .def("base_force", [](const Simulation& s) { return s.scalar(World::kBaseForce); })

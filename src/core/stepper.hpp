@@ -99,6 +99,9 @@ private:
     std::vector<World>& world_;
     std::vector<Node> node_;
     std::vector<Factor<V>> factor_;
+    static constexpr int kTogether = 8;            // nodes that a part of the evaluation takes at a time
+    Diagonal<V> block_[kTogether + 1];
+    Coupling<V> coupling_[kTogether];
     Lane lane_[W];
     // per lane: settings of the step, results of a sweep
     V active_{}, geometric_{}, inverse_dt_{}, eps_{}, first_{}, damping_{}, friction_{}, way_{}, swing_{};
@@ -151,6 +154,10 @@ private:
 
     // Sweeps over the nodes of all lanes (sweeps.hpp).
     void evaluate(int n);
+    void add_rod(int first, int count);
+    void add_lumen(int first, int count);
+    void add_drag(int first, int count);
+    void eliminate_nodes(int first, int count);
     V add_loads(int i, const Node& node, Diagonal<V>& own) const;
     V solve(int n);
     void update(int n, const Verdict (&verdict)[W], const V& factor);

@@ -37,39 +37,76 @@ V Stepper<V>::add_loads(int i, const Node& node, Diagonal<V>& own) const {
     return energy;
 }
 
+// Energy, gradient and Hessian at the trial point, eliminated from tip to base. A few nodes at a time, part by part:
+// within a part the nodes do not wait for each other, and what passes between parts stays in the fastest cache.
 template <class V>
 void Stepper<V>::evaluate(int n) {
-    const V zero{};
-    energy_ = descent_ = jump_ = zero;
+    energy_ = descent_ = jump_ = V{};
     pivot_ = broadcast<V>(1.0);
-    const Vec3<double> axis = frame(base_.orientation).d3;
-    Diagonal<V> own{}, next;
-    for (int i = 0; i < n; ++i) {
-        Node& node = node_[i];
-        const Mask<V> on = active_ > broadcast<V>(i);
-        const Mask<V> last = active_ == broadcast<V>(i + 1);
-        Coupling<V> coupling;
-        V energy = add_element(rod_, i, geometric_, node.x, node_[i + 1].x, frame(node.q), own, next, coupling);
-        energy += add_joint(rod_, i + 1, geometric_, node.q, node_[i + 1].q, own, next, coupling);
-        const V along = axis.x * next.force.x + axis.y * next.force.y + axis.z * next.force.z;
-        base_force_ = select<V>(last, along, base_force_);
-        base_torque_ = select<V>(last, next.moment.z, base_torque_);
+    block_[0] = Diagonal<V>{};
+    for (int first = 0; first < n; first += kTogether) {
+        const int count = std::min(kTogether, n - first);
+        add_rod(first, count);
+        if (lumen_) add_lumen(first, count);
+        add_drag(first, count);
+        eliminate_nodes(first, count);
+        block_[0] = block_[count];
+    }
+}
 
+// Elements and joints of `count` nodes from `first` on; what the wire asks of its base.
+template <class V>
+void Stepper<V>::add_rod(int first, int count) {
+    const Vec3<double> axis = frame(base_.orientation).d3;
+    for (int k = 0; k < count; ++k) {
+        const int i = first + k;
+        const Node &node = node_[i], &behind = node_[i + 1];
+        Diagonal<V>&own = block_[k], &next = block_[k + 1];
+        V energy = add_element(rod_, i, geometric_, node.x, behind.x, frame(node.q), own, next, coupling_[k]);
+        energy += add_joint(rod_, i + 1, geometric_, node.q, behind.q, own, next, coupling_[k]);
+        energy_ += select<V>(active_ > broadcast<V>(i), energy, V{});
+        const Mask<V> last = active_ == broadcast<V>(i + 1);
+        base_force_ = select<V>(last, axis.x * next.force.x + axis.y * next.force.y + axis.z * next.force.z, base_force_);
+        base_torque_ = select<V>(last, next.moment.z, base_torque_);
+    }
+}
+
+// The wall's reaction and friction.
+template <class V>
+void Stepper<V>::add_lumen(int first, int count) {
+    const V zero{};
+    for (int k = 0; k < count; ++k) {
+        const int i = first + k;
+        Node& node = node_[i];
+        const Distance<V> d = distance_to_wall(*lumen_, node.x);
+        node.wall = {d.value, d.slope};
+        const Mask<V> sticky = (first_ > zero) & (node.grip.limit > zero) & (d.value < rod_.radius[i] + kReach);
+        const V energy = add_wall<V>(options_.wall_stiffness, rod_.radius[i], geometric_, sticky, d, block_[k]);
+        energy_ += select<V>(active_ > broadcast<V>(i), energy, zero);
+    }
+    for (int k = 0; k < count; ++k) {
+        const Node& node = node_[first + k];
+        const V energy = add_friction(node.grip, eps_, node.x - node.start, relative(node.start_q, node.q), block_[k]);
+        energy_ += select<V>(active_ > broadcast<V>(first + k), energy, zero);
+    }
+}
+
+// Drag, damping and loads; how far the nodes have moved in the step.
+template <class V>
+void Stepper<V>::add_drag(int first, int count) {
+    for (int k = 0; k < count; ++k) {
+        const int i = first + k;
+        const Node& node = node_[i];
+        Diagonal<V>& own = block_[k];
+        const Mask<V> on = active_ > broadcast<V>(i);
         const Vec3<V> moved = node.x - node.start;
         const Quaternion<V> turned_by = relative(node.start_q, node.q);
         const V way = dot(moved, moved), swing = dot(turned_by.v, turned_by.v);
         jump_ = select<V>(on, maximum<V>(jump_, maximum<V>(way_ * way, swing_ * swing)), jump_);
-        if (lumen_) {
-            const Distance<V> d = distance_to_wall(*lumen_, node.x);
-            node.wall = {d.value, d.slope};
-            const Mask<V> sticky = (first_ > zero) & (node.grip.limit > zero) & (d.value < rod_.radius[i] + kReach);
-            energy += add_wall<V>(options_.wall_stiffness, rod_.radius[i], geometric_, sticky, d, own);
-            energy += add_friction(node.grip, eps_, moved, turned_by, own);
-        }
-        if (loads_) energy += add_loads(i, node, own);
-
         const V drag = rod_.drag[i] * inverse_dt_, spin_drag = rod_.spin_drag[i] * inverse_dt_;
-        energy += 0.5 * drag * way + 2.0 * spin_drag * swing;
+        V energy = 0.5 * drag * way + 2.0 * spin_drag * swing;
+        if (loads_) energy += add_loads(i, node, own);
+        energy_ += select<V>(on, energy, V{});
         const V stiffen = drag + damping_, spin_stiffen = spin_drag + damping_;
         own.force += drag * moved;
         own.moment += (2.0 * spin_drag * turned_by.w) * turned_by.v;
@@ -79,22 +116,29 @@ void Stepper<V>::evaluate(int n) {
         own.tt.xx += spin_stiffen;
         own.tt.yy += spin_stiffen;
         own.tt.zz += spin_stiffen;
+    }
+}
 
-        energy_ += select<V>(on, energy, zero);
-        const Elimination<V> eliminated = eliminate(own, coupling, factor_[i], next);
+template <class V>
+void Stepper<V>::eliminate_nodes(int first, int count) {
+    const V zero{};
+    const Vec3<double> axis = frame(base_.orientation).d3;
+    for (int k = 0; k < count; ++k) {
+        const int i = first + k;
+        const Mask<V> on = active_ > broadcast<V>(i);
+        Diagonal<V>& next = block_[k + 1];
+        const Elimination<V> eliminated = eliminate(block_[k], coupling_[k], factor_[i], next);
         descent_ += select<V>(on, eliminated.descent, zero);
         const Mask<V> sound = eliminated.smallest_pivot > zero;
         pivot_ = select<V>(on, select<V>(sound, pivot_, zero), pivot_);
-        if (in_.force_driven) {
-            const V pull = axis.x * next.force.x + axis.y * next.force.y + axis.z * next.force.z;
-            const Vec3<V> stiff = next.xx * Vec3<V>{broadcast<V>(axis.x), broadcast<V>(axis.y), broadcast<V>(axis.z)};
-            pull_a_ = select<V>(last, pull, pull_a_);
-            pull_r_ = select<V>(last, next.moment.z, pull_r_);
-            stiff_aa_ = select<V>(last, axis.x * stiff.x + axis.y * stiff.y + axis.z * stiff.z, stiff_aa_);
-            stiff_ar_ = select<V>(last, axis.x * next.tx[2][0] + axis.y * next.tx[2][1] + axis.z * next.tx[2][2], stiff_ar_);
-            stiff_rr_ = select<V>(last, next.tt.zz, stiff_rr_);
-        }
-        own = next;
+        if (!in_.force_driven) continue;
+        const Mask<V> last = active_ == broadcast<V>(i + 1);
+        const Vec3<V> stiff = next.xx * Vec3<V>{broadcast<V>(axis.x), broadcast<V>(axis.y), broadcast<V>(axis.z)};
+        pull_a_ = select<V>(last, axis.x * next.force.x + axis.y * next.force.y + axis.z * next.force.z, pull_a_);
+        pull_r_ = select<V>(last, next.moment.z, pull_r_);
+        stiff_aa_ = select<V>(last, axis.x * stiff.x + axis.y * stiff.y + axis.z * stiff.z, stiff_aa_);
+        stiff_ar_ = select<V>(last, axis.x * next.tx[2][0] + axis.y * next.tx[2][1] + axis.z * next.tx[2][2], stiff_ar_);
+        stiff_rr_ = select<V>(last, next.tt.zz, stiff_rr_);
     }
 }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from dataclasses import replace
 from typing import Any
@@ -12,12 +13,13 @@ from endopilot.anatomy.atlas import AtlasConfig, synthesize_one
 from endopilot.simulation.controls import ControlConfig, random_controls
 from endopilot.simulation.device import read_device
 from endopilot.simulation.simulator import SimulatorConfig, simulate
+from endopilot.simulation.stepping import Simulator
 from endopilot.types import SAMPLE_PERIOD_S, Rollout
 
 DEVICE = "workhorse-014"
 WORLDS = 32
 """Worlds that are timed."""
-COMPARED = 8
+COMPARED = 16
 """Worlds that the tip error is measured on."""
 SAMPLES = 120
 """60 s."""
@@ -27,11 +29,12 @@ def bench_simulation() -> dict[str, Any]:
     """Measure the rod core: a synthetic right coronary artery, the 0.014-inch workhorse wire, 60 s of random controls.
 
     Returns:
-        `realtime_factor_per_core` (simulated seconds per second of processor time on one thread,
-        everything that `simulate` does included),
+        `realtime_factor_per_core` (simulated seconds per second of processor time on one thread, everything that
+        `simulate` does included),
         `tip_error_mean_mm`, `tip_error_p95_mm` and `tip_error_max_mm` against the same scenario at a time step of 1 ms
         and a Newton tolerance of 1e-8 mm, `threads_speedup` (two threads against one), and beside them the iterations a
-        time step, the share of valid worlds and the largest wall forces.
+        time step, the share of valid worlds, the largest wall forces and `seconds_for_first_call`: of one world and
+        sample, the first call after the imports.
     """
     anatomy, device = synthesize_one(AtlasConfig(), 0), read_device(DEVICE)
     longest = float(anatomy.tree.longest_path().abscissa[-1])
@@ -45,7 +48,9 @@ def bench_simulation() -> dict[str, Any]:
         return rollout, time.perf_counter() - wall, time.process_time() - processor
 
     one_thread = SimulatorConfig(threads=1)
-    _, fixed, _ = run(1, one_thread)  # also warms up
+    started = time.perf_counter()
+    simulate(anatomy, device, control[:1, :1], config=one_thread)
+    first_call = time.perf_counter() - started
     rollout, alone, processor = run(WORLDS, one_thread)
     _, together, _ = run(WORLDS, replace(one_thread, threads=2))
     exact, _, _ = run(COMPARED, SimulatorConfig(time_step_s=1e-3, tolerance_mm=1e-8))
@@ -65,6 +70,44 @@ def bench_simulation() -> dict[str, Any]:
         "penetration_p999_mm": round(
             float(np.percentile(rollout.contact_force_max, 99.9)) / one_thread.wall_stiffness_n_mm, 4
         ),
-        "seconds_for_one_world": round(fixed, 3),
+        "seconds_for_first_call": round(first_call, 3),
         "worlds": WORLDS,
     }
+
+
+def bench_scaling() -> list[dict[str, Any]]:
+    """Measure how cost and memory grow with the wire's elements and with the number of worlds, on one thread.
+
+    Returns:
+        Rows of `elements`, `worlds`, `seconds` (processor time of the core), `us_per_node_and_iteration` (of the nodes
+        ahead of the catheter) and `kilobytes_per_world` (growth of the process's memory; the map is shared).
+    """
+    anatomy, device = synthesize_one(AtlasConfig(), 0), read_device(DEVICE)
+    depth = 0.6 * float(anatomy.tree.longest_path().abscissa[-1])
+    rows = []
+    for elements, worlds in (*((n, 64) for n in (50, 100, 200, 400)), *((100, n) for n in (1, 10, 100, 1000, 10_000))):
+        config = SimulatorConfig(elements=elements, threads=1)
+        before = _resident_kilobytes()
+        simulator = Simulator(anatomy, device, worlds=worlds, config=config)
+        simulator.reset(inserted_length=np.full(worlds, depth), rotation=np.zeros(worlds))
+        speed = np.column_stack([np.linspace(2, 8, worlds), np.linspace(-2, 2, worlds)])
+        memory = (_resident_kilobytes() - before) / worlds
+        started = time.process_time()
+        iterations = sum(simulator.step(speed, 0.1).iterations.sum() * 0.1 / config.time_step_s for _ in range(10))
+        spent = time.process_time() - started
+        active = float(np.mean(simulator.active_nodes))
+        rows.append(
+            {
+                "elements": elements,
+                "worlds": worlds,
+                "seconds": round(spent, 3),
+                "us_per_node_and_iteration": round(1e6 * spent / (iterations * active), 4),
+                "kilobytes_per_world": round(memory, 1),
+            }
+        )
+    return rows
+
+
+def _resident_kilobytes() -> float:
+    with open("/proc/self/statm", encoding="ascii") as file:
+        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1024

@@ -33,6 +33,7 @@ class Step:
         contact_force_max: largest wall force on one node, N.
         contact_force_sum: sum of the wall forces' magnitudes, N.
         slip: advance that was asked of the drive and not made, mm.
+        iterations: mean Newton iterations a time step.
         valid: false for a world that has failed; it stays as it was.
     """
 
@@ -43,6 +44,7 @@ class Step:
     contact_force_max: Float[np.ndarray, "worlds"]
     contact_force_sum: Float[np.ndarray, "worlds"]
     slip: Float[np.ndarray, "worlds"]
+    iterations: Float[np.ndarray, "worlds"]
     valid: Bool[np.ndarray, "worlds"]
 
 

@@ -329,6 +329,11 @@ class Simulator:
         return self._per_node("contacts", 0.0)
 
     @property
+    def active_nodes(self) -> Float[np.ndarray, "worlds"]:
+        """Number of nodes ahead of the catheter, those that are solved for."""
+        return self._gather("active")
+
+    @property
     def base_load(self) -> Float[np.ndarray, "worlds 2"]:
         """Axial force (N, positive when it pushes) and torque (N·mm) that hold the wire in the catheter."""
         return np.column_stack([self._gather("base_force"), self._gather("base_torque")])

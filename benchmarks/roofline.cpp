@@ -1,0 +1,193 @@
+// Roofline of the rod core: floating-point operations and bytes of one Newton iteration a node, the time each part takes
+// alone, and the processor's own peak of fused multiply-adds beside it. `make roofline` builds and runs it.
+#include <algorithm>
+#include <chrono>
+#include <cstdio>
+#include <random>
+
+#include "contact.hpp"
+#include "solve.hpp"
+
+using namespace endopilot;
+
+// A number that counts what is done to it. As a lane type it runs the very formulas of the core.
+struct Counted {
+    double value;
+    static inline long operations = 0;
+    Counted(double v = 0.0) : value(v) {}
+};
+#define COUNTED(op)                                                                                                     \
+    inline Counted operator op(Counted a, Counted b) { return ++Counted::operations, Counted(a.value op b.value); }     \
+    inline Counted operator op(double a, Counted b) { return ++Counted::operations, Counted(a op b.value); }            \
+    inline Counted operator op(Counted a, double b) { return ++Counted::operations, Counted(a.value op b); }            \
+    inline Counted& operator op##=(Counted& a, Counted b) { return a = a op b; }                                        \
+    inline Counted& operator op##=(Counted& a, double b) { return a = a op b; }
+COUNTED(+)
+COUNTED(-)
+COUNTED(*)
+COUNTED(/)
+#define COMPARED(op)                                                             \
+    inline bool operator op(Counted a, Counted b) { return a.value op b.value; } \
+    inline bool operator op(Counted a, double b) { return a.value op b; }
+COMPARED(<)
+COMPARED(>)
+COMPARED(>=)
+COMPARED(==)
+inline Counted operator-(Counted a) { return Counted(-a.value); }
+
+namespace endopilot {
+template <>
+struct LaneTraits<Counted> {
+    static constexpr int width = 1;
+    using Mask = bool;
+};
+template <>
+inline double get(const Counted& v, int) {
+    return v.value;
+}
+template <>
+inline void set(Counted& v, int, double value) {
+    v.value = value;
+}
+template <>
+inline Counted square_root(Counted a) {
+    ++Counted::operations;
+    return Counted(std::sqrt(a.value));
+}
+}  // namespace endopilot
+
+constexpr int kNodes = 80;
+
+// The arrays of a wire in a straight lumen of 1.5 mm radius, and each part of an iteration as a sweep over its nodes.
+template <class V>
+struct Sweeps {
+    RodModel rod;
+    Lumen& lumen;
+    Vec3<V> x[kNodes + 1];
+    Quaternion<V> q[kNodes + 1];
+    Distance<V> distance[kNodes];
+    Diagonal<V> diagonal[kNodes + 1];
+    Coupling<V> coupling[kNodes];
+    Factor<V> factor[kNodes];
+    V one = broadcast<V>(1.0), sink = broadcast<V>(0.0);
+
+    explicit Sweeps(Lumen& l) : lumen(l) {
+        const auto fill = [](double v) { return std::vector<double>(kNodes + 2, v); };
+        rod.nodes = kNodes + 2;
+        rod.length = fill(0.4), rod.shear = fill(1e3), rod.stretch = fill(2.6e3), rod.joint_length = fill(0.4);
+        rod.bend = fill(5), rod.twist = fill(4), rod.radius = fill(0.18);
+        rod.rest.assign(kNodes + 2, {0.1, 0, 0});
+        std::mt19937 random(1);
+        std::uniform_real_distribution<double> any(-0.5, 0.5);
+        for (int i = 0; i <= kNodes; ++i)
+            for (int lane = 0; lane < kWidth<V>; ++lane) {
+                set(x[i].x, lane, 24 + any(random));
+                set(x[i].y, lane, 25.4 + 0.2 * any(random));
+                set(x[i].z, lane, 40 - 0.4 * i);
+                set(q[i].w, lane, 1.0);
+                set(q[i].v.x, lane, 0.02 * any(random));
+                set(q[i].v.y, lane, 0.02 * any(random));
+                set(q[i].v.z, lane, 0.0);
+            }
+    }
+    void elements() {
+        Diagonal<V> own{}, next;
+        for (int i = 0; i < kNodes; ++i) {
+            sink += add_element<V>(rod, i, one, x[i], x[i + 1], frame(q[i]), own, next, coupling[i]);
+            sink += add_joint<V>(rod, i + 1, one, q[i], q[i + 1], own, next, coupling[i]);
+            diagonal[i] = own;
+            own = next;
+        }
+    }
+    void wall() {
+        for (int i = 0; i < kNodes; ++i) {
+            distance[i] = distance_to_wall<V>(lumen, x[i]);
+            sink += add_wall<V>(5.0, 0.18, one, distance[i].value > 1e6, distance[i], diagonal[i]);
+        }
+    }
+    void friction() {
+        const Grip<V> grip{0.01 * one, {one, 0.0 * one, 0.0 * one}, {0.0 * one, 0.18 * one, 0.0 * one}};
+        for (int i = 0; i < kNodes; ++i) sink += add_friction<V>(grip, 1e-3 * one, x[i] - x[0], q[i], diagonal[i]);
+    }
+    void elimination() {
+        Diagonal<V> own = diagonal[0];
+        for (int i = 0; i < kNodes; ++i) {
+            Diagonal<V> next = diagonal[std::min(i + 1, kNodes - 1)];
+            next.xx.xx += 1e4, next.xx.yy += 1e4, next.xx.zz += 1e4;
+            next.tt.xx += 1e4, next.tt.yy += 1e4, next.tt.zz += 1e4;
+            sink += eliminate(own, coupling[i], factor[i], next).descent;
+            own = next;
+        }
+    }
+    void substitution() {
+        Vec3<V> dx{0.0 * one, 0.0 * one, 0.0 * one}, dt = dx;
+        for (int i = kNodes - 1; i >= 0; --i) substitute(factor[i], dx, dt);
+        sink += dx.x;
+    }
+};
+
+template <class F>
+double fastest(int repeats, const F& f) {
+    double best = 1e300;
+    for (int r = 0; r < repeats; ++r) {
+        const auto t = std::chrono::steady_clock::now();
+        f();
+        best = std::min(best, std::chrono::duration<double>(std::chrono::steady_clock::now() - t).count());
+    }
+    return best;
+}
+
+// Ten independent chains of fused multiply-adds in registers.
+double peak_gflops() {
+    double4 a[10];
+    for (double4& v : a) v = double4{1, 1, 1, 1};
+    double4 factor{1.0000001, 1, 1, 1}, term{1e-9, 0, 0, 0};
+    constexpr long rounds = 20'000'000;
+    const double s = fastest(5, [&] {
+        double4 b[10];
+        std::copy(a, a + 10, b);
+        for (long i = 0; i < rounds; ++i)
+            for (double4& v : b) {
+                v = v * factor + term;
+                asm volatile("" : : "x"(factor));  // keeps the compiler from folding the rounds
+            }
+        std::copy(b, b + 10, a);
+    });
+    if (a[0][0] + a[9][3] > 1e300) std::puts("");  // the result is used
+    return rounds * 10 * 8 / s * 1e-9;
+}
+
+int main() {
+    const int size[3] = {160, 160, 160};
+    const double origin[3] = {0, 0, 0};
+    std::vector<float> map(160 * 160 * 160);
+    for (int z = 0, m = 0; z < 160; ++z)
+        for (int y = 0; y < 160; ++y)
+            for (int x = 0; x < 160; ++x, ++m) map[m] = float(1.5 - 0.3 * std::hypot(x - 80.0, y - 80.0));
+    Lumen lumen(map.data(), size, origin, 0.3, 0.6, 0.5);
+    static Sweeps<Counted> count(lumen);
+    static Sweeps<double4> run(lumen);
+    const double peak = peak_gflops();
+    std::printf("peak: %.1f GFLOP/s of fused multiply-adds, one core, four doubles at a time\n\n", peak);
+    std::printf("%-24s %12s %12s %12s %10s\n", "a node and iteration", "operations", "ns, 4 lanes", "GFLOP/s", "of peak");
+    double all_operations = 0, all_ns = 0;
+    const auto part = [&](const char* name, auto sweep) {
+        Counted::operations = 0;
+        (count.*sweep.first)();
+        const double operations = double(Counted::operations) / kNodes;
+        const double ns = fastest(3000, [&] { (run.*sweep.second)(); }) / kNodes * 1e9;
+        all_operations += operations, all_ns += ns;
+        std::printf("%-24s %12.0f %12.1f %12.1f %9.0f%%\n", name, operations, ns, 4 * operations / ns, 400 * operations / ns / peak);
+    };
+#define PART(name) std::pair(&Sweeps<Counted>::name, &Sweeps<double4>::name)
+    part("element and joint", PART(elements));
+    part("wall", PART(wall));
+    part("friction", PART(friction));
+    part("elimination", PART(elimination));
+    part("substitution", PART(substitution));
+    std::printf("%-24s %12.0f %12.1f %12.1f %9.0f%%\n\n", "all", all_operations, all_ns, 4 * all_operations / all_ns,
+                400 * all_operations / all_ns / peak);
+    std::printf("factor of a block: %zu bytes a node and lane; its writing and reading move %zu bytes an iteration\n",
+                sizeof(Factor<double>), 2 * sizeof(Factor<double>));
+    return get(run.sink, 0) > 1e300;
+}
