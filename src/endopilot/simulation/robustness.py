@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 from endopilot import _core
 from endopilot.anatomy.atlas import AtlasConfig, synthesize_one
@@ -101,9 +101,9 @@ class Chunk:
     penetration_mm: Float[np.ndarray, "rollouts samples"]
     base_force_n: Float[np.ndarray, "rollouts samples"]
     to_end_mm: Float[np.ndarray, "rollouts samples"]
-    slipped: np.ndarray
-    valid: np.ndarray
-    non_finite: np.ndarray
+    slipped: Bool[np.ndarray, "rollouts samples"]
+    valid: Bool[np.ndarray, "rollouts samples"]
+    non_finite: Int[np.ndarray, "rollouts"]
     seconds: float
 
 
@@ -366,7 +366,9 @@ def _results(config: RobustnessConfig, devices: list[Device]) -> Iterator[tuple[
             chunk = None
             if path.exists():
                 with np.load(path) as arrays:
-                    chunk = Chunk(**{name: arrays[name] for name in arrays.files})
+                    chunk = Chunk(
+                        **{name: arrays[name] if arrays[name].ndim else arrays[name].item() for name in arrays.files}
+                    )
             yield device, read_json(path.with_suffix(".json")), chunk
 
 
