@@ -42,7 +42,7 @@ def test_the_core_passes_its_tests_under_sanitizers(compiler: str, tmp_path: Pat
 def test_the_sanitizers_end_a_faulty_program(compiler: str, tmp_path: Path) -> None:
     faults = {
         "heap-buffer-overflow": "std::vector<double> v(4); volatile int i = 4; return int(v.data()[i]);",
-        "signed integer overflow": "volatile int i = 2147483647; return i + 1 > 0;",
+        "signed integer overflow": "volatile int i = 2147483647; volatile int j = i + 1; return j > 0;",
     }
     for report, body in faults.items():
         source = tmp_path / "faulty.cpp"
