@@ -45,7 +45,7 @@ def each(title: str, items: Sequence[Path], work: Callable[[Path], None]) -> dic
             return bad
         # Started afresh, since a fork of a process with running threads can lock up.
         context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(processes, mp_context=context, initializer=_follow_the_parent) as pool:
+        with ProcessPoolExecutor(processes, mp_context=context, initializer=follow_the_parent) as pool:
             futures: dict[Future[None], Path] = {pool.submit(work, item): item for item in items}
             try:
                 for future in as_completed(futures):
@@ -59,7 +59,7 @@ def each(title: str, items: Sequence[Path], work: Callable[[Path], None]) -> dic
     return bad
 
 
-def _follow_the_parent() -> None:
+def follow_the_parent() -> None:
     """Leave interrupts and the screen to the parent, and end with it even where it is killed."""
     silence()
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -8,11 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import SimpleITK as sitk
-from command import refused
+from command import refused, run
 
 from endopilot.anatomy.atlas import AtlasConfig, synthesize_one
 from endopilot.anatomy.io import write_anatomy
+from endopilot.cli import main
+from endopilot.files import read_json
 from endopilot.imaging.volume import write_mask, write_volume
+from endopilot.simulation.device import device_yaml
 from endopilot.types import Insertion, LumenMask, Volume
 
 
@@ -112,3 +115,31 @@ def test_a_lumen_too_narrow_for_the_wire(tmp_path, capsys, patient):
     narrow = replace(anatomy, catheter_radius_mm=0.1, name="narrow")
     write_anatomy(narrow, tmp_path / "narrow")
     assert "catheter" in refused(capsys, "simulate", tmp_path / "narrow", "-o", tmp_path / "rollout.csv")
+
+
+def test_devices(patient, tmp_path, capsys):
+    """A wire of one's own needs no code: it is read by its path; a bad one is refused by every command alike."""
+    main_line = "bend_stiffness_n_mm2 holds -0.3; every value must be positive"
+    text = device_yaml("workhorse-014")[1]
+    bad = tmp_path / "bad.yaml"
+    bad.write_text(text.replace("[0.30, 0.30", "[0.30, -0.30"))
+    for command in (("simulate", patient), ("dataset", patient), ("devices", bad)):
+        chosen = () if command[0] == "devices" else ("--device", bad, "-o", tmp_path / "out")
+        line = refused(capsys, *command, *chosen)
+        assert str(bad) in line and main_line in line, line
+        assert list(tmp_path.iterdir()) == [bad]
+
+
+def test_a_device_of_ones_own(patient, tmp_path, capsys):
+    with pytest.raises(SystemExit) as leaving:
+        main(["devices", "workhorse-014", "--yaml"])
+    assert leaving.value.code == 0
+    own = tmp_path / "my-wire.yaml"
+    own.write_text(capsys.readouterr().out.replace("name: workhorse-014", "name: my-wire").replace("0.36", "0.40"))
+    assert run(capsys, "devices", own)[0]["diameter_mm"] == 0.40
+    out = tmp_path / "rollout.csv"
+    figures = run(capsys, "simulate", patient, "--device", own, "-o", out, "--sequences", "1", "--seconds", "1")
+    assert figures["valid_worlds"] == 1 and out.exists()
+    made = tmp_path / "data"
+    run(capsys, "dataset", patient, "--device", own, "-o", made, "--sequences", "2", "--seconds", "1")
+    assert read_json(made / "meta" / "manifest.json")["device"]["diameter_mm"] == 0.40

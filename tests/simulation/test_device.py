@@ -3,6 +3,7 @@ from __future__ import annotations
 from dataclasses import asdict, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from endopilot.errors import InputError
@@ -17,7 +18,13 @@ def test_shipped_devices_are_whole(name: str) -> None:
     assert device.name == name
     assert all(len(source) > 10 for source in device.sources.values())
     assert Device(**asdict(device)) == device
-    assert device.summary()["diameter_mm"] == device.diameter_mm
+    summary = device.summary()
+    assert summary["ei_tip_n_mm2"] == device.bend_stiffness(np.array([0.0]))[0]
+    assert summary["ei_shaft_n_mm2"] == device.bend_stiffness(np.array([1e3]))[0]
+    assert summary["gj_tip_n_mm2"] == device.twist_stiffness(np.array([0.0]))[0]
+    assert summary["gj_shaft_n_mm2"] == device.twist_stiffness(np.array([1e3]))[0]
+    if device.tip_load_n is not None:
+        assert summary["tip_load_gf"] == pytest.approx(device.tip_load_n / 9.80665e-3, abs=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -25,8 +32,21 @@ def test_shipped_devices_are_whole(name: str) -> None:
     [
         ("value: 0.36", "value: -0.36", "diameter_mm = -0.36"),
         ("value: 0.36", "value: thick", "diameter_mm = 'thick'"),
+        ("value: 0.1\n", "value: -0.1\n", "friction = -0.1 is not a number of 0 or more"),
         ("friction:", "frixion:", "friction is missing"),
-        ('source: "0.05', 'note: "0.05', "friction has no source"),
+        ('source: "0.05', '# "0.05', "friction has no source"),
+        ('source: "0.05', 'note: "0.05', "friction note is unknown"),
+        ("  value: 0.0074", "  # 0.0074", "tip_load_n has no value"),
+        ("value: 0.0074", "value: -0.0074", "tip_load_n = -0.0074"),
+        ("length_mm: 3", "length_mm: -3", "tip_bend length_mm = -3"),
+        ("length_mm: 3", "length_cm: 3", "tip_bend length_cm is unknown"),
+        ("angle_deg: 45", "angle_deg: 450", "tip_bend angle_deg = 450"),
+        ("[0.30, 0.30, 1.2", "[0.30, 1.2", "bend_stiffness_n_mm2 holds 5 values and abscissa_mm 6"),
+        ("[0.30, 0.30, 1.2", "[0.30, -0.30, 1.2", "bend_stiffness_n_mm2 holds -0.3; every value must be positive"),
+        ("value: [0.23, 0.23, 0.92, 6.2, 23, 62]", "value: 5", "twist_stiffness_n_mm2 = 5 is not a list"),
+        ("62]", ".nan]", "twist_stiffness_n_mm2 holds nan"),
+        ("name: workhorse-014", "name: 14", "name = 14 is no text"),
+        ("name: workhorse-014", "name: [", "line 4: not valid YAML"),
         ("[0, 10, 20, 60", "[0, 20, 10, 60", "abscissa_mm"),
         ("[0.30, 0.30, 1.2", "[0.30, 0.0, 1.2", "bend_stiffness_n_mm2"),
         ("name: work", "extra: 1\nname: work", "extra is unknown"),
@@ -39,7 +59,20 @@ def test_bad_file_is_refused(tmp_path: Path, old: str, new: str, message: str) -
     path.write_text(text.replace(old, new, 1), encoding="utf-8")
     with pytest.raises(InputError, match=message) as error:
         read_device(path)
-    assert str(path) in str(error.value)
+    assert str(error.value).startswith(f"{path}: ")
+    assert "\n" not in str(error.value)
+
+
+def test_a_file_that_is_no_device_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "wire.yaml"
+    path.write_text("- 1\n")
+    with pytest.raises(InputError, match="no mapping of fields"):
+        read_device(path)
+    path.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(InputError, match="no text"):
+        read_device(path)
+    with pytest.raises(InputError, match="no such device or file"):
+        read_device(tmp_path)
 
 
 def test_unknown_device_is_refused() -> None:

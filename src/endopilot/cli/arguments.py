@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 from tyro.conf import arg
 
 from endopilot.errors import InputError
@@ -47,13 +47,15 @@ def show_rows(rows: Sequence[Mapping[str, Any]], *, as_json: bool) -> None:
     if as_json:
         print(json_text(list(rows)))
         return
-    table = Table(*(rows[0].keys() if rows else ()))
+    table = Table(*(Column(name, overflow="fold") for name in (rows[0] if rows else ())))
     for row in rows:
         table.add_row(*(_text(value) for value in row.values()))
     Console(width=None if Console().is_terminal else 160).print(table)
 
 
 def _text(value: Any) -> str:
+    if value is None:
+        return "-"
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):

@@ -1,21 +1,51 @@
-"""`endopilot bench`: speed of the rod core together with its accuracy."""
+"""`endopilot bench`: speed of the rod core together with its accuracy, and its robustness."""
 
 from __future__ import annotations
 
-from typing import Literal
+import sys
+from typing import Any, Literal
 
 from tyro.conf import Positional
 
-from endopilot.cli.arguments import show
+from endopilot.cli.arguments import show, show_rows
 from endopilot.simulation.bench import bench_simulation
+from endopilot.simulation.robustness import RobustnessConfig, measure_robustness
+
+EXIT_FAILED = 1
 
 
-def command(subject: Positional[Literal["simulation"]] = "simulation", /, *, json: bool = False) -> None:
-    """Measure the rod core on the reference scenario: simulated seconds per second, and the error that goes with it.
+def command(
+    subject: Positional[Literal["simulation", "robustness"]] = "simulation",
+    /,
+    *,
+    json: bool = False,
+    config: RobustnessConfig = RobustnessConfig(),
+) -> None:
+    """Measure the rod core: its speed with the error that goes with it, or its robustness.
+
+    `simulation` times the reference scenario. `robustness` drives every device through many anatomies and beyond their
+    ends, counts what goes wrong, and leaves with exit code 1 if a figure misses its bar; the options below are its own.
 
     Args:
         subject: what to measure.
         json: print the figures as JSON.
+        config: the rollouts of `robustness`.
     """
-    measure = {"simulation": bench_simulation}[subject]
-    show(measure(), as_json=json)
+    if subject == "simulation":
+        show(bench_simulation(), as_json=json)
+        return
+    measured = measure_robustness(config)
+    if json:
+        show(measured, as_json=True)
+    else:
+        _show_robustness(measured)
+    if not all(row["passed"] for row in measured["figures"]):
+        sys.exit(EXIT_FAILED)
+
+
+def _show_robustness(measured: dict[str, Any]) -> None:
+    groups = ("by_device", "by_manoeuvre")
+    show_rows(measured["figures"], as_json=False)
+    show_rows([{"group": name} | row for group in groups for name, row in measured[group].items()], as_json=False)
+    rest = {name: value for name, value in measured.items() if name not in ("figures", *groups) and value}
+    show(rest, as_json=False)

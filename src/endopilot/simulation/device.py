@@ -23,6 +23,10 @@ _FOLDER = Path(__file__).parent / "devices"
 _SCALARS = ("diameter_mm", "friction", "max_velocity_mm_s", "max_rotation_rad_s")
 _PROFILES = ("abscissa_mm", "bend_stiffness_n_mm2", "twist_stiffness_n_mm2")
 _FIELDS = ("name", *_SCALARS, *_PROFILES, "tip_load_n", "tip_bend")
+_VALUE_KEYS, _TIP_BEND_KEYS = ("value", "source"), ("angle_deg", "length_mm", "source")
+
+GRAM_FORCE_N = 9.80665e-3
+"""One gram-force in N, by the standard acceleration of gravity; catalogues give tip loads in it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,27 +70,34 @@ class Device:
         for name in _SCALARS:
             value = getattr(self, name)
             if not (np.isfinite(value) and (value > 0 or (name == "friction" and value == 0))):
-                raise InputError(f"device {self.name}: {name} = {value} is not a positive number; correct it")
+                wanted = "a number of 0 or more" if name == "friction" else "a positive number"
+                raise InputError(f"device {self.name}: {name} = {value:g} is not {wanted}; correct it")
         self._check_profiles()
         if self.tip_load_n is not None and not (np.isfinite(self.tip_load_n) and self.tip_load_n > 0):
-            raise InputError(f"device {self.name}: tip_load_n = {self.tip_load_n}; give a positive load in N, or null")
+            raise InputError(
+                f"device {self.name}: tip_load_n = {self.tip_load_n:g}; give a positive load in N, or null"
+            )
         bend, length = self.tip_bend_rad, self.tip_bend_length_mm
         if not (np.isfinite(bend) and abs(bend) <= 2 * np.pi):
             raise InputError(f"device {self.name}: tip_bend angle_deg = {np.rad2deg(bend):g}; give -360 to 360 degrees")
-        if not (np.isfinite(length) and (length > 0 or bend == 0)):
-            raise InputError(f"device {self.name}: tip_bend length_mm = {length}; a bent tip needs a positive length")
+        if not (np.isfinite(length) and (length > 0 or length == bend == 0)):
+            raise InputError(f"device {self.name}: tip_bend length_mm = {length:g}; a bent tip needs a positive length")
 
     def _check_profiles(self) -> None:
+        count = len(self.abscissa_mm)
         for name in _PROFILES:
             values = np.asarray(getattr(self, name), dtype=float)
-            if values.ndim != 1 or len(values) != len(self.abscissa_mm) or len(values) == 0:
-                raise InputError(f"device {self.name}: {name} needs one value for each of abscissa_mm's")
-            bad = ~np.isfinite(values) | ((values <= 0) if name != "abscissa_mm" else (values < 0))
+            if values.ndim != 1 or len(values) != count or count == 0:
+                raise InputError(
+                    f"device {self.name}: {name} holds {values.size} values and abscissa_mm {count}; give one for each"
+                )
+            least = "0 or more" if name == "abscissa_mm" else "positive"
+            bad = ~np.isfinite(values) | ((values <= 0) if least == "positive" else (values < 0))
             if bad.any():
-                raise InputError(f"device {self.name}: {name} holds {values[bad][0]:g}; every value must be positive")
-        abscissa = np.asarray(self.abscissa_mm)
+                raise InputError(f"device {self.name}: {name} holds {values[bad][0]:g}; every value must be {least}")
+        abscissa = [float(value) for value in self.abscissa_mm]
         if abscissa[0] != 0 or (np.diff(abscissa) <= 0).any():
-            raise InputError(f"device {self.name}: abscissa_mm = {list(abscissa)} must begin at 0 and increase")
+            raise InputError(f"device {self.name}: abscissa_mm = {abscissa} must begin at 0, the tip, and increase")
 
     @property
     def tip_radius_mm(self) -> float:
@@ -102,13 +113,22 @@ class Device:
         return np.interp(abscissa_mm, self.abscissa_mm, self.twist_stiffness_n_mm2)
 
     def summary(self) -> dict[str, Any]:
-        """Return what a list of devices shows: name, diameter, stiffness at tip and shaft, tip load, tip shape."""
+        """Return what a list of devices shows.
+
+        The keys: `name`, `diameter_mm`, bending stiffness `ei_tip_n_mm2` and `ei_shaft_n_mm2`, torsional stiffness
+        `gj_tip_n_mm2` and `gj_shaft_n_mm2`, the catalogue's `tip_load_n` (N) and `tip_load_gf` (gram-force), which are
+        None where it states none, `tip_bend_deg` and `friction`.
+        """
+        load = self.tip_load_n
         return {
             "name": self.name,
             "diameter_mm": self.diameter_mm,
-            "tip_bend_stiffness_n_mm2": self.bend_stiffness_n_mm2[0],
-            "shaft_bend_stiffness_n_mm2": self.bend_stiffness_n_mm2[-1],
-            "tip_load_n": self.tip_load_n,
+            "ei_tip_n_mm2": self.bend_stiffness_n_mm2[0],
+            "ei_shaft_n_mm2": self.bend_stiffness_n_mm2[-1],
+            "gj_tip_n_mm2": self.twist_stiffness_n_mm2[0],
+            "gj_shaft_n_mm2": self.twist_stiffness_n_mm2[-1],
+            "tip_load_n": load,
+            "tip_load_gf": None if load is None else round(load / GRAM_FORCE_N, 3),
             "tip_bend_deg": round(float(np.rad2deg(self.tip_bend_rad)), 3),
             "friction": self.friction,
         }
@@ -119,21 +139,39 @@ def list_devices() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in _FOLDER.glob("*.yaml")))
 
 
+def device_yaml(name_or_path: str | Path) -> tuple[Path, str]:
+    """Return the YAML file of a device, by its shipped name or its path, and the text in it.
+
+    Raises:
+        InputError: no such device, or a file that is no text.
+    """
+    shipped = _FOLDER / f"{name_or_path}.yaml"
+    path = shipped if shipped.is_file() else Path(name_or_path)
+    try:
+        return path, path.read_text(encoding="utf-8")
+    except OSError as error:
+        names = ", ".join(list_devices())
+        raise InputError(
+            f"device '{name_or_path}': no such device or file; give a path, or choose from {names}"
+        ) from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is no text in UTF-8; give a device's YAML file") from error
+
+
 def read_device(name_or_path: str | Path) -> Device:
     """Read a device by its shipped name, or from a YAML file.
 
     Raises:
         InputError: no such device, or a file that is not a device; the line names file, field, value and mend.
     """
-    shipped = _FOLDER / f"{name_or_path}.yaml"
-    path = shipped if shipped.is_file() else Path(name_or_path)
+    path, text = device_yaml(name_or_path)
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        names = ", ".join(list_devices())
-        raise InputError(f"device '{name_or_path}': no such device or file; choose from {names}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not valid YAML ({str(error).splitlines()[0]}); correct the file") from error
+        content = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        where = getattr(error, "problem_mark", None)
+        line = f"line {where.line + 1}: " if where else ""
+        problem = getattr(error, "problem", None) or str(error).splitlines()[0]
+        raise InputError(f"{path}: {line}not valid YAML ({problem}); correct the file") from error
     try:
         return _parse(content)
     except InputError as error:
@@ -157,32 +195,48 @@ def check_fits(device: Device, anatomy: Anatomy) -> None:
 
 def _parse(content: Any) -> Device:
     if not isinstance(content, dict):
-        raise InputError("a device is a mapping of fields; see the shipped files")
+        raise InputError(
+            "holds no mapping of fields; copy the form of a shipped device (`endopilot devices NAME --yaml`)"
+        )
     for name in _FIELDS:
         if name not in content:
             raise InputError(f"field {name} is missing; add it")
-    unknown = sorted(set(content) - set(_FIELDS))
-    if unknown:
-        raise InputError(f"field {unknown[0]} is unknown; the fields are {', '.join(_FIELDS)}")
+    _refuse_unknown("", content, _FIELDS)
+    if not isinstance(content["name"], str) or not content["name"].strip():
+        raise InputError(f"name = {content['name']!r} is no text; give the device a name")
     sources = {name: _source(name, content[name]) for name in _FIELDS[1:]}
-    tip = content["tip_bend"]
-    load = content["tip_load_n"].get("value")
-    constants: dict[str, Any] = {name: _number(name, content[name].get("value")) for name in _SCALARS}
-    constants |= {name: _numbers(name, content[name].get("value")) for name in _PROFILES}
+    tip, load = content["tip_bend"], content["tip_load_n"]["value"]
+    constants: dict[str, Any] = {name: _number(name, content[name]["value"]) for name in _SCALARS}
+    constants |= {name: _numbers(name, content[name]["value"]) for name in _PROFILES}
     return Device(
-        name=str(content["name"]),
+        name=content["name"],
         **constants,
-        tip_bend_rad=float(np.deg2rad(_number("tip_bend angle_deg", tip.get("angle_deg")))),
-        tip_bend_length_mm=_number("tip_bend length_mm", tip.get("length_mm")),
+        tip_bend_rad=float(np.deg2rad(_number("tip_bend angle_deg", tip["angle_deg"]))),
+        tip_bend_length_mm=_number("tip_bend length_mm", tip["length_mm"]),
         tip_load_n=None if load is None else _number("tip_load_n", load),
         sources=sources,
     )
 
 
 def _source(name: str, entry: Any) -> str:
-    if not isinstance(entry, dict) or not str(entry.get("source") or "").strip():
-        raise InputError(f"field {name} has no source; write it as {{value: ..., source: ...}}")
+    """Check that a field's entry is whole, and return its source."""
+    keys = _TIP_BEND_KEYS if name == "tip_bend" else _VALUE_KEYS
+    form = "{" + ", ".join(f"{key}: ..." for key in keys) + "}"
+    if not isinstance(entry, dict):
+        raise InputError(f"field {name} = {entry!r} has no source; write it as {form}")
+    _refuse_unknown(f"{name} ", entry, keys)
+    if not str(entry.get("source") or "").strip():
+        raise InputError(f"field {name} has no source; write it as {form}")
+    missing = [key for key in keys if key not in entry]
+    if missing:
+        raise InputError(f"field {name} has no {missing[0]}; write it as {form}")
     return str(entry["source"])
+
+
+def _refuse_unknown(of: str, content: dict[Any, Any], fields: Sequence[str]) -> None:
+    unknown = sorted(str(key) for key in set(content) - set(fields))
+    if unknown:
+        raise InputError(f"field {of}{unknown[0]} is unknown; the fields are {', '.join(fields)}")
 
 
 def _number(name: str, value: Any) -> float:

@@ -1,0 +1,375 @@
+// Tests of the core's headers against their meaning: lane types against scalars, the block solver against a dense one,
+// gradients and Hessians against finite differences. Built with sanitizers and run by test_core_sanitized.py.
+#include <cmath>
+#include <cstdio>
+#include <cstdlib>
+#include <limits>
+#include <random>
+#include <string>
+
+#include "core_adapter.hpp"
+
+using namespace adapter;
+
+namespace {
+
+int failures = 0;
+std::mt19937_64 generator(7);
+
+double uniform(double low, double high) { return std::uniform_real_distribution<double>(low, high)(generator); }
+
+void expect(bool fine, const std::string& what) {
+    if (fine) return;
+    std::printf("FAILED: %s\n", what.c_str());
+    ++failures;
+}
+
+void expect_near(double value, double expected, double tolerance, const std::string& what) {
+    const bool fine = std::abs(value - expected) <= tolerance;  // false for NaN
+    if (!fine) std::printf("%.12g, expected %.12g\n", value, expected);
+    expect(fine, what);
+}
+
+template <class V>
+V random_lanes(double low, double high) {
+    V v{};
+    for (int l = 0; l < kWidth<V>; ++l) set(v, l, uniform(low, high));
+    return v;
+}
+
+template <class V>
+Quaternion<V> random_rotation() {
+    const Vec3<V> angle{random_lanes<V>(-1, 1), random_lanes<V>(-1, 1), random_lanes<V>(-1, 1)};
+    return turned(Quaternion<V>{broadcast<V>(1.0), {V{}, V{}, V{}}}, angle);
+}
+
+Vec3<double> lane_of(const auto& v, int l) { return {get(v.x, l), get(v.y, l), get(v.z, l)}; }
+
+void expect_same(const Vec3<double>& a, const Vec3<double>& b, const std::string& what) {
+    expect_near(a.x, b.x, 1e-14, what);
+    expect_near(a.y, b.y, 1e-14, what);
+    expect_near(a.z, b.z, 1e-14, what);
+}
+
+template <class V>
+void test_lanes() {
+    const std::string width = std::to_string(kWidth<V>) + " lanes: ";
+    for (int trial = 0; trial < 20; ++trial) {
+        const Vec3<V> a{random_lanes<V>(-2, 2), random_lanes<V>(-2, 2), random_lanes<V>(-2, 2)};
+        const Vec3<V> b{random_lanes<V>(-2, 2), random_lanes<V>(-2, 2), random_lanes<V>(-2, 2)};
+        const Quaternion<V> p = random_rotation<V>(), q = random_rotation<V>();
+        const V root = square_root(dot(a, a)), larger = maximum(a.x, b.x), chosen = select<V>(a.x > b.x, a.y, b.y);
+        const Vec3<V> product = cross(a, b);
+        const Quaternion<V> between = relative(p, q), back = p * between;
+        const Frame<V> axes = frame(p);
+        for (int l = 0; l < kWidth<V>; ++l) {
+            const Vec3<double> x = lane_of(a, l), y = lane_of(b, l);
+            expect_near(get(root, l), std::sqrt(x.x * x.x + x.y * x.y + x.z * x.z), 1e-14, width + "root");
+            expect_near(get(larger, l), std::max(x.x, y.x), 0, width + "maximum");
+            expect_near(get(chosen, l), x.x > y.x ? x.y : y.y, 0, width + "select");
+            expect_same(lane_of(product, l), cross(x, y), width + "cross");
+            expect_near(get(back.w, l), get(q.w, l), 1e-14, width + "p (p* q) = q");
+            expect_same(lane_of(back.v, l), lane_of(q.v, l), width + "p (p* q) = q");
+            expect_same(cross(lane_of(axes.d1, l), lane_of(axes.d2, l)), lane_of(axes.d3, l), width + "frame");
+            // R(p) e3 = p e3 p*, by the product of quaternions alone
+            const Quaternion<double> pl{get(p.w, l), lane_of(p.v, l)};
+            const Quaternion<double> turned_axis = pl * Quaternion<double>{0, {0, 0, 1}} * Quaternion<double>{pl.w, -1.0 * pl.v};
+            expect_same(lane_of(axes.d3, l), turned_axis.v, width + "third director");
+        }
+    }
+}
+
+// Gaussian elimination with pivoting: an independent solver.
+std::vector<double> solve_dense(std::vector<std::vector<double>> a, std::vector<double> b) {
+    const int n = int(b.size());
+    for (int c = 0; c < n; ++c) {
+        int best = c;
+        for (int r = c + 1; r < n; ++r)
+            if (std::abs(a[r][c]) > std::abs(a[best][c])) best = r;
+        std::swap(a[c], a[best]);
+        std::swap(b[c], b[best]);
+        for (int r = c + 1; r < n; ++r) {
+            const double factor = a[r][c] / a[c][c];
+            for (int k = c; k < n; ++k) a[r][k] -= factor * a[c][k];
+            b[r] -= factor * b[c];
+        }
+    }
+    for (int r = n - 1; r >= 0; --r) {
+        for (int k = r + 1; k < n; ++k) b[r] -= a[r][k] * b[k];
+        b[r] /= a[r][r];
+    }
+    return b;
+}
+
+template <class V>
+void test_solver() {
+    const int n = 7;
+    std::vector<Matrix> own(n), coupling(n);
+    std::vector<Vector> gradient(n);
+    std::vector<std::vector<double>> dense(6 * n, std::vector<double>(6 * n));
+    std::vector<double> right(6 * n);
+    for (int i = 0; i < n; ++i) {
+        for (int r = 0; r < 6; ++r) {
+            for (int c = 0; c <= r; ++c) own[i][r][c] = own[i][c][r] = uniform(-1, 1) + (r == c ? 9.0 : 0.0);
+            for (int c = 0; c < 6; ++c) coupling[i][r][c] = r < 3 && c >= 3 ? 0.0 : uniform(-1, 1);
+            gradient[i][r] = uniform(-1, 1);
+        }
+        for (int r = 0; r < 3; ++r)
+            for (int c = 0; c < r; ++c) coupling[i][r][c] = coupling[i][c][r];
+        for (int r = 0; r < 6; ++r) {
+            right[6 * i + r] = -gradient[i][r];
+            for (int c = 0; c < 6; ++c) {
+                dense[6 * i + r][6 * i + c] = own[i][r][c];
+                if (i + 1 < n) dense[6 * i + r][6 * i + 6 + c] = dense[6 * i + 6 + c][6 * i + r] = coupling[i][r][c];
+            }
+        }
+    }
+    bool positive = false;
+    const auto solution = solve_chain<V>(own, coupling, gradient, positive);
+    const std::vector<double> expected = solve_dense(dense, right);
+    expect(positive, "a diagonally dominant system has positive pivots");
+    for (int l = 0; l < kWidth<V>; ++l)
+        for (int i = 0; i < n; ++i)
+            for (int r = 0; r < 6; ++r)
+                expect_near(solution[l][i][r], (l + 1) * expected[6 * i + r], 1e-12,
+                            "solution in lane " + std::to_string(l) + " of " + std::to_string(kWidth<V>));
+    own[n / 2][4][4] = -9.0;
+    solve_chain<V>(own, coupling, gradient, positive);
+    expect(!positive, "an indefinite system is told by its pivots");
+}
+
+Pose moved(const Pose& pose, int unknown, double by) {
+    Pose out = pose;
+    double step[6] = {};
+    step[unknown] = by;
+    out.x += Vec3<double>{step[0], step[1], step[2]};
+    // exactly the rotation vector `step`, where turned() agrees with it to second order
+    const double half = 0.5 * by;
+    const Quaternion<double> turn{unknown < 3 ? 1.0 : std::cos(half), {unknown == 3 ? std::sin(half) : 0, unknown == 4 ? std::sin(half) : 0,
+                                                                      unknown == 5 ? std::sin(half) : 0}};
+    out.q = pose.q * turn;
+    return out;
+}
+
+// d2/da db of E by central differences of the energy alone; rotations about two axes of one body are averaged over
+// both orders, which is how the Hessian on rotation vectors is symmetric.
+template <class Energy>
+double second_difference(const Energy& energy, const Pose (&poses)[2], int block_a, int a, int block_b, int b, double h) {
+    double sum = 0;
+    for (int order = 0; order < 2; ++order)
+        for (int sa = -1; sa <= 1; sa += 2)
+            for (int sb = -1; sb <= 1; sb += 2) {
+                Pose p[2] = {poses[0], poses[1]};
+                if (order == 0) p[block_a] = moved(p[block_a], a, sa * h);
+                p[block_b] = moved(p[block_b], b, sb * h);
+                if (order == 1) p[block_a] = moved(p[block_a], a, sa * h);
+                sum += sa * sb * energy(p);
+            }
+    return sum / (8 * h * h);
+}
+
+RodModel two_element_rod() {
+    RodModel rod;
+    rod.nodes = 3;
+    rod.abscissa = {0, 0.8, 2.0};
+    rod.length = {0.8, 1.2, 1.0};
+    rod.shear = {3.0, 4.0, 4.0};
+    rod.stretch = {7.0, 9.0, 9.0};
+    rod.joint_length = {1.0, 1.0, 1.0};
+    rod.bend = {2.0, 2.5, 2.5};
+    rod.twist = {1.5, 1.1, 1.1};
+    rod.rest = {{0, 0, 0}, {0.3, -0.2, 0.1}, {0, 0, 0}};
+    rod.radius = rod.drag = rod.spin_drag = {0.1, 0.1, 0.1};
+    return rod;
+}
+
+// The joint's Hessian leaves out the derivatives of g, so it holds to the order of strain: of |v|² where the rest
+// curvature is 0, of |v| times the moment elsewhere. Gradients are exact at any strain.
+void test_elastic_energy(double bent, double rest, double tolerance) {
+    RodModel rod = two_element_rod();
+    rod.rest[1] = rest * rod.rest[1];
+    for (int trial = 0; trial < 4; ++trial) {
+        const auto start = random_rotation<double>();
+        const Vec3<double> bend{uniform(-bent, bent), uniform(-bent, bent), uniform(-bent, bent)};
+        const Vec3<double> along = 0.8 * frame(start).d3, off{uniform(-0.2, 0.2), uniform(-0.2, 0.2), uniform(-0.2, 0.2)};
+        const Pose poses[2] = {{along + off, turned(start, bend)}, {{0, 0, 0}, start}};
+        const auto energy = [&](const Pose (&p)[2]) { return elastic_energy(rod, p[0], p[1]).energy; };
+        const Pair exact = elastic_energy(rod, poses[0], poses[1]);
+        expect(exact.energy > 0, "a strained rod has energy");
+        for (int block = 0; block < 2; ++block)
+            for (int a = 0; a < 6; ++a) {
+                const double h = 1e-5;
+                Pose up[2] = {poses[0], poses[1]}, down[2] = {poses[0], poses[1]};
+                up[block] = moved(poses[block], a, h);
+                down[block] = moved(poses[block], a, -h);
+                const std::string at = ", block " + std::to_string(block) + ", unknown " + std::to_string(a);
+                expect_near(exact.gradient[block][a], (energy(up) - energy(down)) / (2 * h), 1e-8, "elastic gradient" + at);
+                for (int b = 0; b < 6 && tolerance > 0; ++b) {
+                    const double own = second_difference(energy, poses, block, a, block, b, 1e-3);
+                    expect_near(exact.own[block][a][b], own, tolerance, "elastic Hessian" + at + "," + std::to_string(b));
+                    if (block == 1) continue;
+                    const double mixed = second_difference(energy, poses, 0, a, 1, b, 1e-3);
+                    expect_near(exact.coupling[a][b], mixed, tolerance, "elastic coupling" + at + "," + std::to_string(b));
+                }
+            }
+    }
+}
+
+// Without its geometric terms the Hessian is J^T K J: no direction has negative curvature.
+void test_gauss_newton() {
+    const RodModel rod = two_element_rod();
+    for (int trial = 0; trial < 50; ++trial) {
+        const auto start = random_rotation<double>();
+        const Pose distal{{uniform(-1, 1), uniform(-1, 1), uniform(-1, 1)}, random_rotation<double>()};
+        const Pair gauss = elastic_energy(rod, distal, {{0, 0, 0}, start}, 0.0);
+        Vector u[2];
+        for (auto& part : u)
+            for (double& c : part) c = uniform(-1, 1);
+        double form = 0;
+        for (int r = 0; r < 6; ++r)
+            for (int c = 0; c < 6; ++c)
+                form += u[0][r] * gauss.own[0][r][c] * u[0][c] + u[1][r] * gauss.own[1][r][c] * u[1][c] +
+                        2 * u[0][r] * gauss.coupling[r][c] * u[1][c];
+        expect(form > -1e-12, "Gauss-Newton part is positive semidefinite");
+    }
+}
+
+constexpr int kSize[3] = {21, 18, 13};  // no multiples of a brick's edge
+constexpr double kSpacing = 0.5;
+
+Lumen make_lumen(double near) {
+    // coefficients of a curved field; quadratic B-splines of them are smooth whatever they are
+    std::vector<float> c;
+    for (int k = 0; k < kSize[2]; ++k)
+        for (int j = 0; j < kSize[1]; ++j)
+            for (int i = 0; i < kSize[0]; ++i)
+                c.push_back(float(1.5 - 0.3 * std::hypot(0.5 * j - 4.0, 0.5 * k - 3.0) + 0.1 * std::sin(0.9 * i + 0.4 * k)));
+    const double origin[3] = {-2.0, -4.0, -3.0};
+    return Lumen(c.data(), kSize, origin, kSpacing, near, 0.5);
+}
+
+template <class V>
+void test_distance() {
+    const Lumen lumen = make_lumen(1e9);
+    const double h = 1e-4;
+    for (int trial = 0; trial < 100; ++trial) {
+        const Vec3<V> x{random_lanes<V>(-1.9, 7.7), random_lanes<V>(-3.9, 4.2), random_lanes<V>(-2.9, 2.7)};
+        const auto value = [&](int axis, double by) {
+            Vec3<V> at = x;
+            (axis == 0 ? at.x : axis == 1 ? at.y : at.z) += by;
+            return distance_to_wall<V>(lumen, at);
+        };
+        const Distance<V> d = distance_to_wall<V>(lumen, x);
+        for (int axis = 0; axis < 3; ++axis) {
+            const Distance<V> up = value(axis, h), down = value(axis, -h);
+            const Vec3<V> columns[3] = {{d.curve.xx, d.curve.xy, d.curve.xz}, {d.curve.xy, d.curve.yy, d.curve.yz}, {d.curve.xz, d.curve.yz, d.curve.zz}};
+            for (int l = 0; l < kWidth<V>; ++l) {
+                const Vec3<double> slope = lane_of(d.slope, l), column = lane_of(columns[axis], l);
+                const double s[3] = {slope.x, slope.y, slope.z};
+                expect_near(s[axis], (get(up.value, l) - get(down.value, l)) / (2 * h), 1e-3 * h + 1e-8, "slope of the distance");
+                // the spline's second derivative jumps between cells: stay off their borders
+                const double places[3] = {get(x.x, l) + 2.0, get(x.y, l) + 4.0, get(x.z, l) + 3.0};
+                const double place = places[axis] / kSpacing + 0.5;
+                if (std::abs(place - std::round(place)) < 4 * h) continue;
+                const Vec3<double> change = (1 / (2 * h)) * (lane_of(up.slope, l) - lane_of(down.slope, l));
+                expect_near(column.x, change.x, 1e-8, "curve of the distance");
+                expect_near(column.y, change.y, 1e-8, "curve of the distance");
+                expect_near(column.z, change.z, 1e-8, "curve of the distance");
+            }
+        }
+    }
+}
+
+void test_map_borders() {
+    const Lumen lumen = make_lumen(1e9), sparse = make_lumen(-10.0);
+    const double nan = std::numeric_limits<double>::quiet_NaN(), far = 1e300;
+    for (const double bad : {nan, far, -far, 1e6, -2.6, std::numeric_limits<double>::infinity()})
+        for (int axis = 0; axis < 3; ++axis) {
+            Vec3<double> x{1.0, 0.0, 0.0};
+            (axis == 0 ? x.x : axis == 1 ? x.y : x.z) = bad == -2.6 && axis != 0 ? -9.0 : bad;
+            expect(std::isnan(distance_to_wall<double>(lumen, x).value), "outside the map the distance is NaN");
+        }
+    for (int trial = 0; trial < 2000; ++trial) {  // the sanitizers watch the stencil of cells at the border
+        const Vec3<double> x{uniform(-3, 14), uniform(-5, 9), uniform(-4, 8)};
+        const double d = distance_to_wall<double>(lumen, x).value;
+        expect(std::isnan(d) || std::abs(d) < 10, "the distance is finite or NaN");
+    }
+    expect_near(distance_to_wall<double>(sparse, {1, 0, 0}).value, Lumen::kDeep, 0, "cells without wall count as deep inside");
+    expect(sparse.bytes() < lumen.bytes(), "bricks away from the wall are not kept");
+}
+
+void test_wall() {
+    const Lumen lumen = make_lumen(1e9);
+    const double stiffness = 5.0, radius = 0.9;  // touches in part of the map
+    int touching = 0, clear = 0;
+    for (int trial = 0; trial < 400; ++trial) {
+        const Pose poses[2] = {{{uniform(-1.5, 7), uniform(-3.5, 4), uniform(-2.5, 2.5)}, {1, {0, 0, 0}}}, {}};
+        const auto energy = [&](const Vec3<double>& x) { return wall_energy(lumen, stiffness, radius, x).energy; };
+        const Single exact = wall_energy(lumen, stiffness, radius, poses[0].x);
+        const double depth = radius - distance_to_wall<double>(lumen, poses[0].x).value;
+        expect_near(exact.energy, depth > 0 ? 0.5 * stiffness * depth * depth : 0.0, 1e-12, "energy of the wall");
+        (depth > 0 ? touching : clear)++;
+        if (std::abs(depth) < 1e-2) continue;
+        const double h = 1e-5, place[3] = {poses[0].x.x + 2.0, poses[0].x.y + 4.0, poses[0].x.z + 3.0};
+        for (int a = 0; a < 3; ++a) {
+            const Vec3<double> up = moved(poses[0], a, h).x, down = moved(poses[0], a, -h).x;
+            expect_near(exact.gradient[a], (energy(up) - energy(down)) / (2 * h), 1e-7, "gradient of the wall");
+            const double cell = place[a] / kSpacing + 0.5;
+            if (std::abs(cell - std::round(cell)) < 1e-3) continue;
+            const Single above = wall_energy(lumen, stiffness, radius, up), below = wall_energy(lumen, stiffness, radius, down);
+            for (int b = 0; b < 3; ++b)
+                expect_near(exact.hessian[a][b], (above.gradient[b] - below.gradient[b]) / (2 * h), 1e-6, "Hessian of the wall");
+        }
+    }
+    expect(touching > 50 && clear > 50, "the test sees nodes that touch and nodes that do not");
+}
+
+void test_friction() {
+    for (int trial = 0; trial < 50; ++trial) {
+        const Quaternion<double> start_q = random_rotation<double>();
+        const Vec3<double> axis = frame(start_q).d3, other = frame(random_rotation<double>()).d1;
+        Vec3<double> n = cross(axis, other);
+        n = (1 / std::sqrt(dot(n, n))) * n;  // the wall's normal, square to the wire
+        const double limit = 0.7, eps = 0.02, radius = 0.18;
+        const Grip<double> grip{limit, n, radius * cross(n, axis)};
+        const Vec3<double> start{0.1, -0.2, 0.3};
+        const Pose now{start + Vec3<double>{uniform(-.1, .1), uniform(-.1, .1), uniform(-.1, .1)},
+                       turned(start_q, {uniform(-.1, .1), uniform(-.1, .1), uniform(-.3, .3)})};
+        const Single exact = friction_energy(grip, eps, start, start_q, now);
+        const double force = std::hypot(exact.gradient[0], exact.gradient[1], exact.gradient[2]);
+        expect(force <= limit * (1 + 1e-12), "friction is at most its limit");
+        expect_near(exact.gradient[0] * n.x + exact.gradient[1] * n.y + exact.gradient[2] * n.z, 0, 1e-14, "friction acts along the wall");
+        const double h = 1e-5;
+        for (int a = 0; a < 6; ++a) {
+            const Single up = friction_energy(grip, eps, start, start_q, moved(now, a, h));
+            const Single down = friction_energy(grip, eps, start, start_q, moved(now, a, -h));
+            expect_near(exact.gradient[a], (up.energy - down.energy) / (2 * h), 1e-7, "gradient of friction");
+            for (int b = 0; b < 3; ++b)  // the rows of rotations leave out the second derivative of the turn
+                expect_near(exact.hessian[a][b], (up.gradient[b] - down.gradient[b]) / (2 * h), 1e-5, "Hessian of friction");
+        }
+        const Single still = friction_energy(grip, eps, start, start_q, {start, start_q});
+        expect_near(still.energy, 0, 1e-16, "friction at rest holds no energy");
+    }
+}
+
+}  // namespace
+
+int main() {
+    test_lanes<double>();
+    test_lanes<double4>();
+    test_lanes<double8>();
+    test_solver<double>();
+    test_solver<double4>();
+    test_solver<double8>();
+    test_elastic_energy(0.3, 1.0, 0.0);
+    test_elastic_energy(0.02, 0.0, 1e-3);
+    test_elastic_energy(0.02, 1.0, 2e-2);
+    test_gauss_newton();
+    test_distance<double>();
+    test_distance<double4>();
+    test_map_borders();
+    test_wall();
+    test_friction();
+    std::printf(failures == 0 ? "all core tests passed\n" : "%d core checks failed\n", failures);
+    return failures == 0 ? EXIT_SUCCESS : EXIT_FAILURE;
+}

@@ -1,0 +1,53 @@
+"""The core's own C++ tests, built and run under address and undefined-behaviour sanitizers."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+HERE = Path(__file__).parent
+SOURCES = Path(__file__).parents[2] / "src" / "core"
+SANITIZERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+FLAGS = ("-std=gnu++20", "-O1", "-g", "-Wall", "-Wextra", "-Wno-psabi", "-march=native", *SANITIZERS)
+
+
+@pytest.fixture(scope="module")
+def compiler(tmp_path_factory: pytest.TempPathFactory) -> str:
+    found = os.environ.get("CXX") or shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
+    if not found:
+        pytest.skip("no C++ compiler: the core's own tests need one")
+    folder = tmp_path_factory.mktemp("probe")
+    (folder / "empty.cpp").write_text("int main() { return 0; }\n")
+    program = folder / "empty"
+    built = subprocess.run([found, *SANITIZERS, folder / "empty.cpp", "-o", program], capture_output=True, text=True)
+    if built.returncode or subprocess.run([program], capture_output=True).returncode:
+        pytest.skip(f"{found} cannot build programs with address and undefined-behaviour sanitizers here")
+    return found
+
+
+def test_the_core_passes_its_tests_under_sanitizers(compiler: str, tmp_path: Path) -> None:
+    program = tmp_path / "test_core"
+    command = [compiler, *FLAGS, f"-I{SOURCES}", f"-I{HERE}", HERE / "test_core.cpp", "-o", program]
+    built = subprocess.run(command, capture_output=True, text=True)
+    assert built.returncode == 0, built.stderr
+    ran = subprocess.run([program], capture_output=True, text=True)
+    assert ran.returncode == 0, f"{ran.stdout[-4000:]}\n{ran.stderr[-4000:]}"
+    assert "all core tests passed" in ran.stdout
+
+
+def test_the_sanitizers_end_a_faulty_program(compiler: str, tmp_path: Path) -> None:
+    faults = {
+        "heap-buffer-overflow": "std::vector<double> v(4); volatile int i = 4; return int(v.data()[i]);",
+        "signed integer overflow": "volatile int i = 2147483647; volatile int j = i + 1; return j > 0;",
+    }
+    for report, body in faults.items():
+        source = tmp_path / "faulty.cpp"
+        source.write_text(f"#include <vector>\nint main() {{ {body} }}\n")
+        program = tmp_path / "faulty"
+        subprocess.run([compiler, *FLAGS, source, "-o", program], check=True, capture_output=True)
+        ran = subprocess.run([program], capture_output=True, text=True)
+        assert ran.returncode != 0 and report in ran.stderr
