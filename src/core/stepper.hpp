@@ -78,6 +78,22 @@ private:
         double energy, pull_a, pull_r, aa, ar, rr;
     };
 
+    // The same, without the energy, for all lanes.
+    struct DriveRows {
+        V pull_a, pull_r, aa, ar, rr;
+        friend DriveRows operator+(const DriveRows& a, const DriveRows& b) {
+            return {a.pull_a + b.pull_a, a.pull_r + b.pull_r, a.aa + b.aa, a.ar + b.ar, a.rr + b.rr};
+        }
+        friend DriveRows operator-(const DriveRows& a, const DriveRows& b) {
+            return {a.pull_a - b.pull_a, a.pull_r - b.pull_r, a.aa - b.aa, a.ar - b.ar, a.rr - b.rr};
+        }
+        friend DriveRows select(Mask<V> mask, const DriveRows& yes, const DriveRows& no) {
+            return {endopilot::select<V>(mask, yes.pull_a, no.pull_a), endopilot::select<V>(mask, yes.pull_r, no.pull_r),
+                    endopilot::select<V>(mask, yes.aa, no.aa), endopilot::select<V>(mask, yes.ar, no.ar),
+                    endopilot::select<V>(mask, yes.rr, no.rr)};
+        }
+    };
+
     struct Lane {
         int world = -1, sample = 0, tick = 0, stride = 0, active = 0, iterations = 0, rejections = 0, steps = 0;
         long total_iterations = 0;
@@ -106,8 +122,8 @@ private:
     // per lane: settings of the step, results of a sweep
     V active_{}, geometric_{}, inverse_dt_{}, eps_{}, first_{}, damping_{}, friction_{}, way_{}, swing_{};
     V energy_{}, descent_{}, pivot_{}, jump_{}, base_force_{}, base_torque_{};
-    // gradient and Hessian of the wire's energy, all nodes eliminated, in the drive's motion; the drive's Newton step
-    V pull_a_{}, pull_r_{}, stiff_aa_{}, stiff_ar_{}, stiff_rr_{}, drive_a_{}, drive_r_{};
+    DriveRows drive_{};            // of the wire's energy, all nodes eliminated
+    V drive_a_{}, drive_r_{};      // the drive's Newton step
 
     double duration(const Lane& lane) const { return in_.time_step * lane.stride / kTicks; }
     double elapsed(int tick) const { return in_.time_step * tick / kTicks; }
@@ -155,6 +171,7 @@ private:
     // Sweeps over the nodes of all lanes (sweeps.hpp).
     void evaluate(int n);
     void add_rod(int first, int count);
+    DriveRows along_drive(const Diagonal<V>& block) const;
     void add_lumen(int first, int count);
     void add_drag(int first, int count);
     void eliminate_nodes(int first, int count);
@@ -372,10 +389,10 @@ bool Stepper<V>::solve_drive(int l) {
     if (!lane.by_force) return true;
     const DriveTerms t = drive_terms(lane, l);
     const double damping = get(damping_, l);
-    const double aa = t.aa + get(stiff_aa_, l) + damping, ar = t.ar + get(stiff_ar_, l), rr = t.rr + get(stiff_rr_, l) + damping;
+    const double aa = t.aa + get(drive_.aa, l) + damping, ar = t.ar + get(drive_.ar, l), rr = t.rr + get(drive_.rr, l) + damping;
     const double determinant = aa * rr - ar * ar;
     if (!(aa > 0 && determinant > 0)) return false;
-    const double a = t.pull_a + get(pull_a_, l), r = t.pull_r + get(pull_r_, l);
+    const double a = t.pull_a + get(drive_.pull_a, l), r = t.pull_r + get(drive_.pull_r, l);
     const double step_a = (ar * r - rr * a) / determinant, step_r = (ar * a - aa * r) / determinant;
     set(drive_a_, l, step_a);
     set(drive_r_, l, step_r);

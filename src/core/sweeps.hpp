@@ -68,7 +68,17 @@ void Stepper<V>::add_rod(int first, int count) {
         const Mask<V> last = active_ == broadcast<V>(i + 1);
         base_force_ = select<V>(last, axis.x * next.force.x + axis.y * next.force.y + axis.z * next.force.z, base_force_);
         base_torque_ = select<V>(last, next.moment.z, base_torque_);
+        if (in_.force_driven) drive_ = select(last, along_drive(next), drive_);
     }
+}
+
+// A block's gradient and Hessian in the drive's advance and rotation, had its node to follow the drive.
+template <class V>
+typename Stepper<V>::DriveRows Stepper<V>::along_drive(const Diagonal<V>& block) const {
+    const Vec3<double> d = frame(base_.orientation).d3;
+    const Vec3<V> axis{broadcast<V>(d.x), broadcast<V>(d.y), broadcast<V>(d.z)};
+    const Vec3<V> across{block.tx[2][0], block.tx[2][1], block.tx[2][2]};
+    return {dot(axis, block.force), block.moment.z, dot(axis, block.xx * axis), dot(axis, across), block.tt.zz};
 }
 
 // The wall's reaction and friction.
@@ -122,23 +132,18 @@ void Stepper<V>::add_drag(int first, int count) {
 template <class V>
 void Stepper<V>::eliminate_nodes(int first, int count) {
     const V zero{};
-    const Vec3<double> axis = frame(base_.orientation).d3;
     for (int k = 0; k < count; ++k) {
         const int i = first + k;
         const Mask<V> on = active_ > broadcast<V>(i);
         Diagonal<V>& next = block_[k + 1];
+        DriveRows before;
+        if (in_.force_driven) before = along_drive(next);
         const Elimination<V> eliminated = eliminate(block_[k], coupling_[k], factor_[i], next);
         descent_ += select<V>(on, eliminated.descent, zero);
         const Mask<V> sound = eliminated.smallest_pivot > zero;
         pivot_ = select<V>(on, select<V>(sound, pivot_, zero), pivot_);
-        if (!in_.force_driven) continue;
-        const Mask<V> last = active_ == broadcast<V>(i + 1);
-        const Vec3<V> stiff = next.xx * Vec3<V>{broadcast<V>(axis.x), broadcast<V>(axis.y), broadcast<V>(axis.z)};
-        pull_a_ = select<V>(last, axis.x * next.force.x + axis.y * next.force.y + axis.z * next.force.z, pull_a_);
-        pull_r_ = select<V>(last, next.moment.z, pull_r_);
-        stiff_aa_ = select<V>(last, axis.x * stiff.x + axis.y * stiff.y + axis.z * stiff.z, stiff_aa_);
-        stiff_ar_ = select<V>(last, axis.x * next.tx[2][0] + axis.y * next.tx[2][1] + axis.z * next.tx[2][2], stiff_ar_);
-        stiff_rr_ = select<V>(last, next.tt.zz, stiff_rr_);
+        // to a shorter wire's base only the part that is eliminated counts: what lies behind follows the drive
+        if (in_.force_driven) drive_ = select(active_ == broadcast<V>(i + 1), drive_ + (along_drive(next) - before), drive_);
     }
 }
 

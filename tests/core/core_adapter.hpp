@@ -132,7 +132,7 @@ std::array<std::vector<Vector>, kWidth<V>> solve_chain(const std::vector<Matrix>
                 }
         }
         carried = Diagonal<V>{};
-        const V pivot = eliminate(block, k, factor[i], carried);
+        const V pivot = eliminate(block, k, factor[i], carried).smallest_pivot;
         positive = positive && get(pivot, 0) > 0;
     }
     std::array<std::vector<Vector>, W> solution;

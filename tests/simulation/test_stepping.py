@@ -161,9 +161,9 @@ def test_forces_replay_a_velocity_run(anatomy: Anatomy) -> None:
     assert leading.valid.all() and led.valid.all()
     travelled = np.abs(velocity[..., 0]).sum(axis=0) * dt
     assert (travelled > 3).all()
-    assert np.max(apart) < 1e-3
-    assert np.abs(led.inserted_length - leading.inserted_length).max() < 1e-3
-    assert np.abs(led.rotation - leading.rotation).max() < 1e-3
+    assert np.max(apart) < 1e-6
+    assert np.abs(led.inserted_length - leading.inserted_length).max() < 1e-6
+    assert np.abs(led.rotation - leading.rotation).max() < 1e-6
     assert np.array_equal(led.drive_load, leading.drive_load)
 
 

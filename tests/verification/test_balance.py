@@ -20,7 +20,7 @@ def test_the_push_balances_the_wall() -> None:
         ControlConfig(), n_sequences=6, n_samples=24, seed=3, max_inserted_length_mm=longest
     )
     control[:, -4:] = 0.0  # at rest, where drag has gone
-    config = SimulatorConfig(tolerance_mm=1e-7, threads=1)
+    config = SimulatorConfig(tolerance_mm=1e-7, wall_stiffness_n_mm=5.0, threads=1)
     rollout = simulate(
         anatomy, device, control, initial=initial, config=config, record_shape=True, friction=np.zeros(len(control))
     )

@@ -12,7 +12,7 @@ import numpy as np
 from endopilot.anatomy.atlas import AtlasConfig, synthesize_one
 from endopilot.simulation.controls import ControlConfig, random_controls
 from endopilot.simulation.device import read_device
-from endopilot.simulation.simulator import SimulatorConfig, simulate
+from endopilot.simulation.simulator import SimulatorConfig, simulate, wall_stiffness
 from endopilot.simulation.stepping import Simulator
 from endopilot.types import SAMPLE_PERIOD_S, Rollout
 
@@ -68,7 +68,7 @@ def bench_simulation() -> dict[str, Any]:
         "valid_worlds": round(float(rollout.valid[:, -1].mean()), 5),
         "contact_force_p999_n": round(float(np.percentile(rollout.contact_force_max, 99.9)), 4),
         "penetration_p999_mm": round(
-            float(np.percentile(rollout.contact_force_max, 99.9)) / one_thread.wall_stiffness_n_mm, 4
+            float(np.percentile(rollout.contact_force_max, 99.9)) / wall_stiffness(one_thread, device.push_limit_n), 4
         ),
         "seconds_for_first_call": round(first_call, 3),
         "worlds": WORLDS,

@@ -20,7 +20,7 @@ from endopilot.errors import InputError
 from endopilot.types import Anatomy
 
 _FOLDER = Path(__file__).parent / "devices"
-_SCALARS = ("diameter_mm", "friction", "max_velocity_mm_s", "max_rotation_rad_s")
+_SCALARS = ("diameter_mm", "friction", "max_velocity_mm_s", "max_rotation_rad_s", "push_limit_n")
 _PROFILES = ("abscissa_mm", "bend_stiffness_n_mm2", "twist_stiffness_n_mm2")
 _FIELDS = ("name", *_SCALARS, *_PROFILES, "tip_load_n", "tip_bend")
 _VALUE_KEYS, _TIP_BEND_KEYS = ("value", "source"), ("angle_deg", "length_mm", "source")
@@ -45,6 +45,8 @@ class Device:
         friction: Coulomb friction coefficient on the vessel's wall.
         max_velocity_mm_s: fastest translation of the drive, mm/s.
         max_rotation_rad_s: fastest rotation of the drive, rad/s.
+        push_limit_n: force at which the drive slips rather than push the wire harder, N; a wire whose tip is caught is not
+            folded up in the vessel then.
         sources: where each constant comes from.
     """
 
@@ -59,6 +61,7 @@ class Device:
     friction: float
     max_velocity_mm_s: float
     max_rotation_rad_s: float
+    push_limit_n: float
     sources: Mapping[str, str]
 
     def __post_init__(self) -> None:

@@ -31,7 +31,7 @@ from endopilot.parallel import follow_the_parent
 from endopilot.progress import progress
 from endopilot.simulation.controls import ControlConfig, random_controls
 from endopilot.simulation.device import Device, check_fits, list_devices, read_device
-from endopilot.simulation.simulator import SimulatorConfig, simulate
+from endopilot.simulation.simulator import SimulatorConfig, simulate, wall_stiffness
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, Rollout
 
 MOST_INVALID_SHARE = 1e-3
@@ -197,7 +197,7 @@ def run_chunk(path: Path, config: RobustnessConfig, index: int, device: Device, 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # invalid worlds are told below, each with its reason
         rollout = simulate(anatomy, device, control, initial=initial, config=simulator)
-    chunk = _describe(anatomy, rollout, simulator.wall_stiffness_n_mm, time.process_time() - began)
+    chunk = _describe(anatomy, rollout, wall_stiffness(simulator, device.push_limit_n), time.process_time() - began)
     invalid = [
         f"{anatomy.name}, {device.name}, rollout {world} ({MANOEUVRES[world % len(MANOEUVRES)]}): "
         + _reason(anatomy, device, control[[world]], initial[[world]], simulator)

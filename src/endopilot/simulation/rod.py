@@ -103,7 +103,7 @@ def lay_out(device: Device, *, path_mm: float, elements: int, length_mm: float) 
         rest_curvature=curvature,
         radius_mm=np.full(len(abscissa), device.tip_radius_mm),
         drag_n_s_mm=_DRAG_N_S_MM2 * length,
-        spin_drag_n_mm_s=_DRAG_N_S_MM2 * length,
+        spin_drag_n_mm_s=_DRAG_N_S_MM2 * device.tip_radius_mm**2 * length,  # of the surface, radius times rotation
     )
 
 

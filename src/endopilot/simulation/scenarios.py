@@ -135,7 +135,7 @@ def drag_through_bends(bends: int, *, friction: float = 0.2, bend_n_mm2: float =
         entry_mm=-lead,
         inserted_mm=2.0,
         friction=friction,
-        config=SimulatorConfig(tolerance_mm=1e-5, stick_velocity_mm_s=0.02, push_limit_n=50.0, threads=1),
+        config=SimulatorConfig(tolerance_mm=1e-5, stick_velocity_mm_s=0.02, wall_stiffness_n_mm=5.0, threads=1),
         free_behind_mm=0.5 * size,
         loads=_core.make_loads(
             force=force, moment=zero, spring=zero, anchor=zero, hold=np.zeros(nodes), attitude=still
@@ -194,7 +194,7 @@ def stick_slip(*, friction: float = 0.1) -> Pushed:
         entry_mm=-5.0,
         inserted_mm=start,
         friction=friction,
-        config=SimulatorConfig(threads=1),
+        config=SimulatorConfig(threads=1, wall_stiffness_n_mm=5.0),
         approach=True,
     )
     tip = result["tip_position"]
@@ -221,7 +221,7 @@ def push_against_a_plate(*, friction: float, tip_bend_deg: float) -> Pushed:
         entry_mm=0.0,
         inserted_mm=start,
         friction=friction,
-        config=SimulatorConfig(threads=1),
+        config=SimulatorConfig(threads=1, wall_stiffness_n_mm=5.0),
         free_behind_mm=0.0,
     )
     pushed = start - PLATE_GAP_MM + _advance(speed, samples)
@@ -269,7 +269,7 @@ def turn_in_a_bend(curved_mm: float, *, turns: float = 2.25, friction: float = 0
         entry_mm=-_WHIP_LEAD_MM,
         inserted_mm=0.0,
         friction=friction,
-        config=SimulatorConfig(threads=1, push_limit_n=100.0, wall_stiffness_n_mm=20.0),
+        config=SimulatorConfig(threads=1, wall_stiffness_n_mm=20.0),
         free_behind_mm=0.5 * size,
     )
     w, x, y, z = result["attitude"][push + 2 :, 0].T
@@ -366,6 +366,7 @@ def _drive(
         lanes=1,
         approach=approach,
         free_behind_mm=free_behind_mm,
+        push_limit_n=100.0,  # the drive of a scenario does not slip
     )
     if not result["valid"].all():
         raise RuntimeError("a scenario did not converge")

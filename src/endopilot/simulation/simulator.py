@@ -30,6 +30,8 @@ SAMPLE_TOLERANCE = 1e-6
 """Newton tolerance of the step that ends a sample, mm: its forces are recorded, and the wire is stiff axially."""
 LANES = _core.LANES
 """Worlds that one thread steps side by side."""
+_DENT_MM = 0.025
+"""Depth to which a node that bears the whole push limit dents the wall, mm, where the stiffness is not given."""
 _OVERSHOOT_MM = 1e-2
 """Rounding of controls may carry the inserted length this far below 0, mm."""
 
@@ -44,8 +46,8 @@ class SimulatorConfig:
     """Newton's method stops when its step moves no node farther than this, mm."""
     elements: int = 100
     """Elements over the longest path of the anatomy; they are shorter near the tip."""
-    wall_stiffness_n_mm: float = 5.0
-    """Stiffness of the vessel wall at a node, N/mm."""
+    wall_stiffness_n_mm: float | None = None
+    """Stiffness of the vessel wall at a node, N/mm. If not given, the device's push limit dents it by 0.025 mm."""
     stick_velocity_mm_s: float = 0.05
     """Slip velocity under which smoothed Coulomb friction falls off, mm/s; a wire at rest creeps more slowly."""
     approach_velocity_mm_s: float = 20.0
@@ -57,9 +59,6 @@ class SimulatorConfig:
     """Coulomb friction of the introducer's valve, N; the drive feels it, the wire ahead of the valve does not."""
     introducer_drag_n_s_mm: float = 0.002
     """Viscous drag of the introducer's valve, N·s/mm."""
-    push_limit_n: float = 2.0
-    """The drive slips rather than push the wire harder than this, N. Far above what an advance through open vessels
-    takes (some 0.1 N for a coronary wire), it keeps a wire whose tip is caught from being folded up in the vessel."""
     threads: int = 0
     """Threads; 0 for one a processor core. The results do not depend on it."""
 
@@ -69,13 +68,16 @@ class SimulatorConfig:
         Raises:
             InputError: a field is out of its range.
         """
-        for name in ("time_step_s", "tolerance_mm", "wall_stiffness_n_mm", "stick_velocity_mm_s", "push_limit_n"):
+        for name in ("time_step_s", "tolerance_mm", "wall_stiffness_n_mm", "stick_velocity_mm_s", "largest_jump"):
             value = getattr(self, name)
-            if not 0 < value < np.inf:
+            if value is not None and not 0 < value < np.inf:
                 raise InputError(f"{name}: {value}; give a positive number")
         steps = SAMPLE_PERIOD_S / self.time_step_s
         if abs(steps - round(steps)) > 1e-6 or steps < 0.5:
             raise InputError(f"time_step_s: {self.time_step_s} does not divide {SAMPLE_PERIOD_S} s; give e.g. 0.02")
+        for name in ("introducer_friction_n", "introducer_drag_n_s_mm"):
+            if not 0 <= getattr(self, name) < np.inf:
+                raise InputError(f"{name}: {getattr(self, name)}; give 0 or a positive number")
         if not 0 < self.approach_velocity_mm_s < np.inf:
             raise InputError(f"approach_velocity_mm_s: {self.approach_velocity_mm_s}; give a positive velocity")
         if not 10 <= self.elements <= 2000:
@@ -96,7 +98,7 @@ def simulate(
 ) -> Rollout:
     """Drive a device through an anatomy and record it every 0.5 s.
 
-    The drive slips rather than push harder than `config.push_limit_n`, and stops when the wire is pulled out: controls,
+    The drive slips rather than push harder than the device's push limit, and stops when the wire is pulled out: controls,
     inserted lengths and the initial state of the answer are those that were made.
 
     Results are the same to the last bit whatever the number of worlds, their order and the number of threads.
@@ -140,6 +142,7 @@ def simulate(
         control=control,
         friction=friction,
         record_shape=record_shape,
+        push_limit_n=device.push_limit_n,
     )
     _report_invalid(result["reason"], result["valid"])
     made, started = control.copy(), initial.copy()
@@ -188,6 +191,7 @@ def run_core(
     approach: bool = True,
     free_behind_mm: float = FREE_BEHIND_MM,
     sample_tolerance: float = SAMPLE_TOLERANCE,
+    push_limit_n: float = 2.0,
 ) -> dict[str, np.ndarray]:
     """Run the C++ core on checked input. The simulator and the verification both come through here.
 
@@ -206,6 +210,7 @@ def run_core(
         approach: bring the wire to its first inserted length from the ostium; else it starts there, straight.
         free_behind_mm: nodes farther behind the insertion point follow the drive, mm.
         sample_tolerance: Newton tolerance at the end of a sample, mm.
+        push_limit_n: force at which the drive slips, N; of the device, where there is one.
 
     Returns:
         The arrays of `Rollout` that need no centerline, and `reason`: 0 fine, 1 not finite, 2 not converged.
@@ -216,7 +221,11 @@ def run_core(
         loads=loads,
         **insertion_arguments(insertion),
         options=core_options(
-            config, approach=approach, free_behind_mm=free_behind_mm, sample_tolerance=sample_tolerance
+            config,
+            push_limit_n=push_limit_n,
+            approach=approach,
+            free_behind_mm=free_behind_mm,
+            sample_tolerance=sample_tolerance,
         ),
         worlds=len(control),
     )
@@ -250,23 +259,33 @@ def insertion_arguments(insertion: Insertion) -> dict[str, np.ndarray]:
 
 
 def core_options(
-    config: SimulatorConfig, *, free_behind_mm: float, sample_tolerance: float, approach: bool = True
+    config: SimulatorConfig,
+    *,
+    push_limit_n: float,
+    free_behind_mm: float,
+    sample_tolerance: float,
+    approach: bool = True,
 ) -> _core.Options:
     """Return the settings as the core wants them."""
     options = _core.Options()
     options.stick_velocity = config.stick_velocity_mm_s
-    options.wall_stiffness = config.wall_stiffness_n_mm
+    options.wall_stiffness = wall_stiffness(config, push_limit_n)
     options.tolerance = config.tolerance_mm
     options.sample_tolerance = min(sample_tolerance, config.tolerance_mm)
     options.largest_step = _LARGEST_NEWTON_STEP
     options.largest_jump = config.largest_jump
     options.most_iterations = _MOST_ITERATIONS
     options.free_behind = free_behind_mm
-    options.push_limit = config.push_limit_n
+    options.push_limit = push_limit_n
     options.approach_velocity = config.approach_velocity_mm_s if approach else 0.0
     options.introducer_friction = config.introducer_friction_n
     options.introducer_drag = config.introducer_drag_n_s_mm
     return options
+
+
+def wall_stiffness(config: SimulatorConfig, push_limit_n: float) -> float:
+    """Return the stiffness of the wall at a node, N/mm, for a device of some push limit."""
+    return config.wall_stiffness_n_mm or push_limit_n / _DENT_MM
 
 
 def make_lumen(distance_map: DistanceMap, radius_mm: float) -> _core.Lumen:

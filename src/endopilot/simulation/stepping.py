@@ -82,7 +82,7 @@ class Simulator:
             device: the wire of all worlds, or one for each.
             worlds: their number, where neither of the above says it.
             actuation: what `step` takes: "velocity" (mm/s, rad/s; the drive makes exactly that motion, except that it
-                slips rather than push harder than `config.push_limit_n`) or "force" (axial force N and torque N·mm on
+                slips rather than push harder than the device's push limit) or "force" (axial force N and torque N·mm on
                 the wire; advance and rotation follow, against the friction and drag of the introducer).
             config: settings of the rod core.
 
@@ -129,7 +129,12 @@ class Simulator:
                 lumen=lumens[key],
                 loads=None,
                 **insertion_arguments(anatomy.insertion),
-                options=core_options(self._config, free_behind_mm=FREE_BEHIND_MM, sample_tolerance=SAMPLE_TOLERANCE),
+                options=core_options(
+                    self._config,
+                    push_limit_n=device.push_limit_n,
+                    free_behind_mm=FREE_BEHIND_MM,
+                    sample_tolerance=SAMPLE_TOLERANCE,
+                ),
                 worlds=len(worlds),
             )
             groups.append(_Group(anatomy, device, rod, simulation, np.array(worlds), path_mm, longest_mm))

@@ -80,7 +80,9 @@ def capstan() -> list[Case]:
         control=control,
         lumen=make_lumen(field, WIRE_RADIUS_MM),
         friction=friction,
-        config=SimulatorConfig(time_step_s=0.02, tolerance_mm=1e-5, stick_velocity_mm_s=0.02, threads=1),
+        config=SimulatorConfig(
+            time_step_s=0.02, tolerance_mm=1e-5, stick_velocity_mm_s=0.02, wall_stiffness_n_mm=5.0, threads=1
+        ),
         insertion=Insertion(position=np.array([-LEAD_MM, 0.0, 0.0]), direction=np.array([1.0, 0.0, 0.0])),
         inserted_mm=2.0,
         free_behind_mm=0.5 * size,
