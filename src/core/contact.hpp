@@ -65,7 +65,7 @@ public:
     std::size_t bytes() const { return pool_.size() * sizeof(float) + index_.size() * sizeof(std::int32_t); }
 
     // The first coefficient of the 3³ stencil around the cell with whole-numbered coordinates (x, y, z).
-    const float* stencil(double x, double y, double z) const {
+    ENDOPILOT_DEVICE const float* stencil(double x, double y, double z) const {
         // written so that a NaN counts as outside
         const bool inside = x >= 0.0 && x < cells_[0] && y >= 0.0 && y < cells_[1] && z >= 0.0 && z < cells_[2];
         if (!inside) return &pool_[kVolume];
@@ -74,10 +74,10 @@ public:
         return &pool_[std::size_t(index_[at]) * kVolume + ((k % kEdge) * kStored + j % kEdge) * kStored + i % kEdge];
     }
 
-    bool deep(const float* stencil) const { return stencil < pool_.data() + kVolume; }
+    ENDOPILOT_DEVICE bool deep(const float* stencil) const { return stencil < pool_.data() + kVolume; }
 
-    double inverse_spacing() const { return inverse_spacing_; }
-    double origin(int axis) const { return origin_[axis]; }
+    ENDOPILOT_DEVICE double inverse_spacing() const { return inverse_spacing_; }
+    ENDOPILOT_DEVICE double origin(int axis) const { return origin_[axis]; }
 
     static constexpr double kDeep = 1e3;
 
@@ -97,7 +97,8 @@ struct Distance {
 
 // Three neighbouring coefficients per lane, starting at `offset`.
 template <class V>
-[[gnu::always_inline]] inline void gather(const float* const (&from)[kWidth<V>], int offset, V (&c)[3]) {
+[[gnu::always_inline]] ENDOPILOT_DEVICE inline void gather(const float* const (&from)[kWidth<V>], int offset, V (&c)[3]) {
+#ifndef __CUDACC__
     if constexpr (kWidth<V> == 4) {  // four rows of four floats, transposed
         typedef float float4 __attribute__((vector_size(16)));
         float4 row[4];
@@ -115,7 +116,9 @@ template <class V>
         gather<double4>(half[0], offset, low);
         gather<double4>(half[1], offset, high);
         for (int i = 0; i < 3; ++i) c[i] = __builtin_shufflevector(low[i], high[i], 0, 1, 2, 3, 4, 5, 6, 7);
-    } else {
+    } else
+#endif
+    {
         for (int i = 0; i < 3; ++i)
             for (int lane = 0; lane < kWidth<V>; ++lane) set(c[i], lane, double(from[lane][offset + i]));
     }
@@ -124,7 +127,7 @@ template <class V>
 // The spline, its gradient and its Hessian at one point per lane. Outside the map the value is NaN, which makes the
 // line search step back.
 template <class V>
-[[gnu::noinline]] Distance<V> distance_to_wall(const Lumen& lumen, const Vec3<V>& x) {
+[[gnu::noinline]] ENDOPILOT_DEVICE Distance<V> distance_to_wall(const Lumen& lumen, const Vec3<V>& x) {
     constexpr int W = kWidth<V>;
     // Adding 1.5 · 2^52 rounds to whole numbers: the stencil's middle cell, and the place in it (-1/2..1/2).
     constexpr double kRound = 6755399441055744.0;
@@ -204,7 +207,7 @@ struct Grip {
 // gradient and Hessian are those of a wall that can also pull: a node that has just lost touch would otherwise set off
 // freely and hit the wall behind the next Newton step.
 template <class V>
-inline V add_wall(double stiffness, double radius, const V& geometric, Mask<V> sticky, const Distance<V>& d,
+ENDOPILOT_DEVICE inline V add_wall(double stiffness, double radius, const V& geometric, Mask<V> sticky, const Distance<V>& d,
                   Diagonal<V>& own) {
     const Mask<V> clear = d.value >= radius;  // false for NaN, so that NaN reaches the energy
     const V gap = radius - d.value;
@@ -227,7 +230,7 @@ inline V add_wall(double stiffness, double radius, const V& geometric, Mask<V> s
 // displacement of that surface since the start of the step: of the node, and by rotation about the wire's own axis.
 // `moved` is the node's displacement, `p` the element's rotation since the start of the step. Returns the energy.
 template <class V>
-inline V add_friction(const Grip<V>& grip, const V& eps, const Vec3<V>& moved, const Quaternion<V>& p, Diagonal<V>& own) {
+ENDOPILOT_DEVICE inline V add_friction(const Grip<V>& grip, const V& eps, const Vec3<V>& moved, const Quaternion<V>& p, Diagonal<V>& own) {
     const Vec3<V>& n = grip.normal;
     const V twist = 2.0 * p.v.z;
     const Vec3<V> s = moved - dot(moved, n) * n + twist * grip.spin;

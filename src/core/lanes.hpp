@@ -10,12 +10,14 @@
 #include <immintrin.h>
 #endif
 
-namespace endopilot {
+// Functions that also run on a CUDA device, in scalar lanes: one world a thread.
+#ifdef __CUDACC__
+#define ENDOPILOT_DEVICE __host__ __device__
+#else
+#define ENDOPILOT_DEVICE
+#endif
 
-typedef double double4 __attribute__((vector_size(32)));
-typedef double double8 __attribute__((vector_size(64)));
-typedef std::int64_t mask4 __attribute__((vector_size(32)));
-typedef std::int64_t mask8 __attribute__((vector_size(64)));
+namespace endopilot {
 
 template <class V>
 struct LaneTraits;
@@ -24,6 +26,13 @@ struct LaneTraits<double> {
     static constexpr int width = 1;
     using Mask = bool;
 };
+
+#ifndef __CUDACC__
+typedef double double4 __attribute__((vector_size(32)));
+typedef double double8 __attribute__((vector_size(64)));
+typedef std::int64_t mask4 __attribute__((vector_size(32)));
+typedef std::int64_t mask8 __attribute__((vector_size(64)));
+
 template <>
 struct LaneTraits<double4> {
     static constexpr int width = 4;
@@ -41,6 +50,7 @@ inline constexpr int kLanes = 8;
 #else
 inline constexpr int kLanes = 4;
 #endif
+#endif
 
 template <class V>
 inline constexpr int kWidth = LaneTraits<V>::width;
@@ -48,7 +58,7 @@ template <class V>
 using Mask = typename LaneTraits<V>::Mask;
 
 template <class V>
-inline double get(const V& v, int lane) {
+ENDOPILOT_DEVICE inline double get(const V& v, int lane) {
     if constexpr (kWidth<V> == 1)
         return v;
     else
@@ -56,7 +66,7 @@ inline double get(const V& v, int lane) {
 }
 
 template <class V>
-inline void set(V& v, int lane, double value) {
+ENDOPILOT_DEVICE inline void set(V& v, int lane, double value) {
     if constexpr (kWidth<V> == 1)
         v = value;
     else
@@ -64,7 +74,7 @@ inline void set(V& v, int lane, double value) {
 }
 
 template <class V>
-inline void set_mask(Mask<V>& mask, int lane, bool value) {
+ENDOPILOT_DEVICE inline void set_mask(Mask<V>& mask, int lane, bool value) {
     if constexpr (kWidth<V> == 1)
         mask = value;
     else
@@ -72,22 +82,22 @@ inline void set_mask(Mask<V>& mask, int lane, bool value) {
 }
 
 template <class V>
-inline V broadcast(double value) {
+ENDOPILOT_DEVICE inline V broadcast(double value) {
     return V{} + value;
 }
 
 template <class V>
-inline V select(Mask<V> mask, V yes, V no) {
+ENDOPILOT_DEVICE inline V select(Mask<V> mask, V yes, V no) {
     return mask ? yes : no;
 }
 
 template <class V>
-inline V maximum(V a, V b) {
+ENDOPILOT_DEVICE inline V maximum(V a, V b) {
     return a > b ? a : b;
 }
 
 template <class V>
-inline V square_root(V a) {
+ENDOPILOT_DEVICE inline V square_root(V a) {
     if constexpr (kWidth<V> == 1) {
         return std::sqrt(a);
 #ifdef __AVX__
@@ -108,25 +118,25 @@ inline V square_root(V a) {
 template <class V>
 struct Vec3 {
     V x, y, z;
-    friend Vec3 operator+(const Vec3& a, const Vec3& b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
-    friend Vec3 operator-(const Vec3& a, const Vec3& b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
-    friend Vec3 operator*(const V& s, const Vec3& a) { return {s * a.x, s * a.y, s * a.z}; }
-    Vec3& operator+=(const Vec3& b) { return *this = *this + b; }
-    Vec3& operator-=(const Vec3& b) { return *this = *this - b; }
+    ENDOPILOT_DEVICE friend Vec3 operator+(const Vec3& a, const Vec3& b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
+    ENDOPILOT_DEVICE friend Vec3 operator-(const Vec3& a, const Vec3& b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
+    ENDOPILOT_DEVICE friend Vec3 operator*(const V& s, const Vec3& a) { return {s * a.x, s * a.y, s * a.z}; }
+    ENDOPILOT_DEVICE Vec3& operator+=(const Vec3& b) { return *this = *this + b; }
+    ENDOPILOT_DEVICE Vec3& operator-=(const Vec3& b) { return *this = *this - b; }
 };
 
 template <class V>
-inline V dot(const Vec3<V>& a, const Vec3<V>& b) {
+ENDOPILOT_DEVICE inline V dot(const Vec3<V>& a, const Vec3<V>& b) {
     return a.x * b.x + a.y * b.y + a.z * b.z;
 }
 
 template <class V>
-inline Vec3<V> cross(const Vec3<V>& a, const Vec3<V>& b) {
+ENDOPILOT_DEVICE inline Vec3<V> cross(const Vec3<V>& a, const Vec3<V>& b) {
     return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
 }
 
 template <class V>
-inline Vec3<V> select(Mask<V> mask, const Vec3<V>& yes, const Vec3<V>& no) {
+ENDOPILOT_DEVICE inline Vec3<V> select(Mask<V> mask, const Vec3<V>& yes, const Vec3<V>& no) {
     return {select<V>(mask, yes.x, no.x), select<V>(mask, yes.y, no.y), select<V>(mask, yes.z, no.z)};
 }
 
@@ -137,7 +147,7 @@ struct Sym3 {
 };
 
 template <class V>
-inline Vec3<V> operator*(const Sym3<V>& m, const Vec3<V>& a) {
+ENDOPILOT_DEVICE inline Vec3<V> operator*(const Sym3<V>& m, const Vec3<V>& a) {
     return {m.xx * a.x + m.xy * a.y + m.xz * a.z, m.xy * a.x + m.yy * a.y + m.yz * a.z,
             m.xz * a.x + m.yz * a.y + m.zz * a.z};
 }
@@ -150,25 +160,25 @@ struct Quaternion {
 };
 
 template <class V>
-inline Quaternion<V> operator*(const Quaternion<V>& a, const Quaternion<V>& b) {
+ENDOPILOT_DEVICE inline Quaternion<V> operator*(const Quaternion<V>& a, const Quaternion<V>& b) {
     return {a.w * b.w - dot(a.v, b.v), a.w * b.v + b.w * a.v + cross(a.v, b.v)};
 }
 
 // conjugate(a) · b: the rotation from a to b, in the frame of a.
 template <class V>
-inline Quaternion<V> relative(const Quaternion<V>& a, const Quaternion<V>& b) {
+ENDOPILOT_DEVICE inline Quaternion<V> relative(const Quaternion<V>& a, const Quaternion<V>& b) {
     return {a.w * b.w + dot(a.v, b.v), a.w * b.v - b.w * a.v - cross(a.v, b.v)};
 }
 
 template <class V>
-inline Quaternion<V> select(Mask<V> mask, const Quaternion<V>& yes, const Quaternion<V>& no) {
+ENDOPILOT_DEVICE inline Quaternion<V> select(Mask<V> mask, const Quaternion<V>& yes, const Quaternion<V>& no) {
     return {select<V>(mask, yes.w, no.w), select(mask, yes.v, no.v)};
 }
 
 // q turned by the rotation vector `angle` (rad, in the frame of q). (1, angle/2) normalised agrees with the
 // exponential map to second order, which is all that Newton's method needs, and has no trigonometry.
 template <class V>
-inline Quaternion<V> turned(const Quaternion<V>& q, const Vec3<V>& angle) {
+ENDOPILOT_DEVICE inline Quaternion<V> turned(const Quaternion<V>& q, const Vec3<V>& angle) {
     const V half = broadcast<V>(0.5);
     const Vec3<V> h = half * angle;
     const Quaternion<V> p = q * Quaternion<V>{broadcast<V>(1.0), h};
@@ -183,7 +193,7 @@ struct Frame {
 };
 
 template <class V>
-inline Frame<V> frame(const Quaternion<V>& q) {
+ENDOPILOT_DEVICE inline Frame<V> frame(const Quaternion<V>& q) {
     const V xx = q.v.x * q.v.x, yy = q.v.y * q.v.y, zz = q.v.z * q.v.z;
     const V xy = q.v.x * q.v.y, xz = q.v.x * q.v.z, yz = q.v.y * q.v.z;
     const V wx = q.w * q.v.x, wy = q.w * q.v.y, wz = q.w * q.v.z;

@@ -58,7 +58,7 @@ struct Coupling {
 // Adds element i to its own block `own`; sets its part of the next block `next` and of the coupling. `geometric` is 1 for the full
 // Hessian and 0 for its Gauss-Newton part. Returns the energy.
 template <class V>
-inline V add_element(const RodModel& rod, int i, const V& geometric, const Vec3<V>& near_tip, const Vec3<V>& near_base,
+ENDOPILOT_DEVICE inline V add_element(const RodModel& rod, int i, const V& geometric, const Vec3<V>& near_tip, const Vec3<V>& near_base,
                      const Frame<V>& R, Diagonal<V>& own, Diagonal<V>& next, Coupling<V>& coupling) {
     const double l = rod.length[i], a = rod.shear[i], c = rod.stretch[i];
     const Vec3<V> e = broadcast<V>(1.0 / l) * (near_tip - near_base);
@@ -106,7 +106,7 @@ inline V add_element(const RodModel& rod, int i, const V& geometric, const Vec3<
 
 // The same for the joint between element `joint - 1` (block `own`) and element `joint` (block `next`). Returns the energy.
 template <class V>
-inline V add_joint(const RodModel& rod, int joint, const V& geometric, const Quaternion<V>& distal,
+ENDOPILOT_DEVICE inline V add_joint(const RodModel& rod, int joint, const V& geometric, const Quaternion<V>& distal,
                    const Quaternion<V>& proximal, Diagonal<V>& own, Diagonal<V>& next, Coupling<V>& coupling) {
     const double L = rod.joint_length[joint], eb = rod.bend[joint], et = rod.twist[joint];
     const Vec3<double>& rest = rod.rest[joint];

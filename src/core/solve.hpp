@@ -9,7 +9,7 @@ namespace endopilot {
 
 // Calls f with each integer from Begin to End - 1 as a compile-time constant: 6×6 blocks then live in registers.
 template <int Begin, int End, class F>
-[[gnu::always_inline]] inline void unroll(const F& f) {
+[[gnu::always_inline]] ENDOPILOT_DEVICE inline void unroll(const F& f) {
     if constexpr (Begin < End) {
         f(std::integral_constant<int, Begin>{});
         unroll<Begin + 1, End>(f);
@@ -35,7 +35,7 @@ struct Elimination {
 
 // Factors block `own` and eliminates it from block `next`. Row by row, so that work on the coupling hides the latency of the division by the row's pivot.
 template <class V>
-[[gnu::always_inline]] inline Elimination<V> eliminate(const Diagonal<V>& own, const Coupling<V>& coupling, Factor<V>& f, Diagonal<V>& next) {
+[[gnu::always_inline]] ENDOPILOT_DEVICE inline Elimination<V> eliminate(const Diagonal<V>& own, const Coupling<V>& coupling, Factor<V>& f, Diagonal<V>& next) {
     const V d[6][6] = {{own.xx.xx},
                        {own.xx.xy, own.xx.yy},
                        {own.xx.xz, own.xx.yz, own.xx.zz},
@@ -152,7 +152,7 @@ template <class V>
 
 // Solves for this block's unknowns, given those of the next one towards the base.
 template <class V>
-[[gnu::always_inline]] inline void substitute(const Factor<V>& f, Vec3<V>& x, Vec3<V>& t) {
+[[gnu::always_inline]] ENDOPILOT_DEVICE inline void substitute(const Factor<V>& f, Vec3<V>& x, Vec3<V>& t) {
     V s[6];
     unroll<0, 6>([&](auto r_) {
         constexpr int r = decltype(r_)::value;

@@ -6,6 +6,7 @@
 
 #include "contact.hpp"
 #include "solve.hpp"
+#include "spline.hpp"
 
 namespace adapter {
 

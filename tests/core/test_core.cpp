@@ -280,6 +280,24 @@ void test_distance() {
     }
 }
 
+// The spline through random values takes them at the grid's points.
+void test_spline_coefficients() {
+    const int size[3] = {21, 13, 10};
+    const double origin[3] = {1, 2, 3}, spacing = 0.5;
+    std::mt19937 random(11);
+    std::uniform_real_distribution<float> any(-1.0f, 1.0f);
+    std::vector<float> values(std::size_t(size[0]) * size[1] * size[2]);
+    for (float& v : values) v = any(random);
+    const Lumen lumen(spline_coefficients(values.data(), size).data(), size, origin, spacing, 1e9, 1e9);
+    for (int z = 1; z + 1 < size[2]; ++z)
+        for (int y = 1; y + 1 < size[1]; ++y)
+            for (int x = 1; x + 1 < size[0]; ++x) {
+                const Vec3<double> at{origin[0] + spacing * x, origin[1] + spacing * y, origin[2] + spacing * z};
+                const double value = values[(std::size_t(z) * size[1] + y) * size[0] + x];
+                expect_near(distance_to_wall<double>(lumen, at).value, value, 2e-5, "the spline takes the values of the map");
+            }
+}
+
 void test_map_borders() {
     const Lumen lumen = make_lumen(1e9), sparse = make_lumen(-10.0);
     const double nan = std::numeric_limits<double>::quiet_NaN(), far = 1e300;
@@ -367,6 +385,7 @@ int main() {
     test_gauss_newton();
     test_distance<double>();
     test_distance<double4>();
+    test_spline_coefficients();
     test_map_borders();
     test_wall();
     test_friction();

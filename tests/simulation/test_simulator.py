@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -131,7 +134,43 @@ def test_refuses_bad_anatomies(anatomy: Anatomy) -> None:
         (replace(anatomy, distance_map=replace(field, values=-field.values)), "positive"),
         (replace(anatomy, insertion=Insertion(np.array([500.0, 0, 0]), np.array([1.0, 0, 0]))), "positive"),
         (replace(anatomy, insertion=Insertion(np.array([-5.0, 0, 0]), np.array([2.0, 0, 0]))), "unit vector"),
+        (replace(anatomy, insertion=Insertion(np.array([np.nan, 0, 0]), np.array([1.0, 0, 0]))), "not finite"),
+        (replace(anatomy, insertion=Insertion(np.array([-5.0, 0, 0]), np.array([0.0, 0, 1.0]))), "positive"),
+        (replace(anatomy, distance_map=replace(field, spacing_mm=0.0)), "positive spacing"),
         (replace(anatomy, catheter_radius_mm=0.1), "wider"),
     ):
         with pytest.raises(InputError, match=message):
             simulate(bad, DEVICE, control, initial=initial)
+
+
+def test_refuses_arrays_of_wrong_shape(anatomy: Anatomy) -> None:
+    # in a process of its own: here the shape checks of the tests would speak first
+    script = """
+import numpy as np, sys
+sys.path.insert(0, sys.argv[1])
+from bend import vessel
+from endopilot.errors import InputError
+from endopilot.simulation.device import read_device
+from endopilot.simulation.simulator import simulate
+anatomy, device, good = vessel(), read_device("workhorse-014"), np.zeros((2, 4, 2))
+for control, others in (
+    (np.zeros((2, 4, 3)), {}),
+    (np.zeros((4, 2)), {}),
+    (good, {"initial": np.zeros((2, 3))}),
+    (good, {"friction": np.zeros((2, 1))}),
+    (np.broadcast_to(0.0, (10_000_000, 10_000, 2)), {}),
+):
+    try:
+        simulate(anatomy, device, control, **others)
+    except InputError as error:
+        print(error)
+"""
+    folder = str(Path(__file__).parent)
+    run = subprocess.run([sys.executable, "-c", script, folder], check=True, capture_output=True, text=True)
+    lines = run.stdout.splitlines()
+    assert lines[0].startswith("control: shape (2, 4, 3); give (worlds, samples, 2)")
+    assert lines[1].startswith("control: shape (4, 2); give")
+    assert lines[2].startswith("initial: shape (2, 3); give (2, 2)")
+    assert lines[3].startswith("friction: shape (2, 1); give one number")
+    assert "need" in lines[4] and lines[4].endswith("simulate fewer at once")
+    assert len(lines) == 5

@@ -145,7 +145,7 @@ def test_a_seed_draws_the_same_start_whatever_the_number_of_worlds(anatomy: Anat
 def test_forces_replay_a_velocity_run(anatomy: Anatomy) -> None:
     # The drive's force and torque are the gradient of the step's potential in the drive's motion; taken as loads,
     # they make that motion the minimum.
-    config, dt = SimulatorConfig(tolerance_mm=1e-9, largest_jump=1e6), 0.02
+    config, dt = SimulatorConfig(time_step_s=0.02, tolerance_mm=1e-9, largest_jump=1e6), 0.02
     leading = begun(Simulator(anatomy, DEVICE, worlds=4, config=config), 4)
     led = begun(Simulator(anatomy, DEVICE, worlds=4, config=config, actuation="force"), 4)
     random = np.random.default_rng(8)

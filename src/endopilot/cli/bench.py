@@ -1,4 +1,4 @@
-"""`endopilot bench`: speed of the rod core together with its accuracy, and its robustness."""
+"""`endopilot bench`: speed of the rod core together with its accuracy, how cost grows, and its robustness."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ from typing import Any, Literal
 from tyro.conf import Positional
 
 from endopilot.cli.arguments import show, show_rows
-from endopilot.simulation.bench import bench_simulation
+from endopilot.simulation.bench import bench_scaling, bench_simulation
 from endopilot.simulation.robustness import RobustnessConfig, measure_robustness
 
 EXIT_FAILED = 1
 
 
 def command(
-    subject: Positional[Literal["simulation", "robustness"]] = "simulation",
+    subject: Positional[Literal["simulation", "scaling", "robustness"]] = "simulation",
     /,
     *,
     json: bool = False,
     config: RobustnessConfig = RobustnessConfig(),
 ) -> None:
-    """Measure the rod core: its speed with the error that goes with it, or its robustness.
+    """Measure the rod core: its speed with the error that goes with it, how cost grows, or its robustness.
 
-    `simulation` times the reference scenario. `robustness` drives every device through many anatomies and beyond their
+    `simulation` times the reference scenario. `scaling` varies the number of elements and of worlds. `robustness` drives every device through many anatomies and beyond their
     ends, counts what goes wrong, and leaves with exit code 1 if a figure misses its bar; the options below are its own.
 
     Args:
@@ -33,6 +33,9 @@ def command(
     """
     if subject == "simulation":
         show(bench_simulation(), as_json=json)
+        return
+    if subject == "scaling":
+        show_rows(bench_scaling(), as_json=json)
         return
     measured = measure_robustness(config)
     if json:

@@ -93,7 +93,8 @@ def bench_scaling() -> list[dict[str, Any]]:
         speed = np.column_stack([np.linspace(2, 8, worlds), np.linspace(-2, 2, worlds)])
         memory = (_resident_kilobytes() - before) / worlds
         started = time.process_time()
-        iterations = sum(simulator.step(speed, 0.1).iterations.sum() * 0.1 / config.time_step_s for _ in range(10))
+        steps = 0.1 / config.time_step_s
+        iterations = sum(steps * float(simulator.step(speed, 0.1).iterations.sum()) for _ in range(10))
         spent = time.process_time() - started
         active = float(np.mean(simulator.active_nodes))
         rows.append(
@@ -101,7 +102,7 @@ def bench_scaling() -> list[dict[str, Any]]:
                 "elements": elements,
                 "worlds": worlds,
                 "seconds": round(spent, 3),
-                "us_per_node_and_iteration": round(1e6 * spent / (iterations * active), 4),
+                "us_per_node_and_iteration": round(1e6 * spent / float(iterations * active), 4),
                 "kilobytes_per_world": round(memory, 1),
             }
         )

@@ -40,7 +40,7 @@ _OVERSHOOT_MM = 1e-2
 class SimulatorConfig:
     """Settings of the rod core."""
 
-    time_step_s: float = 0.02
+    time_step_s: float = 0.0125
     """Time step, s; it must divide the sample period of 0.5 s. The tip's error grows about linearly with it."""
     tolerance_mm: float = 1e-3
     """Newton's method stops when its step moves no node farther than this, mm."""
@@ -74,7 +74,7 @@ class SimulatorConfig:
                 raise InputError(f"{name}: {value}; give a positive number")
         steps = SAMPLE_PERIOD_S / self.time_step_s
         if abs(steps - round(steps)) > 1e-6 or steps < 0.5:
-            raise InputError(f"time_step_s: {self.time_step_s} does not divide {SAMPLE_PERIOD_S} s; give e.g. 0.02")
+            raise InputError(f"time_step_s: {self.time_step_s} does not divide {SAMPLE_PERIOD_S} s; give e.g. 0.0125")
         for name in ("introducer_friction_n", "introducer_drag_n_s_mm"):
             if not 0 <= getattr(self, name) < np.inf:
                 raise InputError(f"{name}: {getattr(self, name)}; give 0 or a positive number")
@@ -118,9 +118,18 @@ def simulate(
             device that does not fit; a distance map that is not finite, or negative at the ostium.
     """
     config = config or SimulatorConfig()
+    if control.ndim != 3 or control.shape[2] != 2:
+        raise InputError(f"control: shape {control.shape}; give (worlds, samples, 2), in mm/s and rad/s")
     worlds, samples = control.shape[:2]
     initial = np.zeros((worlds, 2)) if initial is None else np.asarray(initial, dtype=float)
     friction = np.full(worlds, device.friction) if friction is None else np.asarray(friction, dtype=float)
+    if initial.shape != (worlds, 2):
+        raise InputError(
+            f"initial: shape {initial.shape}; give ({worlds}, 2), inserted length in mm and rotation in rad"
+        )
+    if friction.shape != (worlds,):
+        raise InputError(f"friction: shape {friction.shape}; give one number for each of the {worlds} worlds")
+    _check_memory(worlds, samples, 0)
     control = np.ascontiguousarray(control, dtype=float)
     inserted = _check_controls(device, control, initial, friction)
     check_fits(device, anatomy)
@@ -309,7 +318,13 @@ def check_distance_map(anatomy: Anatomy) -> None:
     field, insertion = anatomy.distance_map, anatomy.insertion
     if not np.isfinite(field.values).all():
         raise InputError(f"{anatomy.name}: the distance map has values that are not finite; extract it again")
-    if abs(float(np.linalg.norm(insertion.direction)) - 1) > 1e-3:
+    if not 0 < field.spacing_mm < np.inf:
+        raise InputError(
+            f"{anatomy.name}: the distance map's spacing_mm is {field.spacing_mm}; give a positive spacing"
+        )
+    if not np.isfinite(insertion.position).all():
+        raise InputError(f"{anatomy.name}: insertion.position = {insertion.position} is not finite; extract it again")
+    if not abs(float(np.linalg.norm(insertion.direction)) - 1) <= 1e-3:
         raise InputError(f"{anatomy.name}: insertion.direction = {insertion.direction} is no unit vector; normalise it")
     for along in (-FREE_BEHIND_MM, 0.0, 1.0):
         point = insertion.position + along * insertion.direction
@@ -333,8 +348,6 @@ def _check_controls(
     worlds, samples = control.shape[:2]
     if worlds == 0 or samples == 0:
         raise InputError(f"control: {worlds} worlds of {samples} samples; give at least one of one")
-    if len(initial) != worlds or len(friction) != worlds:
-        raise InputError(f"initial, friction: {len(initial)}, {len(friction)} rows for {worlds} worlds; give one each")
     limits = (("translation", device.max_velocity_mm_s, "mm/s"), ("rotation", device.max_rotation_rad_s, "rad/s"))
     for axis, (name, limit, unit) in enumerate(limits):
         _check(~np.isfinite(control[..., axis]), control[..., axis], f"{name} is no finite number; correct it")
