@@ -23,8 +23,9 @@ def command(
 ) -> None:
     """Measure the rod core: its speed with the error that goes with it, how cost grows, or its robustness.
 
-    `simulation` times the reference scenario. `scaling` varies the number of elements and of worlds. `robustness` drives every device through many anatomies and beyond their
-    ends, counts what goes wrong, and leaves with exit code 1 if a figure misses its bar; the options below are its own.
+    `simulation` times the reference scenario. `scaling` varies the number of elements and of worlds. `robustness`
+    drives every device through many anatomies and beyond their ends, counts what goes wrong, and leaves with exit
+    code 1 if a figure misses its bar; the options below are its own.
 
     Args:
         subject: what to measure.

@@ -45,8 +45,8 @@ class Device:
         friction: Coulomb friction coefficient on the vessel's wall.
         max_velocity_mm_s: fastest translation of the drive, mm/s.
         max_rotation_rad_s: fastest rotation of the drive, rad/s.
-        push_limit_n: force at which the drive slips rather than push the wire harder, N; a wire whose tip is caught is not
-            folded up in the vessel then.
+        push_limit_n: force at which the drive slips rather than push the wire harder, N; a wire whose tip is caught
+            is not folded up in the vessel then.
         sources: where each constant comes from.
     """
 

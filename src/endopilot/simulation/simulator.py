@@ -98,8 +98,8 @@ def simulate(
 ) -> Rollout:
     """Drive a device through an anatomy and record it every 0.5 s.
 
-    The drive slips rather than push harder than the device's push limit, and stops when the wire is pulled out: controls,
-    inserted lengths and the initial state of the answer are those that were made.
+    The drive slips rather than push harder than the device's push limit, and stops when the wire is pulled out:
+    controls, inserted lengths and the initial state of the answer are those that were made.
 
     Results are the same to the last bit whatever the number of worlds, their order and the number of threads.
 
