@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import doctest
 import subprocess
 import sys
 from dataclasses import replace
@@ -284,3 +285,16 @@ def test_bad_starts_and_states_are_refused(anatomy: Anatomy, wider: Anatomy, tmp
         Simulator(anatomy, DEVICE, worlds=100_000_000)
     with pytest.raises(InputError, match="wider"):
         Simulator(replace(anatomy, catheter_radius_mm=0.1), DEVICE)
+
+
+def test_every_public_name_has_an_example_that_runs(anatomy: Anatomy) -> None:
+    simulator = Simulator(anatomy, DEVICE, worlds=4)
+    simulator.reset(seed=1)
+    known = {"np": np, "Simulator": Simulator, "anatomy": anatomy, "device": DEVICE, "simulator": simulator}
+    examples = doctest.DocTestFinder(recurse=True).find(Simulator, "Simulator", globs=known)
+    public = {name for name in vars(Simulator) if not name.startswith("_")}
+    assert {test.name.split(".")[-1] for test in examples if test.examples} >= public
+    runner = doctest.DocTestRunner()
+    for test in examples:
+        runner.run(test)
+    assert runner.failures == 0 and runner.tries > 20

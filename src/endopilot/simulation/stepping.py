@@ -59,11 +59,11 @@ class Simulator:
     A world's result does not depend on the others: neither on their number nor on the threads that step them.
 
     Example:
-        >>> simulator = Simulator(anatomy, device, worlds=256)
+        >>> simulator = Simulator(anatomy, device, worlds=4)
         >>> simulator.reset(seed=0)
-        >>> step = simulator.step(np.tile([5.0, 0.5], (256, 1)), duration=0.1)
+        >>> step = simulator.step(np.tile([5.0, 0.5], (4, 1)), duration=0.1)
         >>> step.tip_position.shape
-        (256, 3)
+        (4, 3)
     """
 
     def __init__(
@@ -142,12 +142,22 @@ class Simulator:
 
     @property
     def worlds(self) -> int:
-        """Number of worlds."""
+        """Number of worlds.
+
+        Example:
+            >>> simulator.worlds
+            4
+        """
         return len(self._device)
 
     @property
     def nodes(self) -> int:
-        """Nodes of the longest wire; arrays with a row a node are padded to this."""
+        """Nodes of the longest wire; arrays with a row a node are padded to this.
+
+        Example:
+            >>> simulator.contacts.shape == (4, simulator.nodes)
+            True
+        """
         return max(group.simulation.nodes for group in self._groups)
 
     def reset(
@@ -174,6 +184,12 @@ class Simulator:
 
         Raises:
             InputError: a number that is not finite or out of range; neither a seed nor a start.
+
+        Example:
+            >>> simulator.reset(inserted_length=[5.0, 10.0, 15.0, 20.0], rotation=np.zeros(4))
+            >>> simulator.reset(seed=7, worlds=[2])  # the others stay as they are
+            >>> simulator.inserted_length.round(3)[[0, 1, 3]]
+            array([ 5., 10., 20.])
         """
         chosen = np.arange(self.worlds) if worlds is None else np.array(worlds, dtype=int)
         if ((chosen < 0) | (chosen >= self.worlds)).any():
@@ -228,6 +244,12 @@ class Simulator:
         Raises:
             InputError: a control of another shape, that is not finite, above the device's velocity limit or beyond
                 the length of the wire; a duration that is not positive. No world is moved then.
+
+        Example:
+            >>> before = simulator.inserted_length
+            >>> step = simulator.step([[4.0, 0.0]] * 4, duration=0.25)
+            >>> (step.inserted_length - before).round(6)
+            array([1., 1., 1., 1.])
         """
         array: Any = control
         if not isinstance(array, np.ndarray) and hasattr(array, "__dlpack__"):
@@ -310,37 +332,74 @@ class Simulator:
 
     @property
     def inserted_length(self) -> Float[np.ndarray, "worlds"]:
-        """Inserted lengths Δ, mm."""
+        """Inserted lengths Δ, mm.
+
+        Example:
+            >>> simulator.inserted_length.shape
+            (4,)
+        """
         return self._gather("inserted_length")
 
     @property
     def rotation(self) -> Float[np.ndarray, "worlds"]:
-        """Rotations φ of the drive, rad."""
+        """Rotations φ of the drive, rad.
+
+        Example:
+            >>> simulator.reset(inserted_length=np.full(4, 5.0), rotation=[0.0, 0.5, 1.0, 1.5])
+            >>> simulator.rotation
+            array([0. , 0.5, 1. , 1.5])
+        """
         return self._gather("rotation")
 
     @property
     def position(self) -> Float[np.ndarray, "worlds nodes 3"]:
-        """Positions of the nodes from the tip to the base, LPS mm; NaN beyond the nodes of a shorter wire."""
+        """Positions of the nodes from the tip to the base, LPS mm; NaN beyond the nodes of a shorter wire.
+
+        Example:
+            >>> simulator.position.shape == (4, simulator.nodes, 3)
+            True
+        """
         return self._per_node("positions", np.nan)
 
     @property
     def orientation(self) -> Float[np.ndarray, "worlds nodes 4"]:
-        """Orientations of the elements as quaternions w x y z; the third director points along the wire to its tip."""
+        """Orientations of the elements as quaternions w x y z; the third director points along the wire to its tip.
+
+        Example:
+            >>> bool(np.allclose(np.linalg.norm(simulator.orientation, axis=-1), 1.0))
+            True
+        """
         return self._per_node("attitudes", np.nan)
 
     @property
     def contacts(self) -> Float[np.ndarray, "worlds nodes"]:
-        """Force of the wall on each node, N."""
+        """Force of the wall on each node, N.
+
+        Example:
+            >>> bool((simulator.contacts >= 0).all())
+            True
+        """
         return self._per_node("contacts", 0.0)
 
     @property
     def active_nodes(self) -> Float[np.ndarray, "worlds"]:
-        """Number of nodes ahead of the catheter, those that are solved for."""
+        """Number of nodes ahead of the catheter, those that are solved for.
+
+        Example:
+            >>> bool((simulator.active_nodes <= simulator.nodes).all())
+            True
+        """
         return self._gather("active")
 
     @property
     def base_load(self) -> Float[np.ndarray, "worlds 2"]:
-        """Axial force (N, positive when it pushes) and torque (N·mm) that hold the wire in the catheter."""
+        """Axial force (N, positive when it pushes) and torque (N·mm) that hold the wire in the catheter.
+
+        Example:
+            >>> force_n, torque_n_mm = simulator.base_load.T
+            >>> force_n.shape
+            (4,)
+        """
         return np.column_stack([self._gather("base_force"), self._gather("base_torque")])
 
     @property
@@ -348,16 +407,31 @@ class Simulator:
         """Force (N) and torque (N·mm) of the drive: `base_load` and what the introducer's valve takes.
 
         As controls of a force-driven simulator they make the same motion.
+
+        Example:
+            >>> simulator.drive_load.shape
+            (4, 2)
         """
         return np.column_stack([self._gather("drive_force"), self._gather("drive_torque")])
 
     @property
     def valid(self) -> Bool[np.ndarray, "worlds"]:
-        """False for a world that left the finite numbers or did not converge; it stays as it was until it is reset."""
+        """False for a world that left the finite numbers or did not converge; it stays as it was until it is reset.
+
+        Example:
+            >>> simulator.valid
+            array([ True,  True,  True,  True])
+        """
         return self._gather("reason") == 0
 
     def project(self) -> TipProjection:
-        """Project the tips to the centerline: Δtip (mm), γtip (mm), branch and lumen radius (mm), a row a world."""
+        """Project the tips to the centerline: Δtip (mm), γtip (mm), branch and lumen radius (mm), a row a world.
+
+        Example:
+            >>> tip = simulator.project()
+            >>> bool((tip.offset < tip.radius).all())
+            True
+        """
         fields: dict[str, np.ndarray] = {}
         for group in self._groups:
             tip = project_tip(group.anatomy.tree, group.anatomy.insertion, group.simulation.positions()[:, 0])
@@ -368,7 +442,11 @@ class Simulator:
 
     @property
     def state(self) -> SimulatorState:
-        """The worlds' state, to be kept and given to `set_state`."""
+        """The worlds' state, to be kept and given to `set_state`.
+
+        Example:
+            >>> kept = simulator.state  # kept.save(path) writes it to a file
+        """
         return SimulatorState(tuple(group.simulation.state() for group in self._groups), self._fingerprint())
 
     def set_state(self, state: SimulatorState) -> None:
@@ -376,6 +454,13 @@ class Simulator:
 
         Raises:
             InputError: the state is that of other anatomies, devices or settings, or of another number of worlds.
+
+        Example:
+            >>> kept, control = simulator.state, np.tile([5.0, 0.5], (4, 1))
+            >>> once = simulator.step(control, 0.1)
+            >>> simulator.set_state(kept)
+            >>> np.array_equal(simulator.step(control, 0.1).tip_position, once.tip_position)
+            True
         """
         if state.fingerprint != self._fingerprint():
             raise InputError(
