@@ -4,7 +4,9 @@
 #include <nanobind/stl/shared_ptr.h>
 
 #include <chrono>
+#include <condition_variable>
 #include <memory>
+#include <mutex>
 #include <thread>
 
 #include "spline.hpp"
@@ -100,12 +102,15 @@ struct Result {
 // Calls `work(thread)` on `threads` threads and keeps the interpreter's signals and the progress callback served.
 template <class Work>
 void run_threads(int threads, const nb::object& progress, const std::atomic<long>& done, std::atomic<bool>& stop, Work work) {
-    std::atomic<int> running{threads};
+    int running = threads;
+    std::mutex mutex;
+    std::condition_variable ended;
     std::vector<std::thread> pool;
     for (int t = 0; t < threads; ++t)
         pool.emplace_back([&] {
             work();
-            running.fetch_sub(1);
+            const std::lock_guard<std::mutex> lock(mutex);
+            if (--running == 0) ended.notify_one();
         });
     bool interrupted = false;
     std::exception_ptr failure;
@@ -126,13 +131,14 @@ void run_threads(int threads, const nb::object& progress, const std::atomic<long
     };
     {
         nb::gil_scoped_release release;
-        int waited = 0;
-        while (running.load() > 0) {
-            std::this_thread::sleep_for(std::chrono::milliseconds(waited < 20 ? 1 : 50));
-            if (++waited % 2 == 0 && waited > 20 && !stop.load()) {
-                nb::gil_scoped_acquire acquire;
-                serve();
-            }
+        const auto all_ended = [&] {
+            std::unique_lock<std::mutex> lock(mutex);
+            return ended.wait_for(lock, std::chrono::milliseconds(100), [&] { return running == 0; });
+        };
+        while (!all_ended()) {
+            if (stop.load()) continue;
+            nb::gil_scoped_acquire acquire;
+            serve();
         }
         for (std::thread& thread : pool) thread.join();
     }

@@ -30,7 +30,7 @@ SAMPLE_TOLERANCE = 1e-6
 """Newton tolerance of the step that ends a sample, mm: its forces are recorded, and the wire is stiff axially."""
 LANES = _core.LANES
 """Worlds that one thread steps side by side."""
-_DENT_MM = 0.025
+_DENT_MM = 0.015
 """Depth to which a node that bears the whole push limit dents the wall, mm, where the stiffness is not given."""
 _OVERSHOOT_MM = 1e-2
 """Rounding of controls may carry the inserted length this far below 0, mm."""
@@ -47,7 +47,7 @@ class SimulatorConfig:
     elements: int = 100
     """Elements over the longest path of the anatomy; they are shorter near the tip."""
     wall_stiffness_n_mm: float | None = None
-    """Stiffness of the vessel wall at a node, N/mm. If not given, the device's push limit dents it by 0.025 mm."""
+    """Stiffness of the vessel wall at a node, N/mm. If not given, the device's push limit dents it by 0.015 mm."""
     stick_velocity_mm_s: float = 0.05
     """Slip velocity under which smoothed Coulomb friction falls off, mm/s; a wire at rest creeps more slowly."""
     approach_velocity_mm_s: float = 20.0
