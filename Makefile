@@ -18,7 +18,7 @@ check: $(INSTALLED)
 	$(BIN)/pyright
 	$(BIN)/lint-imports
 
-# The real CT angiogram of the README: segmented from two points, and a J wire driven over the arch.
+# The real CT angiogram of the README: segmented from two points, and a J wire pushed up the aorta.
 CTA := runs/cta-thorax
 cta: $(INSTALLED)
 	mkdir -p $(CTA)
@@ -26,7 +26,7 @@ cta: $(INSTALLED)
 	$(BIN)/endopilot segment $$volume --method aorta --seeds 2 -143 543 2 -184 657 -o $(CTA)/mask.nii.gz \
 	  --reference $$(dirname $$volume)/seg_aorta.nii.gz --picture $(CTA)/mask.png --json > $(CTA)/segment.json
 	$(BIN)/endopilot anatomy $(CTA)/mask.nii.gz --vessel generic -o $(CTA)/anatomy
-	$(BIN)/endopilot simulate $(CTA)/anatomy --device j-035 --controls docs/examples/over-the-arch.csv \
+	$(BIN)/endopilot simulate $(CTA)/anatomy --device j-035 --controls docs/examples/up-the-aorta.csv \
 	  -o $(CTA)/rollout.csv --picture $(CTA)/wire.png --json > $(CTA)/simulate.json
 
 readme: $(INSTALLED)

@@ -81,10 +81,11 @@ def _cta(run: Path) -> str:
         f"{100 * mask['share_inside_reference']:.0f} % of our lumen lies inside theirs, {mask['cut_off_ml']:.0f} ml of "
         "theirs are cut off (mostly false lumen that contrast does not reach), "
         f"{mask['beyond_ml']:.0f} ml lie beyond it (stumps of arch branches). The 0.035″ J wire comes "
-        f"{wire['deepest_tip_mm']:.0f} mm far, from the descending aorta over the arch into the ascending one, pushed "
-        f"with {wire['largest_base_force_n']:.1f} N at most.\n\n"
+        f"{wire['deepest_tip_mm']:.0f} mm far up the descending aorta: a neck of the dissected lumen stops it, it folds "
+        "back, and the drive slips at its limit of 2 N "
+        f"({wire['largest_base_force_n']:.1f} N in the step that found out).\n\n"
         "![The CT in three slices, our lumen in green, the network's aorta in red](docs/images/cta-mask.png)\n\n"
-        "![The J wire in the extracted lumen, from the descending aorta over the arch](docs/images/cta-wire.png)"
+        "![The J wire in the extracted lumen of the aorta](docs/images/cta-wire.png)"
     )
 
 

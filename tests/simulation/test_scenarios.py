@@ -15,7 +15,7 @@ def test_a_string_is_dragged_as_the_capstan_equation_says() -> None:
         run = scenarios.drag_through_bends(bends, friction=friction)
         assert run.ratio == pytest.approx(np.exp(friction * run.wire_turning_rad), rel=0.01)
         # it cuts every bend but by no more than the vessel's width lets it
-        assert 0.5 * run.axis_turning_rad <= run.wire_turning_rad <= run.axis_turning_rad
+        assert 0.5 * run.axis_turning_rad <= run.wire_turning_rad <= run.axis_turning_rad + 1e-6
 
 
 def test_a_stiff_wire_is_dragged_more_than_a_string() -> None:
@@ -32,7 +32,7 @@ def test_a_tip_sticks_at_ridges_and_slips_over_them() -> None:
     assert speed.max() > 2  # and leaps when it goes; this is a mean over half a second
     assert run.tip_mm[-1] == pytest.approx(run.pushed_mm[-1] - run.pushed_mm[0], rel=0.1)  # and gets there all the same
     # the leaps spend the energy that the pushing has stored: the force falls with each
-    leaps = np.flatnonzero(later[1:] & (np.diff(run.tip_mm) > 3 * np.diff(run.pushed_mm)))
+    leaps = np.flatnonzero(later[1:] & (np.diff(run.tip_mm) > 2 * np.diff(run.pushed_mm)))
     assert len(leaps) >= 5
     assert (run.force_n[leaps + 1] < 0.7 * run.force_n[leaps - 1]).mean() > 0.7
 
