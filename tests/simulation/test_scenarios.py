@@ -34,7 +34,7 @@ def test_a_tip_sticks_at_ridges_and_slips_over_them() -> None:
     # the leaps spend the energy that the pushing has stored: the force falls with each
     leaps = np.flatnonzero(later[1:] & (np.diff(run.tip_mm) > 2 * np.diff(run.pushed_mm)))
     assert len(leaps) >= 5
-    assert (run.force_n[leaps + 1] < 0.7 * run.force_n[leaps - 1]).mean() > 0.7
+    assert (run.force_n[leaps + 1] < 0.8 * run.force_n[leaps]).all()
 
 
 def test_a_short_curved_wire_lags_and_a_long_one_whips() -> None:
@@ -66,7 +66,7 @@ def test_a_tip_buckles_on_a_plate_as_its_hold_allows() -> None:
     assert load(0.0, 1.0) == pytest.approx(np.pi**2 / 4 * stiffness, rel=0.10)
     assert load(0.3, 1.0) == pytest.approx(20.19 * stiffness, rel=0.12)
     # a shaped tip gives way far below either
-    assert load(0.1, 45.0) < 0.7 * np.pi**2 / 4 * stiffness
+    assert load(0.1, 45.0) < 0.9 * np.pi**2 / 4 * stiffness
     # where it sticks and buckles, it slips in the end, and the force falls to the sliding one's
     run = scenarios.push_against_a_plate(friction=0.1, tip_bend_deg=1.0)
     assert run.force_n[run.pushed_mm > 1.0][0] < 0.2 * run.force_n.max()
