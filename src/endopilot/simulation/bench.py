@@ -50,7 +50,7 @@ def bench_simulation() -> dict[str, Any]:
 
     one_thread = SimulatorConfig(threads=1)
     started = time.perf_counter()
-    simulate(anatomy, device, control[:1, :1], config=one_thread)
+    simulate(anatomy, device, np.zeros((1, 1, 2)), config=one_thread)
     first_call = time.perf_counter() - started
     rollout, alone, processor = run(WORLDS, one_thread)
     _, together, _ = run(WORLDS, replace(one_thread, threads=2))
