@@ -85,6 +85,15 @@ class SimulatorConfig:
         if self.threads < 0:
             raise InputError(f"threads: {self.threads}; give 0 for all cores, or a positive number")
 
+    @property
+    def steps_per_sample(self) -> int:
+        """Time steps in a sample period of 0.5 s."""
+        return round(SAMPLE_PERIOD_S / self.time_step_s)
+
+    def threads_for(self, worlds: int, lanes: int) -> int:
+        """Return how many threads step some worlds, `lanes` of them side by side: no more than have one to step."""
+        return min(self.threads or os.cpu_count() or 1, -(-worlds // lanes))
+
 
 def simulate(
     anatomy: Anatomy,
@@ -249,10 +258,10 @@ def run_core(
             control=np.ascontiguousarray(control, dtype=float),
             force_driven=False,
             time_step=config.time_step_s,
-            steps_per_sample=round(SAMPLE_PERIOD_S / config.time_step_s),
+            steps_per_sample=config.steps_per_sample,
             record_shape=record_shape,
             record_attitude=record_attitude,
-            threads=min(config.threads or os.cpu_count() or 1, -(-len(control) // lanes)),
+            threads=config.threads_for(len(control), lanes),
             lanes=lanes,
             progress=advance,
         )
@@ -369,12 +378,18 @@ def _check(bad: Bool[np.ndarray, "worlds *rest"], values: Float[np.ndarray, "wor
 
 def _check_memory(worlds: int, samples: int, recorded_nodes: int) -> None:
     needed = 8 * worlds * samples * (20 + 3 * recorded_nodes)
+    check_memory(needed, f"control: {worlds} worlds of {samples} samples", "simulate fewer at once")
+
+
+def check_memory(needed: int, what: str, mend: str) -> None:
+    """Check that `needed` bytes are at most 0.8 of the machine's memory.
+
+    Raises:
+        InputError: they are more; it begins with `what` needs them and ends with the mend.
+    """
     available = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     if needed > 0.8 * available:
-        raise InputError(
-            f"control: {worlds} worlds of {samples} samples need {needed / 2**30:.1f} GiB of {available / 2**30:.1f}; "
-            "simulate fewer at once"
-        )
+        raise InputError(f"{what} need {needed / 2**30:.1f} GiB of {available / 2**30:.1f}; {mend}")
 
 
 def _report_invalid(reason: Integer[np.ndarray, "worlds"], valid: Bool[np.ndarray, "worlds samples"]) -> None:

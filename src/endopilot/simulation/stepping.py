@@ -7,7 +7,6 @@ same C++ core and give the same answer to the last bit.
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -27,6 +26,7 @@ from endopilot.simulation.simulator import (
     SAMPLE_TOLERANCE,
     SimulatorConfig,
     check_distance_map,
+    check_memory,
     core_options,
     insertion_arguments,
     make_lumen,
@@ -120,7 +120,8 @@ class Simulator:
             rod = lay_out(
                 device, path_mm=path_mm, elements=self._config.elements, length_mm=longest_mm + FREE_BEHIND_MM
             )
-            _check_memory(len(worlds), len(rod.abscissa_mm))
+            needed = 8 * len(worlds) * (25 * len(rod.abscissa_mm) + 40)
+            check_memory(needed, f"worlds: {len(worlds)}", "give fewer")
             key = (id(anatomy), device.tip_radius_mm)
             if key not in lumens:
                 lumens[key] = make_lumen(anatomy.distance_map, device.tip_radius_mm)
@@ -210,6 +211,7 @@ class Simulator:
                 raise InputError(
                     f"inserted_length: world {world}: {start[world]:g} mm; give 0 to {group.longest_mm:.1f} mm"
                 )
+        for group in self._groups:
             mine = np.isin(group.index, chosen)
             index = group.index[mine]
             group.simulation.reset(
@@ -218,8 +220,8 @@ class Simulator:
                 friction=np.ascontiguousarray(grip[index]),
                 sample_period=SAMPLE_PERIOD_S,
             )
-            steps = round(SAMPLE_PERIOD_S / self._config.time_step_s)
-            self._run(group, np.zeros((len(group.index), 0, 2)), self._config.time_step_s, steps, by_force=False)
+            no_control = np.zeros((len(group.index), 0, 2))
+            self._run(group, no_control, self._config.time_step_s, self._config.steps_per_sample, by_force=False)
 
     def _random_start(self, seed: int | None) -> tuple[np.ndarray, np.ndarray]:
         if seed is None:
@@ -277,7 +279,7 @@ class Simulator:
             steps_per_sample=steps,
             record_shape=False,
             record_attitude=False,
-            threads=min(self._config.threads or os.cpu_count() or 1, -(-len(group.index) // LANES)),
+            threads=self._config.threads_for(len(group.index), LANES),
             lanes=LANES,
             progress=None,
         )
@@ -480,10 +482,3 @@ class Simulator:
 def _settings(config: SimulatorConfig) -> tuple[Any, ...]:
     """Return the settings that results depend on: all but the threads."""
     return tuple((name, getattr(config, name)) for name in SimulatorConfig.__dataclass_fields__ if name != "threads")
-
-
-def _check_memory(worlds: int, nodes: int) -> None:
-    needed = 8 * worlds * (25 * nodes + 40)
-    available = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    if needed > 0.8 * available:
-        raise InputError(f"worlds: {worlds} need {needed / 2**30:.1f} GiB of {available / 2**30:.1f}; give fewer")
