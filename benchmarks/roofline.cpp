@@ -94,7 +94,7 @@ struct Sweeps {
         Diagonal<V> own{}, next;
         for (int i = 0; i < kNodes; ++i) {
             sink += add_element<V>(rod, i, one, x[i], x[i + 1], frame(q[i]), own, next, coupling[i]);
-            sink += add_joint<V>(rod, i + 1, one, q[i], q[i + 1], own, next, coupling[i]);
+            sink += add_joint<V>(rod, i + 1, one, one, q[i], q[i + 1], own, next, coupling[i]);
             diagonal[i] = own;
             own = next;
         }

@@ -39,8 +39,8 @@ void Stepper<V>::place(int l, int i) {
     Node& n = node_[i];
     put(n.start, l, base_.position(rod_, i, lane.start.advance));
     put(n.start_q, l, base_.attitude(lane.start.rotation));
-    put(n.last, l, {0, 0, 0});
-    put(n.last_turn, l, {0, 0, 0});
+    put(n.last, l, lane.last.advance * frame(base_.orientation).d3);
+    put(n.last_turn, l, {0, 0, lane.last.rotation});
     set(n.grip.limit, l, 0);
     put(n.grip.normal, l, {0, 0, 0});
     put(n.grip.spin, l, {0, 0, 0});

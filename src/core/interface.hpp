@@ -1,6 +1,7 @@
 // What the core is asked and what it answers: options, the drive's base, loads, inputs and outputs.
 #pragma once
 
+#include <algorithm>
 #include <cstdint>
 #include <vector>
 
@@ -16,7 +17,7 @@ struct Options {
     double largest_step;       // displacement that one Newton step is clamped to, mm (rotations: rad)
     double largest_jump;       // motion of a node in a time step beyond the drive's, mm (rotations: rad); the step is shortened
     int most_iterations;       // for one step; then the step is halved, and the shortest may take kPatience times as many
-    double free_behind;        // nodes farther behind the ostium than this follow the drive, mm
+    double free_behind;        // the wire is held, and follows the drive, this far behind the ostium, mm
     double approach_velocity;  // at which a wire is brought to its first inserted length, mm/s; 0: it is put there, straight
     double push_limit;         // the drive slips rather than push the wire harder than this, N
     double introducer_friction;  // Coulomb friction of the introducer's valve, N
@@ -38,12 +39,25 @@ struct Base {
         return orientation * Quaternion<double>{std::cos(0.5 * rotation), {0, 0, std::sin(0.5 * rotation)}};
     }
 
-    // Nodes that do not follow the drive: those from the tip to `free_behind` mm behind the origin.
+    // Nodes that do not follow the drive: those whose element's middle is ahead of where the wire is held, `free_behind` mm
+    // behind the origin; one at least, and all but two at most.
     static int count_active(const RodModel& rod, double inserted, double free_behind) {
         int n = 1;
-        while (n < rod.nodes - 2 && inserted - rod.abscissa[n] > -free_behind) ++n;
+        while (n < rod.nodes - 2 && inserted - middle(rod, n) + free_behind > 0) ++n;
         return n;
     }
+
+    // How much of the joint between the last active element and the first that follows the drive lies ahead of where the
+    // wire is held, 0 to 1: it is set free little by little, else each node that is set free would jolt the wire.
+    static double share_of_last_joint(const RodModel& rod, double inserted, double free_behind, int active) {
+        const double ahead = middle(rod, active - 1), behind = middle(rod, active);
+        return std::clamp((inserted - ahead + free_behind) / (behind - ahead), kLeastShare, 1.0);
+    }
+
+    static double middle(const RodModel& rod, int element) { return rod.abscissa[element] + 0.5 * rod.length[element]; }
+
+private:
+    static constexpr double kLeastShare = 1e-3;  // so that the joint's stiffness stays finite
 };
 
 // Dead loads and springs for verification: arrays of one entry a node, or of an element where they act on rotations.

@@ -104,11 +104,13 @@ ENDOPILOT_DEVICE inline V add_element(const RodModel& rod, int i, const V& geome
     return energy;
 }
 
-// The same for the joint between element `joint - 1` (block `own`) and element `joint` (block `next`). Returns the energy.
+// The same for the joint between element `joint - 1` (block `own`) and element `joint` (block `next`). `share` (0 to 1) is how
+// much of its length is free to bend; the rest is held straight. Returns the energy.
 template <class V>
-ENDOPILOT_DEVICE inline V add_joint(const RodModel& rod, int joint, const V& geometric, const Quaternion<V>& distal,
+ENDOPILOT_DEVICE inline V add_joint(const RodModel& rod, int joint, const V& geometric, const V& share, const Quaternion<V>& distal,
                    const Quaternion<V>& proximal, Diagonal<V>& own, Diagonal<V>& next, Coupling<V>& coupling) {
-    const double L = rod.joint_length[joint], eb = rod.bend[joint], et = rod.twist[joint];
+    const double L = rod.joint_length[joint];
+    const V eb = rod.bend[joint] / share, et = rod.twist[joint] / share;
     const Vec3<double>& rest = rod.rest[joint];
     const Quaternion<V> p = relative(proximal, distal);
     const Vec3<V>& v = p.v;
@@ -118,7 +120,7 @@ ENDOPILOT_DEVICE inline V add_joint(const RodModel& rod, int joint, const V& geo
     const V g = 1.0 + u * (1.0 / 6 + u * (3.0 / 40 + u * (5.0 / 112 + u * (35.0 / 1152))));
     const V slope = 1.0 / 6 + u * (3.0 / 20 + u * (15.0 / 112 + u * (35.0 / 288)));
     const V scale = (2.0 / L) * g;
-    const Vec3<V> bent{scale * v.x - rest.x, scale * v.y - rest.y, scale * v.z - rest.z};
+    const Vec3<V> bent{scale * v.x - share * rest.x, scale * v.y - share * rest.y, scale * v.z - share * rest.z};
     const Vec3<V> n{eb * bent.x, eb * bent.y, et * bent.z};
     const V energy = 0.5 * L * dot(n, bent);
 

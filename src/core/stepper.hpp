@@ -120,7 +120,7 @@ private:
     Coupling<V> coupling_[kTogether];
     Lane lane_[W];
     // per lane: settings of the step, results of a sweep
-    V active_{}, geometric_{}, inverse_dt_{}, eps_{}, first_{}, damping_{}, friction_{}, way_{}, swing_{};
+    V active_{}, share_{}, geometric_{}, inverse_dt_{}, eps_{}, first_{}, damping_{}, friction_{}, way_{}, swing_{};
     V energy_{}, descent_{}, pivot_{}, jump_{}, base_force_{}, base_torque_{};
     DriveRows drive_{};            // of the wire's energy, all nodes eliminated
     V drive_a_{}, drive_r_{};      // the drive's Newton step
@@ -206,6 +206,7 @@ void Stepper<V>::begin(int l, bool fresh) {
     const double way = options_.largest_jump + kDriveShare * std::abs(lane.end.advance - lane.start.advance);
     const double swing = options_.largest_jump + kDriveShare * std::abs(lane.end.rotation - lane.start.rotation);
     set(active_, l, lane.active);
+    set(share_, l, Base::share_of_last_joint(rod_, lane.start.advance, options_.free_behind, lane.active));
     set(geometric_, l, 0.0);
     set(first_, l, 1.0);
     set(damping_, l, 0.0);

@@ -62,10 +62,11 @@ void Stepper<V>::add_rod(int first, int count) {
         const int i = first + k;
         const Node &node = node_[i], &behind = node_[i + 1];
         Diagonal<V>&own = block_[k], &next = block_[k + 1];
-        V energy = add_element(rod_, i, geometric_, node.x, behind.x, frame(node.q), own, next, coupling_[k]);
-        energy += add_joint(rod_, i + 1, geometric_, node.q, behind.q, own, next, coupling_[k]);
-        energy_ += select<V>(active_ > broadcast<V>(i), energy, V{});
         const Mask<V> last = active_ == broadcast<V>(i + 1);
+        V energy = add_element(rod_, i, geometric_, node.x, behind.x, frame(node.q), own, next, coupling_[k]);
+        const V share = select<V>(last, share_, broadcast<V>(1.0));
+        energy += add_joint(rod_, i + 1, geometric_, share, node.q, behind.q, own, next, coupling_[k]);
+        energy_ += select<V>(active_ > broadcast<V>(i), energy, V{});
         base_force_ = select<V>(last, axis.x * next.force.x + axis.y * next.force.y + axis.z * next.force.z, base_force_);
         base_torque_ = select<V>(last, next.moment.z, base_torque_);
         if (in_.force_driven) drive_ = select(last, along_drive(next), drive_);

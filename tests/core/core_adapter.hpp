@@ -70,12 +70,12 @@ Matrix coupling_of(const Coupling<V>& k) {
     return h;
 }
 
-// Stretch and shear of element 0 and bend and twist of joint 1. `geometric` is 1 for the whole Hessian.
-inline Pair elastic_energy(const RodModel& rod, const Pose& distal, const Pose& proximal, double geometric = 1.0) {
+// Stretch and shear of element 0 and bend and twist of joint 1, free to bend along `share` of its length. `geometric` is 1 for the whole Hessian.
+inline Pair elastic_energy(const RodModel& rod, const Pose& distal, const Pose& proximal, double geometric = 1.0, double share = 1.0) {
     Diagonal<double> own{}, next{};
     Coupling<double> k{};
     double energy = add_element<double>(rod, 0, geometric, distal.x, proximal.x, frame(distal.q), own, next, k);
-    energy += add_joint<double>(rod, 1, geometric, distal.q, proximal.q, own, next, k);
+    energy += add_joint<double>(rod, 1, geometric, share, distal.q, proximal.q, own, next, k);
     return {energy, {gradient_of(own), gradient_of(next)}, {hessian_of(own), hessian_of(next)}, coupling_of(k)};
 }
 

@@ -16,7 +16,7 @@ __global__ void newton_direction(const RodModel* rod, const Lumen* lumen, const 
         const int at = first + i;
         Coupling<double> coupling;
         add_element<double>(*rod, i, 1.0, x[at], x[at + 1], frame(q[at]), own, next, coupling);
-        add_joint<double>(*rod, i + 1, 1.0, q[at], q[at + 1], own, next, coupling);
+        add_joint<double>(*rod, i + 1, 1.0, 1.0, q[at], q[at + 1], own, next, coupling);
         add_wall<double>(5.0, rod->radius[i], 1.0, false, distance_to_wall<double>(*lumen, x[at]), own);
         add_friction<double>(grip[at], 1e-3, x[at] - start[at], relative(start_q[at], q[at]), own);
         eliminate(own, coupling, factor[at], next);

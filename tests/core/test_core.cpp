@@ -185,7 +185,7 @@ RodModel two_element_rod() {
 
 // The joint's Hessian leaves out the derivatives of g, so it holds to the order of strain: of |v|² where the rest
 // curvature is 0, of |v| times the moment elsewhere. Gradients are exact at any strain.
-void test_elastic_energy(double bent, double rest, double tolerance) {
+void test_elastic_energy(double bent, double rest, double tolerance, double share = 1.0) {
     RodModel rod = two_element_rod();
     rod.rest[1] = rest * rod.rest[1];
     for (int trial = 0; trial < 4; ++trial) {
@@ -193,8 +193,8 @@ void test_elastic_energy(double bent, double rest, double tolerance) {
         const Vec3<double> bend{uniform(-bent, bent), uniform(-bent, bent), uniform(-bent, bent)};
         const Vec3<double> along = 0.8 * frame(start).d3, off{uniform(-0.2, 0.2), uniform(-0.2, 0.2), uniform(-0.2, 0.2)};
         const Pose poses[2] = {{along + off, turned(start, bend)}, {{0, 0, 0}, start}};
-        const auto energy = [&](const Pose (&p)[2]) { return elastic_energy(rod, p[0], p[1]).energy; };
-        const Pair exact = elastic_energy(rod, poses[0], poses[1]);
+        const auto energy = [&](const Pose (&p)[2]) { return elastic_energy(rod, p[0], p[1], 1.0, share).energy; };
+        const Pair exact = elastic_energy(rod, poses[0], poses[1], 1.0, share);
         expect(exact.energy > 0, "a strained rod has energy");
         for (int block = 0; block < 2; ++block)
             for (int a = 0; a < 6; ++a) {
@@ -381,6 +381,8 @@ int main() {
     test_solver<double8>();
     test_elastic_energy(0.3, 1.0, 0.0);
     test_elastic_energy(0.02, 0.0, 1e-3);
+    test_elastic_energy(0.3, 1.0, 0.0, 0.2);
+    test_elastic_energy(0.02, 0.0, 5e-3, 0.2);
     test_elastic_energy(0.02, 1.0, 2e-2);
     test_gauss_newton();
     test_distance<double>();

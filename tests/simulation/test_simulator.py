@@ -68,6 +68,16 @@ def test_kinematics_and_forces(anatomy: Anatomy) -> None:
     assert rollout.contact_force_max.max() / 5.0 < 0.05  # penetration, mm
 
 
+def test_the_wire_moves_on_evenly_while_nodes_are_set_free(anatomy: Anatomy) -> None:
+    """A node passes the place where the wire is held every 1.2 mm; nothing of that may be seen at the tip."""
+    slippery = replace(DEVICE, friction=0.0)
+    control = np.tile([0.25, 0.0], (1, 40, 1))
+    rollout = simulate(anatomy, slippery, control, initial=np.array([[20.0, 0.0]]))
+    steps = np.diff(rollout.tip_position[0, 2:], axis=0)  # mm, for 0.125 mm of wire each
+    turns = np.linalg.norm(np.diff(steps, axis=0), axis=1)
+    np.testing.assert_allclose(turns, turns.mean(), rtol=0.1)  # as an even bend asks
+
+
 def test_pushes_and_pulls_with_friction(anatomy: Anatomy) -> None:
     control = np.zeros((1, 24, 2))
     control[0, :16, 0], control[0, 16:, 0] = 4.0, -1.0

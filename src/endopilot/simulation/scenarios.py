@@ -136,7 +136,7 @@ def drag_through_bends(bends: int, *, friction: float = 0.2, bend_n_mm2: float =
         inserted_mm=2.0,
         friction=friction,
         config=SimulatorConfig(tolerance_mm=1e-5, stick_velocity_mm_s=0.02, wall_stiffness_n_mm=5.0, threads=1),
-        free_behind_mm=0.5 * size,
+        free_behind_mm=size,
         loads=_core.make_loads(
             force=force, moment=zero, spring=zero, anchor=zero, hold=np.zeros(nodes), attitude=still
         ),
@@ -264,13 +264,13 @@ def turn_in_a_bend(curved_mm: float, *, turns: float = 2.25, friction: float = 0
     control[:push, 0], control[push + 2 :, 1] = length / push / SAMPLE_PERIOD_S, speed
     result = _drive(
         rod,
-        tube(axis, 1.5 * radius, spacing_mm=0.1),
+        tube(axis, 1.3 * radius, spacing_mm=0.1),
         control,
         entry_mm=-_WHIP_LEAD_MM,
         inserted_mm=0.0,
         friction=friction,
         config=SimulatorConfig(threads=1, wall_stiffness_n_mm=20.0),
-        free_behind_mm=0.5 * size,
+        free_behind_mm=size,
     )
     w, x, y, z = result["attitude"][push + 2 :, 0].T
     first = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=1)

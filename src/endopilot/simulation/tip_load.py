@@ -95,8 +95,7 @@ def simulate_tip_load(device: Device) -> TipLoadTest:
         record_shape=True,
         lanes=1,
         approach=False,
-        free_behind_mm=-1.45
-        * size,  # the holder moves with the wire by up to 0.95 of an element: the free length stays
+        free_behind_mm=HELD_MM,  # more than the wire has: its last two nodes are held, and the free length stays
     )
     if not result["valid"].all():
         raise RuntimeError(f"the tip-load test of device {device.name} did not converge")
@@ -128,7 +127,7 @@ def tip_load_row(device: Device) -> dict[str, Any]:
 def _distal_rod(device: Device) -> tuple[RodLayout, float]:
     """Return the distal 10 mm, straight and in elements of one length, with the held nodes behind; and that length."""
     size = HELD_MM / (_ELEMENTS - 0.5)  # the clamped element fixes a direction over its length: half of it is held
-    abscissa = size * np.arange(_ELEMENTS + 3)
+    abscissa = size * np.arange(_ELEMENTS + 1)
     stretch = 16.0 * device.bend_stiffness(abscissa + 0.5 * size) / device.diameter_mm**2  # a round section, as in rod
     rod = RodLayout(
         abscissa_mm=abscissa,

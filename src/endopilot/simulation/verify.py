@@ -209,7 +209,7 @@ def equilibrium(
     config: SimulatorConfig = STATIC,
     insertion: Insertion = X_AXIS,
     inserted_mm: float | None = None,
-    free_behind_mm: float | None = None,
+    free_behind_mm: float = 0.0,
 ) -> dict[str, np.ndarray]:
     """Bring one clamped rod to rest and return the core's arrays, shape and attitude included, without the world axis.
 
@@ -223,7 +223,7 @@ def equilibrium(
         config: settings of the core.
         insertion: where the wall of the clamp is, and the rod's direction.
         inserted_mm: free length; the rod's own if not given.
-        free_behind_mm: nodes farther behind the wall than this are held; half an element ahead of it if not given.
+        free_behind_mm: the rod is held this far behind the wall of the clamp.
     """
     size = float(rod.abscissa_mm[1])
     if inserted_mm is None:
@@ -242,7 +242,7 @@ def equilibrium(
         record_attitude=True,
         lanes=1,
         approach=False,
-        free_behind_mm=free_behind_mm if free_behind_mm is not None else -0.75 * size,  # the wall is half an element in
+        free_behind_mm=free_behind_mm,
         sample_tolerance=1e-8,
     )
     if not result["valid"].all():
