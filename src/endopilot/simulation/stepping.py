@@ -471,6 +471,36 @@ class Simulator:
         for group, values in zip(self._groups, state.values, strict=True):
             group.simulation.set_state(np.ascontiguousarray(values))
 
+    def copy_worlds(self, source: ArrayLike) -> None:
+        """Put every world where another one, of the same anatomy and device, is now; friction goes with it.
+
+        Args:
+            source: for each world, the number of the one that it becomes a copy of; its own to stay as it is.
+
+        Raises:
+            InputError: not one number for each world, or a world of another anatomy or device.
+
+        Example:
+            >>> simulator.copy_worlds([0, 0, 2, 2])
+            >>> bool((simulator.position[1] == simulator.position[0])[simulator.contacts[0] >= 0].all())
+            True
+        """
+        chosen = np.asarray(source)
+        if chosen.shape != (self.worlds,) or not np.issubdtype(chosen.dtype, np.integer):
+            raise InputError(f"source: {source}; give the number of a world for each of the {self.worlds} worlds")
+        for group in self._groups:
+            wanted = chosen[group.index]
+            strange = ~np.isin(wanted, group.index)
+            if strange.any():
+                world = int(group.index[np.argmax(strange)])
+                raise InputError(
+                    f"source: world {world} cannot become world {chosen[world]}, which is none or has another anatomy "
+                    "or device; give one like it"
+                )
+        for group in self._groups:
+            rows = np.searchsorted(group.index, chosen[group.index])
+            group.simulation.set_state(np.ascontiguousarray(group.simulation.state()[rows]))
+
     def _fingerprint(self) -> str:
         digest = hashlib.sha256(repr((self._by_force, _settings(self._config))).encode())
         for group in self._groups:
