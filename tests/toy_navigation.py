@@ -79,6 +79,8 @@ def toy_simulate(anatomy: Anatomy, device, control, *, initial, config, friction
         contact_force_sum=2 * force,
         base_force=force.copy(),
         base_torque=0.1 * force,
+        drive_force=force + 0.05,
+        drive_torque=0.1 * force + 0.01,
         slip=np.zeros((worlds, samples)),
         iterations=np.ones((worlds, samples)),
         valid=np.ones((worlds, samples), dtype=bool),
@@ -98,6 +100,13 @@ def make_toy_dataset(folder: Path, *, patients: int, sequences: int, simulate=to
     """Generate a dataset with the toy wire in place of the rod; two thirds of the patients train, the others test."""
     shares = (2 / 3, 0.0, 1 / 3) if patients > 1 else None
     config = DatasetConfig(**({"sequences": sequences, "anatomy_shares": shares} | settings))
-    with patch("endopilot.dataset.navigate.simulate", simulate):
+
+    def navigate(anatomy, devices, initial, control, friction, config, *, actuation, advance):
+        control = control.astype(np.float32).astype(float)
+        rollout = simulate(anatomy, devices[0], control, initial=initial, config=config, friction=friction)
+        advance(control.shape[0] * control.shape[1])
+        return rollout, control, np.zeros(len(control), dtype=bool)
+
+    with patch("endopilot.dataset.block.navigate", navigate):
         anatomies = write_toy_anatomies(folder.parent / "anatomies", patients)
         generate_dataset(anatomies, folder, read_device("workhorse-014"), config)

@@ -19,12 +19,9 @@ import pytest
 from endopilot.anatomy.io import write_anatomy
 from endopilot.dataset.generate import DatasetConfig
 from endopilot.dataset.loader import load_dataset
-from endopilot.dataset.navigate import END_MM, STOP_SHORT_MM, navigate, stop_short
 from endopilot.errors import InputError
 from endopilot.files import read_json, sha256
-from endopilot.simulation.device import read_device
-from endopilot.simulation.simulator import SimulatorConfig
-from toy_navigation import LENGTH_MM, make_toy_dataset, toy_anatomy, toy_simulate
+from toy_navigation import make_toy_dataset, toy_anatomy, toy_simulate
 
 
 def data_hashes(folder: Path) -> dict[str, str]:
@@ -217,42 +214,6 @@ def test_invalid_worlds_are_listed_and_never_trained_on(tmp_path):
     stats = read_json(tmp_path / "d/meta/stats.json")["observation.state"]
     assert np.isfinite(stats["mean"]).all()
     assert stats["count"] == [10 * 120 - 70]
-
-
-def test_the_drive_stops_short_of_the_end_of_the_vessel(tmp_path):
-    control = np.zeros((3, 40, 2))
-    control[:, :, 0] = np.array([[10.0], [1.0], [-3.0]])
-    control[:, :, 1] = 0.3
-    initial = np.array([[5.0, 0.0], [5.0, 0.0], [LENGTH_MM, 0.0]])
-
-    def without_slack(anatomy, device, control, *, initial, config, friction):
-        rollout = toy_simulate(anatomy, device, control, initial=initial, config=config, friction=friction)
-        ahead = rollout.inserted_length + 4.5  # a wire that cuts corners: its tip is ahead of its length
-        return replace(rollout, tip=replace(rollout.tip, abscissa=ahead))
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("endopilot.dataset.navigate.simulate", without_slack)
-        rollout, stopped = navigate(
-            toy_anatomy("p"), read_device("workhorse-014"), initial, control, np.full(3, 0.1), SimulatorConfig()
-        )
-    assert (rollout.inserted_length <= LENGTH_MM - STOP_SHORT_MM + 1e-4).all()
-    assert (rollout.tip.abscissa <= LENGTH_MM - END_MM).all()
-    assert stopped.tolist() == [True, False, False]
-    free = rollout.inserted_length[0] < LENGTH_MM - 2 * STOP_SHORT_MM - 5.0
-    assert free.sum() == 15
-    np.testing.assert_allclose(rollout.control[0, free, 0], 10.0)
-    np.testing.assert_allclose(rollout.control[..., 1], np.float32(0.3))
-
-
-def test_stopping_short_keeps_the_inserted_length_within_its_limit():
-    generator = np.random.default_rng(3)
-    control = generator.normal(0, 30, (50, 60, 2))
-    limit = generator.uniform(5, 40, 50)
-    initial, driven = stop_short(generator.uniform(0, 60, (50, 2)), control, limit)
-    inserted = initial[:, :1] + 0.5 * np.cumsum(driven[..., 0], axis=1)
-    assert (inserted >= -1e-4).all()
-    assert (inserted <= limit[:, None] + 1e-4).all()
-    assert (driven == driven.astype(np.float32)).all()
 
 
 @pytest.mark.parametrize(
