@@ -1,4 +1,4 @@
-"""One block of navigations, from the draw to its two files: `write_block`. It is the work of a thread or of a cluster."""
+"""One block of navigations, from the draw to its two files: `write_block`, the work of a thread or of a cluster."""
 
 from __future__ import annotations
 

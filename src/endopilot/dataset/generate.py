@@ -135,8 +135,11 @@ def _finish(study: Study, blocks: Sequence[Block]) -> None:
     files = [schema.paths_of_file(plan.output, block.number) for block in blocks]
     columns = ("episode_index", "anatomy", "sequence", "split", "stopped_short", "valid", "invalid_reason")
     episodes = [row for _, path in files for row in schema.read_table(path, plan.key).select(columns).to_pylist()]
+    started = time.process_time()
     with progress("Describing the dataset", total=len(files)) as advance:
         stats, shares = schema.statistics(plan.config.control, [path for path, _ in files], plan.key, advance)
+    work = read_work(plan.output)
+    work["processor_seconds"] += time.process_time() - started
     write_json(plan.output / schema.STATS_PATH, stats)
     tasks = pd.DataFrame({"task_index": [0]}, index=pd.Index([schema.TASK], name="task"))
     with writing(plan.output / schema.TASKS_PATH) as partial:
@@ -161,7 +164,7 @@ def _finish(study: Study, blocks: Sequence[Block]) -> None:
         manoeuvres=shares,
         stopped_short=sum(row["stopped_short"] for row in episodes),
         invalid={"episodes": len(invalid), "which": invalid},
-        work=read_work(plan.output),
+        work=work,
     )
     write_json(plan.output / schema.MANIFEST_PATH, record)
     (plan.output / _WORK_PATH).unlink(missing_ok=True)

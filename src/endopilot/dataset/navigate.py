@@ -9,6 +9,7 @@ back before it pushes again. Simulating the recorded controls without looking gi
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+
 import numpy as np
 from jaxtyping import Bool, Float
 

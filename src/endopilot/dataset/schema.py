@@ -132,7 +132,7 @@ def sample_table(rollout: Rollout, applied: np.ndarray, actuation: Actuation, fi
         "drive_torque_nmm": rollout.drive_torque,
         "valid": rollout.valid,
     }
-    kinds = {name: ("int64", None) for name in INDEX_COLUMNS} | {"timestamp": ("float32", None)} | signals(actuation)
+    kinds = dict.fromkeys(INDEX_COLUMNS, ("int64", None)) | {"timestamp": ("float32", None)} | signals(actuation)
     arrays = {name: _column(columns[name], *kinds[name]) for name in columns if name in kinds}
     return pa.table(arrays).replace_schema_metadata({_KEY: key.encode()})
 
