@@ -2,8 +2,9 @@
 
 A segmented vessel ends where the scan no longer shows it, not where blood stops: a wire that is pushed against that end
 buckles against a wall that is not there. So the drive looks at the tip before every sample, as an operator does: it
-pushes no farther than shortly before the end of the branch that the tip lies in, and where the wire is caught it pulls
-back before it pushes again. Simulating the recorded controls without looking gives the same navigation again.
+pushes no farther than shortly before the end of the branch that the tip lies in. From there, and where the wire is
+caught, it pulls where it was to push, until the wire is well back. Simulating the recorded controls without looking
+gives the same navigation again.
 """
 
 from __future__ import annotations
@@ -21,7 +22,9 @@ from endopilot.simulation.stepping import Simulator
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, Rollout, TipProjection, VesselTree
 
 STOP_SHORT_MM = 5.0
-"""A tip is driven no nearer than this to the end of its branch, and a caught wire pulled back by as much, mm."""
+"""A tip is driven no nearer than this to the end of its branch, mm."""
+PULL_BACK_MM = 15.0
+"""Length by which a wire that came to an end, or is caught, is pulled back before it is pushed again, mm."""
 CAUGHT = 0.5
 """Share of the device's push limit at which a wire counts as caught."""
 _ROUNDING_MM = 1e-2
@@ -64,11 +67,12 @@ def navigate(
     for sample in range(control.shape[1]):
         drawn = control[:, sample]
         caught = (slip > 0) | (simulator.base_load[:, 0] > watch.caught_n)
-        room = watch.room(project_tip(anatomy.tree, anatomy.insertion, tip), inserted, caught)
+        # How far a load moves the wire is not known: about as far as the last one did.
+        needed = last if actuation == "force" else np.zeros(len(control))
+        room = watch.room(project_tip(anatomy.tree, anatomy.insertion, tip), inserted, needed, caught)
+        held = np.where(room > 0, drawn[:, 0], -np.abs(drawn[:, 0]))
         if actuation == "velocity":
-            held = np.clip(drawn[:, 0], -inserted / SAMPLE_PERIOD_S, room / SAMPLE_PERIOD_S)
-        else:  # how far a load moves the wire is not known: about as far as the last one did
-            held = np.where(room > last, drawn[:, 0], np.minimum(drawn[:, 0], 0.0))
+            held = np.clip(held, -inserted / SAMPLE_PERIOD_S, room / SAMPLE_PERIOD_S)
         applied[:, sample] = np.column_stack([held, drawn[:, 1]]).astype(np.float32)
         stopped |= (drawn[:, 0] > 0) & (held < drawn[:, 0])
         step = simulator.step(applied[:, sample], SAMPLE_PERIOD_S)
@@ -92,16 +96,23 @@ class _Watch:
             self._ends[leaf] = tree.branches[leaf].centerline.abscissa[-1]
         self.deepest_mm = max(float(self._ends[np.isfinite(self._ends)].max()) - STOP_SHORT_MM, 0.0)
         self.caught_n = CAUGHT * np.array([device.push_limit_n for device in devices])
-        self._limit = np.full(len(devices), self.deepest_mm)
+        self._limit = np.full(len(devices), np.inf)
 
     def room(
-        self, tip: TipProjection, inserted: Float[np.ndarray, "worlds"], caught: Bool[np.ndarray, "worlds"]
+        self,
+        tip: TipProjection,
+        inserted: Float[np.ndarray, "worlds"],
+        needed: Float[np.ndarray, "worlds"],
+        caught: Bool[np.ndarray, "worlds"],
     ) -> Float[np.ndarray, "worlds"]:
-        """Return the advance (mm) that is left to each wire, 0 or more."""
-        back = np.maximum(inserted - STOP_SHORT_MM, 0.0)
-        self._limit = np.where(caught, np.minimum(self._limit, back), self._limit)
-        self._limit = np.where(inserted < self._limit + _ROUNDING_MM, self.deepest_mm, self._limit)
-        return np.maximum(np.minimum(self._limit - inserted, self.ahead(tip)), 0.0)
+        """Return the advance (mm) that is left to each wire; 0 where it is `needed` or less, and until it is back."""
+        ahead = np.minimum(self.deepest_mm - inserted, self.ahead(tip))
+        stop = caught | (ahead <= np.maximum(needed, _ROUNDING_MM))
+        back = np.maximum(inserted - PULL_BACK_MM, 0.0)
+        self._limit = np.where(stop, np.minimum(self._limit, back), self._limit)
+        is_back = ~stop & (inserted < self._limit + _ROUNDING_MM)
+        self._limit = np.where(is_back, np.inf, self._limit)
+        return np.where(np.isinf(self._limit), ahead, 0.0)
 
     def ahead(self, tip: TipProjection) -> Float[np.ndarray, "worlds"]:
         """Return how far each tip is from where it is stopped in its branch, mm; negative beyond."""
