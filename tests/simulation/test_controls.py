@@ -32,7 +32,7 @@ def test_later_sequences_are_those_of_a_whole_draw() -> None:
 def test_the_load_of_a_free_wire_moves_it_at_the_drawn_speed() -> None:
     device = replace(read_device("workhorse-014"), tip_bend_rad=0.0)
     config = SimulatorConfig()
-    velocity = np.array([[[-1.5, 1.0]], [[1.0, -3.0]]])
+    velocity = np.repeat([[[-1.5, 1.0]], [[1.0, -3.0]]], 2, axis=1)
     load = free_wire_load(
         velocity,
         radius_mm=device.tip_radius_mm,
@@ -42,8 +42,10 @@ def test_the_load_of_a_free_wire_moves_it_at_the_drawn_speed() -> None:
     )
     initial = np.tile([2.0, 0.0], (2, 1))
     rollout = simulate(vessel(), device, load, actuation="force", initial=initial, config=config)
-    np.testing.assert_allclose(rollout.control, velocity, rtol=0.05)  # 1 % more load is 25 % more speed
-    np.testing.assert_allclose(rollout.inserted_length, 2.0 + 0.5 * rollout.control[..., 0], rtol=1e-12)
+    # In the first sample the wire starts from rest; in the second the blood's drag is left. 1 % of load is 25 % of speed.
+    np.testing.assert_allclose(rollout.control[:, 1], velocity[:, 1], rtol=0.02)
+    travel = 0.5 * np.cumsum(rollout.control[..., 0], axis=1)
+    np.testing.assert_allclose(rollout.inserted_length, 2.0 + travel, rtol=1e-12)
     assert np.array_equal(np.stack([rollout.drive_force, rollout.drive_torque], axis=-1), load)
 
 
