@@ -22,6 +22,7 @@ COMMANDS = {
     "phantom": "anatomy -> synthetic CT angiogram",
     "simulate": "anatomy and proximal controls -> what the wire does",
     "dataset": "anatomies -> many random navigations on disk",
+    "dataset-info": "what a dataset holds, with pictures",
     "train": "dataset -> forward and inverse transformers",
     "evaluate": "trained run -> errors beside the paper's and the baselines'",
     "verify": "the rod core against closed forms",
@@ -30,7 +31,8 @@ COMMANDS = {
     "sample": "fetch a real CT angiogram to try",
     "info": "versions and machine",
 }
-"""Name of each command and what it turns into what. The module of the same name in this package holds it."""
+"""Name of each command and what it turns into what. The module of the same name in this package holds it, see
+`module_of`."""
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
@@ -56,9 +58,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sys.exit(EXIT_BAD_INPUT)
 
 
+def module_of(name: str) -> str:
+    """Return the name of the module that holds a command."""
+    return name.replace("-", "_")
+
+
 def overview() -> str:
     """Return the text of `endopilot --help`."""
-    lines = [f"  {name:<9} {summary}" for name, summary in COMMANDS.items()]
+    lines = [f"  {name:<12} {summary}" for name, summary in COMMANDS.items()]
     return "\n".join(
         [
             "usage: endopilot COMMAND ...",
@@ -76,7 +83,7 @@ def overview() -> str:
 def _run(name: str, arguments: Sequence[str]) -> int:
     import tyro
 
-    module = importlib.import_module(f"endopilot.cli.{name}")
+    module = importlib.import_module(f"endopilot.cli.{module_of(name)}")
     try:
         tyro.cli(
             module.command,
