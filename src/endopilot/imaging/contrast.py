@@ -16,8 +16,8 @@ _CALM_HU = 25.0
 """Tissue is homogeneous where its standard deviation over 3 × 3 × 3 blocks is smaller: blood is, bone is not."""
 _BRIGHTEST_HU = 900.0
 """Metal and dense bone lie above this, no blood does."""
-_LEAST_POOL_ML = 3.0
-"""The inside of the narrowest ascending aorta, over 2 cm; homogeneous bone comes in pieces of 1 ml at most."""
+_LEAST_POOL_ML = 2.0
+"""The inside of the narrowest ascending aorta over 2 cm; homogeneous bone of the thorax comes in pieces of 1 ml."""
 
 
 def refuse_other_units(volume: Volume) -> None:
@@ -41,7 +41,7 @@ def refuse_without_contrast(volume: Volume) -> None:
     above 130 HU; blood without measures 30 to 60 HU, like muscle.
 
     Raises:
-        InputError: no connected 3 ml of homogeneous tissue are that bright.
+        InputError: no connected 2 ml of homogeneous tissue are that bright.
     """
     blocks, size_mm = _blocks(volume)
     mean = ndimage.uniform_filter(blocks, 3)

@@ -62,7 +62,10 @@ def segment_by_program(
         if not file.exists():
             written = ", ".join(sorted(path.name for path in target.rglob("*") if path.is_file())[:10]) or "nothing"
             raise InputError(f"{program} wrote no {answer} (it wrote {written}); {mend}")
-        found = read_volume(file)
+        try:
+            found = read_volume(file)
+        except InputError as error:
+            raise InputError(f"{program} wrote a {answer} that is no volume; {mend}") from error
     inside = _labelled(found, label, program)
     on_grid = Volume(inside, found.spacing_mm, found.origin_mm, found.direction)
     if found.voxels.shape != volume.voxels.shape or not np.allclose(found.origin_mm, volume.origin_mm, atol=1e-2):

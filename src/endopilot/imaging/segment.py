@@ -21,10 +21,10 @@ import numpy as np
 from endopilot.errors import InputError
 from endopilot.imaging import methods as method_modules
 from endopilot.imaging.contrast import refuse_other_units, refuse_without_contrast
-from endopilot.types import LumenMask, Volume
+from endopilot.types import Insertion, LumenMask, Volume
 
-_LEAST_EXTENT_MM = 20.0
-"""What is found without seeds and is smaller is a stump or a side branch, not a vessel tree."""
+_ROOT_MM = 5.0
+"""An ostium is on an aorta of 9 mm radius or more: nearer than this to the volume's edge, the aortic root is cut off."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,8 +89,8 @@ def segment(volume: Volume, config: SegmentConfig) -> LumenMask:
     mask: LumenMask = method.segment_lumen(volume, config)
     if not mask.volume.voxels.any():
         raise InputError(f"method={config.method!r} found no lumen; give seeds inside the vessel")
-    if not config.seeds:
-        _refuse_stump(mask, config)
+    if not config.seeds and mask.ostium is not None:
+        _refuse_cut_root(volume, mask.ostium)
     return replace(mask, method=config.method)
 
 
@@ -107,12 +107,12 @@ def _refuse_seeds_outside(volume: Volume, config: SegmentConfig) -> None:
             )
 
 
-def _refuse_stump(mask: LumenMask, config: SegmentConfig) -> None:
-    """Refuse what is too small to be a vessel tree: the ostium is outside the volume, and something else was taken."""
-    inside = np.argwhere(mask.volume.voxels)
-    extent = float(np.linalg.norm(np.ptp(inside, axis=0) * mask.volume.spacing_mm[::-1]))
-    if extent < _LEAST_EXTENT_MM:
+def _refuse_cut_root(volume: Volume, ostium: Insertion) -> None:
+    """Refuse an ostium at the volume's edge: the true one is outside, and the end of a cut vessel was taken for it."""
+    index = volume.world_to_index(ostium.position)
+    room = np.minimum(index, np.array(volume.voxels.shape[::-1]) - 1 - index) * volume.spacing_mm
+    if room.min() < _ROOT_MM:
         raise InputError(
-            f"method={config.method!r} found a lumen of only {extent:.0f} mm: the ostium is probably outside the "
-            "volume; give a CT that holds the aortic root, or seeds: the ostium first, then points along the vessel"
+            f"the vessel found begins {max(room.min(), 0.0):.0f} mm from the volume's edge: the ostium is probably outside; "
+            "give a CT that holds the aortic root, or seeds: where to begin first, then points along the vessel"
         )
