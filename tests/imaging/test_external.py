@@ -121,10 +121,16 @@ def test_nnunet_without_a_model_is_told(ct, options):
     ("text", "expected"),
     [
         (None, "program TotalSegmentator is not on the PATH; install TotalSegmentator"),
-        ("raise SystemExit('ERROR: this task needs a licence')", "exit code 1: ERROR: this task needs a licence; install"),
+        (
+            "raise SystemExit('ERROR: this task needs a licence')",
+            "exit code 1: ERROR: this task needs a licence; install",
+        ),
         ("print('done')", r"wrote no coronary_arteries.nii.gz \(it wrote nothing\)"),
         (_TOTALSEGMENTATOR.format(device="gpu", above=3000), "found no lumen in this CT"),
-        ("import sys, pathlib; pathlib.Path(sys.argv[4], 'coronary_arteries.nii.gz').write_text('x')", "is no volume; install"),
+        (
+            "import sys, pathlib; pathlib.Path(sys.argv[4], 'coronary_arteries.nii.gz').write_text('x')",
+            "is no volume; install",
+        ),
     ],
     ids=["missing", "fails", "writes nothing", "finds nothing", "writes rubbish"],
 )

@@ -10,7 +10,7 @@ from endopilot.imaging import segment as segmentation
 from endopilot.imaging.segment import SegmentConfig, available_methods, segment
 from endopilot.types import Volume
 
-_METHOD = '''
+_METHOD = """
 import numpy as np
 from endopilot.types import Insertion, LumenMask, Volume
 
@@ -20,7 +20,7 @@ def segment_lumen(volume, config):
     inside = volume.voxels > float(config.settings(OPTIONS)["above"])
     ostium = Insertion(np.array(config.seeds[0] if config.seeds else (0.0, 0.0, 0.0)), np.array([0.0, 0.0, 1.0]))
     return LumenMask(Volume(inside, volume.spacing_mm, volume.origin_mm, volume.direction), ostium)
-'''
+"""
 
 
 @pytest.fixture

@@ -7,11 +7,9 @@ although it is not one plain three-dimensional CT is refused here in one line.
 
 from __future__ import annotations
 
-import gzip
-import math
-import struct
-import zlib
-from collections.abc import Mapping
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +22,7 @@ from endopilot.imaging import dicom_seg
 from endopilot.imaging.dicom import is_dicom, read_series
 from endopilot.imaging.dicom_write import write_series
 from endopilot.imaging.grid import from_image, to_image
+from endopilot.imaging.nifti import check_nifti
 from endopilot.types import Insertion, LumenMask, Volume
 
 SUFFIXES = (".nii.gz", ".nii", ".nrrd", ".mha")
@@ -183,13 +182,13 @@ def _read_file(path: Path) -> Volume:
     """Read one file that SimpleITK knows by its suffix, refusing what is not a scalar volume."""
     if path.is_dir() or _suffix(path) is None:
         raise InputError(f"{path}: unknown format; give one of {', '.join(SUFFIXES)}, or a folder of DICOM slices")
-    sitk.ProcessObject.SetGlobalWarningDisplay(False)  # ITK's own lines on standard error would bury ours
     reader = sitk.ImageFileReader()
     reader.SetFileName(str(path))
     try:
-        reader.ReadImageInformation()
+        with _quiet_itk():
+            reader.ReadImageInformation()
     except RuntimeError as error:
-        raise InputError(f"{path}: {_reason(error)}; export it again") from error
+        raise InputError(f"{path}: {_reason(error, path)}; export it again") from error
     size = tuple(reader.GetSize())
     shape = "×".join(map(str, size))
     components = reader.GetNumberOfComponents()
@@ -200,41 +199,17 @@ def _read_file(path: Path) -> Volume:
     if len(size) < 3 or min(size[:3]) < _SMALLEST_SIZE:
         raise InputError(f"{path}: {shape} voxels are no volume; give at least {_SMALLEST_SIZE} along each axis")
     if path.name.lower().endswith((".nii", ".nii.gz")):
-        _refuse_truncated_nifti(path)
+        check_nifti(path)
+    if path.name.lower().endswith((".nrrd", ".nhdr")) and not reader.HasMetaDataKey("NRRD_space"):
+        raise InputError(f"{path}: says no orientation (no space in its header); export it with its space directions")
     try:
-        image = reader.Execute()
+        with _quiet_itk():
+            image = reader.Execute()
         if len(size) > 3:
             image = sitk.Extract(image, [*size[:3], *(0 for _ in size[3:])])
     except RuntimeError as error:
-        raise InputError(f"{path}: truncated or damaged ({_reason(error)}); copy or export it again") from error
+        raise InputError(f"{path}: truncated or damaged ({_reason(error, path)}); copy or export it again") from error
     return _compact(from_image(image))
-
-
-def _refuse_truncated_nifti(path: Path) -> None:
-    """Refuse a NIfTI file that ends before its voxels do: ITK would fill the rest with whatever is in memory.
-
-    Offsets are those of the NIfTI-1 and NIfTI-2 headers (https://nifti.nimh.nih.gov).
-    """
-    opener = gzip.open if path.name.lower().endswith(".gz") else open
-    try:
-        with opener(path, "rb") as stream:
-            header = stream.read(540)
-            order = "<" if header[:4] in (b"\x5c\x01\0\0", b"\x1c\x02\0\0") else ">"
-            if struct.unpack_from(f"{order}i", header)[0] == 540:
-                (bits,) = struct.unpack_from(f"{order}h", header, 14)
-                dimensions = struct.unpack_from(f"{order}8q", header, 16)
-                (offset,) = struct.unpack_from(f"{order}q", header, 168)
-            else:
-                (bits,) = struct.unpack_from(f"{order}h", header, 72)
-                dimensions = struct.unpack_from(f"{order}8h", header, 40)
-                (offset,) = struct.unpack_from(f"{order}f", header, 108)
-            missing = int(offset) + math.prod(dimensions[1 : 1 + dimensions[0]]) * bits // 8 - len(header)
-            while missing > 0 and (chunk := stream.read(1 << 22)):
-                missing -= len(chunk)
-    except (EOFError, OSError, zlib.error, struct.error):
-        missing = 1
-    if missing > 0:
-        raise InputError(f"{path}: truncated or damaged (its voxels are incomplete); copy or export it again")
 
 
 def _compact(volume: Volume) -> Volume:
@@ -246,14 +221,30 @@ def _compact(volume: Volume) -> Volume:
     return Volume(voxels, volume.spacing_mm, volume.origin_mm, volume.direction)
 
 
-def _reason(error: RuntimeError) -> str:
+def _reason(error: RuntimeError, path: Path) -> str:
     """Say in a few words what ITK's long message means; its paths and source lines help nobody."""
     text = str(error)
     if "orthonormal" in text.lower():
         return "its axes are not at right angles (a sheared affine)"
     if "Unable to determine ImageIO reader" in text:
         return "its content is not what its suffix says, or its header is damaged"
+    if path.suffix.lower() in _READ_ONLY_SUFFIXES:
+        return "the file of voxels that it names is missing, incomplete or damaged"
     return "its header or voxels cannot be read"
+
+
+@contextmanager
+def _quiet_itk() -> Iterator[None]:
+    """Keep ITK's and MetaIO's own lines off standard error, where they would bury ours."""
+    sitk.ProcessObject.SetGlobalWarningDisplay(False)
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
 
 
 def _inside(values: np.ndarray, label: int | None, path: Path) -> np.ndarray:
