@@ -24,7 +24,7 @@ from endopilot.imaging.contrast import refuse_other_units, refuse_without_contra
 from endopilot.types import Insertion, LumenMask, Volume
 
 _ROOT_MM = 5.0
-"""An ostium is on an aorta of 9 mm radius or more: nearer than this to the volume's edge, the aortic root is cut off."""
+"""An ostium is on an aorta of 9 mm radius or more: where it is nearer to the volume's edge, the root is cut off."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,6 +113,6 @@ def _refuse_cut_root(volume: Volume, ostium: Insertion) -> None:
     room = np.minimum(index, np.array(volume.voxels.shape[::-1]) - 1 - index) * volume.spacing_mm
     if room.min() < _ROOT_MM:
         raise InputError(
-            f"the vessel found begins {max(room.min(), 0.0):.0f} mm from the volume's edge: the ostium is probably outside; "
-            "give a CT that holds the aortic root, or seeds: where to begin first, then points along the vessel"
+            f"the vessel found begins {max(room.min(), 0.0):.0f} mm from the volume's edge: the ostium is probably "
+            "outside; give a CT that holds the aortic root, or seeds: the begin first, then points along the vessel"
         )
