@@ -32,7 +32,7 @@ def plain_method(tmp_path, monkeypatch):
     monkeypatch.delitem(__import__("sys").modules, f"{methods.__name__}.plain", raising=False)
 
 
-def _ball(radius_mm: float = 12.0) -> Volume:
+def _ball(radius_mm: float = 16.0) -> Volume:
     """Return a ball of blood in fat."""
     grid = empty_grid((30, 30, 30), 2.0, (-29.0, -29.0, -29.0))
     inside = np.linalg.norm(positions(grid), axis=-1) < radius_mm
@@ -105,7 +105,7 @@ def test_contrast_is_told_by_the_histogram(plain_method):
         segment(unenhanced, config)
     seeded = segment(unenhanced, SegmentConfig(method="plain", seeds=((30.0, 30.0, 25.0),)))
     assert seeded.volume.voxels.any()  # a seed says where blood is: the method looks there
-    hu[radius < 14.0] = 200.0
+    hu[radius < 15.0] = 200.0
     enhanced = Volume(hu + noise, grid.spacing_mm, grid.origin_mm, grid.direction)
     with pytest.raises(InputError, match="begins 0 mm from the volume's edge"):  # the plain method's ostium is a corner
         segment(enhanced, config)

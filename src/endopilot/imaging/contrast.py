@@ -14,10 +14,12 @@ _BLOCK_MM = 2.0
 """Voxels are averaged to blocks of about this size: noise goes, pools of blood stay."""
 _CALM_HU = 25.0
 """Tissue is homogeneous where its standard deviation over 3 × 3 × 3 blocks is smaller: blood is, bone is not."""
+_NOISE_FACTOR = 1.3
+"""In a noisy scan, the limit is this many times the lower quartile of that deviation in fat, muscle and blood."""
 _BRIGHTEST_HU = 900.0
 """Metal and dense bone lie above this, no blood does."""
-_LEAST_POOL_ML = 2.0
-"""The inside of the narrowest ascending aorta over 2 cm; homogeneous bone of the thorax comes in pieces of 1 ml."""
+_LEAST_POOL_ML = 5.0
+"""Less than the inside of any heart chamber; homogeneous bone of the thorax comes in pieces of 3 ml at most."""
 
 
 def refuse_other_units(volume: Volume) -> None:
@@ -41,18 +43,19 @@ def refuse_without_contrast(volume: Volume) -> None:
     above 130 HU; blood without measures 30 to 60 HU, like muscle.
 
     Raises:
-        InputError: no connected 2 ml of homogeneous tissue are that bright.
+        InputError: no connected 5 ml of homogeneous tissue are that bright.
     """
     blocks, size_mm = _blocks(volume)
     mean = ndimage.uniform_filter(blocks, 3)
     variance = ndimage.uniform_filter(blocks**2, 3) - mean**2
-    calm = variance < _CALM_HU**2
+    soft = (mean > -120.0) & (mean < LEAST_BLOOD_HU)
+    noise_hu = float(np.sqrt(max(np.percentile(variance[soft], 25), 0.0))) if soft.any() else 0.0
+    calm = variance < max(_CALM_HU, _NOISE_FACTOR * noise_hu) ** 2
     label, _ = ndimage.label(calm & (mean > LEAST_BLOOD_HU) & (mean < _BRIGHTEST_HU))  # pyright: ignore[reportGeneralTypeIssues]
     largest_ml = float(np.bincount(label.ravel())[1:].max(initial=0) * size_mm.prod() / 1000)
     if largest_ml < _LEAST_POOL_ML:
-        soft = mean[calm & (mean > -20.0)]
-        count, edge = np.histogram(soft, bins=np.arange(-20.0, 400.0, 10.0))
-        peak = f"peaks at {edge[count.argmax()] + 5.0:.0f} HU" if len(soft) else "is absent"
+        count, edge = np.histogram(mean[calm], bins=np.arange(-20.0, 400.0, 10.0))
+        peak = f"peaks at {edge[count.argmax()] + 5.0:.0f} HU" if count.any() else "is absent"
         raise InputError(
             f"no contrast: homogeneous soft tissue {peak}, and its largest piece above {LEAST_BLOOD_HU:.0f} HU, "
             f"as blood with contrast is, has {largest_ml:.1f} ml; give a CT angiogram in the arterial phase"

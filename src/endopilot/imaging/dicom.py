@@ -1,6 +1,6 @@
 """CT from DICOM: one series of axial-like slices, its geometry checked, its identifiers left behind.
 
-Headers are read with pydicom, restricted to the tags below, so that nothing that names a patient is ever in memory.
+Headers are read with pydicom, restricted to the tags below, so that nothing that names a patient is ever asked for.
 Pixels are decoded by GDCM through SimpleITK, which knows more compressions than pydicom alone; but for RLE, where GDCM
 does not come back from some damaged files.
 """
@@ -37,8 +37,6 @@ _TAGS = (
     "Rows",
     "Columns",
     "BitsAllocated",
-    "BitsStored",
-    "PixelRepresentation",
     "PixelSpacing",
     "ImagePositionPatient",
     "ImageOrientationPatient",

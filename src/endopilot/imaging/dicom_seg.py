@@ -18,7 +18,6 @@ from endopilot import __version__
 from endopilot.errors import InputError
 from endopilot.files import writing
 from endopilot.imaging.dicom_write import slice_headers
-from endopilot.imaging.grid import right_handed
 from endopilot.types import LumenMask, Volume
 
 SUFFIX = ".dcm"
@@ -47,7 +46,7 @@ def write_seg(mask: LumenMask, path: Path) -> None:
     hd = need_highdicom(path)
     from pydicom.sr.codedict import codes
 
-    volume = right_handed(mask.volume)
+    volume = mask.volume
     header = slice_headers(volume)[0]
     affine = np.eye(4)
     affine[:3, :3] = (volume.direction * volume.spacing_mm)[:, ::-1]
@@ -80,11 +79,8 @@ def write_seg(mask: LumenMask, path: Path) -> None:
         omit_empty_frames=False,
     )
     # highdicom asks for a source image; there is none that may be named.
-    for tag in ("ReferencedSeriesSequence", "SourceImageSequence"):
-        if tag in content:
-            delattr(content, tag)
-    for group in content.PerFrameFunctionalGroupsSequence:
-        group.DerivationImageSequence = []
+    del content.ReferencedSeriesSequence
+    del content.SourceImageSequence
     with writing(path) as partial:
         content.save_as(partial)
 

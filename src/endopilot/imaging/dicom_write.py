@@ -15,7 +15,6 @@ from pydicom.valuerep import format_number_as_ds
 
 from endopilot.errors import InputError
 from endopilot.files import writing
-from endopilot.imaging.grid import right_handed
 from endopilot.progress import progress
 from endopilot.types import Volume
 
@@ -40,7 +39,6 @@ def write_series(volume: Volume, folder: Path) -> None:
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder}: is there already; give a new folder for the DICOM series")
-    volume = right_handed(volume)
     voxels = np.clip(np.round(volume.voxels), -32768, 32767).astype("<i2")
     with writing(folder) as partial, progress("Writing DICOM slices", len(voxels)) as advance:
         partial.mkdir()
@@ -51,7 +49,7 @@ def write_series(volume: Volume, folder: Path) -> None:
 
 
 def slice_headers(volume: Volume) -> list[Dataset]:
-    """Return the header of every slice of a right-handed volume, pixels left out.
+    """Return the header of every slice of a volume, pixels left out.
 
     The UIDs are made from the volume's own content (PS3.5 B.2), so that nothing of another header is in them.
     """

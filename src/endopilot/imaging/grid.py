@@ -33,14 +33,6 @@ def from_image(image: sitk.Image) -> Volume:
     )
 
 
-def right_handed(volume: Volume) -> Volume:
-    """Return the same voxels at the same places with k along i × j, as DICOM stacks slices."""
-    if np.linalg.det(volume.direction) > 0:
-        return volume
-    last = volume.index_to_world(np.array([0.0, 0.0, len(volume.voxels) - 1]))
-    return Volume(volume.voxels[::-1], volume.spacing_mm, last, volume.direction * [1.0, 1.0, -1.0])
-
-
 def resample(volume: Volume, spacing_mm: float) -> Volume:
     """Return a volume on an isotropic grid, its axes in the order and sense nearest to LPS, as float32.
 
