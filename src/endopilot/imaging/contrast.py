@@ -18,8 +18,8 @@ _NOISE_FACTOR = 1.3
 """In a noisy scan, the limit is this many times the lower quartile of that deviation in fat, muscle and blood."""
 _BRIGHTEST_HU = 900.0
 """Metal and dense bone lie above this, no blood does."""
-_LEAST_POOL_ML = 5.0
-"""Less than the inside of any heart chamber; homogeneous bone of the thorax comes in pieces of 3 ml at most."""
+_LEAST_POOL_ML = 4.0
+"""Less than the inside of any heart chamber; homogeneous bone of the thorax comes in smaller pieces."""
 
 
 def refuse_other_units(volume: Volume) -> None:
@@ -43,7 +43,7 @@ def refuse_without_contrast(volume: Volume) -> None:
     above 130 HU; blood without measures 30 to 60 HU, like muscle.
 
     Raises:
-        InputError: no connected 5 ml of homogeneous tissue are that bright.
+        InputError: no connected 4 ml of homogeneous tissue are that bright.
     """
     blocks, size_mm = _blocks(volume)
     mean = ndimage.uniform_filter(blocks, 3)

@@ -19,7 +19,7 @@ import SimpleITK as sitk
 from jaxtyping import Float
 from pydicom.dataset import Dataset
 from pydicom.errors import InvalidDicomError
-from pydicom.pixels import pixel_array
+from pydicom.pixels.utils import pixel_array
 from pydicom.uid import UID
 
 from endopilot.errors import InputError
