@@ -8,6 +8,9 @@ import warnings
 import numpy as np
 import pydicom
 import pytest
+import SimpleITK as sitk
+from pydicom.uid import RLELossless
+from scipy.spatial.transform import Rotation
 
 from endopilot.errors import InputError
 from endopilot.imaging.volume import read_volume, write_mask, write_volume
@@ -28,11 +31,11 @@ _IDENTIFIERS = {
 }
 
 
-def _oblique_ct() -> Volume:
-    c, s = np.cos(np.radians(15)), np.sin(np.radians(15))
-    direction = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
-    voxels = np.random.default_rng(3).integers(-1000, 2000, (6, 7, 8)).astype(np.int16)
-    return Volume(voxels, np.array([0.4, 0.5, 0.75]), np.array([-20.0, -150.0, 80.5]), direction)
+def _oblique_ct(seed: int = 3) -> Volume:
+    """Return an anisotropic volume turned about two axes, its numbers of more digits than a header used to hold."""
+    direction = Rotation.from_euler("xz", [15, -8], degrees=True).as_matrix()
+    voxels = np.random.default_rng(seed).integers(-1000, 2000, (6, 7, 8)).astype(np.int16)
+    return Volume(voxels, np.array([0.390625, 0.5, 0.75]), np.array([-120.123456, -150.0, 1080.54321]), direction)
 
 
 @pytest.fixture
@@ -60,9 +63,95 @@ def test_a_series_keeps_its_geometry_and_hu(series):
         volume = read_volume(path)
         assert volume.voxels.dtype == np.int16
         np.testing.assert_array_equal(volume.voxels, expected.voxels)
-        np.testing.assert_allclose(volume.spacing_mm, expected.spacing_mm, atol=1e-4)
-        np.testing.assert_allclose(volume.origin_mm, expected.origin_mm, atol=1e-3)
-        np.testing.assert_allclose(volume.direction, expected.direction, atol=1e-5)
+        corners = np.array([[0.0, 0.0, 0.0], [7.0, 0.0, 5.0], [0.0, 6.0, 5.0], [7.0, 6.0, 0.0]])
+        np.testing.assert_allclose(volume.index_to_world(corners), expected.index_to_world(corners), atol=1e-6)
+
+
+def test_a_left_handed_volume_keeps_its_places(tmp_path):
+    right = _oblique_ct()
+    left = Volume(right.voxels, right.spacing_mm, right.origin_mm, right.direction * [1.0, 1.0, -1.0])
+    write_volume(left, tmp_path / "left")
+    again = read_volume(tmp_path / "left")
+    k, j, i = np.indices(left.voxels.shape).reshape(3, -1)
+    there = np.stack([i, j, k], axis=-1).astype(float)
+    back = np.round(again.world_to_index(left.index_to_world(there))).astype(int)
+    np.testing.assert_allclose(again.index_to_world(back), left.index_to_world(there), atol=1e-6)
+    np.testing.assert_array_equal(again.voxels[back[:, 2], back[:, 1], back[:, 0]], left.voxels[k, j, i])
+
+
+def test_the_same_volume_gives_the_same_bytes(tmp_path):
+    for name, seed in (("a", 3), ("b", 3), ("c", 4)):
+        write_volume(_oblique_ct(seed), tmp_path / name)
+    first, same, other = ((tmp_path / name / "slice-0002.dcm").read_bytes() for name in "abc")
+    assert first == same != other
+
+
+def test_series_are_found_in_subfolders(series, tmp_path):
+    nested = tmp_path / "disc" / "DICOM" / "S1"
+    nested.parent.mkdir(parents=True)
+    series.rename(nested)
+    for number, file in enumerate(sorted(nested.glob("*.dcm"))[::2]):
+        file.rename(nested.parent / f"IM{number}")
+    np.testing.assert_array_equal(read_volume(tmp_path / "disc").voxels, _oblique_ct().voxels)
+
+
+@pytest.mark.parametrize("compression", ["RLE", "JPEG", "JPEG2000"])
+def test_compressed_series_are_read_and_truncated_ones_refused(tmp_path, compression):
+    ct = Volume(np.tile(_oblique_ct().voxels, (1, 8, 8)), np.array([0.4, 0.4, 0.5]), np.zeros(3), np.eye(3))
+    folder = tmp_path / "series"
+    write_volume(ct, folder)
+    for file in folder.glob("*.dcm"):
+        slice_ = pydicom.dcmread(file)
+        if compression == "RLE":
+            slice_.compress(RLELossless)
+            slice_.save_as(file)
+            continue
+        writer = sitk.ImageFileWriter()  # ITK writes both without loss
+        writer.KeepOriginalImageUIDOn()
+        writer.UseCompressionOn()
+        writer.SetCompressor(compression)
+        writer.SetFileName(str(file))
+        writer.Execute(sitk.ReadImage(str(file)))
+    assert pydicom.dcmread(file).file_meta.TransferSyntaxUID.is_compressed
+    _change(folder, RescaleSlope="2", RescaleIntercept="-24")
+    np.testing.assert_array_equal(read_volume(folder).voxels, ct.voxels * 2 - 24)
+    file = sorted(folder.glob("*.dcm"))[2]
+    content = file.read_bytes()
+    for missing in (4, 90, len(content) // 4):
+        file.write_bytes(content[:-missing])
+        with pytest.raises(InputError, match=rf"{file.name}: its pixels cannot be decoded .truncated"):
+            read_volume(folder)
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ({"RescaleSlope": None}, "no RescaleSlope"),
+        ({"RescaleSlope": "0"}, "is wrong"),
+        ({"PixelSpacing": ["0", "1"]}, "is wrong"),
+        ({"ImageOrientationPatient": ["1", "0", "0", "1", "0", "0"]}, "is wrong"),
+        ({"ImageOrientationPatient": ["1", "0", "0"]}, "no ImageOrientationPatient"),
+        ({"SamplesPerPixel": None, "NumberOfFrames": None}, None),
+    ],
+)
+def test_empty_and_impossible_values_in_the_header(series, values, expected):
+    _change(series, **values)
+    if expected is None:
+        assert read_volume(series).voxels.shape == (6, 7, 8)
+        return
+    with pytest.raises(InputError, match=rf"slice-000\d.dcm: .*{expected}"):
+        read_volume(series)
+
+
+def test_a_header_that_is_no_number_is_told_without_its_content(series):
+    file = sorted(series.glob("*.dcm"))[1]
+    content = file.read_bytes()
+    at = content.index(b"\x28\x00\x30\x00DS") + 8  # PixelSpacing
+    file.write_bytes(content[:at] + b"Doe^Jane" + content[at + 8 :])
+    with pytest.raises(InputError, match=f"{file.name}: its DICOM header is damaged") as caught:
+        read_volume(series)
+    _assert_no_identifier(str(caught.value))
+    assert caught.value.__cause__ is None
 
 
 def test_the_order_of_the_files_does_not_matter(series):
@@ -80,15 +169,15 @@ def test_the_rescale_is_applied(series):
 
 def test_several_series_are_listed_and_one_is_chosen(series):
     second = series.parent / "second"
-    write_volume(_oblique_ct(), second)
+    write_volume(_oblique_ct(seed=5), second)
     uid = pydicom.dcmread(next(second.glob("*.dcm"))).SeriesInstanceUID
     _change(second, SeriesNumber=7, RescaleIntercept="100", SeriesDescription="Doe Jane late")
     for file in second.glob("*.dcm"):
         file.rename(series / f"late-{file.name}")
-    with pytest.raises(InputError, match=r"2 DICOM series \(1: CT, 6 slices of 8×7; 7: CT, .*choose one with series="):
+    with pytest.raises(InputError, match=r"2 DICOM series \(1: CT, 6 slices of 8×7; 7: CT, .*choose one with --series"):
         read_volume(series)
     for name in ("7", str(uid)):
-        np.testing.assert_array_equal(read_volume(series, series=name).voxels, _oblique_ct().voxels + 100)
+        np.testing.assert_array_equal(read_volume(series, series=name).voxels, _oblique_ct(seed=5).voxels + 100)
     np.testing.assert_array_equal(read_volume(series / "slice-0002.dcm").voxels, _oblique_ct().voxels)
     with pytest.raises(InputError, match="no series '9'"):
         read_volume(series, series="9")
@@ -134,7 +223,7 @@ def test_bad_series_are_refused_in_one_line(series, tmp_path, caplog):
         "twice": "several images at one slice position",
         "magnet": "modality MR",
         "few": "only 2 slices",
-        "mixed": "PixelSpacing differs",
+        "mixed": "PixelSpacing differ",
         "nowhere": "no ImagePositionPatient",
         "colour": "colour image",
         "frames": "multi-frame",

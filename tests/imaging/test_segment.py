@@ -2,23 +2,74 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from shapes import empty_grid
+from shapes import BLOOD_HU, empty_grid, positions
 
 from endopilot.errors import InputError
+from endopilot.imaging import methods
 from endopilot.imaging import segment as segmentation
 from endopilot.imaging.segment import SegmentConfig, available_methods, segment
-from endopilot.types import LumenMask
+from endopilot.types import Volume
+
+_METHOD = """
+import numpy as np
+from endopilot.types import Insertion, LumenMask, Volume
+
+OPTIONS = {"above": "200"}
+
+def segment_lumen(volume, config):
+    inside = volume.voxels > float(config.settings(OPTIONS)["above"])
+    ostium = Insertion(np.array(config.seeds[0] if config.seeds else (0.0, 0.0, 0.0)), np.array([0.0, 0.0, 1.0]))
+    return LumenMask(Volume(inside, volume.spacing_mm, volume.origin_mm, volume.direction), ostium)
+"""
+
+
+@pytest.fixture
+def plain_method(tmp_path, monkeypatch):
+    """Add a method by adding one file: what is bright is lumen."""
+    (tmp_path / "plain.py").write_text(_METHOD)
+    monkeypatch.setattr(methods, "__path__", [*methods.__path__, str(tmp_path)])
+    yield
+    monkeypatch.delitem(__import__("sys").modules, f"{methods.__name__}.plain", raising=False)
+
+
+def _ball(radius_mm: float = 16.0) -> Volume:
+    """Return a ball of blood in fat."""
+    grid = empty_grid((30, 30, 30), 2.0, (-29.0, -29.0, -29.0))
+    inside = np.linalg.norm(positions(grid), axis=-1) < radius_mm
+    return Volume(np.where(inside, BLOOD_HU, -90.0), grid.spacing_mm, grid.origin_mm, grid.direction)
 
 
 def test_a_method_is_a_module_of_the_methods_package():
-    assert available_methods() == ("aorta", "coronary")
+    assert available_methods() == ("aorta", "coronary", "nnunet", "totalsegmentator")
+
+
+def test_one_file_adds_a_method(plain_method):
+    assert "plain" in available_methods()
+    mask = segment(_ball(), SegmentConfig(method="plain"))
+    assert mask.method == "plain"
+    np.testing.assert_array_equal(mask.volume.voxels, _ball().voxels > 0)
+    with pytest.raises(InputError, match="method='plain' found no lumen"):
+        segment(_ball(), SegmentConfig(method="plain", options=("above=500",)))
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (("below=3",), r"'below=3' is no setting of method 'plain'; give above=…"),
+        (("above",), "'above' is no setting"),
+    ],
+)
+def test_a_setting_that_a_method_does_not_know_is_refused(plain_method, options, expected):
+    with pytest.raises(InputError, match=expected):
+        SegmentConfig(method="plain", options=options)
 
 
 @pytest.mark.parametrize(
     ("values", "expected"),
     [
-        ({"method": "magic"}, "method='magic' is unknown; choose one of aorta, coronary"),
+        ({"method": "magic"}, "method='magic' is unknown; choose one of aorta, coronary, nnunet, totalsegmentator"),
         ({"seeds": ((0.0, float("nan"), 0.0),)}, "three finite numbers"),
+        ({"options": ("device=cpu",)}, "no setting of method 'coronary'; leave --options out"),
     ],
 )
 def test_a_bad_configuration_is_refused(values, expected):
@@ -29,27 +80,35 @@ def test_a_bad_configuration_is_refused(values, expected):
 @pytest.mark.parametrize("method", ["aorta", "coronary"])
 def test_a_seed_outside_the_volume_is_told_with_the_volume_s_extent(method):
     grid = empty_grid((10, 20, 30), (1.0, 2.0, 3.0), (-5.0, 0.0, 100.0))
+    grid.voxels[:] = -50
     with pytest.raises(InputError, match=r"outside the volume.*x -5…24, y 0…38, z 100…127"):
         segment(grid, SegmentConfig(method=method, seeds=((0.0, 50.0, 110.0),)))
 
 
-def test_the_registry_calls_the_method_and_names_it(monkeypatch):
-    """A method that finds nothing is an error; one that finds a voxel is named in the mask."""
-    from endopilot.imaging.methods import aorta
+def test_a_lost_rescale_is_told(plain_method):
+    ball = _ball()
+    raw = Volume(ball.voxels + 1024, ball.spacing_mm, ball.origin_mm, ball.direction)
+    with pytest.raises(InputError, match=r"from 934 to 1424, but fat, lung and air are below 0 HU"):
+        segment(raw, SegmentConfig(method="plain", seeds=((0.0, 0.0, 0.0),)))
 
-    grid = empty_grid((4, 4, 4), 1.0, (0.0, 0.0, 0.0))
-    found = grid.voxels.astype(bool)
 
-    def stand_in(volume, config):
-        return LumenMask(type(volume)(found, volume.spacing_mm, volume.origin_mm, volume.direction))
-
-    monkeypatch.setattr(aorta, "segment_lumen", stand_in)
-    with pytest.raises(InputError, match="found no lumen"):
-        segment(grid, SegmentConfig(method="aorta"))
-    found[1, 2, 3] = True
-    mask = segment(grid, SegmentConfig(method="aorta"))
-    assert mask.method == "aorta"
-    assert np.argwhere(mask.volume.voxels).tolist() == [[1, 2, 3]]
+def test_contrast_is_told_by_the_histogram(plain_method):
+    """Muscle at 50 HU with bone: a shell of 3 mm and noise fill no millilitre of homogeneous bright tissue."""
+    grid = empty_grid((50, 60, 60), 1.0, (0.0, 0.0, 0.0))
+    radius = np.linalg.norm(positions(grid) - [30.0, 30.0, 25.0], axis=-1)
+    hu = np.where(radius < 22.0, 50.0, -90.0)
+    hu[(radius > 17.0) & (radius < 20.0)] = 600.0
+    noise = np.random.default_rng(0).normal(0.0, 25.0, hu.shape)
+    config = SegmentConfig(method="plain")
+    unenhanced = Volume(hu + noise, grid.spacing_mm, grid.origin_mm, grid.direction)
+    with pytest.raises(InputError, match=r"no contrast: homogeneous soft tissue peaks at (45|55) HU, .*has 0.\d ml"):
+        segment(unenhanced, config)
+    seeded = segment(unenhanced, SegmentConfig(method="plain", seeds=((30.0, 30.0, 25.0),)))
+    assert seeded.volume.voxels.any()  # a seed says where blood is: the method looks there
+    hu[radius < 15.0] = 200.0
+    enhanced = Volume(hu + noise, grid.spacing_mm, grid.origin_mm, grid.direction)
+    with pytest.raises(InputError, match="begins 0 mm from the volume's edge"):  # the plain method's ostium is a corner
+        segment(enhanced, config)
 
 
 def test_importing_the_stage_loads_no_method():

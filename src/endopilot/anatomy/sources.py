@@ -14,7 +14,7 @@ from endopilot.anatomy.surface import Surface
 from endopilot.errors import InputError
 from endopilot.types import LumenMask, VesselTree
 
-MASK_SUFFIXES = (".nii.gz", ".nii", ".nrrd", ".nhdr", ".mha", ".mhd")
+MASK_SUFFIXES = (".nii.gz", ".nii", ".nrrd", ".nhdr", ".mha", ".mhd", ".dcm")
 SURFACE_SUFFIXES = (".stl", ".obj", ".ply", ".vtp", ".vtk")
 RADIUS_NAMES = ("maximuminscribedsphereradius", "misr", "radius", "radii")
 """Names of the point array or measurement that holds radii, in lower case: VMTK's, Slicer's, and plain ones."""
@@ -54,8 +54,8 @@ def read_source(path: str | Path, *, label: int | None = None) -> AnatomySource:
     """Read a vessel from a mask, a surface or centerlines; the kind follows from the file.
 
     Args:
-        path: mask (NIfTI, NRRD, MHA), surface (STL, OBJ, PLY, VTP, VTK) or centerline (VTP with lines and radii, as
-            VMTK writes it, or a Slicer markups curve `.mrk.json` with a radius measurement).
+        path: mask (NIfTI, NRRD, MHA, DICOM-SEG), surface (STL, OBJ, PLY, VTP, VTK) or centerline (VTP with lines and
+            radii, as VMTK writes it, or a Slicer markups curve `.mrk.json` with a radius measurement).
         label: which label of a mask with several is the lumen.
 
     Raises:

@@ -28,7 +28,8 @@ def command(
     and ParaView open them.
 
     Args:
-        source: mask (NIfTI, NRRD, MHA), surface (STL, OBJ, PLY, VTP), or centerline with radii (VTP, Slicer .mrk.json).
+        source: mask (NIfTI, NRRD, MHA, DICOM-SEG), surface (STL, OBJ, PLY, VTP), or centerline with radii (VTP, Slicer
+            .mrk.json).
         output: folder of the anatomy.
         name: name of the patient in datasets and reports; that of the folder by default.
         label: which label of a mask with several to take.

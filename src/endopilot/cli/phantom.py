@@ -9,7 +9,7 @@ from tyro.conf import Positional
 from endopilot.anatomy.io import read_anatomy
 from endopilot.anatomy.phantom import PhantomConfig, make_phantom
 from endopilot.cli.arguments import OutputFile, existing, show
-from endopilot.imaging.volume import write_volume
+from endopilot.imaging.volume import check_output, write_volume
 
 
 def command(
@@ -25,11 +25,12 @@ def command(
 
     Args:
         anatomy: folder made by `endopilot anatomy` or `endopilot atlas`.
-        output: the volume in HU: .nii.gz, .nrrd or .mha.
+        output: the volume in HU: .nii.gz, .nrrd, .mha, or a new folder without suffix for DICOM slices.
         seed: seed of noise and of the surroundings.
         json: print the figures as JSON.
         config: scanner and contrast.
     """
+    check_output(output)
     volume = make_phantom(read_anatomy(existing(anatomy)), config, seed)
     write_volume(volume, output)
     nz, ny, nx = volume.voxels.shape

@@ -11,7 +11,7 @@ from endopilot.cli.arguments import OutputFile, existing, show
 from endopilot.files import input_hash, manifest
 from endopilot.imaging.overlap import compare_masks
 from endopilot.imaging.segment import SegmentConfig, segment
-from endopilot.imaging.volume import read_mask, read_volume, write_mask
+from endopilot.imaging.volume import check_output, read_mask, read_volume, write_mask
 
 
 def command(
@@ -31,13 +31,14 @@ def command(
 
     Args:
         volume: DICOM folder or file, NIfTI, NRRD or MHA, in HU.
-        output: the mask: .nii.gz, .nrrd or .mha.
+        output: the mask: .nii.gz, .nrrd, .mha, or .dcm for DICOM-SEG (needs the extra dicom-seg).
         series: number or instance UID of the series, where a DICOM folder holds several.
         reference: another mask of the same vessel; how far both agree is printed, and it is red in the picture.
         picture: PNG of three slices with the mask's outline in green.
         json: print the figures as JSON.
         config: how to segment.
     """
+    check_output(output, mask=True)
     other = read_mask(existing(reference)) if reference is not None else None
     ct = read_volume(existing(volume), series=series)
     mask = segment(ct, config)

@@ -1,7 +1,8 @@
-"""CT as DICOM: one series of axial-like slices, its geometry checked, its identifiers left behind.
+"""CT from DICOM: one series of axial-like slices, its geometry checked, its identifiers left behind.
 
-Headers are read with pydicom, restricted to the tags below, so that nothing that names a patient is ever in memory.
-Pixels are decoded by GDCM through SimpleITK, which knows more compressions than pydicom alone and applies the rescale.
+Headers are read with pydicom, restricted to the tags below, so that nothing that names a patient is ever asked for.
+Pixels are decoded by GDCM through SimpleITK, which knows more compressions than pydicom alone; but for RLE, where GDCM
+does not come back from some damaged files.
 """
 
 from __future__ import annotations
@@ -16,12 +17,12 @@ import numpy as np
 import pydicom
 import SimpleITK as sitk
 from jaxtyping import Float
-from pydicom.dataset import Dataset, FileMetaDataset
+from pydicom.dataset import Dataset
 from pydicom.errors import InvalidDicomError
-from pydicom.uid import UID, CTImageStorage, ExplicitVRLittleEndian, generate_uid
+from pydicom.pixels.utils import pixel_array
+from pydicom.uid import UID
 
 from endopilot.errors import InputError
-from endopilot.files import writing
 from endopilot.progress import progress
 from endopilot.types import Volume
 
@@ -36,8 +37,6 @@ _TAGS = (
     "Rows",
     "Columns",
     "BitsAllocated",
-    "BitsStored",
-    "PixelRepresentation",
     "PixelSpacing",
     "ImagePositionPatient",
     "ImageOrientationPatient",
@@ -45,14 +44,16 @@ _TAGS = (
     "RescaleIntercept",
 )
 
-# Transfer syntaxes that GDCM decodes: uncompressed, deflated, RLE, JPEG, JPEG-LS, JPEG 2000.
+# Transfer syntaxes that are decoded: uncompressed, deflated, RLE, JPEG, JPEG-LS, JPEG 2000.
 _UNCOMPRESSED = ("1.2.840.10008.1.2", "1.2.840.10008.1.2.1", "1.2.840.10008.1.2.2")
-_DECODED = (
-    *_UNCOMPRESSED,
-    "1.2.840.10008.1.2.1.99",
-    "1.2.840.10008.1.2.5",
-    *(f"1.2.840.10008.1.2.4.{number}" for number in (50, 51, 57, 70, 80, 81, 90, 91)),
-)
+_DEFLATED = "1.2.840.10008.1.2.1.99"
+_RLE = "1.2.840.10008.1.2.5"
+_ENCAPSULATED = (_RLE, *(f"1.2.840.10008.1.2.4.{number}" for number in (50, 51, 57, 70, 80, 81, 90, 91)))
+_DECODED = (*_UNCOMPRESSED, _DEFLATED, *_ENCAPSULATED)
+
+# Encapsulated pixels begin and end with these bytes (PS3.5 A.4).
+_PIXELS_BEGIN = (b"\xe0\x7f\x10\x00OB\0\0\xff\xff\xff\xff", b"\xe0\x7f\x10\x00OW\0\0\xff\xff\xff\xff")
+_PIXELS_END = b"\xfe\xff\xdd\xe0\0\0\0\0"
 
 _TILT_TOLERANCE_DEGREES = 0.1
 _SPACING_TOLERANCE = 0.05
@@ -60,15 +61,39 @@ _SPACING_TOLERANCE = 0.05
 _FEWEST_SLICES = 4
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Slice:
-    """What the header of one file says, identifiers left out."""
+    """What the header of one file says, identifiers left out; None and empty where it says nothing.
+
+    Attributes:
+        path: the file.
+        series_uid: SeriesInstanceUID.
+        series_number: SeriesNumber.
+        modality: Modality.
+        transfer_syntax: UID of the encoding.
+        size: Rows, Columns.
+        bytes_per_value: of the stored pixels.
+        samples: values a pixel.
+        frames: images in the file.
+        rescale: RescaleSlope, RescaleIntercept.
+        spacing_mm: PixelSpacing: between rows, between columns.
+        position: ImagePositionPatient, LPS mm.
+        orientation: ImageOrientationPatient.
+    """
 
     path: Path
     series_uid: str
     series_number: int | None
+    modality: str
     transfer_syntax: str
-    header: Dataset
+    size: tuple[int, int]
+    bytes_per_value: int
+    samples: int
+    frames: int
+    rescale: tuple[float, ...]
+    spacing_mm: tuple[float, ...]
+    position: tuple[float, ...]
+    orientation: tuple[float, ...]
 
 
 def is_dicom(path: Path) -> bool:
@@ -81,52 +106,69 @@ def read_series(path: Path, series: str | None) -> Volume:
     """Read a CT series in HU.
 
     Args:
-        path: a folder, or one file of the series wanted.
+        path: a folder, its subfolders searched too, or one file of the series wanted.
         series: number or SeriesInstanceUID of the series to take where the folder holds several.
 
     Raises:
         InputError: there is no image or more than one series, or the series is no plain CT volume.
     """
     folder = path if path.is_dir() else path.parent
-    slices = _read_headers(folder)
-    if path.is_file():
+    slices = _read_headers(sorted(file for file in (folder.rglob("*") if path == folder else folder.iterdir())))
+    if not slices:
+        raise InputError(f"{path}: no DICOM image here; give the folder that holds the slices of a CT series")
+    if path != folder:
         slices = [slice_ for slice_ in slices if slice_.series_uid == _series_of(path, slices)]
     chosen = _choose(slices, series, folder)
     _check_slices(chosen, folder)
     ordered, spacing, origin, direction = _geometry(chosen, folder)
-    return Volume(_read_pixels(ordered, folder), spacing, origin, direction)
+    return Volume(_read_pixels(ordered), spacing, origin, direction)
 
 
-def _read_headers(folder: Path) -> list[_Slice]:
-    """Return the header of every DICOM image in a folder, other files and scout views left out."""
-    files = sorted(file for file in folder.iterdir() if file.is_file())
+def _read_headers(files: Sequence[Path]) -> list[_Slice]:
+    """Return the headers of DICOM images, other files and scout views left out."""
     found = []
     # pydicom's warnings quote header values; none may reach a log.
     with progress("Reading DICOM headers", len(files)) as advance, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         for file in files:
             advance()
+            if not file.is_file():
+                continue
             try:
                 header = pydicom.dcmread(file, stop_before_pixels=True, specific_tags=list(_TAGS))
+                if "Rows" in header and "LOCALIZER" not in (header.get("ImageType") or ()):
+                    found.append(_slice(file, header))
             except InvalidDicomError:
                 continue
             except Exception:
+                # Whatever pydicom says may quote the header: it ends here.
                 raise InputError(f"{file}: its DICOM header is damaged; copy or export the series again") from None
-            if "Rows" not in header or "LOCALIZER" in header.get("ImageType", ()):
-                continue
-            number = header.get("SeriesNumber")
-            found.append(
-                _Slice(
-                    path=file,
-                    series_uid=str(header.get("SeriesInstanceUID", "")),
-                    series_number=None if number is None else int(number),
-                    transfer_syntax=str(header.file_meta.get("TransferSyntaxUID", _UNCOMPRESSED[0])),
-                    header=header,
-                )
-            )
-    if not found:
-        raise InputError(f"{folder}: no DICOM image in this folder; give the folder that holds the slices themselves")
     return found
+
+
+def _slice(file: Path, header: Dataset) -> _Slice:
+    """Take what is needed out of a header; any error speaks for a damaged one."""
+
+    def numbers(tag: str) -> tuple[float, ...]:
+        value = header.get(tag)
+        return tuple(float(x) for x in np.atleast_1d(value)) if value not in (None, "") else ()
+
+    number = header.get("SeriesNumber")
+    return _Slice(
+        path=file,
+        series_uid=str(header.get("SeriesInstanceUID", "")),
+        series_number=None if number is None else int(number),
+        modality=str(header.get("Modality") or "CT"),
+        transfer_syntax=str(header.file_meta.get("TransferSyntaxUID", _UNCOMPRESSED[0])),
+        size=(int(header.Rows), int(header.Columns)),
+        bytes_per_value=int(header.get("BitsAllocated") or 16) // 8,
+        samples=int(header.get("SamplesPerPixel") or 1),
+        frames=int(header.get("NumberOfFrames") or 1),
+        rescale=numbers("RescaleSlope")[:1] + numbers("RescaleIntercept")[:1],
+        spacing_mm=numbers("PixelSpacing"),
+        position=numbers("ImagePositionPatient"),
+        orientation=numbers("ImageOrientationPatient"),
+    )
 
 
 def _series_of(path: Path, slices: Sequence[_Slice]) -> str:
@@ -156,54 +198,69 @@ def _choose(slices: Sequence[_Slice], series: str | None, folder: Path) -> list[
         if series in (name, group[0].series_uid):
             return group
     listed = "; ".join(
-        f"{name}: {group[0].header.get('Modality', '?')}, {len(group)} slices of "
-        f"{group[0].header.Columns}×{group[0].header.Rows}"
+        f"{name}: {group[0].modality}, {len(group)} slices of {group[0].size[1]}×{group[0].size[0]}"
         for name, group in zip(names, groups, strict=True)
     )
     if series is None:
-        raise InputError(f"{folder}: {len(groups)} DICOM series ({listed}); choose one with series=")
-    raise InputError(f"{folder}: no series {series!r} (the folder holds {listed}); choose one with series=")
+        raise InputError(f"{folder}: {len(groups)} DICOM series ({listed}); choose one with --series")
+    raise InputError(f"{folder}: no series {series!r} (the folder holds {listed}); choose one with --series")
 
 
 def _check_slices(slices: Sequence[_Slice], folder: Path) -> None:
     """Refuse a series that is no CT of plain single-frame slices that can be decoded."""
     for slice_ in slices:
-        header, name = slice_.header, slice_.path.name
-        if header.get("Modality", "CT") != "CT":
-            raise InputError(f"{folder}: modality {header.Modality}; HU are needed, give a CT series")
-        if int(header.get("SamplesPerPixel", 1)) != 1:
-            raise InputError(f"{folder}/{name}: a colour image (RGB); give the grey-level CT series")
-        if int(header.get("NumberOfFrames", 1) or 1) != 1:
-            raise InputError(f"{folder}/{name}: a multi-frame file; export one file a slice, or NIfTI")
+        path = slice_.path
+        if slice_.modality != "CT":
+            raise InputError(f"{folder}: modality {slice_.modality}; HU are needed, give a CT series")
+        if slice_.samples != 1:
+            raise InputError(f"{path}: a colour image (RGB); give the grey-level CT series")
+        if slice_.frames != 1:
+            raise InputError(f"{path}: a multi-frame file; export one file a slice, or NIfTI")
         if slice_.transfer_syntax not in _DECODED:
             raise InputError(
-                f"{folder}/{name}: compressed as {UID(slice_.transfer_syntax).name}, which is not supported; "
+                f"{path}: compressed as {UID(slice_.transfer_syntax).name}, which is not supported; "
                 "decompress the series (gdcmconv --raw) or export it uncompressed"
             )
-        missing = [
-            tag for tag in ("ImagePositionPatient", "ImageOrientationPatient", "PixelSpacing") if not header.get(tag)
-        ]
-        if missing:
-            raise InputError(f"{folder}/{name}: no {missing[0]} in its header; export the series with its geometry")
-        needed = int(header.Rows) * int(header.Columns) * int(header.get("BitsAllocated", 16)) // 8
-        if slice_.transfer_syntax in _UNCOMPRESSED and slice_.path.stat().st_size < needed:
-            raise InputError(f"{folder}/{name}: truncated, its pixels are incomplete; copy or export the series again")
+        for tag, value, count in (
+            ("ImagePositionPatient", slice_.position, 3),
+            ("ImageOrientationPatient", slice_.orientation, 6),
+            ("PixelSpacing", slice_.spacing_mm, 2),
+            ("RescaleSlope and RescaleIntercept", slice_.rescale, 2),
+        ):
+            if len(value) != count or not np.isfinite(value).all():
+                raise InputError(f"{path}: no {tag} in its header; export the series anew with its whole header")
+        if min(slice_.spacing_mm) <= 0 or slice_.rescale[0] == 0 or not _is_rotation(slice_.orientation):
+            raise InputError(f"{path}: PixelSpacing, RescaleSlope or ImageOrientationPatient is wrong; export it anew")
+        needed = slice_.size[0] * slice_.size[1] * slice_.bytes_per_value
+        if slice_.transfer_syntax in _UNCOMPRESSED and path.stat().st_size < needed:
+            raise InputError(f"{path}: truncated, its pixels are incomplete; copy or export the series again")
     if len(slices) < _FEWEST_SLICES:
         raise InputError(f"{folder}: only {len(slices)} slices; give a series of at least {_FEWEST_SLICES}")
-    for tag in ("Rows", "Columns", "PixelSpacing", "ImageOrientationPatient"):
-        values = [np.atleast_1d(np.asarray(slice_.header.get(tag), dtype=float)) for slice_ in slices]
-        if any(not np.allclose(value, values[0], atol=1e-3) for value in values):
-            raise InputError(f"{folder}: {tag} differs between slices; give a folder with one volume alone")
+    for tag, values in (
+        ("Rows and Columns", [slice_.size for slice_ in slices]),
+        ("PixelSpacing", [slice_.spacing_mm for slice_ in slices]),
+        ("ImageOrientationPatient", [slice_.orientation for slice_ in slices]),
+    ):
+        if np.ptp(np.array(values, dtype=float), axis=0).max() > 1e-3:
+            raise InputError(f"{folder}: {tag} differ between slices; give a folder with one volume alone")
+
+
+def _is_rotation(orientation: tuple[float, ...]) -> bool:
+    """Tell whether two directions are unit vectors at right angles."""
+    axes = np.array(orientation).reshape(2, 3)
+    return bool(np.allclose(axes @ axes.T, np.eye(2), atol=1e-3))
 
 
 def _geometry(
     slices: Sequence[_Slice], folder: Path
 ) -> tuple[list[_Slice], Float[np.ndarray, "3"], Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
     """Return slices in order, spacing, origin and direction (DICOM PS3.3 C.7.6.2.1.1), gaps and tilt refused."""
-    orientation = np.array(slices[0].header.ImageOrientationPatient, dtype=float)
-    along_i, along_j = orientation[:3], orientation[3:]
+    along_i, along_j = np.array(slices[0].orientation).reshape(2, 3)
+    along_i = along_i / np.linalg.norm(along_i)
     normal = np.cross(along_i, along_j)
-    positions = np.array([slice_.header.ImagePositionPatient for slice_ in slices], dtype=float)
+    normal /= np.linalg.norm(normal)
+    along_j = np.cross(normal, along_i)  # headers hold few digits: the axes are made orthonormal again
+    positions = np.array([slice_.position for slice_ in slices])
     order = np.argsort(positions @ normal, kind="stable")
     positions = positions[order]
     steps = np.diff(positions @ normal)
@@ -227,32 +284,27 @@ def _geometry(
         raise InputError(
             f"{folder}: gantry tilt of {tilt:.1f}°; resample the series to straight slices (such as dcm2niix does)"
         )
-    rows_mm, columns_mm = (float(value) for value in slices[0].header.PixelSpacing)
+    rows_mm, columns_mm = slices[0].spacing_mm
     spacing = np.array([columns_mm, rows_mm, (travel @ normal) / (len(slices) - 1)])
     return [slices[i] for i in order], spacing, positions[0], np.stack([along_i, along_j, normal], axis=1)
 
 
-def _read_pixels(slices: Sequence[_Slice], folder: Path) -> np.ndarray:
+def _read_pixels(slices: Sequence[_Slice]) -> np.ndarray:
     """Decode slices in the order given and return HU: int16 where all are whole numbers that fit, else float32."""
-    whole = all(
-        float(slice_.header.get(tag, default)).is_integer()
-        for slice_ in slices
-        for tag, default in (("RescaleSlope", 1.0), ("RescaleIntercept", 0.0))
-    )
-    rows, columns = int(slices[0].header.Rows), int(slices[0].header.Columns)
-    voxels = np.empty((len(slices), rows, columns), dtype=np.float32)
+    whole = all(number.is_integer() for slice_ in slices for number in slice_.rescale)
+    voxels = np.empty((len(slices), *slices[0].size), dtype=np.float32)
     sitk.ProcessObject.SetGlobalWarningDisplay(False)  # GDCM's own lines may quote header values
     reader = sitk.ImageFileReader()
     reader.SetImageIO("GDCMImageIO")
-    with progress("Reading DICOM slices", len(slices)) as advance:
+    with progress("Reading DICOM slices", len(slices)) as advance, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
         for slice_, plane in zip(slices, voxels, strict=True):
-            reader.SetFileName(str(slice_.path))
             try:
-                plane[:] = sitk.GetArrayFromImage(reader.Execute()).reshape(rows, columns)
-            except (RuntimeError, ValueError):
-                # GDCM's message may quote the header: it ends here.
+                plane[:] = _decoded(slice_, reader).reshape(plane.shape)
+            except Exception:
+                # What the decoder says may quote the header: it ends here.
                 raise InputError(
-                    f"{folder}/{slice_.path.name}: its pixels cannot be decoded (truncated or damaged); "
+                    f"{slice_.path}: its pixels cannot be decoded (truncated or damaged); "
                     "copy or export the series again"
                 ) from None
             advance()
@@ -262,53 +314,15 @@ def _read_pixels(slices: Sequence[_Slice], folder: Path) -> np.ndarray:
     return voxels
 
 
-def write_series(volume: Volume, folder: Path) -> None:
-    """Write a CT volume as a DICOM series, one uncompressed file a slice, without any patient's data.
-
-    HU are rounded to whole numbers.
-
-    Args:
-        volume: CT in HU.
-        folder: a new folder.
-
-    Raises:
-        InputError: the folder is there already, or cannot be written.
-    """
-    if folder.exists():
-        raise InputError(f"{folder}: is there already; give a new folder for the DICOM series")
-    voxels = np.clip(np.round(volume.voxels), -32768, 32767).astype("<i2")
-    normal = np.cross(volume.direction[:, 0], volume.direction[:, 1])
-    if normal @ volume.direction[:, 2] < 0:
-        raise InputError(f"{folder}: DICOM slices must be right-handed; write the volume as .nii.gz instead")
-    frame, study, series = generate_uid(), generate_uid(), generate_uid()
-    with writing(folder) as partial, progress("Writing DICOM slices", len(voxels)) as advance:
-        partial.mkdir()
-        for k, plane in enumerate(voxels):
-            header = _slice_header(volume, k)
-            header.FrameOfReferenceUID, header.StudyInstanceUID, header.SeriesInstanceUID = frame, study, series
-            header.PixelData = plane.tobytes()
-            header.save_as(partial / f"slice-{k:04d}.dcm", enforce_file_format=True)
-            advance()
-
-
-def _slice_header(volume: Volume, k: int) -> Dataset:
-    """Return the header of slice `k`, identifiers left out (type 2 attributes are present and empty)."""
-    header = Dataset()
-    header.file_meta = FileMetaDataset()
-    header.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
-    header.SOPClassUID = header.file_meta.MediaStorageSOPClassUID = CTImageStorage
-    header.SOPInstanceUID = header.file_meta.MediaStorageSOPInstanceUID = generate_uid()
-    for empty in ("PatientName", "PatientID", "PatientBirthDate", "PatientSex", "StudyDate", "StudyTime", "StudyID"):
-        setattr(header, empty, "")
-    header.ReferringPhysicianName = header.AccessionNumber = header.Manufacturer = ""
-    header.Modality, header.ImageType = "CT", ["DERIVED", "SECONDARY", "AXIAL"]
-    header.SeriesNumber, header.InstanceNumber = 1, k + 1
-    header.ImagePositionPatient = [f"{x:.6g}" for x in volume.index_to_world(np.array([0.0, 0.0, k]))]
-    header.ImageOrientationPatient = [f"{x:.8g}" for x in volume.direction[:, :2].T.ravel()]
-    header.PixelSpacing = [f"{volume.spacing_mm[1]:.8g}", f"{volume.spacing_mm[0]:.8g}"]
-    header.SliceThickness = f"{volume.spacing_mm[2]:.8g}"
-    header.Rows, header.Columns = volume.voxels.shape[1:]
-    header.SamplesPerPixel, header.PhotometricInterpretation = 1, "MONOCHROME2"
-    header.BitsAllocated, header.BitsStored, header.HighBit, header.PixelRepresentation = 16, 16, 15, 1
-    header.RescaleSlope, header.RescaleIntercept, header.RescaleType = 1, 0, "HU"
-    return header
+def _decoded(slice_: _Slice, reader: sitk.ImageFileReader) -> np.ndarray:
+    """Return the HU of one slice; any error speaks for damaged pixels."""
+    if slice_.transfer_syntax in _ENCAPSULATED:
+        content = slice_.path.read_bytes()
+        begin = max(content.rfind(mark) for mark in _PIXELS_BEGIN)
+        if begin < 0 or content.rfind(_PIXELS_END) < begin:
+            raise ValueError("encapsulated pixels without an end")
+    if slice_.transfer_syntax == _RLE:
+        slope, intercept = slice_.rescale
+        return pixel_array(slice_.path) * np.float32(slope) + np.float32(intercept)
+    reader.SetFileName(str(slice_.path))
+    return sitk.GetArrayFromImage(reader.Execute())

@@ -1,17 +1,15 @@
 """Reading and writing volumes and masks, in LPS mm, whatever the file format.
 
-CT comes from a DICOM series or from NIfTI, NRRD or MHA; masks from the last three. SimpleITK turns RAS files into LPS
-and applies the rescale slope and intercept, so that voxels are HU; what it reads without complaint although it is not
-one plain three-dimensional CT is refused here in one line.
+CT comes from a DICOM series or from NIfTI, NRRD or MHA; masks from the last three or DICOM-SEG. SimpleITK turns RAS
+files into LPS and applies the rescale slope and intercept, so that voxels are HU; what it reads without complaint
+although it is not one plain three-dimensional CT is refused here in one line.
 """
 
 from __future__ import annotations
 
-import gzip
-import math
-import struct
-import zlib
-from collections.abc import Mapping
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +18,18 @@ import SimpleITK as sitk
 
 from endopilot.errors import InputError
 from endopilot.files import read_json, write_json, writing
-from endopilot.imaging.dicom import is_dicom, read_series, write_series
+from endopilot.imaging import dicom_seg
+from endopilot.imaging.dicom import is_dicom, read_series
+from endopilot.imaging.dicom_write import write_series
 from endopilot.imaging.grid import from_image, to_image
+from endopilot.imaging.nifti import check_nifti
 from endopilot.types import Insertion, LumenMask, Volume
 
 SUFFIXES = (".nii.gz", ".nii", ".nrrd", ".mha")
 """File formats that are read and written, by suffix."""
+
+MASK_SUFFIXES = (*SUFFIXES, dicom_seg.SUFFIX)
+"""File formats of masks, by suffix; the last is a DICOM-SEG object."""
 
 _READ_ONLY_SUFFIXES = (".mhd", ".nhdr")
 _SMALLEST_SIZE = 4
@@ -51,8 +55,11 @@ def read_volume(path: str | Path, *, series: str | None = None) -> Volume:
     path = Path(path)
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; check the path")
-    if path.is_dir() or (_suffix(path) is None and is_dicom(path)):
-        return read_series(path, series)
+    try:
+        if path.is_dir() or (_suffix(path) is None and is_dicom(path)):
+            return read_series(path, series)
+    except PermissionError as error:
+        raise InputError(f"{path}: may not be read ({error.strerror}); ask for access to it") from error
     if series is not None:
         raise InputError(f"{path}: series={series!r} was given, but only DICOM has series; leave the option out")
     volume = _read_file(path)
@@ -61,24 +68,44 @@ def read_volume(path: str | Path, *, series: str | None = None) -> Volume:
     return volume
 
 
+def check_output(path: str | Path, *, mask: bool = False) -> None:
+    """Refuse a name that nothing could be written under, before the work is done.
+
+    Args:
+        path: where a volume, or a mask, is to be written.
+        mask: it is a mask; a volume may go to a folder of DICOM slices too, a mask to a DICOM-SEG object.
+
+    Raises:
+        InputError: the suffix is unknown, the folder holds something, or highdicom is absent.
+    """
+    path = Path(path)
+    if mask and path.suffix.lower() == dicom_seg.SUFFIX:
+        dicom_seg.need_highdicom(path)
+    elif not mask and path.suffix == "":
+        if path.exists() and (not path.is_dir() or any(path.iterdir())):
+            raise InputError(f"{path}: is there already; give a new folder for the DICOM series")
+    elif _suffix(path) not in SUFFIXES:
+        others = f"or {dicom_seg.SUFFIX} (DICOM-SEG)" if mask else "or a folder without suffix for DICOM slices"
+        raise InputError(f"{path}: unknown format; name the output with one of {', '.join(SUFFIXES)}, {others}")
+
+
 def write_volume(volume: Volume, path: str | Path) -> None:
     """Write a volume; the suffix of `path` chooses the format, and a path without suffix makes a DICOM series.
 
-    Booleans are written as uint8.
+    Booleans are written as uint8; a DICOM series holds whole HU.
 
     Args:
         volume: the volume.
-        path: a file ending in .nii.gz, .nii, .nrrd or .mha, or a folder for a DICOM series of CT images.
+        path: a file ending in .nii.gz, .nii, .nrrd or .mha, or a new folder for a DICOM series of CT images.
 
     Raises:
-        InputError: the suffix is unknown, the folder cannot be written, or the disk is full.
+        InputError: the suffix is unknown, the folder holds something or cannot be written, or the disk is full.
     """
     path = Path(path)
+    check_output(path)
     if path.suffix == "":
         write_series(volume, path)
         return
-    if _suffix(path) not in SUFFIXES:
-        raise InputError(f"{path}: unknown format; name the output with one of {', '.join(SUFFIXES)}")
     with writing(path) as partial:
         try:
             # Level 1 costs a few percent in size and saves most of the time.
@@ -93,7 +120,7 @@ def read_mask(path: str | Path, *, label: int | None = None) -> LumenMask:
     """Read the mask of one vessel, with its ostium where `write_mask` left a sidecar JSON beside it.
 
     Args:
-        path: a NIfTI, NRRD or MHA file of whole numbers, 0 outside.
+        path: a NIfTI, NRRD or MHA file of whole numbers, 0 outside, or a DICOM-SEG object.
         label: which value to take where the file holds several.
 
     Returns:
@@ -105,7 +132,7 @@ def read_mask(path: str | Path, *, label: int | None = None) -> LumenMask:
     path = Path(path)
     if not path.exists():
         raise InputError(f"{path}: no such file; check the path")
-    volume = _read_file(path)
+    volume = dicom_seg.read_seg(path) if path.suffix.lower() == dicom_seg.SUFFIX else _read_file(path)
     inside = _inside(volume.voxels, label, path)
     sidecar = _sidecar(path)
     ostium, method = _read_sidecar(sidecar) if sidecar.exists() else (None, "given")
@@ -117,16 +144,18 @@ def write_mask(mask: LumenMask, path: str | Path, *, manifest: Mapping[str, Any]
 
     Args:
         mask: the mask.
-        path: a file ending in .nii.gz, .nii, .nrrd or .mha.
+        path: a file ending in .nii.gz, .nii, .nrrd, .mha, or .dcm for a DICOM-SEG object.
         manifest: the record of the run, as `endopilot.files.manifest` makes it.
 
     Raises:
-        InputError: the suffix is unknown, the folder cannot be written, or the disk is full.
+        InputError: the suffix is unknown, highdicom is absent, the folder cannot be written, or the disk is full.
     """
     path = Path(path)
-    if _suffix(path) not in SUFFIXES:
-        raise InputError(f"{path}: unknown format; name the mask with one of {', '.join(SUFFIXES)}")
-    write_volume(mask.volume, path)
+    check_output(path, mask=True)
+    if path.suffix.lower() == dicom_seg.SUFFIX:
+        dicom_seg.write_seg(mask, path)
+    else:
+        write_volume(mask.volume, path)
     ostium = mask.ostium
     write_json(
         _sidecar(path),
@@ -153,13 +182,13 @@ def _read_file(path: Path) -> Volume:
     """Read one file that SimpleITK knows by its suffix, refusing what is not a scalar volume."""
     if path.is_dir() or _suffix(path) is None:
         raise InputError(f"{path}: unknown format; give one of {', '.join(SUFFIXES)}, or a folder of DICOM slices")
-    sitk.ProcessObject.SetGlobalWarningDisplay(False)  # ITK's own lines on standard error would bury ours
     reader = sitk.ImageFileReader()
     reader.SetFileName(str(path))
     try:
-        reader.ReadImageInformation()
+        with _quiet_itk():
+            reader.ReadImageInformation()
     except RuntimeError as error:
-        raise InputError(f"{path}: {_reason(error)}; export it again") from error
+        raise InputError(f"{path}: {_reason(error, path)}; export it again") from error
     size = tuple(reader.GetSize())
     shape = "×".join(map(str, size))
     components = reader.GetNumberOfComponents()
@@ -170,41 +199,17 @@ def _read_file(path: Path) -> Volume:
     if len(size) < 3 or min(size[:3]) < _SMALLEST_SIZE:
         raise InputError(f"{path}: {shape} voxels are no volume; give at least {_SMALLEST_SIZE} along each axis")
     if path.name.lower().endswith((".nii", ".nii.gz")):
-        _refuse_truncated_nifti(path)
+        check_nifti(path)
+    if path.name.lower().endswith((".nrrd", ".nhdr")) and not reader.HasMetaDataKey("NRRD_space"):
+        raise InputError(f"{path}: says no orientation (no space in its header); export it with its space directions")
     try:
-        image = reader.Execute()
+        with _quiet_itk():
+            image = reader.Execute()
         if len(size) > 3:
             image = sitk.Extract(image, [*size[:3], *(0 for _ in size[3:])])
     except RuntimeError as error:
-        raise InputError(f"{path}: truncated or damaged ({_reason(error)}); copy or export it again") from error
+        raise InputError(f"{path}: truncated or damaged ({_reason(error, path)}); copy or export it again") from error
     return _compact(from_image(image))
-
-
-def _refuse_truncated_nifti(path: Path) -> None:
-    """Refuse a NIfTI file that ends before its voxels do: ITK would fill the rest with whatever is in memory.
-
-    Offsets are those of the NIfTI-1 and NIfTI-2 headers (https://nifti.nimh.nih.gov).
-    """
-    opener = gzip.open if path.name.lower().endswith(".gz") else open
-    try:
-        with opener(path, "rb") as stream:
-            header = stream.read(540)
-            order = "<" if header[:4] in (b"\x5c\x01\0\0", b"\x1c\x02\0\0") else ">"
-            if struct.unpack_from(f"{order}i", header)[0] == 540:
-                (bits,) = struct.unpack_from(f"{order}h", header, 14)
-                dimensions = struct.unpack_from(f"{order}8q", header, 16)
-                (offset,) = struct.unpack_from(f"{order}q", header, 168)
-            else:
-                (bits,) = struct.unpack_from(f"{order}h", header, 72)
-                dimensions = struct.unpack_from(f"{order}8h", header, 40)
-                (offset,) = struct.unpack_from(f"{order}f", header, 108)
-            missing = int(offset) + math.prod(dimensions[1 : 1 + dimensions[0]]) * bits // 8 - len(header)
-            while missing > 0 and (chunk := stream.read(1 << 22)):
-                missing -= len(chunk)
-    except (EOFError, OSError, zlib.error, struct.error):
-        missing = 1
-    if missing > 0:
-        raise InputError(f"{path}: truncated or damaged (its voxels are incomplete); copy or export it again")
 
 
 def _compact(volume: Volume) -> Volume:
@@ -216,14 +221,30 @@ def _compact(volume: Volume) -> Volume:
     return Volume(voxels, volume.spacing_mm, volume.origin_mm, volume.direction)
 
 
-def _reason(error: RuntimeError) -> str:
+def _reason(error: RuntimeError, path: Path) -> str:
     """Say in a few words what ITK's long message means; its paths and source lines help nobody."""
     text = str(error)
     if "orthonormal" in text.lower():
         return "its axes are not at right angles (a sheared affine)"
     if "Unable to determine ImageIO reader" in text:
         return "its content is not what its suffix says, or its header is damaged"
+    if path.suffix.lower() in _READ_ONLY_SUFFIXES:
+        return "the file of voxels that it names is missing, incomplete or damaged"
     return "its header or voxels cannot be read"
+
+
+@contextmanager
+def _quiet_itk() -> Iterator[None]:
+    """Keep ITK's and MetaIO's own lines off standard error, where they would bury ours."""
+    sitk.ProcessObject.SetGlobalWarningDisplay(False)
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
 
 
 def _inside(values: np.ndarray, label: int | None, path: Path) -> np.ndarray:

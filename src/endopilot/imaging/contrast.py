@@ -1,0 +1,75 @@
+"""Whether a CT is in HU and its blood holds contrast, told by its histogram before anything is sought in it."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+from scipy import ndimage
+
+from endopilot.errors import InputError
+from endopilot.imaging.grid import LEAST_BLOOD_HU
+from endopilot.types import Volume
+
+_BLOCK_MM = 2.0
+"""Voxels are averaged to blocks of about this size: noise goes, pools of blood stay."""
+_CALM_HU = 25.0
+"""Tissue is homogeneous where its standard deviation over 3 × 3 × 3 blocks is smaller: blood is, bone is not."""
+_NOISE_FACTOR = 1.3
+"""In a noisy scan, the limit is this many times the lower quartile of that deviation in fat, muscle and blood."""
+_BRIGHTEST_HU = 900.0
+"""Metal and dense bone lie above this, no blood does."""
+_LEAST_POOL_ML = 4.0
+"""Less than the inside of any heart chamber; homogeneous bone of the thorax comes in smaller pieces."""
+
+
+def refuse_other_units(volume: Volume) -> None:
+    """Refuse a volume that cannot be in HU.
+
+    Raises:
+        InputError: nothing is below 0, where fat, lung and air are.
+    """
+    low, high = float(volume.voxels.min()), float(volume.voxels.max())
+    if low >= 0:
+        raise InputError(
+            f"the volume's values go from {low:g} to {high:g}, but fat, lung and air are below 0 HU: this is no CT, or "
+            "its rescale is lost; export it in HU"
+        )
+
+
+def refuse_without_contrast(volume: Volume) -> None:
+    """Refuse a CT of the chest or abdomen whose blood holds no contrast.
+
+    The histogram is that of homogeneous tissue. Blood with contrast is the one tissue that fills millilitres there
+    above 130 HU; blood without measures 30 to 60 HU, like muscle.
+
+    Raises:
+        InputError: no connected 4 ml of homogeneous tissue are that bright.
+    """
+    blocks, size_mm = _blocks(volume)
+    mean = ndimage.uniform_filter(blocks, 3)
+    variance = ndimage.uniform_filter(blocks**2, 3) - mean**2
+    soft = (mean > -120.0) & (mean < LEAST_BLOOD_HU)
+    noise_hu = float(np.sqrt(max(np.percentile(variance[soft], 25), 0.0))) if soft.any() else 0.0
+    calm = variance < max(_CALM_HU, _NOISE_FACTOR * noise_hu) ** 2
+    label, _ = ndimage.label(calm & (mean > LEAST_BLOOD_HU) & (mean < _BRIGHTEST_HU))  # pyright: ignore[reportGeneralTypeIssues]
+    largest_ml = float(np.bincount(label.ravel())[1:].max(initial=0) * size_mm.prod() / 1000)
+    if largest_ml < _LEAST_POOL_ML:
+        count, edge = np.histogram(mean[calm], bins=np.arange(-20.0, 400.0, 10.0))
+        peak = f"peaks at {edge[count.argmax()] + 5.0:.0f} HU" if count.any() else "is absent"
+        raise InputError(
+            f"no contrast: homogeneous soft tissue {peak}, and its largest piece above {LEAST_BLOOD_HU:.0f} HU, "
+            f"as blood with contrast is, has {largest_ml:.1f} ml; give a CT angiogram in the arterial phase"
+        )
+
+
+def _blocks(volume: Volume) -> tuple[Float[np.ndarray, "mz my mx"], Float[np.ndarray, "3"]]:
+    """Return the means of blocks of voxels, and the blocks' size along k, j and i, mm."""
+    spacing = volume.spacing_mm[::-1]
+    factor = np.maximum(np.round(_BLOCK_MM / spacing), 1).astype(int)
+    factor = np.minimum(factor, volume.voxels.shape)
+    result = volume.voxels
+    for axis, step in enumerate(factor.tolist()):
+        kept = result.shape[axis] // step * step
+        shape = (*result.shape[:axis], kept // step, step, *result.shape[axis + 1 :])
+        result = np.take(result, range(kept), axis=axis).reshape(shape).mean(axis=axis + 1, dtype=np.float32)
+    return result, spacing * factor

@@ -1,0 +1,98 @@
+"""CT to DICOM: one series of uncompressed slices that names no patient.
+
+The attributes are those that DICOM asks of a CT image (PS3.3 A.3.3); those of type 2 are there and empty.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+from pydicom.dataset import Dataset, FileMetaDataset
+from pydicom.uid import UID, CTImageStorage, ExplicitVRLittleEndian, generate_uid
+from pydicom.valuerep import format_number_as_ds
+
+from endopilot.errors import InputError
+from endopilot.files import writing
+from endopilot.progress import progress
+from endopilot.types import Volume
+
+_UNNAMED = (
+    *("PatientName", "PatientID", "PatientBirthDate", "PatientSex", "StudyDate", "StudyTime", "StudyID"),
+    *("ReferringPhysicianName", "AccessionNumber", "Manufacturer", "PositionReferenceIndicator"),
+    *("KVP", "AcquisitionNumber", "PatientPosition", "SeriesDate", "SeriesTime", "ContentDate", "ContentTime"),
+)
+
+
+def write_series(volume: Volume, folder: Path) -> None:
+    """Write a CT volume as a DICOM series, one file a slice, without any patient's data.
+
+    HU are rounded to whole numbers. The same volume gives the same bytes.
+
+    Args:
+        volume: CT in HU.
+        folder: a new folder, or an empty one.
+
+    Raises:
+        InputError: the folder holds files already, or cannot be written.
+    """
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(f"{folder}: is there already; give a new folder for the DICOM series")
+    voxels = np.clip(np.round(volume.voxels), -32768, 32767).astype("<i2")
+    with writing(folder) as partial, progress("Writing DICOM slices", len(voxels)) as advance:
+        partial.mkdir()
+        for k, (header, plane) in enumerate(zip(slice_headers(volume), voxels, strict=True)):
+            header.PixelData = plane.tobytes()
+            header.save_as(partial / f"slice-{k:04d}.dcm", enforce_file_format=True)
+            advance()
+
+
+def slice_headers(volume: Volume) -> list[Dataset]:
+    """Return the header of every slice of a volume, pixels left out.
+
+    The UIDs are made from the volume's own content (PS3.5 B.2), so that nothing of another header is in them.
+    """
+    content = hashlib.sha256(np.ascontiguousarray(volume.voxels).tobytes())
+    for part in (volume.spacing_mm, volume.origin_mm, volume.direction):
+        content.update(np.ascontiguousarray(part).tobytes())
+    digest = content.hexdigest()
+
+    def uid(name: str) -> UID:
+        return generate_uid(entropy_srcs=[digest, name])
+
+    headers = []
+    for k in range(len(volume.voxels)):
+        header = _slice_header(volume, k)
+        header.StudyInstanceUID, header.SeriesInstanceUID = uid("study"), uid("series")
+        header.FrameOfReferenceUID = uid("frame of reference")
+        header.SOPInstanceUID = header.file_meta.MediaStorageSOPInstanceUID = uid(f"slice {k}")
+        headers.append(header)
+    return headers
+
+
+def _slice_header(volume: Volume, k: int) -> Dataset:
+    """Return the header of slice `k` without its UIDs."""
+    header = Dataset()
+    header.file_meta = FileMetaDataset()
+    header.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
+    header.SOPClassUID = header.file_meta.MediaStorageSOPClassUID = CTImageStorage
+    for empty in _UNNAMED:
+        setattr(header, empty, None)
+    header.Modality, header.ImageType = "CT", ["DERIVED", "SECONDARY", "AXIAL"]
+    header.SeriesNumber, header.InstanceNumber = 1, k + 1
+    header.ImagePositionPatient = _decimals(volume.index_to_world(np.array([0.0, 0.0, k])))
+    header.ImageOrientationPatient = _decimals(volume.direction[:, :2].T.ravel())
+    header.PixelSpacing = _decimals(volume.spacing_mm[[1, 0]])
+    header.SliceThickness = _decimals(volume.spacing_mm[2:])[0]
+    header.Rows, header.Columns = volume.voxels.shape[1:]
+    header.SamplesPerPixel, header.PhotometricInterpretation = 1, "MONOCHROME2"
+    header.BitsAllocated, header.BitsStored, header.HighBit, header.PixelRepresentation = 16, 16, 15, 1
+    header.RescaleSlope, header.RescaleIntercept, header.RescaleType = 1, 0, "HU"
+    header.WindowCenter, header.WindowWidth = 200, 800
+    return header
+
+
+def _decimals(values: np.ndarray) -> list[str]:
+    """Return numbers as decimal strings of at most 16 characters, DICOM's limit (PS3.5 6.2)."""
+    return [format_number_as_ds(float(value)) for value in values]

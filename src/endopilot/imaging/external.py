@@ -1,0 +1,127 @@
+"""Segmentation by another program, run as a subprocess with the weights that its user has.
+
+The program gets the CT in a temporary folder, as a file with no header but its geometry, and writes its labels there.
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from endopilot.errors import InputError
+from endopilot.imaging.overlap import mask_like
+from endopilot.imaging.volume import read_volume, write_volume
+from endopilot.progress import progress
+from endopilot.types import Insertion, LumenMask, Volume
+
+_SEED_MM = 5.0
+"""A seed belongs to the lumen within this distance."""
+_MOUTH_MM = 8.0
+"""The vessel's direction at the first seed is that to the middle of the lumen within this distance."""
+_LONGEST_TOLD = 200
+
+
+def segment_by_program(
+    volume: Volume,
+    arguments: Callable[[Path, Path], Sequence[str]],
+    *,
+    given: str,
+    answer: str,
+    label: int | None = None,
+    mend: str,
+) -> LumenMask:
+    """Return the lumen that a program finds in a volume.
+
+    Args:
+        volume: CT in HU.
+        arguments: program and arguments, from the folder that holds the CT and the folder for its answer.
+        given: name of the CT's file.
+        answer: name of the file that the program is to write.
+        label: value of the lumen where the answer holds several.
+        mend: what to do where the program is missing or fails.
+
+    Raises:
+        InputError: the program is not there, fails, writes no such file, or marks nothing.
+    """
+    with tempfile.TemporaryDirectory(prefix="endopilot-") as temporary:
+        source, target = Path(temporary) / "ct", Path(temporary) / "answer"
+        target.mkdir()
+        write_volume(volume, source / given)
+        command = list(arguments(source, target))
+        program = Path(command[0]).name
+        with progress(f"Running {program}", 1) as advance:
+            _run(command, mend)
+            advance()
+        file = target / answer
+        if not file.exists():
+            written = ", ".join(sorted(path.name for path in target.rglob("*") if path.is_file())[:10]) or "nothing"
+            raise InputError(f"{program} wrote no {answer} (it wrote {written}); {mend}")
+        try:
+            found = read_volume(file)
+        except InputError as error:
+            raise InputError(f"{program} wrote a {answer} that is no volume; {mend}") from error
+    inside = _labelled(found, label, program)
+    on_grid = Volume(inside, found.spacing_mm, found.origin_mm, found.direction)
+    if found.voxels.shape != volume.voxels.shape or not np.allclose(found.origin_mm, volume.origin_mm, atol=1e-2):
+        inside = mask_like(LumenMask(on_grid), volume)
+    return LumenMask(Volume(inside, volume.spacing_mm, volume.origin_mm, volume.direction))
+
+
+def ostium_at_seeds(mask: LumenMask, seeds: Sequence[tuple[float, float, float]]) -> Insertion | None:
+    """Return the ostium that the first seed tells, with the direction into the lumen; None without seeds.
+
+    Raises:
+        InputError: a seed lies farther than 5 mm from the lumen.
+    """
+    if not seeds:
+        return None
+    points = mask.volume.index_to_world(np.argwhere(mask.volume.voxels)[:, ::-1].astype(float))
+    for seed in seeds:
+        gap = float(np.linalg.norm(points - np.array(seed), axis=1).min())
+        if gap > _SEED_MM:
+            raise InputError(
+                f"seeds: the lumen found is {gap:.0f} mm from {tuple(seed)}; move the seed into it (LPS mm)"
+            )
+    return Insertion(np.array(seeds[0], dtype=float), _inward(points, np.array(seeds[0], dtype=float)))
+
+
+def _inward(points: Float[np.ndarray, "n 3"], place: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    near = points[np.linalg.norm(points - place, axis=1) < _MOUTH_MM]
+    inward = near.mean(axis=0) - place
+    length = float(np.linalg.norm(inward))
+    return inward / length if length > 1e-6 else np.array([0.0, 0.0, -1.0])
+
+
+def _run(command: Sequence[str], mend: str) -> None:
+    """Run a program and wait for it; what it prints is told only if it fails."""
+    program = Path(command[0]).name
+    if shutil.which(command[0]) is None:
+        raise InputError(f"the program {program} is not on the PATH; {mend}")
+    try:
+        answer = subprocess.run(
+            command, stdin=subprocess.DEVNULL, capture_output=True, text=True, errors="replace", check=False
+        )
+    except OSError as error:
+        raise InputError(f"{program} cannot be run ({error.strerror}); {mend}") from error
+    if answer.returncode != 0:
+        lines = [line.strip() for line in (answer.stderr + "\n" + answer.stdout).splitlines() if line.strip()]
+        said = [line for line in lines if "error" in line.lower()] or lines or ["nothing"]
+        raise InputError(f"{program} failed with exit code {answer.returncode}: {said[-1][:_LONGEST_TOLD]}; {mend}")
+
+
+def _labelled(found: Volume, label: int | None, program: str) -> Bool[np.ndarray, "nz ny nx"]:
+    labels = np.unique(found.voxels[found.voxels > 0]).astype(int)
+    if len(labels) == 0:
+        raise InputError(f"{program} found no lumen in this CT; try another method, or seeds with --method coronary")
+    listed = ", ".join(map(str, labels[:20]))
+    if label is None and len(labels) > 1:
+        raise InputError(f"{program} marked {len(labels)} labels ({listed}); choose one with --options label=NUMBER")
+    if label is not None and label not in labels:
+        raise InputError(f"{program} marked {listed}, and no voxel with label {label}; choose with --options label=")
+    return found.voxels == (labels[0] if label is None else label)
