@@ -28,17 +28,16 @@ from endopilot.anatomy.atlas_tree import (
     build_tree,
     free_origin,
     mouth,
-    stenosis,
+    narrowed,
     truncated,
     uneven,
     until_it_fits,
+    wiggled,
     with_side_branches,
 )
 from endopilot.anatomy.heart_reference import HeartFit
+from endopilot.anatomy.labels_tree import LCA_SECTIONS
 from endopilot.types import VesselTree
-
-SECTION_NAMES = ("5", "6", "7", "8", "9", "10", "11", "12", "13", "14", "15", "16", "D", "septal")
-"""Segments of AHA/SCCT, then further diagonals and septals."""
 
 LEFT_MAIN_MM, LEFT_MAIN_SD_MM, LEFT_MAIN_DIAMETER_MM = 13.1, 3.5, 4.5
 LAD_DIAMETER_MM = {0.0: 3.7, 0.06: 3.6, 0.24: 2.5, 0.58: 1.7, 0.79: 1.4, 0.84: 1.25, 1.0: 1.1}
@@ -158,13 +157,16 @@ def _draw(generator: np.random.Generator, dominance: str, stenosis_share: float)
     trunk = _trunk(generator, dominance)
     calibre = _calibre(generator)
     lad = _lad(generator, trunk, calibre)
-    vessels, narrowed = [lad, _lcx(generator, trunk, lad, dominance, calibre)], []
-    if generator.random() < stenosis_share:
-        truth, vessels = _narrow(generator, trunk, *vessels)
-        narrowed.append(truth)
+    vessels, stenoses = [lad, _lcx(generator, trunk, lad, dominance, calibre)], []
     plans = _plan_branches(generator, trunk, vessels, dominance, calibre)
-    vessels = with_side_branches(generator, _with_sections(trunk, vessels, plans), plans)
-    tree = build_tree(vessels, SECTION_NAMES)
+    vessels = _with_sections(trunk, vessels, plans)
+    if generator.random() < stenosis_share:
+        fork = trunk.fork / len(lad.points)
+        which, shares = (0, (fork + 0.06, 0.65)) if generator.random() < 0.6 else (1, (0.15, 0.6))
+        stenosis, vessels = narrowed(generator, vessels, which, shares)
+        stenoses.append(stenosis)
+    vessels = with_side_branches(generator, vessels, plans)
+    tree = build_tree(vessels, LCA_SECTIONS)
     along, bends = shape.abscissa(lad.points), shape.curvature(lad.points)
     truth = {
         "dominance": dominance,
@@ -175,7 +177,7 @@ def _draw(generator: np.random.Generator, dominance: str, stenosis_share: float)
         "tortuosity": shape.tortuosity(lad.points),
         "curvature_mean_per_mm": float(bends.mean()),
         "curvature_p90_per_mm": float(np.quantile(bends, 0.9)),
-        "stenoses": narrowed,
+        "stenoses": stenoses,
     }
     return tree, truth
 
@@ -196,10 +198,12 @@ def _trunk(generator: np.random.Generator, dominance: str) -> _Trunk:
     end_of_main = main_mm * heart_left.FORK / np.linalg.norm(heart_left.FORK)
     bow = np.array([[0.0, 0.0, 0.0], 0.5 * end_of_main + main_mm * np.array([0.0, 0.06, 0.08])])
     stride = round(6.0 * size)
-    lad = _wiggled(generator, shape.curve_through(np.concatenate([bow, lad[::stride] + end_of_main])), 9.0)
+    lad = wiggled(
+        generator, shape.curve_through(np.concatenate([bow, lad[::stride] + end_of_main])), _WIGGLE_MM, quiet_mm=9.0
+    )
     fork = round(main_mm / shape.STEP_MM)
     crux_at = (heart_left.LCX[-1] - heart_left.FORK) * size
-    lcx = _wiggled(generator, shape.curve_through(lcx[::stride]), 7.0)
+    lcx = wiggled(generator, shape.curve_through(lcx[::stride]), _WIGGLE_MM, quiet_mm=7.0)
     crux = int(np.argmin(np.linalg.norm(lcx - crux_at, axis=1)))
     lad, lcx = turn.apply(lad), turn.apply(lcx + lad[fork])
     heart = heart_left.fit_left_heart(lad, lcx[: crux + 1], lcx[crux:])
@@ -213,15 +217,6 @@ def _trunk(generator: np.random.Generator, dominance: str) -> _Trunk:
     if max(shape.curvature(lad).max(), shape.curvature(lcx).max()) > _SHARPEST_PER_MM:
         raise NoShape
     return _Trunk(lad, lcx, fork, crux if dominance == "left" else None, size, turn, heart)
-
-
-def _wiggled(
-    generator: np.random.Generator, points: Float[np.ndarray, "n 3"], quiet_mm: float
-) -> Float[np.ndarray, "m 3"]:
-    wiggle = shape.Wiggle.draw(generator, 13.0, 60.0)
-    normals = shape.parallel_normals(shape.tangents(points))
-    moved = wiggle.apply(points, normals, generator.uniform(*_WIGGLE_MM), quiet_mm)
-    return shape.curve_through(moved[::4])
 
 
 def _calibre(generator: np.random.Generator) -> float:
@@ -249,19 +244,6 @@ def _lcx(generator: np.random.Generator, trunk: _Trunk, lad: Vessel, dominance: 
     forward = shape.tangents(trunk.lad)[trunk.fork]
     radius = mouth(radius, trunk.lcx, forward, float(lad.radius[trunk.fork]))
     return Vessel(trunk.lcx, radius, (), 0, trunk.fork)
-
-
-def _narrow(
-    generator: np.random.Generator, trunk: _Trunk, lad: Vessel, lcx: Vessel
-) -> tuple[dict[str, Any], list[Vessel]]:
-    """Narrow one of the two vessels beyond the fork."""
-    before = float(shape.abscissa(lad.points)[trunk.fork])
-    if generator.random() < 0.6:
-        truth, factor = stenosis(generator, shape.abscissa(lad.points)[trunk.fork :], (0.08, 0.6))
-        radius = lad.radius * np.concatenate([np.ones(trunk.fork), factor])
-        return truth | {"vessel": "LAD"}, [replace(lad, radius=radius), lcx]
-    truth, factor = stenosis(generator, before + shape.abscissa(lcx.points), (0.15, 0.6))
-    return truth | {"vessel": "LCx"}, [lad, replace(lcx, radius=lcx.radius * factor)]
 
 
 def _plan_branches(

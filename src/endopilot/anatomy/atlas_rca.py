@@ -32,10 +32,8 @@ from endopilot.anatomy.atlas_tree import (
     with_side_branches,
 )
 from endopilot.anatomy.heart_reference import BEYOND_CRUX, TO_CRUX, HeartFit, fit_heart
+from endopilot.anatomy.labels_tree import RCA_SECTIONS
 from endopilot.types import VesselTree
-
-SECTION_NAMES = ("1", "2", "3", "4", "16", "conus", "SA", "RV", "AM")
-"""Names of the sections: segments of AHA/SCCT, then the side branches."""
 
 LENGTH_MM, LENGTH_SD_MM, LENGTH_RANGE_MM = 164.0, 30.0, (112.0, 223.0)
 TORTUOSITY, TORTUOSITY_SD = 2.07, 0.23
@@ -146,7 +144,7 @@ def _draw(
     heart = fit_heart(main, 0.5 * crux, targets.ends_in)
     plans = _plan_branches(generator, heart, healthy, crux, targets, calibre)
     vessels = [Vessel(main, radius, _main_sections(main, crux, targets.ends_in))]
-    tree = build_tree(with_side_branches(generator, vessels, plans), SECTION_NAMES)
+    tree = build_tree(with_side_branches(generator, vessels, plans), RCA_SECTIONS)
     bends = shape.curvature(main)
     truth = {
         "dominance": targets.dominance,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -51,7 +51,7 @@ class SidePlan:
     Attributes:
         section: name of its anatomical section.
         parent: index of the vessel that it leaves.
-        origin: index of the parent's point where it leaves.
+        origin: index of the parent's point where it leaves; -1 for its end.
         length_mm: its length.
         diameter_mm: lumen diameter at its origin.
         courses: (abscissa from which it holds, mm; LPS direction), in order.
@@ -126,6 +126,37 @@ def stenosis(
     return truth, narrowing
 
 
+def narrowed(
+    generator: np.random.Generator, vessels: Sequence[Vessel], index: int, shares: tuple[float, float]
+) -> tuple[dict[str, Any], list[Vessel]]:
+    """Return a stenosis of one vessel (abscissa from the ostium, and section), and the vessels with it."""
+    vessel = vessels[index]
+    along, above = shape.abscissa(vessel.points), vessel
+    while above.parent >= 0:
+        parent = vessels[above.parent]
+        along = along + shape.abscissa(parent.points)[above.origin]
+        above = parent
+    truth, factor = stenosis(generator, along, shares)
+    section = vessel.section[int(np.searchsorted(along, truth["abscissa_mm"]))]
+    changed = replace(vessel, radius=vessel.radius * factor)
+    return truth | {"section": section}, [changed if i == index else other for i, other in enumerate(vessels)]
+
+
+def wiggled(
+    generator: np.random.Generator,
+    points: Float[np.ndarray, "n 3"],
+    amplitude_mm: tuple[float, float],
+    *,
+    quiet_mm: float,
+    wavelengths_mm: tuple[float, float] = (13.0, 60.0),
+) -> Float[np.ndarray, "m 3"]:
+    """Return an evenly spaced curve with a smooth random displacement; its first `quiet_mm` fade in."""
+    wiggle = shape.Wiggle.draw(generator, *wavelengths_mm)
+    normals = shape.parallel_normals(shape.tangents(points))
+    moved = wiggle.apply(points, normals, generator.uniform(*amplitude_mm), quiet_mm)
+    return shape.curve_through(moved[::4])
+
+
 def uneven(generator: np.random.Generator, along: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
     """Return the factor on a lumen's radius by which real vessels vary along the way: waves of 2.5 %."""
     wavelength = generator.uniform(15.0, 60.0, 4)
@@ -154,10 +185,11 @@ def with_side_branches(
 
 
 def _side_branch(generator: np.random.Generator, parent: Vessel, plan: SidePlan) -> Vessel:
-    start, wide = parent.points[plan.origin], float(parent.radius[plan.origin])
+    origin = plan.origin % len(parent.points)
+    start, wide = parent.points[origin], float(parent.radius[origin])
     turn = Rotation.from_rotvec(np.deg2rad(generator.normal(0, 12, 3)))
     headed = [(begin, turn.apply(np.array(course) / np.linalg.norm(course))) for begin, course in plan.courses]
-    forward = shape.tangents(parent.points)[plan.origin]
+    forward = shape.tangents(parent.points)[origin]
     across = headed[0][1] - (headed[0][1] @ forward) * forward
     angle = np.deg2rad(generator.uniform(*plan.angle_deg))
     direction = np.cos(angle) * forward + np.sin(angle) * across / np.linalg.norm(across)
@@ -168,7 +200,7 @@ def _side_branch(generator: np.random.Generator, parent: Vessel, plan: SidePlan)
     points = np.concatenate([start[None], points[1:]])
     lumen = 0.5 * plan.diameter_mm * (1 - plan.taper * np.linspace(0.0, 1.0, len(points)))
     lumen = mouth(np.minimum(lumen, 0.9 * wide), points, forward, wide)
-    return Vessel(points, lumen, [plan.section] * len(points), plan.parent, plan.origin)
+    return Vessel(points, lumen, [plan.section] * len(points), plan.parent, origin)
 
 
 def mouth(

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
-from endopilot.anatomy.atlas import AtlasConfig, synthesize_tree
-from endopilot.anatomy.labels import dominance, label_tree
+from endopilot.anatomy.atlas import ANATOMIES, AtlasConfig, synthesize_tree
+from endopilot.anatomy.labels import Scheme, dominance, label_tree
 from endopilot.types import VesselTree
 
 BAR = 0.95
@@ -27,7 +27,7 @@ def measure_labels(*, count: int, seed: int) -> list[dict[str, Any]]:
         the worst one), `dominance_right` (share of patients, None where there is none), `confusions` (the three pairs
         "truth as label" that cost most, with their share of the length) and `passed` (`right` reaches `BAR`).
     """
-    return [_measure(anatomy, count, seed) for anatomy in AtlasConfig.kinds()]
+    return [_measure(anatomy, count, seed) for anatomy in ANATOMIES]
 
 
 def agreement(truth: VesselTree, found: VesselTree) -> Counter[tuple[str, str]]:
@@ -46,7 +46,7 @@ def _measure(anatomy: str, count: int, seed: int) -> dict[str, Any]:
     shares, dominances = [], []
     for index in range(count):
         truth, drawn = synthesize_tree(config, index)
-        found = label_tree(truth, anatomy)
+        found = label_tree(truth, cast(Scheme, anatomy))
         lengths = agreement(truth, found)
         shares.append(_right(lengths))
         total += lengths

@@ -1,4 +1,4 @@
-"""Anatomical sections for every point of a tree: AHA/SCCT segments of the coronaries, or generation and order.
+"""Anatomical sections for every point of a tree: AHA/SCCT segments, named vessels, or generation and order.
 
 Segments after Austen et al., Circulation 1975;51:5-40 (AHA) and Leipsic et al., J Cardiovasc Comput Tomogr
 2014;8:342-58 (SCCT). Which branch is which follows from where it leaves and where it goes in the patient's axes (LPS):
@@ -7,45 +7,66 @@ left, posterior, up. A tree stored in other axes gets wrong names, not an error.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from typing import Literal
 
 import numpy as np
 
-from endopilot.anatomy.labels_coronary import Labeller, label_lca, label_rca
+from endopilot.anatomy.labels_coronary import label_lca, label_rca
+from endopilot.anatomy.labels_tree import (
+    ARCH_SECTIONS,
+    CEREBRAL_SECTIONS,
+    LCA_SECTIONS,
+    PORTAL_SECTIONS,
+    RCA_SECTIONS,
+    Labeller,
+)
+from endopilot.anatomy.labels_vessels import label_arch, label_cerebral, label_portal
+from endopilot.errors import InputError
 from endopilot.types import Branch, VesselTree
-
-RCA_SECTIONS = ("1", "2", "3", "4", "16", "conus", "SA", "RV", "AM")
-"""Proximal, mid, distal; posterior descending; posterolateral; then conus, sinus node, right ventricular and acute
-marginal branches."""
-
-LCA_SECTIONS = ("5", "6", "7", "8", "9", "10", "11", "12", "13", "14", "15", "16", "D", "septal")
-"""Left main; LAD proximal, mid, distal; first and second diagonal; LCx proximal; first obtuse marginal; LCx distal;
-further marginal or posterolateral; left posterior descending; ramus intermedius; further diagonals; septals."""
 
 _LOW = 0.39
 """A posterolateral branch that leaves this far under the fork of the left main, against the distance from there to the
 apex, feeds the inferior wall (Dodge's CP)."""
 
 
-def label_tree(tree: VesselTree, scheme: Literal["rca", "lca", "generic"]) -> VesselTree:
+Scheme = Literal["rca", "lca", "arch", "cerebral", "portal", "generic"]
+
+_RULES: dict[str, tuple[tuple[str, ...], Callable[[Labeller], None]]] = {
+    "rca": (RCA_SECTIONS, label_rca),
+    "lca": (LCA_SECTIONS, label_lca),
+    "arch": (ARCH_SECTIONS, label_arch),
+    "cerebral": (CEREBRAL_SECTIONS, label_cerebral),
+    "portal": (PORTAL_SECTIONS, label_portal),
+}
+
+
+def label_tree(tree: VesselTree, scheme: Scheme, *, naming: Mapping[str, str] | None = None) -> VesselTree:
     """Return the tree with every point's section.
 
     Args:
         tree: centerlines in LPS mm.
-        scheme: "rca" and "lca" name AHA/SCCT segments; "generic" names branches "G0", "G1.1", "G1.2", …: generation
-            (bifurcations from the root), then order, widest first.
+        scheme: "rca" and "lca" name AHA/SCCT segments, "arch", "cerebral" and "portal" the vessels of these anatomies
+            (`labels_tree` lists all names); "generic" names branches "G0", "G1.1", "G1.2", …: generation (bifurcations
+            from the root), then order, widest first.
+        naming: other names for some sections, such as {"G0": "superficial femoral artery"}.
+
+    Raises:
+        InputError: the naming map names a section that the scheme does not have in this tree.
     """
     if scheme == "generic":
-        return _generic(tree)
-    names = RCA_SECTIONS if scheme == "rca" else LCA_SECTIONS
-    sections = [np.zeros(len(branch.centerline.points), dtype=np.int64) for branch in tree.branches]
-    labeller = Labeller(tree, names, sections)
-    (label_rca if scheme == "rca" else label_lca)(labeller)
-    branches = tuple(
-        Branch(branch.centerline, branch.parent, section)
-        for branch, section in zip(tree.branches, sections, strict=True)
-    )
-    return VesselTree(branches, names)
+        labelled = _generic(tree)
+    else:
+        names, rules = _RULES[scheme]
+        sections = [np.zeros(len(branch.centerline.points), dtype=np.int64) for branch in tree.branches]
+        rules(Labeller(tree, names, sections))
+        named = zip(tree.branches, sections, strict=True)
+        labelled = VesselTree(tuple(Branch(branch.centerline, branch.parent, own) for branch, own in named), names)
+    unknown = sorted(set(naming or ()) - set(labelled.section_names))
+    if unknown:
+        raise InputError(f"naming: no section '{unknown[0]}'; this tree has {', '.join(labelled.section_names)}")
+    renamed = tuple((naming or {}).get(name, name) for name in labelled.section_names)
+    return VesselTree(labelled.branches, renamed)
 
 
 def dominance(tree: VesselTree) -> str | None:

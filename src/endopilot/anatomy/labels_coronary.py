@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
 
-from endopilot.types import VesselTree
+from endopilot.anatomy.labels_tree import Labeller
 
 ACUTE_MARGIN = 0.64
 """The acute margin lies at this share of the way from the ostium to the crux (Dodge et al., Circulation
@@ -23,69 +22,6 @@ _RAMUS_MM = 4.0
 GROOVE = np.array([-0.7, 0.6, -0.3])
 """Direction (LPS) in which the circumflex's course round the left atrioventricular groove reaches farthest at its end,
 the crux."""
-
-
-class Labeller:
-    """A tree with the questions that the schemes ask of it."""
-
-    def __init__(self, tree: VesselTree, names: tuple[str, ...], sections: list[np.ndarray]) -> None:
-        self.tree, self.names, self.sections = tree, names, sections
-
-    def fill(self, branch: int, name: str) -> None:
-        """Name a branch and everything behind it."""
-        self.sections[branch][:] = self.names.index(name)
-        for child in self.tree.children(branch):
-            self.fill(child, name)
-
-    def along(self, route: tuple[int, ...], ends: list[tuple[str, float]]) -> None:
-        """Name the points of a route by the abscissa up to which each name reaches, mm."""
-        indices = np.array([self.names.index(name) for name, _ in ends])
-        for branch in route:
-            abscissa = self.tree.branches[branch].centerline.abscissa.copy()
-            abscissa[0] += 1e-3  # a branch that starts where a section ends belongs to the next one
-            self.sections[branch][:] = indices[np.searchsorted([end for _, end in ends], abscissa)]
-
-    def longest_leaf(self, branch: int) -> int:
-        """The end behind a branch that lies farthest along the tree."""
-        leaves = [leaf for leaf in self.tree.leaves() if branch in self.tree.route(leaf)]
-        return max(leaves, key=lambda leaf: self.tree.branches[leaf].centerline.abscissa[-1])
-
-    def length_behind(self, branch: int) -> float:
-        """Length from a branch's start to the farthest tip behind it, mm."""
-        tip = self.tree.branches[self.longest_leaf(branch)].centerline.abscissa[-1]
-        return float(tip - self.tree.branches[branch].centerline.abscissa[0])
-
-    def reach(self, branch: int, direction: Float[np.ndarray, "3"]) -> float:
-        """How far a branch and everything behind it reach along a direction, mm."""
-        behind = [i for i in range(len(self.tree.branches)) if branch in self.tree.route(i)]
-        return max(float((self.tree.branches[i].centerline.points @ direction).max()) for i in behind)
-
-    def onwards(self, branch: int, leaf: int) -> tuple[int, ...]:
-        """Branches from `branch` to `leaf`, both included."""
-        return tuple(i for i in self.tree.route(leaf) if branch in self.tree.route(i))
-
-    def sides(self, route: tuple[int, ...]) -> list[int]:
-        """Branches that leave a route, in the order of their origins."""
-        return [child for branch in route for child in self.tree.children(branch) if child not in route]
-
-    def origin(self, branch: int) -> float:
-        """Abscissa of a branch's start, mm."""
-        return float(self.tree.branches[branch].centerline.abscissa[0])
-
-    def heading(self, branch: int, reach_mm: float) -> Float[np.ndarray, "3"]:
-        """Unit vector from a branch's start to where its longest path is after `reach_mm`."""
-        line = self.tree.path(self.longest_leaf(branch))
-        start = self.tree.branches[branch].centerline
-        last = line.points[min(np.searchsorted(line.abscissa, start.abscissa[0] + reach_mm), len(line.points) - 1)]
-        heading = last - start.points[0]
-        return heading / max(float(np.linalg.norm(heading)), 1e-9)
-
-    def arriving(self, branch: int, reach_mm: float = 12.0) -> Float[np.ndarray, "3"]:
-        """Unit vector along the path over the last `reach_mm` before a branch's end."""
-        line = self.tree.path(branch)
-        first = line.points[max(np.searchsorted(line.abscissa, line.abscissa[-1] - reach_mm) - 1, 0)]
-        heading = line.points[-1] - first
-        return heading / max(float(np.linalg.norm(heading)), 1e-9)
 
 
 def label_rca(labeller: Labeller) -> None:
@@ -179,12 +115,8 @@ def _label_right_sides(labeller: Labeller, trunk: tuple[int, ...], crux: int | N
 def label_lca(labeller: Labeller) -> None:
     """Name the sections of a left coronary tree."""
     tree = labeller.tree
-    fork = 0
-    while True:
-        major = [child for child in tree.children(fork) if labeller.length_behind(child) >= 2.5 * MAJOR_MM]
-        if len(major) != 1:
-            break
-        fork = major[0]
+    fork = labeller.fork(0, 2.5 * MAJOR_MM)
+    major = labeller.major(fork, 2.5 * MAJOR_MM)
     trunk = tree.route(fork)
     labeller.along(trunk, [("5", np.inf)])
     for side in labeller.sides(trunk):
@@ -231,8 +163,7 @@ def _label_lad(labeller: Labeller, branch: int, end: float) -> None:
 def _label_lcx(labeller: Labeller, branch: int, end: float) -> None:
     tree = labeller.tree
     # The circumflex keeps to the groove, round the back; the marginals leave it to the left.
-    leaves = [leaf for leaf in tree.leaves() if branch in tree.route(leaf)]
-    leaf = max(leaves, key=lambda index: (tree.path(index).points @ GROOVE).max())
+    leaf = max(labeller.ends(branch), key=lambda index: (tree.path(index).points @ GROOVE).max())
     route = labeller.onwards(branch, leaf)
     marginals = []
     for side in labeller.sides(route):
