@@ -3,11 +3,11 @@
 Facts and their sources: internal carotid from the cavernous sinus to its end 33.1 ± 6.1 mm long, 5.0 ± 0.6 mm wide at
 first and 3.6 ± 0.4 mm at its end, middle cerebral artery 3.1 ± 0.4 mm wide at its origin, 22.5 ± 8.1 mm long and 2.4 ±
 0.4 mm wide where M2 begins: 100 CT angiograms, Rai AT et al., J NeuroIntervent Surg 2013;5:371-5. A1 12.7 mm long
-(7.2 to 18) and 2.6 mm wide: Perlmutter D, Rhoton AL, J Neurosurg 1976;45:259-72. The middle cerebral artery divides into two trunks
-in 78 %, into three in 12 % (Osborn AG, Diagnostic Cerebral Angiography); more than three are left out. The course:
-cervical, petrous (vertical, then forwards and inwards), cavernous (forwards, then a knee up and back), supraclinoid
-segment (Bouthillier A et al., Neurosurgery 1996;38:425-32), drawn around mean positions; the siphon's knees vary by
-1 mm. The device enters the high cervical segment.
+(7.2 to 18) and 2.6 mm wide: Perlmutter D, Rhoton AL, J Neurosurg 1976;45:259-72. The middle cerebral artery divides
+into two trunks in 78 %, into three in 12 % (Osborn AG, Diagnostic Cerebral Angiography); more than three are left out.
+The course: cervical, petrous (vertical, then forwards and inwards), cavernous (forwards, then a knee up and back) and
+supraclinoid segment (Bouthillier A et al., Neurosurgery 1996;38:425-32), drawn around mean positions; the siphon's
+knees vary by 1 mm. The device enters the high cervical segment.
 """
 
 from __future__ import annotations

@@ -61,7 +61,7 @@ def _crux(labeller: Labeller, route: tuple[int, ...]) -> int | None:
     whole = float(labeller.tree.branches[route[-1]].centerline.abscissa[-1])
     for branch in forks:
         line = labeller.tree.branches[branch].centerline
-        late = float(line.abscissa[-1]) > 0.42 * whole
+        late = float(line.abscissa[-1]) > 0.52 * whole
         if late and line.points[-1, 2] < low and float(labeller.arriving(branch) @ back) > -0.1:
             return branch
     return None

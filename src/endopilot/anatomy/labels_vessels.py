@@ -17,8 +17,8 @@ _SHORTEST_A1_MM = 5.0
 _TURN_MM = 1.0
 """The anterior cerebral artery has turned up this far behind the end of A1."""
 
-_RIGHT_SHARE = 0.43
-"""Ends of veins of the right lobe lie in this share of the tree's width, from the right."""
+_RIGHT_SHARE = 0.3
+"""Veins that end in this share of the tree's width, from the right, belong to the right lobe for certain."""
 
 
 def label_arch(labeller: Labeller) -> None:
@@ -90,8 +90,14 @@ def label_portal(labeller: Labeller) -> None:
     """Name the sections of a portal vein that is entered from its confluence."""
     tree = labeller.tree
     leaves = sorted(tree.leaves(), key=labeller.leftward)
+    labeller.fill(0, "MPV")
+    if len(leaves) < 2:
+        return
     low, high = labeller.leftward(leaves[0]), labeller.leftward(leaves[-1])
-    right = {leaf for leaf in leaves if labeller.leftward(leaf) < low + _RIGHT_SHARE * (high - low)}
+    # What parts from the way to the leftmost end no later than the veins that end far right leads to the right lobe.
+    part = {leaf: _parting(labeller, leaf, leaves[-1]) for leaf in leaves[:-1]}
+    last = max(part[leaf] for leaf in part if labeller.leftward(leaf) <= low + _RIGHT_SHARE * (high - low))
+    right = {leaf for leaf in part if part[leaf] <= last}
     posterior = _right_posterior(labeller, right)
     groups = {"LPV": set(leaves) - right, "RPPV": posterior, "RAPV": right - posterior}
     for branch in range(len(tree.branches)):
@@ -113,8 +119,14 @@ def label_portal(labeller: Labeller) -> None:
         labeller.fill(labeller.own(lateral[-1]), "S2" if len(lateral) > 1 else "S3")
 
 
+def _parting(labeller: Labeller, one: int, other: int) -> float:
+    """Abscissa at which the ways to two ends part, mm."""
+    common = [branch for branch in labeller.tree.route(one) if branch in labeller.tree.route(other)]
+    return float(labeller.tree.branches[common[-1]].centerline.abscissa[-1])
+
+
 def _right_posterior(labeller: Labeller, right: set[int]) -> set[int]:
-    """Return the ends of the right posterior branch: of those that lead to the right lobe alone, the one at the back."""
+    """Return the ends of the right posterior branch: of what leads to the right lobe alone, the part at the back."""
     tree = labeller.tree
     alone = [branch for branch in range(len(tree.branches)) if set(labeller.ends(branch)) <= right]
     first = [branch for branch in alone if tree.branches[branch].parent not in alone]

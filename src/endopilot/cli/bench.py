@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 from tyro.conf import Positional
 
+from endopilot.anatomy.label_score import measure_labels
 from endopilot.cli.arguments import show, show_rows
 from endopilot.simulation.bench import bench_scaling, bench_simulation
 from endopilot.simulation.robustness import RobustnessConfig, measure_robustness
@@ -15,7 +16,7 @@ EXIT_FAILED = 1
 
 
 def command(
-    subject: Positional[Literal["simulation", "scaling", "robustness"]] = "simulation",
+    subject: Positional[Literal["simulation", "scaling", "robustness", "labels"]] = "simulation",
     /,
     *,
     json: bool = False,
@@ -25,7 +26,8 @@ def command(
 
     `simulation` times the reference scenario. `scaling` varies the number of elements and of worlds. `robustness`
     drives every device through many anatomies and beyond their ends, counts what goes wrong, and leaves with exit
-    code 1 if a figure misses its bar; the options below are its own.
+    code 1 if a figure misses its bar; the options below are its own. `labels` names the sections of as many synthetic
+    patients of each kind (`--anatomies`, `--seed`) and compares with the truth, with the same exit code.
 
     Args:
         subject: what to measure.
@@ -37,6 +39,12 @@ def command(
         return
     if subject == "scaling":
         show_rows(bench_scaling(), as_json=json)
+        return
+    if subject == "labels":
+        rows = measure_labels(count=config.anatomies, seed=config.seed)
+        show_rows(rows, as_json=json)
+        if not all(row["passed"] for row in rows):
+            sys.exit(EXIT_FAILED)
         return
     measured = measure_robustness(config)
     if json:
