@@ -9,6 +9,7 @@ import difflib
 import importlib
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 from endopilot import __version__
 from endopilot.errors import InputError
@@ -26,7 +27,7 @@ COMMANDS = {
     "train": "dataset -> forward and inverse transformers",
     "evaluate": "trained run -> errors beside the paper's and the baselines'",
     "verify": "the rod core against closed forms",
-    "bench": "speed of the rod core together with its accuracy",
+    "bench": "figures beside their bars: speed, robustness, anatomy, imaging, labels, dataset",
     "devices": "the guidewires that endopilot knows",
     "sample": "fetch a real CT angiogram to try",
     "info": "versions and machine",
@@ -84,9 +85,11 @@ def _run(name: str, arguments: Sequence[str]) -> int:
     import tyro
 
     module = importlib.import_module(f"endopilot.cli.{module_of(name)}")
+    subjects: dict[str, Any] | None = getattr(module, "SUBJECTS", None)
+    call = tyro.cli if subjects is None else tyro.extras.subcommand_cli_from_dict
     try:
-        tyro.cli(
-            module.command,
+        call(
+            subjects or module.command,
             prog=f"endopilot {name}",
             args=arguments,
             config=(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes),
