@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 
 import numpy as np
@@ -67,13 +68,13 @@ def straight_tree(radius: float = 1.5, length_mm: float = 40.0) -> VesselTree:
 
 def torus_tree(radius: float = 1.5) -> VesselTree:
     """Return five sixths of a torus around z."""
-    angle = np.linspace(np.pi / 6, 11 * np.pi / 6, 1500)
+    angle = np.linspace(np.pi / 6, 11 * np.pi / 6, 400)
     return tree_of((BEND_MM * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1), radius, -1))
 
 
 def helix_tree(radius: float = 1.5, bend_mm: float = 8.0, pitch_mm: float = 12.0) -> VesselTree:
     """Return one and a half turns of a helix around z: curvature 0.118 /mm and torsion 0.028 /mm by default."""
-    angle = np.linspace(0.0, 3 * np.pi, 2000)
+    angle = np.linspace(0.0, 3 * np.pi, 400)
     height = pitch_mm * (angle / (2 * np.pi) - 0.75)
     return tree_of((np.stack([bend_mm * np.cos(angle), bend_mm * np.sin(angle), height], axis=1), radius, -1))
 
@@ -109,8 +110,8 @@ def tree_distance(tree: VesselTree, points: Float[np.ndarray, "*n 3"]) -> Float[
     asked = points.reshape(-1, 3)
     result = np.full(len(asked), -np.inf)
     for branch in tree.branches:
-        gap, _ = _to_axis(branch.centerline.points, asked)
-        np.maximum(result, branch.centerline.radius[-1] - gap, out=result)
+        line = branch.centerline
+        np.maximum(result, line.radius[-1] - distance_to_line(line.points, asked), out=result)
     return result.reshape(points.shape[:-1])
 
 
@@ -145,18 +146,15 @@ def half_extent(tree: VesselTree, margin_mm: float = 2.0) -> tuple[float, float,
     return float(x), float(y), float(z)
 
 
-def _to_axis(
-    line: Float[np.ndarray, "m 3"], points: Float[np.ndarray, "n 3"]
-) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-    """Return the distance of points to a polyline, and where along it, in points, the nearest place is."""
-    dense = np.concatenate([np.linspace(a, b, 8, endpoint=False) for a, b in zip(line[:-1], line[1:], strict=True)])
-    nearest = np.asarray(KDTree(dense).query(points)[1]) // 8
-    best, place = np.full(len(points), np.inf), np.zeros(len(points))
+def distance_to_line(line: Float[np.ndarray, "m 3"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    """Return the distance of points to a polyline, mm."""
+    shares = max(1, round(float(np.linalg.norm(np.diff(line, axis=0), axis=1).max()) / 0.25))
+    dense = np.concatenate([np.linspace(a, b, shares, endpoint=False) for a, b in itertools.pairwise(line)])
+    nearest = np.asarray(KDTree(dense).query(points)[1]) // shares
+    best = np.full(len(points), np.inf)
     for start in (np.maximum(nearest - 1, 0), nearest, np.minimum(nearest + 1, len(line) - 2)):
         along = line[start + 1] - line[start]
         relative = points - line[start]
         share = np.clip(np.einsum("ij,ij->i", relative, along) / np.einsum("ij,ij->i", along, along), 0.0, 1.0)
-        gap = np.linalg.norm(relative - share[:, None] * along, axis=1)
-        nearer = gap < best
-        best[nearer], place[nearer] = gap[nearer], (start + share)[nearer]
-    return best, place
+        np.minimum(best, np.linalg.norm(relative - share[:, None] * along, axis=1), out=best)
+    return best
