@@ -87,8 +87,8 @@ def test_agrees_with_brute_force_on_a_whole_tree():
     insertion = Insertion(start[0], (start[1] - start[0]) / np.linalg.norm(start[1] - start[0]))
     points = points[(points - start[0]) @ insertion.direction > 0.5]
     found, exact = project_tip(tree, insertion, points), brute_force(tree, points)
-    ratio = np.array([np.interp(exact[0][i], tree.branches[int(exact[2][i])].centerline.abscissa,
-                                tree.branches[int(exact[2][i])].centerline.radius) for i in range(len(points))])  # fmt: skip
+    lines = [tree.branches[int(index)].centerline for index in exact[2]]
+    ratio = np.array([np.interp(at, own.abscissa, own.radius) for at, own in zip(exact[0], lines, strict=True)])
     depth, least = found.offset / found.radius, exact[1] / ratio
     inside = least < 1.0
     # nearest places on a polyline and on its turning planes differ by the corners alone
@@ -110,7 +110,7 @@ def test_abscissa_follows_a_bend_smoothly_and_exactly():
         found = project_tip(tree, insertion, points)
         assert np.abs(found.abscissa - bend * fine).max() < 0.01
         speed = np.diff(found.abscissa) / (bend * np.diff(fine))
-        assert 0.95 < speed.min() and speed.max() < 1.05  # neither a jump nor a halt at any vertex
+        assert speed.min() > 0.95 and speed.max() < 1.05  # neither a jump nor a halt at any vertex
         assert np.abs(found.offset - abs(off)).max() < 0.01
 
 
@@ -128,7 +128,8 @@ def test_a_step_into_a_branch_is_no_longer_than_the_shortcut():
     tree = forked_tree()
     rng = np.random.default_rng(1)
     for _ in range(20):
-        start, end = rng.uniform(-1.0, 1.0, 3) + [0, 0, 15], rng.uniform(-0.6, 0.6, 3) + [6.0, 0, 23.5]
+        start = np.array([0.0, 0, 15]) + rng.uniform(-1.0, 1.0, 3)
+        end = np.array([6.0, 0, 23.5]) + rng.uniform(-0.6, 0.6, 3)
         share = np.linspace(0.0, 1.0, 2001)[:, None]
         found = project_tip(tree, INSERTION, (1 - share) * start + share * end)
         jump = np.abs(np.diff(found.abscissa))

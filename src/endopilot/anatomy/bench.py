@@ -31,6 +31,7 @@ POSE = (Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix(), np.array([0.13, -0.2
 
 FORK_DEG = (30.0, 60.0, 90.0)
 NEAR_WALL_MM = 2.0
+COMPARED_POINTS = 100_000
 PROJECTED = 1_000_000
 
 VOXEL_BAR = 0.1
@@ -160,6 +161,8 @@ def _wall(tree: VesselTree, mask: LumenMask) -> dict[str, tuple[float, float | N
 def _error_near_wall(tree: VesselTree, points: Float[np.ndarray, "n 3"], values: Float[np.ndarray, "n"]) -> float:
     ends = [tree.branches[0].centerline.points[0], *(tree.branches[i].centerline.points[-1] for i in tree.leaves())]
     reach = NEAR_WALL_MM + max(float(branch.centerline.radius.max()) for branch in tree.branches)
+    chosen = np.random.default_rng(0).permutation(len(points))[:COMPARED_POINTS]
+    points, values = points[chosen], values[chosen]
     away = np.min([np.linalg.norm(points - end, axis=1) for end in ends], axis=0) > reach
     exact = analytic.tree_distance(tree, points[away])
     near = np.abs(exact) < NEAR_WALL_MM

@@ -69,7 +69,8 @@ class _Slabs:
             and its change, radius and its change: (m, 18).
         first, last: of every branch, its first and its last vertex.
         branch: of every vertex, its branch.
-        rival: (m, branches), how far from this, its nearest vertex, a point must lie to lie deeper in another branch, mm.
+        rival: (m, branches), how far a point must lie from this, its nearest vertex, to lie deeper in another branch,
+            mm.
         entry: (m, branches), the branch's vertex that is nearest to this one.
         places: the vertices, to search.
     """
