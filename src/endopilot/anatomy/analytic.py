@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -26,8 +26,8 @@ def torus_distance(points: Float[np.ndarray, "*n 3"], radius: float) -> Float[np
 
 def mask_of(
     distance: Distance,
-    half_mm: tuple[float, float, float],
-    spacing: tuple[float, float, float],
+    half_mm: Sequence[float | int],
+    spacing: Sequence[float | int],
     rotation: Float[np.ndarray, "3 3"] | None = None,
 ) -> LumenMask:
     """Sample a signed distance on voxels centred at the origin, perhaps on rotated axes.

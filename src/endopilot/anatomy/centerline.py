@@ -35,6 +35,9 @@ _RING = 12
 _FEWEST_DIRECTIONS = 5
 """In fewer directions of the ring a vessel has too little wall of its own to be centred by it."""
 
+_STRAIGHT = 10
+"""This many steps of a branch from where it leaves its parent tell where it comes from."""
+
 _NEAR_WALL = 0.8
 """The ring on which the radius is measured, in distances to the wall."""
 
@@ -159,7 +162,8 @@ def refined_lines(
 def end_score(distance_map: DistanceMap, graph: LumenGraph, path: Int[np.ndarray, "_"]) -> float:
     """Return how much the end of a path looks like the vessel's inlet: its radius in mm, less if it is not cut open.
 
-    A blind end counts 0.6 times its radius, and one that bulges behind a neck, as an aneurysm does, 0.2 times.
+    A blind end counts 0.6 times its radius, and one that bulges behind a neck, as an aneurysm does, 0.2 times, but no
+    more than half the neck's.
     """
     kept = path[: _before_cap(graph, path)]
     radius = float(np.median(graph.clearance[kept[-5:]]))
@@ -175,7 +179,7 @@ def end_score(distance_map: DistanceMap, graph: LumenGraph, path: Int[np.ndarray
         return radius
     gap = np.linalg.norm(graph.points[kept] - graph.points[kept[-1]], axis=1)
     neck = graph.clearance[kept[gap < 4 * radius]].min()
-    return (0.2 if radius > 1.3 * neck else 0.6) * radius
+    return min(0.2 * radius, 0.5 * float(neck)) if radius > 1.3 * neck else 0.6 * radius
 
 
 _HALF_NEIGHBOURHOOD = np.array(
@@ -388,13 +392,13 @@ def _outside(points: Float[np.ndarray, "n 3"], parent: Line) -> int:
 
 def _meeting_point(body: Float[np.ndarray, "n 3"], parent: Line) -> int:
     """Return the index of the parent's point that the side branch's axis, drawn back, comes nearest to."""
-    reach = min(len(body) - 1, 6)
-    back = body[0] - body[reach]
-    back /= np.linalg.norm(back)
-    relative = parent.points - body[0]
+    start = body[: min(len(body), _STRAIGHT + 1)]
+    back = np.linalg.svd(start - start.mean(axis=0))[2][0]
+    back *= np.sign(back @ (start[0] - start[-1]))
+    relative = parent.points - start.mean(axis=0)
     along = np.clip(relative @ back, 0.0, None)
     miss = np.linalg.norm(relative - along[:, None] * back, axis=1)
-    gap = np.linalg.norm(relative, axis=1)
+    gap = np.linalg.norm(parent.points - body[0], axis=1)
     near = gap <= 2.0 * parent.radius + gap.min()
     score = np.where(near, miss + 0.1 * gap, np.inf)
     place = int(score.argmin())
