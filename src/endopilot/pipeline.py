@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from endopilot.anatomy.atlas import AtlasConfig, synthesize_one
-from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
+from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy, read_source
 from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.anatomy.phantom import PhantomConfig, make_phantom
 from endopilot.dataset.generate import DatasetConfig, generate_dataset
@@ -203,7 +203,7 @@ def _make_anatomy(volume: Path, *, output: Path, config: AnatomyConfig) -> None:
     name = volume.name.removesuffix(VOLUME_SUFFIX)
     mask, folder = output / "masks" / volume.name, output / "anatomies" / name
     if mask.exists() and not folder.exists():
-        write_anatomy(extract_anatomy(read_mask(mask), name=name, config=config), folder)
+        write_anatomy(extract_anatomy(read_source(mask), name=name, config=config), folder)
 
 
 def _study(
