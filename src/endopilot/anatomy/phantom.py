@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Float32, Int
-from scipy.ndimage import gaussian_filter1d
+from scipy.ndimage import gaussian_filter1d, shift
 from scipy.spatial import KDTree
 
 from endopilot.anatomy import phantom_heart as chest
@@ -27,6 +27,10 @@ _FAT_MM = 5.5
 """Fat reaches at least this far from a coronary's axis, mm."""
 _WALL_MM = 0.5
 """Thickness of a coronary wall, mm."""
+_PHASES = 7
+"""Positions of a moving heart that are averaged."""
+_HELD_MM = 4.0
+"""The motion fades over this depth below the pericardium, mm."""
 _SLAB = 8
 """Slices rendered at once: a slab stays in the processor's cache."""
 
@@ -47,19 +51,29 @@ class PhantomConfig:
     """Width of the point-spread function at half its height, mm."""
     calcium: float = 2.0
     """Mean number of calcified plaques."""
+    right_heart: tuple[float, float] = (0.35, 0.8)
+    """CT number of the right ventricle's blood as a share of the lumen's: less where saline has washed it out."""
+    motion_mm: float = 0.0
+    """How far the heart moves while it is scanned, mm: it is smeared along that way, more where it moved last."""
     margin_mm: float = 16.0
     """Width of surroundings beyond the tree on every side, mm."""
+    voxels: tuple[int, int, int] | None = None
+    """Voxels along x, y and z, the tree in their middle; by default as many as the margin asks for."""
 
     def __post_init__(self) -> None:
         for name in ("in_plane_mm", "slice_mm", "margin_mm"):
             if not getattr(self, name) > 0:
                 raise InputError(f"{name}: {getattr(self, name)} mm; give a length above 0")
-        for name in ("lumen_hu", "noise_hu", "psf_mm"):
+        for name in ("lumen_hu", "noise_hu", "psf_mm", "right_heart"):
             low, high = getattr(self, name)
             if not 0 <= low <= high:
                 raise InputError(f"{name}: ({low}, {high}); give two numbers from 0 up, the smaller one first")
         if self.calcium < 0:
             raise InputError(f"calcium: {self.calcium} plaques; give 0 or more")
+        if not 0 <= self.motion_mm <= 10:
+            raise InputError(f"motion_mm: {self.motion_mm} mm; give 0 to 10")
+        if self.voxels is not None and min(self.voxels) < 16:
+            raise InputError(f"voxels: {self.voxels}; give at least 16 along each axis")
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +115,7 @@ def make_phantom(anatomy: Anatomy, config: PhantomConfig, seed: int) -> Volume:
     lumen_hu, noise_hu, psf_mm = (
         generator.uniform(*span) for span in (config.lumen_hu, config.noise_hu, config.psf_mm)
     )
-    tissue = _tissue_hu(generator, lumen_hu)
+    tissue = _tissue_hu(generator, lumen_hu, config.right_heart)
     coronaries = [branch.centerline for branch in anatomy.tree.branches] + list(chest.left_coronary(heart))
     lumen = _small_vessels(grid, coronaries)
     veins = _small_vessels(grid, chest.cardiac_veins(heart, anatomy.tree))
@@ -110,6 +124,8 @@ def make_phantom(anatomy: Anatomy, config: PhantomConfig, seed: int) -> Volume:
     image = _render(grid, painter, organs, lumen, veins, tissue)
     for plaque in _plaques(grid, anatomy, generator, config.calcium):
         painter.paint(image[plaque.box], np.minimum(plaque.depth, -lumen[plaque.box]), tissue[plaque.tissue])
+    if config.motion_mm > 0:
+        _smear(image, painter, organs, config, generator)
     _scan(image, config, psf_mm, noise_hu, generator)
     return Volume(
         voxels=np.clip(np.rint(image), -1024, 3071).astype(np.int16),
@@ -126,13 +142,18 @@ def _field_of_view(anatomy: Anatomy, config: PhantomConfig) -> _Grid:
     high[2] = max(high[2], anatomy.insertion.position[2] + 2 * config.margin_mm)
     high[:2] = np.maximum(high[:2], anatomy.insertion.position[:2] + np.array([44.0, 36.0]))
     steps = (config.in_plane_mm, config.in_plane_mm, config.slice_mm)
+    if config.voxels is not None:
+        half = 0.5 * np.array(config.voxels) * steps
+        low, high = (low + high) / 2 - half, (low + high) / 2 + half - 0.5 * np.array(steps)
     axes = [np.arange(a, b, step) for a, b, step in zip(low, high, steps, strict=True)]
     return _Grid(*axes)
 
 
-def _tissue_hu(generator: np.random.Generator, lumen_hu: float) -> dict[str, float]:
+def _tissue_hu(
+    generator: np.random.Generator, lumen_hu: float, right_heart: tuple[float, float]
+) -> dict[str, float]:
     """Draw the CT numbers of one scan, HU (see docs/atlas.md for their ranges)."""
-    right = generator.uniform(0.35, 0.8)
+    right = generator.uniform(*right_heart)
     return {
         "lung": generator.uniform(-830, -780),
         "chest wall": 45.0,
@@ -340,6 +361,36 @@ def _render(
             painter.paint(slab[:, box_y, box_x], fine, tissue[organ.name])
         painter.paint(slab, vessel, tissue["lumen"])
     return image
+
+
+def _smear(
+    image: Float32[np.ndarray, "nz ny nx"],
+    painter: _Painter,
+    organs: Sequence[chest.Organ],
+    config: PhantomConfig,
+    generator: np.random.Generator,
+) -> None:
+    """Average the heart over the way that it moves along while it is scanned, in place; the chest stays.
+
+    The heart stands longest where the way ends, so that edges across the way show a ghost. The truth is the middle.
+    """
+    way = generator.normal(size=3)
+    way *= config.motion_mm / np.linalg.norm(way) / (config.slice_mm, config.in_plane_mm, config.in_plane_mm)
+    still = image.copy()
+    places, weights = np.linspace(-0.5, 0.5, _PHASES), np.linspace(0.5, 1.5, _PHASES)
+    places = places - (weights @ places) / weights.sum()
+    image[...] = 0
+    for place, weight in zip(places, weights / weights.sum(), strict=True):
+        image += np.float32(weight) * shift(still, place * way, order=1, mode="nearest")
+    fat = next(organ.depth for organ in organs if organ.name == "fat")
+    for begin in range(0, len(image), _SLAB):
+        rows = slice(begin, begin + _SLAB)
+        found = painter.fine(fat, rows)
+        moves = np.zeros(image[rows].shape, dtype=np.float32)
+        if found is not None:
+            fine, (box_y, box_x) = found
+            moves[:, box_y, box_x] = np.clip(fine / np.float32(_HELD_MM), 0, 1)
+        image[rows] = still[rows] + moves * (image[rows] - still[rows])
 
 
 def _scan(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
@@ -18,6 +20,8 @@ _SURROUNDINGS_MM = 1.2
 """Width of the window in which the surroundings' HU are averaged, mm."""
 _WALL_HU = 0.0
 """Even in fat and lung, the vessel's own wall lies next to the lumen: half a millimetre of soft tissue, blurred."""
+_BLOCK = 8
+"""Edge of the blocks in which voxels near the vessel are looked for, voxels."""
 _CALCIUM = 1.5
 """Times the lumen's HU; brighter voxels are calcium or metal."""
 
@@ -42,15 +46,16 @@ def lumen_at_half_height(
         excluded: voxels that belong to other blood pools.
     """
     spacing = volume.spacing_mm[::-1]
-    hu = ndimage.gaussian_filter(volume.voxels.astype(np.float32), _SMOOTHING_MM / spacing)
+    hu = ndimage.gaussian_filter(volume.voxels.astype(np.float32), _SMOOTHING_MM / spacing, truncate=3.0)
     distance, local_radius = _distance_to_paths(volume, points, radius, margin_mm=4.0)
     band = (distance <= 1.35 * local_radius + 0.7) & ~excluded
     rough = band & (hu > 0.5 * lumen_hu)
     beside = (distance <= 1.35 * local_radius + 4.0) & (hu < 0.6 * lumen_hu)
     beside &= distance_to_outside(~rough, tuple(spacing)) > 2 * _BLUR_MM
     window = _SURROUNDINGS_MM / spacing
-    weight = ndimage.gaussian_filter(beside.astype(np.float32), window)
-    surroundings = ndimage.gaussian_filter(np.where(beside, hu, np.float32(0)), window) / np.maximum(weight, 1e-4)
+    weight = ndimage.gaussian_filter(beside.astype(np.float32), window, truncate=3.0)
+    surroundings = ndimage.gaussian_filter(np.where(beside, hu, np.float32(0)), window, truncate=3.0)
+    surroundings /= np.maximum(weight, 1e-4)
     surroundings = np.clip(surroundings, _WALL_HU, 0.5 * lumen_hu)
     # A blurred disc has less than half its height at its own edge, the less the smaller it is (to first order in σ/r).
     share = 0.5 - 0.2 * np.minimum(_BLUR_MM / np.maximum(local_radius, 0.1), 1.0)
@@ -62,16 +67,22 @@ def _distance_to_paths(
     volume: Volume, points: np.ndarray, radius: np.ndarray, margin_mm: float
 ) -> tuple[Float[np.ndarray, "nz ny nx"], Float[np.ndarray, "nz ny nx"]]:
     """Return the distance to the nearest path point and that point's radius, mm; infinite and 0 far away."""
-    shape = volume.voxels.shape
-    marked = np.ones(shape, dtype=bool)
-    last = np.array(shape) - 1
-    index = np.clip(np.round(volume.world_to_index(points)).astype(int)[:, ::-1], 0, last)
-    marked[tuple(index.T)] = False
-    near = distance_to_outside(marked, tuple(volume.spacing_mm[::-1])) < radius.max() * 1.35 + margin_mm
-    voxels = np.argwhere(near)
-    found, nearest = KDTree(points).query(volume.index_to_world(voxels[:, ::-1].astype(float)))
-    distance = np.full(shape, np.inf, dtype=np.float32)
-    local_radius = np.zeros(shape, dtype=np.float32)
-    distance[near] = found
-    local_radius[near] = radius[nearest]
+    shape = np.array(volume.voxels.shape)
+    # Blocks of voxels first: most of the volume is far from the vessel.
+    blocks = np.ones(-(-shape // _BLOCK), dtype=bool)
+    index = np.clip(np.round(volume.world_to_index(points)).astype(int)[:, ::-1], 0, shape - 1) // _BLOCK
+    blocks[tuple(index.T)] = False
+    size = _BLOCK * volume.spacing_mm[::-1]
+    reach = radius.max() * 1.35 + margin_mm
+    near = distance_to_outside(blocks, tuple(size)) < reach + float(np.linalg.norm(size))
+    corners = _BLOCK * np.argwhere(near)
+    voxels = (corners[:, None] + np.array(list(product(range(_BLOCK), repeat=3)))).reshape(-1, 3)
+    voxels = voxels[np.all(voxels < shape, axis=1)]
+    found, nearest = KDTree(points).query(
+        volume.index_to_world(voxels[:, ::-1].astype(float)), distance_upper_bound=reach
+    )
+    distance = np.full(tuple(shape), np.inf, dtype=np.float32)
+    local_radius = np.zeros(tuple(shape), dtype=np.float32)
+    distance[tuple(voxels.T)] = found
+    local_radius[tuple(voxels.T)] = np.append(radius, 0.0)[nearest]
     return distance, local_radius
