@@ -99,7 +99,7 @@ class _Plaque:
 
 
 def make_phantom(anatomy: Anatomy, config: PhantomConfig, seed: int) -> Volume:
-    """Return a synthetic CT angiogram of a right coronary anatomy, in HU.
+    """Return a synthetic CT angiogram of a right or left coronary anatomy, in HU.
 
     Args:
         anatomy: its tree gives the lumen; a stenosis named in its provenance gets a soft plaque.
@@ -116,7 +116,8 @@ def make_phantom(anatomy: Anatomy, config: PhantomConfig, seed: int) -> Volume:
         generator.uniform(*span) for span in (config.lumen_hu, config.noise_hu, config.psf_mm)
     )
     tissue = _tissue_hu(generator, lumen_hu, config.right_heart)
-    coronaries = [branch.centerline for branch in anatomy.tree.branches] + list(chest.left_coronary(heart))
+    coronaries = [branch.centerline for branch in anatomy.tree.branches]
+    coronaries += chest.other_coronary(heart, anatomy.tree)
     lumen = _small_vessels(grid, coronaries)
     veins = _small_vessels(grid, chest.cardiac_veins(heart, anatomy.tree))
     coarse, organs = _organs(grid, heart, coronaries, generator)
@@ -136,11 +137,15 @@ def make_phantom(anatomy: Anatomy, config: PhantomConfig, seed: int) -> Volume:
 
 
 def _field_of_view(anatomy: Anatomy, config: PhantomConfig) -> _Grid:
-    """Return a grid around the tree with the margin, and twice the margin of aorta above the ostium."""
+    """Return a grid around the tree with the margin; the aorta beside the ostium, and above it by twice the margin."""
     points = np.concatenate([branch.centerline.points for branch in anatomy.tree.branches])
     low, high = points.min(axis=0) - config.margin_mm, points.max(axis=0) + config.margin_mm
     high[2] = max(high[2], anatomy.insertion.position[2] + 2 * config.margin_mm)
-    high[:2] = np.maximum(high[:2], anatomy.insertion.position[:2] + np.array([44.0, 36.0]))
+    across = np.array([44.0, 36.0])
+    if chest.is_left(anatomy.tree):
+        low[:2] = np.minimum(low[:2], anatomy.insertion.position[:2] - across)
+    else:
+        high[:2] = np.maximum(high[:2], anatomy.insertion.position[:2] + across)
     steps = (config.in_plane_mm, config.in_plane_mm, config.slice_mm)
     if config.voxels is not None:
         half = 0.5 * np.array(config.voxels) * steps
