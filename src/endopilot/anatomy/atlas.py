@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from endopilot.anatomy import distance
+from endopilot.anatomy.atlas_lca import synthesize_lca
 from endopilot.anatomy.atlas_rca import synthesize_rca
 from endopilot.anatomy.atlas_shape import tangents
 from endopilot.errors import InputError
@@ -19,7 +20,10 @@ CATHETER_RADIUS_MM = 0.9
 CATHETER_LENGTH_MM = 30.0
 """Length of catheter behind the ostium that the distance map holds, mm."""
 
-_KINDS: dict[str, Callable[[np.random.Generator, float], tuple[VesselTree, dict[str, Any]]]] = {"rca": synthesize_rca}
+_KINDS: dict[str, Callable[[np.random.Generator, float], tuple[VesselTree, dict[str, Any]]]] = {
+    "rca": synthesize_rca,
+    "lca": synthesize_lca,
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,7 +31,7 @@ class AtlasConfig:
     """Which synthetic patients to make."""
 
     anatomy: str = "rca"
-    """Kind of vessel tree: rca (right coronary artery)."""
+    """Kind of vessel tree: rca or lca (right or left coronary artery)."""
     count: int = 1
     """Number of patients."""
     seed: int = 0
