@@ -128,8 +128,8 @@ def fit_heart(main: Float[np.ndarray, "n 3"], crux_mm: float, last_section: str)
     return HeartFit(main[0], rotation, scale, knots, reference - knots)
 
 
-def fit_left_heart(lines: Sequence[Float[np.ndarray, "_ 3"]], courses: Sequence[Float[np.ndarray, "_ 3"]]) -> HeartFit:
-    """Fit the reference heart to the beginnings of a left coronary tree's main vessels.
+def fit_heart_along(lines: Sequence[Float[np.ndarray, "_ 3"]], courses: Sequence[Float[np.ndarray, "_ 3"]]) -> HeartFit:
+    """Fit the reference heart to the main vessels of a tree, as far as they go.
 
     A patient's point belongs to the reference point at the same way from the ostium, measured in sizes of the heart.
 

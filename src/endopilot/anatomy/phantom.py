@@ -154,9 +154,7 @@ def _field_of_view(anatomy: Anatomy, config: PhantomConfig) -> _Grid:
     return _Grid(*axes)
 
 
-def _tissue_hu(
-    generator: np.random.Generator, lumen_hu: float, right_heart: tuple[float, float]
-) -> dict[str, float]:
+def _tissue_hu(generator: np.random.Generator, lumen_hu: float, right_heart: tuple[float, float]) -> dict[str, float]:
     """Draw the CT numbers of one scan, HU (see docs/atlas.md for their ranges)."""
     right = generator.uniform(*right_heart)
     return {
@@ -206,15 +204,17 @@ def _small_vessels(grid: _Grid, lines: Sequence[Centerline]) -> Float32[np.ndarr
 
 def _plaques(grid: _Grid, anatomy: Anatomy, generator: np.random.Generator, mean_count: float) -> list[_Plaque]:
     """Return soft plaques around stenoses, and calcified ones in the wall."""
-    line = anatomy.tree.longest_path()
+    paths = chest.main_paths(anatomy.tree)
     plaques = []
     for stenosis in anatomy.provenance.get("stenoses", ()):
+        line = paths[-1] if stenosis.get("vessel") == "LCx" else paths[0]
         half = 0.6 * stenosis["length_mm"]
         ends = stenosis["abscissa_mm"] + np.array([-half, half])
         wall = float(np.interp(ends, line.abscissa, line.radius).max()) + 0.4
         near = int(np.searchsorted(line.abscissa, stenosis["abscissa_mm"]))
         plaques.append(_plaque(grid, "soft plaque", line, near, (0.0, 0.0), (half, wall, wall)))
-    for _ in range(generator.poisson(mean_count)):
+    for number in range(generator.poisson(mean_count)):
+        line = paths[number % len(paths)]
         near = int(generator.integers(4, round(0.75 * len(line.points))))
         along, across, around = (float(a) for a in generator.uniform((1.0, 0.4, 0.8), (3.5, 0.9, 1.4)))
         place = float(line.radius[near]) + 0.4 * across, float(generator.uniform(0, 2 * np.pi))

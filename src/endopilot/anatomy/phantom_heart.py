@@ -10,8 +10,12 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from endopilot.anatomy import atlas_shape as shape
 from endopilot.anatomy import heart_reference as reference
+from endopilot.anatomy.heart_left import reference_courses
 from endopilot.anatomy.heart_reference import HeartFit, ellipsoid, tube
 from endopilot.types import Centerline, VesselTree
+
+_KNOTS = 16
+"""Points of each of the left reference courses."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,24 +41,33 @@ def is_left(tree: VesselTree) -> bool:
 def place(tree: VesselTree) -> HeartFit:
     """Fit the reference heart to the tree; without section labels it is a right one, its crux at 60 % of the way."""
     if is_left(tree):
-        main, lad, lcx = (shape.curve_through(np.array(points, dtype=float)) for points, *_ in _LEFT_CORONARY)
-        lad = np.concatenate([main, shape.curve_through(np.concatenate([lad[::8], _TO_APEX]))[1:]])
-        lines = [_main_line(tree, ("8", "7", "6")), _main_line(tree, ("15", "13", "11"))]
-        return reference.fit_left_heart(lines, [lad, np.concatenate([main, lcx[1:]])])
+        courses = reference_courses().copy()
+        # Onto the aorta's surface: the direction of its axis is nearly z there.
+        outward = courses[0] - np.array(reference.AORTA[2], dtype=float)
+        outward[2] = 0.0
+        courses[0] += reference.aorta(courses[:1])[0] * outward / np.linalg.norm(outward)
+        lad, lcx = courses[:_KNOTS], courses[_KNOTS : 2 * _KNOTS]
+        fork = int(np.linalg.norm(lad - lcx[0], axis=1).argmin())
+        lcx = np.concatenate([lad[: fork + 1], lcx[1:]])
+        lines = [line.points for line in main_paths(tree)]
+        return reference.fit_heart_along(lines, [shape.curve_through(course) for course in (lad, lcx)])
     line = tree.longest_path()
     leaf = max(tree.leaves(), key=lambda branch: tree.branches[branch].centerline.abscissa[-1])
     last = tree.section_names[tree.branches[leaf].section[-1]]
     return reference.fit_heart(line.points, _crux_abscissa(tree), last)
 
 
-def _main_line(tree: VesselTree, ends_in: tuple[str, ...]) -> Float[np.ndarray, "n 3"]:
-    """Return the longest way from the ostium that ends in the first of some sections that the tree has."""
+def main_paths(tree: VesselTree) -> tuple[Centerline, ...]:
+    """Return the ways from the ostium along the main vessels: of a left tree LAD and LCx, of another the longest."""
+    if not is_left(tree):
+        return (tree.longest_path(),)
     ends = {leaf: tree.section_names[tree.branches[leaf].section[-1]] for leaf in tree.leaves()}
-    for section in (*ends_in, None):
-        leaves = [leaf for leaf, name in ends.items() if name == section or section is None]
-        if leaves:
-            return tree.path(max(leaves, key=lambda leaf: tree.branches[leaf].centerline.abscissa[-1])).points
-    raise AssertionError("a tree has leaves")
+    paths = []
+    for sections in (("8", "7", "6"), ("15", "13", "11")):
+        found = next((name for name in sections if name in ends.values()), None)
+        leaves = [leaf for leaf, name in ends.items() if found in (name, None)]
+        paths.append(tree.path(max(leaves, key=lambda leaf: tree.branches[leaf].centerline.abscissa[-1])))
+    return tuple(paths)
 
 
 def organs(
@@ -175,8 +188,6 @@ _PULMONARY_VEINS = [
     [(44, 46, -16), (60, 58, -24), (88, 64, -36)],
 ]
 _CORONARY_SINUS = [(-6, 20, -47), (4, 29, -48), (18, 36, -44), (33, 37, -38), (48, 27, -28)]
-_TO_APEX = [(64, -61, -41), (67, -62, -52)]
-"""The anterior descending artery from the end of its course below to the apex."""
 _RIGHT_CORONARY = ((reference.TO_CRUX[:7].tolist(), 2.0, 1.8),)
 _LEFT_CORONARY = (
     ([(26, 14, 2), (31, 12, 2.5), (36, 8, 2), (40, 3, 0)], 2.25, 2.1),

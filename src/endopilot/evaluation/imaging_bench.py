@@ -22,7 +22,7 @@ from endopilot.files import manifest, read_json, write_json
 from endopilot.imaging.segment import SegmentConfig, segment
 from endopilot.parallel import each
 
-VESSELS = ("rca",)
+VESSELS = ("rca", "lca")
 """Coronary trees of the cases, in turn."""
 
 
