@@ -90,7 +90,7 @@ def test_masks_are_scored_by_their_voxels():
     assert good.dice > 0.97 and good.cldice > 0.97
     # A disc of half the area in one of the full: 2·½ / 1½.
     thin = score_anatomy(mask(1.5 / np.sqrt(2)), truth, truth)
-    assert thin.dice == pytest.approx(2 / 3, abs=0.03) and thin.cldice > 0.95
+    assert thin.dice == pytest.approx(2 / 3, abs=0.05) and thin.cldice > 0.95
     half = score_anatomy(mask(1.5, 20.0), truth, truth)
     assert half.dice == pytest.approx(2 / 3, abs=0.02)
     assert half.cldice == pytest.approx(2 / 3, abs=0.03)

@@ -5,11 +5,15 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
+from endopilot.anatomy.atlas import synthesize_one
 from endopilot.errors import InputError
 from endopilot.evaluation import imaging_bench
 from endopilot.evaluation.imaging_bench import BARS, ImagingBenchConfig, bench_imaging, draw_case
+from endopilot.imaging.overlap import mask_like
+from endopilot.types import LumenMask, Volume
 
 GOOD = {
     "dice": 0.93,
@@ -72,13 +76,26 @@ def test_a_case_depends_on_seed_and_index_alone():
 
 def test_one_case_from_the_volume_to_its_scores(tmp_path, monkeypatch):
     patients, scan = draw_case(1000, 0)
-    coarse = replace(scan, in_plane_mm=0.8, slice_mm=0.8, calcium=0.0)
+    coarse = replace(scan, in_plane_mm=0.9, slice_mm=0.9)
+    truth = synthesize_one(patients, 0)
+
+    def whole_lumen(volume, config):
+        inside = mask_like(LumenMask(as_volume(truth.distance_map)), volume)
+        return LumenMask(replace(volume, voxels=inside), truth.insertion)
+
     monkeypatch.setattr(imaging_bench, "draw_case", lambda seed, index: (patients, coarse))
+    monkeypatch.setattr(imaging_bench, "segment", whole_lumen)
+    monkeypatch.setattr(imaging_bench, "extract_anatomy", lambda mask, name, config: truth)
     found = bench_imaging(ImagingBenchConfig(cases=1, seed=1000, folder=tmp_path))
     assert found["failed"] == {}
-    assert found["overlap"]["mean"] > 0.6 and 0.5 < found["dice"]["mean"] < 1
+    assert found["dice"]["mean"] > 0.9 and found["overlap"]["mean"] == 1.0
     row = json.loads((tmp_path / "1000-0000.json").read_text())
-    assert row["scan"]["in_plane_mm"] == 0.8 and row["manifest"]["seed"] == 1000
+    assert row["scan"]["in_plane_mm"] == 0.9 and row["manifest"]["seed"] == 1000
+
+
+def as_volume(distance_map):
+    inside = distance_map.values > 0
+    return Volume(inside, np.full(3, distance_map.spacing_mm), distance_map.origin_mm, np.eye(3))
 
 
 @pytest.mark.parametrize(("options", "told"), [({"cases": 0}, "cases: 0"), ({"seed": -1}, "seed: -1")])

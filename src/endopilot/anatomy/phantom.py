@@ -58,7 +58,7 @@ class PhantomConfig:
     margin_mm: float = 16.0
     """Width of surroundings beyond the tree on every side, mm."""
     voxels: tuple[int, int, int] | None = None
-    """Voxels along x, y and z, the tree in their middle; by default as many as the margin asks for."""
+    """Voxels along x, y and z about the middle of what the margin asks for; by default as many as that takes."""
 
     def __post_init__(self) -> None:
         for name in ("in_plane_mm", "slice_mm", "margin_mm"):

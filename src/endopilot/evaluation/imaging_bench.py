@@ -69,6 +69,8 @@ class ImagingBenchConfig:
 def bench_imaging(config: ImagingBenchConfig) -> dict[str, Any]:
     """Segment synthetic CT angiograms from the volume alone and compare with what they were made of.
 
+    Centerlines and radii are those that `extract_anatomy` finds in the mask; its tree begins at the mask's ostium.
+
     Returns:
         For each of `BARS` its `mean`, `sd`, `worst`, `bar`, `counts` (mean or worst) and whether it is `met`; `seconds`
         and `processor_seconds` of the segmentation a case; `cases`, and `failed`: cases without any result, each with
