@@ -51,7 +51,8 @@ def lumen_at_half_height(
     band = (distance <= 1.35 * local_radius + 0.7) & ~excluded
     rough = band & (hu > 0.5 * lumen_hu)
     beside = (distance <= 1.35 * local_radius + 4.0) & (hu < 0.6 * lumen_hu)
-    beside &= distance_to_outside(~rough, tuple(spacing)) > 2 * _BLUR_MM
+    reach = [2 * round(step) + 1 for step in 2 * _BLUR_MM / spacing]
+    beside &= ~np.asarray(ndimage.maximum_filter(rough, reach), dtype=bool)
     window = _SURROUNDINGS_MM / spacing
     weight = ndimage.gaussian_filter(beside.astype(np.float32), window, truncate=3.0)
     surroundings = ndimage.gaussian_filter(np.where(beside, hu, np.float32(0)), window, truncate=3.0)
