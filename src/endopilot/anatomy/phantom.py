@@ -10,29 +10,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float32, Int
-from scipy.ndimage import gaussian_filter1d, shift
+from jaxtyping import Float32
 from scipy.spatial import KDTree
 
 from endopilot.anatomy import phantom_heart as chest
 from endopilot.anatomy.heart_reference import HeartFit
+from endopilot.anatomy.phantom_painter import COARSE_MM, SLAB, Grid, Painter, smooth_min, window
+from endopilot.anatomy.phantom_scanner import scan, smear
 from endopilot.errors import InputError
 from endopilot.types import Anatomy, Centerline, Volume
 
-_COARSE_MM = 2.0
-"""Spacing of the grid on which organs are computed, mm."""
 _REACH_MM = 5.0
 """Distances to small vessels are computed up to this far, mm."""
 _FAT_MM = 5.5
 """Fat reaches at least this far from a coronary's axis, mm."""
 _WALL_MM = 0.5
 """Thickness of a coronary wall, mm."""
-_PHASES = 7
-"""Positions of a moving heart that are averaged."""
-_HELD_MM = 4.0
-"""The motion fades over this depth below the pericardium, mm."""
-_SLAB = 8
-"""Slices rendered at once: a slab stays in the processor's cache."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,19 +70,6 @@ class PhantomConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class _Grid:
-    """The voxel centres along x, y and z, mm."""
-
-    x: Float[np.ndarray, "nx"]
-    y: Float[np.ndarray, "ny"]
-    z: Float[np.ndarray, "nz"]
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        return len(self.z), len(self.y), len(self.x)
-
-
-@dataclass(frozen=True, eq=False)
 class _Plaque:
     """A plaque: its tissue, the voxels around it, and the signed distance to its surface there, mm, positive inside."""
 
@@ -121,13 +101,15 @@ def make_phantom(anatomy: Anatomy, config: PhantomConfig, seed: int) -> Volume:
     lumen = _small_vessels(grid, coronaries)
     veins = _small_vessels(grid, chest.cardiac_veins(heart, anatomy.tree))
     coarse, organs = _organs(grid, heart, coronaries, generator)
-    painter = _Painter(grid, coarse, config)
+    painter = Painter(grid, coarse, in_plane_mm=config.in_plane_mm, slice_mm=config.slice_mm)
     image = _render(grid, painter, organs, lumen, veins, tissue)
     for plaque in _plaques(grid, anatomy, generator, config.calcium):
         painter.paint(image[plaque.box], np.minimum(plaque.depth, -lumen[plaque.box]), tissue[plaque.tissue])
+    spacing = config.slice_mm, config.in_plane_mm, config.in_plane_mm
     if config.motion_mm > 0:
-        _smear(image, painter, organs, config, generator)
-    _scan(image, config, psf_mm, noise_hu, generator)
+        pericardium = next(organ.depth for organ in organs if organ.name == "fat")
+        smear(image, painter, pericardium, spacing, config.motion_mm, generator)
+    scan(image, spacing, psf_mm, noise_hu, generator)
     return Volume(
         voxels=np.clip(np.rint(image), -1024, 3071).astype(np.int16),
         spacing_mm=np.array([config.in_plane_mm, config.in_plane_mm, config.slice_mm]),
@@ -136,7 +118,7 @@ def make_phantom(anatomy: Anatomy, config: PhantomConfig, seed: int) -> Volume:
     )
 
 
-def _field_of_view(anatomy: Anatomy, config: PhantomConfig) -> _Grid:
+def _field_of_view(anatomy: Anatomy, config: PhantomConfig) -> Grid:
     """Return a grid around the tree with the margin; the aorta beside the ostium, and above it by twice the margin."""
     points = np.concatenate([branch.centerline.points for branch in anatomy.tree.branches])
     low, high = points.min(axis=0) - config.margin_mm, points.max(axis=0) + config.margin_mm
@@ -151,7 +133,7 @@ def _field_of_view(anatomy: Anatomy, config: PhantomConfig) -> _Grid:
         half = 0.5 * np.array(config.voxels) * steps
         low, high = (low + high) / 2 - half, (low + high) / 2 + half - 0.5 * np.array(steps)
     axes = [np.arange(a, b, step) for a, b, step in zip(low, high, steps, strict=True)]
-    return _Grid(*axes)
+    return Grid(*axes)
 
 
 def _tissue_hu(generator: np.random.Generator, lumen_hu: float, right_heart: tuple[float, float]) -> dict[str, float]:
@@ -183,7 +165,7 @@ def _tissue_hu(generator: np.random.Generator, lumen_hu: float, right_heart: tup
     }
 
 
-def _small_vessels(grid: _Grid, lines: Sequence[Centerline]) -> Float32[np.ndarray, "nz ny nx"]:
+def _small_vessels(grid: Grid, lines: Sequence[Centerline]) -> Float32[np.ndarray, "nz ny nx"]:
     """Return the signed distance to the wall of tubes with rounded ends, mm, positive inside, not below -5."""
     depth = np.full(grid.shape, -_REACH_MM, dtype=np.float32)
     for line in lines:
@@ -191,7 +173,7 @@ def _small_vessels(grid: _Grid, lines: Sequence[Centerline]) -> Float32[np.ndarr
         points, radius = line.points[chosen], line.radius[chosen]
         for a, b, ra, rb in zip(points[:-1], points[1:], radius[:-1], radius[1:], strict=True):
             reach = max(ra, rb) + _REACH_MM
-            box, (z, y, x) = _window(grid, np.minimum(a, b) - reach, np.maximum(a, b) + reach)
+            box, (z, y, x) = window(grid, np.minimum(a, b) - reach, np.maximum(a, b) + reach)
             x, y, z, step = x - a[0], y - a[1], z - a[2], b - a
             share = (x * step[0] + y * step[1] + z * step[2]) * np.float32(1 / (step @ step))
             np.clip(share, 0, 1, out=share)
@@ -202,7 +184,7 @@ def _small_vessels(grid: _Grid, lines: Sequence[Centerline]) -> Float32[np.ndarr
     return depth
 
 
-def _plaques(grid: _Grid, anatomy: Anatomy, generator: np.random.Generator, mean_count: float) -> list[_Plaque]:
+def _plaques(grid: Grid, anatomy: Anatomy, generator: np.random.Generator, mean_count: float) -> list[_Plaque]:
     """Return soft plaques around stenoses, and calcified ones in the wall."""
     paths = chest.main_paths(anatomy.tree)
     plaques = []
@@ -223,7 +205,7 @@ def _plaques(grid: _Grid, anatomy: Anatomy, generator: np.random.Generator, mean
 
 
 def _plaque(
-    grid: _Grid,
+    grid: Grid,
     tissue: str,
     line: Centerline,
     index: int,
@@ -245,7 +227,7 @@ def _plaque(
     outward = np.cos(place[1]) * line.normals[index] + np.sin(place[1]) * np.cross(tangent, line.normals[index])
     frame = np.stack([tangent, outward, np.cross(tangent, outward)])
     centre, reach = line.points[index] + place[0] * outward, max(semi_axes) + 1.0
-    box, (z, y, x) = _window(grid, centre - reach, centre + reach)
+    box, (z, y, x) = window(grid, centre - reach, centre + reach)
     local = [(x - centre[0]) * e[0] + (y - centre[1]) * e[1] + (z - centre[2]) * e[2] for e in frame]
     # Distance to an ellipsoid, exact to first order at its surface.
     level = np.sqrt(sum((u / a) ** 2 for u, a in zip(local, semi_axes, strict=True)))
@@ -253,21 +235,12 @@ def _plaque(
     return _Plaque(tissue, box, (level * (1 - level) / np.maximum(slope, 1e-6)).astype(np.float32))
 
 
-def _window(
-    grid: _Grid, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]
-) -> tuple[tuple[slice, slice, slice], tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Return the slices (k, j, i) of the voxels in a box, and their z, y and x, ready to broadcast."""
-    spans = [slice(*np.searchsorted(axis, (low[i], high[i]))) for i, axis in enumerate((grid.x, grid.y, grid.z))]
-    x, y, z = (axis[span].astype(np.float32) for axis, span in zip((grid.x, grid.y, grid.z), spans, strict=True))
-    return (spans[2], spans[1], spans[0]), (z[:, None, None], y[:, None], x)
-
-
 def _organs(
-    grid: _Grid, heart: HeartFit, coronaries: Sequence[Centerline], generator: np.random.Generator
-) -> tuple[_Grid, tuple[chest.Organ, ...]]:
+    grid: Grid, heart: HeartFit, coronaries: Sequence[Centerline], generator: np.random.Generator
+) -> tuple[Grid, tuple[chest.Organ, ...]]:
     """Return the coarse grid and the organs on it; fat wraps the coronaries too."""
-    axes = (np.arange(axis[0] - _COARSE_MM, axis[-1] + 2 * _COARSE_MM, _COARSE_MM) for axis in (grid.x, grid.y, grid.z))
-    coarse = _Grid(*axes)
+    axes = (np.arange(axis[0] - COARSE_MM, axis[-1] + 2 * COARSE_MM, COARSE_MM) for axis in (grid.x, grid.y, grid.z))
+    coarse = Grid(*axes)
     z, y, x = np.meshgrid(coarse.z, coarse.y, coarse.x, indexing="ij")
     positions = np.stack([x, y, z], axis=-1).astype(np.float32)
     vessels = KDTree(np.concatenate([line.points[::2] for line in coronaries]))
@@ -275,73 +248,9 @@ def _organs(
     return coarse, chest.organs(heart, positions, _FAT_MM - np.minimum(distance, 2 * _FAT_MM), generator)
 
 
-class _Painter:
-    """Paints tissues over each other, slab by slab, each voxel by the share that it holds of them."""
-
-    def __init__(self, grid: _Grid, coarse: _Grid, config: PhantomConfig) -> None:
-        self.sharpness = np.float32(3 / (2 * config.in_plane_mm + config.slice_mm))
-        self.x, self.y, self.z = (
-            _interpolation(fine, rough) for fine, rough in ((grid.x, coarse.x), (grid.y, coarse.y), (grid.z, coarse.z))
-        )
-
-    def share(self, depth: np.ndarray) -> np.ndarray:
-        """Return how much of each voxel lies within a surface at signed distance `depth`, mm."""
-        share = depth * self.sharpness
-        share += np.float32(0.5)
-        return np.clip(share, 0, 1, out=share)
-
-    def paint(self, image: np.ndarray, depth: np.ndarray, hu: float) -> None:
-        """Mix `hu` into the image where the depth is positive."""
-        change = np.float32(hu) - image
-        change *= self.share(depth)
-        image += change
-
-    def fine(self, depth: np.ndarray, rows: slice) -> tuple[np.ndarray, tuple[slice, slice]] | None:
-        """Interpolate a coarse depth linearly; return it with the (y, x) box that holds its inside, or None."""
-        (left, share), depth = self.z, depth
-        used = depth[left[rows][0] : left[rows][-1] + 2]
-        _, ys, xs = np.nonzero(used > -1.0)
-        if not len(ys):
-            return None
-        box_y, box_x = _covered(self.y[0], ys), _covered(self.x[0], xs)
-        used = _lerp(used, left[rows] - left[rows][0], share[rows], axis=0)
-        used = _lerp(used, self.y[0][box_y], self.y[1][box_y], axis=1)
-        return _lerp(used, self.x[0][box_x], self.x[1][box_x], axis=2), (box_y, box_x)
-
-
-def _interpolation(
-    fine: Float[np.ndarray, "n"], coarse: Float[np.ndarray, "m"]
-) -> tuple[Int[np.ndarray, "n"], Float32[np.ndarray, "n"]]:
-    """Return, for each fine position, the coarse index to its left and the share of the one to its right."""
-    place = (fine - coarse[0]) / _COARSE_MM
-    left = place.astype(int)
-    return left, (place - left).astype(np.float32)
-
-
-def _lerp(values: np.ndarray, left: np.ndarray, share: np.ndarray, axis: int) -> np.ndarray:
-    shaped = share.reshape([-1 if i == axis else 1 for i in range(3)])
-    low = np.take(values, left, axis=axis)
-    high = np.take(values, left + 1, axis=axis)
-    high -= low
-    high *= shaped
-    high += low
-    return high
-
-
-def _smooth_min(a: np.ndarray, b: np.ndarray, width_mm: float = 2.5) -> np.ndarray:
-    """Return the smaller of two depths with the edge between them rounded (polynomial smooth minimum)."""
-    share = np.clip((b - a) * np.float32(0.5 / width_mm) + np.float32(0.5), 0, 1)
-    return b + (a - b) * share - np.float32(width_mm) * share * (1 - share)
-
-
-def _covered(left: Int[np.ndarray, "n"], coarse: Int[np.ndarray, "m"]) -> slice:
-    """Return the fine indices between the outermost of the coarse ones."""
-    return slice(*np.searchsorted(left, (coarse.min() - 1, coarse.max() + 1)))
-
-
 def _render(
-    grid: _Grid,
-    painter: _Painter,
+    grid: Grid,
+    painter: Painter,
     organs: Sequence[chest.Organ],
     lumen: Float32[np.ndarray, "nz ny nx"],
     veins: Float32[np.ndarray, "nz ny nx"],
@@ -349,8 +258,8 @@ def _render(
 ) -> Float32[np.ndarray, "nz ny nx"]:
     """Paint the organs from the outside in, then veins, coronary walls and lumens."""
     image = np.full(grid.shape, tissue["lung"], dtype=np.float32)
-    for begin in range(0, grid.shape[0], _SLAB):
-        rows = slice(begin, begin + _SLAB)
+    for begin in range(0, grid.shape[0], SLAB):
+        rows = slice(begin, begin + SLAB)
         slab, vessel = image[rows], lumen[rows]
         for organ in organs:
             if organ.name == "aorta":
@@ -362,57 +271,7 @@ def _render(
                 continue
             fine, (box_y, box_x) = found
             if organ.clearance_mm is not None:
-                fine = _smooth_min(fine, -vessel[:, box_y, box_x] - np.float32(organ.clearance_mm))
+                fine = smooth_min(fine, -vessel[:, box_y, box_x] - np.float32(organ.clearance_mm))
             painter.paint(slab[:, box_y, box_x], fine, tissue[organ.name])
         painter.paint(slab, vessel, tissue["lumen"])
     return image
-
-
-def _smear(
-    image: Float32[np.ndarray, "nz ny nx"],
-    painter: _Painter,
-    organs: Sequence[chest.Organ],
-    config: PhantomConfig,
-    generator: np.random.Generator,
-) -> None:
-    """Average the heart over the way that it moves along while it is scanned, in place; the chest stays.
-
-    The heart stands longest where the way ends, so that edges across the way show a ghost. The truth is the middle.
-    """
-    way = generator.normal(size=3)
-    way *= config.motion_mm / np.linalg.norm(way) / (config.slice_mm, config.in_plane_mm, config.in_plane_mm)
-    still = image.copy()
-    places, weights = np.linspace(-0.5, 0.5, _PHASES), np.linspace(0.5, 1.5, _PHASES)
-    places = places - (weights @ places) / weights.sum()
-    image[...] = 0
-    for place, weight in zip(places, weights / weights.sum(), strict=True):
-        image += np.float32(weight) * shift(still, place * way, order=1, mode="nearest")
-    fat = next(organ.depth for organ in organs if organ.name == "fat")
-    for begin in range(0, len(image), _SLAB):
-        rows = slice(begin, begin + _SLAB)
-        found = painter.fine(fat, rows)
-        moves = np.zeros(image[rows].shape, dtype=np.float32)
-        if found is not None:
-            fine, (box_y, box_x) = found
-            moves[:, box_y, box_x] = np.clip(fine / np.float32(_HELD_MM), 0, 1)
-        image[rows] = still[rows] + moves * (image[rows] - still[rows])
-
-
-def _scan(
-    image: Float32[np.ndarray, "nz ny nx"],
-    config: PhantomConfig,
-    psf_mm: float,
-    noise_hu: float,
-    generator: np.random.Generator,
-) -> None:
-    """Add noise and blur, in place: the reconstruction kernel shapes the image and the noise's grain alike."""
-    sigma_mm = psf_mm / np.sqrt(8 * np.log(2))
-    sigmas = [sigma_mm / step for step in (config.slice_mm, config.in_plane_mm, config.in_plane_mm)]
-    impulse = np.zeros(33)
-    impulse[16] = 1.0
-    gain = np.prod([np.linalg.norm(gaussian_filter1d(impulse, sigma, truncate=3.0)) for sigma in sigmas])
-    for begin in range(0, len(image), _SLAB):
-        slab = image[begin : begin + _SLAB]
-        slab += generator.standard_normal(slab.shape, dtype=np.float32) * np.float32(noise_hu / gain)
-    for axis, sigma in enumerate(sigmas):
-        gaussian_filter1d(image, sigma, axis=axis, truncate=3.0, output=image)

@@ -78,7 +78,7 @@ def bench_imaging(config: ImagingBenchConfig) -> dict[str, Any]:
     """
     paths = [config.folder / f"{config.seed}-{index:04d}.json" for index in range(config.cases)]
     method = _method()
-    missing = [path for path in paths if not path.exists() or read_json(path)["method"] != method]
+    missing = [path for path in paths if not path.exists() or read_json(path).get("method") != method]
     bad = each("Synthetic CT angiograms", missing, partial(_measure, seed=config.seed, method=method))
     if bad:
         raise next(iter(bad.values()))
