@@ -60,7 +60,7 @@ _FEMALE_CALIBRE = 0.91
 _SIZE_SD, _TURN_SD_DEG, _WIGGLE_MM = 0.085, 6.0, (0.5, 1.3)
 """Spread of the heart's size, of its position about each axis (from the SD of Dodge's positions), of the wiggles."""
 
-_ENDS = {"right": (68.0, 12.0, 40.0, 88.0), "balanced": (88.0, 5.0, 80.0, 97.0)}
+_ENDS = {"right": (66.0, 9.0, 40.0, 76.0), "balanced": (88.0, 4.0, 82.0, 97.0)}
 """Length of the circumflex artery, mm: mean, SD, least, most, in a heart of mean size. A left-dominant one goes on over
 the crux into the posterior descending artery."""
 
