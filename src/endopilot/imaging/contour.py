@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 from scipy.spatial import KDTree
 
-from endopilot.imaging.grid import distance_to_outside
+from endopilot.imaging.grid import connected_components, distance_to_outside
 from endopilot.types import Volume
 
 _SMOOTHING_MM = 0.3
@@ -24,6 +24,10 @@ _BLOCK = 8
 """Edge of the blocks in which voxels near the vessel are looked for, voxels."""
 _CALCIUM = 1.5
 """Times the lumen's HU; brighter voxels are calcium or metal."""
+_FEWEST_VOXELS = 5
+"""Smaller bright specks are noise."""
+_RIM_MM = 1.2
+"""Blur spreads calcium's brightness this far: at a distance of three of its widths nothing is left."""
 
 
 def lumen_at_half_height(
@@ -61,7 +65,33 @@ def lumen_at_half_height(
     # A blurred disc has less than half its height at its own edge, the less the smaller it is (to first order in σ/r).
     share = 0.5 - 0.2 * np.minimum(_BLUR_MM / np.maximum(local_radius, 0.1), 1.0)
     level = surroundings + share * (lumen_hu - surroundings)
-    return band & (hu > level) & (hu < _CALCIUM * lumen_hu)
+    calcium = band & (hu >= _CALCIUM * lumen_hu)
+    inside = band & (hu > level) & ~calcium
+    _drop_rims(inside, _large_parts(calcium), distance, spacing)
+    return inside
+
+
+def _drop_rims(inside: np.ndarray, calcium: np.ndarray, distance: np.ndarray, spacing: np.ndarray) -> None:
+    """Take out of the lumen, in place, what lies beside calcium and no nearer to the axis: its blurred rim."""
+    plaque = np.argwhere(calcium)
+    if len(plaque) == 0:
+        return
+    voxels = np.argwhere(inside)
+    gap, nearest = KDTree(plaque * spacing).query(voxels * spacing, distance_upper_bound=_RIM_MM)
+    beside = np.isfinite(gap)
+    voxels, plaque = voxels[beside], plaque[nearest[beside]]
+    rim = distance[tuple(voxels.T)] >= distance[tuple(plaque.T)]
+    inside[tuple(voxels[rim].T)] = False
+
+
+def _large_parts(mask: np.ndarray) -> Bool[np.ndarray, "nz ny nx"]:
+    """Return a mask without specks, which are noise."""
+    if not mask.any():
+        return mask
+    label = connected_components(mask)
+    kept = np.bincount(label.ravel()) >= _FEWEST_VOXELS
+    kept[0] = False
+    return kept[label]
 
 
 def _distance_to_paths(
