@@ -25,7 +25,7 @@ def command(
 
     Args:
         anatomy: folder made by `endopilot anatomy` or `endopilot atlas`.
-        output: the volume in HU: .nii.gz, .nrrd or .mha, or a folder for a DICOM series.
+        output: the volume in HU: .nii.gz, .nrrd or .mha.
         seed: seed of noise and of the surroundings.
         json: print the figures as JSON.
         config: scanner and contrast.
