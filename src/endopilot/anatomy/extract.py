@@ -21,7 +21,7 @@ from endopilot.anatomy.distance import (
 from endopilot.anatomy.labels import dominance, label_tree
 from endopilot.anatomy.sources import AnatomySource, Polylines, read_source, transformed
 from endopilot.anatomy.surface import Surface, surface_from_mask
-from endopilot.anatomy.tree import tree_from_lines
+from endopilot.anatomy.tree import Line, tree_from_lines
 from endopilot.errors import InputError
 from endopilot.progress import progress
 from endopilot.types import Anatomy, DistanceMap, Insertion, LumenMask, VesselTree
@@ -191,6 +191,8 @@ def _tree(
     middle = float(np.median(graph.clearance[np.concatenate(paths)]))
     step = float(np.clip(0.3 * middle, 0.25, 2.0))
     lines = centerline.refined_lines(surface, distance_map, graph, paths, step)
+    if given is not None and given.direction.any():
+        lines[0] = _from_ostium(lines[0], given)
     tree = tree_from_lines(lines)
     longest = tree.longest_path()
     if longest.abscissa[-1] < SHORTEST_IN_DIAMETERS * 2 * float(longest.radius.mean()):
@@ -199,6 +201,17 @@ def _tree(
             f"of {2 * longest.radius.mean():.1f} mm; check the label or the segmentation"
         )
     return tree, rule
+
+
+def _from_ostium(line: Line, ostium: Insertion) -> Line:
+    """Let the first line begin at an ostium that is known: near the cut across the vessel the medial axis feels it."""
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line.points, axis=0), axis=1))])
+    shift = ostium.position - line.points[0]
+    if np.linalg.norm(shift) > 2 * line.radius[0]:
+        return line
+    share = np.clip(1 - along / (3 * line.radius[0]), 0.0, 1.0)
+    moved = line.points + (share**2 * (3 - 2 * share))[:, None] * shift
+    return Line(moved, line.radius, line.parent, line.place)
 
 
 def _component(distance_map: DistanceMap, given: Insertion | None) -> Bool[np.ndarray, "nz ny nx"]:

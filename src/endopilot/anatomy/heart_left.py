@@ -95,7 +95,7 @@ def fit_left_heart(
         inferior: the course of `INFERIOR` in this patient, whatever runs there.
     """
     course = np.concatenate([_evenly(line) for line in (lad, lcx, inferior)])
-    reference = _reference_courses()
+    reference = reference_courses()
     ostium = lad[0]
     u, s, vt = np.linalg.svd((course - ostium).T @ (reference - LEFT_OSTIUM))
     sign = np.array([1.0, 1.0, np.linalg.det(u @ vt)])
@@ -107,8 +107,10 @@ def fit_left_heart(
 
 
 @cache
-def _reference_courses() -> Float[np.ndarray, "n 3"]:
-    """Return the courses on the reference heart's surface, mm in its frame."""
+def reference_courses() -> Float[np.ndarray, "n 3"]:
+    """Return the courses on the reference heart's surface, mm in its frame: 16 points each of left main and anterior
+    descending artery, circumflex artery from the fork, inferior groove.
+    """
     heart = HeartFit(np.zeros(3), np.eye(3), 1.0, np.zeros((1, 3)), np.zeros((1, 3)))
     inferior = np.concatenate([TO_CRUX[-1:], BEYOND_CRUX["4"][:4]])
     lines = [_REFERENCE_LAD, np.concatenate([_REFERENCE_LCX, TO_CRUX[-1:]]), inferior]
