@@ -42,7 +42,8 @@ def test_the_load_of_a_free_wire_moves_it_at_the_drawn_speed() -> None:
     )
     initial = np.tile([2.0, 0.0], (2, 1))
     rollout = simulate(vessel(), device, load, actuation="force", initial=initial, config=config)
-    # In the first sample the wire starts from rest; in the second the blood's drag is left. 1 % of load is 25 % of speed.
+    # In the first sample the wire starts from rest; in the second the blood's drag is left. 1 % of load is 25 % of
+    # speed.
     np.testing.assert_allclose(rollout.control[:, 1], velocity[:, 1], rtol=0.02)
     travel = 0.5 * np.cumsum(rollout.control[..., 0], axis=1)
     np.testing.assert_allclose(rollout.inserted_length, 2.0 + travel, rtol=1e-12)

@@ -24,7 +24,6 @@ from endopilot.files import manifest, read_json, write_json, writing
 from endopilot.progress import progress
 from endopilot.simulation.device import Device
 
-__all__ = ["DatasetConfig", "generate_dataset"]
 _WORK_PATH = "meta/work.json"
 """What the files that are there have cost so far; it goes into the manifest when the dataset is whole."""
 
