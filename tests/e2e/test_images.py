@@ -158,6 +158,7 @@ def test_methods_and_outputs_that_do_not_fit(few, tmp_path, capsys, monkeypatch)
         ("--method", "aorta"): "--seeds x y z",
         ("--seeds", "0", "0", "900"): "lies outside the volume",
         ("--series", "9"): "no series '9'",
+        ("--picture", "slices.jpeg2"): "slices.jpeg2: a picture is written as PNG",
     }.items():
         assert fragment in _refused(capsys, few, *options)
     assert "unknown format" in refused(capsys, "segment", few, "-o", tmp_path / "mask.png")
