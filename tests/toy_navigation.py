@@ -79,6 +79,8 @@ def toy_simulate(anatomy: Anatomy, device, control, *, initial, config, friction
         contact_force_sum=2 * force,
         base_force=force.copy(),
         base_torque=0.1 * force,
+        drive_force=force + 0.05,
+        drive_torque=0.1 * force + 0.01,
         slip=np.zeros((worlds, samples)),
         iterations=np.ones((worlds, samples)),
         valid=np.ones((worlds, samples), dtype=bool),
@@ -94,10 +96,31 @@ def write_toy_anatomies(folder: Path, patients: int) -> list[Path]:
     return folders
 
 
-def make_toy_dataset(folder: Path, *, patients: int, sequences: int, simulate=toy_simulate, **settings) -> None:
+def toy_navigate(simulate=toy_simulate):
+    """Return what stands in for `navigate`: the drawn controls, driven as they are through a simulator like the toy."""
+
+    def navigate(anatomy, devices, initial, control, friction, config, *, actuation, advance):
+        control = control.astype(np.float32).astype(float)
+        rollout = simulate(anatomy, devices[0], control, initial=initial, config=config, friction=friction)
+        advance(control.shape[0] * control.shape[1])
+        return rollout, control, np.zeros(len(control), dtype=bool)
+
+    return navigate
+
+
+def make_toy_dataset(
+    folder: Path,
+    *,
+    patients: int,
+    sequences: int,
+    simulate=toy_simulate,
+    scheduler: str | None = None,
+    device: str = "workhorse-014",
+    **settings,
+) -> None:
     """Generate a dataset with the toy wire in place of the rod; two thirds of the patients train, the others test."""
     shares = (2 / 3, 0.0, 1 / 3) if patients > 1 else None
     config = DatasetConfig(**({"sequences": sequences, "anatomy_shares": shares} | settings))
-    with patch("endopilot.dataset.navigate.simulate", simulate):
+    with patch("endopilot.dataset.block.navigate", toy_navigate(simulate)):
         anatomies = write_toy_anatomies(folder.parent / "anatomies", patients)
-        generate_dataset(anatomies, folder, read_device("workhorse-014"), config)
+        generate_dataset(anatomies, folder, read_device(device), config, scheduler=scheduler)

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from endopilot.anatomy.atlas import AtlasConfig, synthesize_one
-from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
+from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy, read_source
 from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.anatomy.phantom import PhantomConfig, make_phantom
 from endopilot.dataset.generate import DatasetConfig, generate_dataset
@@ -32,7 +32,7 @@ from endopilot.models.config import TrainConfig
 from endopilot.parallel import each
 from endopilot.progress import progress
 from endopilot.simulation.device import Device, read_device
-from endopilot.simulation.simulator import simulate
+from endopilot.simulation.simulator import SimulatorConfig, simulate
 from endopilot.types import Rollout
 
 VOLUME_SUFFIX = ".nii.gz"
@@ -203,7 +203,7 @@ def _make_anatomy(volume: Path, *, output: Path, config: AnatomyConfig) -> None:
     name = volume.name.removesuffix(VOLUME_SUFFIX)
     mask, folder = output / "masks" / volume.name, output / "anatomies" / name
     if mask.exists() and not folder.exists():
-        write_anatomy(extract_anatomy(read_mask(mask), name=name, config=config), folder)
+        write_anatomy(extract_anatomy(read_source(mask), name=name, config=config), folder)
 
 
 def _study(
@@ -308,7 +308,11 @@ def _replay(output: Path, device: Device) -> tuple[Path, Rollout]:
     folder = dataset.anatomy_folder(str(one.anatomy[0]))
     initial = np.stack([one.initial_inserted_length, one.initial_rotation], axis=-1)
     anatomy = read_anatomy(folder)
-    return folder, simulate(anatomy, device, one.control, initial=initial, friction=one.friction, record_shape=True)
+    settings = SimulatorConfig(**dataset.manifest["config"]["simulator"])
+    rollout = simulate(
+        anatomy, device, one.control, initial=initial, config=settings, friction=one.friction, record_shape=True
+    )
+    return folder, rollout
 
 
 def _finish(output: Path, config: StudyConfig, ledger: Ledger) -> dict[str, Any]:

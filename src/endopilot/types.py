@@ -235,6 +235,8 @@ class Rollout:
         contact_force_sum: sum of the wall forces' magnitudes, N.
         base_force: axial force that the drive must apply to the wire, N, positive when it pushes.
         base_torque: torque that the drive must apply about the wire's axis, N·mm.
+        drive_force: axial force of the drive, N: `base_force` and what the introducer's valve takes.
+        drive_torque: torque of the drive, N·mm, likewise.
         slip: advance that was asked of the drive and not made in the period, mm; 0 unless the wire was caught.
         iterations: mean Newton iterations a time step over the period.
         valid: false from the sample in which a world failed to converge or left the finite numbers.
@@ -254,6 +256,8 @@ class Rollout:
     contact_force_sum: Float[np.ndarray, "worlds samples"]
     base_force: Float[np.ndarray, "worlds samples"]
     base_torque: Float[np.ndarray, "worlds samples"]
+    drive_force: Float[np.ndarray, "worlds samples"]
+    drive_torque: Float[np.ndarray, "worlds samples"]
     slip: Float[np.ndarray, "worlds samples"]
     iterations: Float[np.ndarray, "worlds samples"]
     valid: Bool[np.ndarray, "worlds samples"]

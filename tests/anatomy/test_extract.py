@@ -16,7 +16,7 @@ from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy, read_sourc
 from endopilot.anatomy.sources import Polylines
 from endopilot.anatomy.surface import Surface, surface_from_mask
 from endopilot.errors import InputError
-from endopilot.types import LumenMask, Volume
+from endopilot.types import Insertion, LumenMask, Volume
 
 REAL = Path(__file__).parents[3] / "shared" / "data" / "coronary_centerlines"
 
@@ -87,6 +87,15 @@ def test_given_ostium_is_the_root_and_mid_vessel_ostium_looks_onwards(fork_mask)
     anatomy = extract_anatomy(fork_mask, name="x", config=AnatomyConfig(ostium_mm=tuple(side_tip)))
     assert np.linalg.norm(anatomy.insertion.position - side_tip) < 2.0
     assert anatomy.provenance["ostium_rule"] == "given"
+
+
+def test_the_tree_begins_at_the_ostium_that_the_segmentation_found(fork_mask):
+    ostium = Insertion(np.array([0.5, -0.4, -17.0]), np.array([0.0, 0.0, 1.0]))
+    anatomy = extract_anatomy(LumenMask(fork_mask.volume, ostium), name="fork")
+    np.testing.assert_allclose(anatomy.insertion.position, ostium.position, atol=1e-9)
+    root = anatomy.tree.branches[0].centerline
+    far = (root.points[:, 2] > -10.0) & (root.points[:, 2] < -3.0)
+    assert np.linalg.norm(root.points[far, :2], axis=1).max() < 0.2
 
 
 def test_flaws_of_masks_are_mended(fork_mask):

@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import map_coordinates, maximum_filter
 
 from endopilot.anatomy import phantom
 from endopilot.anatomy.atlas import AtlasConfig, synthesize_one
 from endopilot.anatomy.atlas_shape import abscissa, curve_through
 from endopilot.anatomy.heart_reference import TO_CRUX, aorta, fit_heart
 from endopilot.anatomy.phantom import PhantomConfig, make_phantom
+from endopilot.anatomy.phantom_painter import Grid, Painter
 from endopilot.errors import InputError
 from endopilot.types import Branch, VesselTree
 
@@ -95,8 +96,8 @@ def test_every_tissue_is_there(clean):
 
 def test_partial_volume_of_a_sphere():
     axis = np.arange(-5.0, 5.0, 0.4)
-    grid = phantom._Grid(axis + 0.13, axis - 0.07, axis + 0.02)
-    painter = phantom._Painter(grid, grid, PhantomConfig(in_plane_mm=0.4, slice_mm=0.4))
+    grid = Grid(axis + 0.13, axis - 0.07, axis + 0.02)
+    painter = Painter(grid, grid, in_plane_mm=0.4, slice_mm=0.4)
     distance = np.sqrt(grid.z[:, None, None] ** 2 + grid.y[:, None] ** 2 + grid.x**2)
     image = np.zeros(grid.shape, dtype=np.float32)
     painter.paint(image, (1.5 - distance).astype(np.float32), 1.0)
@@ -153,6 +154,62 @@ def test_a_tree_without_section_labels_will_do(anatomy):
     assert np.mean(at(volume, anatomy.tree.branches[0].centerline.points)) > 200
 
 
+def test_a_moving_heart_is_smeared_and_the_chest_is_not(anatomy):
+    quiet = replace(CLEAN, in_plane_mm=1.0, slice_mm=1.0)
+    still, moved = (make_phantom(anatomy, replace(quiet, motion_mm=way), 4) for way in (0.0, 4.0))
+    change = np.abs(moved.voxels.astype(int) - still.voxels)
+    lung = maximum_filter(still.voxels, 9) < -700  # farther from the heart than the point-spread function reaches
+    assert lung.sum() > 1000 and change[lung].max() == 0
+    path = anatomy.tree.longest_path()
+    before, after = at(still, path.points), at(moved, path.points)
+    assert np.nanmedian(after) < np.nanmedian(before) - 15
+    # The truth is the mean place: the artery is still the brightest near its axis.
+    beside = at(moved, path.points + (path.radius + 3.0)[:, None] * path.normals)
+    assert np.mean(after > beside + 50) > 0.9
+
+
+def test_the_volume_has_the_voxels_asked_for(anatomy):
+    usual, asked = make_phantom(anatomy, COARSE, 0), make_phantom(anatomy, replace(COARSE, voxels=(90, 80, 70)), 0)
+    assert asked.voxels.shape == (70, 80, 90)
+    middles = [v.index_to_world((np.array(v.voxels.shape[::-1]) - 1) / 2) for v in (usual, asked)]
+    np.testing.assert_allclose(*middles, atol=1.2)
+
+
+def test_the_right_heart_is_as_bright_as_asked(anatomy):
+    washed, full = (make_phantom(anatomy, replace(COARSE, right_heart=(s, s)), 1).voxels for s in (0.2, 0.9))
+    assert np.mean(full > 250) > 1.3 * np.mean(washed > 250)
+
+
+@pytest.fixture(scope="module")
+def left():
+    return synthesize_one(AtlasConfig(anatomy="lca", seed=1000), 1)
+
+
+def test_a_left_tree_leaves_the_aorta_and_runs_on_its_own_heart(left):
+    volume = make_phantom(left, replace(CLEAN, in_plane_mm=0.7, slice_mm=1.0), 0)
+    steps = np.linspace(-10.0, 2.0, 40)
+    assert at(volume, left.insertion.position + steps[:, None] * left.insertion.direction).min() > 350
+    for path in phantom.chest.main_paths(left.tree):
+        wide = path.radius > 1.2
+        assert np.quantile(at(volume, path.points[wide]), 0.1) > 320
+    heart = phantom.chest.place(left.tree)
+    assert abs(aorta(heart.to_reference(left.insertion.position[None]))[0]) < 0.3
+    (right,) = phantom.chest.other_coronary(heart, left.tree)
+    inside = np.all((volume.world_to_index(right.points) > 0), axis=1)
+    assert np.median(at(volume, right.points[inside][:40])) > 300
+
+
+def test_plaques_of_the_circumflex_lie_on_it(left):
+    lad, lcx = phantom.chest.main_paths(left.tree)
+    spot = {"abscissa_mm": 40.0, "length_mm": 8.0, "diameter_reduction": 0.4, "vessel": "LCx"}
+    grid = phantom._field_of_view(left, COARSE)
+    (plaque,) = phantom._plaques(grid, replace(left, provenance={"stenoses": [spot]}), np.random.default_rng(0), 0.0)
+    k, j, i = np.unravel_index(plaque.depth.argmax(), plaque.depth.shape)
+    centre = [grid.x[plaque.box[2]][i], grid.y[plaque.box[1]][j], grid.z[plaque.box[0]][k]]
+    assert np.linalg.norm(lcx.points - centre, axis=1).min() < 1.5
+    assert np.linalg.norm(lad.points - centre, axis=1).min() > 5.0
+
+
 def test_fit_recovers_a_moved_heart():
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     course = curve_through(TO_CRUX)
@@ -170,6 +227,8 @@ def test_fit_recovers_a_moved_heart():
         ({"in_plane_mm": 0.0}, "in_plane_mm: 0.0"),
         ({"noise_hu": (50.0, 20.0)}, "noise_hu"),
         ({"calcium": -1.0}, "calcium: -1.0"),
+        ({"motion_mm": -1.0}, "motion_mm: -1.0"),
+        ({"voxels": (512, 512, 3)}, "voxels"),
     ],
 )
 def test_bad_configuration_is_told(options, told):

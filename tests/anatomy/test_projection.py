@@ -7,6 +7,8 @@ import itertools
 import numpy as np
 from analytic_shapes import forked_tree
 
+from endopilot.anatomy.analytic import tree_of
+from endopilot.anatomy.atlas import AtlasConfig, synthesize_tree
 from endopilot.anatomy.projection import project_tip
 from endopilot.types import Insertion
 
@@ -73,3 +75,64 @@ def test_shapes_follow_the_points():
     assert found.abscissa.shape == found.branch.shape == (3, 5)
     assert np.allclose(found.abscissa, 10.0) and np.allclose(found.offset, 0.5)
     assert project_tip(forked_tree(), INSERTION, np.array([0.0, 0, -3.0])).abscissa == -3.0
+
+
+def test_agrees_with_brute_force_on_a_whole_tree():
+    tree, _ = synthesize_tree(AtlasConfig(seed=3), 0)
+    rng = np.random.default_rng(0)
+    centre, size = (np.concatenate([getattr(b.centerline, n) for b in tree.branches]) for n in ("points", "radius"))
+    chosen = rng.integers(0, len(centre), 3000)
+    points = centre[chosen] + 0.4 * size[chosen, None] * rng.normal(size=(3000, 3))
+    start = tree.branches[0].centerline.points
+    insertion = Insertion(start[0], (start[1] - start[0]) / np.linalg.norm(start[1] - start[0]))
+    points = points[(points - start[0]) @ insertion.direction > 0.5]
+    found, exact = project_tip(tree, insertion, points), brute_force(tree, points)
+    lines = [tree.branches[int(index)].centerline for index in exact[2]]
+    ratio = np.array([np.interp(at, own.abscissa, own.radius) for at, own in zip(exact[0], lines, strict=True)])
+    depth, least = found.offset / found.radius, exact[1] / ratio
+    inside = least < 1.0
+    # nearest places on a polyline and on its turning planes differ by the corners alone
+    assert np.abs(depth - least)[inside].max() < 0.02
+    assert (found.branch == exact[2])[inside].mean() > 0.99
+    same = inside & (found.branch == exact[2])
+    assert np.quantile(np.abs(found.abscissa - exact[0])[same], 0.99) < 0.2
+
+
+def test_abscissa_follows_a_bend_smoothly_and_exactly():
+    bend, step = 5.0, 0.5
+    angle = np.arange(0.0, 2.0, step / bend)
+    line = bend * np.stack([np.sin(angle), 0 * angle, 1 - np.cos(angle)], axis=1)
+    tree, insertion = tree_of((line, 2.0, -1)), Insertion(np.zeros(3), np.array([1.0, 0, 0]))
+    fine = np.linspace(0.05, angle[-1] - 0.05, 20_001)
+    for off in (-1.5, 0.0, 1.5):  # outwards, on the axis and inwards of the bend
+        radius = bend - off
+        points = np.stack([radius * np.sin(fine), 0 * fine, bend - radius * np.cos(fine)], axis=1)
+        found = project_tip(tree, insertion, points)
+        assert np.abs(found.abscissa - bend * fine).max() < 0.01
+        speed = np.diff(found.abscissa) / (bend * np.diff(fine))
+        assert speed.min() > 0.95 and speed.max() < 1.05  # neither a jump nor a halt at any vertex
+        assert np.abs(found.offset - abs(off)).max() < 0.01
+
+
+def test_abscissa_is_continuous_across_the_ostium_and_joints_off_the_axis():
+    tree = forked_tree()
+    way = np.linspace(-3.0, 30.0, 3301)
+    points = np.stack([0 * way, np.full(len(way), 1.5), way], axis=1)
+    for direction in ([0.0, 0.0, 1.0], [0.0, 0.15, np.sqrt(1 - 0.15**2)], [0.0, -0.15, np.sqrt(1 - 0.15**2)]):
+        found = project_tip(tree, Insertion(np.zeros(3), np.array(direction)), points)
+        assert np.abs(np.diff(found.abscissa)).max() < 0.05
+        assert np.diff(found.abscissa).min() >= 0.0
+
+
+def test_a_step_into_a_branch_is_no_longer_than_the_shortcut():
+    tree = forked_tree()
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        start = np.array([0.0, 0, 15]) + rng.uniform(-1.0, 1.0, 3)
+        end = np.array([6.0, 0, 23.5]) + rng.uniform(-0.6, 0.6, 3)
+        share = np.linspace(0.0, 1.0, 2001)[:, None]
+        found = project_tip(tree, INSERTION, (1 - share) * start + share * end)
+        jump = np.abs(np.diff(found.abscissa))
+        change = np.flatnonzero(np.diff(found.branch))
+        assert found.branch[-1] == 2 and np.delete(jump, change).max() < 0.02
+        assert (jump[change] <= found.offset[change] + found.offset[change + 1] + 0.02).all()

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from endopilot.cli import COMMANDS, main
+from endopilot.cli import COMMANDS, main, module_of
 
 
 def run(*arguments: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
@@ -61,7 +61,7 @@ def test_every_command_documents_all_its_options(name: str, capsys: pytest.Captu
 
 def test_every_command_has_a_module() -> None:
     for name in COMMANDS:
-        assert callable(importlib.import_module(f"endopilot.cli.{name}").command)
+        assert callable(importlib.import_module(f"endopilot.cli.{module_of(name)}").command)
 
 
 def test_an_unknown_command_proposes_a_near_one() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import json
 import os
 import signal
@@ -17,14 +18,12 @@ import pandas as pd
 import pytest
 
 from endopilot.anatomy.io import write_anatomy
+from endopilot.cli import main
 from endopilot.dataset.generate import DatasetConfig
 from endopilot.dataset.loader import load_dataset
-from endopilot.dataset.navigate import END_MM, STOP_SHORT_MM, navigate, stop_short
 from endopilot.errors import InputError
 from endopilot.files import read_json, sha256
-from endopilot.simulation.device import read_device
-from endopilot.simulation.simulator import SimulatorConfig
-from toy_navigation import LENGTH_MM, make_toy_dataset, toy_anatomy, toy_simulate
+from toy_navigation import make_toy_dataset, toy_anatomy, toy_simulate
 
 
 def data_hashes(folder: Path) -> dict[str, str]:
@@ -88,6 +87,15 @@ def test_no_anatomy_of_test_is_trained_on(toy_dataset):
     assert set(data.of_split("seen_test").anatomy) == set(data.of_split("train").anatomy)
     pairs = {(a, s) for split in ("train", "seen_test") for a, s in _keys(data.of_split(split))}
     assert len(pairs) == len(data.of_split("train")) + len(data.of_split("seen_test"))
+
+
+def test_no_anatomy_is_in_two_of_the_three_splits_that_are_stored(tmp_path):
+    make_toy_dataset(tmp_path / "d", patients=10, sequences=3, anatomy_shares=None, seconds=5.0)
+    episodes = pd.concat(pd.read_parquet(p) for p in sorted((tmp_path / "d/meta/episodes").glob("*/*.parquet")))
+    by_anatomy = episodes.groupby("anatomy")["split"].agg(lambda splits: "+".join(sorted(set(splits))))
+    assert by_anatomy.value_counts().to_dict() == {"seen_test+train": 6, "calibrate": 2, "test": 2}
+    ranked = sorted(by_anatomy.index, key=lambda name: hashlib.sha256(name.encode()).digest())
+    assert by_anatomy[ranked].tolist() == ["seen_test+train"] * 6 + ["calibrate"] * 2 + ["test"] * 2
 
 
 def test_bits_do_not_depend_on_how_sequences_are_put_into_files(tmp_path, toy_dataset):
@@ -219,42 +227,6 @@ def test_invalid_worlds_are_listed_and_never_trained_on(tmp_path):
     assert stats["count"] == [10 * 120 - 70]
 
 
-def test_the_drive_stops_short_of_the_end_of_the_vessel(tmp_path):
-    control = np.zeros((3, 40, 2))
-    control[:, :, 0] = np.array([[10.0], [1.0], [-3.0]])
-    control[:, :, 1] = 0.3
-    initial = np.array([[5.0, 0.0], [5.0, 0.0], [LENGTH_MM, 0.0]])
-
-    def without_slack(anatomy, device, control, *, initial, config, friction):
-        rollout = toy_simulate(anatomy, device, control, initial=initial, config=config, friction=friction)
-        ahead = rollout.inserted_length + 4.5  # a wire that cuts corners: its tip is ahead of its length
-        return replace(rollout, tip=replace(rollout.tip, abscissa=ahead))
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("endopilot.dataset.navigate.simulate", without_slack)
-        rollout, stopped = navigate(
-            toy_anatomy("p"), read_device("workhorse-014"), initial, control, np.full(3, 0.1), SimulatorConfig()
-        )
-    assert (rollout.inserted_length <= LENGTH_MM - STOP_SHORT_MM + 1e-4).all()
-    assert (rollout.tip.abscissa <= LENGTH_MM - END_MM).all()
-    assert stopped.tolist() == [True, False, False]
-    free = rollout.inserted_length[0] < LENGTH_MM - 2 * STOP_SHORT_MM - 5.0
-    assert free.sum() == 15
-    np.testing.assert_allclose(rollout.control[0, free, 0], 10.0)
-    np.testing.assert_allclose(rollout.control[..., 1], np.float32(0.3))
-
-
-def test_stopping_short_keeps_the_inserted_length_within_its_limit():
-    generator = np.random.default_rng(3)
-    control = generator.normal(0, 30, (50, 60, 2))
-    limit = generator.uniform(5, 40, 50)
-    initial, driven = stop_short(generator.uniform(0, 60, (50, 2)), control, limit)
-    inserted = initial[:, :1] + 0.5 * np.cumsum(driven[..., 0], axis=1)
-    assert (inserted >= -1e-4).all()
-    assert (inserted <= limit[:, None] + 1e-4).all()
-    assert (driven == driven.astype(np.float32)).all()
-
-
 @pytest.mark.parametrize(
     ("field", "value"),
     [
@@ -263,6 +235,8 @@ def test_stopping_short_keeps_the_inserted_length_within_its_limit():
         ("seconds", float("nan")),
         ("seed", -1),
         ("friction", (0.2, 0.1)),
+        ("tip_bend_factor", (1.5, 0.5)),
+        ("tip_stiffness_factor", (0.0, 2.0)),
         ("anatomy_shares", (0.0, 0.5, 0.5)),
         ("anatomy_shares", (0.5, 0.1, 0.1)),
         ("seen_test_share", 1.0),
@@ -297,9 +271,56 @@ def test_loader_names_what_is_damaged(tmp_path):
     (tmp_path / "d/meta/info.json").write_text(json.dumps(info | {"codebase_version": "v2.1"}))
     with pytest.raises(InputError, match=r"codebase_version is v2\.1"):
         load_dataset(tmp_path / "d")
+    (tmp_path / "d/meta/info.json").write_text(json.dumps(info))
+    manifest = read_json(tmp_path / "d/meta/manifest.json")
+    older = manifest["settings"] | {"version": "endopilot 0.0.9, format 1"}
+    (tmp_path / "d/meta/manifest.json").write_text(json.dumps(manifest | {"settings": older}))
+    with pytest.raises(InputError, match=r"made by endopilot 0\.0\.9, format 1, which .* cannot read"):
+        load_dataset(tmp_path / "d")
+    (tmp_path / "d/meta/manifest.json").write_text(json.dumps({"complete": True}))
+    with pytest.raises(InputError, match=r"manifest\.json: damaged"):
+        load_dataset(tmp_path / "d")
+    (tmp_path / "d/meta/manifest.json").write_text(json.dumps(manifest))
     (tmp_path / "d/meta/info.json").unlink()
     with pytest.raises(InputError, match=r"info\.json: no such file"):
         load_dataset(tmp_path / "d")
+
+
+def test_files_of_two_devices_are_not_mixed(tmp_path):
+    make_toy_dataset(tmp_path / "d", patients=1, sequences=4, sequences_per_file=2)
+    make_toy_dataset(tmp_path / "e", patients=1, sequences=4, sequences_per_file=2, device="stiff-014")
+    for path in ("data", "meta/episodes"):
+        file = f"{path}/chunk-000/file-001.parquet"
+        (tmp_path / "d" / file).write_bytes((tmp_path / "e" / file).read_bytes())
+    with pytest.raises(InputError, match=r"file-001\.parquet: written by another version or with other settings"):
+        load_dataset(tmp_path / "d")
+    with pytest.raises(InputError, match=r"was begun with device\.bend_stiffness_n_mm2 = "):
+        make_toy_dataset(tmp_path / "d", patients=1, sequences=4, sequences_per_file=2, device="stiff-014")
+
+
+def test_bad_datasets_are_one_line_at_the_command_line(tmp_path, capsys):
+    make_toy_dataset(tmp_path / "d", patients=2, sequences=4, sequences_per_file=2)
+    anatomies = [str(tmp_path / f"anatomies/patient-{i}") for i in range(2)]
+
+    def refused(*arguments: str) -> str:
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as leaving:
+            main(list(arguments))
+        assert leaving.value.code == 2
+        captured = capsys.readouterr()
+        assert captured.out == ""
+        (line,) = captured.err.strip().splitlines()
+        return line
+
+    few = refused("dataset", *anatomies, "-o", str(tmp_path / "few"), "--sequences", "4")
+    assert "2 anatomies cannot fill 3 splits" in few
+    assert not (tmp_path / "few").exists()
+    file = tmp_path / "d/meta/episodes/chunk-000/file-002.parquet"
+    whole = file.read_bytes()
+    file.write_bytes(whole[: len(whole) // 2])
+    assert "file-002.parquet: damaged" in refused("dataset-info", str(tmp_path / "d"))
+    file.unlink()
+    assert "file-002.parquet: missing" in refused("dataset-info", str(tmp_path / "d"))
 
 
 def test_an_absent_split_is_named(tmp_path):

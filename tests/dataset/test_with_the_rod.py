@@ -3,32 +3,116 @@
 from __future__ import annotations
 
 import numpy as np
+import pandas as pd
+import pytest
 
 from endopilot.anatomy.atlas import AtlasConfig, synthesize_one
 from endopilot.anatomy.io import read_anatomy, write_anatomy
+from endopilot.dataset.draw import TIP_GROUP, draw_navigations
 from endopilot.dataset.generate import DatasetConfig, generate_dataset
 from endopilot.dataset.loader import load_dataset
+from endopilot.dataset.navigate import PULL_BACK_MM, STOP_SHORT_MM, navigate
 from endopilot.simulation.device import read_device
 from endopilot.simulation.simulator import simulate
 
+DEVICE = read_device("workhorse-014")
 
-def test_an_episode_simulated_from_the_disk_repeats_to_the_bit(tmp_path):
-    write_anatomy(synthesize_one(AtlasConfig(count=1, seed=4), 0), tmp_path / "patient")
-    device = read_device("workhorse-014")
-    config = DatasetConfig(sequences=4, seconds=4.0, friction=(0.05, 0.2), seed=2)
-    generate_dataset([tmp_path / "patient"], tmp_path / "dataset", device, config)
+
+@pytest.fixture(scope="module")
+def patient(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("anatomies") / "patient"
+    write_anatomy(synthesize_one(AtlasConfig(count=1, seed=4), 0), folder)
+    return folder
+
+
+def test_an_episode_simulated_from_the_disk_repeats_to_the_bit(tmp_path, patient):
+    ranges = {"friction": (0.05, 0.2), "tip_bend_factor": (0.5, 1.5), "tip_stiffness_factor": (0.5, 2.0)}
+    config = DatasetConfig(sequences=TIP_GROUP + 2, seconds=4.0, seed=2, **ranges)
+    generate_dataset([patient], tmp_path / "dataset", DEVICE, config)
     data = load_dataset(tmp_path / "dataset")
     assert data.valid.all()
-    assert set(data.device) == {device.name}
-    assert (data.anatomy_folder(str(data.anatomy[0]))) == (tmp_path / "patient").resolve()
-    again = simulate(
-        read_anatomy(data.anatomy_folder(str(data.anatomy[0]))),
-        device,
-        data.control.astype(float),
-        initial=np.stack([data.initial_inserted_length, data.initial_rotation], axis=-1),
-        config=config.simulator,
-        friction=data.friction,
-    )
-    np.testing.assert_array_equal(again.tip.abscissa.astype(np.float32), data.tip_abscissa)
-    np.testing.assert_array_equal(again.contact_force_sum.astype(np.float32), data.contact_force_sum)
+    assert set(data.device) == {DEVICE.name}
+    assert (data.anatomy_folder(str(data.anatomy[0]))) == patient.resolve()
     assert np.ptp(data.tip_abscissa, axis=1).max() > 1
+    tips = list(zip(data.tip_bend.tolist(), data.tip_stiffness_factor.tolist(), strict=True))
+    assert [tip == tips[0] for tip in tips] == [True] * TIP_GROUP + [False] * 2
+    for tip in set(tips):
+        one = data.select(np.array([other == tip for other in tips]))
+        again = simulate(
+            read_anatomy(data.anatomy_folder(str(data.anatomy[0]))),
+            DEVICE.with_tip(bend_rad=tip[0], stiffness_factor=tip[1]),
+            one.control.astype(float),
+            initial=np.stack([one.initial_inserted_length, one.initial_rotation], axis=-1),
+            config=config.simulator,
+            friction=one.friction,
+        )
+        np.testing.assert_array_equal(again.tip.abscissa.astype(np.float32), one.tip_abscissa)
+        np.testing.assert_array_equal(again.contact_force_sum.astype(np.float32), one.contact_force_sum)
+        np.testing.assert_array_equal(again.drive_force.astype(np.float32), one.drive_force)
+
+
+def test_wires_stay_inside_what_was_imaged_and_repeat_without_looking(patient):
+    anatomy, config = read_anatomy(patient), DatasetConfig().simulator
+    leaves = anatomy.tree.leaves()
+    ends = np.array([b.centerline.abscissa[-1] if i in leaves else np.inf for i, b in enumerate(anatomy.tree.branches)])
+    control = np.zeros((6, 24, 2))
+    control[:, :, 0] = 12.0
+    control[:, :, 1] = np.linspace(-2, 2, 6)[:, None]
+    initial = np.column_stack([np.linspace(70.0, 1.5 * ends[np.isfinite(ends)].max(), 6), np.zeros(6)])
+    friction = np.linspace(0.05, 0.2, 6)
+    rollout, applied, stopped = navigate(anatomy, [DEVICE] * 6, initial, control, friction, config)
+    assert rollout.valid.all()
+    assert stopped.all()
+    assert (rollout.tip.abscissa < ends[rollout.tip.branch] - 0.5 * STOP_SHORT_MM).all()
+    pulled = applied[..., 0] < 0
+    assert pulled.any(axis=1).all()  # pushed into a dead end, every wire is pulled back some way
+    longest = max(len(run) for world in pulled for run in "".join("x" if p else " " for p in world).split())
+    assert 0.5 * 12.0 * longest == pytest.approx(PULL_BACK_MM, abs=6.1)
+    free = ~pulled & (applied[..., 0] == 12.0)
+    assert free.mean() > 0.3
+    started = np.column_stack([rollout.initial_inserted_length, rollout.initial_rotation])
+    again = simulate(anatomy, DEVICE, applied, initial=started, friction=friction, config=config)
+    np.testing.assert_array_equal(again.tip_position, rollout.tip_position)
+    np.testing.assert_array_equal(again.inserted_length, rollout.inserted_length)
+
+
+def test_a_draw_does_not_depend_on_the_others(patient):
+    anatomy = read_anatomy(patient)
+    ranges = {"friction": (0.05, 0.2), "tip_bend_factor": (0.5, 1.5), "tip_stiffness_factor": (0.5, 2.0)}
+    for control in ("velocity", "force"):
+        few = DatasetConfig(sequences=12, seconds=5.0, control=control, **ranges)
+        many = DatasetConfig(sequences=40, seconds=5.0, control=control, **ranges)
+        some = draw_navigations(few, DEVICE, anatomy, range(9, 12))
+        everything = draw_navigations(many, DEVICE, anatomy, range(40))
+        for name, values in vars(some).items():
+            assert np.array_equal(values, vars(everything)[name][9:12]), name
+        assert len(set(everything.tip_bend_rad.tolist())) == 40 // TIP_GROUP
+        assert 0.5 <= everything.tip_bend_rad.min() / DEVICE.tip_bend_rad < 1.5
+        assert len({id(device) for device in everything.devices(DEVICE)}) == 40 // TIP_GROUP
+
+
+def test_a_dataset_driven_by_force(tmp_path, patient):
+    config = DatasetConfig(sequences=2, seconds=12.0, control="force", sequences_per_file=1, seed=6)
+    generate_dataset([patient], tmp_path / "dataset", DEVICE, config)
+    samples = pd.read_parquet(tmp_path / "dataset/data/chunk-000/file-001.parquet")
+    load, velocity = np.stack(samples["action"]), np.stack(samples["velocity"])
+    assert np.array_equal(load, samples[["drive_force_n", "drive_torque_nmm"]].to_numpy())
+    assert 0.05 < np.abs(load[:, 0]).max() < DEVICE.push_limit_n
+    data = load_dataset(tmp_path / "dataset")
+    one = data.select(np.array([1]))
+    assert np.array_equal(one.control[0], velocity)
+    travel = 0.5 * np.cumsum(one.control.astype(float), axis=1)
+    np.testing.assert_allclose(one.inserted_length, one.initial_inserted_length[:, None] + travel[..., 0], atol=1e-4)
+    assert np.ptp(data.inserted_length, axis=1).max() > 5
+    initial = np.stack([one.initial_inserted_length, one.initial_rotation], axis=-1)
+    again = simulate(
+        read_anatomy(patient),
+        DEVICE,
+        load[None].astype(float),
+        actuation="force",
+        initial=initial,
+        config=config.simulator,
+        friction=one.friction,
+    )
+    np.testing.assert_array_equal(again.tip.abscissa.astype(np.float32), one.tip_abscissa)
+    assert sum(data.manifest["manoeuvres"].values()) == pytest.approx(1)

@@ -63,6 +63,8 @@ def make_rollout(samples: int = 6) -> Rollout:
         contact_force_sum=flat,
         base_force=flat,
         base_torque=flat,
+        drive_force=flat,
+        drive_torque=flat,
         slip=flat,
         iterations=flat,
         valid=np.ones((1, samples), dtype=bool),

@@ -25,10 +25,12 @@ def make_untrained_run(dataset_folder, run_folder):
     size = TransformerConfig(d_model=24, encoder_layers=1, decoder_layers=1)
     for name, network in NETWORKS.items():
         write_network(run_folder / f"{name}.safetensors", name, network(size), size, {})
+    device = read_json(dataset_folder / "meta" / "manifest.json")["device"]
     record = {
+        "config": {"model": "paper"},
         "dataset": os.path.relpath(dataset_folder, run_folder),
         "networks": {"ff": {}, "if": {}},
-        "control_limits": [1e3, 1e3],
+        "device": device | {"max_velocity_mm_s": 1e3, "max_rotation_rad_s": 1e3},
     }
     write_json(run_folder / "manifest.json", record)
 

@@ -1,12 +1,16 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from bend import vessel
 
 from endopilot.errors import InputError
-from endopilot.simulation.controls import ControlConfig, random_controls, read_controls_csv
+from endopilot.simulation.controls import ControlConfig, free_wire_load, random_controls, read_controls_csv
+from endopilot.simulation.device import read_device
+from endopilot.simulation.simulator import SimulatorConfig, simulate
 
 
 def test_a_sequence_does_not_depend_on_the_others() -> None:
@@ -16,6 +20,33 @@ def test_a_sequence_does_not_depend_on_the_others() -> None:
     assert np.array_equal(few[0], many[0][:3])
     assert np.array_equal(few[1], many[1][:3])
     assert not np.array_equal(few[1], other[1])
+
+
+def test_later_sequences_are_those_of_a_whole_draw() -> None:
+    everything = random_controls(ControlConfig(), n_sequences=9, n_samples=50, seed=4, max_inserted_length_mm=60.0)
+    later = random_controls(ControlConfig(), n_sequences=4, n_samples=50, seed=4, max_inserted_length_mm=60.0, first=5)
+    assert np.array_equal(later[0], everything[0][5:])
+    assert np.array_equal(later[1], everything[1][5:])
+
+
+def test_the_load_of_a_free_wire_moves_it_at_the_drawn_speed() -> None:
+    device = replace(read_device("workhorse-014"), tip_bend_rad=0.0)
+    config = SimulatorConfig()
+    velocity = np.repeat([[[-1.5, 1.0]], [[1.0, -3.0]]], 2, axis=1)
+    load = free_wire_load(
+        velocity,
+        radius_mm=device.tip_radius_mm,
+        friction_n=config.introducer_friction_n,
+        drag_n_s_mm=config.introducer_drag_n_s_mm,
+        stick_mm_s=config.stick_velocity_mm_s,
+    )
+    initial = np.tile([2.0, 0.0], (2, 1))
+    rollout = simulate(vessel(), device, load, actuation="force", initial=initial, config=config)
+    # In the first sample the wire starts from rest; in the second the blood's drag is left. 1 % of load is 25 % of speed.
+    np.testing.assert_allclose(rollout.control[:, 1], velocity[:, 1], rtol=0.02)
+    travel = 0.5 * np.cumsum(rollout.control[..., 0], axis=1)
+    np.testing.assert_allclose(rollout.inserted_length, 2.0 + travel, rtol=1e-12)
+    assert np.array_equal(np.stack([rollout.drive_force, rollout.drive_torque], axis=-1), load)
 
 
 def test_insertion_stays_in_its_range() -> None:

@@ -80,3 +80,15 @@ def test_unknown_device_is_refused() -> None:
         read_device("no-such-wire")
     with pytest.raises(InputError, match="tip_load_n"):
         replace(read_device("workhorse-014"), tip_load_n=-1.0)
+
+
+def test_another_tip_leaves_the_shaft_as_it_is() -> None:
+    device = read_device("workhorse-014")
+    other = device.with_tip(bend_rad=1.0, stiffness_factor=2.0)
+    at = np.array([0.0, 10.0, 15.0, 20.0, 60.0, 400.0])
+    assert other.tip_bend_rad == 1.0
+    np.testing.assert_allclose(other.bend_stiffness(at)[:2], 2 * device.bend_stiffness(at)[:2])
+    np.testing.assert_allclose(other.twist_stiffness(at)[:2], 2 * device.twist_stiffness(at)[:2])
+    assert device.bend_stiffness(at)[2] < other.bend_stiffness(at)[2] < 2 * device.bend_stiffness(at)[2]
+    np.testing.assert_array_equal(other.bend_stiffness(at)[3:], device.bend_stiffness(at)[3:])
+    assert device.with_tip(bend_rad=device.tip_bend_rad, stiffness_factor=1.0) == device

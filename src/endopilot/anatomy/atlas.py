@@ -9,6 +9,10 @@ from typing import Any
 import numpy as np
 
 from endopilot.anatomy import distance
+from endopilot.anatomy.atlas_arch import synthesize_arch
+from endopilot.anatomy.atlas_cerebral import synthesize_cerebral
+from endopilot.anatomy.atlas_lca import synthesize_lca
+from endopilot.anatomy.atlas_portal import synthesize_portal
 from endopilot.anatomy.atlas_rca import synthesize_rca
 from endopilot.anatomy.atlas_shape import tangents
 from endopilot.errors import InputError
@@ -19,7 +23,16 @@ CATHETER_RADIUS_MM = 0.9
 CATHETER_LENGTH_MM = 30.0
 """Length of catheter behind the ostium that the distance map holds, mm."""
 
-_KINDS: dict[str, Callable[[np.random.Generator, float], tuple[VesselTree, dict[str, Any]]]] = {"rca": synthesize_rca}
+_KINDS: dict[str, Callable[[np.random.Generator, float], tuple[VesselTree, dict[str, Any]]]] = {
+    "rca": synthesize_rca,
+    "lca": synthesize_lca,
+    "cerebral": synthesize_cerebral,
+    "portal": synthesize_portal,
+    "arch": synthesize_arch,
+}
+
+ANATOMIES = tuple(_KINDS)
+"""Names of the kinds of vessel trees."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,7 +40,8 @@ class AtlasConfig:
     """Which synthetic patients to make."""
 
     anatomy: str = "rca"
-    """Kind of vessel tree: rca (right coronary artery)."""
+    """Kind of vessel tree: rca or lca (right or left coronary artery), cerebral (internal carotid with middle and
+    anterior cerebral arteries), arch (aortic arch with its branches), portal (portal vein)."""
     count: int = 1
     """Number of patients."""
     seed: int = 0

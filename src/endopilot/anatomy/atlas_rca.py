@@ -7,7 +7,9 @@ the way and the origins of branches, measured on sixteen manually segmented righ
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,11 +19,21 @@ from scipy.optimize import root
 from scipy.spatial.transform import Rotation
 
 from endopilot.anatomy import atlas_shape as shape
+from endopilot.anatomy.atlas_tree import (
+    NoShape,
+    SidePlan,
+    Vessel,
+    build_tree,
+    free_origin,
+    stenosis,
+    truncated,
+    uneven,
+    until_it_fits,
+    with_side_branches,
+)
 from endopilot.anatomy.heart_reference import BEYOND_CRUX, TO_CRUX, HeartFit, fit_heart
+from endopilot.anatomy.labels_tree import RCA_SECTIONS
 from endopilot.types import VesselTree
-
-SECTION_NAMES = ("1", "2", "3", "4", "16", "conus", "SA", "RV", "AM")
-"""Names of the sections: segments of AHA/SCCT, then the side branches."""
 
 LENGTH_MM, LENGTH_SD_MM, LENGTH_RANGE_MM = 164.0, 30.0, (112.0, 223.0)
 TORTUOSITY, TORTUOSITY_SD = 2.07, 0.23
@@ -36,6 +48,9 @@ _CALIBRE = {"right": 1.025, "balanced": 0.9, "left": 0.74}
 _FEMALE_CALIBRE = 0.91
 """Women's lumens against men's (Dodge 1992)."""
 
+Courses = tuple[tuple[float, tuple[float, float, float]], ...]
+"""Where a side branch heads: (abscissa from which it holds, mm; LPS direction), in order."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class _SideKind:
@@ -45,7 +60,7 @@ class _SideKind:
     length_mm: tuple[float, float]
     diameter_mm: float
     share: float
-    courses: tuple[tuple[float, tuple[float, float, float]], ...]
+    courses: Courses
 
 
 _SIDES = {
@@ -72,10 +87,6 @@ _DISTAL_COURSES = {
 }
 
 
-class _NoShape(Exception):
-    """The drawn targets cannot be met together, or lumens collide: draw again."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class _Targets:
     """What a patient's main vessel must have: length in mm, mean curvature in 1/mm, the section its tip lies in."""
@@ -98,12 +109,8 @@ def synthesize_rca(generator: np.random.Generator, stenosis_share: float) -> tup
     """
     for _ in range(10):
         targets = _targets(generator)
-        for attempt in range(60):
-            try:
-                tree, truth = _draw(generator, targets, stenosis_share)
-            except _NoShape:
-                continue
-            return tree, truth | {"redrawn": attempt}
+        with suppress(NoShape):
+            return until_it_fits(partial(_draw, generator, targets, stenosis_share), "right coronary artery")
     raise RuntimeError("no right coronary artery found in 600 draws")
 
 
@@ -114,13 +121,13 @@ def _targets(generator: np.random.Generator) -> _Targets:
         length, ends_in = 112.0 + abs(float(generator.normal(0, 10))), "3"
     else:
         # The mean makes up for the shorter left-dominant arteries.
-        length = _truncated(generator, LENGTH_MM + 2.4, LENGTH_SD_MM, *LENGTH_RANGE_MM)
+        length = truncated(generator, LENGTH_MM + 2.4, LENGTH_SD_MM, *LENGTH_RANGE_MM)
         ends_in = "4" if dominance == "balanced" or generator.random() < 0.6 else "16"
     return _Targets(
         dominance=dominance,
         length_mm=length,
-        tortuosity=_truncated(generator, TORTUOSITY, TORTUOSITY_SD, TORTUOSITY - 0.45, TORTUOSITY + 0.45),
-        curvature_per_mm=_truncated(generator, CURVATURE, CURVATURE_SD, CURVATURE - 0.025, CURVATURE + 0.025),
+        tortuosity=truncated(generator, TORTUOSITY, TORTUOSITY_SD, TORTUOSITY - 0.45, TORTUOSITY + 0.45),
+        curvature_per_mm=truncated(generator, CURVATURE, CURVATURE_SD, CURVATURE - 0.025, CURVATURE + 0.025),
         ends_in=ends_in,
     )
 
@@ -130,15 +137,14 @@ def _draw(
 ) -> tuple[VesselTree, dict[str, Any]]:
     main, crux = _main_vessel(generator, targets)
     healthy, calibre = _main_radius(generator, targets.dominance, main)
-    radius, stenosis = healthy, None
+    radius, narrowed = healthy, None
     if generator.random() < stenosis_share:
-        stenosis, narrowing = _stenosis(generator, main)
+        narrowed, narrowing = stenosis(generator, shape.abscissa(main), (0.12, 0.75))
         radius = healthy * narrowing
     heart = fit_heart(main, 0.5 * crux, targets.ends_in)
-    plans = _plan_branches(generator, healthy, crux, targets, calibre)
-    sides = _side_branches(generator, heart, main, radius, plans)
-    section = _main_sections(main, crux, targets.ends_in)
-    tree = shape.build_tree(main, radius, section, sides, SECTION_NAMES)
+    plans = _plan_branches(generator, heart, healthy, crux, targets, calibre)
+    vessels = [Vessel(main, radius, _main_sections(main, crux, targets.ends_in))]
+    tree = build_tree(with_side_branches(generator, vessels, plans), RCA_SECTIONS)
     bends = shape.curvature(main)
     truth = {
         "dominance": targets.dominance,
@@ -146,20 +152,13 @@ def _draw(
         "tortuosity": shape.tortuosity(main),
         "curvature_mean_per_mm": float(bends.mean()),
         "curvature_p90_per_mm": float(np.quantile(bends, 0.9)),
-        "stenoses": [] if stenosis is None else [stenosis],
+        "stenoses": [] if narrowed is None else [narrowed],
     }
     return tree, truth
 
 
 def _dominance(u: float) -> str:
     return "right" if u < _RIGHT_SHARE else "balanced" if u < _RIGHT_SHARE + _BALANCED_SHARE else "left"
-
-
-def _truncated(generator: np.random.Generator, mean: float, sd: float, low: float, high: float) -> float:
-    while True:
-        value = generator.normal(mean, sd)
-        if low <= value <= high:
-            return float(value)
 
 
 def _main_vessel(generator: np.random.Generator, targets: _Targets) -> tuple[Float[np.ndarray, "n 3"], int]:
@@ -202,7 +201,7 @@ def _main_vessel(generator: np.random.Generator, targets: _Targets) -> tuple[Flo
     solution = root(misfit, np.array([np.log(length / keep) - 0.05, 0.0, 0.5]), tol=1e-3, options={"maxfev": 60})
     points = curve(np.clip(solution.x, (-1, -2, -4), (1, 2, 3)))
     if np.abs(misfit(solution.x)).max() > 0.01 or shape.curvature(points).max() > 0.28:
-        raise _NoShape
+        raise NoShape
     crux = len(points) - 1 if ends_in == "3" else round(len(points) * template_crux / keep)
     return points, crux
 
@@ -218,22 +217,7 @@ def _main_radius(
     diameter = PchipInterpolator([0.0, *DIAMETER_MM, 1.0], [4.1, *DIAMETER_MM.values(), 2.15])(share)
     if dominance == "left":
         diameter = diameter * (1 - 0.2 * share)
-    along = shape.abscissa(main)
-    wavelength = generator.uniform(15.0, 60.0, 4)
-    waves = np.sin(2 * np.pi * along[:, None] / wavelength + generator.uniform(0, 2 * np.pi, 4)).sum(axis=1)
-    return 0.5 * diameter * calibre * (1 + 0.025 * waves), calibre
-
-
-def _stenosis(
-    generator: np.random.Generator, main: Float[np.ndarray, "n 3"]
-) -> tuple[dict[str, float], Float[np.ndarray, "n"]]:
-    """Return a narrowing of 30 to 65 % of the diameter over 6 to 14 mm, and the factor on the radius."""
-    along = shape.abscissa(main)
-    place, extent = generator.uniform(0.12, 0.75) * along[-1], generator.uniform(6.0, 14.0)
-    degree = generator.uniform(0.3, 0.65)
-    narrowing = 1 - degree * np.exp(-0.5 * ((along - place) / (extent / 4)) ** 2)
-    truth = {"abscissa_mm": float(place), "length_mm": float(extent), "diameter_reduction": float(degree)}
-    return truth, narrowing
+    return 0.5 * diameter * calibre * uneven(generator, shape.abscissa(main)), calibre
 
 
 def _main_sections(main: Float[np.ndarray, "n 3"], crux: int, ends_in: str) -> list[str]:
@@ -244,91 +228,42 @@ def _main_sections(main: Float[np.ndarray, "n 3"], crux: int, ends_in: str) -> l
     return [str(name) for name in names]
 
 
-@dataclass(frozen=True, eq=False)
-class _Plan:
-    """A side branch to be drawn: section, index of its origin, length and diameter in mm, courses."""
-
-    section: str
-    origin: int
-    length_mm: float
-    diameter_mm: float
-    courses: tuple[tuple[float, tuple[float, float, float]], ...]
-
-
 def _plan_branches(
-    generator: np.random.Generator, radius: Float[np.ndarray, "n"], crux: int, targets: _Targets, calibre: float
-) -> list[_Plan]:
+    generator: np.random.Generator,
+    heart: HeartFit,
+    radius: Float[np.ndarray, "n"],
+    crux: int,
+    targets: _Targets,
+    calibre: float,
+) -> list[SidePlan]:
     """Draw which branches there are, where they leave, how long and how wide they are."""
-    plans: list[_Plan] = []
+    plans: list[SidePlan] = []
     end_mm = (len(radius) - 1) * shape.STEP_MM
     for section, kind in _SIDES.items():
         if generator.random() > kind.share:
             continue
-        origin = _free_origin(generator, kind.origin_mm, [plan.origin for plan in plans])
-        length = _truncated(generator, *kind.length_mm, 0.5 * kind.length_mm[0], 1.5 * kind.length_mm[0])
+        origin = free_origin(generator, *kind.origin_mm, [plan.origin for plan in plans])
+        length = truncated(generator, *kind.length_mm, 0.5 * kind.length_mm[0], 1.5 * kind.length_mm[0])
         # The main vessel's tip stays the farthest.
         length = min(length, 0.95 * end_mm - origin * shape.STEP_MM)
         diameter = kind.diameter_mm * (0.6 + 0.4 * calibre) * (1 + 0.1 * float(generator.normal()))
-        plans.append(_Plan(section, origin, length, diameter, kind.courses))
+        plans.append(_plan(section, origin, length, diameter, kind.courses, heart))
     if targets.dominance == "right":
         other = "16" if targets.ends_in == "4" else "4"
         length = max((end_mm - crux * shape.STEP_MM) * float(generator.uniform(0.6, 0.92)), 12.0)
         diameter = 2 * float(radius[crux]) * float(generator.uniform(0.68, 0.8))
-        plans.append(_Plan(other, crux, length, diameter, _DISTAL_COURSES[other]))
+        plans.append(_plan(other, crux, length, diameter, _DISTAL_COURSES[other], heart))
     return plans
 
 
-def _side_branches(
-    generator: np.random.Generator,
-    heart: HeartFit,
-    main: Float[np.ndarray, "n 3"],
-    radius: Float[np.ndarray, "n"],
-    plans: list[_Plan],
-) -> list[shape.SideBranch]:
-    """Draw the branches; one that cuts another lumen is drawn again, and the patient's shape with it in the end."""
-    sides: list[shape.SideBranch] = []
-    for plan in plans:
-        for _ in range(12):
-            side = _side_branch(generator, heart, main, radius, plan)
-            if not shape.lumens_collide(main, radius, [*sides, side]):
-                sides.append(side)
-                break
-        else:
-            raise _NoShape
-    return sides
-
-
-def _free_origin(generator: np.random.Generator, origin_mm: tuple[float, float], taken: list[int]) -> int:
-    """Draw the index of a branch's origin, 3 mm or more from the ostium and from other origins."""
-    mean, sd = origin_mm
-    while True:
-        origin = round(_truncated(generator, mean, sd, max(mean - 2 * sd, 3.0), mean + 2 * sd) / shape.STEP_MM)
-        if all(abs(origin - other) * shape.STEP_MM >= 3.0 for other in taken):
-            return origin
-
-
-def _side_branch(
-    generator: np.random.Generator,
-    heart: HeartFit,
-    main: Float[np.ndarray, "n 3"],
-    radius: Float[np.ndarray, "n"],
-    plan: _Plan,
-) -> shape.SideBranch:
-    origin = plan.origin
-    turn = Rotation.from_rotvec(np.deg2rad(generator.normal(0, 12, 3)))
-    headed = [(begin, turn.apply(np.array(course) / np.linalg.norm(course))) for begin, course in plan.courses]
-    forward = shape.tangents(main)[origin]
-    across = headed[0][1] - (headed[0][1] @ forward) * forward
-    angle = np.deg2rad(generator.uniform(40, 70))
-    direction = np.cos(angle) * forward + np.sin(angle) * across / np.linalg.norm(across)
-    points = shape.steer(
-        main[origin], direction, headed, plan.length_mm, generator.uniform(6.0, 9.0), heart.solid_depth
+def _plan(
+    section: str, origin: int, length_mm: float, diameter_mm: float, courses: Courses, heart: HeartFit
+) -> SidePlan:
+    return SidePlan(
+        section=section,
+        origin=origin,
+        length_mm=length_mm,
+        diameter_mm=diameter_mm,
+        courses=courses,
+        depth=heart.solid_depth,
     )
-    across = shape.parallel_normals(shape.tangents(points))
-    points = shape.Wiggle.draw(generator, 13.0, 45.0, 6).apply(points, across, generator.uniform(0.3, 0.8), 10.0)
-    points = shape.curve_through(points[:: max(len(points) // 24, 1)])
-    points = np.concatenate([main[origin][None], points[1:]])
-    share = np.linspace(0.0, 1.0, len(points))
-    lumen = 0.5 * plan.diameter_mm * (1 - 0.3 * share)
-    lumen = shape.mouth(np.minimum(lumen, 0.9 * radius[origin]), points, forward, float(radius[origin]))
-    return shape.SideBranch(origin, points, lumen, plan.section)

@@ -1,4 +1,4 @@
-"""Shapes that synthetic vessels are made of: smooth curves, lumens that taper, trees that do not cut themselves."""
+"""Curves that synthetic vessels are made of: smooth, wiggling, steered along a surface."""
 
 from __future__ import annotations
 
@@ -8,37 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
-from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
-
-from endopilot.types import Branch, Centerline, VesselTree
 
 STEP_MM = 0.5
 """Distance between neighbouring centerline points, mm."""
 
-_CLEARANCE_MM = 0.6
-"""Tissue between two lumens that do not belong together, mm: two walls."""
-
-
 _HEIGHT_MM = 3.0
 """Side branches run this far above the surface that they follow, mm: in epicardial fat."""
-
-
-@dataclass(frozen=True, eq=False)
-class SideBranch:
-    """A vessel that leaves the main vessel.
-
-    Attributes:
-        origin: index of the main vessel's point where it leaves.
-        points: positions, LPS mm; the first one is that point.
-        radius: lumen radius, mm.
-        section: name of its anatomical section.
-    """
-
-    origin: int
-    points: Float[np.ndarray, "n 3"]
-    radius: Float[np.ndarray, "n"]
-    section: str
 
 
 def abscissa(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
@@ -141,7 +117,7 @@ def steer(
     courses: Sequence[tuple[float, Float[np.ndarray, "3"]]],
     length_mm: float,
     relaxation_mm: float,
-    depth: Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n"]],
+    depth: Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n"]] | None,
 ) -> Float[np.ndarray, "n 3"]:
     """Return a smooth curve that leaves `start` along `direction` and follows one course after another on a surface.
 
@@ -151,15 +127,16 @@ def steer(
         courses: (abscissa from which it holds, mm; unit direction), in order.
         length_mm: length of the curve.
         relaxation_mm: way over which the direction approaches the course by a factor e.
-        depth: how deep points lie below the surface, mm; the curve seeks a height of `_HEIGHT_MM` above it.
+        depth: how deep points lie below the surface, mm; the curve seeks a height of `_HEIGHT_MM` above it. None for
+            no surface.
     """
     count = max(round(length_mm / STEP_MM), 8)
-    heading, aim, rise, outward = direction, direction, 0.0, direction
+    heading, aim, rise, outward = direction, direction, 0.0, np.zeros(3)
     points = [start]
     probes = np.concatenate([np.zeros((1, 3)), np.eye(3)])
     for i in range(count):
         course = [vector for begin, vector in courses if i * STEP_MM >= begin][-1]
-        if i % 2 == 0:
+        if i % 2 == 0 and depth is not None:
             below = depth(points[-1] + 3.0 * heading + probes)
             outward = below[0] - below[1:]
             outward = outward / max(float(np.linalg.norm(outward)), 1e-6)
@@ -171,86 +148,3 @@ def steer(
         heading = heading / np.linalg.norm(heading)
         points.append(points[-1] + STEP_MM * heading)
     return np.array(points)
-
-
-def mouth(
-    radius: Float[np.ndarray, "n"],
-    points: Float[np.ndarray, "n 3"],
-    parent_direction: Float[np.ndarray, "3"],
-    parent_radius: float,
-) -> Float[np.ndarray, "n"]:
-    """Return a branch's radius with its mouth: inside the parent's lumen the inscribed sphere is the parent's.
-
-    The distance from the parent's axis eats up that sphere; a smooth maximum rounds the carina.
-    """
-    away = points - points[0]
-    off_axis = np.linalg.norm(away - (away @ parent_direction)[:, None] * parent_direction, axis=1)
-    inside = parent_radius - off_axis
-    smooth = np.logaddexp(6.0 * radius, 6.0 * inside) / 6.0
-    far = off_axis > 2 * parent_radius
-    smooth = np.where(far, radius, np.minimum(smooth, parent_radius))
-    smooth[0] = parent_radius
-    return smooth
-
-
-def build_tree(
-    main: Float[np.ndarray, "n 3"],
-    radius: Float[np.ndarray, "n"],
-    section: Sequence[str],
-    sides: Sequence[SideBranch],
-    section_names: tuple[str, ...],
-) -> VesselTree:
-    """Cut the main vessel at its branching points and hang the side branches there.
-
-    Args:
-        main: the main vessel, evenly spaced, LPS mm.
-        radius: its lumen radius, mm.
-        section: name of the section at each of its points.
-        sides: side branches, each at an origin of its own.
-        section_names: all names, in the order that numbers them.
-    """
-    number = {name: i for i, name in enumerate(section_names)}
-    along, tangent = abscissa(main), tangents(main)
-    normals = parallel_normals(tangent)
-    labels = np.array([number[name] for name in section])
-    ordered = sorted(sides, key=lambda side: side.origin)
-    branches: list[Branch] = []
-    parent, begin = -1, 0
-    for side in [*ordered, None]:
-        end = side.origin if side is not None else len(main) - 1
-        if end == begin:
-            break
-        piece = slice(begin, end + 1)
-        label = labels[piece].copy()
-        label[0] = label[1]
-        line = Centerline(main[piece], radius[piece], along[piece], normals[piece])
-        branches.append(Branch(line, parent, label))
-        parent, begin = len(branches) - 1, end
-        if side is not None:
-            line = Centerline(
-                side.points,
-                side.radius,
-                along[end] + abscissa(side.points),
-                parallel_normals(tangents(side.points), normals[end]),
-            )
-            branches.append(Branch(line, parent, np.full(len(side.points), number[side.section])))
-    return VesselTree(tuple(branches), section_names)
-
-
-def lumens_collide(main: Float[np.ndarray, "n 3"], radius: Float[np.ndarray, "n"], sides: Sequence[SideBranch]) -> bool:
-    """Tell whether lumens touch that lie far apart along the tree."""
-    points = np.concatenate([main, *(side.points for side in sides)])
-    radii = np.concatenate([radius, *(side.radius for side in sides)])
-    main_place = np.concatenate([np.arange(len(main)), *(np.full(len(s.points), s.origin) for s in sides)]) * STEP_MM
-    side_place = np.concatenate([np.zeros(len(main)), *(abscissa(s.points) for s in sides)])
-    owner = np.repeat(np.arange(len(sides) + 1), [len(main), *(len(s.points) for s in sides)])
-    near = KDTree(points).query_pairs(2 * radii.max() + _CLEARANCE_MM, output_type="ndarray")
-    a, b = near[:, 0], near[:, 1]
-    way = np.where(
-        owner[a] == owner[b],
-        np.abs(main_place[a] - main_place[b]) + np.abs(side_place[a] - side_place[b]),
-        np.abs(main_place[a] - main_place[b]) + side_place[a] + side_place[b],
-    )
-    reach = radii[a] + radii[b]
-    gap = np.linalg.norm(points[a] - points[b], axis=1) - reach
-    return bool(np.any((way > 2.2 * reach + 4.0) & (gap < _CLEARANCE_MM)))

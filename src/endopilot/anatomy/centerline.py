@@ -14,7 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
 from endopilot.anatomy.distance import sample
@@ -32,6 +32,15 @@ ROUNDNESS = 0.05
 """A cross-section whose half-axes differ by less than twice this share of its radius counts as round."""
 
 _RING = 12
+_FEWEST_DIRECTIONS = 5
+"""In fewer directions of the ring a vessel has too little wall of its own to be centred by it."""
+
+_STRAIGHT = 10
+"""This many steps of a branch from where it leaves its parent tell where it comes from."""
+
+_NEAR_WALL = 0.8
+"""The ring on which the radius is measured, in distances to the wall."""
+
 _REFINEMENTS = 8
 _STEP_LIMIT = 0.3
 """A refinement moves a point by at most this share of its distance to the wall."""
@@ -136,7 +145,8 @@ def refined_lines(
         raw = _smooth(graph.points[kept], 3.0) if len(kept) > 3 else graph.points[kept]
         if index and np.linalg.norm(np.diff(raw, axis=0), axis=1).sum() < 3 * step_mm:
             continue
-        points, radius = _to_axis(surface, distance_map, resampled(raw, step_mm))
+        mouth = None if index == 0 else lines[parent]
+        points, radius = _to_axis(surface, distance_map, resampled(raw, step_mm), mouth)
         points, radius = _to_cut(distance_map, points, radius, step_mm)
         place = 0
         if index == 0:
@@ -144,7 +154,7 @@ def refined_lines(
         else:
             home[nodes[1:]] = len(lines)
             place = _meeting_point(points, lines[parent])
-            points, radius = _joined(lines[parent], place, points, radius, step_mm)
+            points, radius = _joined(surface, lines[parent], place, points, radius, step_mm)
         lines.append(Line(points, radius, parent, place))
     return lines
 
@@ -152,7 +162,8 @@ def refined_lines(
 def end_score(distance_map: DistanceMap, graph: LumenGraph, path: Int[np.ndarray, "_"]) -> float:
     """Return how much the end of a path looks like the vessel's inlet: its radius in mm, less if it is not cut open.
 
-    A blind end counts 0.6 times its radius, and one that bulges behind a neck, as an aneurysm does, 0.2 times.
+    A blind end counts 0.6 times its radius, and one that bulges behind a neck, as an aneurysm does, 0.2 times, but no
+    more than half the neck's.
     """
     kept = path[: _before_cap(graph, path)]
     radius = float(np.median(graph.clearance[kept[-5:]]))
@@ -168,20 +179,7 @@ def end_score(distance_map: DistanceMap, graph: LumenGraph, path: Int[np.ndarray
         return radius
     gap = np.linalg.norm(graph.points[kept] - graph.points[kept[-1]], axis=1)
     neck = graph.clearance[kept[gap < 4 * radius]].min()
-    return (0.2 if radius > 1.3 * neck else 0.6) * radius
-
-
-def cross_section_radius(
-    distance_map: DistanceMap, point: Float[np.ndarray, "3"], tangent: Float[np.ndarray, "3"], limit_mm: float
-) -> float:
-    """Return the median distance to the wall across a vessel, mm: 0 outside the lumen, at most `limit_mm`."""
-    one, two = _frame(tangent[None])
-    angle = 2 * np.pi * np.arange(_RING) / _RING
-    rays = np.cos(angle)[:, None] * one + np.sin(angle)[:, None] * two
-    along = np.arange(0.0, limit_mm, 0.25 * distance_map.spacing_mm)
-    value = sample(distance_map, (point + along[:, None, None] * rays).reshape(-1, 3)).reshape(len(along), _RING)
-    first = np.where((value <= 0).any(axis=0), (value <= 0).argmax(axis=0), len(along))
-    return float(np.median(first) * 0.25 * distance_map.spacing_mm)
+    return min(0.2 * radius, 0.5 * float(neck)) if radius > 1.3 * neck else 0.6 * radius
 
 
 _HALF_NEIGHBOURHOOD = np.array(
@@ -213,32 +211,64 @@ def _is_branch(graph: LumenGraph, nodes: Int[np.ndarray, "_"], minimum_length_mm
 
 
 def _to_axis(
-    surface: Surface, distance_map: DistanceMap, points: Float[np.ndarray, "n 3"]
+    surface: Surface, distance_map: DistanceMap, points: Float[np.ndarray, "n 3"], parent: Line | None
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]:
-    """Move a line onto the medial axis; return it with its radii."""
+    """Move a line onto its vessel's axis; return it with its radii.
+
+    Where a branch runs together with its parent, the directions in which it opens into the parent do not count.
+    """
     for iteration in range(_REFINEMENTS):
         clearance = surface.distance(points)
         around, ring = _ring_distance(surface, points, 0.5 * clearance)
-        shift = 2.0 / _RING * np.einsum("rn,rnj->nj", around, ring)
+        _, shift = _harmonics(around, ring, _walled(points, clearance, ring, parent))
         size = np.linalg.norm(shift, axis=1)
         shift *= np.minimum(1.0, _STEP_LIMIT * clearance / np.maximum(size, 1e-12))[:, None]
         moved = points + shift
         moved = np.where((sample(distance_map, moved) > 0)[:, None], moved, points)
         points = _twice_smooth(moved, 3.0 if iteration < _REFINEMENTS - 2 else 2.0)
-    return points, _inscribed_radius(surface, points)
+    return points, _inscribed_radius(surface, points, parent)
 
 
-def _inscribed_radius(surface: Surface, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+def _walled(
+    points: Float[np.ndarray, "n 3"],
+    clearance: Float[np.ndarray, "n"],
+    ring: Float[np.ndarray, "r n 3"],
+    parent: Line | None,
+) -> Bool[np.ndarray, "r n"]:
+    """Return in which directions a vessel has a wall of its own: not where it opens into its parent."""
+    if parent is None:
+        return np.ones(ring.shape[:2], dtype=bool)
+    gap, nearest = KDTree(parent.points).query((points + clearance[:, None] * ring).reshape(-1, 3))
+    own = (np.asarray(gap) > parent.radius[np.asarray(nearest)]).reshape(ring.shape[:2])
+    return own | (own.sum(axis=0) < _FEWEST_DIRECTIONS)
+
+
+def _harmonics(
+    around: Float[np.ndarray, "r n"], ring: Float[np.ndarray, "r n 3"], walled: Bool[np.ndarray, "r n"]
+) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
+    """Fit a mean and a first harmonic to the wall distances around each point; return it and the way to the centre."""
+    angle = 2 * np.pi * np.arange(_RING) / _RING
+    basis = np.stack([np.ones(_RING), np.cos(angle), np.sin(angle)], axis=1)
+    matrix = np.einsum("rn,ri,rj->nij", walled.astype(float), basis, basis)
+    matrix[:, [1, 2], [1, 2]] += 0.1 * (~walled).sum(axis=0)[:, None]  # a half ring alone tells the way poorly
+    fit = np.linalg.solve(matrix, np.einsum("rn,ri,rn->ni", walled.astype(float), basis, around)[..., None])[..., 0]
+    return fit[:, 0], fit[:, 1, None] * ring[0] + fit[:, 2, None] * ring[_RING // 4]
+
+
+def _inscribed_radius(
+    surface: Surface, points: Float[np.ndarray, "n 3"], parent: Line | None
+) -> Float[np.ndarray, "n"]:
     """Return inscribed-sphere radii that the wall's voxel noise does not shrink.
 
     The distance at the axis is the least over the whole circumference, and so reads the deepest ripple of the wall.
     Instead, each direction is asked on its own on a ring near the wall. Their mean is the radius of a round lumen; the
     second harmonic's amplitude, where it is more than ripple, leads from it to the small half-axis of a flat one.
     """
-    reach = 0.7 * surface.distance(points)
-    around, _ = _ring_distance(surface, points, reach)
-    mean = around.mean(axis=0) + reach
-    flatness = np.abs(2.0 / _RING * np.exp(4j * np.pi * np.arange(_RING) / _RING) @ around)
+    clearance = surface.distance(points)
+    around, ring = _ring_distance(surface, points, _NEAR_WALL * clearance)
+    walled = _walled(points, clearance, ring, parent)
+    mean = _harmonics(around, ring, walled)[0] + _NEAR_WALL * clearance
+    flatness = np.abs(2.0 / _RING * np.exp(4j * np.pi * np.arange(_RING) / _RING) @ around) * walled.all(axis=0)
     radius = mean - np.maximum(flatness - ROUNDNESS * mean, 0.0)
     return _smooth(radius[:, None], 1.5)[:, 0] if len(points) > 3 else radius
 
@@ -287,24 +317,58 @@ def _before_cap(graph: LumenGraph, nodes: Int[np.ndarray, "_"]) -> int:
 def _to_cut(
     distance_map: DistanceMap, points: Float[np.ndarray, "n 3"], radius: Float[np.ndarray, "n"], step_mm: float
 ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m"]]:
-    """Draw a line out straight as long as the lumen keeps its width, to the cut of a vessel that ends flat."""
+    """Draw a line out as long as the lumen keeps its width, to the cut of a vessel that ends flat.
+
+    Each step goes on along the last ones, bent as they are, and is centred by the walls beside it alone: the cut ahead
+    does not draw it back.
+    """
     width = float(radius[-1])
-    behind = max(0, len(points) - 1 - max(3, round(1.5 * width / step_mm)))
-    axis = points[-1] - points[behind]
-    axis /= max(float(np.linalg.norm(axis)), 1e-12)
-    added: list[np.ndarray] = []
-    for count in range(1, int(3 * width / step_mm) + 2):
-        candidate = points[-1] + count * step_mm * axis
-        if cross_section_radius(distance_map, candidate, axis, 2 * width) < 0.9 * width:
+    back = max(3, round(1.5 * width / step_mm))
+    line = list(points[-2 * back - 1 :])
+    kept = len(line)
+    for _ in range(int(3 * width / step_mm) + 1):
+        behind = min(back, len(line) - 1)
+        axis = line[-1] - line[-1 - behind]
+        if len(line) > 2 * behind:
+            axis = 1.5 * axis - 0.5 * (line[-1 - behind] - line[-1 - 2 * behind])
+        axis /= max(float(np.linalg.norm(axis)), 1e-12)
+        candidate = line[-1] + step_mm * axis
+        wall, rays = _section(distance_map, candidate, axis, 2 * width)
+        if np.median(wall) < 0.9 * width:
             break
-        added.append(candidate)
+        shift = 2.0 / _RING * wall @ rays
+        size = float(np.linalg.norm(shift))
+        line.append(candidate + shift * min(0.5, 0.2 * step_mm / max(size, 1e-12)))
+    added = line[kept:]
     if not added:
         return points, radius
     return np.concatenate([points, added]), np.concatenate([radius, np.full(len(added), width)])
 
 
+def _section(
+    distance_map: DistanceMap, point: Float[np.ndarray, "3"], tangent: Float[np.ndarray, "3"], limit_mm: float
+) -> tuple[Float[np.ndarray, "r"], Float[np.ndarray, "r 3"]]:
+    """Return the distance to the wall along rays across a vessel, mm, and the rays: 0 outside, at most `limit_mm`."""
+    one, two = _frame(tangent[None])
+    angle = 2 * np.pi * np.arange(_RING) / _RING
+    rays = np.cos(angle)[:, None] * one + np.sin(angle)[:, None] * two
+    step = 0.5 * distance_map.spacing_mm
+    along = np.arange(0.0, limit_mm + step, step)
+    value = sample(distance_map, (point + along[:, None, None] * rays).reshape(-1, 3)).reshape(len(along), _RING)
+    outside = value <= 0
+    first = np.maximum(outside.argmax(axis=0), 1)
+    before, after = value[first - 1, np.arange(_RING)], value[first, np.arange(_RING)]
+    crossing = along[first - 1] + step * before / np.maximum(before - after, 1e-12)
+    return np.where(outside[0], 0.0, np.where(outside.any(axis=0), crossing, limit_mm)), rays
+
+
 def _joined(
-    parent: Line, place: int, points: Float[np.ndarray, "n 3"], radius: Float[np.ndarray, "n"], step_mm: float
+    surface: Surface,
+    parent: Line,
+    place: int,
+    points: Float[np.ndarray, "n 3"],
+    radius: Float[np.ndarray, "n"],
+    step_mm: float,
 ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m"]]:
     """Join a side branch's axis to its parent's by a straight piece, rounded where it meets the axis."""
     start = parent.points[place]
@@ -315,7 +379,7 @@ def _joined(
     weight = np.exp(-(((np.arange(len(line)) - count) / 3.0) ** 2))[:, None]
     line = (1 - weight) * line + weight * _smooth(line, 2.0)
     line[0] = start
-    size = np.concatenate([parent.radius[place] + share[:, 0] * (radius[0] - parent.radius[place]), radius])
+    size = np.concatenate([surface.distance(line[:count]), radius])
     return line, size
 
 
@@ -328,13 +392,13 @@ def _outside(points: Float[np.ndarray, "n 3"], parent: Line) -> int:
 
 def _meeting_point(body: Float[np.ndarray, "n 3"], parent: Line) -> int:
     """Return the index of the parent's point that the side branch's axis, drawn back, comes nearest to."""
-    reach = min(len(body) - 1, 6)
-    back = body[0] - body[reach]
-    back /= np.linalg.norm(back)
-    relative = parent.points - body[0]
+    start = body[: min(len(body), _STRAIGHT + 1)]
+    back = np.linalg.svd(start - start.mean(axis=0))[2][0]
+    back *= np.sign(back @ (start[0] - start[-1]))
+    relative = parent.points - start.mean(axis=0)
     along = np.clip(relative @ back, 0.0, None)
     miss = np.linalg.norm(relative - along[:, None] * back, axis=1)
-    gap = np.linalg.norm(relative, axis=1)
+    gap = np.linalg.norm(parent.points - body[0], axis=1)
     near = gap <= 2.0 * parent.radius + gap.min()
     score = np.where(near, miss + 0.1 * gap, np.inf)
     place = int(score.argmin())

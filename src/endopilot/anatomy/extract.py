@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import asdict, dataclass
 from typing import Literal
 
@@ -20,7 +21,7 @@ from endopilot.anatomy.distance import (
 from endopilot.anatomy.labels import dominance, label_tree
 from endopilot.anatomy.sources import AnatomySource, Polylines, read_source, transformed
 from endopilot.anatomy.surface import Surface, surface_from_mask
-from endopilot.anatomy.tree import tree_from_lines
+from endopilot.anatomy.tree import Line, tree_from_lines
 from endopilot.errors import InputError
 from endopilot.progress import progress
 from endopilot.types import Anatomy, DistanceMap, Insertion, LumenMask, VesselTree
@@ -32,6 +33,9 @@ SMALLEST_MEAN_RADIUS_MM, LARGEST_MEAN_RADIUS_MM = 0.25, 40.0
 
 CORONARY_RADIUS_MM = 1.6
 """Mean radius of a coronary tree at most: what counts for the grid where a lumen holds a piece of the aorta too."""
+
+ENTRANCE_RADII = 3.0
+"""An ostium given nearer than this many radii to an end of the vessel enters at that end."""
 
 SHORTEST_IN_DIAMETERS = 1.5
 """A lumen whose longest path is shorter than this many of its own mean diameters is no vessel."""
@@ -117,7 +121,7 @@ def extract_anatomy(
         advance()
     provenance = {
         "endopilot": __version__,
-        "source": {"file": wrapped.file, "sha256": wrapped.sha256, "kind": type(content).__name__},
+        "source": _source_record(wrapped),
         "config": asdict(config),
         "ostium_rule": rule,
         "dominance": dominance(tree),
@@ -126,11 +130,34 @@ def extract_anatomy(
     return Anatomy(name, tree, distance_map, insertion, radius, provenance)
 
 
+def _source_record(source: AnatomySource) -> dict[str, str | None]:
+    """Return what the anatomy was made from: its file and hash, or the hash of arrays that came from no file."""
+    digest, content = source.sha256, source.content
+    if not digest:
+        arrays: list[np.ndarray]
+        if isinstance(content, LumenMask):
+            volume = content.volume
+            arrays = [volume.voxels, volume.spacing_mm, volume.origin_mm, volume.direction]
+        elif isinstance(content, Surface):
+            arrays = [content.vertices, content.faces]
+        elif isinstance(content, VesselTree):
+            arrays = [part for b in content.branches for part in (b.centerline.points, b.centerline.radius)]
+        else:
+            arrays = [*content.points, *content.radius]
+        digest = hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)).hexdigest()
+    return {"file": source.file or None, "sha256": digest, "kind": type(content).__name__}
+
+
 def _tree(
     surface: Surface, finest_mm: float, given: Insertion | None, config: AnatomyConfig, label: str
 ) -> tuple[VesselTree, str]:
     """Return the centerline tree inside a closed wall, and the rule by which its root was chosen."""
     mean_radius = 2.0 * surface.volume / surface.area
+    if mean_radius < min(SMALLEST_MEAN_RADIUS_MM, finest_mm):
+        raise InputError(
+            f"{label}: the lumen is about one voxel thick (mean radius {mean_radius:.2g} mm, voxels of "
+            f"{finest_mm:.2g} mm), too thin to follow; segment on a finer grid"
+        )
     if not SMALLEST_MEAN_RADIUS_MM <= mean_radius <= LARGEST_MEAN_RADIUS_MM:
         raise InputError(
             f"{label}: the lumen's mean radius is {mean_radius:.3g} mm, which no vessel has; "
@@ -155,6 +182,8 @@ def _tree(
     if given is None:
         root = _widest_open_end(distance_map, points, clearance, config)
     else:
+        if not given.direction.any() and rule == "given":
+            given = _directed(distance_map, points, clearance, given, config)
         points, clearance = _in_front(points, clearance, given)
         root = int(np.linalg.norm(points - given.position, axis=1).argmin())
     graph = centerline.lumen_graph(points, clearance, spacing, root)
@@ -162,6 +191,8 @@ def _tree(
     middle = float(np.median(graph.clearance[np.concatenate(paths)]))
     step = float(np.clip(0.3 * middle, 0.25, 2.0))
     lines = centerline.refined_lines(surface, distance_map, graph, paths, step)
+    if given is not None and given.direction.any():
+        lines[0] = _from_ostium(lines[0], given)
     tree = tree_from_lines(lines)
     longest = tree.longest_path()
     if longest.abscissa[-1] < SHORTEST_IN_DIAMETERS * 2 * float(longest.radius.mean()):
@@ -170,6 +201,17 @@ def _tree(
             f"of {2 * longest.radius.mean():.1f} mm; check the label or the segmentation"
         )
     return tree, rule
+
+
+def _from_ostium(line: Line, ostium: Insertion) -> Line:
+    """Let the first line begin at an ostium that is known: near the cut across the vessel the medial axis feels it."""
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line.points, axis=0), axis=1))])
+    shift = ostium.position - line.points[0]
+    if np.linalg.norm(shift) > 2 * line.radius[0]:
+        return line
+    share = np.clip(1 - along / (3 * line.radius[0]), 0.0, 1.0)
+    moved = line.points + (share**2 * (3 - 2 * share))[:, None] * shift
+    return Line(moved, line.radius, line.parent, line.place)
 
 
 def _component(distance_map: DistanceMap, given: Insertion | None) -> Bool[np.ndarray, "nz ny nx"]:
@@ -243,6 +285,30 @@ def _part_at(
     return labels == labels[tuple(nearest)]
 
 
+def _directed(
+    distance_map: DistanceMap,
+    points: Float[np.ndarray, "n 3"],
+    clearance: Float[np.ndarray, "n"],
+    given: Insertion,
+    config: AnatomyConfig,
+) -> Insertion:
+    """Return an ostium inside a vessel with the direction away from the inlet; one near an end stays without."""
+    inlet = _widest_open_end(distance_map, points, clearance, config)
+    graph = centerline.lumen_graph(points, clearance, distance_map.spacing_mm, inlet)
+    node = int(np.linalg.norm(graph.points - given.position, axis=1).argmin())
+    reach = ENTRANCE_RADII * float(clearance[np.linalg.norm(points - given.position, axis=1) < 3.0].max(initial=1.0))
+    way = [node]
+    while graph.predecessor[way[-1]] >= 0 and graph.length[node] - graph.length[way[-1]] < reach:
+        way.append(int(graph.predecessor[way[-1]]))
+    direction = graph.points[node] - graph.points[way[-1]]
+    length = float(np.linalg.norm(direction))
+    ahead = (graph.points - graph.points[node]) @ direction > length * reach
+    beyond = ahead & (graph.length > graph.length[node] + reach)
+    if graph.length[node] < reach or length == 0.0 or not beyond.any():
+        return given
+    return Insertion(given.position, direction / length)
+
+
 def _in_front(
     points: Float[np.ndarray, "n 3"], clearance: Float[np.ndarray, "n"], given: Insertion
 ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m"]]:
@@ -269,9 +335,18 @@ def _widest_open_end(
     ends = [*paths, paths[0][::-1]]
     tips = np.array([graph.points[path[-1]] for path in ends])
     score = np.array([centerline.end_score(distance_map, graph, path) for path in ends])
+    middle = np.concatenate(paths)
+    score *= [0.6 + 0.4 * _tapering(graph.points[middle], graph.clearance[middle], tip) for tip in tips]
     if config.vessel != "generic":  # the coronary ostia lie at the top of their trees
         score *= 0.5 + (tips[:, 2] - tips[:, 2].min()) / max(float(np.ptp(tips[:, 2])), 1.0)
     return int(np.linalg.norm(points - tips[score.argmax()], axis=1).argmin())
+
+
+def _tapering(points: Float[np.ndarray, "n 3"], radius: Float[np.ndarray, "n"], tip: Float[np.ndarray, "3"]) -> float:
+    """Return how steadily a tree narrows away from an end: its rank correlation, −1 where it widens all the way."""
+    distance = np.linalg.norm(points - tip, axis=1)
+    ranks = [np.argsort(np.argsort(values)).astype(float) for values in (distance, radius)]
+    return -float(np.corrcoef(*ranks)[0, 1]) if len(points) > 3 else 0.0
 
 
 def _final_map(surface: Surface, tree: VesselTree, config: AnatomyConfig) -> DistanceMap:

@@ -10,7 +10,7 @@ are ellipsoids and tubes that leave the artery its fat; all depths are signed di
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 
 import numpy as np
@@ -68,6 +68,7 @@ class HeartFit:
         scale: size of the patient's heart against the reference.
         knots: points of the patient's artery after the similarity, mm.
         shifts: what is missing from each knot to the reference course, mm.
+        anchor: where the patient's ostium lies after the similarity, mm: the warp leaves it in its place.
     """
 
     origin: Float[np.ndarray, "3"]
@@ -75,13 +76,14 @@ class HeartFit:
     scale: float
     knots: Float[np.ndarray, "n 3"]
     shifts: Float[np.ndarray, "n 3"]
+    anchor: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
 
     def to_reference(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Return the reference position of the patient's points, mm."""
         aligned = (points - self.origin) @ self.rotation / self.scale
-        # The ostium stays at the origin, on the aorta's surface: the warp fades out around it.
-        fade = np.exp((aligned**2).sum(axis=1, keepdims=True) * (-0.5 / _WARP_WIDTH_MM**2))
-        return aligned + self._warp(aligned) - fade * self._warp(np.zeros((1, 3)))
+        # The ostium stays on the aorta's surface: the warp fades out around it.
+        fade = np.exp(((aligned - self.anchor) ** 2).sum(axis=1, keepdims=True) * (-0.5 / _WARP_WIDTH_MM**2))
+        return aligned + self._warp(aligned) - fade * self._warp(self.anchor[None])
 
     def _warp(self, aligned: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Return the mean of the knots' shifts, weighted by nearness; it vanishes far from the artery."""
@@ -114,10 +116,7 @@ def fit_heart(main: Float[np.ndarray, "n 3"], crux_mm: float, last_section: str)
     course = _at(main, along, np.linspace(0.0, crux_mm, 20))
     to_crux = shape.curve_through(TO_CRUX)
     reference = _at(to_crux, shape.abscissa(to_crux), np.linspace(0.0, shape.abscissa(to_crux)[-1], 20))
-    u, s, vt = np.linalg.svd((course - course[0]).T @ reference)
-    sign = np.array([1.0, 1.0, np.linalg.det(u @ vt)])
-    rotation = u @ np.diag(sign) @ vt
-    scale = float(np.clip((s * sign).sum() / (reference**2).sum(), 0.6, 1.6))
+    rotation, scale = _similarity(course - course[0], reference)
     if last_section in BEYOND_CRUX:
         beyond = shape.curve_through(np.concatenate([TO_CRUX, BEYOND_CRUX[last_section]]))
         start = shape.abscissa(to_crux)[-1]
@@ -127,6 +126,39 @@ def fit_heart(main: Float[np.ndarray, "n 3"], crux_mm: float, last_section: str)
         reference = np.concatenate([reference, _at(beyond, shape.abscissa(beyond), start + steps)])
     knots = (course - course[0]) @ rotation / scale
     return HeartFit(main[0], rotation, scale, knots, reference - knots)
+
+
+def fit_heart_along(lines: Sequence[Float[np.ndarray, "_ 3"]], courses: Sequence[Float[np.ndarray, "_ 3"]]) -> HeartFit:
+    """Fit the reference heart to the main vessels of a tree, as far as they go.
+
+    A patient's point belongs to the reference point at the same way from the ostium, measured in sizes of the heart.
+
+    Args:
+        lines: the patient's main vessels, each from the ostium, LPS mm.
+        courses: their courses on the reference heart, each from the ostium, mm.
+    """
+    ostium, anchor, scale = lines[0][0], courses[0][0], 1.0
+    for _ in range(4):
+        course, reference = [], []
+        for line, ideal in zip(lines, courses, strict=True):
+            along, way = shape.abscissa(line), shape.abscissa(ideal)
+            places = np.linspace(0.0, min(way[-1], along[-1] / scale), 16)
+            course.append(_at(line, along, scale * places))
+            reference.append(_at(ideal, way, places))
+        found, wanted = np.concatenate(course) - ostium, np.concatenate(reference) - anchor
+        rotation, scale = _similarity(found, wanted)
+    origin = ostium - scale * rotation @ anchor
+    knots = anchor + found @ rotation / scale
+    return HeartFit(origin, rotation, scale, knots, anchor + wanted - knots, anchor)
+
+
+def _similarity(
+    course: Float[np.ndarray, "n 3"], reference: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "3 3"], float]:
+    """Return rotation and size that take reference points nearest to the patient's (Umeyama 1991), about the origin."""
+    u, s, vt = np.linalg.svd(course.T @ reference)
+    sign = np.array([1.0, 1.0, np.linalg.det(u @ vt)])
+    return u @ np.diag(sign) @ vt, float(np.clip((s * sign).sum() / (reference**2).sum(), 0.6, 1.6))
 
 
 def ellipsoid(

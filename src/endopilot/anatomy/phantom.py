@@ -10,25 +10,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float32, Int
-from scipy.ndimage import gaussian_filter1d
+from jaxtyping import Float32
 from scipy.spatial import KDTree
 
 from endopilot.anatomy import phantom_heart as chest
 from endopilot.anatomy.heart_reference import HeartFit
+from endopilot.anatomy.phantom_painter import COARSE_MM, SLAB, Grid, Painter, smooth_min, window
+from endopilot.anatomy.phantom_scanner import scan, smear
 from endopilot.errors import InputError
 from endopilot.types import Anatomy, Centerline, Volume
 
-_COARSE_MM = 2.0
-"""Spacing of the grid on which organs are computed, mm."""
 _REACH_MM = 5.0
 """Distances to small vessels are computed up to this far, mm."""
 _FAT_MM = 5.5
 """Fat reaches at least this far from a coronary's axis, mm."""
 _WALL_MM = 0.5
 """Thickness of a coronary wall, mm."""
-_SLAB = 8
-"""Slices rendered at once: a slab stays in the processor's cache."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,32 +44,29 @@ class PhantomConfig:
     """Width of the point-spread function at half its height, mm."""
     calcium: float = 2.0
     """Mean number of calcified plaques."""
+    right_heart: tuple[float, float] = (0.35, 0.8)
+    """CT number of the right ventricle's blood as a share of the lumen's: less where saline has washed it out."""
+    motion_mm: float = 0.0
+    """How far the heart moves while it is scanned, mm: it is smeared along that way, more where it moved last."""
     margin_mm: float = 16.0
     """Width of surroundings beyond the tree on every side, mm."""
+    voxels: tuple[int, int, int] | None = None
+    """Voxels along x, y and z about the middle of what the margin asks for; by default as many as that takes."""
 
     def __post_init__(self) -> None:
         for name in ("in_plane_mm", "slice_mm", "margin_mm"):
             if not getattr(self, name) > 0:
                 raise InputError(f"{name}: {getattr(self, name)} mm; give a length above 0")
-        for name in ("lumen_hu", "noise_hu", "psf_mm"):
+        for name in ("lumen_hu", "noise_hu", "psf_mm", "right_heart"):
             low, high = getattr(self, name)
             if not 0 <= low <= high:
                 raise InputError(f"{name}: ({low}, {high}); give two numbers from 0 up, the smaller one first")
         if self.calcium < 0:
             raise InputError(f"calcium: {self.calcium} plaques; give 0 or more")
-
-
-@dataclass(frozen=True, eq=False)
-class _Grid:
-    """The voxel centres along x, y and z, mm."""
-
-    x: Float[np.ndarray, "nx"]
-    y: Float[np.ndarray, "ny"]
-    z: Float[np.ndarray, "nz"]
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        return len(self.z), len(self.y), len(self.x)
+        if not 0 <= self.motion_mm <= 10:
+            raise InputError(f"motion_mm: {self.motion_mm} mm; give 0 to 10")
+        if self.voxels is not None and min(self.voxels) < 16:
+            raise InputError(f"voxels: {self.voxels}; give at least 16 along each axis")
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +79,7 @@ class _Plaque:
 
 
 def make_phantom(anatomy: Anatomy, config: PhantomConfig, seed: int) -> Volume:
-    """Return a synthetic CT angiogram of a right coronary anatomy, in HU.
+    """Return a synthetic CT angiogram of a right or left coronary anatomy, in HU.
 
     Args:
         anatomy: its tree gives the lumen; a stenosis named in its provenance gets a soft plaque.
@@ -101,16 +95,21 @@ def make_phantom(anatomy: Anatomy, config: PhantomConfig, seed: int) -> Volume:
     lumen_hu, noise_hu, psf_mm = (
         generator.uniform(*span) for span in (config.lumen_hu, config.noise_hu, config.psf_mm)
     )
-    tissue = _tissue_hu(generator, lumen_hu)
-    coronaries = [branch.centerline for branch in anatomy.tree.branches] + list(chest.left_coronary(heart))
+    tissue = _tissue_hu(generator, lumen_hu, config.right_heart)
+    coronaries = [branch.centerline for branch in anatomy.tree.branches]
+    coronaries += chest.other_coronary(heart, anatomy.tree)
     lumen = _small_vessels(grid, coronaries)
     veins = _small_vessels(grid, chest.cardiac_veins(heart, anatomy.tree))
     coarse, organs = _organs(grid, heart, coronaries, generator)
-    painter = _Painter(grid, coarse, config)
+    painter = Painter(grid, coarse, in_plane_mm=config.in_plane_mm, slice_mm=config.slice_mm)
     image = _render(grid, painter, organs, lumen, veins, tissue)
     for plaque in _plaques(grid, anatomy, generator, config.calcium):
         painter.paint(image[plaque.box], np.minimum(plaque.depth, -lumen[plaque.box]), tissue[plaque.tissue])
-    _scan(image, config, psf_mm, noise_hu, generator)
+    spacing = config.slice_mm, config.in_plane_mm, config.in_plane_mm
+    if config.motion_mm > 0:
+        pericardium = next(organ.depth for organ in organs if organ.name == "fat")
+        smear(image, painter, pericardium, spacing, config.motion_mm, generator)
+    scan(image, spacing, psf_mm, noise_hu, generator)
     return Volume(
         voxels=np.clip(np.rint(image), -1024, 3071).astype(np.int16),
         spacing_mm=np.array([config.in_plane_mm, config.in_plane_mm, config.slice_mm]),
@@ -119,20 +118,27 @@ def make_phantom(anatomy: Anatomy, config: PhantomConfig, seed: int) -> Volume:
     )
 
 
-def _field_of_view(anatomy: Anatomy, config: PhantomConfig) -> _Grid:
-    """Return a grid around the tree with the margin, and twice the margin of aorta above the ostium."""
+def _field_of_view(anatomy: Anatomy, config: PhantomConfig) -> Grid:
+    """Return a grid around the tree with the margin; the aorta beside the ostium, and above it by twice the margin."""
     points = np.concatenate([branch.centerline.points for branch in anatomy.tree.branches])
     low, high = points.min(axis=0) - config.margin_mm, points.max(axis=0) + config.margin_mm
     high[2] = max(high[2], anatomy.insertion.position[2] + 2 * config.margin_mm)
-    high[:2] = np.maximum(high[:2], anatomy.insertion.position[:2] + np.array([44.0, 36.0]))
+    across = np.array([44.0, 36.0])
+    if chest.is_left(anatomy.tree):
+        low[:2] = np.minimum(low[:2], anatomy.insertion.position[:2] - across)
+    else:
+        high[:2] = np.maximum(high[:2], anatomy.insertion.position[:2] + across)
     steps = (config.in_plane_mm, config.in_plane_mm, config.slice_mm)
+    if config.voxels is not None:
+        half = 0.5 * np.array(config.voxels) * steps
+        low, high = (low + high) / 2 - half, (low + high) / 2 + half - 0.5 * np.array(steps)
     axes = [np.arange(a, b, step) for a, b, step in zip(low, high, steps, strict=True)]
-    return _Grid(*axes)
+    return Grid(*axes)
 
 
-def _tissue_hu(generator: np.random.Generator, lumen_hu: float) -> dict[str, float]:
+def _tissue_hu(generator: np.random.Generator, lumen_hu: float, right_heart: tuple[float, float]) -> dict[str, float]:
     """Draw the CT numbers of one scan, HU (see docs/atlas.md for their ranges)."""
-    right = generator.uniform(0.35, 0.8)
+    right = generator.uniform(*right_heart)
     return {
         "lung": generator.uniform(-830, -780),
         "chest wall": 45.0,
@@ -159,7 +165,7 @@ def _tissue_hu(generator: np.random.Generator, lumen_hu: float) -> dict[str, flo
     }
 
 
-def _small_vessels(grid: _Grid, lines: Sequence[Centerline]) -> Float32[np.ndarray, "nz ny nx"]:
+def _small_vessels(grid: Grid, lines: Sequence[Centerline]) -> Float32[np.ndarray, "nz ny nx"]:
     """Return the signed distance to the wall of tubes with rounded ends, mm, positive inside, not below -5."""
     depth = np.full(grid.shape, -_REACH_MM, dtype=np.float32)
     for line in lines:
@@ -167,7 +173,7 @@ def _small_vessels(grid: _Grid, lines: Sequence[Centerline]) -> Float32[np.ndarr
         points, radius = line.points[chosen], line.radius[chosen]
         for a, b, ra, rb in zip(points[:-1], points[1:], radius[:-1], radius[1:], strict=True):
             reach = max(ra, rb) + _REACH_MM
-            box, (z, y, x) = _window(grid, np.minimum(a, b) - reach, np.maximum(a, b) + reach)
+            box, (z, y, x) = window(grid, np.minimum(a, b) - reach, np.maximum(a, b) + reach)
             x, y, z, step = x - a[0], y - a[1], z - a[2], b - a
             share = (x * step[0] + y * step[1] + z * step[2]) * np.float32(1 / (step @ step))
             np.clip(share, 0, 1, out=share)
@@ -178,17 +184,19 @@ def _small_vessels(grid: _Grid, lines: Sequence[Centerline]) -> Float32[np.ndarr
     return depth
 
 
-def _plaques(grid: _Grid, anatomy: Anatomy, generator: np.random.Generator, mean_count: float) -> list[_Plaque]:
+def _plaques(grid: Grid, anatomy: Anatomy, generator: np.random.Generator, mean_count: float) -> list[_Plaque]:
     """Return soft plaques around stenoses, and calcified ones in the wall."""
-    line = anatomy.tree.longest_path()
+    paths = chest.main_paths(anatomy.tree)
     plaques = []
     for stenosis in anatomy.provenance.get("stenoses", ()):
+        line = paths[-1] if stenosis.get("vessel") == "LCx" else paths[0]
         half = 0.6 * stenosis["length_mm"]
         ends = stenosis["abscissa_mm"] + np.array([-half, half])
         wall = float(np.interp(ends, line.abscissa, line.radius).max()) + 0.4
         near = int(np.searchsorted(line.abscissa, stenosis["abscissa_mm"]))
         plaques.append(_plaque(grid, "soft plaque", line, near, (0.0, 0.0), (half, wall, wall)))
-    for _ in range(generator.poisson(mean_count)):
+    for number in range(generator.poisson(mean_count)):
+        line = paths[number % len(paths)]
         near = int(generator.integers(4, round(0.75 * len(line.points))))
         along, across, around = (float(a) for a in generator.uniform((1.0, 0.4, 0.8), (3.5, 0.9, 1.4)))
         place = float(line.radius[near]) + 0.4 * across, float(generator.uniform(0, 2 * np.pi))
@@ -197,7 +205,7 @@ def _plaques(grid: _Grid, anatomy: Anatomy, generator: np.random.Generator, mean
 
 
 def _plaque(
-    grid: _Grid,
+    grid: Grid,
     tissue: str,
     line: Centerline,
     index: int,
@@ -219,7 +227,7 @@ def _plaque(
     outward = np.cos(place[1]) * line.normals[index] + np.sin(place[1]) * np.cross(tangent, line.normals[index])
     frame = np.stack([tangent, outward, np.cross(tangent, outward)])
     centre, reach = line.points[index] + place[0] * outward, max(semi_axes) + 1.0
-    box, (z, y, x) = _window(grid, centre - reach, centre + reach)
+    box, (z, y, x) = window(grid, centre - reach, centre + reach)
     local = [(x - centre[0]) * e[0] + (y - centre[1]) * e[1] + (z - centre[2]) * e[2] for e in frame]
     # Distance to an ellipsoid, exact to first order at its surface.
     level = np.sqrt(sum((u / a) ** 2 for u, a in zip(local, semi_axes, strict=True)))
@@ -227,21 +235,12 @@ def _plaque(
     return _Plaque(tissue, box, (level * (1 - level) / np.maximum(slope, 1e-6)).astype(np.float32))
 
 
-def _window(
-    grid: _Grid, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]
-) -> tuple[tuple[slice, slice, slice], tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Return the slices (k, j, i) of the voxels in a box, and their z, y and x, ready to broadcast."""
-    spans = [slice(*np.searchsorted(axis, (low[i], high[i]))) for i, axis in enumerate((grid.x, grid.y, grid.z))]
-    x, y, z = (axis[span].astype(np.float32) for axis, span in zip((grid.x, grid.y, grid.z), spans, strict=True))
-    return (spans[2], spans[1], spans[0]), (z[:, None, None], y[:, None], x)
-
-
 def _organs(
-    grid: _Grid, heart: HeartFit, coronaries: Sequence[Centerline], generator: np.random.Generator
-) -> tuple[_Grid, tuple[chest.Organ, ...]]:
+    grid: Grid, heart: HeartFit, coronaries: Sequence[Centerline], generator: np.random.Generator
+) -> tuple[Grid, tuple[chest.Organ, ...]]:
     """Return the coarse grid and the organs on it; fat wraps the coronaries too."""
-    axes = (np.arange(axis[0] - _COARSE_MM, axis[-1] + 2 * _COARSE_MM, _COARSE_MM) for axis in (grid.x, grid.y, grid.z))
-    coarse = _Grid(*axes)
+    axes = (np.arange(axis[0] - COARSE_MM, axis[-1] + 2 * COARSE_MM, COARSE_MM) for axis in (grid.x, grid.y, grid.z))
+    coarse = Grid(*axes)
     z, y, x = np.meshgrid(coarse.z, coarse.y, coarse.x, indexing="ij")
     positions = np.stack([x, y, z], axis=-1).astype(np.float32)
     vessels = KDTree(np.concatenate([line.points[::2] for line in coronaries]))
@@ -249,73 +248,9 @@ def _organs(
     return coarse, chest.organs(heart, positions, _FAT_MM - np.minimum(distance, 2 * _FAT_MM), generator)
 
 
-class _Painter:
-    """Paints tissues over each other, slab by slab, each voxel by the share that it holds of them."""
-
-    def __init__(self, grid: _Grid, coarse: _Grid, config: PhantomConfig) -> None:
-        self.sharpness = np.float32(3 / (2 * config.in_plane_mm + config.slice_mm))
-        self.x, self.y, self.z = (
-            _interpolation(fine, rough) for fine, rough in ((grid.x, coarse.x), (grid.y, coarse.y), (grid.z, coarse.z))
-        )
-
-    def share(self, depth: np.ndarray) -> np.ndarray:
-        """Return how much of each voxel lies within a surface at signed distance `depth`, mm."""
-        share = depth * self.sharpness
-        share += np.float32(0.5)
-        return np.clip(share, 0, 1, out=share)
-
-    def paint(self, image: np.ndarray, depth: np.ndarray, hu: float) -> None:
-        """Mix `hu` into the image where the depth is positive."""
-        change = np.float32(hu) - image
-        change *= self.share(depth)
-        image += change
-
-    def fine(self, depth: np.ndarray, rows: slice) -> tuple[np.ndarray, tuple[slice, slice]] | None:
-        """Interpolate a coarse depth linearly; return it with the (y, x) box that holds its inside, or None."""
-        (left, share), depth = self.z, depth
-        used = depth[left[rows][0] : left[rows][-1] + 2]
-        _, ys, xs = np.nonzero(used > -1.0)
-        if not len(ys):
-            return None
-        box_y, box_x = _covered(self.y[0], ys), _covered(self.x[0], xs)
-        used = _lerp(used, left[rows] - left[rows][0], share[rows], axis=0)
-        used = _lerp(used, self.y[0][box_y], self.y[1][box_y], axis=1)
-        return _lerp(used, self.x[0][box_x], self.x[1][box_x], axis=2), (box_y, box_x)
-
-
-def _interpolation(
-    fine: Float[np.ndarray, "n"], coarse: Float[np.ndarray, "m"]
-) -> tuple[Int[np.ndarray, "n"], Float32[np.ndarray, "n"]]:
-    """Return, for each fine position, the coarse index to its left and the share of the one to its right."""
-    place = (fine - coarse[0]) / _COARSE_MM
-    left = place.astype(int)
-    return left, (place - left).astype(np.float32)
-
-
-def _lerp(values: np.ndarray, left: np.ndarray, share: np.ndarray, axis: int) -> np.ndarray:
-    shaped = share.reshape([-1 if i == axis else 1 for i in range(3)])
-    low = np.take(values, left, axis=axis)
-    high = np.take(values, left + 1, axis=axis)
-    high -= low
-    high *= shaped
-    high += low
-    return high
-
-
-def _smooth_min(a: np.ndarray, b: np.ndarray, width_mm: float = 2.5) -> np.ndarray:
-    """Return the smaller of two depths with the edge between them rounded (polynomial smooth minimum)."""
-    share = np.clip((b - a) * np.float32(0.5 / width_mm) + np.float32(0.5), 0, 1)
-    return b + (a - b) * share - np.float32(width_mm) * share * (1 - share)
-
-
-def _covered(left: Int[np.ndarray, "n"], coarse: Int[np.ndarray, "m"]) -> slice:
-    """Return the fine indices between the outermost of the coarse ones."""
-    return slice(*np.searchsorted(left, (coarse.min() - 1, coarse.max() + 1)))
-
-
 def _render(
-    grid: _Grid,
-    painter: _Painter,
+    grid: Grid,
+    painter: Painter,
     organs: Sequence[chest.Organ],
     lumen: Float32[np.ndarray, "nz ny nx"],
     veins: Float32[np.ndarray, "nz ny nx"],
@@ -323,8 +258,8 @@ def _render(
 ) -> Float32[np.ndarray, "nz ny nx"]:
     """Paint the organs from the outside in, then veins, coronary walls and lumens."""
     image = np.full(grid.shape, tissue["lung"], dtype=np.float32)
-    for begin in range(0, grid.shape[0], _SLAB):
-        rows = slice(begin, begin + _SLAB)
+    for begin in range(0, grid.shape[0], SLAB):
+        rows = slice(begin, begin + SLAB)
         slab, vessel = image[rows], lumen[rows]
         for organ in organs:
             if organ.name == "aorta":
@@ -336,27 +271,7 @@ def _render(
                 continue
             fine, (box_y, box_x) = found
             if organ.clearance_mm is not None:
-                fine = _smooth_min(fine, -vessel[:, box_y, box_x] - np.float32(organ.clearance_mm))
+                fine = smooth_min(fine, -vessel[:, box_y, box_x] - np.float32(organ.clearance_mm))
             painter.paint(slab[:, box_y, box_x], fine, tissue[organ.name])
         painter.paint(slab, vessel, tissue["lumen"])
     return image
-
-
-def _scan(
-    image: Float32[np.ndarray, "nz ny nx"],
-    config: PhantomConfig,
-    psf_mm: float,
-    noise_hu: float,
-    generator: np.random.Generator,
-) -> None:
-    """Add noise and blur, in place: the reconstruction kernel shapes the image and the noise's grain alike."""
-    sigma_mm = psf_mm / np.sqrt(8 * np.log(2))
-    sigmas = [sigma_mm / step for step in (config.slice_mm, config.in_plane_mm, config.in_plane_mm)]
-    impulse = np.zeros(33)
-    impulse[16] = 1.0
-    gain = np.prod([np.linalg.norm(gaussian_filter1d(impulse, sigma, truncate=3.0)) for sigma in sigmas])
-    for begin in range(0, len(image), _SLAB):
-        slab = image[begin : begin + _SLAB]
-        slab += generator.standard_normal(slab.shape, dtype=np.float32) * np.float32(noise_hu / gain)
-    for axis, sigma in enumerate(sigmas):
-        gaussian_filter1d(image, sigma, axis=axis, truncate=3.0, output=image)

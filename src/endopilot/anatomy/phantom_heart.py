@@ -1,4 +1,4 @@
-"""What surrounds a right coronary artery in the chest: organs on a coarse grid, and small vessels."""
+"""What surrounds a coronary artery in the chest: organs on a coarse grid, and small vessels."""
 
 from __future__ import annotations
 
@@ -10,8 +10,12 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from endopilot.anatomy import atlas_shape as shape
 from endopilot.anatomy import heart_reference as reference
+from endopilot.anatomy.heart_left import reference_courses
 from endopilot.anatomy.heart_reference import HeartFit, ellipsoid, tube
 from endopilot.types import Centerline, VesselTree
+
+_KNOTS = 16
+"""Points of each of the left reference courses."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,12 +33,41 @@ class Organ:
     clearance_mm: float | None = None
 
 
+def is_left(tree: VesselTree) -> bool:
+    """Tell whether section names say that this is a left coronary tree: it begins in the left main artery."""
+    return tree.section_names[tree.branches[0].section[0]] == "5"
+
+
 def place(tree: VesselTree) -> HeartFit:
-    """Fit the reference heart to the tree; without section labels the crux is taken at 60 % of the way."""
+    """Fit the reference heart to the tree; without section labels it is a right one, its crux at 60 % of the way."""
+    if is_left(tree):
+        courses = reference_courses().copy()
+        # Onto the aorta's surface: the direction of its axis is nearly z there.
+        outward = courses[0] - np.array(reference.AORTA[2], dtype=float)
+        outward[2] = 0.0
+        courses[0] += reference.aorta(courses[:1])[0] * outward / np.linalg.norm(outward)
+        lad, lcx = courses[:_KNOTS], courses[_KNOTS : 2 * _KNOTS]
+        fork = int(np.linalg.norm(lad - lcx[0], axis=1).argmin())
+        lcx = np.concatenate([lad[: fork + 1], lcx[1:]])
+        lines = [line.points for line in main_paths(tree)]
+        return reference.fit_heart_along(lines, [shape.curve_through(course) for course in (lad, lcx)])
     line = tree.longest_path()
     leaf = max(tree.leaves(), key=lambda branch: tree.branches[branch].centerline.abscissa[-1])
     last = tree.section_names[tree.branches[leaf].section[-1]]
     return reference.fit_heart(line.points, _crux_abscissa(tree), last)
+
+
+def main_paths(tree: VesselTree) -> tuple[Centerline, ...]:
+    """Return the ways from the ostium along the main vessels: of a left tree LAD and LCx, of another the longest."""
+    if not is_left(tree):
+        return (tree.longest_path(),)
+    ends = {leaf: tree.section_names[tree.branches[leaf].section[-1]] for leaf in tree.leaves()}
+    paths = []
+    for sections in (("8", "7", "6"), ("15", "13", "11")):
+        found = next((name for name in sections if name in ends.values()), None)
+        leaves = [leaf for leaf, name in ends.items() if found in (name, None)]
+        paths.append(tree.path(max(leaves, key=lambda leaf: tree.branches[leaf].centerline.abscissa[-1])))
+    return tuple(paths)
 
 
 def organs(
@@ -90,10 +123,14 @@ def organs(
     return tuple(Organ(o.name, (heart.scale * o.depth).astype(np.float32), o.clearance_mm) for o in found)
 
 
-def left_coronary(heart: HeartFit) -> tuple[Centerline, ...]:
-    """Return the left main with the beginnings of LAD and LCx (diameters after Dodge 1992: 4.5, 3.7, 3.4 mm)."""
+def other_coronary(heart: HeartFit, tree: VesselTree) -> tuple[Centerline, ...]:
+    """Return the beginnings of the other coronary artery, by the mean diameters of Dodge 1992.
+
+    Beside a right tree the left main (4.5 mm), LAD (3.7 mm) and LCx (3.4 mm); beside a left tree the right coronary
+    artery (4.0 mm) nearly to the acute margin.
+    """
     lines = []
-    for waypoints, begin, end in _LEFT_CORONARY:
+    for waypoints, begin, end in _RIGHT_CORONARY if is_left(tree) else _LEFT_CORONARY:
         points = heart.from_reference(shape.curve_through(np.array(waypoints, dtype=float)))
         along = shape.abscissa(points)
         radius = np.interp(along, [0.0, along[-1]], [begin, end])
@@ -105,6 +142,9 @@ def cardiac_veins(heart: HeartFit, tree: VesselTree) -> tuple[Centerline, ...]:
     """Return the small cardiac vein beside segments 2 and 3, a vein beside the distal artery, the coronary sinus."""
     line, crux = tree.longest_path(), _crux_abscissa(tree)
     lines = []
+    if is_left(tree):
+        # The great cardiac vein climbs beside the anterior descending artery, from 25 to 60 % of its way.
+        crux = 0.6 * float(line.abscissa[-1])
     for begin, end, angle, gap, radius in (
         (0.35 * crux, 0.97 * crux, 2.2, 2.3, 1.1),
         (1.06 * crux, 1.6 * crux, 0.6, 1.8, 1.3),
@@ -148,6 +188,7 @@ _PULMONARY_VEINS = [
     [(44, 46, -16), (60, 58, -24), (88, 64, -36)],
 ]
 _CORONARY_SINUS = [(-6, 20, -47), (4, 29, -48), (18, 36, -44), (33, 37, -38), (48, 27, -28)]
+_RIGHT_CORONARY = ((reference.TO_CRUX[:7].tolist(), 2.0, 1.8),)
 _LEFT_CORONARY = (
     ([(26, 14, 2), (31, 12, 2.5), (36, 8, 2), (40, 3, 0)], 2.25, 2.1),
     ([(40, 3, 0), (45, -6, -4), (50, -17, -8), (54, -29, -13), (57, -42, -20), (60, -54, -30)], 1.85, 1.0),

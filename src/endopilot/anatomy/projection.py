@@ -1,20 +1,38 @@
 """Where a tip lies with respect to the centerline tree: Δtip, γtip, the branch and the lumen's radius there.
 
+A centerline is a polyline, and the nearest place on a polyline jumps: on the inner side of every corner two segments
+compete, on the outer side the corner alone is nearest. Therefore a tip is projected along planes instead: at each
+vertex the plane across the line's tangent, between two vertices the plane across the tangent that turns linearly from
+one to the other. Neighbouring segments share a plane, so the abscissa moves continuously, and faithfully to the smooth
+curve that the polyline samples, wherever the planes do not cross: nearer the line than its radius of curvature.
+
 A tip belongs to the branch whose lumen it lies deepest in: the one with the least offset over radius. Only where two
-branches come near each other does that differ from the nearest centerline, so the nearest one is found first, for all
-points at once, and the others are looked at for the few points that are contested.
+branches come near each other does that differ from the nearest centerline, so the nearest one is found first, and the
+others are looked at for the few points that are contested.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-from endopilot.types import Centerline, Insertion, TipProjection, VesselTree
+from endopilot.anatomy.tree import tangents
+from endopilot.types import Insertion, TipProjection, VesselTree
 
-Candidate = tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"], Float[np.ndarray, "n"]]
-"""Abscissa, offset and radius of the projections onto one line."""
+Found = tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"], Int[np.ndarray, "n"], Float[np.ndarray, "n"]]
+"""Abscissa, offset, branch and radius."""
+
+_CHUNK = 32768
+"""Points that are projected at once: their intermediate results stay in the processor's cache."""
+
+_TAPER = 1.25
+"""A branch is at most this many times wider where a point is projected to than where it is nearest to a vertex."""
+
+_WALK = 4
+"""Vertices are corrected at most this often, by the point's distance to the vertex's plane."""
 
 
 def project_tip(tree: VesselTree, insertion: Insertion, points: Float[np.ndarray, "*n 3"]) -> TipProjection:
@@ -31,113 +49,150 @@ def project_tip(tree: VesselTree, insertion: Insertion, points: Float[np.ndarray
     """
     shape = points.shape[:-1]
     flat = np.ascontiguousarray(points.reshape(-1, 3), dtype=float)
-    abscissa, offset, branch, radius = _project(tree, insertion, flat)
-    return TipProjection(
-        abscissa=abscissa.reshape(shape),
-        offset=offset.reshape(shape),
-        branch=branch.reshape(shape),
-        radius=radius.reshape(shape),
-    )
+    slabs = _Slabs.of(tree, insertion)
+    parts = [
+        _behind_ostium(insertion, float(tree.branches[0].centerline.radius[0]), part, slabs.project(part))
+        for part in (flat[start : start + _CHUNK] for start in range(0, max(len(flat), 1), _CHUNK))
+    ]
+    abscissa, offset, branch, radius = (np.concatenate(values).reshape(shape) for values in zip(*parts, strict=True))
+    return TipProjection(abscissa=abscissa, offset=offset, branch=branch, radius=radius)
 
 
-def _project(
-    tree: VesselTree, insertion: Insertion, points: Float[np.ndarray, "n 3"]
-) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"], Int[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-    lines = [branch.centerline for branch in tree.branches]
-    first = np.concatenate([[0], np.cumsum([len(line.points) for line in lines])])
-    everything = Centerline(*(np.concatenate([getattr(line, name) for line in lines]) for name in _FIELDS))
-    owner = np.repeat(np.arange(len(lines)), np.diff(first))
-    nearest = np.asarray(KDTree(everything.points).query(points)[1])
-    branch = owner[nearest]
-    abscissa, offset, radius = _onto_polyline(everything, first[branch], first[branch + 1] - 1, nearest, points)
-    contested = _contested(lines, everything, owner)[nearest]
-    for index in np.unique(owner) if contested.any() else ():
-        others = np.flatnonzero(contested & (branch != index))
-        others = others[_near_box(lines[index], points[others])]
-        if len(others) == 0:
-            continue
-        line, asked = lines[index], points[others]
-        start = np.asarray(KDTree(line.points).query(asked)[1])
-        zero = np.zeros(len(others), dtype=int)
-        candidate = _onto_polyline(line, zero, zero + len(line.points) - 1, start, asked)
-        better = candidate[1] * radius[others] < offset[others] * candidate[2]
-        chosen = others[better]
-        abscissa[chosen], offset[chosen], radius[chosen] = (value[better] for value in candidate)
-        branch[chosen] = index
-    return _behind_ostium(insertion, float(lines[0].radius[0]), points, (abscissa, offset, branch, radius))
+@dataclass(frozen=True, eq=False)
+class _Slabs:
+    """All segments of a tree with what their projection needs, one row a vertex; the last of a branch repeats the one
+    before, so that every vertex has a segment.
 
+    Attributes:
+        vertices: positions of the vertices and their tangents over the length of the segment, (m, 6).
+        segments: start, edge, tangent at the start, its change along the segment, edge·tangent, edge·change, abscissa
+            and its change, radius and its change: (m, 18).
+        first, last: of every branch, its first and its last vertex.
+        branch: of every vertex, its branch.
+        rival: (m, branches), how far a point must lie from this, its nearest vertex, to lie deeper in another branch,
+            mm.
+        entry: (m, branches), the branch's vertex that is nearest to this one.
+        places: the vertices, to search.
+    """
 
-_FIELDS = ("points", "radius", "abscissa", "normals")
+    vertices: Float[np.ndarray, "m 6"]
+    segments: Float[np.ndarray, "m 18"]
+    first: Int[np.ndarray, "b"]
+    last: Int[np.ndarray, "b"]
+    branch: Int[np.ndarray, "m"]
+    rival: Float[np.ndarray, "m b"]
+    entry: Int[np.ndarray, "m b"]
+    places: KDTree
 
+    @classmethod
+    def of(cls, tree: VesselTree, insertion: Insertion) -> _Slabs:
+        lines = [branch.centerline for branch in tree.branches]
+        counts = np.array([len(line.points) for line in lines])
+        last = np.cumsum(counts) - 1
+        first = last - counts + 1
+        points, radius, abscissa = (
+            np.concatenate([getattr(line, name) for line in lines]) for name in ("points", "radius", "abscissa")
+        )
+        tangent = np.concatenate(_shared_tangents(tree, insertion))
+        owner = np.repeat(np.arange(len(lines)), counts)
+        start = np.arange(len(points))
+        start[last] = np.maximum(last - 1, first)
+        end = np.minimum(start + 1, last[owner])
+        edge, change = points[end] - points[start], tangent[end] - tangent[start]
+        spacing = np.maximum(np.linalg.norm(edge, axis=1), 1e-9)
+        products = [np.einsum("ij,ij->i", edge, other) for other in (tangent[start], change)]
+        scalars = [abscissa[start], abscissa[end] - abscissa[start], radius[start], radius[end] - radius[start]]
+        segments = np.column_stack([points[start], edge, tangent[start], change, *products, *scalars])
+        rival = np.full((len(points), len(lines)), np.inf)
+        entry = np.zeros((len(points), len(lines)), dtype=np.int64)
+        for index, line in enumerate(lines):
+            distance, nearest = (np.asarray(found) for found in KDTree(line.points).query(points))
+            entry[:, index] = first[index] + nearest
+            # To win, offset < |p − v|·R is needed, with R the ratio of radii; and distance ≤ |p − v| + offset.
+            ratio = _TAPER * line.radius[nearest] / radius
+            wider = (ratio > 1.0) | (distance < 2.0 * spacing)  # the nearest line loses only to a wider one
+            rival[wider & (owner != index), index] = ((distance - spacing) / (1.0 + ratio))[wider & (owner != index)]
+        vertices = np.column_stack([points, tangent / spacing[:, None]])
+        return cls(vertices, segments, first, last, owner, rival, entry, KDTree(points))
 
-def _onto_polyline(
-    line: Centerline,
-    first: Int[np.ndarray, "n"],
-    last: Int[np.ndarray, "n"],
-    nearest: Int[np.ndarray, "n"],
-    points: Float[np.ndarray, "n 3"],
-) -> Candidate:
-    """Project points onto the two segments that meet at their nearest vertex, and keep the nearer projection."""
-    best: Candidate | None = None
-    for start in (np.maximum(nearest - 1, first), np.minimum(nearest, np.maximum(last - 1, first))):
-        end = np.minimum(start + 1, last)
-        origin = line.points[start]
-        along = line.points[end] - origin
-        relative = points - origin
-        square = np.einsum("ij,ij->i", along, along)
-        share = np.clip(np.einsum("ij,ij->i", relative, along) / np.maximum(square, 1e-24), 0.0, 1.0)
-        relative -= share[:, None] * along
+    def project(self, points: Float[np.ndarray, "n 3"]) -> Found:
+        """Project points onto the branches whose lumens they lie deepest in."""
+        distance, nearest = (np.asarray(found) for found in self.places.query(points))
+        branch = self.branch[nearest]
+        abscissa, offset, radius = self._onto(points, nearest)
+        rivals = self.rival[nearest] < distance[:, None]
+        for index in np.flatnonzero(rivals.any(axis=0)):
+            others = np.flatnonzero(rivals[:, index])
+            asked = points[others]
+            candidate = self._onto(asked, self._walked(asked, self.entry[nearest[others], index]))
+            better = candidate[1] * radius[others] < offset[others] * candidate[2]
+            chosen = others[better]
+            abscissa[chosen], offset[chosen], radius[chosen] = (value[better] for value in candidate)
+            branch[chosen] = index
+        return abscissa, offset, branch, radius
+
+    def _walked(self, points: Float[np.ndarray, "n 3"], vertex: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
+        """Walk along a branch from a vertex to the one that is nearest to each point."""
+        first, last = self.first[self.branch[vertex]], self.last[self.branch[vertex]]
+        for _ in range(_WALK):
+            row = self.vertices[vertex]
+            step = np.rint(np.einsum("ij,ij->i", points - row[:, :3], row[:, 3:])).astype(np.int64)
+            moved = np.minimum(np.maximum(vertex + step, first), last)
+            if np.array_equal(moved, vertex):
+                break
+            vertex = moved
+        return vertex
+
+    def _onto(
+        self, points: Float[np.ndarray, "n 3"], vertex: Int[np.ndarray, "n"]
+    ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+        """Project points onto the segment before or behind a vertex, by the side of its plane that they lie on.
+
+        With q = p − a, edge e, tangent T at a and its change D, the share u solves (q − ue)·(T + uD) = 0:
+        q·T − u(e·T − q·D) − u² e·D = 0, of whose roots the one that stays finite as D vanishes is wanted.
+        """
+        row = self.vertices[vertex]
+        behind = np.einsum("ij,ij->i", points - row[:, :3], row[:, 3:]) < 0
+        row = self.segments[np.where(behind, np.maximum(vertex - 1, self.first[self.branch[vertex]]), vertex)]
+        relative = points - row[:, :3]
+        depth = np.einsum("ij,ij->i", relative, row[:, 6:9])
+        slope = row[:, 12] - np.einsum("ij,ij->i", relative, row[:, 9:12])
+        root = np.sqrt(np.maximum(slope * slope + 4.0 * row[:, 13] * depth, 0.0))
+        share = 2.0 * depth / np.maximum(slope + root, 1e-12)
+        np.minimum(np.maximum(share, 0.0, out=share), 1.0, out=share)
+        relative -= share[:, None] * row[:, 3:6]
         offset = np.sqrt(np.einsum("ij,ij->i", relative, relative))
-        abscissa = line.abscissa[start] + share * (line.abscissa[end] - line.abscissa[start])
-        radius = line.radius[start] + share * (line.radius[end] - line.radius[start])
-        if best is None:
-            best = (abscissa, offset, radius)
-        else:
-            nearer = offset < best[1]
-            best = (
-                np.where(nearer, abscissa, best[0]),
-                np.where(nearer, offset, best[1]),
-                np.where(nearer, radius, best[2]),
-            )
-    assert best is not None
-    return best
+        return row[:, 14] + share * row[:, 15], offset, row[:, 16] + share * row[:, 17]
 
 
-def _contested(lines: list[Centerline], everything: Centerline, owner: Int[np.ndarray, "n"]) -> np.ndarray:
-    """Return for every centerline point whether another branch's lumen reaches near it."""
-    contested = np.zeros(len(everything.points), dtype=bool)
-    if len(lines) == 1:
-        return contested
-    for index, line in enumerate(lines):
-        foreign = np.flatnonzero(owner != index)
-        distance, start = KDTree(line.points).query(everything.points[foreign])
-        contested[foreign] |= distance < 1.5 * (everything.radius[foreign] + line.radius[start])
-    return contested
+def _shared_tangents(tree: VesselTree, insertion: Insertion) -> list[Float[np.ndarray, "n 3"]]:
+    """Return the tangents at all vertices; a branch and the child that carries it on share that at the joint.
+
+    So do the catheter and the first branch: the plane through the ostium stands across the catheter's axis.
+    """
+    result = [tangents(branch.centerline.points) for branch in tree.branches]
+    for index in range(len(result)):
+        children = [i for i in tree.children(index) if len(result[i]) > 1]
+        if children:
+            onwards = max(children, key=lambda child: float(result[child][0] @ result[index][-1]))
+            mean = result[index][-1] + result[onwards][0]
+            mean /= max(float(np.linalg.norm(mean)), 1e-9)
+            result[index][-1] = result[onwards][0] = mean
+    if result[0][0] @ insertion.direction > 0.5:
+        result[0][0] = insertion.direction
+    return result
 
 
-def _near_box(line: Centerline, points: Float[np.ndarray, "n 3"]) -> np.ndarray:
-    """Return which points lie in the box around a line's lumen: outside it, offset over radius exceeds one."""
-    margin = 1.5 * line.radius[:, None]
-    inside = (points >= (line.points - margin).min(axis=0)) & (points <= (line.points + margin).max(axis=0))
-    return inside.all(axis=1)
-
-
-def _behind_ostium(
-    insertion: Insertion,
-    ostium_radius: float,
-    points: Float[np.ndarray, "n 3"],
-    found: tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"], Int[np.ndarray, "n"], Float[np.ndarray, "n"]],
-) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"], Int[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+def _behind_ostium(insertion: Insertion, ostium_radius: float, points: Float[np.ndarray, "n 3"], found: Found) -> Found:
     """Give points behind the ostium to the catheter's axis, where its lumen holds them better than the vessel's."""
     abscissa, offset, branch, radius = found
-    relative = points - insertion.position
-    depth = relative @ insertion.direction
+    depth = points @ insertion.direction - insertion.position @ insertion.direction
     behind = np.flatnonzero(depth < 0)
-    across = relative[behind] - depth[behind, None] * insertion.direction
-    distance = np.linalg.norm(across, axis=1)
-    chosen = behind[distance * radius[behind] <= offset[behind] * ostium_radius]
-    abscissa[chosen] = depth[chosen]
-    offset[chosen] = np.linalg.norm(relative[chosen] - depth[chosen, None] * insertion.direction, axis=1)
-    branch[chosen] = 0
-    radius[chosen] = ostium_radius
+    depth = depth[behind]
+    distance = np.linalg.norm(points[behind] - insertion.position - depth[:, None] * insertion.direction, axis=1)
+    chosen = distance * radius[behind] <= offset[behind] * ostium_radius
+    abscissa[behind[chosen]] = depth[chosen]
+    offset[behind[chosen]] = distance[chosen]
+    branch[behind[chosen]] = 0
+    radius[behind[chosen]] = ostium_radius
     return abscissa, offset, branch, radius

@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
@@ -24,6 +24,12 @@ NEAR_OSTIUM_MM = 5.0
 
 LARGEST_GAP_VOXELS = 4.0
 """Pieces of a mask that are this near each other are taken for one interrupted vessel."""
+
+_DIRECTION_VOXELS = 12.0
+"""A piece's direction at its end is that of its voxels within this distance."""
+
+_ONWARDS = 0.5
+"""Cosine of the largest angle between a piece and the gap that it is joined across."""
 
 SMALLEST_PIECE = 12
 """A piece of fewer voxels is noise."""
@@ -62,15 +68,17 @@ def connected_mask(
     result = labels == main
     if count > 1:
         pieces = [int(piece) for piece in np.argsort(-sizes)[: min(count, 200)] if piece != main]
-        result, joined = _bridged(result, labels, [p for p in pieces if sizes[p] >= SMALLEST_PIECE])
+        result, joined, beside = _bridged(result, labels, [p for p in pieces if sizes[p] >= SMALLEST_PIECE])
         left = count - 1 - joined
+        if beside:
+            remarks.append(f"{beside} pieces that run alongside the lumen, not on from it, were not joined to it")
         apart = [piece for piece in others if not result[labels == piece].any()]
         if apart:
             remarks.append(_other_pieces(vessel, len(apart)))
         if joined:
             remarks.append(f"{joined} gaps of up to {LARGEST_GAP_VOXELS:g} voxels bridged")
         if left:
-            remarks.append(f"{left} pieces apart from the lumen left out ({int(voxels.sum() - result.sum())} voxels)")
+            remarks.append(_left_out(cropped, result, labels, sizes, left))
     if result.sum() < SMALLEST_PIECE:
         raise InputError(f"{label}: the lumen has only {int(result.sum())} voxels; check the label or segment again")
     closed = binary_fill_holes(result)
@@ -157,15 +165,35 @@ def _nearest_piece(mask: Volume, labels: np.ndarray, sizes: np.ndarray, given: I
     return int(labels[tuple(index[gap.argmin()])])
 
 
+def _left_out(
+    mask: Volume, result: Bool[np.ndarray, "nz ny nx"], labels: np.ndarray, sizes: np.ndarray, count: int
+) -> str:
+    """Tell how much was left out, and of the largest piece where it lies, since a real vessel may be lost with it."""
+    lost = np.where(np.isin(np.arange(len(sizes)), labels[result]), 0, sizes)
+    largest = np.argwhere(labels == int(lost.argmax()))
+    place = mask.index_to_world(largest[:, ::-1].astype(float))
+    gap = np.asarray(KDTree(mask.index_to_world(np.argwhere(result)[:, ::-1].astype(float))).query(place)[0])
+    at = ", ".join(f"{value:.0f}" for value in place[gap.argmin()])
+    extent = float(np.linalg.norm(np.ptp(place, axis=0)))
+    return (
+        f"{count} pieces apart from the lumen left out ({int(lost.sum())} voxels); the largest is {extent:.0f} mm "
+        f"long and begins {gap.min():.1f} mm away at ({at}) mm: close the gap in the mask if it belongs to the vessel"
+    )
+
+
 def _bridged(
     result: Bool[np.ndarray, "nz ny nx"], labels: np.ndarray, pieces: list[int]
-) -> tuple[Bool[np.ndarray, "nz ny nx"], int]:
-    """Join pieces that lie within the largest gap by tubes as wide as the vessels at both ends."""
+) -> tuple[Bool[np.ndarray, "nz ny nx"], int, int]:
+    """Join pieces that lie within the largest gap by tubes as wide as the vessels at both ends.
+
+    Returns the lumen, how many pieces were joined, and how many are near enough but run alongside it: two vessels that
+    pass each other are not one.
+    """
     from scipy.ndimage import distance_transform_edt
 
     if not pieces:
-        return result, 0
-    result, joined = result.copy(), 0
+        return result, 0, 0
+    result, joined, beside = result.copy(), 0, 0
     clearance = np.asarray(distance_transform_edt(np.isin(labels, [0], invert=True)))
     members = {piece: np.argwhere(labels == piece) for piece in pieces}
     changed = True
@@ -178,13 +206,28 @@ def _bridged(
             best = int(np.argmin(gap))
             if not np.isfinite(gap[best]):
                 continue
-            start, end = here[nearest[best]], members.pop(piece)[best]
+            start, own = here[nearest[best]], members.pop(piece)
+            end = own[best]
+            if not (_carries_on(here, start, end) or _carries_on(own, end, start)):
+                beside += 1
+                continue
             width = min(_widest(clearance, start), _widest(clearance, end))
             _draw_tube(result, start, end, width)
             result |= labels == piece
             joined += 1
             changed = True
-    return result, joined
+    return result, joined, beside
+
+
+def _carries_on(voxels: Int[np.ndarray, "n 3"], end: Int[np.ndarray, "3"], beyond: Int[np.ndarray, "3"]) -> bool:
+    """Return whether a piece points from its voxel `end` to a place beyond, or is too short to point anywhere."""
+    relative = (voxels - end).astype(float)
+    near = relative[np.linalg.norm(relative, axis=1) < _DIRECTION_VOXELS]
+    spread, axes = np.linalg.eigh(np.cov(near.T)) if len(near) > 3 else (np.ones(3), np.eye(3))
+    if spread[2] < 3.0 * spread[1]:
+        return True
+    way = (beyond - end) / max(float(np.linalg.norm(beyond - end)), 1e-9)
+    return bool(abs(axes[:, 2] @ way) > _ONWARDS)
 
 
 def _widest(clearance: np.ndarray, place: np.ndarray) -> float:

@@ -97,8 +97,15 @@ def parallel_transport(
 
 
 def tangents(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Return the unit tangents of a line, by central differences."""
+    """Return the unit tangents of a line: central differences, at both ends the chords' directions carried on."""
     direction = np.gradient(points, axis=0)
+    if len(points) > 2:
+        for end, inwards, third in ((0, 1, 2), (-1, -2, -3)):
+            last, before = points[inwards] - points[end], points[third] - points[inwards]
+            size = max(float(np.linalg.norm(last)), 1e-12), max(float(np.linalg.norm(before)), 1e-12)
+            share = size[0] / (size[0] + size[1])
+            outwards = (1.0 + share) * last / size[0] - share * before / size[1]
+            direction[end] = outwards if end == 0 else -outwards
     return direction / np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-12)
 
 

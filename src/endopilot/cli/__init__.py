@@ -9,6 +9,7 @@ import difflib
 import importlib
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 from endopilot import __version__
 from endopilot.errors import InputError
@@ -22,15 +23,17 @@ COMMANDS = {
     "phantom": "anatomy -> synthetic CT angiogram",
     "simulate": "anatomy and proximal controls -> what the wire does",
     "dataset": "anatomies -> many random navigations on disk",
+    "dataset-info": "what a dataset holds, with pictures",
     "train": "dataset -> forward and inverse transformers",
     "evaluate": "trained run -> errors beside the paper's and the baselines'",
     "verify": "the rod core against closed forms",
-    "bench": "speed of the rod core together with its accuracy",
+    "bench": "figures beside their bars: speed, robustness, anatomy, imaging, labels, dataset",
     "devices": "the guidewires that endopilot knows",
     "sample": "fetch a real CT angiogram to try",
     "info": "versions and machine",
 }
-"""Name of each command and what it turns into what. The module of the same name in this package holds it."""
+"""Name of each command and what it turns into what. The module of the same name in this package holds it, see
+`module_of`."""
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
@@ -56,9 +59,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sys.exit(EXIT_BAD_INPUT)
 
 
+def module_of(name: str) -> str:
+    """Return the name of the module that holds a command."""
+    return name.replace("-", "_")
+
+
 def overview() -> str:
     """Return the text of `endopilot --help`."""
-    lines = [f"  {name:<9} {summary}" for name, summary in COMMANDS.items()]
+    lines = [f"  {name:<12} {summary}" for name, summary in COMMANDS.items()]
     return "\n".join(
         [
             "usage: endopilot COMMAND ...",
@@ -76,10 +84,12 @@ def overview() -> str:
 def _run(name: str, arguments: Sequence[str]) -> int:
     import tyro
 
-    module = importlib.import_module(f"endopilot.cli.{name}")
+    module = importlib.import_module(f"endopilot.cli.{module_of(name)}")
+    subjects: dict[str, Any] | None = getattr(module, "SUBJECTS", None)
+    call = tyro.cli if subjects is None else tyro.extras.subcommand_cli_from_dict
     try:
-        tyro.cli(
-            module.command,
+        call(
+            subjects or module.command,
             prog=f"endopilot {name}",
             args=arguments,
             config=(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes),

@@ -2,44 +2,73 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 from tyro.conf import Positional
 
+from endopilot.anatomy.batch import extract_all
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy, read_source
 from endopilot.anatomy.io import write_anatomy
 from endopilot.cli.arguments import OutputFolder, existing, show
+from endopilot.errors import InputError
+from endopilot.imaging.volume import read_volume
 from endopilot.types import Anatomy
 
 
 def command(
-    source: Positional[Path],
+    sources: Positional[tuple[Path, ...]],
     /,
     *,
     output: OutputFolder,
     name: str | None = None,
     label: int | None = None,
+    picture: Path | None = None,
+    ct: Path | None = None,
     json: bool = False,
     config: AnatomyConfig = AnatomyConfig(),
 ) -> None:
     """Make an anatomy: centerline tree with section labels, distance map, ostium.
 
     The folder holds centerline.vtp, lumen.nrrd (distance to the wall, mm, positive inside) and anatomy.json; 3D Slicer
-    and ParaView open them.
+    and ParaView open them. Of several files, each that can be used becomes a folder in the output folder; the others
+    are listed with what is wrong with them.
 
     Args:
-        source: mask (NIfTI, NRRD, MHA, DICOM-SEG), surface (STL, OBJ, PLY, VTP), or centerline with radii (VTP, Slicer
-            .mrk.json).
-        output: folder of the anatomy.
+        sources: masks (NIfTI, NRRD, MHA, DICOM-SEG), surfaces (STL, OBJ, PLY, VTP), or centerlines with radii (VTP,
+            Slicer .mrk.json).
+        output: folder of the anatomy; of several, the folder that takes theirs.
         name: name of the patient in datasets and reports; that of the folder by default.
         label: which label of a mask with several to take.
+        picture: PNG of the tree by section and radius, its longest path straightened, and cross-sections.
+        ct: the CT angiogram to show in the picture behind the walls, in HU.
         json: print the figures as JSON.
         config: how to extract.
     """
-    content = read_source(existing(source), label=label)
+    if not sources:
+        raise InputError("no file was given; name a mask, a surface or a centerline")
+    if len(sources) > 1:
+        for option, value in (("name", name), ("picture", picture), ("ct", ct)):
+            if value is not None:
+                raise InputError(f"--{option} {value}: serves one patient, and {len(sources)} are given; leave it out")
+        made, rejected = extract_all(sources, output, label=label, config=config)
+        show({"anatomies": [str(folder) for folder in made], "rejected": rejected}, as_json=json)
+        for reason in rejected.values():
+            print(f"endopilot anatomy: rejected: {reason}", file=sys.stderr)
+        return
+    if ct is not None and picture is None:
+        raise InputError(f"--ct {ct}: is only shown in a picture; give --picture FILE.png too")
+    volume = None if ct is None else read_volume(existing(ct))
+    content = read_source(existing(sources[0]), label=label)
     anatomy = extract_anatomy(content, name=name or output.resolve().name, config=config)
     write_anatomy(anatomy, output)
-    show({"anatomy": str(output), **describe(anatomy)}, as_json=json)
+    figures = {"anatomy": str(output), **describe(anatomy)}
+    if picture is not None:
+        from endopilot.anatomy.picture import draw_anatomy  # matplotlib is slow to import
+
+        draw_anatomy(anatomy, picture, volume=volume)
+        figures["picture"] = str(picture)
+    show(figures, as_json=json)
 
 
 def describe(anatomy: Anatomy) -> dict[str, object]:

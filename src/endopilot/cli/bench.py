@@ -1,49 +1,130 @@
-"""`endopilot bench`: speed of the rod core together with its accuracy, how cost grows, and its robustness."""
+"""`endopilot bench SUBJECT`: figures beside their bars, one function for each subject.
+
+Where every figure has a bar, the command leaves with exit code 1 if one is missed.
+"""
 
 from __future__ import annotations
 
 import sys
-from typing import Any, Literal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
-from tyro.conf import Positional
-
-from endopilot.cli.arguments import show, show_rows
-from endopilot.simulation.bench import bench_scaling, bench_simulation
-from endopilot.simulation.robustness import RobustnessConfig, measure_robustness
+from endopilot.cli.arguments import OutputFolder, existing, show, show_rows
+from endopilot.simulation.robustness import RobustnessConfig
 
 EXIT_FAILED = 1
 
 
-def command(
-    subject: Positional[Literal["simulation", "scaling", "robustness"]] = "simulation",
-    /,
-    *,
-    json: bool = False,
-    config: RobustnessConfig = RobustnessConfig(),
-) -> None:
-    """Measure the rod core: its speed with the error that goes with it, how cost grows, or its robustness.
-
-    `simulation` times the reference scenario. `scaling` varies the number of elements and of worlds. `robustness`
-    drives every device through many anatomies and beyond their ends, counts what goes wrong, and leaves with exit
-    code 1 if a figure misses its bar; the options below are its own.
+def simulation(*, json: bool = False) -> None:
+    """Measure the speed of the rod core on its reference scenario, with the error that goes with it.
 
     Args:
-        subject: what to measure.
         json: print the figures as JSON.
-        config: the rollouts of `robustness`.
     """
-    if subject == "simulation":
-        show(bench_simulation(), as_json=json)
-        return
-    if subject == "scaling":
-        show_rows(bench_scaling(), as_json=json)
-        return
+    from endopilot.simulation.bench import bench_simulation
+
+    show(bench_simulation(), as_json=json)
+
+
+def scaling(*, json: bool = False) -> None:
+    """Measure how the rod core's cost grows with elements and worlds.
+
+    Args:
+        json: print the figures as JSON.
+    """
+    from endopilot.simulation.bench import bench_scaling
+
+    show_rows(bench_scaling(), as_json=json)
+
+
+def robustness(*, json: bool = False, config: RobustnessConfig = RobustnessConfig()) -> None:
+    """Drive every device through many anatomies and beyond their ends, and count what goes wrong.
+
+    Args:
+        json: print the figures as JSON.
+        config: the rollouts.
+    """
+    from endopilot.simulation.robustness import measure_robustness
+
     measured = measure_robustness(config)
     if json:
         show(measured, as_json=True)
     else:
         _show_robustness(measured)
-    if not all(row["passed"] for row in measured["figures"]):
+    _leave(all(row["passed"] for row in measured["figures"]))
+
+
+def dataset(*, output: OutputFolder = Path("runs/bench-dataset"), share: float = 0.05, json: bool = False) -> None:
+    """Make a slice of the paper's set of 100 000 navigations, and say what all of it would take.
+
+    Args:
+        output: folder of the slice; an interrupted run goes on where it stopped.
+        share: of the paper's set, 0 to 1.
+        json: print the figures as JSON.
+    """
+    from endopilot.dataset.bench import bench_dataset
+
+    show(bench_dataset(output, share=share), as_json=json)
+
+
+def labels(*, count: int = 40, seed: int = 0, json: bool = False) -> None:
+    """Name the sections of synthetic patients of every kind, and compare with the truth.
+
+    Args:
+        count: patients of each kind.
+        seed: seed of the atlas.
+        json: print the figures as JSON.
+    """
+    from endopilot.anatomy.label_score import measure_labels
+
+    rows = measure_labels(count=count, seed=seed)
+    show_rows(rows, as_json=json)
+    _leave(all(row["passed"] for row in rows))
+
+
+def anatomy(*, centerlines: Path | None = None, json: bool = False) -> None:
+    """Extract lumens whose truth is known, and print each error beside its bar.
+
+    Args:
+        centerlines: a folder with VMTK's rca_cl.vtp and lca_cl.vtp of a real patient.
+        json: print the figures as JSON.
+    """
+    from endopilot.anatomy.bench import bench_anatomy
+
+    rows = bench_anatomy(None if centerlines is None else existing(centerlines))
+    show_rows(rows, as_json=json)
+    _leave(all(row["passed"] is not False for row in rows))
+
+
+def imaging(*, cases: int = 50, seed: int = 0, folder: Path = Path("runs/imaging"), json: bool = False) -> None:
+    """Segment synthetic CT angiograms from the volume alone, and compare with the truth.
+
+    Args:
+        cases: number of CT angiograms.
+        seed: seed of the patients and their scans.
+        folder: where the cases' results are kept; an interrupted run goes on where it stopped.
+        json: print the figures as JSON.
+    """
+    from endopilot.evaluation.imaging_bench import BARS, ImagingBenchConfig, bench_imaging
+
+    measured = bench_imaging(ImagingBenchConfig(cases=cases, seed=seed, folder=folder))
+    if json:
+        show(measured, as_json=True)
+    else:
+        show_rows([{"figure": name} | measured[name] for name in BARS], as_json=False)
+        show({name: value for name, value in measured.items() if name not in BARS}, as_json=False)
+    _leave(all(measured[name]["met"] for name in BARS))
+
+
+SUBJECTS: dict[str, Callable[..., None]] = {
+    function.__name__: function for function in (simulation, scaling, robustness, dataset, labels, anatomy, imaging)
+}
+"""The subjects that can be measured."""
+
+
+def _leave(passed: bool) -> None:
+    if not passed:
         sys.exit(EXIT_FAILED)
 
 

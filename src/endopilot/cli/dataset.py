@@ -18,6 +18,7 @@ def command(
     *,
     output: OutputFolder,
     device: str = "workhorse-014",
+    scheduler: str | None = None,
     json: bool = False,
     config: DatasetConfig = DatasetConfig(),
 ) -> None:
@@ -29,10 +30,14 @@ def command(
         anatomies: folders made by `endopilot anatomy` or `endopilot atlas`.
         output: folder of the dataset.
         device: name of a shipped device (`endopilot devices`) or a YAML file.
+        scheduler: address of a Dask scheduler (tcp://host:8786) whose workers simulate, and see the same folders; the
+            cores of this machine if not given.
         json: print the figures as JSON.
         config: how many navigations, how long, and how they are split.
     """
-    generate_dataset([existing(folder) for folder in anatomies], output, read_device(device), config)
+    generate_dataset(
+        [existing(folder) for folder in anatomies], output, read_device(device), config, scheduler=scheduler
+    )
     info = read_json(output / "meta" / "info.json")
     show(
         {"dataset": str(output), "episodes": info["total_episodes"], "samples": info["total_frames"]},

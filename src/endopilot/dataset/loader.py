@@ -9,14 +9,16 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
+from endopilot.dataset.plan import version
 from endopilot.dataset.schema import (
     INFO_PATH,
     LEROBOT_VERSION,
     MANIFEST_PATH,
-    SIGNALS,
+    actuation_of,
     column_values,
     paths_of_file,
     read_table,
+    signals,
 )
 from endopilot.errors import InputError
 from endopilot.files import read_json
@@ -35,9 +37,11 @@ class Dataset:
         split: "train", "seen_test", "calibrate" or "test".
         device: name of the device.
         friction: friction coefficient between wire and wall.
+        tip_bend: angle by which the unloaded tip is bent, rad.
+        tip_stiffness_factor: factor on the stiffness of the device's distal 10 mm.
         initial_inserted_length: Δ before the first period, mm.
         initial_rotation: φ before the first period, rad.
-        control: π = (dΔ/dt mm/s, dφ/dt rad/s).
+        control: π = (dΔ/dt mm/s, dφ/dt rad/s): what was applied, or what came of the force and torque that were.
         inserted_length: Δ, mm.
         rotation: φ, rad, unwrapped.
         tip_abscissa: Δtip, mm.
@@ -50,6 +54,8 @@ class Dataset:
         contact_force_sum: sum of the wall forces' magnitudes, N.
         base_force: axial force of the drive, N, positive when it pushes.
         base_torque: torque of the drive, N·mm.
+        drive_force: axial force of the drive with what the introducer's valve takes, N.
+        drive_torque: torque of the drive, likewise, N·mm.
         valid: false from the sample in which the simulation of that episode failed.
     """
 
@@ -61,6 +67,8 @@ class Dataset:
     split: Shaped[np.ndarray, "episodes"]
     device: Shaped[np.ndarray, "episodes"]
     friction: Float[np.ndarray, "episodes"]
+    tip_bend: Float[np.ndarray, "episodes"]
+    tip_stiffness_factor: Float[np.ndarray, "episodes"]
     initial_inserted_length: Float[np.ndarray, "episodes"]
     initial_rotation: Float[np.ndarray, "episodes"]
     control: Float[np.ndarray, "episodes samples 2"]
@@ -76,6 +84,8 @@ class Dataset:
     contact_force_sum: Float[np.ndarray, "episodes samples"]
     base_force: Float[np.ndarray, "episodes samples"]
     base_torque: Float[np.ndarray, "episodes samples"]
+    drive_force: Float[np.ndarray, "episodes samples"]
+    drive_torque: Float[np.ndarray, "episodes samples"]
     valid: Bool[np.ndarray, "episodes samples"]
 
     def __len__(self) -> int:
@@ -108,6 +118,29 @@ class Dataset:
         return (self.folder / record["folder"]).resolve()
 
 
+def read_manifest(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Read how a finished dataset was made, `meta/manifest.json`, and what it holds, `meta/info.json`.
+
+    Raises:
+        InputError: the folder holds no finished dataset, or one of another version.
+    """
+    if not (folder / MANIFEST_PATH).exists():
+        raise InputError(f"{folder}: no dataset here ({MANIFEST_PATH} is missing); make one with `endopilot dataset`")
+    manifest = read_json(folder / MANIFEST_PATH)
+    if not isinstance(manifest, dict) or not {"complete", "key", "settings"} <= manifest.keys():
+        raise InputError(f"{folder / MANIFEST_PATH}: damaged; make the dataset again")
+    if not manifest["complete"]:
+        raise InputError(f"{folder}: the dataset is unfinished; run the same `endopilot dataset` command again")
+    made = manifest["settings"].get("version")
+    if made != version():
+        raise InputError(f"{folder}: made by {made}, which {version()} cannot read; make the dataset again")
+    info = read_json(folder / INFO_PATH)
+    if info.get("codebase_version") != LEROBOT_VERSION:
+        found = info.get("codebase_version")
+        raise InputError(f"{folder / INFO_PATH}: codebase_version is {found}, not {LEROBOT_VERSION}; make it again")
+    return manifest, info
+
+
 def load_dataset(folder: Path) -> Dataset:
     """Read a whole dataset made by `endopilot dataset`.
 
@@ -115,19 +148,12 @@ def load_dataset(folder: Path) -> Dataset:
         InputError: the folder holds no finished dataset, or a file of it is missing, damaged or of another version.
     """
     folder = Path(folder)
-    if not (folder / MANIFEST_PATH).exists():
-        raise InputError(f"{folder}: no dataset here ({MANIFEST_PATH} is missing); make one with `endopilot dataset`")
-    manifest = read_json(folder / MANIFEST_PATH)
-    if not manifest.get("complete"):
-        raise InputError(f"{folder}: the dataset is unfinished; run the same `endopilot dataset` command again")
-    info = read_json(folder / INFO_PATH)
-    if info.get("codebase_version") != LEROBOT_VERSION:
-        found = info.get("codebase_version")
-        raise InputError(f"{folder / INFO_PATH}: codebase_version is {found}, not {LEROBOT_VERSION}; make it again")
-
-    samples = manifest["samples_per_episode"]
+    manifest, info = read_manifest(folder)
+    samples, total = manifest["samples_per_episode"], info["total_episodes"]
+    actuation = actuation_of(info["features"])
     episodes: dict[str, list[np.ndarray]] = {}
-    signals: dict[str, list[np.ndarray]] = {name: [] for name in SIGNALS}
+    signal: dict[str, np.ndarray] = {}
+    filled = 0
     for number in range(manifest["files"]):
         data_path, episodes_path = paths_of_file(folder, number)
         table = read_table(episodes_path, manifest["key"])
@@ -139,15 +165,21 @@ def load_dataset(folder: Path) -> Dataset:
                 f"{data_path}: {data.num_rows} rows where {table.num_rows * samples} belong; "
                 "delete it and run `endopilot dataset` again"
             )
-        for name in SIGNALS:
+        end = filled + table.num_rows
+        if end > total:
+            break
+        for name in signals(actuation):
             values = column_values(data, name)
-            signals[name].append(values.reshape(table.num_rows, samples, *values.shape[1:]))
+            values = values.reshape(table.num_rows, samples, *values.shape[1:])
+            if name not in signal:  # in place, so that a large dataset is never held twice
+                signal[name] = np.empty((total, *values.shape[1:]), dtype=values.dtype)
+            signal[name][filled:end] = values
+        filled = end
 
     episode = {name: np.concatenate(parts) for name, parts in episodes.items()}
-    signal = {name: np.concatenate(parts) for name, parts in signals.items()}
-    if len(episode["episode_index"]) != info["total_episodes"]:
+    if len(episode["episode_index"]) != total:
         raise InputError(
-            f"{folder}: {len(episode['episode_index'])} episodes where {INFO_PATH} counts {info['total_episodes']}; "
+            f"{folder}: {len(episode['episode_index'])} episodes where {INFO_PATH} counts {total}; "
             "run `endopilot dataset` again"
         )
     state = signal["observation.state"]
@@ -160,9 +192,11 @@ def load_dataset(folder: Path) -> Dataset:
         split=episode["split"].astype(str),
         device=episode["device"].astype(str),
         friction=episode["friction"],
+        tip_bend=episode["tip_bend_rad"],
+        tip_stiffness_factor=episode["tip_stiffness_factor"],
         initial_inserted_length=episode["initial_inserted_length_mm"],
         initial_rotation=episode["initial_rotation_rad"],
-        control=signal["action"],
+        control=signal["velocity" if actuation == "force" else "action"],
         inserted_length=state[..., 0],
         rotation=state[..., 1],
         tip_abscissa=state[..., 2],
@@ -175,5 +209,7 @@ def load_dataset(folder: Path) -> Dataset:
         contact_force_sum=signal["contact_force_sum_n"],
         base_force=signal["base_force_n"],
         base_torque=signal["base_torque_nmm"],
+        drive_force=signal["drive_force_n"],
+        drive_torque=signal["drive_torque_nmm"],
         valid=signal["valid"],
     )

@@ -1,119 +1,155 @@
 """Random navigations of one anatomy that stay inside the vessel that was imaged.
 
 A segmented vessel ends where the scan no longer shows it, not where blood stops: a wire that is pushed against that end
-buckles against a wall that is not there. So where a tip comes to the end of its branch, or is caught so firmly that the
-drive slips, the drive is stopped short of that depth and the navigation is simulated again; its beginning, and so the
-branch that it takes, stays the same.
+buckles against a wall that is not there. So the drive looks at the tip before every sample, as an operator does: it
+pushes no farther than shortly before the end of the branch that the tip lies in. From there, and where the wire is
+caught, it pulls where it was to push, until the wire is well back. Simulating the recorded controls without looking
+gives the same navigation again.
 """
 
 from __future__ import annotations
 
-import warnings
-from dataclasses import fields, is_dataclass
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
+from endopilot.anatomy.projection import project_tip
 from endopilot.simulation.device import Device
-from endopilot.simulation.simulator import SimulatorConfig, simulate
-from endopilot.types import SAMPLE_PERIOD_S, Anatomy, Rollout, VesselTree
+from endopilot.simulation.simulator import RECORDED, Actuation, SimulatorConfig, make_rollout
+from endopilot.simulation.state import Step
+from endopilot.simulation.stepping import Simulator
+from endopilot.types import SAMPLE_PERIOD_S, Anatomy, Rollout, TipProjection, VesselTree
 
-ATTEMPTS = 4
-"""Simulations of a navigation at most; the tree has few ends that one navigation can come to in turn."""
-END_MM = 1.0
-"""A tip nearer than this to the end of its branch has come to it, mm."""
 STOP_SHORT_MM = 5.0
-"""The drive is stopped this much before the length of the path that ends there, mm."""
+"""A tip is driven no nearer than this to the end of its branch, mm."""
+PULL_BACK_MM = 15.0
+"""Length by which a wire that came to an end, or is caught, is pulled back before it is pushed again, mm."""
+CAUGHT = 0.5
+"""Share of the device's push limit at which a wire counts as caught."""
+_ROUNDING_MM = 1e-2
+"""A wire that is this near to where it had to be pulled back to has been."""
 
 
 def navigate(
     anatomy: Anatomy,
-    device: Device,
+    devices: Sequence[Device],
     initial: Float[np.ndarray, "worlds 2"],
     control: Float[np.ndarray, "worlds samples 2"],
     friction: Float[np.ndarray, "worlds"],
     config: SimulatorConfig,
-) -> tuple[Rollout, Bool[np.ndarray, "worlds"]]:
+    *,
+    actuation: Actuation = "velocity",
+    advance: Callable[[int], None] = lambda samples: None,
+) -> tuple[Rollout, Float[np.ndarray, "worlds samples 2"], Bool[np.ndarray, "worlds"]]:
     """Simulate navigations, stopped short of the ends of the vessel.
 
     Args:
         anatomy: the vessel.
-        device: the wire.
+        devices: the wire of each world.
         initial: (Δ mm, φ rad) before the first period.
-        control: (mm/s, rad/s), before it is stopped short and rounded to float32, as the disk keeps it.
+        control: velocities (mm/s, rad/s) or loads (N, N·mm) that were drawn.
         friction: friction coefficient of each world.
         config: settings of the rod core.
+        actuation: what the controls are.
+        advance: called after each sample with the number of worlds.
 
     Returns:
-        What happened, and which worlds were stopped short.
+        What happened; the controls that were applied, rounded to float32 as the disk keeps them; and which worlds were
+        stopped short.
     """
-    ends = _ends(anatomy.tree)
-    limit = np.full(len(control), ends[np.isfinite(ends)].max() - STOP_SHORT_MM)
-    stopped = np.zeros(len(control), dtype=bool)
-    again, rollout = np.arange(len(control)), None
-    for _ in range(ATTEMPTS):
-        started, driven = stop_short(initial[again], control[again], limit[again])
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # invalid worlds are listed in the dataset's manifest
-            part = simulate(anatomy, device, driven, initial=started, config=config, friction=friction[again])
-        if rollout is None:
-            rollout = part
-        else:
-            _overwrite(rollout, again, part)
-        depth = _depth_of_end(part, ends)
-        came = np.isfinite(depth)
-        again, depth = again[came], depth[came]
-        if len(again) == 0:
-            break
-        stopped[again] = True
-        limit[again] = np.minimum(limit[again], depth) - STOP_SHORT_MM
-    assert rollout is not None
-    return rollout, stopped
+    watch = _Watch(anatomy.tree, devices)
+    simulator = Simulator(anatomy, list(devices), actuation=actuation, config=config)
+    started = _begin(simulator, watch, anatomy, initial, friction)
+    applied, stopped = np.empty_like(control), np.zeros(len(control), dtype=bool)
+    result: dict[str, np.ndarray] = {}
+    tip, inserted, last, slip = simulator.position[:, 0], started[:, 0], np.zeros(len(control)), np.zeros(len(control))
+    for sample in range(control.shape[1]):
+        drawn = control[:, sample]
+        caught = (slip > 0) | (simulator.base_load[:, 0] > watch.caught_n)
+        # How far a load moves the wire is not known: about as far as the last one did.
+        needed = last if actuation == "force" else np.zeros(len(control))
+        room = watch.room(project_tip(anatomy.tree, anatomy.insertion, tip), inserted, needed, caught)
+        held = np.where(room > 0, drawn[:, 0], -np.abs(drawn[:, 0]))
+        if actuation == "velocity":
+            held = np.clip(held, -inserted / SAMPLE_PERIOD_S, room / SAMPLE_PERIOD_S)
+        applied[:, sample] = np.column_stack([held, drawn[:, 1]]).astype(np.float32)
+        stopped |= (drawn[:, 0] > 0) & (held < drawn[:, 0])
+        step = simulator.step(applied[:, sample], SAMPLE_PERIOD_S)
+        _record(result, sample, control.shape[1], step, simulator)
+        tip, slip, last, inserted = step.tip_position, step.slip, step.inserted_length - inserted, step.inserted_length
+        advance(len(control))
+    return make_rollout(anatomy, actuation, started, applied, result), applied, stopped
 
 
-def stop_short(
+class _Watch:
+    """How far each wire may still be pushed.
+
+    Attributes:
+        deepest_mm: inserted length that no wire may exceed.
+        caught_n: push at which each wire counts as caught, N.
+    """
+
+    def __init__(self, tree: VesselTree, devices: Sequence[Device]) -> None:
+        self._ends = np.full(len(tree.branches), np.inf)
+        for leaf in tree.leaves():
+            self._ends[leaf] = tree.branches[leaf].centerline.abscissa[-1]
+        self.deepest_mm = max(float(self._ends[np.isfinite(self._ends)].max()) - STOP_SHORT_MM, 0.0)
+        self.caught_n = CAUGHT * np.array([device.push_limit_n for device in devices])
+        self._limit = np.full(len(devices), np.inf)
+
+    def room(
+        self,
+        tip: TipProjection,
+        inserted: Float[np.ndarray, "worlds"],
+        needed: Float[np.ndarray, "worlds"],
+        caught: Bool[np.ndarray, "worlds"],
+    ) -> Float[np.ndarray, "worlds"]:
+        """Return the advance (mm) that is left to each wire; 0 where it is `needed` or less, and until it is back."""
+        ahead = np.minimum(self.deepest_mm - inserted, self.ahead(tip))
+        stop = caught | (ahead <= np.maximum(needed, _ROUNDING_MM))
+        back = np.maximum(inserted - PULL_BACK_MM, 0.0)
+        self._limit = np.where(stop, np.minimum(self._limit, back), self._limit)
+        is_back = ~stop & (inserted < self._limit + _ROUNDING_MM)
+        self._limit = np.where(is_back, np.inf, self._limit)
+        return np.where(np.isinf(self._limit), ahead, 0.0)
+
+    def ahead(self, tip: TipProjection) -> Float[np.ndarray, "worlds"]:
+        """Return how far each tip is from where it is stopped in its branch, mm; negative beyond."""
+        return self._ends[tip.branch] - STOP_SHORT_MM - tip.abscissa
+
+
+def _begin(
+    simulator: Simulator,
+    watch: _Watch,
+    anatomy: Anatomy,
     initial: Float[np.ndarray, "worlds 2"],
-    control: Float[np.ndarray, "worlds samples 2"],
-    limit: Float[np.ndarray, "worlds"],
-) -> tuple[Float[np.ndarray, "worlds 2"], Float[np.ndarray, "worlds samples 2"]]:
-    """Return initial states and controls of which the inserted length stays between 0 and each world's limit, mm.
-
-    The controls are rounded to float32, so that simulating what the disk keeps repeats an episode exactly.
-    """
-    initial, control = initial.copy(), control.copy()
-    initial[:, 0] = np.clip(initial[:, 0], 0, limit)
-    inserted = initial[:, 0].copy()
-    for sample in np.moveaxis(control, 1, 0):
-        sample[:, 0] = np.clip(sample[:, 0], -inserted / SAMPLE_PERIOD_S, (limit - inserted) / SAMPLE_PERIOD_S)
-        sample[:] = sample.astype(np.float32)
-        inserted += SAMPLE_PERIOD_S * sample[:, 0]
-    return initial, control
+    friction: Float[np.ndarray, "worlds"],
+) -> Float[np.ndarray, "worlds 2"]:
+    """Push the wires to their first inserted length, or as deep as they come freely, and return Δ and φ there."""
+    start, again = np.minimum(initial[:, 0], watch.deepest_mm), np.arange(len(initial))
+    while True:
+        simulator.reset(inserted_length=start, rotation=initial[:, 1], friction=friction, worlds=again.tolist())
+        tip = project_tip(anatomy.tree, anatomy.insertion, simulator.position[:, 0])
+        slipped = simulator.inserted_length < start
+        far = np.where(slipped, STOP_SHORT_MM, -watch.ahead(tip))
+        again = np.flatnonzero((slipped | (far > _ROUNDING_MM)) & (start > 0) & simulator.valid)
+        if len(again) == 0:
+            return np.column_stack([simulator.inserted_length, simulator.rotation])
+        start[again] = np.maximum(simulator.inserted_length[again] - np.maximum(far[again], 1.0), 0.0)
 
 
-def _ends(tree: VesselTree) -> Float[np.ndarray, "branches"]:
-    """Return the abscissa at which each branch ends distally, mm; infinity where it divides instead."""
-    ends = np.full(len(tree.branches), np.inf)
-    for leaf in tree.leaves():
-        ends[leaf] = tree.branches[leaf].centerline.abscissa[-1]
-    return ends
-
-
-def _depth_of_end(rollout: Rollout, ends: Float[np.ndarray, "branches"]) -> Float[np.ndarray, "worlds"]:
-    """Return how deep each world's wire came, mm: the abscissa of the first end that its tip came to, or the inserted
-    length at which the drive first slipped; infinity if it did neither."""
-    end: Float[np.ndarray, "worlds samples"] = ends[rollout.tip.branch]
-    came, slipped = rollout.tip.abscissa > end - END_MM, rollout.slip != 0
-    depth = np.where(came, end, rollout.inserted_length)
-    first = np.argmax(came | slipped, axis=1)
-    return np.where((came | slipped).any(axis=1), depth[np.arange(len(end)), first], np.inf)
-
-
-def _overwrite(rollout: Any, worlds: Int[np.ndarray, "chosen"], part: Any) -> None:
-    """Put the worlds of `part` in the place of some worlds of `rollout`."""
-    for record in fields(rollout):
-        whole, values = getattr(rollout, record.name), getattr(part, record.name)
-        if isinstance(whole, np.ndarray):
-            whole[worlds] = values
-        elif is_dataclass(whole):
-            _overwrite(whole, worlds, values)
+def _record(result: dict[str, np.ndarray], sample: int, samples: int, step: Step, simulator: Simulator) -> None:
+    """Put what the worlds did in one sample into arrays of all samples."""
+    base, drive = simulator.base_load, simulator.drive_load
+    loads = {
+        "base_force": base[:, 0],
+        "base_torque": base[:, 1],
+        "drive_force": drive[:, 0],
+        "drive_torque": drive[:, 1],
+    }
+    for name in (*RECORDED, "inserted_length", "rotation"):
+        values = loads[name] if name in loads else getattr(step, name)
+        if sample == 0:
+            result[name] = np.empty((len(values), samples, *values.shape[1:]), dtype=values.dtype)
+        result[name][:, sample] = values

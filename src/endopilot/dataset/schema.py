@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 
 from endopilot.errors import InputError
 from endopilot.progress import Advance
+from endopilot.simulation.simulator import Actuation
 from endopilot.types import SAMPLE_PERIOD_S, Rollout
 
 LEROBOT_VERSION = "v3.0"
@@ -28,12 +29,17 @@ TASKS_PATH = "meta/tasks.parquet"
 MANIFEST_PATH = "meta/manifest.json"
 TASK = "random navigation"
 _KEY = b"endopilot_key"
+_LEVEL = 5
+"""Of Zstandard; higher ones take longer and save next to nothing."""
+_FEW_VALUES = {"timestamp"}
+"""Columns that repeat their values: a dictionary is the smallest."""
 
 INDEX_COLUMNS = ("index", "episode_index", "frame_index", "task_index")
 """Integer columns that LeRobot asks for; `timestamp` (s, float32) is the fifth."""
 
-SIGNALS: dict[str, tuple[str, list[str] | None]] = {
-    "action": ("float32", ["translation_mm_s", "rotation_rad_s"]),
+VELOCITY = ["translation_mm_s", "rotation_rad_s"]
+LOAD = ["drive_force_n", "drive_torque_nmm"]
+_SIGNALS: dict[str, tuple[str, list[str] | None]] = {
     "observation.state": ("float32", ["inserted_length_mm", "rotation_rad", "tip_abscissa_mm", "tip_offset_mm"]),
     "tip_position_mm": ("float32", ["x", "y", "z"]),
     "tip_direction": ("float32", ["x", "y", "z"]),
@@ -43,16 +49,44 @@ SIGNALS: dict[str, tuple[str, list[str] | None]] = {
     "contact_force_sum_n": ("float32", None),
     "base_force_n": ("float32", None),
     "base_torque_nmm": ("float32", None),
+    "drive_force_n": ("float32", None),
+    "drive_torque_nmm": ("float32", None),
     "valid": ("bool", None),
 }
-"""Name of each simulated column, its type, and the names of its components if it is a vector."""
+MANOEUVRES = ("insertion", "retraction", "spin", "pause")
+_MOVES_MM_S, _TURNS_RAD_S = 0.1, 0.02
+"""Below these a drive rests: mm/s, rad/s."""
 
 
-def features() -> dict[str, dict[str, Any]]:
+def signals(actuation: Actuation) -> dict[str, tuple[str, list[str] | None]]:
+    """Return the name of each simulated column, its type, and the names of its components if it is a vector.
+
+    `action` is the control that was applied. The velocity that came of a force stands in `velocity`; the load that a
+    velocity took in `drive_force_n` and `drive_torque_nmm`, which are there either way.
+    """
+    velocity = {"velocity": ("float32", VELOCITY)} if actuation == "force" else {}
+    return {"action": ("float32", LOAD if actuation == "force" else VELOCITY), **velocity, **_SIGNALS}
+
+
+def actuation_of(described: Mapping[str, Any]) -> Actuation:
+    """Return what the control of a dataset is, from the `features` of its `meta/info.json`."""
+    return "force" if "velocity" in described else "velocity"
+
+
+def manoeuvres(velocity: np.ndarray) -> np.ndarray:
+    """Return the manoeuvre of each row of velocities (mm/s, rad/s), as an index of `MANOEUVRES`.
+
+    A wire that advances is inserted, whether it turns or not; slower than 0.1 mm/s and 0.02 rad/s it rests.
+    """
+    along, turn = velocity[..., 0], np.abs(velocity[..., 1])
+    return np.select([along > _MOVES_MM_S, along < -_MOVES_MM_S, turn > _TURNS_RAD_S], [0, 1, 2], 3)
+
+
+def features(actuation: Actuation) -> dict[str, dict[str, Any]]:
     """Return the `features` entry of `meta/info.json`: type, shape and component names of every column."""
     described = {"timestamp": {"dtype": "float32", "shape": [1], "names": None}}
     described |= {name: {"dtype": "int64", "shape": [1], "names": None} for name in INDEX_COLUMNS}
-    for name, (dtype, names) in SIGNALS.items():
+    for name, (dtype, names) in signals(actuation).items():
         described[name] = {"dtype": dtype, "shape": [len(names) if names else 1], "names": names}
     return described
 
@@ -64,11 +98,13 @@ def paths_of_file(folder: Path, number: int) -> tuple[Path, Path]:
     return folder / DATA_PATH.format(**where), folder / EPISODES_PATH.format(**where)
 
 
-def sample_table(rollout: Rollout, first_episode: int, key: str) -> pa.Table:
+def sample_table(rollout: Rollout, applied: np.ndarray, actuation: Actuation, first_episode: int, key: str) -> pa.Table:
     """Return the samples of a rollout as rows, one episode after the other.
 
     Args:
         rollout: one world for each episode.
+        applied: control of each world and sample, where it is a load (N, N·mm).
+        actuation: what the control is.
         first_episode: index in the dataset of the rollout's first world.
         key: marks the dataset that the file belongs to.
     """
@@ -81,7 +117,8 @@ def sample_table(rollout: Rollout, first_episode: int, key: str) -> pa.Table:
         "task_index": np.zeros(worlds * samples, dtype=np.int64),
         # LeRobot's clock starts at 0 with the first recorded sample.
         "timestamp": np.tile(np.arange(samples) * rollout.sample_period_s, worlds),
-        "action": rollout.control,
+        "action": applied if actuation == "force" else rollout.control,
+        "velocity": rollout.control,
         "observation.state": np.stack(state, axis=-1),
         "tip_position_mm": rollout.tip_position,
         "tip_direction": rollout.tip_direction,
@@ -91,9 +128,12 @@ def sample_table(rollout: Rollout, first_episode: int, key: str) -> pa.Table:
         "contact_force_sum_n": rollout.contact_force_sum,
         "base_force_n": rollout.base_force,
         "base_torque_nmm": rollout.base_torque,
+        "drive_force_n": rollout.drive_force,
+        "drive_torque_nmm": rollout.drive_torque,
         "valid": rollout.valid,
     }
-    arrays = {name: _column(name, values) for name, values in columns.items()}
+    kinds = dict.fromkeys(INDEX_COLUMNS, ("int64", None)) | {"timestamp": ("float32", None)} | signals(actuation)
+    arrays = {name: _column(columns[name], *kinds[name]) for name in columns if name in kinds}
     return pa.table(arrays).replace_schema_metadata({_KEY: key.encode()})
 
 
@@ -105,7 +145,20 @@ def episode_table(columns: Mapping[str, Any], key: str) -> pa.Table:
 def parquet_bytes(table: pa.Table) -> bytes:
     """Return a table as a Parquet file in memory, so that a full disk shows as an ordinary OSError on writing."""
     sink = pa.BufferOutputStream()
-    pq.write_table(table, sink, compression="zstd")
+    floats = {field.name for field in table.schema if _is_float(field.type)} - _FEW_VALUES
+    counters = {name for name in ("index", "episode_index") if name in table.column_names}
+    leaf = {name: name if table.schema.field(name).type == pa.float32() else f"{name}.list.element" for name in floats}
+    pq.write_table(
+        table,
+        sink,
+        compression="zstd",
+        compression_level=_LEVEL,
+        use_dictionary=[name for name in table.column_names if name not in floats | counters],
+        # Bytes of like significance side by side compress best; counters by their differences.
+        column_encoding={leaf[name]: "BYTE_STREAM_SPLIT" for name in floats}
+        | dict.fromkeys(counters, "DELTA_BINARY_PACKED"),
+        write_statistics=list(INDEX_COLUMNS),
+    )
     return sink.getvalue().to_pybytes()
 
 
@@ -129,6 +182,10 @@ def read_table(path: Path, key: str) -> pa.Table:
     return table
 
 
+def _is_float(kind: pa.DataType) -> bool:
+    return kind == pa.float32() or (pa.types.is_fixed_size_list(kind) and kind.value_type == pa.float32())
+
+
 def column_values(table: pa.Table, name: str) -> np.ndarray:
     """Return a column as an array, (rows,) for scalars and (rows, components) for vectors."""
     column = table.column(name).combine_chunks()
@@ -137,7 +194,7 @@ def column_values(table: pa.Table, name: str) -> np.ndarray:
     return column.to_numpy(zero_copy_only=False)
 
 
-def info(episodes: int, samples_per_episode: int) -> dict[str, Any]:
+def info(actuation: Actuation, episodes: int, samples_per_episode: int) -> dict[str, Any]:
     """Return the content of `meta/info.json`.
 
     LeRobot's `splits` are ranges of episodes, which ours are not: they stand in the episode table, column `split`.
@@ -153,25 +210,32 @@ def info(episodes: int, samples_per_episode: int) -> dict[str, Any]:
         "splits": {},
         "data_path": DATA_PATH,
         "video_path": None,
-        "features": features(),
+        "features": features(actuation),
     }
 
 
-def statistics(paths: Iterable[Path], key: str, advance: Advance) -> dict[str, dict[str, list[float]]]:
-    """Return the content of `meta/stats.json`: min, max, mean, std and count of every numeric signal's valid samples.
+def statistics(
+    actuation: Actuation, paths: Iterable[Path], key: str, advance: Advance
+) -> tuple[dict[str, dict[str, list[float]]], dict[str, float]]:
+    """Return the content of `meta/stats.json`, and the share of each manoeuvre in what was driven.
+
+    The first holds min, max, mean, std and count of every numeric signal's valid samples.
 
     Args:
+        actuation: what the dataset's control is.
         paths: the data files.
         key: key of the dataset.
         advance: called once for each file that has been read.
     """
     sums: dict[str, list[np.ndarray]] = {}
-    count = 0
+    count, driven = 0, np.zeros(len(MANOEUVRES))
     for path in paths:
         table = read_table(path, key)
         valid = column_values(table, "valid")
         count += int(valid.sum())
-        for name, (dtype, _) in SIGNALS.items():
+        velocity = column_values(table, "velocity" if actuation == "force" else "action")[valid]
+        driven += np.bincount(manoeuvres(velocity), minlength=len(driven))
+        for name, (dtype, _) in signals(actuation).items():
             if dtype == "bool" or not valid.any():
                 continue
             values = column_values(table, name)[valid].astype(np.float64).reshape(int(valid.sum()), -1)
@@ -188,7 +252,7 @@ def statistics(paths: Iterable[Path], key: str, advance: Advance) -> dict[str, d
                 ]
             )
         advance()
-    return {
+    described = {
         name: {
             "min": low.tolist(),
             "max": high.tolist(),
@@ -198,9 +262,9 @@ def statistics(paths: Iterable[Path], key: str, advance: Advance) -> dict[str, d
         }
         for name, (low, high, total, squares) in sums.items()
     }
+    return described, dict(zip(MANOEUVRES, (driven / max(count, 1)).tolist(), strict=True))
 
 
-def _column(name: str, values: np.ndarray) -> pa.Array:
-    dtype, names = SIGNALS.get(name, ("float32" if name == "timestamp" else "int64", None))
+def _column(values: np.ndarray, dtype: str, names: list[str] | None) -> pa.Array:
     flat = pa.array(np.ascontiguousarray(values, dtype=dtype).reshape(-1))
     return pa.FixedSizeListArray.from_arrays(flat, len(names)) if names else flat

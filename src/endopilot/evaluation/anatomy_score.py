@@ -6,7 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import SimpleITK as sitk
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from scipy import ndimage
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from endopilot.anatomy.projection import project_tip
@@ -22,18 +25,19 @@ SAMPLE_STEP_MM = 0.1
 class AnatomyScore:
     """Agreement of an extracted vessel with the true one, over true vessels of radius 0.75 mm or more.
 
-    Overlap and inside accuracy are those of Schaap et al., Med. Image Anal. 2009 (CAT08).
-
     Attributes:
-        dice: Dice coefficient of the lumen's voxels.
-        overlap: OV, share of both centerlines that lies within the true radius of the other.
-        inside_accuracy_mm: AI, mean distance between the centerlines where they overlap, mm.
+        dice: Dice coefficient of the lumen's voxels beyond the ostium.
+        cldice: centerline Dice (Shit et al., CVPR 2021), see `cl_dice`.
+        overlap: OV (Schaap et al., Med. Image Anal. 2009, "CAT08"), see `Agreement`.
+        inside_accuracy_mm: AI of the same, mm.
         radius_mae_mm: mean absolute error of the radius where the centerlines overlap, mm.
         ostium_error_mm: distance between the ostia, mm.
-        false_length_mm: length of extracted centerline that follows no true vessel of any radius, mm.
+        false_length_mm: length of the longest connected piece of extracted centerline that follows no true vessel of
+            any radius, mm.
     """
 
     dice: float
+    cldice: float
     overlap: float
     inside_accuracy_mm: float
     radius_mae_mm: float
@@ -41,25 +45,86 @@ class AnatomyScore:
     false_length_mm: float
 
 
+@dataclass(frozen=True, kw_only=True)
+class Agreement:
+    """Agreement of two centerline trees, after CAT08 (Schaap et al. 2009).
+
+    A true point is found (TPR) if an extracted point lies within the true radius there, missed (FN) otherwise; an
+    extracted point is right (TPM) if it lies within the true radius of the true point nearest to it, false (FP)
+    otherwise. CAT08 pairs the points of one vessel by dynamic programming; here, in trees, each is paired with the
+    nearest. Points whose true radius is below `SMALLEST_RADIUS_MM` are not counted.
+
+    Attributes:
+        overlap: OV = (TPR + TPM) / (TPR + TPM + FN + FP).
+        inside_accuracy_mm: AI, mean distance over the pairs of points that are found or right, mm.
+        radius_mae_mm: mean absolute difference of the radii over the pairs that are right, mm.
+        false_length_mm: length of the longest connected piece of extracted line that is false, whatever the radius, mm.
+    """
+
+    overlap: float
+    inside_accuracy_mm: float
+    radius_mae_mm: float
+    false_length_mm: float
+
+
 def score_anatomy(mask: LumenMask, extracted: Anatomy, truth: Anatomy) -> AnatomyScore:
     """Compare a mask and the anatomy extracted from it with the anatomy that the volume was made of."""
-    true_points, true_radius = _sample(truth.tree)
-    points, radius = _sample(extracted.tree)
-    distance, nearest = KDTree(true_points).query(points)
-    follows = distance <= true_radius[nearest]
-    scored = true_radius[nearest] >= SMALLEST_RADIUS_MM
-    large = true_radius >= SMALLEST_RADIUS_MM
-    reached = KDTree(points).query(true_points[large])[0] <= true_radius[large]
-    found, missed = reached.sum() + (follows & scored).sum(), (~reached).sum() + (~follows & scored).sum()
-    inside = follows & scored
+    agreement = compare_trees(extracted.tree, truth.tree)
+    dice, cldice = _mask_scores(mask, truth)
     return AnatomyScore(
-        dice=_dice(mask, truth),
-        overlap=float(found / max(found + missed, 1)),
-        inside_accuracy_mm=float(distance[inside].mean()) if inside.any() else float("nan"),
-        radius_mae_mm=float(np.abs(radius - true_radius[nearest])[inside].mean()) if inside.any() else float("nan"),
+        dice=dice,
+        cldice=cldice,
+        overlap=agreement.overlap,
+        inside_accuracy_mm=agreement.inside_accuracy_mm,
+        radius_mae_mm=agreement.radius_mae_mm,
         ostium_error_mm=float(np.linalg.norm(extracted.insertion.position - truth.insertion.position)),
-        false_length_mm=float((~follows).sum() * SAMPLE_STEP_MM),
+        false_length_mm=agreement.false_length_mm,
     )
+
+
+def compare_trees(extracted: VesselTree, truth: VesselTree) -> Agreement:
+    """Return how far an extracted centerline tree agrees with the true one."""
+    true_points, true_radius = _sample(truth)
+    points, radius = _sample(extracted)
+    distance, nearest = KDTree(true_points).query(points)
+    follows, scored = distance <= true_radius[nearest], true_radius[nearest] >= SMALLEST_RADIUS_MM
+    large = true_radius >= SMALLEST_RADIUS_MM
+    to_extracted, _ = KDTree(points).query(true_points[large])
+    found, right = to_extracted <= true_radius[large], follows & scored
+    agreeing = int(found.sum() + right.sum())
+    pairs = np.concatenate([to_extracted[found], distance[right]])
+    return Agreement(
+        overlap=agreeing / max(len(found) + int(scored.sum()), 1),
+        inside_accuracy_mm=float(pairs.mean()) if len(pairs) else float("nan"),
+        radius_mae_mm=float(np.abs(radius - true_radius[nearest])[right].mean()) if right.any() else float("nan"),
+        false_length_mm=_longest_piece(points[~follows]),
+    )
+
+
+def cl_dice(
+    mask: Bool[np.ndarray, "nz ny nx"],
+    truth: Bool[np.ndarray, "nz ny nx"],
+    mask_skeleton: Bool[np.ndarray, "nz ny nx"],
+    truth_skeleton: Bool[np.ndarray, "nz ny nx"],
+) -> float:
+    """Return the centerline Dice of two masks (Shit et al., "clDice", CVPR 2021).
+
+    With V the masks and S their skeletons: topology precision T_prec = |S_mask ∩ V_truth| / |S_mask|, topology
+    sensitivity T_sens = |S_truth ∩ V_mask| / |S_truth|, clDice = 2·T_prec·T_sens / (T_prec + T_sens).
+    """
+    precision = (mask_skeleton & truth).sum() / max(mask_skeleton.sum(), 1)
+    sensitivity = (truth_skeleton & mask).sum() / max(truth_skeleton.sum(), 1)
+    return float(2 * precision * sensitivity / max(precision + sensitivity, 1e-12))
+
+
+def _longest_piece(points: Float[np.ndarray, "n 3"]) -> float:
+    """Return the length of the largest group of samples that hang together, mm."""
+    if len(points) == 0:
+        return 0.0
+    pairs = KDTree(points).query_pairs(2.5 * SAMPLE_STEP_MM, output_type="ndarray")
+    links = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(points), len(points)))
+    _, piece = connected_components(links, directed=False)
+    return float(np.bincount(piece).max() * SAMPLE_STEP_MM)
 
 
 def _sample(tree: VesselTree) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]:
@@ -73,14 +138,27 @@ def _sample(tree: VesselTree) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarra
     return np.concatenate(points), np.concatenate(radius)
 
 
-def _dice(mask: LumenMask, truth: Anatomy) -> float:
-    """Return Dice over voxels beyond the ostium whose nearest true vessel is large enough."""
-    ours, true = mask.volume.voxels.astype(bool), _resample(truth.distance_map, mask.volume) > 0
+def _mask_scores(mask: LumenMask, truth: Anatomy) -> tuple[float, float]:
+    """Return Dice and clDice over voxels beyond the ostium whose nearest true vessel is large enough.
+
+    The true skeleton is the true centerline; the mask's is thinned out of it (Lee et al. 1994).
+    """
+    from skimage.morphology import skeletonize
+
+    true = _resample(truth.distance_map, mask.volume) > 0
+    box = ndimage.find_objects((mask.volume.voxels | true).astype(np.uint8))[0]
+    ours, true = np.pad(mask.volume.voxels[box], 1), np.pad(true[box], 1)
+    corner = np.array([part.start - 1 for part in box])
     indices = np.argwhere(ours | true)
-    projection = project_tip(truth.tree, truth.insertion, mask.volume.index_to_world(indices[:, ::-1].astype(float)))
-    scored = indices[(projection.abscissa > 0) & (projection.radius >= SMALLEST_RADIUS_MM)]
-    ours, true = ours[tuple(scored.T)], true[tuple(scored.T)]
-    return float(2 * (true & ours).sum() / max(true.sum() + ours.sum(), 1))
+    places = mask.volume.index_to_world((indices + corner)[:, ::-1].astype(float))
+    projection = project_tip(truth.tree, truth.insertion, places)
+    scored = np.zeros(ours.shape, dtype=bool)
+    scored[tuple(indices[(projection.abscissa > 0) & (projection.radius >= SMALLEST_RADIUS_MM)].T)] = True
+    points, _ = _sample(truth.tree)
+    line = np.zeros(ours.shape, dtype=bool)
+    line[tuple((np.rint(mask.volume.world_to_index(points)).astype(int)[:, ::-1] - corner).T)] = True
+    dice = 2 * (true & ours & scored).sum() / max((true & scored).sum() + (ours & scored).sum(), 1)
+    return float(dice), cl_dice(ours, true, skeletonize(ours) & scored, line & true & scored)
 
 
 def _resample(distance_map: DistanceMap, grid: Volume) -> Float[np.ndarray, "nz ny nx"]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -14,7 +13,7 @@ from endopilot.dataset.loader import Dataset
 from endopilot.evaluation import baselines
 from endopilot.evaluation.results import SplitResult, TipSeries
 from endopilot.models.config import WINDOW
-from endopilot.models.rollout import Predictor
+from endopilot.models.open_loop import Predictor
 from endopilot.progress import Advance
 from endopilot.simulation.device import Device
 from endopilot.simulation.simulator import SimulatorConfig, simulate
@@ -39,7 +38,7 @@ def run_protocols(predictor: Predictor, data: Dataset, train: Dataset, advance: 
     """
     names, anatomy_of = np.unique(data.anatomy, return_inverse=True)
     anatomies = [read_anatomy(data.anatomy_folder(str(name))) for name in names]
-    device = _device(data)
+    device = Device.from_record(data.manifest["device"])
     predicted = {}
     for protocol in ("forward", "inverse", "dual"):
         predicted[protocol] = getattr(predictor, f"rollout_{protocol}")(data)
@@ -78,13 +77,6 @@ def run_protocols(predictor: Predictor, data: Dataset, train: Dataset, advance: 
         base_torque={"true": _after_given(data.base_torque)} | {name: r.base_torque for name, r in replays.items()},
         tip_distance={name: r.distance for name, r in replays.items()},
     )
-
-
-def _device(data: Dataset) -> Device:
-    """Return the device of a dataset as it was when the dataset was made."""
-    stored = data.manifest["device"].items()
-    constants: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in stored}
-    return Device(**constants)
 
 
 def _drivable(data: Dataset, control: Control, device: Device, reach_mm: Float[np.ndarray, "episodes"]) -> Control:

@@ -204,6 +204,7 @@ def score_columns(patients: list[dict[str, Any]]) -> list[str]:
 
 SCORE_TITLES: Mapping[str, str] = {
     "dice": "Dice",
+    "cldice": "clDice",
     "overlap": "centerline overlap",
     "inside_accuracy_mm": "centerline error, mm",
     "radius_mae_mm": "radius error, mm",

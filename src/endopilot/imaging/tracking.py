@@ -11,6 +11,8 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import KDTree
 
+from endopilot.imaging.grid import distance_to_outside
+
 _SHORTEST_BRANCH_MM = 4.0
 """Shorter side branches are bumps of the wall."""
 _COST_FLOOR = 0.05
@@ -51,7 +53,7 @@ def track_tree(
     # The box around the tree, not the volume, bounds the distance transform.
     corner, opposite = voxels.min(axis=0), voxels.max(axis=0) + 1
     box = np.pad(passable[tuple(slice(a, b) for a, b in zip(corner, opposite, strict=True))], 1)
-    depth = np.asarray(ndimage.distance_transform_edt(box))[tuple((voxels - corner + 1).T)] * spacing_mm
+    depth = distance_to_outside(box, spacing_mm)[tuple((voxels - corner + 1).T)]
 
     left = np.isfinite(length)
     on_path = np.zeros(len(voxels), dtype=bool)

@@ -44,11 +44,46 @@ class TransformerConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class TwinConfig:
+    """The ensemble of rod simulations that the twin is, and how far it is from the truth at most."""
+
+    members: int = 32
+    """Simulations of each navigation."""
+    friction_spread: float = 0.2
+    """The friction coefficient may be off by this share, either way."""
+    stiffness_spread: float = 0.2
+    """The stiffness of the tip may be off by this share, either way."""
+    ostium_spread_mm: float = 0.5
+    """The ostium may lie this much deeper or less deep along the catheter's axis, mm."""
+    abscissa_sd_mm: float = 0.05
+    """Scale of what a good member misses a seen tip by along the centerline, mm."""
+    offset_sd_mm: float = 0.025
+    """The same away from the centerline, mm."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            InputError: a field is out of its range.
+        """
+        if self.members < 1:
+            raise InputError(f"members: {self.members} is not positive; give at least 1")
+        for name in ("friction_spread", "stiffness_spread"):
+            if not 0 <= getattr(self, name) < 1:
+                raise InputError(f"{name}: {getattr(self, name)} is not in [0, 1); give e.g. 0.2")
+        if not self.ostium_spread_mm >= 0:
+            raise InputError(f"ostium_spread_mm: {self.ostium_spread_mm}; give 0 or more")
+        for name in ("abscissa_sd_mm", "offset_sd_mm"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"{name}: {getattr(self, name)} is not positive; give e.g. 0.05")
+
+
+@dataclass(frozen=True, kw_only=True)
 class TrainConfig:
     """Which networks are trained, and how long."""
 
-    model: Literal["paper"] = "paper"
-    """Kind of model: the paper's pair of Transformers."""
+    model: Literal["paper", "twin"] = "paper"
+    """Kind of model: the paper's pair of Transformers, or the rod core itself, which needs no training."""
     network: Literal["both", "ff", "if"] = "both"
     """Forward network (ff), inverse network (if), or both."""
     epochs: int = 20
@@ -65,6 +100,8 @@ class TrainConfig:
     """Seed of the initial weights, the order of the windows, and dropout."""
     size: TransformerConfig = field(default_factory=TransformerConfig)
     """Size of the networks; the paper's if not given."""
+    twin: TwinConfig = field(default_factory=TwinConfig)
+    """The twin's ensemble; of no use to the other models."""
 
     def __post_init__(self) -> None:
         """Check every field.
@@ -82,4 +119,6 @@ class TrainConfig:
     @property
     def networks(self) -> tuple[str, ...]:
         """Names of the networks to train."""
+        if self.model == "twin":
+            return ()
         return ("ff", "if") if self.network == "both" else (self.network,)

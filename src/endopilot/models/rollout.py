@@ -1,14 +1,12 @@
-"""Open-loop rollouts: the first 30 states are given, then the networks feed back on themselves.
+"""Open-loop rollouts of the paper's networks, which feed back on themselves after the 30 given states.
 
-P1, `rollout_forward`: FF with the true controls. P2, `rollout_inverse`: IF with the true tip as desired. P3,
-`rollout_dual`: IF asks for a control, FF foretells what it does, and IF sees that in place of an X-ray image.
+In P3 IF asks for a control, FF foretells what it does, and IF sees that in place of an X-ray image.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -18,44 +16,14 @@ from endopilot.dataset.loader import Dataset
 from endopilot.errors import InputError
 from endopilot.files import read_json
 from endopilot.models.checkpoint import read_network
-from endopilot.models.config import WINDOW
+from endopilot.models.config import WINDOW, TwinConfig
+from endopilot.models.open_loop import OpenLoop, Predictor, Steps2
 from endopilot.models.transformer import Network
+from endopilot.models.twin import TwinPredictor
 from endopilot.models.windows import Episodes
+from endopilot.simulation.device import Device
+from endopilot.simulation.simulator import SimulatorConfig
 from endopilot.types import SAMPLE_PERIOD_S
-
-Steps2 = Float[np.ndarray, "episodes steps 2"]
-
-
-@dataclass(frozen=True, eq=False)
-class OpenLoop:
-    """What a predictor foretells of each episode for the samples after the 30 given ones.
-
-    Attributes:
-        tip: (Δtip, γtip), mm; the true tip in P2, where none is predicted.
-        proximal: x^prox = (Δ mm, φ rad), the exact integral of `control`; the true one in P1.
-        control: π = (mm/s, rad/s); the true one in P1.
-    """
-
-    tip: Steps2
-    proximal: Steps2
-    control: Steps2
-
-
-@runtime_checkable
-class Predictor(Protocol):
-    """Whatever rolls episodes out: the networks of a run, or a baseline."""
-
-    def rollout_forward(self, episodes: Dataset) -> OpenLoop:
-        """P1: predict the tip under the true controls."""
-        ...
-
-    def rollout_inverse(self, episodes: Dataset) -> OpenLoop:
-        """P2: predict the controls that make the tip go the true way."""
-        ...
-
-    def rollout_dual(self, episodes: Dataset) -> OpenLoop:
-        """P3: predict the controls that make the tip go the true way, and the tip that they make."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,15 +95,24 @@ def _rollout_batch(
     return tuple(signal[:, WINDOW:].double().numpy() for signal in (tip, proximal, control))  # pyright: ignore[reportReturnType]
 
 
-def load_run(run_folder: Path) -> TransformerPredictor:
-    """Read the networks of a run made by `endopilot train`.
+def load_run(run_folder: Path) -> Predictor:
+    """Return the predictor of a run made by `endopilot train`.
 
     Raises:
         InputError: the run is unfinished, or a file of it is damaged or of another version.
     """
     run_folder = Path(run_folder)
     record = read_json(run_folder / "manifest.json")
+    device = Device.from_record(record["device"])
+    if record["config"]["model"] == "twin":
+        return TwinPredictor(
+            device=device,
+            simulator=SimulatorConfig(**record["simulator"]),
+            config=TwinConfig(**record["config"]["twin"]),
+        )
     networks = {name: read_network(run_folder / f"{name}.safetensors")[0] for name in record["networks"]}
     return TransformerPredictor(
-        forward=networks.get("ff"), inverse=networks.get("if"), control_limits=np.array(record["control_limits"])
+        forward=networks.get("ff"),
+        inverse=networks.get("if"),
+        control_limits=np.array([device.max_velocity_mm_s, device.max_rotation_rad_s]),
     )

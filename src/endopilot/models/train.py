@@ -45,6 +45,8 @@ _GRADIENT_NORM = 1.0
 def train(dataset_folder: Path, run_folder: Path, config: TrainConfig) -> None:
     """Train the forward and the inverse network on the split "train" and write them into a run folder.
 
+    The twin has no networks: its run is a folder with settings alone.
+
     Writes `ff.safetensors` and `if.safetensors` (weights and scales), `config.json`, `training.json` (learning
     curves) and `manifest.json`. A run that was interrupted goes on where it stopped when it is started again with the
     same arguments; a finished one returns at once.
@@ -69,6 +71,7 @@ def train(dataset_folder: Path, run_folder: Path, config: TrainConfig) -> None:
         job = _Job(name, config, training, validation, run_folder)
         results[name] = job.run()
         write_json(run_folder / "training.json", results)
+    write_json(run_folder / "training.json", results)  # of a model that trains nothing too
     record = manifest(
         config=config,
         seed=config.seed,
@@ -76,7 +79,8 @@ def train(dataset_folder: Path, run_folder: Path, config: TrainConfig) -> None:
         dataset=os.path.relpath(dataset_folder.resolve(), run_folder.resolve()),
         episodes={"train": len(training.tip), "seen_test": 0 if validation is None else len(validation.tip)},
         rejected={"invalid_episodes": int((~dataset.valid.all(axis=1)).sum())},
-        control_limits=[dataset.manifest["device"][name] for name in ("max_velocity_mm_s", "max_rotation_rad_s")],
+        device=dataset.manifest["device"],
+        simulator=dataset.manifest["config"]["simulator"],
         networks={name: {key: result[key] for key in result if key != "curve"} for name, result in results.items()},
         threads=torch.get_num_threads(),
         wall_seconds=time.perf_counter() - start,

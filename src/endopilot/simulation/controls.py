@@ -66,7 +66,13 @@ class ControlConfig:
 
 
 def random_controls(
-    config: ControlConfig, *, n_sequences: int, n_samples: int, seed: int, max_inserted_length_mm: float
+    config: ControlConfig,
+    *,
+    n_sequences: int,
+    n_samples: int,
+    seed: int,
+    max_inserted_length_mm: float,
+    first: int = 0,
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n samples 2"]]:
     """Draw random navigations; sequence i is the same whatever `n_sequences`.
 
@@ -76,6 +82,7 @@ def random_controls(
         n_samples: number of sample periods of each.
         seed: key of the random streams.
         max_inserted_length_mm: largest inserted length that a navigation reaches, mm; the smallest is 0.
+        first: index of the first of them.
 
     Returns:
         Initial (Δ mm, φ rad), and controls (mm/s, rad/s).
@@ -91,9 +98,34 @@ def random_controls(
         raise InputError(f"max_inserted_length_mm: {max_inserted_length_mm}; give a positive length")
     initial, control = np.empty((n_sequences, 2)), np.empty((n_sequences, n_samples, 2))
     for index in range(n_sequences):
-        generator = np.random.Generator(np.random.Philox(key=np.array([seed, index], dtype=np.uint64)))
+        generator = np.random.Generator(np.random.Philox(key=np.array([seed, first + index], dtype=np.uint64)))
         initial[index], control[index] = _navigation(config, generator, n_samples, max_inserted_length_mm)
+    inserted = initial[:, 0].copy()
+    for sample in np.moveaxis(control, 1, 0):
+        left = max_inserted_length_mm - inserted
+        sample[:, 0] = np.clip(sample[:, 0], -inserted / SAMPLE_PERIOD_S, left / SAMPLE_PERIOD_S)
+        inserted += sample[:, 0] * SAMPLE_PERIOD_S
     return initial, control
+
+
+def free_wire_load(
+    velocity: Float[np.ndarray, "*n 2"], *, radius_mm: float, friction_n: float, drag_n_s_mm: float, stick_mm_s: float
+) -> Float[np.ndarray, "*n 2"]:
+    """Return the drive's force (N) and torque (N·mm) that move a wire through the introducer alone at some velocity.
+
+    The wire's surface moves by v = (Δ̇, r φ̇) past the valve, whose smoothed Coulomb friction F and drag c oppose it with
+    F v / √(|v|² + ε²) + c v, as the rod core has it.
+
+    Args:
+        velocity: Δ̇ (mm/s) and φ̇ (rad/s).
+        radius_mm: of the wire, r.
+        friction_n: F.
+        drag_n_s_mm: c.
+        stick_mm_s: ε, velocity below which friction falls off.
+    """
+    surface = velocity * np.array([1.0, radius_mm])
+    size = np.sqrt((surface**2).sum(axis=-1, keepdims=True) + stick_mm_s**2)
+    return (friction_n / size + drag_n_s_mm) * surface * np.array([1.0, radius_mm])
 
 
 def _navigation(
@@ -109,9 +141,6 @@ def _navigation(
         wanted[at : at + samples] = _manoeuvre(config, generator)
         at += samples
     smooth = 0.25 * wanted[:-2] + 0.5 * wanted[1:-1] + 0.25 * wanted[2:]  # ramps of one period between manoeuvres
-    for sample in smooth:
-        sample[0] = np.clip(sample[0], -inserted / SAMPLE_PERIOD_S, (longest - inserted) / SAMPLE_PERIOD_S)
-        inserted += sample[0] * SAMPLE_PERIOD_S
     return initial, smooth
 
 

@@ -8,7 +8,7 @@ beyond the last one.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,8 @@ _PROFILES = ("abscissa_mm", "bend_stiffness_n_mm2", "twist_stiffness_n_mm2")
 _FIELDS = ("name", *_SCALARS, *_PROFILES, "tip_load_n", "tip_bend")
 _VALUE_KEYS, _TIP_BEND_KEYS = ("value", "source"), ("angle_deg", "length_mm", "source")
 
+TIP_LENGTH_MM = 10.0
+"""Length of the floppy tip, mm: the buckling length of catalogues' tip loads, and the distal coil of coronary wires."""
 GRAM_FORCE_N = 9.80665e-3
 """One gram-force in N, by the standard acceleration of gravity; catalogues give tip loads in it."""
 
@@ -114,6 +116,32 @@ class Device:
     def twist_stiffness(self, abscissa_mm: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
         """Return GJ in N·mm² at distances from the tip."""
         return np.interp(abscissa_mm, self.abscissa_mm, self.twist_stiffness_n_mm2)
+
+    @staticmethod
+    def from_record(record: Mapping[str, Any]) -> Device:
+        """Return the device that `dataclasses.asdict` made a record of, as manifests hold it."""
+        constants: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in record.items()}
+        return Device(**constants)
+
+    def with_tip(self, *, bend_rad: float, stiffness_factor: float) -> Device:
+        """Return the device with another tip.
+
+        Args:
+            bend_rad: angle by which the unloaded tip is bent, rad.
+            stiffness_factor: EI and GJ of the distal `TIP_LENGTH_MM` are multiplied by it, and less and less so as far
+                as the next abscissa of the profiles.
+        """
+        at = np.asarray(self.abscissa_mm, dtype=float)
+        factor = np.where(at <= TIP_LENGTH_MM, stiffness_factor, 1.0)
+        bend, twist = (
+            factor * np.asarray(p, dtype=float) for p in (self.bend_stiffness_n_mm2, self.twist_stiffness_n_mm2)
+        )
+        return replace(
+            self,
+            tip_bend_rad=bend_rad,
+            bend_stiffness_n_mm2=tuple(bend.tolist()),
+            twist_stiffness_n_mm2=tuple(twist.tolist()),
+        )
 
     def summary(self) -> dict[str, Any]:
         """Return what a list of devices shows.

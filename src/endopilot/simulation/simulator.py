@@ -7,7 +7,9 @@ C++ core in `src/core`; this module checks its input, lays the rod out and gives
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Integer
@@ -32,6 +34,10 @@ LANES = _core.LANES
 """Worlds that one thread steps side by side."""
 _DENT_MM = 0.015
 """Depth to which a node that bears the whole push limit dents the wall, mm, where the stiffness is not given."""
+SPARE_MM = 20.0
+"""Length that a wire can be driven beyond the end of the vessel's longest path, mm, where it is not known how far."""
+Actuation = Literal["velocity", "force"]
+"""What a control is: translation (mm/s) and rotation (rad/s), or the drive's axial force (N) and torque (N·mm)."""
 _OVERSHOOT_MM = 1e-2
 """Rounding of controls may carry the inserted length this far below 0, mm."""
 
@@ -100,6 +106,7 @@ def simulate(
     device: Device,
     control: Float[np.ndarray, "worlds samples 2"],
     *,
+    actuation: Actuation = "velocity",
     initial: Float[np.ndarray, "worlds 2"] | None = None,
     config: SimulatorConfig | None = None,
     record_shape: bool = False,
@@ -108,14 +115,17 @@ def simulate(
     """Drive a device through an anatomy and record it every 0.5 s.
 
     The drive slips rather than push harder than the device's push limit, and stops when the wire is pulled out:
-    controls, inserted lengths and the initial state of the answer are those that were made.
+    controls, inserted lengths and the initial state of the answer are those that were made. Where force and torque are
+    given, advance and rotation follow, and the answer's controls are the mean velocities that came of them.
 
     Results are the same to the last bit whatever the number of worlds, their order and the number of threads.
 
     Args:
         anatomy: the vessel.
         device: the wire.
-        control: proximal velocities (mm/s, rad/s), constant over each sample period.
+        control: proximal velocities (mm/s, rad/s), or force and torque (N, N·mm) of the drive, constant over each
+            sample period.
+        actuation: which of the two: "velocity" or "force".
         initial: inserted length (mm) and rotation (rad) before the first period; zeros if not given. The wire is
             pushed there from the ostium at `config.approach_velocity_mm_s`, then rests for one period.
         config: settings of the rod core.
@@ -140,7 +150,7 @@ def simulate(
         raise InputError(f"friction: shape {friction.shape}; give one number for each of the {worlds} worlds")
     _check_memory(worlds, samples, 0)
     control = np.ascontiguousarray(control, dtype=float)
-    inserted = _check_controls(device, control, initial, friction)
+    deepest = _check_controls(device, control, initial, friction, actuation)
     check_fits(device, anatomy)
     check_distance_map(anatomy)
     path_mm = float(anatomy.tree.longest_path().abscissa[-1])
@@ -148,7 +158,7 @@ def simulate(
         device,
         path_mm=path_mm,
         elements=config.elements,
-        length_mm=float(max(path_mm, inserted.max())) + FREE_BEHIND_MM,
+        length_mm=max(path_mm, deepest if actuation == "velocity" else path_mm + SPARE_MM) + FREE_BEHIND_MM,
     )
     _check_memory(worlds, samples, len(rod.abscissa_mm) if record_shape else 0)
     result = run_core(
@@ -158,35 +168,63 @@ def simulate(
         config=config,
         initial=initial,
         control=control,
+        actuation=actuation,
         friction=friction,
         record_shape=record_shape,
         push_limit_n=device.push_limit_n,
     )
     _report_invalid(result["reason"], result["valid"])
-    made, started = control.copy(), initial.copy()
-    made[..., 0] -= result["slip"] / SAMPLE_PERIOD_S
+    started = initial.copy()
     started[:, 0] -= result["approach_slip"]
-    start, rate = started[:, None, :], np.cumsum(made, axis=1) * SAMPLE_PERIOD_S
+    return make_rollout(anatomy, actuation, started, control, result)
+
+
+def make_rollout(
+    anatomy: Anatomy,
+    actuation: Actuation,
+    started: Float[np.ndarray, "worlds 2"],
+    control: Float[np.ndarray, "worlds samples 2"],
+    result: Mapping[str, np.ndarray],
+) -> Rollout:
+    """Return what the core recorded as a rollout.
+
+    Args:
+        anatomy: the vessel.
+        actuation: what the controls are.
+        started: inserted length (mm) and rotation (rad) before the first period.
+        control: what was asked of the drive.
+        result: arrays as `run_core` returns them.
+    """
+    start = started[:, None, :]
+    if actuation == "velocity":
+        made = control.copy()
+        made[..., 0] -= result["slip"] / SAMPLE_PERIOD_S
+        proximal = start + np.cumsum(made, axis=1) * SAMPLE_PERIOD_S
+    else:
+        proximal = np.stack([result["inserted_length"], result["rotation"]], axis=-1)
+        made = np.diff(proximal, axis=1, prepend=start) / SAMPLE_PERIOD_S
     return Rollout(
         sample_period_s=SAMPLE_PERIOD_S,
         initial_inserted_length=started[:, 0],
         initial_rotation=started[:, 1],
         control=made,
-        inserted_length=start[..., 0] + rate[..., 0],
-        rotation=start[..., 1] + rate[..., 1],
+        inserted_length=proximal[..., 0],
+        rotation=proximal[..., 1],
         tip=project_tip(anatomy.tree, anatomy.insertion, result["tip_position"]),
         shape=result.get("shape"),
-        **{name: result[name] for name in _RECORDED},
+        **{name: result[name] for name in RECORDED},
     )
 
 
-_RECORDED = (
+RECORDED = (
     "tip_position",
     "tip_direction",
     "contact_force_max",
     "contact_force_sum",
     "base_force",
     "base_torque",
+    "drive_force",
+    "drive_torque",
     "slip",
     "iterations",
     "valid",
@@ -202,6 +240,7 @@ def run_core(
     initial: Float[np.ndarray, "worlds 2"],
     control: Float[np.ndarray, "worlds samples 2"],
     friction: Float[np.ndarray, "worlds"],
+    actuation: Actuation = "velocity",
     loads: _core.Loads | None = None,
     record_shape: bool = False,
     record_attitude: bool = False,
@@ -219,8 +258,9 @@ def run_core(
         insertion: the point and the direction along which the base slides.
         config: settings.
         initial: inserted length (mm) and rotation (rad) of each world before the first period.
-        control: mm/s, rad/s.
+        control: mm/s and rad/s, or N and N·mm.
         friction: Coulomb coefficients.
+        actuation: what the controls are.
         loads: dead loads and springs.
         record_shape: record node positions, mm.
         record_attitude: record element orientations, quaternions w x y z.
@@ -256,7 +296,7 @@ def run_core(
     with progress("Simulating the wire", total=control.shape[0] * control.shape[1]) as advance:
         result = simulation.run(
             control=np.ascontiguousarray(control, dtype=float),
-            force_driven=False,
+            force_driven=actuation == "force",
             time_step=config.time_step_s,
             steps_per_sample=config.steps_per_sample,
             record_shape=record_shape,
@@ -352,21 +392,27 @@ def _check_controls(
     control: Float[np.ndarray, "worlds samples 2"],
     initial: Float[np.ndarray, "worlds 2"],
     friction: Float[np.ndarray, "worlds"],
-) -> Float[np.ndarray, "worlds samples_1"]:
-    """Check controls, initial state and friction, and return the inserted lengths from the first one on."""
+    actuation: Actuation,
+) -> float:
+    """Check controls, initial state and friction, and return the largest inserted length that they name, mm."""
+    if actuation not in ("velocity", "force"):
+        raise InputError(f"actuation: {actuation!r}; give 'velocity' or 'force'")
     worlds, samples = control.shape[:2]
     if worlds == 0 or samples == 0:
         raise InputError(f"control: {worlds} worlds of {samples} samples; give at least one of one")
     limits = (("translation", device.max_velocity_mm_s, "mm/s"), ("rotation", device.max_rotation_rad_s, "rad/s"))
+    if actuation == "force":
+        limits = (("force", np.inf, "N"), ("torque", np.inf, "N·mm"))
     for axis, (name, limit, unit) in enumerate(limits):
         _check(~np.isfinite(control[..., axis]), control[..., axis], f"{name} is no finite number; correct it")
         fast = np.abs(control[..., axis]) > limit * (1 + 1e-6)
         _check(fast, control[..., axis], f"{name} in {unit} exceeds {device.name}'s limit of {limit:g}; slow down")
     _check(~np.isfinite(initial), initial, "initial state is no finite number; correct it")
     _check(~(np.isfinite(friction) & (friction >= 0)), friction, "friction must be a finite number of 0 or more")
-    inserted = np.cumsum(np.column_stack([initial[:, 0], SAMPLE_PERIOD_S * control[..., 0]]), axis=1)
+    advance = SAMPLE_PERIOD_S * control[..., 0] if actuation == "velocity" else np.zeros(control.shape[:2])
+    inserted = np.cumsum(np.column_stack([initial[:, 0], advance]), axis=1)
     _check(inserted < -_OVERSHOOT_MM, inserted, "inserted length in mm is negative; pull less, or start deeper")
-    return inserted
+    return float(inserted.max())
 
 
 def _check(bad: Bool[np.ndarray, "worlds *rest"], values: Float[np.ndarray, "worlds *rest"], what: str) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Integer
@@ -24,6 +24,8 @@ from endopilot.simulation.simulator import (
     FREE_BEHIND_MM,
     LANES,
     SAMPLE_TOLERANCE,
+    SPARE_MM,
+    Actuation,
     SimulatorConfig,
     check_distance_map,
     check_memory,
@@ -34,8 +36,6 @@ from endopilot.simulation.simulator import (
 from endopilot.simulation.state import SimulatorState, Step, SupportsDLPack
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, TipProjection
 
-_SPARE_MM = 20.0
-"""Length that the wire can be pushed beyond the end of the vessel's longest path, mm."""
 _DEEPEST_START = 0.8
 """Share of the longest path that a random start may lie at."""
 
@@ -72,7 +72,7 @@ class Simulator:
         device: Device | Sequence[Device],
         *,
         worlds: int = 1,
-        actuation: Literal["velocity", "force"] = "velocity",
+        actuation: Actuation = "velocity",
         config: SimulatorConfig | None = None,
     ) -> None:
         """Lay the wires out; every world starts with its tip at the ostium.
@@ -116,7 +116,7 @@ class Simulator:
             check_fits(device, anatomy)
             check_distance_map(anatomy)
             path_mm = float(anatomy.tree.longest_path().abscissa[-1])
-            longest_mm = path_mm + _SPARE_MM
+            longest_mm = path_mm + SPARE_MM
             rod = lay_out(
                 device, path_mm=path_mm, elements=self._config.elements, length_mm=longest_mm + FREE_BEHIND_MM
             )
@@ -316,7 +316,7 @@ class Simulator:
                 world = int(group.index[np.argmax(end)])
                 raise InputError(
                     f"control: world {world}: would insert {end.max():.1f} mm, and the wire is laid out for "
-                    f"{group.longest_mm:.1f} mm, {_SPARE_MM:g} mm more than the vessel's longest path; push less"
+                    f"{group.longest_mm:.1f} mm, {SPARE_MM:g} mm more than the vessel's longest path; push less"
                 )
 
     def _gather(self, name: str) -> Float[np.ndarray, "worlds"]:
@@ -470,6 +470,36 @@ class Simulator:
             )
         for group, values in zip(self._groups, state.values, strict=True):
             group.simulation.set_state(np.ascontiguousarray(values))
+
+    def copy_worlds(self, source: ArrayLike) -> None:
+        """Put every world where another one, of the same anatomy and device, is now; friction goes with it.
+
+        Args:
+            source: for each world, the number of the one that it becomes a copy of; its own to stay as it is.
+
+        Raises:
+            InputError: not one number for each world, or a world of another anatomy or device.
+
+        Example:
+            >>> simulator.copy_worlds([0, 0, 2, 2])
+            >>> bool((simulator.position[1] == simulator.position[0])[simulator.contacts[0] >= 0].all())
+            True
+        """
+        chosen = np.asarray(source)
+        if chosen.shape != (self.worlds,) or not np.issubdtype(chosen.dtype, np.integer):
+            raise InputError(f"source: {source}; give the number of a world for each of the {self.worlds} worlds")
+        for group in self._groups:
+            wanted = chosen[group.index]
+            strange = ~np.isin(wanted, group.index)
+            if strange.any():
+                world = int(group.index[np.argmax(strange)])
+                raise InputError(
+                    f"source: world {world} cannot become world {chosen[world]}, which is none or has another anatomy "
+                    "or device; give one like it"
+                )
+        for group in self._groups:
+            rows = np.searchsorted(group.index, chosen[group.index])
+            group.simulation.set_state(np.ascontiguousarray(group.simulation.state()[rows]))
 
     def _fingerprint(self) -> str:
         digest = hashlib.sha256(repr((self._by_force, _settings(self._config))).encode())

@@ -33,6 +33,8 @@ def rollout_table(rollout: Rollout) -> pd.DataFrame:
         "contact_force_sum_n": rollout.contact_force_sum,
         "base_force_n": rollout.base_force,
         "base_torque_nmm": rollout.base_torque,
+        "drive_force_n": rollout.drive_force,
+        "drive_torque_nmm": rollout.drive_torque,
         "slip_mm": rollout.slip,
         "newton_iterations": rollout.iterations,
         "valid": rollout.valid,

@@ -69,7 +69,7 @@ def simulate_tip_load(device: Device) -> TipLoadTest:
     Raises:
         RuntimeError: the rod core did not converge.
     """
-    rod, size = _distal_rod(device)
+    rod = _distal_rod(device)
     nodes = len(rod.abscissa_mm)
     dead, plate, anchor = np.zeros((nodes, 3)), np.zeros((nodes, 3)), np.zeros((nodes, 3))
     dead[0, 1] = _IMPERFECTION * np.pi**2 * device.bend_stiffness_n_mm2[0] / (4 * HELD_MM**2)
@@ -124,12 +124,12 @@ def tip_load_row(device: Device) -> dict[str, Any]:
     }
 
 
-def _distal_rod(device: Device) -> tuple[RodLayout, float]:
-    """Return the distal 10 mm, straight and in elements of one length, with the held nodes behind; and that length."""
+def _distal_rod(device: Device) -> RodLayout:
+    """Return the distal 10 mm, straight and in elements of one length, with the held nodes behind."""
     size = HELD_MM / (_ELEMENTS - 0.5)  # the clamped element fixes a direction over its length: half of it is held
     abscissa = size * np.arange(_ELEMENTS + 1)
     stretch = 16.0 * device.bend_stiffness(abscissa + 0.5 * size) / device.diameter_mm**2  # a round section, as in rod
-    rod = RodLayout(
+    return RodLayout(
         abscissa_mm=abscissa,
         shear_n=SHEAR_CORRECTION * stretch / (2 * (1 + POISSON_RATIO)),
         stretch_n=stretch,
@@ -140,4 +140,3 @@ def _distal_rod(device: Device) -> tuple[RodLayout, float]:
         drag_n_s_mm=np.full(len(abscissa), _DRAG),
         spin_drag_n_mm_s=np.full(len(abscissa), _DRAG),
     )
-    return rod, size

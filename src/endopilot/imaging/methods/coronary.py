@@ -99,9 +99,10 @@ def segment_lumen(volume: Volume, config: SegmentConfig) -> LumenMask:
         InputError: there is no contrast, no aorta, no such vessel at its wall, or no vessel at a seed.
     """
     with progress("Segmenting the coronary tree", 5) as advance:
-        root = _find_root(volume, config)
+        grid = resample(volume, _GRID_MM)
+        root = _find_root(grid, config)
         advance()
-        scan = _find_vessels(volume, root.blood_hu if root else _hu_at(volume, config.seeds[0]))
+        scan = _find_vessels(grid, root.blood_hu if root else _hu_at(volume, config.seeds[0]))
         advance()
         aorta = _aorta(scan, root) if root else np.zeros(scan.pools.shape, dtype=bool)
         tree, start = (
@@ -122,10 +123,10 @@ def segment_lumen(volume: Volume, config: SegmentConfig) -> LumenMask:
     return LumenMask(Volume(mask, volume.spacing_mm, volume.origin_mm, volume.direction), ostium)
 
 
-def _find_root(volume: Volume, config: SegmentConfig) -> AorticRoot | None:
+def _find_root(grid: Volume, config: SegmentConfig) -> AorticRoot | None:
     """Return the ascending aorta; None where it is not in the volume and a seed tells what it would."""
     try:
-        return find_aortic_root(resample(volume, _ROOT_GRID_MM))
+        return find_aortic_root(resample(grid, _ROOT_GRID_MM))
     except InputError:
         if config.seeds:
             return None
@@ -145,10 +146,9 @@ def _hu_at(volume: Volume, seed: tuple[float, float, float]) -> float:
     return found
 
 
-def _find_vessels(volume: Volume, lumen_hu: float) -> _Scan:
+def _find_vessels(grid: Volume, lumen_hu: float) -> _Scan:
     """Tell blood pools and thin vessels apart."""
-    grid = resample(volume, _GRID_MM)
-    hu = np.asarray(ndimage.gaussian_filter(grid.voxels, 0.35 / _GRID_MM))
+    hu = np.asarray(ndimage.gaussian_filter(grid.voxels, 0.35 / _GRID_MM, truncate=3.0))
     body = resample(grid, _BODY_GRID_MM)
     above_muscle = _MUSCLE_HU + _LOW_SHARE * (lumen_hu - _MUSCLE_HU)
     above_fat = _FAT_HU + _LOW_SHARE * (lumen_hu - _FAT_HU)

@@ -1,0 +1,59 @@
+"""Measure extraction, write the figures into docs/anatomy.md and draw its picture.
+
+`python docs/figures/anatomy.py [FOLDER]`, where the folder holds rca_cl.vtp and lca_cl.vtp of a real patient; takes
+some five minutes. With `--from FILE` it takes the figures from what `endopilot bench anatomy --json` printed.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+from endopilot.anatomy.atlas import AtlasConfig, synthesize_one
+from endopilot.anatomy.bench import bench_anatomy
+from endopilot.anatomy.phantom import PhantomConfig, make_phantom
+from endopilot.anatomy.picture import draw_anatomy
+
+DOCS = Path(__file__).parents[1]
+PAGE = DOCS / "anatomy.md"
+
+
+def tables(rows: list[dict]) -> str:
+    """Return the figures of the analytic tubes as one row a case, and the others below."""
+    tubes = [row for row in rows if "voxel" in row["case"]]
+    columns = list(dict.fromkeys(row["figure"] for row in tubes))
+    bars = {row["figure"]: row["bar"] for row in tubes}
+    lines = ["| lumen | " + " | ".join(columns) + " |", "|---" * (len(columns) + 1) + "|"]
+    lines.append(
+        "| *bar* | " + " | ".join("–" if bars[name] is None else f"*{bars[name]:g}*" for name in columns) + " |"
+    )
+    for case in dict.fromkeys(row["case"] for row in tubes):
+        lines.append(f"| {case} | " + " | ".join(text(row) for row in tubes if row["case"] == case) + " |")
+    lines += ["", "| case | figure | value | bar |", "|---|---|---|---|"]
+    for row in rows:
+        if row not in tubes:
+            lines.append(f"| {row['case']} | {row['figure']} | {text(row)} | {row['bar']:g} |")
+    return "\n".join(lines)
+
+
+def text(row: dict) -> str:
+    """Return a value, in bold where it misses its bar."""
+    return f"**{row['value']:.3g}**" if row["passed"] is False else f"{row['value']:.3g}"
+
+
+def main(arguments: list[str]) -> None:
+    """Measure, write and draw."""
+    if arguments[:1] == ["--from"]:
+        rows = json.loads(Path(arguments[1]).read_text(encoding="utf-8"))
+    else:
+        rows = bench_anatomy(Path(arguments[0]) if arguments else None)
+    begin, end = "<!-- bench:begin -->", "<!-- bench:end -->"
+    page = PAGE.read_text(encoding="utf-8")
+    PAGE.write_text(f"{page.split(begin)[0]}{begin}\n{tables(rows)}\n{end}{page.split(end)[1]}", encoding="utf-8")
+    patient = synthesize_one(AtlasConfig(seed=1), 0)
+    draw_anatomy(patient, DOCS / "images" / "anatomy.png", volume=make_phantom(patient, PhantomConfig(), 1))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

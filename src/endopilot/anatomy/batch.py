@@ -1,0 +1,69 @@
+"""Many patients at once: an anatomy of each file that can be read, and a list of the others with what was wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+from endopilot import files
+from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
+from endopilot.anatomy.io import write_anatomy
+from endopilot.anatomy.sources import MASK_SUFFIXES, SURFACE_SUFFIXES, read_source
+from endopilot.errors import InputError
+from endopilot.parallel import each
+
+
+def extract_all(
+    sources: Sequence[Path], output: Path, *, label: int | None = None, config: AnatomyConfig
+) -> tuple[list[Path], dict[str, str]]:
+    """Make one anatomy a file, each in a folder of its own, on as many processes as there are cores.
+
+    A patient's name is that of the file, or of its folder where several files have the same name. The
+    configuration, and which files were rejected and why, are written to `output`/manifest.json.
+
+    Args:
+        sources: masks, surfaces or centerlines.
+        output: folder that takes one anatomy folder a patient.
+        label: which label of masks with several is the lumen.
+        config: how to make them all.
+
+    Returns:
+        The folders that were made, and of every rejected file what was wrong with it.
+
+    Raises:
+        InputError: two patients would have the same name, one ostium is given for all, or no file was any good.
+    """
+    if config.ostium_mm is not None and len(sources) > 1:
+        raise InputError(f"ostium_mm={config.ostium_mm}: cannot serve {len(sources)} patients; make them one by one")
+    folders = {source: output / name for source, name in zip(sources, _names(sources), strict=True)}
+    bad = each("Anatomies", list(sources), partial(_make, folders=folders, label=label, config=config))
+    rejected = {str(source): str(bad[source]) for source in sources if source in bad}
+    if len(rejected) == len(sources):
+        raise InputError(
+            f"none of the {len(sources)} files gives an anatomy; the first: {next(iter(rejected.values()))}"
+        )
+    files.write_json(output / "manifest.json", files.manifest(config=config, rejected=rejected))
+    return [folders[source] for source in sources if source not in bad], rejected
+
+
+def _make(source: Path, *, folders: dict[Path, Path], label: int | None, config: AnatomyConfig) -> None:
+    folder = folders[source]
+    write_anatomy(extract_anatomy(read_source(source, label=label), name=folder.name, config=config), folder)
+
+
+def _names(sources: Sequence[Path]) -> list[str]:
+    names = [_stem(source) for source in sources]
+    if len(set(names)) < len(names):
+        names = [source.resolve().parent.name for source in sources]
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    if repeated:
+        raise InputError(f"{repeated[0]}: several of the files would have this name; rename them or their folders")
+    return names
+
+
+def _stem(path: Path) -> str:
+    for suffix in sorted((*MASK_SUFFIXES, *SURFACE_SUFFIXES, ".mrk.json"), key=len, reverse=True):
+        if path.name.lower().endswith(suffix):
+            return path.name[: -len(suffix)]
+    return path.stem

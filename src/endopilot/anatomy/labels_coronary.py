@@ -1,0 +1,187 @@
+"""AHA/SCCT segments of coronary trees, from where branches leave and where they go (see `labels`)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from endopilot.anatomy.labels_tree import Labeller
+
+ACUTE_MARGIN = 0.64
+"""The acute margin lies at this share of the way from the ostium to the crux (Dodge et al., Circulation
+1988;78:1167-80, R2 distal); segment 1 ends half the way to it."""
+
+MAJOR_MM = 6.0
+"""A branch with at least this much length behind it counts as a named end vessel, mm."""
+
+_EARLY, _LATE = 0.22, 0.4
+"""A conus branch leaves within the first share of the way to the crux, a sinus node branch within the second."""
+
+_RAMUS_MM = 4.0
+"""Where LAD and LCx divide again this near the left main's end, the middle branch is the ramus intermedius."""
+
+GROOVE = np.array([-0.7, 0.6, -0.3])
+"""Direction (LPS) in which the circumflex's course round the left atrioventricular groove reaches farthest at its end,
+the crux."""
+
+
+def label_rca(labeller: Labeller) -> None:
+    """Name the sections of a right coronary tree."""
+    tree = labeller.tree
+    leaf = max(tree.leaves(), key=lambda index: tree.branches[index].centerline.abscissa[-1])
+    route = tree.route(leaf)
+    crux = _crux(labeller, route)
+    if crux is None:
+        end, trunk = _unforked_crux(labeller, route), route
+    else:
+        end = float(tree.branches[crux].centerline.abscissa[-1])
+        trunk = tree.route(crux)
+    margin = ACUTE_MARGIN * end
+    labeller.along(trunk, [("1", margin / 2), ("2", margin), ("3", end), ("4", np.inf)])
+    if crux is not None:
+        ends = sorted(tree.children(crux), key=lambda child: _towards_apex(labeller, child))
+        for child in ends[:-1]:
+            labeller.fill(child, "16")
+        labeller.fill(ends[-1], "4")
+    _label_right_sides(labeller, trunk, crux, end)
+
+
+def _crux(labeller: Labeller, route: tuple[int, ...]) -> int | None:
+    """Return the branch that ends at the crux: the first low fork into two branches after the turn to the back.
+
+    Before the acute margin the vessel runs down and to the right; from there to the crux, to the left and the back.
+    """
+    forks = [
+        branch
+        for branch in route
+        if sum(labeller.length_behind(child) >= MAJOR_MM for child in labeller.tree.children(branch)) >= 2
+    ]
+    back = np.array([1.0, 1.0, 0.0]) / np.sqrt(2.0)
+    height = labeller.tree.path(route[-1]).points[:, 2]
+    low = height.min() + 0.4 * float(np.ptp(height))
+    whole = float(labeller.tree.branches[route[-1]].centerline.abscissa[-1])
+    for branch in forks:
+        line = labeller.tree.branches[branch].centerline
+        late = float(line.abscissa[-1]) > 0.52 * whole
+        if late and line.points[-1, 2] < low and float(labeller.arriving(branch) @ back) > -0.1:
+            return branch
+    return None
+
+
+def _unforked_crux(labeller: Labeller, route: tuple[int, ...]) -> float:
+    """Return where segment 3 ends in a tree whose end does not fork, mm.
+
+    If the vessel turns forwards again behind its most posterior point for long enough, what follows is the posterior
+    descending artery; otherwise it ends as segment 3.
+    """
+    line = labeller.tree.path(route[-1])
+    later = np.flatnonzero(line.abscissa > 0.5 * line.abscissa[-1])
+    turn = int(later[line.points[later, 1].argmax()])
+    forwards = line.points[turn, 1] - line.points[-1, 1]
+    beyond = line.abscissa[-1] - line.abscissa[turn]
+    return float(line.abscissa[turn]) if beyond > 15.0 and forwards > 8.0 else float(line.abscissa[-1])
+
+
+def _towards_apex(labeller: Labeller, branch: int) -> float:
+    """Tell how much a branch from the crux runs forwards and down to the apex, as the posterior descending does."""
+    return float(labeller.heading(branch, 25.0) @ np.array([0.0, -1.0, -0.4]))
+
+
+def _label_right_sides(labeller: Labeller, trunk: tuple[int, ...], crux: int | None, end: float) -> None:
+    behind = labeller.tree.children(crux) if crux is not None else ()
+    sides = [side for side in labeller.sides(trunk) if side not in behind]
+    # The sinus node's branch runs back and up over the atrium, the others forwards over the right ventricle.
+    atrial = np.array([-0.9, 1.45, 0.7])
+    anterior = [
+        side
+        for side in sides
+        if labeller.origin(side) > _LATE * end or float(labeller.heading(side, 20.0) @ atrial) < 0
+    ]
+    for side in sides:
+        if side not in anterior:
+            labeller.fill(side, "SA")
+    first = next(iter(anterior), -1)
+    conus = first if len(anterior) > 2 or labeller.origin(first) < _EARLY * end else -1
+    ventricular = [side for side in anterior if side != conus]
+    # Of the branches to the right ventricle, the acute marginal is the long and late one.
+    marginal = max(
+        ventricular,
+        key=lambda side: labeller.origin(side) / (0.06 * end) + labeller.length_behind(side) / 9.0,
+        default=-1,
+    )
+    for side in anterior:
+        labeller.fill(side, "conus" if side == conus else "AM" if side == marginal else "RV")
+
+
+def label_lca(labeller: Labeller) -> None:
+    """Name the sections of a left coronary tree."""
+    tree = labeller.tree
+    fork = labeller.fork(0, 2.5 * MAJOR_MM)
+    major = labeller.major(fork, 2.5 * MAJOR_MM)
+    trunk = tree.route(fork)
+    labeller.along(trunk, [("5", np.inf)])
+    for side in labeller.sides(trunk):
+        labeller.fill(side, "16")
+    if len(major) < 2:
+        return
+    towards_apex = np.array([0.3, -0.7, -0.6])
+    lad = max(major, key=lambda child: labeller.reach(child, towards_apex))
+    lcx = max((child for child in major if child != lad), key=lambda child: labeller.reach(child, GROOVE))
+    for middle in major:
+        if middle not in (lad, lcx):
+            labeller.fill(middle, "16")
+    end = float(tree.branches[fork].centerline.abscissa[-1])
+    _label_lad(labeller, lad, end)
+    _label_lcx(labeller, lcx, end)
+
+
+def _label_lad(labeller: Labeller, branch: int, end: float) -> None:
+    tree = labeller.tree
+    route = labeller.onwards(branch, labeller.longest_leaf(branch))
+    # Diagonals run to the left over the free wall; septals dive to the right of the vessel's own course.
+    diagonals, named = [], []
+    for side in labeller.sides(route):
+        main = next(i for i in route if tree.branches[i].parent == tree.branches[side].parent)
+        leftward = labeller.heading(side, 25.0) - labeller.heading(main, 25.0)
+        if labeller.origin(side) - end < _RAMUS_MM and labeller.length_behind(side) > 2.5 * MAJOR_MM:
+            labeller.fill(side, "16")
+            continue
+        named.append(side)
+        if leftward @ np.array([1.0, 0.2, 0.0]) > 0:
+            diagonals.append(side)
+        else:
+            labeller.fill(side, "septal")
+    for order, side in enumerate(diagonals):
+        labeller.fill(side, ("9", "10")[order] if order < 2 else "D")
+    line = tree.path(route[-1])
+    own = np.flatnonzero(line.abscissa >= labeller.origin(branch))
+    apex = own[np.linalg.norm(line.points[own] - line.points[own[0]], axis=1).argmax()]
+    apex_mm = float(line.abscissa[apex])
+    proximal = labeller.origin(named[0]) if named else end + (apex_mm - end) / 3
+    labeller.along(route, [("6", proximal), ("7", 0.5 * (proximal + apex_mm)), ("8", np.inf)])
+
+
+def _label_lcx(labeller: Labeller, branch: int, end: float) -> None:
+    tree = labeller.tree
+    # The circumflex keeps to the groove, round the back; the marginals leave it to the left.
+    leaf = max(labeller.ends(branch), key=lambda index: (tree.path(index).points @ GROOVE).max())
+    route = labeller.onwards(branch, leaf)
+    marginals = []
+    for side in labeller.sides(route):
+        if labeller.origin(side) - end < _RAMUS_MM and labeller.length_behind(side) > 2.5 * MAJOR_MM:
+            labeller.fill(side, "16")
+        else:
+            marginals.append(side)
+    for order, side in enumerate(marginals):
+        labeller.fill(side, "12" if order == 0 else "14")
+    tip = float(tree.branches[route[-1]].centerline.abscissa[-1])
+    proximal = labeller.origin(marginals[0]) if marginals else end + 0.5 * (tip - end)
+    labeller.along(route, [("11", proximal), ("13", _left_crux(labeller, route)), ("15", np.inf)])
+
+
+def _left_crux(labeller: Labeller, route: tuple[int, ...]) -> float:
+    """Return where the circumflex becomes the left posterior descending, mm; infinity where it does not."""
+    line = labeller.tree.path(route[-1])
+    turn = int((line.points @ GROOVE).argmax())
+    beyond = line.abscissa[-1] - line.abscissa[turn]
+    forwards = line.points[turn, 1] - line.points[-1, 1]
+    return float(line.abscissa[turn]) if beyond > 15.0 and forwards > 8.0 else np.inf

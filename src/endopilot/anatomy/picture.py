@@ -1,0 +1,167 @@
+"""A picture of an anatomy: the tree by section and by radius, its longest path straightened, and cross-sections."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+
+mpl.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+from jaxtyping import Float
+from matplotlib.collections import PolyCollection
+from scipy.ndimage import map_coordinates, zoom
+from scipy.spatial import KDTree
+from skimage.measure import marching_cubes
+
+from endopilot.anatomy.distance import sample
+from endopilot.anatomy.tree import tangents
+from endopilot.files import writing
+from endopilot.types import Anatomy, Centerline, Volume
+
+SECTIONS = 6
+"""Cross-sections that are drawn, evenly along the longest path."""
+
+WINDOW_HU = (-150.0, 650.0)
+_LARGEST_GRID = 1_500_000
+_LIGHT = np.array([-0.35, -0.8, 0.5]) / np.linalg.norm([-0.35, -0.8, 0.5])
+
+
+def draw_anatomy(anatomy: Anatomy, path: Path, *, volume: Volume | None = None) -> None:
+    """Write a PNG of the tree, its longest path as a straightened curved planar reformation, and cross-sections.
+
+    The walls are the distance map's zero level (green) and, in the cross-sections, the inscribed circle (yellow).
+
+    Args:
+        anatomy: the vessel.
+        path: the PNG.
+        volume: the CT in HU that is shown behind the walls; without one it is the distance to the wall.
+    """
+    figure = plt.figure(figsize=(15, 13), facecolor="white", layout="constrained")
+    top, middle, bottom = figure.subfigures(3, 1, height_ratios=(2.0, 1.15, 1.0))
+    _draw_tree(anatomy, top)
+    line = anatomy.tree.longest_path()
+    half = 2.2 * float(np.quantile(line.radius, 0.95)) + 1.0
+    _draw_straightened(anatomy, line, half, volume, middle)
+    _draw_sections(anatomy, line, half, volume, bottom)
+    with writing(Path(path)) as partial:
+        figure.savefig(partial, dpi=90)
+    plt.close(figure)
+
+
+def _draw_tree(anatomy: Anatomy, figure: Any) -> None:
+    """Draw the wall from the front, once coloured by section and once by radius."""
+    vertices, faces = _wall(anatomy)
+    tree = anatomy.tree
+    points, radius, section = (
+        np.concatenate(values)
+        for values in zip(*((b.centerline.points, b.centerline.radius, b.section) for b in tree.branches), strict=True)
+    )
+    corners = vertices[faces]
+    nearest = np.asarray(KDTree(points).query(corners.mean(axis=1))[1])
+    catheter = (corners.mean(axis=1) - anatomy.insertion.position) @ anatomy.insertion.direction < 0
+    catheter &= np.linalg.norm(corners.mean(axis=1) - anatomy.insertion.position, axis=1) < 25.0
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    shade = 0.45 + 0.55 * np.abs(normal @ _LIGHT)
+    order = np.argsort(-corners[:, :, 1].mean(axis=1))  # from the back (large y) to the front
+    present = np.unique(section)
+    palette = plt.get_cmap("tab20" if len(present) > 10 else "tab10")
+    scale = mpl.colors.Normalize(float(radius.min()), float(radius.max()))
+    number = np.searchsorted(present, section)
+    for axes, title in zip(figure.subplots(1, 2), ("sections", "radius, mm"), strict=True):
+        colour = (
+            palette(number[nearest] % palette.N)
+            if title == "sections"
+            else plt.get_cmap("viridis")(scale(radius[nearest]))
+        )
+        colour = np.where(catheter[:, None], [0.75, 0.75, 0.75, 1.0], colour)
+        colour[:, :3] *= shade[:, None]
+        axes.add_collection(PolyCollection(corners[order][:, :, [0, 2]], facecolors=colour[order], edgecolors="none"))
+        axes.set(aspect="equal", title=title, xlabel="x (left), mm", ylabel="z (head), mm")
+        axes.autoscale_view()
+        if title == "sections":
+            handles = [
+                mpl.patches.Patch(color=palette(i % palette.N), label=tree.section_names[s])
+                for i, s in enumerate(present)
+            ]
+            axes.legend(
+                handles=[*handles, mpl.patches.Patch(color="0.75", label="catheter")], fontsize=8, loc="upper right"
+            )
+        else:
+            figure.colorbar(mpl.cm.ScalarMappable(scale, "viridis"), ax=axes, shrink=0.8)
+
+
+def _wall(anatomy: Anatomy) -> tuple[Float[np.ndarray, "n 3"], Any]:
+    field, spacing = anatomy.distance_map, anatomy.distance_map.spacing_mm
+    values = np.pad(field.values, 1, constant_values=float(field.values.min()))
+    factor = min(1.0, (_LARGEST_GRID / values.size) ** (1 / 3))
+    coarse = np.asarray(zoom(values, factor, order=1, grid_mode=False)) if factor < 1 else values
+    vertices, faces, _, _ = marching_cubes(coarse, 0.0)
+    step = spacing * (np.array(values.shape) - 1) / (np.array(coarse.shape) - 1)
+    return (vertices * step)[:, ::-1] + field.origin_mm - spacing, faces
+
+
+def _draw_straightened(anatomy: Anatomy, line: Centerline, half: float, volume: Volume | None, figure: Any) -> None:
+    """Draw the longest path straightened, in the planes of its normal and binormal."""
+    count = max(2, int(line.abscissa[-1] / 0.2))
+    at = np.linspace(0.0, float(line.abscissa[-1]), count)
+    points, normals, directions = (
+        _along(line, values, at) for values in (line.points, line.normals, tangents(line.points))
+    )
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    across = np.linspace(-half, half, 81)
+    for axes, (title, side) in zip(
+        figure.subplots(2, 1, sharex=True),
+        (("normal", normals), ("binormal", np.cross(directions, normals))),
+        strict=True,
+    ):
+        grid = points[None] + across[:, None, None] * side[None]
+        _show(axes, anatomy, grid, (0.0, float(at[-1]), -half, half), volume)
+        axes.set(ylabel=f"{title}, mm")
+        axes.plot(at, 0 * at, color="yellow", linewidth=0.5)
+    axes.set_xlabel("abscissa along the longest path, mm")
+
+
+def _draw_sections(anatomy: Anatomy, line: Centerline, half: float, volume: Volume | None, figure: Any) -> None:
+    places = np.linspace(0.03, 0.97, SECTIONS) * float(line.abscissa[-1])
+    direction = tangents(line.points)
+    circle = np.linspace(0.0, 2 * np.pi, 73)
+    across = np.linspace(-half, half, 81)
+    for axes, place in zip(figure.subplots(1, SECTIONS), places, strict=True):
+        centre, normal, tangent = (
+            _along(line, values, np.array([place]))[0] for values in (line.points, line.normals, direction)
+        )
+        binormal = np.cross(tangent, normal)
+        grid = centre + across[None, :, None] * normal + across[:, None, None] * binormal
+        _show(axes, anatomy, grid, (-half, half, -half, half), volume)
+        radius = float(np.interp(place, line.abscissa, line.radius))
+        axes.plot(radius * np.cos(circle), radius * np.sin(circle), color="yellow", linewidth=0.8)
+        axes.set(title=f"{place:.0f} mm, r = {radius:.2f} mm", aspect="equal", xticks=[], yticks=[])
+
+
+def _show(
+    axes: Any,
+    anatomy: Anatomy,
+    grid: Float[np.ndarray, "h w 3"],
+    extent: tuple[float, float, float, float],
+    volume: Volume | None,
+) -> None:
+    """Show the CT, or the distance to the wall, on a grid of points, with the wall as a white line."""
+    shape, points = grid.shape[:2], grid.reshape(-1, 3)
+    distance = sample(anatomy.distance_map, points).reshape(shape)
+    if volume is None:
+        limit = float(np.abs(distance).max())
+        axes.imshow(distance, extent=extent, origin="lower", cmap="RdGy_r", vmin=-limit, vmax=limit, aspect="auto")
+    else:
+        index = volume.world_to_index(points)[:, ::-1].T
+        hu = map_coordinates(volume.voxels, index, order=1, cval=-1000.0, output=np.float32).reshape(shape)
+        axes.imshow(hu, extent=extent, origin="lower", cmap="gray", vmin=WINDOW_HU[0], vmax=WINDOW_HU[1], aspect="auto")
+    if distance.min() < 0 < distance.max():
+        axes.contour(distance, [0.0], extent=extent, origin="lower", colors="lime", linewidths=0.9)
+
+
+def _along(line: Centerline, values: Float[np.ndarray, "n d"], at: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m d"]:
+    return np.stack([np.interp(at, line.abscissa, values[:, axis]) for axis in range(values.shape[1])], axis=1)

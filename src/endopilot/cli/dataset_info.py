@@ -1,0 +1,30 @@
+"""`endopilot dataset-info`: what a dataset holds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from endopilot.cli.arguments import existing, show
+from endopilot.dataset.info import describe_dataset, draw_pictures
+
+
+def command(
+    dataset: Positional[Path],
+    /,
+    *,
+    output: Annotated[Path | None, arg(name="output", aliases=("-o",), metavar="DIR")] = None,
+    json: bool = False,
+) -> None:
+    """Count what a dataset holds: distributions of depth, offset and force, branches, failures and why.
+
+    Args:
+        dataset: folder made by `endopilot dataset`.
+        output: folder that takes a picture of each distribution; none is drawn if not given.
+        json: print the figures as JSON.
+    """
+    description = describe_dataset(existing(dataset))
+    pictures = [] if output is None else draw_pictures(description, output)
+    show(description.figures | ({"pictures": [str(path) for path in pictures]} if pictures else {}), as_json=json)

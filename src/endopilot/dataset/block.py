@@ -1,0 +1,101 @@
+"""One block of navigations, from the draw to its two files: `write_block`, the work of a thread or of a cluster."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool
+
+from endopilot.anatomy.io import read_anatomy
+from endopilot.dataset import schema
+from endopilot.dataset.draw import Draw, draw_navigations
+from endopilot.dataset.navigate import navigate
+from endopilot.dataset.plan import Block, Plan
+from endopilot.files import writing
+from endopilot.types import SAMPLE_PERIOD_S, Anatomy, Rollout
+
+
+def write_block(plan: Plan, block: Block, *, threads: int = 1, advance: Callable[[int], None] = lambda _: None) -> None:
+    """Simulate one block and write its episodes, then its samples: the sample file says that both are whole.
+
+    Args:
+        plan: what all blocks share.
+        block: which navigations.
+        threads: of the rod core.
+        advance: called with the number of samples that were simulated since the last call.
+    """
+    config, anatomy = plan.config, _read(block.folder, block.fingerprint)
+    draw = draw_navigations(config, plan.device, anatomy, block.sequences)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # invalid worlds are listed in the dataset's manifest
+        rollout, applied, stopped = navigate(
+            anatomy,
+            draw.devices(plan.device),
+            draw.initial,
+            draw.control,
+            draw.friction,
+            replace(config.simulator, threads=threads),
+            actuation=config.control,
+            advance=advance,
+        )
+    data_path, episodes_path = schema.paths_of_file(plan.output, block.number)
+    samples = schema.sample_table(rollout, applied, config.control, block.first_episode, plan.key)
+    for path, table in (
+        (episodes_path, schema.episode_table(_episodes(plan, block, draw, rollout, stopped), plan.key)),
+        (data_path, samples),
+    ):
+        with writing(path) as partial:
+            partial.write_bytes(schema.parquet_bytes(table))
+
+
+@lru_cache(maxsize=4)
+def _read(folder: Path, fingerprint: str) -> Anatomy:
+    """Read an anatomy; the blocks of one come one after the other."""
+    return read_anatomy(folder)
+
+
+def _episodes(plan: Plan, block: Block, draw: Draw, rollout: Rollout, stopped: Bool[np.ndarray, "n"]) -> dict[str, Any]:
+    """Return the columns of the episode table; the first seven and the last two are LeRobot's."""
+    n, samples = rollout.valid.shape
+    episode = block.first_episode + np.arange(n)
+    chunk, file = divmod(block.number, schema.FILES_PER_CHUNK)
+    return {
+        "episode_index": episode,
+        "tasks": [[schema.TASK]] * n,
+        "length": np.full(n, samples),
+        "dataset_from_index": episode * samples,
+        "dataset_to_index": (episode + 1) * samples,
+        "data/chunk_index": np.full(n, chunk),
+        "data/file_index": np.full(n, file),
+        "anatomy": [block.anatomy] * n,
+        "anatomy_sha256": [block.fingerprint] * n,
+        "sequence": np.array(block.sequences),
+        "split": block.splits.tolist(),
+        "device": [plan.device.name] * n,
+        "friction": draw.friction,
+        "tip_bend_rad": draw.tip_bend_rad,
+        "tip_stiffness_factor": draw.tip_stiffness_factor,
+        "initial_inserted_length_mm": rollout.initial_inserted_length,
+        "initial_rotation_rad": rollout.initial_rotation,
+        "stopped_short": stopped,
+        "valid": rollout.valid.all(axis=1),
+        "invalid_reason": _reasons(rollout),
+        "meta/episodes/chunk_index": np.full(n, chunk),
+        "meta/episodes/file_index": np.full(n, file),
+    }
+
+
+def _reasons(rollout: Rollout) -> list[str]:
+    """Return why each world is invalid, "" for the valid ones."""
+    return [
+        ""
+        if valid.all()
+        else f"did not converge or left the finite numbers after {np.argmin(valid) * SAMPLE_PERIOD_S:g} s"
+        for valid in rollout.valid
+    ]

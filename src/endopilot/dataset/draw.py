@@ -1,0 +1,104 @@
+"""The random part of a dataset: what every navigation is driven with, and through which wire.
+
+Everything follows from the seed, the anatomy's name and the navigation's index, through random streams of their own.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from endopilot.dataset.plan import DatasetConfig
+from endopilot.simulation.controls import free_wire_load, random_controls
+from endopilot.simulation.device import Device
+from endopilot.types import Anatomy
+
+TIP_GROUP = 8
+"""Navigations, from the first on, that share a drawn tip: a simulation has one rod."""
+SURPLUS = (1.0, 3.0)
+"""Range of what a navigation's drawn velocities are multiplied by before they become loads of the drive: how much more
+than a free wire needs. It is drawn uniformly, and the result kept within the device's fastest velocities."""
+
+
+@dataclass(frozen=True, eq=False)
+class Draw:
+    """What navigations are driven with.
+
+    Attributes:
+        initial: Δ (mm) and φ (rad) before the first period.
+        control: velocities (mm/s, rad/s) or loads (N, N·mm) of the drive.
+        friction: friction coefficient.
+        tip_bend_rad: angle of the unloaded tip.
+        tip_stiffness_factor: factor on the stiffness of the distal 10 mm.
+    """
+
+    initial: Float[np.ndarray, "n 2"]
+    control: Float[np.ndarray, "n samples 2"]
+    friction: Float[np.ndarray, "n"]
+    tip_bend_rad: Float[np.ndarray, "n"]
+    tip_stiffness_factor: Float[np.ndarray, "n"]
+
+    def devices(self, device: Device) -> list[Device]:
+        """Return each navigation's wire; those of one tip share one object, and `device` itself where nothing is
+        drawn."""
+        made = {(device.tip_bend_rad, 1.0): device}
+        for tip in zip(self.tip_bend_rad.tolist(), self.tip_stiffness_factor.tolist(), strict=True):
+            if tip not in made:
+                made[tip] = device.with_tip(bend_rad=tip[0], stiffness_factor=tip[1])
+        return [made[tip] for tip in zip(self.tip_bend_rad.tolist(), self.tip_stiffness_factor.tolist(), strict=True)]
+
+
+def draw_navigations(config: DatasetConfig, device: Device, anatomy: Anatomy, sequences: range) -> Draw:
+    """Draw some navigations of an anatomy; each is the same whatever the number of the others."""
+    name_number = int.from_bytes(hashlib.sha256(anatomy.name.encode()).digest()[:8], "little")
+    controls, friction, tip, surplus = np.random.SeedSequence([config.seed, name_number]).spawn(4)
+    initial, control = random_controls(
+        config.navigation,
+        n_sequences=len(sequences),
+        n_samples=config.samples,
+        seed=int(controls.generate_state(1, np.uint64)[0]),
+        max_inserted_length_mm=float(anatomy.tree.longest_path().abscissa[-1]),
+        first=sequences.start,
+    )
+    groups = np.array(sequences) // TIP_GROUP
+    bend, stiffness = np.moveaxis(_uniform(tip, (0.0, 1.0), (sequences.stop // TIP_GROUP + 1, 2))[groups], 1, 0)
+    own = config.friction or (device.friction, device.friction)
+    if config.control == "force":
+        free = control * _uniform(surplus, SURPLUS, sequences.stop)[sequences.start :, None, None]
+        control = _loads(config, device, free)
+    return Draw(
+        initial=initial,
+        control=control,
+        friction=_uniform(friction, own, sequences.stop)[sequences.start :],
+        tip_bend_rad=device.tip_bend_rad * _within(config.tip_bend_factor, bend),
+        tip_stiffness_factor=_within(config.tip_stiffness_factor, stiffness),
+    )
+
+
+def _uniform(
+    seed: np.random.SeedSequence, bounds: tuple[float, float], size: int | tuple[int, ...]
+) -> Float[np.ndarray, "*size"]:
+    if bounds[0] == bounds[1]:
+        return np.full(size, bounds[0])
+    return np.random.Generator(np.random.Philox(seed)).uniform(*bounds, size)
+
+
+def _within(bounds: tuple[float, float] | None, share: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    return np.ones_like(share) if bounds is None else bounds[0] + (bounds[1] - bounds[0]) * share
+
+
+def _loads(
+    config: DatasetConfig, device: Device, velocity: Float[np.ndarray, "n samples 2"]
+) -> Float[np.ndarray, "n samples 2"]:
+    """Return the drive's loads (N, N·mm) that would move a free wire at these velocities, or as fast as it may go."""
+    limit = np.array([device.max_velocity_mm_s, device.max_rotation_rad_s])
+    return free_wire_load(
+        np.clip(velocity, -limit, limit),
+        radius_mm=device.tip_radius_mm,
+        friction_n=config.simulator.introducer_friction_n,
+        drag_n_s_mm=config.simulator.introducer_drag_n_s_mm,
+        stick_mm_s=config.simulator.stick_velocity_mm_s,
+    )

@@ -1,0 +1,49 @@
+"""Open loop: the first 30 states of an episode are given, then a predictor goes on alone.
+
+P1, `rollout_forward`: the tip under the true controls. P2, `rollout_inverse`: the controls that make the true tip, as
+desired. P3, `rollout_dual`: those controls, and the tip that the predictor believes they make.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float
+
+from endopilot.dataset.loader import Dataset
+
+Steps2 = Float[np.ndarray, "episodes steps 2"]
+
+
+@dataclass(frozen=True, eq=False)
+class OpenLoop:
+    """What a predictor foretells of each episode for the samples after the 30 given ones.
+
+    Attributes:
+        tip: (Δtip, γtip), mm; the true tip in P2, where none is predicted.
+        proximal: x^prox = (Δ mm, φ rad), the exact integral of `control`; the true one in P1.
+        control: π = (mm/s, rad/s); the true one in P1.
+    """
+
+    tip: Steps2
+    proximal: Steps2
+    control: Steps2
+
+
+@runtime_checkable
+class Predictor(Protocol):
+    """Whatever rolls episodes out: the networks of a run, the twin, or a baseline."""
+
+    def rollout_forward(self, episodes: Dataset) -> OpenLoop:
+        """P1: predict the tip under the true controls."""
+        ...
+
+    def rollout_inverse(self, episodes: Dataset) -> OpenLoop:
+        """P2: predict the controls that make the tip go the true way."""
+        ...
+
+    def rollout_dual(self, episodes: Dataset) -> OpenLoop:
+        """P3: predict the controls that make the tip go the true way, and the tip that they make."""
+        ...

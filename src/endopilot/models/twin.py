@@ -1,0 +1,220 @@
+"""The digital twin: the rod core itself as a model, with what is uncertain about it found from the given tips.
+
+An ensemble of wires differs in friction, in the stiffness of the tip and in where along the catheter's axis the ostium
+lies. All are driven by the known controls; each is weighted by how well it retraces the tips that were seen. A second
+ensemble, drawn closer around the best of the first, is weighted likewise; its weighted median is the prediction, its
+weighted spread the uncertainty. There is nothing to train.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.stats import qmc
+
+from endopilot.anatomy.io import read_anatomy
+from endopilot.dataset.loader import Dataset
+from endopilot.models.config import WINDOW, TwinConfig
+from endopilot.models.open_loop import OpenLoop
+from endopilot.models.tracking import track
+from endopilot.simulation.device import Device
+from endopilot.simulation.simulator import SimulatorConfig, simulate
+from endopilot.types import SAMPLE_PERIOD_S, Anatomy
+
+LEVELS = 7
+"""Tips of different stiffness in an ensemble. A simulation has one rod, so members share the few."""
+NARROWEST = 0.15
+"""The second ensemble is spread over this share of the first at least; and over two standard deviations of it."""
+Members = Float[np.ndarray, "members episodes 3"]
+"""Friction factor, tip stiffness factor and depth of the ostium (mm) of each member, for each episode."""
+_BELIEVED = np.array([1.0, 1.0, 0.0])
+
+
+@dataclass(frozen=True, eq=False)
+class Foretold:
+    """What an ensemble foretells of each episode, at every sample.
+
+    Attributes:
+        tip: (Δtip, γtip), mm: the weighted median of the members.
+        spread: their weighted standard deviation around it, mm.
+        parameters: friction factor, tip stiffness factor and depth of the ostium (mm) of the likeliest member.
+    """
+
+    tip: Float[np.ndarray, "episodes samples 2"]
+    spread: Float[np.ndarray, "episodes samples 2"]
+    parameters: Float[np.ndarray, "episodes 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class TwinPredictor:
+    """The rod core as a predictor.
+
+    Attributes:
+        device: the wire as it is believed to be.
+        simulator: settings of the rod core.
+        config: size and spread of the ensemble.
+    """
+
+    device: Device
+    simulator: SimulatorConfig
+    config: TwinConfig
+
+    def foretell(self, episodes: Dataset, seen: Bool[np.ndarray, "samples"]) -> Foretold:
+        """Predict the tips of episodes under their controls, from those that were seen.
+
+        Args:
+            episodes: their controls, and the tips where `seen`; no other tip is looked at.
+            seen: samples at which the tip was measured, for example by X-ray.
+        """
+        shape, last = (len(episodes), episodes.valid.shape[1], 2), int(np.flatnonzero(seen).max(initial=0))
+        tip, spread, parameters = np.full(shape, np.nan), np.full(shape, np.nan), np.full((len(episodes), 3), np.nan)
+        for anatomy, chosen in _by_anatomy(episodes):
+            data = episodes.select(chosen)
+            members = self._members(np.tile(_BELIEVED, (len(data), 1)), np.tile(self._spread, (len(data), 1)))
+            paths = self._simulate(anatomy, data, members, last + 1)
+            weight = _weights(paths, data, seen, self.config)
+            members = self._members(*_narrowed(members, weight, self._spread))
+            paths = self._simulate(anatomy, data, members, shape[1])
+            weight = _weights(paths, data, seen, self.config)
+            tip[chosen], spread[chosen] = _median_and_spread(paths, weight)
+            parameters[chosen] = members[weight.argmax(axis=0), np.arange(len(data))]
+        return Foretold(tip, spread, parameters)
+
+    def rollout_forward(self, episodes: Dataset) -> OpenLoop:
+        """P1: predict the tip under the true controls."""
+        told = self.foretell(episodes, np.arange(episodes.valid.shape[1]) < WINDOW)
+        return OpenLoop(
+            tip=told.tip[:, WINDOW:], proximal=_proximal(episodes)[:, WINDOW:], control=_control(episodes)[:, WINDOW:]
+        )
+
+    def rollout_inverse(self, episodes: Dataset) -> OpenLoop:
+        """P2: predict the controls that make the tip go the true way."""
+        found = self.rollout_dual(episodes)
+        return OpenLoop(tip=_tips(episodes)[:, WINDOW:], proximal=found.proximal, control=found.control)
+
+    def rollout_dual(self, episodes: Dataset) -> OpenLoop:
+        """P3: predict the controls that make the tip go the true way, and the tip that they make.
+
+        The likeliest member is driven along the desired tips, one sample at a time: see `tracking.track`.
+        """
+        likeliest = self.foretell(episodes, np.arange(episodes.valid.shape[1]) < WINDOW).parameters
+        desired = _tips(episodes)[:, WINDOW:]
+        tip, control = np.empty(desired.shape), np.empty(desired.shape)
+        wires = {stiffness: self._wire(stiffness) for stiffness in np.unique(likeliest[:, 1])}
+        for anatomy, chosen in _by_anatomy(episodes):
+            data, ours = episodes.select(chosen), likeliest[chosen]
+            tip[chosen], control[chosen] = track(
+                anatomy,
+                [wires[stiffness] for stiffness in ours[:, 1]],
+                friction=self.device.friction * ours[:, 0],
+                start=np.column_stack([data.initial_inserted_length + ours[:, 2], data.initial_rotation]),
+                given=_control(data)[:, :WINDOW],
+                desired=desired[chosen],
+                config=self.simulator,
+            )
+        proximal = _proximal(episodes)[:, WINDOW - 1 : WINDOW] + SAMPLE_PERIOD_S * np.cumsum(control, axis=1)
+        return OpenLoop(tip=tip, proximal=proximal, control=control)
+
+    @property
+    def _spread(self) -> Float[np.ndarray, "3"]:
+        config = self.config
+        return np.array([config.friction_spread, config.stiffness_spread, config.ostium_spread_mm])
+
+    def _members(self, center: Float[np.ndarray, "episodes 3"], spread: Float[np.ndarray, "episodes 3"]) -> Members:
+        """Return ensembles around some centers, each first: the same Sobol sequence for all."""
+        count = self.config.members  # the point after 0 is the middle
+        unit = qmc.Sobol(3, scramble=False).random_base2(count.bit_length())[1 : count + 1]
+        members = center + (2 * unit[:, None] - 1) * spread
+        members = np.clip(members, _BELIEVED - self._spread, _BELIEVED + self._spread)
+        level = np.linspace(1 - self.config.stiffness_spread, 1 + self.config.stiffness_spread, LEVELS)
+        members[..., 1] = level[np.abs(members[..., 1, None] - level).argmin(axis=-1)]
+        return members
+
+    def _wire(self, stiffness: float) -> Device:
+        return self.device.with_tip(bend_rad=self.device.tip_bend_rad, stiffness_factor=float(stiffness))
+
+    def _simulate(
+        self, anatomy: Anatomy, data: Dataset, members: Members, samples: int
+    ) -> Float[np.ndarray, "members episodes s 2"]:
+        """Return (Δtip, γtip) of every member over the first samples, mm; NaN from where a simulation fails."""
+        paths = np.full((*members.shape[:2], samples, 2), np.nan)
+        for stiffness in np.unique(members[..., 1]):
+            member, episode = np.nonzero(members[..., 1] == stiffness)
+            control = _control(data)[episode, :samples]
+            least = -(SAMPLE_PERIOD_S * np.cumsum(control[..., 0], axis=1)).min(axis=1).clip(max=0.0)
+            start = np.maximum(data.initial_inserted_length[episode] + members[member, episode, 2], least)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # a member that fails has no weight
+                rollout = simulate(
+                    anatomy,
+                    self._wire(stiffness),
+                    control,
+                    initial=np.column_stack([start, data.initial_rotation[episode]]),
+                    config=self.simulator,
+                    friction=self.device.friction * members[member, episode, 0],
+                )
+            tip = np.stack([rollout.tip.abscissa, rollout.tip.offset], axis=-1)
+            paths[member, episode] = np.where(rollout.valid[..., None], tip, np.nan)
+        return paths
+
+
+def _weights(
+    paths: Float[np.ndarray, "members episodes s 2"],
+    data: Dataset,
+    seen: Bool[np.ndarray, "samples"],
+    config: TwinConfig,
+) -> Float[np.ndarray, "members episodes"]:
+    """Return the members' weights: the product of Cauchy densities of what they miss the seen tips by.
+
+    Heavy tails, because a snap that comes a moment too early is off by a millimetre and says little about friction.
+    """
+    at = np.flatnonzero(seen)
+    off = (paths[:, :, at] - _tips(data)[:, at]) / np.array([config.abscissa_sd_mm, config.offset_sd_mm])
+    score = np.nan_to_num(-np.log1p(off**2), nan=-1e3).sum(axis=(2, 3))
+    weight = np.exp(score - score.max(axis=0))
+    return weight / weight.sum(axis=0)
+
+
+def _narrowed(
+    members: Members, weight: Float[np.ndarray, "members episodes"], spread: Float[np.ndarray, "3"]
+) -> tuple[Float[np.ndarray, "episodes 3"], Float[np.ndarray, "episodes 3"]]:
+    """Return center and spread of the second ensemble of each episode."""
+    mean = np.einsum("me,mec->ec", weight, members)
+    variance = np.einsum("me,mec->ec", weight, (members - mean) ** 2)
+    return mean, np.clip(2 * np.sqrt(variance), NARROWEST * spread, spread)
+
+
+def _median_and_spread(
+    paths: Float[np.ndarray, "members episodes s 2"], weight: Float[np.ndarray, "members episodes"]
+) -> tuple[Float[np.ndarray, "episodes s 2"], Float[np.ndarray, "episodes s 2"]]:
+    """Return the weighted median over the members, and the standard deviation around it, mm; NaN where none is left."""
+    share = np.where(np.isfinite(paths), weight[:, :, None, None], 0.0)
+    total = share.sum(axis=0)
+    order = np.argsort(paths, axis=0)  # NaN last
+    reached = np.cumsum(np.take_along_axis(share, order, axis=0), axis=0) >= 0.5 * total
+    middle = np.take_along_axis(paths, np.take_along_axis(order, reached.argmax(axis=0)[None], axis=0), axis=0)[0]
+    variance = (share * np.nan_to_num(paths - middle) ** 2).sum(axis=0)
+    left = total > 0
+    spread = np.sqrt(np.divide(variance, total, out=np.full_like(total, np.nan), where=left))
+    return np.where(left, middle, np.nan), spread
+
+
+def _by_anatomy(episodes: Dataset) -> Iterator[tuple[Anatomy, Int[np.ndarray, "chosen"]]]:
+    for name in np.unique(episodes.anatomy):
+        yield read_anatomy(episodes.anatomy_folder(str(name))), np.flatnonzero(episodes.anatomy == name)
+
+
+def _tips(episodes: Dataset) -> Float[np.ndarray, "episodes samples 2"]:
+    return np.stack([episodes.tip_abscissa, episodes.tip_offset], axis=-1).astype(float)
+
+
+def _proximal(episodes: Dataset) -> Float[np.ndarray, "episodes samples 2"]:
+    return np.stack([episodes.inserted_length, episodes.rotation], axis=-1).astype(float)
+
+
+def _control(episodes: Dataset) -> Float[np.ndarray, "episodes samples 2"]:
+    return episodes.control.astype(float)

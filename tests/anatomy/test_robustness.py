@@ -1,0 +1,100 @@
+"""Masks with the faults of real segmentations: the right inlet, the right vessel, and a word on what was lost."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from analytic_shapes import forked_tree, mask_of, tree_distance
+
+from endopilot.anatomy.analytic import tree_of
+from endopilot.anatomy.batch import extract_all
+from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
+from endopilot.errors import InputError
+from endopilot.files import read_json
+from endopilot.imaging.volume import write_mask
+from endopilot.types import LumenMask, Volume
+
+VOXEL_MM = (0.6, 0.6, 0.6)
+FORK_MM = np.array([0.0, 0.0, 20.0])
+
+
+def tube(points, x, low, high, radius=1.5):
+    z = np.clip(points[..., 2], low, high)
+    return radius - np.linalg.norm(points - np.stack([x + 0 * z, 0 * z, z], axis=-1), axis=-1)
+
+
+@pytest.fixture(scope="module")
+def fork_mask():
+    return mask_of(lambda points: tree_distance(forked_tree(), points + FORK_MM), (22, 4, 24), VOXEL_MM)
+
+
+def test_two_vessels_that_pass_each_other_are_not_joined():
+    mask = mask_of(lambda p: np.maximum(tube(p, -2.2, -20, 20), tube(p, 2.2, -15, 15)), (8, 5, 24), VOXEL_MM)
+    anatomy = extract_anatomy(mask, name="beside")
+    assert len(anatomy.tree.branches) == 1 and abs(anatomy.insertion.position[0] + 2.2) < 0.5
+    assert any("alongside" in note for note in anatomy.provenance["notes"])
+
+
+def test_what_lies_beyond_a_long_gap_is_told():
+    mask = mask_of(lambda p: np.maximum(tube(p, 0, -24, 0), tube(p, 0, 8.0, 20.0)), (4, 4, 28), VOXEL_MM)
+    notes = extract_anatomy(mask, name="gap").provenance["notes"]
+    told = next(note for note in notes if "left out" in note)
+    assert "15 mm long" in told and "begins 6.0 mm away" in told and "close the gap" in told
+
+
+def test_a_distal_end_that_is_wider_than_others_is_not_the_inlet():
+    narrowing = lambda p: tube(p, 0, -30, 30, 1.6 + np.clip(p[..., 2], -30, 30) / 60)  # noqa: E731
+    bulb = lambda p: 2.6 - np.linalg.norm(p - np.array([0, 0, -30.0]), axis=-1)  # noqa: E731
+    anatomy = extract_anatomy(mask_of(lambda p: np.maximum(narrowing(p), bulb(p)), (5, 5, 36), VOXEL_MM), name="bulb")
+    assert anatomy.insertion.position[2] > 25
+
+
+def test_an_ostium_in_mid_vessel_looks_away_from_the_inlet():
+    narrowing = lambda p: tube(p, 0, -30, 30, 1.6 + np.clip(p[..., 2], -30, 30) / 60)  # noqa: E731
+    mask = mask_of(narrowing, (5, 5, 36), VOXEL_MM)
+    anatomy = extract_anatomy(mask, name="mid", config=AnatomyConfig(ostium_mm=(0.0, 0.0, 5.0)))
+    assert len(anatomy.tree.branches) == 1 and anatomy.insertion.direction[2] < -0.9
+    assert abs(anatomy.tree.longest_path().abscissa[-1] - 35) < 3
+
+
+def test_a_vessel_of_one_voxel_is_told_so():
+    mask = mask_of(lambda p: tube(p, 0.125, -9, 9, 0.13), (2, 2, 10), (0.25, 0.25, 0.25))
+    with pytest.raises(InputError, match=r"one voxel|nowhere thick"):
+        extract_anatomy(mask, name="thin")
+
+
+def test_a_mask_from_no_file_is_named_by_its_content(fork_mask):
+    source = extract_anatomy(fork_mask, name="x").provenance["source"]
+    assert source["file"] is None and len(source["sha256"]) == 64
+
+
+def test_a_batch_makes_the_good_and_lists_the_bad(fork_mask, tmp_path):
+    volume = fork_mask.volume
+    for name, voxels in (("good", volume.voxels), ("bad", np.ones((30, 30, 30), dtype=bool))):
+        mask = LumenMask(Volume(voxels, volume.spacing_mm, volume.origin_mm, volume.direction))
+        write_mask(mask, tmp_path / f"{name}.nrrd", manifest={})
+    (tmp_path / "broken.stl").write_bytes(b"")
+    sources = [tmp_path / "bad.nrrd", tmp_path / "good.nrrd", tmp_path / "broken.stl"]
+    made, rejected = extract_all(sources, tmp_path / "out", config=AnatomyConfig())
+    assert made == [tmp_path / "out" / "good"] and (made[0] / "anatomy.json").exists()
+    assert "solid block" in rejected[str(sources[0])] and "empty" in rejected[str(sources[2])]
+    assert read_json(tmp_path / "out" / "manifest.json")["rejected"] == rejected
+    with pytest.raises(InputError, match="none of the 2 files"):
+        extract_all([sources[0], sources[2]], tmp_path / "none", config=AnatomyConfig())
+    assert not (tmp_path / "none").exists()
+
+
+def test_branches_of_a_batch_need_names_of_their_own(tmp_path):
+    with pytest.raises(InputError, match="several of the files"):
+        extract_all([tmp_path / "a.stl", tmp_path / "a.ply"], tmp_path / "out", config=AnatomyConfig())
+
+
+def test_a_branch_begins_on_its_parents_axis_at_the_fork():
+    tree = tree_of((np.outer(np.linspace(0, 1, 2), [0, 0, 40.0]) - FORK_MM, 2.0, -1))
+    for angle in (60.0, 90.0):
+        lumen = forked_tree(angle)
+        mask = mask_of(lambda p, lumen=lumen: tree_distance(lumen, p + FORK_MM), (22, 4, 24), (0.5, 0.5, 0.5))
+        found = extract_anatomy(mask, name="fork", config=AnatomyConfig(ostium_mm=(0.0, 0.0, -20.0)))
+        joint = found.tree.branches[0].centerline.points[-1]
+        assert len(found.tree.branches) == 3 and np.linalg.norm(joint) < 1.2
+        assert tree.branches[0].centerline.radius[0] - np.hypot(joint[0], joint[1]) > 1.8
