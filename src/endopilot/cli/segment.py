@@ -8,6 +8,7 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from endopilot.cli.arguments import OutputFile, existing, show
+from endopilot.errors import InputError
 from endopilot.files import input_hash, manifest
 from endopilot.imaging.overlap import compare_masks
 from endopilot.imaging.segment import SegmentConfig, segment
@@ -39,15 +40,18 @@ def command(
         config: how to segment.
     """
     check_output(output, mask=True)
+    if picture is not None and picture.suffix.lower() != ".png":
+        raise InputError(f"{picture}: a picture is written as PNG; name it with .png")
     other = read_mask(existing(reference)) if reference is not None else None
     ct = read_volume(existing(volume), series=series)
     mask = segment(ct, config)
+    agreement = compare_masks(mask, other) if other is not None else None
     write_mask(mask, output, manifest=manifest(config=config, inputs=input_hash(volume)))
     volume_ml = float(mask.volume.voxels.sum() * mask.volume.spacing_mm.prod() / 1000)
     ostium = mask.ostium.position.round(2).tolist() if mask.ostium is not None else None
     figures = {"mask": str(output), "method": mask.method, "lumen_ml": round(volume_ml, 3), "ostium_lps_mm": ostium}
-    if other is not None:
-        figures |= {name: round(value, 4) for name, value in asdict(compare_masks(mask, other)).items()}
+    if agreement is not None:
+        figures |= {name: round(value, 4) for name, value in asdict(agreement).items()}
     if picture is not None:
         from endopilot.imaging.picture import draw_overlay  # matplotlib is slow to import
 
