@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from analytic_shapes import forked_tree
 
-from endopilot.anatomy.atlas import AtlasConfig, synthesize_one
+from endopilot.anatomy.atlas import AtlasConfig, synthesize_tree
 from endopilot.anatomy.labels import dominance, label_tree
 from endopilot.anatomy.tree import curvature_torsion, make_centerline
+from endopilot.errors import InputError
 
 
 def test_right_coronary_sections_agree_with_the_atlas():
     right = total = 0
     for index in range(6):
-        truth = synthesize_one(AtlasConfig(anatomy="rca", count=6, seed=7), index)
-        found = label_tree(truth.tree, "rca")
-        for one, two in zip(truth.tree.branches, found.branches, strict=True):
-            names = [truth.tree.section_names[i] for i in one.section]
+        truth, _ = synthesize_tree(AtlasConfig(anatomy="rca", count=6, seed=7), index)
+        found = label_tree(truth, "rca")
+        for one, two in zip(truth.branches, found.branches, strict=True):
+            names = [truth.section_names[i] for i in one.section]
             right += sum(a == found.section_names[b] for a, b in zip(names, two.section, strict=True))
             total += len(names)
         assert dominance(found) in ("right", "balanced", "left")
@@ -25,6 +27,13 @@ def test_right_coronary_sections_agree_with_the_atlas():
 
 def test_generic_names_count_generations():
     assert label_tree(forked_tree(), "generic").section_names == ("G0", "G1.1", "G1.2")
+
+
+def test_a_naming_map_renames_sections():
+    named = label_tree(forked_tree(), "generic", naming={"G0": "common iliac", "G1.2": "internal iliac"})
+    assert named.section_names == ("common iliac", "G1.1", "internal iliac")
+    with pytest.raises(InputError, match="no section 'G7'; this tree has G0"):
+        label_tree(forked_tree(), "generic", naming={"G7": "femoral"})
 
 
 def test_helix_has_its_curvature_and_torsion_and_untwisted_normals():

@@ -129,6 +129,7 @@ def _main(
     m2 = m1[-1] + _BEYOND_M1 + generator.normal(0, 1.0, _BEYOND_M1.shape)
     wiggle = shape.Wiggle.draw(generator, 13.0, 45.0)
     amplitude, stretch = float(generator.uniform(0.2, 0.6)), np.ones(2)
+    points, marks = knees, dict[str, int]()
     for _ in range(4):
         # Siphon and M1 take their lengths from the draw; what lies before and behind keeps its own.
         siphon = knees[0] + (knees - knees[0]) * stretch[0]

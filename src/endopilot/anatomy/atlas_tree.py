@@ -129,7 +129,10 @@ def stenosis(
 def narrowed(
     generator: np.random.Generator, vessels: Sequence[Vessel], index: int, shares: tuple[float, float]
 ) -> tuple[dict[str, Any], list[Vessel]]:
-    """Return a stenosis of one vessel (abscissa from the ostium, and section), and the vessels with it."""
+    """Return a stenosis of one vessel (abscissa from the ostium, and section), and the vessels with it.
+
+    The mouths of its branches, which lie in its lumen, narrow with it.
+    """
     vessel = vessels[index]
     along, above = shape.abscissa(vessel.points), vessel
     while above.parent >= 0:
@@ -138,8 +141,14 @@ def narrowed(
         above = parent
     truth, factor = stenosis(generator, along, shares)
     section = vessel.section[int(np.searchsorted(along, truth["abscissa_mm"]))]
-    changed = replace(vessel, radius=vessel.radius * factor)
-    return truth | {"section": section}, [changed if i == index else other for i, other in enumerate(vessels)]
+    changed = []
+    for i, other in enumerate(vessels):
+        scale = factor if i == index else np.ones(len(other.radius))
+        if other.parent == index:
+            inside = np.exp(-((shape.abscissa(other.points) / vessel.radius[other.origin]) ** 2))
+            scale = factor[other.origin] * inside + (1 - inside)
+        changed.append(replace(other, radius=other.radius * scale))
+    return truth | {"section": section}, changed
 
 
 def wiggled(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import defaultdict
 from typing import Any, cast
 
 import numpy as np
@@ -30,9 +30,13 @@ def measure_labels(*, count: int, seed: int) -> list[dict[str, Any]]:
     return [_measure(anatomy, count, seed) for anatomy in ANATOMIES]
 
 
-def agreement(truth: VesselTree, found: VesselTree) -> Counter[tuple[str, str]]:
+Lengths = dict[tuple[str, str], float]
+"""Length in mm for pairs of true and found section."""
+
+
+def agreement(truth: VesselTree, found: VesselTree) -> Lengths:
     """Return the length in mm for every pair of true and found section; both trees have the same branches."""
-    lengths: Counter[tuple[str, str]] = Counter()
+    lengths: Lengths = defaultdict(float)
     for one, two in zip(truth.branches, found.branches, strict=True):
         steps = np.diff(one.centerline.abscissa)
         for a, b, step in zip(one.section[1:], two.section[1:], steps, strict=True):
@@ -42,27 +46,28 @@ def agreement(truth: VesselTree, found: VesselTree) -> Counter[tuple[str, str]]:
 
 def _measure(anatomy: str, count: int, seed: int) -> dict[str, Any]:
     config = AtlasConfig(anatomy=anatomy, count=count, seed=seed)
-    total: Counter[tuple[str, str]] = Counter()
+    total: Lengths = defaultdict(float)
     shares, dominances = [], []
     for index in range(count):
         truth, drawn = synthesize_tree(config, index)
         found = label_tree(truth, cast(Scheme, anatomy))
         lengths = agreement(truth, found)
         shares.append(_right(lengths))
-        total += lengths
+        for pair, length in lengths.items():
+            total[pair] += length
         if "dominance" in drawn:
             dominances.append(dominance(found) == drawn["dominance"])
-    wrong = [(pair, length) for pair, length in total.most_common() if pair[0] != pair[1]]
+    wrong = [(pair, length) for pair, length in sorted(total.items(), key=lambda item: -item[1]) if pair[0] != pair[1]]
     return {
         "anatomy": anatomy,
         "patients": count,
         "right": round(_right(total), 4),
         "worst_patient": round(min(shares), 4),
         "dominance_right": round(float(np.mean(dominances)), 3) if dominances else None,
-        "confusions": {f"{a} as {b}": round(length / total.total(), 4) for (a, b), length in wrong[:3]},
+        "confusions": {f"{a} as {b}": round(length / sum(total.values()), 4) for (a, b), length in wrong[:3]},
         "passed": _right(total) >= BAR,
     }
 
 
-def _right(lengths: Counter[tuple[str, str]]) -> float:
-    return sum(length for (a, b), length in lengths.items() if a == b) / lengths.total()
+def _right(lengths: Lengths) -> float:
+    return sum(length for (a, b), length in lengths.items() if a == b) / sum(lengths.values())
