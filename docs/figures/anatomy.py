@@ -12,7 +12,6 @@ from pathlib import Path
 
 from endopilot.anatomy.atlas import AtlasConfig, synthesize_one
 from endopilot.anatomy.bench import bench_anatomy
-from endopilot.anatomy.phantom import PhantomConfig, make_phantom
 from endopilot.anatomy.picture import draw_anatomy
 
 DOCS = Path(__file__).parents[1]
@@ -51,8 +50,7 @@ def main(arguments: list[str]) -> None:
     begin, end = "<!-- bench:begin -->", "<!-- bench:end -->"
     page = PAGE.read_text(encoding="utf-8")
     PAGE.write_text(f"{page.split(begin)[0]}{begin}\n{tables(rows)}\n{end}{page.split(end)[1]}", encoding="utf-8")
-    patient = synthesize_one(AtlasConfig(seed=1), 0)
-    draw_anatomy(patient, DOCS / "images" / "anatomy.png", volume=make_phantom(patient, PhantomConfig(), 1))
+    draw_anatomy(synthesize_one(AtlasConfig(seed=1), 0), DOCS / "images" / "anatomy.png")
 
 
 if __name__ == "__main__":

@@ -29,9 +29,9 @@ def fork_mask():
 
 
 def test_two_vessels_that_pass_each_other_are_not_joined():
-    mask = mask_of(lambda p: np.maximum(tube(p, -2.2, -20, 20), tube(p, 2.2, -15, 15)), (8, 5, 24), VOXEL_MM)
+    mask = mask_of(lambda p: np.maximum(tube(p, -1.9, -20, 20), tube(p, 1.9, -15, 15)), (8, 5, 24), VOXEL_MM)
     anatomy = extract_anatomy(mask, name="beside")
-    assert len(anatomy.tree.branches) == 1 and abs(anatomy.insertion.position[0] + 2.2) < 0.5
+    assert len(anatomy.tree.branches) == 1 and abs(anatomy.insertion.position[0] + 1.9) < 0.5
     assert any("alongside" in note for note in anatomy.provenance["notes"])
 
 

@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.collections import PolyCollection
 from scipy.ndimage import map_coordinates, zoom
-from scipy.spatial import KDTree
 from skimage.measure import marching_cubes
 
 from endopilot.anatomy.distance import sample
+from endopilot.anatomy.projection import project_tip
 from endopilot.anatomy.tree import tangents
 from endopilot.files import writing
 from endopilot.types import Anatomy, Centerline, Volume
@@ -55,14 +55,13 @@ def _draw_tree(anatomy: Anatomy, figure: Any) -> None:
     """Draw the wall from the front, once coloured by section and once by radius."""
     vertices, faces = _wall(anatomy)
     tree = anatomy.tree
-    points, radius, section = (
-        np.concatenate(values)
-        for values in zip(*((b.centerline.points, b.centerline.radius, b.section) for b in tree.branches), strict=True)
-    )
     corners = vertices[faces]
-    nearest = np.asarray(KDTree(points).query(corners.mean(axis=1))[1])
-    catheter = (corners.mean(axis=1) - anatomy.insertion.position) @ anatomy.insertion.direction < 0
-    catheter &= np.linalg.norm(corners.mean(axis=1) - anatomy.insertion.position, axis=1) < 25.0
+    place = project_tip(tree, anatomy.insertion, corners.mean(axis=1))
+    catheter, radius, section = place.abscissa < 0, place.radius, np.zeros(len(corners), dtype=int)
+    for index, branch in enumerate(tree.branches):
+        own = place.branch == index
+        at = np.searchsorted(branch.centerline.abscissa, place.abscissa[own])
+        section[own] = branch.section[np.minimum(at, len(branch.section) - 1)]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
     shade = 0.45 + 0.55 * np.abs(normal @ _LIGHT)
@@ -72,11 +71,7 @@ def _draw_tree(anatomy: Anatomy, figure: Any) -> None:
     scale = mpl.colors.Normalize(float(radius.min()), float(radius.max()))
     number = np.searchsorted(present, section)
     for axes, title in zip(figure.subplots(1, 2), ("sections", "radius, mm"), strict=True):
-        colour = (
-            palette(number[nearest] % palette.N)
-            if title == "sections"
-            else plt.get_cmap("viridis")(scale(radius[nearest]))
-        )
+        colour = palette(number % palette.N) if title == "sections" else plt.get_cmap("viridis")(scale(radius))
         colour = np.where(catheter[:, None], [0.75, 0.75, 0.75, 1.0], colour)
         colour[:, :3] *= shade[:, None]
         axes.add_collection(PolyCollection(corners[order][:, :, [0, 2]], facecolors=colour[order], edgecolors="none"))

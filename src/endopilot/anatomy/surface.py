@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 from endopilot.errors import InputError
 from endopilot.types import Volume
 
-SMOOTHING_VOXELS = 1.5
+SMOOTHING_VOXELS = 1.75
 """Standard deviation, in voxels, of the Gaussian under which the surface must look like the mask."""
 
 _FIT_ITERATIONS = 8
