@@ -84,9 +84,6 @@ private:
         friend DriveRows operator+(const DriveRows& a, const DriveRows& b) {
             return {a.pull_a + b.pull_a, a.pull_r + b.pull_r, a.aa + b.aa, a.ar + b.ar, a.rr + b.rr};
         }
-        friend DriveRows operator-(const DriveRows& a, const DriveRows& b) {
-            return {a.pull_a - b.pull_a, a.pull_r - b.pull_r, a.aa - b.aa, a.ar - b.ar, a.rr - b.rr};
-        }
         friend DriveRows select(Mask<V> mask, const DriveRows& yes, const DriveRows& no) {
             return {endopilot::select<V>(mask, yes.pull_a, no.pull_a), endopilot::select<V>(mask, yes.pull_r, no.pull_r),
                     endopilot::select<V>(mask, yes.aa, no.aa), endopilot::select<V>(mask, yes.ar, no.ar),
@@ -172,6 +169,7 @@ private:
     void evaluate(int n);
     void add_rod(int first, int count);
     DriveRows along_drive(const Diagonal<V>& block) const;
+    void clear_drive_rows(Mask<V> mask, Diagonal<V>& block) const;
     void add_lumen(int first, int count);
     void add_drag(int first, int count);
     void eliminate_nodes(int first, int count);

@@ -130,6 +130,16 @@ void Stepper<V>::add_drag(int first, int count) {
     }
 }
 
+// Empties what `along_drive` reads of a base's block: of what is there only the part that is eliminated into it counts.
+// What lies behind follows the drive, and is there only where the wire of another lane is longer.
+template <class V>
+void Stepper<V>::clear_drive_rows(Mask<V> mask, Diagonal<V>& block) const {
+    const V zero{};
+    for (V* entry : {&block.force.x, &block.force.y, &block.force.z, &block.moment.z, &block.xx.xx, &block.xx.yy, &block.xx.zz,
+                     &block.xx.xy, &block.xx.xz, &block.xx.yz, &block.tx[2][0], &block.tx[2][1], &block.tx[2][2], &block.tt.zz})
+        *entry = select<V>(mask, zero, *entry);
+}
+
 template <class V>
 void Stepper<V>::eliminate_nodes(int first, int count) {
     const V zero{};
@@ -137,14 +147,13 @@ void Stepper<V>::eliminate_nodes(int first, int count) {
         const int i = first + k;
         const Mask<V> on = active_ > broadcast<V>(i);
         Diagonal<V>& next = block_[k + 1];
-        DriveRows before;
-        if (in_.force_driven) before = along_drive(next);
+        const Mask<V> base_next = active_ == broadcast<V>(i + 1);
+        if (in_.force_driven) clear_drive_rows(base_next, next);
         const Elimination<V> eliminated = eliminate(block_[k], coupling_[k], factor_[i], next);
         descent_ += select<V>(on, eliminated.descent, zero);
         const Mask<V> sound = eliminated.smallest_pivot > zero;
         pivot_ = select<V>(on, select<V>(sound, pivot_, zero), pivot_);
-        // to a shorter wire's base only the part that is eliminated counts: what lies behind follows the drive
-        if (in_.force_driven) drive_ = select(active_ == broadcast<V>(i + 1), drive_ + (along_drive(next) - before), drive_);
+        if (in_.force_driven) drive_ = select(base_next, drive_ + along_drive(next), drive_);
     }
 }
 

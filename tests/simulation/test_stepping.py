@@ -298,3 +298,18 @@ def test_every_public_name_has_an_example_that_runs(anatomy: Anatomy) -> None:
     for test in examples:
         runner.run(test)
     assert runner.failures == 0 and runner.tries > 20
+
+
+def test_driven_by_force_a_world_is_the_same_in_any_company() -> None:
+    anatomy, worlds = vessel(), 6
+    random = np.random.default_rng(4)
+    start, load = random.uniform(3, 40, worlds), random.uniform([0.0, -0.02], [0.15, 0.02], (6, worlds, 2))
+
+    def drive(chosen: list[int]) -> np.ndarray:
+        simulator = Simulator(anatomy, DEVICE, worlds=len(chosen), actuation="force")
+        simulator.reset(inserted_length=start[chosen], rotation=np.zeros(len(chosen)))
+        return np.stack([simulator.step(row[chosen], 0.1).tip_position for row in load])
+
+    together = drive(list(range(worlds)))
+    for chosen in ([3], [5, 0, 2]):
+        np.testing.assert_array_equal(drive(chosen), together[:, chosen])
