@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Integer
+from scipy.stats import rankdata
 
 from endopilot import __version__
 from endopilot.anatomy import centerline, parent_vessel, polylines, repair
@@ -345,8 +346,8 @@ def _widest_open_end(
 def _tapering(points: Float[np.ndarray, "n 3"], radius: Float[np.ndarray, "n"], tip: Float[np.ndarray, "3"]) -> float:
     """Return how steadily a tree narrows away from an end: its rank correlation, −1 where it widens all the way."""
     distance = np.linalg.norm(points - tip, axis=1)
-    ranks = [np.argsort(np.argsort(values)).astype(float) for values in (distance, radius)]
-    return -float(np.corrcoef(*ranks)[0, 1]) if len(points) > 3 else 0.0
+    ranks = np.stack([rankdata(distance), rankdata(radius)])
+    return -float(np.corrcoef(ranks)[0, 1]) if len(points) > 3 else 0.0
 
 
 def _final_map(surface: Surface, tree: VesselTree, config: AnatomyConfig) -> DistanceMap:

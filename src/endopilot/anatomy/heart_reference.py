@@ -137,7 +137,8 @@ def fit_heart_along(lines: Sequence[Float[np.ndarray, "_ 3"]], courses: Sequence
         lines: the patient's main vessels, each from the ostium, LPS mm.
         courses: their courses on the reference heart, each from the ostium, mm.
     """
-    ostium, anchor, scale = lines[0][0], courses[0][0], 1.0
+    ostium, anchor, scale, rotation = lines[0][0], courses[0][0], 1.0, np.eye(3)
+    found = wanted = np.zeros((0, 3))
     for _ in range(4):
         course, reference = [], []
         for line, ideal in zip(lines, courses, strict=True):

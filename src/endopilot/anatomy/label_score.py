@@ -36,7 +36,7 @@ Lengths = dict[tuple[str, str], float]
 
 def agreement(truth: VesselTree, found: VesselTree) -> Lengths:
     """Return the length in mm for every pair of true and found section; both trees have the same branches."""
-    lengths: Lengths = defaultdict(float)
+    lengths: defaultdict[tuple[str, str], float] = defaultdict(float)
     for one, two in zip(truth.branches, found.branches, strict=True):
         steps = np.diff(one.centerline.abscissa)
         for a, b, step in zip(one.section[1:], two.section[1:], steps, strict=True):

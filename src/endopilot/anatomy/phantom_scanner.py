@@ -35,7 +35,7 @@ def smear(
         generator: random stream.
     """
     way = generator.normal(size=3)
-    way *= motion_mm / np.linalg.norm(way) / spacing_mm
+    way *= motion_mm / (np.linalg.norm(way) * np.array(spacing_mm))
     still = image.copy()
     places, weights = np.linspace(-0.5, 0.5, _PHASES), np.linspace(0.5, 1.5, _PHASES)
     places = places - (weights @ places) / weights.sum()

@@ -11,7 +11,10 @@ mpl.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 from jaxtyping import Float
+from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PolyCollection
+from matplotlib.colors import Normalize
+from matplotlib.patches import Patch
 from scipy.ndimage import map_coordinates, zoom
 from skimage.measure import marching_cubes
 
@@ -40,7 +43,8 @@ def draw_anatomy(anatomy: Anatomy, path: Path, *, volume: Volume | None = None) 
         volume: the CT in HU that is shown behind the walls; without one it is the distance to the wall.
     """
     figure = plt.figure(figsize=(15, 13), facecolor="white", layout="constrained")
-    top, middle, bottom = figure.subfigures(3, 1, height_ratios=(2.0, 1.15, 1.0))
+    parts: Any = figure.subfigures(3, 1, height_ratios=(2.0, 1.15, 1.0))
+    top, middle, bottom = parts
     _draw_tree(anatomy, top)
     line = anatomy.tree.longest_path()
     half = 2.2 * float(np.quantile(line.radius, 0.95)) + 1.0
@@ -68,25 +72,21 @@ def _draw_tree(anatomy: Anatomy, figure: Any) -> None:
     order = np.argsort(-corners[:, :, 1].mean(axis=1))  # from the back (large y) to the front
     present = np.unique(section)
     palette = plt.get_cmap("tab20" if len(present) > 10 else "tab10")
-    scale = mpl.colors.Normalize(float(radius.min()), float(radius.max()))
+    scale = Normalize(float(radius.min()), float(radius.max()))
     number = np.searchsorted(present, section)
     for axes, title in zip(figure.subplots(1, 2), ("sections", "radius, mm"), strict=True):
         colour = palette(number % palette.N) if title == "sections" else plt.get_cmap("viridis")(scale(radius))
         colour = np.where(catheter[:, None], [0.75, 0.75, 0.75, 1.0], colour)
         colour[:, :3] *= shade[:, None]
-        axes.add_collection(PolyCollection(corners[order][:, :, [0, 2]], facecolors=colour[order], edgecolors="none"))
+        seen = list(corners[order][:, :, [0, 2]])
+        axes.add_collection(PolyCollection(seen, facecolors=colour[order], edgecolors="none"))
         axes.set(aspect="equal", title=title, xlabel="x (left), mm", ylabel="z (head), mm")
         axes.autoscale_view()
         if title == "sections":
-            handles = [
-                mpl.patches.Patch(color=palette(i % palette.N), label=tree.section_names[s])
-                for i, s in enumerate(present)
-            ]
-            axes.legend(
-                handles=[*handles, mpl.patches.Patch(color="0.75", label="catheter")], fontsize=8, loc="upper right"
-            )
+            handles = [Patch(color=palette(i % palette.N), label=tree.section_names[s]) for i, s in enumerate(present)]
+            axes.legend(handles=[*handles, Patch(color="0.75", label="catheter")], fontsize=8, loc="upper right")
         else:
-            figure.colorbar(mpl.cm.ScalarMappable(scale, "viridis"), ax=axes, shrink=0.8)
+            figure.colorbar(ScalarMappable(scale, "viridis"), ax=axes, shrink=0.8)
 
 
 def _wall(anatomy: Anatomy) -> tuple[Float[np.ndarray, "n 3"], Any]:
@@ -108,8 +108,9 @@ def _draw_straightened(anatomy: Anatomy, line: Centerline, half: float, volume: 
     )
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     across = np.linspace(-half, half, 81)
+    rows = figure.subplots(2, 1, sharex=True)
     for axes, (title, side) in zip(
-        figure.subplots(2, 1, sharex=True),
+        rows,
         (("normal", normals), ("binormal", np.cross(directions, normals))),
         strict=True,
     ):
@@ -117,7 +118,7 @@ def _draw_straightened(anatomy: Anatomy, line: Centerline, half: float, volume: 
         _show(axes, anatomy, grid, (0.0, float(at[-1]), -half, half), volume)
         axes.set(ylabel=f"{title}, mm")
         axes.plot(at, 0 * at, color="yellow", linewidth=0.5)
-    axes.set_xlabel("abscissa along the longest path, mm")
+    rows[-1].set_xlabel("abscissa along the longest path, mm")
 
 
 def _draw_sections(anatomy: Anatomy, line: Centerline, half: float, volume: Volume | None, figure: Any) -> None:

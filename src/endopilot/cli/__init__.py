@@ -86,7 +86,7 @@ def _run(name: str, arguments: Sequence[str]) -> int:
 
     module = importlib.import_module(f"endopilot.cli.{module_of(name)}")
     subjects: dict[str, Any] | None = getattr(module, "SUBJECTS", None)
-    call = tyro.cli if subjects is None else tyro.extras.subcommand_cli_from_dict
+    call: Any = tyro.cli if subjects is None else tyro.extras.subcommand_cli_from_dict
     try:
         call(
             subjects or module.command,

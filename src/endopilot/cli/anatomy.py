@@ -59,7 +59,8 @@ def command(
     if ct is not None and picture is None:
         raise InputError(f"--ct {ct}: is only shown in a picture; give --picture FILE.png too")
     volume = None if ct is None else read_volume(existing(ct))
-    content = read_source(existing(sources[0]), label=label)
+    source = next(iter(sources))
+    content = read_source(existing(source), label=label)
     anatomy = extract_anatomy(content, name=name or output.resolve().name, config=config)
     write_anatomy(anatomy, output)
     figures = {"anatomy": str(output), **describe(anatomy)}

@@ -148,7 +148,8 @@ def parquet_bytes(table: pa.Table) -> bytes:
     floats = {field.name for field in table.schema if _is_float(field.type)} - _FEW_VALUES
     counters = {name for name in ("index", "episode_index") if name in table.column_names}
     leaf = {name: name if table.schema.field(name).type == pa.float32() else f"{name}.list.element" for name in floats}
-    pq.write_table(
+    write: Any = pq.write_table  # whose types do not know lists of columns
+    write(
         table,
         sink,
         compression="zstd",

@@ -77,7 +77,8 @@ def _drop_rims(inside: np.ndarray, calcium: np.ndarray, distance: np.ndarray, sp
     if len(plaque) == 0:
         return
     voxels = np.argwhere(inside)
-    gap, nearest = KDTree(plaque * spacing).query(voxels * spacing, distance_upper_bound=_RIM_MM)
+    found = KDTree(plaque * spacing).query(voxels * spacing, distance_upper_bound=_RIM_MM)
+    gap, nearest = (np.asarray(part) for part in found)
     beside = np.isfinite(gap)
     voxels, plaque = voxels[beside], plaque[nearest[beside]]
     rim = distance[tuple(voxels.T)] >= distance[tuple(plaque.T)]
