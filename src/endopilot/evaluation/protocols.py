@@ -120,13 +120,17 @@ def _replay(
     settings = SimulatorConfig(**data.manifest["config"]["simulator"])
     shape = data.control[:, WINDOW:].shape[:2]
     out = {name: {key: np.full(shape, np.nan) for key in _REPLAYED} for name in controls}
-    for index, anatomy in enumerate(anatomies):
-        episodes = np.flatnonzero(anatomy_of == index)
+    # a simulation has one anatomy and one wire
+    alike = np.stack([anatomy_of, data.tip_bend, data.tip_stiffness_factor], axis=-1).astype(float)
+    kinds, kind_of = np.unique(alike, axis=0, return_inverse=True)
+    for kind, (index, bend, factor) in enumerate(kinds):
+        anatomy, episodes = anatomies[int(index)], np.flatnonzero(kind_of.ravel() == kind)
+        wire = device.with_tip(bend_rad=float(bend), stiffness_factor=float(factor))
         driven = np.concatenate([_whole(data, control)[episodes] for control in controls.values()])
         worlds = np.tile(episodes, len(controls))
         initial = np.stack([data.initial_inserted_length[worlds], data.initial_rotation[worlds]], axis=-1)
         rollout = simulate(
-            anatomy, device, np.nan_to_num(driven), initial=initial, config=settings, friction=data.friction[worlds]
+            anatomy, wire, np.nan_to_num(driven), initial=initial, config=settings, friction=data.friction[worlds]
         )
         usable = (rollout.valid & np.isfinite(driven).all(axis=-1).cumprod(axis=1).astype(bool))[:, WINDOW:]
         distance = np.linalg.norm(rollout.tip_position - data.tip_position[worlds], axis=-1)
@@ -135,7 +139,8 @@ def _replay(
             values = np.where(usable, signal[:, WINDOW:], np.nan)
             for name, part in zip(controls, values.reshape(len(controls), len(episodes), -1), strict=True):
                 out[name][key][episodes] = part
-        advance(1, anatomy.name)
+        if kind + 1 == len(kinds) or kinds[kind + 1][0] != index:
+            advance(1, anatomy.name)
     return {
         name: _Replay(
             tip=TipSeries(signals["abscissa"], signals["offset"], signals["radius"]),
