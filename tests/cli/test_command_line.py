@@ -61,7 +61,9 @@ def test_every_command_documents_all_its_options(name: str, capsys: pytest.Captu
 
 def test_every_command_has_a_module() -> None:
     for name in COMMANDS:
-        assert callable(importlib.import_module(f"endopilot.cli.{module_of(name)}").command)
+        module = importlib.import_module(f"endopilot.cli.{module_of(name)}")
+        functions = getattr(module, "SUBJECTS", None) or {name: module.command}
+        assert functions and all(map(callable, functions.values()))
 
 
 def test_an_unknown_command_proposes_a_near_one() -> None:

@@ -205,10 +205,14 @@ def _tree(
 
 
 def _from_ostium(line: Line, ostium: Insertion) -> Line:
-    """Let the first line begin at an ostium that is known: near the cut across the vessel the medial axis feels it."""
+    """Let the first line begin at an ostium that is known: near the cut across the vessel the medial axis feels it.
+
+    One that lies farther beside the line than half the vessel's radius is a seed, not a centre, and the line stays.
+    """
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line.points, axis=0), axis=1))])
     shift = ostium.position - line.points[0]
-    if np.linalg.norm(shift) > 2 * line.radius[0]:
+    beside = shift - (shift @ ostium.direction) * ostium.direction
+    if np.linalg.norm(shift) > 2 * line.radius[0] or np.linalg.norm(beside) > 0.5 * line.radius[0]:
         return line
     share = np.clip(1 - along / (3 * line.radius[0]), 0.0, 1.0)
     moved = line.points + (share**2 * (3 - 2 * share))[:, None] * shift
