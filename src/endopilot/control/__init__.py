@@ -1,0 +1,1 @@
+"""The agent: plans, robots, and advice on X-ray."""

@@ -1,0 +1,76 @@
+"""What decides during a navigation: `Policy`, what it is told (`Sight`) and what it answers (`Decision`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float
+
+from endopilot.env.task import Navigation
+
+DECISION_PERIOD_S = 0.5
+"""Time between two decisions, s: the paper's sample period, at which its models speak."""
+
+
+@dataclass(frozen=True, eq=False)
+class TipMeasurement:
+    """What an X-ray exposure says of the tip; a measurement, never the truth.
+
+    Attributes:
+        position: of the tip, LPS mm.
+        abscissa: Δtip of that position on the vessel's tree, mm.
+        offset: γtip, mm.
+        branch: index of the branch that it is seen in.
+    """
+
+    position: Float[np.ndarray, "3"]
+    abscissa: float
+    offset: float
+    branch: int
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """All that a policy is told at a decision.
+
+    Attributes:
+        time_s: since the start of the navigation, s.
+        inserted_length: Δ by the robot's encoder, mm.
+        rotation: φ by the robot's encoder, rad.
+        tip: what X-ray shows now, or None where it is off.
+    """
+
+    time_s: float
+    inserted_length: float
+    rotation: float
+    tip: TipMeasurement | None
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What is done until the next decision.
+
+    Attributes:
+        translation: of the wire's proximal end, mm/s.
+        rotation: of the wire's proximal end, rad/s.
+        expose: whether X-ray is to be on at the next decision.
+    """
+
+    translation: float
+    rotation: float
+    expose: bool = False
+
+
+@runtime_checkable
+class Policy(Protocol):
+    """Drives one navigation."""
+
+    def start(self, navigation: Navigation, seed: int) -> None:
+        """Prepare for a navigation, as it is believed to be: the truth may have another friction or ostium."""
+        ...
+
+    def decide(self, sight: Sight) -> Decision:
+        """Say what to do until the next decision, `DECISION_PERIOD_S` later."""
+        ...
