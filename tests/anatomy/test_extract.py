@@ -13,10 +13,11 @@ from scipy.spatial.transform import Rotation
 
 from endopilot.anatomy.distance import distance_map_from_spheres, sample
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy, read_source
+from endopilot.anatomy.line_ends import to_cut
 from endopilot.anatomy.sources import Polylines
 from endopilot.anatomy.surface import Surface, surface_from_mask
 from endopilot.errors import InputError
-from endopilot.types import Insertion, LumenMask, Volume
+from endopilot.types import DistanceMap, Insertion, LumenMask, Volume
 
 REAL = Path(__file__).parents[3] / "shared" / "data" / "coronary_centerlines"
 
@@ -225,6 +226,37 @@ def test_what_is_no_vessel_is_refused(fork_mask, make, told):
     with pytest.raises(InputError, match=told) as error:
         extract_anatomy(mask, name="bad")
     assert "\n" not in str(error.value)
+
+
+def test_a_known_ostium_beside_the_axis_is_led_to_in_a_straight_line():
+    def wide_tube(points):
+        return np.minimum(6.0 - np.hypot(points[..., 0], points[..., 1]), points[..., 2])
+
+    ostium = Insertion(np.array([4.0, 0.5, 1.0]), np.array([0.0, 0.0, 1.0]))
+    mask = mask_of(wide_tube, (8, 8, 45), (0.8, 0.8, 0.8))
+    anatomy = extract_anatomy(LumenMask(mask.volume, ostium), name="wide")
+    line = anatomy.tree.branches[0].centerline
+    np.testing.assert_allclose(anatomy.insertion.position, ostium.position, atol=1e-9)
+    assert is_sound(anatomy)
+    beside = np.hypot(line.points[:, 0], line.points[:, 1])
+    assert np.all(np.diff(beside[line.points[:, 2] < 10]) < 1e-6)
+    assert beside[line.points[:, 2] > 20].max() < 0.5
+    bend = np.diff(line.points, axis=0) / np.linalg.norm(np.diff(line.points, axis=0), axis=1, keepdims=True)
+    assert (bend[1:] * bend[:-1]).sum(axis=1).min() > 0.95
+
+
+def test_a_line_is_drawn_out_only_as_far_as_the_vessel_is_round():
+    axis = np.arange(-6.0, 6.2, 0.2)
+    height = np.arange(-10.0, 10.2, 0.2)
+    z, y, x = np.meshgrid(height, axis, axis, indexing="ij")
+    half = np.where(z < 0, 3.0, 3.0 - 0.2 * z)  # the smaller half-axis; the larger one grows
+    wall = 1.0 - np.hypot(x / np.where(z < 0, 3.0, 3.0 + 0.3 * z), y / half)
+    field = DistanceMap(3.0 * wall, 0.2, np.array([-6.0, -6.0, -10.0]))
+    points = np.stack([np.zeros(9), np.zeros(9), np.arange(-8.0, 1.0)], axis=-1)
+    line, radius = to_cut(field, points, np.full(9, 3.0), 1.0)
+    # the smaller half-axis is 0.75 · 3 mm at z = 3.75 mm
+    assert line[-1, 2] == pytest.approx(3.0, abs=0.3)
+    np.testing.assert_allclose(radius[9:], 3.0 - 0.2 * line[9:, 2], atol=0.15)
 
 
 def test_mask_away_from_the_ostium_is_refused(fork_mask):

@@ -11,7 +11,8 @@ from jaxtyping import Bool, Float, Integer
 from scipy.stats import rankdata
 
 from endopilot import __version__
-from endopilot.anatomy import centerline, parent_vessel, polylines, repair
+from endopilot.anatomy import parent_vessel, polylines, repair
+from endopilot.anatomy.centerline import refined_lines
 from endopilot.anatomy.distance import (
     MAXIMUM_GRID_POINTS,
     add_catheter,
@@ -20,9 +21,11 @@ from endopilot.anatomy.distance import (
     distance_map_from_surface,
 )
 from endopilot.anatomy.labels import dominance, label_tree
+from endopilot.anatomy.line_ends import end_score
+from endopilot.anatomy.lumen_graph import lumen_graph, trace_branches
 from endopilot.anatomy.sources import AnatomySource, Polylines, read_source, transformed
 from endopilot.anatomy.surface import Surface, surface_from_mask
-from endopilot.anatomy.tree import Line, tree_from_lines
+from endopilot.anatomy.tree import tree_from_lines
 from endopilot.errors import InputError
 from endopilot.progress import progress
 from endopilot.types import Anatomy, DistanceMap, Insertion, LumenMask, VesselTree
@@ -187,13 +190,12 @@ def _tree(
             given = _directed(distance_map, points, clearance, given, config)
         points, clearance = _in_front(points, clearance, given)
         root = int(np.linalg.norm(points - given.position, axis=1).argmin())
-    graph = centerline.lumen_graph(points, clearance, spacing, root)
-    paths = centerline.trace_branches(graph, minimum_length_mm=config.minimum_branch_length_mm)
+    graph = lumen_graph(points, clearance, spacing, root)
+    paths = trace_branches(graph, minimum_length_mm=config.minimum_branch_length_mm)
     middle = float(np.median(graph.clearance[np.concatenate(paths)]))
     step = float(np.clip(0.3 * middle, 0.25, 2.0))
-    lines = centerline.refined_lines(surface, distance_map, graph, paths, step)
-    if given is not None and given.direction.any():
-        lines[0] = _from_ostium(lines[0], given)
+    ostium = given if given is not None and given.direction.any() else None
+    lines = refined_lines(surface, distance_map, graph, paths, step, ostium)
     tree = tree_from_lines(lines)
     longest = tree.longest_path()
     if longest.abscissa[-1] < SHORTEST_IN_DIAMETERS * 2 * float(longest.radius.mean()):
@@ -202,21 +204,6 @@ def _tree(
             f"of {2 * longest.radius.mean():.1f} mm; check the label or the segmentation"
         )
     return tree, rule
-
-
-def _from_ostium(line: Line, ostium: Insertion) -> Line:
-    """Let the first line begin at an ostium that is known: near the cut across the vessel the medial axis feels it.
-
-    One that lies farther beside the line than half the vessel's radius is a seed, not a centre, and the line stays.
-    """
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line.points, axis=0), axis=1))])
-    shift = ostium.position - line.points[0]
-    beside = shift - (shift @ ostium.direction) * ostium.direction
-    if np.linalg.norm(shift) > 2 * line.radius[0] or np.linalg.norm(beside) > 0.5 * line.radius[0]:
-        return line
-    share = np.clip(1 - along / (3 * line.radius[0]), 0.0, 1.0)
-    moved = line.points + (share**2 * (3 - 2 * share))[:, None] * shift
-    return Line(moved, line.radius, line.parent, line.place)
 
 
 def _component(distance_map: DistanceMap, given: Insertion | None) -> Bool[np.ndarray, "nz ny nx"]:
@@ -262,9 +249,9 @@ def _beyond_parent(
         height = points[:, 2]
         if height[root] < height.max() - float(np.ptp(height)) / 3:  # the coronary ostia lie high in their trees
             return None, inside
-    graph = centerline.lumen_graph(points, clearance, coarse.spacing_mm, root)
+    graph = lumen_graph(points, clearance, coarse.spacing_mm, root)
     if not aorta:
-        paths = centerline.trace_branches(graph, minimum_length_mm=config.minimum_branch_length_mm)
+        paths = trace_branches(graph, minimum_length_mm=config.minimum_branch_length_mm)
         usual = float(np.median(graph.clearance[np.concatenate(paths)]))
     parent = parent_vessel.parent_region(coarse, within, graph, usual)
     ostium = None if parent is None else parent_vessel.ostium_beyond(coarse, within, parent, graph, config.vessel)
@@ -299,7 +286,7 @@ def _directed(
 ) -> Insertion:
     """Return an ostium inside a vessel with the direction away from the inlet; one near an end stays without."""
     inlet = _widest_open_end(distance_map, points, clearance, config)
-    graph = centerline.lumen_graph(points, clearance, distance_map.spacing_mm, inlet)
+    graph = lumen_graph(points, clearance, distance_map.spacing_mm, inlet)
     node = int(np.linalg.norm(graph.points - given.position, axis=1).argmin())
     reach = ENTRANCE_RADII * float(clearance[np.linalg.norm(points - given.position, axis=1) < 3.0].max(initial=1.0))
     way = [node]
@@ -333,13 +320,13 @@ def _widest_open_end(
 ) -> int:
     """Return the grid point at the end that looks most like the inlet: wide, cut open, for coronaries high up."""
     spacing = distance_map.spacing_mm
-    graph = centerline.lumen_graph(points, clearance, spacing, int(clearance.argmax()))
+    graph = lumen_graph(points, clearance, spacing, int(clearance.argmax()))
     first = int(graph.length.argmax())
-    graph = centerline.lumen_graph(graph.points, graph.clearance, spacing, first)
-    paths = centerline.trace_branches(graph, minimum_length_mm=config.minimum_branch_length_mm)
+    graph = lumen_graph(graph.points, graph.clearance, spacing, first)
+    paths = trace_branches(graph, minimum_length_mm=config.minimum_branch_length_mm)
     ends = [*paths, paths[0][::-1]]
     tips = np.array([graph.points[path[-1]] for path in ends])
-    score = np.array([centerline.end_score(distance_map, graph, path) for path in ends])
+    score = np.array([end_score(distance_map, graph, path) for path in ends])
     middle = np.concatenate(paths)
     score *= [0.6 + 0.4 * _tapering(graph.points[middle], graph.clearance[middle], tip) for tip in tips]
     if config.vessel != "generic":  # the coronary ostia lie at the top of their trees

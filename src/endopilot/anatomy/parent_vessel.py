@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float
 
-from endopilot.anatomy.centerline import LumenGraph
+from endopilot.anatomy.lumen_graph import LumenGraph
 from endopilot.types import DistanceMap, Insertion
 
 Vessel = Literal["rca", "lca", "generic"]

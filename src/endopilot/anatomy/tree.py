@@ -122,6 +122,24 @@ def resampled(points: Float[np.ndarray, "n 3"], step_mm: float) -> Float[np.ndar
     return np.asarray(PchipInterpolator(length, points, axis=0)(np.linspace(0.0, length[-1], count)))
 
 
+def smoothed(points: Float[np.ndarray, "n d"], width: float) -> Float[np.ndarray, "n d"]:
+    """Blur a line with a Gaussian of `width` samples that leaves its ends in place."""
+    from scipy.ndimage import gaussian_filter1d
+
+    extra = min(int(4 * width), len(points) - 1)
+    head = 2 * points[0] - points[extra:0:-1]
+    tail = 2 * points[-1] - points[-2 : -extra - 2 : -1]
+    return gaussian_filter1d(np.concatenate([head, points, tail]), width, axis=0)[len(head) : len(head) + len(points)]
+
+
+def cross_axes(direction: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Return two unit vectors perpendicular to each direction and to each other."""
+    helper = np.eye(3)[np.abs(direction).argmin(axis=1)]
+    one = np.cross(direction, helper)
+    one /= np.linalg.norm(one, axis=1, keepdims=True)
+    return one, np.cross(direction, one)
+
+
 def curvature_torsion(centerline: Centerline) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
     """Return curvature and torsion along a line, 1/mm.
 
