@@ -84,6 +84,7 @@ def toy_simulate(anatomy: Anatomy, device, control, *, initial, config, friction
         slip=np.zeros((worlds, samples)),
         iterations=np.ones((worlds, samples)),
         valid=np.ones((worlds, samples), dtype=bool),
+        reason=np.zeros(worlds, dtype=int),
     )
 
 

@@ -240,6 +240,7 @@ class Rollout:
         slip: advance that was asked of the drive and not made in the period, mm; 0 unless the wire was caught.
         iterations: mean Newton iterations a time step over the period.
         valid: false from the sample in which a world failed to converge or left the finite numbers.
+        reason: why a world became invalid: 0 it did not, 1 it left the finite numbers, 2 it did not converge.
         shape: positions of all nodes from tip to base, LPS mm, if asked for.
     """
 
@@ -261,6 +262,7 @@ class Rollout:
     slip: Float[np.ndarray, "worlds samples"]
     iterations: Float[np.ndarray, "worlds samples"]
     valid: Bool[np.ndarray, "worlds samples"]
+    reason: Int[np.ndarray, "worlds"]
     shape: Float[np.ndarray, "worlds samples nodes 3"] | None = None
 
 

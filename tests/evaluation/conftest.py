@@ -68,6 +68,7 @@ def make_rollout(samples: int = 6) -> Rollout:
         slip=flat,
         iterations=flat,
         valid=np.ones((1, samples), dtype=bool),
+        reason=np.zeros(1, dtype=int),
         shape=shape,
     )
 

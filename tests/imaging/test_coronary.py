@@ -29,13 +29,13 @@ def _branch() -> np.ndarray:
 @pytest.fixture(scope="module")
 def heart():
     """Return the scan of an aorta with two coronary arteries, a dim vein and a chamber close by, and the right tree."""
-    grid = empty_grid((120, 100, 110), (0.5, 0.5, 0.6), (-25.0, -28.0, -46.0))
+    grid = empty_grid((120, 100, 150), (0.5, 0.5, 0.6), (-25.0, -28.0, -46.0))
     x = positions(grid)
     centre = np.array([0.6, 0.8]) * AORTA_RADIUS_MM
     aorta = np.hypot(x[..., 0] - centre[0], x[..., 1] - centre[1]) < AORTA_RADIUS_MM
     axis, branch = _axis(), _branch()
     tree = inside_tube(grid, axis, np.linspace(1.9, 1.2, len(axis))) | inside_tube(grid, branch, 1.0)
-    across = np.array([centre[0], centre[1], 4.0]) + np.linspace(AORTA_RADIUS_MM - 2, 40, 90)[:, None] * [0.9, 0.44, 0]
+    across = np.array([centre[0], centre[1], 4.0]) + np.linspace(AORTA_RADIUS_MM - 2, 42, 90)[:, None] * [0.97, 0.24, 0]
     vein = inside_tube(grid, _axis()[110:] + np.array([-0.6, -3.8, 0.0]), 1.0)
     chamber = np.linalg.norm(x - [10.0, -16.0, -32.0], axis=-1) < 13.0
     hu = np.full(grid.voxels.shape, FAT_HU)
@@ -117,3 +117,24 @@ def test_an_aorta_without_artery_is_told():
         segment(volume, SegmentConfig())
     with pytest.raises(InputError, match="no vessel"):
         segment(volume, SegmentConfig(seeds=((10.0, 10.0, 10.0),)))
+
+
+def changed(volume, where, hu):
+    voxels = volume.voxels.copy()
+    voxels[where] = hu
+    return Volume(voxels, volume.spacing_mm, volume.origin_mm, volume.direction)
+
+
+def test_what_comes_to_a_chamber_below_the_aorta_is_no_coronary_tree(heart):
+    x = positions(heart[0])
+    along, across = x[..., 0] * 0.6 + x[..., 1] * 0.8, x[..., 0] * 0.8 - x[..., 1] * 0.6
+    below = (along > 0.5) & (along < 40.0) & (x[..., 2] < 8.0)
+    flat = changed(heart[0], below & (np.abs(across) < 16.0), 50.0)
+    flat = changed(flat, below & (np.abs(across) < 5.0), BLOOD_HU)
+    with pytest.raises(InputError, match="no such artery .* holds the aortic root"):
+        segment(flat, SegmentConfig(vessel="rca"))
+
+
+def test_a_stump_is_no_coronary_tree(heart):
+    with pytest.raises(InputError, match="no such artery"):
+        segment(changed(heart[0], positions(heart[0])[..., 0] > 36.0, FAT_HU), SegmentConfig(vessel="lca"))

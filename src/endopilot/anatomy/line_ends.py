@@ -16,6 +16,9 @@ _RING = 12
 _FLAT = 0.75
 """A vessel whose smaller half-axis falls below this share of its radius is not drawn out any farther."""
 
+_ROUND = 0.9
+"""A half-axis is told apart from the radius where it is smaller than this share of it."""
+
 _AHEAD = 0.87
 """Cosine of the largest angle at which a line may leave a known ostium off the catheter's axis."""
 
@@ -77,7 +80,7 @@ def to_cut(
         small = 0.5 * float((wall[: _RING // 2] + wall[_RING // 2 :]).min())
         if np.median(wall) < 0.9 * width or small < _FLAT * width:
             break
-        added.append(min(small, width))
+        added.append(width if small > _ROUND * width else small)  # less than that is ripple
         shift = 2.0 / _RING * wall @ rays
         size = float(np.linalg.norm(shift))
         line.append(candidate + shift * min(0.5, 0.2 * step_mm / max(size, 1e-12)))

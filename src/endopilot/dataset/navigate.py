@@ -79,6 +79,7 @@ def navigate(
         _record(result, sample, control.shape[1], step, simulator)
         tip, slip, last, inserted = step.tip_position, step.slip, step.inserted_length - inserted, step.inserted_length
         advance(len(control))
+    result["reason"] = simulator.reason
     return make_rollout(anatomy, actuation, started, applied, result), applied, stopped
 
 

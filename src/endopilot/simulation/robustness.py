@@ -31,7 +31,7 @@ from endopilot.parallel import follow_the_parent
 from endopilot.progress import progress
 from endopilot.simulation.controls import ControlConfig, random_controls
 from endopilot.simulation.device import Device, check_fits, list_devices, read_device
-from endopilot.simulation.simulator import SimulatorConfig, simulate, wall_stiffness
+from endopilot.simulation.simulator import SimulatorConfig, simulate, wall_stiffness, why_invalid
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, Rollout
 
 MOST_INVALID_SHARE = 1e-3
@@ -200,8 +200,8 @@ def run_chunk(path: Path, config: RobustnessConfig, index: int, device: Device, 
     chunk = _describe(anatomy, rollout, wall_stiffness(simulator, device.push_limit_n), time.process_time() - began)
     invalid = [
         f"{anatomy.name}, {device.name}, rollout {world} ({MANOEUVRES[world % len(MANOEUVRES)]}): "
-        + _reason(anatomy, device, control[[world]], initial[[world]], simulator)
-        for world in np.flatnonzero(~rollout.valid.all(axis=1))
+        + why_invalid(rollout, world)
+        for world in np.flatnonzero(rollout.reason)
     ]
     with writing(path) as partial:
         np.savez_compressed(partial, **{field.name: getattr(chunk, field.name) for field in fields(chunk)})
@@ -233,20 +233,6 @@ def _describe(anatomy: Anatomy, rollout: Rollout, wall_n_mm: float, seconds: flo
         non_finite=bad,
         seconds=seconds,
     )
-
-
-def _reason(
-    anatomy: Anatomy,
-    device: Device,
-    control: Float[np.ndarray, "1 samples 2"],
-    initial: Float[np.ndarray, "1 2"],
-    config: SimulatorConfig,
-) -> str:
-    """Return why one world is invalid: alone it does the same to the last bit, and the simulator warns of it."""
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("always")
-        simulate(anatomy, device, control, initial=initial, config=config)
-    return str(told[0].message).partition("world 0 ")[2] if told else "valid when simulated alone"
 
 
 @lru_cache(maxsize=1)

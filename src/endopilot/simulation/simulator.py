@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Integer
+from jaxtyping import Bool, Float
 
 from endopilot import _core
 from endopilot.anatomy.projection import project_tip
@@ -38,6 +38,8 @@ SPARE_MM = 20.0
 """Length that a wire can be driven beyond the end of the vessel's longest path, mm, where it is not known how far."""
 Actuation = Literal["velocity", "force"]
 """What a control is: translation (mm/s) and rotation (rad/s), or the drive's axial force (N) and torque (N·mm)."""
+_REASONS = {1: "left the finite numbers", 2: "did not converge"}
+"""What `Rollout.reason` says of an invalid world."""
 _OVERSHOOT_MM = 1e-2
 """Rounding of controls may carry the inserted length this far below 0, mm."""
 
@@ -173,10 +175,11 @@ def simulate(
         record_shape=record_shape,
         push_limit_n=device.push_limit_n,
     )
-    _report_invalid(result["reason"], result["valid"])
     started = initial.copy()
     started[:, 0] -= result["approach_slip"]
-    return make_rollout(anatomy, actuation, started, control, result)
+    rollout = make_rollout(anatomy, actuation, started, control, result)
+    _report_invalid(rollout)
+    return rollout
 
 
 def make_rollout(
@@ -211,6 +214,7 @@ def make_rollout(
         inserted_length=proximal[..., 0],
         rotation=proximal[..., 1],
         tip=project_tip(anatomy.tree, anatomy.insertion, result["tip_position"]),
+        reason=result["reason"],
         shape=result.get("shape"),
         **{name: result[name] for name in RECORDED},
     )
@@ -438,17 +442,21 @@ def check_memory(needed: int, what: str, mend: str) -> None:
         raise InputError(f"{what} need {needed / 2**30:.1f} GiB of {available / 2**30:.1f}; {mend}")
 
 
-def _report_invalid(reason: Integer[np.ndarray, "worlds"], valid: Bool[np.ndarray, "worlds samples"]) -> None:
-    bad = np.flatnonzero(~valid.all(axis=1))
+def why_invalid(rollout: Rollout, world: int) -> str:
+    """Return why and when a world of a rollout became invalid, such as "did not converge after 12.5 s"."""
+    seconds = rollout.sample_period_s * float(np.argmin(rollout.valid[world]))
+    return f"{_REASONS[int(rollout.reason[world])]} after {seconds:g} s"
+
+
+def _report_invalid(rollout: Rollout) -> None:
+    bad = np.flatnonzero(rollout.reason)
     if len(bad) == 0:
         return
     import warnings
 
-    names = {1: "left the finite numbers", 2: "did not converge"}
     first = int(bad[0])
-    seconds = SAMPLE_PERIOD_S * float(np.argmin(valid[first]))
     warnings.warn(
-        f"{len(bad)} of {len(valid)} worlds are invalid; world {first} {names[int(reason[first])]} after {seconds:g} s",
+        f"{len(bad)} of {len(rollout.valid)} worlds are invalid; world {first} {why_invalid(rollout, first)}",
         stacklevel=3,
     )
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Integer
+from jaxtyping import Bool, Float, Int, Integer
 from numpy.typing import ArrayLike
 
 from endopilot import _core
@@ -424,7 +424,17 @@ class Simulator:
             >>> simulator.valid
             array([ True,  True,  True,  True])
         """
-        return self._gather("reason") == 0
+        return self.reason == 0
+
+    @property
+    def reason(self) -> Int[np.ndarray, "worlds"]:
+        """Why a world is invalid: 0 it is valid, 1 it left the finite numbers, 2 it did not converge.
+
+        Example:
+            >>> simulator.reason
+            array([0, 0, 0, 0])
+        """
+        return self._gather("reason").astype(int)
 
     def project(self) -> TipProjection:
         """Project the tips to the centerline: Δtip (mm), γtip (mm), branch and lumen radius (mm), a row a world.

@@ -51,8 +51,8 @@ _TO_WALL_MM = 3.5
 """Vesselness fades where the artery opens into the aorta: the tree starts within this distance of the wall."""
 _SEED_MM = 5.0
 """A seed belongs to the vessel within this distance."""
-_LEAST_TREE_MM3 = 40.0
-"""A smaller connected vessel is no coronary tree."""
+_LEAST_TREE_MM3 = 250.0
+"""A smaller connected vessel is no coronary tree: 50 mm of 2.5 mm width hold as much."""
 _WALL_HU = 50.0
 """The aortic wall."""
 _MOUTH_MM = 4.0
@@ -219,12 +219,14 @@ def _tree_at_aorta(
         point = scan.grid.index_to_world(nearest[::-1].astype(float))
         disc = int(np.abs(root.centres[:, 2] - point[2]).argmin())
         outward = point[:2] - root.centres[disc, :2]
+        if point[2] < root.centres[0, 2]:  # what comes to a chamber below is no ostium
+            continue
         if outward @ np.array(_SIDE[vessel]) > 0 and sizes[name] > sizes[best] * (best > 0):
             best, start = int(name), nearest
     if start is None or sizes[best] * _GRID_MM**3 < _LEAST_TREE_MM3:
         raise InputError(
             f"vessel={vessel!r}: no such artery comes to the aorta's wall in this volume; "
-            "give seeds: the ostium first, then points along the vessel (LPS mm)"
+            "give a CT that holds the aortic root, or seeds: the ostium first, then points along the vessel (LPS mm)"
         )
     return label == best, start
 
