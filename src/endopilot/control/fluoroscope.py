@@ -21,7 +21,9 @@ from endopilot.types import Anatomy
 
 _CATHETER_MM = 20.0
 """Length of the catheter's axis behind the ostium in which a tip may be found, mm."""
-_ITERATIONS = 12
+_ITERATIONS = 8
+_HOPELESS = 30.0
+"""Branches whose best vertex is this much less likely than the best of all (twice the log-likelihood) are left out."""
 _NEAR_SHARE = 0.1
 """Standard deviation of (abscissa of the tip)/(inserted length): curved vessels are cut short, wires snake."""
 
@@ -42,7 +44,7 @@ class FluoroscopeConfig:
     """Pixel pitch of the detector in fluoroscopy, mm."""
     pixel_sd: float = 0.5
     """Standard deviation of the tip's place in the image across the wire, pixels."""
-    along_sd: float = 1.5
+    along_sd: float = 2.6
     """Standard deviation along the wire, pixels: where a thin tip ends is harder to see than where it runs."""
 
     def __post_init__(self) -> None:
@@ -79,6 +81,21 @@ class _View:
         """Return the derivative of the pixel by the point, pixels/mm."""
         seen = self.axes @ (point - self.source)
         return self.scale / seen[2] * (self.axes[:2] - np.outer(seen[:2] / seen[2], self.axes[2]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Detection:
+    """A tip found in an image.
+
+    Attributes:
+        view: of the image.
+        pixel: where it was found.
+        whiten: turns a miss, pixels, into one along and one across the wire, in standard deviations.
+    """
+
+    view: _View
+    pixel: Float[np.ndarray, "2"]
+    whiten: Float[np.ndarray, "2 2"]
 
 
 def _view(angles_deg: tuple[float, float], isocenter: Float[np.ndarray, "3"], config: FluoroscopeConfig) -> _View:
@@ -135,8 +152,8 @@ class Fluoroscope:
             inserted_length: Δ by the robot's encoder, mm.
             random: where the errors are drawn from.
         """
-        pixels = [self._detect(view, tip_position, tip_direction, random) for view in self._views]
-        position = self._locate(pixels, inserted_length)
+        seen = [self._detect(view, tip_position, tip_direction, random) for view in self._views]
+        position = self._locate(seen, inserted_length)
         tip = project_tip(self._anatomy.tree, self._anatomy.insertion, position[None])
         return TipMeasurement(position, float(tip.abscissa[0]), float(tip.offset[0]), int(tip.branch[0]))
 
@@ -146,54 +163,54 @@ class Fluoroscope:
         position: Float[np.ndarray, "3"],
         direction: Float[np.ndarray, "3"],
         random: np.random.Generator,
-    ) -> Float[np.ndarray, "2"]:
-        """Return the pixel at which the tip is found: farther off along the wire's image than across it."""
+    ) -> _Detection:
+        """Return where the tip is found in the image: farther off along the wire than across it."""
         slope = view.slope(position) @ direction
-        length = float(np.linalg.norm(slope))
-        along = slope / length if length > 0 else np.array([1.0, 0.0])
-        across = np.array([-along[1], along[0]])
-        along_off, across_off = random.standard_normal(2) * (self._config.along_sd, self._config.pixel_sd)
-        return view.project(position) + along_off * along + across_off * across
+        along = slope / max(float(np.linalg.norm(slope)), 1e-9)
+        axes = np.array([along, [-along[1], along[0]]])
+        sd = np.array([self._config.along_sd, self._config.pixel_sd])
+        off = random.standard_normal(2) * sd
+        return _Detection(view, view.project(position) + off @ axes, axes / sd[:, None])
 
-    def _locate(self, pixels: list[Float[np.ndarray, "2"]], inserted_length: float) -> Float[np.ndarray, "3"]:
+    def _locate(self, seen: list[_Detection], inserted_length: float) -> Float[np.ndarray, "3"]:
         """Return the most likely place of the tip, LPS mm: the best of the likeliest places in every branch."""
         length_sd = 2.0 + _NEAR_SHARE * max(inserted_length, 0.0)
+        prior = [((abscissa - inserted_length) / length_sd) ** 2 for abscissa in self._abscissa]
+        magnified = self._views[0].scale / self._config.source_to_isocenter_mm
+        first = []
+        for points, sd, unlikely in zip(self._points, self._lateral_sd, prior, strict=True):
+            misses = sum(((one.view.project(points) - one.pixel) ** 2).sum(axis=1) for one in seen)
+            first.append(misses / (self._config.along_sd**2 + (magnified * sd) ** 2) + unlikely)
+        least = min(float(cost.min()) for cost in first)
         best, found = np.inf, self._points[0][-1]
-        for points, tangent, abscissa, sd in zip(
-            self._points, self._tangents, self._abscissa, self._lateral_sd, strict=True
-        ):
-            prior = ((abscissa - inserted_length) / length_sd) ** 2
-            spread = self._config.along_sd**2 + (self._views[0].scale / self._config.source_to_isocenter_mm * sd) ** 2
-            misses = [((view.project(points) - pixel) ** 2).sum(axis=1) for view, pixel in zip(self._views, pixels)]
-            start = int(np.argmin(sum(misses) / spread + prior))
-            place, cost = self._refine(pixels, points, tangent, sd, start)
-            cost += float(prior[np.argmin(((points - place) ** 2).sum(axis=1))])
-            if cost < best:
-                best, found = cost, place
+        for branch, cost in enumerate(first):
+            if cost.min() > least + _HOPELESS:
+                continue
+            place, miss, nearest = self._refine(seen, branch, int(np.argmin(cost)))
+            miss += float(prior[branch][nearest])
+            if miss < best:
+                best, found = miss, place
         return found
 
-    def _refine(
-        self,
-        pixels: list[Float[np.ndarray, "2"]],
-        points: Float[np.ndarray, "n 3"],
-        tangent: Float[np.ndarray, "n 3"],
-        sd: Float[np.ndarray, "n"],
-        start: int,
-    ) -> tuple[Float[np.ndarray, "3"], float]:
-        """Return the likeliest place near one branch, LPS mm, and twice its negative log-likelihood.
+    def _refine(self, seen: list[_Detection], branch: int, nearest: int) -> tuple[Float[np.ndarray, "3"], float, int]:
+        """Return the likeliest place near one branch, LPS mm, twice its negative log-likelihood, and its vertex.
 
         Gauss-Newton on the pixels' misses, in units of the detection's error, and on the distance from the line in
         units of what is usual in that lumen.
         """
-        place, nearest, cost = points[start], start, np.inf
+        points, tangent, sd = self._points[branch], self._tangents[branch], self._lateral_sd[branch]
+        place, cost = points[nearest], np.inf
         for _ in range(_ITERATIONS):
             across = (np.eye(3) - np.outer(tangent[nearest], tangent[nearest])) / sd[nearest]
-            rows, misses = [across], [across @ (place - points[nearest])]
-            for view, pixel in zip(self._views, pixels, strict=True):
-                rows.append(view.slope(place) / self._config.along_sd)
-                misses.append((view.project(place) - pixel) / self._config.along_sd)
+            rows, misses = [across, 1e-3 * np.eye(3)], [across @ (place - points[nearest]), np.zeros(3)]
+            for one in seen:
+                rows.append(one.whiten @ one.view.slope(place))
+                misses.append(one.whiten @ (one.view.project(place) - one.pixel))
             jacobian, miss = np.concatenate(rows), np.concatenate(misses)
             cost = float(miss @ miss)
-            place = place - np.linalg.lstsq(jacobian, miss, rcond=None)[0]
+            place = place - np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ miss)
             nearest = int(np.argmin(((points - place) ** 2).sum(axis=1)))
-        return place, cost
+        lateral = place - points[nearest]
+        lateral = lateral - (lateral @ tangent[nearest]) * tangent[nearest]
+        beyond = 1 - np.sqrt(2) * sd[nearest] / max(float(np.linalg.norm(lateral)), 1e-9)
+        return place - max(beyond, 0.0) * lateral, cost, nearest  # a tip does not leave the lumen

@@ -7,10 +7,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
+from endopilot.anatomy.projection import project_tip
 from endopilot.control.fluoroscope import Fluoroscope, FluoroscopeConfig
 from endopilot.control.policy import DECISION_PERIOD_S, Policy, Sight, TipMeasurement
 from endopilot.control.robot import Limits, RobotConfig, SimulatedRobot
-from endopilot.env.task import Navigation
+from endopilot.env.task import SUCCESS_MM, Navigation
 from endopilot.errors import InputError
 from endopilot.simulation.simulator import SimulatorConfig
 from endopilot.simulation.stepping import Simulator
@@ -148,7 +149,7 @@ def navigate(
         if not simulator.valid[0]:
             reason = "invalid"
             break
-        if navigation.reached(simulator.project())[0]:
+        if _reached(navigation, simulator):
             reason = "reached"
             break
     return track.record(navigation, reason)
@@ -167,6 +168,15 @@ def _start(navigation: Navigation, truth: Truth, config: SimulatorConfig) -> Sim
     return simulator
 
 
+def _reached(navigation: Navigation, simulator: Simulator) -> bool:
+    """Return whether the tip has reached the target; it is only projected, which takes time, where it is near."""
+    line = navigation.anatomy.tree.branches[navigation.target.branch].centerline
+    at = navigation.target.abscissa
+    width = float(line.radius[np.abs(line.abscissa - at) <= SUCCESS_MM + 1.0].max())
+    away = np.linalg.norm(simulator.position[0, 0] - navigation.target.position(navigation.anatomy))
+    return bool(away <= SUCCESS_MM + 3 * width and navigation.reached(simulator.project())[0])
+
+
 def _tip_direction(simulator: Simulator) -> Float[np.ndarray, "3"]:
     """Return the unit vector along the wire at its tip."""
     edge = simulator.position[0, 0] - simulator.position[0, 1]
@@ -177,7 +187,7 @@ class _Track:
     """Gathers what happens."""
 
     def __init__(self, simulator: Simulator) -> None:
-        self._columns: dict[str, list] = {name: [] for name in ("proximal", "position", "tip", "force")}
+        self._columns: dict[str, list] = {name: [] for name in ("proximal", "position", "force")}
         self._controls: list[tuple[float, float]] = []
         self._measured: list[TipMeasurement | None] = []
         self._faults = 0
@@ -191,12 +201,10 @@ class _Track:
     def moved(self, simulator: Simulator, peak_n: float) -> None:
         self._columns["proximal"].append([simulator.inserted_length[0], simulator.rotation[0]])
         self._columns["position"].append(simulator.position[0, 0])
-        self._columns["tip"].append(simulator.project())
         self._columns["force"].append(peak_n)
 
     def record(self, navigation: Navigation, reason: str) -> Record:
-        tips: list[TipProjection] = self._columns["tip"]
-        names = TipProjection.__dataclass_fields__
+        anatomy = navigation.anatomy
         proximal, position = np.array(self._columns["proximal"]), np.array(self._columns["position"])
         force = np.array(self._columns["force"])
         measured = (*self._measured, None)
@@ -205,7 +213,7 @@ class _Track:
             inserted_length=proximal[:, 0],
             rotation=proximal[:, 1],
             tip_position=position,
-            tip=TipProjection(**{name: np.concatenate([getattr(tip, name) for tip in tips]) for name in names}),
+            tip=project_tip(anatomy.tree, anatomy.insertion, position),
             contact_force_max=force,
             exposed=np.array([tip is not None for tip in measured]),
             control=np.array([*self._controls, (0.0, 0.0)]),

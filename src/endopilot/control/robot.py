@@ -1,8 +1,8 @@
 """What moves the wire: the interface of a robot, its limits, the motion of a drive, and a robot in the simulator.
 
 A drive follows a velocity command late (latency), no faster and no more suddenly than its limits, and with lost motion
-where it reverses (backlash). `DriveMotion` is that and nothing else; the simulated robot puts a simulated wire behind it,
-the drive process (`endopilot drive`) a clock.
+where it reverses (backlash). `DriveMotion` is that and nothing else; the simulated robot puts a simulated wire behind
+it, the drive process (`endopilot drive`) a clock.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ class Limits:
         )
 
     def safe(self, translation: Any, rotation: Any) -> tuple[float, float]:
-        """Return a command that is finite and within the speed limits, whatever is asked: where one number is none, 0, 0.
+        """Return a command that is finite and within the speed limits, whatever is asked; what is no number stops.
 
         Args:
             translation: mm/s.
