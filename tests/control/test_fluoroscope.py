@@ -12,7 +12,7 @@ RADIUS = 0.18
 PIXEL_MM = 0.308 * 765 / 1100  # at the isocenter
 
 
-def located(fork, config: FluoroscopeConfig, count: int = 200) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def located(fork, config: FluoroscopeConfig, count: int = 120) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return true places inside the straight vessel, along the wire there, and where they are found."""
     arm, random = Fluoroscope(fork, RADIUS, config), np.random.default_rng(0)
     height, turn = random.uniform(5, 15, count), random.uniform(0, 2 * np.pi, count)

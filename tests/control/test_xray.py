@@ -44,7 +44,7 @@ def test_bands_hold_over_whole_intervals_of_new_patients(unlike) -> None:
 
 
 def test_too_few_patients_are_told() -> None:
-    with pytest.raises(InputError, match="needs at least 9 patients.* has 8"):
+    with pytest.raises(InputError, match=r"needs at least 9 patients.* has 8"):
         conformal_scale(np.ones(16), np.repeat(np.arange(8), 2), 0.9)
     assert conformal_scale(np.arange(9.0), np.arange(9), 0.9) == 8.0
 
@@ -62,7 +62,7 @@ def test_the_spread_is_fitted_to_the_errors() -> None:
 
 
 def test_a_calibration_is_read_again_and_its_absence_told(tmp_path) -> None:
-    with pytest.raises(InputError, match="the model has no calibration.*endopilot advise"):
+    with pytest.raises(InputError, match=r"the model has no calibration.*endopilot advise"):
         Calibration.read(tmp_path)
     calibration().write(tmp_path)
     assert Calibration.read(tmp_path) == calibration()
