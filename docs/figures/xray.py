@@ -21,6 +21,7 @@ def tables(folder: Path) -> str:
     cover, at, own = found["coverage"], found["adviser"], found["coverage_of_calibration_patients"]
     share = found["share_of_the_exposures_of_periodic_imaging"]
     equal = found["periodic_exposures_per_minute_with_the_same_missed_share"]
+    error, half = cover["error_mae_mm"], cover["median_half_width_mm"]
     oracle = found["curves"]["oracle"][0]
     rows = [
         "| | measured | bar |",
@@ -35,10 +36,9 @@ def tables(folder: Path) -> str:
         f"| fewer frames than fluoroscopy at 7.5 Hz | {100 * at['fewer_frames_than_fluoroscopy']:.1f} % | ≥ 95 % |",
         f"| events a minute, which an oracle exposes | {oracle['events_per_minute']:.1f} | |",
         "",
-        f"Mean error of Δtip and γtip: {cover['error_mae_mm'][0]:.3f} and {cover['error_mae_mm'][1]:.4f} mm; median "
-        f"half-width of the bands: {cover['median_half_width_mm'][0]:.2f} and {cover['median_half_width_mm'][1]:.3f} mm. "
-        f"On the {own['patients']} calibration patients the bands hold throughout {100 * own['simultaneous']:.1f} % of the "
-        "intervals.",
+        f"Mean error of Δtip and γtip: {error[0]:.3f} and {error[1]:.4f} mm; median half-width of the bands: "
+        f"{half[0]:.2f} and {half[1]:.3f} mm. On the {own['patients']} calibration patients the bands hold throughout "
+        f"{100 * own['simultaneous']:.1f} % of the intervals.",
         "",
         "| τ | δ, mm | events a minute | missed | exposures a minute |",
         "|---|---|---|---|---|",

@@ -17,6 +17,7 @@ from endopilot.errors import InputError
 from endopilot.evaluation import advice
 from endopilot.evaluation.advice import AdviseConfig
 from endopilot.evaluation.advise import advise
+from endopilot.files import write_json
 from endopilot.models.config import WINDOW, TwinConfig
 from endopilot.models.open_loop import OpenLoop
 from endopilot.models.twin import TwinPredictor
@@ -47,7 +48,7 @@ def folder(tmp_path_factory) -> Path:
     shares = (1 / 12, 10 / 12, 1 / 12)
     shape = {"patients": 12, "sequences": 1, "seconds": 25.0}
     make_toy_dataset(folder / "dataset", **shape, anatomy_shares=shares, seen_test_share=0.0)
-    (folder / "run").mkdir()
+    write_json(folder / "run" / "manifest.json", {"device": {"name": "workhorse-014"}})
     return folder
 
 
@@ -132,8 +133,11 @@ def test_the_command_calibrates_measures_and_draws(folder, hold_slack, capsys) -
     assert widest["width"] == 2.5 and figures["curves"]["adviser"][0]["width"] == 0.0
 
 
-def test_too_few_patients_to_calibrate_on_leave_nothing_behind(folder, hold_slack, tmp_path) -> None:
+def test_too_few_patients_or_another_wire_leave_nothing_behind(folder, hold_slack, tmp_path) -> None:
     config = AdviseConfig(advisor=AdvisorConfig(level=0.95))
     with pytest.raises(InputError, match="needs at least 19 patients"):
-        advise(tmp_path, folder / "dataset", tmp_path / "out", config)
+        advise(folder / "run", folder / "dataset", tmp_path / "out", config)
+    write_json(tmp_path / "manifest.json", {"device": {"name": "j-035"}})
+    with pytest.raises(InputError, match=r"its wire is workhorse-014, and that of .* is j-035"):
+        advise(tmp_path, folder / "dataset", tmp_path / "out", AdviseConfig())
     assert not (tmp_path / "out").exists() and not (tmp_path / "xray.json").exists()
