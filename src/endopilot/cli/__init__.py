@@ -26,6 +26,8 @@ COMMANDS = {
     "dataset-info": "what a dataset holds, with pictures",
     "train": "dataset -> forward and inverse transformers",
     "evaluate": "trained run -> errors beside the paper's and the baselines'",
+    "advise": "trained run -> when X-ray is needed: calibrated bands, exposures against missed events",
+    "drive": "a simulated drive behind TCP, with a watchdog",
     "verify": "the rod core against closed forms",
     "bench": "figures beside their bars: speed, robustness, anatomy, imaging, labels, dataset",
     "devices": "the guidewires that endopilot knows",
