@@ -471,35 +471,44 @@ class Simulator:
         for group, values in zip(self._groups, state.values, strict=True):
             group.simulation.set_state(np.ascontiguousarray(values))
 
-    def copy_worlds(self, source: ArrayLike) -> None:
+    def copy_worlds(self, source: ArrayLike, *, of: Simulator | None = None) -> None:
         """Put every world where another one, of the same anatomy and device, is now; friction goes with it.
 
         Args:
             source: for each world, the number of the one that it becomes a copy of; its own to stay as it is.
+            of: the simulator that the numbers belong to, made with the very same anatomies, devices and settings but
+                maybe another number of worlds; this one if not given.
 
         Raises:
-            InputError: not one number for each world, or a world of another anatomy or device.
+            InputError: not one number for each world, or a world of another anatomy or device, or other settings.
 
         Example:
             >>> simulator.copy_worlds([0, 0, 2, 2])
             >>> bool((simulator.position[1] == simulator.position[0])[simulator.contacts[0] >= 0].all())
             True
         """
+        of = of or self
         chosen = np.asarray(source)
         if chosen.shape != (self.worlds,) or not np.issubdtype(chosen.dtype, np.integer):
             raise InputError(f"source: {source}; give the number of a world for each of the {self.worlds} worlds")
+        if (self._by_force, _settings(self._config)) != (of._by_force, _settings(of._config)):
+            raise InputError("of: a simulator with other settings; make both with the same actuation and config")
+        originals = {(id(group.anatomy), id(group.device)): group for group in of._groups}
+        states = []
         for group in self._groups:
             wanted = chosen[group.index]
-            strange = ~np.isin(wanted, group.index)
-            if strange.any():
+            original = originals.get((id(group.anatomy), id(group.device)))
+            strange = ~np.isin(wanted, original.index if original else [])
+            if original is None or strange.any():
                 world = int(group.index[np.argmax(strange)])
                 raise InputError(
                     f"source: world {world} cannot become world {chosen[world]}, which is none or has another anatomy "
                     "or device; give one like it"
                 )
-        for group in self._groups:
-            rows = np.searchsorted(group.index, chosen[group.index])
-            group.simulation.set_state(np.ascontiguousarray(group.simulation.state()[rows]))
+            rows = np.searchsorted(original.index, wanted)
+            states.append(np.ascontiguousarray(original.simulation.state()[rows]))
+        for group, state in zip(self._groups, states, strict=True):
+            group.simulation.set_state(state)
 
     def _fingerprint(self) -> str:
         digest = hashlib.sha256(repr((self._by_force, _settings(self._config))).encode())

@@ -1,0 +1,332 @@
+"""Finding a way to a target by trying it in the rod core: `Search`.
+
+One wire, or several that differ in what is uncertain, is driven from its present state. On a clear way it is pushed
+straight on. Where that would lead into a wrong branch, or the tip stops, the wires go back to where they were before
+and a population of candidates tries other motions: every round each candidate draws a constant control for a second,
+and those nearest to the waypoint, in the mean over the wires and with the cost of what they did on the way, are kept
+and copied over the others, until one of them has entered the wanted branch.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from endopilot.control.cost import Cost, safety_ratio
+from endopilot.control.policy import DECISION_PERIOD_S
+from endopilot.control.route import Route
+from endopilot.env.task import Navigation
+from endopilot.errors import InputError
+from endopilot.simulation.device import Device
+from endopilot.simulation.simulator import SPARE_MM, SimulatorConfig
+from endopilot.simulation.stepping import Simulator
+from endopilot.types import TipProjection
+
+Controls = Float[np.ndarray, "periods 2"]
+_STALL_PERIODS = 4
+"""A tip that has come forward by less than `_STALL_SHARE` of the wire's advance in this many periods has stopped."""
+_STALL_SHARE = 0.25
+_LOOKOUT_MM = 12.0
+"""A waypoint that is searched for lies no farther ahead than this, mm: beyond, a chord says little."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchConfig:
+    """How hard is searched."""
+
+    candidates: int = 32
+    """Candidates that are tried side by side where the way is not clear."""
+    rounds: int = 20
+    """Rounds of one search, at most."""
+    round_periods: int = 2
+    """Decision periods of 0.5 s in a round."""
+    keep_share: float = 0.25
+    """Share of the candidates that a round keeps."""
+    speed_mm_s: float = 10.0
+    """Translation on a clear way, mm/s."""
+    turn_rad_s: float = 7.0
+    """Fastest rotation that is tried, rad/s."""
+    lead_mm: float = 4.0
+    """A search begins this far before the wall of the junction, mm."""
+    cost: Cost = field(default_factory=Cost)
+    """What the candidates are compared by."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            InputError: a field is out of its range.
+        """
+        for name in ("candidates", "rounds", "round_periods", "speed_mm_s", "turn_rad_s", "lead_mm"):
+            if not 0 < getattr(self, name) < np.inf:
+                raise InputError(f"{name}: {getattr(self, name)}; give a positive number")
+        if not 0 < self.keep_share < 1:
+            raise InputError(f"keep_share: {self.keep_share}; give a share between 0 and 1")
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """Controls, and what the wires that they were found with do under them.
+
+    Attributes:
+        control: (mm/s, rad/s) of each decision period.
+        abscissa: Δtip at the end of each period, a column a wire, mm.
+        offset: γtip, mm.
+        branch: index of the branch of the tip.
+        radius: lumen radius at the tip, mm.
+        position: of the tips, LPS mm.
+        force: largest wall force on a node, N.
+        inserted: Δ, mm, of the first wire.
+        rotation: φ, rad, of the first wire.
+        reached: whether they end at the target, by weight: 1 if all do.
+    """
+
+    control: Controls
+    abscissa: Float[np.ndarray, "periods wires"]
+    offset: Float[np.ndarray, "periods wires"]
+    branch: Int[np.ndarray, "periods wires"]
+    radius: Float[np.ndarray, "periods wires"]
+    position: Float[np.ndarray, "periods wires 3"]
+    force: Float[np.ndarray, "periods wires"]
+    inserted: Float[np.ndarray, "periods"]
+    rotation: Float[np.ndarray, "periods"]
+    reached: float
+
+
+class Search:
+    """Searches ways for a navigation, from any state of its wires."""
+
+    def __init__(
+        self,
+        navigation: Navigation,
+        route: Route,
+        wires: list[Device],
+        *,
+        core: SimulatorConfig,
+        config: SearchConfig,
+        seed: int,
+    ) -> None:
+        """Lay out the wires, and the candidates of each.
+
+        Args:
+            navigation: where, and how hard the wall may be pressed.
+            route: the way to its target.
+            wires: as they may be; the same object where two have the same stiffness.
+            core: settings of the rod core.
+            config: how hard is searched.
+            seed: of the random candidates.
+        """
+        self.navigation, self.route, self.config = navigation, route, config
+        self._random = np.random.default_rng([seed, 0x5EA])
+        self.single = Simulator(navigation.anatomy, wires, config=core)
+        self._many = Simulator(
+            navigation.anatomy, [wire for wire in wires for _ in range(config.candidates)], config=core
+        )
+        self._limits = np.array([wires[0].max_velocity_mm_s, wires[0].max_rotation_rad_s])
+        self._longest = float(navigation.anatomy.tree.longest_path().abscissa[-1]) + SPARE_MM
+        self._wire_radius = wires[0].tip_radius_mm
+
+    def find(self, start: Simulator, source: Int[np.ndarray, "wires"], weight: Float[np.ndarray, "wires"], *,
+             seconds: float) -> Course:  # fmt: skip
+        """Find a way from a state of the wires to the target.
+
+        Args:
+            start: a simulator of the same wires.
+            source: which of its worlds each wire is.
+            weight: how much each wire counts; their sum is 1.
+            seconds: time that is left.
+        """
+        self.single.copy_worlds(source, of=start)
+        self._weight = weight
+        log = _Log()
+        periods = max(1, int(seconds / DECISION_PERIOD_S))
+        while log.periods < periods:
+            progress = float(self.route.progress(self.single.project()) @ weight)
+            kept, before = self.single.state, log.periods
+            if self._push_on(log, periods, self.route.next_waypoint(progress)):
+                if self._reached() > 0.5:
+                    break
+                continue
+            self.single.set_state(kept)
+            log.cut(before)
+            self._approach(log, periods, self.route.next_waypoint(progress))
+            if not self._try_others(log, periods):
+                break
+        return log.course(self._reached())
+
+    def _reached(self) -> float:
+        return float(self.navigation.reached(self.single.project()) @ self._weight)
+
+    def _push_on(self, log: _Log, periods: int, waypoint: float) -> bool:
+        """Push straight on past a waypoint; False if a wire goes astray, stops or presses too hard."""
+        begun = log.periods
+        while log.periods < periods:
+            tip = self.single.project()
+            if self.route.passed(tip, waypoint).all():
+                return True
+            if (self.route.astray(tip) > 0).any():
+                return False
+            left = waypoint - float(self.route.progress(tip) @ self._weight)
+            last = waypoint >= self.route.target.abscissa
+            speed = np.clip(left / DECISION_PERIOD_S, 1.0, self.config.speed_mm_s) if last else self.config.speed_mm_s
+            self._drive(log, np.array([speed, 0.0]))
+            if self._pressed(log) or (log.periods - begun >= _STALL_PERIODS and log.stalled()):
+                return False
+        return bool(self.route.passed(self.single.project(), waypoint).all())
+
+    def _approach(self, log: _Log, periods: int, waypoint: float) -> None:
+        """Push on, or pull back, to where a search for a waypoint begins."""
+        before = self.route.junctions[self.route.junctions < waypoint]
+        last = waypoint >= self.route.target.abscissa
+        begin = waypoint - _LOOKOUT_MM if last or not len(before) else float(before[-1]) - self.config.lead_mm
+        for _ in range(periods - log.periods):
+            tip = self.single.project()
+            here, astray = self.route.progress(tip) @ self._weight, (self.route.astray(tip) > 0).any()
+            if astray and self.single.inserted_length.min() > 1.0:
+                self._drive(log, np.array([-self.config.speed_mm_s, 0.0]))
+            elif here < begin - 1.0 and not (log.periods >= _STALL_PERIODS and log.stalled()):
+                self._drive(log, np.array([min(self.config.speed_mm_s, (begin - here) / DECISION_PERIOD_S), 0.0]))
+            else:
+                return
+
+    def _drive(self, log: _Log, control: Float[np.ndarray, "2"]) -> None:
+        made = self._possible(control[None], self.single)[0]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            step = self.single.step(np.tile(made, (self.single.worlds, 1)), DECISION_PERIOD_S)
+        tip = self.single.project()
+        log.add(made, tip, step.tip_position, step.contact_force_max, step.inserted_length, step.rotation)
+
+    def _possible(self, control: Float[np.ndarray, "n 2"], simulator: Simulator) -> Float[np.ndarray, "n 2"]:
+        """Return what the drive can do of controls, with the shortest and the longest wire that it is given."""
+        made = np.clip(control, -self._limits, self._limits)
+        inserted = simulator.inserted_length
+        room = (self._longest - 1.0 - float(inserted.max())) / DECISION_PERIOD_S
+        made[:, 0] = np.clip(made[:, 0], -float(inserted.min()) / DECISION_PERIOD_S, max(room, 0.0))
+        return made
+
+    def _pressed(self, log: _Log) -> bool:
+        limit = self.config.cost.forbidden * self.navigation.force_limit_n
+        return bool((log.force[-1] > limit).any() or not self.single.valid.all())
+
+    def _try_others(self, log: _Log, periods: int) -> bool:
+        """Search with the whole population for a way past the next waypoint; append the best to the log."""
+        count, wires = self.config.candidates, self.single.worlds
+        self._many.copy_worlds(np.repeat(np.arange(wires), count), of=self.single)
+        progress = float(self.route.progress(self.single.project()) @ self._weight)
+        waypoint = min(self.route.next_waypoint(progress), progress + _LOOKOUT_MM)
+        history = np.zeros((0, count, 2))
+        spent = np.zeros(count)
+        for number in range(self.config.rounds):
+            if log.periods + len(history) + self.config.round_periods > periods:
+                break
+            drawn = self._draw(history[-1] if len(history) else None, number)
+            drawn = self._possible(drawn, self._many)
+            spent += self._run_round(drawn, history[-1] if len(history) else None, waypoint)
+            history = np.concatenate([history, np.repeat(drawn[None], self.config.round_periods, axis=0)])
+            score, won = self._judge(waypoint, spent)
+            if won.any():
+                self._follow(log, history[:, np.argmin(np.where(won, score, np.inf))])
+                return True
+            chosen = self._select(score)
+            self._many.copy_worlds((np.arange(wires)[:, None] * count + chosen).ravel())
+            history, spent = history[:, chosen], spent[chosen]
+        if len(history):
+            self._follow(log, history[:, 0])
+        return False
+
+    def _draw(self, last: Float[np.ndarray, "candidates 2"] | None, number: int) -> Float[np.ndarray, "candidates 2"]:
+        """Draw a control for each candidate; a few go on with what they did."""
+        count, config, random = self.config.candidates, self.config, self._random
+        speed = np.where(
+            random.random(count) < 0.55, random.uniform(0.1, 0.8, count), random.uniform(-0.8, 0.0, count)
+        )
+        turn = np.where(random.random(count) < 0.25, 0.0, random.uniform(-1.0, 1.0, count))
+        drawn = np.column_stack([speed * config.speed_mm_s, turn * config.turn_rad_s])
+        if last is not None:
+            same = random.random(count) < 0.2
+            drawn[same] = last[same]
+        return drawn
+
+    def _run_round(
+        self, control: Float[np.ndarray, "candidates 2"], before: Float[np.ndarray, "candidates 2"] | None,
+        waypoint: float,
+    ) -> Float[np.ndarray, "candidates"]:  # fmt: skip
+        """Drive all candidates for a round; return what it cost each, in the mean over its wires."""
+        cost, wires = self.config.cost, self.single.worlds
+        spent = np.zeros(len(control)) if before is None else cost.roughness(before, control, self._limits)
+        for _ in range(self.config.round_periods):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                step = self._many.step(np.tile(control, (wires, 1)), DECISION_PERIOD_S)
+            tip = self._many.project()
+            running = cost.running(
+                error=self._distance(step.tip_position, waypoint),
+                ratio=safety_ratio(tip.offset, tip.radius, self._wire_radius),
+                force_share=step.contact_force_max / self.navigation.force_limit_n,
+            )
+            running = np.where(step.valid, running, 1e3)
+            spent += DECISION_PERIOD_S * (self._weight @ running.reshape(wires, -1))
+        return spent
+
+    def _distance(self, position: Float[np.ndarray, "n 3"], waypoint: float) -> Float[np.ndarray, "n"]:
+        return np.linalg.norm(position - self.route.position(waypoint), axis=-1)
+
+    def _judge(
+        self, waypoint: float, spent: Float[np.ndarray, "candidates"]
+    ) -> tuple[Float[np.ndarray, "candidates"], Bool[np.ndarray, "candidates"]]:
+        """Return each candidate's cost so far and to go, and whether all its wires have passed the waypoint."""
+        tip, wires = self._many.project(), self.single.worlds
+        to_go = self._distance(self._many.position[:, 0], waypoint) + 0.5 * self.route.astray(tip)
+        passed = (self.route.passed(tip, waypoint) & self._many.valid).reshape(wires, -1)
+        score = self._weight @ to_go.reshape(wires, -1) + spent
+        return score, self._weight @ passed > 1 - 1e-9
+
+    def _select(self, score: Float[np.ndarray, "candidates"]) -> Int[np.ndarray, "candidates"]:
+        """Return whose copy each candidate becomes: the best stay and are copied over the others."""
+        best = np.argsort(score)[: max(1, round(self.config.keep_share * len(score)))]
+        others = self._random.choice(best, len(score) - len(best))
+        return np.concatenate([best, others])
+
+    def _follow(self, log: _Log, controls: Controls) -> None:
+        for control in controls:
+            self._drive(log, control)
+
+
+class _Log:
+    """What the wires have done so far, a row a period."""
+
+    def __init__(self) -> None:
+        self.rows: list[tuple] = []
+
+    def add(self, control: np.ndarray, tip: TipProjection, *rest: np.ndarray) -> None:
+        self.rows.append((control, tip.abscissa, tip.offset, tip.branch, tip.radius, *rest))
+
+    def cut(self, periods: int) -> None:
+        del self.rows[periods:]
+
+    @property
+    def periods(self) -> int:
+        return len(self.rows)
+
+    @property
+    def force(self) -> list[np.ndarray]:
+        return [row[6] for row in self.rows]
+
+    def stalled(self) -> bool:
+        """Return whether the tips have stayed behind in the last periods while the wires went forward."""
+        last = self.rows[-_STALL_PERIODS:]
+        advance = sum(float(row[0][0]) for row in last) * DECISION_PERIOD_S
+        gain = float(np.min(last[-1][1] - last[0][1]))
+        return len(last) == _STALL_PERIODS and advance > 2.0 and gain < _STALL_SHARE * advance
+
+    def course(self, reached: float) -> Course:
+        columns = [np.array(column) for column in zip(*self.rows, strict=True)]
+        control, abscissa, offset, branch, radius, position, force, inserted, rotation = columns
+        return Course(
+            control=control, abscissa=abscissa, offset=offset, branch=branch, radius=radius, position=position,
+            force=force, inserted=inserted[:, 0], rotation=rotation[:, 0], reached=reached,
+        )  # fmt: skip
