@@ -14,6 +14,7 @@ others are looked at for the few points that are contested.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -85,6 +86,7 @@ class _Slabs:
     places: KDTree
 
     @classmethod
+    @lru_cache(maxsize=4)  # a controller projects tips of one tree over and over
     def of(cls, tree: VesselTree, insertion: Insertion) -> _Slabs:
         lines = [branch.centerline for branch in tree.branches]
         counts = np.array([len(line.points) for line in lines])

@@ -21,7 +21,7 @@ from endopilot.control.route import Route
 from endopilot.env.task import Navigation
 from endopilot.errors import InputError
 from endopilot.simulation.device import Device
-from endopilot.simulation.simulator import SPARE_MM, SimulatorConfig
+from endopilot.simulation.simulator import SPARE_MM
 from endopilot.simulation.stepping import Simulator
 from endopilot.types import TipProjection
 
@@ -105,9 +105,9 @@ class Search:
         route: Route,
         wires: list[Device],
         *,
-        core: SimulatorConfig,
         config: SearchConfig,
         seed: int,
+        sharing: Simulator,
     ) -> None:
         """Lay out the wires, and the candidates of each.
 
@@ -115,16 +115,16 @@ class Search:
             navigation: where, and how hard the wall may be pressed.
             route: the way to its target.
             wires: as they may be; the same object where two have the same stiffness.
-            core: settings of the rod core.
             config: how hard is searched.
             seed: of the random candidates.
+            sharing: the simulator that ways will be searched from; its wires are among `wires`, its settings are taken.
         """
         self.navigation, self.route, self.config = navigation, route, config
         self._random = np.random.default_rng([seed, 0x5EA])
-        self.single = Simulator(navigation.anatomy, wires, config=core)
-        self._many = Simulator(
-            navigation.anatomy, [wire for wire in wires for _ in range(config.candidates)], config=core
-        )
+        crowd = [wire for wire in wires for _ in range(config.candidates)]
+        anatomy, core = navigation.anatomy, sharing.config
+        self.single, self._kept = (Simulator(anatomy, wires, config=core, sharing=sharing) for _ in range(2))
+        self._many = Simulator(anatomy, crowd, config=core, sharing=sharing)
         self._limits = np.array([wires[0].max_velocity_mm_s, wires[0].max_rotation_rad_s])
         self._longest = float(navigation.anatomy.tree.longest_path().abscissa[-1]) + SPARE_MM
         self._wire_radius = wires[0].tip_radius_mm
@@ -145,12 +145,13 @@ class Search:
         periods = max(1, int(seconds / DECISION_PERIOD_S))
         while log.periods < periods:
             progress = float(self.route.progress(self.single.project()) @ weight)
-            kept, before = self.single.state, log.periods
+            self._kept.copy_worlds(np.arange(len(weight)), of=self.single)
+            before = log.periods
             if self._push_on(log, periods, self.route.next_waypoint(progress)):
                 if self._reached() > 0.5:
                     break
                 continue
-            self.single.set_state(kept)
+            self.single.copy_worlds(np.arange(len(weight)), of=self._kept)
             log.cut(before)
             self._approach(log, periods, self.route.next_waypoint(progress))
             if not self._try_others(log, periods):

@@ -74,6 +74,7 @@ class Simulator:
         worlds: int = 1,
         actuation: Actuation = "velocity",
         config: SimulatorConfig | None = None,
+        sharing: Simulator | None = None,
     ) -> None:
         """Lay the wires out; every world starts with its tip at the ostium.
 
@@ -85,6 +86,7 @@ class Simulator:
                 slips rather than push harder than the device's push limit) or "force" (axial force N and torque N·mm on
                 the wire; advance and rotation follow, against the friction and drag of the introducer).
             config: settings of the rod core.
+            sharing: a simulator that has prepared the same anatomy, whose lumen is then not prepared again.
 
         Raises:
             InputError: a device that does not fit its anatomy; a distance map that is not finite, or negative at the
@@ -94,6 +96,7 @@ class Simulator:
             raise InputError(f"actuation: {actuation!r}; give 'velocity' or 'force'")
         self._config = config or SimulatorConfig()
         self._by_force = actuation == "force"
+        self._lumens: dict[tuple[int, float], tuple[Anatomy, _core.Lumen]] = dict(sharing._lumens) if sharing else {}
         anatomies = [anatomy] * worlds if isinstance(anatomy, Anatomy) else list(anatomy)
         devices = [device] * len(anatomies) if isinstance(device, Device) else list(device)
         if isinstance(anatomy, Anatomy) and not isinstance(device, Device):
@@ -110,11 +113,14 @@ class Simulator:
         members: dict[tuple[int, int], list[int]] = {}
         for world, pair in enumerate(zip(anatomies, devices, strict=True)):
             members.setdefault((id(pair[0]), id(pair[1])), []).append(world)
-        groups, lumens = [], {}
+        groups = []
         for worlds in members.values():
             anatomy, device = anatomies[worlds[0]], devices[worlds[0]]
             check_fits(device, anatomy)
-            check_distance_map(anatomy)
+            key = (id(anatomy), device.tip_radius_mm)
+            if key not in self._lumens:
+                check_distance_map(anatomy)
+                self._lumens[key] = anatomy, make_lumen(anatomy.distance_map, device.tip_radius_mm)
             path_mm = float(anatomy.tree.longest_path().abscissa[-1])
             longest_mm = path_mm + SPARE_MM
             rod = lay_out(
@@ -122,12 +128,9 @@ class Simulator:
             )
             needed = 8 * len(worlds) * (25 * len(rod.abscissa_mm) + 40)
             check_memory(needed, f"worlds: {len(worlds)}", "give fewer")
-            key = (id(anatomy), device.tip_radius_mm)
-            if key not in lumens:
-                lumens[key] = make_lumen(anatomy.distance_map, device.tip_radius_mm)
             simulation = _core.Simulation(
                 rod=rod.model(),
-                lumen=lumens[key],
+                lumen=self._lumens[key][1],
                 loads=None,
                 **insertion_arguments(anatomy.insertion),
                 options=core_options(
@@ -140,6 +143,16 @@ class Simulator:
             )
             groups.append(_Group(anatomy, device, rod, simulation, np.array(worlds), path_mm, longest_mm))
         return groups
+
+    @property
+    def config(self) -> SimulatorConfig:
+        """Settings of the rod core.
+
+        Example:
+            >>> simulator.config.elements
+            100
+        """
+        return self._config
 
     @property
     def worlds(self) -> int:
