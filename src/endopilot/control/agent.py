@@ -7,7 +7,7 @@ with X-ray on, until one agrees with what is seen, and another way is searched f
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
@@ -19,6 +19,8 @@ from endopilot.control.robot import Limits
 from endopilot.control.route import Route, check_passable
 from endopilot.control.search import Course, Search, SearchConfig
 from endopilot.env.task import Navigation
+from endopilot.progress import Advance
+from endopilot.types import TipProjection
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,25 +128,29 @@ class _PlanningPolicy:
         off = np.abs(self._course.abscissa[self._at - 1] - tip.abscissa[0]).min()
         return bool(strayed or off > self.config.off_course_mm)
 
-    def _planned_tip(self):
+    def _planned_tip(self) -> TipProjection:
         """Return where the course has the tips of its wires now."""
-        from endopilot.types import TipProjection
-
         course, at = self._course, self._at - 1
         assert course is not None
         return TipProjection(
             abscissa=course.abscissa[at], offset=course.offset[at], branch=course.branch[at], radius=course.radius[at]
         )
 
-    def _plan(self, sight: Sight) -> None:
-        """Search a way from where the likeliest wires are."""
-        seconds = self.navigation.seconds - sight.time_s
-        self._at, self._course = 0, None
-        if seconds < DECISION_PERIOD_S:
-            return
+    def find_course(self, seconds: float, advance: Advance | None = None) -> Course:
+        """Search a way from where the likeliest wires are.
+
+        Args:
+            seconds: time that is left, s.
+            advance: told of every millimetre along the route.
+        """
         source, weight = self.belief.likeliest()
         self._ostium = float(self.belief.parameters[source[0], 2])
-        self._course = self._search.find(self.belief.simulator, source, weight, seconds=seconds)
+        return self._search.find(self.belief.simulator, source, weight, seconds=seconds, advance=advance)
+
+    def _plan(self, sight: Sight) -> None:
+        seconds = self.navigation.seconds - sight.time_s
+        self._at = 0
+        self._course = self.find_course(seconds) if seconds >= DECISION_PERIOD_S else None
 
 
 class TwinPolicy(_PlanningPolicy):

@@ -36,7 +36,7 @@ class BeliefConfig:
     ostium_spread_mm: float = 0.5
     """The ostium may lie this much deeper or less deep along the catheter's axis, mm."""
     along_sd_mm: float = 0.6
-    """Scale of what a good member's tip misses a measured one by along the wire, mm: where a tip ends is hard to see."""
+    """Scale of what a good member's tip misses a measured one by along the wire, mm: a tip's end is hard to see."""
     across_sd_mm: float = 0.3
     """The same across the wire, mm."""
     elements: int = 50
@@ -74,7 +74,9 @@ class Belief:
         weight: their likelihoods; the sum is 1.
     """
 
-    def __init__(self, navigation: Navigation, parameters: Float[np.ndarray, "members 3"], config: BeliefConfig) -> None:
+    def __init__(
+        self, navigation: Navigation, parameters: Float[np.ndarray, "members 3"], config: BeliefConfig
+    ) -> None:
         """Bring every member's wire to the start of the navigation."""
         self.parameters, self._config = parameters, config
         device = navigation.device
@@ -97,7 +99,7 @@ class Belief:
 
     @staticmethod
     def around(told: Float[np.ndarray, "3"], config: BeliefConfig) -> Float[np.ndarray, "members 3"]:
-        """Return members evenly around what is told: every stiffness, with friction and ostium from a Sobol sequence."""
+        """Return members evenly around what is told: friction and ostium from a Sobol sequence, every stiffness."""
         levels = np.linspace(-1.0, 1.0, config.stiffness_levels) if config.stiffness_levels > 1 else np.zeros(1)
         unit = 2 * qmc.Sobol(2, scramble=False).random_base2(config.members.bit_length())[1 : config.members + 1] - 1
         parameters = np.tile(told, (config.members, 1)).astype(float)

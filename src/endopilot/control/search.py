@@ -20,6 +20,7 @@ from endopilot.control.policy import DECISION_PERIOD_S
 from endopilot.control.route import Route
 from endopilot.env.task import Navigation
 from endopilot.errors import InputError
+from endopilot.progress import Advance
 from endopilot.simulation.device import Device
 from endopilot.simulation.simulator import SPARE_MM
 from endopilot.simulation.stepping import Simulator
@@ -129,31 +130,42 @@ class Search:
         self._longest = float(navigation.anatomy.tree.longest_path().abscissa[-1]) + SPARE_MM
         self._wire_radius = wires[0].tip_radius_mm
 
-    def find(self, start: Simulator, source: Int[np.ndarray, "wires"], weight: Float[np.ndarray, "wires"], *,
-             seconds: float) -> Course:  # fmt: skip
+    def find(
+        self,
+        start: Simulator,
+        source: Int[np.ndarray, "wires"],
+        weight: Float[np.ndarray, "wires"],
+        *,
+        seconds: float,
+        advance: Advance | None = None,
+    ) -> Course:
         """Find a way from a state of the wires to the target.
 
         Args:
             start: a simulator of the same wires.
             source: which of its worlds each wire is.
             weight: how much each wire counts; their sum is 1.
-            seconds: time that is left.
+            seconds: time that is left, s.
+            advance: told of every millimetre along the route.
         """
         self.single.copy_worlds(source, of=start)
-        self._weight = weight
-        log = _Log()
+        self._weight, same = weight, np.arange(len(weight))
+        log, told = _Log(), 0.0
         periods = max(1, int(seconds / DECISION_PERIOD_S))
         while log.periods < periods:
-            progress = float(self.route.progress(self.single.project()) @ weight)
-            self._kept.copy_worlds(np.arange(len(weight)), of=self.single)
-            before = log.periods
-            if self._push_on(log, periods, self.route.next_waypoint(progress)):
+            here = float(self.route.progress(self.single.project()) @ weight)
+            if advance is not None:
+                advance(max(here - told, 0.0))
+                told = max(here, told)
+            waypoint, before = self.route.next_waypoint(here), log.periods
+            self._kept.copy_worlds(same, of=self.single)
+            if self._push_on(log, periods, waypoint):
                 if self._reached() > 0.5:
                     break
                 continue
-            self.single.copy_worlds(np.arange(len(weight)), of=self._kept)
+            self.single.copy_worlds(same, of=self._kept)
             log.cut(before)
-            self._approach(log, periods, self.route.next_waypoint(progress))
+            self._approach(log, periods, waypoint)
             if not self._try_others(log, periods):
                 break
         return log.course(self._reached())
@@ -242,9 +254,7 @@ class Search:
     def _draw(self, last: Float[np.ndarray, "candidates 2"] | None, number: int) -> Float[np.ndarray, "candidates 2"]:
         """Draw a control for each candidate; a few go on with what they did."""
         count, config, random = self.config.candidates, self.config, self._random
-        speed = np.where(
-            random.random(count) < 0.55, random.uniform(0.1, 0.8, count), random.uniform(-0.8, 0.0, count)
-        )
+        speed = np.where(random.random(count) < 0.55, random.uniform(0.1, 0.8, count), random.uniform(-0.8, 0.0, count))
         turn = np.where(random.random(count) < 0.25, 0.0, random.uniform(-1.0, 1.0, count))
         drawn = np.column_stack([speed * config.speed_mm_s, turn * config.turn_rad_s])
         if last is not None:
