@@ -35,6 +35,8 @@ class AgentConfig:
     """The tip is looked at when the simulated ones are this far apart, mm."""
     off_course_mm: float = 2.5
     """Another way is searched when the likeliest tip is this far along the centerline from where it should be, mm."""
+    tries: int = 8
+    """Searches in vain, one after another, before the wire is left where it is."""
     lost_along_mm: float = 4.0
     """A measured tip this far along the wire from all simulated ones is explained by none, mm."""
     lost_across_mm: float = 1.5
@@ -81,7 +83,7 @@ class _PlanningPolicy:
         self._limits = Limits.of(navigation.device, navigation.anatomy)
         self._course: Course | None = None
         self._at, self._lost, self._began = 0, False, False
-        self._passed = 0
+        self._passed, self.plans, self._vain = 0, 0, 0
 
     def decide(self, sight: Sight) -> Decision:
         """Follow the course, search another one, or pull back; see the module."""
@@ -149,8 +151,12 @@ class _PlanningPolicy:
 
     def _plan(self, sight: Sight) -> None:
         seconds = self.navigation.seconds - sight.time_s
-        self._at = 0
+        if self._vain >= self.config.tries:
+            self._course = None
+            return
+        self._at, self.plans = 0, self.plans + 1
         self._course = self.find_course(seconds) if seconds >= DECISION_PERIOD_S else None
+        self._vain = self._vain + 1 if self._course is not None and self._course.reached < 0.5 else 0
 
 
 class TwinPolicy(_PlanningPolicy):

@@ -41,7 +41,7 @@ _IDEAL = RobotConfig(
 class SampleConfig:
     """Sampling through the forward network (method mppi), after Williams et al., J. Guid. Control Dyn. 40, 2017."""
 
-    candidates: int = 16
+    candidates: int = 12
     """Control sequences that are rolled out together."""
     iterations: int = 4
     """Rounds; each draws around the weighted mean of the one before."""
@@ -257,8 +257,8 @@ def _check_time(navigation: Navigation, config: PlanConfig) -> None:
     fastest = min(navigation.device.max_velocity_mm_s, config.speed_mm_s)
     if way / fastest > navigation.seconds:
         raise InputError(
-            f"seconds: {navigation.seconds:g} s are too few for the {way:.0f} mm to the target at {fastest:g} mm/s; give "
-            f"{way / fastest:.0f} s or more, or a larger speed_mm_s (the device's limit is "
+            f"seconds: {navigation.seconds:g} s are too few for the {way:.0f} mm to the target at {fastest:g} mm/s; "
+            f"give {way / fastest:.0f} s or more, or a larger speed_mm_s (the device's limit is "
             f"{navigation.device.max_velocity_mm_s:g} mm/s)"
         )
 

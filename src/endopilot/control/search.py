@@ -30,6 +30,8 @@ Controls = Float[np.ndarray, "periods 2"]
 _STALL_PERIODS = 4
 """A tip that has come forward by less than `_STALL_SHARE` of the wire's advance in this many periods has stopped."""
 _STALL_SHARE = 0.25
+_LEFT_BEHIND = 0.2
+"""Each attempt is content with a way that leaves this much more of the wires, by weight, behind."""
 _LOOKOUT_MM = 12.0
 """A waypoint that is searched for lies no farther ahead than this, mm: beyond, a chord says little."""
 
@@ -40,8 +42,10 @@ class SearchConfig:
 
     candidates: int = 32
     """Candidates that are tried side by side where the way is not clear."""
-    rounds: int = 20
-    """Rounds of one search, at most."""
+    rounds: int = 6
+    """Rounds of one attempt, at most."""
+    attempts: int = 4
+    """Attempts, each from the same state, before a search is given up."""
     round_periods: int = 2
     """Decision periods of 0.5 s in a round."""
     keep_share: float = 0.25
@@ -61,7 +65,7 @@ class SearchConfig:
         Raises:
             InputError: a field is out of its range.
         """
-        for name in ("candidates", "rounds", "round_periods", "speed_mm_s", "turn_rad_s", "lead_mm"):
+        for name in ("candidates", "rounds", "attempts", "round_periods", "speed_mm_s", "turn_rad_s", "lead_mm"):
             if not 0 < getattr(self, name) < np.inf:
                 raise InputError(f"{name}: {getattr(self, name)}; give a positive number")
         if not 0 < self.keep_share < 1:
@@ -168,7 +172,7 @@ class Search:
             self._approach(log, periods, waypoint)
             if not self._try_others(log, periods):
                 break
-        return log.course(self._reached())
+        return log.course(len(weight), self._reached())
 
     def _reached(self) -> float:
         return float(self.navigation.reached(self.single.project()) @ self._weight)
@@ -178,17 +182,17 @@ class Search:
         begun = log.periods
         while log.periods < periods:
             tip = self.single.project()
-            if self.route.passed(tip, waypoint).all():
+            if self._all(self.route.passed(tip, waypoint)):
                 return True
-            if (self.route.astray(tip) > 0).any():
+            if not self._all(self.route.astray(tip) == 0):
                 return False
             left = waypoint - float(self.route.progress(tip) @ self._weight)
             last = waypoint >= self.route.target.abscissa
             speed = np.clip(left / DECISION_PERIOD_S, 1.0, self.config.speed_mm_s) if last else self.config.speed_mm_s
             self._drive(log, np.array([speed, 0.0]))
-            if self._pressed(log) or (log.periods - begun >= _STALL_PERIODS and log.stalled()):
+            if self._pressed(log) or (log.periods - begun >= _STALL_PERIODS and log.stalled(self._weight > 0)):
                 return False
-        return bool(self.route.passed(self.single.project(), waypoint).all())
+        return self._all(self.route.passed(self.single.project(), waypoint))
 
     def _approach(self, log: _Log, periods: int, waypoint: float) -> None:
         """Push on, or pull back, to where a search for a waypoint begins."""
@@ -197,10 +201,10 @@ class Search:
         begin = waypoint - _LOOKOUT_MM if last or not len(before) else float(before[-1]) - self.config.lead_mm
         for _ in range(periods - log.periods):
             tip = self.single.project()
-            here, astray = self.route.progress(tip) @ self._weight, (self.route.astray(tip) > 0).any()
-            if astray and self.single.inserted_length.min() > 1.0:
+            here, on_route = self.route.progress(tip) @ self._weight, self._all(self.route.astray(tip) == 0)
+            if not on_route and self.single.inserted_length.min() > 1.0:
                 self._drive(log, np.array([-self.config.speed_mm_s, 0.0]))
-            elif here < begin - 1.0 and not (log.periods >= _STALL_PERIODS and log.stalled()):
+            elif here < begin - 1.0 and not (log.periods >= _STALL_PERIODS and log.stalled(self._weight > 0)):
                 self._drive(log, np.array([min(self.config.speed_mm_s, (begin - here) / DECISION_PERIOD_S), 0.0]))
             else:
                 return
@@ -223,43 +227,85 @@ class Search:
 
     def _pressed(self, log: _Log) -> bool:
         limit = self.config.cost.forbidden * self.navigation.force_limit_n
-        return bool((log.force[-1] > limit).any() or not self.single.valid.all())
+        return not self._all((log.force[-1] <= limit) & self.single.valid)
+
+    def _all(self, holds: Bool[np.ndarray, "wires"]) -> bool:
+        """Return whether something holds for all wires that have not been left behind."""
+        return bool(holds[self._weight > 0].all())
 
     def _try_others(self, log: _Log, periods: int) -> bool:
-        """Search with the whole population for a way past the next waypoint; append the best to the log."""
-        count, wires = self.config.candidates, self.single.worlds
-        self._many.copy_worlds(np.repeat(np.arange(wires), count), of=self.single)
+        """Search with the whole population for a way past the next waypoint; append the best to the log.
+
+        What is searched in vain is begun anew from the same state, so that a plan holds no vain motion.
+        """
         progress = float(self.route.progress(self.single.project()) @ self._weight)
         waypoint = min(self.route.next_waypoint(progress), progress + _LOOKOUT_MM)
-        history = np.zeros((0, count, 2))
-        spent = np.zeros(count)
-        for number in range(self.config.rounds):
-            if log.periods + len(history) + self.config.round_periods > periods:
-                break
-            drawn = self._draw(history[-1] if len(history) else None, number)
-            drawn = self._possible(drawn, self._many)
-            spent += self._run_round(drawn, history[-1] if len(history) else None, waypoint)
-            history = np.concatenate([history, np.repeat(drawn[None], self.config.round_periods, axis=0)])
-            score, won = self._judge(waypoint, spent)
-            if won.any():
-                self._follow(log, history[:, np.argmin(np.where(won, score, np.inf))])
+        rounds = min(self.config.rounds, (periods - log.periods) // self.config.round_periods)
+        nearest, best = np.inf, np.zeros((0, 2))
+        for attempt in range(self.config.attempts):
+            score, controls, won = self._attempt(waypoint, rounds, attempt)
+            if won:
+                self._follow(log, controls)
+                self._leave_behind(self.route.passed(self.single.project(), waypoint))
                 return True
+            if score < nearest:
+                nearest, best = score, controls
+        self._follow(log, best)
+        return False
+
+    def _leave_behind(self, passed: Bool[np.ndarray, "wires"]) -> None:
+        """Go on without the wires that a way does not bring past a waypoint."""
+        left = np.where(passed, self._weight, 0.0)
+        if left.sum() > 0:
+            self._weight = left / left.sum()
+
+    def _attempt(self, waypoint: float, rounds: int, attempt: int) -> tuple[float, Controls, bool]:
+        """Search once; return the least cost so far and to go, its controls, and whether they pass the waypoint."""
+        count, wires = self.config.candidates, self.single.worlds
+        self._many.copy_worlds(np.repeat(np.arange(wires), count), of=self.single)
+        history, spent = np.zeros((0, count, 2)), np.zeros(count)
+        nearest, best = np.inf, np.zeros((0, 2))
+        for number in range(rounds):
+            before = history[-1] if number else np.zeros((count, 2))
+            drawn = self._possible(self._draw(before, number, attempt), self._many)
+            spent += self._run_round(drawn, before, waypoint)
+            history = np.concatenate([history, np.repeat(drawn[None], self.config.round_periods, axis=0)])
+            score, share = self._judge(waypoint, spent)
+            won = share >= 1 - _LEFT_BEHIND * attempt - 1e-9
+            if won.any():
+                return 0.0, history[:, np.argmin(np.where(won, score, np.inf))], True
+            if number == 0:
+                continue  # what has only turned has not shown yet where it leads
+            if score.min() < nearest:
+                nearest, best = float(score.min()), history[:, np.argmin(score)]
             chosen = self._select(score)
             self._many.copy_worlds((np.arange(wires)[:, None] * count + chosen).ravel())
             history, spent = history[:, chosen], spent[chosen]
-        if len(history):
-            self._follow(log, history[:, 0])
-        return False
+        return nearest, best, False
 
-    def _draw(self, last: Float[np.ndarray, "candidates 2"] | None, number: int) -> Float[np.ndarray, "candidates 2"]:
-        """Draw a control for each candidate; a few go on with what they did."""
+    def _draw(
+        self, last: Float[np.ndarray, "candidates 2"], number: int, attempt: int
+    ) -> Float[np.ndarray, "candidates 2"]:
+        """Draw a control for each candidate.
+
+        In the first round they turn the tip to all sides, and pull back, in later attempts farther; in the second most
+        go straight on; then they move at random, and a few go on with what they did.
+        """
         count, config, random = self.config.candidates, self.config, self._random
-        speed = np.where(random.random(count) < 0.55, random.uniform(0.1, 0.8, count), random.uniform(-0.8, 0.0, count))
-        turn = np.where(random.random(count) < 0.25, 0.0, random.uniform(-1.0, 1.0, count))
-        drawn = np.column_stack([speed * config.speed_mm_s, turn * config.turn_rad_s])
-        if last is not None:
-            same = random.random(count) < 0.2
-            drawn[same] = last[same]
+        turn = np.where(random.random(count) < 0.25, 0.0, random.uniform(-1.0, 1.0, count)) * config.turn_rad_s
+        if number == 0:
+            sides = (np.arange(count) + random.random(count)) / count
+            turn = (2 * sides - 1) * np.pi / (config.round_periods * DECISION_PERIOD_S)
+            speed = random.uniform(-0.3 * (1 + attempt), 0.3, count)
+        elif number == 1:
+            turn = np.where(random.random(count) < 0.6, 0.0, turn)
+            speed = random.uniform(0.2, 1.0, count)
+        else:
+            back = random.random(count) < 0.45
+            speed = np.where(back, random.uniform(-0.8, 0.0, count), random.uniform(0.1, 0.8, count))
+        drawn = np.column_stack([np.clip(speed, -1.0, 1.0) * config.speed_mm_s, turn])
+        same = (random.random(count) < 0.2) & (number > 1)
+        drawn[same] = last[same]
         return drawn
 
     def _run_round(
@@ -268,7 +314,7 @@ class Search:
     ) -> Float[np.ndarray, "candidates"]:  # fmt: skip
         """Drive all candidates for a round; return what it cost each, in the mean over its wires."""
         cost, wires = self.config.cost, self.single.worlds
-        spent = np.zeros(len(control)) if before is None else cost.roughness(before, control, self._limits)
+        spent = cost.roughness(before, control, self._limits)
         for _ in range(self.config.round_periods):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
@@ -288,13 +334,13 @@ class Search:
 
     def _judge(
         self, waypoint: float, spent: Float[np.ndarray, "candidates"]
-    ) -> tuple[Float[np.ndarray, "candidates"], Bool[np.ndarray, "candidates"]]:
-        """Return each candidate's cost so far and to go, and whether all its wires have passed the waypoint."""
+    ) -> tuple[Float[np.ndarray, "candidates"], Float[np.ndarray, "candidates"]]:
+        """Return each candidate's cost so far and to go, and the share of its wires that have passed the waypoint."""
         tip, wires = self._many.project(), self.single.worlds
         to_go = self._distance(self._many.position[:, 0], waypoint) + 0.5 * self.route.astray(tip)
         passed = (self.route.passed(tip, waypoint) & self._many.valid).reshape(wires, -1)
         score = self._weight @ to_go.reshape(wires, -1) + spent
-        return score, self._weight @ passed > 1 - 1e-9
+        return score, self._weight @ passed
 
     def _select(self, score: Float[np.ndarray, "candidates"]) -> Int[np.ndarray, "candidates"]:
         """Return whose copy each candidate becomes: the best stay and are copied over the others."""
@@ -327,15 +373,17 @@ class _Log:
     def force(self) -> list[np.ndarray]:
         return [row[6] for row in self.rows]
 
-    def stalled(self) -> bool:
-        """Return whether the tips have stayed behind in the last periods while the wires went forward."""
+    def stalled(self, counted: Bool[np.ndarray, "wires"]) -> bool:
+        """Return whether a tip that counts has stayed behind in the last periods while the wires went forward."""
         last = self.rows[-_STALL_PERIODS:]
         advance = sum(float(row[0][0]) for row in last) * DECISION_PERIOD_S
-        gain = float(np.min(last[-1][1] - last[0][1]))
+        gain = float(np.min((last[-1][1] - last[0][1])[counted]))
         return len(last) == _STALL_PERIODS and advance > 2.0 and gain < _STALL_SHARE * advance
 
-    def course(self, reached: float) -> Course:
-        columns = [np.array(column) for column in zip(*self.rows, strict=True)]
+    def course(self, wires: int, reached: float) -> Course:
+        shapes = ((2,), *[(wires,)] * 4, (wires, 3), *[(wires,)] * 3)
+        empty = [np.zeros((0, *shape), dtype=int if k == 3 else float) for k, shape in enumerate(shapes)]
+        columns = [np.array(column) for column in zip(*self.rows, strict=True)] or empty
         control, abscissa, offset, branch, radius, position, force, inserted, rotation = columns
         return Course(
             control=control, abscissa=abscissa, offset=offset, branch=branch, radius=radius, position=position,
