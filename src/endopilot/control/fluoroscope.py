@@ -21,7 +21,7 @@ from endopilot.types import Anatomy
 
 _CATHETER_MM = 20.0
 """Length of the catheter's axis behind the ostium in which a tip may be found, mm."""
-_ITERATIONS = 8
+_ITERATIONS, _NEAR_ENOUGH_MM = 8, 1e-2
 _HOPELESS = 30.0
 """Branches whose best vertex is this much less likely than the best of all (twice the log-likelihood) are left out."""
 _NEAR_SHARE = 0.1
@@ -144,7 +144,19 @@ class Fluoroscope:
         inserted_length: float,
         random: np.random.Generator,
     ) -> TipMeasurement:
-        """Take one exposure of every view and locate the tip.
+        """Take one exposure of every view and say where the tip is. The arguments are those of `locate`."""
+        position = self.locate(tip_position, tip_direction, inserted_length, random)
+        tip = project_tip(self._anatomy.tree, self._anatomy.insertion, position[None])
+        return TipMeasurement(position, float(tip.abscissa[0]), float(tip.offset[0]), int(tip.branch[0]))
+
+    def locate(
+        self,
+        tip_position: Float[np.ndarray, "3"],
+        tip_direction: Float[np.ndarray, "3"],
+        inserted_length: float,
+        random: np.random.Generator,
+    ) -> Float[np.ndarray, "3"]:
+        """Take one exposure of every view and return where the tip is found to be, LPS mm.
 
         Args:
             tip_position: where the tip truly is, LPS mm.
@@ -153,9 +165,7 @@ class Fluoroscope:
             random: where the errors are drawn from.
         """
         seen = [self._detect(view, tip_position, tip_direction, random) for view in self._views]
-        position = self._locate(seen, inserted_length)
-        tip = project_tip(self._anatomy.tree, self._anatomy.insertion, position[None])
-        return TipMeasurement(position, float(tip.abscissa[0]), float(tip.offset[0]), int(tip.branch[0]))
+        return self._likeliest(seen, inserted_length)
 
     def _detect(
         self,
@@ -172,7 +182,7 @@ class Fluoroscope:
         off = random.standard_normal(2) * sd
         return _Detection(view, view.project(position) + off @ axes, axes / sd[:, None])
 
-    def _locate(self, seen: list[_Detection], inserted_length: float) -> Float[np.ndarray, "3"]:
+    def _likeliest(self, seen: list[_Detection], inserted_length: float) -> Float[np.ndarray, "3"]:
         """Return the most likely place of the tip, LPS mm: the best of the likeliest places in every branch."""
         length_sd = 2.0 + _NEAR_SHARE * max(inserted_length, 0.0)
         prior = [((abscissa - inserted_length) / length_sd) ** 2 for abscissa in self._abscissa]
@@ -208,8 +218,11 @@ class Fluoroscope:
                 misses.append(one.whiten @ (one.view.project(place) - one.pixel))
             jacobian, miss = np.concatenate(rows), np.concatenate(misses)
             cost = float(miss @ miss)
-            place = place - np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ miss)
+            step = np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ miss)
+            place = place - step
             nearest = int(np.argmin(((points - place) ** 2).sum(axis=1)))
+            if step @ step < _NEAR_ENOUGH_MM**2:
+                break
         lateral = place - points[nearest]
         lateral = lateral - (lateral @ tangent[nearest]) * tangent[nearest]
         beyond = 1 - np.sqrt(2) * sd[nearest] / max(float(np.linalg.norm(lateral)), 1e-9)

@@ -70,19 +70,37 @@ class TwinPredictor:
             episodes: their controls, and the tips where `seen`; no other tip is looked at.
             seen: samples at which the tip was measured, for example by X-ray.
         """
-        shape, last = (len(episodes), episodes.valid.shape[1], 2), int(np.flatnonzero(seen).max(initial=0))
+        shape = (len(episodes), episodes.valid.shape[1], 2)
         tip, spread, parameters = np.full(shape, np.nan), np.full(shape, np.nan), np.full((len(episodes), 3), np.nan)
         for anatomy, chosen in _by_anatomy(episodes):
             data = episodes.select(chosen)
-            members = self._members(np.tile(_BELIEVED, (len(data), 1)), np.tile(self._spread, (len(data), 1)))
-            paths = self._simulate(anatomy, data, members, last + 1)
-            weight = _weights(paths, data, seen, self.config)
-            members = self._members(*_narrowed(members, weight, self._spread))
-            paths = self._simulate(anatomy, data, members, shape[1])
-            weight = _weights(paths, data, seen, self.config)
+            members, paths = self._narrowed_ensemble(anatomy, data, seen)
+            weight = _weights(paths, _tips(data), seen, self.config)
             tip[chosen], spread[chosen] = _median_and_spread(paths, weight)
             parameters[chosen] = members[weight.argmax(axis=0), np.arange(len(data))]
         return Foretold(tip, spread, parameters)
+
+    def ensemble(
+        self, episodes: Dataset, seen: Bool[np.ndarray, "samples"]
+    ) -> Float[np.ndarray, "members episodes samples 2"]:
+        """Return the tips, mm, of every wire that is likely after the seen ones; NaN from where a simulation fails.
+
+        `weigh` says what they foretell, and again, without another simulation, when more tips are seen.
+        """
+        paths = np.full((self.config.members, len(episodes), episodes.valid.shape[1], 2), np.nan)
+        for anatomy, chosen in _by_anatomy(episodes):
+            paths[:, chosen] = self._narrowed_ensemble(anatomy, episodes.select(chosen), seen)[1]
+        return paths
+
+    def _narrowed_ensemble(
+        self, anatomy: Anatomy, data: Dataset, seen: Bool[np.ndarray, "samples"]
+    ) -> tuple[Members, Float[np.ndarray, "members episodes s 2"]]:
+        """Return the second ensemble of the episodes of one anatomy, and its tips."""
+        members = self._members(np.tile(_BELIEVED, (len(data), 1)), np.tile(self._spread, (len(data), 1)))
+        paths = self._simulate(anatomy, data, members, int(np.flatnonzero(seen).max(initial=0)) + 1)
+        weight = _weights(paths, _tips(data), seen, self.config)
+        members = self._members(*_narrowed(members, weight, self._spread))
+        return members, self._simulate(anatomy, data, members, data.valid.shape[1])
 
     def rollout_forward(self, episodes: Dataset) -> OpenLoop:
         """P1: predict the tip under the true controls."""
@@ -162,19 +180,37 @@ class TwinPredictor:
         return paths
 
 
+def weigh(
+    paths: Float[np.ndarray, "members episodes samples 2"],
+    tips: Float[np.ndarray, "episodes samples 2"],
+    seen: Bool[np.ndarray, "episodes samples"],
+    config: TwinConfig,
+) -> tuple[Float[np.ndarray, "episodes samples 2"], Float[np.ndarray, "episodes samples 2"]]:
+    """Return what an ensemble foretells, and its spread, mm, from the tips that were seen of each episode.
+
+    Args:
+        paths: of the members, mm, as `TwinPredictor.ensemble` gives them.
+        tips: (Δtip, γtip) where `seen`, mm; no other is looked at.
+        seen: samples at which the tip was measured.
+        config: scales of what a good member misses a seen tip by.
+    """
+    return _median_and_spread(paths, _weights(paths, tips, seen, config))
+
+
 def _weights(
     paths: Float[np.ndarray, "members episodes s 2"],
-    data: Dataset,
-    seen: Bool[np.ndarray, "samples"],
+    tips: Float[np.ndarray, "episodes samples 2"],
+    seen: Bool[np.ndarray, "*episodes samples"],
     config: TwinConfig,
 ) -> Float[np.ndarray, "members episodes"]:
     """Return the members' weights: the product of Cauchy densities of what they miss the seen tips by.
 
     Heavy tails, because a snap that comes a moment too early is off by a millimetre and says little about friction.
     """
-    at = np.flatnonzero(seen)
-    off = (paths[:, :, at] - _tips(data)[:, at]) / np.array([config.abscissa_sd_mm, config.offset_sd_mm])
-    score = np.nan_to_num(-np.log1p(off**2), nan=-1e3).sum(axis=(2, 3))
+    at = np.flatnonzero(seen.any(axis=tuple(range(seen.ndim - 1))))
+    at = at[at < paths.shape[2]]
+    off = (paths[:, :, at] - tips[:, at]) / np.array([config.abscissa_sd_mm, config.offset_sd_mm])
+    score = np.where(seen[..., at, None], np.nan_to_num(-np.log1p(off**2), nan=-1e3), 0.0).sum(axis=(2, 3))
     weight = np.exp(score - score.max(axis=0))
     return weight / weight.sum(axis=0)
 
