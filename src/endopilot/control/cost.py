@@ -9,6 +9,8 @@ from jaxtyping import Float
 
 from endopilot.errors import InputError
 
+_OVERLOAD = 100.0
+"""What each share of the force limit beyond `forbidden_share` costs, mm/s."""
 Samples = Float[np.ndarray, "*n"]
 
 
@@ -16,24 +18,25 @@ Samples = Float[np.ndarray, "*n"]
 class Cost:
     """Weights of the cost of a navigation. One unit is one mm of tip error at the end.
 
-    The cost of a control sequence is e_T + Σ_t [ tip·e_t + ratio·max(0, ρ_t − ρ₀)² + force·(F_t/F_max)² + time ]·h +
-    smooth·Σ_t [ (Δv_t/v_max)² + (Δω_t/ω_max)² ], with h the sample period (s), e the distance of the tip from where it
-    is to be (mm), ρ = γ/(r − r_w) the safety ratio, F the largest wall force on a node, and v, ω the controls.
+    The cost of a control sequence is e_T + Σ_t c_t·h + w_smooth·Σ_t [ (Δv_t/v_max)² + (Δω_t/ω_max)² ] with
+    c = w_tip·e + w_ratio·max(0, ρ − ρ₀)² + w_force·f² + 100 max(0, f − f₀) + w_time: h is the sample period (s), e the
+    distance of the tip from where it is to be (mm), ρ = γ/(r − r_w) the safety ratio and ρ₀ the safe one, f the largest
+    wall force on a node over the limit and f₀ the forbidden share, v and ω the controls.
     """
 
-    tip: float = 0.1
+    tip_weight: float = 0.1
     """Tip error on the way, 1/s."""
-    ratio: float = 0.05
+    ratio_weight: float = 0.05
     """Safety ratio above `safe_ratio`, mm/s. A wire lies on the wall most of the time, which is no harm by itself."""
     safe_ratio: float = 0.8
     """Safety ratio below which nothing is charged."""
-    force: float = 8.0
+    force_weight: float = 8.0
     """Contact force, as a share of the limit squared, mm/s."""
-    time: float = 1.0
+    time_weight: float = 1.0
     """Time, mm/s."""
-    smooth: float = 0.05
+    smooth_weight: float = 0.05
     """Changes of the control, as a share of the drive's limits squared, mm."""
-    forbidden: float = 0.7
+    forbidden_share: float = 0.7
     """Share of the force limit above which a way is not taken where there is another."""
 
     def __post_init__(self) -> None:
@@ -56,14 +59,20 @@ class Cost:
             force_share: contact force over its limit; 0 where a model does not foretell it.
         """
         excess = np.maximum(ratio - self.safe_ratio, 0.0)
-        overload = 100.0 * np.maximum(np.asarray(force_share) - self.forbidden, 0.0)
-        return self.tip * error + self.ratio * excess**2 + self.force * np.square(force_share) + overload + self.time
+        overload = _OVERLOAD * np.maximum(np.asarray(force_share) - self.forbidden_share, 0.0)
+        return (
+            self.tip_weight * error
+            + self.ratio_weight * excess**2
+            + self.force_weight * np.square(force_share)
+            + overload
+            + self.time_weight
+        )
 
     def roughness(
         self, before: Float[np.ndarray, "*n 2"], after: Float[np.ndarray, "*n 2"], limits: Float[np.ndarray, "2"]
     ) -> Samples:
         """Return what a change from one control to the next costs, mm."""
-        return self.smooth * np.square((after - before) / limits).sum(axis=-1)
+        return self.smooth_weight * np.square((after - before) / limits).sum(axis=-1)
 
 
 def safety_ratio(offset: Samples, radius: Samples, wire_radius_mm: float) -> Samples:

@@ -156,10 +156,10 @@ class Plan:
         h = DECISION_PERIOD_S
         return {
             "end": abs(float(self.simulated.abscissa[-1]) - self.navigation.target.abscissa),
-            "tip": float(weights.tip * error.sum() * h),
-            "ratio": float(weights.ratio * (np.maximum(self.ratio - weights.safe_ratio, 0) ** 2).sum() * h),
-            "force": float(weights.force * (share**2).sum() * h),
-            "time": float(weights.time * len(error) * h),
+            "tip": float(weights.tip_weight * error.sum() * h),
+            "ratio": float(weights.ratio_weight * (np.maximum(self.ratio - weights.safe_ratio, 0) ** 2).sum() * h),
+            "force": float(weights.force_weight * (share**2).sum() * h),
+            "time": float(weights.time_weight * len(error) * h),
             "smooth": float(weights.roughness(self.control[:-1], self.control[1:], limits).sum()),
         }
 
@@ -307,8 +307,8 @@ def _by_policy(navigation: Navigation, config: PlanConfig) -> tuple[Steps, Steps
 
 
 def _checked(
-    navigation: Navigation, config: PlanConfig, model: Path | None, desired: Steps, control: Steps, predicted: Steps,
-    spent: tuple[float, float],
+    navigation: Navigation, config: PlanConfig, model: Path | None, desired: Float[np.ndarray, "wanted 2"],
+    control: Steps, predicted: Steps, spent: tuple[float, float],
 ) -> Plan:  # fmt: skip
     """Put the controls within the limits, drive the rod core with them, and return the plan."""
     limits = Limits.of(navigation.device, navigation.anatomy)

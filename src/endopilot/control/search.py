@@ -226,7 +226,7 @@ class Search:
         return made
 
     def _pressed(self, log: _Log) -> bool:
-        limit = self.config.cost.forbidden * self.navigation.force_limit_n
+        limit = self.config.cost.forbidden_share * self.navigation.force_limit_n
         return not self._all((log.force[-1] <= limit) & self.single.valid)
 
     def _all(self, holds: Bool[np.ndarray, "wires"]) -> bool:
