@@ -27,6 +27,7 @@ COMMANDS = {
     "train": "dataset -> forward and inverse transformers",
     "evaluate": "trained run -> errors beside the paper's and the baselines'",
     "plan": "anatomy and target -> controls that bring the tip there",
+    "advise": "trained run -> when X-ray is needed: calibrated bands, exposures against missed events",
     "drive": "a simulated drive behind TCP, with a watchdog",
     "verify": "the rod core against closed forms",
     "bench": "figures beside their bars: speed, robustness, anatomy, imaging, labels, dataset",

@@ -1,0 +1,129 @@
+"""What a model foretells while X-ray is off, and again after each exposure: the same for a twin and for networks."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from endopilot.dataset.loader import Dataset
+from endopilot.models.config import WINDOW
+from endopilot.models.open_loop import Predictor
+from endopilot.models.twin import TwinPredictor, weigh
+
+Tips = Float[np.ndarray, "episodes samples 2"]
+
+
+@runtime_checkable
+class Foreteller(Protocol):
+    """Foretells the tips of navigations whose controls are known.
+
+    Attributes:
+        tip: (Δtip, γtip) at every sample, mm, from what was shown so far; of the past, as it was foretold.
+        spread: what the model says of its own error, mm; 0 where it says nothing.
+    """
+
+    tip: Tips
+    spread: Tips
+
+    def restart(self) -> None:
+        """Forget what was shown after the first `WINDOW` samples."""
+        ...
+
+    def show(self, episodes: Int[np.ndarray, "shown"], sample: int, tip: Float[np.ndarray, "shown 2"]) -> None:
+        """Take what X-ray shows of some navigations at a sample, mm, and foretell the later ones anew."""
+        ...
+
+
+class TwinForeteller:
+    """A twin, whose ensemble is simulated once and weighed again at every exposure."""
+
+    def __init__(self, twin: TwinPredictor, episodes: Dataset) -> None:
+        """Simulate, and foretell from the first `WINDOW` samples.
+
+        Args:
+            twin: the model.
+            episodes: their controls, and their tips as they are measured.
+        """
+        samples = episodes.valid.shape[1]
+        self._config, self._seen = twin.config, np.tile(np.arange(samples) < WINDOW, (len(episodes), 1))
+        self._shown = np.stack([episodes.tip_abscissa, episodes.tip_offset], axis=-1).astype(float)
+        self._paths = twin.ensemble(episodes, self._seen[0])
+        self.tip, self.spread = weigh(self._paths, self._shown, self._seen, self._config)
+
+    def restart(self) -> None:
+        """Forget what was shown after the first `WINDOW` samples."""
+        self._seen[:, WINDOW:] = False
+        self.tip, self.spread = weigh(self._paths, self._shown, self._seen, self._config)
+
+    def show(self, episodes: Int[np.ndarray, "shown"], sample: int, tip: Float[np.ndarray, "shown 2"]) -> None:
+        """Take what X-ray shows of some navigations at a sample, mm, and foretell the later ones anew."""
+        self._seen[episodes, sample], self._shown[episodes, sample] = True, tip
+        found = weigh(self._paths[:, episodes], self._shown[episodes], self._seen[episodes], self._config)
+        later = slice(sample + 1, None)
+        self.tip[episodes, later], self.spread[episodes, later] = (part[:, later] for part in found)
+
+
+class NetworkForeteller:
+    """Any other model: it goes on from its last `WINDOW` states, in which what was not seen is as it foretold it."""
+
+    def __init__(self, predictor: Predictor, episodes: Dataset) -> None:
+        """Foretell from the first `WINDOW` samples.
+
+        Args:
+            predictor: the model.
+            episodes: their controls, and their tips as they are measured.
+        """
+        self._predictor, self._episodes = predictor, episodes
+        self.tip = np.stack([episodes.tip_abscissa, episodes.tip_offset], axis=-1).astype(float)
+        self.spread = np.zeros_like(self.tip)
+        self.tip[:, WINDOW:] = predictor.rollout_forward(episodes).tip
+        self._first, self._known = self.tip.copy(), self.tip.copy()
+
+    def restart(self) -> None:
+        """Forget what was shown after the first `WINDOW` samples."""
+        self.tip, self._known = self._first.copy(), self._first.copy()
+
+    def show(self, episodes: Int[np.ndarray, "shown"], sample: int, tip: Float[np.ndarray, "shown 2"]) -> None:
+        """Take what X-ray shows of some navigations at a sample, mm, and foretell the later ones anew."""
+        self._known[episodes, sample] = tip
+        known = self._known[episodes]
+        data = replace(
+            self._episodes.select(episodes),
+            tip_abscissa=known[..., 0].astype(np.float32),
+            tip_offset=known[..., 1].astype(np.float32),
+        )
+        if sample + 1 < known.shape[1]:
+            found = self._predictor.rollout_forward(_from(data, sample + 1 - WINDOW))
+            self.tip[episodes, sample + 1 :] = self._known[episodes, sample + 1 :] = found.tip
+
+
+def foreteller(predictor: Predictor, episodes: Dataset) -> Foreteller:
+    """Return what foretells the tips of navigations with a model.
+
+    Args:
+        predictor: of a run.
+        episodes: their controls, and their tips as they are measured.
+    """
+    if isinstance(predictor, TwinPredictor):
+        return TwinForeteller(predictor, episodes)
+    return NetworkForeteller(predictor, episodes)
+
+
+def _from(episodes: Dataset, first: int) -> Dataset:
+    """Return the episodes from a sample on, mm and rad before it as their initial state."""
+    if first == 0:
+        return episodes
+    later = {
+        field.name: getattr(episodes, field.name)[:, first:]
+        for field in fields(episodes)
+        if isinstance(getattr(episodes, field.name), np.ndarray) and getattr(episodes, field.name).ndim > 1
+    }
+    return replace(
+        episodes,
+        **later,
+        initial_inserted_length=episodes.inserted_length[:, first - 1],
+        initial_rotation=episodes.rotation[:, first - 1],
+    )
