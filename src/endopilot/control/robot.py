@@ -1,0 +1,248 @@
+"""What moves the wire: the interface of a robot, its limits, the motion of a drive, and a robot in the simulator.
+
+A drive follows a velocity command late (latency), no faster and no more suddenly than its limits, and with lost motion
+where it reverses (backlash). `DriveMotion` is that and nothing else; the simulated robot puts a simulated wire behind
+it, the drive process (`endopilot drive`) a clock.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float
+
+from endopilot.errors import InputError
+from endopilot.simulation.device import Device
+from endopilot.simulation.simulator import SPARE_MM
+from endopilot.simulation.stepping import Simulator
+from endopilot.types import Anatomy
+
+CYCLE_S = 0.05
+"""Period of the drive's own loop, s."""
+
+
+@dataclass(frozen=True)
+class ProximalState:
+    """What a robot's encoders say of the wire's proximal end.
+
+    Attributes:
+        time_s: by the robot's clock, s.
+        inserted_length: Δ, mm.
+        rotation: φ, rad, unwrapped.
+    """
+
+    time_s: float
+    inserted_length: float
+    rotation: float
+
+
+@runtime_checkable
+class Robot(Protocol):
+    """Whatever drives a wire."""
+
+    def command(self, translation: float, rotation: float) -> None:
+        """Move on at a velocity, mm/s and rad/s, until the next command. What is not finite stops the wire."""
+        ...
+
+    def proximal_state(self) -> ProximalState:
+        """Return what the encoders say now."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """What a drive must never exceed.
+
+    Attributes:
+        max_velocity_mm_s: fastest translation, either way, mm/s.
+        max_rotation_rad_s: fastest rotation, either way, rad/s.
+        travel_mm: least and largest inserted length, mm.
+    """
+
+    max_velocity_mm_s: float
+    max_rotation_rad_s: float
+    travel_mm: tuple[float, float] = (0.0, np.inf)
+
+    def __post_init__(self) -> None:
+        """Check every limit.
+
+        Raises:
+            InputError: a limit is not positive, or the travel is no range.
+        """
+        for name in ("max_velocity_mm_s", "max_rotation_rad_s"):
+            if not 0 < getattr(self, name) < np.inf:
+                raise InputError(f"{name}: {getattr(self, name)}; give a positive number")
+        if not self.travel_mm[0] < self.travel_mm[1]:
+            raise InputError(f"travel_mm: {self.travel_mm} is no range; give the smaller first")
+
+    @staticmethod
+    def of(device: Device, anatomy: Anatomy) -> Limits:
+        """Return the limits of a wire in a vessel: the drive's speed, and no more wire than reaches its far end."""
+        reach = float(anatomy.tree.longest_path().abscissa[-1]) + SPARE_MM
+        return Limits(
+            max_velocity_mm_s=device.max_velocity_mm_s,
+            max_rotation_rad_s=device.max_rotation_rad_s,
+            travel_mm=(0.0, reach),
+        )
+
+    def safe(self, translation: Any, rotation: Any) -> tuple[float, float]:
+        """Return a command that is finite and within the speed limits, whatever is asked; what is no number stops.
+
+        Args:
+            translation: mm/s.
+            rotation: rad/s.
+        """
+        try:
+            asked = np.array([float(translation), float(rotation)])
+        except (TypeError, ValueError, OverflowError):
+            return 0.0, 0.0
+        if not np.isfinite(asked).all():
+            return 0.0, 0.0
+        bound = np.array([self.max_velocity_mm_s, self.max_rotation_rad_s])
+        translation_mm_s, rotation_rad_s = np.clip(asked, -bound, bound).tolist()
+        return translation_mm_s, rotation_rad_s
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotConfig:
+    """How a real drive differs from an ideal one. docs/robot.md says where the numbers come from."""
+
+    latency_s: float = 0.05
+    """Time from a command to the motion, s."""
+    max_acceleration_mm_s2: float = 200.0
+    """Largest change of the translation's speed, mm/s²."""
+    max_acceleration_rad_s2: float = 60.0
+    """Largest change of the rotation's speed, rad/s²."""
+    backlash_mm: float = 0.1
+    """Motion that is lost where the translation reverses, mm."""
+    backlash_rad: float = 0.035
+    """Motion that is lost where the rotation reverses, rad."""
+    encoder_sd_mm: float = 0.02
+    """Standard deviation of a reading of the inserted length, mm."""
+    encoder_sd_rad: float = 0.005
+    """Standard deviation of a reading of the rotation, rad."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            InputError: a field is out of its range.
+        """
+        for name in ("max_acceleration_mm_s2", "max_acceleration_rad_s2"):
+            if not 0 < getattr(self, name) < np.inf:
+                raise InputError(f"{name}: {getattr(self, name)}; give a positive number")
+        for name in ("latency_s", "backlash_mm", "backlash_rad", "encoder_sd_mm", "encoder_sd_rad"):
+            if not 0 <= getattr(self, name) < np.inf:
+                raise InputError(f"{name}: {getattr(self, name)}; give 0 or a positive number")
+
+
+class DriveMotion:
+    """The motion of a drive under velocity commands.
+
+    Attributes:
+        time_s: since the start, s.
+        position: of the wire's proximal end: Δ, mm, and φ, rad. Set it where the wire did not follow.
+        velocity: of the motor, mm/s and rad/s.
+    """
+
+    def __init__(self, limits: Limits, config: RobotConfig, position: tuple[float, float]) -> None:
+        """Begin at rest at a position, in the middle of the backlash."""
+        self._limits = limits
+        self._acceleration = np.array([config.max_acceleration_mm_s2, config.max_acceleration_rad_s2])
+        self._half_gap = np.array([config.backlash_mm, config.backlash_rad]) / 2
+        self._latency_s = config.latency_s
+        self._orders: deque[tuple[float, Float[np.ndarray, "2"]]] = deque()
+        self._wanted, self._ahead = np.zeros(2), np.zeros(2)
+        self.time_s, self.velocity, self.position = 0.0, np.zeros(2), np.array(position, dtype=float)
+
+    def command(self, translation: float, rotation: float) -> None:
+        """Take a velocity, mm/s and rad/s, which acts after the latency."""
+        self._orders.append((self.time_s + self._latency_s, np.array(self._limits.safe(translation, rotation))))
+
+    def stop(self) -> None:
+        """Brake at once, whatever was commanded before."""
+        self._orders.clear()
+        self._wanted = np.zeros(2)
+
+    def advance(self, duration: float) -> Float[np.ndarray, "2"]:
+        """Let some time pass, s, and return how far the wire's proximal end moves in it, mm and rad."""
+        before, end = self.position.copy(), self.time_s + duration
+        while self.time_s < end - 1e-12:
+            while self._orders and self._orders[0][0] <= self.time_s + 1e-12:
+                self._wanted = self._orders.popleft()[1]
+            until = min(self._orders[0][0], end) if self._orders else end
+            self._move(until - self.time_s)
+            self.time_s = until
+        return self.position - before
+
+    def _move(self, duration: float) -> None:
+        """Move towards the wanted velocity for a while, s: ramp, then constant; the wire follows through the gap."""
+        ramp = np.minimum(np.abs(self._wanted - self.velocity) / self._acceleration, duration)
+        reached = self.velocity + np.sign(self._wanted - self.velocity) * self._acceleration * ramp
+        motor = (self.velocity + reached) / 2 * ramp + reached * (duration - ramp)
+        self.velocity = reached
+        ahead = np.clip(self._ahead + motor, -self._half_gap, self._half_gap)
+        moved = motor - (ahead - self._ahead)
+        self._ahead = ahead
+        self.position = self.position + moved
+        self.position[0] = np.clip(self.position[0], *self._limits.travel_mm)
+
+
+class SimulatedRobot:
+    """A robot whose wire is the one world of a simulator.
+
+    The encoders sit on the wire, behind the gears: they see what backlash and a slipping drive leave of a command.
+    They count from where the ostium is believed to be.
+    """
+
+    def __init__(
+        self,
+        simulator: Simulator,
+        limits: Limits,
+        config: RobotConfig | None = None,
+        *,
+        seed: int = 0,
+        ostium_mm: float = 0.0,
+    ) -> None:
+        """Take hold of the wire as it lies.
+
+        Args:
+            simulator: of one world, driven by velocity.
+            limits: of the drive.
+            config: latency, backlash, accelerations and encoder noise.
+            seed: of the encoder noise.
+            ostium_mm: the true inserted length is this much more than the encoder's, mm.
+        """
+        self._simulator, self._limits, self._ostium_mm = simulator, limits, ostium_mm
+        config = config or RobotConfig()
+        self._noise = np.array([config.encoder_sd_mm, config.encoder_sd_rad])
+        self._random = np.random.default_rng([seed, 1])
+        self._drive = DriveMotion(limits, config, self._encoder())
+
+    def command(self, translation: float, rotation: float) -> None:
+        """Move on at a velocity, mm/s and rad/s, until the next command. What is not finite stops the wire."""
+        self._drive.command(translation, rotation)
+
+    def proximal_state(self) -> ProximalState:
+        """Return what the encoders say now; every reading has a noise of its own."""
+        inserted, rotation = np.array(self._encoder()) + self._noise * self._random.standard_normal(2)
+        return ProximalState(self._drive.time_s, float(inserted), float(rotation))
+
+    def run(self, duration: float) -> float:
+        """Let the robot and its wire run for some time, s, and return the largest wall force on a node, N."""
+        cycles = max(1, round(duration / CYCLE_S))
+        period, peak = duration / cycles, 0.0
+        for _ in range(cycles):
+            moved = self._drive.advance(period)
+            longest = self._limits.travel_mm[1] - float(self._simulator.inserted_length[0])
+            moved[0] = min(moved[0], max(longest, 0.0))
+            step = self._simulator.step(moved[None] / period, period)
+            self._drive.position = np.array(self._encoder())
+            peak = max(peak, float(step.contact_force_max[0]))
+        return peak
+
+    def _encoder(self) -> tuple[float, float]:
+        return float(self._simulator.inserted_length[0]) - self._ostium_mm, float(self._simulator.rotation[0])

@@ -1,0 +1,108 @@
+"""One navigation: what the policy is told, what is recorded, and how it ends."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from endopilot.control.fluoroscope import FluoroscopeConfig
+from endopilot.control.navigate import NavigateConfig, Truth, navigate
+from endopilot.control.policy import Decision, Policy, Sight
+from endopilot.control.robot import RobotConfig
+from endopilot.env.task import Navigation, Target
+
+PERFECT = RobotConfig(
+    latency_s=0.0,
+    max_acceleration_mm_s2=1e9,
+    max_acceleration_rad_s2=1e9,
+    backlash_mm=0.0,
+    backlash_rad=0.0,
+    encoder_sd_mm=0.0,
+    encoder_sd_rad=0.0,
+)
+
+
+class Forward:
+    """Pushes on, and asks for X-ray at some of its decisions."""
+
+    def __init__(self, speed: float, expose_every: int = 1000, rotation: float = 0.0) -> None:
+        self.speed, self.expose_every, self.rotation = speed, expose_every, rotation
+        self.told: list[Sight] = []
+
+    def start(self, navigation: Navigation, seed: int) -> None:
+        self.navigation = navigation
+
+    def decide(self, sight: Sight) -> Decision:
+        self.told.append(sight)
+        return Decision(self.speed, self.rotation, expose=len(self.told) % self.expose_every == 0)
+
+
+@pytest.fixture
+def straight(fork, wire) -> Navigation:
+    return Navigation(anatomy=fork, device=wire, target=Target(branch=1, abscissa=30.0), seconds=10.0)
+
+
+def test_a_policy_that_pushes_on_reaches_a_target_straight_ahead(straight) -> None:
+    policy = Forward(6.0, expose_every=3)
+    assert isinstance(policy, Policy)
+    record = navigate(straight, policy, seed=1)
+    assert record.reason == "reached" and record.success
+    assert abs(record.tip.abscissa[-1] - 30.0) <= 2.0 and record.tip.branch[-1] == 1
+    assert (np.abs(record.tip.abscissa[:-1] - 30.0) > 2.0).all()  # it ends at once
+    samples = len(policy.told)
+    assert len(record.time_s) == len(record.inserted_length) == len(record.tip.abscissa) == samples + 1
+    assert record.seconds == record.time_s[-1] == 0.5 * samples
+    # X-ray is on at the start and where the decision before asked for it; only then is a tip told
+    on = [index == 0 or index % 3 == 0 for index in range(samples)]
+    assert [sight.tip is not None for sight in policy.told] == on == record.exposed[:-1].tolist()
+    assert record.exposures == sum(on)
+    for index in np.flatnonzero(record.exposed):
+        assert policy.told[index].tip is record.measured[index]
+        off = np.linalg.norm(record.measured[index].position - record.tip_position[index])
+        assert 0.0 < off < 1.5
+    assert record.peak_force_n == record.contact_force_max.max()
+    assert record.safe == (record.peak_force_n <= straight.force_limit_n)
+    assert 20 < record.path_mm < 40
+
+
+def test_it_ends_in_time_and_the_same_seed_repeats_it(straight) -> None:
+    first, again = (navigate(straight, Forward(1.0, 2, 0.7), seed=5) for _ in range(2))
+    other = navigate(straight, Forward(1.0, 2, 0.7), seed=6)
+    assert first.reason == "time" and not first.success and first.seconds == 10.0
+    np.testing.assert_array_equal(first.tip_position, again.tip_position)
+    assert first.measured[2].position.tolist() == again.measured[2].position.tolist()
+    assert first.measured[2].position.tolist() != other.measured[2].position.tolist()
+
+
+def test_encoders_count_from_where_the_ostium_is_believed_to_be(straight) -> None:
+    policy = Forward(4.0)
+    record = navigate(straight, policy, config=NavigateConfig(robot=PERFECT), truth=Truth(ostium_mm=1.5))
+    encoder = np.array([sight.inserted_length for sight in policy.told])
+    np.testing.assert_allclose(record.inserted_length[:-1] - encoder, 1.5, atol=1e-9)
+    np.testing.assert_allclose(np.diff(record.inserted_length), 2.0, atol=1e-6)
+
+
+def test_friction_and_stiffness_of_the_truth_change_what_happens(straight) -> None:
+    config = NavigateConfig(robot=PERFECT)
+    plain = navigate(straight, Forward(3.0, rotation=2.0), config=config)
+    for truth in (Truth(friction_factor=2.0), Truth(stiffness_factor=0.5)):
+        changed = navigate(straight, Forward(3.0, rotation=2.0), config=config, truth=truth)
+        both = min(len(plain.time_s), len(changed.time_s))
+        assert np.abs(changed.tip_position[:both] - plain.tip_position[:both]).max() > 1e-3
+
+
+def test_what_a_policy_asks_is_kept_within_the_limits(straight) -> None:
+    for asked in ((np.nan, 1.0), (1e9, 0.0), (5.0, -np.inf)):
+        record = navigate(straight, Forward(asked[0], rotation=asked[1]))
+        bound = [straight.device.max_velocity_mm_s, straight.device.max_rotation_rad_s]
+        assert np.isfinite(record.control).all() and (np.abs(record.control) <= bound).all()
+        assert record.faults == len(record.time_s) - 1
+        assert record.reason != "invalid"
+
+
+def test_one_view_alone_locates_the_tip_by_the_vessel(straight) -> None:
+    config = NavigateConfig(fluoroscope=FluoroscopeConfig(biplane=False))
+    record = navigate(straight, Forward(5.0, expose_every=1), config=config)
+    seen = [measured for measured in record.measured if measured is not None]
+    off = np.array([tip.abscissa for tip in seen]) - record.tip.abscissa[: len(seen)]
+    assert np.abs(off).max() < 2.0
