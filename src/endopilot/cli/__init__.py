@@ -26,6 +26,7 @@ COMMANDS = {
     "dataset-info": "what a dataset holds, with pictures",
     "train": "dataset -> forward and inverse transformers",
     "evaluate": "trained run -> errors beside the paper's and the baselines'",
+    "drive": "a simulated drive behind TCP, with a watchdog",
     "verify": "the rod core against closed forms",
     "bench": "figures beside their bars: speed, robustness, anatomy, imaging, labels, dataset",
     "devices": "the guidewires that endopilot knows",

@@ -1,0 +1,64 @@
+"""`endopilot drive`: a simulated drive behind TCP."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from endopilot.control.drive import Drive, serve
+from endopilot.control.drive_protocol import read_secret
+from endopilot.control.robot import Limits, RobotConfig
+from endopilot.errors import InputError
+from endopilot.simulation.device import read_device
+
+
+@dataclass(frozen=True, kw_only=True)
+class ListenConfig:
+    """Where the drive listens, and how far it may move."""
+
+    host: str = "127.0.0.1"
+    """Address to listen on; this machine alone if not given."""
+    port: int = 7345
+    """TCP port; 0 for a free one."""
+    travel_mm: tuple[float, float] = (0.0, 300.0)
+    """Least and largest inserted length, mm."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.port <= 65535:
+            raise InputError(f"port: {self.port}; give 0 to 65535")
+
+
+def command(
+    *,
+    secret: Path,
+    device: str = "workhorse-014",
+    listen: ListenConfig = ListenConfig(),
+    config: RobotConfig = RobotConfig(),
+) -> None:
+    """Run a simulated drive that one client commands over TCP (docs/robot.md), until Ctrl-C. It is no medical device.
+
+    Args:
+        secret: file that holds what drive and client share, at least 16 bytes, readable by you alone.
+        device: name of a shipped device (`endopilot devices`) or a YAML file; it gives the speed limits.
+        listen: where it listens, and how far it may move.
+        config: how the drive differs from an ideal one.
+    """
+    wire = read_device(device)
+    limits = Limits(
+        max_velocity_mm_s=wire.max_velocity_mm_s,
+        max_rotation_rad_s=wire.max_rotation_rad_s,
+        travel_mm=listen.travel_mm,
+    )
+    drive = Drive(
+        limits,
+        read_secret(secret),
+        now=time.monotonic(),
+        config=config,
+        inserted_length=max(listen.travel_mm[0], 0.0),
+        report=lambda line: print(line, flush=True),
+    )
+    asyncio.run(
+        serve(drive, listen.host, listen.port, lambda port: print(f"listening on {listen.host}:{port}", flush=True))
+    )
