@@ -72,7 +72,8 @@ class TipProjector:
             _behind_ostium(self._insertion, self._ostium_radius, part, self._slabs.project(part))
             for part in (flat[start : start + _CHUNK] for start in range(0, max(len(flat), 1), _CHUNK))
         ]
-        abscissa, offset, branch, radius = (np.concatenate(values).reshape(shape) for values in zip(*parts, strict=True))
+        fields = (np.concatenate(values).reshape(shape) for values in zip(*parts, strict=True))
+        abscissa, offset, branch, radius = fields
         return TipProjection(abscissa=abscissa, offset=offset, branch=branch, radius=radius)
 
 

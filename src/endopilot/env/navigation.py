@@ -14,6 +14,7 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from jaxtyping import Bool, Float
+from numpy.typing import ArrayLike
 
 from endopilot.env import observation
 from endopilot.env.observation import Measured, observe
@@ -184,7 +185,8 @@ class NavigateVectorEnv(VectorEnv):
             if device.max_velocity_mm_s < TRANSLATION_MM_S or device.max_rotation_rad_s < ROTATION_RAD_S:
                 raise InputError(
                     f"device {device.name}: max_velocity_mm_s = {device.max_velocity_mm_s:g}, max_rotation_rad_s = "
-                    f"{device.max_rotation_rad_s:g}; an action of 1 is {TRANSLATION_MM_S:g} mm/s, {ROTATION_RAD_S:g} rad/s"
+                    f"{device.max_rotation_rad_s:g}; an action of 1 is {TRANSLATION_MM_S:g} mm/s and "
+                    f"{ROTATION_RAD_S:g} rad/s; give a faster device"
                 )
         count = len(navigations)
         self.navigations, self._config = tuple(navigations), config
@@ -238,7 +240,7 @@ class NavigateVectorEnv(VectorEnv):
         return self._observe(now), self._infos(now, self._distance)
 
     def step(
-        self, actions: Float[np.ndarray, "worlds 2"]
+        self, actions: ArrayLike
     ) -> tuple[
         Float[np.ndarray, "worlds features"],
         Float[np.ndarray, "worlds"],
@@ -247,6 +249,9 @@ class NavigateVectorEnv(VectorEnv):
         dict[str, Any],
     ]:
         """Drive every world for a control period.
+
+        Args:
+            actions: a row a world.
 
         Returns:
             Observations, rewards, terminations, truncations and info, as the class says.
@@ -279,10 +284,7 @@ class NavigateVectorEnv(VectorEnv):
         infos = self._infos(now, self._distance)
         success = infos["success"] & going
         rewards = (
-            PROGRESS_REWARD * (before - self._distance)
-            + STEP_REWARD
-            + FORCE_REWARD * unsafe
-            + SUCCESS_REWARD * success
+            PROGRESS_REWARD * (before - self._distance) + STEP_REWARD + FORCE_REWARD * unsafe + SUCCESS_REWARD * success
         )
         terminations = (success | ~now.valid) & going
         truncations = (infos["time_s"] > self._seconds - 1e-9) & ~terminations & going
@@ -418,9 +420,7 @@ class NavigateEnv(gymnasium.Env):
         observations, infos = self._worlds.reset()
         return observations[0], _first(infos)
 
-    def step(
-        self, action: Float[np.ndarray, "2"]
-    ) -> tuple[Float[np.ndarray, "features"], float, bool, bool, dict[str, Any]]:
+    def step(self, action: ArrayLike) -> tuple[Float[np.ndarray, "features"], float, bool, bool, dict[str, Any]]:
         """Drive the wire for a control period."""
         row = np.asarray(action, dtype=float)[None]
         observations, rewards, terminations, truncations, infos = self._worlds.step(row)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated
@@ -43,6 +44,8 @@ class Task(BaseModel):
         title: what is to be done, in a few words.
         anatomy: kind of vessel tree of the atlas.
         device: shipped device.
+        tip_bend_deg: angle to which its tip is shaped for this task, degrees.
+        tip_bend_mm: length from the tip over which it is bent, mm.
         section: section that the target lies in.
         depth_mm: distance of the target from the section's begin, along the centerline, mm.
         start_inserted_mm: inserted length at the start, mm.
@@ -60,6 +63,8 @@ class Task(BaseModel):
     title: str
     anatomy: str
     device: str
+    tip_bend_deg: Annotated[float, Field(ge=0, le=180)]
+    tip_bend_mm: _Positive
     section: str
     depth_mm: _Positive
     start_inserted_mm: Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -77,15 +82,21 @@ class Task(BaseModel):
         config = AtlasConfig(anatomy=self.anatomy, seed=patients.seed, stenosis_share=self.stenosis_share)
         return synthesize_one(config, patients.numbers[place])
 
+    def ladder_navigation(self, place: int) -> Navigation:
+        """Return the task in one of the patients that the ladder is scored on, with its own first rotation."""
+        turn = np.random.default_rng([self.ladder.seed, self.ladder.numbers[place]]).uniform(0.0, 2 * np.pi)
+        return self.navigation(self.patient(self.ladder, place), start_rotation=turn)
+
     def navigation(self, anatomy: Anatomy, *, start_rotation: float = 0.0) -> Navigation:
         """Return what is to be done in one of the task's patients.
 
         Raises:
             InputError: the anatomy lacks the section, or it is too short.
         """
+        bend = {"tip_bend_rad": float(np.deg2rad(self.tip_bend_deg)), "tip_bend_length_mm": self.tip_bend_mm}
         return Navigation(
             anatomy=anatomy,
-            device=read_device(self.device),
+            device=replace(read_device(self.device), **bend),
             target=find_target(anatomy.tree, self.section, self.depth_mm),
             start_inserted_mm=self.start_inserted_mm,
             start_rotation=start_rotation,
@@ -119,11 +130,11 @@ def find_target(tree: VesselTree, section: str, depth_mm: float) -> Target:
         onwards = [child for child in tree.children(branch) if child in begins]
         if not onwards:
             raise InputError(f"depth_mm: {depth_mm:g}; section {section} of this tree is shorter")
-        branch = min(onwards, key=lambda child: _turn(tree, child))
+        branch = min(onwards, key=lambda child: turn_rad(tree, child))
     return Target(branch=branch, abscissa=abscissa)
 
 
-def _turn(tree: VesselTree, branch: int) -> float:
+def turn_rad(tree: VesselTree, branch: int) -> float:
     """Return the angle between a branch's first direction and its parent's last, rad, over some millimetres."""
     line, before = tree.branches[branch].centerline, tree.branches[tree.branches[branch].parent].centerline
     clear = float(line.radius[0]) + float(line.radius[-1])
@@ -187,7 +198,7 @@ def training_navigations(name: str, first: int, count: int) -> list[Navigation]:
 
 @lru_cache(maxsize=1)
 def reference_navigation() -> Navigation:
-    """Return the navigation of `endopilot/Navigate-v0`: into the posterior descending artery of the reference anatomy."""
+    """Return `endopilot/Navigate-v0`'s navigation: into the posterior descending artery of the reference anatomy."""
     anatomy = synthesize_one(AtlasConfig(), 0)
     return Navigation(
         anatomy=anatomy,
