@@ -210,6 +210,8 @@ def _behind_ostium(insertion: Insertion, ostium_radius: float, points: Float[np.
     abscissa, offset, branch, radius = found
     depth = points @ insertion.direction - insertion.position @ insertion.direction
     behind = np.flatnonzero(depth < 0)
+    if len(behind) == 0:
+        return found
     depth = depth[behind]
     distance = np.linalg.norm(points[behind] - insertion.position - depth[:, None] * insertion.direction, axis=1)
     chosen = distance * radius[behind] <= offset[behind] * ostium_radius

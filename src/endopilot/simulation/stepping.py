@@ -439,6 +439,8 @@ class Simulator:
             >>> bool((tip.offset < tip.radius).all())
             True
         """
+        if len(self._groups) == 1:
+            return self._groups[0].project(self._groups[0].simulation.positions()[:, 0])
         fields: dict[str, np.ndarray] = {}
         for group in self._groups:
             tip = group.project(group.simulation.positions()[:, 0])
