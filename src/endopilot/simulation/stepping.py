@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Integer
 from numpy.typing import ArrayLike
 
 from endopilot import _core
-from endopilot.anatomy.projection import project_tip
+from endopilot.anatomy.projection import TipProjector
 from endopilot.errors import InputError
 from endopilot.simulation.device import Device, check_fits
 from endopilot.simulation.rod import RodLayout, lay_out
@@ -51,6 +51,7 @@ class _Group:
     index: Integer[np.ndarray, "members"]
     path_mm: float
     longest_mm: float
+    project: TipProjector
 
 
 class Simulator:
@@ -105,15 +106,17 @@ class Simulator:
             raise InputError(
                 f"anatomy, device: {len(anatomies)} and {len(devices)}; give at least one, and as many of each"
             )
+        self._projectors = {id(group.anatomy): group.project for group in sharing._groups} if sharing else {}
         self._groups = self._make_groups(anatomies, devices)
         self._device = devices
+        self._fastest = np.array([(device.max_velocity_mm_s, device.max_rotation_rad_s) for device in devices])
         self.reset(inserted_length=np.zeros(len(devices)), rotation=np.zeros(len(devices)))
 
     def _make_groups(self, anatomies: list[Anatomy], devices: list[Device]) -> list[_Group]:
         members: dict[tuple[int, int], list[int]] = {}
         for world, pair in enumerate(zip(anatomies, devices, strict=True)):
             members.setdefault((id(pair[0]), id(pair[1])), []).append(world)
-        groups = []
+        groups, projectors = [], self._projectors
         for worlds in members.values():
             anatomy, device = anatomies[worlds[0]], devices[worlds[0]]
             check_fits(device, anatomy)
@@ -141,7 +144,9 @@ class Simulator:
                 ),
                 worlds=len(worlds),
             )
-            groups.append(_Group(anatomy, device, rod, simulation, np.array(worlds), path_mm, longest_mm))
+            project = projectors.get(id(anatomy)) or TipProjector(anatomy.tree, anatomy.insertion)
+            projectors[id(anatomy)] = project
+            groups.append(_Group(anatomy, device, rod, simulation, np.array(worlds), path_mm, longest_mm, project))
         return groups
 
     @property
@@ -315,14 +320,15 @@ class Simulator:
             raise InputError(f"control: world {world}: {control[world]} is not finite; correct it")
         if self._by_force:
             return
-        for world, device in enumerate(self._device):
-            speed, spin = np.abs(control[world])
-            if speed > device.max_velocity_mm_s * (1 + 1e-6) or spin > device.max_rotation_rad_s * (1 + 1e-6):
-                raise InputError(
-                    f"control: world {world}: {control[world, 0]:g} mm/s, {control[world, 1]:g} rad/s exceed "
-                    f"{device.max_velocity_mm_s:g} mm/s, {device.max_rotation_rad_s:g} rad/s, the limits of "
-                    f"{device.name}; slow down"
-                )
+        fast = (np.abs(control) > self._fastest * (1 + 1e-6)).any(axis=1)
+        if fast.any():
+            world = int(np.argmax(fast))
+            device = self._device[world]
+            raise InputError(
+                f"control: world {world}: {control[world, 0]:g} mm/s, {control[world, 1]:g} rad/s exceed "
+                f"{device.max_velocity_mm_s:g} mm/s, {device.max_rotation_rad_s:g} rad/s, the limits of "
+                f"{device.name}; slow down"
+            )
         for group in self._groups:
             end = group.simulation.inserted_length() + control[group.index, 0] * duration
             if (end > group.longest_mm).any():
@@ -447,9 +453,11 @@ class Simulator:
             >>> bool((tip.offset < tip.radius).all())
             True
         """
+        if len(self._groups) == 1:
+            return self._groups[0].project(self._groups[0].simulation.positions()[:, 0])
         fields: dict[str, np.ndarray] = {}
         for group in self._groups:
-            tip = project_tip(group.anatomy.tree, group.anatomy.insertion, group.simulation.positions()[:, 0])
+            tip = group.project(group.simulation.positions()[:, 0])
             for name in TipProjection.__dataclass_fields__:
                 part = np.asarray(getattr(tip, name))
                 fields.setdefault(name, np.empty(self.worlds, dtype=part.dtype))[group.index] = part
