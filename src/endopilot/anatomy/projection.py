@@ -47,15 +47,34 @@ def project_tip(tree: VesselTree, insertion: Insertion, points: Float[np.ndarray
         insertion: the ostium and the catheter's axis.
         points: tip positions, LPS mm.
     """
-    shape = points.shape[:-1]
-    flat = np.ascontiguousarray(points.reshape(-1, 3), dtype=float)
-    slabs = _Slabs.of(tree, insertion)
-    parts = [
-        _behind_ostium(insertion, float(tree.branches[0].centerline.radius[0]), part, slabs.project(part))
-        for part in (flat[start : start + _CHUNK] for start in range(0, max(len(flat), 1), _CHUNK))
-    ]
-    abscissa, offset, branch, radius = (np.concatenate(values).reshape(shape) for values in zip(*parts, strict=True))
-    return TipProjection(abscissa=abscissa, offset=offset, branch=branch, radius=radius)
+    return TipProjector(tree, insertion)(points)
+
+
+class TipProjector:
+    """`project_tip` for one vessel, prepared once: for callers that project a few tips at a time, again and again."""
+
+    def __init__(self, tree: VesselTree, insertion: Insertion) -> None:
+        """Prepare the segments of a tree.
+
+        Args:
+            tree: centerlines.
+            insertion: the ostium and the catheter's axis.
+        """
+        self._slabs = _Slabs.of(tree, insertion)
+        self._insertion = insertion
+        self._ostium_radius = float(tree.branches[0].centerline.radius[0])
+
+    def __call__(self, points: Float[np.ndarray, "*n 3"]) -> TipProjection:
+        """Project tips (LPS mm) as `project_tip` does, to the same bits."""
+        shape = points.shape[:-1]
+        flat = np.ascontiguousarray(points.reshape(-1, 3), dtype=float)
+        parts = [
+            _behind_ostium(self._insertion, self._ostium_radius, part, self._slabs.project(part))
+            for part in (flat[start : start + _CHUNK] for start in range(0, max(len(flat), 1), _CHUNK))
+        ]
+        fields = (np.concatenate(values).reshape(shape) for values in zip(*parts, strict=True))
+        abscissa, offset, branch, radius = fields
+        return TipProjection(abscissa=abscissa, offset=offset, branch=branch, radius=radius)
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,14 +140,17 @@ class _Slabs:
         branch = self.branch[nearest]
         abscissa, offset, radius = self._onto(points, nearest)
         rivals = self.rival[nearest] < distance[:, None]
-        for index in np.flatnonzero(rivals.any(axis=0)):
-            others = np.flatnonzero(rivals[:, index])
-            asked = points[others]
-            candidate = self._onto(asked, self._walked(asked, self.entry[nearest[others], index]))
-            better = candidate[1] * radius[others] < offset[others] * candidate[2]
-            chosen = others[better]
-            abscissa[chosen], offset[chosen], radius[chosen] = (value[better] for value in candidate)
-            branch[chosen] = index
+        contested, rival = np.nonzero(rivals)
+        if len(contested):
+            asked = points[contested]
+            found = self._onto(asked, self._walked(asked, self.entry[nearest[contested], rival]))
+            order = np.lexsort((found[1] / found[2], contested))  # of each point's rivals the best comes first
+            best = order[np.diff(contested[order], prepend=-1) > 0]
+            place = contested[best]
+            better = found[1][best] * radius[place] < offset[place] * found[2][best]
+            chosen, best = place[better], best[better]
+            abscissa[chosen], offset[chosen], radius[chosen] = (value[best] for value in found)
+            branch[chosen] = rival[best]
         return abscissa, offset, branch, radius
 
     def _walked(self, points: Float[np.ndarray, "n 3"], vertex: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
@@ -138,7 +160,7 @@ class _Slabs:
             row = self.vertices[vertex]
             step = np.rint(np.einsum("ij,ij->i", points - row[:, :3], row[:, 3:])).astype(np.int64)
             moved = np.minimum(np.maximum(vertex + step, first), last)
-            if np.array_equal(moved, vertex):
+            if (moved == vertex).all():
                 break
             vertex = moved
         return vertex
@@ -188,6 +210,8 @@ def _behind_ostium(insertion: Insertion, ostium_radius: float, points: Float[np.
     abscissa, offset, branch, radius = found
     depth = points @ insertion.direction - insertion.position @ insertion.direction
     behind = np.flatnonzero(depth < 0)
+    if len(behind) == 0:
+        return found
     depth = depth[behind]
     distance = np.linalg.norm(points[behind] - insertion.position - depth[:, None] * insertion.direction, axis=1)
     chosen = distance * radius[behind] <= offset[behind] * ostium_radius

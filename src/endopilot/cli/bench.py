@@ -55,6 +55,17 @@ def robustness(*, json: bool = False, config: RobustnessConfig = RobustnessConfi
     _leave(all(row["passed"] for row in measured["figures"]))
 
 
+def env(*, json: bool = False) -> None:
+    """Measure the steps a second of the learning environments in the reference anatomy, and the tip's error with them.
+
+    Args:
+        json: print the figures as JSON.
+    """
+    from endopilot.env.bench import bench_env
+
+    show(bench_env(), as_json=json)
+
+
 def dataset(*, output: OutputFolder = Path("runs/bench-dataset"), share: float = 0.05, json: bool = False) -> None:
     """Make a slice of the paper's set of 100 000 navigations, and say what all of it would take.
 
@@ -118,7 +129,8 @@ def imaging(*, cases: int = 50, seed: int = 0, folder: Path = Path("runs/imaging
 
 
 SUBJECTS: dict[str, Callable[..., None]] = {
-    function.__name__: function for function in (simulation, scaling, robustness, dataset, labels, anatomy, imaging)
+    function.__name__: function
+    for function in (simulation, scaling, robustness, env, dataset, labels, anatomy, imaging)
 }
 """The subjects that can be measured."""
 

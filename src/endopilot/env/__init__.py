@@ -1,1 +1,30 @@
-"""Navigation as a task: what is to be reached, and when it is reached."""
+"""Navigation as a task: what is to be reached, and when it is reached; and as environments for learning.
+
+Importing this package registers `endopilot/Navigate-v0` and one environment for each task of the ladder with Gymnasium.
+"""
+
+import gymnasium
+
+TASKS = (
+    "Straight",
+    "Descending",
+    "Stenosis",
+    "Tortuous",
+    "Crux",
+    "Circumflex",
+    "Diagonal",
+    "Marginal",
+    "Portal",
+    "Middle-Cerebral",
+    "Anterior-Cerebral",
+    "Carotid",
+)
+"""Names of the ladder's tasks as the environments have them; those of the files are in lower case."""
+
+for _name, _task in (("Navigate", None), *((name, name.lower()) for name in TASKS)):
+    gymnasium.register(
+        id=f"endopilot/{_name}-v0",
+        entry_point="endopilot.env.navigation:NavigateEnv",
+        vector_entry_point="endopilot.env.navigation:NavigateVectorEnv",
+        kwargs={} if _task is None else {"task": _task},
+    )

@@ -90,7 +90,7 @@ def write_report(output_html: Path, content: ReportContent) -> list[str]:
     metrics = read_json(content.evaluation / METRICS_FILE) if content.evaluation is not None else None
     context = {
         "content": content,
-        "css": Markup(_template_text("report.css")),
+        "css": Markup(template_text("report.css")),
         "metrics": metrics,
         "text": report_text,
         "patients": [_patient(patient) for patient in content.patients],
@@ -117,7 +117,8 @@ def _environment() -> Environment:
     )
 
 
-def _template_text(name: str) -> str:
+def template_text(name: str) -> str:
+    """Return a file of the templates' folder."""
     return (Path(__file__).parent / "templates" / name).read_text(encoding="utf-8")
 
 
@@ -129,7 +130,7 @@ def _patient(patient: PatientContent) -> dict[str, Any]:
         figure = figures.tree_figure(anatomy)
     return {
         "name": patient.name,
-        "picture": _image(figures.png(figure), f"{patient.name}: CT with the segmented lumen, and the centerline"),
+        "picture": image(figures.png(figure), f"{patient.name}: CT with the segmented lumen, and the centerline"),
         "facts": report_text.anatomy_facts(anatomy),
         "scores": dict(patient.scores),
     }
@@ -155,7 +156,7 @@ def _scene(content: ReportContent, still: Path, remarks: list[str]) -> dict[str,
     return {
         "html": Markup(body),
         "plotly": Markup(get_plotlyjs()),
-        "still": None if problem else _image(still.read_bytes(), f"The vessel of {anatomy.name} with the wire in it"),
+        "still": None if problem else image(still.read_bytes(), f"The vessel of {anatomy.name} with the wire in it"),
         "caption": _scene_caption(anatomy, replay),
     }
 
@@ -179,7 +180,7 @@ def _stored_figure(evaluation: Path | None, name: str) -> Markup | None:
     path = None if evaluation is None else evaluation / FIGURES_FOLDER / f"{name}.png"
     if path is None or not path.exists():
         return None
-    return _image(path.read_bytes(), report_text.EVALUATION_FIGURES[name])
+    return image(path.read_bytes(), report_text.EVALUATION_FIGURES[name])
 
 
 def _training(run: Path | None) -> dict[str, Any] | None:
@@ -194,7 +195,7 @@ def _training(run: Path | None) -> dict[str, Any] | None:
         if point[key] is not None
     ]
     return {
-        "picture": _image(figures.png(figures.loss_figure(pd.DataFrame(curves))), "Loss of both networks by epoch"),
+        "picture": image(figures.png(figures.loss_figure(pd.DataFrame(curves))), "Loss of both networks by epoch"),
         "budget": report_text.training_budget(record),
     }
 
@@ -202,10 +203,11 @@ def _training(run: Path | None) -> dict[str, Any] | None:
 def _stages(seconds: Mapping[str, float]) -> dict[str, Any] | None:
     if not seconds:
         return None
-    picture = _image(figures.png(figures.stage_figure(stage_table(seconds))), "Wall time of each stage")
+    picture = image(figures.png(figures.stage_figure(stage_table(seconds))), "Wall time of each stage")
     return {"picture": picture, "rows": list(seconds.items()), "total": sum(seconds.values())}
 
 
-def _image(png: bytes, description: str) -> Markup:
+def image(png: bytes, description: str) -> Markup:
+    """Return a PNG as an HTML element that needs no file."""
     data = base64.b64encode(png).decode("ascii")
     return Markup(f'<img alt="{html.escape(description)}" src="data:image/png;base64,{data}">')

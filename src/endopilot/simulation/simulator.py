@@ -36,6 +36,7 @@ _DENT_MM = 0.015
 """Depth to which a node that bears the whole push limit dents the wall, mm, where the stiffness is not given."""
 SPARE_MM = 20.0
 """Length that a wire can be driven beyond the end of the vessel's longest path, mm, where it is not known how far."""
+_CORES = os.cpu_count() or 1
 Actuation = Literal["velocity", "force"]
 """What a control is: translation (mm/s) and rotation (rad/s), or the drive's axial force (N) and torque (N·mm)."""
 _REASONS = {1: "left the finite numbers", 2: "did not converge"}
@@ -100,7 +101,7 @@ class SimulatorConfig:
 
     def threads_for(self, worlds: int, lanes: int) -> int:
         """Return how many threads step some worlds, `lanes` of them side by side: no more than have one to step."""
-        return min(self.threads or os.cpu_count() or 1, -(-worlds // lanes))
+        return min(self.threads or _CORES, -(-worlds // lanes))
 
 
 def simulate(

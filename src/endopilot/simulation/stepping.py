@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int, Integer
 from numpy.typing import ArrayLike
 
 from endopilot import _core
-from endopilot.anatomy.projection import project_tip
+from endopilot.anatomy.projection import TipProjector
 from endopilot.errors import InputError
 from endopilot.simulation.device import Device, check_fits
 from endopilot.simulation.rod import RodLayout, lay_out
@@ -51,6 +51,7 @@ class _Group:
     index: Integer[np.ndarray, "members"]
     path_mm: float
     longest_mm: float
+    project: TipProjector
 
 
 class Simulator:
@@ -74,6 +75,7 @@ class Simulator:
         worlds: int = 1,
         actuation: Actuation = "velocity",
         config: SimulatorConfig | None = None,
+        sharing: Simulator | None = None,
     ) -> None:
         """Lay the wires out; every world starts with its tip at the ostium.
 
@@ -85,6 +87,7 @@ class Simulator:
                 slips rather than push harder than the device's push limit) or "force" (axial force N and torque N·mm on
                 the wire; advance and rotation follow, against the friction and drag of the introducer).
             config: settings of the rod core.
+            sharing: a simulator that has prepared the same anatomy, whose lumen is then not prepared again.
 
         Raises:
             InputError: a device that does not fit its anatomy; a distance map that is not finite, or negative at the
@@ -94,6 +97,7 @@ class Simulator:
             raise InputError(f"actuation: {actuation!r}; give 'velocity' or 'force'")
         self._config = config or SimulatorConfig()
         self._by_force = actuation == "force"
+        self._lumens: dict[tuple[int, float], tuple[Anatomy, _core.Lumen]] = dict(sharing._lumens) if sharing else {}
         anatomies = [anatomy] * worlds if isinstance(anatomy, Anatomy) else list(anatomy)
         devices = [device] * len(anatomies) if isinstance(device, Device) else list(device)
         if isinstance(anatomy, Anatomy) and not isinstance(device, Device):
@@ -102,19 +106,24 @@ class Simulator:
             raise InputError(
                 f"anatomy, device: {len(anatomies)} and {len(devices)}; give at least one, and as many of each"
             )
+        self._projectors = {id(group.anatomy): group.project for group in sharing._groups} if sharing else {}
         self._groups = self._make_groups(anatomies, devices)
         self._device = devices
+        self._fastest = np.array([(device.max_velocity_mm_s, device.max_rotation_rad_s) for device in devices])
         self.reset(inserted_length=np.zeros(len(devices)), rotation=np.zeros(len(devices)))
 
     def _make_groups(self, anatomies: list[Anatomy], devices: list[Device]) -> list[_Group]:
         members: dict[tuple[int, int], list[int]] = {}
         for world, pair in enumerate(zip(anatomies, devices, strict=True)):
             members.setdefault((id(pair[0]), id(pair[1])), []).append(world)
-        groups, lumens = [], {}
+        groups, projectors = [], self._projectors
         for worlds in members.values():
             anatomy, device = anatomies[worlds[0]], devices[worlds[0]]
             check_fits(device, anatomy)
-            check_distance_map(anatomy)
+            key = (id(anatomy), device.tip_radius_mm)
+            if key not in self._lumens:
+                check_distance_map(anatomy)
+                self._lumens[key] = anatomy, make_lumen(anatomy.distance_map, device.tip_radius_mm)
             path_mm = float(anatomy.tree.longest_path().abscissa[-1])
             longest_mm = path_mm + SPARE_MM
             rod = lay_out(
@@ -122,12 +131,9 @@ class Simulator:
             )
             needed = 8 * len(worlds) * (25 * len(rod.abscissa_mm) + 40)
             check_memory(needed, f"worlds: {len(worlds)}", "give fewer")
-            key = (id(anatomy), device.tip_radius_mm)
-            if key not in lumens:
-                lumens[key] = make_lumen(anatomy.distance_map, device.tip_radius_mm)
             simulation = _core.Simulation(
                 rod=rod.model(),
-                lumen=lumens[key],
+                lumen=self._lumens[key][1],
                 loads=None,
                 **insertion_arguments(anatomy.insertion),
                 options=core_options(
@@ -138,8 +144,20 @@ class Simulator:
                 ),
                 worlds=len(worlds),
             )
-            groups.append(_Group(anatomy, device, rod, simulation, np.array(worlds), path_mm, longest_mm))
+            project = projectors.get(id(anatomy)) or TipProjector(anatomy.tree, anatomy.insertion)
+            projectors[id(anatomy)] = project
+            groups.append(_Group(anatomy, device, rod, simulation, np.array(worlds), path_mm, longest_mm, project))
         return groups
+
+    @property
+    def config(self) -> SimulatorConfig:
+        """Settings of the rod core.
+
+        Example:
+            >>> simulator.config.elements
+            100
+        """
+        return self._config
 
     @property
     def worlds(self) -> int:
@@ -302,14 +320,15 @@ class Simulator:
             raise InputError(f"control: world {world}: {control[world]} is not finite; correct it")
         if self._by_force:
             return
-        for world, device in enumerate(self._device):
-            speed, spin = np.abs(control[world])
-            if speed > device.max_velocity_mm_s * (1 + 1e-6) or spin > device.max_rotation_rad_s * (1 + 1e-6):
-                raise InputError(
-                    f"control: world {world}: {control[world, 0]:g} mm/s, {control[world, 1]:g} rad/s exceed "
-                    f"{device.max_velocity_mm_s:g} mm/s, {device.max_rotation_rad_s:g} rad/s, the limits of "
-                    f"{device.name}; slow down"
-                )
+        fast = (np.abs(control) > self._fastest * (1 + 1e-6)).any(axis=1)
+        if fast.any():
+            world = int(np.argmax(fast))
+            device = self._device[world]
+            raise InputError(
+                f"control: world {world}: {control[world, 0]:g} mm/s, {control[world, 1]:g} rad/s exceed "
+                f"{device.max_velocity_mm_s:g} mm/s, {device.max_rotation_rad_s:g} rad/s, the limits of "
+                f"{device.name}; slow down"
+            )
         for group in self._groups:
             end = group.simulation.inserted_length() + control[group.index, 0] * duration
             if (end > group.longest_mm).any():
@@ -444,9 +463,11 @@ class Simulator:
             >>> bool((tip.offset < tip.radius).all())
             True
         """
+        if len(self._groups) == 1:
+            return self._groups[0].project(self._groups[0].simulation.positions()[:, 0])
         fields: dict[str, np.ndarray] = {}
         for group in self._groups:
-            tip = project_tip(group.anatomy.tree, group.anatomy.insertion, group.simulation.positions()[:, 0])
+            tip = group.project(group.simulation.positions()[:, 0])
             for name in TipProjection.__dataclass_fields__:
                 part = np.asarray(getattr(tip, name))
                 fields.setdefault(name, np.empty(self.worlds, dtype=part.dtype))[group.index] = part
@@ -481,35 +502,44 @@ class Simulator:
         for group, values in zip(self._groups, state.values, strict=True):
             group.simulation.set_state(np.ascontiguousarray(values))
 
-    def copy_worlds(self, source: ArrayLike) -> None:
+    def copy_worlds(self, source: ArrayLike, *, of: Simulator | None = None) -> None:
         """Put every world where another one, of the same anatomy and device, is now; friction goes with it.
 
         Args:
             source: for each world, the number of the one that it becomes a copy of; its own to stay as it is.
+            of: the simulator that the numbers belong to, made with the very same anatomies, devices and settings but
+                maybe another number of worlds; this one if not given.
 
         Raises:
-            InputError: not one number for each world, or a world of another anatomy or device.
+            InputError: not one number for each world, or a world of another anatomy or device, or other settings.
 
         Example:
             >>> simulator.copy_worlds([0, 0, 2, 2])
             >>> bool((simulator.position[1] == simulator.position[0])[simulator.contacts[0] >= 0].all())
             True
         """
+        of = of or self
         chosen = np.asarray(source)
         if chosen.shape != (self.worlds,) or not np.issubdtype(chosen.dtype, np.integer):
             raise InputError(f"source: {source}; give the number of a world for each of the {self.worlds} worlds")
+        if (self._by_force, _settings(self._config)) != (of._by_force, _settings(of._config)):
+            raise InputError("of: a simulator with other settings; make both with the same actuation and config")
+        originals = {(id(group.anatomy), id(group.device)): group for group in of._groups}
+        states = []
         for group in self._groups:
             wanted = chosen[group.index]
-            strange = ~np.isin(wanted, group.index)
-            if strange.any():
+            original = originals.get((id(group.anatomy), id(group.device)))
+            strange = ~np.isin(wanted, original.index if original else [])
+            if original is None or strange.any():
                 world = int(group.index[np.argmax(strange)])
                 raise InputError(
                     f"source: world {world} cannot become world {chosen[world]}, which is none or has another anatomy "
                     "or device; give one like it"
                 )
-        for group in self._groups:
-            rows = np.searchsorted(group.index, chosen[group.index])
-            group.simulation.set_state(np.ascontiguousarray(group.simulation.state()[rows]))
+            rows = np.searchsorted(original.index, wanted)
+            states.append(np.ascontiguousarray(original.simulation.state()[rows]))
+        for group, state in zip(self._groups, states, strict=True):
+            group.simulation.set_state(state)
 
     def _fingerprint(self) -> str:
         digest = hashlib.sha256(repr((self._by_force, _settings(self._config))).encode())

@@ -1,0 +1,189 @@
+"""Choose the patients of the ladder's tasks: `python benchmarks/ladder_patients.py [TASK ...] [--write]`.
+
+Of each task's atlas the first twenty patients are taken that are eligible by the task's `chosen_for` and in which the
+target can be reached at all: a search that may look and try again finds a way on which the wall's force stays below the
+task's limit. It knows the whole state of the wire, and at each fork tries twelve directions of the tip from a little
+way before it; what turns the tip for good, without looking, is the policies' business. The patients to learn on are
+the first twenty eligible ones of another atlas, without the search.
+
+With `--write` the numbers go into the tasks' files.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from endopilot.anatomy.atlas import AtlasConfig, synthesize_tree
+from endopilot.env.navigation import CORE
+from endopilot.env.task import Navigation, Target
+from endopilot.env.tasks import Task, find_target, ladder_tasks, turn_rad
+from endopilot.errors import InputError
+from endopilot.simulation.stepping import Simulator
+from endopilot.types import TipProjection, VesselTree
+
+WANTED = 20
+MOST_EXAMINED = 400
+TRIES = 12
+"""Directions of the tip that are tried at a fork."""
+PUSH_MM_S, PERIOD_S = 4.0, 0.5
+
+
+def _always(tree: VesselTree, truth: dict[str, Any], target: Target) -> bool:
+    return True
+
+
+def _turns(section: str, degrees: float) -> Callable[[VesselTree, dict[str, Any], Target], bool]:
+    def eligible(tree: VesselTree, truth: dict[str, Any], target: Target) -> bool:
+        first = find_target(tree, section, 0.5).branch
+        return first > 0 and np.rad2deg(turn_rad(tree, first)) >= degrees
+
+    return eligible
+
+
+def _stenosed(tree: VesselTree, truth: dict[str, Any], target: Target) -> bool:
+    place = max(truth["stenoses"], key=lambda stenosis: stenosis["diameter_reduction"])
+    return place["diameter_reduction"] >= 0.4 and place["abscissa_mm"] < target.abscissa - 15
+
+
+ELIGIBLE: dict[str, Callable[[VesselTree, dict[str, Any], Target], bool]] = {
+    "stenosis": _stenosed,
+    "tortuous": lambda tree, truth, target: truth["tortuosity"] >= 2.2,
+    "portal": _turns("RPPV", 45),
+    "crux": _turns("4", 35),
+    "diagonal": _turns("10", 40),
+    "circumflex": _turns("11", 60),
+    "marginal": _turns("12", 40),
+    "anterior-cerebral": _turns("A1", 70),
+    "carotid": _turns("left common carotid", 90),
+}
+
+
+@dataclass
+class _Search:
+    """Worlds that try the directions of the tip at one fork after another."""
+
+    navigation: Navigation
+
+    def __post_init__(self) -> None:
+        navigation = self.navigation
+        self.simulator = Simulator(navigation.anatomy, navigation.device, worlds=TRIES, config=CORE)
+        self.simulator.reset(inserted_length=np.full(TRIES, navigation.start_inserted_mm), rotation=np.zeros(TRIES))
+        self.deepest = float(navigation.anatomy.tree.longest_path().abscissa[-1]) + 19.0
+        self.peak, self.seconds = np.zeros(TRIES), np.zeros(TRIES)
+
+    def reachable(self) -> bool:
+        """Return whether a way to the target was found, below the force limit and in time."""
+        navigation, tree = self.navigation, self.navigation.anatomy.tree
+        route = tree.route(navigation.target.branch)
+        for place, branch in enumerate(route[:-1]):
+            line = tree.branches[branch].centerline
+            fork, radius = float(line.abscissa[-1]), float(line.radius[-1])
+            before, beyond = fork - max(5.0, 1.4 * radius), fork + max(7.0, 1.6 * radius)
+            self.drive(PUSH_MM_S, 0.0, 60.0, lambda tip, before=before: tip.abscissa >= before)
+            self.drive(-PUSH_MM_S, 0.0, 5.0, lambda tip, before=before: tip.abscissa <= before)
+            if not self.enter(route[place + 1 :], fork + 3.0, beyond):
+                return False
+            if self.done().any():
+                return True
+        self.drive(PUSH_MM_S, 0.0, 30.0, lambda tip: tip.abscissa > navigation.target.abscissa + 3.0)
+        return bool(self.done().any())
+
+    def enter(self, wanted: tuple[int, ...], inside: float, beyond: float) -> bool:
+        """Try the directions; all worlds become the one that entered with the least force, if one did."""
+        kept, peak, seconds = self.simulator.state, self.peak.copy(), self.seconds.copy()
+        for attempt in range(3):
+            self.simulator.set_state(kept)
+            self.peak, self.seconds = peak.copy(), seconds.copy()
+            if attempt == 1:
+                self.drive(-PUSH_MM_S, 0.0, 1.5, _never)
+            turn = ((np.arange(TRIES) + attempt / 3) / TRIES - 0.5) * 2 * np.pi
+            self.drive(0.0, turn / 2.5, 2.5, _never)
+            spin = np.linspace(-1.5, 1.5, TRIES) if attempt == 2 else 0.0
+            self.drive(PUSH_MM_S, spin, 4.0 + (beyond - inside) / 2, lambda tip: tip.abscissa > beyond)
+            tip = self.simulator.project()
+            entered = (np.isin(tip.branch, wanted) & (tip.abscissa > inside)) | self.done()
+            entered &= self.peak <= self.navigation.force_limit_n
+            if entered.any():
+                best = int(np.argmin(np.where(entered, self.peak, np.inf)))
+                self.simulator.copy_worlds(np.full(TRIES, best))
+                self.peak[:], self.seconds[:] = self.peak[best], self.seconds[best]
+                return True
+        return False
+
+    def done(self) -> np.ndarray:
+        """Return which worlds stand at the target, safely and in time."""
+        navigation = self.navigation
+        in_time = self.seconds <= navigation.seconds
+        return navigation.reached(self.simulator.project()) & (self.peak <= navigation.force_limit_n) & in_time
+
+    def drive(
+        self, translation: float, rotation: float | np.ndarray, most_s: float, enough: Callable[[TipProjection], Any]
+    ) -> None:
+        """Drive every world until it has had enough, stands at the target, or the time is over."""
+        tip = self.simulator.project()
+        still = enough(tip) | self.navigation.reached(tip)
+        for _ in range(round(most_s / PERIOD_S)):
+            if still.all():
+                return
+            room = np.array([-self.simulator.inserted_length, self.deepest - self.simulator.inserted_length]) / PERIOD_S
+            control = np.column_stack([np.clip(np.full(TRIES, translation), *room), np.full(TRIES, rotation)])
+            step = self.simulator.step(np.where(still[:, None], 0.0, control), PERIOD_S)
+            self.peak = np.where(still, self.peak, np.maximum(self.peak, step.contact_force_max))
+            self.seconds += PERIOD_S * ~still
+            tip = self.simulator.project()
+            still |= enough(tip) | self.navigation.reached(tip)
+
+
+def _never(tip: TipProjection) -> np.ndarray:
+    return np.zeros(tip.abscissa.shape, dtype=bool)
+
+
+def choose(task: Task, seed: int, *, search: bool) -> tuple[list[int], int, int]:
+    """Return the chosen patients' numbers, how many were eligible and how many were examined."""
+    atlas = AtlasConfig(anatomy=task.anatomy, seed=seed, stenosis_share=task.stenosis_share)
+    eligible = ELIGIBLE.get(task.name, _always)
+    chosen: list[int] = []
+    count = 0
+    for number in range(MOST_EXAMINED):
+        tree, truth = synthesize_tree(atlas, number)
+        try:
+            target = find_target(tree, task.section, task.depth_mm)
+        except InputError:
+            continue
+        if not eligible(tree, truth, target):
+            continue
+        count += 1
+        patients = task.ladder.model_copy(update={"seed": seed, "numbers": (number,)})
+        if not search or _Search(task.navigation(task.patient(patients, 0))).reachable():
+            chosen.append(number)
+            if len(chosen) == WANTED:
+                return chosen, count, number + 1
+    raise SystemExit(f"{task.name}: only {len(chosen)} of {MOST_EXAMINED} patients will do; choose others")
+
+
+def main() -> None:
+    """Choose, print, and write if asked to."""
+    names = [argument for argument in sys.argv[1:] if argument != "--write"]
+    for task in ladder_tasks():
+        if names and task.name not in names:
+            continue
+        path = Path(__file__).parents[1] / "src" / "endopilot" / "env" / "tasks" / f"{task.name}.yaml"
+        text = path.read_text(encoding="utf-8")
+        for role, patients, search in (("ladder", task.ladder, True), ("training", task.training, False)):
+            chosen, eligible, examined = choose(task, patients.seed, search=search)
+            print(f"{task.name}, {role}: {WANTED} of {eligible} eligible patients, of {examined}: {chosen}", flush=True)
+            pattern = rf"({role}:\n  seed: \d+\n  numbers: )\[[^\]]*\]"
+            text = re.sub(pattern, lambda found, chosen=chosen: found[1] + str(chosen), text)
+        if "--write" in sys.argv:
+            path.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

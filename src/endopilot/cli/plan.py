@@ -1,0 +1,38 @@
+"""`endopilot plan`: anatomy, target and model -> controls that bring the tip there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from endopilot.cli.arguments import OutputFolder, existing, show
+from endopilot.control.plan import PlanConfig, plan
+from endopilot.control.plan_file import write_plan
+
+
+def command(
+    anatomy: Positional[Path],
+    /,
+    *,
+    target: str,
+    output: OutputFolder,
+    model: Path | None = None,
+    device: str | None = None,
+    json: bool = False,
+    config: PlanConfig = PlanConfig(),
+) -> None:
+    """Plan a navigation to a target.
+
+    Args:
+        anatomy: folder made by `endopilot anatomy` or `endopilot atlas`.
+        target: section label such as 4 or PDA, point X,Y,Z in LPS mm, or CSV of desired tips (time_s, tip_abscissa_mm,
+            tip_offset_mm).
+        output: folder of plan.csv, plan.png and manifest.json.
+        model: folder made by `endopilot train`; needed for the methods inverse and mppi.
+        device: name of a shipped device or a YAML file; the model's by default, workhorse-014 without one.
+        json: print the figures as JSON.
+        config: method, limits and cost.
+    """
+    found = plan(existing(anatomy), target, config, model=None if model is None else existing(model), device=device)
+    show(write_plan(found, output, seed=config.seed), as_json=json)

@@ -1,0 +1,166 @@
+"""What is believed of the wire between X-ray exposures: an ensemble of simulated wires, driven as the real one is.
+
+Its members differ in what is uncertain: friction, the stiffness of the tip, and how deep the ostium lies (as
+`models/twin.py` has it). Each follows the robot's encoders. A measurement of the tip weighs them by how near theirs is.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.stats import qmc
+
+from endopilot.control.policy import DECISION_PERIOD_S, TipMeasurement
+from endopilot.env.task import Navigation
+from endopilot.errors import InputError
+from endopilot.simulation.simulator import SimulatorConfig
+from endopilot.simulation.stepping import Simulator
+from endopilot.types import TipProjection
+
+
+@dataclass(frozen=True, kw_only=True)
+class BeliefConfig:
+    """The ensemble, and how far measurements are trusted."""
+
+    members: int = 12
+    """Simulated wires."""
+    stiffness_levels: int = 3
+    """Different stiffnesses of the tip among them."""
+    friction_spread: float = 0.2
+    """The friction coefficient may be off by this share, either way."""
+    stiffness_spread: float = 0.2
+    """The stiffness of the tip may be off by this share, either way."""
+    ostium_spread_mm: float = 0.5
+    """The ostium may lie this much deeper or less deep along the catheter's axis, mm."""
+    along_sd_mm: float = 0.6
+    """Scale of what a good member's tip misses a measured one by along the wire, mm: a tip's end is hard to see."""
+    across_sd_mm: float = 0.3
+    """The same across the wire, mm."""
+    elements: int = 50
+    """Elements of the rod core over the longest path."""
+    time_step_s: float = 0.025
+    """Time step of the rod core, s."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            InputError: a field is out of its range.
+        """
+        for name in ("members", "stiffness_levels", "along_sd_mm", "across_sd_mm"):
+            if not 0 < getattr(self, name) < np.inf:
+                raise InputError(f"{name}: {getattr(self, name)}; give a positive number")
+        for name in ("friction_spread", "stiffness_spread"):
+            if not 0 <= getattr(self, name) < 1:
+                raise InputError(f"{name}: {getattr(self, name)} is not in [0, 1); give e.g. 0.2")
+        if not 0 <= self.ostium_spread_mm < np.inf:
+            raise InputError(f"ostium_spread_mm: {self.ostium_spread_mm}; give 0 or more")
+
+    @property
+    def core(self) -> SimulatorConfig:
+        """Settings of the rod core."""
+        return SimulatorConfig(elements=self.elements, time_step_s=self.time_step_s, threads=1)
+
+
+class Belief:
+    """An ensemble of simulated wires, and how likely each is.
+
+    Attributes:
+        parameters: friction factor, tip stiffness factor and depth of the ostium (mm) of each member.
+        simulator: their worlds.
+        weight: their likelihoods; the sum is 1.
+    """
+
+    def __init__(
+        self, navigation: Navigation, parameters: Float[np.ndarray, "members 3"], config: BeliefConfig
+    ) -> None:
+        """Bring every member's wire to the start of the navigation."""
+        self.parameters, self._config = parameters, config
+        device = navigation.device
+        self.wires = {
+            factor: device.with_tip(bend_rad=device.tip_bend_rad, stiffness_factor=float(factor))
+            for factor in np.unique(parameters[:, 1])
+        }
+        self.simulator = Simulator(
+            navigation.anatomy, [self.wires[factor] for factor in parameters[:, 1]], config=config.core
+        )
+        self._ostium = parameters[:, 2]
+        self.simulator.reset(
+            inserted_length=np.maximum(navigation.start_inserted_mm + self._ostium, 0.0),
+            rotation=np.full(len(parameters), navigation.start_rotation),
+            friction=device.friction * parameters[:, 0],
+        )
+        self._limits = np.array([device.max_velocity_mm_s, device.max_rotation_rad_s])
+        self._score = np.zeros(len(parameters))
+        self.tip = self.simulator.project()
+
+    @staticmethod
+    def around(told: Float[np.ndarray, "3"], config: BeliefConfig) -> Float[np.ndarray, "members 3"]:
+        """Return members evenly around what is told: friction and ostium from a Sobol sequence, every stiffness."""
+        levels = np.linspace(-1.0, 1.0, config.stiffness_levels) if config.stiffness_levels > 1 else np.zeros(1)
+        unit = 2 * qmc.Sobol(2, scramble=False).random_base2(config.members.bit_length())[1 : config.members + 1] - 1
+        parameters = np.tile(told, (config.members, 1)).astype(float)
+        parameters[:, 0] *= 1 + config.friction_spread * unit[:, 0]
+        parameters[:, 1] *= 1 + config.stiffness_spread * np.resize(levels, config.members)
+        parameters[:, 2] += config.ostium_spread_mm * unit[:, 1]
+        return parameters
+
+    @property
+    def weight(self) -> Float[np.ndarray, "members"]:
+        """Likelihoods of the members; a member whose simulation failed has none."""
+        score = np.where(self.simulator.valid, self._score, -1e6)
+        weight = np.exp(score - score.max())
+        return weight / weight.sum()
+
+    def follow(self, inserted_length: float, rotation: float) -> None:
+        """Move every member's proximal end to where the encoders say that it is, in one decision period."""
+        simulator = self.simulator
+        motion = np.column_stack(
+            [
+                np.maximum(inserted_length + self._ostium, 0.0) - simulator.inserted_length,
+                rotation - simulator.rotation,
+            ]
+        )
+        control = np.clip(motion / DECISION_PERIOD_S, -self._limits, self._limits)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a member that fails has no weight
+            simulator.step(control, DECISION_PERIOD_S)
+        self.tip = simulator.project()
+
+    def misses(self, measured: TipMeasurement) -> Float[np.ndarray, "members 2"]:
+        """Return how far the members' tips are from a measured one, along and across each wire, mm."""
+        nodes = self.simulator.position[:, :2]
+        along = nodes[:, 0] - nodes[:, 1]
+        along /= np.linalg.norm(along, axis=1, keepdims=True)
+        off = measured.position - nodes[:, 0]
+        shift = np.einsum("mi,mi->m", off, along)
+        return np.column_stack([np.abs(shift), np.linalg.norm(off - shift[:, None] * along, axis=1)])
+
+    def weigh(self, measured: TipMeasurement) -> None:
+        """Let a measurement change the likelihoods.
+
+        By a Cauchy density, whose tails are heavy: a tip that snapped a moment too early says little about friction.
+        """
+        scaled = self.misses(measured) / np.array([self._config.along_sd_mm, self._config.across_sd_mm])
+        self._score = self._score - np.log1p((scaled**2).sum(axis=1))
+
+    def likeliest(self) -> tuple[Int[np.ndarray, "levels"], Float[np.ndarray, "levels"]]:
+        """Return the likeliest member of every stiffness, and how likely each stiffness is."""
+        weight = self.weight
+        groups = [np.flatnonzero(self.parameters[:, 1] == factor) for factor in self.wires]
+        best = np.array([members[np.argmax(weight[members])] for members in groups])
+        share = np.array([weight[members].sum() for members in groups])
+        return best, share / share.sum()
+
+    def spread(self) -> float:
+        """Return how far apart the members' tips are believed to be: their weighted standard deviation, mm."""
+        weight, position = self.weight, self.simulator.position[:, 0]
+        return float(np.sqrt(weight @ ((position - weight @ position) ** 2).sum(axis=1)))
+
+    def likeliest_tip(self) -> TipProjection:
+        """Return where the tip of the likeliest member is, as arrays of one."""
+        best = [int(np.argmax(self.weight))]
+        return TipProjection(**{name: getattr(self.tip, name)[best] for name in TipProjection.__dataclass_fields__})

@@ -1,0 +1,91 @@
+"""Desired tip states over time: along a route at a constant speed, or from a CSV."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Float
+
+from endopilot.control.policy import DECISION_PERIOD_S
+from endopilot.control.route import Route
+from endopilot.env.task import Target
+from endopilot.errors import InputError
+from endopilot.types import Anatomy
+
+_MARGIN_S = 5.0
+"""Time that desired tips rest at the target, s."""
+
+
+def read_tips(path: Path) -> pd.DataFrame:
+    """Read desired tip states: columns time_s (0.5, 1.0, ...), tip_abscissa_mm, tip_offset_mm and, optional, branch.
+
+    Returns:
+        A table with columns abscissa, offset and branch (−1 where it is not given), a row a sample period.
+
+    Raises:
+        InputError: not such a table; the line names file, column, row and mend.
+    """
+    try:
+        table = pd.read_csv(path)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read as CSV ({str(error).splitlines()[0]}); check the file") from error
+    columns = ("time_s", "tip_abscissa_mm", "tip_offset_mm")
+    missing = [name for name in columns if name not in table.columns]
+    if missing or len(table) == 0:
+        what = f"column {missing[0]} is missing" if missing else "has no rows"
+        raise InputError(f"{path}: {what}; the columns are {', '.join(columns)}")
+    if "branch" not in table.columns:
+        table["branch"] = -1
+    for name in (*columns, "branch"):
+        numbers = np.asarray(pd.to_numeric(table[name], errors="coerce"), dtype=float)
+        if not np.isfinite(numbers).all():
+            row = int(np.argmin(np.isfinite(numbers)))
+            raise InputError(f"{path}: row {row + 2}: {name} = {table[name].iloc[row]} is no finite number; correct it")
+        table[name] = numbers
+    late = np.flatnonzero(np.abs(table["time_s"] - DECISION_PERIOD_S * (np.arange(len(table)) + 1)) > 1e-6)
+    if len(late):
+        row = int(late[0])
+        raise InputError(f"{path}: row {row + 2}: time_s = {table['time_s'].iloc[row]:g}; count 0.5, 1.0, 1.5, ...")
+    return table.rename(columns={"tip_abscissa_mm": "abscissa", "tip_offset_mm": "offset"})
+
+
+def last_place(anatomy: Anatomy, tips: pd.DataFrame, target: str) -> Target:
+    """Return the place of the last desired tip, on its branch or else on the longest path.
+
+    Raises:
+        InputError: it lies outside the tree.
+    """
+    tree, branch, abscissa = anatomy.tree, int(tips["branch"].iloc[-1]), float(tips["abscissa"].iloc[-1])
+    leaf = max(tree.leaves(), key=lambda one: tree.branches[one].centerline.abscissa[-1])
+    on_path = [b for b in tree.route(leaf) if tree.branches[b].centerline.abscissa[0] <= abscissa]
+    if branch < 0 and on_path:
+        branch = on_path[-1]
+    if not 0 <= branch < len(tree.branches) or abscissa > tree.branches[branch].centerline.abscissa[-1]:
+        raise InputError(
+            f"{target}: the last tip, at {abscissa:g} mm in branch {branch}, lies outside the tree of {anatomy.name}, "
+            f"which has branches 0 to {len(tree.branches) - 1}; correct tip_abscissa_mm or branch"
+        )
+    return Target(branch=branch, abscissa=abscissa)
+
+
+def tips_along(
+    route: Route, wire_radius_mm: float, *, start_mm: float, speed_mm_s: float, seconds: float, safe_ratio: float
+) -> Float[np.ndarray, "samples 2"]:
+    """Return desired tips that go along a route at some speed, as near to the wall as is safe, and rest at its end.
+
+    Args:
+        route: the way.
+        wire_radius_mm: of the wire, mm.
+        start_mm: Δtip at the start, mm.
+        speed_mm_s: mm/s.
+        seconds: most time that they take, s.
+        safe_ratio: γ/(r − r_w) of the desired tips.
+    """
+    way = max(route.target.abscissa - start_mm, 0.0)
+    periods = int(np.ceil(min(way / speed_mm_s + _MARGIN_S, seconds) / DECISION_PERIOD_S))
+    ahead = start_mm + speed_mm_s * DECISION_PERIOD_S * np.arange(1, periods + 1)
+    abscissa = np.minimum(ahead, route.target.abscissa)
+    room = np.maximum(route.radius(abscissa) - wire_radius_mm, 0.0)
+    return np.column_stack([abscissa, safe_ratio * room])

@@ -1,0 +1,355 @@
+"""`plan`: the controls that bring a wire's tip along the vessel to a target, found before anything moves."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from endopilot.anatomy.io import read_anatomy
+from endopilot.control.agent import AgentConfig, TwinPolicy
+from endopilot.control.cost import Cost, safety_ratio
+from endopilot.control.desired import last_place, read_tips, tips_along
+from endopilot.control.navigate import NavigateConfig, navigate
+from endopilot.control.policy import DECISION_PERIOD_S
+from endopilot.control.robot import Limits, RobotConfig
+from endopilot.control.route import Route, check_passable, find_target
+from endopilot.control.search import SearchConfig
+from endopilot.env.task import Navigation
+from endopilot.errors import InputError
+from endopilot.files import read_json
+from endopilot.progress import progress
+from endopilot.simulation.device import Device, read_device
+from endopilot.simulation.simulator import SimulatorConfig, simulate
+from endopilot.types import TipProjection
+
+Method = Literal["twin", "inverse", "mppi", "forward", "spin", "retract-rotate"]
+Steps = Float[np.ndarray, "samples 2"]
+_IDEAL = RobotConfig(
+    latency_s=0.0, max_acceleration_mm_s2=1e6, max_acceleration_rad_s2=1e6, backlash_mm=0.0, backlash_rad=0.0,
+    encoder_sd_mm=0.0, encoder_sd_rad=0.0,
+)  # fmt: skip
+"""A drive that does what it is told."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SampleConfig:
+    """Sampling through the forward network (method mppi), after Williams et al., J. Guid. Control Dyn. 40, 2017."""
+
+    candidates: int = 12
+    """Control sequences that are rolled out together."""
+    iterations: int = 4
+    """Rounds; each draws around the weighted mean of the one before."""
+    translation_sd_mm_s: float = 1.0
+    """Standard deviation of the translation that is drawn, mm/s."""
+    rotation_sd_rad_s: float = 0.5
+    """Standard deviation of the rotation that is drawn, rad/s."""
+    temperature: float = 0.1
+    """Candidates are weighted by exp(−cost/(temperature · standard deviation of the costs))."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            InputError: a field is out of its range.
+        """
+        for name in self.__dataclass_fields__:
+            if not 0 < getattr(self, name) < np.inf:
+                raise InputError(f"sample.{name}: {getattr(self, name)}; give a positive number")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanConfig:
+    """What is asked of a plan."""
+
+    method: Method = "twin"
+    """How the controls are found: twin (tried in the rod core), inverse (the inverse network of --model), mppi
+    (sampled through its forward network), or a baseline: forward, spin, retract-rotate."""
+    seconds: float = 60.0
+    """Time in which the target is to be reached, s."""
+    speed_mm_s: float = 10.0
+    """Speed of the desired tip along the route, mm/s."""
+    start_inserted_mm: float = 2.0
+    """Inserted length at the start, mm."""
+    start_rotation: float = 0.0
+    """Rotation at the start, rad."""
+    force_limit_n: float = 0.5
+    """Largest force of the wall on one node that is safe, N."""
+    seed: int = 0
+    """Seed of what is drawn at random."""
+    cost: Cost = field(default_factory=Cost)
+    """What a good way is."""
+    sample: SampleConfig = field(default_factory=SampleConfig)
+    """Sampling through the forward network."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            InputError: a field is out of its range.
+        """
+        for name in ("seconds", "speed_mm_s", "force_limit_n"):
+            if not 0 < getattr(self, name) < np.inf:
+                raise InputError(f"{name}: {getattr(self, name)}; give a positive number")
+        if not 0 <= self.start_inserted_mm < np.inf or not np.isfinite(self.start_rotation):
+            raise InputError(
+                f"start_inserted_mm, start_rotation: {self.start_inserted_mm}, {self.start_rotation}; "
+                "give 0 or more, and a finite angle"
+            )
+        if self.seed < 0:
+            raise InputError(f"seed: {self.seed} is negative; give 0 or more")
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A planned navigation; row t is the end of sample period t, `DECISION_PERIOD_S` long.
+
+    Attributes:
+        navigation: what is to be done.
+        method: how it was found.
+        model: the trained run that it was found with, if any.
+        cost: the weights of its cost.
+        control: π, mm/s and rad/s.
+        proximal: (Δ mm, φ rad), its integral.
+        desired: desired tip states (Δtip, γtip), mm.
+        predicted: those that the model foretells, mm.
+        simulated: where the rod core, at its own settings, has the tip under these controls.
+        position: of that tip, LPS mm.
+        force: largest wall force on one node in the rod core, N.
+        reached: whether the target is reached at the end of a period in the rod core.
+        seconds_to_plan: wall time that finding the controls took, s.
+        processor_seconds: processor time of it, s.
+    """
+
+    navigation: Navigation
+    method: str
+    model: str | None
+    cost: Cost
+    control: Steps
+    proximal: Steps
+    desired: Steps
+    predicted: Steps
+    simulated: TipProjection
+    position: Float[np.ndarray, "samples 3"]
+    force: Float[np.ndarray, "samples"]
+    reached: bool
+    seconds_to_plan: float
+    processor_seconds: float
+
+    @property
+    def ratio(self) -> Float[np.ndarray, "samples"]:
+        """Safety ratio γ/(r − r_w) in the rod core."""
+        tip = self.simulated
+        return safety_ratio(tip.offset, tip.radius, self.navigation.device.tip_radius_mm)
+
+    def cost_terms(self) -> dict[str, float]:
+        """Return what each term of the cost comes to in the rod core, mm."""
+        device, weights = self.navigation.device, self.cost
+        error = np.abs(self.simulated.abscissa - self.desired[:, 0])
+        share = self.force / self.navigation.force_limit_n
+        limits = np.array([device.max_velocity_mm_s, device.max_rotation_rad_s])
+        h = DECISION_PERIOD_S
+        return {
+            "end": abs(float(self.simulated.abscissa[-1]) - self.navigation.target.abscissa),
+            "tip": float(weights.tip_weight * error.sum() * h),
+            "ratio": float(weights.ratio_weight * (np.maximum(self.ratio - weights.safe_ratio, 0) ** 2).sum() * h),
+            "force": float(weights.force_weight * (share**2).sum() * h),
+            "time": float(weights.time_weight * len(error) * h),
+            "smooth": float(weights.roughness(self.control[:-1], self.control[1:], limits).sum()),
+        }
+
+
+def plan(
+    anatomy: Path,
+    target: str,
+    config: PlanConfig | None = None,
+    *,
+    model: Path | None = None,
+    device: str | None = None,
+) -> Plan:
+    """Plan a navigation.
+
+    Args:
+        anatomy: folder of the vessel.
+        target: a section such as "4" or "PDA", a point "X,Y,Z" in LPS mm, or the path of a CSV of desired tips.
+        config: method, time, limits and cost.
+        model: run made by `endopilot train`; needed for the methods inverse and mppi.
+        device: name or YAML file of the wire; the model's if not given, the workhorse if there is none.
+
+    Raises:
+        InputError: a target outside the tree, behind an occlusion or too far for the time; a model of another device or
+            without the network that the method needs; no way found.
+    """
+    config = config or PlanConfig()
+    vessel = read_anatomy(anatomy)
+    wire = _wire(model, device, config.method)
+    tips = read_tips(Path(target)) if target.endswith(".csv") else None
+    goal = find_target(vessel, target) if tips is None else last_place(vessel, tips, target)
+    navigation = Navigation(
+        anatomy=vessel,
+        device=wire,
+        target=goal,
+        start_inserted_mm=config.start_inserted_mm,
+        start_rotation=config.start_rotation,
+        seconds=config.seconds if tips is None else len(tips) * DECISION_PERIOD_S,
+        force_limit_n=config.force_limit_n,
+    )
+    route = Route.to(vessel, goal)
+    check_passable(route, wire)
+    if tips is None:
+        _check_time(navigation, config)
+        desired = tips_along(
+            route,
+            wire.tip_radius_mm,
+            start_mm=config.start_inserted_mm,
+            speed_mm_s=config.speed_mm_s,
+            seconds=config.seconds,
+            safe_ratio=config.cost.safe_ratio,
+        )
+    else:
+        desired = tips[["abscissa", "offset"]].to_numpy(float)
+    way = _method(navigation, config, anatomy, model, desired, route, follow=tips is not None)
+    began, worked = time.perf_counter(), time.process_time()
+    control, predicted = way()
+    spent = time.perf_counter() - began, time.process_time() - worked
+    return _checked(navigation, config, model, desired, control, predicted, spent)
+
+
+def _method(
+    navigation: Navigation, config: PlanConfig, anatomy: Path, model: Path | None, desired: Steps, route: Route, *,
+    follow: bool,
+) -> Callable[[], tuple[Steps, Steps]]:  # fmt: skip
+    """Return what finds controls and foretells tips; what it takes to load a model is over then."""
+    if config.method in ("inverse", "mppi"):
+        from endopilot.control.learned import with_networks  # torch is slow to import
+
+        assert model is not None
+        return with_networks(navigation, anatomy, model, desired, route, config)
+    if config.method != "twin":
+        return lambda: _by_policy(navigation, config)
+    return lambda: _track(navigation, desired) if follow else _search(navigation, config)
+
+
+def _wire(model: Path | None, device: str | None, method: str) -> Device:
+    """Return the wire: the one that is asked for, else the model's; both must be the same."""
+    if model is None:
+        if method in ("inverse", "mppi"):
+            raise InputError(f"--model: none given, and method {method} needs one; give a run of `endopilot train`")
+        return read_device(device or "workhorse-014")
+    record = read_json(Path(model) / "manifest.json")
+    if not isinstance(record, dict) or "device" not in record:
+        raise InputError(f"{model}: is not a run of this version's `endopilot train`; train anew")
+    trained = Device.from_record(record["device"])
+    if device is not None and replace(read_device(device), sources={}) != replace(trained, sources={}):
+        raise InputError(
+            f"--device {device}: {model} was trained with {trained.name}; leave --device out or train anew"
+        )
+    return trained
+
+
+def _check_time(navigation: Navigation, config: PlanConfig) -> None:
+    way = navigation.target.abscissa - navigation.start_inserted_mm
+    fastest = min(navigation.device.max_velocity_mm_s, config.speed_mm_s)
+    if way / fastest > navigation.seconds:
+        raise InputError(
+            f"seconds: {navigation.seconds:g} s are too few for the {way:.0f} mm to the target at {fastest:g} mm/s; "
+            f"give {way / fastest:.0f} s or more, or a larger speed_mm_s (the device's limit is "
+            f"{navigation.device.max_velocity_mm_s:g} mm/s)"
+        )
+
+
+def _search(navigation: Navigation, config: PlanConfig) -> tuple[Steps, Steps]:
+    """Search a way in the rod core."""
+    policy = TwinPolicy(config=AgentConfig(search=SearchConfig(speed_mm_s=config.speed_mm_s, cost=config.cost)))
+    policy.start(navigation, config.seed)
+    with progress("plan: trying in the rod core", total=navigation.target.abscissa) as advance:
+        course = policy.find_course(navigation.seconds, advance)
+    if course.reached < 0.5:
+        far = float(course.abscissa[-1, 0])
+        raise InputError(
+            f"target: no way found to branch {navigation.target.branch} of {navigation.anatomy.name} in "
+            f"{navigation.seconds:g} s under {navigation.force_limit_n:g} N with {navigation.device.name}; the tip "
+            f"came to {far:.0f} of {navigation.target.abscissa:.0f} mm; give more seconds or a wire of larger tip bend"
+        )
+    return course.control, np.column_stack([course.abscissa[:, 0], course.offset[:, 0]])
+
+
+def _track(navigation: Navigation, desired: Steps) -> tuple[Steps, Steps]:
+    """Lead the rod core along desired tips, one sample at a time."""
+    from endopilot.models.tracking import track
+
+    core = SimulatorConfig(threads=1)
+    tip, control = track(
+        navigation.anatomy,
+        [navigation.device],
+        friction=np.array([navigation.device.friction]),
+        start=np.array([[navigation.start_inserted_mm, navigation.start_rotation]]),
+        given=np.zeros((1, 0, 2)),
+        desired=desired[None],
+        config=core,
+    )
+    return control[0], tip[0]
+
+
+def _by_policy(navigation: Navigation, config: PlanConfig) -> tuple[Steps, Steps]:
+    """Let a policy drive the rod core with an ideal drive, and take down what it did."""
+    from endopilot.control.policies import make_policy
+
+    record = navigate(navigation, make_policy(config.method), config=NavigateConfig(robot=_IDEAL), seed=config.seed)
+    proximal = np.column_stack([record.inserted_length, record.rotation])
+    control = np.diff(proximal, axis=0) / DECISION_PERIOD_S
+    return control, np.column_stack([record.tip.abscissa, record.tip.offset])[1:]
+
+
+def _checked(
+    navigation: Navigation, config: PlanConfig, model: Path | None, desired: Float[np.ndarray, "wanted 2"],
+    control: Steps, predicted: Steps, spent: tuple[float, float],
+) -> Plan:  # fmt: skip
+    """Put the controls within the limits, drive the rod core with them, and return the plan."""
+    limits = Limits.of(navigation.device, navigation.anatomy)
+    control = within_limits(control, limits, navigation.start_inserted_mm)
+    start = np.array([navigation.start_inserted_mm, navigation.start_rotation])
+    rollout = simulate(
+        navigation.anatomy, navigation.device, control[None], initial=start[None], config=SimulatorConfig(threads=1)
+    )
+    tip = TipProjection(**{name: getattr(rollout.tip, name)[0] for name in TipProjection.__dataclass_fields__})
+    wanted = np.concatenate([desired, np.repeat(desired[-1:], max(len(control) - len(desired), 0), axis=0)])
+    return Plan(
+        navigation=navigation,
+        method=config.method,
+        model=None if model is None else str(model),
+        cost=config.cost,
+        control=control,
+        proximal=start + DECISION_PERIOD_S * np.cumsum(control, axis=0),
+        desired=wanted[: len(control)],
+        predicted=predicted,
+        simulated=tip,
+        position=rollout.tip_position[0],
+        force=rollout.contact_force_max[0],
+        reached=bool(navigation.reached(tip).any()),
+        seconds_to_plan=spent[0],
+        processor_seconds=spent[1],
+    )
+
+
+def within_limits(control: Steps, limits: Limits, inserted_mm: float) -> Steps:
+    """Return controls that are finite and within the drive's limits and its travel, whatever a model asks for.
+
+    Args:
+        control: mm/s and rad/s of each period.
+        limits: of the drive.
+        inserted_mm: inserted length at the start, mm.
+    """
+    made = np.empty((len(control), 2))
+    low, high = limits.travel_mm
+    for row, asked in zip(made, control, strict=True):
+        row[:] = limits.safe(*asked)
+        ahead = np.clip(inserted_mm + row[0] * DECISION_PERIOD_S, low, high) if row[0] else inserted_mm
+        row[0] = np.clip((ahead - inserted_mm) / DECISION_PERIOD_S, -limits.max_velocity_mm_s, limits.max_velocity_mm_s)
+        inserted_mm += row[0] * DECISION_PERIOD_S
+    return made

@@ -1,0 +1,171 @@
+"""A plan on disk: a folder of `plan.csv`, `manifest.json` and `plan.png`.
+
+`plan.csv` holds a row for the end of each sample period of 0.5 s. Its first columns are those that `endopilot simulate
+--controls` takes, so that a plan can be driven again.
+
+================================================  ====================================================================
+column                                            meaning
+================================================  ====================================================================
+time_s                                            end of the period, s
+translation_mm_s, rotation_rad_s                  control π over the period
+inserted_length_mm, rotation_rad                  Δ and φ at its end
+desired_tip_abscissa_mm, desired_tip_offset_mm    desired Δtip and γtip
+predicted_tip_abscissa_mm, …_offset_mm            those that the model of the method foretells
+tip_abscissa_mm, tip_offset_mm, branch            where the rod core has the tip under these controls
+tip_x_mm, tip_y_mm, tip_z_mm                      likewise, LPS
+lumen_radius_mm, safety_ratio, contact_force_n    lumen radius r there, γ/(r − r_w), largest wall force on one node
+================================================  ====================================================================
+"""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from endopilot.control.cost import Cost
+from endopilot.control.plan import Plan
+from endopilot.control.policy import DECISION_PERIOD_S
+from endopilot.env.task import Navigation, Target
+from endopilot.errors import InputError
+from endopilot.files import json_text, manifest, read_json, sha256, writing
+from endopilot.simulation.device import Device
+from endopilot.types import Anatomy, TipProjection
+
+_TABLE, _RECORD, PICTURE = "plan.csv", "manifest.json", "plan.png"
+_COLUMNS = (
+    "time_s", "translation_mm_s", "rotation_rad_s", "inserted_length_mm", "rotation_rad",
+    "desired_tip_abscissa_mm", "desired_tip_offset_mm", "predicted_tip_abscissa_mm", "predicted_tip_offset_mm",
+    "tip_abscissa_mm", "tip_offset_mm", "branch", "tip_x_mm", "tip_y_mm", "tip_z_mm",
+    "lumen_radius_mm", "safety_ratio", "contact_force_n",
+)  # fmt: skip
+
+
+def fingerprint(anatomy: Anatomy) -> str:
+    """Return a hash of an anatomy's centerlines, distance map and insertion."""
+    digest = hashlib.sha256()
+    lines = [
+        array for branch in anatomy.tree.branches for array in (branch.centerline.points, branch.centerline.radius)
+    ]
+    for array in (*lines, anatomy.insertion.position, anatomy.insertion.direction, anatomy.distance_map.origin_mm):
+        digest.update(np.ascontiguousarray(array, dtype=np.float32).tobytes())
+    digest.update(np.ascontiguousarray(anatomy.distance_map.values, dtype=np.float32).tobytes())
+    return digest.hexdigest()
+
+
+def write_plan(plan: Plan, folder: Path, *, seed: int = 0) -> dict[str, Any]:
+    """Write a plan as a folder, whole or not at all; a plan that stands there already is replaced. Return its figures.
+
+    Raises:
+        InputError: the folder cannot be written, or holds something that is not a plan.
+    """
+    from endopilot.control.plan_picture import draw_plan  # matplotlib is slow to import
+
+    folder = Path(folder)
+    if folder.exists() and not (folder.is_dir() and ((folder / _TABLE).exists() or not any(folder.iterdir()))):
+        raise InputError(f"{folder}: exists and is not a plan; choose another output folder")
+    navigation, tip = plan.navigation, plan.simulated
+    values = np.column_stack(
+        [
+            DECISION_PERIOD_S * np.arange(1, len(plan.control) + 1), plan.control, plan.proximal, plan.desired,
+            plan.predicted, tip.abscissa, tip.offset, tip.branch, plan.position, tip.radius, plan.ratio, plan.force,
+        ]
+    )  # fmt: skip
+    figures = {
+        "method": plan.method,
+        "reached": plan.reached,
+        "seconds": DECISION_PERIOD_S * len(plan.control),
+        "target_mm": round(navigation.target.abscissa, 2),
+        "tip_error_mm": round(float(np.abs(tip.abscissa[-1] - navigation.target.abscissa)), 3),
+        "model_error_mm": round(float(np.abs(plan.predicted[:, 0] - tip.abscissa).mean()), 3),
+        "peak_force_n": round(float(plan.force.max()), 4),
+        "largest_safety_ratio": round(float(plan.ratio.max()), 3),
+        "cost": {name: round(value, 3) for name, value in plan.cost_terms().items()},
+        "seconds_to_plan": round(plan.seconds_to_plan, 2),
+        "processor_seconds": round(plan.processor_seconds, 2),
+    }
+    with writing(folder) as partial:
+        partial.mkdir()
+        table = pd.DataFrame(values, columns=list(_COLUMNS))
+        table["branch"] = table["branch"].astype(int)
+        table.to_csv(partial / _TABLE, index=False)
+        draw_plan(plan, partial / PICTURE)
+        record = manifest(
+            config={"cost": asdict(plan.cost)},
+            seed=seed,
+            inputs={},
+            anatomy={"name": navigation.anatomy.name, "sha256": fingerprint(navigation.anatomy)},
+            device=asdict(navigation.device),
+            model=plan.model,
+            target=asdict(navigation.target),
+            start={"inserted_length_mm": navigation.start_inserted_mm, "rotation_rad": navigation.start_rotation},
+            limits={"seconds": navigation.seconds, "force_n": navigation.force_limit_n},
+            table_sha256=sha256(partial / _TABLE),
+            **figures,
+        )
+        (partial / _RECORD).write_text(json_text(record) + "\n", encoding="utf-8")
+        if folder.exists():
+            shutil.rmtree(folder)
+    return {"plan": str(folder), **figures}
+
+
+def read_plan(folder: Path, anatomy: Anatomy, device: Device) -> Plan:
+    """Read a plan that `write_plan` wrote, for the anatomy and the wire that it was made for.
+
+    Raises:
+        InputError: a file is missing or damaged, or the plan is for another anatomy or device.
+    """
+    folder = Path(folder)
+    record = read_json(folder / _RECORD)
+    if not isinstance(record, dict) or "table_sha256" not in record:
+        raise InputError(f"{folder / _RECORD}: is not the manifest of a plan; make one with `endopilot plan`")
+    made = record["anatomy"]
+    if made["sha256"] != fingerprint(anatomy):
+        raise InputError(
+            f"{folder}: the plan is for another anatomy ({made['name']}), not for this {anatomy.name}; plan anew"
+        )
+    planned = Device.from_record(record["device"])
+    if replace(planned, sources={}) != replace(device, sources={}):
+        raise InputError(f"{folder}: the plan is for another device ({planned.name}), not for {device.name}; plan anew")
+    if not (folder / _TABLE).exists() or sha256(folder / _TABLE) != record["table_sha256"]:
+        raise InputError(f"{folder / _TABLE}: is missing or differs from what {_RECORD} records; plan anew")
+    table = pd.read_csv(folder / _TABLE)
+    column = {name: table[name].to_numpy() for name in _COLUMNS}
+
+    def pair(first: str, second: str) -> np.ndarray:
+        return np.column_stack([column[first], column[second]])
+
+    return Plan(
+        navigation=Navigation(
+            anatomy=anatomy,
+            device=device,
+            target=Target(**record["target"]),
+            start_inserted_mm=record["start"]["inserted_length_mm"],
+            start_rotation=record["start"]["rotation_rad"],
+            seconds=record["limits"]["seconds"],
+            force_limit_n=record["limits"]["force_n"],
+        ),
+        method=record["method"],
+        model=record["model"],
+        cost=Cost(**record["config"]["cost"]),
+        control=pair("translation_mm_s", "rotation_rad_s"),
+        proximal=pair("inserted_length_mm", "rotation_rad"),
+        desired=pair("desired_tip_abscissa_mm", "desired_tip_offset_mm"),
+        predicted=pair("predicted_tip_abscissa_mm", "predicted_tip_offset_mm"),
+        simulated=TipProjection(
+            abscissa=column["tip_abscissa_mm"],
+            offset=column["tip_offset_mm"],
+            branch=column["branch"],
+            radius=column["lumen_radius_mm"],
+        ),
+        position=np.column_stack([column[f"tip_{axis}_mm"] for axis in "xyz"]),
+        force=column["contact_force_n"],
+        reached=record["reached"],
+        seconds_to_plan=record["seconds_to_plan"],
+        processor_seconds=record["processor_seconds"],
+    )

@@ -1,0 +1,86 @@
+"""A picture of a plan: the route, the tip's way, desired and predicted tip, safety ratio, force and controls."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib as mpl
+
+mpl.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+
+from endopilot.control.plan import Plan
+from endopilot.control.policy import DECISION_PERIOD_S
+from endopilot.control.route import Route
+from endopilot.files import writing
+
+
+def draw_plan(plan: Plan, path: Path) -> None:
+    """Write a PNG of a plan."""
+    figure = plt.figure(figsize=(13, 8), facecolor="white", layout="constrained")
+    grid = figure.add_gridspec(4, 2, width_ratios=(1.0, 1.25))
+    _draw_route(plan, figure.add_subplot(grid[:, 0]))
+    time_s = DECISION_PERIOD_S * np.arange(1, len(plan.control) + 1)
+    panels = [figure.add_subplot(grid[row, 1]) for row in range(4)]
+    _draw_tip(plan, time_s, panels[0])
+    _draw_safety(plan, time_s, panels[1])
+    panels[2].plot(time_s, plan.force, color="tab:red")
+    panels[2].axhline(plan.navigation.force_limit_n, color="0.4", linestyle="--", linewidth=1)
+    panels[2].set_ylabel("wall force, N")
+    panels[2].set_ylim(0, 1.1 * plan.navigation.force_limit_n)
+    panels[3].step(time_s, plan.control[:, 0], where="pre", color="tab:blue", label="translation, mm/s")
+    panels[3].step(time_s, plan.control[:, 1], where="pre", color="tab:orange", label="rotation, rad/s")
+    panels[3].legend(loc="upper right", fontsize=8)
+    panels[3].set_ylabel("control")
+    panels[3].set_xlabel("time, s")
+    for panel in panels[:3]:
+        panel.tick_params(labelbottom=False)
+    with writing(Path(path)) as partial:
+        figure.savefig(partial, dpi=90)
+    plt.close(figure)
+
+
+def _draw_route(plan: Plan, axes: Axes) -> None:
+    """Draw the tree from the front with the route and the tip's way."""
+    navigation = plan.navigation
+    tree, route = navigation.anatomy.tree, Route.to(navigation.anatomy, navigation.target)
+    for branch in tree.branches:
+        x, _, z = branch.centerline.points.T
+        axes.plot(x, z, color="0.75", linewidth=1.5)
+    ahead = route.line.abscissa <= navigation.target.abscissa
+    x, _, z = route.line.points[ahead].T
+    axes.plot(x, z, color="tab:green", linewidth=5, alpha=0.4, label="route")
+    axes.plot(
+        plan.position[:, 0], plan.position[:, 2], ".-", color="tab:blue", linewidth=0.8, markersize=3, label="tip"
+    )
+    goal = navigation.target.position(navigation.anatomy)
+    axes.plot(goal[0], goal[2], "*", color="tab:red", markersize=14, label="target")
+    axes.set_aspect("equal")
+    axes.set_xlabel("x (to the patient's left), mm")
+    axes.set_ylabel("z (to the head), mm")
+    axes.set_title(f"{navigation.anatomy.name}, {navigation.device.name}: {plan.method}")
+    axes.legend(loc="best", fontsize=9)
+
+
+def _draw_tip(plan: Plan, time_s: np.ndarray, axes: Axes) -> None:
+    tip = plan.simulated
+    route = Route.to(plan.navigation.anatomy, plan.navigation.target)
+    astray = route.astray(tip) > 0
+    axes.plot(time_s, plan.desired[:, 0], color="tab:green", label="desired")
+    axes.plot(time_s, plan.predicted[:, 0], color="tab:orange", linestyle="--", label="foretold by the model")
+    axes.plot(time_s, tip.abscissa, color="tab:blue", linewidth=1, label="in the rod core")
+    if astray.any():
+        axes.plot(time_s[astray], tip.abscissa[astray], "x", color="tab:red", label="in a wrong branch")
+    for junction in route.junctions:
+        axes.axhline(float(junction), color="0.8", linewidth=0.8, zorder=0)
+    axes.set_ylabel("Δtip, mm")
+    axes.legend(loc="lower right", fontsize=8)
+
+
+def _draw_safety(plan: Plan, time_s: np.ndarray, axes: Axes) -> None:
+    axes.plot(time_s, plan.ratio, color="tab:purple")
+    axes.axhline(plan.cost.safe_ratio, color="0.4", linestyle="--", linewidth=1)
+    axes.set_ylim(0, 1.1)
+    axes.set_ylabel("γ/(r − r_w)")

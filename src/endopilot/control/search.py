@@ -1,0 +1,391 @@
+"""Finding a way to a target by trying it in the rod core: `Search`.
+
+One wire, or several that differ in what is uncertain, is driven from its present state. On a clear way it is pushed
+straight on. Where that would lead into a wrong branch, or the tip stops, the wires go back to where they were before
+and a population of candidates tries other motions: every round each candidate draws a constant control for a second,
+and those nearest to the waypoint, in the mean over the wires and with the cost of what they did on the way, are kept
+and copied over the others, until one of them has entered the wanted branch.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from endopilot.control.cost import Cost, safety_ratio
+from endopilot.control.policy import DECISION_PERIOD_S
+from endopilot.control.route import Route
+from endopilot.env.task import Navigation
+from endopilot.errors import InputError
+from endopilot.progress import Advance
+from endopilot.simulation.device import Device
+from endopilot.simulation.simulator import SPARE_MM
+from endopilot.simulation.stepping import Simulator
+from endopilot.types import TipProjection
+
+Controls = Float[np.ndarray, "periods 2"]
+_STALL_PERIODS = 4
+"""A tip that has come forward by less than `_STALL_SHARE` of the wire's advance in this many periods has stopped."""
+_STALL_SHARE = 0.25
+_LEFT_BEHIND = 0.2
+"""Each attempt is content with a way that leaves this much more of the wires, by weight, behind."""
+_LOOKOUT_MM = 12.0
+"""A waypoint that is searched for lies no farther ahead than this, mm: beyond, a chord says little."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchConfig:
+    """How hard is searched."""
+
+    candidates: int = 32
+    """Candidates that are tried side by side where the way is not clear."""
+    rounds: int = 6
+    """Rounds of one attempt, at most."""
+    attempts: int = 4
+    """Attempts, each from the same state, before a search is given up."""
+    round_periods: int = 2
+    """Decision periods of 0.5 s in a round."""
+    keep_share: float = 0.25
+    """Share of the candidates that a round keeps."""
+    speed_mm_s: float = 10.0
+    """Translation on a clear way, mm/s."""
+    turn_rad_s: float = 7.0
+    """Fastest rotation that is tried, rad/s."""
+    lead_mm: float = 4.0
+    """A search begins this far before the wall of the junction, mm."""
+    cost: Cost = field(default_factory=Cost)
+    """What the candidates are compared by."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            InputError: a field is out of its range.
+        """
+        for name in ("candidates", "rounds", "attempts", "round_periods", "speed_mm_s", "turn_rad_s", "lead_mm"):
+            if not 0 < getattr(self, name) < np.inf:
+                raise InputError(f"{name}: {getattr(self, name)}; give a positive number")
+        if not 0 < self.keep_share < 1:
+            raise InputError(f"keep_share: {self.keep_share}; give a share between 0 and 1")
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """Controls, and what the wires that they were found with do under them.
+
+    Attributes:
+        control: (mm/s, rad/s) of each decision period.
+        abscissa: Δtip at the end of each period, a column a wire, mm.
+        offset: γtip, mm.
+        branch: index of the branch of the tip.
+        radius: lumen radius at the tip, mm.
+        position: of the tips, LPS mm.
+        force: largest wall force on a node, N.
+        inserted: Δ, mm, of the first wire.
+        rotation: φ, rad, of the first wire.
+        reached: whether they end at the target, by weight: 1 if all do.
+    """
+
+    control: Controls
+    abscissa: Float[np.ndarray, "periods wires"]
+    offset: Float[np.ndarray, "periods wires"]
+    branch: Int[np.ndarray, "periods wires"]
+    radius: Float[np.ndarray, "periods wires"]
+    position: Float[np.ndarray, "periods wires 3"]
+    force: Float[np.ndarray, "periods wires"]
+    inserted: Float[np.ndarray, "periods"]
+    rotation: Float[np.ndarray, "periods"]
+    reached: float
+
+
+class Search:
+    """Searches ways for a navigation, from any state of its wires."""
+
+    def __init__(
+        self,
+        navigation: Navigation,
+        route: Route,
+        wires: list[Device],
+        *,
+        config: SearchConfig,
+        seed: int,
+        sharing: Simulator,
+    ) -> None:
+        """Lay out the wires, and the candidates of each.
+
+        Args:
+            navigation: where, and how hard the wall may be pressed.
+            route: the way to its target.
+            wires: as they may be; the same object where two have the same stiffness.
+            config: how hard is searched.
+            seed: of the random candidates.
+            sharing: the simulator that ways will be searched from; its wires are among `wires`, its settings are taken.
+        """
+        self.navigation, self.route, self.config = navigation, route, config
+        self._random = np.random.default_rng([seed, 0x5EA])
+        crowd = [wire for wire in wires for _ in range(config.candidates)]
+        anatomy, core = navigation.anatomy, sharing.config
+        self.single, self._kept = (Simulator(anatomy, wires, config=core, sharing=sharing) for _ in range(2))
+        self._many = Simulator(anatomy, crowd, config=core, sharing=sharing)
+        self._limits = np.array([wires[0].max_velocity_mm_s, wires[0].max_rotation_rad_s])
+        self._longest = float(navigation.anatomy.tree.longest_path().abscissa[-1]) + SPARE_MM
+        self._wire_radius = wires[0].tip_radius_mm
+
+    def find(
+        self,
+        start: Simulator,
+        source: Int[np.ndarray, "wires"],
+        weight: Float[np.ndarray, "wires"],
+        *,
+        seconds: float,
+        advance: Advance | None = None,
+    ) -> Course:
+        """Find a way from a state of the wires to the target.
+
+        Args:
+            start: a simulator of the same wires.
+            source: which of its worlds each wire is.
+            weight: how much each wire counts; their sum is 1.
+            seconds: time that is left, s.
+            advance: told of every millimetre along the route.
+        """
+        self.single.copy_worlds(source, of=start)
+        self._weight, same = weight, np.arange(len(weight))
+        log, told = _Log(), 0.0
+        periods = max(1, int(seconds / DECISION_PERIOD_S))
+        while log.periods < periods:
+            here = float(self.route.progress(self.single.project()) @ weight)
+            if advance is not None:
+                advance(max(here - told, 0.0))
+                told = max(here, told)
+            waypoint, before = self.route.next_waypoint(here), log.periods
+            self._kept.copy_worlds(same, of=self.single)
+            if self._push_on(log, periods, waypoint):
+                if self._reached() > 0.5:
+                    break
+                continue
+            self.single.copy_worlds(same, of=self._kept)
+            log.cut(before)
+            self._approach(log, periods, waypoint)
+            if not self._try_others(log, periods):
+                break
+        return log.course(len(weight), self._reached())
+
+    def _reached(self) -> float:
+        return float(self.navigation.reached(self.single.project()) @ self._weight)
+
+    def _push_on(self, log: _Log, periods: int, waypoint: float) -> bool:
+        """Push straight on past a waypoint; False if a wire goes astray, stops or presses too hard."""
+        begun = log.periods
+        while log.periods < periods:
+            tip = self.single.project()
+            if self._all(self.route.passed(tip, waypoint)):
+                return True
+            if not self._all(self.route.astray(tip) == 0):
+                return False
+            left = waypoint - float(self.route.progress(tip) @ self._weight)
+            last = waypoint >= self.route.target.abscissa
+            speed = np.clip(left / DECISION_PERIOD_S, 1.0, self.config.speed_mm_s) if last else self.config.speed_mm_s
+            self._drive(log, np.array([speed, 0.0]))
+            if self._pressed(log) or (log.periods - begun >= _STALL_PERIODS and log.stalled(self._weight > 0)):
+                return False
+        return self._all(self.route.passed(self.single.project(), waypoint))
+
+    def _approach(self, log: _Log, periods: int, waypoint: float) -> None:
+        """Push on, or pull back, to where a search for a waypoint begins."""
+        before = self.route.junctions[self.route.junctions < waypoint]
+        last = waypoint >= self.route.target.abscissa
+        begin = waypoint - _LOOKOUT_MM if last or not len(before) else float(before[-1]) - self.config.lead_mm
+        for _ in range(periods - log.periods):
+            tip = self.single.project()
+            here, on_route = self.route.progress(tip) @ self._weight, self._all(self.route.astray(tip) == 0)
+            if not on_route and self.single.inserted_length.min() > 1.0:
+                self._drive(log, np.array([-self.config.speed_mm_s, 0.0]))
+            elif here < begin - 1.0 and not (log.periods >= _STALL_PERIODS and log.stalled(self._weight > 0)):
+                self._drive(log, np.array([min(self.config.speed_mm_s, (begin - here) / DECISION_PERIOD_S), 0.0]))
+            else:
+                return
+
+    def _drive(self, log: _Log, control: Float[np.ndarray, "2"]) -> None:
+        made = self._possible(control[None], self.single)[0]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            step = self.single.step(np.tile(made, (self.single.worlds, 1)), DECISION_PERIOD_S)
+        tip = self.single.project()
+        log.add(made, tip, step.tip_position, step.contact_force_max, step.inserted_length, step.rotation)
+
+    def _possible(self, control: Float[np.ndarray, "n 2"], simulator: Simulator) -> Float[np.ndarray, "n 2"]:
+        """Return what the drive can do of controls, with the shortest and the longest wire that it is given."""
+        made = np.clip(control, -self._limits, self._limits)
+        inserted = simulator.inserted_length
+        room = (self._longest - 1.0 - float(inserted.max())) / DECISION_PERIOD_S
+        made[:, 0] = np.clip(made[:, 0], -float(inserted.min()) / DECISION_PERIOD_S, max(room, 0.0))
+        return made
+
+    def _pressed(self, log: _Log) -> bool:
+        limit = self.config.cost.forbidden_share * self.navigation.force_limit_n
+        return not self._all((log.force[-1] <= limit) & self.single.valid)
+
+    def _all(self, holds: Bool[np.ndarray, "wires"]) -> bool:
+        """Return whether something holds for all wires that have not been left behind."""
+        return bool(holds[self._weight > 0].all())
+
+    def _try_others(self, log: _Log, periods: int) -> bool:
+        """Search with the whole population for a way past the next waypoint; append the best to the log.
+
+        What is searched in vain is begun anew from the same state, so that a plan holds no vain motion.
+        """
+        progress = float(self.route.progress(self.single.project()) @ self._weight)
+        waypoint = min(self.route.next_waypoint(progress), progress + _LOOKOUT_MM)
+        rounds = min(self.config.rounds, (periods - log.periods) // self.config.round_periods)
+        nearest, best = np.inf, np.zeros((0, 2))
+        for attempt in range(self.config.attempts):
+            score, controls, won = self._attempt(waypoint, rounds, attempt)
+            if won:
+                self._follow(log, controls)
+                self._leave_behind(self.route.passed(self.single.project(), waypoint))
+                return True
+            if score < nearest:
+                nearest, best = score, controls
+        self._follow(log, best)
+        return False
+
+    def _leave_behind(self, passed: Bool[np.ndarray, "wires"]) -> None:
+        """Go on without the wires that a way does not bring past a waypoint."""
+        left = np.where(passed, self._weight, 0.0)
+        if left.sum() > 0:
+            self._weight = left / left.sum()
+
+    def _attempt(self, waypoint: float, rounds: int, attempt: int) -> tuple[float, Controls, bool]:
+        """Search once; return the least cost so far and to go, its controls, and whether they pass the waypoint."""
+        count, wires = self.config.candidates, self.single.worlds
+        self._many.copy_worlds(np.repeat(np.arange(wires), count), of=self.single)
+        history, spent = np.zeros((0, count, 2)), np.zeros(count)
+        nearest, best = np.inf, np.zeros((0, 2))
+        for number in range(rounds):
+            before = history[-1] if number else np.zeros((count, 2))
+            drawn = self._possible(self._draw(before, number, attempt), self._many)
+            spent += self._run_round(drawn, before, waypoint)
+            history = np.concatenate([history, np.repeat(drawn[None], self.config.round_periods, axis=0)])
+            score, share = self._judge(waypoint, spent)
+            won = share >= 1 - _LEFT_BEHIND * attempt - 1e-9
+            if won.any():
+                return 0.0, history[:, np.argmin(np.where(won, score, np.inf))], True
+            if number == 0:
+                continue  # what has only turned has not shown yet where it leads
+            if score.min() < nearest:
+                nearest, best = float(score.min()), history[:, np.argmin(score)]
+            chosen = self._select(score)
+            self._many.copy_worlds((np.arange(wires)[:, None] * count + chosen).ravel())
+            history, spent = history[:, chosen], spent[chosen]
+        return nearest, best, False
+
+    def _draw(
+        self, last: Float[np.ndarray, "candidates 2"], number: int, attempt: int
+    ) -> Float[np.ndarray, "candidates 2"]:
+        """Draw a control for each candidate.
+
+        In the first round they turn the tip to all sides, and pull back, in later attempts farther; in the second most
+        go straight on; then they move at random, and a few go on with what they did.
+        """
+        count, config, random = self.config.candidates, self.config, self._random
+        turn = np.where(random.random(count) < 0.25, 0.0, random.uniform(-1.0, 1.0, count)) * config.turn_rad_s
+        if number == 0:
+            sides = (np.arange(count) + random.random(count)) / count
+            turn = (2 * sides - 1) * np.pi / (config.round_periods * DECISION_PERIOD_S)
+            speed = random.uniform(-0.3 * (1 + attempt), 0.3, count)
+        elif number == 1:
+            turn = np.where(random.random(count) < 0.6, 0.0, turn)
+            speed = random.uniform(0.2, 1.0, count)
+        else:
+            back = random.random(count) < 0.45
+            speed = np.where(back, random.uniform(-0.8, 0.0, count), random.uniform(0.1, 0.8, count))
+        drawn = np.column_stack([np.clip(speed, -1.0, 1.0) * config.speed_mm_s, turn])
+        same = (random.random(count) < 0.2) & (number > 1)
+        drawn[same] = last[same]
+        return drawn
+
+    def _run_round(
+        self, control: Float[np.ndarray, "candidates 2"], before: Float[np.ndarray, "candidates 2"] | None,
+        waypoint: float,
+    ) -> Float[np.ndarray, "candidates"]:  # fmt: skip
+        """Drive all candidates for a round; return what it cost each, in the mean over its wires."""
+        cost, wires = self.config.cost, self.single.worlds
+        spent = cost.roughness(before, control, self._limits)
+        for _ in range(self.config.round_periods):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                step = self._many.step(np.tile(control, (wires, 1)), DECISION_PERIOD_S)
+            tip = self._many.project()
+            running = cost.running(
+                error=self._distance(step.tip_position, waypoint),
+                ratio=safety_ratio(tip.offset, tip.radius, self._wire_radius),
+                force_share=step.contact_force_max / self.navigation.force_limit_n,
+            )
+            running = np.where(step.valid, running, 1e3)
+            spent += DECISION_PERIOD_S * (self._weight @ running.reshape(wires, -1))
+        return spent
+
+    def _distance(self, position: Float[np.ndarray, "n 3"], waypoint: float) -> Float[np.ndarray, "n"]:
+        return np.linalg.norm(position - self.route.position(waypoint), axis=-1)
+
+    def _judge(
+        self, waypoint: float, spent: Float[np.ndarray, "candidates"]
+    ) -> tuple[Float[np.ndarray, "candidates"], Float[np.ndarray, "candidates"]]:
+        """Return each candidate's cost so far and to go, and the share of its wires that have passed the waypoint."""
+        tip, wires = self._many.project(), self.single.worlds
+        to_go = self._distance(self._many.position[:, 0], waypoint) + 0.5 * self.route.astray(tip)
+        passed = (self.route.passed(tip, waypoint) & self._many.valid).reshape(wires, -1)
+        score = self._weight @ to_go.reshape(wires, -1) + spent
+        return score, self._weight @ passed
+
+    def _select(self, score: Float[np.ndarray, "candidates"]) -> Int[np.ndarray, "candidates"]:
+        """Return whose copy each candidate becomes: the best stay and are copied over the others."""
+        best = np.argsort(score)[: max(1, round(self.config.keep_share * len(score)))]
+        others = self._random.choice(best, len(score) - len(best))
+        return np.concatenate([best, others])
+
+    def _follow(self, log: _Log, controls: Controls) -> None:
+        for control in controls:
+            self._drive(log, control)
+
+
+class _Log:
+    """What the wires have done so far, a row a period."""
+
+    def __init__(self) -> None:
+        self.rows: list[tuple] = []
+
+    def add(self, control: np.ndarray, tip: TipProjection, *rest: np.ndarray) -> None:
+        self.rows.append((control, tip.abscissa, tip.offset, tip.branch, tip.radius, *rest))
+
+    def cut(self, periods: int) -> None:
+        del self.rows[periods:]
+
+    @property
+    def periods(self) -> int:
+        return len(self.rows)
+
+    @property
+    def force(self) -> list[np.ndarray]:
+        return [row[6] for row in self.rows]
+
+    def stalled(self, counted: Bool[np.ndarray, "wires"]) -> bool:
+        """Return whether a tip that counts has stayed behind in the last periods while the wires went forward."""
+        last = self.rows[-_STALL_PERIODS:]
+        advance = sum(float(row[0][0]) for row in last) * DECISION_PERIOD_S
+        gain = float(np.min((last[-1][1] - last[0][1])[counted]))
+        return len(last) == _STALL_PERIODS and advance > 2.0 and gain < _STALL_SHARE * advance
+
+    def course(self, wires: int, reached: float) -> Course:
+        shapes = ((2,), *[(wires,)] * 4, (wires, 3), *[(wires,)] * 3)
+        empty = [np.zeros((0, *shape), dtype=int if k == 3 else float) for k, shape in enumerate(shapes)]
+        columns = [np.array(column) for column in zip(*self.rows, strict=True)] or empty
+        control, abscissa, offset, branch, radius, position, force, inserted, rotation = columns
+        return Course(
+            control=control, abscissa=abscissa, offset=offset, branch=branch, radius=radius, position=position,
+            force=force, inserted=inserted[:, 0], rotation=rotation[:, 0], reached=reached,
+        )  # fmt: skip

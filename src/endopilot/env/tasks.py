@@ -1,0 +1,209 @@
+"""The tasks of the ladder, from fixed files, in fixed synthetic patients; and the one that environments start with."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from endopilot.anatomy.atlas import ANATOMIES, AtlasConfig, synthesize_one
+from endopilot.env.task import Navigation, Target
+from endopilot.errors import InputError
+from endopilot.simulation.device import list_devices, read_device
+from endopilot.types import Anatomy, VesselTree
+
+_FOLDER = Path(__file__).parent / "tasks"
+_Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+_STRICT = ConfigDict(extra="forbid", frozen=True)
+
+
+class Patients(BaseModel):
+    """Patients of an atlas.
+
+    Attributes:
+        seed: of the atlas.
+        numbers: of the patients in it.
+    """
+
+    model_config = _STRICT
+    seed: Annotated[int, Field(ge=0, lt=2**64)]
+    numbers: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
+
+
+class Task(BaseModel):
+    """One task of the ladder.
+
+    Attributes:
+        name: short name.
+        level: place on the ladder, 1 to 12.
+        title: what is to be done, in a few words.
+        anatomy: kind of vessel tree of the atlas.
+        device: shipped device.
+        tip_bend_deg: angle to which its tip is shaped for this task, degrees.
+        tip_bend_mm: length from the tip over which it is bent, mm.
+        section: section that the target lies in.
+        depth_mm: distance of the target from the section's begin, along the centerline, mm.
+        start_inserted_mm: inserted length at the start, mm.
+        seconds: time limit, s.
+        force_limit_n: largest force of the wall on one node that is safe, N.
+        stenosis_share: share of the atlas' patients that have a stenosis.
+        chosen_for: what makes the patients of the atlas eligible; the first eligible ones are taken.
+        ladder: the patients that the ladder is scored on.
+        training: patients to learn on.
+    """
+
+    model_config = _STRICT
+    name: str
+    level: Annotated[int, Field(ge=1, le=12)]
+    title: str
+    anatomy: str
+    device: str
+    tip_bend_deg: Annotated[float, Field(ge=0, le=180)]
+    tip_bend_mm: _Positive
+    section: str
+    depth_mm: _Positive
+    start_inserted_mm: Annotated[float, Field(ge=0, allow_inf_nan=False)]
+    seconds: _Positive
+    force_limit_n: _Positive
+    stenosis_share: Annotated[float, Field(ge=0, le=1)]
+    chosen_for: str
+    ladder: Patients
+    training: Patients
+
+    def patient(self, patients: Patients, place: int) -> Anatomy:
+        """Return the anatomy of one of the task's patients, by its place in the list."""
+        if not 0 <= place < len(patients.numbers):
+            raise InputError(f"patient: {place}; task {self.name} has patients 0 to {len(patients.numbers) - 1}")
+        config = AtlasConfig(anatomy=self.anatomy, seed=patients.seed, stenosis_share=self.stenosis_share)
+        return synthesize_one(config, patients.numbers[place])
+
+    def ladder_navigation(self, place: int) -> Navigation:
+        """Return the task in one of the patients that the ladder is scored on, with its own first rotation."""
+        turn = np.random.default_rng([self.ladder.seed, self.ladder.numbers[place]]).uniform(0.0, 2 * np.pi)
+        return self.navigation(self.patient(self.ladder, place), start_rotation=turn)
+
+    def navigation(self, anatomy: Anatomy, *, start_rotation: float = 0.0) -> Navigation:
+        """Return what is to be done in one of the task's patients.
+
+        Raises:
+            InputError: the anatomy lacks the section, or it is too short.
+        """
+        bend = {"tip_bend_rad": float(np.deg2rad(self.tip_bend_deg)), "tip_bend_length_mm": self.tip_bend_mm}
+        return Navigation(
+            anatomy=anatomy,
+            device=replace(read_device(self.device), **bend),
+            target=find_target(anatomy.tree, self.section, self.depth_mm),
+            start_inserted_mm=self.start_inserted_mm,
+            start_rotation=start_rotation,
+            seconds=self.seconds,
+            force_limit_n=self.force_limit_n,
+        )
+
+
+def find_target(tree: VesselTree, section: str, depth_mm: float) -> Target:
+    """Return the place that lies `depth_mm` beyond the begin of a section, in the branch where it begins.
+
+    Where several branches begin the section, it is the one that begins nearest to the ostium. If the section goes on in
+    several branches, the target lies where the way goes straight on.
+
+    Raises:
+        InputError: the tree lacks the section, or the section ends before.
+    """
+    if section not in tree.section_names:
+        raise InputError(f"section: {section!r}; the tree has {', '.join(tree.section_names)}")
+    label = tree.section_names.index(section)
+    begins = {
+        index: float(branch.centerline.abscissa[max(int(np.argmax(branch.section == label)) - 1, 0)])
+        for index, branch in enumerate(tree.branches)
+        if (branch.section == label).any()
+    }
+    if not begins:
+        raise InputError(f"section: {section!r} has no branch in this tree; choose another patient")
+    branch = min(begins, key=lambda index: begins[index])
+    abscissa = begins[branch] + depth_mm
+    while abscissa > tree.branches[branch].centerline.abscissa[-1]:
+        onwards = [child for child in tree.children(branch) if child in begins]
+        if not onwards:
+            raise InputError(f"depth_mm: {depth_mm:g}; section {section} of this tree is shorter")
+        branch = min(onwards, key=lambda child: turn_rad(tree, child))
+    return Target(branch=branch, abscissa=abscissa)
+
+
+def turn_rad(tree: VesselTree, branch: int) -> float:
+    """Return the angle between a branch's first direction and its parent's last, rad, over some millimetres."""
+    line, before = tree.branches[branch].centerline, tree.branches[tree.branches[branch].parent].centerline
+    clear = float(line.radius[0]) + float(line.radius[-1])
+    out = line.points[min(int(np.searchsorted(line.abscissa, line.abscissa[0] + clear)), len(line.points) - 1)]
+    back = before.points[max(int(np.searchsorted(before.abscissa, before.abscissa[-1] - clear)) - 1, 0)]
+    into, onto = line.points[0] - back, out - line.points[0]
+    return float(np.arccos(np.clip(into @ onto / (np.linalg.norm(into) * np.linalg.norm(onto)), -1.0, 1.0)))
+
+
+def read_task(path: Path) -> Task:
+    """Read a task from a YAML file.
+
+    Raises:
+        InputError: the file is no task; the line names file, field, value and mend.
+    """
+    try:
+        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+        task = Task.model_validate(content)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; give a task's YAML file") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not valid YAML ({str(error).splitlines()[0]}); correct the file") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(str(part) for part in first["loc"]) or "file"
+        raise InputError(f"{path}: {field} = {first['input']!r}: {first['msg']}; correct it") from error
+    for name, known in (("anatomy", ANATOMIES), ("device", list_devices())):
+        if getattr(task, name) not in known:
+            raise InputError(f"{path}: {name} = {getattr(task, name)!r}; choose from {', '.join(known)}")
+    return task
+
+
+@lru_cache(maxsize=1)
+def ladder_tasks() -> tuple[Task, ...]:
+    """Return the ladder's tasks, the lowest first."""
+    tasks = (read_task(path) for path in _FOLDER.glob("*.yaml"))
+    return tuple(sorted(tasks, key=lambda task: task.level))
+
+
+def find_task(name: str) -> Task:
+    """Return a task of the ladder by its name.
+
+    Raises:
+        InputError: the ladder has no such task.
+    """
+    for task in ladder_tasks():
+        if task.name == name:
+            return task
+    raise InputError(f"task: {name!r}; choose from {', '.join(task.name for task in ladder_tasks())}")
+
+
+def training_navigations(name: str, first: int, count: int) -> list[Navigation]:
+    """Return a task in `count` of its training patients, from number `first` on.
+
+    Raises:
+        InputError: the ladder has no such task, or the task fewer patients.
+    """
+    task = find_task(name)
+    return [task.navigation(task.patient(task.training, first + place)) for place in range(count)]
+
+
+@lru_cache(maxsize=1)
+def reference_navigation() -> Navigation:
+    """Return `endopilot/Navigate-v0`'s navigation: into the posterior descending artery of the reference anatomy."""
+    anatomy = synthesize_one(AtlasConfig(), 0)
+    return Navigation(
+        anatomy=anatomy,
+        device=read_device("workhorse-014"),
+        target=find_target(anatomy.tree, "4", 15.0),
+        start_inserted_mm=5.0,
+        seconds=60.0,
+    )

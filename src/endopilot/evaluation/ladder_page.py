@@ -1,0 +1,137 @@
+"""The ladder's page: scores, the tips' ways in pictures, and a replay of one navigation of each task."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from jaxtyping import Float
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from plotly.offline import get_plotlyjs
+
+from endopilot.env.navigation import CORE
+from endopilot.env.task import Navigation
+from endopilot.env.tasks import Task, find_task
+from endopilot.evaluation.figures import BLACK, BLUE, GREEN, ORANGE, STYLE, VERMILLION, png
+from endopilot.evaluation.ladder import SCORES_FILE
+from endopilot.evaluation.report import image, template_text
+from endopilot.evaluation.scene import navigation_scene
+from endopilot.files import read_json, writing
+from endopilot.simulation.simulator import simulate
+from endopilot.types import SAMPLE_PERIOD_S, Rollout
+
+PAGE_FILE = "index.html"
+SHOWN = 5
+"""Patients of each task that the pictures show."""
+OUTCOMES = {"safe success": GREEN, "success, but too large a force": ORANGE, "not reached": VERMILLION}
+
+
+def write_page(output: Path) -> Path:
+    """Write the page of a folder that `climb` has filled, and the replays beside it.
+
+    Returns:
+        The page, `output`/index.html; it needs the files beside it.
+
+    Raises:
+        InputError: the folder holds no scores.
+    """
+    content = read_json(output / SCORES_FILE)
+    tasks = [find_task(row["task"]) for row in content["scores"] if row["level"] is not None]
+    plotly = output / "plotly.min.js"
+    if not plotly.exists():
+        with writing(plotly) as partial:
+            partial.write_text(get_plotlyjs(), encoding="utf-8")
+    sections = [_section(output, task, content["patients"]) for task in tasks]
+    template = Environment(
+        loader=PackageLoader("endopilot.evaluation", "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    ).get_template("ladder.html.j2")
+    page = template.render(
+        css=Markup(template_text("report.css")),
+        policy=content["policy"],
+        patients=content["patients"],
+        scores=content["scores"],
+        sections=sections,
+        outcomes=OUTCOMES,
+    )
+    with writing(output / PAGE_FILE) as partial:
+        partial.write_text(page, encoding="utf-8")
+    return output / PAGE_FILE
+
+
+def _section(output: Path, task: Task, patients: int) -> dict[str, Any]:
+    results = [read_json(output / task.name / f"{place:02d}.json") for place in range(min(SHOWN, patients))]
+    navigations = [task.ladder_navigation(place) for place in range(len(results))]
+    picture = image(png(_courses(navigations, results)), f"{task.title}: the tip's way in {len(results)} patients")
+    replay = output / f"replay-{task.name}.html"
+    if not replay.exists():
+        figure = navigation_scene(navigations[0].anatomy, _replay(navigations[0], results[0]["course"]))
+        with writing(replay) as partial:
+            figure.write_html(partial, include_plotlyjs="directory", auto_play=False, config={"displaylogo": False})
+    return {"task": task, "picture": picture, "replay": replay.name, "first": results[0]}
+
+
+def _replay(navigation: Navigation, course: dict[str, Any]) -> Rollout:
+    """Return the whole wire over a navigation, by driving its proximal end along the same course again."""
+    proximal = np.column_stack([course["inserted_length"], course["rotation"]])
+    return simulate(
+        navigation.anatomy,
+        navigation.device,
+        (np.diff(proximal, axis=0) / SAMPLE_PERIOD_S)[None],
+        initial=proximal[:1],
+        config=replace(CORE, threads=1),
+        record_shape=True,
+    )
+
+
+def _courses(navigations: list[Navigation], results: list[dict[str, Any]]) -> Figure:
+    """Draw trees, seen across their largest extent, with route, target and the tip's way."""
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(2.4 * SHOWN, 2.9), layout="constrained")
+        for ax, navigation, result in zip(
+            figure.subplots(1, SHOWN, squeeze=False)[0], navigations, results, strict=False
+        ):
+            _draw(ax, navigation, result)
+        for ax in figure.axes:
+            ax.set_axis_off()
+        marks = [Line2D([], [], color=color, lw=2, label=name) for name, color in OUTCOMES.items()]
+        marks.append(Line2D([], [], color=BLUE, lw=4, alpha=0.35, label="route"))
+        marks.append(Line2D([], [], color=BLACK, marker="*", ms=9, ls="none", label="target"))
+        figure.legend(handles=marks, loc="outside lower center", ncols=len(marks))
+    return figure
+
+
+def _draw(ax: Axes, navigation: Navigation, result: dict[str, Any]) -> None:
+    tree = navigation.anatomy.tree
+    everything = np.concatenate([branch.centerline.points for branch in tree.branches])
+    centre = everything.mean(axis=0)
+    axes = np.linalg.svd(everything - centre, full_matrices=False)[2][:2]
+    axes *= np.where(np.abs(axes).max(axis=1) == axes.max(axis=1), 1.0, -1.0)[:, None]
+
+    def seen(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "2 n"]:
+        return axes @ (points - centre).T
+
+    route = tree.route(navigation.target.branch)
+    for index, branch in enumerate(tree.branches):
+        line, chosen = branch.centerline, index in route
+        width = max(1.2, 1.1 * float(line.radius.mean()))
+        ax.plot(
+            *seen(line.points), color=BLUE if chosen else "#c9ced6", lw=width, alpha=0.35 if chosen else 1, zorder=1
+        )
+    outcome = "not reached"
+    if result["success"]:
+        outcome = "safe success" if result["safe"] else "success, but too large a force"
+    ax.plot(*seen(np.array(result["course"]["tip_position"])), color=OUTCOMES[outcome], lw=1.3, zorder=2)
+    ax.plot(*seen(navigation.target.position(navigation.anatomy)[None]), color=BLACK, marker="*", ms=9, zorder=3)
+    ax.set_aspect("equal")
+    ax.set_title(f"{navigation.anatomy.name}\n{result['seconds']:g} s, {result['peak_force_n']:.2f} N", fontsize=8)

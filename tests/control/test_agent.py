@@ -1,0 +1,141 @@
+"""Searching a way in the rod core, believing in an ensemble, and the policies made of both."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from endopilot.control.agent import AgentConfig, AgentPolicy, TwinPolicy
+from endopilot.control.belief import Belief, BeliefConfig
+from endopilot.control.navigate import Truth, navigate
+from endopilot.control.policy import Decision, Policy, Sight, TipMeasurement
+from endopilot.control.search import Course
+from endopilot.env.task import Navigation, Target
+
+QUICK = AgentConfig(belief=BeliefConfig(members=6, time_step_s=0.05))
+
+
+class Forward:
+    """Pushes on."""
+
+    def start(self, navigation: Navigation, seed: int) -> None:
+        pass
+
+    def decide(self, sight: Sight) -> Decision:
+        return Decision(6.0, 0.0)
+
+
+@pytest.fixture(scope="module")
+def shaped(wire):
+    return replace(wire.with_tip(bend_rad=np.deg2rad(70.0), stiffness_factor=1.0), tip_bend_length_mm=4.0)
+
+
+@pytest.fixture(scope="module")
+def side_branch(fork, shaped) -> Navigation:
+    return Navigation(anatomy=fork, device=shaped, target=Target(branch=2, abscissa=33.0), seconds=40.0)
+
+
+def test_the_twin_gets_into_a_side_branch_that_pushing_misses(side_branch) -> None:
+    missed = navigate(replace(side_branch, seconds=8.0), Forward(), seed=1)
+    assert not missed.success
+    policy = TwinPolicy(config=QUICK)
+    assert isinstance(policy, Policy)
+    record = navigate(side_branch, policy, seed=1)
+    assert record.success and record.safe and record.faults == 0
+    assert record.tip.branch[-1] == 2
+    assert record.exposures == len(record.time_s) - 1  # X-ray is always on
+
+
+def test_a_course_is_what_the_simulator_does_under_its_controls(side_branch) -> None:
+    policy = TwinPolicy(config=QUICK)
+    policy.start(side_branch, 0)
+    course = policy.find_course(side_branch.seconds)
+    assert course.reached == 1.0
+    moved = side_branch.start_inserted_mm + 0.5 * np.cumsum(course.control[:, 0])
+    assert np.allclose(course.inserted, moved, atol=1e-9)
+    simulator = Belief(side_branch, np.array([[1.0, 1.0, 0.0]]), QUICK.belief).simulator
+    for k in range(len(course.control)):
+        step = simulator.step(course.control[k : k + 1], 0.5)
+        assert np.array_equal(step.tip_position[0], course.position[k, 0])
+    assert side_branch.reached(simulator.project())[0]
+
+
+def test_the_agent_finds_the_way_though_the_wire_is_another_than_believed(side_branch) -> None:
+    truth = Truth(friction_factor=1.2, stiffness_factor=0.8, ostium_mm=0.3)
+    record = navigate(side_branch, AgentPolicy(QUICK), seed=2, truth=truth)
+    assert record.success and record.safe and record.faults == 0
+    assert 1 <= record.exposures < (len(record.time_s) - 1) / 2  # it looks seldom
+
+
+def measured(belief: Belief, member: int) -> TipMeasurement:
+    tip = belief.tip
+    return TipMeasurement(
+        position=belief.simulator.position[member, 0],
+        abscissa=float(tip.abscissa[member]),
+        offset=float(tip.offset[member]),
+        branch=int(tip.branch[member]),
+    )
+
+
+def test_measurements_weigh_the_member_that_they_are_of(side_branch) -> None:
+    config = BeliefConfig(members=6, time_step_s=0.05, ostium_spread_mm=2.0)
+    belief = Belief(side_branch, Belief.around(np.array([1.0, 1.0, 0.0]), config), config)
+    assert len(np.unique(belief.parameters[:, 1])) == 3 and np.ptp(belief.parameters[:, 2]) > 1.0
+    assert np.allclose(belief.weight, 1 / 6)
+    wide = belief.spread()
+    for k in range(4):
+        belief.follow(4.0 + 2.0 * k, 0.0)
+        assert np.allclose(belief.simulator.inserted_length - belief.parameters[:, 2], 4.0 + 2.0 * k)
+        belief.weigh(measured(belief, 4))
+    assert belief.weight.argmax() == 4 and belief.weight[4] > 0.5
+    assert belief.spread() < 0.8 * wide
+    best, share = belief.likeliest()
+    assert 4 in best and share.sum() == pytest.approx(1.0) and best[share.argmax()] == 4
+
+
+def test_a_tip_that_no_wire_explains_is_pulled_back_under_xray(side_branch) -> None:
+    policy = AgentPolicy(QUICK)
+    policy.start(side_branch, 0)
+    seen = measured(policy.belief, 0)
+    first = policy.decide(Sight(0.0, 2.0, 0.0, seen))
+    assert first.translation > 0
+    far = replace(seen, position=seen.position + np.array([6.0, 0.0, 5.0]))
+    lost = policy.decide(Sight(0.5, 2.0, 0.0, far))
+    assert lost.translation < 0 and lost.expose
+    policy.decide(Sight(1.0, 2.0, 0.0, measured(policy.belief, 0)))
+    assert policy.plans == 2  # found again, it searches another way
+
+
+NUMBERS = st.floats(allow_nan=True, allow_infinity=True, width=64)
+
+
+@pytest.fixture(scope="module")
+def started(side_branch) -> AgentPolicy:
+    policy = AgentPolicy(QUICK)
+    policy.start(side_branch, 0)
+    return policy
+
+
+@given(control=st.lists(st.tuples(NUMBERS, NUMBERS, NUMBERS, NUMBERS), min_size=1, max_size=4))
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_whatever_the_model_returns_commands_are_finite_and_within_limits(started, shaped, control) -> None:
+    """The search is made to return any numbers at all."""
+    wild = np.array(control)
+
+    def find(*_, **__) -> Course:
+        tip = np.repeat(wild[:, 2:3], 3, axis=1)
+        return Course(
+            control=wild[:, :2], abscissa=tip, offset=tip, branch=np.zeros(tip.shape, dtype=int), radius=tip,
+            position=np.zeros((*tip.shape, 3)), force=tip, inserted=wild[:, 2], rotation=wild[:, 3], reached=0.0,
+        )  # fmt: skip
+
+    started._search.find, started._course, started._vain = find, None, 0
+    for k in range(len(control)):
+        decision = started.decide(Sight(0.5 * k, 2.0, 0.0, None))
+        assert np.isfinite([decision.translation, decision.rotation]).all()
+        assert abs(decision.translation) <= shaped.max_velocity_mm_s
+        assert abs(decision.rotation) <= shaped.max_rotation_rad_s

@@ -1,0 +1,178 @@
+"""Plans: what is written is read back, for the same vessel and wire alone; networks; limits; desired tips."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from endopilot.anatomy.io import read_anatomy, write_anatomy
+from endopilot.control import learned
+from endopilot.control.cost import Cost, safety_ratio
+from endopilot.control.desired import read_tips
+from endopilot.control.plan import Plan, PlanConfig, plan, within_limits
+from endopilot.control.plan_file import read_plan, write_plan
+from endopilot.control.robot import Limits
+from endopilot.dataset.loader import Dataset
+from endopilot.errors import InputError
+from endopilot.files import write_json
+from endopilot.models.config import WINDOW
+from endopilot.models.open_loop import OpenLoop
+from endopilot.simulation.controls import read_controls_csv
+from endopilot.simulation.simulator import SimulatorConfig, simulate
+
+SLACK = 0.9
+
+
+@pytest.fixture(scope="module")
+def vessel(fork, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("vessel") / "fork"
+    write_anatomy(fork, folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def found(vessel) -> Plan:
+    return plan(vessel, "0,0,33", PlanConfig(seconds=30.0))
+
+
+def test_a_plan_reaches_its_target_and_counts_its_cost(found):
+    assert found.reached and found.method == "twin"
+    assert abs(found.simulated.abscissa[-1] - 33.0) <= 2.0
+    assert np.allclose(found.proximal[-1, 0], 2.0 + 0.5 * found.control[:, 0].sum())
+    terms, cost = found.cost_terms(), found.cost
+    assert terms["time"] == pytest.approx(0.5 * len(found.control) * cost.time_weight)
+    assert terms["end"] == pytest.approx(abs(found.simulated.abscissa[-1] - 33.0))
+    # each weight scales its own term and no other
+    dearer = replace(found, cost=replace(cost, tip_weight=2 * cost.tip_weight)).cost_terms()
+    assert dearer["tip"] == pytest.approx(2 * terms["tip"]) and terms["tip"] > 0
+    assert {name: dearer[name] for name in terms if name != "tip"} == {n: v for n, v in terms.items() if n != "tip"}
+
+
+def test_cost_charges_what_is_unsafe():
+    cost = Cost()
+    charge = cost.running(
+        error=np.zeros(4), ratio=np.array([0.5, 1.0, 0.5, 0.5]), force_share=np.array([0, 0, 0.5, 1.0])
+    )
+    assert charge[0] == cost.time_weight and (np.diff(charge[[0, 1]]) > 0).all() and charge[0] < charge[2] < charge[3]
+    assert charge[3] > 10 * charge[2]  # near the limit no time that is saved outweighs it
+    ratio = safety_ratio(np.array([0.4, 0.4]), np.array([1.0, 0.1]), 0.2)
+    assert np.allclose(ratio, [0.5, 0.0])
+
+
+def test_a_written_plan_is_read_back_and_drives_the_simulator(found, vessel, tmp_path):
+    figures = write_plan(found, tmp_path / "plan")
+    assert figures["reached"] is True
+    assert {path.name for path in (tmp_path / "plan").iterdir()} == {"plan.csv", "plan.png", "manifest.json"}
+    anatomy, device = read_anatomy(vessel), found.navigation.device
+    back = read_plan(tmp_path / "plan", anatomy, device)
+    for name in ("control", "proximal", "desired", "predicted", "position", "force"):
+        assert np.allclose(getattr(back, name), getattr(found, name), atol=1e-12), name
+    assert np.array_equal(back.simulated.branch, found.simulated.branch)
+    assert back.navigation.target == found.navigation.target and back.cost == found.cost
+    initial, control = read_controls_csv(tmp_path / "plan" / "plan.csv")
+    rollout = simulate(anatomy, device, control, initial=initial, config=SimulatorConfig(threads=1))
+    assert np.allclose(rollout.tip_position[0], found.position, atol=1e-3)
+
+
+def test_a_plan_for_another_vessel_or_wire_is_refused(found, vessel, tmp_path):
+    folder = tmp_path / "plan"
+    write_plan(found, folder)
+    anatomy, device = read_anatomy(vessel), found.navigation.device
+    values = anatomy.distance_map.values.copy()
+    values[40, 10, 10] += 0.5
+    other = replace(anatomy, distance_map=replace(anatomy.distance_map, values=values))
+    with pytest.raises(InputError, match="another anatomy"):
+        read_plan(folder, other, device)
+    with pytest.raises(InputError, match="another device"):
+        read_plan(folder, anatomy, replace(device, friction=0.2))
+    read_plan(folder, anatomy, replace(device, sources={}))  # the same wire, told in other words
+    table = folder / "plan.csv"
+    table.write_text(table.read_text().replace("10.0,", "11.0,", 1))
+    with pytest.raises(InputError, match=r"plan\.csv.* differs"):
+        read_plan(folder, anatomy, device)
+
+
+@dataclass
+class Toy:
+    """A predictor of a tip that lags behind: Δtip = 0.9 Δ, γtip = 0.5 mm. Its inverse knows that."""
+
+    asked: int = 0
+
+    def rollout_forward(self, episodes: Dataset) -> OpenLoop:
+        self.asked += len(episodes)
+        proximal = np.stack([episodes.inserted_length, episodes.rotation], axis=-1)[:, WINDOW:]
+        tip = np.stack([SLACK * proximal[..., 0], np.full(proximal.shape[:2], 0.5)], axis=-1)
+        return OpenLoop(tip=tip, proximal=proximal, control=episodes.control[:, WINDOW:])
+
+    def rollout_dual(self, episodes: Dataset) -> OpenLoop:
+        wanted = episodes.tip_abscissa[:, WINDOW:] / SLACK
+        before = np.concatenate([episodes.inserted_length[:, WINDOW - 1 : WINDOW], wanted[:, :-1]], axis=1)
+        control = np.stack([(wanted - before) / 0.5, np.zeros_like(wanted)], axis=-1)
+        tip = np.stack([SLACK * wanted, np.full_like(wanted, 0.5)], axis=-1)
+        return OpenLoop(tip=tip, proximal=np.zeros_like(tip), control=control)
+
+    rollout_inverse = rollout_dual
+
+
+@pytest.fixture
+def run(found, tmp_path, monkeypatch):
+    from dataclasses import asdict
+
+    write_json(tmp_path / "run" / "manifest.json", {"device": asdict(found.navigation.device)})
+    monkeypatch.setattr(learned, "load_run", lambda _: Toy())
+    return tmp_path / "run"
+
+
+def test_the_inverse_network_is_asked_for_the_desired_tips(vessel, run):
+    made = plan(vessel, "0,0,33", PlanConfig(method="inverse", seconds=30.0), model=run)
+    assert np.allclose(made.predicted[:, 0], made.desired[:, 0])
+    assert made.proximal[-1, 0] == pytest.approx(made.desired[-1, 0] / SLACK, abs=1e-6)
+
+
+def test_sampling_brings_the_foretold_tip_nearer_to_the_desired_one(vessel, run):
+    settings = {"method": "mppi", "seconds": 30.0}
+    few = PlanConfig(**settings)
+    few = replace(few, sample=replace(few.sample, iterations=1, candidates=1))
+    many = PlanConfig(**settings)
+    many = replace(many, sample=replace(many.sample, iterations=6, candidates=24))
+    off = [
+        np.abs(made.predicted - made.desired).mean()
+        for made in (plan(vessel, "0,0,33", c, model=run) for c in (few, many))
+    ]
+    assert off[1] < 0.8 * off[0]
+
+
+def test_a_model_of_another_wire_is_refused(vessel, run):
+    with pytest.raises(InputError, match="trained with workhorse-014"):
+        plan(vessel, "0,0,33", PlanConfig(method="inverse"), model=run, device="stiff-014")
+    with pytest.raises(InputError, match="--model"):
+        plan(vessel, "0,0,33", PlanConfig(method="mppi"))
+
+
+def test_desired_tips_are_followed(vessel, tmp_path):
+    path = tmp_path / "tips.csv"
+    rows = [f"{0.5 * (k + 1)},{4 + 1.5 * k},0.6,{int(4 + 1.5 * k > 20)}" for k in range(14)]
+    path.write_text("time_s,tip_abscissa_mm,tip_offset_mm,branch\n" + "\n".join(rows) + "\n")
+    made = plan(vessel, str(path))
+    assert len(made.control) == 14 and made.navigation.target.branch == 1
+    assert np.abs(made.simulated.abscissa - made.desired[:, 0]).max() < 0.5
+    path.write_text("time_s,tip_abscissa_mm,tip_offset_mm\n0.5,5,0.1\n1.5,6,0.1\n")
+    with pytest.raises(InputError, match=r"row 3: time_s = 1\.5"):
+        read_tips(path)
+
+
+NUMBERS = st.floats(allow_nan=True, allow_infinity=True, width=64)
+
+
+@given(asked=st.lists(st.tuples(NUMBERS, NUMBERS), min_size=1, max_size=30), start=st.floats(0.0, 60.0))
+@settings(max_examples=150, deadline=None)
+def test_planned_controls_are_finite_and_within_limits_whatever_a_model_asks(asked, start):
+    limits = Limits(max_velocity_mm_s=40.0, max_rotation_rad_s=12.6, travel_mm=(0.0, 60.0))
+    made = within_limits(np.array(asked), limits, start)
+    assert np.isfinite(made).all() and (np.abs(made) <= [40.0, 12.6]).all()
+    inserted = start + 0.5 * np.cumsum(made[:, 0])
+    assert (inserted >= -1e-9).all() and (inserted <= 60.0 + 1e-9).all()

@@ -1,0 +1,81 @@
+"""The way to a target: progress along it, leaving it, and targets that do not lie in the vessel."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from endopilot.anatomy.projection import project_tip
+from endopilot.control.route import Route, check_passable, find_target
+from endopilot.env.task import Target
+from endopilot.errors import InputError
+from endopilot.types import Branch, VesselTree
+
+
+@pytest.fixture
+def route(fork) -> Route:
+    return Route.to(fork, Target(branch=2, abscissa=35.0))
+
+
+def tips(route, *points):
+    return project_tip(route.anatomy.tree, route.anatomy.insertion, np.array(points, dtype=float))
+
+
+def test_a_tip_in_the_wrong_branch_has_come_as_far_as_the_junction(route):
+    side = np.array([0, 0, 20.0]) + 8.0 * np.array([np.sin(np.pi / 3), 0, np.cos(np.pi / 3)])
+    tip = tips(route, [0, 0, 12.0], [0, 0, 27.0], side)
+    assert np.allclose(route.progress(tip), [12.0, 20.0, 28.0], atol=0.2)
+    assert np.allclose(route.astray(tip), [0.0, 7.0, 0.0], atol=0.2)
+
+
+def test_a_waypoint_is_passed_in_the_right_branch_alone(route):
+    assert np.allclose(route.junctions, [20.0])
+    assert np.allclose(route.waypoints, [22.5, 35.0])  # parent's radius 1 mm and 1.5 mm beyond
+    out = np.array([np.sin(np.pi / 3), 0, np.cos(np.pi / 3)])
+    inside, beside = np.array([0, 0, 20.0]) + 5.0 * out, [0, 0, 25.0]
+    tip = tips(route, inside, beside, np.array([0, 0, 20.0]) + 15.0 * out)
+    assert route.passed(tip, 22.5).tolist() == [True, False, True]
+    assert route.passed(tip, 35.0).tolist() == [False, False, True]
+    assert route.next_waypoint(10.0) == 22.5 and route.next_waypoint(24.0) == 35.0
+
+
+def named(fork):
+    branches = [
+        Branch(branch.centerline, branch.parent, np.full(len(branch.section), index))
+        for index, branch in enumerate(fork.tree.branches)
+    ]
+    return replace(fork, tree=VesselTree(tuple(branches), ("1", "3", "4")))
+
+
+def test_targets_by_name_and_by_place(fork):
+    anatomy = named(fork)
+    assert find_target(anatomy, "PDA") == find_target(anatomy, "4")
+    target = find_target(anatomy, "4")
+    assert target.branch == 2 and target.abscissa == pytest.approx(30.0, abs=0.5)
+    point = find_target(anatomy, "0.3, 0, 31.9")
+    assert point.branch == 1 and point.abscissa == pytest.approx(32.0, abs=0.3)
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [("LAD", "no such section"), ("50,0,0", "nearest centerline"), ("1,nan,2", "finite"), ("1,x,2", "finite")],
+)
+def test_targets_outside_the_tree_are_refused(fork, text, part):
+    with pytest.raises(InputError, match=part):
+        find_target(named(fork), text)
+
+
+def test_a_lumen_narrower_than_the_wire_hides_what_lies_behind_it(fork, wire):
+    branches = list(fork.tree.branches)
+    line = branches[2].centerline
+    radius = line.radius.copy()
+    radius[20] = 0.17
+    branches[2] = Branch(replace(line, radius=radius), branches[2].parent, branches[2].section)
+    anatomy = replace(fork, tree=VesselTree(tuple(branches), fork.tree.section_names))
+    at = float(line.abscissa[20])
+    with pytest.raises(InputError, match=f"occlusion.* at {at:.1f} mm"):
+        check_passable(Route.to(anatomy, Target(branch=2, abscissa=35.0)), wire)
+    check_passable(Route.to(anatomy, Target(branch=2, abscissa=at - 1.0)), wire)
+    check_passable(Route.to(anatomy, Target(branch=1, abscissa=35.0)), wire)

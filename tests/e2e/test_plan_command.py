@@ -1,0 +1,87 @@
+"""`endopilot plan` as a command: figures and files, and one line for what cannot be planned."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command import refused, run
+
+from endopilot.anatomy.analytic import forked_tree, tree_distance
+from endopilot.anatomy.io import write_anatomy
+from endopilot.types import Anatomy, Branch, DistanceMap, Insertion, VesselTree
+
+
+@pytest.fixture(scope="module")
+def fork() -> Anatomy:
+    tree, low = forked_tree(radius=(1.0, 0.8)), np.array([-4.0, -4.0, -26.0])
+    axes = [np.arange(a, b, 0.4) for a, b in zip(low, (22.0, 4.0, 44.0), strict=True)]
+    z, y, x = np.meshgrid(*axes[::-1], indexing="ij")
+    grid = np.stack([x, y, z], axis=-1)
+    catheter = np.where(z < 1.0, 0.9 - np.hypot(x, y), -1.0)
+    values = np.maximum(np.maximum(np.where(z > 0, tree_distance(tree, grid), -1.0), catheter), -1.0)
+    field = DistanceMap(values, 0.4, low)
+    return Anatomy("fork", tree, field, Insertion(np.zeros(3), np.array([0.0, 0.0, 1.0])), 0.9)
+
+
+@pytest.fixture
+def patient(fork, tmp_path) -> Path:
+    write_anatomy(fork, tmp_path / "patient")
+    return tmp_path / "patient"
+
+
+def test_a_plan_is_written_whole(patient, tmp_path, capsys):
+    figures = run(capsys, "plan", patient, "--target", "0,0,33", "-o", tmp_path / "plan")
+    assert figures["reached"] and figures["tip_error_mm"] <= 2.0 and figures["peak_force_n"] < 0.5
+    assert set(figures["cost"]) == {"end", "tip", "ratio", "force", "time", "smooth"}
+    rollout = tmp_path / "again.csv"
+    again = run(capsys, "simulate", patient, "--controls", tmp_path / "plan" / "plan.csv", "-o", rollout)
+    assert again["valid_worlds"] == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        (("--target", "PDA"), ("PDA", "no such section")),
+        (("--target", "80,0,0"), ("80,0,0", "LPS")),
+        (("--target", "0,0"), ("0,0", "no such section")),
+        (("--target", "nothing.csv"), ("nothing.csv",)),
+        (("--target", "0,0,33", "--seconds", "2"), ("seconds: 2", "31 mm", "speed_mm_s")),
+        (("--target", "0,0,33", "--method", "inverse"), ("--model",)),
+        (("--target", "0,0,33", "--force-limit-n", "nan"), ("force_limit_n",)),
+        (("--target", "0,0,33", "--force-weight", "-1"), ("force_weight",)),
+    ],
+)
+def test_what_cannot_be_planned_is_told_in_one_line(patient, tmp_path, capsys, arguments, parts):
+    line = refused(capsys, "plan", patient, *arguments, "-o", tmp_path / "plan")
+    assert all(part in line for part in parts), line
+    assert not (tmp_path / "plan").exists()
+
+
+def test_a_target_behind_an_occlusion(fork, tmp_path, capsys):
+    branches = list(fork.tree.branches)
+    line = branches[1].centerline
+    radius = np.where(np.abs(line.abscissa - 26.0) < 0.6, 0.1, line.radius)
+    branches[1] = Branch(replace(line, radius=radius), 0, branches[1].section)
+    closed = replace(fork, tree=VesselTree(tuple(branches), fork.tree.section_names))
+    write_anatomy(closed, tmp_path / "closed")
+    line = refused(capsys, "plan", tmp_path / "closed", "--target", "0,0,33", "-o", tmp_path / "plan")
+    assert "occlusion" in line and "0.20 mm" in line and "workhorse-014" in line
+    assert not (tmp_path / "plan").exists()
+
+
+def test_a_branch_that_the_wire_does_not_get_into(patient, tmp_path, capsys):
+    """A wire without a bend at its tip."""
+    from endopilot.simulation.device import device_yaml
+
+    text = device_yaml("workhorse-014")[1].replace("angle_deg: 45", "angle_deg: 0")
+    (tmp_path / "straight.yaml").write_text(text)
+    out = 20.0 * np.array([np.sin(np.pi / 3), 0.0, np.cos(np.pi / 3)]) * 0.8 + [0.0, 0.0, 20.0]
+    target = ",".join(f"{x:.2f}" for x in out)
+    line = refused(
+        capsys, "plan", patient, "--target", target, "-o", tmp_path / "plan", "--device", tmp_path / "straight.yaml"
+    )
+    assert "no way found to branch 2" in line and "tip bend" in line
+    assert not (tmp_path / "plan").exists()

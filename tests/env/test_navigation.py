@@ -1,0 +1,234 @@
+"""The learning environments: Gymnasium's contract, exact repetition, one dynamics for one world or many."""
+
+from __future__ import annotations
+
+import pickle
+import warnings
+from dataclasses import replace
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
+
+from endopilot.env.navigation import (
+    CONTROL_PERIOD_S,
+    FORCE_REWARD,
+    PROGRESS_REWARD,
+    STEP_REWARD,
+    SUCCESS_REWARD,
+    NavigateEnv,
+    NavigateVectorEnv,
+)
+from endopilot.env.task import Navigation, Target
+from endopilot.env.tasks import reference_navigation
+from endopilot.errors import InputError
+from endopilot.simulation.stepping import Simulator
+
+WORLDS, STEPS = 3, 12
+
+
+@pytest.fixture(scope="module")
+def near() -> Navigation:
+    """Return a target 25 mm down the reference anatomy, past two side branches, with 3 s to reach it."""
+    tree = reference_navigation().anatomy.tree
+    branch = next(b for b in tree.route(tree.leaves()[-1]) if tree.branches[b].centerline.abscissa[-1] > 25)
+    return replace(reference_navigation(), target=Target(branch=branch, abscissa=25.0), seconds=3.0)
+
+
+def _actions(steps: int = STEPS, worlds: int = WORLDS, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(-0.5, 1.0, (steps, worlds, 2)).astype(np.float32)
+
+
+def _rollout(env: NavigateVectorEnv, actions: np.ndarray) -> list[np.ndarray]:
+    """Return observations, rewards and ends of all steps."""
+    steps = [env.step(row)[:4] for row in actions]
+    return [np.array(values) for values in zip(*steps, strict=True)]
+
+
+def _same(one: list[np.ndarray], other: list[np.ndarray]) -> bool:
+    return all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
+
+
+def test_the_registered_environment_passes_gymnasiums_check():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(gymnasium.make("endopilot/Navigate-v0").unwrapped)
+
+
+def test_a_vector_environment_is_made_by_its_name(near):
+    env = gymnasium.make_vec("endopilot/Navigate-v0", num_envs=WORLDS, navigations=near)
+    assert isinstance(env, NavigateVectorEnv)
+    observations, _ = env.reset(seed=0)
+    assert env.observation_space.contains(observations)
+    observations, rewards, terminations, truncations, infos = env.step(env.action_space.sample())
+    assert env.observation_space.contains(observations)
+    assert rewards.shape == terminations.shape == truncations.shape == (WORLDS,)
+    assert infos["valid"].all() and (infos["contact_force_max"] >= 0).all()
+    assert {f"_{name}" for name in infos if not name.startswith("_")} == {n for n in infos if n.startswith("_")}
+
+
+def test_the_same_seed_and_actions_give_the_same_bits(near):
+    first = NavigateVectorEnv(WORLDS, navigations=near)
+    second = NavigateVectorEnv(WORLDS, navigations=near)
+    start, again = first.reset(seed=4)[0], second.reset(seed=4)[0]
+    assert np.array_equal(start, again)
+    assert not np.array_equal(start[0], start[1]), "worlds begin with rotations of their own"
+    assert _same(_rollout(first, _actions()), _rollout(second, _actions()))
+    assert not np.array_equal(start, first.reset(seed=5)[0])
+
+
+def test_a_single_environment_is_one_world_of_the_vector_environment(near):
+    actions = _actions(steps=30)
+    many = NavigateVectorEnv(WORLDS, navigations=near, autoreset_mode=AutoresetMode.DISABLED)
+    begun = many.reset(seed=7)[0]
+    steps = _rollout(many, actions)
+    for world in (0, 2):
+        one = NavigateEnv(navigation=near)
+        assert np.array_equal(one.reset(seed=7 + world)[0], begun[world])
+        for step, action in enumerate(actions[:, world]):
+            observation, reward, terminated, truncated, _ = one.step(action)
+            assert np.array_equal(observation, steps[0][step, world])
+            assert (reward, terminated, truncated) == tuple(values[step, world] for values in steps[1:])
+
+
+def test_an_environment_goes_on_with_the_same_bits_from_a_state_and_from_a_pickle(near):
+    env = NavigateVectorEnv(WORLDS, navigations=near)
+    env.reset(seed=1)
+    _rollout(env, _actions(steps=5))
+    kept, stored = env.state, pickle.dumps(env)
+    actions = _actions(steps=40, seed=2)  # past the time limit, so that new rotations are drawn too
+    went = _rollout(env, actions)
+    assert went[3].any()
+    env.set_state(pickle.loads(pickle.dumps(kept)))
+    assert _same(_rollout(env, actions), went)
+    assert _same(_rollout(pickle.loads(stored), actions), went)
+
+
+def test_a_single_environment_can_be_pickled_and_restored(near):
+    env = NavigateEnv(navigation=near)
+    env.reset(seed=3)
+    env.step(np.array([1.0, 0.2]))
+    kept = env.state
+    copy = pickle.loads(pickle.dumps(env))
+    went = env.step(np.array([0.5, 1.0]))
+    start = env.reset()[0]
+    again = copy.step(np.array([0.5, 1.0]))
+    assert np.array_equal(went[0], again[0]) and went[1:4] == again[1:4] and went[4] == again[4]
+    assert np.array_equal(copy.reset()[0], start)
+    env.set_state(kept)
+    assert np.array_equal(env.step(np.array([0.5, 1.0]))[0], went[0])
+    assert np.array_equal(env.reset()[0], start)
+
+
+def test_a_state_of_another_environment_is_refused(near):
+    other = NavigateVectorEnv(2, navigations=near).state
+    with pytest.raises(InputError, match="state"):
+        NavigateVectorEnv(WORLDS, navigations=near).set_state(other)
+
+
+def test_reward_is_what_the_table_says_and_success_terminates(near):
+    env = NavigateEnv(navigation=near)
+    _, info = env.reset(seed=0)
+    before, ended = info["distance_mm"], False
+    assert before == pytest.approx(20.0, abs=1.0)
+    while not ended:
+        _, reward, ended, truncated, info = env.step(np.array([1.0, 0.0]))
+        expected = PROGRESS_REWARD * (before - info["distance_mm"]) + STEP_REWARD
+        expected += FORCE_REWARD * (info["contact_force_max"] > near.force_limit_n) + SUCCESS_REWARD * info["success"]
+        assert reward == pytest.approx(expected, abs=1e-9)
+        assert not truncated
+        before = info["distance_mm"]
+    assert info["success"] and info["valid"] and info["safe"] and info["distance_mm"] <= 2.0
+
+
+def test_the_time_limit_truncates_and_the_next_step_begins_anew(near):
+    env = NavigateVectorEnv(WORLDS, navigations=near)
+    env.reset(seed=0)
+    still, steps = np.zeros((WORLDS, 2)), int(np.ceil(near.seconds / CONTROL_PERIOD_S - 1e-9))
+    for step in range(steps):
+        _, _, terminations, truncations, infos = env.step(still)
+        assert not terminations.any()
+        assert truncations.all() == (step == steps - 1) == truncations.any()
+    assert infos["time_s"][0] == pytest.approx(steps * CONTROL_PERIOD_S)
+    _, rewards, terminations, truncations, infos = env.step(np.ones((WORLDS, 2)))
+    assert (rewards == 0).all() and not (terminations | truncations).any() and (infos["time_s"] == 0).all()
+    assert np.allclose(infos["inserted_length"], near.start_inserted_mm)
+
+
+def test_only_the_worlds_of_the_mask_are_reset(near):
+    env = NavigateVectorEnv(WORLDS, navigations=near, autoreset_mode=AutoresetMode.DISABLED)
+    env.reset(seed=0)
+    before = env.step(np.ones((WORLDS, 2)))[0]
+    after, infos = env.reset(options={"reset_mask": np.array([False, True, False])})
+    assert np.allclose(after[[0, 2]], before[[0, 2]], atol=1e-6)
+    assert infos["time_s"].tolist() == pytest.approx([CONTROL_PERIOD_S, 0.0, CONTROL_PERIOD_S])
+
+
+def test_a_world_that_fails_terminates_and_says_so(near, monkeypatch):
+    env = NavigateVectorEnv(WORLDS, navigations=near, autoreset_mode=AutoresetMode.DISABLED)
+    env.reset(seed=0)
+    step = Simulator.step
+
+    def failing(self, control, duration):
+        done = step(self, control, duration)
+        return replace(done, valid=np.array([True, False, True]))
+
+    monkeypatch.setattr(Simulator, "step", failing)
+    _, _, terminations, truncations, infos = env.step(np.zeros((WORLDS, 2)))
+    assert terminations.tolist() == [False, True, False] == (~infos["valid"]).tolist()
+    assert not truncations.any() and not infos["success"].any()
+
+
+def test_too_large_a_force_is_told_and_remembered(near):
+    env = NavigateEnv(navigation=replace(near, force_limit_n=1e-4))
+    env.reset(seed=0)
+    told = [env.step(np.array([1.0, 0.0]))[4] for _ in range(15)]
+    unsafe = np.array([info["contact_force_max"] > 1e-4 for info in told])
+    assert unsafe.any()
+    assert [info["safe"] for info in told] == (~np.maximum.accumulate(unsafe)).tolist()
+
+
+def test_a_wrong_branch_lengthens_the_way():
+    navigation = reference_navigation()
+    tree = navigation.anatomy.tree
+    env = NavigateEnv(navigation=navigation)
+    env.reset(seed=0)
+    route = tree.route(navigation.target.branch)
+    side = next(i for i in range(len(tree.branches)) if i not in route and tree.branches[i].parent == 0)
+    fork = tree.branches[0].centerline.abscissa[-1]
+    tip = replace(env.simulator.project(), abscissa=np.array([fork + 7.0]), branch=np.array([side]), offset=np.zeros(1))
+    way = env._worlds._routes.distance(tip)
+    assert way == pytest.approx(7.0 + navigation.target.abscissa - fork)
+    assert not env._worlds._routes.on_route(tip).any()
+
+
+@pytest.mark.parametrize("action", [np.full((WORLDS, 2), np.nan), np.zeros((WORLDS, 3)), np.zeros(2)])
+def test_bad_actions_are_refused(near, action):
+    env = NavigateVectorEnv(WORLDS, navigations=near)
+    env.reset(seed=0)
+    with pytest.raises(InputError, match="actions"):
+        env.step(action)
+
+
+def test_pushing_on_for_ever_stops_at_the_end_of_the_wire():
+    navigation = replace(reference_navigation(), seconds=60.0, start_inserted_mm=130.0)
+    env = NavigateEnv(navigation=navigation)
+    env.reset(seed=0)
+    longest = navigation.anatomy.tree.longest_path().abscissa[-1]
+    for _ in range(30):
+        _, _, terminated, _, info = env.step(np.array([1.0, 1.0]))
+        assert info["inserted_length"] <= longest + 20.0 + 1e-9
+        if terminated:
+            break
+
+
+def test_bad_arguments_are_one_clear_line(near):
+    with pytest.raises(InputError, match="num_envs: 0"):
+        NavigateVectorEnv(0, navigations=near)
+    with pytest.raises(InputError, match="task: 'moon'"):
+        NavigateVectorEnv(1, task="moon")
+    slow = replace(near, device=replace(near.device, max_velocity_mm_s=1.0))
+    with pytest.raises(InputError, match="max_velocity_mm_s"):
+        NavigateVectorEnv(1, navigations=slow)

@@ -1,0 +1,84 @@
+"""The ladder's tasks are whole, and what is wrong in a task's file is told in one line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+
+import endopilot.env
+from endopilot.anatomy.atlas import AtlasConfig, synthesize_tree
+from endopilot.env import tasks
+from endopilot.env.tasks import find_target, find_task, ladder_tasks, read_task
+from endopilot.errors import InputError
+
+FILES = sorted((Path(tasks.__file__).parent / "tasks").glob("*.yaml"))
+
+
+def test_there_are_twelve_tasks_one_a_level_each_with_its_environment():
+    assert [task.level for task in ladder_tasks()] == list(range(1, 13))
+    assert [path.stem for path in FILES] == sorted(task.name for task in ladder_tasks())
+    assert {name.lower() for name in endopilot.env.TASKS} == {task.name for task in ladder_tasks()}
+    for name in endopilot.env.TASKS:
+        assert f"endopilot/{name}-v0" in gymnasium.registry
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_a_task_has_twenty_patients_and_others_to_learn_on(path):
+    task = read_task(path)
+    assert len(set(task.ladder.numbers)) == len(set(task.training.numbers)) == 20
+    assert task.ladder.seed != task.training.seed
+    seeds = [other.ladder.seed for other in ladder_tasks()]
+    assert len(set(seeds)) == 12 and task.training.seed not in seeds
+
+
+@pytest.mark.parametrize("name", ["straight", "crux", "carotid"])
+def test_the_target_lies_in_its_section(name):
+    task = find_task(name)
+    atlas = AtlasConfig(anatomy=task.anatomy, seed=task.ladder.seed, stenosis_share=task.stenosis_share)
+    tree, _ = synthesize_tree(atlas, task.ladder.numbers[0])
+    target = find_target(tree, task.section, task.depth_mm)
+    branch = tree.branches[target.branch]
+    at = int(np.searchsorted(branch.centerline.abscissa, target.abscissa))
+    assert tree.section_names[branch.section[at]] == task.section
+
+
+def test_a_ladder_navigation_is_the_same_every_time():
+    one, other = (find_task("straight").ladder_navigation(3) for _ in range(2))
+    assert one.start_rotation == other.start_rotation != find_task("straight").ladder_navigation(4).start_rotation
+    assert one.target == other.target
+    assert np.array_equal(one.anatomy.distance_map.values, other.anatomy.distance_map.values)
+    assert one.device.tip_bend_rad == pytest.approx(np.deg2rad(find_task("straight").tip_bend_deg))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ("level: 6", "level: 13", "level = 13"),
+        ("seconds: 90", "seconds: -1", "seconds = -1"),
+        ("force_limit_n: 0.2", "force_limit_n: .nan", "force_limit_n"),
+        ("anatomy: rca", "anatomy: knee", "anatomy = 'knee'; choose from"),
+        ("device: workhorse-014", "device: rope", "device = 'rope'; choose from"),
+        ("level: 6", "level: 6\nlength: 3", "length"),
+        ("name: crux", "name: [", "not valid YAML"),
+    ],
+)
+def test_what_is_wrong_in_a_file_is_named(tmp_path, old, new, told):
+    text = (Path(tasks.__file__).parent / "tasks" / "crux.yaml").read_text()
+    assert old in text
+    (tmp_path / "task.yaml").write_text(text.replace(old, new))
+    with pytest.raises(InputError) as error:
+        read_task(tmp_path / "task.yaml")
+    assert told in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_target_outside_the_tree_is_refused():
+    tree, _ = synthesize_tree(AtlasConfig(), 0)
+    with pytest.raises(InputError, match="section: 'LAD'"):
+        find_target(tree, "LAD", 5.0)
+    with pytest.raises(InputError, match="depth_mm: 500"):
+        find_target(tree, "4", 500.0)
+    with pytest.raises(InputError, match="patient: 20"):
+        find_task("crux").patient(find_task("crux").ladder, 20)
