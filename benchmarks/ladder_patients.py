@@ -1,10 +1,10 @@
 """Choose the patients of the ladder's tasks: `python benchmarks/ladder_patients.py [TASK ...] [--write]`.
 
-Of each task's atlas the first twenty patients are taken that are eligible by the task's `chosen_for` and in which the
-target can be reached at all: a search that may look and try again finds a way on which the wall's force stays below the
-task's limit. It knows the whole state of the wire, and at each fork tries twelve directions of the tip from a little
-way before it; what turns the tip for good, without looking, is the policies' business. The patients to learn on are
-the first twenty eligible ones of another atlas, without the search.
+Of each task's atlas the first twenty patients are taken that are eligible by the task's `chosen_for` and, from level 5
+on, in which the target can be reached at all: a search that may look and try again finds a way on which the wall's
+force stays below the task's limit. It knows the whole state of the wire, and at each fork tries twelve directions of
+the tip from a little way before it; what turns the tip for good, without looking, is the policies' business. The
+patients to learn on are the first twenty eligible ones of another atlas, without the search.
 
 With `--write` the numbers go into the tasks' files.
 """
@@ -176,7 +176,7 @@ def main() -> None:
             continue
         path = Path(__file__).parents[1] / "src" / "endopilot" / "env" / "tasks" / f"{task.name}.yaml"
         text = path.read_text(encoding="utf-8")
-        for role, patients, search in (("ladder", task.ladder, True), ("training", task.training, False)):
+        for role, patients, search in (("ladder", task.ladder, task.level >= 5), ("training", task.training, False)):
             chosen, eligible, examined = choose(task, patients.seed, search=search)
             print(f"{task.name}, {role}: {WANTED} of {eligible} eligible patients, of {examined}: {chosen}", flush=True)
             pattern = rf"({role}:\n  seed: \d+\n  numbers: )\[[^\]]*\]"

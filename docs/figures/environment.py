@@ -1,0 +1,39 @@
+"""Write the environments' specification and speed into docs/environment.md: `python docs/figures/environment.py`.
+
+Takes some two minutes; nothing else should run meanwhile. With `--specification` the speed is not measured again.
+"""
+
+from __future__ import annotations
+
+import inspect
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+from endopilot.env.navigation import NavigateVectorEnv
+
+ROOT = Path(__file__).parents[2]
+PAGE = ROOT / "docs" / "environment.md"
+
+
+def fill(name: str, text: str) -> None:
+    """Replace what stands between the page's marks of some name."""
+    begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
+    page = PAGE.read_text(encoding="utf-8")
+    PAGE.write_text(f"{page.split(begin)[0]}{begin}\n{text}\n{end}{page.split(end)[1]}", encoding="utf-8")
+
+
+def main() -> None:
+    """Fill the page."""
+    fill("specification", (inspect.getdoc(NavigateVectorEnv) or "").replace("\n## ", "\n### "))
+    if "--specification" in sys.argv:
+        return
+    command = [sys.executable, "-m", "endopilot.cli", "bench", "env", "--json"]
+    figures = json.loads(subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout)
+    rows = [f"| {name} | {value} |" for name, value in figures.items() if name != "processor"]
+    fill("bench", "\n".join([f"{figures['processor']}:\n", "| figure | value |", "|---|---|", *rows]))
+
+
+if __name__ == "__main__":
+    main()
