@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from endopilot.dataset.generate import DatasetConfig, generate_dataset
 from endopilot.dataset.loader import load_dataset
 from endopilot.errors import InputError
 from endopilot.evaluation.baselines import follow_slack, hold_slack, mean_control
-from endopilot.files import sha256
+from endopilot.files import read_json, sha256
 from endopilot.models.causal import CausalNetwork, CausalPredictor
 from endopilot.models.config import CausalConfig, TrainConfig, run_path
 from endopilot.models.open_loop import Foreteller, Predictor
@@ -26,7 +26,7 @@ from endopilot.simulation.device import read_device
 
 GIVEN = 30
 SMALL = CausalConfig(width=8)
-SHORT = TrainConfig(model="causal", epochs=2, batch_size=4, causal=SMALL)
+SHORT = TrainConfig(model="causal", network="ff", epochs=2, batch_size=4, causal=SMALL)
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ def folder(tmp_path_factory):
         anatomy = synthesize_one(AtlasConfig(seed=910), index)
         patients.append(folder / anatomy.name)
         write_anatomy(anatomy, patients[-1])
-    config = DatasetConfig(sequences=5, anatomy_shares=(0.5, 0.0, 0.5), seed=4)
+    config = DatasetConfig(sequences=4, seconds=45.0, anatomy_shares=(0.5, 0.0, 0.5), seed=4)
     generate_dataset(patients, folder / "dataset", read_device("workhorse-014"), config)
     return folder / "dataset"
 
@@ -47,6 +47,13 @@ def folder(tmp_path_factory):
 def everyone(folder):
     """Return the navigations of both patients."""
     return load_dataset(folder)
+
+
+@pytest.fixture(scope="module")
+def brief(everyone):
+    """Return them cut off after 22.5 s, where what counts is that nothing later is looked at."""
+    arrays = {f.name: getattr(everyone, f.name) for f in fields(everyone)}
+    return replace(everyone, **{name: a[:, :45] for name, a in arrays.items() if getattr(a, "ndim", 0) > 1})
 
 
 @pytest.fixture(scope="module")
@@ -106,38 +113,38 @@ def test_the_loop_of_both_leads_the_foretold_tip_along(packaged, everyone):
     assert miss(found.tip, everyone)[..., 0].mean() < 0.4  # mm
 
 
-@pytest.mark.parametrize("k", [30, 77, 118])
-def test_a_later_control_changes_no_earlier_prediction(everyone, k):
-    length, rotation = everyone.inserted_length.copy(), everyone.rotation.copy()
+@pytest.mark.parametrize("k", [30, 43])
+def test_a_later_control_changes_no_earlier_prediction(brief, k):
+    length, rotation = brief.inserted_length.copy(), brief.rotation.copy()
     length[:, k + 1 :] += 3.0
     rotation[:, k + 1 :] += 1.0
-    other = replace(everyone, inserted_length=length, rotation=rotation)
-    seen = given(everyone)
-    before, after = (untrained().foretell(episodes, seen) for episodes in (everyone, other))
+    other = replace(brief, inserted_length=length, rotation=rotation)
+    seen = given(brief)
+    before, after = (untrained().foretell(episodes, seen) for episodes in (brief, other))
     np.testing.assert_array_equal(before.tip[:, : k + 1], after.tip[:, : k + 1])
     np.testing.assert_array_equal(before.spread[:, : k + 1], after.spread[:, : k + 1])
     assert np.abs(before.tip[:, k + 1] - after.tip[:, k + 1]).max() > 0.1
 
 
-def test_a_tip_that_is_not_seen_is_not_looked_at_and_one_that_is_counts(everyone):
-    blind = replace(everyone, tip_abscissa=everyone.tip_abscissa.copy(), tip_offset=everyone.tip_offset.copy())
+def test_a_tip_that_is_not_seen_is_not_looked_at_and_one_that_is_counts(brief):
+    blind = replace(brief, tip_abscissa=brief.tip_abscissa.copy(), tip_offset=brief.tip_offset.copy())
     blind.tip_abscissa[:, GIVEN:] = blind.tip_offset[:, GIVEN:] = np.nan
-    predictor, seen = untrained(), given(everyone)
-    told = predictor.foretell(everyone, seen)
+    predictor, seen = untrained(), given(brief)
+    told = predictor.foretell(brief, seen)
     np.testing.assert_array_equal(predictor.foretell(blind, seen).tip, told.tip)
     later = seen.copy()
-    later[60] = True
-    more = predictor.foretell(everyone, later)
-    np.testing.assert_array_equal(more.tip[:, :60], told.tip[:, :60])
-    np.testing.assert_array_equal(more.tip[:, 60, 0], everyone.tip_abscissa[:, 60].astype(float))
-    assert np.abs(more.tip[:, 61:] - told.tip[:, 61:]).max() > 0.01
+    later[36] = True
+    more = predictor.foretell(brief, later)
+    np.testing.assert_array_equal(more.tip[:, :36], told.tip[:, :36])
+    np.testing.assert_array_equal(more.tip[:, 36, 0], brief.tip_abscissa[:, 36].astype(float))
+    assert np.abs(more.tip[:, 37:] - told.tip[:, 37:]).max() > 0.01
 
 
 def test_a_later_x_ray_helps(packaged, everyone):
     seen = given(everyone)
     later = seen.copy()
-    later[[60, 75]] = True
-    after = slice(76, 90)
+    later[[50, 70]] = True
+    after = slice(71, 85)
     off = [
         np.abs(packaged.foretell(everyone, mask).tip[:, after, 0] - everyone.tip_abscissa[:, after]).mean()
         for mask in (seen, later)
@@ -146,20 +153,20 @@ def test_a_later_x_ray_helps(packaged, everyone):
 
 
 @pytest.mark.parametrize("protocol", ["rollout_inverse", "rollout_dual"])
-def test_inverse_sees_no_later_motion_and_no_later_desired_tip(everyone, protocol):
-    k = 60
-    control, length, rotation = everyone.control.copy(), everyone.inserted_length.copy(), everyone.rotation.copy()
+def test_inverse_sees_no_later_motion_and_no_later_desired_tip(brief, protocol):
+    k = 36
+    control, length, rotation = brief.control.copy(), brief.inserted_length.copy(), brief.rotation.copy()
     for later in (control, length, rotation):
         later[:, GIVEN:] = 7.0
-    tip, offset = everyone.tip_abscissa.copy(), everyone.tip_offset.copy()
+    tip, offset = brief.tip_abscissa.copy(), brief.tip_offset.copy()
     tip[:, k + 1 :] -= 2.0
     offset[:, k + 1 :] = 0.1
     rollout = getattr(untrained(), protocol)
-    whole = rollout(everyone).control
+    whole = rollout(brief).control
     np.testing.assert_array_equal(
-        whole, rollout(replace(everyone, control=control, inserted_length=length, rotation=rotation)).control
+        whole, rollout(replace(brief, control=control, inserted_length=length, rotation=rotation)).control
     )
-    cut = rollout(replace(everyone, tip_abscissa=tip, tip_offset=offset)).control
+    cut = rollout(replace(brief, tip_abscissa=tip, tip_offset=offset)).control
     np.testing.assert_array_equal(whole[:, : k + 1 - GIVEN], cut[:, : k + 1 - GIVEN])
     assert np.abs(whole - cut).max() > 0.1
 
@@ -172,10 +179,10 @@ def test_the_play_operator_alone_beats_holding_the_slack(everyone):
     assert miss(guess, everyone)[..., 0].mean() < 0.5 * held.mean()
 
 
-def test_mirrored_vessels_behave_alike(everyone):
+def test_mirrored_vessels_behave_alike(brief):
     assert mirrored().shape == (N_FEATURES,)
-    vessels = read_vessels(everyone)
-    forms = Sequences.of(everyone, vessels, ("ff",), 0)
+    vessels = read_vessels(brief)
+    forms = Sequences.of(brief, vessels, ("ff",), 0)
     inputs, change = forms.window("ff", torch.tensor([[0, 0], [0, 2]]))
     np.testing.assert_array_equal(change[0], change[1])
     assert (inputs[0] != inputs[1]).any()
@@ -194,10 +201,10 @@ def test_mirrored_vessels_behave_alike(everyone):
         leaf=np.roll(vessels.leaf[:, ::-1], 1, axis=1),
         on_route=np.roll(vessels.on_route[..., ::-1], 1, axis=2),
     )
-    turned = replace(everyone, rotation=-everyone.rotation, initial_rotation=-everyone.initial_rotation)
-    patient = np.unique(everyone.anatomy, return_inverse=True)[1]
-    seen = np.broadcast_to(given(everyone), everyone.valid.shape)
-    ours = unfold("forward", vessels, patient, everyone, seen).inputs * np.append(
+    turned = replace(brief, rotation=-brief.rotation, initial_rotation=-brief.initial_rotation)
+    patient = np.unique(brief.anatomy, return_inverse=True)[1]
+    seen = np.broadcast_to(given(brief), brief.valid.shape)
+    ours = unfold("forward", vessels, patient, brief, seen).inputs * np.append(
         mirrored(), np.ones(N_INPUTS - N_FEATURES)
     )
     theirs = unfold("forward", twin, patient, turned, seen).inputs
@@ -206,8 +213,7 @@ def test_mirrored_vessels_behave_alike(everyone):
 
 def test_a_seed_repeats_to_the_bit_and_an_interrupted_run_goes_on(folder, tmp_path):
     train(folder, tmp_path / "once", SHORT)
-    train(folder, tmp_path / "again", replace(SHORT, network="ff"))
-    assert sha256(tmp_path / "once/ff.safetensors") == sha256(tmp_path / "again/ff.safetensors")
+    assert read_json(tmp_path / "once/training.json")["ff"]["parameters"] < 10_000
 
     class Cut(Exception):
         pass
@@ -223,14 +229,13 @@ def test_a_seed_repeats_to_the_bit_and_an_interrupted_run_goes_on(folder, tmp_pa
         patch.setattr(_Job, "_save", stop)
         train(folder, tmp_path / "cut", SHORT)
     train(folder, tmp_path / "cut", SHORT)
-    for name in ("ff", "if"):
-        assert sha256(tmp_path / f"cut/{name}.safetensors") == sha256(tmp_path / f"once/{name}.safetensors")
+    assert sha256(tmp_path / "cut/ff.safetensors") == sha256(tmp_path / "once/ff.safetensors")
     assert isinstance(load_run(tmp_path / "cut"), CausalPredictor)
 
 
-def test_bad_input_is_named(everyone, tmp_path):
+def test_bad_input_is_named(brief, tmp_path):
     with pytest.raises(InputError, match="no inverse network; train it with --network both"):
-        replace(untrained(), inverse=None).rollout_dual(everyone)
+        replace(untrained(), inverse=None).rollout_dual(brief)
     with pytest.raises(InputError, match=r"^width: 0"):
         CausalConfig(width=0)
     with pytest.raises(InputError, match="no such run; give a folder made by `endopilot train`, or 'pretrained'"):

@@ -51,11 +51,11 @@ class CausalNetwork(nn.Module):
         super().__init__()
         width = config.width
         self.embedding = nn.Sequential(
-            nn.Linear(N_INPUTS, width), nn.GELU(), nn.Dropout(config.dropout), nn.Linear(width, width)
+            nn.Linear(N_INPUTS, width), nn.GELU(), nn.Dropout(config.drop_share), nn.Linear(width, width)
         )
         self.memory = nn.GRU(width, width, config.layers, batch_first=True)
         self.head = nn.Sequential(
-            nn.LayerNorm(2 * width), nn.Linear(2 * width, width), nn.GELU(), nn.Dropout(config.dropout)
+            nn.LayerNorm(2 * width), nn.Linear(2 * width, width), nn.GELU(), nn.Dropout(config.drop_share)
         )
         self.output = nn.Linear(width, 4)
         nn.init.zeros_(self.output.weight)  # an untrained network is the play operator

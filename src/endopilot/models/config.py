@@ -69,7 +69,7 @@ class CausalConfig:
     """Width of every layer."""
     layers: int = 1
     """Recurrent layers."""
-    dropout: float = 0.2
+    drop_share: float = 0.2
     """Share of activations that are dropped in training."""
 
     def __post_init__(self) -> None:
@@ -81,8 +81,8 @@ class CausalConfig:
         for name in ("width", "layers"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name}: {getattr(self, name)} is not positive; give at least 1")
-        if not 0 <= self.dropout < 1:
-            raise InputError(f"dropout: {self.dropout} is not in [0, 1); give e.g. 0.1")
+        if not 0 <= self.drop_share < 1:
+            raise InputError(f"drop_share: {self.drop_share} is not in [0, 1); give e.g. 0.2")
 
 
 @dataclass(frozen=True, kw_only=True)

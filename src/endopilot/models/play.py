@@ -271,7 +271,7 @@ def _stacked(parts: Sequence[np.ndarray]) -> np.ndarray:
     return np.stack([np.pad(p, [(0, n - m) for n, m in zip(shape, p.shape, strict=True)], mode="edge") for p in parts])
 
 
-def _padded(parts: Sequence[Float[np.ndarray, "wires lengths"]]) -> Float[np.ndarray, "patients wires lengths"]:
+def _padded(parts: Sequence[Float[np.ndarray, "wires _"]]) -> Float[np.ndarray, "patients wires lengths"]:
     """Return tables of a length as one, each carried on as it ends."""
     width = max(part.shape[1] for part in parts)
     out = []

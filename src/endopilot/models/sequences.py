@@ -36,11 +36,13 @@ class Unfolded:
     Attributes:
         inputs: what the network is told.
         guess: forward: (Δtip, γtip) of play and envelopes, mm; inverse: Δ by the play (mm) and a turn of 0 (rad).
+        branch: branch that the tip is believed to be in.
         truth: forward: (Δtip, γtip), mm; inverse: Δ (mm) and the turn over the sample (rad).
     """
 
     inputs: Float[np.ndarray, "episodes samples inputs"]
     guess: Float[np.ndarray, "episodes samples 2"]
+    branch: Int[np.ndarray, "episodes samples"]
     truth: Float[np.ndarray, "episodes samples 2"]
 
 
@@ -81,7 +83,7 @@ def unfold(
     if not forward:
         state = replace(state, partial=np.repeat(state.inserted[:, None], len(PARTIAL_PLAYS), axis=1))
     inputs = np.zeros((*tip.shape, N_INPUTS), dtype=np.float32)
-    guess = np.zeros((*tip.shape, 2))
+    guess, believed = np.zeros((*tip.shape, 2)), np.zeros(tip.shape, dtype=np.int64)
     angle, turn = episodes.initial_rotation.astype(float), np.zeros(len(tip))
     for t in range(tip.shape[1]):
         if forward:
@@ -91,6 +93,7 @@ def unfold(
         known = inserted[:, t] if forward else tip[:, t]
         state, features, off_axis = vessels.step(direction, patient, state, known, angle, turn)
         inputs[:, t, : play.N_FEATURES] = features
+        believed[:, t] = state.branch
         guess[:, t, 0] = state.tip if forward else state.inserted
         if forward:
             guess[:, t, 1] = off_axis
@@ -110,7 +113,7 @@ def unfold(
             turn, angle = np.where(now, rotation[:, t] - angle, 0.0), np.where(now, rotation[:, t], angle)
     turned = np.diff(rotation, axis=1, prepend=episodes.initial_rotation[:, None])
     truth = np.stack([tip, offset] if forward else [inserted, turned], axis=-1)
-    return Unfolded(inputs, guess, truth)
+    return Unfolded(inputs, guess, believed, truth)
 
 
 @dataclass(frozen=True, eq=False)
