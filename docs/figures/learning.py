@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import re
 import sys
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -19,13 +20,18 @@ import torch
 
 from endopilot.dataset.loader import Dataset, load_dataset
 from endopilot.evaluation.baselines import hold_slack
+from endopilot.evaluation.metrics import OFF_WALL_MM
 from endopilot.files import read_json
 from endopilot.models import play
 from endopilot.models.causal import CausalNetwork
 from endopilot.models.config import WINDOW, CausalConfig
+from endopilot.models.rollout import load_run
 from endopilot.models.sequences import N_INPUTS, Sequences, read_vessels, unfold
+from endopilot.simulation.device import read_device
 
 PAGE = Path(__file__).parents[1] / "learning.md"
+RUNS = ("pretrained", "paper")
+RADIUS_MM = read_device("workhorse-014").tip_radius_mm
 SPANS = ((30, 50), (50, 90), (90, 120))
 PATIENTS, EPOCHS, BATCH, RATE = 60, 3, 32, 2e-3
 ENVELOPES = np.r_[2:8, 11:27]
@@ -122,6 +128,48 @@ def _trained(made: Sequences, test: Sequences, size: CausalConfig, hidden: np.nd
     return (answer[..., :2] - test.change["ff"][:, 0]).abs().numpy()
 
 
+def headline_rows(folder: Path) -> Iterator[str]:
+    """Yield P1 on all navigations of the new patients: every run that is there, the play operator, the held slack."""
+    data = load_dataset(folder / "dataset").of_split("test")
+    truth = np.stack([data.tip_abscissa, data.tip_offset], axis=-1)[:, WINDOW:].astype(float)
+    clear = (data.lumen_radius - data.tip_offset)[:, WINDOW:] - RADIUS_MM > OFF_WALL_MM
+    vessels, patient = read_vessels(data), np.unique(data.anatomy, return_inverse=True)[1]
+    seen = np.broadcast_to(np.arange(data.valid.shape[1]) < WINDOW, data.valid.shape)
+    played = unfold("forward", vessels, patient, data, seen)
+    tips = {f"`{run}`": load_run(folder / run).rollout_forward(data).tip for run in RUNS if (folder / run).is_dir()}
+    tips |= {"play operator alone": played.guess[:, WINDOW:], "hold slack and offset": hold_slack(data, WINDOW)}
+    held = np.sqrt(((tips["hold slack and offset"] - truth) ** 2).mean(axis=(0, 1)))
+    for name, tip in tips.items():
+        off = np.abs(tip - truth)
+        skills = 1 - np.sqrt((off**2).mean(axis=(0, 1))) / held
+        told = row(name, np.pad(off, ((0, 0), (WINDOW, 0), (0, 0))))
+        yield f"{told} {off[clear][:, 1].mean():.3f} | {skills[0]:.2f} {skills[1]:.2f} |"
+    ours = np.abs(tips["`pretrained`"] - truth)
+    right = (played.branch == data.branch)[:, WINDOW:]
+    few = ours[..., 0] < np.quantile(ours[..., 0], 0.95)
+    yield (
+        f"| `pretrained`, samples in the branch that it believes ({right.mean():.0%}) | "
+        f"all {ours[right][:, 0].mean():.3f} | all {ours[right][:, 1].mean():.3f} | | |"
+    )
+    yield (
+        f"| `pretrained`, without the worst 5 % of Δtip | all {ours[few][:, 0].mean():.3f} | "
+        f"all {ours[few][:, 1].mean():.3f} | | |"
+    )
+
+
+def speed_rows(folder: Path) -> Iterator[str]:
+    """Yield the processor time of a rollout, ms a step and sequence, on one thread."""
+    data, run = load_dataset(folder / "dataset").of_split("test"), load_run(folder / RUNS[0])
+    for count, repeats in ((1, 5), (256, 1)):
+        few = data.select(np.arange(count) % len(data))
+        run.rollout_forward(few)  # reads the patients
+        start = time.process_time()
+        for _ in range(repeats):
+            run.rollout_forward(few)
+        spent = 1e3 * (time.process_time() - start) / (repeats * count * few.valid.shape[1])
+        yield f"| {count} | {spent:.3f} |"
+
+
 def result_rows(folder: Path) -> Iterator[str]:
     """Yield the rows of the evaluations that are there: P1 to P4 of every model, and the baselines."""
     for path in sorted(folder.glob("evaluation*/metrics.json")):
@@ -167,6 +215,8 @@ if __name__ == "__main__":
     torch.set_num_threads(1)
     folder = Path(sys.argv[1])
     page = PAGE.read_text(encoding="utf-8")
+    page = written(page, "headline", list(headline_rows(folder)))
+    page = written(page, "speed", list(speed_rows(folder)))
     page = written(page, "results", list(result_rows(folder)))
     page = written(page, "controls", list(control_rows(folder)))
     if "--tried" in sys.argv:

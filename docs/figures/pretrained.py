@@ -95,7 +95,7 @@ def card(folder: Path) -> str:
                 f"--seen-test-share {made['seen_test_share']:g} --threads 1",
                 "endopilot train runs/causal/dataset -o runs/causal/pretrained --model causal "
                 f"--epochs {config['epochs']} --learning-rate {rate:g}",
-                "endopilot evaluate runs/causal/pretrained -o runs/causal/evaluation --sequences 96",
+                "endopilot evaluate runs/causal/pretrained -o runs/causal/evaluation --sequences 48",
                 "python docs/figures/pretrained.py runs/causal",
             )
         ),
