@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -111,9 +112,10 @@ def load_run(run_folder: Path) -> Predictor:
             simulator=SimulatorConfig(**record["simulator"]),
             config=TwinConfig(**record["config"]["twin"]),
         )
-    networks = {name: read_network(run_folder / f"{name}.safetensors")[0] for name in record["networks"]}
+    files = {name: run_folder / f"{name}.safetensors" for name in record["networks"]}
+    networks: dict[str, Any] = {name: read_network(file)[0] for name, file in files.items()}
     kind = CausalPredictor if record["config"]["model"] == "causal" else TransformerPredictor
-    return kind(  # pyright: ignore[reportArgumentType] (a run's networks are of its model's kind)
+    return kind(
         forward=networks.get("ff"),
         inverse=networks.get("if"),
         control_limits=np.array([device.max_velocity_mm_s, device.max_rotation_rad_s]),
