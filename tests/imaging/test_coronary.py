@@ -131,7 +131,7 @@ def test_what_comes_to_a_chamber_below_the_aorta_is_no_coronary_tree(heart):
     below = (along > 0.5) & (along < 40.0) & (x[..., 2] < 8.0)
     flat = changed(heart[0], below & (np.abs(across) < 16.0), 50.0)
     flat = changed(flat, below & (np.abs(across) < 5.0), BLOOD_HU)
-    with pytest.raises(InputError, match="no such artery .* holds the aortic root"):
+    with pytest.raises(InputError, match=r"no such artery .* holds the aortic root"):
         segment(flat, SegmentConfig(vessel="rca"))
 
 

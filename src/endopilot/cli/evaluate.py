@@ -15,15 +15,17 @@ def command(
     /,
     *,
     output: OutputFolder,
+    dataset: Path | None = None,
     json: bool = False,
     config: EvaluateConfig = EvaluateConfig(),
 ) -> None:
     """Roll the networks of a run out open loop (protocols P1 to P4) and measure their errors.
 
     Args:
-        run: folder made by `endopilot train`.
+        run: folder made by `endopilot train`, or `pretrained`, the causal model that comes with endopilot.
         output: folder of metrics.json, figures and tables.
+        dataset: dataset to evaluate on; the one that the run was trained on if not given.
         json: print the figures as JSON.
         config: what to evaluate.
     """
-    show(evaluate(existing(run), output, config), as_json=json)
+    show(evaluate(run, output, config, existing(dataset) if dataset else None), as_json=json)

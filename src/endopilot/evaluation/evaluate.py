@@ -16,6 +16,7 @@ from endopilot.evaluation.metrics import PAPER_ERRORS
 from endopilot.evaluation.results import SPLIT_TITLES, SplitResult, write_results
 from endopilot.evaluation.summary import findings, summarize
 from endopilot.files import manifest, read_json, sha256, write_json, writing
+from endopilot.models.config import run_path
 from endopilot.progress import progress
 
 METRICS_FILE, RESULTS_FILE, FIGURES_FOLDER = "metrics.json", "evaluation.npz", "figures"
@@ -42,7 +43,9 @@ class EvaluateConfig:
             raise InputError(f"seed: {self.seed} is negative; give 0 or more")
 
 
-def evaluate(run_folder: Path, output: Path, config: EvaluateConfig) -> dict[str, Any]:
+def evaluate(
+    run_folder: Path, output: Path, config: EvaluateConfig, dataset_folder: Path | None = None
+) -> dict[str, Any]:
     """Evaluate both networks of a run on the navigations and the patients that they never saw.
 
     Writes `metrics.json` (every figure, and how it was made), `evaluation.npz` (the predictions) and, in `figures/`,
@@ -50,9 +53,10 @@ def evaluate(run_folder: Path, output: Path, config: EvaluateConfig) -> dict[str
     where it is, everything is.
 
     Args:
-        run_folder: made by `endopilot train`.
+        run_folder: made by `endopilot train`, or "pretrained", the model of the package.
         output: where the result goes.
         config: how much is evaluated.
+        dataset_folder: dataset to evaluate on; the one that the run was trained on if not given.
 
     Returns:
         The content of `metrics.json`.
@@ -64,8 +68,11 @@ def evaluate(run_folder: Path, output: Path, config: EvaluateConfig) -> dict[str
     from endopilot.models.rollout import load_run
 
     start = time.perf_counter()
-    run_folder, output = Path(run_folder), Path(output)
-    dataset = load_dataset((run_folder / read_json(run_folder / "manifest.json")["dataset"]).resolve())
+    run_folder, output = run_path(run_folder), Path(output)
+    own = run_folder / read_json(run_folder / "manifest.json")["dataset"]
+    if dataset_folder is None and not own.is_dir():
+        raise InputError(f"{own}: the dataset that the run was trained on is not here; name one with --dataset")
+    dataset = load_dataset(Path(dataset_folder or own).resolve())
     predictor = load_run(run_folder)
     train = dataset.of_split("train")
     chosen = {

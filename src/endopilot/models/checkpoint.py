@@ -15,14 +15,26 @@ from torch import Tensor
 
 from endopilot.errors import InputError
 from endopilot.files import json_text, writing
-from endopilot.models.config import TransformerConfig
+from endopilot.models.causal import CAUSAL_NETWORKS, CausalNetwork
+from endopilot.models.config import CausalConfig, TransformerConfig
 from endopilot.models.transformer import NETWORKS, Network
 
 FORMAT_VERSION = 1
 """Counts changes of the tensors or of their meaning."""
 
 
-def write_network(path: Path, name: str, network: Network, config: TransformerConfig, facts: Mapping[str, Any]) -> None:
+Size = TransformerConfig | CausalConfig
+"""What a network of either kind is made from."""
+
+
+def make_network(name: str, size: Size) -> Network | CausalNetwork:
+    """Return a fresh network, "ff" or "if", of the kind that its size says."""
+    return CAUSAL_NETWORKS[name](size) if isinstance(size, CausalConfig) else NETWORKS[name](size)
+
+
+def write_network(
+    path: Path, name: str, network: Network | CausalNetwork, config: Size, facts: Mapping[str, Any]
+) -> None:
     """Write weights and scales of a network, whole or not at all.
 
     Args:
@@ -32,10 +44,11 @@ def write_network(path: Path, name: str, network: Network, config: TransformerCo
         config: its size.
         facts: what else the header shall say, as JSON values.
     """
-    write_tensors(path, network.state_dict(), {"network": name, "size": asdict(config), **facts})
+    kind = "causal" if isinstance(config, CausalConfig) else "paper"
+    write_tensors(path, network.state_dict(), {"network": name, "kind": kind, "size": asdict(config), **facts})
 
 
-def read_network(path: Path) -> tuple[Network, dict[str, Any]]:
+def read_network(path: Path) -> tuple[Network | CausalNetwork, dict[str, Any]]:
     """Return a network and the facts in its header.
 
     Raises:
@@ -43,7 +56,8 @@ def read_network(path: Path) -> tuple[Network, dict[str, Any]]:
     """
     tensors, facts = read_tensors(path)
     try:
-        network = NETWORKS[facts["network"]](TransformerConfig(**facts["size"]))
+        size = CausalConfig if facts.get("kind") == "causal" else TransformerConfig
+        network = make_network(facts["network"], size(**facts["size"]))
         network.load_state_dict(tensors)
     except (KeyError, TypeError, RuntimeError) as error:
         raise InputError(f"{path}: holds no network of this version ({error}); train it again") from error

@@ -3,12 +3,30 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal
 
 from endopilot.errors import InputError
 
 WINDOW = 30
 """States that each prediction sees: the paper gives 30 states in and one out."""
+
+
+PRETRAINED = "pretrained"
+"""Name of the trained causal model that comes with the package, in place of a run's folder."""
+
+
+def run_path(run: Path) -> Path:
+    """Return the folder of a run: the package's own for `PRETRAINED`, else `run` itself.
+
+    Raises:
+        InputError: there is no such folder.
+    """
+    if str(run) == PRETRAINED:
+        return Path(__file__).parent / PRETRAINED
+    if not Path(run).is_dir():
+        raise InputError(f"{run}: no such run; give a folder made by `endopilot train`, or '{PRETRAINED}'")
+    return Path(run)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,6 +59,30 @@ class TransformerConfig:
             raise InputError(f"d_model: {self.d_model} is not even and divisible by heads = {self.heads}; give e.g. 96")
         if not 0 <= self.dropout < 1:
             raise InputError(f"dropout: {self.dropout} is not in [0, 1); give e.g. 0.1")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CausalConfig:
+    """Size of the causal network: see `models.causal`."""
+
+    width: int = 96
+    """Width of every layer."""
+    layers: int = 1
+    """Recurrent layers."""
+    drop_share: float = 0.2
+    """Share of activations that are dropped in training."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            InputError: a field is out of its range.
+        """
+        for name in ("width", "layers"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name}: {getattr(self, name)} is not positive; give at least 1")
+        if not 0 <= self.drop_share < 1:
+            raise InputError(f"drop_share: {self.drop_share} is not in [0, 1); give e.g. 0.2")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,24 +124,27 @@ class TwinConfig:
 class TrainConfig:
     """Which networks are trained, and how long."""
 
-    model: Literal["paper", "twin"] = "paper"
-    """Kind of model: the paper's pair of Transformers, or the rod core itself, which needs no training."""
+    model: Literal["paper", "causal", "twin"] = "paper"
+    """Kind of model: the paper's pair of Transformers; ours, a pair of recurrent networks that are told of the vessel;
+    or the rod core itself, which needs no training."""
     network: Literal["both", "ff", "if"] = "both"
     """Forward network (ff), inverse network (if), or both."""
     epochs: int = 20
-    """Passes over the training windows."""
+    """Passes over the training windows (causal: sequences)."""
     learning_rate: float = 1e-3
     """Adam's peak step size."""
     batch_size: int = 32
-    """Windows of 30 states in one step."""
+    """Windows of 30 states (causal: sequences) in one step."""
     windows_per_epoch: int | None = None
-    """Windows drawn in one epoch; all of the training split if not given."""
+    """Windows (causal: sequences) drawn in one epoch; all of the training split if not given."""
     max_seconds: float | None = None
     """Wall time that each network may train for, s; epochs are shortened to what is left of it."""
     seed: int = 0
     """Seed of the initial weights, the order of the windows, and dropout."""
     size: TransformerConfig = field(default_factory=TransformerConfig)
-    """Size of the networks; the paper's if not given."""
+    """Size of the paper's networks; as published if not given."""
+    causal: CausalConfig = field(default_factory=CausalConfig)
+    """Size of the causal networks; of no use to the other models."""
     twin: TwinConfig = field(default_factory=TwinConfig)
     """The twin's ensemble; of no use to the other models."""
 
@@ -115,6 +160,11 @@ class TrainConfig:
                 raise InputError(f"{name}: {value} is not positive; give a positive number")
         if self.seed < 0:
             raise InputError(f"seed: {self.seed} is negative; give 0 or more")
+
+    @property
+    def network_size(self) -> TransformerConfig | CausalConfig:
+        """Size of the networks to train."""
+        return self.causal if self.model == "causal" else self.size
 
     @property
     def networks(self) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from endopilot.dataset.loader import Dataset
 
@@ -30,6 +30,33 @@ class OpenLoop:
     tip: Steps2
     proximal: Steps2
     control: Steps2
+
+
+@dataclass(frozen=True, eq=False)
+class Foretold:
+    """What a predictor foretells of each episode at every sample, the tips that were seen included.
+
+    Attributes:
+        tip: (Δtip, γtip), mm.
+        spread: how far they may be off: one standard deviation, mm.
+    """
+
+    tip: Float[np.ndarray, "episodes samples 2"]
+    spread: Float[np.ndarray, "episodes samples 2"]
+
+
+@runtime_checkable
+class Foreteller(Protocol):
+    """A predictor that takes tips seen at any time, and says how sure it is: the causal networks and the twin."""
+
+    def foretell(self, episodes: Dataset, seen: Bool[np.ndarray, "samples"]) -> Foretold:
+        """Predict the tips of episodes under their controls, from those that were seen.
+
+        Args:
+            episodes: their controls, and the tips where `seen`; no other tip is looked at.
+            seen: samples at which the tip was measured, for example by X-ray.
+        """
+        ...
 
 
 @runtime_checkable

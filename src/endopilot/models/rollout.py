@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,8 +16,9 @@ from jaxtyping import Float
 from endopilot.dataset.loader import Dataset
 from endopilot.errors import InputError
 from endopilot.files import read_json
+from endopilot.models.causal import CausalPredictor
 from endopilot.models.checkpoint import read_network
-from endopilot.models.config import WINDOW, TwinConfig
+from endopilot.models.config import WINDOW, TwinConfig, run_path
 from endopilot.models.open_loop import OpenLoop, Predictor, Steps2
 from endopilot.models.transformer import Network
 from endopilot.models.twin import TwinPredictor
@@ -96,12 +98,12 @@ def _rollout_batch(
 
 
 def load_run(run_folder: Path) -> Predictor:
-    """Return the predictor of a run made by `endopilot train`.
+    """Return the predictor of a run made by `endopilot train`, or the packaged one, named "pretrained".
 
     Raises:
         InputError: the run is unfinished, or a file of it is damaged or of another version.
     """
-    run_folder = Path(run_folder)
+    run_folder = run_path(run_folder)
     record = read_json(run_folder / "manifest.json")
     device = Device.from_record(record["device"])
     if record["config"]["model"] == "twin":
@@ -110,8 +112,10 @@ def load_run(run_folder: Path) -> Predictor:
             simulator=SimulatorConfig(**record["simulator"]),
             config=TwinConfig(**record["config"]["twin"]),
         )
-    networks = {name: read_network(run_folder / f"{name}.safetensors")[0] for name in record["networks"]}
-    return TransformerPredictor(
+    files = {name: run_folder / f"{name}.safetensors" for name in record["networks"]}
+    networks: dict[str, Any] = {name: read_network(file)[0] for name, file in files.items()}
+    kind = CausalPredictor if record["config"]["model"] == "causal" else TransformerPredictor
+    return kind(
         forward=networks.get("ff"),
         inverse=networks.get("if"),
         control_limits=np.array([device.max_velocity_mm_s, device.max_rotation_rad_s]),

@@ -1,4 +1,4 @@
-"""Training of the paper's FF and IF on a dataset: `train`.
+"""Training of FF and IF, the paper's or ours, on a dataset: `train`.
 
 After every epoch one file, `checkpoints/<network>.safetensors`, is written whole or not at all; it holds weights,
 optimizer and learning curve, and a killed run goes on from it along the same curve. All randomness follows from the
@@ -21,7 +21,9 @@ import torch
 from endopilot.dataset.loader import Dataset, load_dataset
 from endopilot.errors import InputError
 from endopilot.files import manifest, read_json, write_json
+from endopilot.models.causal import CausalNetwork
 from endopilot.models.checkpoint import (
+    make_network,
     optimizer_tensors,
     read_tensors,
     restore_optimizer,
@@ -29,14 +31,18 @@ from endopilot.models.checkpoint import (
     write_tensors,
 )
 from endopilot.models.config import TrainConfig
-from endopilot.models.transformer import NETWORKS, Network
-from endopilot.models.windows import Episodes
+from endopilot.models.sequences import Sequences, read_vessels
+from endopilot.models.transformer import Network
+from endopilot.models.windows import Episodes, check_length
 from endopilot.progress import Advance, progress
 
 VALIDATION_WINDOWS = 512
 """Windows of held-out navigations that the loss is checked on after every epoch."""
 WARM_UP_EPOCHS = 0.5
 """Epochs over which the learning rate rises to its peak; afterwards it falls to zero along a cosine."""
+Examples = Episodes | Sequences
+"""What is trained on: windows for the paper's networks, whole sequences for ours."""
+AnyNetwork = Network | CausalNetwork
 _SCALE_WINDOWS = 16384
 _TIMED_STEPS = 12
 _GRADIENT_NORM = 1.0
@@ -63,8 +69,8 @@ def train(dataset_folder: Path, run_folder: Path, config: TrainConfig) -> None:
     dataset_folder, run_folder = Path(dataset_folder), Path(run_folder)
     dataset = load_dataset(dataset_folder)
     _begin(run_folder, {"train": asdict(config), "dataset": dataset.manifest["key"]})
-    training = _episodes(dataset, "train")
-    validation = _episodes(dataset, "seen_test") if "seen_test" in dataset.split else None
+    training = _examples(dataset, "train", config)
+    validation = _examples(dataset, "seen_test", config) if "seen_test" in dataset.split else None
     start = time.perf_counter()
     results: dict[str, Any] = {}
     for name in config.networks:
@@ -108,7 +114,7 @@ def _begin(run_folder: Path, settings: dict[str, Any]) -> None:
         )
 
 
-def _episodes(dataset: Dataset, split: str) -> Episodes:
+def _examples(dataset: Dataset, split: str, config: TrainConfig) -> Examples:
     """Return the episodes of a split, which must be finite: one bad sample would spoil the scales of all."""
     chosen = dataset.of_split(split)
     for name in ("tip_abscissa", "tip_offset", "inserted_length", "rotation", "control"):
@@ -119,7 +125,10 @@ def _episodes(dataset: Dataset, split: str) -> Episodes:
                 f"{dataset.folder}: {name} of {chosen.anatomy[bad]}, sequence {chosen.sequence[bad]}, is not finite "
                 "though the episode is marked valid; make the dataset again"
             )
-    return Episodes.of(chosen)
+    if config.model != "causal":
+        return Episodes.of(chosen)
+    check_length(chosen)
+    return Sequences.of(chosen, read_vessels(chosen), config.networks, config.seed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,8 +137,8 @@ class _Job:
 
     name: str
     config: TrainConfig
-    training: Episodes
-    validation: Episodes | None
+    training: Examples
+    validation: Examples | None
     run_folder: Path
 
     def run(self) -> dict[str, Any]:
@@ -137,7 +146,7 @@ class _Job:
         config = self.config
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(_seed(config.seed, self.name, "weights"))
-            network = NETWORKS[self.name](self.config.size)
+            network = make_network(self.name, config.network_size)
             self._fit_scales(network)
             optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate, fused=True)
             state = self._resume(network, optimizer) or {"seconds": 0.0, "curve": []}
@@ -148,7 +157,7 @@ class _Job:
                     self._save(network, optimizer, state)
         return {"parameters": sum(p.numel() for p in network.parameters())} | state
 
-    def _epoch(self, network: Network, optimizer: torch.optim.Adam, state: dict[str, Any], advance: Advance) -> None:
+    def _epoch(self, network: AnyNetwork, optimizer: torch.optim.Adam, state: dict[str, Any], advance: Advance) -> None:
         """Go through one epoch, check the loss on held-out navigations, and add both to the state's curve."""
         epoch, epochs, start = len(state["curve"]), self.config.epochs, time.perf_counter()
         batches = self._batches(epoch, self._steps(network, state))
@@ -183,7 +192,7 @@ class _Job:
         )
         state["seconds"] += time.perf_counter() - start
 
-    def _step(self, network: Network, optimizer: torch.optim.Adam, targets: torch.Tensor, rate: float) -> float:
+    def _step(self, network: AnyNetwork, optimizer: torch.optim.Adam, targets: torch.Tensor, rate: float) -> float:
         """Take one step along the gradient and return the loss before it; a loss that is not finite takes no step."""
         *window, truth = self.training.window(self.name, targets)
         loss = network.loss(network(*window), truth)
@@ -197,7 +206,7 @@ class _Job:
         return value
 
     @torch.no_grad()
-    def _validate(self, network: Network) -> float | None:
+    def _validate(self, network: AnyNetwork) -> float | None:
         if self.validation is None:
             return None
         network.eval()
@@ -213,12 +222,12 @@ class _Job:
         order = torch.randperm(len(targets), generator=generator)
         return list(targets[order].split(self.config.batch_size)[:steps])
 
-    def _fit_scales(self, network: Network) -> None:
+    def _fit_scales(self, network: AnyNetwork) -> None:
         targets = self.training.targets()
         chosen = torch.linspace(0, len(targets) - 1, min(len(targets), _SCALE_WINDOWS)).long()
         network.fit_scales(*self.training.window(self.name, targets[chosen]))
 
-    def _steps(self, network: Network, state: dict[str, Any]) -> int:
+    def _steps(self, network: AnyNetwork, state: dict[str, Any]) -> int:
         """Return the steps of the next epoch: every window once, or what `windows_per_epoch` or the time allow."""
         config = self.config
         windows = min(len(self.training.targets()), config.windows_per_epoch or 2**62)
@@ -234,7 +243,7 @@ class _Job:
         seconds_left = (config.max_seconds - state["seconds"]) / (config.epochs - len(curve)) - validation
         return max(min(steps, int(seconds_left / a_step)), 1)
 
-    def _time(self, network: Network) -> tuple[float, float]:
+    def _time(self, network: AnyNetwork) -> tuple[float, float]:
         """Return how long a training step and a validation take, s, tried out on a copy of the network."""
         trial = copy.deepcopy(network).train()
         optimizer = torch.optim.Adam(trial.parameters(), fused=True)
@@ -248,12 +257,12 @@ class _Job:
         self._validate(trial)
         return float(np.median(times)), time.perf_counter() - start
 
-    def _save(self, network: Network, optimizer: torch.optim.Adam, state: dict[str, Any]) -> None:
+    def _save(self, network: AnyNetwork, optimizer: torch.optim.Adam, state: dict[str, Any]) -> None:
         tensors = {f"network.{key}": value for key, value in network.state_dict().items()}
         write_tensors(self._checkpoint, tensors | optimizer_tensors(optimizer), {"network": self.name, **state})
-        write_network(self.run_folder / f"{self.name}.safetensors", self.name, network, self.config.size, {})
+        write_network(self.run_folder / f"{self.name}.safetensors", self.name, network, self.config.network_size, {})
 
-    def _resume(self, network: Network, optimizer: torch.optim.Adam) -> dict[str, Any] | None:
+    def _resume(self, network: AnyNetwork, optimizer: torch.optim.Adam) -> dict[str, Any] | None:
         if not self._checkpoint.exists():
             return None
         tensors, facts = read_tensors(self._checkpoint)
@@ -261,7 +270,7 @@ class _Job:
         network.load_state_dict(weights)
         restore_optimizer(optimizer, tensors)
         # A kill between the two files of an epoch leaves the second one behind by an epoch.
-        write_network(self.run_folder / f"{self.name}.safetensors", self.name, network, self.config.size, {})
+        write_network(self.run_folder / f"{self.name}.safetensors", self.name, network, self.config.network_size, {})
         return {key: facts[key] for key in ("seconds", "curve")}
 
     @property

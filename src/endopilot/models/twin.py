@@ -19,7 +19,7 @@ from scipy.stats import qmc
 from endopilot.anatomy.io import read_anatomy
 from endopilot.dataset.loader import Dataset
 from endopilot.models.config import WINDOW, TwinConfig
-from endopilot.models.open_loop import OpenLoop
+from endopilot.models.open_loop import Foretold, OpenLoop
 from endopilot.models.tracking import track
 from endopilot.simulation.device import Device
 from endopilot.simulation.simulator import SimulatorConfig, simulate
@@ -35,17 +35,13 @@ _BELIEVED = np.array([1.0, 1.0, 0.0])
 
 
 @dataclass(frozen=True, eq=False)
-class Foretold:
-    """What an ensemble foretells of each episode, at every sample.
+class TwinForetold(Foretold):
+    """What the ensemble foretells: the weighted median of its members, and their weighted deviation from it.
 
     Attributes:
-        tip: (Δtip, γtip), mm: the weighted median of the members.
-        spread: their weighted standard deviation around it, mm.
         parameters: friction factor, tip stiffness factor and depth of the ostium (mm) of the likeliest member.
     """
 
-    tip: Float[np.ndarray, "episodes samples 2"]
-    spread: Float[np.ndarray, "episodes samples 2"]
     parameters: Float[np.ndarray, "episodes 3"]
 
 
@@ -63,7 +59,7 @@ class TwinPredictor:
     simulator: SimulatorConfig
     config: TwinConfig
 
-    def foretell(self, episodes: Dataset, seen: Bool[np.ndarray, "samples"]) -> Foretold:
+    def foretell(self, episodes: Dataset, seen: Bool[np.ndarray, "samples"]) -> TwinForetold:
         """Predict the tips of episodes under their controls, from those that were seen.
 
         Args:
@@ -78,7 +74,7 @@ class TwinPredictor:
             weight = _weights(paths, _tips(data), seen, self.config)
             tip[chosen], spread[chosen] = _median_and_spread(paths, weight)
             parameters[chosen] = members[weight.argmax(axis=0), np.arange(len(data))]
-        return Foretold(tip, spread, parameters)
+        return TwinForetold(tip, spread, parameters)
 
     def ensemble(
         self, episodes: Dataset, seen: Bool[np.ndarray, "samples"]

@@ -35,13 +35,7 @@ class Episodes:
         Raises:
             InputError: the episodes are no longer than a window.
         """
-        samples = dataset.valid.shape[1]
-        if samples <= WINDOW:
-            seconds = (WINDOW + 1) * dataset.sample_period_s
-            raise InputError(
-                f"{dataset.folder}: episodes of {samples} samples leave nothing to predict after {WINDOW} given ones; "
-                f"make the dataset with seconds of {seconds:g} or more"
-            )
+        check_length(dataset)
         return Episodes(
             tip=_tensor(dataset.tip_abscissa, dataset.tip_offset),
             proximal=_tensor(dataset.inserted_length, dataset.rotation),
@@ -68,6 +62,21 @@ class Episodes:
             self.proximal[episode, motion_at],
             self.control[episode, motion_at],
             truth[target[:, 0], target[:, 1]],
+        )
+
+
+def check_length(dataset: Dataset) -> None:
+    """Check that episodes are longer than the given states.
+
+    Raises:
+        InputError: they are not.
+    """
+    samples = dataset.valid.shape[1]
+    if samples <= WINDOW:
+        seconds = (WINDOW + 1) * dataset.sample_period_s
+        raise InputError(
+            f"{dataset.folder}: episodes of {samples} samples leave nothing to predict after {WINDOW} given ones; "
+            f"make the dataset with seconds of {seconds:g} or more"
         )
 
 
