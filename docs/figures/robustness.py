@@ -1,0 +1,44 @@
+"""Write the figures of `endopilot bench robustness --json > FILE` into docs/simulation.md.
+
+`python docs/figures/robustness.py FILE`. The run itself takes half an hour on two quiet cores.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+PAGE = Path(__file__).parents[1] / "simulation.md"
+BEGIN, END = "<!-- robustness:begin -->", "<!-- robustness:end -->"
+
+
+def text(measured: dict) -> str:
+    """Return the figures beside their bars, those of each device and manoeuvre, and every invalid world."""
+    lines = [
+        f"Of {measured['rollouts']} rollouts ({measured['simulated_hours']:.0f} simulated hours):",
+        "",
+        "| figure | value | bar |",
+        "|---|---|---|",
+        *(f"| {row['figure']} | {row['value']:g} | {row['bar']:g} |" for row in measured["figures"]),
+        "",
+        "| group | rollouts | invalid | penetration p99, mm | p99.9, mm | largest, mm |",
+        "|---|---|---|---|---|---|",
+    ]
+    for group in ("by_device", "by_manoeuvre"):
+        for name, row in measured[group].items():
+            depths = (row[f"penetration_{which}_mm"] for which in ("p99", "p999", "max"))
+            lines.append(f"| {name} | {row['rollouts']} | {row['invalid']} | " + " | ".join(map(str, depths)) + " |")
+    told = measured["invalid_worlds"] + measured["crashed"]
+    return "\n".join([*lines, "", "Invalid worlds:", "", *(f"- {line}" for line in told or ["none"])])
+
+
+def main(file: str) -> None:
+    """Replace what stands between the page's marks."""
+    page = PAGE.read_text(encoding="utf-8")
+    figures = text(json.loads(Path(file).read_text(encoding="utf-8")))
+    PAGE.write_text(f"{page.split(BEGIN)[0]}{BEGIN}\n{figures}\n{END}{page.split(END)[1]}", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
