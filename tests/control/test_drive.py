@@ -159,7 +159,7 @@ def test_replayed_changed_and_reflected_lines_are_dropped() -> None:
     assert drive.stopped == "silence"
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=30)
 @given(some.lists(some.one_of(some.binary(max_size=400), some.integers(0, 5)), max_size=20), some.data())
 def test_fuzzed_lines_never_move_it_nor_break_it(pieces, data) -> None:
     drive, client = moving()

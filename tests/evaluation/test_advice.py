@@ -76,7 +76,7 @@ def test_imaging_often_enough_misses_nothing_and_none_misses_all(watched) -> Non
     often = advice.run(watched, advice.periodic(watched, 3), EVENTS)
     never = advice.run(watched, lambda sample, tip, spread: np.zeros(len(tip), dtype=bool), EVENTS)
     knowing = advice.run(watched, advice.oracle(watched, EVENTS), EVENTS)
-    assert often["missed_share"] == 0.0 and often["exposures_per_minute"] == pytest.approx(40.0)
+    assert often["missed_share"] == 0.0 and often["exposures_per_minute"] == pytest.approx(40.0, rel=0.02)
     assert 0.7 < never["missed_share"] < 1.0  # what begins at the first sample was seen by the X-ray before
     assert never["exposures_per_minute"] == 0.0
     assert never["events_per_minute"] > 1.0 and never["fewer_frames_than_fluoroscopy"] == 1.0

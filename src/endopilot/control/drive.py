@@ -54,7 +54,7 @@ class Drive:
             now: time by the drive's clock, s.
             config: latency, backlash, accelerations and encoder noise.
             inserted_length: Δ at the start, mm.
-            report: called with a line for people at every stop and every new client.
+            report: called with a line for people at every stop, and when a client comes or goes.
         """
         self._limits, self._secret, self._report, config = limits, secret, report, config or RobotConfig()
         self._motion = DriveMotion(limits, config, (inserted_length, 0.0))
@@ -124,6 +124,12 @@ class Drive:
         numbers = (self._limits.max_velocity_mm_s, self._limits.max_rotation_rad_s, low, high)
         return tuple(repr(float(number)) for number in numbers)
 
+    def lose_owner(self) -> None:
+        """Stop, for the connection of the owner is gone."""
+        self.stop("connection")
+        self.owner = None
+        self._report("the client is gone")
+
     def _advance(self, until: float) -> None:
         self._motion.advance(until - self._now)
         self._now = until
@@ -169,8 +175,7 @@ class Session:
         self._drive.tick(now)
         self.closed = True
         if self._drive.owner is self:
-            self._drive.stop("connection")
-            self._drive.owner = None
+            self._drive.lose_owner()
 
     def _answer(self, message: Message) -> Message | None:
         """Do what a genuine message asks and return the reply; None where it makes no sense."""
