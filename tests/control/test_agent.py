@@ -14,6 +14,7 @@ from endopilot.control.belief import Belief, BeliefConfig
 from endopilot.control.navigate import Truth, navigate
 from endopilot.control.policy import Decision, Policy, Sight, TipMeasurement
 from endopilot.control.search import Course
+from endopilot.control.xray import AdvisorConfig, Calibration
 from endopilot.env.task import Navigation, Target
 
 QUICK = AgentConfig(belief=BeliefConfig(members=6, time_step_s=0.05))
@@ -108,6 +109,18 @@ def test_a_tip_that_no_wire_explains_is_pulled_back_under_xray(side_branch) -> N
     assert lost.translation < 0 and lost.expose
     policy.decide(Sight(1.0, 2.0, 0.0, measured(policy.belief, 0)))
     assert policy.plans == 2  # found again, it searches another way
+
+
+def test_with_a_calibration_the_adviser_says_when_to_look(side_branch) -> None:
+    """A band of Δtip that widens by 0.5 mm a second is 1 mm wide after 2 s: X-ray every fourth period."""
+    calibration = Calibration(
+        level=0.9, scale=1.0, abscissa_terms=(0.0, 0.5, 0.0, 0.0), offset_terms=(0.0, 0.0, 0.0, 0.0), anatomies=9,
+        intervals=9, dataset="",
+    )  # fmt: skip
+    policy = AgentPolicy(QUICK, calibration=calibration, advice=AdvisorConfig(abscissa_mm=1.0, wall_ratio=2.0))
+    policy.start(replace(side_branch, target=Target(branch=1, abscissa=39.0)), 0)
+    at = [k for k in range(9) if policy.decide(Sight(0.5 * k, 2.0, 0.0, None)).expose]
+    assert at == [3, 7]
 
 
 NUMBERS = st.floats(allow_nan=True, allow_infinity=True, width=64)

@@ -131,6 +131,21 @@ np.save("after.npy", simulator.state.values[0])
     assert np.load(tmp_path / "after.npy").tobytes() == after.tobytes()
 
 
+def test_worlds_go_over_into_another_simulator_of_the_same_kind(anatomy: Anatomy, wider: Anatomy) -> None:
+    first = begun(Simulator(anatomy, [DEVICE, STIFF, DEVICE]), 3)
+    second = Simulator(anatomy, [STIFF, DEVICE], sharing=first)
+    second.copy_worlds([1, 2], of=first)
+    moved = second.step(controls(1, 2)[0], PERIOD)
+    wanted = first.step(controls(1, 2)[0][[0, 0, 1]], PERIOD)  # world 1 and world 2 get the controls of their copies
+    assert np.array_equal(moved.tip_position, wanted.tip_position[[1, 2]])
+    with pytest.raises(InputError, match="world 0 cannot become world 0"):
+        second.copy_worlds([0, 2], of=first)
+    with pytest.raises(InputError, match="world 0 cannot become world 0"):
+        Simulator(wider, DEVICE).copy_worlds([0], of=first)
+    with pytest.raises(InputError, match="other settings"):
+        Simulator(anatomy, DEVICE, config=SimulatorConfig(elements=50)).copy_worlds([0], of=first)
+
+
 def test_a_seed_draws_the_same_start_whatever_the_number_of_worlds(anatomy: Anatomy) -> None:
     few, many = Simulator(anatomy, DEVICE, worlds=2), Simulator(anatomy, DEVICE, worlds=5)
     few.reset(seed=7)

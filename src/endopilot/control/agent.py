@@ -18,6 +18,7 @@ from endopilot.control.policy import DECISION_PERIOD_S, Decision, Sight, TipMeas
 from endopilot.control.robot import Limits
 from endopilot.control.route import Route, check_passable
 from endopilot.control.search import Course, Search, SearchConfig
+from endopilot.control.xray import AdvisorConfig, Calibration, XrayAdvisor
 from endopilot.env.task import Navigation
 from endopilot.progress import Advance
 from endopilot.types import TipProjection
@@ -181,12 +182,49 @@ class TwinPolicy(_PlanningPolicy):
 
 
 class AgentPolicy(_PlanningPolicy):
-    """Plans in an ensemble of rod cores that it weighs by what it sees, and looks only when they disagree."""
+    """Plans in an ensemble of rod cores that it weighs by what it sees, and looks only when its adviser asks."""
+
+    def __init__(
+        self,
+        config: AgentConfig | None = None,
+        *,
+        calibration: Calibration | None = None,
+        advice: AdvisorConfig | None = None,
+    ) -> None:
+        """Take the settings.
+
+        Args:
+            config: how to search, believe and look.
+            calibration: of the bands around what the simulated wires foretell; X-ray then goes on by `XrayAdvisor`.
+                Without one the tip is looked at when the wires are `config.spread_mm` apart, and once beyond each
+                junction.
+            advice: what the adviser must not miss.
+        """
+        super().__init__(config)
+        self._calibration, self._advice = calibration, advice or AdvisorConfig()
+
+    def start(self, navigation: Navigation, seed: int) -> None:
+        """Lay the simulated wires out, and begin to watch the bands."""
+        super().start(navigation, seed)
+        self._advisor = None
+        if self._calibration is not None:
+            self._advisor = XrayAdvisor(self._calibration, self._advice, navigation.device.tip_radius_mm)
+            self._advisor.start(*self._told())
 
     def _parameters(self) -> Float[np.ndarray, "members 3"]:
         return Belief.around(np.array([1.0, 1.0, 0.0]), self.config.belief)
 
+    def _told(self) -> tuple[Float[np.ndarray, "1 2"], Float[np.ndarray, "1 2"], Float[np.ndarray, "1"]]:
+        """Return what the adviser is told: (Δ, φ), (Δtip, γtip) and the lumen's radius, of the likeliest wire."""
+        best, tip = int(np.argmax(self.belief.weight)), self.belief.likeliest_tip()
+        wires = self.belief.simulator
+        proximal = np.array([[wires.inserted_length[best], wires.rotation[best]]])
+        return proximal, np.array([[tip.abscissa[0], tip.offset[0]]]), tip.radius
+
     def _wants_xray(self) -> bool:
+        if self._advisor is not None:
+            proximal, tip, radius = self._told()
+            return bool(self._advisor.advise(proximal, tip, self.belief.tip_spread()[None], radius)[0])
         return self.belief.spread() > self.config.spread_mm or self._entered_branch()
 
     def _entered_branch(self) -> bool:

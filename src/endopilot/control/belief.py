@@ -160,6 +160,11 @@ class Belief:
         weight, position = self.weight, self.simulator.position[:, 0]
         return float(np.sqrt(weight @ ((position - weight @ position) ** 2).sum(axis=1)))
 
+    def tip_spread(self) -> Float[np.ndarray, "2"]:
+        """Return the members' weighted standard deviations of (Δtip, γtip), mm."""
+        tip, weight = np.stack([self.tip.abscissa, self.tip.offset], axis=-1), self.weight
+        return np.sqrt(weight @ (tip - weight @ tip) ** 2)
+
     def likeliest_tip(self) -> TipProjection:
         """Return where the tip of the likeliest member is, as arrays of one."""
         best = [int(np.argmax(self.weight))]

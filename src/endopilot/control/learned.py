@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
+from scipy.ndimage import convolve1d
 
 from endopilot.control.cost import safety_ratio
 from endopilot.control.robot import Limits
@@ -76,7 +77,7 @@ def _sample(predictor: Predictor, rest: _Rest, desired: Steps, route: Route, con
     with progress("plan: sampling the forward network", total=sampling.iterations) as advance:
         for _ in range(sampling.iterations):
             drawn = random.standard_normal((sampling.candidates, *mean.shape))
-            drawn = np.apply_along_axis(np.convolve, 1, drawn, _SMOOTH, mode="same") * sd
+            drawn = convolve1d(drawn, _SMOOTH, axis=1, mode="constant") * sd
             drawn[0] = 0.0
             control = np.clip(mean + drawn, -bound, bound)
             wanted = np.repeat(desired[None], len(control), axis=0)

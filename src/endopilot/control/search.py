@@ -309,7 +309,7 @@ class Search:
         return drawn
 
     def _run_round(
-        self, control: Float[np.ndarray, "candidates 2"], before: Float[np.ndarray, "candidates 2"] | None,
+        self, control: Float[np.ndarray, "candidates 2"], before: Float[np.ndarray, "candidates 2"],
         waypoint: float,
     ) -> Float[np.ndarray, "candidates"]:  # fmt: skip
         """Drive all candidates for a round; return what it cost each, in the mean over its wires."""

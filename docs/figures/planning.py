@@ -1,0 +1,88 @@
+"""Measure the policies on side branches of patients of the atlas, and write the table into docs/planning.md.
+
+`python docs/figures/planning.py` takes some minutes on one core.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from endopilot.anatomy.atlas import AtlasConfig, synthesize_one
+from endopilot.control.agent import AgentPolicy, TwinPolicy
+from endopilot.control.navigate import Truth, navigate
+from endopilot.control.policies import make_policy
+from endopilot.control.policy import Policy
+from endopilot.env.task import Navigation, Target
+from endopilot.simulation.device import Device, read_device
+from endopilot.types import Anatomy
+
+PAGE = Path(__file__).parents[1] / "planning.md"
+SEED, PATIENTS, DEEP_MM, SECONDS, FORCE_N = 900, (("rca", 0), ("lca", 0)), 15.0, 60.0, 0.3
+TIPS = ((90.0, 8.0), (45.0, 3.0))
+POLICIES = ("forward", "spin", "twin", "agent")
+
+
+def side_branches(anatomy: Anatomy) -> Iterator[Target]:
+    """Yield a target in every branch that leaves a wider one and is long enough."""
+    tree = anatomy.tree
+    for index, branch in enumerate(tree.branches):
+        line, others = branch.centerline, [c for c in tree.children(branch.parent) if c != index]
+        middle = np.median(line.radius)
+        if branch.parent < 0 or line.abscissa[-1] - line.abscissa[0] < DEEP_MM + 3:
+            continue
+        if any(np.median(tree.branches[other].centerline.radius) > middle for other in others):
+            yield Target(branch=index, abscissa=float(line.abscissa[0]) + DEEP_MM)
+
+
+def shaped(angle_deg: float, length_mm: float) -> Device:
+    """Return the workhorse with its tip shaped."""
+    wire = read_device("workhorse-014").with_tip(bend_rad=float(np.deg2rad(angle_deg)), stiffness_factor=1.0)
+    return replace(wire, tip_bend_length_mm=length_mm)
+
+
+def drive(name: str, navigation: Navigation, truth: Truth) -> tuple[bool, int, float]:
+    """Return safe success, exposures and processor seconds of one navigation."""
+    kinds: dict[str, Policy] = {"twin": TwinPolicy(truth), "agent": AgentPolicy()}
+    policy, began = kinds.get(name) or make_policy(name), time.process_time()
+    record = navigate(navigation, policy, seed=1, truth=truth)
+    return record.success and record.safe, record.exposures, time.process_time() - began
+
+
+def measure() -> list[str]:
+    """Return the rows of the table."""
+    patients = [synthesize_one(AtlasConfig(anatomy=kind, seed=SEED), number) for kind, number in PATIENTS]
+    rows = ["| tip | policy | safe success | exposures | processor, s |", "|---|---|---|---|---|"]
+    for angle_deg, length_mm in TIPS:
+        for name in POLICIES:
+            off, runs = np.random.default_rng(SEED), []
+            for anatomy in patients:
+                for target in side_branches(anatomy):
+                    friction, stiffness, side = off.choice([-1.0, 1.0], 3)
+                    truth = Truth(
+                        friction_factor=1 + 0.2 * friction, stiffness_factor=1 + 0.2 * stiffness, ostium_mm=0.3 * side
+                    )
+                    navigation = Navigation(
+                        anatomy=anatomy, device=shaped(angle_deg, length_mm), target=target, seconds=SECONDS,
+                        force_limit_n=FORCE_N,
+                    )  # fmt: skip
+                    runs.append(drive(name, navigation, truth))
+            good, exposures, seconds = np.array(runs, dtype=float).T
+            rows.append(
+                f"| {angle_deg:g}° over {length_mm:g} mm | `{name}` | {int(good.sum())} of {len(good)} | "
+                f"{exposures.mean():.1f} | {seconds.mean():.1f} |"
+            )
+            print(rows[-1], flush=True)
+    return rows
+
+
+if __name__ == "__main__":
+    table = "\n".join(measure())
+    before, after = PAGE.read_text(encoding="utf-8").split("<!-- planning:begin -->")
+    after = after.split("<!-- planning:end -->")[1]
+    text = f"{before}<!-- planning:begin -->\n{table}\n<!-- planning:end -->{after}"
+    PAGE.write_text(text, encoding="utf-8")
