@@ -201,8 +201,9 @@ def coverage(watched: Watched, calibration: Calibration) -> dict[str, Any]:
     """Return how often the bands hold: over whole intervals of 45 s, sample by sample, and in the worst patients."""
     watched.model.restart()
     half = calibration.half_width(*watched.since, watched.model.spread[:, WINDOW:])
-    inside = np.asarray(np.abs((watched.model.tip - watched.truth)[:, WINDOW:]) <= half)
-    whole, anatomy = inside.all(axis=(1, 2)), watched.told.anatomy
+    inside: np.ndarray = np.less_equal(np.abs((watched.model.tip - watched.truth)[:, WINDOW:]), half)
+    whole: np.ndarray = np.asarray(inside.all(axis=(1, 2)))
+    anatomy = watched.told.anatomy
     each = np.sort([whole[anatomy == name].mean() for name in np.unique(anatomy)])
     worst = each[: max(1, round(len(each) / 10))]
     return {
