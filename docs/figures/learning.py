@@ -68,8 +68,10 @@ def play_rows(data: Dataset) -> Iterator[str]:
         return np.abs(unfold("forward", vessels, patient, episodes, seen).guess - truth)
 
     yield row("play operator, nothing learned", guessed(data))
-    lag = np.clip(data.rotation, *(_lagging(data) + sign * 0.003 * data.inserted_length for sign in (-1, 1)))
-    yield row("play operator, the tip's rotation lags by up to 0.003 rad a mm", guessed(replace(data, rotation=lag)))
+    yield row(
+        "play operator, the tip's rotation lags by up to 0.003 rad a mm",
+        guessed(replace(data, rotation=_lagging(data))),
+    )
     before = play._SHARPNESS
     for sharpness in (4.0, 80.0):
         play._SHARPNESS = sharpness
@@ -150,6 +152,12 @@ def headline_rows(folder: Path) -> Iterator[str]:
     yield (
         f"| `pretrained`, samples in the branch that it believes ({right.mean():.0%}) | "
         f"all {ours[right][:, 0].mean():.3f} | all {ours[right][:, 1].mean():.3f} | | |"
+    )
+    spread = load_run(folder / RUNS[0]).foretell(data, seen[0]).spread[:, WINDOW:]
+    within = (ours < spread).mean(axis=(0, 1))
+    yield (
+        f"| `pretrained`, share of errors within one spread (76 % of a Laplace distribution) | "
+        f"{within[0]:.0%} | {within[1]:.0%} | | |"
     )
     yield (
         f"| `pretrained`, without the worst 5 % of Δtip | all {ours[few][:, 0].mean():.3f} | "
