@@ -24,7 +24,7 @@ COMMANDS = {
     "simulate": "anatomy and proximal controls -> what the wire does",
     "dataset": "anatomies -> many random navigations on disk",
     "dataset-info": "what a dataset holds, with pictures",
-    "train": "dataset -> forward and inverse transformers",
+    "train": "dataset -> forward and inverse networks: the paper's, ours, or the rod core as a twin",
     "evaluate": "trained run -> errors beside the paper's and the baselines'",
     "plan": "anatomy and target -> controls that bring the tip there",
     "advise": "trained run -> when X-ray is needed: calibrated bands, exposures against missed events",
