@@ -233,7 +233,7 @@ class NavigateVectorEnv(VectorEnv):
             raise InputError(f"reset_mask: shape {mask.shape}; give a boolean for each of the {self.num_envs} worlds")
         if seed is not None:
             seeds = [seed + world for world in range(self.num_envs)] if isinstance(seed, int | np.integer) else seed
-            for world in np.flatnonzero(mask):
+            for world in np.flatnonzero(mask).tolist():
                 self._generators[world] = seeding.np_random(seeds[world])[0]
         self._begin(mask)
         now = Measured.standing(self._simulator)
@@ -336,7 +336,7 @@ class NavigateVectorEnv(VectorEnv):
         return NavigationState(
             self._simulator.state,
             *(array.copy() for array in (self._steps, self._distance, self._safe, self._ended)),
-            generators=tuple(copy.deepcopy(generator.bit_generator.state) for generator in self._generators),
+            generators=tuple(dict(copy.deepcopy(generator.bit_generator.state)) for generator in self._generators),
         )
 
     def set_state(self, state: NavigationState) -> None:

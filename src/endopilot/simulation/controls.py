@@ -114,7 +114,7 @@ def free_wire_load(
     """Return the drive's force (N) and torque (N·mm) that move a wire through the introducer alone at some velocity.
 
     The wire's surface moves by v = (Δ̇, r φ̇) past the valve, whose smoothed Coulomb friction F and drag c oppose it with
-    F v / √(|v|² + ε²) + c v, as the rod core has it.
+    F v / √(v² + ε²) + c v, as the rod core has it.
 
     Args:
         velocity: Δ̇ (mm/s) and φ̇ (rad/s).

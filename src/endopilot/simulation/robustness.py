@@ -201,7 +201,7 @@ def run_chunk(path: Path, config: RobustnessConfig, index: int, device: Device, 
     invalid = [
         f"{anatomy.name}, {device.name}, rollout {world} ({MANOEUVRES[world % len(MANOEUVRES)]}): "
         + why_invalid(rollout, world)
-        for world in np.flatnonzero(rollout.reason)
+        for world in np.flatnonzero(rollout.reason).tolist()
     ]
     with writing(path) as partial:
         np.savez_compressed(partial, **{field.name: getattr(chunk, field.name) for field in fields(chunk)})

@@ -40,6 +40,10 @@ _DEEPEST_START = 0.8
 """Share of the longest path that a random start may lie at."""
 
 
+_LEAST_BYTES = 4000
+"""No world takes less memory, bytes; a number of worlds that needs more is refused before they are listed."""
+
+
 @dataclass(frozen=True, eq=False)
 class _Group:
     """The worlds that share an anatomy and a device."""
@@ -98,6 +102,7 @@ class Simulator:
         self._config = config or SimulatorConfig()
         self._by_force = actuation == "force"
         self._lumens: dict[tuple[int, float], tuple[Anatomy, _core.Lumen]] = dict(sharing._lumens) if sharing else {}
+        check_memory(worlds * _LEAST_BYTES, f"worlds: {worlds}", "give fewer")
         anatomies = [anatomy] * worlds if isinstance(anatomy, Anatomy) else list(anatomy)
         devices = [device] * len(anatomies) if isinstance(device, Device) else list(device)
         if isinstance(anatomy, Anatomy) and not isinstance(device, Device):
