@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import signal
 import socket
 import subprocess
 import sys
@@ -44,7 +43,7 @@ def drive(tmp_path):
     )
     found = re.fullmatch(r"listening on 127\.0\.0\.1:(\d+)\n", process.stdout.readline())
     yield process, int(found.group(1))
-    process.send_signal(signal.SIGINT)
+    process.terminate()
     process.wait(timeout=20)
     process.stdout.close()
 
