@@ -141,7 +141,7 @@ def test_volumes_that_miss_the_ostium(enhanced, tmp_path, capsys):
         first = whole.index_to_world(np.array([0.0, 0.0, float(kept.argmax())]))
         write_volume(Volume(whole.voxels[kept], whole.spacing_mm, first, whole.direction), tmp_path / f"{name}.nii.gz")
         line = _refused(capsys, tmp_path / f"{name}.nii.gz")
-        assert "give seeds: the ostium" in line or "the ostium is probably outside; give a CT" in line, line
+        assert "seeds: the ostium first" in line or "the ostium is probably outside; give a CT" in line, line
 
 
 def test_methods_and_outputs_that_do_not_fit(few, tmp_path, capsys, monkeypatch):

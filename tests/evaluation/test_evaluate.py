@@ -124,7 +124,7 @@ def test_a_run_without_its_dataset_is_told(evaluated, tmp_path):
     folder = evaluated[0]
     record = read_json(folder / "run" / "manifest.json")
     write_json(tmp_path / "manifest.json", record | {"dataset": "elsewhere"})
-    with pytest.raises(InputError, match="no dataset here"):
+    with pytest.raises(InputError, match="is not here; name one with --dataset"):
         evaluate(tmp_path, tmp_path / "out", EvaluateConfig())
     assert not (tmp_path / "out").exists()
 
