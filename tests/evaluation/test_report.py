@@ -116,7 +116,7 @@ def test_nothing_is_loaded_from_outside(page):
 
 
 def test_style_sheets_load_nothing():
-    assert not re.search(r"url\(|@import", report._template_text("report.css"))
+    assert not re.search(r"url\(|@import", report.template_text("report.css"))
 
 
 def test_the_numbers_of_the_tables_are_those_of_metrics_json(page, material):
