@@ -35,7 +35,9 @@ def tasks() -> list[str]:
 
 def scores(folder: Path) -> list[str]:
     """Return one table of the policies' scores: safe success, and in brackets success, %."""
-    done = {path.parent.name: json.loads(path.read_text()) for path in sorted(folder.glob("*/ladder.json"))}
+    done = {
+        path.parent.name: json.loads(path.read_text(encoding="utf-8")) for path in sorted(folder.glob("*/ladder.json"))
+    }
     tables = {name: {row["task"]: row for row in content["scores"]} for name, content in done.items()}
     names = list(dict.fromkeys(task for table in tables.values() for task in table))
     lines = ["| task | " + " | ".join(tables) + " |", "|---|" + "---|" * len(tables)]

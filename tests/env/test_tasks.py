@@ -66,9 +66,9 @@ def test_a_ladder_navigation_is_the_same_every_time():
     ],
 )
 def test_what_is_wrong_in_a_file_is_named(tmp_path, old, new, told):
-    text = (Path(tasks.__file__).parent / "tasks" / "crux.yaml").read_text()
+    text = (Path(tasks.__file__).parent / "tasks" / "crux.yaml").read_text(encoding="utf-8")
     assert old in text
-    (tmp_path / "task.yaml").write_text(text.replace(old, new))
+    (tmp_path / "task.yaml").write_text(text.replace(old, new), encoding="utf-8")
     with pytest.raises(InputError) as error:
         read_task(tmp_path / "task.yaml")
     assert told in str(error.value) and "\n" not in str(error.value)

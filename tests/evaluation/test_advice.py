@@ -124,7 +124,7 @@ def test_the_command_calibrates_measures_and_draws(folder, hold_slack, capsys) -
     assert leave.value.code == 0
     printed = capsys.readouterr().out
     assert "missed_share" in printed and "exposures_per_minute" in printed
-    figures = json.loads((output / "advice.json").read_text())
+    figures = json.loads((output / "advice.json").read_text(encoding="utf-8"))
     assert Calibration.read(run).scale == figures["calibration"]["scale"] > 0
     assert figures["calibration"]["anatomies"] == 10 and figures["coverage"]["patients"] == 1
     assert 0 <= figures["coverage"]["simultaneous"] <= figures["coverage"]["samplewise"] <= 1

@@ -39,7 +39,7 @@ def test_pushing_solves_the_straight_run(climbed):
     target = find_task("straight")
     assert row["seconds"] == pytest.approx((target.depth_mm - target.start_inserted_mm) / 5.0, abs=1.0)
     assert 0.9 < row["path_ratio"] < 1.1 and 0 < row["peak_force_n"] < target.force_limit_n
-    assert json.loads((folder / "ladder.json").read_text())["scores"] == rows
+    assert json.loads((folder / "ladder.json").read_text(encoding="utf-8"))["scores"] == rows
 
 
 def test_an_interrupted_run_goes_on_with_what_is_missing(climbed, monkeypatch):
@@ -69,10 +69,10 @@ def test_a_folder_of_another_task_is_refused(climbed, monkeypatch):
 
 def test_the_page_shows_the_scores_and_links_the_replay(climbed):
     folder, _ = climbed
-    text = write_page(folder).read_text()
+    text = write_page(folder).read_text(encoding="utf-8")
     assert "The ladder: forward" in text and find_task("straight").title in text
     assert "replay-straight.html" in text and "data:image/png;base64," in text
-    replay = (folder / "replay-straight.html").read_text()
+    replay = (folder / "replay-straight.html").read_text(encoding="utf-8")
     assert "Guidewire" in replay and 'src="plotly.min.js"' in replay
     assert (folder / "plotly.min.js").stat().st_size > 1e6
 
