@@ -13,7 +13,7 @@ from endopilot.control.agent import AgentConfig, AgentPolicy, TwinPolicy
 from endopilot.control.belief import Belief, BeliefConfig
 from endopilot.control.navigate import Truth, navigate
 from endopilot.control.policy import Decision, Policy, Sight, TipMeasurement
-from endopilot.control.search import Course
+from endopilot.control.search import Course, Search
 from endopilot.control.xray import AdvisorConfig, Calibration
 from endopilot.env.task import Navigation, Target
 
@@ -152,3 +152,12 @@ def test_whatever_the_model_returns_commands_are_finite_and_within_limits(starte
         assert np.isfinite([decision.translation, decision.rotation]).all()
         assert abs(decision.translation) <= shaped.max_velocity_mm_s
         assert abs(decision.rotation) <= shaped.max_rotation_rad_s
+
+
+@pytest.mark.timeout(60)
+def test_a_search_ends_though_pushing_seems_to_arrive_and_the_target_is_not_reached(side_branch, monkeypatch) -> None:
+    monkeypatch.setattr(Search, "_push_on", lambda *_: True)
+    policy = TwinPolicy(config=QUICK)
+    policy.start(side_branch, 0)
+    course = policy.find_course(5.0)
+    assert course.reached == 0.0 and len(course.control) == 10

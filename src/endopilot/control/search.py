@@ -27,6 +27,8 @@ from endopilot.simulation.stepping import Simulator
 from endopilot.types import TipProjection
 
 Controls = Float[np.ndarray, "periods 2"]
+_BACK_MM_S = 2.0
+"""Speed at which a wire that has gone past its target is pulled back, mm/s."""
 _STALL_PERIODS = 4
 """A tip that has come forward by less than `_STALL_SHARE` of the wire's advance in this many periods has stopped."""
 _STALL_SHARE = 0.25
@@ -166,11 +168,13 @@ class Search:
             if self._push_on(log, periods, waypoint):
                 if self._reached() > 0.5:
                     break
+                if log.periods == before:  # past the waypoint and not at the target: some wire lies beyond it
+                    self._drive(log, np.array([-_BACK_MM_S, 0.0]))
                 continue
             self.single.copy_worlds(same, of=self._kept)
             log.cut(before)
             self._approach(log, periods, waypoint)
-            if not self._try_others(log, periods):
+            if not self._try_others(log, periods) or log.periods == before:
                 break
         return log.course(len(weight), self._reached())
 
