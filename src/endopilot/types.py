@@ -143,6 +143,14 @@ class VesselTree:
             route.append(self.branches[route[-1]].parent)
         return tuple(reversed(route))
 
+    def departures(self, branch: int) -> Float[np.ndarray, "branches"]:
+        """Return the abscissa, mm, where the way into each branch leaves the route to `branch`; infinite on it."""
+        route, at = self.route(branch), np.full(len(self.branches), np.inf)
+        for index in set(range(len(self.branches))) - set(route):
+            first = next(b for b in self.route(index) if b not in route)
+            at[index] = self.branches[first].centerline.abscissa[0]
+        return at
+
     def path(self, branch: int) -> Centerline:
         """Return the connected line from the ostium to the end of `branch`."""
         lines = [self.branches[i].centerline for i in self.route(branch)]

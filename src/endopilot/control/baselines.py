@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from endopilot.control.policy import Decision, Sight
+from endopilot.control.policy import DECISION_PERIOD_S, Decision, Sight
 from endopilot.env.task import Navigation
 
 ADVANCE_MM_S = 5.0
@@ -50,13 +50,8 @@ class RetractRotate:
 
     def start(self, navigation: Navigation, seed: int) -> None:
         """Take the route."""
-        tree = navigation.anatomy.tree
-        route = tree.route(navigation.target.branch)
         self._target = navigation.target.abscissa
-        self._fork = {}  # of every branch off the route: the abscissa where its way leaves the route
-        for branch in set(range(len(tree.branches))) - set(route):
-            last = max(set(tree.route(branch)) & set(route), key=route.index)
-            self._fork[branch] = float(tree.branches[last].centerline.abscissa[-1])
+        self._fork = navigation.anatomy.tree.departures(navigation.target.branch)
         self._back_to: float | None = None
         self._turn_to: float | None = None
         self._deepest: list[float] = []
@@ -77,18 +72,18 @@ class RetractRotate:
             self._back_to, self._turn_to = None, sight.rotation + np.pi
         left = (self._turn_to or 0.0) - sight.rotation
         if left > 0.05:
-            return Decision(0.0, min(SPIN_RAD_S, left / 0.5), expose=True)
+            return Decision(0.0, min(SPIN_RAD_S, left / DECISION_PERIOD_S), expose=True)
         self._turn_to, self._deepest = None, []
         return Decision(ADVANCE_MM_S, 0.0, expose=True)
 
     def _missed(self, branch: int, abscissa: float) -> float | None:
         """Return how far the tip is to be retracted, as an abscissa, or None where it is well on its way."""
-        if branch in self._fork:
-            return self._fork[branch] - _RETRACT_MM
+        if np.isfinite(self._fork[branch]):
+            return float(self._fork[branch]) - _RETRACT_MM
         if abscissa > self._target + _RETRACT_MM:
             return self._target - _RETRACT_MM
         self._deepest.append(abscissa)
-        before = round(_CAUGHT_S / 0.5)
+        before = round(_CAUGHT_S / DECISION_PERIOD_S)
         if len(self._deepest) > before and max(self._deepest) - max(self._deepest[:-before]) < _CAUGHT_MM:
             return abscissa - _RETRACT_MM
         return None

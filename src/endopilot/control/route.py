@@ -63,12 +63,7 @@ class Route:
     @cached_property
     def _leaves_at(self) -> Float[np.ndarray, "branches"]:
         """Abscissa at which the way to each branch of the tree leaves the route; infinite for those on it."""
-        tree, leaves = self.anatomy.tree, np.full(len(self.anatomy.tree.branches), np.inf)
-        for branch in range(len(leaves)):
-            strange = [b for b in tree.route(branch) if b not in self.branches]
-            if strange:
-                leaves[branch] = tree.branches[strange[0]].centerline.abscissa[0]
-        return leaves
+        return self.anatomy.tree.departures(self.target.branch)
 
     def astray(self, tip: TipProjection) -> Float[np.ndarray, "..."]:
         """Return how far tips are in branches that do not lie on the route, mm; 0 for those on it."""

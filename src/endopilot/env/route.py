@@ -76,13 +76,7 @@ def _tables(navigation: Navigation) -> tuple[np.ndarray, ...]:
     point = np.column_stack([np.interp(along, line.abscissa, axis) for axis in line.points.T])
     tangent, normal = tangents(point), parallel_transport(point)
     frame = np.stack([tangent, normal, np.cross(tangent, normal)], axis=1)
-    route = tree.route(navigation.target.branch)
-    leave = np.full(len(tree.branches), np.inf)
-    for branch in range(len(tree.branches)):
-        if branch not in route:
-            fork = max((b for b in tree.route(branch) if b in route), key=route.index)
-            leave[branch] = tree.branches[fork].centerline.abscissa[-1]
-    return point, frame, np.interp(along, line.abscissa, line.radius), leave
+    return point, frame, np.interp(along, line.abscissa, line.radius), tree.departures(navigation.target.branch)
 
 
 def _padded(rows: np.ndarray, count: int, value: float | None = None) -> np.ndarray:
