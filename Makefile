@@ -35,7 +35,7 @@ readme: $(INSTALLED)
 # What the rod core's arithmetic could cost on this processor, and what it does cost.
 roofline:
 	mkdir -p build
-	$(CXX) -std=gnu++20 -O3 -march=native -fno-math-errno -fno-trapping-math -fschedule-insns -fsched-pressure -Wno-psabi \
+	$(CXX) -std=gnu++20 -O3 -march=native -fno-math-errno -fno-trapping-math -fno-tree-pre -Wno-psabi \
 	  -I src/core benchmarks/roofline.cpp -o build/roofline
 	build/roofline
 

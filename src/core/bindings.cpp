@@ -329,7 +329,7 @@ private:
         std::stable_sort(order.begin(), order.end(), [&](int a, int b) { return depth[std::size_t(a)] > depth[std::size_t(b)]; });
         return Crew(std::move(order), std::move(length), kCrew * std::max(1, threads));
     }
-    static constexpr int kCrew = 16;  // worlds under way for each thread
+    static constexpr int kCrew = 64;  // worlds under way for each thread: enough to find four of like length
 };
 
 }  // namespace
