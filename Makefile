@@ -10,7 +10,7 @@ demo: $(INSTALLED)
 	$(BIN)/endopilot demo
 
 test: $(INSTALLED)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --dist loadfile
 
 check: $(INSTALLED)
 	$(BIN)/ruff check .
