@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from analytic_shapes import forked_tree, mask_of, tree_distance
@@ -9,10 +11,11 @@ from analytic_shapes import forked_tree, mask_of, tree_distance
 from endopilot.anatomy.analytic import tree_of
 from endopilot.anatomy.batch import extract_all
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
+from endopilot.anatomy.projection import project_tip
 from endopilot.errors import InputError
 from endopilot.files import read_json
 from endopilot.imaging.volume import write_mask
-from endopilot.types import LumenMask, Volume
+from endopilot.types import Insertion, LumenMask, Volume
 
 VOXEL_MM = (0.6, 0.6, 0.6)
 FORK_MM = np.array([0.0, 0.0, 20.0])
@@ -55,6 +58,26 @@ def test_an_ostium_in_mid_vessel_looks_away_from_the_inlet():
     anatomy = extract_anatomy(mask, name="mid", config=AnatomyConfig(ostium_mm=(0.0, 0.0, 5.0)))
     assert len(anatomy.tree.branches) == 1 and anatomy.insertion.direction[2] < -0.9
     assert abs(anatomy.tree.longest_path().abscissa[-1] - 35) < 3
+
+
+def crescent(points):
+    """A lumen whose section grows towards z = -20 into two lobes and a web between them, as in a dissection."""
+    aside = np.clip(5.0 - points[..., 2], 0.0, 40.0) / 25.0 * 9.0  # of the second lobe's axis, mm
+    x = points[..., 0] - np.clip(points[..., 0], 0.0, aside)
+    web = 0.8 - np.hypot(x, points[..., 1])
+    lobe = 2.2 - np.hypot(points[..., 0] - aside, points[..., 1])
+    return np.maximum(tube(points, 0.0, -40, 30, 2.0), np.where(points[..., 2] < 5.0, np.maximum(web, lobe), -1.0))
+
+
+def test_the_other_side_of_a_wide_inlet_is_no_branch_that_leads_back():
+    lumen = lambda p: np.minimum(crescent(p), p[..., 2] + 20.0)  # noqa: E731
+    mask = mask_of(lumen, (13, 4, 34), VOXEL_MM)
+    ostium = Insertion(np.array([0.0, 0.0, -20.0]), np.array([0.0, 0.0, 1.0]))
+    anatomy = extract_anatomy(replace(mask, ostium=ostium), name="crescent")
+    assert len(anatomy.tree.branches) == 1
+    up = np.stack([np.full(20, 4.0), np.zeros(20), np.linspace(-19, -2, 20)], axis=1)
+    tip = project_tip(anatomy.tree, anatomy.insertion, up)
+    assert np.abs(tip.abscissa - (up[:, 2] + 20)).max() < 1.5  # a wire in the web lies beside the line, not far ahead
 
 
 def test_a_vessel_of_one_voxel_is_told_so():

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
 from endopilot.anatomy.distance import sample
-from endopilot.anatomy.line_ends import before_cap, from_ostium, to_cut
+from endopilot.anatomy.line_ends import before_cap, from_ostium, to_cut, without_inlets
 from endopilot.anatomy.lumen_graph import LumenGraph
 from endopilot.anatomy.surface import Surface
 from endopilot.anatomy.tree import Line, cross_axes, resampled, smoothed, tangents
@@ -74,7 +74,7 @@ def refined_lines(
             place = _meeting_point(points, lines[parent])
             points, radius = _joined(surface, lines[parent], place, points, radius, step_mm)
         lines.append(Line(points, radius, parent, place))
-    return lines
+    return lines if ostium is None else without_inlets(distance_map, lines, ostium)
 
 
 def _to_axis(

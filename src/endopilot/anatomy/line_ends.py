@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float, Int
 
 from endopilot.anatomy.distance import sample
 from endopilot.anatomy.lumen_graph import LumenGraph
-from endopilot.anatomy.tree import cross_axes, smoothed
+from endopilot.anatomy.tree import Line, cross_axes, smoothed
 from endopilot.types import DistanceMap, Insertion
 
 _RING = 12
@@ -21,6 +23,9 @@ _ROUND = 0.9
 
 _AHEAD = 0.87
 """Cosine of the largest angle at which a line may leave a known ostium off the catheter's axis."""
+
+_SIGHT = np.linspace(0.0, 1.0, 50)
+"""Shares of a line of sight at which the lumen is looked at."""
 
 _LONGEST_BRIDGE = 4.0
 """A known ostium is joined to a line that begins at most this many radii away."""
@@ -124,7 +129,35 @@ def from_ostium(
     clearance = sample(distance_map, bridge)
     if clearance[1:].min() <= 0:
         return None
+    # Near the ostium the nearest wall is the cut's own cap, and no width of the vessel.
+    free = int(np.argmax(np.append(np.linalg.norm(bridge - ostium.position, axis=1) > clearance, True)))
+    clearance[:free] = np.append(clearance, radius[first])[free]
     return smoothed(np.concatenate([bridge, points[first:]]), 3.0), np.concatenate([clearance, radius[first:]])
+
+
+def without_inlets(distance_map: DistanceMap, lines: list[Line], ostium: Insertion) -> list[Line]:
+    """Leave out lines that lead back to the ostium's own cut: the other side of a wide inlet, and no branch.
+
+    Such a line ends in the plane of the ostium, and there the first line is seen from it straight through the lumen. In
+    the merged lumens of a dissection, a wire beside the first line would seem to lie far ahead, on its way back.
+
+    Args:
+        distance_map: the wall.
+        lines: of the whole tree, parents before their children.
+        ostium: where the vessel begins, with its direction.
+    """
+    first, kept = lines[0].points, [True] * len(lines)
+    for index in range(len(lines) - 1, 0, -1):
+        points, width = lines[index].points, float(lines[index].radius[-1])
+        leads_on = any(kept[i] and other.parent == index for i, other in enumerate(lines))
+        if leads_on or abs((points[-1] - ostium.position) @ ostium.direction) > width:
+            continue
+        inner = points[int(np.argmax(np.linalg.norm(points - points[-1], axis=1) <= width))]
+        beside = first[int(np.linalg.norm(first - inner, axis=1).argmin())]
+        kept[index] = bool(sample(distance_map, inner + _SIGHT[:, None] * (beside - inner)).min() <= 0)
+    number = np.cumsum(kept) - 1
+    whole = [line for line, stays in zip(lines, kept, strict=True) if stays]
+    return [replace(line, parent=int(number[line.parent]) if line.parent >= 0 else -1) for line in whole]
 
 
 def _section(

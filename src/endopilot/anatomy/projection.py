@@ -25,7 +25,7 @@ from endopilot.types import Insertion, TipProjection, VesselTree
 Found = tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"], Int[np.ndarray, "n"], Float[np.ndarray, "n"]]
 """Abscissa, offset, branch and radius."""
 
-_CHUNK = 32768
+_CHUNK = 8192
 """Points that are projected at once: their intermediate results stay in the processor's cache."""
 
 _TAPER = 1.25
@@ -83,23 +83,25 @@ class _Slabs:
     before, so that every vertex has a segment.
 
     Attributes:
-        vertices: positions of the vertices and their tangents over the length of the segment, (m, 6).
+        vertices: positions of the vertices and their tangents over the length of the segment, (6, m).
         segments: start, edge, tangent at the start, its change along the segment, edge·tangent, edge·change, abscissa
-            and its change, radius and its change: (m, 18).
+            and its change, radius and its change: (18, m).
         first, last: of every branch, its first and its last vertex.
         branch: of every vertex, its branch.
         rival: (m, branches), how far a point must lie from this, its nearest vertex, to lie deeper in another branch,
             mm.
+        soonest: the least of `rival`.
         entry: (m, branches), the branch's vertex that is nearest to this one.
         places: the vertices, to search.
     """
 
-    vertices: Float[np.ndarray, "m 6"]
-    segments: Float[np.ndarray, "m 18"]
+    vertices: Float[np.ndarray, "6 m"]
+    segments: Float[np.ndarray, "18 m"]
     first: Int[np.ndarray, "b"]
     last: Int[np.ndarray, "b"]
     branch: Int[np.ndarray, "m"]
     rival: Float[np.ndarray, "m b"]
+    soonest: Float[np.ndarray, "m"]
     entry: Int[np.ndarray, "m b"]
     places: KDTree
 
@@ -131,16 +133,18 @@ class _Slabs:
             ratio = _TAPER * line.radius[nearest] / radius
             wider = (ratio > 1.0) | (distance < 2.0 * spacing)  # the nearest line loses only to a wider one
             rival[wider & (owner != index), index] = ((distance - spacing) / (1.0 + ratio))[wider & (owner != index)]
-        vertices = np.column_stack([points, tangent / spacing[:, None]])
-        return cls(vertices, segments, first, last, owner, rival, entry, KDTree(points))
+        vertices = np.ascontiguousarray(np.column_stack([points, tangent / spacing[:, None]]).T)
+        segments = np.ascontiguousarray(segments.T)
+        return cls(vertices, segments, first, last, owner, rival, rival.min(axis=1), entry, KDTree(points))
 
     def project(self, points: Float[np.ndarray, "n 3"]) -> Found:
         """Project points onto the branches whose lumens they lie deepest in."""
         distance, nearest = (np.asarray(found) for found in self.places.query(points))
         branch = self.branch[nearest]
         abscissa, offset, radius = self._onto(points, nearest)
-        rivals = self.rival[nearest] < distance[:, None]
-        contested, rival = np.nonzero(rivals)
+        doubtful = np.flatnonzero(self.soonest[nearest] < distance)
+        row, rival = np.nonzero(self.rival[nearest[doubtful]] < distance[doubtful, None])
+        contested = doubtful[row]
         if len(contested):
             asked = points[contested]
             found = self._onto(asked, self._walked(asked, self.entry[nearest[contested], rival]))
@@ -157,13 +161,17 @@ class _Slabs:
         """Walk along a branch from a vertex to the one that is nearest to each point."""
         first, last = self.first[self.branch[vertex]], self.last[self.branch[vertex]]
         for _ in range(_WALK):
-            row = self.vertices[vertex]
-            step = np.rint(np.einsum("ij,ij->i", points - row[:, :3], row[:, 3:])).astype(np.int64)
+            step = np.rint(self._ahead(points.T, vertex)).astype(np.int64)
             moved = np.minimum(np.maximum(vertex + step, first), last)
             if (moved == vertex).all():
                 break
             vertex = moved
         return vertex
+
+    def _ahead(self, points: Float[np.ndarray, "3 n"], vertex: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+        """Return how far points lie before the planes of vertices, in segments."""
+        row = np.take(self.vertices, vertex, axis=1, mode="clip")
+        return _dot(points - row[:3], row[3:])
 
     def _onto(
         self, points: Float[np.ndarray, "n 3"], vertex: Int[np.ndarray, "n"]
@@ -173,18 +181,23 @@ class _Slabs:
         With q = p − a, edge e, tangent T at a and its change D, the share u solves (q − ue)·(T + uD) = 0:
         q·T − u(e·T − q·D) − u² e·D = 0, of whose roots the one that stays finite as D vanishes is wanted.
         """
-        row = self.vertices[vertex]
-        behind = np.einsum("ij,ij->i", points - row[:, :3], row[:, 3:]) < 0
-        row = self.segments[np.where(behind, np.maximum(vertex - 1, self.first[self.branch[vertex]]), vertex)]
-        relative = points - row[:, :3]
-        depth = np.einsum("ij,ij->i", relative, row[:, 6:9])
-        slope = row[:, 12] - np.einsum("ij,ij->i", relative, row[:, 9:12])
-        root = np.sqrt(np.maximum(slope * slope + 4.0 * row[:, 13] * depth, 0.0))
+        points = np.ascontiguousarray(points.T)  # an array a coordinate, so that the processor adds several at once
+        behind = self._ahead(points, vertex) < 0
+        segment = np.where(behind, np.maximum(vertex - 1, self.first[self.branch[vertex]]), vertex)
+        row = np.take(self.segments, segment, axis=1, mode="clip")
+        relative = points - row[:3]
+        depth = _dot(relative, row[6:9])
+        slope = row[12] - _dot(relative, row[9:12])
+        root = np.sqrt(np.maximum(slope * slope + 4.0 * row[13] * depth, 0.0))
         share = 2.0 * depth / np.maximum(slope + root, 1e-12)
         np.minimum(np.maximum(share, 0.0, out=share), 1.0, out=share)
-        relative -= share[:, None] * row[:, 3:6]
-        offset = np.sqrt(np.einsum("ij,ij->i", relative, relative))
-        return row[:, 14] + share * row[:, 15], offset, row[:, 16] + share * row[:, 17]
+        relative -= share * row[3:6]
+        offset = np.sqrt(_dot(relative, relative))
+        return row[14] + share * row[15], offset, row[16] + share * row[17]
+
+
+def _dot(one: Float[np.ndarray, "3 n"], other: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "n"]:
+    return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
 
 
 def _shared_tangents(tree: VesselTree, insertion: Insertion) -> list[Float[np.ndarray, "n 3"]]:

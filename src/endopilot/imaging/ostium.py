@@ -16,8 +16,18 @@ _BOX_MM = 18.0
 """Half the edge of the box around the artery's beginning that is looked at, mm."""
 _SECTIONS_MM = np.arange(1.0, 6.01, 0.5)
 """Heights above the aortic wall at which the artery's middle is measured, mm."""
+_FITTED = 8
+"""So many of the lowest sections carry the parabola that goes on to the wall."""
 _NEAR_MM = 4.5
 """Blood farther than this from the tracked path is not this artery's."""
+_MOUTH_MM = 3.0
+"""Nearer than this to the artery's axis, the opened aorta bulges into the mouth."""
+_WALL_MM = 3.0
+"""Width of the wall around the mouth that tells where the wall would be without the mouth, mm."""
+_FEWEST_OF_WALL = 100
+"""Fewer voxels of wall around the mouth tell nothing."""
+_DEEPEST_MM = 1.0
+"""A ball that opens the aorta bulges no deeper into a mouth: its cap of 3.5 mm radius is 0.9 mm high."""
 
 
 def find_ostium(
@@ -29,7 +39,8 @@ def find_ostium(
     """Return the ostium, and the path begun anew from there.
 
     The artery's middle is the centroid of its blood at several heights above the aortic wall; a parabola through the
-    lowest of them is carried on to height 0.
+    lowest of them is carried on to the wall. Where the artery leaves at a slant, the tracked path begins at its edge,
+    and the blood near the path is more of one side than of the other: a second round looks around the parabola.
 
     Args:
         path: LPS mm, the first point within a few mm of the aortic wall, or anywhere if no aorta is near.
@@ -46,19 +57,56 @@ def find_ostium(
     if not deep.any():
         return Insertion(path[0], _heading(path)), path
     height = distance_to_outside(~deep, spacing) - _BALL_MM
-    middles = _middles(path, blood[box], height, corner, grid)
-    if len(middles) < 3:
-        return Insertion(path[0], _heading(path)), path
-    heights = np.array(sorted(middles))[:6]
-    points = np.array([middles[h] for h in heights])
-    fit = np.polynomial.Polynomial.fit
-    curves = [fit(heights, points[:, axis], 2 if len(heights) >= 5 else 1) for axis in range(3)]
-    position = np.array([curve(0.0) for curve in curves])
-    slope = np.array([curve.deriv()(0.5) for curve in curves])
-    beginning = np.array([[curve(h) for curve in curves] for h in np.arange(0.0, heights[-1] + 0.01, 0.25)])
-    kept = np.linalg.norm(path - position, axis=1) > np.linalg.norm(beginning[-1] - position) + 1.0
-    first = int(np.argmax(kept)) if kept.any() else len(path) - 1
-    return Insertion(position, slope / np.linalg.norm(slope)), np.concatenate([beginning, path[first:]])
+    ostium = Insertion(path[0], _heading(path))
+    for _ in range(2):
+        middles = _middles(path, blood[box], height, corner, grid)
+        if len(middles) < 3:
+            break
+        heights = np.array(sorted(middles))[:_FITTED]
+        points = np.array([middles[h] for h in heights])
+        fit = np.polynomial.Polynomial.fit
+        curves = [fit(heights, points[:, axis], 2 if len(heights) >= 5 else 1) for axis in range(3)]
+        wall = _height_of_wall(np.array([curve(0.0) for curve in curves]), height, corner, grid)
+        position = np.array([curve(wall) for curve in curves])
+        slope = np.array([curve.deriv()(0.5) for curve in curves])
+        beginning = np.array([[curve(h) for curve in curves] for h in np.arange(wall, heights[-1] + 0.01, 0.25)])
+        kept = np.linalg.norm(path - position, axis=1) > np.linalg.norm(beginning[-1] - position) + 1.0
+        first = int(np.argmax(kept)) if kept.any() else len(path) - 1
+        path = np.concatenate([beginning, path[first:]])
+        ostium = Insertion(position, slope / np.linalg.norm(slope))
+    return ostium, path
+
+
+def _height_of_wall(
+    mouth: Float[np.ndarray, "3"], height: Float[np.ndarray, "nz ny nx"], corner: np.ndarray, grid: Volume
+) -> float:
+    """Return where the aortic wall goes on under the artery's mouth, mm of height: below 0, as the ball bulges in.
+
+    A quadric through the wall around the mouth tells it; what lies off it, such as another vessel's mouth, is left out.
+    """
+    spacing = float(grid.spacing_mm[0])
+    near = np.argwhere(np.abs(height) < 0.8 * spacing)
+    offset = grid.index_to_world((near + corner)[:, ::-1].astype(float)) - mouth
+    close = np.linalg.norm(offset, axis=1) < _MOUTH_MM + _WALL_MM
+    offset, level = offset[close], height[tuple(near[close].T)]
+    if len(offset) == 0:
+        return 0.0
+    slope = [values[tuple((near[close]).T)] for values in np.gradient(height)]
+    outward = np.array([values.mean() for values in slope])[::-1]
+    outward = grid.direction @ outward / max(float(np.linalg.norm(outward)), 1e-9)
+    above = offset @ outward
+    u, v = (offset @ axis for axis in np.linalg.svd(outward[None])[2][1:])
+    around = np.hypot(u, v) > _MOUTH_MM
+    if around.sum() < _FEWEST_OF_WALL:
+        return 0.0
+    terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)[around]
+    place = (above - level)[around]
+    kept = np.ones(len(place), dtype=bool)
+    for _ in range(3):
+        found, *_ = np.linalg.lstsq(terms[kept], place[kept], rcond=None)
+        miss = np.abs(place - terms @ found)
+        kept = miss <= max(2.5 * float(np.median(miss)), 0.2)
+    return float(np.clip(found[0], -_DEEPEST_MM, 0.0))
 
 
 def _middles(
