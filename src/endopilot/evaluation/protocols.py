@@ -58,10 +58,9 @@ def run_protocols(predictor: Predictor, data: Dataset, train: Dataset, advance: 
     }
     tips = {name: _series(tip, [a.tree for a in anatomies], anatomy_of, data.branch) for name, tip in foretold.items()}
     replayed = {"P4": "P3", "P2_replayed": "P2", "hold_control": "hold_control", "follow_slack": "follow_slack"}
-    recorded = data.control[:, WINDOW:].astype(float)
     reach_mm = np.array([a.tree.longest_path().abscissa[-1] for a in anatomies])[anatomy_of]
     simulated = {name: _drivable(data, controls[source], device, reach_mm) for name, source in replayed.items()}
-    simulated["true_replay"] = recorded
+    simulated["true_replay"] = data.asked[:, WINDOW:]
     replays = _replay(data, anatomies, anatomy_of, device, simulated, advance)
     return SplitResult(
         sample_period_s=data.sample_period_s,
@@ -70,7 +69,7 @@ def run_protocols(predictor: Predictor, data: Dataset, train: Dataset, advance: 
         sequence=data.sequence,
         wire_radius_mm=device.tip_radius_mm,
         true=TipSeries(*(_after_given(values) for values in (data.tip_abscissa, data.tip_offset, data.lumen_radius))),
-        true_control=recorded,
+        true_control=data.control[:, WINDOW:].astype(float),
         tips=tips | {name: replay.tip for name, replay in replays.items()},
         controls=controls,
         base_force={"true": _after_given(data.base_force)} | {name: r.base_force for name, r in replays.items()},
@@ -113,7 +112,7 @@ def _replay(
     controls: Mapping[str, Control],
     advance: Advance,
 ) -> dict[str, _Replay]:
-    """Simulate every episode again with the recorded controls while states are given, and with each series after.
+    """Simulate every episode again as the drive was asked while states are given, and with each series after.
 
     Where a simulation fails, or a series holds no finite control, the result is NaN from there on.
     """
@@ -156,8 +155,8 @@ _REPLAYED = ("abscissa", "offset", "radius", "base_force", "base_torque", "dista
 
 
 def _whole(data: Dataset, control: Control) -> Float[np.ndarray, "episodes all_samples 2"]:
-    """Return the recorded controls while states are given, followed by `control`."""
-    return np.concatenate([data.control[:, :WINDOW].astype(float), control], axis=1)
+    """Return what was asked of the drive while states are given, followed by `control`."""
+    return np.concatenate([data.asked[:, :WINDOW], control], axis=1)
 
 
 def _series(

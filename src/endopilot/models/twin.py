@@ -141,7 +141,7 @@ class TwinPredictor:
                 [wires[stiffness] for stiffness in ours[:, 1]],
                 friction=self.device.friction * ours[:, 0],
                 start=np.column_stack([data.initial_inserted_length + ours[:, 2], data.initial_rotation]),
-                given=_control(data)[:, :WINDOW],
+                given=data.asked[:, :WINDOW],
                 desired=desired[chosen],
                 config=self.simulator,
             )
@@ -173,7 +173,7 @@ class TwinPredictor:
         paths = np.full((*members.shape[:2], samples, 2), np.nan)
         for stiffness in np.unique(members[..., 1]):
             member, episode = np.nonzero(members[..., 1] == stiffness)
-            control = _control(data)[episode, :samples]
+            control = data.asked[episode, :samples]
             least = -(SAMPLE_PERIOD_S * np.cumsum(control[..., 0], axis=1)).min(axis=1).clip(max=0.0)
             start = np.maximum(data.initial_inserted_length[episode] + members[member, episode, 2], least)
             with warnings.catch_warnings():
