@@ -56,7 +56,7 @@ class Dataset:
         base_torque: torque of the drive, N·mm.
         drive_force: axial force of the drive with what the introducer's valve takes, N.
         drive_torque: torque of the drive, likewise, N·mm.
-        slip: advance that was asked of the drive and not made over the period, mm; not 0 only where the wire was caught.
+        slip: advance that was asked of the drive and not made over the period, mm; nearly always 0.
         valid: false from the sample in which the simulation of that episode failed.
     """
 
