@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
-.PHONY: demo test check cta readme docs roofline clean
+.PHONY: demo test check cta readme docs roofline recipe-laptop recipe-gpu clean
 
 demo: $(INSTALLED)
 	$(BIN)/endopilot demo
@@ -31,6 +31,34 @@ cta: $(INSTALLED)
 
 readme: $(INSTALLED)
 	$(BIN)/python docs/readme.py
+
+# docs/learning.md's figures: two cores and an evening. What is there already is not made again.
+LEARNING := runs/causal
+recipe-laptop: $(INSTALLED)
+	$(BIN)/endopilot atlas --count 160 --seed 51 -o $(LEARNING)/patients
+	$(BIN)/endopilot dataset $(LEARNING)/patients/* -o $(LEARNING)/dataset --sequences 12 --seed 51 \
+	  --anatomy-shares 0.725 0.125 0.15 --seen-test-share 0.1
+	for seed in 0 1 2; do \
+	  $(BIN)/endopilot train $(LEARNING)/dataset -o $(LEARNING)/seed-$$seed --model causal --epochs 10 \
+	    --learning-rate 0.002 --seed $$seed || exit; \
+	done
+	$(BIN)/endopilot train $(LEARNING)/dataset -o $(LEARNING)/paper --batch-size 64
+	$(BIN)/endopilot evaluate $(LEARNING)/seed-0 -o $(LEARNING)/evaluation --sequences 48 \
+	  --other-seeds $(LEARNING)/seed-1 $(LEARNING)/seed-2
+	$(BIN)/endopilot evaluate $(LEARNING)/paper -o $(LEARNING)/evaluation-paper --sequences 48
+
+# The paper's full set and both models on one large GPU with some processor cores beside it; never run so far.
+FULL := runs/full
+recipe-gpu: $(INSTALLED)
+	$(BIN)/endopilot atlas --count 100 --seed 52 -o $(FULL)/patients
+	$(BIN)/endopilot dataset $(FULL)/patients/* -o $(FULL)/dataset --sequences 1000 --seed 52
+	$(BIN)/torchrun --nproc-per-node gpu -m endopilot.cli train $(FULL)/dataset -o $(FULL)/paper \
+	  --precision bfloat16 --batch-size 4096
+	$(BIN)/torchrun --nproc-per-node gpu -m endopilot.cli train $(FULL)/dataset -o $(FULL)/causal --model causal \
+	  --precision bfloat16 --batch-size 512 --epochs 10 --learning-rate 0.002
+	for model in paper causal; do \
+	  $(BIN)/endopilot evaluate $(FULL)/$$model -o $(FULL)/evaluation-$$model --sequences 96 || exit; \
+	done
 
 # What the rod core's arithmetic could cost on this processor, and what it does cost.
 roofline:

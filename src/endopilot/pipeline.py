@@ -28,7 +28,7 @@ from endopilot.evaluation.anatomy_score import score_anatomy
 from endopilot.files import input_hash, json_text, manifest, read_json, write_json
 from endopilot.imaging.segment import SegmentConfig, segment
 from endopilot.imaging.volume import read_mask, read_volume, write_mask, write_volume
-from endopilot.models.config import TrainConfig
+from endopilot.models.config import PRETRAINED, TrainConfig, run_path
 from endopilot.parallel import each
 from endopilot.progress import progress
 from endopilot.simulation.device import Device, read_device
@@ -39,6 +39,7 @@ VOLUME_SUFFIX = ".nii.gz"
 REPORT_FILE = "report.html"
 EVALUATED = 48
 """Navigations of each split that are evaluated; each is simulated five times."""
+_PRETRAINED_DEVICE = "workhorse-014"
 DEMO_ORIGIN = (
     "The patients are synthetic: right coronary arteries drawn from published statistics, and a CT angiogram of each, "
     "made with noise, blur, calcium, chambers and veins. Everything after the CT is made from it alone."
@@ -57,21 +58,30 @@ class StudyConfig:
     seconds: float = 60.0
     """Length of a navigation, s."""
     training_seconds: float = 100.0
-    """Training time of each of the two networks, s."""
+    """Training time of each of the paper's two networks, s."""
     seed: int = 1
     """Seed of everything random."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DemoConfig(StudyConfig):
-    """The demo: synthetic right-coronary patients, a third of them never trained on."""
+    """The demo: synthetic right-coronary patients that the networks which are evaluated have never seen."""
 
     patients: int = 6
     """Number of patients, at least 3."""
+    training_seconds: float = 0.0
+    """Training time of each of the paper's two networks, s; 0 takes the trained networks that come with the package."""
 
     def __post_init__(self) -> None:
         if self.patients < 3:
             raise InputError(f"--patients {self.patients}: at least 3 are needed, so that one can be kept unseen")
+        if not self.training_seconds >= 0:
+            raise InputError(f"--training-seconds {self.training_seconds}: give 0 or more")
+        if self.training_seconds == 0 and self.device != _PRETRAINED_DEVICE:
+            raise InputError(
+                f"--device {self.device}: the networks of the package know {_PRETRAINED_DEVICE} alone; "
+                "train others, for example with --training-seconds 100"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,6 +90,10 @@ class RunConfig(StudyConfig):
 
     segmentation: SegmentConfig = field(default_factory=SegmentConfig)
     """How to segment."""
+
+    def __post_init__(self) -> None:
+        if not self.training_seconds > 0:
+            raise InputError(f"--training-seconds {self.training_seconds}: give a positive number")
 
 
 class Ledger:
@@ -231,23 +245,36 @@ def _study(
 
 
 def _learn(output: Path, anatomies: Sequence[Path], config: StudyConfig, ledger: Ledger) -> None:
-    """Simulate navigations, train both networks on them and evaluate these."""
+    """Simulate navigations, train both networks on them unless the packaged ones are to do, and evaluate these."""
     from endopilot.evaluation.evaluate import EvaluateConfig, evaluate
     from endopilot.models.train import train  # torch takes seconds to import
 
-    unseen = len(anatomies) // 3
+    trains = config.training_seconds > 0
+    unseen = len(anatomies) // 3 if trains else len(anatomies) - len(anatomies) // 3  # the others give baselines' means
     shares = (1 - unseen / len(anatomies), 0.0, unseen / len(anatomies)) if unseen else None
-    dataset = DatasetConfig(sequences=config.sequences, seconds=config.seconds, seed=config.seed, anatomy_shares=shares)
-    training = TrainConfig(model="paper", max_seconds=config.training_seconds, seed=config.seed)
+    dataset = DatasetConfig(
+        sequences=config.sequences,
+        seconds=config.seconds,
+        seed=config.seed,
+        anatomy_shares=shares,
+        seen_test_share=DatasetConfig.seen_test_share if trains else 0.0,  # the packaged networks know none of them
+    )
     device = read_device(config.device)
     ledger.stage("dataset", lambda: generate_dataset(anatomies, output / "dataset", device, dataset))
-    ledger.stage("training", lambda: train(output / "dataset", output / "training", training))
+    if trains:
+        training = TrainConfig(model="paper", max_seconds=config.training_seconds, seed=config.seed)
+        ledger.stage("training", lambda: train(output / "dataset", output / "training", training))
 
     def measure() -> None:
         settings = EvaluateConfig(sequences=EVALUATED, seed=config.seed)
-        evaluate(output / "training", output / "evaluation", settings)
+        evaluate(_run(output, config.training_seconds), output / "evaluation", settings, output / "dataset")
 
     ledger.stage("evaluation", measure)
+
+
+def _run(output: Path, training_seconds: float) -> Path:
+    """Return the run whose networks are evaluated."""
+    return output / "training" if training_seconds > 0 else run_path(Path(PRETRAINED))
 
 
 def _report(output: Path, names: Sequence[str], origin: str, command: str, ledger: Ledger) -> None:
@@ -272,7 +299,7 @@ def _report(output: Path, names: Sequence[str], origin: str, command: str, ledge
         command=command,
         patients=patients,
         evaluation=output / "evaluation",
-        run=output / "training",
+        run=_run(output, ledger.config["training_seconds"]),
         replay=replay,
         replay_anatomy=anatomy,
         stage_seconds=ledger.seconds,

@@ -51,6 +51,26 @@ def test_an_episode_simulated_from_the_disk_repeats_to_the_bit(tmp_path, patient
         np.testing.assert_array_equal(again.drive_force.astype(np.float32), one.drive_force)
 
 
+def test_where_the_drive_slipped_what_was_asked_of_it_retraces_the_navigation(tmp_path, patient):
+    config = DatasetConfig(sequences=6, seconds=30.0, seed=5, friction=(0.2, 0.3))
+    generate_dataset([patient], tmp_path / "dataset", DEVICE, config)
+    data = load_dataset(tmp_path / "dataset")
+    caught = (data.slip != 0).any(axis=1)
+    assert caught.any() and (data.slip >= 0).all()
+    initial = np.stack([data.initial_inserted_length, data.initial_rotation], axis=-1)
+
+    def retraced(control):
+        return simulate(
+            read_anatomy(patient), DEVICE, control, initial=initial, config=config.simulator, friction=data.friction
+        )
+
+    again = retraced(data.asked)
+    np.testing.assert_array_equal(again.tip.abscissa.astype(np.float32), data.tip_abscissa)
+    np.testing.assert_array_equal(again.slip, data.slip)
+    # what was made of it, driven evenly, does not
+    assert np.abs(retraced(data.control.astype(float)).tip.abscissa - data.tip_abscissa)[caught].max() > 0.01
+
+
 def test_wires_stay_inside_what_was_imaged_and_repeat_without_looking(patient):
     anatomy, config = read_anatomy(patient), DatasetConfig().simulator
     leaves = anatomy.tree.leaves()

@@ -10,8 +10,8 @@ import time
 
 from endopilot.files import read_json
 
-SIZE = ("--patients", "3", "--sequences", "6", "--seconds", "25", "--training-seconds", "4")
-STAGES = ["atlas", "phantom", "segmentation", "anatomy", "dataset", "training", "evaluation", "report"]
+SIZE = ("--patients", "3", "--sequences", "6", "--seconds", "25")
+STAGES = ["atlas", "phantom", "segmentation", "anatomy", "dataset", "evaluation", "report"]
 
 
 def test_killed_and_started_again_it_ends_with_a_report(tmp_path):
@@ -39,7 +39,9 @@ def test_killed_and_started_again_it_ends_with_a_report(tmp_path):
     assert abs(manifest["wall_seconds"] - sum(manifest["stages"].values())) < 1e-6
     metrics = read_json(folder / "metrics.json")
     unseen = metrics["splits"]["test"]
-    assert len(unseen["anatomies"]) == 1 and unseen["episodes"] == 6
+    assert list(metrics["splits"]) == ["test"]
+    assert len(unseen["anatomies"]) == 2 and unseen["episodes"] == 12
+    assert unseen["tip"]["P1"]["abscissa"]["all"]["skill"]["hold_slack"] > 0.4  # the packaged networks
     for series in ("P1", "P3", "P4", "hold_slack", "training_mean"):
         assert unseen["tip"][series]["abscissa"]["all"]["count"] > 0
     assert min(score["dice"] for score in metrics["anatomy_scores"].values()) > 0.85
@@ -51,6 +53,18 @@ def test_killed_and_started_again_it_ends_with_a_report(tmp_path):
     assert third.returncode == 0, third.stderr
     assert json.loads(third.stdout) == json.loads(again.stdout)
     assert (folder / "report.html").stat().st_mtime_ns == finished
+
+
+def test_settings_that_the_packaged_networks_do_not_fit_are_refused(tmp_path):
+    for arguments, message in (
+        (("demo", "--device", "j-035"), "--device j-035: the networks of the package know workhorse-014 alone"),
+        (("demo", "--training-seconds", "-1"), "--training-seconds -1.0: give 0 or more"),
+        (("run", "ct.nii.gz", "--training-seconds", "0"), "--training-seconds 0.0: give a positive number"),
+    ):
+        command = [sys.executable, "-m", "endopilot.cli", *arguments, "-o", str(tmp_path / "out")]
+        result = subprocess.run(command, capture_output=True, text=True)
+        assert result.returncode == 2 and message in result.stderr
+    assert not (tmp_path / "out").exists()
 
 
 def test_another_size_in_the_same_folder_is_refused(tmp_path):

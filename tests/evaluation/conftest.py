@@ -107,6 +107,7 @@ def make_result(anatomies: tuple[str, ...] = ("a", "b"), episodes: int = 6, seed
         },
         base_force={name: random.normal(0, 0.1, size) for name in ("true", *simulated)},
         base_torque={name: random.normal(0, 0.1, size) for name in ("true", *simulated)},
+        events={name: random.random(size) < share for name, share in (("stick", 0.1), ("slip", 0.05), ("whip", 0.0))},
         tip_distance={name: np.abs(random.normal(0, scales[name], size)) for name in simulated},
     )
 

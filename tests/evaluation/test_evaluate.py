@@ -44,7 +44,8 @@ def evaluated(toy_dataset, tmp_path_factory):
     torch.set_num_threads(1)  # small batches gain nothing from two, and lose much where cores are shared
     make_untrained_run(toy_dataset, folder / "run")
     with patch("endopilot.evaluation.protocols.simulate", toy_simulate):
-        metrics = evaluate(folder / "run", folder / "evaluation", EvaluateConfig(sequences=8))
+        settings = EvaluateConfig(sequences=8)
+        metrics = evaluate(folder / "run", folder / "evaluation", settings, other_seeds=[folder / "run"])
     torch.set_num_threads(threads)
     return folder, metrics
 
@@ -96,6 +97,27 @@ def test_recorded_controls_lead_back_to_the_recorded_tips(evaluated):
     result = read_results(evaluated[0] / "evaluation" / "evaluation.npz")["seen_test"]
     assert np.abs(result.error("true_replay", "abscissa")).max() < 1e-3
     assert result.tip_distance["true_replay"].max() < 1e-3
+
+
+def test_the_core_is_replayed_with_other_friction(toy_dataset, evaluated):
+    asked = {}
+
+    def watched(anatomy, device, control, *, initial, config, friction):
+        asked[anatomy.name] = friction
+        return toy_simulate(anatomy, device, control, initial=initial, config=config, friction=friction)
+
+    with patch("endopilot.evaluation.protocols.simulate", watched):
+        metrics = evaluate(evaluated[0] / "run", evaluated[0] / "again", EvaluateConfig(sequences=2))
+    true = load_dataset(toy_dataset).friction[0]
+    for friction in asked.values():
+        assert set(np.round(friction / true, 6).tolist()) == {0.9, 1.0, 1.1}
+    assert {"friction_90", "friction_110"} <= metrics["splits"]["test"]["tip"].keys()
+
+
+def test_another_seed_stands_beside_the_run(evaluated):
+    told = evaluated[1]["splits"]["test"]
+    assert told["seeds"]["P1"]["abscissa"]["0-10"]["mae"] == [told["tip"]["P1"]["abscissa"]["0-10"]["mae"]] * 2
+    assert told["seeds"]["P1"]["abscissa"]["0-10"]["sd"] == 0.0
 
 
 def test_replayed_controls_are_simulated_from_the_start_of_the_episode(evaluated, toy_dataset):

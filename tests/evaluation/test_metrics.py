@@ -113,6 +113,34 @@ def test_tip_statistics_normalises_by_the_radius_of_each_sample():
     assert found["all"]["mae_over_radius"] == pytest.approx(0.625)
 
 
+def test_a_tip_that_sticks_slips_or_whips_is_told_from_one_that_goes_along():
+    # goes along; stays behind; springs ahead; all rest; the drive turns and the tip with it; the tip swings alone
+    inserted = np.array([[0.0, 1.0, 2.0, 3.0, 3.0, 3.0, 3.0]])
+    abscissa = np.array([[0.0, 1.0, 1.05, 3.2, 3.2, 3.2, 3.2]])
+    rotation = np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0]])
+    angle = np.array([[0.0, 0.1, 0.1, 0.3, 0.3, 1.3, 2.0]])
+    direction = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=-1)
+    found = metrics.tip_events(inserted, rotation, abscissa, direction)
+    assert {name: np.flatnonzero(where[0]).tolist() for name, where in found.items()} == {
+        "stick": [1],
+        "slip": [2],
+        "whip": [5],
+    }
+    back = metrics.tip_events(np.array([[5.0, 4.0]]), np.zeros((1, 2)), np.array([[4.0, 5.2]]), direction[:, :2])
+    assert back["slip"].all()  # the other way
+
+
+def test_errors_by_depth_hold_each_sample_once():
+    error, depth = np.array([[1.0, -2.0, 3.0, NAN]]), np.array([[5.0, 30.0, 200.0, 10.0]])
+    found = metrics.by_depth(error, depth)
+    assert {name: (part["mae"], part["count"]) for name, part in found.items()} == {
+        "0-30": (1.0, 1),
+        "30-60": (2.0, 1),
+        "60-90": (None, 0),
+        "90-inf": (3.0, 1),
+    }
+
+
 def test_worst_anatomy():
     found = metrics.worst_anatomy(np.array([[1.0], [-5.0], [2.0]]), np.array([0, 1, 0]), ("good", "bad"))
     assert found == {"name": "bad", "mae": 5.0}

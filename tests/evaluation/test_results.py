@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import pytest
 from endopilot.errors import InputError
 from endopilot.evaluation import tables
 from endopilot.evaluation.results import read_results, write_results
-from endopilot.evaluation.summary import findings, summarize
+from endopilot.evaluation.summary import findings, over_seeds, summarize
 
 
 def test_results_read_back_as_written(results, tmp_path):
@@ -31,6 +32,19 @@ def test_damaged_results_are_told_in_one_line(tmp_path):
 
 def test_summary_is_plain_json_without_nan(results):
     json.dumps(summarize(results["test"], seed=0), allow_nan=False)
+
+
+def test_several_seeds_are_told_with_their_mean_and_spread(results):
+    result = results["test"]
+    tips = [replace(result.true, abscissa=result.true.abscissa + off) for off in (0.1, -0.2, 0.6)]
+    found = over_seeds(result, tips)["abscissa"]["10-30"]
+    np.testing.assert_allclose(found["mae"], [0.1, 0.2, 0.6])
+    assert (found["mean"], found["sd"]) == (pytest.approx(0.3), pytest.approx(np.sqrt(0.07)))
+
+
+def test_shares_of_events_are_told(results):
+    shares = summarize(results["test"], seed=0)["event_shares"]
+    assert shares["stick"] == results["test"].events["stick"].mean() > shares["whip"] == 0.0
 
 
 def test_lost_samples_make_a_sequence_diverged(results):

@@ -12,6 +12,7 @@ from endopilot.anatomy.io import write_anatomy
 from endopilot.dataset.generate import DatasetConfig, generate_dataset
 from endopilot.dataset.loader import load_dataset
 from endopilot.errors import InputError
+from endopilot.models import twin as twin_module
 from endopilot.models.config import TrainConfig, TwinConfig
 from endopilot.models.rollout import load_run
 from endopilot.models.train import train
@@ -78,6 +79,32 @@ def test_it_finds_controls_that_lead_the_tip_along(folder, episodes) -> None:
     assert (np.abs(found.control) <= [twin.device.max_velocity_mm_s, twin.device.max_rotation_rad_s]).all()
     # and not those that were recorded
     assert np.abs(found.control - episodes.control[:, later]).mean() > 0.1
+
+
+def test_all_protocols_share_one_ensemble_and_one_search(folder, episodes, monkeypatch) -> None:
+    calls = {"simulate": 0, "track": 0}
+
+    def counted(name):
+        real = getattr(twin_module, name)
+
+        def called(*args, **kwargs):
+            calls[name] += 1
+            return real(*args, **kwargs)
+
+        return called
+
+    for name in calls:
+        monkeypatch.setattr(twin_module, name, counted(name))
+    few = episodes.select(np.array([0]))
+    twin = load_run(folder / "run")
+    forward = twin.rollout_forward(few)
+    simulated = calls["simulate"]
+    inverse, dual = twin.rollout_inverse(few), twin.rollout_dual(few)
+    assert simulated > 0 and calls == {"simulate": simulated, "track": 1}
+    np.testing.assert_array_equal(inverse.control, dual.control)
+    # other episodes are not taken for these
+    other = twin.rollout_forward(episodes.select(np.array([1])))
+    assert np.abs(other.tip - forward.tip).max() > 0.1
 
 
 def test_refuses_bad_settings() -> None:

@@ -31,7 +31,7 @@ COMMANDS = {
     "drive": "a simulated drive behind TCP, with a watchdog",
     "ladder": "a policy on twelve tasks in unseen patients -> scores and a page",
     "verify": "the rod core against closed forms",
-    "bench": "figures beside their bars: speed, environments, robustness, anatomy, imaging, labels, dataset",
+    "bench": "figures beside their bars: speed, environments, robustness, anatomy, imaging, labels, dataset, training",
     "devices": "the guidewires that endopilot knows",
     "sample": "fetch a real CT angiogram to try",
     "info": "versions and machine",

@@ -79,6 +79,20 @@ def dataset(*, output: OutputFolder = Path("runs/bench-dataset"), share: float =
     show(bench_dataset(output, share=share), as_json=json)
 
 
+def training(*, folder: Path = Path("runs/bench-training"), json: bool = False) -> None:
+    """Measure the speed of training on one core beside a plain PyTorch loop over the same model and data.
+
+    Args:
+        folder: takes the patient and the navigations to train on.
+        json: print the figures as JSON.
+    """
+    from endopilot.models.bench import bench_training
+
+    rows = bench_training(folder)
+    show_rows(rows, as_json=json)
+    _leave(all(row["passed"] for row in rows))
+
+
 def labels(*, count: int = 40, seed: int = 0, json: bool = False) -> None:
     """Name the sections of synthetic patients of every kind, and compare with the truth.
 
@@ -130,7 +144,7 @@ def imaging(*, cases: int = 50, seed: int = 0, folder: Path = Path("runs/imaging
 
 SUBJECTS: dict[str, Callable[..., None]] = {
     function.__name__: function
-    for function in (simulation, scaling, robustness, env, dataset, labels, anatomy, imaging)
+    for function in (simulation, scaling, robustness, env, dataset, training, labels, anatomy, imaging)
 }
 """The subjects that can be measured."""
 

@@ -16,6 +16,7 @@ def command(
     *,
     output: OutputFolder,
     dataset: Path | None = None,
+    other_seeds: tuple[Path, ...] = (),
     json: bool = False,
     config: EvaluateConfig = EvaluateConfig(),
 ) -> None:
@@ -25,7 +26,9 @@ def command(
         run: folder made by `endopilot train`, or `pretrained`, the causal model that comes with endopilot.
         output: folder of metrics.json, figures and tables.
         dataset: dataset to evaluate on; the one that the run was trained on if not given.
+        other_seeds: runs of the same training with other seeds; their errors in P1 stand beside the run's, with mean
+            and standard deviation.
         json: print the figures as JSON.
         config: what to evaluate.
     """
-    show(evaluate(run, output, config, existing(dataset) if dataset else None), as_json=json)
+    show(evaluate(run, output, config, existing(dataset) if dataset else None, other_seeds), as_json=json)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from tyro.conf import Positional
@@ -32,4 +33,6 @@ def command(
     from endopilot.models.train import train  # torch takes seconds to import; --help must not wait for it
 
     train(existing(dataset), output, config)
+    if os.environ.get("RANK", "0") != "0":  # torchrun runs several; one tells
+        return
     show({"run": str(output), "training": read_json(output / "training.json")}, as_json=json)

@@ -157,6 +157,7 @@ class _Rest:
             tip_direction=np.zeros((count, samples, 3)),
             branch=np.zeros((count, samples), dtype=np.int64),
             lumen_radius=zeros,
+            slip=zeros,
             valid=np.ones((count, samples), dtype=bool),
             **dict.fromkeys(names, zeros),
         )

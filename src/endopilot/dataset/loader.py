@@ -56,6 +56,7 @@ class Dataset:
         base_torque: torque of the drive, N·mm.
         drive_force: axial force of the drive with what the introducer's valve takes, N.
         drive_torque: torque of the drive, likewise, N·mm.
+        slip: advance that was asked of the drive and not made over the period, mm; nearly always 0.
         valid: false from the sample in which the simulation of that episode failed.
     """
 
@@ -86,11 +87,23 @@ class Dataset:
     base_torque: Float[np.ndarray, "episodes samples"]
     drive_force: Float[np.ndarray, "episodes samples"]
     drive_torque: Float[np.ndarray, "episodes samples"]
+    slip: Float[np.ndarray, "episodes samples"]
     valid: Bool[np.ndarray, "episodes samples"]
 
     def __len__(self) -> int:
         """Return the number of episodes."""
         return len(self.anatomy)
+
+    @property
+    def asked(self) -> Float[np.ndarray, "episodes samples 2"]:
+        """Control that was asked of the drive (mm/s, rad/s): `control`, and what the drive slipped by.
+
+        Simulated again it gives the same navigation to the bit, which `control` does not: a drive that pushes at one
+        speed until it slips strains the wire otherwise than one that is slower from the start.
+        """
+        asked = self.control.astype(float)
+        asked[..., 0] += self.slip / self.sample_period_s
+        return asked.astype(self.control.dtype).astype(float)
 
     def select(self, episodes: Shaped[np.ndarray, "chosen"]) -> Dataset:
         """Return the chosen episodes, given as a mask or as indices."""
@@ -211,5 +224,6 @@ def load_dataset(folder: Path) -> Dataset:
         base_torque=signal["base_torque_nmm"],
         drive_force=signal["drive_force_n"],
         drive_torque=signal["drive_torque_nmm"],
+        slip=signal["slip_mm"],
         valid=signal["valid"],
     )

@@ -21,7 +21,7 @@ from endopilot.simulation.device import Device
 from endopilot.simulation.simulator import Actuation, SimulatorConfig
 from endopilot.types import SAMPLE_PERIOD_S
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 """Counts changes of the columns or of their meaning."""
 
 

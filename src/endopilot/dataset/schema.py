@@ -51,6 +51,7 @@ _SIGNALS: dict[str, tuple[str, list[str] | None]] = {
     "base_torque_nmm": ("float32", None),
     "drive_force_n": ("float32", None),
     "drive_torque_nmm": ("float32", None),
+    "slip_mm": ("float64", None),  # with all its digits, so that `Dataset.asked` is exact; nearly all are 0
     "valid": ("bool", None),
 }
 MANOEUVRES = ("insertion", "retraction", "spin", "pause")
@@ -130,6 +131,7 @@ def sample_table(rollout: Rollout, applied: np.ndarray, actuation: Actuation, fi
         "base_torque_nmm": rollout.base_torque,
         "drive_force_n": rollout.drive_force,
         "drive_torque_nmm": rollout.drive_torque,
+        "slip_mm": rollout.slip,
         "valid": rollout.valid,
     }
     kinds = dict.fromkeys(INDEX_COLUMNS, ("int64", None)) | {"timestamp": ("float32", None)} | signals(actuation)

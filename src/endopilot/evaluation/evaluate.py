@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,8 +13,8 @@ import numpy as np
 from endopilot.dataset.loader import Dataset, load_dataset
 from endopilot.errors import InputError
 from endopilot.evaluation.metrics import PAPER_ERRORS
-from endopilot.evaluation.results import SPLIT_TITLES, SplitResult, write_results
-from endopilot.evaluation.summary import findings, summarize
+from endopilot.evaluation.results import SPLIT_TITLES, SplitResult, told, write_results
+from endopilot.evaluation.summary import findings, over_seeds, summarize
 from endopilot.files import manifest, read_json, sha256, write_json, writing
 from endopilot.models.config import run_path
 from endopilot.progress import progress
@@ -44,7 +44,11 @@ class EvaluateConfig:
 
 
 def evaluate(
-    run_folder: Path, output: Path, config: EvaluateConfig, dataset_folder: Path | None = None
+    run_folder: Path,
+    output: Path,
+    config: EvaluateConfig,
+    dataset_folder: Path | None = None,
+    other_seeds: Sequence[Path] = (),
 ) -> dict[str, Any]:
     """Evaluate both networks of a run on the navigations and the patients that they never saw.
 
@@ -57,6 +61,7 @@ def evaluate(
         output: where the result goes.
         config: how much is evaluated.
         dataset_folder: dataset to evaluate on; the one that the run was trained on if not given.
+        other_seeds: runs of the same training with other seeds, whose errors in P1 shall stand beside the run's.
 
     Returns:
         The content of `metrics.json`.
@@ -73,7 +78,7 @@ def evaluate(
     if dataset_folder is None and not own.is_dir():
         raise InputError(f"{own}: the dataset that the run was trained on is not here; name one with --dataset")
     dataset = load_dataset(Path(dataset_folder or own).resolve())
-    predictor = load_run(run_folder)
+    predictor, others = load_run(run_folder), [load_run(other) for other in other_seeds]
     train = dataset.of_split("train")
     chosen = {
         split: _chosen(dataset.of_split(split), config.sequences) for split in SPLIT_TITLES if split in dataset.split
@@ -97,6 +102,10 @@ def evaluate(
             wall_seconds=time.perf_counter() - start,
         )
     }
+    for split, data in chosen.items() if others else ():
+        tips = [results[split].tips["P1"], *(told(other.rollout_forward(data).tip) for other in others)]
+        runs = [str(run_folder), *map(str, other_seeds)]
+        metrics["splits"][split]["seeds"] = {"runs": runs, "P1": over_seeds(results[split], tips)}
     (output / METRICS_FILE).unlink(missing_ok=True)
     write_results(results, output / RESULTS_FILE)
     _write_figures(results, output / FIGURES_FOLDER)

@@ -6,7 +6,9 @@ finite where the truth is counts as lost, and its sequence as diverged: both sha
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -26,6 +28,53 @@ DIVERGED_MM = 2.0
 
 OFF_WALL_MM = 0.1
 """A tip with more than this between wire and wall, mm, is off the wall."""
+
+
+DEPTHS_MM: tuple[float, ...] = (0.0, 30.0, 60.0, 90.0, math.inf)
+"""Edges of the parts of the vessel, by the true Δtip, over which errors are reported too, mm."""
+
+_PUSHED_MM, _STUCK_SHARE = 0.5, 0.1
+_SLIP_MM = 1.0
+_WHIP_RAD, _BEND_PER_MM = 0.5, 0.2
+
+
+def tip_events(
+    inserted: Float[np.ndarray, "episodes samples"],
+    rotation: Float[np.ndarray, "episodes samples"],
+    abscissa: Float[np.ndarray, "episodes samples"],
+    direction: Float[np.ndarray, "episodes samples 3"],
+) -> dict[str, Bool[np.ndarray, "episodes later"]]:
+    """Return in which samples after the first the tip does not go with the drive.
+
+    `stick`: the drive moves by more than 0.5 mm, and the tip by less than a tenth of that. `slip`: the tip moves by
+    1 mm more than the drive, or as much the other way. `whip`: the tip's direction turns by 0.5 rad more than the drive
+    and the bends that it passes (0.2 rad a mm, which few arteries exceed) explain.
+
+    Args:
+        inserted: Δ, mm.
+        rotation: φ, rad.
+        abscissa: Δtip, mm.
+        direction: unit vector along the wire at its tip.
+    """
+    pushed, moved = np.diff(inserted.astype(float), axis=1), np.diff(abscissa.astype(float), axis=1)
+    turned = np.abs(np.diff(rotation.astype(float), axis=1))
+    cosine = (direction[:, 1:].astype(float) * direction[:, :-1]).sum(axis=-1)
+    swung = np.arccos(np.clip(cosine, -1.0, 1.0))
+    return {
+        "stick": (np.abs(pushed) > _PUSHED_MM) & (np.abs(moved) < _STUCK_SHARE * np.abs(pushed)),
+        "slip": (np.abs(moved) > np.abs(pushed) + _SLIP_MM) | (moved * np.sign(pushed) < -_SLIP_MM),
+        "whip": swung > turned + _BEND_PER_MM * np.abs(moved) + _WHIP_RAD,
+    }
+
+
+def by_depth(
+    error: Float[np.ndarray, "episodes samples"], depth: Float[np.ndarray, "episodes samples"]
+) -> dict[str, dict[str, float | int | None]]:
+    """Return the statistics of an error over the parts of the vessel that `DEPTHS_MM` bounds, keys such as "30-60"."""
+    return {
+        f"{low:g}-{high:g}": error_statistics(np.where((depth >= low) & (depth < high), error, np.nan))
+        for low, high in pairwise(DEPTHS_MM)
+    }
 
 
 def span_name(span: tuple[float, float]) -> str:

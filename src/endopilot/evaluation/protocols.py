@@ -11,7 +11,8 @@ from jaxtyping import Float, Int
 from endopilot.anatomy.io import read_anatomy
 from endopilot.dataset.loader import Dataset
 from endopilot.evaluation import baselines
-from endopilot.evaluation.results import SplitResult, TipSeries
+from endopilot.evaluation.metrics import tip_events
+from endopilot.evaluation.results import REPLAYED, SplitResult, TipSeries
 from endopilot.models.config import WINDOW
 from endopilot.models.open_loop import Predictor
 from endopilot.progress import Advance
@@ -58,10 +59,9 @@ def run_protocols(predictor: Predictor, data: Dataset, train: Dataset, advance: 
     }
     tips = {name: _series(tip, [a.tree for a in anatomies], anatomy_of, data.branch) for name, tip in foretold.items()}
     replayed = {"P4": "P3", "P2_replayed": "P2", "hold_control": "hold_control", "follow_slack": "follow_slack"}
-    recorded = data.control[:, WINDOW:].astype(float)
     reach_mm = np.array([a.tree.longest_path().abscissa[-1] for a in anatomies])[anatomy_of]
     simulated = {name: _drivable(data, controls[source], device, reach_mm) for name, source in replayed.items()}
-    simulated["true_replay"] = recorded
+    simulated |= dict.fromkeys(REPLAYED, data.asked[:, WINDOW:])
     replays = _replay(data, anatomies, anatomy_of, device, simulated, advance)
     return SplitResult(
         sample_period_s=data.sample_period_s,
@@ -70,13 +70,18 @@ def run_protocols(predictor: Predictor, data: Dataset, train: Dataset, advance: 
         sequence=data.sequence,
         wire_radius_mm=device.tip_radius_mm,
         true=TipSeries(*(_after_given(values) for values in (data.tip_abscissa, data.tip_offset, data.lumen_radius))),
-        true_control=recorded,
+        true_control=data.control[:, WINDOW:].astype(float),
         tips=tips | {name: replay.tip for name, replay in replays.items()},
         controls=controls,
         base_force={"true": _after_given(data.base_force)} | {name: r.base_force for name, r in replays.items()},
         base_torque={"true": _after_given(data.base_torque)} | {name: r.base_torque for name, r in replays.items()},
         tip_distance={name: r.distance for name, r in replays.items()},
+        events=tip_events(*(signal[:, WINDOW - 1 :] for signal in _moving(data))),
     )
+
+
+def _moving(data: Dataset) -> tuple[np.ndarray, ...]:
+    return data.inserted_length, data.rotation, data.tip_abscissa, data.tip_direction
 
 
 def _drivable(data: Dataset, control: Control, device: Device, reach_mm: Float[np.ndarray, "episodes"]) -> Control:
@@ -113,7 +118,9 @@ def _replay(
     controls: Mapping[str, Control],
     advance: Advance,
 ) -> dict[str, _Replay]:
-    """Simulate every episode again with the recorded controls while states are given, and with each series after.
+    """Simulate every episode again as the drive was asked while states are given, and with each series after.
+
+    Those of `REPLAYED` with another friction have it from the start.
 
     Where a simulation fails, or a series holds no finite control, the result is NaN from there on.
     """
@@ -129,9 +136,8 @@ def _replay(
         driven = np.concatenate([_whole(data, control)[episodes] for control in controls.values()])
         worlds = np.tile(episodes, len(controls))
         initial = np.stack([data.initial_inserted_length[worlds], data.initial_rotation[worlds]], axis=-1)
-        rollout = simulate(
-            anatomy, wire, np.nan_to_num(driven), initial=initial, config=settings, friction=data.friction[worlds]
-        )
+        friction = np.concatenate([REPLAYED.get(name, 1.0) * data.friction[episodes] for name in controls])
+        rollout = simulate(anatomy, wire, np.nan_to_num(driven), initial=initial, config=settings, friction=friction)
         usable = (rollout.valid & np.isfinite(driven).all(axis=-1).cumprod(axis=1).astype(bool))[:, WINDOW:]
         distance = np.linalg.norm(rollout.tip_position - data.tip_position[worlds], axis=-1)
         tip = (rollout.tip.abscissa, rollout.tip.offset, rollout.tip.radius)
@@ -156,8 +162,8 @@ _REPLAYED = ("abscissa", "offset", "radius", "base_force", "base_torque", "dista
 
 
 def _whole(data: Dataset, control: Control) -> Float[np.ndarray, "episodes all_samples 2"]:
-    """Return the recorded controls while states are given, followed by `control`."""
-    return np.concatenate([data.control[:, :WINDOW].astype(float), control], axis=1)
+    """Return what was asked of the drive while states are given, followed by `control`."""
+    return np.concatenate([data.asked[:, :WINDOW], control], axis=1)
 
 
 def _series(

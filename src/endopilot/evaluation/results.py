@@ -26,6 +26,8 @@ SERIES_TITLES: Mapping[str, str] = {
     "hold_control": "Baseline: hold the last control",
     "follow_slack": "Baseline: drive by the held slack",
     "true_replay": "True controls, simulated again",
+    "friction_90": "True controls, simulated with 10 % less friction",
+    "friction_110": "True controls, simulated with 10 % more friction",
 }
 """What a reader calls each predicted series."""
 
@@ -37,6 +39,9 @@ TIP_BASELINES: Mapping[str, tuple[str, ...]] = {
 }
 """Baselines that stand beside each protocol's tip errors. Those of P1 know the true controls, as it does; those of P3
 and P4 choose controls, which are then simulated."""
+
+REPLAYED: Mapping[str, float] = {"true_replay": 1.0, "friction_90": 0.9, "friction_110": 1.1}
+"""Series that simulate the true controls again, and the factor on friction of each."""
 
 CONTROL_BASELINES: tuple[str, ...] = ("hold_control", "training_mean", "follow_slack")
 """Baselines that stand beside the inverse network's control errors (P2)."""
@@ -57,6 +62,11 @@ class TipSeries:
     radius: Float[np.ndarray, "episodes samples"]
 
 
+def told(tip: Float[np.ndarray, "episodes samples 2"]) -> TipSeries:
+    """Return a foretold (Δtip, γtip), mm, as a series whose radius nobody asks for."""
+    return TipSeries(tip[..., 0], tip[..., 1], np.full(tip.shape[:2], np.nan))
+
+
 @dataclass(frozen=True, eq=False)
 class SplitResult:
     """Everything predicted on one split, over the samples after the given states.
@@ -74,6 +84,7 @@ class SplitResult:
         base_force: axial force of the drive by simulated series, "true" being the recorded one, N.
         base_torque: torque of the drive likewise, N·mm.
         tip_distance: distance between the simulated and the recorded tip in space, by simulated series, mm.
+        events: where the recorded tip sticks, slips or whips (see `metrics.tip_events`).
     """
 
     sample_period_s: float
@@ -88,6 +99,7 @@ class SplitResult:
     base_force: Mapping[str, Float[np.ndarray, "episodes samples"]]
     base_torque: Mapping[str, Float[np.ndarray, "episodes samples"]]
     tip_distance: Mapping[str, Float[np.ndarray, "episodes samples"]]
+    events: Mapping[str, Bool[np.ndarray, "episodes samples"]]
 
     @property
     def time_s(self) -> Float[np.ndarray, "samples"]:
@@ -104,7 +116,7 @@ class SplitResult:
         return ~(np.isfinite(tip.abscissa) & np.isfinite(tip.offset))
 
 
-_MAPPINGS = ("controls", "base_force", "base_torque", "tip_distance")
+_MAPPINGS = ("controls", "base_force", "base_torque", "tip_distance", "events")
 _TIP_FIELDS = ("abscissa", "offset", "radius")
 
 

@@ -2,32 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from endopilot.evaluation.metrics import (
     OFF_WALL_MM,
+    by_depth,
     control_rmse,
     distribution,
     diverged_share,
     error_statistics,
     safety_ratio,
     skill,
+    span_slices,
     tip_statistics,
     worst_anatomy,
 )
-from endopilot.evaluation.results import CONTROL_BASELINES, TIP_BASELINES, SplitResult
+from endopilot.evaluation.results import CONTROL_BASELINES, REPLAYED, TIP_BASELINES, SplitResult, TipSeries
 
 
 def summarize(result: SplitResult, *, seed: int) -> dict[str, Any]:
     """Return the figures of one split: tips, controls, safety ratios and forces of drive, by series."""
     baselines = [name for names in TIP_BASELINES.values() for name in names]
-    shown = [name for name in dict.fromkeys((*TIP_BASELINES, *baselines, "true_replay")) if name in result.tips]
+    shown = [name for name in dict.fromkeys((*TIP_BASELINES, *baselines, *REPLAYED)) if name in result.tips]
     return {
         "anatomies": list(result.anatomies),
         "episodes": len(result.anatomy),
+        "event_shares": {name: float(where.mean()) for name, where in result.events.items()},
         "tip": {series: _tip(result, series, seed) for series in shown},
         "control": _control(result),
         "safety": {series: _safety(result, series) for series in ("true", *shown)},
@@ -49,6 +52,8 @@ def _tip(result: SplitResult, series: str, seed: int) -> dict[str, Any]:
         )
         for coordinate in ("abscissa", "offset")
     }
+    for coordinate in ("abscissa", "offset"):
+        out[coordinate]["by_depth"] = by_depth(result.error(series, coordinate), result.true.abscissa)
     clearance = result.true.radius - result.wire_radius_mm - result.true.offset
     off_wall = clearance > OFF_WALL_MM
     error = result.error(series, "abscissa")
@@ -59,6 +64,21 @@ def _tip(result: SplitResult, series: str, seed: int) -> dict[str, Any]:
     out["worst_anatomy"] = worst_anatomy(error, result.anatomy, result.anatomies)
     if series in result.tip_distance:
         out["distance_3d"] = error_statistics(result.tip_distance[series])
+    return out
+
+
+def over_seeds(result: SplitResult, tips: Sequence[TipSeries]) -> dict[str, Any]:
+    """Return the mean absolute errors of several seeds' tips, by coordinate and span: each, their mean and their SD."""
+    out: dict[str, Any] = {}
+    for coordinate in ("abscissa", "offset"):
+        errors = [getattr(tip, coordinate) - getattr(result.true, coordinate) for tip in tips]
+        out[coordinate] = {}
+        spans = span_slices(errors[0].shape[1], result.sample_period_s) | {"all": slice(None)}
+        for span, samples in spans.items():
+            each = [error_statistics(error[:, samples])["mae"] for error in errors]
+            known = [mae for mae in each if mae is not None]
+            mean, sd = (float(np.mean(known)), float(np.std(known, ddof=1))) if len(known) > 1 else (None, None)
+            out[coordinate][span] = {"mae": each, "mean": mean, "sd": sd}
     return out
 
 

@@ -89,7 +89,7 @@ class CausalNetwork(nn.Module):
         miss = (answer[..., :2] - change).abs()
         scale = answer[..., 2:]
         each = miss / scale + (scale / self.output_scale).log() + miss / self.output_scale
-        weight = torch.ones(change.shape[1], 1)
+        weight = torch.ones(change.shape[1], 1, device=change.device)
         weight[:WINDOW] = _GIVEN_WEIGHT
         return (weight * each).mean()
 

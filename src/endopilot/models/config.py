@@ -12,6 +12,9 @@ WINDOW = 30
 """States that each prediction sees: the paper gives 30 states in and one out."""
 
 
+Processor = Literal["auto", "cpu", "cuda"]
+"""What training computes on."""
+
 PRETRAINED = "pretrained"
 """Name of the trained causal model that comes with the package, in place of a run's folder."""
 
@@ -141,6 +144,11 @@ class TrainConfig:
     """Wall time that each network may train for, s; epochs are shortened to what is left of it."""
     seed: int = 0
     """Seed of the initial weights, the order of the windows, and dropout."""
+    processor: Processor = "auto"
+    """Where to compute: "auto" takes a GPU where there is one."""
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """Of the networks' products in training: "bfloat16" is mixed precision; weights, loss and what is written stay
+    float32."""
     size: TransformerConfig = field(default_factory=TransformerConfig)
     """Size of the paper's networks; as published if not given."""
     causal: CausalConfig = field(default_factory=CausalConfig)

@@ -164,7 +164,9 @@ class Sequences:
         """Return what the network is told of some forms, and by how much the truth differs from the guess."""
         sequence, form = target[:, 0], target[:, 1]
         inputs, change = self.inputs[network][sequence, form % 2], self.change[network][sequence, form % 2]
-        mirrored = (form >= 2)[:, None, None]
+        mirrored = (form >= 2)[:, None, None]  # and the others by 1: one product is cheaper than a choice of two
         sign = torch.as_tensor(np.append(play.mirrored(), np.ones(N_INPUTS - play.N_FEATURES)), dtype=torch.float32)
         turned = torch.tensor([1.0, 1.0 if network == "ff" else -1.0])
-        return torch.where(mirrored, inputs * sign, inputs), torch.where(mirrored, change * turned, change)
+        inputs *= torch.where(mirrored, sign, 1.0)  # of the copies that indexing made
+        change *= torch.where(mirrored, turned, 1.0)
+        return inputs, change

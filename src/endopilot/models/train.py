@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import nn
 
 from endopilot.dataset.loader import Dataset, load_dataset
 from endopilot.errors import InputError
@@ -32,6 +33,7 @@ from endopilot.models.checkpoint import (
 )
 from endopilot.models.config import TrainConfig
 from endopilot.models.sequences import Sequences, read_vessels
+from endopilot.models.team import Team, joined
 from endopilot.models.transformer import Network
 from endopilot.models.windows import Episodes, check_length
 from endopilot.progress import Advance, progress
@@ -66,17 +68,25 @@ def train(dataset_folder: Path, run_folder: Path, config: TrainConfig) -> None:
         InputError: the dataset cannot be used, the run folder was begun with other settings, or the loss left the
             finite numbers (the last good checkpoint stays).
     """
-    dataset_folder, run_folder = Path(dataset_folder), Path(run_folder)
+    with joined(config.processor) as team:
+        _train(Path(dataset_folder), Path(run_folder), config, team)
+
+
+def _train(dataset_folder: Path, run_folder: Path, config: TrainConfig, team: Team) -> None:
     dataset = load_dataset(dataset_folder)
-    _begin(run_folder, {"train": asdict(config), "dataset": dataset.manifest["key"]})
-    training = _examples(dataset, "train", config)
-    validation = _examples(dataset, "seen_test", config) if "seen_test" in dataset.split else None
+    with team.first():  # which writes the settings and prepares the patients, where need be
+        _begin(run_folder, {"train": asdict(config), "dataset": dataset.manifest["key"]})
+        training = examples_of(dataset, "train", config)
+        validation = examples_of(dataset, "seen_test", config) if "seen_test" in dataset.split else None
     start = time.perf_counter()
     results: dict[str, Any] = {}
     for name in config.networks:
-        job = _Job(name, config, training, validation, run_folder)
+        job = Job(name, config, training, validation, run_folder, team)
         results[name] = job.run()
-        write_json(run_folder / "training.json", results)
+        if team.writes:
+            write_json(run_folder / "training.json", results)
+    if not team.writes:
+        return
     write_json(run_folder / "training.json", results)  # of a model that trains nothing too
     record = manifest(
         config=config,
@@ -89,6 +99,8 @@ def train(dataset_folder: Path, run_folder: Path, config: TrainConfig) -> None:
         simulator=dataset.manifest["config"]["simulator"],
         networks={name: {key: result[key] for key in result if key != "curve"} for name, result in results.items()},
         threads=torch.get_num_threads(),
+        processes=team.size,
+        processor=team.device.type,
         wall_seconds=time.perf_counter() - start,
     )
     write_json(run_folder / "manifest.json", record)
@@ -114,7 +126,7 @@ def _begin(run_folder: Path, settings: dict[str, Any]) -> None:
         )
 
 
-def _examples(dataset: Dataset, split: str, config: TrainConfig) -> Examples:
+def examples_of(dataset: Dataset, split: str, config: TrainConfig) -> Examples:
     """Return the episodes of a split, which must be finite: one bad sample would spoil the scales of all."""
     chosen = dataset.of_split(split)
     for name in ("tip_abscissa", "tip_offset", "inserted_length", "rotation", "control"):
@@ -132,14 +144,15 @@ def _examples(dataset: Dataset, split: str, config: TrainConfig) -> Examples:
 
 
 @dataclass(frozen=True, eq=False)
-class _Job:
-    """The training of one network."""
+class Job:
+    """The training of one network, by one process of a team."""
 
     name: str
     config: TrainConfig
     training: Examples
     validation: Examples | None
     run_folder: Path
+    team: Team
 
     def run(self) -> dict[str, Any]:
         """Train, or go on training, until the last epoch; return the learning curve and how the steps were planned."""
@@ -148,25 +161,43 @@ class _Job:
             torch.manual_seed(_seed(config.seed, self.name, "weights"))
             network = make_network(self.name, config.network_size)
             self._fit_scales(network)
+            network.to(self.team.device)
             optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate, fused=True)
             state = self._resume(network, optimizer) or {"seconds": 0.0, "curve": []}
             with progress(f"Training {self.name.upper()}", total=config.epochs) as advance:
                 advance(len(state["curve"]))
+                together = self.team.together(network)
                 while len(state["curve"]) < config.epochs:
-                    self._epoch(network, optimizer, state, advance)
-                    self._save(network, optimizer, state)
+                    self._epoch(network, together, optimizer, state, advance)
+                    if self.team.writes:
+                        self._save(network, optimizer, state)
         return {"parameters": sum(p.numel() for p in network.parameters())} | state
 
-    def _epoch(self, network: AnyNetwork, optimizer: torch.optim.Adam, state: dict[str, Any], advance: Advance) -> None:
-        """Go through one epoch, check the loss on held-out navigations, and add both to the state's curve."""
+    def _epoch(
+        self,
+        network: AnyNetwork,
+        together: nn.Module,
+        optimizer: torch.optim.Adam,
+        state: dict[str, Any],
+        advance: Advance,
+    ) -> None:
+        """Go through one epoch, check the loss on held-out navigations, and add both to the state's curve.
+
+        Args:
+            network: what is trained.
+            together: the same, as all processes of the team run it.
+            optimizer: of its parameters.
+            state: `seconds` and `curve` so far.
+            advance: told after every step.
+        """
         epoch, epochs, start = len(state["curve"]), self.config.epochs, time.perf_counter()
-        batches = self._batches(epoch, self._steps(network, state))
-        torch.manual_seed(_seed(self.config.seed, self.name, epoch))
+        batches = self.batches(epoch, self._steps(network, state))
+        torch.manual_seed(_seed(self.config.seed, self.name, epoch, *([self.team.rank] if self.team.rank else [])))
         network.train()
         total, steps, first = 0.0, len(batches), time.perf_counter()
         for step, targets in enumerate(batches):
             rate = self.config.learning_rate * _schedule(epoch + step / steps, epochs)
-            loss = self._step(network, optimizer, targets, rate)
+            loss = self.step(network, together, optimizer, targets, rate)
             if not math.isfinite(loss):
                 episodes = sorted(set(targets[:, 0].tolist()))[:8]
                 raise InputError(
@@ -192,14 +223,24 @@ class _Job:
         )
         state["seconds"] += time.perf_counter() - start
 
-    def _step(self, network: AnyNetwork, optimizer: torch.optim.Adam, targets: torch.Tensor, rate: float) -> float:
+    def step(
+        self,
+        network: AnyNetwork,
+        together: nn.Module,
+        optimizer: torch.optim.Adam,
+        targets: torch.Tensor,
+        rate: float,
+    ) -> float:
         """Take one step along the gradient and return the loss before it; a loss that is not finite takes no step."""
-        *window, truth = self.training.window(self.name, targets)
-        loss = network.loss(network(*window), truth)
-        value = loss.item()
+        team, ours = self.team, self.team.share(targets)
+        *window, truth = self._window(self.training, ours)
+        with torch.autocast(team.device.type, torch.bfloat16, enabled=self.config.precision == "bfloat16"):
+            answer = together(*window)
+        loss = network.loss(answer.float(), truth)
+        value = team.mean(loss, len(ours), len(targets))
         if math.isfinite(value):
             optimizer.zero_grad()
-            loss.backward()
+            (loss * (len(ours) * team.size / len(targets))).backward()  # the team's mean is then that over the batch
             torch.nn.utils.clip_grad_norm_(network.parameters(), _GRADIENT_NORM)
             optimizer.param_groups[0]["lr"] = rate
             optimizer.step()
@@ -212,15 +253,26 @@ class _Job:
         network.eval()
         targets = self.validation.targets()
         chosen = torch.linspace(0, len(targets) - 1, min(len(targets), VALIDATION_WINDOWS)).long()
-        *window, truth = self.validation.window(self.name, targets[chosen])
+        *window, truth = self._window(self.validation, targets[chosen])
         return network.loss(network(*window), truth).item()
 
-    def _batches(self, epoch: int, steps: int) -> list[torch.Tensor]:
-        """Return the targets of every batch of an epoch: all windows in random order, or the first of them."""
+    def batches(self, epoch: int, steps: int) -> list[torch.Tensor]:
+        """Return the targets of every batch of an epoch: all windows in random order, or the first of them.
+
+        A last batch that is too small for each process to have a share is left out.
+        """
         targets = self.training.targets()
         generator = torch.Generator().manual_seed(_seed(self.config.seed, self.name, "order", epoch))
         order = torch.randperm(len(targets), generator=generator)
-        return list(targets[order].split(self.config.batch_size)[:steps])
+        batches = targets[order].split(self.config.batch_size)[:steps]
+        whole = [batch for batch in batches if len(batch) >= self.team.size]
+        if not whole:
+            raise InputError(f"batch_size: {len(batches[0])} samples for {self.team.size} processes; give more")
+        return whole
+
+    def _window(self, examples: Examples, targets: torch.Tensor) -> list[torch.Tensor]:
+        """Return what the network is told of some targets, and the truth, where this process computes."""
+        return [part.to(self.team.device) for part in examples.window(self.name, targets)]
 
     def _fit_scales(self, network: AnyNetwork) -> None:
         targets = self.training.targets()
@@ -241,17 +293,17 @@ class _Job:
         else:
             a_step, validation = self._time(network)
         seconds_left = (config.max_seconds - state["seconds"]) / (config.epochs - len(curve)) - validation
-        return max(min(steps, int(seconds_left / a_step)), 1)
+        return self.team.agreed(max(min(steps, int(seconds_left / a_step)), 1))
 
     def _time(self, network: AnyNetwork) -> tuple[float, float]:
         """Return how long a training step and a validation take, s, tried out on a copy of the network."""
         trial = copy.deepcopy(network).train()
         optimizer = torch.optim.Adam(trial.parameters(), fused=True)
-        targets = self._batches(0, 1)[0]
+        targets = self.batches(0, 1)[0]
         times = []
         for _ in range(_TIMED_STEPS):
             start = time.perf_counter()
-            self._step(trial, optimizer, targets, 0.0)
+            self.step(trial, trial, optimizer, targets, 0.0)
             times.append(time.perf_counter() - start)
         start = time.perf_counter()
         self._validate(trial)
@@ -270,7 +322,10 @@ class _Job:
         network.load_state_dict(weights)
         restore_optimizer(optimizer, tensors)
         # A kill between the two files of an epoch leaves the second one behind by an epoch.
-        write_network(self.run_folder / f"{self.name}.safetensors", self.name, network, self.config.network_size, {})
+        if self.team.writes:
+            write_network(
+                self.run_folder / f"{self.name}.safetensors", self.name, network, self.config.network_size, {}
+            )
         return {key: facts[key] for key in ("seconds", "curve")}
 
     @property

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -53,11 +54,15 @@ class TwinPredictor:
         device: the wire as it is believed to be.
         simulator: settings of the rod core.
         config: size and spread of the ensemble.
+        told: what the given states of the episodes foretell that it has been asked about; all protocols share it.
+        led: the controls that lead the tip along the desired one, likewise.
     """
 
     device: Device
     simulator: SimulatorConfig
     config: TwinConfig
+    told: WeakKeyDictionary[Dataset, TwinForetold] = field(default_factory=WeakKeyDictionary, repr=False)
+    led: WeakKeyDictionary[Dataset, OpenLoop] = field(default_factory=WeakKeyDictionary, repr=False)
 
     def foretell(self, episodes: Dataset, seen: Bool[np.ndarray, "samples"]) -> TwinForetold:
         """Predict the tips of episodes under their controls, from those that were seen.
@@ -100,9 +105,9 @@ class TwinPredictor:
 
     def rollout_forward(self, episodes: Dataset) -> OpenLoop:
         """P1: predict the tip under the true controls."""
-        told = self.foretell(episodes, np.arange(episodes.valid.shape[1]) < WINDOW)
+        tip = self._told(episodes).tip
         return OpenLoop(
-            tip=told.tip[:, WINDOW:], proximal=_proximal(episodes)[:, WINDOW:], control=_control(episodes)[:, WINDOW:]
+            tip=tip[:, WINDOW:], proximal=_proximal(episodes)[:, WINDOW:], control=_control(episodes)[:, WINDOW:]
         )
 
     def rollout_inverse(self, episodes: Dataset) -> OpenLoop:
@@ -115,7 +120,17 @@ class TwinPredictor:
 
         The likeliest member is driven along the desired tips, one sample at a time: see `tracking.track`.
         """
-        likeliest = self.foretell(episodes, np.arange(episodes.valid.shape[1]) < WINDOW).parameters
+        if episodes not in self.led:
+            self.led[episodes] = self._lead(episodes, self._told(episodes).parameters)
+        return self.led[episodes]
+
+    def _told(self, episodes: Dataset) -> TwinForetold:
+        if episodes not in self.told:
+            self.told[episodes] = self.foretell(episodes, np.arange(episodes.valid.shape[1]) < WINDOW)
+        return self.told[episodes]
+
+    def _lead(self, episodes: Dataset, likeliest: Float[np.ndarray, "episodes 3"]) -> OpenLoop:
+        """Drive wires of these parameters along the desired tips."""
         desired = _tips(episodes)[:, WINDOW:]
         tip, control = np.empty(desired.shape), np.empty(desired.shape)
         wires = {stiffness: self._wire(stiffness) for stiffness in np.unique(likeliest[:, 1])}
@@ -126,7 +141,7 @@ class TwinPredictor:
                 [wires[stiffness] for stiffness in ours[:, 1]],
                 friction=self.device.friction * ours[:, 0],
                 start=np.column_stack([data.initial_inserted_length + ours[:, 2], data.initial_rotation]),
-                given=_control(data)[:, :WINDOW],
+                given=data.asked[:, :WINDOW],
                 desired=desired[chosen],
                 config=self.simulator,
             )
@@ -158,7 +173,7 @@ class TwinPredictor:
         paths = np.full((*members.shape[:2], samples, 2), np.nan)
         for stiffness in np.unique(members[..., 1]):
             member, episode = np.nonzero(members[..., 1] == stiffness)
-            control = _control(data)[episode, :samples]
+            control = data.asked[episode, :samples]
             least = -(SAMPLE_PERIOD_S * np.cumsum(control[..., 0], axis=1)).min(axis=1).clip(max=0.0)
             start = np.maximum(data.initial_inserted_length[episode] + members[member, episode, 2], least)
             with warnings.catch_warnings():
