@@ -34,8 +34,11 @@ _STALL_PERIODS = 4
 _STALL_SHARE = 0.25
 _LEFT_BEHIND = 0.2
 """Each attempt is content with a way that leaves this much more of the wires, by weight, behind."""
-_LOOKOUT_MM = 12.0
-"""A waypoint that is searched for lies no farther ahead than this, mm: beyond, a chord says little."""
+_LOOKOUT_MM, _LOOKOUT_RADII = 12.0, 3.0
+"""A waypoint that is searched for lies no farther ahead than this, mm, or lumen radii where that is more: beyond, a
+chord says little."""
+_LEAD_RADII = 1.4
+"""In a wide vessel a search begins this many lumen radii before the junction: a branch's mouth is about as wide."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +60,7 @@ class SearchConfig:
     turn_rad_s: float = 7.0
     """Fastest rotation that is tried, rad/s."""
     lead_mm: float = 4.0
-    """A search begins this far before the wall of the junction, mm."""
+    """A search begins this far before a junction, mm, or 1.4 lumen radii where that is more."""
     cost: Cost = field(default_factory=Cost)
     """What the candidates are compared by."""
 
@@ -202,7 +205,10 @@ class Search:
         """Push on, or pull back, to where a search for a waypoint begins."""
         before = self.route.junctions[self.route.junctions < waypoint]
         last = waypoint >= self.route.target.abscissa
-        begin = waypoint - _LOOKOUT_MM if last or not len(before) else float(before[-1]) - self.config.lead_mm
+        begin = waypoint - _LOOKOUT_MM
+        if len(before) and not last:
+            radius = float(self.route.radius(before[-1]))
+            begin = float(before[-1]) - max(self.config.lead_mm, _LEAD_RADII * radius)
         for _ in range(periods - log.periods):
             tip = self.single.project()
             here, on_route = self.route.progress(tip) @ self._weight, self._all(self.route.astray(tip) == 0)
@@ -243,7 +249,8 @@ class Search:
         What is searched in vain is begun anew from the same state, so that a plan holds no vain motion.
         """
         progress = float(self.route.progress(self.single.project()) @ self._weight)
-        waypoint = min(self.route.next_waypoint(progress), progress + _LOOKOUT_MM)
+        lookout = max(_LOOKOUT_MM, _LOOKOUT_RADII * float(self.route.radius(progress)))
+        waypoint = min(self.route.next_waypoint(progress), progress + lookout)
         rounds = min(self.config.rounds, (periods - log.periods) // self.config.round_periods)
         nearest, best = np.inf, np.zeros((0, 2))
         for attempt in range(self.config.attempts):
