@@ -59,17 +59,21 @@ class Measured:
     @classmethod
     def standing(cls, simulator: Simulator) -> Measured:
         """Return the worlds as they stand."""
-        w, x, y, z = simulator.orientation[:, 0].T
-        third = np.column_stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
         return cls(
             tip=simulator.project(),
             position=simulator.position[:, 0],
-            direction=third,
+            direction=tip_direction(simulator),
             contact_force=simulator.contacts.max(axis=1),
             inserted_length=simulator.inserted_length,
             rotation=simulator.rotation,
             valid=simulator.valid,
         )
+
+
+def tip_direction(simulator: Simulator) -> Float[np.ndarray, "worlds 3"]:
+    """Return the unit vectors along the wires at their tips: the third axes of the last elements."""
+    w, x, y, z = simulator.orientation[:, 0].T
+    return np.column_stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
 
 
 def observe(
