@@ -65,10 +65,10 @@ def degrade(output: Path, config: LadderConfig, off: float) -> list[dict[str, An
 
 def truth_of(case: str, off: float, navigation: Navigation, task: Task, place: int) -> Truth:
     """Return how reality differs from what is told, in one case and one patient."""
-    share = dict.fromkeys(QUANTITIES, 0.0)
+    share: dict[str, float] = dict.fromkeys(QUANTITIES, 0.0)
     if case == "all":
         sides = np.random.default_rng([task.ladder.seed, task.ladder.numbers[place], 1]).choice([-1.0, 1.0], 4)
-        share = dict(zip(QUANTITIES, off * sides, strict=True))
+        share = dict(zip(QUANTITIES, (off * sides).tolist(), strict=True))
     elif case != "as-told":
         name, way = case.split("-")
         share[name] = off if way == "more" else -off
