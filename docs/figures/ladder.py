@@ -1,6 +1,7 @@
-"""Write tasks and scores into docs/ladder.md: `python docs/figures/ladder.py [FOLDER]`.
+"""Write tasks and scores into docs/ladder.md: `python docs/figures/ladder.py [FOLDER [ROBUSTNESS]]`.
 
-FOLDER, runs/ladder if not given, holds what `endopilot ladder` made of each policy.
+FOLDER, runs/ladder if not given, holds what `endopilot ladder` made of each policy, and ROBUSTNESS, runs/robustness if
+not given, what it made with `--off 0.2`; a folder that is not there leaves its table as it is.
 """
 
 from __future__ import annotations
@@ -10,9 +11,11 @@ import sys
 from pathlib import Path
 
 from endopilot.env.tasks import ladder_tasks
+from endopilot.evaluation.robustness import title_of
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "ladder.md"
+_MEANS = (("peak force, median, N", "peak_force_n"), ("exposures, mean", "exposures"))
 
 
 def fill(name: str, lines: list[str]) -> None:
@@ -34,29 +37,57 @@ def tasks() -> list[str]:
 
 
 def scores(folder: Path) -> list[str]:
-    """Return one table of the policies' scores: safe success, and in brackets success, %."""
-    done = {
-        path.parent.name: json.loads(path.read_text(encoding="utf-8")) for path in sorted(folder.glob("*/ladder.json"))
-    }
-    tables = {name: {row["task"]: row for row in content["scores"]} for name, content in done.items()}
-    names = list(dict.fromkeys(task for table in tables.values() for task in table))
-    lines = ["| task | " + " | ".join(tables) + " |", "|---|" + "---|" * len(tables)]
+    """Return one table of the policies' scores: safe success, and in brackets success, %.
+
+    A policy that is not in the folder keeps its column as the page has it.
+    """
+    columns = _kept()
+    for path in sorted(folder.glob("*/ladder.json")):
+        content = json.loads(path.read_text(encoding="utf-8"))
+        table = {row["task"]: row for row in content["scores"]}
+        column = {name: f"{100 * row['safe_success']:.0f} ({100 * row['success']:.0f})" for name, row in table.items()}
+        if (over := table.get("all twelve") or table.get("upper eight")) is not None:
+            column |= {title: f"{over[key]:.3g}" for title, key in _MEANS}
+        columns[path.parent.name] = column | {"patients a task": str(content["patients"])}
+    names = [task.name for task in ladder_tasks()] + ["lower four", "upper eight", "all twelve"]
+    names += [*(title for title, _ in _MEANS), "patients a task"]
+    policies = sorted(columns)
+    lines = ["| task | " + " | ".join(policies) + " |", "|---|" + "---|" * len(policies)]
     for name in names:
-        cells = []
-        for table in tables.values():
-            row = table.get(name)
-            cells.append("–" if row is None else f"{100 * row['safe_success']:.0f} ({100 * row['success']:.0f})")
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    for title, key in (("peak force, median, N", "peak_force_n"), ("exposures, mean", "exposures")):
-        rows = [table.get("all twelve") or table.get("upper eight") for table in tables.values()]
-        lines.append(f"| {title} | " + " | ".join("–" if row is None else f"{row[key]:.3g}" for row in rows) + " |")
+        lines.append(f"| {name} | " + " | ".join(columns[policy].get(name, "–") for policy in policies) + " |")
+    return lines
+
+
+def _kept() -> dict[str, dict[str, str]]:
+    """Return the columns that stand in the page."""
+    text = PAGE.read_text(encoding="utf-8").split("<!-- scores:begin -->")[1].split("<!-- scores:end -->")[0]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.strip().splitlines()]
+    head, body = rows[0][1:], rows[2:]
+    return {policy: {row[0]: row[1 + place] for row in body} for place, policy in enumerate(head)}
+
+
+def robustness(folder: Path) -> list[str]:
+    """Return a table of how the policies degrade: safe success, in brackets success, %, and exposures."""
+    done = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(folder.glob("*/robustness.json"))]
+    names = [name for content in done for name in (f"`{content['policy']}`, safe success", "exposures")]
+    lines = ["| off | " + " | ".join(names) + " |", "|---|" + "---|" * len(names)]
+    for rows in zip(*(content["cases"] for content in done), strict=True):
+        cells = [title_of(rows[0]["case"], done[0]["off"])]
+        for row in rows:
+            cells += [f"{100 * row['safe_success']:.0f} ({100 * row['success']:.0f})", f"{row['exposures']:g}"]
+        lines.append("| " + " | ".join(cells) + " |")
     return lines
 
 
 def main() -> None:
     """Fill the page."""
+    given = [Path(argument) for argument in sys.argv[1:]]
+    ladder, off = [*given, *[ROOT / "runs" / name for name in ("ladder", "robustness")][len(given) :]]
     fill("tasks", tasks())
-    fill("scores", scores(Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "runs" / "ladder"))
+    if ladder.is_dir():
+        fill("scores", scores(ladder))
+    if off.is_dir():
+        fill("robustness", robustness(off))
 
 
 if __name__ == "__main__":

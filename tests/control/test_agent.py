@@ -9,7 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from endopilot.control.agent import AgentConfig, AgentPolicy, TwinPolicy
+from endopilot.control.agent import AgentConfig, AgentPolicy, OpenLoopPolicy, TwinPolicy
 from endopilot.control.belief import Belief, BeliefConfig
 from endopilot.control.navigate import Truth, navigate
 from endopilot.control.policy import Decision, Policy, Sight, TipMeasurement
@@ -87,13 +87,13 @@ def test_measurements_weigh_the_member_that_they_are_of(side_branch) -> None:
     belief = Belief(side_branch, Belief.around(np.array([1.0, 1.0, 0.0]), config), config)
     assert len(np.unique(belief.parameters[:, 1])) == 3 and np.ptp(belief.parameters[:, 2]) > 1.0
     assert np.allclose(belief.weight, 1 / 6)
-    wide = belief.spread()
+    wide = belief.tip_spread()
     for k in range(4):
         belief.follow(4.0 + 2.0 * k, 0.0)
         assert np.allclose(belief.simulator.inserted_length - belief.parameters[:, 2], 4.0 + 2.0 * k)
         belief.weigh(measured(belief, 4))
     assert belief.weight.argmax() == 4 and belief.weight[4] > 0.5
-    assert belief.spread() < 0.8 * wide
+    assert belief.tip_spread()[0] < 0.8 * wide[0]
     best, share = belief.likeliest()
     assert 4 in best and share.sum() == pytest.approx(1.0) and best[share.argmax()] == 4
 
@@ -121,6 +121,24 @@ def test_with_a_calibration_the_adviser_says_when_to_look(side_branch) -> None:
     policy.start(replace(side_branch, target=Target(branch=1, abscissa=39.0)), 0)
     at = [k for k in range(9) if policy.decide(Sight(0.5 * k, 2.0, 0.0, None)).expose]
     assert at == [3, 7]
+
+
+def test_without_another_the_agent_takes_the_calibration_of_the_package(side_branch) -> None:
+    """It is of this agent's wires: surer than nothing, and of enough patients for its level."""
+    policy = AgentPolicy(QUICK)
+    policy.start(side_branch, 0)
+    half = policy._calibration.half_width(np.array([5.0]), np.array([20.0]), np.array([[0.5, 0.1]]))
+    assert policy._calibration.level == 0.9 and policy._calibration.anatomies >= 9
+    assert 0.5 < half[0, 0] < 5.0 and 0.05 < half[0, 1] < 1.0
+
+
+def test_open_loop_plans_once_and_looks_no_more(side_branch) -> None:
+    policy = OpenLoopPolicy(config=QUICK)
+    record = navigate(side_branch, policy, seed=1)
+    assert record.success and record.exposures == 1 and policy.plans == 1
+    policy.start(side_branch, 0)
+    far = replace(measured(policy.belief, 0), position=np.full(3, 50.0))
+    assert policy.decide(Sight(0.0, 2.0, 0.0, far)).translation > 0  # whatever the first exposure shows
 
 
 NUMBERS = st.floats(allow_nan=True, allow_infinity=True, width=64)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -144,6 +145,14 @@ def test_sampling_brings_the_foretold_tip_nearer_to_the_desired_one(vessel, run)
         for made in (plan(vessel, "0,0,33", c, model=run) for c in (few, many))
     ]
     assert off[1] < 0.8 * off[0]
+
+
+def test_the_model_of_the_package_plans_to_a_target_and_leaves_the_patients_folder_alone(vessel):
+    before = sorted(vessel.parent.rglob("*"))
+    made = plan(vessel, "0,0,33", PlanConfig(method="inverse", seconds=30.0), model=Path("pretrained"))
+    assert made.reached and made.model == "pretrained"
+    assert np.abs(made.predicted[:, 0] - made.simulated.abscissa).max() < 0.5
+    assert sorted(vessel.parent.rglob("*")) == before
 
 
 def test_a_model_of_another_wire_is_refused(vessel, run):

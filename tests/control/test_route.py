@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from endopilot.anatomy.analytic import tree_of
 from endopilot.anatomy.projection import project_tip
 from endopilot.control.route import Route, check_passable, find_target
 from endopilot.env.task import Target
@@ -39,6 +40,20 @@ def test_a_waypoint_is_passed_in_the_right_branch_alone(route):
     assert route.passed(tip, 22.5).tolist() == [True, False, True]
     assert route.passed(tip, 35.0).tolist() == [False, False, True]
     assert route.next_waypoint(10.0) == 22.5 and route.next_waypoint(24.0) == 35.0
+
+
+def test_the_waypoint_of_a_short_branch_lies_before_its_end(fork):
+    """A branch of 2 mm between two forks, in a vessel of 1 mm: its end comes before 1.5 mm beyond the parent's wall."""
+    axis = np.arange(0.0, 41.0)[:, None] * np.array([0.0, 0.0, 0.5])
+    aside = axis * np.array([0.0, 0.0, 0.5]) + axis[:, [2]] * np.array([0.8, 0.0, 0.0])
+    tree = tree_of(
+        (axis, 1.0, -1), (axis[:5] + axis[-1], 1.0, 0), (axis[-1] + aside, 0.8, 0),
+        (axis + axis[-1] + axis[4], 1.0, 1), (axis[-1] + axis[4] + aside, 0.8, 1),
+    )  # fmt: skip
+    route = Route.to(replace(fork, tree=tree), Target(branch=4, abscissa=32.0))
+    assert np.allclose(route.junctions, [20.0, 22.0])
+    assert np.allclose(route.waypoints, [21.0, 24.5, 32.0])
+    assert route.next_waypoint(21.9) == 21.0  # its branch is passed with its end
 
 
 def named(fork):

@@ -18,9 +18,9 @@ from endopilot.env.navigation import (
     PROGRESS_REWARD,
     STEP_REWARD,
     SUCCESS_REWARD,
-    NavigateEnv,
     NavigateVectorEnv,
 )
+from endopilot.env.single import NavigateEnv
 from endopilot.env.task import Navigation, Target
 from endopilot.env.tasks import reference_navigation
 from endopilot.errors import InputError
@@ -201,7 +201,7 @@ def test_a_wrong_branch_lengthens_the_way():
     tip = replace(env.simulator.project(), abscissa=np.array([fork + 7.0]), branch=np.array([side]), offset=np.zeros(1))
     way = env._worlds._routes.distance(tip)
     assert way == pytest.approx(7.0 + navigation.target.abscissa - fork)
-    assert not env._worlds._routes.on_route(tip).any()
+    assert not env._worlds._routes.place(tip).on_route.any()
 
 
 @pytest.mark.parametrize("action", [np.full((WORLDS, 2), np.nan), np.zeros((WORLDS, 3)), np.zeros(2)])

@@ -74,6 +74,8 @@ def test_the_page_shows_the_scores_and_links_the_replay(climbed):
     assert "replay-straight.html" in text and "data:image/png;base64," in text
     replay = (folder / "replay-straight.html").read_text(encoding="utf-8")
     assert "Guidewire" in replay and 'src="plotly.min.js"' in replay
+    assert all(word in replay for word in ("Target", "Tip under X-ray", "safe success", "exposures: 1"))
+    assert "1 of the ladder's twelve tasks" in text
     assert (folder / "plotly.min.js").stat().st_size > 1e6
 
 

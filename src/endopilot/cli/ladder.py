@@ -14,6 +14,7 @@ from endopilot.evaluation.ladder import LadderConfig, climb
 def command(
     *,
     output: Annotated[Path | None, arg(name="output", aliases=("-o",), metavar="DIR")] = None,
+    off: float = 0.0,
     page: bool = True,
     json: bool = False,
     config: LadderConfig = LadderConfig(),
@@ -21,17 +22,19 @@ def command(
     """Let a policy climb the ladder: twelve tasks, each in twenty synthetic patients. An interrupted run goes on.
 
     Args:
-        output: folder of the results; runs/ladder/POLICY if not given.
+        output: folder of the results; runs/ladder/POLICY if not given, or runs/robustness/POLICY with --off.
+        off: share, such as 0.2, by which friction, tip stiffness, latency and ostium are off from what the policy is
+            told, one after another and together; a table of how its scores degrade takes the place of the ladder's.
         page: write index.html with pictures and replays.
         json: print the scores as JSON.
         config: which policy, tasks and patients.
     """
     from endopilot.evaluation.ladder_page import write_page
+    from endopilot.evaluation.robustness import PICTURE_FILE, degrade
 
-    folder = output or Path("runs/ladder") / config.policy
-    rows = climb(folder, config)
+    folder = output or Path("runs") / ("robustness" if off else "ladder") / config.policy
+    rows = degrade(folder, config, off) if off else climb(folder, config)
     show_rows(rows, as_json=json)
-    if page:
-        made = write_page(folder)
-        if not json:
-            show({"page": str(made)}, as_json=False)
+    made = {"picture": folder / PICTURE_FILE} if off else {"page": write_page(folder)} if page else {}
+    if made and not json:
+        show({name: str(path) for name, path in made.items()}, as_json=False)

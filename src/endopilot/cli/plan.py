@@ -29,10 +29,11 @@ def command(
         target: section label such as 4 or PDA, point X,Y,Z in LPS mm, or CSV of desired tips (time_s, tip_abscissa_mm,
             tip_offset_mm).
         output: folder of plan.csv, plan.png and manifest.json.
-        model: folder made by `endopilot train`; needed for the methods inverse and mppi.
+        model: folder made by `endopilot train`, or `pretrained`, the causal model that comes with endopilot; needed for
+            the methods inverse and mppi.
         device: name of a shipped device or a YAML file; the model's by default, workhorse-014 without one.
         json: print the figures as JSON.
         config: method, limits and cost.
     """
-    found = plan(existing(anatomy), target, config, model=None if model is None else existing(model), device=device)
+    found = plan(existing(anatomy), target, config, model=model, device=device)
     show(write_plan(found, output, seed=config.seed), as_json=json)

@@ -8,6 +8,7 @@ with X-ray on, until one agrees with what is seen, and another way is searched f
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
@@ -23,6 +24,9 @@ from endopilot.env.task import Navigation
 from endopilot.progress import Advance
 from endopilot.types import TipProjection
 
+_PACKAGE = Path(__file__).parent
+"""Where the agent's own calibration lies."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class AgentConfig:
@@ -32,8 +36,6 @@ class AgentConfig:
     """The search for a way."""
     belief: BeliefConfig = field(default_factory=BeliefConfig)
     """The simulated wires."""
-    spread_mm: float = 1.0
-    """The tip is looked at when the simulated ones are this far apart, mm."""
     off_course_mm: float = 2.5
     """Another way is searched when the likeliest tip is this far along the centerline from where it should be, mm."""
     tries: int = 8
@@ -59,7 +61,7 @@ class _PlanningPolicy:
         """Return friction factor, tip stiffness factor and depth of the ostium (mm) of the simulated wires."""
         raise NotImplementedError
 
-    def _wants_xray(self) -> bool:
+    def wants_xray(self) -> bool:
         """Return whether the tip is to be looked at at the next decision."""
         raise NotImplementedError
 
@@ -84,7 +86,7 @@ class _PlanningPolicy:
         self._limits = Limits.of(navigation.device, navigation.anatomy)
         self._course: Course | None = None
         self._at, self._lost, self._began = 0, False, False
-        self._passed, self.plans, self._vain = 0, 0, 0
+        self.plans, self._vain = 0, 0
 
     def decide(self, sight: Sight) -> Decision:
         """Follow the course, search another one, or pull back; see the module."""
@@ -98,7 +100,7 @@ class _PlanningPolicy:
         else:
             translation, rotation = self._follow(sight)
         translation, rotation = self._limits.safe(translation, rotation)
-        return Decision(translation, rotation, expose=self._lost or self._wants_xray())
+        return Decision(translation, rotation, expose=self._lost or self.wants_xray())
 
     def _look(self, measured: TipMeasurement) -> None:
         """Let a measurement tell which wires are likely, and whether all are wrong."""
@@ -177,8 +179,20 @@ class TwinPolicy(_PlanningPolicy):
         truth = self._truth
         return np.array([[truth.friction_factor, truth.stiffness_factor, truth.ostium_mm]])
 
-    def _wants_xray(self) -> bool:
+    def wants_xray(self) -> bool:
+        """X-ray is always on."""
         return True
+
+
+class OpenLoopPolicy(TwinPolicy):
+    """Plans once, with what it is told, and follows the plan by the encoders: what is planned is replayed, unseen."""
+
+    def _look(self, measured: TipMeasurement) -> None:
+        """Learn nothing from the first exposure."""
+
+    def wants_xray(self) -> bool:
+        """X-ray stays off."""
+        return False
 
 
 class AgentPolicy(_PlanningPolicy):
@@ -195,42 +209,36 @@ class AgentPolicy(_PlanningPolicy):
 
         Args:
             config: how to search, believe and look.
-            calibration: of the bands around what the simulated wires foretell; X-ray then goes on by `XrayAdvisor`.
-                Without one the tip is looked at when the wires are `config.spread_mm` apart, and once beyond each
-                junction.
+            calibration: of the bands around what the simulated wires foretell, by which `XrayAdvisor` asks for X-ray;
+                the package's own, which `benchmarks/agent_calibration.py` makes, if not given.
             advice: what the adviser must not miss.
         """
         super().__init__(config)
-        self._calibration, self._advice = calibration, advice or AdvisorConfig()
+        self._calibration, self._advice = calibration or Calibration.read(_PACKAGE), advice or AdvisorConfig()
 
     def start(self, navigation: Navigation, seed: int) -> None:
         """Lay the simulated wires out, and begin to watch the bands."""
         super().start(navigation, seed)
-        self._advisor = None
-        if self._calibration is not None:
-            self._advisor = XrayAdvisor(self._calibration, self._advice, navigation.device.tip_radius_mm)
-            self._advisor.start(*self._told())
+        self._advisor = XrayAdvisor(self._calibration, self._advice, navigation.device.tip_radius_mm)
+        proximal, tip, _, radius = self.foretold()
+        self._advisor.start(proximal, tip, radius)
 
     def _parameters(self) -> Float[np.ndarray, "members 3"]:
         return Belief.around(np.array([1.0, 1.0, 0.0]), self.config.belief)
 
-    def _told(self) -> tuple[Float[np.ndarray, "1 2"], Float[np.ndarray, "1 2"], Float[np.ndarray, "1"]]:
-        """Return what the adviser is told: (Δ, φ), (Δtip, γtip) and the lumen's radius, of the likeliest wire."""
+    def foretold(
+        self,
+    ) -> tuple[Float[np.ndarray, "1 2"], Float[np.ndarray, "1 2"], Float[np.ndarray, "1 2"], Float[np.ndarray, "1"]]:
+        """Return what the adviser is told, of the likeliest wire.
+
+        That is (Δ, φ), mm and rad; (Δtip, γtip), mm; the wires' standard deviations of these, mm; and the lumen's
+        radius at the tip, mm.
+        """
         best, tip = int(np.argmax(self.belief.weight)), self.belief.likeliest_tip()
         wires = self.belief.simulator
         proximal = np.array([[wires.inserted_length[best], wires.rotation[best]]])
-        return proximal, np.array([[tip.abscissa[0], tip.offset[0]]]), tip.radius
+        return proximal, np.array([[tip.abscissa[0], tip.offset[0]]]), self.belief.tip_spread()[None], tip.radius
 
-    def _wants_xray(self) -> bool:
-        if self._advisor is not None:
-            proximal, tip, radius = self._told()
-            return bool(self._advisor.advise(proximal, tip, self.belief.tip_spread()[None], radius)[0])
-        return self.belief.spread() > self.config.spread_mm or self._entered_branch()
-
-    def _entered_branch(self) -> bool:
-        """Return whether the likeliest tip has just passed a waypoint for the first time."""
-        tip = self.belief.likeliest_tip()
-        progress = float(self.route.progress(tip)[0])
-        passed = int((self.route.waypoints < progress).sum()) if self.route.astray(tip)[0] == 0 else 0
-        new, self._passed = passed > self._passed, max(passed, self._passed)
-        return new
+    def wants_xray(self) -> bool:
+        """Ask the adviser."""
+        return bool(self._advisor.advise(*self.foretold())[0])

@@ -155,11 +155,6 @@ class Belief:
         share = np.array([weight[members].sum() for members in groups])
         return best, share / share.sum()
 
-    def spread(self) -> float:
-        """Return how far apart the members' tips are believed to be: their weighted standard deviation, mm."""
-        weight, position = self.weight, self.simulator.position[:, 0]
-        return float(np.sqrt(weight @ ((position - weight @ position) ** 2).sum(axis=1)))
-
     def tip_spread(self) -> Float[np.ndarray, "2"]:
         """Return the members' weighted standard deviations of (Δtip, γtip), mm."""
         tip, weight = np.stack([self.tip.abscissa, self.tip.offset], axis=-1), self.weight

@@ -7,7 +7,9 @@ the start stand in for them.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,7 +21,8 @@ from endopilot.control.robot import Limits
 from endopilot.control.route import Route
 from endopilot.dataset.loader import Dataset
 from endopilot.env.task import Navigation
-from endopilot.models.config import WINDOW
+from endopilot.files import read_json
+from endopilot.models.config import WINDOW, run_path
 from endopilot.models.open_loop import Predictor
 from endopilot.models.rollout import load_run
 from endopilot.progress import progress
@@ -49,9 +52,10 @@ def with_networks(
         config: method, cost and sampling.
 
     Raises:
-        InputError: the run is unfinished or damaged; when called, it has not the network that the method needs.
+        InputError: the run is unfinished or damaged, or has not the network that the method needs.
     """
-    predictor, rest = load_run(model), _Rest(navigation, folder)
+    predictor, rest = load_run(model), _Rest(navigation, folder, run_path(model))
+    predictor.rollout_forward(rest.episodes(desired[None, :1], np.zeros((1, 1, 2))))  # a causal model learns the vessel
     ask = _ask if config.method == "inverse" else _sample
     return lambda: ask(predictor, rest, desired, route, config)
 
@@ -118,8 +122,16 @@ class _Rest:
         tip: (Δtip, γtip) at rest, mm.
     """
 
-    def __init__(self, navigation: Navigation, folder: Path) -> None:
-        self.navigation, self._folder = navigation, Path(folder).resolve()
+    def __init__(self, navigation: Navigation, folder: Path, run: Path) -> None:
+        self.navigation, vessel = navigation, str(Path(folder).resolve())
+        self._scratch = TemporaryDirectory(prefix="endopilot-plan-")  # where a model keeps what it makes of the patient
+        record = read_json(run / "manifest.json")
+        self._manifest = {
+            "key": f"plan in {vessel}",
+            "device": asdict(navigation.device),
+            "config": {"simulator": record.get("simulator", {})},
+            "anatomies": [{"name": navigation.anatomy.name, "folder": vessel, "sha256": vessel}],
+        }
         simulator = Simulator(navigation.anatomy, navigation.device, config=SimulatorConfig(threads=1))
         simulator.reset(inserted_length=[navigation.start_inserted_mm], rotation=[navigation.start_rotation])
         tip = simulator.project()
@@ -136,8 +148,8 @@ class _Rest:
         device, zeros = self.navigation.device, np.zeros((count, samples))
         names = ("base_force", "base_torque", "drive_force", "drive_torque", "contact_force_max", "contact_force_sum")
         return Dataset(
-            folder=self._folder.parent,
-            manifest={"anatomies": [{"name": self.navigation.anatomy.name, "folder": str(self._folder)}]},
+            folder=Path(self._scratch.name),
+            manifest=self._manifest,
             sample_period_s=SAMPLE_PERIOD_S,
             anatomy=np.full(count, self.navigation.anatomy.name),
             sequence=np.arange(count),

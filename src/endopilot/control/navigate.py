@@ -11,6 +11,7 @@ from endopilot.anatomy.projection import project_tip
 from endopilot.control.fluoroscope import Fluoroscope, FluoroscopeConfig
 from endopilot.control.policy import DECISION_PERIOD_S, Policy, Sight, TipMeasurement
 from endopilot.control.robot import Limits, RobotConfig, SimulatedRobot
+from endopilot.env.observation import tip_direction
 from endopilot.env.task import SUCCESS_MM, Navigation
 from endopilot.errors import InputError
 from endopilot.simulation.simulator import SimulatorConfig
@@ -132,7 +133,7 @@ def navigate(
     random = np.random.default_rng([seed, 2])
     track, periods = _Track(simulator), int(np.ceil(navigation.seconds / DECISION_PERIOD_S - 1e-9))
     policy.start(navigation, seed)
-    reason, expose, direction = "time", True, _tip_direction(simulator)
+    reason, expose, direction = "time", True, tip_direction(simulator)[0]
     for period in range(periods):
         state, tip = robot.proximal_state(), None
         if expose:
@@ -145,7 +146,7 @@ def navigate(
         robot.command(*control)
         peak = robot.run(DECISION_PERIOD_S)
         track.moved(simulator, peak)
-        direction = _tip_direction(simulator)
+        direction = tip_direction(simulator)[0]
         if not simulator.valid[0]:
             reason = "invalid"
             break
@@ -175,12 +176,6 @@ def _reached(navigation: Navigation, simulator: Simulator) -> bool:
     width = float(line.radius[np.abs(line.abscissa - at) <= SUCCESS_MM + 1.0].max())
     away = np.linalg.norm(simulator.position[0, 0] - navigation.target.position(navigation.anatomy))
     return bool(away <= SUCCESS_MM + 3 * width and navigation.reached(simulator.project())[0])
-
-
-def _tip_direction(simulator: Simulator) -> Float[np.ndarray, "3"]:
-    """Return the unit vector along the wire at its tip."""
-    edge = simulator.position[0, 0] - simulator.position[0, 1]
-    return edge / np.linalg.norm(edge)
 
 
 class _Track:

@@ -23,6 +23,7 @@ from endopilot.control.search import SearchConfig
 from endopilot.env.task import Navigation
 from endopilot.errors import InputError
 from endopilot.files import read_json
+from endopilot.models.config import run_path
 from endopilot.progress import progress
 from endopilot.simulation.device import Device, read_device
 from endopilot.simulation.simulator import SimulatorConfig, simulate
@@ -178,7 +179,8 @@ def plan(
         anatomy: folder of the vessel.
         target: a section such as "4" or "PDA", a point "X,Y,Z" in LPS mm, or the path of a CSV of desired tips.
         config: method, time, limits and cost.
-        model: run made by `endopilot train`; needed for the methods inverse and mppi.
+        model: run made by `endopilot train`, or "pretrained", the model of the package; needed for the methods inverse
+            and mppi.
         device: name or YAML file of the wire; the model's if not given, the workhorse if there is none.
 
     Raises:
@@ -239,9 +241,11 @@ def _wire(model: Path | None, device: str | None, method: str) -> Device:
     """Return the wire: the one that is asked for, else the model's; both must be the same."""
     if model is None:
         if method in ("inverse", "mppi"):
-            raise InputError(f"--model: none given, and method {method} needs one; give a run of `endopilot train`")
+            raise InputError(
+                f"--model: none given, and method {method} needs one; give a run of `endopilot train`, or pretrained"
+            )
         return read_device(device or "workhorse-014")
-    record = read_json(Path(model) / "manifest.json")
+    record = read_json(run_path(model) / "manifest.json")
     if not isinstance(record, dict) or "device" not in record:
         raise InputError(f"{model}: is not a run of this version's `endopilot train`; train anew")
     trained = Device.from_record(record["device"])

@@ -13,6 +13,7 @@ POLICIES = {
     "retract-rotate": "endopilot.control.baselines:RetractRotate",
     "twin": "endopilot.control.agent:TwinPolicy",
     "agent": "endopilot.control.agent:AgentPolicy",
+    "open-loop": "endopilot.control.agent:OpenLoopPolicy",
 }
 """Name of each policy and where its class is, which is made without arguments; only the one that is asked for is
 imported."""

@@ -101,9 +101,29 @@ class Limits:
             return 0.0, 0.0
         if not np.isfinite(asked).all():
             return 0.0, 0.0
-        bound = np.array([self.max_velocity_mm_s, self.max_rotation_rad_s])
-        translation_mm_s, rotation_rad_s = np.clip(asked, -bound, bound).tolist()
+        translation_mm_s, rotation_rad_s = np.clip(asked, -self.fastest, self.fastest).tolist()
         return translation_mm_s, rotation_rad_s
+
+    @property
+    def fastest(self) -> Float[np.ndarray, "2"]:
+        """Largest translation and rotation, mm/s and rad/s."""
+        return np.array([self.max_velocity_mm_s, self.max_rotation_rad_s])
+
+    def possible(
+        self, control: Float[np.ndarray, "n 2"], inserted_length: Float[np.ndarray, "wires"], duration: float
+    ) -> Float[np.ndarray, "n 2"]:
+        """Return what a drive can do of finite controls, mm/s and rad/s, within its speed and its travel.
+
+        Args:
+            control: each is held for the whole time.
+            inserted_length: of the wires that it may hold, mm: neither the shortest nor the longest leaves the travel.
+            duration: s.
+        """
+        made = np.clip(control, -self.fastest, self.fastest)
+        back = (self.travel_mm[0] - float(inserted_length.min())) / duration
+        room = (self.travel_mm[1] - float(inserted_length.max())) / duration
+        made[:, 0] = np.clip(made[:, 0], min(back, 0.0), max(room, 0.0))
+        return made
 
 
 @dataclass(frozen=True, kw_only=True)

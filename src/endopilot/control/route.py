@@ -50,7 +50,8 @@ class Route:
         starts = [tree.branches[b].centerline for b in branches[1:]]
         junctions = np.array([line.abscissa[0] for line in starts if line.abscissa[0] < target.abscissa])
         beyond = np.array([line.abscissa[0] + line.radius[0] + BEYOND_MM for line in starts[: len(junctions)]])
-        beyond = np.minimum(beyond, target.abscissa)
+        ends = np.append(junctions[1:] - ENTERED_MM, target.abscissa)[: len(junctions)]  # of a branch shorter than that
+        beyond = np.minimum(beyond, ends)
         return Route(
             anatomy=anatomy,
             target=target,

@@ -10,32 +10,37 @@ and copied over the others, until one of them has entered the wanted branch.
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from endopilot.control.cost import Cost, safety_ratio
 from endopilot.control.policy import DECISION_PERIOD_S
+from endopilot.control.robot import Limits
 from endopilot.control.route import Route
 from endopilot.env.task import Navigation
 from endopilot.errors import InputError
 from endopilot.progress import Advance
 from endopilot.simulation.device import Device
-from endopilot.simulation.simulator import SPARE_MM
 from endopilot.simulation.stepping import Simulator
 from endopilot.types import TipProjection
 
 Controls = Float[np.ndarray, "periods 2"]
 _BACK_MM_S = 2.0
 """Speed at which a wire that has gone past its target is pulled back, mm/s."""
+_SHORT_MM = 1.0
+"""No way is planned that needs the last of the wire, mm: encoders err."""
 _STALL_PERIODS = 4
 """A tip that has come forward by less than `_STALL_SHARE` of the wire's advance in this many periods has stopped."""
 _STALL_SHARE = 0.25
 _LEFT_BEHIND = 0.2
 """Each attempt is content with a way that leaves this much more of the wires, by weight, behind."""
-_LOOKOUT_MM = 12.0
-"""A waypoint that is searched for lies no farther ahead than this, mm: beyond, a chord says little."""
+_LOOKOUT_MM, _LOOKOUT_RADII = 12.0, 3.0
+"""A waypoint that is searched for lies no farther ahead than this, mm, or lumen radii where that is more: beyond, a
+chord says little."""
+_LEAD_RADII = 1.4
+"""In a wide vessel a search begins this many lumen radii before the junction: a branch's mouth is about as wide."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +62,7 @@ class SearchConfig:
     turn_rad_s: float = 7.0
     """Fastest rotation that is tried, rad/s."""
     lead_mm: float = 4.0
-    """A search begins this far before the wall of the junction, mm."""
+    """A search begins this far before a junction, mm, or 1.4 lumen radii where that is more."""
     cost: Cost = field(default_factory=Cost)
     """What the candidates are compared by."""
 
@@ -132,8 +137,8 @@ class Search:
         anatomy, core = navigation.anatomy, sharing.config
         self.single, self._kept = (Simulator(anatomy, wires, config=core, sharing=sharing) for _ in range(2))
         self._many = Simulator(anatomy, crowd, config=core, sharing=sharing)
-        self._limits = np.array([wires[0].max_velocity_mm_s, wires[0].max_rotation_rad_s])
-        self._longest = float(navigation.anatomy.tree.longest_path().abscissa[-1]) + SPARE_MM
+        limits = Limits.of(wires[0], anatomy)
+        self._limits = replace(limits, travel_mm=(limits.travel_mm[0], limits.travel_mm[1] - _SHORT_MM))
         self._wire_radius = wires[0].tip_radius_mm
 
     def find(
@@ -202,7 +207,10 @@ class Search:
         """Push on, or pull back, to where a search for a waypoint begins."""
         before = self.route.junctions[self.route.junctions < waypoint]
         last = waypoint >= self.route.target.abscissa
-        begin = waypoint - _LOOKOUT_MM if last or not len(before) else float(before[-1]) - self.config.lead_mm
+        begin = waypoint - _LOOKOUT_MM
+        if len(before) and not last:
+            radius = float(self.route.radius(before[-1:])[0])
+            begin = float(before[-1]) - max(self.config.lead_mm, _LEAD_RADII * radius)
         for _ in range(periods - log.periods):
             tip = self.single.project()
             here, on_route = self.route.progress(tip) @ self._weight, self._all(self.route.astray(tip) == 0)
@@ -222,12 +230,7 @@ class Search:
         log.add(made, tip, step.tip_position, step.contact_force_max, step.inserted_length, step.rotation)
 
     def _possible(self, control: Float[np.ndarray, "n 2"], simulator: Simulator) -> Float[np.ndarray, "n 2"]:
-        """Return what the drive can do of controls, with the shortest and the longest wire that it is given."""
-        made = np.clip(control, -self._limits, self._limits)
-        inserted = simulator.inserted_length
-        room = (self._longest - 1.0 - float(inserted.max())) / DECISION_PERIOD_S
-        made[:, 0] = np.clip(made[:, 0], -float(inserted.min()) / DECISION_PERIOD_S, max(room, 0.0))
-        return made
+        return self._limits.possible(control, simulator.inserted_length, DECISION_PERIOD_S)
 
     def _pressed(self, log: _Log) -> bool:
         limit = self.config.cost.forbidden_share * self.navigation.force_limit_n
@@ -243,7 +246,8 @@ class Search:
         What is searched in vain is begun anew from the same state, so that a plan holds no vain motion.
         """
         progress = float(self.route.progress(self.single.project()) @ self._weight)
-        waypoint = min(self.route.next_waypoint(progress), progress + _LOOKOUT_MM)
+        lookout = max(_LOOKOUT_MM, _LOOKOUT_RADII * float(self.route.radius(np.array([progress]))[0]))
+        waypoint = min(self.route.next_waypoint(progress), progress + lookout)
         rounds = min(self.config.rounds, (periods - log.periods) // self.config.round_periods)
         nearest, best = np.inf, np.zeros((0, 2))
         for attempt in range(self.config.attempts):
@@ -318,7 +322,7 @@ class Search:
     ) -> Float[np.ndarray, "candidates"]:  # fmt: skip
         """Drive all candidates for a round; return what it cost each, in the mean over its wires."""
         cost, wires = self.config.cost, self.single.worlds
-        spent = cost.roughness(before, control, self._limits)
+        spent = cost.roughness(before, control, self._limits.fastest)
         for _ in range(self.config.round_periods):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")

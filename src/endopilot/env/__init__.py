@@ -24,7 +24,7 @@ TASKS = (
 for _name, _task in (("Navigate", None), *((name, name.lower()) for name in TASKS)):
     gymnasium.register(
         id=f"endopilot/{_name}-v0",
-        entry_point="endopilot.env.navigation:NavigateEnv",
+        entry_point="endopilot.env.single:NavigateEnv",
         vector_entry_point="endopilot.env.navigation:NavigateVectorEnv",
         kwargs={} if _task is None else {"task": _task},
     )

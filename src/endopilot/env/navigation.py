@@ -1,4 +1,4 @@
-"""Navigation as a learning environment: `NavigateVectorEnv`, many worlds at once, and `NavigateEnv`, one of them."""
+"""Navigation as a learning environment, many worlds at once: `NavigateVectorEnv`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import gymnasium
 import numpy as np
 from gymnasium.spaces import Box
 from gymnasium.utils import seeding
@@ -19,23 +18,32 @@ from numpy.typing import ArrayLike
 from endopilot.env import observation
 from endopilot.env.observation import Measured, observe
 from endopilot.env.route import Routes
-from endopilot.env.task import Navigation
+from endopilot.env.task import Navigation, reached
 from endopilot.env.tasks import reference_navigation, training_navigations
 from endopilot.errors import InputError
 from endopilot.simulation.simulator import SPARE_MM, SimulatorConfig
 from endopilot.simulation.state import SimulatorState
 from endopilot.simulation.stepping import Simulator
-from endopilot.types import TipProjection
 
 CONTROL_PERIOD_S = 2 / 15
 """Time between two actions, s: fluoroscopy's usual 7.5 frames a second."""
 TRANSLATION_MM_S, ROTATION_RAD_S = 12.0, 3.14
 """Velocities of an action of 1: the fastest of the random navigations of `ControlConfig`, and half a turn a second."""
+_FASTEST = np.array([TRANSLATION_MM_S, ROTATION_RAD_S])
 CORE = SimulatorConfig(elements=50, time_step_s=1 / 14)
 """Settings of the rod core in a learning environment: half the elements and two time steps a control period, which cost
 a fifth of the default's time; docs/environment.md states the accuracy that they keep."""
 PROGRESS_REWARD, STEP_REWARD, FORCE_REWARD, SUCCESS_REWARD = 0.1, -0.01, -0.1, 5.0
 """A mm nearer to the target, every step, every step with too large a force, and the target."""
+
+_MASKS = tuple(
+    f"_{name}"
+    for name in (
+        *("contact_force_max", "valid", "success", "safe", "distance_mm", "inserted_length", "rotation"),
+        *("tip_abscissa", "tip_offset", "tip_branch", "time_s"),
+    )
+)
+"""Names of the masks in the info of a vector environment."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,10 +211,9 @@ class NavigateVectorEnv(VectorEnv):
         )
         self._routes = Routes.of(navigations)
         self._ends = np.array([nav.anatomy.tree.longest_path().abscissa[-1] + SPARE_MM for nav in navigations])
-        shared: dict[int, list[int]] = {}
-        for world, navigation in enumerate(navigations):
-            shared.setdefault(id(navigation), []).append(world)
-        self._shared = [(navigations[worlds[0]], np.array(worlds)) for worlds in shared.values()]
+        targets = [navigation.target for navigation in navigations]
+        self._target_branch = np.array([target.branch for target in targets])
+        self._target_abscissa = np.array([target.abscissa for target in targets])
         self._start, self._seconds, self._force_limit = (
             np.array([getattr(navigation, name) for navigation in navigations])
             for name in ("start_inserted_mm", "seconds", "force_limit_n")
@@ -263,7 +270,7 @@ class NavigateVectorEnv(VectorEnv):
         if control.shape != (self.num_envs, 2) or not np.isfinite(control).all():
             raise InputError(f"actions: shape {control.shape}; give finite numbers of shape ({self.num_envs}, 2)")
         fresh = self._ended & (self.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP)
-        control = np.clip(control, -1.0, 1.0) * (TRANSLATION_MM_S, ROTATION_RAD_S)
+        control = np.minimum(np.maximum(control, -1.0), 1.0) * _FASTEST
         control[fresh] = 0.0
         room = (self._ends - self._simulator.inserted_length) / CONTROL_PERIOD_S
         control[:, 0] = np.minimum(control[:, 0], room)
@@ -309,10 +316,10 @@ class NavigateVectorEnv(VectorEnv):
         self._distance = np.where(mask, self._routes.distance(self._simulator.project()), self._distance)
 
     def _infos(self, now: Measured, distance: Float[np.ndarray, "worlds"]) -> dict[str, Any]:
-        infos: dict[str, Any] = {
+        infos: dict[str, Any] = {  # the names of `_MASKS`
             "contact_force_max": now.contact_force,
             "valid": now.valid,
-            "success": self._reached(now.tip),
+            "success": reached(now.tip, self._target_branch, self._target_abscissa),
             "safe": self._safe.copy(),
             "distance_mm": distance,
             "inserted_length": now.inserted_length,
@@ -322,13 +329,7 @@ class NavigateVectorEnv(VectorEnv):
             "tip_branch": now.tip.branch,
             "time_s": self._steps * CONTROL_PERIOD_S,
         }
-        return infos | {f"_{name}": self._everyone for name in infos}
-
-    def _reached(self, tip: TipProjection) -> Bool[np.ndarray, "worlds"]:
-        reached = np.empty(self.num_envs, dtype=bool)
-        for navigation, worlds in self._shared:
-            reached[worlds] = navigation.reached(tip)[worlds]
-        return reached
+        return infos | dict.fromkeys(_MASKS, self._everyone)
 
     @property
     def state(self) -> NavigationState:
@@ -371,76 +372,3 @@ class NavigateVectorEnv(VectorEnv):
         self._prepare(kept["navigations"], kept["autoreset_mode"], kept["config"])
         self.set_state(kept["state"])
         self.spec = kept["spec"]
-
-
-class NavigateEnv(gymnasium.Env):
-    """Bring a guidewire to a target in a vessel tree: `NavigateVectorEnv` with one world.
-
-    Spaces, reward, start and ends are as `NavigateVectorEnv` says; info holds numbers in place of arrays. After the end
-    of an episode it waits for `reset`.
-
-    ## Version history
-
-    - v0: first version.
-    """
-
-    def __init__(
-        self,
-        *,
-        navigation: Navigation | None = None,
-        task: str | None = None,
-        patient: int = 0,
-        config: SimulatorConfig = CORE,
-    ) -> None:
-        """Lay the wire out; `reset` starts the first episode.
-
-        Args:
-            navigation: what is to be done.
-            task: in its place, the name of a task of the ladder.
-            patient: which of its training patients.
-            config: settings of the rod core.
-        """
-        self._worlds = NavigateVectorEnv(
-            navigations=navigation,
-            task=task,
-            patient=patient,
-            autoreset_mode=AutoresetMode.DISABLED,
-            config=config,
-        )
-        self.metadata = {"render_modes": []}
-        self.action_space = self._worlds.single_action_space
-        self.observation_space = self._worlds.single_observation_space
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Float[np.ndarray, "features"], dict[str, Any]]:
-        """Start an episode; `options` are not used."""
-        super().reset(seed=seed)
-        self._worlds.draw_from(self.np_random)
-        observations, infos = self._worlds.reset()
-        return observations[0], _first(infos)
-
-    def step(self, action: ArrayLike) -> tuple[Float[np.ndarray, "features"], float, bool, bool, dict[str, Any]]:
-        """Drive the wire for a control period."""
-        row = np.asarray(action, dtype=float)[None]
-        observations, rewards, terminations, truncations, infos = self._worlds.step(row)
-        return observations[0], float(rewards[0]), bool(terminations[0]), bool(truncations[0]), _first(infos)
-
-    @property
-    def simulator(self) -> Simulator:
-        """The world, for pictures of the wire; stepping it goes past the environment."""
-        return self._worlds.simulator
-
-    @property
-    def state(self) -> NavigationState:
-        """All that the future depends on, to be kept and given to `set_state`."""
-        return self._worlds.state
-
-    def set_state(self, state: NavigationState) -> None:
-        """Go back to a state, bit by bit."""
-        self._worlds.draw_from(self.np_random)
-        self._worlds.set_state(state)
-
-
-def _first(infos: dict[str, Any]) -> dict[str, Any]:
-    return {name: values[0].item() for name, values in infos.items() if not name.startswith("_")}

@@ -8,14 +8,11 @@ import numpy as np
 from gymnasium.spaces import Box
 from jaxtyping import Bool, Float
 
-from endopilot.env.route import STEP_MM, Routes
+from endopilot.env.route import Routes
 from endopilot.simulation.state import Step
 from endopilot.simulation.stepping import Simulator
 from endopilot.types import TipProjection
 
-AHEAD_MM = np.array([3.0, 6.0, 12.0, 24.0])
-"""Distances ahead at which the route is observed, mm."""
-_PLACES_AHEAD = np.rint(AHEAD_MM / STEP_MM).astype(np.int64)
 _BOUND = 10.0
 SPACE = Box(-_BOUND, _BOUND, (31,), np.float32)
 """Of one world's observation; what lies beyond is cut off."""
@@ -59,17 +56,21 @@ class Measured:
     @classmethod
     def standing(cls, simulator: Simulator) -> Measured:
         """Return the worlds as they stand."""
-        w, x, y, z = simulator.orientation[:, 0].T
-        third = np.column_stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
         return cls(
             tip=simulator.project(),
             position=simulator.position[:, 0],
-            direction=third,
+            direction=tip_direction(simulator),
             contact_force=simulator.contacts.max(axis=1),
             inserted_length=simulator.inserted_length,
             rotation=simulator.rotation,
             valid=simulator.valid,
         )
+
+
+def tip_direction(simulator: Simulator) -> Float[np.ndarray, "worlds 3"]:
+    """Return the unit vectors along the wires at their tips: the third axes of the last elements."""
+    w, x, y, z = simulator.orientation[:, 0].T
+    return np.column_stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
 
 
 def observe(
@@ -88,23 +89,21 @@ def observe(
         force_limit_n: their force limits.
         time_share: share of the time limit that is used up.
     """
-    rows, place = np.arange(len(time_share)), routes.place(now.tip)
-    point, frame = routes.point[rows, place], routes.frame[rows, place]
-    ahead = np.minimum(place[:, None] + _PLACES_AHEAD, routes.radius.shape[1] - 1)
-    away = (routes.point[rows[:, None], ahead] - point[:, None]) / AHEAD_MM[:, None]
-    beside = np.einsum("wij,wj->wi", frame[:, 1:], now.position - point) / routes.radius[rows, place][:, None]
-    out = np.empty((len(rows), *SPACE.shape))
+    place, tip = routes.place(now.tip), now.tip
+    beside = (now.position - place.point) / place.radius[:, None]
+    inside = place.frame @ np.stack([now.direction, beside], axis=-1)
+    out = np.empty((len(time_share), *SPACE.shape))
     out[:, 0] = now.inserted_length / 100.0
     out[:, 1], out[:, 2] = np.cos(now.rotation), np.sin(now.rotation)
-    out[:, 3] = now.tip.abscissa / 100.0
-    out[:, 4] = now.tip.offset / now.tip.radius
+    out[:, 3] = tip.abscissa / 100.0
+    out[:, 4] = tip.offset / tip.radius
     out[:, 5] = distance_mm / 100.0
-    out[:, 6] = routes.on_route(now.tip)
+    out[:, 6] = place.on_route
     out[:, 7] = now.contact_force / force_limit_n
     out[:, 8] = time_share
-    out[:, 9:12] = np.einsum("wij,wj->wi", frame, now.direction)
-    out[:, 12:14] = beside
-    out[:, 14:26] = np.einsum("wij,wkj->wki", frame, away).reshape(len(rows), -1)
-    out[:, 26:30] = routes.radius[rows[:, None], ahead] / 2.0
-    out[:, 30] = (now.inserted_length - now.tip.abscissa) / 10.0
-    return np.clip(out, -_BOUND, _BOUND, out=out).astype(np.float32)
+    out[:, 9:12] = inside[:, :, 0]
+    out[:, 12:14] = inside[:, 1:, 1]
+    out[:, 14:26] = place.ahead
+    out[:, 26:30] = place.radius_ahead / 2.0
+    out[:, 30] = (now.inserted_length - tip.abscissa) / 10.0
+    return np.minimum(np.maximum(out, -_BOUND, out=out), _BOUND, out=out).astype(np.float32)

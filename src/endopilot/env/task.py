@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from endopilot.errors import InputError
 from endopilot.simulation.device import Device
@@ -78,5 +78,17 @@ class Navigation:
 
     def reached(self, tip: TipProjection) -> Bool[np.ndarray, "..."]:
         """Return which tips have reached the target: in its branch, within `SUCCESS_MM` of it along the centerline."""
-        near = np.abs(tip.abscissa - self.target.abscissa) <= SUCCESS_MM
-        return near & (tip.branch == self.target.branch)
+        return reached(tip, self.target.branch, self.target.abscissa)
+
+
+def reached(
+    tip: TipProjection, branch: int | Int[np.ndarray, "..."], abscissa: float | Float[np.ndarray, "..."]
+) -> Bool[np.ndarray, "..."]:
+    """Return which tips have reached targets: in their branch, within `SUCCESS_MM` of them along the centerline.
+
+    Args:
+        tip: the tips.
+        branch: of the target of all, or of each.
+        abscissa: of the target of all, or of each, mm.
+    """
+    return (np.abs(tip.abscissa - abscissa) <= SUCCESS_MM) & (tip.branch == branch)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from endopilot.control.navigate import NavigateConfig, Record, navigate
+from endopilot.control.navigate import NavigateConfig, Record, Truth, navigate
 from endopilot.control.policies import POLICIES, make_policy
 from endopilot.env.navigation import CORE
 from endopilot.env.task import Navigation
@@ -66,7 +66,7 @@ def climb(output: Path, config: LadderConfig) -> list[dict[str, Any]]:
         InputError: the folder holds the results of another policy or of other tasks, or a navigation cannot be begun.
     """
     tasks = [task for task in ladder_tasks() if not config.tasks or task.name in config.tasks]
-    _claim(output, config.policy, tasks)
+    claim(output, tasks, policy=config.policy)
     paths = [output / task.name / f"{place:02d}.json" for task in tasks for place in range(config.patients)]
     missing = [path for path in paths if not path.exists()]
     bad = each(f"Ladder, {config.policy}", missing, partial(_navigate, policy=config.policy))
@@ -87,16 +87,17 @@ def score(tasks: Sequence[Task], results: dict[str, list[dict[str, Any]]]) -> li
     `seconds` and `path_ratio` (length of the tip's path over that of the centerline); and of all the median of
     `peak_force_n` (N) and the mean of `exposures`.
     """
-    rows = [{"level": task.level, "task": task.name} | _summary(results[task.name]) for task in tasks]
+    rows = [{"level": task.level, "task": task.name} | summary(results[task.name]) for task in tasks]
     levels = {task.level: task.name for task in tasks}
     for title, wanted in (("lower four", range(1, 5)), ("upper eight", UPPER), ("all twelve", range(1, 13))):
         if all(level in levels for level in wanted):
             together = [result for level in wanted for result in results[levels[level]]]
-            rows.append({"level": None, "task": title} | _summary(together))
+            rows.append({"level": None, "task": title} | summary(together))
     return rows
 
 
-def _summary(results: list[dict[str, Any]]) -> dict[str, Any]:
+def summary(results: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return the scores of some navigations together, see `score`."""
     reached = [result for result in results if result["success"]]
 
     def median(name: str, of: list[dict[str, Any]], digits: int) -> float | None:
@@ -112,14 +113,19 @@ def _summary(results: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _claim(output: Path, policy: str, tasks: Sequence[Task]) -> None:
-    """Claim a folder, or check that it was begun with the same policy and the same tasks."""
+def claim(output: Path, tasks: Sequence[Task], **settings: Any) -> None:
+    """Claim a folder, or check that it was begun with the same settings and the same tasks.
+
+    Raises:
+        InputError: it holds the results of other settings, or something else.
+    """
     path = output / SETTINGS_FILE
-    now = {"policy": policy, "tasks": {task.name: _digest(task) for task in tasks}}
+    now = {**settings, "tasks": {task.name: _digest(task) for task in tasks}}
     if path.exists():
         before = read_json(path)
-        if before["policy"] != policy:
-            raise InputError(f"{output}: holds the results of policy {before['policy']!r}; choose another --output")
+        for name, value in settings.items():
+            if before.get(name) != value:
+                raise InputError(f"{output}: holds the results of {name} {before.get(name)!r}; choose another --output")
         for name, digest in now["tasks"].items():
             if before["tasks"].get(name, digest) != digest:
                 raise InputError(f"{output}: was begun with another task {name!r}; choose another --output")
@@ -136,9 +142,13 @@ def _digest(task: Task) -> str:
 def _navigate(path: Path, *, policy: str) -> None:
     """Do one navigation and write what came of it."""
     task, place = find_task(path.parent.name), int(path.stem)
-    navigation = task.ladder_navigation(place)
+    drive(path, task, place, task.ladder_navigation(place), policy, Truth())
+
+
+def drive(path: Path, task: Task, place: int, navigation: Navigation, policy: str, truth: Truth) -> None:
+    """Let a policy do a task in the patient at some place of its list, and write what came of it to a file."""
     config = NavigateConfig(simulator=replace(CORE, threads=1))
-    record = navigate(navigation, make_policy(policy), config=config, seed=100 * task.level + place)
+    record = navigate(navigation, make_policy(policy), config=config, seed=100 * task.level + place, truth=truth)
     write_json(path, {"task": task.name, "patient": navigation.anatomy.name} | _result(navigation, record))
 
 

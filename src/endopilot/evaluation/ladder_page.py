@@ -8,6 +8,7 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+import plotly.graph_objects as go
 from jaxtyping import Float
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
@@ -22,7 +23,7 @@ from endopilot.env.tasks import Task, find_task
 from endopilot.evaluation.figures import BLACK, BLUE, GREEN, ORANGE, STYLE, VERMILLION, png
 from endopilot.evaluation.ladder import SCORES_FILE
 from endopilot.evaluation.report import image, template_text
-from endopilot.evaluation.scene import navigation_scene
+from endopilot.evaluation.scene import INK, navigation_scene
 from endopilot.files import read_json, writing
 from endopilot.simulation.simulator import simulate
 from endopilot.types import SAMPLE_PERIOD_S, Rollout
@@ -31,6 +32,9 @@ PAGE_FILE = "index.html"
 SHOWN = 5
 """Patients of each task that the pictures show."""
 OUTCOMES = {"safe success": GREEN, "success, but too large a force": ORANGE, "not reached": VERMILLION}
+
+XRAY = {"color": BLACK, "marker": "o", "ms": 4.5, "mfc": "none", "mew": 0.8, "ls": "none"}
+"""How an exposure is drawn."""
 
 
 def write_page(output: Path) -> Path:
@@ -75,10 +79,40 @@ def _section(output: Path, task: Task, patients: int) -> dict[str, Any]:
     picture = image(png(_courses(navigations, results)), f"{task.title}: the tip's way in {len(results)} patients")
     replay = output / f"replay-{task.name}.html"
     if not replay.exists():
-        figure = navigation_scene(navigations[0].anatomy, _replay(navigations[0], results[0]["course"]))
+        figure = _replay_scene(task, navigations[0], results[0])
         with writing(replay) as partial:
-            figure.write_html(partial, include_plotlyjs="directory", auto_play=False, config={"displaylogo": False})
+            figure.write_html(
+                partial,
+                include_plotlyjs="directory",
+                auto_play=False,
+                default_height="97vh",
+                config={"displaylogo": False},
+            )
     return {"task": task, "picture": picture, "replay": replay.name, "first": results[0]}
+
+
+def _replay_scene(task: Task, navigation: Navigation, result: dict[str, Any]) -> go.Figure:
+    """Return a navigation replayed in space, with its target, what X-ray showed, and what came of it."""
+    course = result["course"]
+    figure = navigation_scene(navigation.anatomy, _replay(navigation, course))
+    seen = np.array(course["tip_position"])[np.array(course["exposed"])]
+    for points, name, marker in (
+        (navigation.target.position(navigation.anatomy)[None], "Target", {"symbol": "diamond", "size": 6}),
+        (seen, "Tip under X-ray", {"symbol": "circle-open", "size": 7}),
+    ):
+        x, y, z = points.T
+        figure.add_trace(go.Scatter3d(x=x, y=y, z=z, mode="markers", marker=marker | {"color": INK}, name=name))
+    told = f"{result['seconds']:g} s, {result['peak_force_n']:.2f} N, exposures: {result['exposures']}"
+    title = f"{task.title}: {navigation.anatomy.name}<br><sup>{_outcome(result)}, {told}</sup>"
+    figure.update_layout(height=None, title={"text": title, "x": 0.02, "y": 0.96, "font": {"size": 18}})
+    return figure
+
+
+def _outcome(result: dict[str, Any]) -> str:
+    """Return one of `OUTCOMES`."""
+    if not result["success"]:
+        return "not reached"
+    return "safe success" if result["safe"] else "success, but too large a force"
 
 
 def _replay(navigation: Navigation, course: dict[str, Any]) -> Rollout:
@@ -107,6 +141,7 @@ def _courses(navigations: list[Navigation], results: list[dict[str, Any]]) -> Fi
         marks = [Line2D([], [], color=color, lw=2, label=name) for name, color in OUTCOMES.items()]
         marks.append(Line2D([], [], color=BLUE, lw=4, alpha=0.35, label="route"))
         marks.append(Line2D([], [], color=BLACK, marker="*", ms=9, ls="none", label="target"))
+        marks.append(Line2D([], [], **XRAY, label="tip under X-ray"))
         figure.legend(handles=marks, loc="outside lower center", ncols=len(marks))
     return figure
 
@@ -128,10 +163,9 @@ def _draw(ax: Axes, navigation: Navigation, result: dict[str, Any]) -> None:
         ax.plot(
             *seen(line.points), color=BLUE if chosen else "#c9ced6", lw=width, alpha=0.35 if chosen else 1, zorder=1
         )
-    outcome = "not reached"
-    if result["success"]:
-        outcome = "safe success" if result["safe"] else "success, but too large a force"
-    ax.plot(*seen(np.array(result["course"]["tip_position"])), color=OUTCOMES[outcome], lw=1.3, zorder=2)
-    ax.plot(*seen(navigation.target.position(navigation.anatomy)[None]), color=BLACK, marker="*", ms=9, zorder=3)
-    ax.set_aspect("equal")
+    way = seen(np.array(result["course"]["tip_position"]))
+    ax.plot(*way, color=OUTCOMES[_outcome(result)], lw=1.3, zorder=2)
+    ax.plot(*way[:, np.array(result["course"]["exposed"])], **XRAY, zorder=3)
+    ax.plot(*seen(navigation.target.position(navigation.anatomy)[None]), color=BLACK, marker="*", ms=9, zorder=4)
+    ax.set_aspect("equal", adjustable="datalim")
     ax.set_title(f"{navigation.anatomy.name}\n{result['seconds']:g} s, {result['peak_force_n']:.2f} N", fontsize=8)

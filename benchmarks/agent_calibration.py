@@ -1,0 +1,176 @@
+"""Calibrate the X-ray adviser of the ladder's `agent`: `python benchmarks/agent_calibration.py [FOLDER] [--write]`.
+
+In patients to learn on of every task of the ladder the agent drives wires whose friction, stiffness of the tip and
+ostium are off by as much as it holds possible. X-ray is on every 10 s; between, what it foretells is held against the
+truth. The spread is fitted in the first four patients of each task, the bands are scaled in the next five, and three
+patients of each task that the ladder is scored on tell whether they hold. FOLDER, runs/agent-calibration if not given,
+holds a file a navigation; an interrupted run goes on with the others.
+
+With `--write` the calibration goes into the package, and the figures into docs/xray.md.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from endopilot.control import xray
+from endopilot.control.agent import AgentConfig, AgentPolicy
+from endopilot.control.navigate import NavigateConfig, Truth, navigate
+from endopilot.control.xray import Calibration, conformal_scale, fit_spread, spread_of
+from endopilot.env.navigation import CORE
+from endopilot.env.task import Navigation
+from endopilot.env.tasks import Task, find_task, ladder_tasks
+from endopilot.files import read_json, write_json
+from endopilot.parallel import each
+
+ROOT = Path(__file__).parents[1]
+ROLES = {"fit": range(4), "calibrate": range(4, 9), "test": range(3)}
+"""Places of the patients in the task's lists: to learn on, and for the test those of the ladder."""
+LEVEL, EXPOSED_EVERY, SECONDS = 0.9, 20, 30.0
+"""Share of the intervals that the bands are to hold; periods of 0.5 s from one exposure to the next; s a navigation."""
+
+
+class Watched(AgentPolicy):
+    """The agent with X-ray at fixed times, which keeps what it foretold before each of them."""
+
+    def start(self, navigation: Navigation, seed: int) -> None:
+        """Begin to keep."""
+        self.kept: list[np.ndarray] = []
+        super().start(navigation, seed)
+
+    def wants_xray(self) -> bool:
+        """Keep what is foretold now, and ask for X-ray when it is time."""
+        proximal, tip, spread, _ = self.foretold()
+        self.kept.append(np.concatenate([proximal[0], tip[0], spread[0]]))
+        return len(self.kept) % EXPOSED_EVERY == 0
+
+
+def truth_of(task: Task, place: int, role: str) -> Truth:
+    """Return what a patient's wire and ostium truly are, as far off as the agent holds possible."""
+    belief, roles = AgentConfig().belief, list(ROLES)
+    off = np.random.default_rng([task.level, place, roles.index(role)]).uniform(-1.0, 1.0, 3)
+    return Truth(
+        friction_factor=1 + belief.friction_spread * off[0],
+        stiffness_factor=1 + belief.stiffness_spread * off[1],
+        ostium_mm=belief.ostium_spread_mm * off[2],
+    )
+
+
+def watch(path: Path) -> None:
+    """Navigate in a patient, and write what was foretold and what was true at each period after the first."""
+    task, role, place = find_task(path.parent.name), *path.stem.split("-")
+    number = int(place)
+    if role == "test":
+        navigation = task.ladder_navigation(number)
+    else:
+        turn = np.random.default_rng([task.training.seed, number]).uniform(0.0, 2 * np.pi)
+        navigation = task.navigation(task.patient(task.training, number), start_rotation=turn)
+    policy = Watched(AgentConfig(tries=2), calibration=NO_BANDS)
+    record = navigate(
+        replace(navigation, seconds=min(SECONDS, navigation.seconds)),
+        policy,
+        config=NavigateConfig(simulator=replace(CORE, threads=1)),
+        seed=1000 + 100 * task.level + number,
+        truth=truth_of(task, number, role),
+    )
+    kept, count = np.array(policy.kept), len(policy.kept)
+    true = np.column_stack([record.tip.abscissa, record.tip.offset])[:count]
+    exposed = record.exposed[:count]
+    write_json(path, {"told": kept.tolist(), "true": true.tolist(), "exposed": exposed.tolist()})
+
+
+NO_BANDS = Calibration(
+    level=LEVEL, scale=0.0, abscissa_terms=(0.0,) * 4, offset_terms=(0.0,) * 4, anatomies=0, intervals=0, dataset=""
+)
+
+
+def intervals(content: dict) -> list[tuple[np.ndarray, ...]]:
+    """Return error (mm), time (s) and travel (mm) since the exposure, and spread (mm), of each interval without one."""
+    told, true, exposed = np.array(content["told"]), np.array(content["true"]), np.array(content["exposed"])
+    begins = np.flatnonzero(exposed)
+    found = []
+    for begin, end in zip(begins, np.append(begins[1:], len(exposed)), strict=True):
+        part = slice(begin + 1, end)  # what is foretold at an exposure is what it shows
+        if end - begin < 2:
+            continue
+        seconds = 0.5 * np.arange(1, end - begin)
+        travel = np.cumsum(np.abs(np.diff(told[begin:end, 0])))
+        found.append((true[part] - told[part, 2:4], seconds, travel, told[part, 4:6]))
+    return found
+
+
+def gathered(folder: Path, role: str) -> tuple[list[tuple[np.ndarray, ...]], np.ndarray]:
+    """Return the intervals of a role, and the patient of each."""
+    rows, owner = [], []
+    for path in sorted(folder.glob(f"*/{role}-*.json")):
+        of_one = intervals(read_json(path))
+        rows += of_one
+        owner += [f"{path.parent.name}/{path.stem}"] * len(of_one)
+    return rows, np.array(owner)
+
+
+def scores(rows: list[tuple[np.ndarray, ...]], terms: tuple[tuple[float, ...], tuple[float, ...]]) -> np.ndarray:
+    """Return of each interval the largest error over the spread."""
+    return np.array([np.max(np.abs(error) / spread_of(terms, *rest)) for error, *rest in rows])
+
+
+def calibrate(folder: Path) -> tuple[Calibration, list[str]]:
+    """Return the calibration, and a table of how well it holds."""
+    fitted, _ = gathered(folder, "fit")
+    terms = fit_spread(*(np.concatenate(column) for column in zip(*fitted, strict=True)))
+    rows, owner = gathered(folder, "calibrate")
+    calibration = Calibration(
+        level=LEVEL,
+        scale=conformal_scale(scores(rows, terms), owner, LEVEL),
+        abscissa_terms=terms[0],
+        offset_terms=terms[1],
+        anatomies=len(np.unique(owner)),
+        intervals=len(rows),
+        dataset="patients to learn on of the ladder's tasks",
+    )
+    lines = ["| patients | intervals without X-ray | in which both bands hold throughout |", "|---|---|---|"]
+    for title, role in (("calibrated on", "calibrate"), ("the ladder's, not seen", "test")):
+        rows, owner = gathered(folder, role)
+        held = float(np.mean(scores(rows, terms) <= calibration.scale))
+        lines.append(f"| {title}: {len(np.unique(owner))} | {len(rows)} | {100 * held:.1f} % |")
+    half = calibration.scale * np.concatenate([spread_of(terms, *rest) for _, *rest in rows])
+    error = np.abs(np.concatenate([row[0] for row in rows]))
+    lines += [
+        "",
+        f"Mean error of Δtip and γtip: {error[:, 0].mean():.2f} and {error[:, 1].mean():.2f} mm, medians "
+        f"{np.median(error[:, 0]):.2f} and {np.median(error[:, 1]):.2f} mm; median half-width of the bands: "
+        f"{np.median(half[:, 0]):.2f} and {np.median(half[:, 1]):.2f} mm.",
+    ]
+    return calibration, lines
+
+
+def main() -> None:
+    """Drive what is missing, calibrate, print, and write if asked to."""
+    folders = [argument for argument in sys.argv[1:] if not argument.startswith("--")]
+    folder = Path(folders[0]) if folders else ROOT / "runs" / "agent-calibration"
+    wanted = [
+        folder / task.name / f"{role}-{place:02d}.json"
+        for role, places in ROLES.items()
+        for task in ladder_tasks()
+        for place in places
+    ]
+    bad = each("Calibrating the agent's adviser", [path for path in wanted if not path.exists()], watch)
+    if bad:
+        raise SystemExit("\n".join(f"{path}: {error}" for path, error in bad.items()))
+    calibration, lines = calibrate(folder)
+    print(calibration, *lines, sep="\n")
+    if "--write" in sys.argv:
+        calibration.write(Path(xray.__file__).parent)
+        page = ROOT / "docs" / "xray.md"
+        begin, end = "<!-- agent:begin -->", "<!-- agent:end -->"
+        text = page.read_text(encoding="utf-8")
+        text = "\n".join([text.split(begin)[0] + begin, *lines, end + text.split(end)[1]])
+        page.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,89 @@
+"""Navigation as a learning environment, one world: `NavigateEnv`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from endopilot.env.navigation import CORE, NavigateVectorEnv, NavigationState
+from endopilot.env.task import Navigation
+from endopilot.simulation.simulator import SimulatorConfig
+from endopilot.simulation.stepping import Simulator
+
+
+class NavigateEnv(gymnasium.Env):
+    """Bring a guidewire to a target in a vessel tree: `NavigateVectorEnv` with one world.
+
+    Spaces, reward, start and ends are as `NavigateVectorEnv` says; info holds numbers in place of arrays. After the end
+    of an episode it waits for `reset`.
+
+    ## Version history
+
+    - v0: first version.
+    """
+
+    def __init__(
+        self,
+        *,
+        navigation: Navigation | None = None,
+        task: str | None = None,
+        patient: int = 0,
+        config: SimulatorConfig = CORE,
+    ) -> None:
+        """Lay the wire out; `reset` starts the first episode.
+
+        Args:
+            navigation: what is to be done.
+            task: in its place, the name of a task of the ladder.
+            patient: which of its training patients.
+            config: settings of the rod core.
+        """
+        self._worlds = NavigateVectorEnv(
+            navigations=navigation,
+            task=task,
+            patient=patient,
+            autoreset_mode=AutoresetMode.DISABLED,
+            config=config,
+        )
+        self.metadata = {"render_modes": []}
+        self.action_space = self._worlds.single_action_space
+        self.observation_space = self._worlds.single_observation_space
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Float[np.ndarray, "features"], dict[str, Any]]:
+        """Start an episode; `options` are not used."""
+        super().reset(seed=seed)
+        self._worlds.draw_from(self.np_random)
+        observations, infos = self._worlds.reset()
+        return observations[0], _first(infos)
+
+    def step(self, action: ArrayLike) -> tuple[Float[np.ndarray, "features"], float, bool, bool, dict[str, Any]]:
+        """Drive the wire for a control period."""
+        row = np.asarray(action, dtype=float)[None]
+        observations, rewards, terminations, truncations, infos = self._worlds.step(row)
+        return observations[0], float(rewards[0]), bool(terminations[0]), bool(truncations[0]), _first(infos)
+
+    @property
+    def simulator(self) -> Simulator:
+        """The world, for pictures of the wire; stepping it goes past the environment."""
+        return self._worlds.simulator
+
+    @property
+    def state(self) -> NavigationState:
+        """All that the future depends on, to be kept and given to `set_state`."""
+        return self._worlds.state
+
+    def set_state(self, state: NavigationState) -> None:
+        """Go back to a state, bit by bit."""
+        self._worlds.draw_from(self.np_random)
+        self._worlds.set_state(state)
+
+
+def _first(infos: dict[str, Any]) -> dict[str, Any]:
+    return {name: values[0].item() for name, values in infos.items() if not name.startswith("_")}
