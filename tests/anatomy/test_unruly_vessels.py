@@ -60,11 +60,11 @@ def test_an_ostium_in_mid_vessel_looks_away_from_the_inlet():
     assert abs(anatomy.tree.longest_path().abscissa[-1] - 35) < 3
 
 
-def crescent(points):
+def crescent(points, web_mm=0.8):
     """A lumen whose section grows towards z = -20 into two lobes and a web between them, as in a dissection."""
     aside = np.clip(5.0 - points[..., 2], 0.0, 40.0) / 25.0 * 9.0  # of the second lobe's axis, mm
     x = points[..., 0] - np.clip(points[..., 0], 0.0, aside)
-    web = 0.8 - np.hypot(x, points[..., 1])
+    web = web_mm - np.hypot(x, points[..., 1])
     lobe = 2.2 - np.hypot(points[..., 0] - aside, points[..., 1])
     return np.maximum(tube(points, 0.0, -40, 30, 2.0), np.where(points[..., 2] < 5.0, np.maximum(web, lobe), -1.0))
 
@@ -78,6 +78,13 @@ def test_the_other_side_of_a_wide_inlet_is_no_branch_that_leads_back():
     up = np.stack([np.full(20, 4.0), np.zeros(20), np.linspace(-19, -2, 20)], axis=1)
     tip = project_tip(anatomy.tree, anatomy.insertion, up)
     assert np.abs(tip.abscissa - (up[:, 2] + 20)).max() < 1.5  # a wire in the web lies beside the line, not far ahead
+
+
+def test_the_radius_at_a_given_ostium_is_the_vessels_and_not_the_distance_to_the_cut():
+    mask = mask_of(lambda p: np.minimum(crescent(p, 1.1), p[..., 2] + 20.0), (13, 4, 34), VOXEL_MM)
+    ostium = Insertion(np.array([0.0, 0.0, -20.0]), np.array([0.0, 0.0, 1.0]))
+    anatomy = extract_anatomy(replace(mask, ostium=ostium), name="wide")
+    assert anatomy.tree.branches[0].centerline.radius.min() > 1.2 and anatomy.catheter_radius_mm > 1.2
 
 
 def test_a_vessel_of_one_voxel_is_told_so():

@@ -19,6 +19,7 @@ from endopilot.anatomy.distance import BAND_MM, distance_map_from_mask, distance
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy, read_source
 from endopilot.anatomy.io import write_anatomy
 from endopilot.anatomy.projection import project_tip
+from endopilot.anatomy.tree import sampled
 from endopilot.errors import InputError
 from endopilot.progress import progress
 from endopilot.types import Anatomy, LumenMask, VesselTree, Volume
@@ -86,8 +87,8 @@ def agreement(true: VesselTree, found: VesselTree) -> tuple[float, float, float]
     OV is the share of both centerlines that lies within the true radius of the other, AI the mean distance of the found
     centerline from the true one where they overlap (Schaap et al., Med. Image Anal. 13, 2009).
     """
-    one, size = _sampled(true)
-    two, radius = _sampled(found)
+    one, size = sampled(true)
+    two, radius = sampled(found)
     gap, nearest = (np.asarray(value) for value in KDTree(one).query(two))
     back = np.asarray(KDTree(two).query(one)[0])
     inside, reached = gap < size[nearest], back < size
@@ -125,9 +126,9 @@ def _axis_and_radius(tree: VesselTree, mask: LumenMask) -> dict[str, tuple[float
     """Return the errors of the extracted centerline."""
     found = extract_anatomy(mask, name="bench")
     voxel = float(mask.volume.spacing_mm.min())
-    points, radius = _sampled(found.tree)
+    points, radius = sampled(found.tree)
     gap = np.min([analytic.distance_to_line(b.centerline.points, points) for b in tree.branches], axis=0)
-    axis, _ = _sampled(tree)
+    axis, _ = sampled(tree)
     true_radius = analytic.tree_distance(tree, axis)[np.asarray(KDTree(axis).query(points)[1])]
     overlap, _, _ = agreement(tree, found.tree)
     return {
@@ -196,7 +197,7 @@ def _projection_speed() -> dict[str, tuple[float, float | None]]:
     from endopilot.anatomy.atlas import AtlasConfig, synthesize_one
 
     patient = synthesize_one(AtlasConfig(seed=0), 0)
-    centre, size = _sampled(patient.tree)
+    centre, size = sampled(patient.tree)
     random = np.random.default_rng(0)
     chosen = random.integers(0, len(centre), PROJECTED)
     points = centre[chosen] + 0.4 * size[chosen, None] * random.normal(size=(PROJECTED, 3))
@@ -212,14 +213,3 @@ def _projection_speed() -> dict[str, tuple[float, float | None]]:
         "points projected a second of processor time": (PROJECTED / min(spent), SPEED_BAR),
         "stored distance map, MB": (stored, STORED_MB_BAR),
     }
-
-
-def _sampled(tree: VesselTree) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]:
-    """Return points and radii every 0.1 mm along all branches."""
-    points, radius = [], []
-    for branch in tree.branches:
-        line = branch.centerline
-        at = np.arange(line.abscissa[0], line.abscissa[-1], 0.1)
-        points.append(np.stack([np.interp(at, line.abscissa, line.points[:, axis]) for axis in range(3)], axis=-1))
-        radius.append(np.interp(at, line.abscissa, line.radius))
-    return np.concatenate(points), np.concatenate(radius)

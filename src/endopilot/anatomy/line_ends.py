@@ -130,7 +130,8 @@ def from_ostium(
     if clearance[1:].min() <= 0:
         return None
     # Near the ostium the nearest wall is the cut's own cap, and no width of the vessel.
-    free = int(np.argmax(np.append(np.linalg.norm(bridge - ostium.position, axis=1) > clearance, True)))
+    gone = np.linalg.norm(bridge - ostium.position, axis=1)
+    free = int(np.argmax(np.append(gone > 1.25 * clearance + step_mm, True)))
     clearance[:free] = np.append(clearance, radius[first])[free]
     return smoothed(np.concatenate([bridge, points[first:]]), 3.0), np.concatenate([clearance, radius[first:]])
 

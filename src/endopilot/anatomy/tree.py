@@ -10,6 +10,9 @@ from jaxtyping import Float
 
 from endopilot.types import Branch, Centerline, VesselTree
 
+SAMPLE_STEP_MM = 0.1
+"""Distance of the points by which two trees are compared."""
+
 
 @dataclass(frozen=True, eq=False)
 class Line:
@@ -107,6 +110,17 @@ def tangents(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
             outwards = (1.0 + share) * last / size[0] - share * before / size[1]
             direction[end] = outwards if end == 0 else -outwards
     return direction / np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-12)
+
+
+def sampled(tree: VesselTree) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]:
+    """Return points and radii every 0.1 mm along all branches."""
+    points, radius = [], []
+    for branch in tree.branches:
+        line = branch.centerline
+        at = np.arange(line.abscissa[0], line.abscissa[-1], SAMPLE_STEP_MM)
+        points.append(np.stack([np.interp(at, line.abscissa, line.points[:, axis]) for axis in range(3)], axis=-1))
+        radius.append(np.interp(at, line.abscissa, line.radius))
+    return np.concatenate(points), np.concatenate(radius)
 
 
 def resampled(points: Float[np.ndarray, "n 3"], step_mm: float) -> Float[np.ndarray, "m 3"]:

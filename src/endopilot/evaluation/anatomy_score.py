@@ -13,12 +13,11 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from endopilot.anatomy.projection import project_tip
+from endopilot.anatomy.tree import SAMPLE_STEP_MM, sampled
 from endopilot.types import Anatomy, DistanceMap, LumenMask, VesselTree, Volume
 
 SMALLEST_RADIUS_MM = 0.75
 """Vessels thinner than this are not scored: two voxels of a coronary CTA across, CAT08 scores from 0.75 mm up too."""
-
-SAMPLE_STEP_MM = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,8 +83,8 @@ def score_anatomy(mask: LumenMask, extracted: Anatomy, truth: Anatomy) -> Anatom
 
 def compare_trees(extracted: VesselTree, truth: VesselTree) -> Agreement:
     """Return how far an extracted centerline tree agrees with the true one."""
-    true_points, true_radius = _sample(truth)
-    points, radius = _sample(extracted)
+    true_points, true_radius = sampled(truth)
+    points, radius = sampled(extracted)
     distance, nearest = KDTree(true_points).query(points)
     follows, scored = distance <= true_radius[nearest], true_radius[nearest] >= SMALLEST_RADIUS_MM
     large = true_radius >= SMALLEST_RADIUS_MM
@@ -127,17 +126,6 @@ def _longest_piece(points: Float[np.ndarray, "n 3"]) -> float:
     return float(np.bincount(piece).max() * SAMPLE_STEP_MM)
 
 
-def _sample(tree: VesselTree) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]:
-    """Return points and radii every 0.1 mm along all branches."""
-    points, radius = [], []
-    for branch in tree.branches:
-        line = branch.centerline
-        at = np.arange(line.abscissa[0], line.abscissa[-1], SAMPLE_STEP_MM)
-        points.append(np.stack([np.interp(at, line.abscissa, line.points[:, axis]) for axis in range(3)], axis=-1))
-        radius.append(np.interp(at, line.abscissa, line.radius))
-    return np.concatenate(points), np.concatenate(radius)
-
-
 def _mask_scores(mask: LumenMask, truth: Anatomy) -> tuple[float, float]:
     """Return Dice and clDice over voxels beyond the ostium whose nearest true vessel is large enough.
 
@@ -154,7 +142,7 @@ def _mask_scores(mask: LumenMask, truth: Anatomy) -> tuple[float, float]:
     projection = project_tip(truth.tree, truth.insertion, places)
     scored = np.zeros(ours.shape, dtype=bool)
     scored[tuple(indices[(projection.abscissa > 0) & (projection.radius >= SMALLEST_RADIUS_MM)].T)] = True
-    points, _ = _sample(truth.tree)
+    points, _ = sampled(truth.tree)
     line = np.zeros(ours.shape, dtype=bool)
     line[tuple((np.rint(mask.volume.world_to_index(points)).astype(int)[:, ::-1] - corner).T)] = True
     dice = 2 * (true & ours & scored).sum() / max((true & scored).sum() + (ours & scored).sum(), 1)

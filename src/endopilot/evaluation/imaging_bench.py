@@ -72,7 +72,8 @@ def bench_imaging(config: ImagingBenchConfig) -> dict[str, Any]:
     Centerlines and radii are those that `extract_anatomy` finds in the mask; its tree begins at the mask's ostium.
 
     Returns:
-        For each of `BARS` its `mean`, `sd`, `worst`, `bar`, `counts` (mean or worst) and whether it is `met`; `seconds`
+        For each of `BARS` its `mean`, `sd`, `worst` of all cases and `worst_found` of those with a result, `bar`,
+        `counts` (mean or worst) and whether it is `met`; `seconds`
         and `processor_seconds` of the segmentation a case; `cases`, and `failed`: cases without any result, each with
         the reason. A failed case counts 0 in the shares, and no bar in mm is met then.
     """
@@ -136,6 +137,7 @@ def _figure(name: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
     lost = 0.0 if bar.at_least else float("inf")
     values = np.array([lost if row["failed"] else row[name] for row in rows], dtype=float)
     counted = values[np.isfinite(values)]
+    found = np.array([row[name] for row in rows if not row["failed"]], dtype=float)
     worst = float(values.min() if bar.at_least else values.max())
     mean = float(counted.mean()) if len(counted) else float("nan")
     decisive = worst if bar.worst or len(counted) < len(values) else mean
@@ -143,6 +145,7 @@ def _figure(name: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
         "mean": _rounded(mean),
         "sd": _rounded(float(counted.std(ddof=1)) if len(counted) > 1 else 0.0),
         "worst": _rounded(worst),
+        "worst_found": _rounded(float((found.min() if bar.at_least else found.max()) if len(found) else np.nan)),
         "bar": bar.limit,
         "counts": "worst" if bar.worst else "mean",
         "met": bool(decisive >= bar.limit if bar.at_least else decisive <= bar.limit),
