@@ -203,6 +203,28 @@ def result_rows(folder: Path) -> Iterator[str]:
                 yield f"| {model} | {split} | {series} | {cells[0]} | {cells[1]} | {off_wall:.3f} | {skills} |"
 
 
+def depth_rows(folder: Path) -> Iterator[str]:
+    """Yield the errors by depth, the worst patient and the share of diverged navigations, on new patients."""
+    for path in sorted(folder.glob("evaluation*/metrics.json")):
+        model = path.parent.name.removeprefix("evaluation-").removeprefix("evaluation") or "causal"
+        result = read_json(path)["splits"]["test"]["tip"]
+        for series in ("P1", "hold_slack", "training_mean", "friction_90", "friction_110"):
+            figures = result[series]
+            cells = [
+                " ".join(f"{part['mae']:.3f}" for part in figures[name]["by_depth"].values())
+                for name in ("abscissa", "offset")
+            ]
+            worst = figures["worst_anatomy"]["mae"]
+            yield f"| {model} | {series} | {cells[0]} | {cells[1]} | {worst:.3f} | {figures['diverged_share']:.0%} |"
+
+
+def event_rows(folder: Path) -> Iterator[str]:
+    """Yield the share of the samples in which the recorded tip sticks, slips or whips."""
+    for split, result in read_json(folder / "evaluation" / "metrics.json")["splits"].items():
+        shares = " | ".join(f"{result['event_shares'][name]:.2%}" for name in ("stick", "slip", "whip"))
+        yield f"| {split} | {shares} |"
+
+
 def control_rows(folder: Path) -> Iterator[str]:
     """Yield the errors of the controls that every model's IF asks for."""
     for path in sorted(folder.glob("evaluation*/metrics.json")):
@@ -226,6 +248,8 @@ if __name__ == "__main__":
     page = written(page, "headline", list(headline_rows(folder)))
     page = written(page, "speed", list(speed_rows(folder)))
     page = written(page, "results", list(result_rows(folder)))
+    page = written(page, "depth", list(depth_rows(folder)))
+    page = written(page, "events", list(event_rows(folder)))
     page = written(page, "controls", list(control_rows(folder)))
     if "--tried" in sys.argv:
         data = load_dataset(folder / "dataset")

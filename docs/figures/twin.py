@@ -67,8 +67,7 @@ def measure(folder: Path) -> Iterator[str]:
 
 
 if __name__ == "__main__":
-    text = PAGE.read_text(encoding="utf-8")
-    head, rest = text.split("<!-- twin:begin -->\n")
-    tail = rest.split("<!-- twin:end -->")[1]
     table = "\n".join(measure(Path(sys.argv[1])))
+    head, rest = PAGE.read_text(encoding="utf-8").split("<!-- twin:begin -->\n")
+    tail = rest.split("<!-- twin:end -->")[1]
     PAGE.write_text(f"{head}<!-- twin:begin -->\n{table}\n<!-- twin:end -->{tail}", encoding="utf-8")

@@ -224,11 +224,11 @@ def test_a_seed_repeats_to_the_bit_and_an_interrupted_run_goes_on(folder, tmp_pa
         save(self, *args)
         raise Cut
 
-    from endopilot.models.train import _Job
+    from endopilot.models.train import Job
 
-    save = _Job._save
+    save = Job._save
     with pytest.MonkeyPatch.context() as patch, pytest.raises(Cut):
-        patch.setattr(_Job, "_save", stop)
+        patch.setattr(Job, "_save", stop)
         train(folder, tmp_path / "cut", SHORT)
     train(folder, tmp_path / "cut", SHORT)
     assert sha256(tmp_path / "cut/ff.safetensors") == sha256(tmp_path / "once/ff.safetensors")
