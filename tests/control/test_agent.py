@@ -9,6 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from endopilot.control import search
 from endopilot.control.agent import AgentConfig, AgentPolicy, OpenLoopPolicy, TwinPolicy
 from endopilot.control.belief import Belief, BeliefConfig
 from endopilot.control.navigate import Truth, navigate
@@ -179,3 +180,18 @@ def test_a_search_ends_though_pushing_seems_to_arrive_and_the_target_is_not_reac
     policy.start(side_branch, 0)
     course = policy.find_course(5.0)
     assert course.reached == 0.0 and len(course.control) == 10
+
+
+def test_a_search_begins_farther_before_a_wide_junction(side_branch, monkeypatch) -> None:
+    """The junction is at 20 mm in a vessel of 1 mm: 4 mm before it, or as many radii as a mouth needs."""
+    begun = []
+    for radii in (1.4, 8.0):
+        monkeypatch.setattr(search, "_LEAD_RADII", radii)
+        policy = TwinPolicy(config=QUICK)
+        policy.start(side_branch, 0)
+        one = policy._search
+        one.single.copy_worlds(np.zeros(1, dtype=int), of=policy.belief.simulator)
+        one._weight = np.ones(1)
+        one._approach(search._Log(), 20, 22.5)
+        begun.append(float(one.single.project().abscissa[0]))
+    assert begun == pytest.approx([16.0, 12.0], abs=1.1)
