@@ -91,7 +91,7 @@ def _height_of_wall(
     offset, level = offset[close], height[tuple(near[close].T)]
     if len(offset) == 0:
         return 0.0
-    slope = [values[tuple((near[close]).T)] for values in np.gradient(height)]
+    slope = [values[tuple(near[close].T)] for values in np.gradient(height)]
     outward = np.array([values.mean() for values in slope])[::-1]
     outward = grid.direction @ outward / max(float(np.linalg.norm(outward)), 1e-9)
     above = offset @ outward
@@ -101,11 +101,11 @@ def _height_of_wall(
         return 0.0
     terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)[around]
     place = (above - level)[around]
-    kept = np.ones(len(place), dtype=bool)
-    for _ in range(3):
-        found, *_ = np.linalg.lstsq(terms[kept], place[kept], rcond=None)
+    found = np.linalg.lstsq(terms, place, rcond=None)[0]
+    for _ in range(2):
         miss = np.abs(place - terms @ found)
         kept = miss <= max(2.5 * float(np.median(miss)), 0.2)
+        found = np.linalg.lstsq(terms[kept], place[kept], rcond=None)[0]
     return float(np.clip(found[0], -_DEEPEST_MM, 0.0))
 
 
