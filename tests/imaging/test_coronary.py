@@ -138,3 +138,21 @@ def test_what_comes_to_a_chamber_below_the_aorta_is_no_coronary_tree(heart):
 def test_a_stump_is_no_coronary_tree(heart):
     with pytest.raises(InputError, match="no such artery"):
         segment(changed(heart[0], positions(heart[0])[..., 0] > 36.0, FAT_HU), SegmentConfig(vessel="lca"))
+
+
+def test_a_pulmonary_trunk_as_bright_as_the_aorta_is_not_taken_for_it():
+    # It is wider than the aorta, and the artery passes by in front of it, 2 mm from its blood.
+    grid = empty_grid((90, 130, 108), (0.6, 0.6, 0.6), (-20.0, -50.0, -36.0))
+    x = positions(grid)
+    aorta, trunk = (
+        np.hypot(x[..., 0] - middle[0], x[..., 1] - middle[1]) - radius
+        for middle, radius in (((7.8, 10.4), AORTA_RADIUS_MM), ((22.0, -26.0), 16.0))
+    )
+    corners = np.array([[0, 0, 0], [-7, -10, -2], [-5, -26, -6], [2, -38, -12], [9.3, -41.2, -20], [22, -46, -34]])
+    axis = np.stack([np.interp(np.linspace(0, 5, 300), np.arange(6), column) for column in corners.T], axis=1)
+    artery = inside_tube(grid, axis, 1.6)
+    hu = np.where(np.minimum(aorta, trunk) < 1.2, 50.0, FAT_HU)
+    hu[(aorta < 0) | (trunk < 0) | artery] = BLOOD_HU
+    found = segment(scan(grid, hu, blur_mm=0.4, noise_hu=20.0), SegmentConfig(vessel="rca"))
+    assert found.ostium is not None
+    assert np.linalg.norm(found.ostium.position) < 1.5

@@ -20,6 +20,7 @@ _ROUND_SHARE = 0.6
 """Share of the directions in which the edge must lie near the circle; neighbours touch in the others."""
 _FEWEST_SLICES_MM = 10.0
 """Length over which the disc must persist, mm."""
+_MOST_ROOTS = 3
 _DIRECTIONS = 32
 _BRIGHTEST_HU = 600.0
 """Undiluted contrast in the superior vena cava is brighter than this, and no more likely to be the aorta."""
@@ -52,11 +53,14 @@ class _Disc:
     hu: float
 
 
-def find_aortic_root(grid: Volume) -> AorticRoot:
-    """Find the ascending aorta.
+def find_aortic_roots(grid: Volume) -> list[AorticRoot]:
+    """Find what may be the ascending aorta, the likeliest first: a right heart as bright as the left is as likely.
 
     Args:
         grid: CT in HU along the LPS axes, isotropic, of about 1.5 mm: finer detail is of no use here.
+
+    Returns:
+        One to three, apart from each other.
 
     Raises:
         InputError: no contrast, or no such vessel in the volume.
@@ -68,20 +72,30 @@ def find_aortic_root(grid: Volume) -> AorticRoot:
             f"the volume holds no contrast-filled blood pool: nothing 9 mm wide exceeds {LEAST_BLOOD_HU:.0f} HU; "
             "give a CT angiogram in HU"
         )
-    best: list[_Disc] = []
-    for level in _LEVELS_HU:
-        chain = _best_chain([_discs(hu[k], k, level, spacing) for k in range(len(hu))])
-        if _weight(chain) > _weight(best):
-            best = chain
-    if len(best) * spacing < _FEWEST_SLICES_MM:
+    levels = [[_discs(hu[k], k, level, spacing) for k in range(len(hu))] for level in _LEVELS_HU]
+    roots: list[AorticRoot] = []
+    while len(roots) < _MOST_ROOTS:
+        best = max((_best_chain(slices) for slices in levels), key=_weight)
+        if len(best) * spacing < _FEWEST_SLICES_MM:
+            break
+        discs = np.array([[disc.i, disc.j, disc.k] for disc in best])
+        radius = np.array([disc.radius for disc in best])
+        blood = np.median(np.concatenate([_within(hu[disc.k], disc.j, disc.i, 0.7 * disc.radius) for disc in best]))
+        roots.append(AorticRoot(grid.index_to_world(discs), radius * spacing, float(blood)))
+        taken = {disc.k: disc for disc in best}
+        levels = [[[disc for disc in discs if not _overlaps(disc, taken)] for discs in slices] for slices in levels]
+    if not roots:
         raise InputError(
             "the ascending aorta was not found; give a CT angiogram that holds the aortic root, or seeds: the ostium "
             "first, then points along the vessel"
         )
-    discs = np.array([[disc.i, disc.j, disc.k] for disc in best])
-    radius = np.array([disc.radius for disc in best])
-    blood = np.median(np.concatenate([_within(hu[disc.k], disc.j, disc.i, 0.7 * disc.radius) for disc in best]))
-    return AorticRoot(grid.index_to_world(discs), radius * spacing, float(blood))
+    return roots
+
+
+def _overlaps(disc: _Disc, taken: dict[int, _Disc]) -> bool:
+    """Return whether a disc's middle lies in the disc that is taken in its slice."""
+    other = taken.get(disc.k)
+    return other is not None and float(np.hypot(disc.j - other.j, disc.i - other.i)) < other.radius
 
 
 def _weight(chain: list[_Disc]) -> float:

@@ -1,7 +1,7 @@
 """One coronary tree, from its ostium to its distal ends, in a cardiac CT angiogram: automatic.
 
-1. The ascending aorta is found as the largest round bright disc that persists from slice to slice; its median HU tell
-   how bright contrast-filled lumen is in this scan.
+1. The ascending aorta is found as the largest round bright disc that persists from slice to slice and that an artery
+   opens into; its median HU tell how bright contrast-filled lumen is in this scan.
 2. Bright voxels that a ball of 3.5 mm fits in are aorta, chambers and large veins. Of the others, those that look like
    the middle of a bright tube at some scale are vessels.
 3. The connected vessel that comes to the aorta's wall on the right side of it is the tree wanted; its paths are tracked
@@ -19,7 +19,7 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from endopilot.errors import InputError
-from endopilot.imaging.aortic_root import AorticRoot, find_aortic_root
+from endopilot.imaging.aortic_root import AorticRoot, find_aortic_roots
 from endopilot.imaging.contour import lumen_at_half_height
 from endopilot.imaging.grid import LEAST_BLOOD_HU, connected_components, distance_to_outside, interpolate_like, resample
 from endopilot.imaging.ostium import find_ostium
@@ -100,17 +100,14 @@ def segment_lumen(volume: Volume, config: SegmentConfig) -> LumenMask:
     """
     with progress("Segmenting the coronary tree", 5) as advance:
         grid = resample(volume, _GRID_MM)
-        root = _find_root(grid, config)
+        roots = _find_roots(grid, config)
         advance()
-        scan = _find_vessels(grid, root.blood_hu if root else _hu_at(volume, config.seeds[0]))
-        advance()
-        aorta = _aorta(scan, root) if root else np.zeros(scan.pools.shape, dtype=bool)
-        tree, start = (
-            _tree_at_seed(scan, aorta, config.seeds[0])
-            if root is None or config.seeds
-            else _tree_at_aorta(scan, root, aorta, config.vessel)
+        scan, aorta, tree, start = (
+            _seeded_tree(volume, grid, roots, config.seeds[0])
+            if config.seeds
+            else _tree_at_an_aorta(grid, roots, config.vessel)
         )
-        advance()
+        advance(2)
         ends = [_vessel_near(scan, tree, seed) for seed in config.seeds[1:]]
         paths = [
             scan.grid.index_to_world(path[:, ::-1]) for path in track_tree(scan.response, tree, start, ends, _GRID_MM)
@@ -123,13 +120,13 @@ def segment_lumen(volume: Volume, config: SegmentConfig) -> LumenMask:
     return LumenMask(Volume(mask, volume.spacing_mm, volume.origin_mm, volume.direction), ostium)
 
 
-def _find_root(grid: Volume, config: SegmentConfig) -> AorticRoot | None:
-    """Return the ascending aorta; None where it is not in the volume and a seed tells what it would."""
+def _find_roots(grid: Volume, config: SegmentConfig) -> list[AorticRoot]:
+    """Return what may be the ascending aorta; nothing where it is not in the volume and a seed tells what it would."""
     try:
-        return find_aortic_root(resample(grid, _ROOT_GRID_MM))
+        return find_aortic_roots(resample(grid, _ROOT_GRID_MM))
     except InputError:
         if config.seeds:
-            return None
+            return []
         raise
 
 
@@ -188,6 +185,45 @@ def _aorta(scan: _Scan, root: AorticRoot) -> Bool[np.ndarray, "nz ny nx"]:
     return aorta
 
 
+_Tree = tuple[_Scan, Bool[np.ndarray, "nz ny nx"], Bool[np.ndarray, "nz ny nx"], Int[np.ndarray, "3"]]
+"""The scan, the aorta in it, the connected vessel wanted, and its voxel nearest the aortic wall."""
+
+
+def _seeded_tree(volume: Volume, grid: Volume, roots: list[AorticRoot], seed: tuple[float, float, float]) -> _Tree:
+    """Return the vessel at a seed."""
+    scan = _find_vessels(grid, roots[0].blood_hu if roots else _hu_at(volume, seed))
+    aorta = _aorta(scan, roots[0]) if roots else np.zeros(scan.pools.shape, dtype=bool)
+    return scan, aorta, *_tree_at_seed(scan, aorta, seed)
+
+
+def _tree_at_an_aorta(grid: Volume, roots: list[AorticRoot], vessel: str) -> _Tree:
+    """Return the tree at the likeliest aorta that one opens into; the pulmonary trunk has arteries pass by at most."""
+    passing: _Tree | None = None
+    for root in roots:
+        scan = _find_vessels(grid, root.blood_hu)
+        aorta = _aorta(scan, root)
+        found = _tree_at_aorta(scan, root, aorta, vessel)
+        if found is None:
+            continue
+        if _opens_into(scan, aorta, *found):
+            return scan, aorta, *found
+        passing = passing or (scan, aorta, *found)
+    if passing is not None:  # a narrow ostium may be too dim to be seen open
+        return passing
+    raise InputError(
+        f"vessel={vessel!r}: no such artery comes to the aorta's wall in this volume; "
+        "give a CT that holds the aortic root, or seeds: the ostium first, then points along the vessel (LPS mm)"
+    )
+
+
+def _opens_into(scan: _Scan, aorta: np.ndarray, tree: np.ndarray, start: np.ndarray) -> bool:
+    """Return whether blood joins a tree to the aorta around the tree's voxel nearest to it."""
+    box = _box(start[None], np.full(3, _SEED_MM / _GRID_MM), tree.shape)
+    blood = scan.hu[box] > 0.5 * (scan.lumen_hu + _WALL_HU)
+    label = connected_components(blood)
+    return bool(np.intersect1d(label[tree[box] & blood], label[aorta[box] & blood]).size)
+
+
 def _tree_at_seed(
     scan: _Scan, aorta: np.ndarray, seed: tuple[float, float, float]
 ) -> tuple[Bool[np.ndarray, "nz ny nx"], Int[np.ndarray, "3"]]:
@@ -205,8 +241,8 @@ def _tree_at_seed(
 
 def _tree_at_aorta(
     scan: _Scan, root: AorticRoot, aorta: np.ndarray, vessel: str
-) -> tuple[Bool[np.ndarray, "nz ny nx"], Int[np.ndarray, "3"]]:
-    """Return the connected vessel that belongs to the ostium wanted, and its voxel nearest the aortic wall."""
+) -> tuple[Bool[np.ndarray, "nz ny nx"], Int[np.ndarray, "3"]] | None:
+    """Return the connected vessel that belongs to the ostium wanted, and its voxel nearest the aortic wall, if any."""
     label = connected_components(scan.vessels, corners=True)
     box = _box(np.argwhere(aorta), np.full(3, _TO_WALL_MM / _GRID_MM + 1), aorta.shape)
     gap = distance_to_outside(~aorta[box], _GRID_MM)
@@ -224,10 +260,7 @@ def _tree_at_aorta(
         if outward @ np.array(_SIDE[vessel]) > 0 and sizes[name] > sizes[best] * (best > 0):
             best, start = int(name), nearest
     if start is None or sizes[best] * _GRID_MM**3 < _LEAST_TREE_MM3:
-        raise InputError(
-            f"vessel={vessel!r}: no such artery comes to the aorta's wall in this volume; "
-            "give a CT that holds the aortic root, or seeds: the ostium first, then points along the vessel (LPS mm)"
-        )
+        return None
     return label == best, start
 
 
