@@ -38,7 +38,7 @@ from endopilot.types import Rollout
 VOLUME_SUFFIX = ".nii.gz"
 REPORT_FILE = "report.html"
 EVALUATED = 48
-"""Navigations of each split that are evaluated; each is simulated five times."""
+"""Navigations of each split that are evaluated; each is simulated seven times."""
 _PRETRAINED_DEVICE = "workhorse-014"
 DEMO_ORIGIN = (
     "The patients are synthetic: right coronary arteries drawn from published statistics, and a CT angiogram of each, "

@@ -51,6 +51,8 @@ _TO_WALL_MM = 3.5
 """Vesselness fades where the artery opens into the aorta: the tree starts within this distance of the wall."""
 _SEED_MM = 5.0
 """A seed belongs to the vessel within this distance."""
+_OPENING_MM = 5.0
+"""Blood that joins a tree to the aorta is looked for this far around the tree's voxel nearest the wall."""
 _LEAST_TREE_MM3 = 250.0
 """A smaller connected vessel is no coronary tree: 50 mm of 2.5 mm width hold as much."""
 _WALL_HU = 50.0
@@ -88,6 +90,11 @@ class _Scan:
     vessels: Bool[np.ndarray, "nz ny nx"]
     response: Float[np.ndarray, "nz ny nx"]
 
+    @property
+    def blood_hu(self) -> float:
+        """HU half way from the aortic wall to lumen: what is brighter is blood."""
+        return 0.5 * (self.lumen_hu + _WALL_HU)
+
 
 def segment_lumen(volume: Volume, config: SegmentConfig) -> LumenMask:
     """Segment the right or left coronary tree.
@@ -105,7 +112,7 @@ def segment_lumen(volume: Volume, config: SegmentConfig) -> LumenMask:
         scan, aorta, tree, start = (
             _seeded_tree(volume, grid, roots, config.seeds[0])
             if config.seeds
-            else _tree_at_an_aorta(grid, roots, config.vessel)
+            else _unseeded_tree(grid, roots, config.vessel)
         )
         advance(2)
         ends = [_vessel_near(scan, tree, seed) for seed in config.seeds[1:]]
@@ -113,7 +120,7 @@ def segment_lumen(volume: Volume, config: SegmentConfig) -> LumenMask:
             scan.grid.index_to_world(path[:, ::-1]) for path in track_tree(scan.response, tree, start, ends, _GRID_MM)
         ]
         advance()
-        blood = scan.hu > 0.5 * (scan.lumen_hu + _WALL_HU)
+        blood = scan.hu > scan.blood_hu
         ostium, paths[0] = find_ostium(paths[0], blood, aorta, scan.grid)
         mask = _refine(volume, scan, paths, ostium)
         advance()
@@ -196,7 +203,7 @@ def _seeded_tree(volume: Volume, grid: Volume, roots: list[AorticRoot], seed: tu
     return scan, aorta, *_tree_at_seed(scan, aorta, seed)
 
 
-def _tree_at_an_aorta(grid: Volume, roots: list[AorticRoot], vessel: str) -> _Tree:
+def _unseeded_tree(grid: Volume, roots: list[AorticRoot], vessel: str) -> _Tree:
     """Return the tree at the likeliest aorta that one opens into; the pulmonary trunk has arteries pass by at most."""
     passing: _Tree | None = None
     for root in roots:
@@ -218,8 +225,8 @@ def _tree_at_an_aorta(grid: Volume, roots: list[AorticRoot], vessel: str) -> _Tr
 
 def _opens_into(scan: _Scan, aorta: np.ndarray, tree: np.ndarray, start: np.ndarray) -> bool:
     """Return whether blood joins a tree to the aorta around the tree's voxel nearest to it."""
-    box = _box(start[None], np.full(3, _SEED_MM / _GRID_MM), tree.shape)
-    blood = scan.hu[box] > 0.5 * (scan.lumen_hu + _WALL_HU)
+    box = _box(start[None], np.full(3, _OPENING_MM / _GRID_MM), tree.shape)
+    blood = scan.hu[box] > scan.blood_hu
     label = connected_components(blood)
     return bool(np.intersect1d(label[tree[box] & blood], label[aorta[box] & blood]).size)
 
@@ -319,7 +326,7 @@ def _rough_radius(lines: list[np.ndarray], scan: _Scan) -> Float[np.ndarray, "n"
     """Return the lumen radius along each path, mm, from the distance to voxels below half height."""
     index = np.round(scan.grid.world_to_index(np.concatenate(lines))).astype(int)[:, ::-1]
     box = _box(index, np.full(3, 4.0 / _GRID_MM), scan.hu.shape)
-    blood = scan.hu[box] > 0.5 * (scan.lumen_hu + _WALL_HU)
+    blood = scan.hu[box] > scan.blood_hu
     depth = np.asarray(ndimage.maximum_filter(distance_to_outside(blood, _GRID_MM), 3)) - _GRID_MM / 2
     pieces = []
     for number, line in enumerate(lines):
