@@ -20,6 +20,7 @@ import numpy as np
 from endopilot.control import xray
 from endopilot.control.agent import AgentConfig, AgentPolicy
 from endopilot.control.navigate import NavigateConfig, Truth, navigate
+from endopilot.control.policy import DECISION_PERIOD_S
 from endopilot.control.xray import Calibration, conformal_scale, fit_spread, spread_of
 from endopilot.env.navigation import CORE
 from endopilot.env.task import Navigation
@@ -97,7 +98,7 @@ def intervals(content: dict) -> list[tuple[np.ndarray, ...]]:
         part = slice(begin + 1, end)  # what is foretold at an exposure is what it shows
         if end - begin < 2:
             continue
-        seconds = 0.5 * np.arange(1, end - begin)
+        seconds = DECISION_PERIOD_S * np.arange(1, end - begin)
         travel = np.cumsum(np.abs(np.diff(told[begin:end, 0])))
         found.append((true[part] - told[part, 2:4], seconds, travel, told[part, 4:6]))
     return found

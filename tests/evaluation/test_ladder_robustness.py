@@ -8,7 +8,7 @@ import pytest
 
 from endopilot.env.tasks import find_task
 from endopilot.errors import InputError
-from endopilot.evaluation import robustness
+from endopilot.evaluation import ladder, robustness
 from endopilot.evaluation.ladder import LadderConfig
 from endopilot.evaluation.robustness import CASES, degrade, title_of, truth_of
 
@@ -28,7 +28,7 @@ def degraded(tmp_path_factory):
     folder = tmp_path_factory.mktemp("robustness") / "forward"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(robustness, "CASES", ("as-told", "ostium-more", "all"))
-        patch.setattr(robustness, "each", here)
+        patch.setattr(ladder, "each", here)
         return folder, degrade(folder, ONE, 0.2)
 
 
@@ -64,7 +64,7 @@ def test_an_interrupted_run_goes_on_and_another_share_needs_another_folder(degra
     folder, rows = degraded
     monkeypatch.setattr(robustness, "CASES", ("as-told", "ostium-more", "all"))
     asked = []
-    monkeypatch.setattr(robustness, "each", lambda title, items, work: asked.extend(items) or {})
+    monkeypatch.setattr(ladder, "each", lambda title, items, work: asked.extend(items) or {})
     assert degrade(folder, ONE, 0.2) == rows and asked == []
     with pytest.raises(InputError, match=r"holds the results of off 0\.2"):
         degrade(folder, ONE, 0.3)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -49,6 +49,11 @@ class LadderConfig:
         if not 1 <= self.patients <= 20:
             raise InputError(f"patients: {self.patients}; give 1 to 20")
 
+    @property
+    def chosen(self) -> list[Task]:
+        """The tasks named, or all."""
+        return [task for task in ladder_tasks() if not self.tasks or task.name in self.tasks]
+
 
 def climb(output: Path, config: LadderConfig) -> list[dict[str, Any]]:
     """Let a policy do the tasks in their patients, and score it.
@@ -65,14 +70,10 @@ def climb(output: Path, config: LadderConfig) -> list[dict[str, Any]]:
     Raises:
         InputError: the folder holds the results of another policy or of other tasks, or a navigation cannot be begun.
     """
-    tasks = [task for task in ladder_tasks() if not config.tasks or task.name in config.tasks]
+    tasks = config.chosen
     claim(output, tasks, policy=config.policy)
     paths = [output / task.name / f"{place:02d}.json" for task in tasks for place in range(config.patients)]
-    missing = [path for path in paths if not path.exists()]
-    bad = each(f"Ladder, {config.policy}", missing, partial(_navigate, policy=config.policy))
-    if bad:
-        path, error = next(iter(bad.items()))
-        raise InputError(f"task {path.parent.name}, patient {int(path.stem)}: {error}")
+    do_missing(f"Ladder, {config.policy}", paths, partial(_navigate, policy=config.policy))
     results = {task.name: [read_json(path) for path in paths if path.parent.name == task.name] for task in tasks}
     rows = score(tasks, results)
     write_json(output / SCORES_FILE, {"policy": config.policy, "patients": config.patients, "scores": rows})
@@ -133,6 +134,18 @@ def claim(output: Path, tasks: Sequence[Task], **settings: Any) -> None:
     elif output.exists() and any(output.iterdir()):
         raise InputError(f"{output}: is not empty and holds no ladder; choose another --output")
     write_json(path, now)
+
+
+def do_missing(title: str, paths: Sequence[Path], work: Callable[[Path], None]) -> None:
+    """Do the navigations TASK/PATIENT.json whose files are not there yet, in several processes.
+
+    Raises:
+        InputError: one of them cannot be begun; the others are done.
+    """
+    bad = each(title, [path for path in paths if not path.exists()], work)
+    if bad:
+        path, error = next(iter(bad.items()))
+        raise InputError(f"task {path.parent.name}, patient {int(path.stem)}: {error}")
 
 
 def _digest(task: Task) -> str:

@@ -11,11 +11,10 @@ from matplotlib.figure import Figure
 
 from endopilot.control.navigate import Truth
 from endopilot.env.task import Navigation
-from endopilot.env.tasks import Task, find_task, ladder_tasks
+from endopilot.env.tasks import Task, find_task
 from endopilot.errors import InputError
-from endopilot.evaluation.ladder import LadderConfig, claim, drive, summary
+from endopilot.evaluation.ladder import LadderConfig, claim, do_missing, drive, summary
 from endopilot.files import read_json, write_json, writing
-from endopilot.parallel import each
 
 ROBUSTNESS_FILE, PICTURE_FILE = "robustness.json", "robustness.png"
 QUANTITIES = ("friction", "stiffness", "latency", "ostium")
@@ -44,17 +43,14 @@ def degrade(output: Path, config: LadderConfig, off: float) -> list[dict[str, An
     """
     if not 0 < off < 1:
         raise InputError(f"off: {off} is not in (0, 1); give e.g. 0.2")
-    tasks = [task for task in ladder_tasks() if not config.tasks or task.name in config.tasks]
+    tasks = config.chosen
     claim(output, tasks, policy=config.policy, off=off)
     paths = {
         case: [output / case / task.name / f"{place:02d}.json" for task in tasks for place in range(config.patients)]
         for case in CASES
     }
-    missing = [path for of_case in paths.values() for path in of_case if not path.exists()]
-    bad = each(f"Robustness, {config.policy}", missing, partial(_navigate, policy=config.policy, off=off))
-    if bad:
-        path, error = next(iter(bad.items()))
-        raise InputError(f"task {path.parent.name}, patient {int(path.stem)}: {error}")
+    every = [path for of_case in paths.values() for path in of_case]
+    do_missing(f"Robustness, {config.policy}", every, partial(_navigate, policy=config.policy, off=off))
     rows = [{"case": case} | _scores([read_json(path) for path in paths[case]]) for case in CASES]
     with writing(output / PICTURE_FILE) as partly:
         partly.write_bytes(_picture(rows, config.policy, off))
