@@ -21,7 +21,7 @@ from endopilot.dataset.loader import Dataset
 from endopilot.errors import InputError
 from endopilot.files import write_json
 from endopilot.models.config import WINDOW
-from endopilot.models.open_loop import OpenLoop
+from endopilot.models.open_loop import OpenLoop, Seen
 from endopilot.simulation.controls import read_controls_csv
 from endopilot.simulation.simulator import SimulatorConfig, simulate
 
@@ -109,7 +109,7 @@ class Toy:
         tip = np.stack([SLACK * proximal[..., 0], np.full(proximal.shape[:2], 0.5)], axis=-1)
         return OpenLoop(tip=tip, proximal=proximal, control=episodes.control[:, WINDOW:])
 
-    def rollout_dual(self, episodes: Dataset) -> OpenLoop:
+    def rollout_dual(self, episodes: Dataset, seen: Seen | None = None) -> OpenLoop:
         wanted = episodes.tip_abscissa[:, WINDOW:] / SLACK
         before = np.concatenate([episodes.inserted_length[:, WINDOW - 1 : WINDOW], wanted[:, :-1]], axis=1)
         control = np.stack([(wanted - before) / 0.5, np.zeros_like(wanted)], axis=-1)

@@ -38,7 +38,10 @@ class HoldSlack:
         tip = np.stack([length[:, WINDOW:] - slack, offset.astype(float)], axis=-1)
         return OpenLoop(tip=tip, proximal=tip, control=tip)
 
-    rollout_inverse = rollout_dual = rollout_forward
+    rollout_inverse = rollout_forward
+
+    def rollout_dual(self, episodes, seen=None) -> OpenLoop:
+        return self.rollout_forward(episodes)
 
 
 @pytest.fixture(scope="module")

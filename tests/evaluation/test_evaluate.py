@@ -43,7 +43,7 @@ def evaluated(toy_dataset, tmp_path_factory):
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # small batches gain nothing from two, and lose much where cores are shared
     make_untrained_run(toy_dataset, folder / "run")
-    with patch("endopilot.evaluation.protocols.simulate", toy_simulate):
+    with patch("endopilot.evaluation.replay.simulate", toy_simulate):
         settings = EvaluateConfig(sequences=8)
         metrics = evaluate(folder / "run", folder / "evaluation", settings, other_seeds=[folder / "run"])
     torch.set_num_threads(threads)
@@ -106,7 +106,7 @@ def test_the_core_is_replayed_with_other_friction(toy_dataset, evaluated):
         asked[anatomy.name] = friction
         return toy_simulate(anatomy, device, control, initial=initial, config=config, friction=friction)
 
-    with patch("endopilot.evaluation.protocols.simulate", watched):
+    with patch("endopilot.evaluation.replay.simulate", watched):
         metrics = evaluate(evaluated[0] / "run", evaluated[0] / "again", EvaluateConfig(sequences=2))
     true = load_dataset(toy_dataset).friction[0]
     for friction in asked.values():

@@ -173,6 +173,29 @@ def test_inverse_sees_no_later_motion_and_no_later_desired_tip(brief, protocol, 
     assert np.abs(whole - cut).max() > 0.1
 
 
+def test_a_plan_under_way_begins_where_the_drive_is_and_heeds_what_was_seen(brief, monkeypatch):
+    monkeypatch.setattr("endopilot.models.causal._REFINEMENTS", 1)
+    now, seen = 37, given(brief)
+    seen[now] = True
+    predictor = untrained()
+    plan = predictor.rollout_dual(brief, seen)
+    assert plan.control.shape == (len(brief), brief.valid.shape[1] - now - 1, 2)
+    start = np.stack([brief.inserted_length, brief.rotation], axis=-1)[:, now].astype(float)
+    np.testing.assert_allclose(plan.proximal[:, 0], start + 0.5 * plan.control[:, 0], atol=1e-9)
+    # the drive's later motion is not looked at, its motion since the given states is
+    control, length = brief.control.copy(), brief.inserted_length.copy()
+    control[:, now + 1 :], length[:, now + 1 :] = 7.0, 7.0
+    np.testing.assert_array_equal(
+        predictor.rollout_dual(replace(brief, control=control, inserted_length=length), seen).control, plan.control
+    )
+    length[:, GIVEN : now + 1] += 2.0
+    assert np.abs(predictor.rollout_dual(replace(brief, inserted_length=length), seen).tip - plan.tip).max() > 0.1
+    # nor is the tip that was seen forgotten: unseen, the same navigation goes on otherwise
+    blind = given(brief)
+    blind[now - 1] = True
+    assert np.abs(predictor.rollout_dual(brief, blind).tip[:, 1:] - plan.tip).max() > 1e-3
+
+
 def test_the_play_operator_alone_beats_holding_the_slack(everyone):
     patient = np.unique(everyone.anatomy, return_inverse=True)[1]
     seen = np.broadcast_to(given(everyone), everyone.valid.shape)

@@ -116,6 +116,29 @@ def test_dual_feeds_the_foretold_tip_back(unseen):
     np.testing.assert_allclose(predictor.rollout_forward(along).tip, dual.tip, atol=1e-3)
 
 
+def test_a_plan_under_way_sees_the_last_thirty_states(unseen):
+    predictor, now = untrained(), 69
+    seen = np.arange(120) < GIVEN
+    seen[now] = True
+    plan = predictor.rollout_dual(unseen, seen)
+    assert plan.control.shape == (len(unseen), 120 - now - 1, 2)
+    start = np.stack([unseen.inserted_length, unseen.rotation], axis=-1)[:, now].astype(float)
+    np.testing.assert_allclose(plan.proximal[:, 0], start + 0.5 * plan.control[:, 0], atol=1e-9)
+
+    def planned(**changed):
+        return predictor.rollout_dual(replace(unseen, **changed), seen).control
+
+    tip = unseen.tip_abscissa.copy()
+    tip[:, : now - 29] = np.nan  # before the window
+    np.testing.assert_array_equal(planned(tip_abscissa=tip), plan.control)
+    tip = unseen.tip_abscissa.copy()
+    tip[:, now] += 1.0
+    assert np.abs(planned(tip_abscissa=tip) - plan.control).max() > 1e-3
+    motion = unseen.control.copy()
+    motion[:, now + 1 :] = np.nan
+    np.testing.assert_array_equal(planned(control=motion), plan.control)
+
+
 def test_controls_stay_within_the_device_s_limits_and_in_the_catheter(unseen):
     result = untrained((0.7, 0.2)).rollout_inverse(unseen)
     assert np.abs(result.control[..., 0]).max() == pytest.approx(0.7)

@@ -81,6 +81,16 @@ def test_it_finds_controls_that_lead_the_tip_along(folder, episodes) -> None:
     assert np.abs(found.control - episodes.control[:, later]).mean() > 0.1
 
 
+def test_under_way_it_drives_on_from_what_was_driven(folder, episodes) -> None:
+    few, now = episodes.select(np.array([0, 1])), 37
+    seen = GIVEN.copy()
+    seen[now] = True
+    found = load_run(folder / "run").rollout_dual(few, seen)
+    assert np.abs(found.tip[..., 0] - few.tip_abscissa[:, now + 1 :]).mean() < 0.4  # mm
+    start = np.stack([few.inserted_length, few.rotation], axis=-1)[:, now].astype(float)
+    np.testing.assert_allclose(found.proximal[:, 0], start + 0.5 * found.control[:, 0], atol=1e-9)
+
+
 def test_all_protocols_share_one_ensemble_and_one_search(folder, episodes, monkeypatch) -> None:
     calls = {"simulate": 0, "track": 0}
 

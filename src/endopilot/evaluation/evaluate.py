@@ -69,7 +69,7 @@ def evaluate(
     Raises:
         InputError: the run, its dataset or one of its anatomies is missing or damaged, or nothing was held out.
     """
-    from endopilot.evaluation.protocols import run_protocols  # brings torch, which takes seconds to import
+    from endopilot.evaluation.protocols import count_steps, run_protocols  # brings torch, which takes seconds to import
     from endopilot.models.rollout import load_run
 
     start = time.perf_counter()
@@ -89,7 +89,7 @@ def evaluate(
             "make it with seen_test_share above 0 or with more patients"
         )
     results: dict[str, SplitResult] = {}
-    steps = sum(3 + len(np.unique(data.anatomy)) for data in chosen.values())
+    steps = sum(count_steps(data) for data in chosen.values())
     with progress("Evaluating", total=steps) as advance:
         for split, data in chosen.items():
             results[split] = run_protocols(predictor, data, train, advance)

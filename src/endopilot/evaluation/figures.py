@@ -41,6 +41,7 @@ SERIES_STYLE: dict[str, dict] = {
     "P2": {"color": BLUE},
     "P3": {"color": ORANGE},
     "P4": {"color": VERMILLION},
+    "P4_replanned": {"color": PURPLE},
     "hold_slack": {"color": GREY, "linestyle": "--"},
     "training_mean": {"color": GREY, "linestyle": ":"},
     "hold_control": {"color": "#5d4a3a", "linestyle": "-."},

@@ -20,6 +20,7 @@ SERIES_TITLES: Mapping[str, str] = {
     "P2": "Inverse network (P2)",
     "P3": "Inverse into forward network (P3)",
     "P4": "Controls of P3, simulated (P4)",
+    "P4_replanned": "The same, planned anew at an X-ray image every 10 s",
     "P2_replayed": "Controls of P2, simulated",
     "hold_slack": "Baseline: hold slack and offset",
     "training_mean": "Baseline: training mean",
@@ -35,6 +36,7 @@ TIP_BASELINES: Mapping[str, tuple[str, ...]] = {
     "P1": ("hold_slack", "training_mean"),
     "P3": ("hold_control", "follow_slack"),
     "P4": ("hold_control", "follow_slack"),
+    "P4_replanned": ("hold_control", "follow_slack"),
     "P2_replayed": ("hold_control", "follow_slack"),
 }
 """Baselines that stand beside each protocol's tip errors. Those of P1 know the true controls, as it does; those of P3

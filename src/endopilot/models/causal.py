@@ -26,7 +26,7 @@ from torch import Tensor, nn
 from endopilot.dataset.loader import Dataset
 from endopilot.errors import InputError
 from endopilot.models.config import WINDOW, CausalConfig
-from endopilot.models.open_loop import Foretold, OpenLoop, Steps2
+from endopilot.models.open_loop import Foretold, OpenLoop, Seen, Steps2, begin_after, given_states
 from endopilot.models.play import Direction, Vessels
 from endopilot.models.sequences import N_INPUTS, read_vessels, unfold
 from endopilot.types import SAMPLE_PERIOD_S
@@ -113,7 +113,7 @@ class CausalPredictor:
     control_limits: Float[np.ndarray, "2"]
     known: dict[tuple[str, ...], Vessels] = field(default_factory=dict, repr=False)
 
-    def foretell(self, episodes: Dataset, seen: Bool[np.ndarray, "samples"]) -> Foretold:
+    def foretell(self, episodes: Dataset, seen: Seen) -> Foretold:
         """Predict the tips of episodes under their controls, from those that were seen.
 
         Args:
@@ -130,39 +130,41 @@ class CausalPredictor:
 
     def rollout_forward(self, episodes: Dataset) -> OpenLoop:
         """P1: predict the tip under the true controls."""
-        told = self.foretell(episodes, np.arange(episodes.valid.shape[1]) < WINDOW)
+        told = self.foretell(episodes, given_states(episodes))
         proximal = np.stack([episodes.inserted_length, episodes.rotation], axis=-1).astype(float)
         return OpenLoop(told.tip[:, WINDOW:], proximal[:, WINDOW:], episodes.control[:, WINDOW:].astype(float))
 
     def rollout_inverse(self, episodes: Dataset) -> OpenLoop:
         """P2: predict the controls that make the tip go the true way."""
         desired = np.stack([episodes.tip_abscissa, episodes.tip_offset], axis=-1).astype(float)[:, WINDOW:]
-        length, turn = self._asked(episodes)
+        length, turn = self._asked(episodes, WINDOW)
         proximal, control = _driven(episodes, length, turn, self.control_limits)
         return OpenLoop(desired, proximal, control)
 
-    def rollout_dual(self, episodes: Dataset) -> OpenLoop:
+    def rollout_dual(self, episodes: Dataset, seen: Seen | None = None) -> OpenLoop:
         """P3: predict the controls that make the tip go the true way, and the tip that they make.
 
         IF proposes controls, FF foretells what they do, and the inserted length is corrected at every sample by what
         the foretold tip misses the desired one by, a few times over. No control depends on a later desired tip.
         """
-        desired = episodes.tip_abscissa[:, WINDOW:].astype(float)
-        length, turn = self._asked(episodes)
+        seen = given_states(episodes) if seen is None else seen
+        begin = begin_after(seen)
+        desired = episodes.tip_abscissa[:, begin:].astype(float)
+        length, turn = self._asked(episodes, begin)
         proximal, control = _driven(episodes, length, turn, self.control_limits)
-        tip = self.rollout_forward(_along(episodes, proximal, control)).tip
+        tip = self.foretell(_along(episodes, proximal, control), seen).tip[:, begin:]
         for _ in range(_REFINEMENTS):
             length = proximal[..., 0] + desired - tip[..., 0]
             proximal, control = _driven(episodes, length, turn, self.control_limits)
-            tip = self.rollout_forward(_along(episodes, proximal, control)).tip
+            tip = self.foretell(_along(episodes, proximal, control), seen).tip[:, begin:]
         return OpenLoop(tip, proximal, control)
 
-    def _asked(self, episodes: Dataset) -> tuple[np.ndarray, np.ndarray]:
-        """Return inserted length (mm) and turn (rad) of every sample after the given ones, as IF asks for them."""
+    def _asked(self, episodes: Dataset, begin: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return inserted length (mm) and turn (rad) of every sample from `begin` on, as IF asks for them."""
         network = _needed(self.inverse, "inverse")
-        given = np.broadcast_to(np.arange(episodes.valid.shape[1]) < WINDOW, episodes.valid.shape)
+        given = np.broadcast_to(np.arange(episodes.valid.shape[1]) < begin, episodes.valid.shape)
         guess, answer = self._answered(network, "inverse", episodes, given)
-        wanted = (guess + answer[..., :2])[:, WINDOW:]
+        wanted = (guess + answer[..., :2])[:, begin:]
         return wanted[..., 0], wanted[..., 1]
 
     @torch.inference_mode()
@@ -194,23 +196,24 @@ def _driven(
     turn: Float[np.ndarray, "episodes samples"],
     limits: Float[np.ndarray, "2"],
 ) -> tuple[Steps2, Steps2]:
-    """Return x^prox and control of a drive that is led along inserted lengths and turns as far as it can follow."""
+    """Return x^prox and control of a drive that is led along the last lengths and turns as far as it can follow."""
     control = np.empty((*length.shape, 2))
-    inserted = episodes.inserted_length[:, WINDOW - 1].astype(float)
+    last = episodes.valid.shape[1] - length.shape[1] - 1
+    inserted = episodes.inserted_length[:, last].astype(float)
     control[..., 1] = np.clip(turn / SAMPLE_PERIOD_S, -limits[1], limits[1])
     for t in range(length.shape[1]):
         speed = np.clip((length[:, t] - inserted) / SAMPLE_PERIOD_S, -limits[0], limits[0])
         control[:, t, 0] = np.maximum(speed, -inserted / SAMPLE_PERIOD_S)  # not out of the catheter
         inserted = inserted + SAMPLE_PERIOD_S * control[:, t, 0]
-    start = np.stack([episodes.inserted_length, episodes.rotation], axis=-1)[:, WINDOW - 1 : WINDOW].astype(float)
+    start = np.stack([episodes.inserted_length, episodes.rotation], axis=-1)[:, last : last + 1].astype(float)
     return start + SAMPLE_PERIOD_S * np.cumsum(control, axis=1), control
 
 
 def _along(episodes: Dataset, proximal: Steps2, control: Steps2) -> Dataset:
-    """Return episodes that are driven otherwise after the given states."""
+    """Return episodes that are driven otherwise in their last samples."""
 
     def then(given: np.ndarray, later: np.ndarray) -> np.ndarray:
-        return np.concatenate([given[:, :WINDOW], later.astype(given.dtype)], axis=1)
+        return np.concatenate([given[:, : -later.shape[1]], later.astype(given.dtype)], axis=1)
 
     return replace(
         episodes,

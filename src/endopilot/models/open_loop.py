@@ -1,7 +1,8 @@
 """Open loop: the first 30 states of an episode are given, then a predictor goes on alone.
 
 P1, `rollout_forward`: the tip under the true controls. P2, `rollout_inverse`: the controls that make the true tip, as
-desired. P3, `rollout_dual`: those controls, and the tip that the predictor believes they make.
+desired. P3, `rollout_dual`: those controls, and the tip that the predictor believes they make; it may also begin later,
+from a navigation under way whose tip was seen now and then.
 """
 
 from __future__ import annotations
@@ -13,13 +14,16 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from endopilot.dataset.loader import Dataset
+from endopilot.models.config import WINDOW
 
+Seen = Bool[np.ndarray, "samples"]
+"""Samples at which the tip was measured, for example by X-ray."""
 Steps2 = Float[np.ndarray, "episodes steps 2"]
 
 
 @dataclass(frozen=True, eq=False)
 class OpenLoop:
-    """What a predictor foretells of each episode for the samples after the 30 given ones.
+    """What a predictor foretells of each episode for the samples after the given ones.
 
     Attributes:
         tip: (Δtip, γtip), mm; the true tip in P2, where none is predicted.
@@ -49,7 +53,7 @@ class Foretold:
 class Foreteller(Protocol):
     """A predictor that takes tips seen at any time, and says how sure it is: the causal networks and the twin."""
 
-    def foretell(self, episodes: Dataset, seen: Bool[np.ndarray, "samples"]) -> Foretold:
+    def foretell(self, episodes: Dataset, seen: Seen) -> Foretold:
         """Predict the tips of episodes under their controls, from those that were seen.
 
         Args:
@@ -71,6 +75,23 @@ class Predictor(Protocol):
         """P2: predict the controls that make the tip go the true way."""
         ...
 
-    def rollout_dual(self, episodes: Dataset) -> OpenLoop:
-        """P3: predict the controls that make the tip go the true way, and the tip that they make."""
+    def rollout_dual(self, episodes: Dataset, seen: Seen | None = None) -> OpenLoop:
+        """P3: predict the controls that make the tip go the true way, and the tip that they make.
+
+        Args:
+            episodes: up to the last seen sample the drive's motion as it was, and the tip as it was seen or else is
+                believed to have been; after it, the desired tip.
+            seen: the 30 given states if not given, and later samples at which the tip was measured too; what comes
+                after the last of them is predicted.
+        """
         ...
+
+
+def given_states(episodes: Dataset) -> Seen:
+    """Return the samples at which every protocol sees the tip: the first 30."""
+    return np.arange(episodes.valid.shape[1]) < WINDOW
+
+
+def begin_after(seen: Seen) -> int:
+    """Return the first sample that is to be predicted: the one after the last that was seen."""
+    return int(np.flatnonzero(seen)[-1]) + 1

@@ -19,7 +19,7 @@ from endopilot.files import read_json
 from endopilot.models.causal import CausalPredictor
 from endopilot.models.checkpoint import read_network
 from endopilot.models.config import WINDOW, TwinConfig, run_path
-from endopilot.models.open_loop import OpenLoop, Predictor, Steps2
+from endopilot.models.open_loop import OpenLoop, Predictor, Seen, Steps2, begin_after
 from endopilot.models.transformer import Network
 from endopilot.models.twin import TwinPredictor
 from endopilot.models.windows import Episodes
@@ -47,24 +47,29 @@ class TransformerPredictor:
 
     def rollout_forward(self, episodes: Dataset) -> OpenLoop:
         """P1: predict the tip under the true controls."""
-        return self._rollout(episodes, ask=False, foretell=True)
+        return self._rollout(episodes, WINDOW, ask=False, foretell=True)
 
     def rollout_inverse(self, episodes: Dataset) -> OpenLoop:
         """P2: predict the controls that make the tip go the true way."""
-        return self._rollout(episodes, ask=True, foretell=False)
+        return self._rollout(episodes, WINDOW, ask=True, foretell=False)
 
-    def rollout_dual(self, episodes: Dataset) -> OpenLoop:
-        """P3: predict the controls that make the tip go the true way, and the tip that they make."""
-        return self._rollout(episodes, ask=True, foretell=True)
+    def rollout_dual(self, episodes: Dataset, seen: Seen | None = None) -> OpenLoop:
+        """P3: predict the controls that make the tip go the true way, and the tip that they make.
+
+        The networks see the last 30 states only, of which those that were not seen are as `episodes` believes them.
+        """
+        begin = WINDOW if seen is None else begin_after(seen)
+        return self._rollout(episodes, begin, ask=True, foretell=True)
 
     @torch.inference_mode()
-    def _rollout(self, episodes: Dataset, *, ask: bool, foretell: bool) -> OpenLoop:
-        """Roll out with the controls that IF asks for or the true ones; likewise the tip that FF foretells."""
+    def _rollout(self, episodes: Dataset, begin: int, *, ask: bool, foretell: bool) -> OpenLoop:
+        """Roll out from a sample on, with controls that IF asks for or the true ones; likewise the tip and FF."""
         forward, inverse = self._network("forward", foretell), self._network("inverse", ask)
         parts = []
         for first in range(0, len(episodes), self.batch_size):
             chosen = np.arange(first, min(first + self.batch_size, len(episodes)))
-            parts.append(_rollout_batch(forward, inverse, self.control_limits, Episodes.of(episodes.select(chosen))))
+            batch = Episodes.of(episodes.select(chosen))
+            parts.append(_rollout_batch(forward, inverse, self.control_limits, batch, begin))
         tip, proximal, control = (np.concatenate(signal) for signal in zip(*parts, strict=True))
         return OpenLoop(tip=tip, proximal=proximal, control=control)
 
@@ -76,14 +81,14 @@ class TransformerPredictor:
 
 
 def _rollout_batch(
-    forward: Network | None, inverse: Network | None, limits: Float[np.ndarray, "2"], episodes: Episodes
+    forward: Network | None, inverse: Network | None, limits: Float[np.ndarray, "2"], episodes: Episodes, begin: int
 ) -> tuple[Steps2, Steps2, Steps2]:
-    """Return tip, x^prox and control after the given states of one batch."""
+    """Return tip, x^prox and control of one batch from a sample on."""
     desired = episodes.tip
     tip, control = desired.clone(), episodes.control.clone()
     proximal = episodes.proximal.double()  # float64, so that x^prox stays the integral of the controls
     bound = torch.as_tensor(limits, dtype=torch.float32)
-    for k in range(WINDOW, tip.shape[1]):
+    for k in range(begin, tip.shape[1]):
         if inverse is not None:
             asked = torch.cat([tip[:, k - WINDOW + 1 : k], desired[:, k : k + 1]], dim=1)
             given = slice(k - WINDOW, k)
@@ -94,7 +99,7 @@ def _rollout_batch(
         if forward is not None:
             moved = slice(k - WINDOW + 1, k + 1)
             tip[:, k] = forward(tip[:, k - WINDOW : k], proximal[:, moved].float(), control[:, moved])
-    return tuple(signal[:, WINDOW:].double().numpy() for signal in (tip, proximal, control))  # pyright: ignore[reportReturnType]
+    return tuple(signal[:, begin:].double().numpy() for signal in (tip, proximal, control))  # pyright: ignore[reportReturnType]
 
 
 def load_run(run_folder: Path) -> Predictor:

@@ -20,7 +20,7 @@ from scipy.stats import qmc
 from endopilot.anatomy.io import read_anatomy
 from endopilot.dataset.loader import Dataset
 from endopilot.models.config import WINDOW, TwinConfig
-from endopilot.models.open_loop import Foretold, OpenLoop
+from endopilot.models.open_loop import Foretold, OpenLoop, Seen, begin_after, given_states
 from endopilot.models.tracking import track
 from endopilot.simulation.device import Device
 from endopilot.simulation.simulator import SimulatorConfig, simulate
@@ -64,7 +64,7 @@ class TwinPredictor:
     told: WeakKeyDictionary[Dataset, TwinForetold] = field(default_factory=WeakKeyDictionary, repr=False)
     led: WeakKeyDictionary[Dataset, OpenLoop] = field(default_factory=WeakKeyDictionary, repr=False)
 
-    def foretell(self, episodes: Dataset, seen: Bool[np.ndarray, "samples"]) -> TwinForetold:
+    def foretell(self, episodes: Dataset, seen: Seen) -> TwinForetold:
         """Predict the tips of episodes under their controls, from those that were seen.
 
         Args:
@@ -81,9 +81,7 @@ class TwinPredictor:
             parameters[chosen] = members[weight.argmax(axis=0), np.arange(len(data))]
         return TwinForetold(tip, spread, parameters)
 
-    def ensemble(
-        self, episodes: Dataset, seen: Bool[np.ndarray, "samples"]
-    ) -> Float[np.ndarray, "members episodes samples 2"]:
+    def ensemble(self, episodes: Dataset, seen: Seen) -> Float[np.ndarray, "members episodes samples 2"]:
         """Return the tips, mm, of every wire that is likely after the seen ones; NaN from where a simulation fails.
 
         `weigh` says what they foretell, and again, without another simulation, when more tips are seen.
@@ -94,7 +92,7 @@ class TwinPredictor:
         return paths
 
     def _narrowed_ensemble(
-        self, anatomy: Anatomy, data: Dataset, seen: Bool[np.ndarray, "samples"]
+        self, anatomy: Anatomy, data: Dataset, seen: Seen
     ) -> tuple[Members, Float[np.ndarray, "members episodes s 2"]]:
         """Return the second ensemble of the episodes of one anatomy, and its tips."""
         members = self._members(np.tile(_BELIEVED, (len(data), 1)), np.tile(self._spread, (len(data), 1)))
@@ -115,23 +113,25 @@ class TwinPredictor:
         found = self.rollout_dual(episodes)
         return OpenLoop(tip=_tips(episodes)[:, WINDOW:], proximal=found.proximal, control=found.control)
 
-    def rollout_dual(self, episodes: Dataset) -> OpenLoop:
+    def rollout_dual(self, episodes: Dataset, seen: Seen | None = None) -> OpenLoop:
         """P3: predict the controls that make the tip go the true way, and the tip that they make.
 
         The likeliest member is driven along the desired tips, one sample at a time: see `tracking.track`.
         """
+        if seen is not None:
+            return self._lead(episodes, self.foretell(episodes, seen).parameters, begin_after(seen))
         if episodes not in self.led:
-            self.led[episodes] = self._lead(episodes, self._told(episodes).parameters)
+            self.led[episodes] = self._lead(episodes, self._told(episodes).parameters, WINDOW)
         return self.led[episodes]
 
     def _told(self, episodes: Dataset) -> TwinForetold:
         if episodes not in self.told:
-            self.told[episodes] = self.foretell(episodes, np.arange(episodes.valid.shape[1]) < WINDOW)
+            self.told[episodes] = self.foretell(episodes, given_states(episodes))
         return self.told[episodes]
 
-    def _lead(self, episodes: Dataset, likeliest: Float[np.ndarray, "episodes 3"]) -> OpenLoop:
-        """Drive wires of these parameters along the desired tips."""
-        desired = _tips(episodes)[:, WINDOW:]
+    def _lead(self, episodes: Dataset, likeliest: Float[np.ndarray, "episodes 3"], begin: int) -> OpenLoop:
+        """Drive wires of these parameters along the desired tips from a sample on."""
+        desired = _tips(episodes)[:, begin:]
         tip, control = np.empty(desired.shape), np.empty(desired.shape)
         wires = {stiffness: self._wire(stiffness) for stiffness in np.unique(likeliest[:, 1])}
         for anatomy, chosen in _by_anatomy(episodes):
@@ -141,11 +141,11 @@ class TwinPredictor:
                 [wires[stiffness] for stiffness in ours[:, 1]],
                 friction=self.device.friction * ours[:, 0],
                 start=np.column_stack([data.initial_inserted_length + ours[:, 2], data.initial_rotation]),
-                given=data.asked[:, :WINDOW],
+                given=data.asked[:, :begin],
                 desired=desired[chosen],
                 config=self.simulator,
             )
-        proximal = _proximal(episodes)[:, WINDOW - 1 : WINDOW] + SAMPLE_PERIOD_S * np.cumsum(control, axis=1)
+        proximal = _proximal(episodes)[:, begin - 1 : begin] + SAMPLE_PERIOD_S * np.cumsum(control, axis=1)
         return OpenLoop(tip=tip, proximal=proximal, control=control)
 
     @property

@@ -1,0 +1,152 @@
+"""Controls simulated again in the patients that navigations were recorded in: `replay`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from endopilot.anatomy.io import read_anatomy
+from endopilot.dataset.loader import Dataset
+from endopilot.evaluation.results import REPLAYED, TipSeries
+from endopilot.models.config import WINDOW
+from endopilot.progress import Advance
+from endopilot.simulation.device import Device
+from endopilot.simulation.simulator import SimulatorConfig, simulate
+from endopilot.types import Anatomy, Rollout
+
+Control = Float[np.ndarray, "episodes samples 2"]
+Samples = Float[np.ndarray, "episodes samples"]
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """Recorded episodes, with the patients and the wire that they were recorded with.
+
+    Attributes:
+        data: the episodes.
+        names: of the anatomies, sorted.
+        anatomies: in the order of their names.
+        anatomy_of: index of each episode's anatomy.
+        device: the wire.
+    """
+
+    data: Dataset
+    names: tuple[str, ...]
+    anatomies: tuple[Anatomy, ...]
+    anatomy_of: Int[np.ndarray, "episodes"]
+    device: Device
+
+    @staticmethod
+    def of(data: Dataset) -> Recorded:
+        """Read what the episodes of a dataset were recorded with.
+
+        Raises:
+            InputError: an anatomy is missing or damaged.
+        """
+        names, anatomy_of = np.unique(data.anatomy, return_inverse=True)
+        anatomies = tuple(read_anatomy(data.anatomy_folder(str(name))) for name in names)
+        device = Device.from_record(data.manifest["device"])
+        return Recorded(data, tuple(map(str, names)), anatomies, anatomy_of, device)
+
+    def drivable(self, control: Control) -> Control:
+        """Return what a drive makes of controls: no faster than it can, nor out of the catheter or beyond the vessel.
+
+        Controls that are not finite stay so.
+        """
+        limits = np.array([self.device.max_velocity_mm_s, self.device.max_rotation_rad_s])
+        driven, period = np.clip(control, -limits, limits), self.data.sample_period_s
+        inserted = self.data.inserted_length[:, WINDOW - 1].astype(float)
+        reach_mm = np.array([a.tree.longest_path().abscissa[-1] for a in self.anatomies])[self.anatomy_of]
+        reach_mm = np.maximum(reach_mm, inserted)
+        for sample in range(driven.shape[1]):
+            after = np.clip(inserted + period * driven[:, sample, 0], 0.0, reach_mm)
+            driven[:, sample, 0] = (after - inserted) / period
+            inserted = after
+        return driven
+
+    def simulated(
+        self, controls: Mapping[str, Control], advance: Advance | None = None
+    ) -> Iterator[tuple[Int[np.ndarray, "chosen"], Rollout]]:
+        """Drive episodes as they were driven while states are given, and by each series of controls after.
+
+        Series of `REPLAYED` with another friction have it from the start.
+
+        Args:
+            controls: after the given states, by series, all of one length.
+            advance: told after each anatomy.
+
+        Yields:
+            Episodes that one simulation serves, and the simulation: a world for each series and episode, series by
+            series.
+        """
+        data, settings = self.data, SimulatorConfig(**self.data.manifest["config"]["simulator"])
+        # a simulation has one anatomy and one wire
+        alike = np.stack([self.anatomy_of, data.tip_bend, data.tip_stiffness_factor], axis=-1).astype(float)
+        kinds, kind_of = np.unique(alike, axis=0, return_inverse=True)
+        for kind, (index, bend, factor) in enumerate(kinds):
+            anatomy, chosen = self.anatomies[int(index)], np.flatnonzero(kind_of.ravel() == kind)
+            wire = self.device.with_tip(bend_rad=float(bend), stiffness_factor=float(factor))
+            driven = np.concatenate([self._whole(control)[chosen] for control in controls.values()])
+            worlds = np.tile(chosen, len(controls))
+            initial = np.stack([data.initial_inserted_length[worlds], data.initial_rotation[worlds]], axis=-1)
+            friction = np.concatenate([REPLAYED.get(name, 1.0) * data.friction[chosen] for name in controls])
+            yield (
+                chosen,
+                simulate(anatomy, wire, np.nan_to_num(driven), initial=initial, config=settings, friction=friction),
+            )
+            if advance and (kind + 1 == len(kinds) or kinds[kind + 1][0] != index):
+                advance(1, anatomy.name)
+
+    def _whole(self, control: Control) -> Float[np.ndarray, "episodes all_samples 2"]:
+        """Return what was asked of the drive while states are given, followed by `control`."""
+        return np.concatenate([self.data.asked[:, :WINDOW], control], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Replay:
+    """One series of controls, simulated: its tip, the drive's load, and the tip's distance from the recorded one, mm.
+
+    NaN from where the simulation fails, or the series holds no finite control.
+    """
+
+    tip: TipSeries
+    base_force: Samples
+    base_torque: Samples
+    distance: Samples
+
+
+def replay(recorded: Recorded, controls: Mapping[str, Control], advance: Advance) -> dict[str, Replay]:
+    """Simulate every episode again with each series of controls after the given states.
+
+    Args:
+        recorded: the episodes.
+        controls: mm/s and rad/s after the given states, by series.
+        advance: told after each anatomy.
+    """
+    shape = recorded.data.control[:, WINDOW:].shape[:2]
+    out = {name: {key: np.full(shape, np.nan) for key in _SIGNALS} for name in controls}
+    for chosen, rollout in recorded.simulated(controls, advance):
+        asked = np.concatenate([control[chosen] for control in controls.values()])
+        usable = rollout.valid[:, WINDOW:] & np.isfinite(asked).all(axis=-1).cumprod(axis=1).astype(bool)
+        true_tip = recorded.data.tip_position[np.tile(chosen, len(controls))]
+        distance = np.linalg.norm(rollout.tip_position - true_tip, axis=-1)
+        tip = (rollout.tip.abscissa, rollout.tip.offset, rollout.tip.radius)
+        for key, signal in zip(_SIGNALS, (*tip, rollout.base_force, rollout.base_torque, distance), strict=True):
+            values = np.where(usable, signal[:, WINDOW:], np.nan)
+            for name, part in zip(controls, values.reshape(len(controls), len(chosen), -1), strict=True):
+                out[name][key][chosen] = part
+    return {
+        name: Replay(
+            tip=TipSeries(signals["abscissa"], signals["offset"], signals["radius"]),
+            base_force=signals["base_force"],
+            base_torque=signals["base_torque"],
+            distance=signals["distance"],
+        )
+        for name, signals in out.items()
+    }
+
+
+_SIGNALS = ("abscissa", "offset", "radius", "base_force", "base_torque", "distance")
