@@ -24,8 +24,8 @@ WINDOW_MM = (-40.0, -25.0, -15.0, -10.0, -6.0, -3.0, 0.0, 3.0, 6.0, 10.0, 15.0)
 """Where along the centerline, from the tip on, the vessel is looked at."""
 PARTIAL_PLAYS = (0.25, 0.5, 0.75)
 """Further plays, as shares of the width between the envelopes."""
-_AHEAD_MM = (-4.0, -2.0, 2.0, 4.0)
-"""Where the envelopes are looked at beside the present place: a jump there is a snap to come."""
+_AROUND_MM = np.array([0.0, -4.0, -2.0, 2.0, 4.0])
+"""Where the envelopes are looked at: at the present place, and beside it, where a jump is a snap to come."""
 _SHARPNESS = 20.0
 """Concentration of the von Mises kernel by which nominal wires count that are turned about as the wire is."""
 
@@ -97,7 +97,7 @@ class Vessels:
         tip = np.zeros(len(patient))
         for _ in range(3):  # into the branch that a wire turned so comes to
             weight = self._weight(patient, branch, inserted, rotation)
-            tip = self._mixed(self.known["forward"][0], patient, weight, inserted)
+            tip = _mixed(weight, _looked_up(self.known["forward"][0], patient, inserted))
             branch = self._branch(patient, self._leaf(patient, branch, weight), tip)
         return PlayState(tip, inserted.copy(), np.repeat(tip[:, None], len(PARTIAL_PLAYS), axis=1), branch)
 
@@ -126,7 +126,10 @@ class Vessels:
         forward = direction == "forward"
         before, output = (state.inserted, state.tip) if forward else (state.tip, state.inserted)
         weight = self._weight(patient, state.branch, known if forward else state.inserted, rotation)
-        low, high = (self._mixed(table, patient, weight, known) for table in self.known[direction])
+        around = known[:, None] + _AROUND_MM
+        values = [_looked_up(table, patient, around) for table in self.known[direction]]
+        here = [value[:, 0] for value in values]
+        low, high = (_mixed(weight, value) for value in here)
         low, high = np.minimum(low, high), np.maximum(low, high)
         moved = np.clip(output, low, high)
         middle, half = 0.5 * (low + high), 0.5 * (high - low)
@@ -135,20 +138,18 @@ class Vessels:
         tip, inserted = (moved, known) if forward else (known, moved)
         leaf = self._leaf(patient, state.branch, weight)
         after = PlayState(tip, inserted, partial, self._branch(patient, leaf, tip))
-        spread = self._spread(self.known[direction][0], patient, weight, known)
-        around = [
-            self._mixed(table, patient, weight, known + ahead) - known - ahead - (edge - known)
-            for table, edge in zip(self.known[direction], (low, high), strict=True)
-            for ahead in _AHEAD_MM
+        beside = [
+            _mixed(weight, value[:, 1:]) - around[:, 1:] - (edge - known)[:, None]
+            for value, edge in zip(values, (low, high), strict=True)
         ]
-        clearance = [self._mixed(table, patient, weight, inserted) for table in self.clearance]
+        clear = [_looked_up(table, patient, inserted) for table in self.clearance]
+        clearance = [_mixed(weight, value) for value in clear]
         share = np.divide(moved - low, high - low, out=np.full(len(low), 0.5), where=high - low > 1e-6)
         pulled = share if forward else 1 - share
         radius = self._geometry(patient, leaf, tip[:, None])[:, 0, 3]
         off_axis = np.maximum(radius - self.wire_radius_mm - (1 - pulled) * clearance[0] - pulled * clearance[1], 0.0)
         sharp = weight**4 / (weight**4).sum(axis=1, keepdims=True)
-        nearest = [self._mixed(table, patient, sharp, known) for table in self.known[direction]]
-        nearest_clearance = [self._mixed(table, patient, sharp, inserted) for table in self.clearance]
+        nearest, nearest_clearance = ([_mixed(sharp, value) for value in found] for found in (here, clear))
         columns = [
             inserted,
             inserted - tip,
@@ -159,8 +160,8 @@ class Vessels:
             known - before,
             turned,
             np.abs(turned),
-            spread,
-            *around,
+            _spread(weight, here[0]),
+            *np.concatenate(beside, axis=1).T,
             *clearance,
             nearest[0] - low,
             nearest[1] - high,
@@ -180,17 +181,6 @@ class Vessels:
         weight = kernel * np.where(near, 1.0, np.where(fits, 1e-4, 1e-9))
         return weight / weight.sum(axis=1, keepdims=True)
 
-    def _mixed(self, table, patient, weight, at) -> Float[np.ndarray, "n"]:
-        return np.einsum("nk,nk->n", weight, _looked_up(table, patient, at))
-
-    def _spread(self, table, patient, weight, at) -> Float[np.ndarray, "n"]:
-        """Return how far nominal wires differ that could be in the same place, turned any way, mm."""
-        values = _looked_up(table, patient, at)
-        share = np.sqrt(weight)  # a wider kernel
-        share = share / share.sum(axis=1, keepdims=True)
-        mean = (share * values).sum(axis=1, keepdims=True)
-        return np.sqrt((share * (values - mean) ** 2).sum(axis=1))
-
     def _leaf(self, patient, branch, weight) -> Int[np.ndarray, "n"]:
         """Return the way to a distal end that each wire is on."""
         likeliest = weight.argmax(axis=1)
@@ -198,11 +188,11 @@ class Vessels:
         return np.where(led, self.leaf[patient, likeliest], self.leaf_of_branch[patient, branch])
 
     def _branch(self, patient, leaf, tip) -> Int[np.ndarray, "n"]:
-        at = np.clip(np.rint(tip / STEP_MM).astype(int), 0, self.branch.shape[2] - 1)
+        at = np.minimum(np.maximum(np.rint(tip / STEP_MM).astype(int), 0), self.branch.shape[2] - 1)
         return self.branch[patient, leaf, at]
 
     def _geometry(self, patient, leaf, at) -> Float[np.ndarray, "n places 7"]:
-        place = np.clip(at / STEP_MM, 0.0, self.geometry.shape[2] - 1.001)
+        place = np.minimum(np.maximum(at / STEP_MM, 0.0), self.geometry.shape[2] - 1.001)
         index = place.astype(int)
         share = (place - index)[..., None]
         rows = patient[:, None], leaf[:, None]
@@ -219,7 +209,7 @@ class Vessels:
         )
 
 
-_N_LEADING = 8 + len(PARTIAL_PLAYS) + 1 + 2 * len(_AHEAD_MM) + 7
+_N_LEADING = 8 + len(PARTIAL_PLAYS) + 1 + 2 * (len(_AROUND_MM) - 1) + 7
 N_FEATURES = _N_LEADING + 4 * len(WINDOW_MM) + 3
 """Number of features of a sample."""
 
@@ -235,14 +225,26 @@ def mirrored() -> Float[np.ndarray, "features"]:
     return sign
 
 
-def _looked_up(table, patient, at) -> Float[np.ndarray, "n wires"]:
-    """Return every nominal wire's value at some length, carried on with slope 1 beyond the tables."""
+def _looked_up(table, patient, at) -> Float[np.ndarray, "n *places wires"]:
+    """Return every nominal wire's value at some lengths, carried on with slope 1 beyond the tables."""
     place = at / STEP_MM
-    last = table.shape[2] - 1
-    index = np.clip(place.astype(int), 0, last - 1)
-    share = (place - index)[:, None]
-    rows = table[patient, :, index], table[patient, :, index + 1]
-    return rows[0] + share * (rows[1] - rows[0])
+    index = np.minimum(np.maximum(place.astype(int), 0), table.shape[2] - 2)
+    share = (place - index)[..., None]
+    row = patient if at.ndim == 1 else patient[:, None]
+    before, after = table[row, :, index], table[row, :, index + 1]
+    return before + share * (after - before)
+
+
+def _mixed(weight, values) -> Float[np.ndarray, "n *places"]:
+    return np.einsum("nk,n...k->n...", weight, values)
+
+
+def _spread(weight, values) -> Float[np.ndarray, "n"]:
+    """Return how far nominal wires differ that could be in the same place, turned any way, mm."""
+    share = np.sqrt(weight)  # a wider kernel
+    share = share / share.sum(axis=1, keepdims=True)
+    mean = (share * values).sum(axis=1, keepdims=True)
+    return np.sqrt((share * (values - mean) ** 2).sum(axis=1))
 
 
 def _inverted(tip: Float[np.ndarray, "wires lengths"]) -> Float[np.ndarray, "wires lengths"]:
