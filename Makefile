@@ -42,7 +42,8 @@ recipe-laptop: $(INSTALLED)
 	  $(BIN)/endopilot train $(LEARNING)/dataset -o $(LEARNING)/seed-$$seed --model causal --epochs 10 \
 	    --learning-rate 0.002 --seed $$seed || exit; \
 	done
-	$(BIN)/endopilot train $(LEARNING)/dataset -o $(LEARNING)/paper --batch-size 64
+	$(BIN)/endopilot train $(LEARNING)/dataset -o $(LEARNING)/paper --batch-size 64 \
+	  --windows-per-epoch 20000
 	$(BIN)/endopilot evaluate $(LEARNING)/seed-0 -o $(LEARNING)/evaluation --sequences 48 \
 	  --other-seeds $(LEARNING)/seed-1 $(LEARNING)/seed-2
 	$(BIN)/endopilot evaluate $(LEARNING)/paper -o $(LEARNING)/evaluation-paper --sequences 48
