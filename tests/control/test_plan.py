@@ -171,7 +171,7 @@ def test_desired_tips_are_followed(vessel, tmp_path):
     assert np.abs(made.simulated.abscissa - made.desired[:, 0]).max() < 0.5
     path.write_text("time_s,tip_abscissa_mm,tip_offset_mm\n0.5,5,0.1\n1.5,6,0.1\n")
     with pytest.raises(InputError, match=r"row 3: time_s = 1\.5"):
-        read_tips(path)
+        read_tips(path, 40.0, 2.0)
 
 
 NUMBERS = st.floats(allow_nan=True, allow_infinity=True, width=64)

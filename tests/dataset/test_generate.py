@@ -159,6 +159,27 @@ def test_a_lost_file_is_made_again(tmp_path):
     assert data_hashes(tmp_path / "d") == before
 
 
+@pytest.mark.parametrize("name", ["info.json", "stats.json", "tasks.parquet"])
+def test_what_describes_a_dataset_is_made_again(tmp_path, name):
+    make_toy_dataset(tmp_path / "d", patients=1, sequences=4)
+    before = (tmp_path / "d/meta" / name).read_bytes()
+    (tmp_path / "d/meta" / name).unlink()
+    if name == "info.json":
+        with pytest.raises(InputError, match=r"info\.json: missing"):
+            load_dataset(tmp_path / "d")
+    make_toy_dataset(tmp_path / "d", patients=1, sequences=4)
+    assert (tmp_path / "d/meta" / name).read_bytes() == before
+
+
+def test_another_anatomy_in_the_place_of_a_dataset_s_is_refused(tmp_path):
+    make_toy_dataset(tmp_path / "d", patients=1, sequences=4)
+    data, folder = load_dataset(tmp_path / "d"), tmp_path / "anatomies/patient-0"
+    assert data.anatomy_folder("patient-0") == folder.resolve()
+    write_anatomy(replace(toy_anatomy("patient-0"), catheter_radius_mm=1.0), folder)
+    with pytest.raises(InputError, match="is not the anatomy that"):
+        data.anatomy_folder("patient-0")
+
+
 def test_other_settings_are_refused_by_name(tmp_path):
     make_toy_dataset(tmp_path / "d", patients=1, sequences=4)
     with pytest.raises(InputError, match=r"config\.sequences = 4, now it is 5"):
@@ -282,7 +303,7 @@ def test_loader_names_what_is_damaged(tmp_path):
         load_dataset(tmp_path / "d")
     (tmp_path / "d/meta/manifest.json").write_text(json.dumps(manifest))
     (tmp_path / "d/meta/info.json").unlink()
-    with pytest.raises(InputError, match=r"info\.json: no such file"):
+    with pytest.raises(InputError, match=r"info\.json: missing from the dataset"):
         load_dataset(tmp_path / "d")
 
 

@@ -41,6 +41,27 @@ def test_a_plan_is_written_whole(patient, tmp_path, capsys):
     assert again["valid_worlds"] == 1
 
 
+def test_a_plan_is_driven_where_it_was_made_and_nowhere_else(fork, patient, tmp_path, capsys):
+    planned = run(capsys, "plan", patient, "--target", "0,0,33", "-o", tmp_path / "plan")
+    drive = ("--controls", tmp_path / "plan", "-o", tmp_path / "again.csv")
+    again = run(capsys, "simulate", patient, *drive)
+    assert again["samples"] == 2 * planned["seconds"] and again["deepest_tip_mm"] == pytest.approx(33.0, abs=2.0)
+    (tmp_path / "again.csv").unlink()
+    write_anatomy(replace(fork, insertion=Insertion(np.zeros(3), np.array([0.1, 0.0, 0.995]))), tmp_path / "other")
+    assert "another anatomy" in refused(capsys, "simulate", tmp_path / "other", *drive)
+    assert "another device" in refused(capsys, "simulate", patient, *drive, "--device", "wire-018")
+    assert not (tmp_path / "again.csv").exists()
+
+
+def test_desired_tips_that_no_drive_can_keep_up_with(patient, tmp_path, capsys):
+    (tmp_path / "tips.csv").write_text("time_s,tip_abscissa_mm,tip_offset_mm\n0.5,10,0.2\n")
+    run(capsys, "plan", patient, "--target", tmp_path / "tips.csv", "-o", tmp_path / "kept-up")
+    (tmp_path / "tips.csv").write_text("time_s,tip_abscissa_mm,tip_offset_mm\n0.5,10,0.2\n1.0,43,0\n")
+    line = refused(capsys, "plan", patient, "--target", tmp_path / "tips.csv", "-o", tmp_path / "plan")
+    assert "1 s are too few for the 41 mm" in line and "40 mm/s" in line
+    assert not (tmp_path / "plan").exists()
+
+
 @pytest.mark.parametrize(
     ("arguments", "parts"),
     [

@@ -11,6 +11,7 @@ from tyro.conf import Positional
 
 from endopilot.anatomy.io import read_anatomy
 from endopilot.cli.arguments import OutputFile, existing, show
+from endopilot.control.plan_file import read_plan
 from endopilot.errors import InputError
 from endopilot.simulation.controls import ControlConfig, random_controls, read_controls_csv
 from endopilot.simulation.device import read_device
@@ -56,7 +57,8 @@ def command(
         anatomy: folder made by `endopilot anatomy` or `endopilot atlas`.
         output: one row a sample as .parquet or .csv, or all arrays as .npz.
         device: name of a shipped device (`endopilot devices`) or a YAML file.
-        controls: CSV of scripted proximal velocities; random ones by default.
+        controls: CSV of scripted proximal velocities, or folder made by `endopilot plan` for this anatomy and device;
+            random ones by default.
         shape: record the positions of all nodes too (.npz only).
         picture: PNG of the vessel and of the first world's wire at the end.
         json: print the figures as JSON.
@@ -65,7 +67,11 @@ def command(
     """
     patient = read_anatomy(existing(anatomy))
     wire = read_device(device)
-    if controls is not None:
+    if controls is not None and controls.is_dir():
+        plan = read_plan(controls, patient, wire)
+        begin = plan.navigation.start_inserted_mm, plan.navigation.start_rotation
+        initial, control = np.array([begin]), plan.control[None]
+    elif controls is not None:
         initial, control = read_controls_csv(existing(controls))
     else:
         initial, control = random_controls(

@@ -35,4 +35,10 @@ def command(
     train(existing(dataset), output, config)
     if os.environ.get("RANK", "0") != "0":  # torchrun runs several; one tells
         return
-    show({"run": str(output), "training": read_json(output / "training.json")}, as_json=json)
+    training = read_json(output / "training.json")
+    if json:
+        show({"run": str(output), "training": training}, as_json=True)
+        return
+    ends = {name.upper(): {"epochs": len(told["curve"])} | told["curve"][-1] for name, told in training.items()}
+    shown = ("epochs", "loss", "validation_loss", "samples_per_second")
+    show({"run": str(output)} | {name: {key: end[key] for key in shown} for name, end in ends.items()}, as_json=False)

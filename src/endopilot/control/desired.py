@@ -18,14 +18,20 @@ _MARGIN_S = 5.0
 """Time that desired tips rest at the target, s."""
 
 
-def read_tips(path: Path) -> pd.DataFrame:
+def read_tips(path: Path, fastest_mm_s: float, start_mm: float) -> pd.DataFrame:
     """Read desired tip states: columns time_s (0.5, 1.0, ...), tip_abscissa_mm, tip_offset_mm and, optional, branch.
+
+    Args:
+        path: of the table.
+        fastest_mm_s: translation of the drive, mm/s.
+        start_mm: Δ at the start, mm.
 
     Returns:
         A table with columns abscissa, offset and branch (−1 where it is not given), a row a sample period.
 
     Raises:
-        InputError: not such a table; the line names file, column, row and mend.
+        InputError: not such a table, or it asks for the end sooner than the drive can be there; the line names file,
+            column, row and mend.
     """
     try:
         table = pd.read_csv(path)
@@ -48,6 +54,12 @@ def read_tips(path: Path) -> pd.DataFrame:
     if len(late):
         row = int(late[0])
         raise InputError(f"{path}: row {row + 2}: time_s = {table['time_s'].iloc[row]:g}; count 0.5, 1.0, 1.5, ...")
+    way, seconds = float(table["tip_abscissa_mm"].iloc[-1]) - start_mm, DECISION_PERIOD_S * len(table)
+    if way > fastest_mm_s * seconds:
+        raise InputError(
+            f"{path}: {seconds:g} s are too few for the {way:.0f} mm to the last tip at the device's {fastest_mm_s:g} "
+            f"mm/s; give rows up to {way / fastest_mm_s:.1f} s or more"
+        )
     return table.rename(columns={"tip_abscissa_mm": "abscissa", "tip_offset_mm": "offset"})
 
 

@@ -20,6 +20,7 @@ from endopilot.control.cost import safety_ratio
 from endopilot.control.robot import Limits
 from endopilot.control.route import Route
 from endopilot.dataset.loader import Dataset
+from endopilot.dataset.plan import identify
 from endopilot.env.task import Navigation
 from endopilot.files import read_json
 from endopilot.models.config import WINDOW, run_path
@@ -130,7 +131,7 @@ class _Rest:
             "key": f"plan in {vessel}",
             "device": asdict(navigation.device),
             "config": {"simulator": record.get("simulator", {})},
-            "anatomies": [{"name": navigation.anatomy.name, "folder": vessel, "sha256": vessel}],
+            "anatomies": [{"name": navigation.anatomy.name, "folder": vessel, "sha256": identify(folder)[1]}],
         }
         simulator = Simulator(navigation.anatomy, navigation.device, config=SimulatorConfig(threads=1))
         simulator.reset(inserted_length=[navigation.start_inserted_mm], rotation=[navigation.start_rotation])

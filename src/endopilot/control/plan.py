@@ -190,7 +190,9 @@ def plan(
     config = config or PlanConfig()
     vessel = read_anatomy(anatomy)
     wire = _wire(model, device, config.method)
-    tips = read_tips(Path(target)) if target.endswith(".csv") else None
+    tips = (
+        read_tips(Path(target), wire.max_velocity_mm_s, config.start_inserted_mm) if target.endswith(".csv") else None
+    )
     goal = find_target(vessel, target) if tips is None else last_place(vessel, tips, target)
     navigation = Navigation(
         anatomy=vessel,

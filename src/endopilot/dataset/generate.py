@@ -116,6 +116,7 @@ def _begin(study: Study, blocks: Sequence[Block]) -> bool:
                 "choose another output folder or go back to the first settings"
             )
         files = [file for block in blocks for file in schema.paths_of_file(output, block.number)]
+        files += [output / name for name in (schema.INFO_PATH, schema.STATS_PATH, schema.TASKS_PATH)]
         if before["complete"] and all(file.exists() for file in files):
             return True
     elif output.exists() and any(output.iterdir()):

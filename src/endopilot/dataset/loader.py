@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
-from endopilot.dataset.plan import version
+from endopilot.dataset.plan import identify, version
 from endopilot.dataset.schema import (
     INFO_PATH,
     LEROBOT_VERSION,
@@ -126,9 +126,16 @@ class Dataset:
         return self.select(chosen)
 
     def anatomy_folder(self, name: str) -> Path:
-        """Return the folder of an anatomy of the dataset, as it lay when the dataset was made."""
+        """Return the folder of an anatomy of the dataset.
+
+        Raises:
+            InputError: there is no anatomy any more, or another one than the dataset was made in.
+        """
         record = next(record for record in self.manifest["anatomies"] if record["name"] == name)
-        return (self.folder / record["folder"]).resolve()
+        folder = (self.folder / record["folder"]).resolve()
+        if identify(folder) != (name, record["sha256"]):
+            raise InputError(f"{folder}: is not the anatomy that {self.folder} was made in; make the dataset again")
+        return folder
 
 
 def read_manifest(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -147,6 +154,10 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     made = manifest["settings"].get("version")
     if made != version():
         raise InputError(f"{folder}: made by {made}, which {version()} cannot read; make the dataset again")
+    if not (folder / INFO_PATH).exists():
+        raise InputError(
+            f"{folder / INFO_PATH}: missing from the dataset; run the same `endopilot dataset` command again"
+        )
     info = read_json(folder / INFO_PATH)
     if info.get("codebase_version") != LEROBOT_VERSION:
         found = info.get("codebase_version")

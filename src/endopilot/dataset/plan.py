@@ -176,7 +176,7 @@ def plan_study(folders: Sequence[Path], output: Path, device: Device, config: Da
     """
     if not folders:
         raise InputError("anatomies: none given; name at least one folder made by `endopilot anatomy`")
-    names, fingerprints = zip(*(_identify(Path(folder)) for folder in folders), strict=True)
+    names, fingerprints = zip(*(identify(Path(folder)) for folder in folders), strict=True)
     for name in names:
         if names.count(name) > 1:
             raise InputError(f"anatomies: {names.count(name)} are named '{name}'; give each patient a name of its own")
@@ -211,8 +211,12 @@ def differences(before: Any, now: Any, name: str = "") -> Iterator[tuple[str, An
         yield name, before, now
 
 
-def _identify(folder: Path) -> tuple[str, str]:
-    """Return an anatomy's name and the SHA-256 of what the simulation depends on."""
+def identify(folder: Path) -> tuple[str, str]:
+    """Return an anatomy's name and the SHA-256 of what the simulation depends on.
+
+    Raises:
+        InputError: the folder holds no anatomy, or a damaged one.
+    """
     if not (folder / "anatomy.json").exists():
         raise InputError(f"{folder}: holds no anatomy.json, so it is not an anatomy; make one with `endopilot anatomy`")
     record = read_json(folder / "anatomy.json")
