@@ -16,6 +16,7 @@ import torch
 from endopilot.dataset.loader import load_dataset
 from endopilot.errors import InputError
 from endopilot.files import read_json, sha256
+from endopilot.models.board import board
 from endopilot.models.checkpoint import read_network, read_tensors
 from endopilot.models.config import TrainConfig, TransformerConfig
 from endopilot.models.rollout import load_run
@@ -67,7 +68,8 @@ def test_overfits_one_batch(toy_dataset, name):
 
 def test_writes_what_a_run_holds(short_run, toy_dataset):
     names = {path.name for path in short_run.iterdir()}
-    assert names == {"ff.safetensors", "if.safetensors", "config.json", "training.json", "manifest.json", "checkpoints"}
+    networks = {"ff.safetensors", "if.safetensors"}
+    assert names == networks | {"config.json", "training.json", "manifest.json", "checkpoints", "tensorboard"}
     record = read_json(short_run / "manifest.json")
     assert (short_run / record["dataset"]).resolve() == toy_dataset.resolve()
     assert record["networks"]["ff"]["parameters"] == sum(p.numel() for p in NETWORKS["ff"](SMALL).parameters())
@@ -109,6 +111,33 @@ def test_killed_and_resumed_continues_the_same_curve(short_run, toy_dataset, tmp
         curves = [read_json(folder / "training.json")[name]["curve"] for folder in (run, short_run)]
         losses = [[(entry["loss"], entry["validation_loss"]) for entry in curve] for curve in curves]
         assert losses[0] == losses[1]
+        shown = scalars(run / "tensorboard" / name, "loss")
+        assert list(shown) == [entry["epoch"] for entry in curves[0]]
+        assert list(shown.values()) == pytest.approx([entry["loss"] for entry in curves[0]], rel=1e-6)
+
+
+def scalars(folder, name):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(folder)).Reload().Scalars(name)
+    assert len({event.step for event in events}) == len(events)
+    return {event.step: event.value for event in events}
+
+
+def test_an_epoch_that_was_shown_but_not_kept_is_shown_as_it_was_trained_again(tmp_path):
+    def epoch(number, loss):
+        return {"epoch": number, "loss": loss, "validation_loss": None, "learning_rate": 0.5, "samples_per_second": 9.0}
+
+    for losses in ({1: 1.0, 2: 0.9}, {2: 0.5, 3: 0.25}):
+        with board(tmp_path / "ff") as show:
+            for number, loss in losses.items():
+                show(epoch(number, loss))
+    assert scalars(tmp_path / "ff", "loss") == {1: 1.0, 2: 0.5, 3: 0.25}
+    with board(None) as show:
+        show(epoch(1, 1.0))
+    with board(tmp_path / "none"):
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == ["ff"]
 
 
 def test_a_finished_run_returns_at_once(short_run, toy_dataset):

@@ -22,6 +22,7 @@ from torch import nn
 from endopilot.dataset.loader import Dataset, load_dataset
 from endopilot.errors import InputError
 from endopilot.files import manifest, read_json, write_json
+from endopilot.models.board import board
 from endopilot.models.causal import CausalNetwork
 from endopilot.models.checkpoint import (
     make_network,
@@ -164,11 +165,13 @@ class Job:
             network.to(self.team.device)
             optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate, fused=True)
             state = self._resume(network, optimizer) or {"seconds": 0.0, "curve": []}
-            with progress(f"Training {self.name.upper()}", total=config.epochs) as advance:
+            shown = self.run_folder / "tensorboard" / self.name if self.team.writes else None
+            with progress(f"Training {self.name.upper()}", total=config.epochs) as advance, board(shown) as show:
                 advance(len(state["curve"]))
                 together = self.team.together(network)
                 while len(state["curve"]) < config.epochs:
                     self._epoch(network, together, optimizer, state, advance)
+                    show(state["curve"][-1])
                     if self.team.writes:
                         self._save(network, optimizer, state)
         return {"parameters": sum(p.numel() for p in network.parameters())} | state
@@ -194,7 +197,7 @@ class Job:
         batches = self.batches(epoch, self._steps(network, state))
         torch.manual_seed(_seed(self.config.seed, self.name, epoch, *([self.team.rank] if self.team.rank else [])))
         network.train()
-        total, steps, first = 0.0, len(batches), time.perf_counter()
+        total, rate, steps, first = 0.0, 0.0, len(batches), time.perf_counter()
         for step, targets in enumerate(batches):
             rate = self.config.learning_rate * _schedule(epoch + step / steps, epochs)
             loss = self.step(network, together, optimizer, targets, rate)
@@ -216,6 +219,7 @@ class Job:
                 "steps": steps,
                 "loss": total / steps,
                 "validation_loss": validation_loss,
+                "learning_rate": rate,
                 "samples_per_second": sum(map(len, batches)) / seconds,
                 "seconds": seconds,
                 "validation_seconds": time.perf_counter() - first - seconds,
