@@ -68,6 +68,21 @@ def test_identified_from_the_given_tips_it_foretells_the_others(folder, episodes
     np.testing.assert_array_equal(twin.foretell(blind, GIVEN).tip, told.tip)
 
 
+def test_wires_that_agree_on_what_is_wrong_are_not_sure_of_it() -> None:
+    # three members, one path each for two episodes; the first was seen 30 mm away from all of them
+    paths = np.zeros((3, 2, 8, 2))
+    paths[..., 0] = 10.0 + 0.01 * np.arange(3)[:, None, None]
+    tips, seen = np.full((2, 8, 2), np.nan), np.zeros((2, 8), dtype=bool)
+    seen[:, [2, 5]] = True
+    tips[:, [2, 5]] = 10.0, 0.0
+    tips[0, 5] = 40.0, 0.0
+    middle, spread = twin_module.weigh(paths, tips, seen, TwinConfig())
+    assert spread[0, 5:, 0] == pytest.approx(30.0, abs=0.3)
+    assert spread[0, :5].max() < 0.02 and spread[1].max() < 0.02
+    assert spread[0, :, 1].max() == 0.0
+    assert np.abs(middle[..., 0] - 10.0).max() < 0.03
+
+
 def test_it_finds_controls_that_lead_the_tip_along(folder, episodes) -> None:
     twin = load_run(folder / "run")
     found = twin.rollout_dual(episodes)

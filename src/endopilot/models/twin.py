@@ -30,6 +30,8 @@ LEVELS = 7
 """Tips of different stiffness in an ensemble. A simulation has one rod, so members share the few."""
 NARROWEST = 0.15
 """The second ensemble is spread over this share of the first at least; and over two standard deviations of it."""
+GOOD = 3.0
+"""A good member misses a seen tip by this many of the scales of `TwinConfig` at most."""
 Members = Float[np.ndarray, "members episodes 3"]
 """Friction factor, tip stiffness factor and depth of the ostium (mm) of each member, for each episode."""
 _BELIEVED = np.array([1.0, 1.0, 0.0])
@@ -38,6 +40,8 @@ _BELIEVED = np.array([1.0, 1.0, 0.0])
 @dataclass(frozen=True, eq=False)
 class TwinForetold(Foretold):
     """What the ensemble foretells: the weighted median of its members, and their weighted deviation from it.
+
+    The spread is no smaller than what the median missed the last seen tip by beyond what a good member does.
 
     Attributes:
         parameters: friction factor, tip stiffness factor and depth of the ostium (mm) of the likeliest member.
@@ -77,7 +81,9 @@ class TwinPredictor:
             data = episodes.select(chosen)
             members, paths = self._narrowed_ensemble(anatomy, data, seen)
             weight = _weights(paths, _tips(data), seen, self.config)
-            tip[chosen], spread[chosen] = _median_and_spread(paths, weight)
+            tip[chosen], spread[chosen] = weigh(
+                paths, _tips(data), np.broadcast_to(seen, data.valid.shape), self.config
+            )
             parameters[chosen] = members[weight.argmax(axis=0), np.arange(len(data))]
         return TwinForetold(tip, spread, parameters)
 
@@ -205,7 +211,26 @@ def weigh(
         seen: samples at which the tip was measured.
         config: scales of what a good member misses a seen tip by.
     """
-    return _median_and_spread(paths, _weights(paths, tips, seen, config))
+    middle, spread = _median_and_spread(paths, _weights(paths, tips, seen, config))
+    return middle, np.hypot(spread, _unexplained(middle, tips, seen, config))
+
+
+def _unexplained(
+    middle: Float[np.ndarray, "episodes samples 2"],
+    tips: Float[np.ndarray, "episodes samples 2"],
+    seen: Bool[np.ndarray, "episodes samples"],
+    config: TwinConfig,
+) -> Float[np.ndarray, "episodes samples 2"]:
+    """Return by how much more than a good member what is foretold missed the tip when it was last seen, mm.
+
+    Where something else than the ensemble's parameters is off, all members may agree on what is wrong: their spread
+    does not tell.
+    """
+    off = np.nan_to_num(np.abs(middle - np.where(seen[..., None], tips, middle)))
+    beyond = np.maximum(off - GOOD * np.array([config.abscissa_sd_mm, config.offset_sd_mm]), 0.0)
+    last = np.maximum.accumulate(np.where(seen, np.arange(seen.shape[1]), -1), axis=1)
+    carried = np.take_along_axis(beyond, np.maximum(last, 0)[..., None], axis=1)
+    return np.where(last[..., None] >= 0, carried, 0.0)
 
 
 def _weights(
