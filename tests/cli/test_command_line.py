@@ -99,3 +99,16 @@ def test_info_is_json_and_imports_nothing_heavy() -> None:
 def test_a_missing_input_is_told_in_one_line(arguments: tuple[str, ...], tmp_path: Path) -> None:
     assert_one_line(run(*arguments, cwd=tmp_path), "missing")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_output_that_nobody_reads_is_no_error() -> None:
+    with subprocess.Popen(
+        [sys.executable, "-m", "endopilot.cli", "evaluate", "--help"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        process.stdout.close()  # as `head` does
+        told = process.stderr.read()
+    assert told == ""
+    assert process.returncode == 141

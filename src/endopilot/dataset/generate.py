@@ -110,7 +110,9 @@ def _begin(study: Study, blocks: Sequence[Block]) -> bool:
     path = output / schema.MANIFEST_PATH
     if path.exists():
         before = read_json(path)
-        for field_name, then, now in differences(before.get("settings", {}), study.settings):
+        nothing_yet = not before["complete"] and not any(output.rglob("*.parquet"))
+        changes = () if nothing_yet else differences(before.get("settings", {}), study.settings)
+        for field_name, then, now in changes:
             raise InputError(
                 f"{output}: was begun with {field_name} = {then}, now it is {now}; "
                 "choose another output folder or go back to the first settings"
