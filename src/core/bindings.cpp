@@ -4,10 +4,9 @@
 #include <nanobind/stl/shared_ptr.h>
 
 #include <chrono>
-#include <condition_variable>
 #include <memory>
-#include <mutex>
 #include <thread>
+#include <tuple>
 
 #include "spline.hpp"
 #include "stepper.hpp"
@@ -99,52 +98,35 @@ struct Result {
     }
 };
 
-// Calls `work(thread)` on `threads` threads and keeps the interpreter's signals and the progress callback served.
+// Calls `work(thread, until)` on `threads` threads, of which this is number 0, until it says that all is done. On this one
+// it is called with a moment to come back at, so that the interpreter's signals and the progress callback stay served.
 template <class Work>
-void run_threads(int threads, const nb::object& progress, const std::atomic<long>& done, std::atomic<bool>& stop, Work work) {
-    int running = threads;
-    std::mutex mutex;
-    std::condition_variable ended;
-    std::vector<std::thread> pool;
-    for (int t = 0; t < threads; ++t)
-        pool.emplace_back([&] {
-            work();
-            const std::lock_guard<std::mutex> lock(mutex);
-            if (--running == 0) ended.notify_one();
-        });
-    bool interrupted = false;
+void run_threads(int threads, const nb::object& progress, const std::atomic<long>& done, std::atomic<bool>& stop, const Work& work) {
     std::exception_ptr failure;
     long reported = 0;
     const auto serve = [&] {
-        if (PyErr_CheckSignals() != 0) {
-            interrupted = true;
-        } else if (!progress.is_none()) {
+        try {
+            if (PyErr_CheckSignals() != 0) throw nb::python_error();
             const long now = done.load();
-            try {
-                if (now > reported) progress(now - reported);
-            } catch (...) {
-                failure = std::current_exception();
-            }
+            if (!progress.is_none() && now > reported) progress(now - reported);
             reported = now;
+        } catch (...) {
+            failure = std::current_exception();
+            stop.store(true);
         }
-        if (interrupted || failure) stop.store(true);
     };
     {
         nb::gil_scoped_release release;
-        const auto all_ended = [&] {
-            std::unique_lock<std::mutex> lock(mutex);
-            return ended.wait_for(lock, std::chrono::milliseconds(100), [&] { return running == 0; });
-        };
-        while (!all_ended()) {
-            if (stop.load()) continue;
+        std::vector<std::thread> others;
+        for (int t = 1; t < threads; ++t) others.emplace_back([&work, t] { work(t, Moment::max()); });
+        while (!work(0, std::chrono::steady_clock::now() + std::chrono::milliseconds(100))) {
             nb::gil_scoped_acquire acquire;
             serve();
         }
-        for (std::thread& thread : pool) thread.join();
+        for (std::thread& thread : others) thread.join();
     }
-    if (!stop.load()) serve();
+    if (!failure) serve();
     if (failure) std::rethrow_exception(failure);
-    if (interrupted) throw nb::python_error();
 }
 
 // Many worlds of one device in one lumen.
@@ -159,6 +141,8 @@ public:
         base_ = {vec3(origin.data()), quaternion(orientation.data())};
         worlds_.assign(std::size_t(worlds), World(rod_.nodes));
     }
+
+    Simulation(const Simulation&) = delete;  // the steppers hold on to this one's rod and worlds
 
     // Puts worlds at the ostium, ready to be pushed to their first inserted length by the next run.
     void reset(const Indices& index, const Array<2>& initial, const Array<1>& friction, double sample_period) {
@@ -213,23 +197,12 @@ public:
                           force_sum.data,   base_force.data,  base_torque.data,  drive_force.data,  drive_torque.data,
                           iterations.data,  slip.data,        valid.data,        approach_slip.data,
                           record_shape ? shape.data : nullptr, record_attitude ? attitude.data : nullptr};
-        Crew crew = assemble(in, threads);
-        std::atomic<long> done{0};
-        std::atomic<bool> stop{false};
-        const auto work = [&](auto lane) {
-            using V = decltype(lane);
-            const auto stepper =
-                std::make_unique<Stepper<V>>(rod_, lumen_.get(), loads_.get(), base_, options_, in, out, worlds_);
-            stepper->run(crew, done, stop);
-        };
-        run_threads(std::max(1, threads), progress, done, stop, [&] {
-            if (lanes == 1)
-                work(double{});
-            else if (lanes == 8)
-                work(double8{});
-            else
-                work(double4{});
-        });
+        if (lanes == 1)
+            step<double>(in, out, std::max(1, threads), progress);
+        else if (lanes == 8)
+            step<double8>(in, out, std::max(1, threads), progress);
+        else
+            step<double4>(in, out, std::max(1, threads), progress);
         return result;
     }
 
@@ -298,6 +271,23 @@ private:
     Base base_;
     Options options_;
     std::vector<World> worlds_;
+    template <class V>
+    using Steppers = std::vector<std::unique_ptr<Stepper<V>>>;  // one a thread, kept from call to call
+    std::tuple<Steppers<double>, Steppers<double4>, Steppers<double8>> steppers_;
+
+    template <class V>
+    void step(const Inputs& in, const Outputs& out, int threads, const nb::object& progress) {
+        Steppers<V>& steppers = std::get<Steppers<V>>(steppers_);
+        while (int(steppers.size()) < threads)
+            steppers.push_back(std::make_unique<Stepper<V>>(rod_, lumen_.get(), loads_.get(), base_, options_, worlds_));
+        for (const auto& stepper : steppers) stepper->prepare(in, out);
+        Crew crew = assemble(in, threads);
+        std::atomic<long> done{0};
+        std::atomic<bool> stop{false};
+        run_threads(threads, progress, done, stop, [&](int thread, Moment until) {
+            return steppers[std::size_t(thread)]->run(crew, done, stop, until);
+        });
+    }
 
     void lay_straight(World& w) const {
         const double inserted = w[World::kInserted];
@@ -327,7 +317,7 @@ private:
             order.push_back(int(w));
         }
         std::stable_sort(order.begin(), order.end(), [&](int a, int b) { return depth[std::size_t(a)] > depth[std::size_t(b)]; });
-        return Crew(std::move(order), std::move(length), kCrew * std::max(1, threads));
+        return Crew(std::move(order), std::move(length), kCrew * threads);
     }
     static constexpr int kCrew = 64;  // worlds under way for each thread: enough to find four of like length
 };
