@@ -23,7 +23,6 @@ from endopilot.simulation.rod import RodLayout, lay_out
 from endopilot.simulation.simulator import (
     FREE_BEHIND_MM,
     LANES,
-    SAMPLE_TOLERANCE,
     SPARE_MM,
     Actuation,
     SimulatorConfig,
@@ -141,12 +140,7 @@ class Simulator:
                 lumen=self._lumens[key][1],
                 loads=None,
                 **insertion_arguments(anatomy.insertion),
-                options=core_options(
-                    self._config,
-                    push_limit_n=device.push_limit_n,
-                    free_behind_mm=FREE_BEHIND_MM,
-                    sample_tolerance=SAMPLE_TOLERANCE,
-                ),
+                options=core_options(self._config, push_limit_n=device.push_limit_n, free_behind_mm=FREE_BEHIND_MM),
                 worlds=len(worlds),
             )
             project = projectors.get(id(anatomy)) or TipProjector(anatomy.tree, anatomy.insertion)
