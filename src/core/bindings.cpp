@@ -228,6 +228,14 @@ public:
         return out.array(worlds_.size());
     }
 
+    // Positions of the first nodes.
+    nb::object tips() const {
+        Result<double> out(3 * worlds_.size());
+        double* to = out.data;
+        for (const World& w : worlds_) to = std::copy_n(w.node(0) + World::kX, 3, to);
+        return out.array(worlds_.size(), 3);
+    }
+
     // `size` numbers of each node, from `offset` on; those of nodes that follow the drive from `behind(world, node)`.
     template <class Behind>
     nb::object per_node(int offset, int size, const Behind& behind) const {
@@ -361,6 +369,7 @@ NB_MODULE(_core, module) {
              nb::arg("lanes"), nb::arg("progress").none())
         .def("state", &Simulation::state)
         .def("set_state", &Simulation::set_state, nb::arg("all"))
+        .def("tips", &Simulation::tips)
         .def("positions", &Simulation::positions)
         .def("attitudes", &Simulation::attitudes)
         .def("contacts", &Simulation::contacts)

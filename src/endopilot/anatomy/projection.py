@@ -61,19 +61,19 @@ class TipProjector:
             insertion: the ostium and the catheter's axis.
         """
         self._slabs = _Slabs.of(tree, insertion)
-        self._insertion = insertion
-        self._ostium_radius = float(tree.branches[0].centerline.radius[0])
+        self._catheter = _Catheter(insertion, float(tree.branches[0].centerline.radius[0]))
 
     def __call__(self, points: Float[np.ndarray, "*n 3"]) -> TipProjection:
         """Project tips (LPS mm) as `project_tip` does, to the same bits."""
         shape = points.shape[:-1]
-        flat = np.ascontiguousarray(points.reshape(-1, 3), dtype=float)
+        # an array a coordinate, so that the processor adds several at once
+        flat = np.ascontiguousarray(points.reshape(-1, 3).T, dtype=float)
         parts = [
-            _behind_ostium(self._insertion, self._ostium_radius, part, self._slabs.project(part))
-            for part in (flat[start : start + _CHUNK] for start in range(0, max(len(flat), 1), _CHUNK))
+            self._catheter.take(part, self._slabs.project(part))
+            for part in (flat[:, start : start + _CHUNK] for start in range(0, max(flat.shape[1], 1), _CHUNK))
         ]
-        fields = (np.concatenate(values).reshape(shape) for values in zip(*parts, strict=True))
-        abscissa, offset, branch, radius = fields
+        fields = parts[0] if len(parts) == 1 else (np.concatenate(values) for values in zip(*parts, strict=True))
+        abscissa, offset, branch, radius = (values.reshape(shape) for values in fields)
         return TipProjection(abscissa=abscissa, offset=offset, branch=branch, radius=radius)
 
 
@@ -84,9 +84,10 @@ class _Slabs:
 
     Attributes:
         vertices: positions of the vertices and their tangents over the length of the segment, (6, m).
-        segments: start, edge, tangent at the start, its change along the segment, edge·tangent, edge·change, abscissa
-            and its change, radius and its change: (18, m).
-        first, last: of every branch, its first and its last vertex.
+        segments: start and edge; tangent at the start and its change along the segment, by turns; edge·tangent and
+            edge·change; abscissa and radius, and their changes: (18, m).
+        first, last: of every vertex, the first and the last one of its branch.
+        behind: of every vertex, the one before it in its branch.
         branch: of every vertex, its branch.
         rival: (m, branches), how far a point must lie from this, its nearest vertex, to lie deeper in another branch,
             mm.
@@ -97,8 +98,9 @@ class _Slabs:
 
     vertices: Float[np.ndarray, "6 m"]
     segments: Float[np.ndarray, "18 m"]
-    first: Int[np.ndarray, "b"]
-    last: Int[np.ndarray, "b"]
+    first: Int[np.ndarray, "m"]
+    last: Int[np.ndarray, "m"]
+    behind: Int[np.ndarray, "m"]
     branch: Int[np.ndarray, "m"]
     rival: Float[np.ndarray, "m b"]
     soonest: Float[np.ndarray, "m"]
@@ -122,8 +124,9 @@ class _Slabs:
         edge, change = points[end] - points[start], tangent[end] - tangent[start]
         spacing = np.maximum(np.linalg.norm(edge, axis=1), 1e-9)
         products = [np.einsum("ij,ij->i", edge, other) for other in (tangent[start], change)]
-        scalars = [abscissa[start], abscissa[end] - abscissa[start], radius[start], radius[end] - radius[start]]
-        segments = np.column_stack([points[start], edge, tangent[start], change, *products, *scalars])
+        turning = np.stack([tangent[start], change], axis=-1).reshape(-1, 6)
+        scalars = [abscissa[start], radius[start], abscissa[end] - abscissa[start], radius[end] - radius[start]]
+        segments = np.column_stack([points[start], edge, turning, *products, *scalars])
         rival = np.full((len(points), len(lines)), np.inf)
         entry = np.zeros((len(points), len(lines)), dtype=np.int64)
         for index, line in enumerate(lines):
@@ -133,37 +136,47 @@ class _Slabs:
             ratio = _TAPER * line.radius[nearest] / radius
             wider = (ratio > 1.0) | (distance < 2.0 * spacing)  # the nearest line loses only to a wider one
             rival[wider & (owner != index), index] = ((distance - spacing) / (1.0 + ratio))[wider & (owner != index)]
-        vertices = np.ascontiguousarray(np.column_stack([points, tangent / spacing[:, None]]).T)
-        segments = np.ascontiguousarray(segments.T)
-        return cls(vertices, segments, first, last, owner, rival, rival.min(axis=1), entry, KDTree(points))
+        index = np.arange(len(points))
+        return cls(
+            vertices=np.ascontiguousarray(np.column_stack([points, tangent / spacing[:, None]]).T),
+            segments=np.ascontiguousarray(segments.T),
+            first=first[owner],
+            last=last[owner],
+            behind=np.maximum(index - 1, first[owner]),
+            branch=owner,
+            rival=rival,
+            soonest=rival.min(axis=1),
+            entry=entry,
+            places=KDTree(points),
+        )
 
-    def project(self, points: Float[np.ndarray, "n 3"]) -> Found:
+    def project(self, points: Float[np.ndarray, "3 n"]) -> Found:
         """Project points onto the branches whose lumens they lie deepest in."""
-        distance, nearest = (np.asarray(found) for found in self.places.query(points))
+        distance, nearest = (np.asarray(found) for found in self.places.query(points.T))
         branch = self.branch[nearest]
         abscissa, offset, radius = self._onto(points, nearest)
         doubtful = np.flatnonzero(self.soonest[nearest] < distance)
+        if len(doubtful) == 0:
+            return abscissa, offset, branch, radius
         row, rival = np.nonzero(self.rival[nearest[doubtful]] < distance[doubtful, None])
         contested = doubtful[row]
-        if len(contested):
-            asked = points[contested]
-            found = self._onto(asked, self._walked(asked, self.entry[nearest[contested], rival]))
-            order = np.lexsort((found[1] / found[2], contested))  # of each point's rivals the best comes first
-            best = order[np.diff(contested[order], prepend=-1) > 0]
-            place = contested[best]
-            better = found[1][best] * radius[place] < offset[place] * found[2][best]
-            chosen, best = place[better], best[better]
-            abscissa[chosen], offset[chosen], radius[chosen] = (value[best] for value in found)
-            branch[chosen] = rival[best]
+        asked = np.take(points, contested, axis=1)
+        found = self._onto(asked, self._walked(asked, self.entry[nearest[contested], rival]))
+        better = np.flatnonzero(found[1] * radius[contested] < offset[contested] * found[2])
+        # of a point's rivals the best comes last, and stays
+        best = better[np.argsort(found[1][better] / found[2][better], kind="stable")[::-1]]
+        chosen = contested[best]
+        abscissa[chosen], offset[chosen], radius[chosen] = (value[best] for value in found)
+        branch[chosen] = rival[best]
         return abscissa, offset, branch, radius
 
-    def _walked(self, points: Float[np.ndarray, "n 3"], vertex: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
+    def _walked(self, points: Float[np.ndarray, "3 n"], vertex: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
         """Walk along a branch from a vertex to the one that is nearest to each point."""
-        first, last = self.first[self.branch[vertex]], self.last[self.branch[vertex]]
+        first, last = self.first[vertex], self.last[vertex]
         for _ in range(_WALK):
-            step = np.rint(self._ahead(points.T, vertex)).astype(np.int64)
+            step = np.rint(self._ahead(points, vertex)).astype(np.int64)
             moved = np.minimum(np.maximum(vertex + step, first), last)
-            if (moved == vertex).all():
+            if np.array_equal(moved, vertex):
                 break
             vertex = moved
         return vertex
@@ -174,30 +187,60 @@ class _Slabs:
         return _dot(points - row[:3], row[3:])
 
     def _onto(
-        self, points: Float[np.ndarray, "n 3"], vertex: Int[np.ndarray, "n"]
+        self, points: Float[np.ndarray, "3 n"], vertex: Int[np.ndarray, "n"]
     ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
         """Project points onto the segment before or behind a vertex, by the side of its plane that they lie on.
 
         With q = p − a, edge e, tangent T at a and its change D, the share u solves (q − ue)·(T + uD) = 0:
         q·T − u(e·T − q·D) − u² e·D = 0, of whose roots the one that stays finite as D vanishes is wanted.
         """
-        points = np.ascontiguousarray(points.T)  # an array a coordinate, so that the processor adds several at once
-        behind = self._ahead(points, vertex) < 0
-        segment = np.where(behind, np.maximum(vertex - 1, self.first[self.branch[vertex]]), vertex)
+        segment = np.where(self._ahead(points, vertex) < 0, self.behind[vertex], vertex)
         row = np.take(self.segments, segment, axis=1, mode="clip")
         relative = points - row[:3]
-        depth = _dot(relative, row[6:9])
-        slope = row[12] - _dot(relative, row[9:12])
+        depth, turn = _dot(relative[:, None], row[6:12].reshape(3, 2, -1))
+        slope = row[12] - turn
         root = np.sqrt(np.maximum(slope * slope + 4.0 * row[13] * depth, 0.0))
         share = 2.0 * depth / np.maximum(slope + root, 1e-12)
         np.minimum(np.maximum(share, 0.0, out=share), 1.0, out=share)
         relative -= share * row[3:6]
-        offset = np.sqrt(_dot(relative, relative))
-        return row[14] + share * row[15], offset, row[16] + share * row[17]
+        abscissa, radius = row[14:16] + share * row[16:]
+        return abscissa, np.sqrt(_dot(relative, relative)), radius
 
 
-def _dot(one: Float[np.ndarray, "3 n"], other: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "n"]:
-    return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
+def _dot(one: Float[np.ndarray, "3 *#n"], other: Float[np.ndarray, "3 *#n"]) -> Float[np.ndarray, "*#n"]:
+    x, y, z = one * other
+    return x + y + z
+
+
+@dataclass(frozen=True, eq=False)
+class _Catheter:
+    """The catheter's lumen behind the ostium.
+
+    Attributes:
+        insertion: the ostium and the catheter's axis.
+        radius: at the ostium, mm.
+    """
+
+    insertion: Insertion
+    radius: float
+
+    def take(self, points: Float[np.ndarray, "3 n"], found: Found) -> Found:
+        """Give points behind the ostium to the catheter's axis, where its lumen holds them better than the vessel's."""
+        abscissa, offset, branch, radius = found
+        relative = points - self.insertion.position[:, None]
+        depth = _dot(relative, self.insertion.direction[:, None])
+        behind = np.flatnonzero(depth < 0)
+        if len(behind) == 0:
+            return found
+        depth = depth[behind]
+        across = relative[:, behind] - depth * self.insertion.direction[:, None]
+        distance = np.sqrt(_dot(across, across))
+        chosen = distance * radius[behind] <= offset[behind] * self.radius
+        abscissa[behind[chosen]] = depth[chosen]
+        offset[behind[chosen]] = distance[chosen]
+        branch[behind[chosen]] = 0
+        radius[behind[chosen]] = self.radius
+        return abscissa, offset, branch, radius
 
 
 def _shared_tangents(tree: VesselTree, insertion: Insertion) -> list[Float[np.ndarray, "n 3"]]:
@@ -216,20 +259,3 @@ def _shared_tangents(tree: VesselTree, insertion: Insertion) -> list[Float[np.nd
     if result[0][0] @ insertion.direction > 0.5:
         result[0][0] = insertion.direction
     return result
-
-
-def _behind_ostium(insertion: Insertion, ostium_radius: float, points: Float[np.ndarray, "n 3"], found: Found) -> Found:
-    """Give points behind the ostium to the catheter's axis, where its lumen holds them better than the vessel's."""
-    abscissa, offset, branch, radius = found
-    depth = points @ insertion.direction - insertion.position @ insertion.direction
-    behind = np.flatnonzero(depth < 0)
-    if len(behind) == 0:
-        return found
-    depth = depth[behind]
-    distance = np.linalg.norm(points[behind] - insertion.position - depth[:, None] * insertion.direction, axis=1)
-    chosen = distance * radius[behind] <= offset[behind] * ostium_radius
-    abscissa[behind[chosen]] = depth[chosen]
-    offset[behind[chosen]] = distance[chosen]
-    branch[behind[chosen]] = 0
-    radius[behind[chosen]] = ostium_radius
-    return abscissa, offset, branch, radius

@@ -52,8 +52,8 @@ class SimulatorConfig:
     tolerance_mm: float = 1e-3
     """Newton's method stops when its step moves no node farther than this, mm."""
     sample_tolerance_mm: float = 1e-6
-    """The same for the time step that ends a sample (no more than `tolerance_mm`): its forces are recorded, and the wire
-    is stiff axially."""
+    """The same for the time step that ends a sample (no more than `tolerance_mm`): its forces are recorded, and the
+    wire is stiff axially."""
     elements: int = 100
     """Elements over the longest path of the anatomy; they are shorter near the tip."""
     wall_stiffness_n_mm: float | None = None
