@@ -76,7 +76,7 @@ class TipProjector:
     def __call__(self, points: Float[np.ndarray, "*n 3"]) -> TipProjection:
         """Project tips (LPS mm) as `project_tip` does, to the same bits."""
         flat = np.ascontiguousarray(points.reshape(-1, 3), dtype=float)
-        distance, nearest = self._places.query(flat)
+        distance, nearest = (np.asarray(found) for found in self._places.query(flat))
         found = self._core.project(flat, nearest, distance)
         abscissa, offset, branch, radius = (values.reshape(points.shape[:-1]) for values in found)
         branch = branch.view(np.int64)  # the core's type is C's long long, another one of as many bits
