@@ -1,42 +1,20 @@
 // Python bindings: numpy in, numpy out; worlds spread over threads with the interpreter lock released.
 #include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
 #include <nanobind/stl/shared_ptr.h>
 
 #include <chrono>
-#include <condition_variable>
 #include <memory>
-#include <mutex>
 #include <thread>
+#include <tuple>
 
+#include "arrays.hpp"
+#include "projection.hpp"
 #include "spline.hpp"
 #include "stepper.hpp"
 
-namespace nb = nanobind;
 using namespace endopilot;
 
 namespace {
-
-template <int Dims>
-using Array = nb::ndarray<const double, nb::ndim<Dims>, nb::c_contig, nb::device::cpu>;
-using Indices = nb::ndarray<const std::int64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
-using Image = nb::ndarray<const float, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
-
-std::vector<double> values(const Array<1>& a) { return {a.data(), a.data() + a.size()}; }
-
-Vec3<double> vec3(const double* p) { return {p[0], p[1], p[2]}; }
-
-std::vector<Vec3<double>> vectors(const Array<2>& a) {
-    std::vector<Vec3<double>> out;
-    for (std::size_t i = 0; i < a.shape(0); ++i) out.push_back(vec3(a.data() + 3 * i));
-    return out;
-}
-
-Quaternion<double> quaternion(const double* p) { return {p[0], {p[1], p[2], p[3]}}; }
-
-void require(bool fine, const char* what) {
-    if (!fine) throw std::invalid_argument(what);
-}
 
 // All arrays have one entry a node; entries without a meaning (the last element, the first joint) are ignored.
 RodModel make_rod(const Array<1>& abscissa, const Array<1>& shear, const Array<1>& stretch, const Array<1>& bend,
@@ -88,63 +66,69 @@ Loads make_loads(const Array<2>& force, const Array<2>& moment, const Array<2>& 
     return loads;
 }
 
-template <class T>
-struct Result {
-    explicit Result(std::size_t size) : data(new T[size]()) {}
-    T* data;
-    template <class... Shape>
-    nb::object array(Shape... shape) {
-        nb::capsule owner(data, [](void* p) noexcept { delete[] static_cast<T*>(p); });
-        return nb::cast(nb::ndarray<nb::numpy, T>(data, {std::size_t(shape)...}, owner));
-    }
-};
+// All arrays but those of the catheter have a row a vertex; `rival` and `entry` a column a branch.
+Projector make_projector(const Array<2>& point, const Array<2>& tangent, const Array<1>& abscissa, const Array<1>& radius,
+                         const Indices<1>& first, const Indices<1>& last, const Indices<1>& branch, const Array<2>& rival,
+                         const Indices<2>& entry, const Array<1>& ostium, const Array<1>& axis, double catheter_radius) {
+    const std::size_t n = point.shape(0), branches = rival.shape(1);
+    require(n > 0 && point.shape(1) == 3 && tangent.shape(0) == n && tangent.shape(1) == 3 && abscissa.size() == n &&
+                radius.size() == n && first.size() == n && last.size() == n && branch.size() == n && rival.shape(0) == n &&
+                entry.shape(0) == n && entry.shape(1) == branches,
+            "every array of a projector needs one row a vertex");
+    require(ostium.size() == 3 && axis.size() == 3, "the catheter needs a position and a direction");
+    std::vector<Vertex> vertices;
+    for (std::size_t v = 0; v < n; ++v)
+        vertices.push_back({vec3(point.data() + 3 * v), vec3(tangent.data() + 3 * v), abscissa.data()[v], radius.data()[v],
+                            first.data()[v], last.data()[v], branch.data()[v]});
+    std::vector<Rival> rivals;
+    for (std::size_t i = 0; i < n * branches; ++i) rivals.push_back({rival.data()[i], entry.data()[i]});
+    return {std::move(vertices), std::move(rivals), {vec3(ostium.data()), vec3(axis.data()), catheter_radius}};
+}
 
-// Calls `work(thread)` on `threads` threads and keeps the interpreter's signals and the progress callback served.
+nb::tuple project(const Projector& projector, const Array<2>& points, const Indices<1>& nearest, const Array<1>& distance) {
+    const std::size_t n = points.shape(0);
+    require(points.shape(1) == 3 && nearest.size() == n && distance.size() == n, "project needs one row a point");
+    Result<double> abscissa(n), offset(n), radius(n);
+    Result<std::int64_t> branch(n);
+    const nb::tuple result = nb::make_tuple(abscissa.array(n), offset.array(n), branch.array(n), radius.array(n));
+    for (std::size_t i = 0; i < n; ++i) {
+        const std::int64_t at = nearest.data()[i];
+        require(at >= 0 && std::size_t(at) < projector.vertices(), "project names no such vertex");
+        const Projected p = projector(vec3(points.data() + 3 * i), at, distance.data()[i]);
+        abscissa.data[i] = p.abscissa, offset.data[i] = p.offset, branch.data[i] = p.branch, radius.data[i] = p.radius;
+    }
+    return result;
+}
+
+// Calls `work(thread, until)` on `threads` threads, of which this is number 0, until it says that all is done. On this one
+// it is called with a moment to come back at, so that the interpreter's signals and the progress callback stay served.
 template <class Work>
-void run_threads(int threads, const nb::object& progress, const std::atomic<long>& done, std::atomic<bool>& stop, Work work) {
-    int running = threads;
-    std::mutex mutex;
-    std::condition_variable ended;
-    std::vector<std::thread> pool;
-    for (int t = 0; t < threads; ++t)
-        pool.emplace_back([&] {
-            work();
-            const std::lock_guard<std::mutex> lock(mutex);
-            if (--running == 0) ended.notify_one();
-        });
-    bool interrupted = false;
+void run_threads(int threads, const nb::object& progress, const std::atomic<long>& done, std::atomic<bool>& stop, const Work& work) {
     std::exception_ptr failure;
     long reported = 0;
     const auto serve = [&] {
-        if (PyErr_CheckSignals() != 0) {
-            interrupted = true;
-        } else if (!progress.is_none()) {
+        try {
+            if (PyErr_CheckSignals() != 0) throw nb::python_error();
             const long now = done.load();
-            try {
-                if (now > reported) progress(now - reported);
-            } catch (...) {
-                failure = std::current_exception();
-            }
+            if (!progress.is_none() && now > reported) progress(now - reported);
             reported = now;
+        } catch (...) {
+            failure = std::current_exception();
+            stop.store(true);
         }
-        if (interrupted || failure) stop.store(true);
     };
     {
         nb::gil_scoped_release release;
-        const auto all_ended = [&] {
-            std::unique_lock<std::mutex> lock(mutex);
-            return ended.wait_for(lock, std::chrono::milliseconds(100), [&] { return running == 0; });
-        };
-        while (!all_ended()) {
-            if (stop.load()) continue;
+        std::vector<std::thread> others;
+        for (int t = 1; t < threads; ++t) others.emplace_back([&work, t] { work(t, Moment::max()); });
+        while (!work(0, std::chrono::steady_clock::now() + std::chrono::milliseconds(100))) {
             nb::gil_scoped_acquire acquire;
             serve();
         }
-        for (std::thread& thread : pool) thread.join();
+        for (std::thread& thread : others) thread.join();
     }
-    if (!stop.load()) serve();
+    if (!failure) serve();
     if (failure) std::rethrow_exception(failure);
-    if (interrupted) throw nb::python_error();
 }
 
 // Many worlds of one device in one lumen.
@@ -160,8 +144,10 @@ public:
         worlds_.assign(std::size_t(worlds), World(rod_.nodes));
     }
 
+    Simulation(const Simulation&) = delete;  // the steppers hold on to this one's rod and worlds
+
     // Puts worlds at the ostium, ready to be pushed to their first inserted length by the next run.
-    void reset(const Indices& index, const Array<2>& initial, const Array<1>& friction, double sample_period) {
+    void reset(const Indices<1>& index, const Array<2>& initial, const Array<1>& friction, double sample_period) {
         const std::size_t n = index.size();
         require(initial.shape(0) == n && initial.shape(1) == 2 && friction.size() == n, "reset needs one row a world");
         for (std::size_t k = 0; k < n; ++k) {
@@ -213,23 +199,12 @@ public:
                           force_sum.data,   base_force.data,  base_torque.data,  drive_force.data,  drive_torque.data,
                           iterations.data,  slip.data,        valid.data,        approach_slip.data,
                           record_shape ? shape.data : nullptr, record_attitude ? attitude.data : nullptr};
-        Crew crew = assemble(in, threads);
-        std::atomic<long> done{0};
-        std::atomic<bool> stop{false};
-        const auto work = [&](auto lane) {
-            using V = decltype(lane);
-            const auto stepper =
-                std::make_unique<Stepper<V>>(rod_, lumen_.get(), loads_.get(), base_, options_, in, out, worlds_);
-            stepper->run(crew, done, stop);
-        };
-        run_threads(std::max(1, threads), progress, done, stop, [&] {
-            if (lanes == 1)
-                work(double{});
-            else if (lanes == 8)
-                work(double8{});
-            else
-                work(double4{});
-        });
+        if (lanes == 1)
+            step<double>(in, out, std::max(1, threads), progress);
+        else if (lanes == 8)
+            step<double8>(in, out, std::max(1, threads), progress);
+        else
+            step<double4>(in, out, std::max(1, threads), progress);
         return result;
     }
 
@@ -253,6 +228,14 @@ public:
         Result<double> out(worlds_.size());
         for (std::size_t w = 0; w < worlds_.size(); ++w) out.data[w] = worlds_[w][which];
         return out.array(worlds_.size());
+    }
+
+    // Positions of the first nodes.
+    nb::object tips() const {
+        Result<double> out(3 * worlds_.size());
+        double* to = out.data;
+        for (const World& w : worlds_) to = std::copy_n(w.node(0) + World::kX, 3, to);
+        return out.array(worlds_.size(), 3);
     }
 
     // `size` numbers of each node, from `offset` on; those of nodes that follow the drive from `behind(world, node)`.
@@ -298,6 +281,23 @@ private:
     Base base_;
     Options options_;
     std::vector<World> worlds_;
+    template <class V>
+    using Steppers = std::vector<std::unique_ptr<Stepper<V>>>;  // one a thread, kept from call to call
+    std::tuple<Steppers<double>, Steppers<double4>, Steppers<double8>> steppers_;
+
+    template <class V>
+    void step(const Inputs& in, const Outputs& out, int threads, const nb::object& progress) {
+        Steppers<V>& steppers = std::get<Steppers<V>>(steppers_);
+        while (int(steppers.size()) < threads)
+            steppers.push_back(std::make_unique<Stepper<V>>(rod_, lumen_.get(), loads_.get(), base_, options_, worlds_));
+        for (const auto& stepper : steppers) stepper->prepare(in, out);
+        Crew crew = assemble(in, threads);
+        std::atomic<long> done{0};
+        std::atomic<bool> stop{false};
+        run_threads(threads, progress, done, stop, [&](int thread, Moment until) {
+            return steppers[std::size_t(thread)]->run(crew, done, stop, until);
+        });
+    }
 
     void lay_straight(World& w) const {
         const double inserted = w[World::kInserted];
@@ -327,7 +327,7 @@ private:
             order.push_back(int(w));
         }
         std::stable_sort(order.begin(), order.end(), [&](int a, int b) { return depth[std::size_t(a)] > depth[std::size_t(b)]; });
-        return Crew(std::move(order), std::move(length), kCrew * std::max(1, threads));
+        return Crew(std::move(order), std::move(length), kCrew * threads);
     }
     static constexpr int kCrew = 64;  // worlds under way for each thread: enough to find four of like length
 };
@@ -335,7 +335,7 @@ private:
 }  // namespace
 
 NB_MODULE(_core, module) {
-    module.doc() = "The Cosserat rod core of endopilot.";
+    module.doc() = "The core of endopilot: Cosserat rods, and projection to centerlines.";
     module.attr("LANES") = kLanes;
     nb::class_<RodModel>(module, "RodModel")
         .def_ro("nodes", &RodModel::nodes);
@@ -344,6 +344,11 @@ NB_MODULE(_core, module) {
     nb::class_<Lumen>(module, "Lumen").def_prop_ro("bytes", &Lumen::bytes);
     module.def("make_lumen", &make_lumen, nb::kw_only(), nb::arg("values"), nb::arg("origin"), nb::arg("spacing"),
                nb::arg("near"), nb::arg("far"));
+    nb::class_<Projector>(module, "Projector")
+        .def("project", &project, nb::arg("points"), nb::arg("nearest"), nb::arg("distance"));
+    module.def("make_projector", &make_projector, nb::kw_only(), nb::arg("point"), nb::arg("tangent"), nb::arg("abscissa"),
+               nb::arg("radius"), nb::arg("first"), nb::arg("last"), nb::arg("branch"), nb::arg("rival"), nb::arg("entry"),
+               nb::arg("ostium"), nb::arg("axis"), nb::arg("catheter_radius"));
     nb::class_<Loads>(module, "Loads");
     module.def("make_loads", &make_loads, nb::kw_only(), nb::arg("force"), nb::arg("moment"), nb::arg("spring"),
                nb::arg("anchor"), nb::arg("hold"), nb::arg("attitude"));
@@ -371,6 +376,7 @@ NB_MODULE(_core, module) {
              nb::arg("lanes"), nb::arg("progress").none())
         .def("state", &Simulation::state)
         .def("set_state", &Simulation::set_state, nb::arg("all"))
+        .def("tips", &Simulation::tips)
         .def("positions", &Simulation::positions)
         .def("attitudes", &Simulation::attitudes)
         .def("contacts", &Simulation::contacts)

@@ -8,6 +8,7 @@
 
 #include <algorithm>
 #include <atomic>
+#include <chrono>
 #include <cmath>
 #include <thread>
 #include <vector>
@@ -29,17 +30,26 @@ constexpr double kAtRest = 1e-5;         // N that a damped solution may be out 
 constexpr double kStop = 100;            // N/mm, of the stops at both ends of the drive's travel
 constexpr double kDriveShare = 1.2;      // of the drive's own motion that a node may move in a step before it counts as a jump
 
+using Moment = std::chrono::steady_clock::time_point;
+
 template <class V>
 class Stepper {
 public:
     Stepper(const RodModel& rod, const Lumen* lumen, const Loads* loads, const Base& base, const Options& options,
-            const Inputs& in, const Outputs& out, std::vector<World>& worlds)
-        : rod_(rod), lumen_(lumen), loads_(loads), base_(base), options_(options), in_(in), out_(out), world_(worlds),
-          node_(rod.nodes), factor_(rod.nodes) {}
+            std::vector<World>& worlds)
+        : rod_(rod), lumen_(lumen), loads_(loads), base_(base), options_(options), world_(worlds), node_(rod.nodes),
+          factor_(rod.nodes) {}
 
-    // Steps the crew's worlds until none is left or `stop` is set. `done` counts finished samples.
-    void run(Crew& crew, std::atomic<long>& done, const std::atomic<bool>& stop) {
+    // Sets what the next runs are asked, with all lanes free.
+    void prepare(const Inputs& in, const Outputs& out) {
+        in_ = in;
+        out_ = out;
         for (Lane& lane : lane_) lane.world = -1;
+    }
+
+    // Steps the crew's worlds until none is left or `stop` is set, and returns whether that is so: else it is `until`, and
+    // the next run goes on. `done` counts finished samples.
+    bool run(Crew& crew, std::atomic<long>& done, const std::atomic<bool>& stop, Moment until) {
         while (!stop.load(std::memory_order_relaxed)) {
             bool busy = false;
             for (int l = 0; l < W; ++l) {
@@ -49,10 +59,12 @@ public:
             if (busy) {
                 done.fetch_add(pass(crew), std::memory_order_relaxed);
             } else {
-                if (crew.done()) return;
+                if (crew.done()) return true;
                 std::this_thread::yield();
             }
+            if (std::chrono::steady_clock::now() > until) return false;
         }
+        return true;
     }
 
 private:
@@ -107,8 +119,8 @@ private:
     const Loads* loads_;
     const Base base_;
     const Options options_;
-    const Inputs in_;
-    const Outputs out_;
+    Inputs in_{};
+    Outputs out_{};
     std::vector<World>& world_;
     std::vector<Node> node_;
     std::vector<Factor<V>> factor_;

@@ -1,4 +1,4 @@
-"""The Cosserat rod core (C++); see `endopilot.simulation` for what callers use."""
+"""The core (C++): Cosserat rods and projection to centerlines; see `endopilot.simulation`, `anatomy.projection`."""
 
 from collections.abc import Callable
 from typing import Any
@@ -10,6 +10,11 @@ class RodModel:
 
 class Lumen:
     bytes: int
+
+class Projector:
+    def project(
+        self, points: np.ndarray, nearest: np.ndarray, distance: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]: ...
 
 class Loads: ...
 
@@ -42,6 +47,21 @@ def make_rod(
     spin_drag: np.ndarray,
 ) -> RodModel: ...
 def make_lumen(*, values: np.ndarray, origin: np.ndarray, spacing: float, near: float, far: float) -> Lumen: ...
+def make_projector(
+    *,
+    point: np.ndarray,
+    tangent: np.ndarray,
+    abscissa: np.ndarray,
+    radius: np.ndarray,
+    first: np.ndarray,
+    last: np.ndarray,
+    branch: np.ndarray,
+    rival: np.ndarray,
+    entry: np.ndarray,
+    ostium: np.ndarray,
+    axis: np.ndarray,
+    catheter_radius: float,
+) -> Projector: ...
 def make_loads(
     *,
     force: np.ndarray,
@@ -82,6 +102,7 @@ class Simulation:
     ) -> dict[str, np.ndarray]: ...
     def state(self) -> np.ndarray: ...
     def set_state(self, all: np.ndarray) -> None: ...
+    def tips(self) -> np.ndarray: ...
     def positions(self) -> np.ndarray: ...
     def attitudes(self) -> np.ndarray: ...
     def contacts(self) -> np.ndarray: ...

@@ -70,6 +70,15 @@ def test_wall_of_a_wide_vessel_is_not_given_to_a_thin_neighbour():
     assert found.radius[0] == 2.0
 
 
+def test_a_point_is_projected_to_the_same_bits_in_any_company():
+    tree = forked_tree()
+    points = np.random.default_rng(1).uniform((-2, -1, -4), (8, 1, 30), (500, 3))  # behind the ostium too
+    together = project_tip(tree, INSERTION, points)
+    for name in ("abscissa", "offset", "branch", "radius"):
+        alone = [getattr(project_tip(tree, INSERTION, point), name) for point in points[:100]]
+        assert np.array_equal(alone, getattr(together, name)[:100])
+
+
 def test_shapes_follow_the_points():
     found = project_tip(forked_tree(), INSERTION, np.tile([0.5, 0, 10.0], (3, 5, 1)))
     assert found.abscissa.shape == found.branch.shape == (3, 5)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import doctest
+import signal
 import subprocess
 import sys
 from dataclasses import replace
@@ -93,6 +94,21 @@ def test_threads_change_no_bit(anatomy: Anatomy) -> None:
             step = simulator.step(control, 0.25)
         tips.append(step.tip_position)
     assert np.array_equal(*tips)
+
+
+@pytest.mark.parametrize("worlds", [1, 5])
+def test_ctrl_c_stops_a_step_that_has_begun(anatomy: Anatomy, worlds: int) -> None:
+    simulator = begun(Simulator(anatomy, DEVICE, worlds=worlds, config=SimulatorConfig(threads=2)), worlds)
+    inserted = simulator.inserted_length
+    before = signal.signal(signal.SIGALRM, signal.default_int_handler)
+    signal.setitimer(signal.ITIMER_REAL, 0.2)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            simulator.step(np.tile([1e-3, 0.1], (worlds, 1)), 5000.0)
+    finally:
+        signal.signal(signal.SIGALRM, before)
+    assert np.array_equal(simulator.inserted_length, inserted)
+    assert simulator.step(np.ones((worlds, 2)), 0.1).valid.all()
 
 
 def test_restored_state_goes_on_with_the_same_bits(anatomy: Anatomy, tmp_path: Path) -> None:

@@ -13,26 +13,16 @@ others are looked at for the few points that are contested.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
+from endopilot import _core
 from endopilot.anatomy.tree import tangents
 from endopilot.types import Insertion, TipProjection, VesselTree
 
-Found = tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"], Int[np.ndarray, "n"], Float[np.ndarray, "n"]]
-"""Abscissa, offset, branch and radius."""
-
-_CHUNK = 8192
-"""Points that are projected at once: their intermediate results stay in the processor's cache."""
-
 _TAPER = 1.25
 """A branch is at most this many times wider where a point is projected to than where it is nearest to a vertex."""
-
-_WALK = 4
-"""Vertices are corrected at most this often, by the point's distance to the vertex's plane."""
 
 
 def project_tip(tree: VesselTree, insertion: Insertion, points: Float[np.ndarray, "*n 3"]) -> TipProjection:
@@ -60,144 +50,75 @@ class TipProjector:
             tree: centerlines.
             insertion: the ostium and the catheter's axis.
         """
-        self._slabs = _Slabs.of(tree, insertion)
-        self._insertion = insertion
-        self._ostium_radius = float(tree.branches[0].centerline.radius[0])
+        lines = [branch.centerline for branch in tree.branches]
+        points = np.concatenate([line.points for line in lines])
+        self._places = KDTree(points)
+        counts = np.array([len(line.points) for line in lines])
+        branch = np.repeat(np.arange(len(lines)), counts)
+        last = np.cumsum(counts) - 1
+        first = last - counts + 1
+        rival, entry = _rivals(tree, points, first, branch)
+        self._core = _core.make_projector(
+            point=points,
+            tangent=np.concatenate(_shared_tangents(tree, insertion)),
+            abscissa=np.concatenate([line.abscissa for line in lines]),
+            radius=np.concatenate([line.radius for line in lines]),
+            first=first[branch],
+            last=last[branch],
+            branch=branch,
+            rival=rival,
+            entry=entry,
+            ostium=np.asarray(insertion.position, dtype=float),
+            axis=np.asarray(insertion.direction, dtype=float),
+            catheter_radius=float(lines[0].radius[0]),
+        )
 
     def __call__(self, points: Float[np.ndarray, "*n 3"]) -> TipProjection:
         """Project tips (LPS mm) as `project_tip` does, to the same bits."""
-        shape = points.shape[:-1]
         flat = np.ascontiguousarray(points.reshape(-1, 3), dtype=float)
-        parts = [
-            _behind_ostium(self._insertion, self._ostium_radius, part, self._slabs.project(part))
-            for part in (flat[start : start + _CHUNK] for start in range(0, max(len(flat), 1), _CHUNK))
-        ]
-        fields = (np.concatenate(values).reshape(shape) for values in zip(*parts, strict=True))
-        abscissa, offset, branch, radius = fields
+        distance, nearest = (np.asarray(found) for found in self._places.query(flat))
+        found = self._core.project(flat, nearest, distance)
+        abscissa, offset, branch, radius = (values.reshape(points.shape[:-1]) for values in found)
+        branch = branch.view(np.int64)  # the core's type is C's long long, another one of as many bits
         return TipProjection(abscissa=abscissa, offset=offset, branch=branch, radius=radius)
 
 
-@dataclass(frozen=True, eq=False)
-class _Slabs:
-    """All segments of a tree with what their projection needs, one row a vertex; the last of a branch repeats the one
-    before, so that every vertex has a segment.
+def _rivals(
+    tree: VesselTree, points: Float[np.ndarray, "m 3"], first: Int[np.ndarray, "b"], owner: Int[np.ndarray, "m"]
+) -> tuple[Float[np.ndarray, "m b"], Int[np.ndarray, "m b"]]:
+    """Return what a point may lie deeper in than in the branch of its nearest vertex, a row for each such vertex.
 
-    Attributes:
-        vertices: positions of the vertices and their tangents over the length of the segment, (6, m).
-        segments: start, edge, tangent at the start, its change along the segment, edge·tangent, edge·change, abscissa
-            and its change, radius and its change: (18, m).
-        first, last: of every branch, its first and its last vertex.
-        branch: of every vertex, its branch.
-        rival: (m, branches), how far a point must lie from this, its nearest vertex, to lie deeper in another branch,
-            mm.
-        soonest: the least of `rival`.
-        entry: (m, branches), the branch's vertex that is nearest to this one.
-        places: the vertices, to search.
+    Args:
+        tree: centerlines.
+        points: all their vertices.
+        first: the first vertex of every branch.
+        owner: the branch of every vertex.
+
+    Returns:
+        How far a point must lie from the vertex to lie deeper in each other branch, mm; and the branch's vertex that is
+        nearest to this one.
     """
-
-    vertices: Float[np.ndarray, "6 m"]
-    segments: Float[np.ndarray, "18 m"]
-    first: Int[np.ndarray, "b"]
-    last: Int[np.ndarray, "b"]
-    branch: Int[np.ndarray, "m"]
-    rival: Float[np.ndarray, "m b"]
-    soonest: Float[np.ndarray, "m"]
-    entry: Int[np.ndarray, "m b"]
-    places: KDTree
-
-    @classmethod
-    def of(cls, tree: VesselTree, insertion: Insertion) -> _Slabs:
-        lines = [branch.centerline for branch in tree.branches]
-        counts = np.array([len(line.points) for line in lines])
-        last = np.cumsum(counts) - 1
-        first = last - counts + 1
-        points, radius, abscissa = (
-            np.concatenate([getattr(line, name) for line in lines]) for name in ("points", "radius", "abscissa")
-        )
-        tangent = np.concatenate(_shared_tangents(tree, insertion))
-        owner = np.repeat(np.arange(len(lines)), counts)
-        start = np.arange(len(points))
-        start[last] = np.maximum(last - 1, first)
-        end = np.minimum(start + 1, last[owner])
-        edge, change = points[end] - points[start], tangent[end] - tangent[start]
-        spacing = np.maximum(np.linalg.norm(edge, axis=1), 1e-9)
-        products = [np.einsum("ij,ij->i", edge, other) for other in (tangent[start], change)]
-        scalars = [abscissa[start], abscissa[end] - abscissa[start], radius[start], radius[end] - radius[start]]
-        segments = np.column_stack([points[start], edge, tangent[start], change, *products, *scalars])
-        rival = np.full((len(points), len(lines)), np.inf)
-        entry = np.zeros((len(points), len(lines)), dtype=np.int64)
-        for index, line in enumerate(lines):
-            distance, nearest = (np.asarray(found) for found in KDTree(line.points).query(points))
-            entry[:, index] = first[index] + nearest
-            # To win, offset < |p − v|·R is needed, with R the ratio of radii; and distance ≤ |p − v| + offset.
-            ratio = _TAPER * line.radius[nearest] / radius
-            wider = (ratio > 1.0) | (distance < 2.0 * spacing)  # the nearest line loses only to a wider one
-            rival[wider & (owner != index), index] = ((distance - spacing) / (1.0 + ratio))[wider & (owner != index)]
-        vertices = np.ascontiguousarray(np.column_stack([points, tangent / spacing[:, None]]).T)
-        segments = np.ascontiguousarray(segments.T)
-        return cls(vertices, segments, first, last, owner, rival, rival.min(axis=1), entry, KDTree(points))
-
-    def project(self, points: Float[np.ndarray, "n 3"]) -> Found:
-        """Project points onto the branches whose lumens they lie deepest in."""
-        distance, nearest = (np.asarray(found) for found in self.places.query(points))
-        branch = self.branch[nearest]
-        abscissa, offset, radius = self._onto(points, nearest)
-        doubtful = np.flatnonzero(self.soonest[nearest] < distance)
-        row, rival = np.nonzero(self.rival[nearest[doubtful]] < distance[doubtful, None])
-        contested = doubtful[row]
-        if len(contested):
-            asked = points[contested]
-            found = self._onto(asked, self._walked(asked, self.entry[nearest[contested], rival]))
-            order = np.lexsort((found[1] / found[2], contested))  # of each point's rivals the best comes first
-            best = order[np.diff(contested[order], prepend=-1) > 0]
-            place = contested[best]
-            better = found[1][best] * radius[place] < offset[place] * found[2][best]
-            chosen, best = place[better], best[better]
-            abscissa[chosen], offset[chosen], radius[chosen] = (value[best] for value in found)
-            branch[chosen] = rival[best]
-        return abscissa, offset, branch, radius
-
-    def _walked(self, points: Float[np.ndarray, "n 3"], vertex: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
-        """Walk along a branch from a vertex to the one that is nearest to each point."""
-        first, last = self.first[self.branch[vertex]], self.last[self.branch[vertex]]
-        for _ in range(_WALK):
-            step = np.rint(self._ahead(points.T, vertex)).astype(np.int64)
-            moved = np.minimum(np.maximum(vertex + step, first), last)
-            if (moved == vertex).all():
-                break
-            vertex = moved
-        return vertex
-
-    def _ahead(self, points: Float[np.ndarray, "3 n"], vertex: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-        """Return how far points lie before the planes of vertices, in segments."""
-        row = np.take(self.vertices, vertex, axis=1, mode="clip")
-        return _dot(points - row[:3], row[3:])
-
-    def _onto(
-        self, points: Float[np.ndarray, "n 3"], vertex: Int[np.ndarray, "n"]
-    ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-        """Project points onto the segment before or behind a vertex, by the side of its plane that they lie on.
-
-        With q = p − a, edge e, tangent T at a and its change D, the share u solves (q − ue)·(T + uD) = 0:
-        q·T − u(e·T − q·D) − u² e·D = 0, of whose roots the one that stays finite as D vanishes is wanted.
-        """
-        points = np.ascontiguousarray(points.T)  # an array a coordinate, so that the processor adds several at once
-        behind = self._ahead(points, vertex) < 0
-        segment = np.where(behind, np.maximum(vertex - 1, self.first[self.branch[vertex]]), vertex)
-        row = np.take(self.segments, segment, axis=1, mode="clip")
-        relative = points - row[:3]
-        depth = _dot(relative, row[6:9])
-        slope = row[12] - _dot(relative, row[9:12])
-        root = np.sqrt(np.maximum(slope * slope + 4.0 * row[13] * depth, 0.0))
-        share = 2.0 * depth / np.maximum(slope + root, 1e-12)
-        np.minimum(np.maximum(share, 0.0, out=share), 1.0, out=share)
-        relative -= share * row[3:6]
-        offset = np.sqrt(_dot(relative, relative))
-        return row[14] + share * row[15], offset, row[16] + share * row[17]
+    lines = [branch.centerline for branch in tree.branches]
+    radius = np.concatenate([line.radius for line in lines])
+    spacing = np.concatenate([_spacing(line.points) for line in lines])
+    rival = np.full((len(points), len(lines)), np.inf)
+    entry = np.zeros((len(points), len(lines)), dtype=np.int64)
+    for index, line in enumerate(lines):
+        distance, nearest = (np.asarray(found) for found in KDTree(line.points).query(points))
+        entry[:, index] = first[index] + nearest
+        # To win, offset < |p − v|·R is needed, with R the ratio of radii; and distance ≤ |p − v| + offset.
+        ratio = _TAPER * line.radius[nearest] / radius
+        wider = (ratio > 1.0) | (distance < 2.0 * spacing)  # the nearest line loses only to a wider one
+        rival[wider & (owner != index), index] = ((distance - spacing) / (1.0 + ratio))[wider & (owner != index)]
+    return rival, entry
 
 
-def _dot(one: Float[np.ndarray, "3 n"], other: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "n"]:
-    return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
+def _spacing(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    """Return the length of the segment from each vertex of a line on; of that before it at the last one, mm."""
+    if len(points) == 1:
+        return np.full(1, 1e-9)
+    lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    return np.maximum(np.append(lengths, lengths[-1]), 1e-9)
 
 
 def _shared_tangents(tree: VesselTree, insertion: Insertion) -> list[Float[np.ndarray, "n 3"]]:
@@ -216,20 +137,3 @@ def _shared_tangents(tree: VesselTree, insertion: Insertion) -> list[Float[np.nd
     if result[0][0] @ insertion.direction > 0.5:
         result[0][0] = insertion.direction
     return result
-
-
-def _behind_ostium(insertion: Insertion, ostium_radius: float, points: Float[np.ndarray, "n 3"], found: Found) -> Found:
-    """Give points behind the ostium to the catheter's axis, where its lumen holds them better than the vessel's."""
-    abscissa, offset, branch, radius = found
-    depth = points @ insertion.direction - insertion.position @ insertion.direction
-    behind = np.flatnonzero(depth < 0)
-    if len(behind) == 0:
-        return found
-    depth = depth[behind]
-    distance = np.linalg.norm(points[behind] - insertion.position - depth[:, None] * insertion.direction, axis=1)
-    chosen = distance * radius[behind] <= offset[behind] * ostium_radius
-    abscissa[behind[chosen]] = depth[chosen]
-    offset[behind[chosen]] = distance[chosen]
-    branch[behind[chosen]] = 0
-    radius[behind[chosen]] = ostium_radius
-    return abscissa, offset, branch, radius

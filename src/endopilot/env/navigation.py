@@ -30,9 +30,9 @@ CONTROL_PERIOD_S = 2 / 15
 TRANSLATION_MM_S, ROTATION_RAD_S = 12.0, 3.14
 """Velocities of an action of 1: the fastest of the random navigations of `ControlConfig`, and half a turn a second."""
 _FASTEST = np.array([TRANSLATION_MM_S, ROTATION_RAD_S])
-CORE = SimulatorConfig(elements=50, time_step_s=1 / 14)
-"""Settings of the rod core in a learning environment: half the elements and two time steps a control period, which cost
-a fifth of the default's time; docs/environment.md states the accuracy that they keep."""
+CORE = SimulatorConfig(elements=50, time_step_s=1 / 14, sample_tolerance_mm=1e-4)
+"""Settings of the rod core in a learning environment: half the elements, two time steps a control period, and forces
+that are exact to a micronewton; docs/environment.md states the accuracy that they keep."""
 PROGRESS_REWARD, STEP_REWARD, FORCE_REWARD, SUCCESS_REWARD = 0.1, -0.01, -0.1, 5.0
 """A mm nearer to the target, every step, every step with too large a force, and the target."""
 

@@ -90,8 +90,10 @@ def observe(
         time_share: share of the time limit that is used up.
     """
     place, tip = routes.place(now.tip), now.tip
-    beside = (now.position - place.point) / place.radius[:, None]
-    inside = place.frame @ np.stack([now.direction, beside], axis=-1)
+    outside = np.empty((len(time_share), 3, 2))
+    outside[:, :, 0] = now.direction
+    outside[:, :, 1] = (now.position - place.point) / place.radius[:, None]
+    inside = place.frame @ outside
     out = np.empty((len(time_share), *SPACE.shape))
     out[:, 0] = now.inserted_length / 100.0
     out[:, 1], out[:, 2] = np.cos(now.rotation), np.sin(now.rotation)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from endopilot.anatomy.tree import parallel_transport, tangents
 from endopilot.env.task import Navigation
@@ -44,44 +44,44 @@ class Routes:
     """The route of each world, from the ostium to the end of the target's branch.
 
     Attributes:
-        places: a row for each place, every `STEP_MM` along the route, as `Place` has it; a shorter route is padded
-            with its last place.
-        leave: for each branch of the tree, the abscissa where the way into it leaves the route, mm; infinite for the
-            branches of the route and for those that the tree does not have.
-        target: abscissa of the target, mm.
+        places: of each route, a row for each place, every `STEP_MM` along it, as `Place` has it; a shorter route is
+            padded with its last place.
+        leave: of each route, for each branch of the tree, the abscissa where the way into it leaves the route, mm;
+            infinite for the branches of the route and for those that the tree does not have.
+        route: which of these routes each world has.
+        target: abscissa of each world's target, mm.
     """
 
-    places: Float[np.ndarray, "worlds places columns"]
-    leave: Float[np.ndarray, "worlds branches"]
+    places: Float[np.ndarray, "routes places columns"]
+    leave: Float[np.ndarray, "routes branches"]
+    route: Int[np.ndarray, "worlds"]
     target: Float[np.ndarray, "worlds"]
 
     @classmethod
     def of(cls, navigations: Sequence[Navigation]) -> Routes:
-        """Make the tables, a row a navigation."""
-        made: dict[int, tuple[np.ndarray, ...]] = {}
-        for navigation in navigations:
-            if id(navigation) not in made:
-                made[id(navigation)] = _tables(navigation)
-        rows = [made[id(navigation)] for navigation in navigations]
-        places, branches = max(len(row[0]) for row in rows), max(len(row[1]) for row in rows)
+        """Make the tables, once for worlds that have the same navigation."""
+        numbers = {key: number for number, key in enumerate(dict.fromkeys(map(id, navigations)))}
+        route = np.array([numbers[id(navigation)] for navigation in navigations])
+        made = [_tables(navigations[world]) for world in np.unique(route, return_index=True)[1]]
+        places, branches = max(len(row[0]) for row in made), max(len(row[1]) for row in made)
         return cls(
-            places=np.stack([_padded(row[0], places) for row in rows]),
-            leave=np.stack([_padded(row[1], branches, np.inf) for row in rows]),
+            places=np.stack([_padded(row[0], places) for row in made]),
+            leave=np.stack([_padded(row[1], branches, np.inf) for row in made]),
+            route=route,
             target=np.array([navigation.target.abscissa for navigation in navigations]),
         )
 
     def distance(self, tip: TipProjection) -> Float[np.ndarray, "worlds"]:
         """Return the way that each tip still has to go, mm, back out of a wrong branch first."""
-        leave = self.leave[np.arange(len(self.leave)), tip.branch]
+        leave = self.leave[self.route, tip.branch]
         fork = np.minimum(leave, tip.abscissa)
         return (tip.abscissa - fork) + np.abs(self.target - fork)
 
     def place(self, tip: TipProjection) -> Place:
         """Return the place of each world's route that is nearest to its tip along the tree."""
-        worlds = np.arange(len(self.leave))
-        leave = self.leave[worlds, tip.branch]
+        leave = self.leave[self.route, tip.branch]
         along = np.rint(np.minimum(leave, tip.abscissa) / STEP_MM).astype(np.int64)
-        row = self.places[worlds, np.minimum(np.maximum(along, 0), self.places.shape[1] - 1)]
+        row = self.places[self.route, np.minimum(np.maximum(along, 0), self.places.shape[1] - 1)]
         return Place(
             point=row[:, :3],
             frame=row[:, 3:12].reshape(-1, 3, 3),

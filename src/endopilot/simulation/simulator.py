@@ -28,8 +28,6 @@ _LARGEST_NEWTON_STEP = 0.3
 """Displacement of a node (mm) that one Newton step is clamped to; larger ones can tangle the wire for good."""
 _MOST_ITERATIONS = 400
 """Newton iterations after which a time step is halved, down to 1/64; a wire that snaps over needs some hundred."""
-SAMPLE_TOLERANCE = 1e-6
-"""Newton tolerance of the step that ends a sample, mm: its forces are recorded, and the wire is stiff axially."""
 LANES = _core.LANES
 """Worlds that one thread steps side by side."""
 _DENT_MM = 0.015
@@ -53,6 +51,9 @@ class SimulatorConfig:
     """Time step, s; it must divide the sample period of 0.5 s. The tip's error grows about linearly with it."""
     tolerance_mm: float = 1e-3
     """Newton's method stops when its step moves no node farther than this, mm."""
+    sample_tolerance_mm: float = 1e-6
+    """The same for the time step that ends a sample (no more than `tolerance_mm`): its forces are recorded, and the
+    wire is stiff axially."""
     elements: int = 100
     """Elements over the longest path of the anatomy; they are shorter near the tip."""
     wall_stiffness_n_mm: float | None = None
@@ -77,7 +78,8 @@ class SimulatorConfig:
         Raises:
             InputError: a field is out of its range.
         """
-        for name in ("time_step_s", "tolerance_mm", "wall_stiffness_n_mm", "stick_velocity_mm_s", "largest_jump"):
+        positive = ("time_step_s", "tolerance_mm", "sample_tolerance_mm", "wall_stiffness_n_mm", "stick_velocity_mm_s")
+        for name in (*positive, "largest_jump"):
             value = getattr(self, name)
             if value is not None and not 0 < value < np.inf:
                 raise InputError(f"{name}: {value}; give a positive number")
@@ -252,7 +254,6 @@ def run_core(
     lanes: int = LANES,
     approach: bool = True,
     free_behind_mm: float = FREE_BEHIND_MM,
-    sample_tolerance: float = SAMPLE_TOLERANCE,
     push_limit_n: float = 2.0,
 ) -> dict[str, np.ndarray]:
     """Run the C++ core on checked input. The simulator and the verification both come through here.
@@ -272,7 +273,6 @@ def run_core(
         lanes: worlds stepped side by side by one thread: 1, 4 or 8.
         approach: bring the wire to its first inserted length from the ostium; else it starts there, straight.
         free_behind_mm: nodes farther behind the insertion point follow the drive, mm.
-        sample_tolerance: Newton tolerance at the end of a sample, mm.
         push_limit_n: force at which the drive slips, N; of the device, where there is one.
 
     Returns:
@@ -288,7 +288,6 @@ def run_core(
             push_limit_n=push_limit_n,
             approach=approach,
             free_behind_mm=free_behind_mm,
-            sample_tolerance=sample_tolerance,
         ),
         worlds=len(control),
     )
@@ -326,7 +325,6 @@ def core_options(
     *,
     push_limit_n: float,
     free_behind_mm: float,
-    sample_tolerance: float,
     approach: bool = True,
 ) -> _core.Options:
     """Return the settings as the core wants them."""
@@ -334,7 +332,7 @@ def core_options(
     options.stick_velocity = config.stick_velocity_mm_s
     options.wall_stiffness = wall_stiffness(config, push_limit_n)
     options.tolerance = config.tolerance_mm
-    options.sample_tolerance = min(sample_tolerance, config.tolerance_mm)
+    options.sample_tolerance = min(config.sample_tolerance_mm, config.tolerance_mm)
     options.largest_step = _LARGEST_NEWTON_STEP
     options.largest_jump = config.largest_jump
     options.most_iterations = _MOST_ITERATIONS

@@ -7,32 +7,18 @@ same C++ core and give the same answer to the last bit.
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Integer
+from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
-from endopilot import _core
-from endopilot.anatomy.projection import TipProjector
 from endopilot.errors import InputError
-from endopilot.simulation.device import Device, check_fits
-from endopilot.simulation.rod import RodLayout, lay_out
-from endopilot.simulation.simulator import (
-    FREE_BEHIND_MM,
-    LANES,
-    SAMPLE_TOLERANCE,
-    SPARE_MM,
-    Actuation,
-    SimulatorConfig,
-    check_distance_map,
-    check_memory,
-    core_options,
-    insertion_arguments,
-    make_lumen,
-)
+from endopilot.simulation.device import Device
+from endopilot.simulation.groups import Group, make_groups, merge
+from endopilot.simulation.simulator import LANES, SPARE_MM, Actuation, SimulatorConfig, check_memory
 from endopilot.simulation.state import SimulatorState, Step, SupportsDLPack
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, TipProjection
 
@@ -42,20 +28,6 @@ _DEEPEST_START = 0.8
 
 _LEAST_BYTES = 4000
 """No world takes less memory, bytes; a number of worlds that needs more is refused before they are listed."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Group:
-    """The worlds that share an anatomy and a device."""
-
-    anatomy: Anatomy
-    device: Device
-    rod: RodLayout
-    simulation: _core.Simulation
-    index: Integer[np.ndarray, "members"]
-    path_mm: float
-    longest_mm: float
-    project: TipProjector
 
 
 class Simulator:
@@ -101,7 +73,6 @@ class Simulator:
             raise InputError(f"actuation: {actuation!r}; give 'velocity' or 'force'")
         self._config = config or SimulatorConfig()
         self._by_force = actuation == "force"
-        self._lumens: dict[tuple[int, float], tuple[Anatomy, _core.Lumen]] = dict(sharing._lumens) if sharing else {}
         check_memory(worlds * _LEAST_BYTES, f"worlds: {worlds}", "give fewer")
         anatomies = [anatomy] * worlds if isinstance(anatomy, Anatomy) else list(anatomy)
         devices = [device] * len(anatomies) if isinstance(device, Device) else list(device)
@@ -111,48 +82,12 @@ class Simulator:
             raise InputError(
                 f"anatomy, device: {len(anatomies)} and {len(devices)}; give at least one, and as many of each"
             )
-        self._projectors = {id(group.anatomy): group.project for group in sharing._groups} if sharing else {}
-        self._groups = self._make_groups(anatomies, devices)
+        self._groups = make_groups(anatomies, devices, self._config, sharing._groups if sharing else ())
         self._device = devices
-        self._fastest = np.array([(device.max_velocity_mm_s, device.max_rotation_rad_s) for device in devices])
+        fastest = np.array([(device.max_velocity_mm_s, device.max_rotation_rad_s) for device in devices])
+        self._largest = np.full_like(fastest, np.finfo(float).max) if self._by_force else fastest * (1 + 1e-6)
+        self._longest = self._merge([np.full(len(group.index), group.longest_mm) for group in self._groups])
         self.reset(inserted_length=np.zeros(len(devices)), rotation=np.zeros(len(devices)))
-
-    def _make_groups(self, anatomies: list[Anatomy], devices: list[Device]) -> list[_Group]:
-        members: dict[tuple[int, int], list[int]] = {}
-        for world, pair in enumerate(zip(anatomies, devices, strict=True)):
-            members.setdefault((id(pair[0]), id(pair[1])), []).append(world)
-        groups, projectors = [], self._projectors
-        for worlds in members.values():
-            anatomy, device = anatomies[worlds[0]], devices[worlds[0]]
-            check_fits(device, anatomy)
-            key = (id(anatomy), device.tip_radius_mm)
-            if key not in self._lumens:
-                check_distance_map(anatomy)
-                self._lumens[key] = anatomy, make_lumen(anatomy.distance_map, device.tip_radius_mm)
-            path_mm = float(anatomy.tree.longest_path().abscissa[-1])
-            longest_mm = path_mm + SPARE_MM
-            rod = lay_out(
-                device, path_mm=path_mm, elements=self._config.elements, length_mm=longest_mm + FREE_BEHIND_MM
-            )
-            needed = 8 * len(worlds) * (25 * len(rod.abscissa_mm) + 40)
-            check_memory(needed, f"worlds: {len(worlds)}", "give fewer")
-            simulation = _core.Simulation(
-                rod=rod.model(),
-                lumen=self._lumens[key][1],
-                loads=None,
-                **insertion_arguments(anatomy.insertion),
-                options=core_options(
-                    self._config,
-                    push_limit_n=device.push_limit_n,
-                    free_behind_mm=FREE_BEHIND_MM,
-                    sample_tolerance=SAMPLE_TOLERANCE,
-                ),
-                worlds=len(worlds),
-            )
-            project = projectors.get(id(anatomy)) or TipProjector(anatomy.tree, anatomy.insertion)
-            projectors[id(anatomy)] = project
-            groups.append(_Group(anatomy, device, rod, simulation, np.array(worlds), path_mm, longest_mm, project))
-        return groups
 
     @property
     def config(self) -> SimulatorConfig:
@@ -282,18 +217,16 @@ class Simulator:
         array = np.ascontiguousarray(array, dtype=float)
         self._check_control(array, duration)
         steps = max(1, int(np.ceil(duration / self._config.time_step_s - 1e-9)))
-        first: dict[str, np.ndarray] = {}
-        for group in self._groups:
-            rows = np.ascontiguousarray(array[group.index][:, None, :])
-            result = self._run(group, rows, duration / steps, steps, by_force=self._by_force)
-            for name in Step.__dataclass_fields__:
-                values = result[name][:, 0]
-                first.setdefault(name, np.empty((self.worlds, *values.shape[1:]), dtype=values.dtype))
-                first[name][group.index] = values
-        return Step(**first)
+        results = [
+            self._run(group, array[group.index][:, None], duration / steps, steps, by_force=self._by_force)
+            for group in self._groups
+        ]
+        return Step(
+            **{name: self._merge([result[name][:, 0] for result in results]) for name in Step.__dataclass_fields__}
+        )
 
     def _run(
-        self, group: _Group, control: np.ndarray, time_step: float, steps: int, *, by_force: bool
+        self, group: Group, control: np.ndarray, time_step: float, steps: int, *, by_force: bool
     ) -> dict[str, Any]:
         return group.simulation.run(
             control=control,
@@ -318,36 +251,37 @@ class Simulator:
     def _check_control(self, control: np.ndarray, duration: float) -> None:
         if control.shape != (self.worlds, 2):
             raise InputError(f"control: shape {control.shape}; give ({self.worlds}, 2), a row a world")
-        if not (np.isfinite(duration) and duration > 0):
+        if not (math.isfinite(duration) and duration > 0):
             raise InputError(f"duration: {duration}; give a positive number of seconds")
-        if not np.isfinite(control).all():
-            world = int(np.argwhere(~np.isfinite(control))[0, 0])
-            raise InputError(f"control: world {world}: {control[world]} is not finite; correct it")
+        if not (np.abs(control) <= self._largest).all():
+            self._refuse(control)
         if self._by_force:
             return
-        fast = (np.abs(control) > self._fastest * (1 + 1e-6)).any(axis=1)
-        if fast.any():
-            world = int(np.argmax(fast))
-            device = self._device[world]
+        end = self.inserted_length + control[:, 0] * duration
+        if (end > self._longest).any():
+            world = int(np.argmax(end - self._longest))
             raise InputError(
-                f"control: world {world}: {control[world, 0]:g} mm/s, {control[world, 1]:g} rad/s exceed "
-                f"{device.max_velocity_mm_s:g} mm/s, {device.max_rotation_rad_s:g} rad/s, the limits of "
-                f"{device.name}; slow down"
+                f"control: world {world}: would insert {end[world]:.1f} mm, and the wire is laid out for "
+                f"{self._longest[world]:.1f} mm, {SPARE_MM:g} mm more than the vessel's longest path; push less"
             )
-        for group in self._groups:
-            end = group.simulation.inserted_length() + control[group.index, 0] * duration
-            if (end > group.longest_mm).any():
-                world = int(group.index[np.argmax(end)])
-                raise InputError(
-                    f"control: world {world}: would insert {end.max():.1f} mm, and the wire is laid out for "
-                    f"{group.longest_mm:.1f} mm, {SPARE_MM:g} mm more than the vessel's longest path; push less"
-                )
+
+    def _refuse(self, control: np.ndarray) -> None:
+        """Say which control is not finite, or too large."""
+        world = int(np.argmin((np.abs(control) <= self._largest).all(axis=1)))
+        if not np.isfinite(control[world]).all():
+            raise InputError(f"control: world {world}: {control[world]} is not finite; correct it")
+        device = self._device[world]
+        raise InputError(
+            f"control: world {world}: {control[world, 0]:g} mm/s, {control[world, 1]:g} rad/s exceed "
+            f"{device.max_velocity_mm_s:g} mm/s, {device.max_rotation_rad_s:g} rad/s, the limits of "
+            f"{device.name}; slow down"
+        )
+
+    def _merge(self, parts: Sequence[np.ndarray]) -> np.ndarray:
+        return merge(self._groups, parts)
 
     def _gather(self, name: str) -> Float[np.ndarray, "worlds"]:
-        out = np.empty(self.worlds)
-        for group in self._groups:
-            out[group.index] = getattr(group.simulation, name)()
-        return out
+        return self._merge([getattr(group.simulation, name)() for group in self._groups])
 
     def _per_node(self, name: str, pad: float) -> np.ndarray:
         parts = [getattr(group.simulation, name)() for group in self._groups]
@@ -468,15 +402,9 @@ class Simulator:
             >>> bool((tip.offset < tip.radius).all())
             True
         """
-        if len(self._groups) == 1:
-            return self._groups[0].project(self._groups[0].simulation.positions()[:, 0])
-        fields: dict[str, np.ndarray] = {}
-        for group in self._groups:
-            tip = group.project(group.simulation.positions()[:, 0])
-            for name in TipProjection.__dataclass_fields__:
-                part = np.asarray(getattr(tip, name))
-                fields.setdefault(name, np.empty(self.worlds, dtype=part.dtype))[group.index] = part
-        return TipProjection(**fields)
+        tips = [group.project(group.simulation.tips()) for group in self._groups]
+        names = TipProjection.__dataclass_fields__
+        return TipProjection(**{name: self._merge([getattr(tip, name) for tip in tips]) for name in names})
 
     @property
     def state(self) -> SimulatorState:

@@ -6,7 +6,7 @@ Every case drives the same C++ core as the product, through `simulator.run_core`
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -233,7 +233,7 @@ def equilibrium(
         rod,
         lumen,
         insertion,
-        config=config,
+        config=replace(config, sample_tolerance_mm=1e-8),
         initial=np.array([[inserted_mm, 0.0]]),
         control=control[None],
         friction=np.array([friction]),
@@ -243,7 +243,6 @@ def equilibrium(
         lanes=1,
         approach=False,
         free_behind_mm=free_behind_mm,
-        sample_tolerance=1e-8,
     )
     if not result["valid"].all():
         raise RuntimeError("a verification case did not converge")

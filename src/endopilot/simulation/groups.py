@@ -1,0 +1,109 @@
+"""Worlds in groups: those that share an anatomy and a device are stepped by one simulation of the core."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Integer
+
+from endopilot import _core
+from endopilot.anatomy.projection import TipProjector
+from endopilot.simulation.device import Device, check_fits
+from endopilot.simulation.rod import RodLayout, lay_out
+from endopilot.simulation.simulator import (
+    FREE_BEHIND_MM,
+    SPARE_MM,
+    SimulatorConfig,
+    check_distance_map,
+    check_memory,
+    core_options,
+    insertion_arguments,
+    make_lumen,
+)
+from endopilot.types import Anatomy
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """The worlds that share an anatomy and a device.
+
+    Attributes:
+        anatomy: the vessel.
+        device: the wire.
+        rod: its nodes and stiffnesses.
+        lumen: the wall, as the core has it.
+        simulation: the worlds, as the core has them.
+        index: their numbers, ascending.
+        path_mm: length of the vessel's longest path.
+        longest_mm: inserted length that the wire is laid out for.
+        project: projection to the vessel's centerline.
+    """
+
+    anatomy: Anatomy
+    device: Device
+    rod: RodLayout
+    lumen: _core.Lumen
+    simulation: _core.Simulation
+    index: Integer[np.ndarray, "members"]
+    path_mm: float
+    longest_mm: float
+    project: TipProjector
+
+
+def make_groups(
+    anatomies: Sequence[Anatomy], devices: Sequence[Device], config: SimulatorConfig, sharing: Sequence[Group]
+) -> list[Group]:
+    """Return the groups of worlds, with their wires laid out and at the ostium.
+
+    Args:
+        anatomies: of each world.
+        devices: of each world.
+        config: settings of the rod core.
+        sharing: groups whose lumens and projections are taken rather than prepared again.
+
+    Raises:
+        InputError: a device that does not fit its anatomy; a distance map that is not finite, or negative at the
+            ostium; more worlds than the memory holds.
+    """
+    lumens = {(id(group.anatomy), group.device.tip_radius_mm): group.lumen for group in sharing}
+    projectors = {id(group.anatomy): group.project for group in sharing}
+    members: dict[tuple[int, int], list[int]] = {}
+    for world, pair in enumerate(zip(anatomies, devices, strict=True)):
+        members.setdefault((id(pair[0]), id(pair[1])), []).append(world)
+    groups = []
+    for worlds in members.values():
+        anatomy, device = anatomies[worlds[0]], devices[worlds[0]]
+        check_fits(device, anatomy)
+        key = (id(anatomy), device.tip_radius_mm)
+        if key not in lumens:
+            check_distance_map(anatomy)
+            lumens[key] = make_lumen(anatomy.distance_map, device.tip_radius_mm)
+        if id(anatomy) not in projectors:
+            projectors[id(anatomy)] = TipProjector(anatomy.tree, anatomy.insertion)
+        path_mm = float(anatomy.tree.longest_path().abscissa[-1])
+        longest_mm = path_mm + SPARE_MM
+        rod = lay_out(device, path_mm=path_mm, elements=config.elements, length_mm=longest_mm + FREE_BEHIND_MM)
+        check_memory(8 * len(worlds) * (25 * len(rod.abscissa_mm) + 40), f"worlds: {len(worlds)}", "give fewer")
+        simulation = _core.Simulation(
+            rod=rod.model(),
+            lumen=lumens[key],
+            loads=None,
+            **insertion_arguments(anatomy.insertion),
+            options=core_options(config, push_limit_n=device.push_limit_n, free_behind_mm=FREE_BEHIND_MM),
+            worlds=len(worlds),
+        )
+        index, project = np.array(worlds), projectors[id(anatomy)]
+        groups.append(Group(anatomy, device, rod, lumens[key], simulation, index, path_mm, longest_mm, project))
+    return groups
+
+
+def merge(groups: Sequence[Group], parts: Sequence[np.ndarray]) -> np.ndarray:
+    """Return one array with a row a world, of one array a group."""
+    if len(groups) == 1:
+        return parts[0]
+    merged = np.empty((sum(len(part) for part in parts), *parts[0].shape[1:]), dtype=parts[0].dtype)
+    for group, part in zip(groups, parts, strict=True):
+        merged[group.index] = part
+    return merged
