@@ -69,16 +69,17 @@ def test_identified_from_the_given_tips_it_foretells_the_others(folder, episodes
 
 
 def test_wires_that_agree_on_what_is_wrong_are_not_sure_of_it() -> None:
-    # three members, one path each for two episodes; the first was seen 30 mm away from all of them
-    paths = np.zeros((3, 2, 8, 2))
+    # three members, one path each for three episodes; the first was seen 30 mm away from all of them since sample 3
+    paths = np.zeros((3, 3, 10, 2))
     paths[..., 0] = 10.0 + 0.01 * np.arange(3)[:, None, None]
-    tips, seen = np.full((2, 8, 2), np.nan), np.zeros((2, 8), dtype=bool)
-    seen[:, [2, 5]] = True
-    tips[:, [2, 5]] = 10.0, 0.0
-    tips[0, 5] = 40.0, 0.0
+    tips, seen = np.full((3, 10, 2), np.nan), np.zeros((3, 10), dtype=bool)
+    seen[:, [1, 3, 5, 7]] = True
+    tips[seen] = 10.0, 0.0
+    tips[0, [3, 5, 7]] = 40.0, 0.0
+    tips[1, 7] = 40.0, 0.0  # once: a measurement that went wrong
     middle, spread = twin_module.weigh(paths, tips, seen, TwinConfig())
-    assert spread[0, 5:, 0] == pytest.approx(30.0, abs=0.3)
-    assert spread[0, :5].max() < 0.02 and spread[1].max() < 0.02
+    assert spread[0, 7:, 0] == pytest.approx(30.0, abs=0.3)
+    assert spread[0, :7].max() < 0.02 and spread[1:].max() < 0.02
     assert spread[0, :, 1].max() == 0.0
     assert np.abs(middle[..., 0] - 10.0).max() < 0.03
 

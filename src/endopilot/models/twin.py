@@ -32,6 +32,8 @@ NARROWEST = 0.15
 """The second ensemble is spread over this share of the first at least; and over two standard deviations of it."""
 GOOD = 3.0
 """A good member misses a seen tip by this many of the scales of `TwinConfig` at most."""
+_MISSES = 3
+"""Times in a row that the foretold tip must have missed the seen one to be doubted."""
 Members = Float[np.ndarray, "members episodes 3"]
 """Friction factor, tip stiffness factor and depth of the ostium (mm) of each member, for each episode."""
 _BELIEVED = np.array([1.0, 1.0, 0.0])
@@ -41,7 +43,8 @@ _BELIEVED = np.array([1.0, 1.0, 0.0])
 class TwinForetold(Foretold):
     """What the ensemble foretells: the weighted median of its members, and their weighted deviation from it.
 
-    The spread is no smaller than what the median missed the last seen tip by beyond what a good member does.
+    The spread is no smaller than what the median missed each of the last three seen tips by beyond what a good member
+    does.
 
     Attributes:
         parameters: friction factor, tip stiffness factor and depth of the ostium (mm) of the likeliest member.
@@ -221,16 +224,19 @@ def _unexplained(
     seen: Bool[np.ndarray, "episodes samples"],
     config: TwinConfig,
 ) -> Float[np.ndarray, "episodes samples 2"]:
-    """Return by how much more than a good member what is foretold missed the tip when it was last seen, mm.
+    """Return by how much more than a good member it missed the tip each of the last times it was seen, mm.
 
     Where something else than the ensemble's parameters is off, all members may agree on what is wrong: their spread
-    does not tell.
+    does not tell. A single miss may be one of the measurement.
     """
     off = np.nan_to_num(np.abs(middle - np.where(seen[..., None], tips, middle)))
     beyond = np.maximum(off - GOOD * np.array([config.abscissa_sd_mm, config.offset_sd_mm]), 0.0)
-    last = np.maximum.accumulate(np.where(seen, np.arange(seen.shape[1]), -1), axis=1)
-    carried = np.take_along_axis(beyond, np.maximum(last, 0)[..., None], axis=1)
-    return np.where(last[..., None] >= 0, carried, 0.0)
+    count = np.cumsum(seen, axis=1)
+    order = np.argsort(~seen, axis=1, kind="stable")  # seen samples first
+    last = np.maximum(count[..., None] - 1 - np.arange(_MISSES), 0)
+    episode = np.arange(len(seen))[:, None, None]
+    persistent = beyond[episode, order[episode, last]].min(axis=2)
+    return np.where(count[..., None] >= _MISSES, persistent, 0.0)
 
 
 def _weights(
