@@ -29,7 +29,7 @@ def draw_plan(plan: Plan, path: Path) -> None:
     panels[2].plot(time_s, plan.force, color="tab:red")
     panels[2].axhline(plan.navigation.force_limit_n, color="0.4", linestyle="--", linewidth=1)
     panels[2].set_ylabel("wall force, N")
-    panels[2].set_ylim(0, 1.1 * plan.navigation.force_limit_n)
+    panels[2].set_ylim(0, 1.1 * max(plan.navigation.force_limit_n, float(plan.force.max())))
     panels[3].step(time_s, plan.control[:, 0], where="pre", color="tab:blue", label="translation, mm/s")
     panels[3].step(time_s, plan.control[:, 1], where="pre", color="tab:orange", label="rotation, rad/s")
     _legend_above(panels[3])
