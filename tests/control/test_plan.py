@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.control import learned
+from endopilot.control import plan as plan_module
 from endopilot.control.cost import Cost, safety_ratio
 from endopilot.control.desired import read_tips
 from endopilot.control.plan import Plan, PlanConfig, plan, within_limits
@@ -19,7 +20,7 @@ from endopilot.control.plan_file import read_plan, write_plan
 from endopilot.control.robot import Limits
 from endopilot.dataset.loader import Dataset
 from endopilot.errors import InputError
-from endopilot.files import write_json
+from endopilot.files import read_json, write_json
 from endopilot.models.config import WINDOW
 from endopilot.models.open_loop import OpenLoop, Seen
 from endopilot.simulation.controls import read_controls_csv
@@ -37,18 +38,19 @@ def vessel(fork, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def found(vessel) -> Plan:
-    return plan(vessel, "0,0,33", PlanConfig(seconds=30.0))
+    return plan(vessel, "0,0,33", PlanConfig(seconds=30.0, start_rotation=0.1, seed=4))
 
 
 def test_a_plan_reaches_its_target_and_counts_its_cost(found):
-    assert found.reached and found.method == "twin"
+    assert found.reached and found.config.method == "twin"
     assert abs(found.simulated.abscissa[-1] - 33.0) <= 2.0
     assert np.allclose(found.proximal[-1, 0], 2.0 + 0.5 * found.control[:, 0].sum())
-    terms, cost = found.cost_terms(), found.cost
+    terms, cost = found.cost_terms(), found.config.cost
     assert terms["time"] == pytest.approx(0.5 * len(found.control) * cost.time_weight)
     assert terms["end"] == pytest.approx(abs(found.simulated.abscissa[-1] - 33.0))
     # each weight scales its own term and no other
-    dearer = replace(found, cost=replace(cost, tip_weight=2 * cost.tip_weight)).cost_terms()
+    twice = replace(found.config, cost=replace(cost, tip_weight=2 * cost.tip_weight))
+    dearer = replace(found, config=twice).cost_terms()
     assert dearer["tip"] == pytest.approx(2 * terms["tip"]) and terms["tip"] > 0
     assert {name: dearer[name] for name in terms if name != "tip"} == {n: v for n, v in terms.items() if n != "tip"}
 
@@ -73,10 +75,35 @@ def test_a_written_plan_is_read_back_and_drives_the_simulator(found, vessel, tmp
     for name in ("control", "proximal", "desired", "predicted", "position", "force"):
         assert np.allclose(getattr(back, name), getattr(found, name), atol=1e-12), name
     assert np.array_equal(back.simulated.branch, found.simulated.branch)
-    assert back.navigation.target == found.navigation.target and back.cost == found.cost
+    assert back.navigation.target == found.navigation.target and back.config == found.config
     initial, control = read_controls_csv(tmp_path / "plan" / "plan.csv")
     rollout = simulate(anatomy, device, control, initial=initial, config=SimulatorConfig(threads=1))
     assert np.allclose(rollout.tip_position[0], found.position, atol=1e-3)
+
+
+def test_a_plan_whose_manifest_lacks_what_was_asked_is_refused(found, vessel, tmp_path):
+    write_plan(found, tmp_path / "plan")
+    path = tmp_path / "plan" / "manifest.json"
+    record = read_json(path)
+    assert record["seed"] == 4 and record["config"]["seconds"] == 30.0
+    write_json(path, record | {"config": {"cost": record["config"]["cost"]}})
+    with pytest.raises(InputError, match=r"manifest\.json: config is not that of this version"):
+        read_plan(tmp_path / "plan", read_anatomy(vessel), found.navigation.device)
+
+
+def test_a_way_that_does_not_arrive_in_the_rod_core_is_no_plan(vessel, monkeypatch):
+    """The search believes that it arrived; the rod core at its own settings has the tip elsewhere."""
+    still = np.zeros((4, 2)), np.full((4, 2), 33.0)
+    monkeypatch.setattr(plan_module, "_search", lambda *_: still)
+    with pytest.raises(InputError, match=r"target: not reached in 30 s .* ends at \d\.\d of 33\.0 mm"):
+        plan(vessel, "0,0,33", PlanConfig(seconds=30.0))
+
+
+def test_a_plan_of_another_method_says_that_it_breaks_the_force_limit(found, vessel, tmp_path):
+    made = plan(vessel, "0,0,33", PlanConfig(method="forward", force_limit_n=1e-6))
+    assert write_plan(made, tmp_path / "pushed")["within_force_limit"] is False
+    assert read_json(tmp_path / "pushed" / "manifest.json")["within_force_limit"] is False
+    assert write_plan(found, tmp_path / "found")["within_force_limit"] is True
 
 
 def test_a_plan_for_another_vessel_or_wire_is_refused(found, vessel, tmp_path):

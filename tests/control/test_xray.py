@@ -10,7 +10,9 @@ from endopilot.control.xray import (
     Calibration,
     XrayAdvisor,
     conformal_scale,
+    count_events,
     fit_spread,
+    near_exposures,
     spread_of,
 )
 from endopilot.errors import InputError
@@ -41,6 +43,15 @@ def test_bands_hold_over_whole_intervals_of_new_patients(unlike) -> None:
         samplewise.append((score[16] <= np.quantile(errors[:16], 0.9)).mean())
     assert abs(np.mean(covered) - 0.9) < 0.03
     assert np.mean(samplewise) < 0.5  # bands made sample by sample hold too few whole intervals
+
+
+def test_an_event_is_where_a_state_begins_and_an_exposure_beside_it_shows_it() -> None:
+    state = np.array([[1, 1, 0, 1, 1, 0, 0, 1, 0, 1], [0, 0, 0, 0, 1, 0, 0, 0, 0, 0]], dtype=bool)
+    exposed = np.zeros((2, 10), dtype=bool)
+    assert count_events(state, near_exposures(exposed)) == (3, 3)  # not what was so at first, nor the last sample
+    exposed[0, [2, 9]] = True  # one period before the first; two after the second
+    exposed[1, 5] = True
+    assert count_events(state, near_exposures(exposed)) == (3, 1)
 
 
 def test_too_few_patients_are_told() -> None:

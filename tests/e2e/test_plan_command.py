@@ -68,10 +68,12 @@ def test_desired_tips_that_no_drive_can_keep_up_with(patient, tmp_path, capsys):
         (("--target", "PDA"), ("PDA", "no such section")),
         (("--target", "80,0,0"), ("80,0,0", "LPS")),
         (("--target", "0,0"), ("0,0", "no such section")),
+        (("--target", ""), ("--target: is empty", "X,Y,Z")),
         (("--target", "nothing.csv"), ("nothing.csv",)),
         (("--target", "0,0,33", "--seconds", "2"), ("seconds: 2", "31 mm", "speed_mm_s")),
         (("--target", "0,0,33", "--method", "inverse"), ("--model",)),
         (("--target", "0,0,33", "--force-limit-n", "nan"), ("force_limit_n",)),
+        (("--target", "0,0,33", "--force-limit-n", "1e-6"), ("force_limit_n: 1e-06 N", "workhorse-014", "larger")),
         (("--target", "0,0,33", "--force-weight", "-1"), ("force_weight",)),
     ],
 )

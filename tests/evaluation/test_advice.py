@@ -15,10 +15,11 @@ from endopilot.control.xray import AdvisorConfig, Calibration
 from endopilot.dataset.loader import load_dataset
 from endopilot.errors import InputError
 from endopilot.evaluation import advice
+from endopilot.evaluation import advise as advise_module
 from endopilot.evaluation.advice import AdviseConfig
 from endopilot.evaluation.advise import advise
 from endopilot.files import write_json
-from endopilot.models.config import WINDOW, TwinConfig
+from endopilot.models.config import WINDOW, TwinConfig, run_path
 from endopilot.models.open_loop import OpenLoop
 from endopilot.models.twin import TwinPredictor
 from endopilot.simulation.device import read_device
@@ -134,6 +135,20 @@ def test_the_command_calibrates_measures_and_draws(folder, hold_slack, capsys) -
     assert (output / "advice.png").stat().st_size > 10_000
     widest = figures["curves"]["adviser"][-1]
     assert widest["width"] == 2.5 and figures["curves"]["adviser"][0]["width"] == 0.0
+
+
+def test_the_calibration_of_the_model_of_the_package_goes_to_the_output(
+    folder, watched, hold_slack, tmp_path, monkeypatch
+) -> None:
+    monkeypatch.setattr(advice, "watch", lambda *_: watched)
+    monkeypatch.setattr(advise_module, "PERIODS", (1, 90))
+    monkeypatch.setattr(advise_module, "WIDTHS", (1.0,))
+    monkeypatch.setattr(advise_module, "THRESHOLDS", ())
+    found = advise(Path("pretrained"), folder / "dataset", tmp_path / "out", AdviseConfig())
+    assert Calibration.read(tmp_path / "out") == found["calibration"]
+    assert not (run_path(Path("pretrained")) / "xray.json").exists() and not Path("pretrained").exists()
+    with pytest.raises(InputError, match="no-run: no such run; give a folder made by"):
+        advise(tmp_path / "no-run", folder / "dataset", tmp_path / "out", AdviseConfig())
 
 
 def test_too_few_patients_or_another_wire_leave_nothing_behind(folder, hold_slack, tmp_path) -> None:

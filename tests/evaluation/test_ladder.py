@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
+from html import unescape
 
+import numpy as np
 import pytest
 
+from endopilot.control.navigate import Truth
 from endopilot.env.tasks import find_task, ladder_tasks
 from endopilot.errors import InputError
 from endopilot.evaluation import ladder
-from endopilot.evaluation.ladder import LadderConfig, climb, score
+from endopilot.evaluation.ladder import LadderConfig, climb, drive, score
 from endopilot.evaluation.ladder_page import write_page
+from endopilot.types import TipProjection
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +80,8 @@ def test_the_page_shows_the_scores_and_links_the_replay(climbed):
     replay = (folder / "replay-straight.html").read_text(encoding="utf-8")
     assert "Guidewire" in replay and 'src="plotly.min.js"' in replay
     assert all(word in replay for word in ("Target", "Tip under X-ray", "safe success", "exposures: 1"))
-    assert "1 of the ladder's twelve tasks" in text
+    assert "1 of the ladder's twelve tasks, in 1 synthetic patient of each" in text
+    assert "the tip's way in 1 patient" in unescape(text) and "1 patients" not in text
     assert (folder / "plotly.min.js").stat().st_size > 1e6
 
 
@@ -87,6 +93,40 @@ def test_safe_success_needs_both_and_medians_are_of_those_that_arrived():
     assert row["seconds"] == 20.0 and row["exposures"] == 3.0
     (none,) = score([task], {"crux": [_result(False, True)]})
     assert none["safe_success"] == 0.0 and none["seconds"] is None and none["path_ratio"] is None
+
+
+def test_missed_events_are_counted_over_all_navigations_of_the_agent():
+    events = [(3, 1), (0, 0), (5, 1)]
+    results = [_result(True, True) | {"events": pair} for pair in events]
+    (row,) = score([find_task("crux")], {"crux": results})
+    assert row["missed_events"] == 0.25
+    (none,) = score([find_task("crux")], {"crux": [*results, _result(True, True)]})
+    assert "missed_events" not in none  # one navigation was not watched
+
+
+def test_the_events_of_a_navigation_are_at_the_wall_and_where_the_agent_is_off():
+    tip = TipProjection(
+        offset=np.array([0.1, 0.1, 0.6, 0.6, 0.1, 0.1, 0.1, 0.6, 0.1]),  # of 0.82: at the wall from sample 2, and at 7
+        radius=np.full(9, 1.0),
+        abscissa=np.arange(9.0),
+        branch=np.zeros(9, dtype=int),
+    )
+    exposed = np.array([1, 0, 0, 0, 0, 0, 1, 0, 0], dtype=bool)
+    foretold = np.arange(8.0)
+    foretold[5] += 2.0
+    assert ladder._events(tip, exposed, foretold, 0.18) == (2, 1)
+    foretold[4] += 2.0  # it begins sooner: nobody looked
+    assert ladder._events(tip, exposed, foretold, 0.18) == (2, 2)
+
+
+def test_the_agent_is_watched_as_it_climbs(tmp_path):
+    task = find_task("straight")
+    navigation = replace(task.ladder_navigation(0), seconds=2.0)
+    for policy in ("agent", "forward"):
+        drive(tmp_path / f"{policy}.json", task, 0, navigation, policy, Truth())
+    count, missed = json.loads((tmp_path / "agent.json").read_text(encoding="utf-8"))["events"]
+    assert 0 <= missed <= count <= 8
+    assert "events" not in json.loads((tmp_path / "forward.json").read_text(encoding="utf-8"))
 
 
 def test_the_upper_eight_are_summed_only_where_all_were_done():

@@ -23,13 +23,14 @@ def command(
     """Calibrate the X-ray adviser of a run, and measure what it misses on patients not seen.
 
     Args:
-        run: folder made by `endopilot train`; it takes the calibration, xray.json.
+        run: folder made by `endopilot train`, which takes the calibration, xray.json; or `pretrained`, the model that
+            comes with endopilot, whose calibration goes to the output.
         dataset: folder made by `endopilot dataset`, with at least 9 patients in its split 'calibrate'.
         output: folder of advice.json and advice.png.
         json: print the figures as JSON.
         config: what X-ray must not miss, and how it errs.
     """
-    found = advise(existing(run), existing(dataset), output, config)
+    found = advise(run, existing(dataset), output, config)
     if json:
         show(found, as_json=True)
         return

@@ -36,4 +36,4 @@ def command(
         config: method, limits and cost.
     """
     found = plan(existing(anatomy), target, config, model=model, device=device)
-    show(write_plan(found, output, seed=config.seed), as_json=json)
+    show(write_plan(found, output), as_json=json)

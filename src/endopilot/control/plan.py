@@ -19,7 +19,7 @@ from endopilot.control.navigate import NavigateConfig, navigate
 from endopilot.control.policy import DECISION_PERIOD_S
 from endopilot.control.robot import Limits, RobotConfig
 from endopilot.control.route import Route, check_passable, find_target
-from endopilot.control.search import SearchConfig
+from endopilot.control.search import Course, SearchConfig
 from endopilot.env.task import Navigation
 from endopilot.errors import InputError
 from endopilot.files import read_json
@@ -112,9 +112,8 @@ class Plan:
 
     Attributes:
         navigation: what is to be done.
-        method: how it was found.
+        config: what was asked of it.
         model: the trained run that it was found with, if any.
-        cost: the weights of its cost.
         control: π, mm/s and rad/s.
         proximal: (Δ mm, φ rad), its integral.
         desired: desired tip states (Δtip, γtip), mm.
@@ -128,9 +127,8 @@ class Plan:
     """
 
     navigation: Navigation
-    method: str
+    config: PlanConfig
     model: str | None
-    cost: Cost
     control: Steps
     proximal: Steps
     desired: Steps
@@ -148,9 +146,14 @@ class Plan:
         tip = self.simulated
         return safety_ratio(tip.offset, tip.radius, self.navigation.device.tip_radius_mm)
 
+    @property
+    def within_force_limit(self) -> bool:
+        """Whether no node ever presses on the wall with more than the navigation's limit, in the rod core."""
+        return bool(self.force.max() <= self.navigation.force_limit_n)
+
     def cost_terms(self) -> dict[str, float]:
         """Return what each term of the cost comes to in the rod core, mm."""
-        device, weights = self.navigation.device, self.cost
+        device, weights = self.navigation.device, self.config.cost
         error = np.abs(self.simulated.abscissa - self.desired[:, 0])
         share = self.force / self.navigation.force_limit_n
         limits = np.array([device.max_velocity_mm_s, device.max_rotation_rad_s])
@@ -185,7 +188,8 @@ def plan(
 
     Raises:
         InputError: a target outside the tree, behind an occlusion or too far for the time; a model of another device or
-            without the network that the method needs; no way found.
+            without the network that the method needs; with the method twin, no way found, or one that in the rod core
+            at its own settings breaks the force limit or does not reach the target.
     """
     config = config or PlanConfig()
     vessel = read_anatomy(anatomy)
@@ -221,7 +225,10 @@ def plan(
     began, worked = time.perf_counter(), time.process_time()
     control, predicted = way()
     spent = time.perf_counter() - began, time.process_time() - worked
-    return _checked(navigation, config, model, desired, control, predicted, spent)
+    made = _checked(navigation, config, model, desired, control, predicted, spent)
+    if config.method == "twin":
+        _check_kept(made)
+    return made
 
 
 def _method(
@@ -276,13 +283,45 @@ def _search(navigation: Navigation, config: PlanConfig) -> tuple[Steps, Steps]:
     with progress("plan: trying in the rod core", total=navigation.target.abscissa) as advance:
         course = policy.find_course(navigation.seconds, advance)
     if course.reached < 0.5:
-        far = float(course.abscissa[-1, 0])
-        raise InputError(
-            f"target: no way found to branch {navigation.target.branch} of {navigation.anatomy.name} in "
-            f"{navigation.seconds:g} s under {navigation.force_limit_n:g} N with {navigation.device.name}; the tip "
-            f"came to {far:.0f} of {navigation.target.abscissa:.0f} mm; give more seconds or a wire of larger tip bend"
-        )
+        raise InputError(_no_way(navigation, course))
     return course.control, np.column_stack([course.abscissa[:, 0], course.offset[:, 0]])
+
+
+def _no_way(navigation: Navigation, course: Course) -> str:
+    """Say how far a search came, and which limit it met."""
+    if course.force.max() > navigation.force_limit_n:
+        mend = f"pressing with {course.force.max():.3g} N; give a larger force_limit_n or a softer wire"
+    elif DECISION_PERIOD_S * (len(course.control) + 2) > navigation.seconds:  # a round of the search is 2 periods
+        mend = "when the time was over; give more seconds"
+    else:
+        mend = "and no further; give a wire of larger tip bend"
+    return (
+        f"target: no way found to branch {navigation.target.branch} of {navigation.anatomy.name} in "
+        f"{navigation.seconds:g} s under {navigation.force_limit_n:g} N with {navigation.device.name}; the tip came to "
+        f"{course.abscissa[-1, 0]:.0f} of {navigation.target.abscissa:.0f} mm, {mend}"
+    )
+
+
+def _check_kept(made: Plan) -> None:
+    """Check that a plan which was tried in the rod core keeps the force limit there, and reaches the target.
+
+    Raises:
+        InputError: it does not; the line says which.
+    """
+    navigation, wire = made.navigation, made.navigation.device.name
+    goal = f"branch {navigation.target.branch} of {navigation.anatomy.name} with {wire}"
+    if not made.within_force_limit:
+        raise InputError(
+            f"force_limit_n: {navigation.force_limit_n:g} N is broken on the way found to {goal}, which presses "
+            f"with {made.force.max():.3g} N; give a larger force_limit_n, another seed or a softer wire"
+        )
+    if not made.reached:
+        far = float(made.simulated.abscissa[-1])
+        raise InputError(
+            f"target: not reached in {navigation.seconds:g} s on the way found to {goal}: in the rod core the "
+            f"tip ends at {far:.1f} of {navigation.target.abscissa:.1f} mm; give another seed, more seconds or a wire "
+            "of larger tip bend"
+        )
 
 
 def _track(navigation: Navigation, desired: Steps) -> tuple[Steps, Steps]:
@@ -327,9 +366,8 @@ def _checked(
     wanted = np.concatenate([desired, np.repeat(desired[-1:], max(len(control) - len(desired), 0), axis=0)])
     return Plan(
         navigation=navigation,
-        method=config.method,
+        config=config,
         model=None if model is None else str(model),
-        cost=config.cost,
         control=control,
         proximal=start + DECISION_PERIOD_S * np.cumsum(control, axis=0),
         desired=wanted[: len(control)],

@@ -29,7 +29,7 @@ import numpy as np
 import pandas as pd
 
 from endopilot.control.cost import Cost
-from endopilot.control.plan import Plan
+from endopilot.control.plan import Plan, PlanConfig, SampleConfig
 from endopilot.control.policy import DECISION_PERIOD_S
 from endopilot.env.task import Navigation, Target
 from endopilot.errors import InputError
@@ -58,7 +58,7 @@ def fingerprint(anatomy: Anatomy) -> str:
     return digest.hexdigest()
 
 
-def write_plan(plan: Plan, folder: Path, *, seed: int = 0) -> dict[str, Any]:
+def write_plan(plan: Plan, folder: Path) -> dict[str, Any]:
     """Write a plan as a folder, whole or not at all; a plan that stands there already is replaced. Return its figures.
 
     Raises:
@@ -77,8 +77,9 @@ def write_plan(plan: Plan, folder: Path, *, seed: int = 0) -> dict[str, Any]:
         ]
     )  # fmt: skip
     figures = {
-        "method": plan.method,
+        "method": plan.config.method,
         "reached": plan.reached,
+        "within_force_limit": plan.within_force_limit,
         "seconds": DECISION_PERIOD_S * len(plan.control),
         "target_mm": round(navigation.target.abscissa, 2),
         "tip_error_mm": round(float(np.abs(tip.abscissa[-1] - navigation.target.abscissa)), 3),
@@ -96,8 +97,8 @@ def write_plan(plan: Plan, folder: Path, *, seed: int = 0) -> dict[str, Any]:
         table.to_csv(partial / _TABLE, index=False)
         draw_plan(plan, partial / PICTURE)
         record = manifest(
-            config={"cost": asdict(plan.cost)},
-            seed=seed,
+            config=plan.config,
+            seed=plan.config.seed,
             inputs={},
             anatomy={"name": navigation.anatomy.name, "sha256": fingerprint(navigation.anatomy)},
             device=asdict(navigation.device),
@@ -124,6 +125,7 @@ def read_plan(folder: Path, anatomy: Anatomy, device: Device) -> Plan:
     record = read_json(folder / _RECORD)
     if not isinstance(record, dict) or "table_sha256" not in record:
         raise InputError(f"{folder / _RECORD}: is not the manifest of a plan; make one with `endopilot plan`")
+    config = _config(folder / _RECORD, record["config"])
     made = record["anatomy"]
     if made["sha256"] != fingerprint(anatomy):
         raise InputError(
@@ -150,9 +152,8 @@ def read_plan(folder: Path, anatomy: Anatomy, device: Device) -> Plan:
             seconds=record["limits"]["seconds"],
             force_limit_n=record["limits"]["force_n"],
         ),
-        method=record["method"],
+        config=config,
         model=record["model"],
-        cost=Cost(**record["config"]["cost"]),
         control=pair("translation_mm_s", "rotation_rad_s"),
         proximal=pair("inserted_length_mm", "rotation_rad"),
         desired=pair("desired_tip_abscissa_mm", "desired_tip_offset_mm"),
@@ -169,3 +170,10 @@ def read_plan(folder: Path, anatomy: Anatomy, device: Device) -> Plan:
         seconds_to_plan=record["seconds_to_plan"],
         processor_seconds=record["processor_seconds"],
     )
+
+
+def _config(path: Path, record: dict[str, Any]) -> PlanConfig:
+    """Return what was asked of a plan, as its manifest has it."""
+    if set(record) != set(PlanConfig.__dataclass_fields__):
+        raise InputError(f"{path}: config is not that of this version's `endopilot plan`; plan anew")
+    return PlanConfig(**record | {"cost": Cost(**record["cost"]), "sample": SampleConfig(**record["sample"])})

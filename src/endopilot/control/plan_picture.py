@@ -29,10 +29,10 @@ def draw_plan(plan: Plan, path: Path) -> None:
     panels[2].plot(time_s, plan.force, color="tab:red")
     panels[2].axhline(plan.navigation.force_limit_n, color="0.4", linestyle="--", linewidth=1)
     panels[2].set_ylabel("wall force, N")
-    panels[2].set_ylim(0, 1.1 * plan.navigation.force_limit_n)
+    panels[2].set_ylim(0, 1.1 * max(plan.navigation.force_limit_n, float(plan.force.max())))
     panels[3].step(time_s, plan.control[:, 0], where="pre", color="tab:blue", label="translation, mm/s")
     panels[3].step(time_s, plan.control[:, 1], where="pre", color="tab:orange", label="rotation, rad/s")
-    panels[3].legend(loc="upper right", fontsize=8)
+    _legend_above(panels[3])
     panels[3].set_ylabel("control")
     panels[3].set_xlabel("time, s")
     for panel in panels[:3]:
@@ -60,7 +60,7 @@ def _draw_route(plan: Plan, axes: Axes) -> None:
     axes.set_aspect("equal")
     axes.set_xlabel("x (to the patient's left), mm")
     axes.set_ylabel("z (to the head), mm")
-    axes.set_title(f"{navigation.anatomy.name}, {navigation.device.name}: {plan.method}")
+    axes.set_title(f"{navigation.anatomy.name}, {navigation.device.name}: {plan.config.method}")
     axes.legend(loc="best", fontsize=9)
 
 
@@ -76,11 +76,16 @@ def _draw_tip(plan: Plan, time_s: np.ndarray, axes: Axes) -> None:
     for junction in route.junctions:
         axes.axhline(float(junction), color="0.8", linewidth=0.8, zorder=0)
     axes.set_ylabel("Δtip, mm")
-    axes.legend(loc="lower right", fontsize=8)
+    _legend_above(axes)
+
+
+def _legend_above(axes: Axes) -> None:
+    """Put the legend in a row above a panel, where it covers no curve."""
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, fontsize=8, frameon=False, borderaxespad=0.1)
 
 
 def _draw_safety(plan: Plan, time_s: np.ndarray, axes: Axes) -> None:
     axes.plot(time_s, plan.ratio, color="tab:purple")
-    axes.axhline(plan.cost.safe_ratio, color="0.4", linestyle="--", linewidth=1)
+    axes.axhline(plan.config.cost.safe_ratio, color="0.4", linestyle="--", linewidth=1)
     axes.set_ylim(0, 1.1)
     axes.set_ylabel("γ/(r − r_w)")

@@ -120,8 +120,12 @@ def find_target(anatomy: Anatomy, text: str) -> Target:
     segment 4 (15 where it comes from the left).
 
     Raises:
-        InputError: no such section, a point that is not three numbers, or one outside the lumen.
+        InputError: nothing is named, no such section, a point that is not three numbers, or one outside the lumen.
     """
+    if not text.strip():
+        raise InputError(
+            "--target: is empty; give a section such as 4, a point X,Y,Z in LPS mm, or a CSV of desired tips"
+        )
     parts = text.split(",")
     if len(parts) == 3:
         return _nearest(anatomy, text, parts)

@@ -149,6 +149,28 @@ def _features(
     return np.stack([np.ones_like(spread), seconds, travel_mm, spread], axis=-1)
 
 
+def near_exposures(exposed: Bool[np.ndarray, "*n samples"]) -> Bool[np.ndarray, "*n samples"]:
+    """Return which samples have an exposure within 0.5 s, a sample, given which were exposed."""
+    near = exposed.copy()
+    near[..., 1:] |= exposed[..., :-1]
+    near[..., :-1] |= exposed[..., 1:]
+    return near
+
+
+def count_events(state: Bool[np.ndarray, "*n samples"], near: Bool[np.ndarray, "*n samples"]) -> tuple[int, int]:
+    """Return how many events there are, and how many of them are missed.
+
+    One begins at a sample in the state that follows one which is not; it is missed if no exposure is near. The last
+    sample is left out: the exposure that would show it may come after the end.
+
+    Args:
+        state: whether the tip is at the wall, or Δtip is off by δ.
+        near: which samples have an exposure near, see `near_exposures`.
+    """
+    begins = state[..., 1:-1] & ~state[..., :-2]
+    return int(begins.sum()), int((begins & ~near[..., 1:-1]).sum())
+
+
 def check_enough(patients: int, level: float) -> None:
     """Check that there are enough patients to calibrate on: with n of them no band is surer than n/(n + 1).
 

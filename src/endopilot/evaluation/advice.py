@@ -17,7 +17,9 @@ from endopilot.control.xray import (
     Calibration,
     XrayAdvisor,
     conformal_scale,
+    count_events,
     fit_spread,
+    near_exposures,
     spread_of,
 )
 from endopilot.dataset.loader import Dataset
@@ -232,26 +234,23 @@ def run(watched: Watched, decide: Decide, config: AdvisorConfig) -> dict[str, fl
         exposed[on, sample] = True
         if len(on):
             model.show(on, sample, shown[on, sample])
-    near = exposed.copy()
-    near[:, 1:] |= exposed[:, :-1]
-    near[:, :-1] |= exposed[:, 1:]
+    near = near_exposures(exposed)
     near[:, WINDOW] = True  # X-ray was on until the sample before
     wall = watched.ratio >= config.wall_ratio
     off = np.abs(model.tip[..., 0] - truth[..., 0]) >= config.abscissa_mm
     off[:, WINDOW - 1] = False
-    # an event at the last sample is left out: the exposure that would show it may come after the end
-    begins = [state[:, WINDOW:-1] & ~state[:, WINDOW - 1 : -2] for state in (wall, off)]
-    missed = [(begin & ~near[:, WINDOW:-1]).sum() for begin in begins]
+    counts = [count_events(state[:, WINDOW - 1 :], near[:, WINDOW - 1 :]) for state in (wall, off)]
+    (at_wall, unseen_at_wall), (astray, unseen_astray) = counts
     minutes = exposed[:, WINDOW:].size * SAMPLE_PERIOD_S / 60
-    events = sum(int(begin.sum()) for begin in begins)
+    events = at_wall + astray
     rate = float(exposed.sum() / minutes)
     return {
         "exposures_per_minute": rate,
-        "missed_share": float(sum(missed) / max(events, 1)),
+        "missed_share": (unseen_at_wall + unseen_astray) / max(events, 1),
         "events_per_minute": events / minutes,
-        "wall_events_per_minute": float(begins[0].sum() / minutes),
-        "missed_wall_share": float(missed[0] / max(begins[0].sum(), 1)),
-        "missed_abscissa_share": float(missed[1] / max(begins[1].sum(), 1)),
+        "wall_events_per_minute": at_wall / minutes,
+        "missed_wall_share": unseen_at_wall / max(at_wall, 1),
+        "missed_abscissa_share": unseen_astray / max(astray, 1),
         "fewer_frames_than_fluoroscopy": 1 - rate / (60 * FLUOROSCOPY_HZ),
         "wall_samples_without_exposure_share": float((wall & ~near)[:, WINDOW:].sum() / max(wall[:, WINDOW:].sum(), 1)),
     }

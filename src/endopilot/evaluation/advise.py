@@ -14,6 +14,7 @@ from endopilot.errors import InputError
 from endopilot.evaluation import advice
 from endopilot.evaluation.advice import AdviseConfig
 from endopilot.files import manifest, read_json, write_json, writing
+from endopilot.models.config import PRETRAINED, run_path
 from endopilot.progress import progress
 
 if TYPE_CHECKING:
@@ -31,11 +32,11 @@ THRESHOLDS = tuple((ratio, mm) for ratio in (0.6, 0.7, 0.8, 0.9) for mm in (1.0,
 def advise(run: Path, dataset: Path, output: Path, config: AdviseConfig) -> dict[str, Any]:
     """Calibrate the X-ray adviser of a run on a dataset's calibration patients, and measure it on its test patients.
 
-    Writes the calibration beside the run (`xray.json`), and `advice.json` and `advice.png` to the output, each whole or
-    not at all.
+    Writes the calibration beside the run (`xray.json`; for "pretrained", to the output), and `advice.json` and
+    `advice.png` to the output, each whole or not at all.
 
     Args:
-        run: made by `endopilot train`.
+        run: made by `endopilot train`, or "pretrained", the model of the package.
         dataset: made by `endopilot dataset`; its patients must not be those that the run was trained on, unless they
             are of its split 'train'.
         output: where the figures go.
@@ -52,8 +53,9 @@ def advise(run: Path, dataset: Path, output: Path, config: AdviseConfig) -> dict
     from endopilot.models.rollout import load_run  # brings torch
 
     start = time.perf_counter()
+    record, beside = read_json(run_path(run) / "manifest.json"), output if str(run) == PRETRAINED else run
     episodes, predictor = load_dataset(dataset), load_run(run)
-    wire, other = (record["device"]["name"] for record in (read_json(run / "manifest.json"), episodes.manifest))
+    wire, other = (made["device"]["name"] for made in (record, episodes.manifest))
     if wire != other:
         raise InputError(f"{dataset}: its wire is {other}, and that of {run} is {wire}; make one with the other's wire")
     splits = [episodes.of_split(name) for name in ("train", "calibrate", "test")]
@@ -101,8 +103,8 @@ def advise(run: Path, dataset: Path, output: Path, config: AdviseConfig) -> dict
     (output / FIGURES_FILE).unlink(missing_ok=True)
     with writing(output / PICTURE_FILE) as partial:
         partial.write_bytes(png(_picture(content)))
-    calibration.write(run)
-    write_json(output / FIGURES_FILE, content | {"calibration_file": str(run / CALIBRATION_FILE)})
+    calibration.write(beside)
+    write_json(output / FIGURES_FILE, content | {"calibration_file": str(beside / CALIBRATION_FILE)})
     return content
 
 

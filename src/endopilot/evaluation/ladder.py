@@ -10,15 +10,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Float
 
+from endopilot.control.agent import AgentPolicy
+from endopilot.control.cost import safety_ratio
 from endopilot.control.navigate import NavigateConfig, Record, Truth, navigate
 from endopilot.control.policies import POLICIES, make_policy
+from endopilot.control.policy import Decision, Sight
+from endopilot.control.xray import AdvisorConfig, count_events, near_exposures
 from endopilot.env.navigation import CORE
 from endopilot.env.task import Navigation
 from endopilot.env.tasks import Task, find_task, ladder_tasks
 from endopilot.errors import InputError
 from endopilot.files import read_json, write_json
 from endopilot.parallel import each
+from endopilot.types import TipProjection
 
 SCORES_FILE, SETTINGS_FILE = "ladder.json", "settings.json"
 UPPER = range(5, 13)
@@ -86,7 +92,8 @@ def score(tasks: Sequence[Task], results: dict[str, list[dict[str, Any]]]) -> li
     Each row has `level`; `task`; `safe_success`, the share of navigations that reached the target with a wall force
     that never exceeded the task's limit; `success`, the share that reached it; of those that did, the medians of
     `seconds` and `path_ratio` (length of the tip's path over that of the centerline); and of all the median of
-    `peak_force_n` (N) and the mean of `exposures`.
+    `peak_force_n` (N) and the mean of `exposures`. Rows of `agent` have `missed_events`, the share of the events of all
+    their navigations that X-ray did not show (docs/xray.md).
     """
     rows = [{"level": task.level, "task": task.name} | summary(results[task.name]) for task in tasks]
     levels = {task.level: task.name for task in tasks}
@@ -104,6 +111,8 @@ def summary(results: list[dict[str, Any]]) -> dict[str, Any]:
     def median(name: str, of: list[dict[str, Any]], digits: int) -> float | None:
         return round(float(np.median([result[name] for result in of])), digits) if of else None
 
+    events = [result["events"] for result in results if "events" in result]
+    missed = round(sum(unseen for _, unseen in events) / max(sum(count for count, _ in events), 1), 4)
     return {
         "safe_success": round(float(np.mean([result["success"] and result["safe"] for result in results])), 4),
         "success": round(len(reached) / len(results), 4),
@@ -111,6 +120,7 @@ def summary(results: list[dict[str, Any]]) -> dict[str, Any]:
         "path_ratio": median("path_ratio", reached, 3),
         "peak_force_n": median("peak_force_n", results, 4),
         "exposures": round(float(np.mean([result["exposures"] for result in results])), 1),
+        **({"missed_events": missed} if len(events) == len(results) else {}),
     }
 
 
@@ -161,8 +171,44 @@ def _navigate(path: Path, *, policy: str) -> None:
 def drive(path: Path, task: Task, place: int, navigation: Navigation, policy: str, truth: Truth) -> None:
     """Let a policy do a task in the patient at some place of its list, and write what came of it to a file."""
     config = NavigateConfig(simulator=replace(CORE, threads=1))
-    record = navigate(navigation, make_policy(policy), config=config, seed=100 * task.level + place, truth=truth)
-    write_json(path, {"task": task.name, "patient": navigation.anatomy.name} | _result(navigation, record))
+    climber = make_policy(policy)
+    watched = _Watched(climber) if isinstance(climber, AgentPolicy) else None
+    record = navigate(navigation, watched or climber, config=config, seed=100 * task.level + place, truth=truth)
+    result = _result(navigation, record)
+    if watched is not None:
+        foretold, radius = np.array(watched.abscissa), navigation.device.tip_radius_mm
+        result["events"] = _events(record.tip, record.exposed, foretold, radius)
+    write_json(path, {"task": task.name, "patient": navigation.anatomy.name} | result)
+
+
+class _Watched:
+    """The agent, and where it held the tip to be (Δtip, mm) at each decision."""
+
+    def __init__(self, agent: AgentPolicy) -> None:
+        self._agent = agent
+
+    def start(self, navigation: Navigation, seed: int) -> None:
+        self._agent.start(navigation, seed)
+        self.abscissa: list[float] = []
+
+    def decide(self, sight: Sight) -> Decision:
+        decision = self._agent.decide(sight)
+        self.abscissa.append(float(self._agent.belief.likeliest_tip().abscissa[0]))
+        return decision
+
+
+def _events(
+    tip: TipProjection,
+    exposed: Bool[np.ndarray, "samples"],
+    foretold_mm: Float[np.ndarray, "decisions"],
+    wire_radius_mm: float,
+) -> tuple[int, int]:
+    """Return how many events a navigation had, as `AdvisorConfig` defines them, and how many were missed."""
+    count, advice = len(foretold_mm), AdvisorConfig()
+    wall = safety_ratio(tip.offset, tip.radius, wire_radius_mm)[:count] >= advice.wall_ratio
+    off = np.abs(foretold_mm - tip.abscissa[:count]) >= advice.abscissa_mm
+    found = np.array([count_events(state, near_exposures(exposed[:count])) for state in (wall, off)])
+    return int(found[:, 0].sum()), int(found[:, 1].sum())
 
 
 def _result(navigation: Navigation, record: Record) -> dict[str, Any]:

@@ -76,7 +76,8 @@ def write_page(output: Path) -> Path:
 def _section(output: Path, task: Task, patients: int) -> dict[str, Any]:
     results = [read_json(output / task.name / f"{place:02d}.json") for place in range(min(SHOWN, patients))]
     navigations = [task.ladder_navigation(place) for place in range(len(results))]
-    picture = image(png(_courses(navigations, results)), f"{task.title}: the tip's way in {len(results)} patients")
+    shown = f"{len(results)} patient{'s' if len(results) > 1 else ''}"
+    picture = image(png(_courses(navigations, results)), f"{task.title}: the tip's way in {shown}")
     replay = output / f"replay-{task.name}.html"
     if not replay.exists():
         figure = _replay_scene(task, navigations[0], results[0])

@@ -1,0 +1,69 @@
+"""Compare two rules for planning anew: `python benchmarks/agent_replanning.py [CASE [PATIENTS [TASK ...]]]`.
+
+The ladder's `agent` keeps its course at an exposure unless the tip is lost or off course; `Anew` searches another one
+from the now likeliest state at every exposure. Both drive the same navigations of the ladder, with the same seeds, one
+process after another, since processor time is measured. CASE, as-told if not given, is one of those of `endopilot
+ladder --off 0.2` (endopilot.evaluation.robustness.CASES). Prints a table a task and over all, as Markdown.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import replace
+
+import numpy as np
+
+from endopilot.control.agent import AgentPolicy
+from endopilot.control.navigate import NavigateConfig, navigate
+from endopilot.control.policy import TipMeasurement
+from endopilot.env.navigation import CORE
+from endopilot.env.tasks import find_task
+from endopilot.evaluation.robustness import truth_of
+
+TASKS = ("crux", "circumflex", "middle-cerebral", "carotid", "diagonal")
+OFF = 0.2
+
+
+class Anew(AgentPolicy):
+    """The agent, which drops its course at every exposure."""
+
+    def _look(self, measured: TipMeasurement) -> None:
+        super()._look(measured)
+        self._course = None
+
+
+RULES: dict[str, type[AgentPolicy]] = {"where off course": AgentPolicy, "at every exposure": Anew}
+COLUMNS = ("safe success", "exposures", "time, s", "plans", "processor, s")
+
+
+def drive(name: str, place: int, case: str, rule: type[AgentPolicy]) -> list[float]:
+    """Return the figures of one navigation, as `COLUMNS` names them."""
+    task, policy = find_task(name), rule()
+    navigation = task.ladder_navigation(place)
+    truth = truth_of(case, OFF, navigation, task, place)
+    config, began = NavigateConfig(simulator=replace(CORE, threads=1)), time.process_time()
+    record = navigate(navigation, policy, config=config, seed=100 * task.level + place, truth=truth)
+    spent = time.process_time() - began
+    return [record.success and record.safe, record.exposures, record.seconds, policy.plans, spent]
+
+
+def main() -> None:
+    """Drive and print."""
+    given = sys.argv[1:]
+    case, patients, tasks = given[0] if given else "as-told", int(given[1]) if given[1:] else 6, given[2:] or TASKS
+    found: dict[tuple[str, str], list[list[float]]] = {}
+    print("| task | plans anew | " + " | ".join(COLUMNS) + " |\n|---|---|" + "---|" * len(COLUMNS))
+    for task in (*tasks, "all"):
+        for rule, policy in RULES.items():
+            if task == "all":
+                rows = [row for name in tasks for row in found[name, rule]]
+            else:
+                rows = found[task, rule] = [drive(task, place, case, policy) for place in range(patients)]
+            safe, *means = np.mean(rows, axis=0)
+            cells = [f"{round(safe * len(rows))} of {len(rows)}", *(f"{mean:.1f}" for mean in means)]
+            print(f"| {task} | {rule} | " + " | ".join(cells) + " |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
