@@ -33,6 +33,8 @@ def make_untrained_run(dataset_folder, run_folder):
         "device": device | {"max_velocity_mm_s": 1e3, "max_rotation_rad_s": 1e3},
     }
     write_json(run_folder / "manifest.json", record)
+    epoch = {"epoch": 1, "steps": 1, "loss": 1.0, "validation_loss": None}
+    write_json(run_folder / "training.json", {name: {"seconds": 0.0, "curve": [epoch]} for name in NETWORKS})
 
 
 @pytest.fixture(scope="module")
@@ -140,6 +142,14 @@ def test_every_figure_has_its_table(evaluated, name):
     folder = evaluated[0] / "evaluation" / "figures"
     assert (folder / f"{name}.png").read_bytes().startswith(b"\x89PNG")
     assert set(pd.read_csv(folder / f"{name}.csv")["split"]) == {"seen_test", "test"}
+
+
+def test_the_evaluation_ends_with_a_report_that_needs_nothing_beside_it(evaluated):
+    page = (evaluated[0] / "evaluation" / "report.html").read_text(encoding="utf-8")
+    assert 'src="data:image/png' in page
+    assert 'src="http' not in page
+    assert f"endopilot evaluate {evaluated[0] / 'run'} -o {evaluated[0] / 'evaluation'}" in page
+    assert f"{evaluated[1]['splits']['test']['tip']['P4']['abscissa']['0-10']['mae']:.2f}" in page
 
 
 def test_a_run_without_its_dataset_is_told(evaluated, tmp_path):

@@ -13,13 +13,20 @@ import numpy as np
 from endopilot.dataset.loader import Dataset, load_dataset
 from endopilot.errors import InputError
 from endopilot.evaluation.metrics import PAPER_ERRORS
-from endopilot.evaluation.results import SPLIT_TITLES, SplitResult, told, write_results
+from endopilot.evaluation.results import (
+    FIGURES_FOLDER,
+    METRICS_FILE,
+    REPORT_FILE,
+    RESULTS_FILE,
+    SPLIT_TITLES,
+    SplitResult,
+    told,
+    write_results,
+)
 from endopilot.evaluation.summary import findings, over_seeds, summarize
 from endopilot.files import manifest, read_json, sha256, write_json, writing
-from endopilot.models.config import run_path
+from endopilot.models.config import PRETRAINED, run_path
 from endopilot.progress import progress
-
-METRICS_FILE, RESULTS_FILE, FIGURES_FOLDER = "metrics.json", "evaluation.npz", "figures"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,8 +60,8 @@ def evaluate(
     """Evaluate both networks of a run on the navigations and the patients that they never saw.
 
     Writes `metrics.json` (every figure, and how it was made), `evaluation.npz` (the predictions) and, in `figures/`,
-    the PNG and the CSV of each figure. Every file is written whole or not at all; `metrics.json` comes last, so
-    where it is, everything is.
+    the PNG and the CSV of each figure; `report.html`, one page that needs nothing beside it, is made of these and comes
+    last. Every file is written whole or not at all.
 
     Args:
         run_folder: made by `endopilot train`, or "pretrained", the model of the package.
@@ -106,10 +113,12 @@ def evaluate(
         tips = [results[split].tips["P1"], *(told(other.rollout_forward(data).tip) for other in others)]
         runs = [str(run_folder), *map(str, other_seeds)]
         metrics["splits"][split]["seeds"] = {"runs": runs, "P1": over_seeds(results[split], tips)}
-    (output / METRICS_FILE).unlink(missing_ok=True)
+    for name in (REPORT_FILE, METRICS_FILE):
+        (output / name).unlink(missing_ok=True)
     write_results(results, output / RESULTS_FILE)
     _write_figures(results, output / FIGURES_FOLDER)
     write_json(output / METRICS_FILE, metrics)
+    _write_report(output, run_folder, dataset.folder, metrics["manifest"])
     return metrics
 
 
@@ -150,3 +159,22 @@ def _write_figures(results: Mapping[str, SplitResult], folder: Path) -> None:
             table.to_csv(partial, index=False)
         with writing(folder / f"{name}.png") as partial:
             partial.write_bytes(figures.png(draw(table)))
+
+
+def _write_report(output: Path, run_folder: Path, dataset_folder: Path, record: Mapping[str, Any]) -> None:
+    from endopilot.evaluation.report import ReportContent, write_report  # matplotlib and plotly, slow to import
+
+    name = PRETRAINED if run_folder == run_path(Path(PRETRAINED)) else str(run_folder)
+    command = ["endopilot", "evaluate", name, "-o", str(output), "--dataset", str(dataset_folder)]
+    for option in ("sequences", "seed"):
+        value = record["config"][option]
+        command += [] if value is None else [f"--{option}", str(value)]
+    content = ReportContent(
+        title="endopilot: evaluation of a trained run",
+        origin=f"The run {name}, on the dataset {dataset_folder.name}.",
+        command=" ".join(command),
+        evaluation=output,
+        run=run_folder,
+        manifest=record,
+    )
+    write_report(output / REPORT_FILE, content)

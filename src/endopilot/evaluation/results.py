@@ -12,6 +12,9 @@ from jaxtyping import Bool, Float, Int
 from endopilot.errors import InputError
 from endopilot.files import writing
 
+METRICS_FILE, RESULTS_FILE, FIGURES_FOLDER, REPORT_FILE = "metrics.json", "evaluation.npz", "figures", "report.html"
+"""What an evaluation writes into its folder."""
+
 SPLIT_TITLES: Mapping[str, str] = {"seen_test": "New navigations, known patients", "test": "New patients"}
 """Splits of the dataset that are evaluated, and what a reader calls them."""
 
