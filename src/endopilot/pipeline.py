@@ -274,7 +274,7 @@ def _learn(output: Path, anatomies: Sequence[Path], config: StudyConfig, ledger:
 
 def _run(output: Path, training_seconds: float) -> Path:
     """Return the run whose networks are evaluated."""
-    return output / "training" if training_seconds > 0 else run_path(Path(PRETRAINED))
+    return output / "training" if training_seconds > 0 else Path(PRETRAINED)
 
 
 def _report(output: Path, names: Sequence[str], origin: str, command: str, ledger: Ledger) -> None:
@@ -299,7 +299,7 @@ def _report(output: Path, names: Sequence[str], origin: str, command: str, ledge
         command=command,
         patients=patients,
         evaluation=output / "evaluation",
-        run=_run(output, ledger.config["training_seconds"]),
+        run=run_path(_run(output, ledger.config["training_seconds"])),
         replay=replay,
         replay_anatomy=anatomy,
         stage_seconds=ledger.seconds,
