@@ -25,6 +25,7 @@ from endopilot.dataset.generate import DatasetConfig, generate_dataset
 from endopilot.dataset.loader import load_dataset
 from endopilot.errors import InputError
 from endopilot.evaluation.anatomy_score import score_anatomy
+from endopilot.evaluation.results import REPORT_FILE
 from endopilot.files import input_hash, json_text, manifest, read_json, write_json
 from endopilot.imaging.segment import SegmentConfig, segment
 from endopilot.imaging.volume import read_mask, read_volume, write_mask, write_volume
@@ -36,7 +37,6 @@ from endopilot.simulation.simulator import SimulatorConfig, simulate
 from endopilot.types import Rollout
 
 VOLUME_SUFFIX = ".nii.gz"
-REPORT_FILE = "report.html"
 EVALUATED = 48
 """Navigations of each split that are evaluated; each is simulated seven times."""
 _PRETRAINED_DEVICE = "workhorse-014"
@@ -274,7 +274,7 @@ def _learn(output: Path, anatomies: Sequence[Path], config: StudyConfig, ledger:
 
 def _run(output: Path, training_seconds: float) -> Path:
     """Return the run whose networks are evaluated."""
-    return output / "training" if training_seconds > 0 else run_path(Path(PRETRAINED))
+    return output / "training" if training_seconds > 0 else Path(PRETRAINED)
 
 
 def _report(output: Path, names: Sequence[str], origin: str, command: str, ledger: Ledger) -> None:
@@ -299,7 +299,7 @@ def _report(output: Path, names: Sequence[str], origin: str, command: str, ledge
         command=command,
         patients=patients,
         evaluation=output / "evaluation",
-        run=_run(output, ledger.config["training_seconds"]),
+        run=run_path(_run(output, ledger.config["training_seconds"])),
         replay=replay,
         replay_anatomy=anatomy,
         stage_seconds=ledger.seconds,

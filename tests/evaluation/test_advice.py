@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -52,7 +52,8 @@ def folder(tmp_path_factory) -> Path:
     shares = (1 / 12, 10 / 12, 1 / 12)
     shape = {"patients": 12, "sequences": 1, "seconds": 25.0}
     make_toy_dataset(folder / "dataset", **shape, anatomy_shares=shares, seen_test_share=0.0)
-    write_json(folder / "run" / "manifest.json", {"device": {"name": "workhorse-014"}})
+    record = {"config": {}, "networks": {}, "device": asdict(read_device("workhorse-014"))}
+    write_json(folder / "run" / "manifest.json", record)
     return folder
 
 
@@ -155,7 +156,8 @@ def test_too_few_patients_or_another_wire_leave_nothing_behind(folder, hold_slac
     config = AdviseConfig(advisor=AdvisorConfig(level=0.95))
     with pytest.raises(InputError, match="needs at least 19 patients"):
         advise(folder / "run", folder / "dataset", tmp_path / "out", config)
-    write_json(tmp_path / "manifest.json", {"device": {"name": "j-035"}})
+    record = {"config": {}, "networks": {}, "device": asdict(read_device("j-035"))}
+    write_json(tmp_path / "manifest.json", record)
     with pytest.raises(InputError, match=r"its wire is workhorse-014, and that of .* is j-035"):
         advise(tmp_path, folder / "dataset", tmp_path / "out", AdviseConfig())
     assert not (tmp_path / "out").exists() and not (tmp_path / "xray.json").exists()

@@ -2,12 +2,14 @@ from __future__ import annotations
 
 import json
 import os
+from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
 import pandas as pd
 import pytest
 
+from endopilot.cli import main
 from endopilot.dataset.loader import load_dataset
 from endopilot.errors import InputError
 from endopilot.evaluation.evaluate import EvaluateConfig, evaluate
@@ -28,11 +30,14 @@ def make_untrained_run(dataset_folder, run_folder):
     device = read_json(dataset_folder / "meta" / "manifest.json")["device"]
     record = {
         "config": {"model": "paper"},
+        "inputs": {"dataset": read_json(dataset_folder / "meta" / "manifest.json")["key"]},
         "dataset": os.path.relpath(dataset_folder, run_folder),
         "networks": {"ff": {}, "if": {}},
         "device": device | {"max_velocity_mm_s": 1e3, "max_rotation_rad_s": 1e3},
     }
     write_json(run_folder / "manifest.json", record)
+    epoch = {"epoch": 1, "steps": 1, "loss": 1.0, "validation_loss": None}
+    write_json(run_folder / "training.json", {name: {"seconds": 0.0, "curve": [epoch]} for name in NETWORKS})
 
 
 @pytest.fixture(scope="module")
@@ -114,6 +119,32 @@ def test_the_core_is_replayed_with_other_friction(toy_dataset, evaluated):
     assert {"friction_90", "friction_110"} <= metrics["splits"]["test"]["tip"].keys()
 
 
+def test_patients_that_were_trained_on_are_told_from_new_ones(evaluated):
+    splits = evaluated[1]["splits"]
+    assert [split["title"] for split in splits.values()] == ["New navigations, known patients", "New patients"]
+    assert splits["seen_test"]["known_patients"] == len(splits["seen_test"]["anatomies"])
+    gap, tip = evaluated[1]["generalisation_gap"]["P1"]["abscissa"]["all"], [s["tip"]["P1"] for s in splits.values()]
+    assert gap["difference"] == pytest.approx(tip[1]["abscissa"]["all"]["mae"] - tip[0]["abscissa"]["all"]["mae"])
+
+
+def test_the_command_prints_errors_findings_and_paths(evaluated, monkeypatch, capsys):
+    metrics = evaluated[1]
+    monkeypatch.setattr("endopilot.cli.evaluate.evaluate", lambda *_: metrics)
+    with pytest.raises(SystemExit, match="0"):
+        main(["evaluate", "r", "-o", "out"])
+    printed = capsys.readouterr().out
+    assert max(map(len, printed.splitlines())) <= 250
+    for sentence in metrics["findings"]:
+        assert sentence in printed
+    row = next(line for line in printed.splitlines() if line.startswith("│ P4_replanned"))
+    mae = metrics["splits"]["seen_test"]["tip"]["P4_replanned"]["abscissa"]["30-45"]["mae"]
+    assert row.split("│")[4].strip() == f"{mae:.3f}"
+    assert "out/report.html" in printed
+    with pytest.raises(SystemExit, match="0"):
+        main(["evaluate", "r", "-o", "out", "--json"])
+    assert json.loads(capsys.readouterr().out)["splits"].keys() == metrics["splits"].keys()
+
+
 def test_another_seed_stands_beside_the_run(evaluated):
     told = evaluated[1]["splits"]["test"]
     assert told["seeds"]["P1"]["abscissa"]["0-10"]["mae"] == [told["tip"]["P1"]["abscissa"]["0-10"]["mae"]] * 2
@@ -135,11 +166,19 @@ def test_replayed_controls_are_simulated_from_the_start_of_the_episode(evaluated
     assert (slack <= curliness * inserted + 1.5 + 1e-3).all()
 
 
-@pytest.mark.parametrize("name", ["tip_error", "safety_ratio", "control_error"])
+@pytest.mark.parametrize("name", ["tip_error", "safety_ratio", "control_error", "drive_difference"])
 def test_every_figure_has_its_table(evaluated, name):
     folder = evaluated[0] / "evaluation" / "figures"
     assert (folder / f"{name}.png").read_bytes().startswith(b"\x89PNG")
     assert set(pd.read_csv(folder / f"{name}.csv")["split"]) == {"seen_test", "test"}
+
+
+def test_the_evaluation_ends_with_a_report_that_needs_nothing_beside_it(evaluated):
+    page = (evaluated[0] / "evaluation" / "report.html").read_text(encoding="utf-8")
+    assert 'src="data:image/png' in page
+    assert 'src="http' not in page
+    assert f"endopilot evaluate {evaluated[0] / 'run'} -o {evaluated[0] / 'evaluation'}" in page
+    assert f"{evaluated[1]['splits']['test']['tip']['P4']['abscissa']['0-10']['mae']:.2f}" in page
 
 
 def test_a_run_without_its_dataset_is_told(evaluated, tmp_path):
@@ -149,6 +188,19 @@ def test_a_run_without_its_dataset_is_told(evaluated, tmp_path):
     with pytest.raises(InputError, match="is not here; name one with --dataset"):
         evaluate(tmp_path, tmp_path / "out", EvaluateConfig())
     assert not (tmp_path / "out").exists()
+
+
+def test_the_packaged_model_asks_for_a_dataset(tmp_path):
+    with pytest.raises(InputError, match="not in the package; name one with --dataset"):
+        evaluate(Path("pretrained"), tmp_path / "out", EvaluateConfig())
+
+
+@pytest.mark.parametrize("record", [None, {"config": {}, "stages": {}}])
+def test_a_folder_that_is_no_run_is_told(tmp_path, record):
+    if record is not None:
+        write_json(tmp_path / "manifest.json", record)
+    with pytest.raises(InputError, match=r"no finished run here .* make one with `endopilot train`"):
+        evaluate(tmp_path, tmp_path / "out", EvaluateConfig())
 
 
 @pytest.mark.parametrize(("field", "value"), [("sequences", 0), ("seed", -1)])

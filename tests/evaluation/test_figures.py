@@ -1,11 +1,17 @@
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.figure import Figure
 
 from endopilot.evaluation import figures, tables
+from endopilot.evaluation.results import TIP_BASELINES
 from endopilot.types import Insertion, LumenMask, Volume
+
+TITLES = {"seen_test": "New navigations, known patients", "test": "New patients"}
 
 
 def make_volume(direction: np.ndarray) -> tuple[Volume, LumenMask]:
@@ -60,7 +66,7 @@ def test_the_tree_shows_every_section_in_its_colour(anatomy):
 
 def test_series_are_drawn_with_their_values(results):
     table = tables.tip_error_table(results)
-    ax = figures.tip_error_figure(table).axes[0]
+    ax = figures.tip_error_figure(table, TITLES).axes[0]
     line = next(line for line in ax.get_lines() if "P1" in str(line.get_label()))
     expected = tables.values(tables.rows(table, split="seen_test", series="P1"), "abscissa_mae_mm")
     np.testing.assert_allclose(np.asarray(line.get_ydata(), dtype=float), expected)
@@ -74,8 +80,49 @@ def test_a_series_that_runs_away_does_not_hide_the_others():
 
 
 def test_the_wall_is_marked_at_one(results):
-    ax = figures.safety_figure(tables.safety_table(results)).axes[0]
+    ax = figures.safety_figure(tables.safety_table(results), TITLES).axes[0]
     assert any(np.allclose(np.asarray(line.get_ydata(), dtype=float), 1.0) for line in ax.get_lines())
+
+
+def test_both_safety_ratios_are_drawn_with_their_95_percent_quantile(results):
+    table = tables.safety_table(results)
+    axes = figures.safety_figure(table, TITLES).axes
+    for ax, ratio in ((axes[1], "clearance"), (axes[3], "radius")):
+        lines = [np.asarray(line.get_ydata(), dtype=float) for line in ax.get_lines()]
+        for series in ("true", "P3", "P4"):
+            part = tables.rows(table, split="test", series=series, ratio=ratio)
+            for column in ("median", "p95"):
+                expected = tables.values(part, column)
+                assert any(len(line) == len(expected) and np.allclose(line, expected) for line in lines)
+    assert axes[3].get_ylabel().endswith("γ / r")
+
+
+@pytest.mark.parametrize("name", ["control_error", "drive_difference"])
+def test_the_histograms_of_few_sequences_do_not_cover_one_another(results, name):
+    table = getattr(tables, f"{name}_table")(results)
+    figure = getattr(figures, f"{name}_figure")(table, TITLES)
+    series = tables.distinct(table, "series")
+    assert len(series) >= 4
+    for ax in figure.axes:
+        spans = sorted((stairs.get_data().baseline, stairs.get_data().values.max()) for stairs in ax.patches)
+        assert len(spans) == len(series)
+        assert all(top < bottom for (_, top), (bottom, _) in pairwise(spans))
+
+
+def test_a_histogram_counts_every_sequence():
+    ax = Figure().subplots()
+    figures._histogram(ax, np.array([0.1, 0.2, 0.3, 1.2, 99.0]), np.array([0.0, 0.5, 1.0, 1.5]), -2.0, "#000000")
+    heights = (ax.patches[0].get_data().values + 2.0) / 0.75
+    np.testing.assert_allclose(heights, [1.0, 0.0, 2 / 3])
+    assert ax.texts[0].get_text().strip() == "3 of 5"
+
+
+def test_no_protocol_looks_like_a_baseline():
+    baselines = {name for names in TIP_BASELINES.values() for name in names}
+    grey = {figures._style(name)["color"] for name in baselines}
+    colors = [figures._style(name)["color"] for name in TIP_BASELINES]
+    assert not grey & set(colors)
+    assert len(set(colors)) == len(colors)
 
 
 def test_stages_are_drawn_in_their_order():

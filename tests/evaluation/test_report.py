@@ -59,8 +59,9 @@ def material(tmp_path_factory, anatomy, results):
     grid = (np.full(3, anatomy.distance_map.spacing_mm), anatomy.distance_map.origin_mm, np.eye(3))
     write_volume(Volume(np.where(inside, 400, -80).astype(np.int16), *grid), folder / "ct.nii.gz")
     write_mask(LumenMask(Volume(inside, *grid), anatomy.insertion), folder / "mask.nii.gz", manifest={})
-    write_json(folder / "evaluation" / "metrics.json", evaluate._metrics(results, 0))
-    evaluate._write_figures(results, folder / "evaluation" / "figures")
+    write_json(folder / "evaluation" / "metrics.json", evaluate._metrics(results, {"a", "b"}, 0))
+    titles = {"seen_test": "New navigations, known patients", "test": "New patients"}
+    evaluate._write_figures(results, titles, folder / "evaluation" / "figures")
     curve = [{"epoch": n, "steps": 20, "loss": 1.0 / n, "validation_loss": None} for n in (1, 2, 3)]
     record = {"seconds": 12.0, "curve": curve}
     write_json(folder / "run" / "training.json", {"ff": record, "if": record})
@@ -131,6 +132,22 @@ def test_the_numbers_of_the_tables_are_those_of_metrics_json(page, material):
         assert shown == pytest.approx(scale * value, abs=0.51 if scale == 100 else 0.0051), key
 
 
+def test_the_generalisation_gap_is_told_for_every_protocol_and_span(page, material):
+    gap = read_json(material / "evaluation" / "metrics.json")["generalisation_gap"]
+    for series in ("P1", "P3", "P4", "P2_replayed"):
+        for coordinate in ("abscissa", "offset"):
+            for span in ("0-10", "10-30", "30-45", "all"):
+                shown = page.cells[f"generalisation_gap/{series}/{coordinate}/{span}/difference"]
+                assert shown.endswith(f" ×{gap[series][coordinate][span]['ratio']:.2f}")
+    assert "Generalisation gap, P1: mean error in new patients against known ones" in page.words
+
+
+def test_the_drives_force_and_torque_are_told(page, material):
+    drive = read_json(material / "evaluation" / "metrics.json")["splits"]["test"]["drive"]["P4"]
+    force, torque = (drive[key]["rmse_of_sequences"]["median"] for key in ("force_n", "torque_nmm"))
+    assert f"P4 {force:.3f} N and {torque:.3f} N mm" in page.words
+
+
 def test_the_papers_errors_stand_beside_ours(page):
     assert page.cells["paper/30-45/abscissa/mae"] == "0.62 ± 0.60"
     assert page.cells["paper/0-10/offset/mae"] == "0.09 ± 0.10"
@@ -163,8 +180,16 @@ def test_sections_with_nothing_to_show_are_left_out(material, tmp_path, no_still
     assert "Nothing was evaluated" in page.words
 
 
+def test_a_model_that_trains_nothing_has_no_training_section(material, tmp_path, no_still):
+    write_json(tmp_path / "run" / "training.json", {})
+    content = ReportContent(
+        title="T", origin="O", command="C", evaluation=material / "evaluation", run=tmp_path / "run"
+    )
+    assert "training" not in write_page(tmp_path, content).sections
+
+
 def test_one_patient_without_unseen_ones_is_reported(material, results, tmp_path, no_still):
-    write_json(tmp_path / "e" / "metrics.json", evaluate._metrics({"seen_test": results["test"]}, 0))
+    write_json(tmp_path / "e" / "metrics.json", evaluate._metrics({"seen_test": results["test"]}, {"c"}, 0))
     content = ReportContent(title="T", origin="O", command="C", evaluation=tmp_path / "e")
     page = write_page(tmp_path, content)
     assert "that the networks know" in page.words
@@ -179,5 +204,5 @@ def test_a_failed_report_leaves_nothing_behind(material, rollout, tmp_path, no_s
 
 
 def test_the_summary_speaks_of_new_patients_where_there_are_any(results):
-    metrics = evaluate._metrics(results, 0)
+    metrics = evaluate._metrics(results, {"a", "b"}, 0)
     assert "6 new navigations in 1 patient that neither network has seen" in report_text.summary(metrics)

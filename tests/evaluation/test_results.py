@@ -9,7 +9,7 @@ import pytest
 from endopilot.errors import InputError
 from endopilot.evaluation import tables
 from endopilot.evaluation.results import read_results, write_results
-from endopilot.evaluation.summary import findings, over_seeds, summarize
+from endopilot.evaluation.summary import findings, generalisation_gap, over_seeds, summarize
 
 
 def test_results_read_back_as_written(results, tmp_path):
@@ -64,6 +64,35 @@ def test_findings_say_where_a_baseline_wins(results):
     assert "Δtip beats every baseline" in told["New patients, P1"]
     assert "Δtip loses to a baseline" in told["New patients, P4"]
     assert "driving by the held slack" in told["New patients, P4"]
+
+
+@pytest.fixture
+def splits(results):
+    known = {"seen_test": 2, "test": 0}
+    return {split: {"known_patients": known[split]} | summarize(result, seed=0) for split, result in results.items()}
+
+
+def test_the_generalisation_gap_is_new_patients_error_against_known_ones(results, splits):
+    gap = generalisation_gap(splits)["P4"]["offset"]
+    seen, new = (np.abs(results[split].error("P4", "offset")[:, 20:60]).mean() for split in ("seen_test", "test"))
+    assert gap["10-30"] == {"difference": pytest.approx(new - seen), "ratio": pytest.approx(new / seen)}
+    assert list(gap) == ["0-10", "10-30", "30-45", "all"]
+
+
+def test_there_is_no_gap_without_both_kinds_of_patients(splits):
+    assert generalisation_gap({"test": splits["test"]}) == {}
+    assert generalisation_gap({"seen_test": splits["seen_test"]}) == {}
+    assert generalisation_gap(splits | {"seen_test": splits["seen_test"] | {"known_patients": 0}}) == {}
+
+
+def test_drive_difference_table_holds_the_rmse_of_each_sequence(results):
+    table = tables.rows(tables.drive_difference_table(results), split="test", series="P4")
+    result = results["test"]
+    expected = np.sqrt(np.mean((result.base_torque["P4"] - result.base_torque["true"]) ** 2, axis=1))
+    np.testing.assert_allclose(tables.values(table, "torque_rmse_nmm"), expected)
+    assert list(table["anatomy"]) == ["c"] * 6
+    told = summarize(result, seed=0)["drive"]["P4"]["torque_nmm"]["rmse_of_sequences"]
+    assert told["median"] == pytest.approx(np.median(expected))
 
 
 def test_tip_error_table_holds_the_mean_over_sequences(results):

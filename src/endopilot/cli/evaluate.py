@@ -6,8 +6,10 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
-from endopilot.cli.arguments import OutputFolder, existing, show
+from endopilot.cli.arguments import OutputFolder, existing, show, show_rows
 from endopilot.evaluation.evaluate import EvaluateConfig, evaluate
+from endopilot.evaluation.report_text import mean_errors
+from endopilot.evaluation.results import FIGURES_FOLDER, METRICS_FILE, REPORT_FILE, RESULTS_FILE
 
 
 def command(
@@ -24,11 +26,21 @@ def command(
 
     Args:
         run: folder made by `endopilot train`, or `pretrained`, the causal model that comes with endopilot.
-        output: folder of metrics.json, figures and tables.
+        output: folder of report.html, metrics.json, figures and tables.
         dataset: dataset to evaluate on; the one that the run was trained on if not given.
         other_seeds: runs of the same training with other seeds; their errors in P1 stand beside the run's, with mean
             and standard deviation.
-        json: print the figures as JSON.
+        json: print the whole of metrics.json.
         config: what to evaluate.
     """
-    show(evaluate(run, output, config, existing(dataset) if dataset else None, other_seeds), as_json=json)
+    metrics = evaluate(run, output, config, existing(dataset) if dataset else None, other_seeds)
+    if json:
+        show(metrics, as_json=True)
+        return
+    for split, record in metrics["splits"].items():
+        counts = f"{record['episodes']} navigations, patients: {len(record['anatomies'])}"
+        print(f"{record['title']} ({split}; {counts}): mean absolute error, mm, by s after the given states")
+        show_rows(mean_errors(metrics, split), as_json=False)
+    names = {"report": REPORT_FILE, "figures": FIGURES_FOLDER, "metrics": METRICS_FILE, "predictions": RESULTS_FILE}
+    files = {name: output / file for name, file in names.items()}
+    show({"findings": metrics["findings"], **files}, as_json=False)

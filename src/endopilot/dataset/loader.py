@@ -125,6 +125,11 @@ class Dataset:
             )
         return self.select(chosen)
 
+    @property
+    def patients(self) -> dict[str, str]:
+        """SHA-256 of what a simulation depends on in each anatomy, by the anatomy's name."""
+        return {record["name"]: record["sha256"] for record in self.manifest["anatomies"]}
+
     def anatomy_folder(self, name: str) -> Path:
         """Return the folder of an anatomy of the dataset.
 

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 from endopilot.control.xray import CALIBRATION_FILE, check_enough
 from endopilot.dataset.loader import load_dataset
-from endopilot.errors import InputError
 from endopilot.evaluation import advice
 from endopilot.evaluation.advice import AdviseConfig
-from endopilot.files import manifest, read_json, write_json, writing
-from endopilot.models.config import PRETRAINED, run_path
+from endopilot.evaluation.seen import check_wire
+from endopilot.files import manifest, write_json, writing
+from endopilot.models.config import PRETRAINED, read_run
 from endopilot.progress import progress
 
 if TYPE_CHECKING:
@@ -53,11 +53,9 @@ def advise(run: Path, dataset: Path, output: Path, config: AdviseConfig) -> dict
     from endopilot.models.rollout import load_run  # brings torch
 
     start = time.perf_counter()
-    record, beside = read_json(run_path(run) / "manifest.json"), output if str(run) == PRETRAINED else run
+    beside = output if str(run) == PRETRAINED else run
     episodes, predictor = load_dataset(dataset), load_run(run)
-    wire, other = (made["device"]["name"] for made in (record, episodes.manifest))
-    if wire != other:
-        raise InputError(f"{dataset}: its wire is {other}, and that of {run} is {wire}; make one with the other's wire")
+    check_wire(run, read_run(run), episodes)
     splits = [episodes.of_split(name) for name in ("train", "calibrate", "test")]
     check_enough(len(set(splits[1].anatomy)), config.advisor.level)
     fitted, own, test = (advice.watch(predictor, split, config) for split in splits)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,13 +13,21 @@ import numpy as np
 from endopilot.dataset.loader import Dataset, load_dataset
 from endopilot.errors import InputError
 from endopilot.evaluation.metrics import PAPER_ERRORS
-from endopilot.evaluation.results import SPLIT_TITLES, SplitResult, told, write_results
-from endopilot.evaluation.summary import findings, over_seeds, summarize
-from endopilot.files import manifest, read_json, sha256, write_json, writing
-from endopilot.models.config import run_path
+from endopilot.evaluation.results import (
+    FIGURES_FOLDER,
+    METRICS_FILE,
+    REPORT_FILE,
+    RESULTS_FILE,
+    SPLITS,
+    SplitResult,
+    told,
+    write_results,
+)
+from endopilot.evaluation.seen import split_title, trained_patients
+from endopilot.evaluation.summary import findings, generalisation_gap, over_seeds, summarize
+from endopilot.files import manifest, sha256, write_json, writing
+from endopilot.models.config import PRETRAINED, read_run, run_path
 from endopilot.progress import progress
-
-METRICS_FILE, RESULTS_FILE, FIGURES_FOLDER = "metrics.json", "evaluation.npz", "figures"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,8 +61,8 @@ def evaluate(
     """Evaluate both networks of a run on the navigations and the patients that they never saw.
 
     Writes `metrics.json` (every figure, and how it was made), `evaluation.npz` (the predictions) and, in `figures/`,
-    the PNG and the CSV of each figure. Every file is written whole or not at all; `metrics.json` comes last, so
-    where it is, everything is.
+    the PNG and the CSV of each figure; `report.html`, one page that needs nothing beside it, is made of these and comes
+    last. Every file is written whole or not at all.
 
     Args:
         run_folder: made by `endopilot train`, or "pretrained", the model of the package.
@@ -67,25 +75,21 @@ def evaluate(
         The content of `metrics.json`.
 
     Raises:
-        InputError: the run, its dataset or one of its anatomies is missing or damaged, or nothing was held out.
+        InputError: the run, its dataset or one of its anatomies is missing or damaged, nothing was held out, the
+            dataset was made with another wire, or a patient that a run was trained on is among its test patients.
     """
     from endopilot.evaluation.protocols import count_steps, run_protocols  # brings torch, which takes seconds to import
     from endopilot.models.rollout import load_run
 
     start = time.perf_counter()
-    run_folder, output = run_path(run_folder), Path(output)
-    own = run_folder / read_json(run_folder / "manifest.json")["dataset"]
-    if dataset_folder is None and not own.is_dir():
-        raise InputError(f"{own}: the dataset that the run was trained on is not here; name one with --dataset")
-    dataset = load_dataset(Path(dataset_folder or own).resolve())
+    dataset = load_dataset(Path(dataset_folder or _own_dataset(run_folder, read_run(run_folder))).resolve())
+    known, *_ = [trained_patients(run, read_run(run), dataset) for run in (run_folder, *other_seeds)]
     predictor, others = load_run(run_folder), [load_run(other) for other in other_seeds]
     train = dataset.of_split("train")
-    chosen = {
-        split: _chosen(dataset.of_split(split), config.sequences) for split in SPLIT_TITLES if split in dataset.split
-    }
+    chosen = {split: _chosen(dataset.of_split(split), config.sequences) for split in SPLITS if split in dataset.split}
     if not chosen:
         raise InputError(
-            f"{dataset.folder}: holds neither of the splits {', '.join(SPLIT_TITLES)}; "
+            f"{dataset.folder}: holds neither of the splits {', '.join(SPLITS)}; "
             "make it with seen_test_share above 0 or with more patients"
         )
     results: dict[str, SplitResult] = {}
@@ -93,11 +97,11 @@ def evaluate(
     with progress("Evaluating", total=steps) as advance:
         for split, data in chosen.items():
             results[split] = run_protocols(predictor, data, train, advance)
-    metrics = _metrics(results, config.seed) | {
+    metrics = _metrics(results, known, config.seed) | {
         "manifest": manifest(
             config=config,
             seed=config.seed,
-            inputs={path.name: sha256(path) for path in sorted(run_folder.glob("*.safetensors"))}
+            inputs={path.name: sha256(path) for path in sorted(run_path(run_folder).glob("*.safetensors"))}
             | {"dataset": dataset.manifest["key"]},
             wall_seconds=time.perf_counter() - start,
         )
@@ -106,10 +110,13 @@ def evaluate(
         tips = [results[split].tips["P1"], *(told(other.rollout_forward(data).tip) for other in others)]
         runs = [str(run_folder), *map(str, other_seeds)]
         metrics["splits"][split]["seeds"] = {"runs": runs, "P1": over_seeds(results[split], tips)}
-    (output / METRICS_FILE).unlink(missing_ok=True)
+    for name in (REPORT_FILE, METRICS_FILE):
+        (output / name).unlink(missing_ok=True)
     write_results(results, output / RESULTS_FILE)
-    _write_figures(results, output / FIGURES_FOLDER)
+    titles = {split: of["title"] for split, of in metrics["splits"].items()}
+    _write_figures(results, titles, output / FIGURES_FOLDER)
     write_json(output / METRICS_FILE, metrics)
+    _write_report(output, run_folder, dataset.folder, metrics["manifest"])
     return metrics
 
 
@@ -124,29 +131,66 @@ def _chosen(data: Dataset, sequences: int | None) -> Dataset:
     return data.select(np.sort(np.lexsort((data.anatomy, rank))[:sequences]))
 
 
-def _metrics(results: Mapping[str, SplitResult], seed: int) -> dict[str, Any]:
-    period = next(iter(results.values())).sample_period_s
+def _own_dataset(run: Path, record: Mapping[str, Any]) -> Path:
+    """Return the dataset that a run was trained on."""
+    if str(run) == PRETRAINED:
+        raise InputError(f"{run}: the dataset that it was trained on is not in the package; name one with --dataset")
+    own = Path(run) / record["dataset"]
+    if not own.is_dir():
+        raise InputError(f"{own}: the dataset that the run was trained on is not here; name one with --dataset")
+    return own
+
+
+def _metrics(results: Mapping[str, SplitResult], known: Collection[str], seed: int) -> dict[str, Any]:
+    """Return the content of metrics.json but for its manifest; `known` names the patients that were trained on."""
+    splits = {
+        split: {
+            "title": split_title(split, result.anatomies, known),
+            "known_patients": len(set(result.anatomies) & set(known)),
+        }
+        | summarize(result, seed=seed)
+        for split, result in results.items()
+    }
     metrics: dict[str, Any] = {
         "unit": "mm where no other stands",
-        "sample_period_s": period,
+        "sample_period_s": next(iter(results.values())).sample_period_s,
         "paper": PAPER_ERRORS,
-        "splits": {
-            split: {"title": SPLIT_TITLES[split]} | summarize(result, seed=seed) for split, result in results.items()
-        },
+        "splits": splits,
     }
+    gap = generalisation_gap(splits)
+    metrics |= {"generalisation_gap": gap} if gap else {}
     return metrics | {"findings": findings(metrics)}
 
 
-def _write_figures(results: Mapping[str, SplitResult], folder: Path) -> None:
+def _write_figures(results: Mapping[str, SplitResult], titles: Mapping[str, str], folder: Path) -> None:
     from endopilot.evaluation import figures, tables  # matplotlib and pandas, slow to import
 
     drawn = {
         "tip_error": (tables.tip_error_table(results), figures.tip_error_figure),
         "safety_ratio": (tables.safety_table(results), figures.safety_figure),
         "control_error": (tables.control_error_table(results), figures.control_error_figure),
+        "drive_difference": (tables.drive_difference_table(results), figures.drive_difference_figure),
     }
     for name, (table, draw) in drawn.items():
         with writing(folder / f"{name}.csv") as partial:
             table.to_csv(partial, index=False)
         with writing(folder / f"{name}.png") as partial:
-            partial.write_bytes(figures.png(draw(table)))
+            partial.write_bytes(figures.png(draw(table, titles)))
+
+
+def _write_report(output: Path, run_folder: Path, dataset_folder: Path, record: Mapping[str, Any]) -> None:
+    from endopilot.evaluation.report import ReportContent, write_report  # matplotlib and plotly, slow to import
+
+    command = ["endopilot", "evaluate", str(run_folder), "-o", str(output), "--dataset", str(dataset_folder)]
+    for option in ("sequences", "seed"):
+        value = record["config"][option]
+        command += [] if value is None else [f"--{option}", str(value)]
+    content = ReportContent(
+        title="endopilot: evaluation of a trained run",
+        origin=f"The run {run_folder}, on the dataset {dataset_folder}.",
+        command=" ".join(command),
+        evaluation=output,
+        run=run_path(run_folder),
+        manifest=record,
+    )
+    write_report(output / REPORT_FILE, content)

@@ -1,8 +1,13 @@
-"""The figures of an evaluation and of a report, drawn with matplotlib: each function returns one and saves nothing."""
+"""The figures of an evaluation and of a report, drawn with matplotlib: each function returns one and saves nothing.
+
+`titles` says what a reader calls each split.
+"""
 
 from __future__ import annotations
 
 import io
+from collections.abc import Mapping, Sequence
+from textwrap import fill
 from typing import Any
 
 import matplotlib
@@ -14,7 +19,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from endopilot.evaluation.results import SERIES_TITLES
-from endopilot.evaluation.tables import distinct, rows, split_title, values
+from endopilot.evaluation.tables import distinct, rows, values
 from endopilot.types import Anatomy, LumenMask, Volume
 
 # Okabe & Ito, "Color universal design" (2008): told apart with any kind of colour vision.
@@ -42,6 +47,7 @@ SERIES_STYLE: dict[str, dict] = {
     "P3": {"color": ORANGE},
     "P4": {"color": VERMILLION},
     "P4_replanned": {"color": PURPLE},
+    "P2_replayed": {"color": SKY},
     "hold_slack": {"color": GREY, "linestyle": "--"},
     "training_mean": {"color": GREY, "linestyle": ":"},
     "hold_control": {"color": "#5d4a3a", "linestyle": "-."},
@@ -74,7 +80,7 @@ CROP_MARGIN_MM = 18.0
 """What is shown of the volume around the vessel, mm."""
 
 
-def tip_error_figure(table: pd.DataFrame) -> Figure:
+def tip_error_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:
     """Draw the mean |error| of Δtip and γtip against time, one row a split (`tables.tip_error_table`)."""
     splits = distinct(table, "split")
     panels = (("abscissa_mae_mm", "Mean |error| of Δtip, mm"), ("offset_mae_mm", "Mean |error| of γtip, mm"))
@@ -88,56 +94,109 @@ def tip_error_figure(table: pd.DataFrame) -> Figure:
                     ax.plot(values(line, "time_s"), values(line, column), **_style(series))
                 ax.set(xlabel="Time after the given states, s", ylabel=label, xlim=(0, None))
                 ax.set_ylim(0, _upper(part, column))
-                ax.set_title(split_title(split))
+                ax.set_title(titles[split])
         _legend_below(figure, axes)
     return figure
 
 
-def safety_figure(table: pd.DataFrame) -> Figure:
-    """Draw median and quartiles of γ/(r − r_w) against time, one panel a split (`tables.safety_table`)."""
-    table = rows(table, ratio="clearance")
-    splits = distinct(table, "split")
-    with matplotlib.rc_context(STYLE):
-        figure, axes = _grid(1, len(splits), height=3.6)
-        for ax, split in zip(axes[0], splits, strict=True):
-            part = rows(table, split=split)
-            for series in distinct(part, "series"):
-                line, style = rows(part, series=series), _style(series)
-                time = values(line, "time_s")
-                ax.fill_between(time, values(line, "q25"), values(line, "q75"), color=style["color"], alpha=0.16, lw=0)
-                ax.plot(time, values(line, "median"), **style)
-            ax.axhline(1.0, color=BLACK, lw=1.0, ls=(0, (4, 3)))
-            ax.annotate("wall", (0.995, 1.0), xycoords=("axes fraction", "data"), ha="right", va="bottom", fontsize=8.5)
-            ax.set(xlabel="Time after the given states, s", ylabel="Safety ratio γ / (r − r_w)", xlim=(0, None))
-            ax.set_ylim(0, float(np.clip(_upper(table, "q75"), 1.25, 2.5)))
-            ax.set_title(split_title(split))
-        _legend_below(figure, axes)
-    return figure
+def safety_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:
+    """Draw γ/(r − r_w), below it γ/r, against time: median, quartiles and 95 % quantile (`tables.safety_table`).
 
-
-def control_error_figure(table: pd.DataFrame) -> Figure:
-    """Draw histograms of the control RMSE of each sequence, one row a split (`tables.control_error_table`).
-
-    Sequences beyond the 98 % quantile are counted in the last bar.
+    One column a split.
     """
     splits = distinct(table, "split")
-    panels = (("translation_rmse_mm_s", "Translation RMSE, mm/s"), ("rotation_rmse_deg_s", "Rotation RMSE, deg/s"))
+    plate = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0}
+    ratios = (("clearance", "γ / (r − r_w)", "the wire touches"), ("radius", "γ / r", "the wire's axis on the wall"))
     with matplotlib.rc_context(STYLE):
-        figure, axes = _grid(len(splits), 2, height=2.7)
-        for row, split in enumerate(splits):
-            part = rows(table, split=split)
-            for ax, (column, label) in zip(axes[row], panels, strict=True):
-                edges = np.linspace(0.0, 1.05 * float(np.nanquantile(values(part, column), 0.98)) + 1e-9, 25)
+        figure, axes = _grid(len(ratios), len(splits), height=3.2)
+        for row, (ratio, label, wall) in enumerate(ratios):
+            of_ratio = rows(table, ratio=ratio)
+            for ax, split in zip(axes[row], splits, strict=True):
+                part = rows(of_ratio, split=split)
                 for series in distinct(part, "series"):
-                    rmse = values(rows(part, series=series), column)
-                    rmse, style = np.clip(rmse[np.isfinite(rmse)], edges[0], edges[-1]), _style(series)
-                    if series == "P2":
-                        ax.hist(rmse, bins=edges, color=style["color"], alpha=0.35)
-                    ax.hist(rmse, bins=edges, histtype="step", lw=1.6, **style)
-                ax.set(xlabel=label, ylabel="Sequences")
-                ax.set_title(split_title(split))
+                    line, style = rows(part, series=series), _style(series)
+                    time, quartiles = values(line, "time_s"), (values(line, "q25"), values(line, "q75"))
+                    ax.fill_between(time, *quartiles, color=style["color"], alpha=0.16, lw=0)
+                    ax.plot(time, values(line, "median"), **style)
+                    ax.plot(time, values(line, "p95"), color=style["color"], lw=0.8, ls="-")
+                ax.axhline(1.0, color=BLACK, lw=1.0, ls=(0, (4, 3)))
+                ax.annotate(
+                    wall,
+                    (0.995, 1.0),
+                    xycoords=("axes fraction", "data"),
+                    ha="right",
+                    va="bottom",
+                    size=8.5,
+                    bbox=plate,
+                )
+                ax.set(xlabel="Time after the given states, s", ylabel=f"Safety ratio {label}", xlim=(0, None))
+                ax.set_ylim(0, float(np.clip(_upper(of_ratio, "p95"), 1.25, 1.5)))
+                ax.set_title(titles[split])
+        axes[0, 0].fill_between([], [], [], color=GREY, alpha=0.3, lw=0, label="Quartiles")
+        axes[0, 0].plot([], [], color=GREY, lw=0.8, label="95 % quantile")
         _legend_below(figure, axes)
     return figure
+
+
+def control_error_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:
+    """Draw histograms of the control RMSE of each sequence, one row a split (`tables.control_error_table`)."""
+    panels = (("translation_rmse_mm_s", "Translation RMSE, mm/s"), ("rotation_rmse_deg_s", "Rotation RMSE, deg/s"))
+    return _histograms(table, titles, panels)
+
+
+def drive_difference_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:
+    """Draw histograms of the RMSE of the drive's force and torque of each sequence where controls are simulated.
+
+    One row a split (`tables.drive_difference_table`).
+    """
+    panels = (("force_rmse_n", "Difference in proximal force (RMSE), N"),)
+    return _histograms(table, titles, (*panels, ("torque_rmse_nmm", "Difference in proximal torque (RMSE), N mm")))
+
+
+def _histograms(table: pd.DataFrame, titles: Mapping[str, str], panels: Sequence[tuple[str, str]]) -> Figure:
+    """Draw histograms of columns with one value a sequence, one row a split; the series stand above one another.
+
+    Sequences beyond the 98 % quantile of the second-widest series are counted in the last bar; the tick below a
+    histogram marks its median. The highest bar of each histogram says how many sequences it holds.
+
+    Args:
+        table: with columns `split` and `series`.
+        titles: what a reader calls each split.
+        panels: column and label of each histogram.
+    """
+    splits, series = distinct(table, "split"), distinct(table, "series")
+    with matplotlib.rc_context(STYLE):
+        figure, axes = _grid(len(splits), len(panels), height=0.9 + 0.55 * len(series))
+        for row, split in enumerate(splits):
+            part = rows(table, split=split)
+            most = max(len(rows(part, series=name)) for name in series)
+            bins = int(np.clip(3 * np.sqrt(most), 8, 25))
+            for ax, (column, label) in zip(axes[row], panels, strict=True):
+                of_series = [values(rows(part, series=name), column) for name in series]
+                upper = sorted(float(np.nanquantile(v, 0.98)) for v in of_series if np.isfinite(v).any()) or [1.0]
+                edges = np.linspace(0.0, 1.05 * upper[max(len(upper) - 2, 0)] + 1e-9, bins + 1)
+                for level, (name, each) in enumerate(zip(series, of_series, strict=True)):
+                    _histogram(ax, each[np.isfinite(each)], edges, -float(level), _style(name)["color"])
+                names = [fill(_style(name)["label"].removeprefix("Baseline: "), 27) for name in series]
+                ax.set_yticks([0.3 - level for level in range(len(series))], names if ax is axes[row, 0] else [])
+                ax.set(xlabel=label, xlim=(0, edges[-1]), ylim=(0.75 - len(series), 1.05))
+                ax.tick_params(axis="y", length=0)
+                ax.grid(False, axis="y")
+                ax.set_title(titles[split])
+    return figure
+
+
+def _histogram(ax: Axes, of: Float[np.ndarray, "n"], edges: Float[np.ndarray, "m"], bottom: float, color: str) -> None:
+    """Draw one histogram that stands on `bottom` and is 0.75 high, with its median and the size of its highest bar."""
+    if not len(of):
+        return
+    counts, _ = np.histogram(np.clip(of, 0.0, edges[-1]), edges)
+    top = int(counts.argmax())
+    ax.stairs(0.75 * counts / counts.max() + bottom, edges, baseline=bottom, fill=True, color=color)
+    left = top + 1 > len(counts) / 2  # of the bar, so that the words stay in the picture
+    place, side = (edges[top] if left else edges[top + 1], bottom + 0.73), "right" if left else "left"
+    ax.annotate(f" {counts.max()} of {len(of)} ", place, ha=side, va="top", fontsize=7.5)
+    ax.plot([min(float(np.median(of)), edges[-1])] * 2, [bottom, bottom - 0.12], color=BLACK)
 
 
 def loss_figure(table: pd.DataFrame) -> Figure:

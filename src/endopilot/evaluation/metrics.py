@@ -191,6 +191,14 @@ def mean_over_time(error: Float[np.ndarray, "episodes samples"]) -> Float[np.nda
     return np.divide(total, count, out=np.full(error.shape[1], np.nan), where=count > 0)
 
 
+def rmse_of_sequences(error: Float[np.ndarray, "episodes samples"]) -> Float[np.ndarray, "episodes"]:
+    """Return the RMSE of each sequence over its finite samples, in the unit of the error; NaN where it has none."""
+    finite = np.isfinite(error)
+    count = finite.sum(axis=1)
+    total = np.where(finite, error**2, 0.0).sum(axis=1)
+    return np.sqrt(np.divide(total, count, out=np.full(count.shape, np.nan), where=count > 0))
+
+
 def control_rmse(
     predicted: Float[np.ndarray, "episodes samples 2"], true: Float[np.ndarray, "episodes samples 2"]
 ) -> Float[np.ndarray, "episodes 2"]:
@@ -198,12 +206,8 @@ def control_rmse(
 
     NaN for a sequence without any sample in which both are finite.
     """
-    error = predicted - true
-    finite = np.isfinite(error)
-    count = finite.sum(axis=1)
-    total = np.where(finite, error**2, 0.0).sum(axis=1)
-    mean = np.divide(total, count, out=np.full(count.shape, np.nan), where=count > 0)
-    return np.sqrt(mean) * np.array([1.0, np.rad2deg(1.0)])
+    error = (predicted - true) * np.array([1.0, np.rad2deg(1.0)])
+    return np.stack([rmse_of_sequences(error[..., axis]) for axis in range(2)], axis=-1)
 
 
 def distribution(values: Float[np.ndarray, "n"]) -> dict[str, float | int | None]:

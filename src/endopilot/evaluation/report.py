@@ -17,7 +17,7 @@ from plotly.offline import get_plotlyjs
 
 from endopilot.anatomy.io import read_anatomy
 from endopilot.evaluation import figures, report_text
-from endopilot.evaluation.evaluate import FIGURES_FOLDER, METRICS_FILE
+from endopilot.evaluation.results import FIGURES_FOLDER, METRICS_FILE
 from endopilot.evaluation.scene import navigation_scene, visible_wire
 from endopilot.evaluation.still import render_still
 from endopilot.evaluation.tables import stage_table
@@ -187,6 +187,8 @@ def _training(run: Path | None) -> dict[str, Any] | None:
     if run is None:
         return None
     record = read_json(run / "training.json")
+    if not record:
+        return None  # the twin trains nothing
     curves = [
         {"network": report_text.NETWORK_TITLES[network], "epoch": point["epoch"], "curve": title, "loss": point[key]}
         for network, result in record.items()

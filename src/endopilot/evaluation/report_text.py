@@ -16,6 +16,7 @@ EVALUATION_FIGURES: Mapping[str, str] = {
     "tip_error": "Mean tip error against time, networks beside baselines",
     "safety_ratio": "Safety ratio against time: recorded, predicted and simulated",
     "control_error": "Histograms of the control error of each navigation",
+    "drive_difference": "Histograms of the difference in the drive's force and torque of each navigation",
 }
 """Figures of an evaluation that the report shows, and what each is to someone who cannot see it."""
 
@@ -52,7 +53,7 @@ def summary(metrics: Mapping[str, Any]) -> str:
     split = metrics["splits"][headline_split(metrics)]
     tip = split["tip"]
     patients = _count(len(split["anatomies"]), "patient")
-    whose = "that neither network has seen" if headline_split(metrics) == "test" else "that the networks know"
+    whose = "that the networks know" if split["known_patients"] else "that neither network has seen"
     parts = [
         f"On {_count(split['episodes'], 'new navigation')} in {patients} {whose}, after 15 s of given states:",
         f"knowing the drive's motion, the forward network foretells the tip's way along the vessel with a mean error "
@@ -124,6 +125,33 @@ def _tip_cells(tip: Mapping[str, Any], split: str, series: str) -> tuple[Cell, .
     return tuple(cells)
 
 
+def gap_rows(metrics: Mapping[str, Any]) -> list[Row]:
+    """Return the table of the generalisation gap, by protocol; empty where there is none."""
+    rows = []
+    for series, gap in metrics.get("generalisation_gap", {}).items():
+        cells = tuple(
+            Cell(_gap(gap[coordinate].get(span, {})), f"generalisation_gap/{series}/{coordinate}/{span}/difference")
+            for coordinate in COORDINATES
+            for span in (*SPANS, "all")
+        )
+        rows.append(Row(SERIES_TITLES[series], "network", cells))
+    return rows
+
+
+def mean_errors(metrics: Mapping[str, Any], split: str) -> list[dict[str, str]]:
+    """Return the mean absolute errors of one split, mm: a row a series, a column a coordinate and span."""
+    tip = metrics["splits"][split]["tip"]
+    return [
+        {"series": series}
+        | {
+            f"{symbol} {span}": _three_places(tip[series][coordinate].get(span, {}).get("mae"))
+            for coordinate, symbol in COORDINATES.items()
+            for span in (*SPANS, "all")
+        }
+        for series in tip
+    ]
+
+
 def replay_remark(metrics: Mapping[str, Any], split: str) -> str:
     """Return how far the recorded navigations repeat when they are simulated again: the floor of P4."""
     distance = metrics["splits"][split]["tip"].get("true_replay", {}).get("distance_3d", {})
@@ -170,6 +198,19 @@ def control_remark(metrics: Mapping[str, Any], split: str) -> str:
         if record["translation_mm_s"]["rmse_of_sequences"]["median"] is not None
     ]
     return f"{metrics['splits'][split]['title']}: median RMSE of a navigation: {'; '.join(parts)}."
+
+
+def drive_remark(metrics: Mapping[str, Any], split: str) -> str:
+    """Return the median difference of a navigation's drive force and torque, by simulated series, as a sentence."""
+    drive = metrics["splits"][split]["drive"]
+    names = {"P4": "P4", "P4_replanned": "P4 replanned", "follow_slack": "drive by the held slack"}
+    parts = [
+        f"{title} {drive[name]['force_n']['rmse_of_sequences']['median']:.3f} N and "
+        f"{drive[name]['torque_nmm']['rmse_of_sequences']['median']:.3f} N mm"
+        for name, title in names.items()
+        if name in drive and drive[name]["force_n"]["rmse_of_sequences"]["median"] is not None
+    ]
+    return f"{metrics['splits'][split]['title']}: median of a navigation: {'; '.join(parts)}."
 
 
 def anatomy_facts(anatomy: Anatomy) -> list[tuple[str, str]]:
@@ -228,6 +269,17 @@ def _mean_sd(statistics: Mapping[str, Any]) -> str:
     if statistics.get("mae") is None:
         return "–"
     return f"{statistics['mae']:.2f} ± {statistics['sd']:.2f}"
+
+
+def _three_places(value: float | None) -> str:
+    return "–" if value is None else f"{value:.3f}"
+
+
+def _gap(gap: Mapping[str, float | None]) -> str:
+    difference, ratio = gap.get("difference"), gap.get("ratio")
+    if difference is None:
+        return "–"
+    return _signed(round(difference, 2) + 0.0) + ("" if ratio is None else f" ×{ratio:.2f}")  # no −0.00
 
 
 def _signed(value: float | None) -> str:

@@ -12,8 +12,11 @@ from jaxtyping import Bool, Float, Int
 from endopilot.errors import InputError
 from endopilot.files import writing
 
-SPLIT_TITLES: Mapping[str, str] = {"seen_test": "New navigations, known patients", "test": "New patients"}
-"""Splits of the dataset that are evaluated, and what a reader calls them."""
+METRICS_FILE, RESULTS_FILE, FIGURES_FOLDER, REPORT_FILE = "metrics.json", "evaluation.npz", "figures", "report.html"
+"""What an evaluation writes into its folder."""
+
+SPLITS: tuple[str, ...] = ("seen_test", "test")
+"""Splits of a dataset that are evaluated."""
 
 SERIES_TITLES: Mapping[str, str] = {
     "P1": "Forward network, true controls (P1)",
@@ -111,6 +114,11 @@ class SplitResult:
     def error(self, series: str, coordinate: str) -> Float[np.ndarray, "episodes samples"]:
         """Return predicted − true "abscissa" or "offset" of a series, mm; NaN where the prediction failed."""
         return getattr(self.tips[series], coordinate) - getattr(self.true, coordinate)
+
+    def drive_difference(self, series: str, signal: str) -> Float[np.ndarray, "episodes samples"]:
+        """Return simulated − recorded "force" (N) or "torque" (N·mm) of the drive; NaN where the simulation failed."""
+        of = getattr(self, f"base_{signal}")
+        return of[series] - of["true"]
 
     def lost(self, series: str) -> Bool[np.ndarray, "episodes samples"]:
         """Return where a series has no finite tip."""

@@ -14,6 +14,7 @@ from endopilot.evaluation.metrics import (
     distribution,
     diverged_share,
     error_statistics,
+    rmse_of_sequences,
     safety_ratio,
     skill,
     span_slices,
@@ -116,10 +117,46 @@ def _safety(result: SplitResult, series: str) -> dict[str, Any]:
 
 
 def _drive(result: SplitResult, series: str) -> dict[str, Any]:
+    out = {}
+    for key, signal in (("force_n", "force"), ("torque_nmm", "torque")):
+        difference = result.drive_difference(series, signal)
+        of_sequences = distribution(rmse_of_sequences(difference))
+        out[key] = error_statistics(difference) | {"rmse_of_sequences": of_sequences}
+    return out
+
+
+def generalisation_gap(splits: Mapping[str, Any]) -> dict[str, Any]:
+    """Return how much larger the mean absolute errors are in new patients than in those that were trained on.
+
+    By series, coordinate and span: `difference` (mm) and `ratio`; None where an error is not known or is 0. Empty
+    unless there are both kinds of patients.
+
+    Args:
+        splits: of metrics.json.
+    """
+    if not {"seen_test", "test"} <= splits.keys():
+        return {}
+    seen, new = splits["seen_test"], splits["test"]
+    if seen["known_patients"] < len(seen["anatomies"]):
+        return {}
     return {
-        "force_n": error_statistics(result.base_force[series] - result.base_force["true"]),
-        "torque_nmm": error_statistics(result.base_torque[series] - result.base_torque["true"]),
+        series: {
+            coordinate: {
+                span: _gap(seen["tip"][series][coordinate][span]["mae"], new["tip"][series][coordinate][span]["mae"])
+                for span in new["tip"][series][coordinate]
+                if span != "by_depth"
+            }
+            for coordinate in ("abscissa", "offset")
+        }
+        for series in TIP_BASELINES
+        if series in seen["tip"] and series in new["tip"]
     }
+
+
+def _gap(seen: float | None, new: float | None) -> dict[str, float | None]:
+    if seen is None or new is None:
+        return {"difference": None, "ratio": None}
+    return {"difference": new - seen, "ratio": new / seen if seen else None}
 
 
 BASELINE_WORDS: Mapping[str, str] = {
@@ -144,6 +181,15 @@ def findings(metrics: Mapping[str, Any]) -> list[str]:
             told = "; ".join(part for part in parts if part)
             if told:
                 sentences.append(f"{split['title']}, {series.replace('_', ' ')}: {told}.")
+    for series, gap in metrics.get("generalisation_gap", {}).items():
+        told = " and ".join(
+            f"{gap[coordinate]['all']['difference']:+.2f} mm for {symbol} ({gap[coordinate]['all']['ratio']:.2f} times)"
+            for coordinate, symbol in (("abscissa", "Δtip"), ("offset", "γtip"))
+            if gap[coordinate]["all"]["ratio"] is not None
+        )
+        if told:
+            words = series.replace("_", " ")
+            sentences.append(f"Generalisation gap, {words}: mean error in new patients against known ones {told}.")
     return sentences
 
 

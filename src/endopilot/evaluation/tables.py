@@ -8,10 +8,18 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from endopilot.evaluation.metrics import control_rmse, mean_over_time, quantiles_over_time, safety_ratio
-from endopilot.evaluation.results import CONTROL_BASELINES, SPLIT_TITLES, TIP_BASELINES, SplitResult
+from endopilot.evaluation.metrics import (
+    control_rmse,
+    mean_over_time,
+    quantiles_over_time,
+    rmse_of_sequences,
+    safety_ratio,
+)
+from endopilot.evaluation.results import CONTROL_BASELINES, TIP_BASELINES, SplitResult
 
 SAFETY_SERIES = ("true", "P3", "P4")
+DRIVEN_SERIES = ("P4", "P4_replanned", "P2_replayed", "hold_control", "follow_slack")
+"""Series whose controls are simulated; the recorded controls, simulated again, differ from them by nothing."""
 
 
 def tip_error_table(results: Mapping[str, SplitResult]) -> pd.DataFrame:
@@ -46,16 +54,31 @@ def control_error_table(results: Mapping[str, SplitResult]) -> pd.DataFrame:
     for split, result in results.items():
         for series in _ordered(result.controls, ("P2", *CONTROL_BASELINES)):
             rmse = control_rmse(result.controls[series], result.true_control)
-            columns = {
-                "split": split,
-                "series": series,
-                "anatomy": [result.anatomies[index] for index in result.anatomy],
-                "sequence": result.sequence,
-                "translation_rmse_mm_s": rmse[:, 0],
-                "rotation_rmse_deg_s": rmse[:, 1],
-            }
-            pieces.append(pd.DataFrame(columns))
+            columns = {"translation_rmse_mm_s": rmse[:, 0], "rotation_rmse_deg_s": rmse[:, 1]}
+            pieces.append(pd.DataFrame(_of_sequences(split, series, result) | columns))
     return pd.concat(pieces, ignore_index=True)
+
+
+def drive_difference_table(results: Mapping[str, SplitResult]) -> pd.DataFrame:
+    """Return the RMSE of each sequence's drive force (N) and torque (N·mm) where controls were simulated.
+
+    It is the difference from the recorded ones, for each split and each series of `DRIVEN_SERIES`.
+    """
+    pieces = []
+    for split, result in results.items():
+        for series in _ordered(result.base_force, DRIVEN_SERIES):
+            columns = {
+                "force_rmse_n": rmse_of_sequences(result.drive_difference(series, "force")),
+                "torque_rmse_nmm": rmse_of_sequences(result.drive_difference(series, "torque")),
+            }
+            pieces.append(pd.DataFrame(_of_sequences(split, series, result) | columns))
+    return pd.concat(pieces, ignore_index=True)
+
+
+def _of_sequences(split: str, series: str, result: SplitResult) -> dict[str, Any]:
+    """Return the first columns of a table with one row a sequence."""
+    anatomy = [result.anatomies[index] for index in result.anatomy]
+    return {"split": split, "series": series, "anatomy": anatomy, "sequence": result.sequence}
 
 
 def stage_table(seconds: Mapping[str, float]) -> pd.DataFrame:
@@ -79,11 +102,6 @@ def values(table: pd.DataFrame, column: str) -> np.ndarray:
 def distinct(table: pd.DataFrame, column: str) -> list[str]:
     """Return the different values of a column in the order of their appearance."""
     return [str(value) for value in dict.fromkeys(table[column])]
-
-
-def split_title(split: str) -> str:
-    """Return what a reader calls a split."""
-    return SPLIT_TITLES.get(split, split)
 
 
 def _ordered(available: Mapping[str, Any], order: Sequence[str]) -> list[str]:

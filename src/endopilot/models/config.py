@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from endopilot.errors import InputError
+from endopilot.files import read_json
 
 WINDOW = 30
 """States that each prediction sees: the paper gives 30 states in and one out."""
@@ -30,6 +31,20 @@ def run_path(run: Path) -> Path:
     if not Path(run).is_dir():
         raise InputError(f"{run}: no such run; give a folder made by `endopilot train`, or '{PRETRAINED}'")
     return Path(run)
+
+
+def read_run(run: Path) -> dict[str, Any]:
+    """Return the manifest of a finished run, or of the packaged one, named "pretrained".
+
+    Raises:
+        InputError: there is no such folder, or it is no finished run.
+    """
+    path = run_path(run) / "manifest.json"
+    record = read_json(path) if path.exists() else None
+    if not isinstance(record, dict) or not {"config", "device", "networks"} <= record.keys():
+        what = "is missing" if record is None else "is not of a run"
+        raise InputError(f"{run}: no finished run here (manifest.json {what}); make one with `endopilot train`")
+    return record
 
 
 @dataclass(frozen=True, kw_only=True)

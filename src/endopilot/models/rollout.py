@@ -15,10 +15,9 @@ from jaxtyping import Float
 
 from endopilot.dataset.loader import Dataset
 from endopilot.errors import InputError
-from endopilot.files import read_json
 from endopilot.models.causal import CausalPredictor
 from endopilot.models.checkpoint import read_network
-from endopilot.models.config import WINDOW, TwinConfig, run_path
+from endopilot.models.config import WINDOW, TwinConfig, read_run, run_path
 from endopilot.models.open_loop import OpenLoop, Predictor, Seen, Steps2, begin_after
 from endopilot.models.transformer import Network
 from endopilot.models.twin import TwinPredictor
@@ -108,8 +107,7 @@ def load_run(run_folder: Path) -> Predictor:
     Raises:
         InputError: the run is unfinished, or a file of it is damaged or of another version.
     """
-    run_folder = run_path(run_folder)
-    record = read_json(run_folder / "manifest.json")
+    record, run_folder = read_run(run_folder), run_path(run_folder)
     device = Device.from_record(record["device"])
     if record["config"]["model"] == "twin":
         return TwinPredictor(

@@ -94,6 +94,7 @@ def _train(dataset_folder: Path, run_folder: Path, config: TrainConfig, team: Te
         seed=config.seed,
         inputs={"dataset": dataset.manifest["key"]},
         dataset=os.path.relpath(dataset_folder.resolve(), run_folder.resolve()),
+        patients=_patients(dataset, config),
         episodes={"train": len(training.tip), "seen_test": 0 if validation is None else len(validation.tip)},
         rejected={"invalid_episodes": int((~dataset.valid.all(axis=1)).sum())},
         device=dataset.manifest["device"],
@@ -105,6 +106,12 @@ def _train(dataset_folder: Path, run_folder: Path, config: TrainConfig, team: Te
         wall_seconds=time.perf_counter() - start,
     )
     write_json(run_folder / "manifest.json", record)
+
+
+def _patients(dataset: Dataset, config: TrainConfig) -> list[str]:
+    """Return the SHA-256 of each patient that was trained on, by which it is known in any dataset."""
+    trained = set(dataset.of_split("train").anatomy.tolist()) if config.networks else set()
+    return sorted(sha for name, sha in dataset.patients.items() if name in trained)
 
 
 def _begin(run_folder: Path, settings: dict[str, Any]) -> None:
