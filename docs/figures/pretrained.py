@@ -46,8 +46,8 @@ over 0–10, 10–30 and 30–45 s after the 30 given states:
 | holding slack and offset | {held_slack} |
 
 Skill over holding slack and offset: {skill_abscissa:.2f} (Δ), {skill_offset:.2f} (γ).
-P3 and P4 (its controls, simulated): Δ {p3:.3f} and {p4:.3f} mm over all 45 s; planned anew at an X-ray image every 10 s,
-{p4_replanned:.3f} mm.
+P3 and P4 (its controls, simulated): Δ {p3:.3f} and {p4:.3f} mm over all 45 s; planned anew at an X-ray image every
+10 s, {p4_replanned:.3f} mm.
 
 **Meant for** research with this device or one much like it, in right coronary arteries of the atlas's kind. It is told
 of each patient by simulations of the device (`models/patient.py`), and has seen one device and one friction

@@ -31,7 +31,7 @@ def tables(folder: Path) -> str:
         f"| the same in the worst decile of patients | {100 * cover['worst_decile_of_patients']:.0f} % | |",
         f"| samples in which they hold | {100 * cover['samplewise']:.1f} % | |",
         f"| events missed | {100 * at['missed_share']:.1f} % | ≤ 5 % |",
-        f"| samples at the wall with no exposure within 0.5 s | {100 * at['wall_samples_without_exposure_share']:.0f} % | |",
+        f"| samples at the wall, unexposed for 0.5 s | {100 * at['wall_samples_without_exposure_share']:.0f} % | |",
         f"| exposures a minute | {at['exposures_per_minute']:.1f} | |",
         f"| of what periodic imaging needs to miss as many ({equal:.1f} a minute) | {share:.2f} | ≤ 0.33 |",
         f"| fewer frames than fluoroscopy at 7.5 Hz | {100 * at['fewer_frames_than_fluoroscopy']:.1f} % | ≥ 95 % |",

@@ -84,9 +84,9 @@ class TwinPredictor:
             data = episodes.select(chosen)
             members, paths = self._narrowed_ensemble(anatomy, data, seen)
             weight = _weights(paths, _tips(data), seen, self.config)
-            tip[chosen], spread[chosen] = weigh(
-                paths, _tips(data), np.broadcast_to(seen, data.valid.shape), self.config
-            )
+            tip[chosen], own = _median_and_spread(paths, weight)
+            each = np.broadcast_to(seen, data.valid.shape)
+            spread[chosen] = np.hypot(own, _unexplained(tip[chosen], _tips(data), each, self.config))
             parameters[chosen] = members[weight.argmax(axis=0), np.arange(len(data))]
         return TwinForetold(tip, spread, parameters)
 
@@ -214,8 +214,7 @@ def weigh(
         seen: samples at which the tip was measured.
         config: scales of what a good member misses a seen tip by.
     """
-    middle, spread = _median_and_spread(paths, _weights(paths, tips, seen, config))
-    return middle, np.hypot(spread, _unexplained(middle, tips, seen, config))
+    return _median_and_spread(paths, _weights(paths, tips, seen, config))
 
 
 def _unexplained(
