@@ -187,6 +187,8 @@ def result_rows(folder: Path) -> Iterator[str]:
         model = path.parent.name.removeprefix("evaluation-").removeprefix("evaluation") or "causal"
         for split, result in read_json(path)["splits"].items():
             for series, figures in result["tip"].items():
+                if model != "causal" and not series.startswith("P"):
+                    continue  # the baselines are the same
                 spans = ("0-10", "10-30", "30-45")
                 cells = [
                     " ".join(
@@ -212,6 +214,8 @@ def depth_rows(folder: Path) -> Iterator[str]:
         model = path.parent.name.removeprefix("evaluation-").removeprefix("evaluation") or "causal"
         result = read_json(path)["splits"]["test"]["tip"]
         for series in ("P1", "hold_slack", "training_mean", "friction_90", "friction_110"):
+            if model != "causal" and series != "P1":
+                continue  # the baselines are the same
             figures = result[series]
             cells = [
                 " ".join(f"{part['mae']:.3f}" for part in figures[name]["by_depth"].values())
@@ -234,6 +238,8 @@ def control_rows(folder: Path) -> Iterator[str]:
         model = path.parent.name.removeprefix("evaluation-").removeprefix("evaluation") or "causal"
         result = read_json(path)["splits"]["test"]["control"]
         for series, figures in result.items():
+            if model != "causal" and series != "P2":
+                continue  # the baselines are the same
             cells = " | ".join(f"{figures[axis]['rmse']:.2f}" for axis in ("translation_mm_s", "rotation_deg_s"))
             yield f"| {model} | {series} | {cells} |"
 
