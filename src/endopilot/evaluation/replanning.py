@@ -10,7 +10,7 @@ from jaxtyping import Bool
 from endopilot.dataset.loader import Dataset
 from endopilot.evaluation.replay import Control, Recorded
 from endopilot.models.config import WINDOW
-from endopilot.models.open_loop import OpenLoop, Predictor, given_states
+from endopilot.models.open_loop import OpenLoop, Predictor, begin_after, given_states
 from endopilot.progress import Advance
 
 EXPOSURE_PERIOD_S = 10.0
@@ -41,7 +41,7 @@ def replanned(predictor: Predictor, recorded: Recorded, first: OpenLoop, advance
     for now in exposures(data):
         asked = recorded.drivable(control)[:, : now + 1 - WINDOW]
         failed = ~np.isfinite(asked).all(axis=(1, 2))
-        under_way, lost = _driven(recorded, under_way, asked, int(np.flatnonzero(seen)[-1]))
+        under_way, lost = _driven(recorded, under_way, asked, begin_after(seen) - 1)
         seen = seen.copy()
         seen[now] = True
         plan = predictor.rollout_dual(_desiring(under_way, data, now + 1), seen)
