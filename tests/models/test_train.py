@@ -124,7 +124,11 @@ def scalars(folder, name):
     return {event.step: event.value for event in events}
 
 
-def test_an_epoch_that_was_shown_but_not_kept_is_shown_as_it_was_trained_again(tmp_path):
+def test_an_epoch_that_was_shown_but_not_kept_is_shown_as_it_was_trained_again(tmp_path, monkeypatch):
+    from tensorboard.summary.writer import event_file_writer as files
+
+    monkeypatch.setattr(files, "_global_uid", files.AtomicCounter(9))  # in names, after the second: 10 sorts before 9
+
     def epoch(number, loss):
         return {"epoch": number, "loss": loss, "validation_loss": None, "learning_rate": 0.5, "samples_per_second": 9.0}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -31,6 +32,8 @@ def board(folder: Path | None) -> Iterator[Callable[[Mapping[str, Any]], None]]:
             if writer is None:
                 from torch.utils.tensorboard import SummaryWriter  # slow to import
 
+                if any(folder.glob("events.*")):
+                    time.sleep(1)  # TensorBoard reads files in order of their names, which hold whole seconds
                 writer = stack.enter_context(SummaryWriter(str(folder), purge_step=step))
             for name in SCALARS:
                 value = epoch[name]
