@@ -14,7 +14,6 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
-from endopilot.anatomy.projection import project_tip
 from endopilot.simulation.device import Device
 from endopilot.simulation.simulator import RECORDED, Actuation, SimulatorConfig, make_rollout
 from endopilot.simulation.state import Step
@@ -60,16 +59,16 @@ def navigate(
     """
     watch = _Watch(anatomy.tree, devices)
     simulator = Simulator(anatomy, list(devices), actuation=actuation, config=config)
-    started = _begin(simulator, watch, anatomy, initial, friction)
+    started = _begin(simulator, watch, initial, friction)
     applied, stopped = np.empty_like(control), np.zeros(len(control), dtype=bool)
     result: dict[str, np.ndarray] = {}
-    tip, inserted, last, slip = simulator.position[:, 0], started[:, 0], np.zeros(len(control)), np.zeros(len(control))
+    inserted, last, slip = started[:, 0], np.zeros(len(control)), np.zeros(len(control))
     for sample in range(control.shape[1]):
         drawn = control[:, sample]
         caught = (slip > 0) | (simulator.base_load[:, 0] > watch.caught_n)
         # How far a load moves the wire is not known: about as far as the last one did.
         needed = last if actuation == "force" else np.zeros(len(control))
-        room = watch.room(project_tip(anatomy.tree, anatomy.insertion, tip), inserted, needed, caught)
+        room = watch.room(simulator.project(), inserted, needed, caught)
         held = np.where(room > 0, drawn[:, 0], -np.abs(drawn[:, 0]))
         if actuation == "velocity":
             held = np.clip(held, -inserted / SAMPLE_PERIOD_S, room / SAMPLE_PERIOD_S)
@@ -77,7 +76,7 @@ def navigate(
         stopped |= (drawn[:, 0] > 0) & (held < drawn[:, 0])
         step = simulator.step(applied[:, sample], SAMPLE_PERIOD_S)
         _record(result, sample, control.shape[1], step, simulator)
-        tip, slip, last, inserted = step.tip_position, step.slip, step.inserted_length - inserted, step.inserted_length
+        slip, last, inserted = step.slip, step.inserted_length - inserted, step.inserted_length
         advance(len(control))
     result["reason"] = simulator.reason
     return make_rollout(anatomy, actuation, started, applied, result), applied, stopped
@@ -123,7 +122,6 @@ class _Watch:
 def _begin(
     simulator: Simulator,
     watch: _Watch,
-    anatomy: Anatomy,
     initial: Float[np.ndarray, "worlds 2"],
     friction: Float[np.ndarray, "worlds"],
 ) -> Float[np.ndarray, "worlds 2"]:
@@ -131,7 +129,7 @@ def _begin(
     start, again = np.minimum(initial[:, 0], watch.deepest_mm), np.arange(len(initial))
     while True:
         simulator.reset(inserted_length=start, rotation=initial[:, 1], friction=friction, worlds=again.tolist())
-        tip = project_tip(anatomy.tree, anatomy.insertion, simulator.position[:, 0])
+        tip = simulator.project()
         slipped = simulator.inserted_length < start
         far = np.where(slipped, STOP_SHORT_MM, -watch.ahead(tip))
         again = np.flatnonzero((slipped | (far > _ROUNDING_MM)) & (start > 0) & simulator.valid)
