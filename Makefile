@@ -47,6 +47,7 @@ recipe-laptop: $(INSTALLED)
 	$(BIN)/endopilot evaluate $(LEARNING)/seed-0 -o $(LEARNING)/evaluation --sequences 48 \
 	  --other-seeds $(LEARNING)/seed-1 $(LEARNING)/seed-2
 	$(BIN)/endopilot evaluate $(LEARNING)/paper -o $(LEARNING)/evaluation-paper --sequences 48
+	$(BIN)/endopilot advise $(LEARNING)/seed-0 $(LEARNING)/dataset -o $(LEARNING)/advice
 
 # The paper's full set and both models on one large GPU with some processor cores beside it; never run so far.
 FULL := runs/full

@@ -1,32 +1,27 @@
-"""Measure what was tried for the causal model, and write the tables of docs/learning.md.
+"""Write what the models reach into the tables of docs/learning.md.
 
-`python docs/figures/learning.py FOLDER`: FOLDER holds the dataset and the evaluations that the page's commands make;
-what is not there is left out. `--tried` trains the variants too, some minutes each on one core, on the split
-`calibrate`; without it their table stays as it is.
+`python docs/figures/learning.py FOLDER`: FOLDER holds the dataset, the runs and the evaluations that the page's
+commands make; what is not there is left out. The table of what was tried is that of `learning_tried.py`.
 """
 
 from __future__ import annotations
 
-import math
 import re
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from endopilot.dataset.loader import Dataset, load_dataset
+from endopilot.dataset.loader import load_dataset
 from endopilot.evaluation.baselines import hold_slack
 from endopilot.evaluation.metrics import OFF_WALL_MM
 from endopilot.files import read_json
-from endopilot.models import play
-from endopilot.models.causal import CausalNetwork
-from endopilot.models.config import WINDOW, CausalConfig
+from endopilot.models.config import WINDOW
 from endopilot.models.rollout import load_run
-from endopilot.models.sequences import N_INPUTS, Sequences, read_vessels, unfold
+from endopilot.models.sequences import read_vessels, unfold
 from endopilot.simulation.device import read_device
 
 PAGE = Path(__file__).parents[1] / "learning.md"
@@ -35,19 +30,6 @@ RUNS = {"`pretrained`, seed 0": "seed-0", "seed 1": "seed-1", "seed 2": "seed-2"
 OURS = next(iter(RUNS))
 RADIUS_MM = read_device("workhorse-014").tip_radius_mm
 SPANS = ((30, 50), (50, 90), (90, 120))
-PATIENTS, EPOCHS, BATCH, RATE = 60, 3, 32, 2e-3
-ENVELOPES = np.r_[2:8, 11:27]
-"""Columns that come from the envelopes or the play operator."""
-VESSEL = np.arange(play.N_FEATURES - 4 * len(play.WINDOW_MM) - 3, play.N_FEATURES)
-TURNS = np.array([6, 7]) + len(play.PARTIAL_PLAYS)
-SEEN = np.arange(play.N_FEATURES, N_INPUTS)
-VARIANTS: dict[str, np.ndarray] = {
-    "all": np.array([], dtype=int),
-    "without the vessel's geometry": VESSEL,
-    "without envelopes and play among the inputs": ENVELOPES,
-    "without what was seen a sample ago": SEEN,
-}
-"""What a network is not told, by the name of the row."""
 
 
 def row(name: str, off: np.ndarray) -> str:
@@ -56,80 +38,6 @@ def row(name: str, off: np.ndarray) -> str:
         " ".join(f"{off[:, a:b, i].mean():.3f} ({np.median(off[:, a:b, i]):.3f})" for a, b in SPANS) for i in (0, 1)
     ]
     return f"| {name} | {cells[0]} | {cells[1]} |"
-
-
-def play_rows(data: Dataset) -> Iterator[str]:
-    """Yield what the play operator does alone, as it is and with variations."""
-    vessels, patient = read_vessels(data), np.unique(data.anatomy, return_inverse=True)[1]
-    seen = np.broadcast_to(np.arange(data.valid.shape[1]) < WINDOW, data.valid.shape)
-    truth = np.stack([data.tip_abscissa, data.tip_offset], axis=-1).astype(float)
-    held = np.abs(hold_slack(data, WINDOW) - truth[:, WINDOW:])
-    yield row("hold slack and offset", np.pad(held, ((0, 0), (WINDOW, 0), (0, 0))))
-
-    def guessed(episodes: Dataset) -> np.ndarray:
-        return np.abs(unfold("forward", vessels, patient, episodes, seen).guess - truth)
-
-    yield row("play operator, nothing learned", guessed(data))
-    yield row(
-        "play operator, the tip's rotation lags by up to 0.003 rad a mm",
-        guessed(replace(data, rotation=_lagging(data))),
-    )
-    before = play._SHARPNESS
-    for sharpness in (4.0, 80.0):
-        play._SHARPNESS = sharpness
-        yield row(f"play operator, nominal wires mixed with a concentration of {sharpness:g}", guessed(data))
-    play._SHARPNESS = before
-
-
-def _lagging(data: Dataset) -> np.ndarray:
-    """Return the rotation of a tip that follows the drive's with a play that grows with the inserted length, rad."""
-    angle, out = data.initial_rotation.astype(float), np.empty(data.rotation.shape)
-    for t in range(out.shape[1]):
-        room = 0.003 * data.inserted_length[:, t]
-        angle = np.clip(angle, data.rotation[:, t] - room, data.rotation[:, t] + room)
-        out[:, t] = angle
-    return out
-
-
-def variant_rows(training: Dataset, held_out: Dataset) -> Iterator[str]:
-    """Yield what short trainings reach, each without some of the inputs, another size or other data."""
-    names = np.unique(training.anatomy)
-    few = training.select(np.isin(training.anatomy, names[:PATIENTS]))
-    fewer = training.select(np.isin(training.anatomy, names[: PATIENTS // 3]))
-    test = Sequences.of(held_out, read_vessels(held_out), ("ff",), 0)
-    made = Sequences.of(few, read_vessels(few), ("ff",), 0)
-    for name, hidden in VARIANTS.items():
-        yield row(f"network: {name}", _trained(made, test, CausalConfig(), hidden))
-    yield row("network: half as wide", _trained(made, test, CausalConfig(width=48), VARIANTS["all"]))
-    made = Sequences.of(fewer, read_vessels(fewer), ("ff",), 0)
-    yield row(
-        "network: a third of the patients, as many steps", _trained(made, test, CausalConfig(), VARIANTS["all"], 3)
-    )
-
-
-def _trained(made: Sequences, test: Sequences, size: CausalConfig, hidden: np.ndarray, longer: int = 1) -> np.ndarray:
-    """Return the errors on held-out patients after a short training."""
-    torch.manual_seed(0)
-    network = CausalNetwork(size)
-    keep = torch.ones(N_INPUTS)
-    keep[hidden] = 0.0
-    network.fit_scales(made.inputs["ff"][:, 0] * keep, made.change["ff"][:, 0])
-    optimizer, targets = torch.optim.Adam(network.parameters()), made.targets()
-    steps = longer * EPOCHS * (len(targets) // BATCH)
-    for step in range(steps):
-        if step % (len(targets) // BATCH) == 0:
-            order = torch.randperm(len(targets))
-        at = step % (len(targets) // BATCH)
-        inputs, change = made.window("ff", targets[order[at * BATCH : (at + 1) * BATCH]])
-        loss = network.loss(network(inputs * keep), change)
-        optimizer.param_groups[0]["lr"] = RATE * min(1, (step + 1) / 50) * 0.5 * (1 + math.cos(math.pi * step / steps))
-        optimizer.zero_grad()
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
-        optimizer.step()
-    with torch.inference_mode():
-        answer = network.eval()(test.inputs["ff"][:, 0] * keep)
-    return (answer[..., :2] - test.change["ff"][:, 0]).abs().numpy()
 
 
 def headline_rows(folder: Path) -> Iterator[str]:
@@ -142,6 +50,9 @@ def headline_rows(folder: Path) -> Iterator[str]:
     played = unfold("forward", vessels, patient, data, seen)
     there = {name: folder / run for name, run in RUNS.items() if (folder / run / "manifest.json").is_file()}
     tips = {name: load_run(run).rollout_forward(data).tip for name, run in there.items()}
+    seeds = [tips[name] for name in RUNS if name in tips and "seed" in name]
+    if len(seeds) == 3:
+        tips["mean of the three seeds"] = np.mean(seeds, axis=0)
     tips |= {"play operator alone": played.guess[:, WINDOW:], "hold slack and offset": hold_slack(data, WINDOW)}
     held = np.sqrt(((tips["hold slack and offset"] - truth) ** 2).mean(axis=(0, 1)))
     for name, tip in tips.items():
@@ -260,8 +171,4 @@ if __name__ == "__main__":
     page = written(page, "depth", list(depth_rows(folder)))
     page = written(page, "events", list(event_rows(folder)))
     page = written(page, "controls", list(control_rows(folder)))
-    if "--tried" in sys.argv:
-        data = load_dataset(folder / "dataset")
-        held_out = data.of_split("calibrate")
-        page = written(page, "tried", [*play_rows(held_out), *variant_rows(data.of_split("train"), held_out)])
     PAGE.write_text(page, encoding="utf-8")

@@ -1,7 +1,7 @@
 """Put a trained run into the package as `pretrained`, with the model card that its figures make.
 
-`python docs/figures/pretrained.py FOLDER`: FOLDER holds `dataset`, the run `seed-0` and its `evaluation`, as `make
-recipe-laptop` leaves them.
+`python docs/figures/pretrained.py FOLDER`: FOLDER holds `dataset`, the run `seed-0`, its `evaluation` and its `advice`,
+as `make recipe-laptop` leaves them.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 from endopilot.files import read_json
 
 PACKAGED = Path(__file__).parents[2] / "src" / "endopilot" / "models" / "pretrained"
-FILES = ("ff.safetensors", "if.safetensors", "config.json", "manifest.json", "training.json")
+FILES = ("ff.safetensors", "if.safetensors", "config.json", "manifest.json", "training.json", "xray.json")
 CARD = """# Model card: `pretrained`
 
 A forward and an inverse causal network (`endopilot.models.causal`) for the device {device} in right coronary arteries.
@@ -49,6 +49,10 @@ Skill over holding slack and offset: {skill_abscissa:.2f} (Δ), {skill_offset:.2
 P3 and P4 (its controls, simulated): Δ {p3:.3f} and {p4:.3f} mm over all 45 s; planned anew at an X-ray image every
 10 s, {p4_replanned:.3f} mm.
 
+X-ray advice by `xray.json`, calibrated on {calibrated} patients: on {advised} others the bands of level {level:g}
+hold throughout {coverage:.0f} % of the intervals of 45 s; {missed:.1f} % of the events are missed with {exposures:.1f}
+exposures a minute.
+
 **Meant for** research with this device or one much like it, in right coronary arteries of the atlas's kind. It is told
 of each patient by simulations of the device (`models/patient.py`), and has seen one device and one friction
 coefficient. Wires that snag or prolapse are rare and badly foretold: the mean errors are several times the medians.
@@ -60,6 +64,7 @@ def card(folder: Path) -> str:
     """Return the text of the model card."""
     run, data = read_json(folder / "seed-0" / "manifest.json"), read_json(folder / "dataset" / "meta/manifest.json")
     metrics = read_json(folder / "evaluation" / "metrics.json")["splits"]["test"]
+    advice = read_json(folder / "advice" / "advice.json")
     config, made = run["config"], data["config"]
     names = [record["name"] for record in data["anatomies"]]
     shares = made["anatomy_shares"]
@@ -98,6 +103,7 @@ def card(folder: Path) -> str:
                 "endopilot train runs/causal/dataset -o runs/causal/seed-0 --model causal "
                 f"--epochs {config['epochs']} --learning-rate {rate:g}",
                 "endopilot evaluate runs/causal/seed-0 -o runs/causal/evaluation --sequences 48",
+                "endopilot advise runs/causal/seed-0 runs/causal/dataset -o runs/causal/advice",
                 "python docs/figures/pretrained.py runs/causal",
             )
         ),
@@ -110,6 +116,12 @@ def card(folder: Path) -> str:
         p3=tip["P3"]["abscissa"]["all"]["mae"],
         p4=tip["P4"]["abscissa"]["all"]["mae"],
         p4_replanned=tip["P4_replanned"]["abscissa"]["all"]["mae"],
+        calibrated=advice["calibration"]["anatomies"],
+        advised=advice["coverage"]["patients"],
+        level=advice["calibration"]["level"],
+        coverage=100 * advice["coverage"]["simultaneous"],
+        missed=100 * advice["adviser"]["missed_share"],
+        exposures=advice["adviser"]["exposures_per_minute"],
     )
 
 

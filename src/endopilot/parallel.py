@@ -13,6 +13,8 @@ from pathlib import Path
 from endopilot.errors import InputError
 from endopilot.progress import progress, silence
 
+CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+"""Processor cores that this process may use: a batch system may leave it fewer than the machine has."""
 MOST_PROCESSES = 8
 """A volume under work takes some 1 GB of memory."""
 
@@ -36,7 +38,7 @@ def each(title: str, items: Sequence[Path], work: Callable[[Path], None]) -> dic
         except InputError as error:
             bad[item] = error
 
-    processes = min(len(items), os.cpu_count() or 1, MOST_PROCESSES)
+    processes = min(len(items), CORES, MOST_PROCESSES)
     with progress(title, len(items)) as advance:
         if processes <= 1:
             for item in items:

@@ -37,3 +37,21 @@ def wire():
     from endopilot.simulation.device import read_device
 
     return read_device("workhorse-014")
+
+
+@pytest.fixture(scope="session")
+def vessel(fork, tmp_path_factory):
+    """Return the folder of the vessel."""
+    from endopilot.anatomy.io import write_anatomy
+
+    folder = tmp_path_factory.mktemp("vessel") / "fork"
+    write_anatomy(fork, folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def found(vessel):
+    """Return a plan along the vessel, made by trial in the rod core."""
+    from endopilot.control.plan import PlanConfig, plan
+
+    return plan(vessel, "0,0,33", PlanConfig(seconds=30.0, start_rotation=0.1, seed=4))

@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from endopilot.anatomy.io import read_anatomy, write_anatomy
+from endopilot.anatomy.io import read_anatomy
 from endopilot.control import learned
 from endopilot.control import plan as plan_module
 from endopilot.control.cost import Cost, safety_ratio
 from endopilot.control.desired import read_tips
-from endopilot.control.plan import Plan, PlanConfig, plan, within_limits
+from endopilot.control.plan import PlanConfig, plan, within_limits
 from endopilot.control.plan_file import read_plan, write_plan
 from endopilot.control.robot import Limits
 from endopilot.dataset.loader import Dataset
@@ -27,18 +27,6 @@ from endopilot.simulation.controls import read_controls_csv
 from endopilot.simulation.simulator import SimulatorConfig, simulate
 
 SLACK = 0.9
-
-
-@pytest.fixture(scope="module")
-def vessel(fork, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("vessel") / "fork"
-    write_anatomy(fork, folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def found(vessel) -> Plan:
-    return plan(vessel, "0,0,33", PlanConfig(seconds=30.0, start_rotation=0.1, seed=4))
 
 
 def test_a_plan_reaches_its_target_and_counts_its_cost(found):
@@ -150,7 +138,8 @@ class Toy:
 def run(found, tmp_path, monkeypatch):
     from dataclasses import asdict
 
-    write_json(tmp_path / "run" / "manifest.json", {"device": asdict(found.navigation.device)})
+    record = {"config": {}, "networks": {}, "device": asdict(found.navigation.device)}
+    write_json(tmp_path / "run" / "manifest.json", record)
     monkeypatch.setattr(learned, "load_run", lambda _: Toy())
     return tmp_path / "run"
 

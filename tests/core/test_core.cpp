@@ -8,6 +8,7 @@
 #include <string>
 
 #include "core_adapter.hpp"
+#include "projection.hpp"
 
 using namespace adapter;
 
@@ -370,6 +371,63 @@ void test_friction() {
     }
 }
 
+// A quarter of a circle of 20 mm about the y axis, from the ostium along x, in a lumen that narrows from 2 to 1 mm; at its
+// middle a branch of 1.5 mm leaves straight along its tangent. In polar coordinates the projection is exact but for the chords.
+void test_projection() {
+    constexpr int n = 65, middle = 32, straight = 21;
+    constexpr double R = 20.0, quarter = 1.5707963267948966;
+    const auto arc = [&](double angle, double radius) {
+        return Vec3<double>{radius * std::sin(angle), 0.0, R - radius * std::cos(angle)};
+    };
+    const auto along = [&](double angle) { return Vec3<double>{std::cos(angle), 0.0, std::sin(angle)}; };
+    std::vector<Vertex> vertex;
+    for (int i = 0; i < n; ++i) {
+        const double share = double(i) / (n - 1), angle = quarter * share;
+        vertex.push_back({arc(angle, R), along(angle), R * angle, 2.0 - share, 0, n - 1, 0});
+    }
+    const Vec3<double> fork = vertex[middle].point, onwards = vertex[middle].tangent;
+    for (int i = 0; i < straight; ++i)
+        vertex.push_back({fork + (0.5 * i) * onwards, onwards, vertex[middle].abscissa + 0.5 * i, 1.5, n, n + straight - 1, 1});
+    constexpr double never = std::numeric_limits<double>::infinity();
+    std::vector<Rival> rival(2 * vertex.size(), {never, 0});
+    for (int i = 0; i < n; ++i) rival[2 * i + 1] = {0.0, n + std::clamp(2 * (i - middle), 0, straight - 1)};
+    for (int i = 0; i < straight; ++i) rival[2 * (n + i)] = {0.0, std::min(middle + i, n - 1)};
+    const Projector project(vertex, rival, {{0, 0, 0}, {1, 0, 0}, 2.0});
+    const auto nearest = [&](const Vec3<double>& point) {
+        std::pair<double, std::int64_t> best{never, 0};
+        for (std::size_t v = 0; v < vertex.size(); ++v) {
+            const Vec3<double> off = point - vertex[v].point;
+            best = std::min(best, {std::sqrt(dot(off, off)), std::int64_t(v)});
+        }
+        return best;
+    };
+    for (int trial = 0; trial < 200; ++trial) {
+        const double angle = uniform(0.05, 0.45) * quarter, inwards = uniform(-1, 1), aside = uniform(-1, 1);
+        Vec3<double> point = arc(angle, R + inwards);
+        point.y = aside;
+        const auto [distance, start] = nearest(point);
+        const Projected found = project(point, start, distance);
+        expect(found.branch == 0, "before the fork a point lies in the parent");
+        expect_near(found.abscissa, R * angle, 2e-3, "abscissa along a circle");
+        expect_near(found.offset, std::hypot(inwards, aside), 4e-3, "offset from a circle");
+        expect_near(found.radius, 2.0 - angle / quarter, 1e-3, "radius of a lumen that narrows");
+    }
+    for (double ahead : {4.0, 7.3, 9.9, 12.0}) {  // the last beyond the branch's end: its last plane
+        const Vec3<double> point = fork + ahead * onwards;
+        const auto [distance, start] = nearest(point);
+        const Projected found = project(point, start, distance);
+        expect(found.branch == 1, "a point in the branch lies there");
+        expect_near(found.abscissa, vertex[middle].abscissa + std::min(ahead, 10.0), 1e-9, "abscissa along a branch");
+        expect_near(found.offset, std::max(ahead - 10.0, 0.0), 1e-9, "offset from a branch");
+    }
+    const Vec3<double> behind{-3.0, 0.5, 0.0};
+    const auto [distance, start] = nearest(behind);
+    const Projected found = project(behind, start, distance);
+    expect_near(found.abscissa, -3.0, 1e-12, "abscissa behind the ostium");
+    expect_near(found.offset, 0.5, 1e-12, "offset from the catheter's axis");
+    expect_near(found.radius, 2.0, 1e-12, "radius behind the ostium");
+}
+
 }  // namespace
 
 int main() {
@@ -391,6 +449,7 @@ int main() {
     test_map_borders();
     test_wall();
     test_friction();
+    test_projection();
     std::printf(failures == 0 ? "all core tests passed\n" : "%d core checks failed\n", failures);
     return failures == 0 ? EXIT_SUCCESS : EXIT_FAILURE;
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from command import refused, run
 
 from endopilot.anatomy.analytic import forked_tree, tree_distance
 from endopilot.anatomy.io import write_anatomy
+from endopilot.models.config import run_path
 from endopilot.types import Anatomy, Branch, DistanceMap, Insertion, VesselTree
 
 
@@ -51,6 +53,25 @@ def test_a_plan_is_driven_where_it_was_made_and_nowhere_else(fork, patient, tmp_
     assert "another anatomy" in refused(capsys, "simulate", tmp_path / "other", *drive)
     assert "another device" in refused(capsys, "simulate", patient, *drive, "--device", "wire-018")
     assert not (tmp_path / "again.csv").exists()
+
+
+def test_xray_is_foreseen_along_a_plan(patient, tmp_path, capsys):
+    plan = ("plan", patient, "--target", "0,0,33", "--xray", "-o", tmp_path / "plan")
+    table = tmp_path / "plan" / "plan.csv"
+    by_wires = run(capsys, *plan)
+    assert len(by_wires["xray_due_s"]) <= 1  # straight on, near the middle
+    assert "band_tip_abscissa_mm" in table.read_text(encoding="utf-8").splitlines()[0]
+    by_network = run(capsys, *plan, "--method", "mppi", "--model", "pretrained", "--seconds", "10")
+    assert by_network["method"] == "mppi" and by_network["xray_due_s"][:2] == [1.5, 3.0]  # it is seldom sure enough
+
+
+def test_a_model_without_calibration_foresees_no_xray(patient, tmp_path, capsys):
+    shutil.copytree(run_path(Path("pretrained")), tmp_path / "run")
+    (tmp_path / "run" / "xray.json").unlink()
+    plan = ("plan", patient, "--target", "0,0,33", "--model", tmp_path / "run", "--method", "mppi", "--xray")
+    line = refused(capsys, *plan, "-o", tmp_path / "plan")
+    assert f"{tmp_path / 'run'}: the model has no calibration" in line and "endopilot advise" in line
+    assert not (tmp_path / "plan").exists()
 
 
 def test_desired_tips_that_no_drive_can_keep_up_with(patient, tmp_path, capsys):

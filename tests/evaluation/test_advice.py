@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from endopilot.cli import main
-from endopilot.control.foretell import NetworkForeteller, TwinForeteller
+from endopilot.control.foretell import NetworkForeteller, TwinForeteller, foreteller
 from endopilot.control.xray import AdvisorConfig, Calibration
 from endopilot.dataset.loader import load_dataset
 from endopilot.errors import InputError
@@ -20,7 +20,7 @@ from endopilot.evaluation.advice import AdviseConfig
 from endopilot.evaluation.advise import advise
 from endopilot.files import write_json
 from endopilot.models.config import WINDOW, TwinConfig, run_path
-from endopilot.models.open_loop import OpenLoop
+from endopilot.models.open_loop import Foretold, OpenLoop
 from endopilot.models.twin import TwinPredictor
 from endopilot.simulation.device import read_device
 from endopilot.simulation.simulator import SimulatorConfig
@@ -102,6 +102,36 @@ def test_what_is_shown_changes_what_is_foretold_later_and_nothing_before(watched
     np.testing.assert_array_equal(model.tip, before)
 
 
+class Doubtful(HoldSlack):
+    """Holds the slack of the last tip that was seen, and doubts it by 0.1 mm for each sample since."""
+
+    def foretell(self, episodes, seen) -> Foretold:
+        each = np.broadcast_to(seen, episodes.valid.shape)
+        here = np.arange(each.shape[1])
+        last = np.maximum.accumulate(np.where(each, here, 0), axis=1)
+        row = np.arange(len(episodes))[:, None]
+        abscissa = episodes.inserted_length - (episodes.inserted_length - episodes.tip_abscissa)[row, last]
+        tip = np.stack([abscissa, episodes.tip_offset[row, last]], axis=-1).astype(float)
+        return Foretold(tip, np.repeat(0.1 * (here - last)[..., None], 2, axis=-1))
+
+
+def test_a_model_that_says_how_sure_it_is_is_asked_so(watched) -> None:
+    model = foreteller(Doubtful(), watched.told)
+    before = model.tip.copy(), model.spread.copy()
+    np.testing.assert_allclose(model.spread[:, WINDOW:, 0], np.tile(0.1 * np.arange(1, 21), (len(before[0]), 1)))
+    model.show(np.array([1]), 34, np.array([[20.0, 0.4]]))
+    np.testing.assert_array_equal(model.tip[:, :35], before[0][:, :35])
+    np.testing.assert_array_equal(model.tip[[0, 2]], before[0][[0, 2]])
+    length = watched.told.inserted_length[1]
+    np.testing.assert_allclose(model.tip[1, 35:, 0], length[35:] - (length[34] - 20.0), rtol=1e-5)
+    np.testing.assert_allclose(model.spread[1, 35:, 1], 0.1 * np.arange(1, 16))
+    model.show(np.array([0, 1]), 45, np.array([[30.0, 0.4], [31.0, 0.5]]))
+    assert (model.spread[:2, 46] == 0.1).all() and model.spread[2, 46, 0] > 1.5
+    model.restart()
+    np.testing.assert_array_equal(model.tip, before[0])
+    np.testing.assert_array_equal(model.spread, before[1])
+
+
 def test_a_twin_weighs_its_wires_by_what_is_shown(watched, monkeypatch) -> None:
     samples, count = watched.truth.shape[1], len(watched.truth)
     slack = np.array([0.0, 1.0, 2.0])[:, None, None] * (np.arange(samples) >= WINDOW)
@@ -145,9 +175,11 @@ def test_the_calibration_of_the_model_of_the_package_goes_to_the_output(
     monkeypatch.setattr(advise_module, "PERIODS", (1, 90))
     monkeypatch.setattr(advise_module, "WIDTHS", (1.0,))
     monkeypatch.setattr(advise_module, "THRESHOLDS", ())
+    packaged = Calibration.read(run_path(Path("pretrained")))
     found = advise(Path("pretrained"), folder / "dataset", tmp_path / "out", AdviseConfig())
     assert Calibration.read(tmp_path / "out") == found["calibration"]
-    assert not (run_path(Path("pretrained")) / "xray.json").exists() and not Path("pretrained").exists()
+    assert Calibration.read(run_path(Path("pretrained"))) == packaged != found["calibration"]
+    assert not Path("pretrained").exists()
     with pytest.raises(InputError, match="no-run: no such run; give a folder made by"):
         advise(tmp_path / "no-run", folder / "dataset", tmp_path / "out", AdviseConfig())
 

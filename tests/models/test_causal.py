@@ -141,6 +141,24 @@ def test_a_tip_that_is_not_seen_is_not_looked_at_and_one_that_is_counts(brief):
     assert np.abs(more.tip[:, 37:] - told.tip[:, 37:]).max() > 0.01
 
 
+def test_what_is_seen_of_one_navigation_changes_no_other_one(brief):
+    predictor, seen = untrained(), np.tile(given(brief), (len(brief), 1))
+    told = predictor.foretell(brief, seen)
+    seen[1, 36] = True
+    more = predictor.foretell(brief, seen)
+    np.testing.assert_array_equal(more.tip[2:], told.tip[2:])
+    assert np.abs(more.tip[1, 37:] - told.tip[1, 37:]).max() > 0.01
+
+
+def test_some_navigations_are_foretold_as_they_are_among_all(brief):
+    predictor = untrained()
+    told, last = predictor.foretell(brief, given(brief)), np.array([len(brief) - 1])  # of the second patient
+    alone = predictor.foretell(brief.select(last), given(brief))
+    np.testing.assert_allclose(alone.tip, told.tip[last], atol=1e-5)
+    np.testing.assert_allclose(alone.spread, told.spread[last], atol=1e-5)
+    assert len(predictor.known) == 1  # nobody was read again
+
+
 def test_a_later_x_ray_helps(packaged, everyone):
     seen = given(everyone)
     later = seen.copy()

@@ -9,6 +9,7 @@ from tyro.conf import Positional
 from endopilot.cli.arguments import OutputFolder, existing, show
 from endopilot.control.plan import PlanConfig, plan
 from endopilot.control.plan_file import write_plan
+from endopilot.control.plan_xray import plan_xray, read_calibration
 
 
 def command(
@@ -19,6 +20,7 @@ def command(
     output: OutputFolder,
     model: Path | None = None,
     device: str | None = None,
+    xray: bool = False,
     json: bool = False,
     config: PlanConfig = PlanConfig(),
 ) -> None:
@@ -32,8 +34,12 @@ def command(
         model: folder made by `endopilot train`, or `pretrained`, the causal model that comes with endopilot; needed for
             the methods inverse and mppi.
         device: name of a shipped device or a YAML file; the model's by default, workhorse-014 without one.
+        xray: also foresee when X-ray will be due, by the calibration that `endopilot advise` gave the run (inverse,
+            mppi), or by that of the agent's simulated wires (other methods).
         json: print the figures as JSON.
         config: method, limits and cost.
     """
+    calibration = read_calibration(config, model) if xray else None
     found = plan(existing(anatomy), target, config, model=model, device=device)
-    show(write_plan(found, output), as_json=json)
+    needed = None if calibration is None else plan_xray(found, anatomy, calibration)
+    show(write_plan(found, output, needed), as_json=json)

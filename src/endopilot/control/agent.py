@@ -24,8 +24,11 @@ from endopilot.env.task import Navigation
 from endopilot.progress import Advance
 from endopilot.types import TipProjection
 
-_PACKAGE = Path(__file__).parent
-"""Where the agent's own calibration lies."""
+CALIBRATED = Path(__file__).parent
+"""Where the calibration of the agent's ensemble lies."""
+Foretold = tuple[Float[np.ndarray, "1 2"], Float[np.ndarray, "1 2"], Float[np.ndarray, "1 2"], Float[np.ndarray, "1"]]
+"""What an adviser is told of a navigation: (Δ, φ), mm and rad; (Δtip, γtip), mm; the spread (standard deviation) of
+these by the model's own account, mm; and the lumen's radius at the tip, mm."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -214,7 +217,7 @@ class AgentPolicy(_PlanningPolicy):
             advice: what the adviser must not miss.
         """
         super().__init__(config)
-        self._calibration, self._advice = calibration or Calibration.read(_PACKAGE), advice or AdvisorConfig()
+        self._calibration, self._advice = calibration or Calibration.read(CALIBRATED), advice or AdvisorConfig()
 
     def start(self, navigation: Navigation, seed: int) -> None:
         """Lay the simulated wires out, and begin to watch the bands."""
@@ -226,14 +229,8 @@ class AgentPolicy(_PlanningPolicy):
     def _parameters(self) -> Float[np.ndarray, "members 3"]:
         return Belief.around(np.array([1.0, 1.0, 0.0]), self.config.belief)
 
-    def foretold(
-        self,
-    ) -> tuple[Float[np.ndarray, "1 2"], Float[np.ndarray, "1 2"], Float[np.ndarray, "1 2"], Float[np.ndarray, "1"]]:
-        """Return what the adviser is told, of the likeliest wire.
-
-        That is (Δ, φ), mm and rad; (Δtip, γtip), mm; the wires' standard deviations of these, mm; and the lumen's
-        radius at the tip, mm.
-        """
+    def foretold(self) -> Foretold:
+        """Return what the adviser is told, of the likeliest wire; the spread is that of all wires."""
         best, tip = int(np.argmax(self.belief.weight)), self.belief.likeliest_tip()
         wires = self.belief.simulator
         proximal = np.array([[wires.inserted_length[best], wires.rotation[best]]])

@@ -1,4 +1,4 @@
-"""What a model foretells while X-ray is off, and again after each exposure: the same for a twin and for networks."""
+"""What a model foretells while X-ray is off, and again after each exposure: a twin, our networks, the paper's."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from endopilot.dataset.loader import Dataset
+from endopilot.models import open_loop
 from endopilot.models.config import WINDOW
 from endopilot.models.open_loop import Predictor
 from endopilot.models.twin import TwinPredictor, weigh
@@ -66,8 +67,44 @@ class TwinForeteller:
         self.tip[episodes, later], self.spread[episodes, later] = (part[:, later] for part in found)
 
 
+class CausalForeteller:
+    """Our networks, which take tips that are seen at any time, and say how far they may be off."""
+
+    def __init__(self, predictor: open_loop.Foreteller, episodes: Dataset) -> None:
+        """Foretell from the first `WINDOW` samples.
+
+        Args:
+            predictor: the model.
+            episodes: their controls, and their tips as they are measured.
+        """
+        self._predictor, self._episodes = predictor, episodes
+        samples = episodes.valid.shape[1]
+        self._seen = np.tile(np.arange(samples) < WINDOW, (len(episodes), 1))
+        self._shown = np.stack([episodes.tip_abscissa, episodes.tip_offset], axis=-1).astype(float)
+        found = predictor.foretell(episodes, self._seen[0])
+        self._first = found.tip, found.spread
+        self.tip, self.spread = found.tip.copy(), found.spread.copy()
+
+    def restart(self) -> None:
+        """Forget what was shown after the first `WINDOW` samples."""
+        self._seen[:, WINDOW:] = False
+        self.tip, self.spread = (part.copy() for part in self._first)
+
+    def show(self, episodes: Int[np.ndarray, "shown"], sample: int, tip: Float[np.ndarray, "shown 2"]) -> None:
+        """Take what X-ray shows of some navigations at a sample, mm, and foretell the later ones anew."""
+        self._seen[episodes, sample], self._shown[episodes, sample] = True, tip
+        shown = replace(
+            self._episodes.select(episodes),
+            tip_abscissa=self._shown[episodes, :, 0],
+            tip_offset=self._shown[episodes, :, 1],
+        )
+        found = self._predictor.foretell(shown, self._seen[episodes])
+        later = slice(sample + 1, None)
+        self.tip[episodes, later], self.spread[episodes, later] = found.tip[:, later], found.spread[:, later]
+
+
 class NetworkForeteller:
-    """Any other model: it goes on from its last `WINDOW` states, in which what was not seen is as it foretold it."""
+    """The paper's networks: they go on from the last `WINDOW` states, those not seen as they foretold them."""
 
     def __init__(self, predictor: Predictor, episodes: Dataset) -> None:
         """Foretell from the first `WINDOW` samples.
@@ -109,6 +146,8 @@ def foreteller(predictor: Predictor, episodes: Dataset) -> Foreteller:
     """
     if isinstance(predictor, TwinPredictor):
         return TwinForeteller(predictor, episodes)
+    if isinstance(predictor, open_loop.Foreteller):
+        return CausalForeteller(predictor, episodes)
     return NetworkForeteller(predictor, episodes)
 
 

@@ -55,13 +55,13 @@ def with_networks(
     Raises:
         InputError: the run is unfinished or damaged, or has not the network that the method needs.
     """
-    predictor, rest = load_run(model), _Rest(navigation, folder, run_path(model))
+    predictor, rest = load_run(model), Rest(navigation, folder, run_path(model))
     predictor.rollout_forward(rest.episodes(desired[None, :1], np.zeros((1, 1, 2))))  # a causal model learns the vessel
     ask = _ask if config.method == "inverse" else _sample
     return lambda: ask(predictor, rest, desired, route, config)
 
 
-def _ask(predictor: Predictor, rest: _Rest, desired: Steps, route: Route, config: PlanConfig) -> tuple[Steps, Steps]:
+def _ask(predictor: Predictor, rest: Rest, desired: Steps, route: Route, config: PlanConfig) -> tuple[Steps, Steps]:
     """Ask the inverse network for the controls of the desired tips; the forward one foretells what they make."""
     with progress("plan: asking the inverse network", total=1) as advance:
         found = predictor.rollout_dual(rest.episodes(desired[None], np.zeros((1, len(desired), 2))))
@@ -69,7 +69,7 @@ def _ask(predictor: Predictor, rest: _Rest, desired: Steps, route: Route, config
     return found.control[0], found.tip[0]
 
 
-def _sample(predictor: Predictor, rest: _Rest, desired: Steps, route: Route, config: PlanConfig) -> tuple[Steps, Steps]:
+def _sample(predictor: Predictor, rest: Rest, desired: Steps, route: Route, config: PlanConfig) -> tuple[Steps, Steps]:
     """Sample control sequences around the one that would lead a tip without slack, through the forward network."""
     navigation, sampling = rest.navigation, config.sample
     limits = Limits.of(navigation.device, navigation.anatomy)
@@ -115,7 +115,7 @@ def _cost(
     return np.where(np.isfinite(cost), cost, 1e9)
 
 
-class _Rest:
+class Rest:
     """A wire at rest at the start, as the beginning of episodes.
 
     Attributes:

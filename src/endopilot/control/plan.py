@@ -22,14 +22,15 @@ from endopilot.control.route import Route, check_passable, find_target
 from endopilot.control.search import Course, SearchConfig
 from endopilot.env.task import Navigation
 from endopilot.errors import InputError
-from endopilot.files import read_json
-from endopilot.models.config import run_path
+from endopilot.models.config import read_run
 from endopilot.progress import progress
 from endopilot.simulation.device import Device, read_device
 from endopilot.simulation.simulator import SimulatorConfig, simulate
 from endopilot.types import TipProjection
 
 Method = Literal["twin", "inverse", "mppi", "forward", "spin", "retract-rotate"]
+NETWORK_METHODS = ("inverse", "mppi")
+"""Methods that ask a trained network."""
 Steps = Float[np.ndarray, "samples 2"]
 _IDEAL = RobotConfig(
     latency_s=0.0, max_acceleration_mm_s2=1e6, max_acceleration_rad_s2=1e6, backlash_mm=0.0, backlash_rad=0.0,
@@ -236,7 +237,7 @@ def _method(
     follow: bool,
 ) -> Callable[[], tuple[Steps, Steps]]:  # fmt: skip
     """Return what finds controls and foretells tips; what it takes to load a model is over then."""
-    if config.method in ("inverse", "mppi"):
+    if config.method in NETWORK_METHODS:
         from endopilot.control.learned import with_networks  # torch is slow to import
 
         assert model is not None
@@ -249,15 +250,12 @@ def _method(
 def _wire(model: Path | None, device: str | None, method: str) -> Device:
     """Return the wire: the one that is asked for, else the model's; both must be the same."""
     if model is None:
-        if method in ("inverse", "mppi"):
+        if method in NETWORK_METHODS:
             raise InputError(
                 f"--model: none given, and method {method} needs one; give a run of `endopilot train`, or pretrained"
             )
         return read_device(device or "workhorse-014")
-    record = read_json(run_path(model) / "manifest.json")
-    if not isinstance(record, dict) or "device" not in record:
-        raise InputError(f"{model}: is not a run of this version's `endopilot train`; train anew")
-    trained = Device.from_record(record["device"])
+    trained = Device.from_record(read_run(model)["device"])
     if device is not None and replace(read_device(device), sources={}) != replace(trained, sources={}):
         raise InputError(
             f"--device {device}: {model} was trained with {trained.name}; leave --device out or train anew"

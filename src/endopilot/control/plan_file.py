@@ -14,7 +14,11 @@ predicted_tip_abscissa_mm, …_offset_mm            those that the model of the 
 tip_abscissa_mm, tip_offset_mm, branch            where the rod core has the tip under these controls
 tip_x_mm, tip_y_mm, tip_z_mm                      likewise, LPS
 lumen_radius_mm, safety_ratio, contact_force_n    lumen radius r there, γ/(r − r_w), largest wall force on one node
+xray                                              1 where an exposure will be due at the end of the period, else 0
+band_tip_abscissa_mm, band_tip_offset_mm          half-widths of the adviser's bands around what is foretold
 ================================================  ====================================================================
+
+The last three are there if X-ray was foreseen.
 """
 
 from __future__ import annotations
@@ -30,6 +34,7 @@ import pandas as pd
 
 from endopilot.control.cost import Cost
 from endopilot.control.plan import Plan, PlanConfig, SampleConfig
+from endopilot.control.plan_xray import PlannedXray
 from endopilot.control.policy import DECISION_PERIOD_S
 from endopilot.env.task import Navigation, Target
 from endopilot.errors import InputError
@@ -58,8 +63,13 @@ def fingerprint(anatomy: Anatomy) -> str:
     return digest.hexdigest()
 
 
-def write_plan(plan: Plan, folder: Path) -> dict[str, Any]:
+def write_plan(plan: Plan, folder: Path, xray: PlannedXray | None = None) -> dict[str, Any]:
     """Write a plan as a folder, whole or not at all; a plan that stands there already is replaced. Return its figures.
+
+    Args:
+        plan: the plan.
+        folder: where to.
+        xray: the X-ray that it will need, if that is known.
 
     Raises:
         InputError: the folder cannot be written, or holds something that is not a plan.
@@ -90,12 +100,17 @@ def write_plan(plan: Plan, folder: Path) -> dict[str, Any]:
         "seconds_to_plan": round(plan.seconds_to_plan, 2),
         "processor_seconds": round(plan.processor_seconds, 2),
     }
+    if xray is not None:
+        figures["xray_due_s"] = (DECISION_PERIOD_S * (1 + np.flatnonzero(xray.exposure))).tolist()
     with writing(folder) as partial:
         partial.mkdir()
         table = pd.DataFrame(values, columns=list(_COLUMNS))
         table["branch"] = table["branch"].astype(int)
+        if xray is not None:
+            table["xray"] = xray.exposure.astype(int)
+            table["band_tip_abscissa_mm"], table["band_tip_offset_mm"] = xray.half_width.T
         table.to_csv(partial / _TABLE, index=False)
-        draw_plan(plan, partial / PICTURE)
+        draw_plan(plan, partial / PICTURE, xray)
         record = manifest(
             config=plan.config,
             seed=plan.config.seed,

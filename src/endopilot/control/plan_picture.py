@@ -12,13 +12,14 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from endopilot.control.plan import Plan
+from endopilot.control.plan_xray import PlannedXray
 from endopilot.control.policy import DECISION_PERIOD_S
 from endopilot.control.route import Route
 from endopilot.files import writing
 
 
-def draw_plan(plan: Plan, path: Path) -> None:
-    """Write a PNG of a plan."""
+def draw_plan(plan: Plan, path: Path, xray: PlannedXray | None = None) -> None:
+    """Write a PNG of a plan, with the X-ray that it will need if that is known."""
     figure = plt.figure(figsize=(13, 8), facecolor="white", layout="constrained")
     grid = figure.add_gridspec(4, 2, width_ratios=(1.0, 1.25))
     _draw_route(plan, figure.add_subplot(grid[:, 0]))
@@ -35,6 +36,8 @@ def draw_plan(plan: Plan, path: Path) -> None:
     _legend_above(panels[3])
     panels[3].set_ylabel("control")
     panels[3].set_xlabel("time, s")
+    if xray is not None:
+        _draw_xray(plan, xray, time_s, panels)
     for panel in panels[:3]:
         panel.tick_params(labelbottom=False)
     with writing(Path(path)) as partial:
@@ -79,9 +82,20 @@ def _draw_tip(plan: Plan, time_s: np.ndarray, axes: Axes) -> None:
     _legend_above(axes)
 
 
+def _draw_xray(plan: Plan, xray: PlannedXray, time_s: np.ndarray, panels: list[Axes]) -> None:
+    """Draw the adviser's bands around what is foretold, and a line where an exposure will be due."""
+    middle, half = plan.predicted[:, 0], xray.half_width[:, 0]
+    panels[0].fill_between(time_s, middle - half, middle + half, color="tab:orange", alpha=0.25, linewidth=0)
+    for panel in panels:
+        for moment in time_s[xray.exposure]:
+            panel.axvline(moment, color="black", linestyle=":", linewidth=1)
+    panels[0].plot([], [], color="black", linestyle=":", linewidth=1, label="X-ray")
+    _legend_above(panels[0])
+
+
 def _legend_above(axes: Axes) -> None:
     """Put the legend in a row above a panel, where it covers no curve."""
-    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, fontsize=8, frameon=False, borderaxespad=0.1)
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=5, fontsize=8, frameon=False, borderaxespad=0.1)
 
 
 def _draw_safety(plan: Plan, time_s: np.ndarray, axes: Axes) -> None:

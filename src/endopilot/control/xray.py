@@ -220,6 +220,9 @@ class XrayAdvisor:
     known to be at the wall; across, either may be. An exposure is due where the band reaches τ, where the foretold tip
     crosses it, and where the band has left it below. It shows what is within 0.5 s of it, so none follows another
     sooner than after 1.5 s.
+
+    Attributes:
+        half_width: of the bands of Δtip and γtip at the last call of `advise`, mm, a row for each navigation.
     """
 
     def __init__(self, calibration: Calibration, config: AdvisorConfig, wire_radius_mm: float) -> None:
@@ -231,6 +234,7 @@ class XrayAdvisor:
             wire_radius_mm: radius of the wire at its tip, mm.
         """
         self._calibration, self._config, self._wire_radius_mm = calibration, config, wire_radius_mm
+        self.half_width: Tips = np.zeros((0, 2))
 
     def start(self, proximal: Float[np.ndarray, "n 2"], tip: Tips, radius_mm: Float[np.ndarray, "n"]) -> None:
         """Begin at an exposure.
@@ -257,7 +261,7 @@ class XrayAdvisor:
         """
         self._since, self._travel = self._since + 1, self._travel + np.abs(proximal[:, 0] - self._proximal[:, 0])
         self._proximal = proximal
-        half = self._calibration.half_width(self._since * DECISION_PERIOD_S, self._travel, spread)
+        self.half_width = half = self._calibration.half_width(self._since * DECISION_PERIOD_S, self._travel, spread)
         edges = [tip[:, 1] + side * half[:, 1] for side in (1.0, 0.0, -1.0)]
         beyond = [self._ratio(edge, radius_mm) >= self._config.wall_ratio for edge in edges]
         crossed = np.any([now & ~before for now, before in zip(beyond, self._beyond, strict=True)], axis=0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -12,6 +11,7 @@ from functools import partial
 from endopilot.dataset.block import write_block
 from endopilot.dataset.plan import Block, Plan, version
 from endopilot.errors import InputError
+from endopilot.parallel import CORES
 
 Done = Callable[[Block, float], None]
 """Called with each block that has been written and the processor time that it took, s."""
@@ -35,7 +35,7 @@ def work_here(plan: Plan, blocks: Sequence[Block], done: Done, advance: Callable
         done: called after each block.
         advance: called with the number of samples simulated since the last call.
     """
-    cores = plan.config.simulator.threads or os.cpu_count() or 1
+    cores = plan.config.simulator.threads or CORES
     workers = max(1, min(cores, len(blocks)))
     threads = 1 if plan.config.control == "force" else cores // workers
     stop = threading.Event()

@@ -28,7 +28,7 @@ from endopilot.models.config import WINDOW
 from endopilot.models.open_loop import Predictor
 from endopilot.progress import progress
 from endopilot.simulation.device import Device
-from endopilot.types import SAMPLE_PERIOD_S, Anatomy
+from endopilot.types import SAMPLE_PERIOD_S, VesselTree
 
 FLUOROSCOPY_HZ = 7.5
 """Frame rate of the fluoroscopy that advice is compared with."""
@@ -98,17 +98,17 @@ class Watched:
 class Lumen:
     """The lumen's radius where a tip is foretold: on the way through the branch that it was last seen in."""
 
-    def __init__(self, anatomies: Sequence[Anatomy], owner: Int[np.ndarray, "episodes"]) -> None:
+    def __init__(self, trees: Sequence[VesselTree], owner: Int[np.ndarray, "episodes"]) -> None:
         """Tabulate the radii.
 
         Args:
-            anatomies: the patients.
+            trees: of the patients.
             owner: of each episode, the index of its patient.
         """
-        lines = [[_onwards(anatomy, branch) for branch in range(len(anatomy.tree.branches))] for anatomy in anatomies]
+        lines = [[_onwards(tree, branch) for branch in range(len(tree.branches))] for tree in trees]
         longest = max(line[0][-1] for branches in lines for line in branches)
         grid = np.arange(0.0, longest + _GRID_MM, _GRID_MM)
-        self._table = np.zeros((len(anatomies), max(len(branches) for branches in lines), len(grid)))
+        self._table = np.zeros((len(trees), max(len(branches) for branches in lines), len(grid)))
         for index, branches in enumerate(lines):
             for branch, (abscissa, radius) in enumerate(branches):
                 self._table[index, branch] = np.interp(grid, abscissa, radius)
@@ -122,9 +122,8 @@ class Lumen:
         return self._table[self._owner, branch, place]
 
 
-def _onwards(anatomy: Anatomy, branch: int) -> tuple[np.ndarray, np.ndarray]:
+def _onwards(tree: VesselTree, branch: int) -> tuple[np.ndarray, np.ndarray]:
     """Return abscissa and radius of the path through a branch that follows the widest child to an end."""
-    tree = anatomy.tree
     while children := tree.children(branch):
         branch = max(children, key=lambda child: float(np.median(tree.branches[child].centerline.radius)))
     line = tree.path(branch)
@@ -141,7 +140,7 @@ def watch(predictor: Predictor, episodes: Dataset, config: AdviseConfig) -> Watc
     """
     names, owner = np.unique(episodes.anatomy, return_inverse=True)
     wire_radius = Device.from_record(episodes.manifest["device"]).tip_radius_mm
-    anatomies = [read_anatomy(episodes.anatomy_folder(str(name))) for name in names]
+    trees = []
     deeper = np.array(
         [np.random.default_rng([config.seed, 4, *str(name).encode()]).uniform(-1.0, 1.0) for name in names]
     )
@@ -155,7 +154,9 @@ def watch(predictor: Predictor, episodes: Dataset, config: AdviseConfig) -> Watc
         branch=episodes.branch.copy(),
     )
     with progress("Exposing", len(names)) as advance:
-        for index, anatomy in enumerate(anatomies):
+        for index, name in enumerate(names):
+            anatomy = read_anatomy(episodes.anatomy_folder(str(name)))  # one at a time: a distance map takes memory
+            trees.append(anatomy.tree)
             mine = np.flatnonzero(owner == index)
             arm = Fluoroscope(anatomy, wire_radius, config.fluoroscope)
             tip = arm.expose_episodes(told.select(mine), config.seed)
@@ -166,7 +167,7 @@ def watch(predictor: Predictor, episodes: Dataset, config: AdviseConfig) -> Watc
         ratio=(episodes.tip_offset / np.maximum(episodes.lumen_radius - wire_radius, 1e-3)).astype(float),
         told=told,
         model=foreteller(predictor, told),
-        lumen=Lumen(anatomies, owner),
+        lumen=Lumen(trees, owner),
         wire_radius_mm=wire_radius,
     )
 

@@ -20,13 +20,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from endopilot.dataset.loader import Dataset
 from endopilot.errors import InputError
 from endopilot.models.config import WINDOW, CausalConfig
-from endopilot.models.open_loop import Foretold, OpenLoop, Seen, Steps2, begin_after, given_states
+from endopilot.models.open_loop import EachSeen, Foretold, OpenLoop, Seen, Steps2, begin_after, given_states
 from endopilot.models.play import Direction, Vessels
 from endopilot.models.sequences import N_INPUTS, read_vessels, unfold
 from endopilot.types import SAMPLE_PERIOD_S
@@ -113,12 +113,12 @@ class CausalPredictor:
     control_limits: Float[np.ndarray, "2"]
     known: dict[tuple[str, ...], Vessels] = field(default_factory=dict, repr=False)
 
-    def foretell(self, episodes: Dataset, seen: Seen) -> Foretold:
+    def foretell(self, episodes: Dataset, seen: Seen | EachSeen) -> Foretold:
         """Predict the tips of episodes under their controls, from those that were seen.
 
         Args:
             episodes: their controls, and the tips where `seen`; no other tip is looked at.
-            seen: samples at which the tip was measured, for example by X-ray.
+            seen: samples at which the tip was measured, for example by X-ray, of all episodes alike or of each.
         """
         network = _needed(self.forward, "forward")
         given = np.broadcast_to(seen, episodes.valid.shape)
@@ -176,12 +176,18 @@ class CausalPredictor:
         seen: Bool[np.ndarray, "episodes samples"],
     ) -> tuple[Float[np.ndarray, "episodes samples 2"], Float[np.ndarray, "episodes samples 4"]]:
         """Return the play operator's guess and the network's answer for episodes."""
-        names, patient = np.unique(episodes.anatomy, return_inverse=True)
-        key = (episodes.manifest["key"], *names.tolist())
-        if key not in self.known:
-            self.known[key] = read_vessels(episodes)
-        unfolded = unfold(direction, self.known[key], patient, episodes, seen)
+        vessels, patient = self._vessels(episodes)
+        unfolded = unfold(direction, vessels, patient, episodes, seen)
         return unfolded.guess, network(torch.as_tensor(unfolded.inputs)).double().numpy()
+
+    def _vessels(self, episodes: Dataset) -> tuple[Vessels, Int[np.ndarray, "episodes"]]:
+        """Return the tables of the episodes' patients, perhaps of others too, and which row each episode has."""
+        dataset, wanted = episodes.manifest["key"], set(episodes.anatomy.tolist())
+        key = next((key for key in self.known if key[0] == dataset and wanted <= set(key[1:])), None)
+        if key is None:
+            key = (dataset, *sorted(wanted))
+            self.known[key] = read_vessels(episodes)
+        return self.known[key], np.searchsorted(key[1:], episodes.anatomy)
 
 
 def _needed(network: CausalNetwork | None, role: str) -> CausalNetwork:

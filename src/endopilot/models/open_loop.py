@@ -18,6 +18,8 @@ from endopilot.models.config import WINDOW
 
 Seen = Bool[np.ndarray, "samples"]
 """Samples at which the tip was measured, for example by X-ray."""
+EachSeen = Bool[np.ndarray, "episodes samples"]
+"""The same for each episode."""
 Steps2 = Float[np.ndarray, "episodes steps 2"]
 
 
@@ -53,12 +55,12 @@ class Foretold:
 class Foreteller(Protocol):
     """A predictor that takes tips seen at any time, and says how sure it is: the causal networks and the twin."""
 
-    def foretell(self, episodes: Dataset, seen: Seen) -> Foretold:
+    def foretell(self, episodes: Dataset, seen: Seen | EachSeen) -> Foretold:
         """Predict the tips of episodes under their controls, from those that were seen.
 
         Args:
             episodes: their controls, and the tips where `seen`; no other tip is looked at.
-            seen: samples at which the tip was measured, for example by X-ray.
+            seen: samples at which the tip was measured, for example by X-ray, of all episodes alike or of each.
         """
         ...
 

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float
 from endopilot import _core
 from endopilot.anatomy.projection import project_tip
 from endopilot.errors import InputError
+from endopilot.parallel import CORES
 from endopilot.progress import progress
 from endopilot.simulation.device import Device, check_fits
 from endopilot.simulation.rod import RodLayout, lay_out
@@ -34,7 +35,6 @@ _DENT_MM = 0.015
 """Depth to which a node that bears the whole push limit dents the wall, mm, where the stiffness is not given."""
 SPARE_MM = 20.0
 """Length that a wire can be driven beyond the end of the vessel's longest path, mm, where it is not known how far."""
-_CORES = os.cpu_count() or 1
 Actuation = Literal["velocity", "force"]
 """What a control is: translation (mm/s) and rotation (rad/s), or the drive's axial force (N) and torque (N·mm)."""
 _REASONS = {1: "left the finite numbers", 2: "did not converge"}
@@ -103,7 +103,7 @@ class SimulatorConfig:
 
     def threads_for(self, worlds: int, lanes: int) -> int:
         """Return how many threads step some worlds, `lanes` of them side by side: no more than have one to step."""
-        return min(self.threads or _CORES, -(-worlds // lanes))
+        return min(self.threads or CORES, -(-worlds // lanes))
 
 
 def simulate(

@@ -1,0 +1,157 @@
+"""X-ray that a plan will need: as the agent's simulated wires foretell it, and as a run does."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from endopilot.control.agent import AgentPolicy
+from endopilot.control.belief import Belief
+from endopilot.control.plan import PlanConfig
+from endopilot.control.plan_file import read_plan, write_plan
+from endopilot.control.plan_xray import PlannedXray, plan_xray, read_calibration
+from endopilot.control.xray import Calibration
+from endopilot.dataset.loader import Dataset
+from endopilot.errors import InputError
+from endopilot.files import write_json
+from endopilot.models.config import WINDOW
+from endopilot.models.open_loop import Foretold, OpenLoop
+
+STILL = (0.0, 0.0, 0.0, 0.0)
+
+
+def calibration(abscissa=STILL, offset=STILL) -> Calibration:
+    return Calibration(
+        level=0.9, scale=1.0, abscissa_terms=abscissa, offset_terms=offset, anatomies=9, intervals=36, dataset="key"
+    )
+
+
+class Lagging:
+    """A network whose tip is at 0.8 Δ, in the middle of the lumen."""
+
+    def rollout_forward(self, episodes: Dataset) -> OpenLoop:
+        proximal = np.stack([episodes.inserted_length, episodes.rotation], axis=-1)[:, WINDOW:].astype(float)
+        tip = np.stack([0.8 * proximal[..., 0], np.full(proximal.shape[:2], 0.1)], axis=-1)
+        return OpenLoop(tip=tip, proximal=proximal, control=episodes.control[:, WINDOW:].astype(float))
+
+    rollout_inverse = rollout_dual = rollout_forward
+
+
+class Doubting(Lagging):
+    """The same, whose spread grows by 0.3 mm a period since it last saw the tip."""
+
+    def foretell(self, episodes: Dataset, seen: np.ndarray) -> Foretold:
+        each = np.broadcast_to(seen, episodes.valid.shape)
+        last = np.maximum.accumulate(np.where(each, np.arange(each.shape[1]), 0), axis=1)
+        spread = 0.3 * (np.arange(each.shape[1]) - last)
+        tip = np.stack([0.8 * episodes.inserted_length, np.full(each.shape, 0.1)], axis=-1).astype(float)
+        return Foretold(tip=tip, spread=np.stack([spread, 0.0 * spread], axis=-1))
+
+
+@pytest.fixture
+def by_network(found, tmp_path, monkeypatch):
+    """Return what makes a plan of 20 periods at 4 mm/s by a run that answers as it is told."""
+
+    def made(predictor):
+        monkeypatch.setattr("endopilot.models.rollout.load_run", lambda _: predictor)
+        write_json(tmp_path / "run" / "manifest.json", {})
+        tip, proximal = found.simulated, np.column_stack([2.0 + 2.0 * np.arange(1, 21), np.zeros(20)])
+        return replace(
+            found,
+            config=PlanConfig(method="mppi"),
+            model=str(tmp_path / "run"),
+            control=np.tile([4.0, 0.0], (20, 1)),
+            proximal=proximal,
+            desired=np.resize(found.desired, (20, 2)),
+            predicted=np.column_stack([0.8 * proximal[:, 0], np.full(20, 0.1)]),
+            simulated=replace(tip, **{name: np.resize(getattr(tip, name), 20) for name in tip.__dataclass_fields__}),
+            position=np.resize(found.position, (20, 3)),
+            force=np.resize(found.force, 20),
+        )
+
+    return made
+
+
+def due(xray: PlannedXray) -> list[int]:
+    return (1 + np.flatnonzero(xray.exposure)).tolist()
+
+
+def test_a_networks_band_grows_from_exposure_to_exposure(by_network, vessel):
+    # half-width 0.15 mm a mm of travel: 2 mm are reached after 14 mm, which are 7 periods of 2 mm
+    xray = plan_xray(by_network(Lagging()), vessel, calibration(abscissa=(0.0, 0.0, 0.15, 0.0)))
+    assert due(xray) == [7, 14]
+    travel = 2.0 * np.array([*range(1, 8), *range(1, 8), *range(1, 7)])
+    np.testing.assert_allclose(xray.half_width[:, 0], 0.15 * travel, atol=1e-5)
+
+
+def test_a_networks_own_doubt_widens_its_band_until_it_sees_the_tip(by_network, vessel):
+    # 0.3 mm a period: 2 mm are reached after 7 of them
+    xray = plan_xray(by_network(Doubting()), vessel, calibration(abscissa=(0.0, 0.0, 0.0, 1.0)))
+    assert due(xray) == [7, 14]
+    np.testing.assert_allclose(xray.half_width[:, 0], 0.3 * np.array([*range(1, 8), *range(1, 8), *range(1, 7)]))
+
+
+def test_a_networks_band_of_the_offset_reaches_the_wall(by_network, vessel):
+    plan = by_network(Lagging())
+    # clearance 1 − r_w mm: γ + 0.05 mm a period reaches 0.7 of it
+    first = int(np.ceil((0.7 * (1.0 - plan.navigation.device.tip_radius_mm) - 0.1) / 0.05))
+    assert due(plan_xray(plan, vessel, calibration(offset=(0.0, 0.1, 0.0, 0.0))))[0] == first
+
+
+def test_the_agents_wires_follow_the_plan_and_see_its_tip(found, vessel, monkeypatch):
+    seen, followed = [], []
+    weigh, follow = Belief.weigh, Belief.follow
+
+    def watched_weigh(self, measured):
+        seen.append(measured.position)
+        weigh(self, measured)
+
+    def watched_follow(self, inserted, rotation):
+        followed.append((inserted, rotation))
+        follow(self, inserted, rotation)
+
+    monkeypatch.setattr(Belief, "weigh", watched_weigh)
+    monkeypatch.setattr(Belief, "follow", watched_follow)
+    xray = plan_xray(found, vessel, calibration(abscissa=(5.0, 0.0, 0.0, 0.0)))  # wider than 2 mm from the start
+    assert due(xray) == list(range(3, 1 + len(found.control), 3))  # not sooner than 1.5 s after the last
+    np.testing.assert_array_equal(seen, found.position[xray.exposure])
+    np.testing.assert_allclose(followed, found.proximal)
+
+
+def test_the_agents_own_calibration_asks_seldom_along_a_straight_vessel(found, vessel):
+    own = read_calibration(found.config, None)
+    assert own == AgentPolicy()._calibration
+    xray = plan_xray(found, vessel, own)
+    assert (xray.half_width > 0).all()
+    assert xray.exposure.sum() < len(found.control) / 3
+
+
+def test_it_is_written_beside_the_plan(found, vessel, tmp_path):
+    import pandas as pd
+
+    from endopilot.anatomy.io import read_anatomy
+
+    xray = plan_xray(found, vessel, calibration(abscissa=(5.0, 0.0, 0.0, 0.0)))
+    figures = write_plan(found, tmp_path / "plan", xray)
+    table = pd.read_csv(tmp_path / "plan" / "plan.csv")
+    assert (
+        figures["xray_due_s"]
+        == table.time_s[table.xray == 1].tolist()
+        == [1.5 * (k + 1) for k in range(len(figures["xray_due_s"]))]
+    )
+    assert figures["xray_due_s"]
+    np.testing.assert_allclose(table[["band_tip_abscissa_mm", "band_tip_offset_mm"]], xray.half_width)
+    read_plan(tmp_path / "plan", read_anatomy(vessel), found.navigation.device)
+    assert "xray_due_s" not in write_plan(found, tmp_path / "plan")
+
+
+def test_a_model_without_calibration_is_refused(tmp_path):
+    (tmp_path / "run").mkdir()
+    with pytest.raises(InputError, match=r"run: the model has no calibration.*endopilot advise"):
+        read_calibration(PlanConfig(method="inverse"), tmp_path / "run")
+    assert read_calibration(PlanConfig(method="twin"), tmp_path / "run") == read_calibration(PlanConfig(), None)
+    with pytest.raises(InputError, match="no such run"):
+        read_calibration(PlanConfig(method="mppi"), Path("nowhere"))
