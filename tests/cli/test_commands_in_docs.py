@@ -1,14 +1,18 @@
-"""Commands that README, docs and Makefile show: each option of theirs is one that the command knows."""
+"""Commands that README, docs and Makefile show: they are understood, and each option is one that the command knows."""
 
 from __future__ import annotations
 
 import re
-from functools import cache
+import shlex
+from collections.abc import Callable, Iterator
+from functools import cache, wraps
+from importlib import import_module
 from pathlib import Path
 
 import pytest
+import tyro
 
-from endopilot.cli import main
+from endopilot.cli import main, module_of
 
 ROOT = Path(__file__).parents[2]
 PAGES = ["README.md", "Makefile", "src/endopilot/models/pretrained/MODEL_CARD.md"]
@@ -40,6 +44,48 @@ def test_options_exist(page: str) -> None:
     assert not wrong
 
 
+def whole_commands(page: str) -> Iterator[list[str]]:
+    """Yield the arguments of the commands that stand in blocks of code, line by line, whole."""
+    text = re.sub(r"\\\n\s*", " ", (ROOT / page).read_text(encoding="utf-8"))
+    fenced = re.findall(r"^```(?:bash|console)\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    indented = re.findall(r"^    endopilot .*$", text, re.MULTILINE) if page == "README.md" else []
+    for line in "\n".join([*fenced, *indented]).splitlines():
+        for command in re.split(r"&&|;|\|| & ", line.removeprefix("$ ")):
+            words = shlex.split(command, comments=True)
+            if words[:1] == ["endopilot"]:
+                yield [word.rstrip("&") for word in words[1:]]
+
+
+def understood(arguments: list[str]) -> None:
+    """Have a command's arguments parsed, and do nothing with them."""
+
+    def idle(command: Callable[..., object]) -> Callable[..., object]:
+        return wraps(command)(lambda *_, **__: None)
+
+    name, *rest = arguments
+    module = import_module(f"endopilot.cli.{module_of(name)}")
+    config = (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes)
+    if (subjects := getattr(module, "SUBJECTS", None)) is None:
+        tyro.cli(idle(module.command), prog=name, args=rest, config=config)
+    else:
+        idle_subjects = {subject: idle(command) for subject, command in subjects.items()}
+        tyro.extras.subcommand_cli_from_dict(idle_subjects, prog=name, args=rest, config=config)
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if page.endswith(".md")])
+def test_whole_commands_are_understood(page: str, capsys) -> None:
+    wrong = []
+    for arguments in whole_commands(page):
+        try:
+            understood(arguments)
+        except SystemExit as leave:
+            said = capsys.readouterr()
+            if leave.code != 0:  # --help and --version leave too
+                wrong.append(f"endopilot {shlex.join(arguments)}: {said.err or said.out}")
+    assert not wrong
+
+
 def test_some_are_found() -> None:
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     assert sum(bool(OPTION.findall(rest)) for _, rest in COMMAND.findall(text)) > 3
+    assert len(list(whole_commands("README.md"))) > 10

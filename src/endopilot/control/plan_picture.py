@@ -31,13 +31,16 @@ def draw_plan(plan: Plan, path: Path, xray: PlannedXray | None = None) -> None:
     panels[2].axhline(plan.navigation.force_limit_n, color="0.4", linestyle="--", linewidth=1)
     panels[2].set_ylabel("wall force, N")
     panels[2].set_ylim(0, 1.1 * max(plan.navigation.force_limit_n, float(plan.force.max())))
-    panels[3].step(time_s, plan.control[:, 0], where="pre", color="tab:blue", label="translation, mm/s")
-    panels[3].step(time_s, plan.control[:, 1], where="pre", color="tab:orange", label="rotation, rad/s")
+    edges = np.append(0.0, time_s)
+    for axis, color, label in ((0, "tab:blue", "translation, mm/s"), (1, "tab:orange", "rotation, rad/s")):
+        panels[3].stairs(plan.control[:, axis], edges, baseline=None, color=color, linewidth=1.5, label=label)
     _legend_above(panels[3])
     panels[3].set_ylabel("control")
     panels[3].set_xlabel("time, s")
     if xray is not None:
         _draw_xray(plan, xray, time_s, panels)
+    for panel in panels:
+        panel.set_xlim(0.0, time_s[-1])
     for panel in panels[:3]:
         panel.tick_params(labelbottom=False)
     with writing(Path(path)) as partial:
