@@ -234,7 +234,7 @@ class XrayAdvisor:
             wire_radius_mm: radius of the wire at its tip, mm.
         """
         self._calibration, self._config, self._wire_radius_mm = calibration, config, wire_radius_mm
-        self.half_width: Tips = np.zeros((0, 2))
+        self.half_width = np.zeros((0, 2))
 
     def start(self, proximal: Float[np.ndarray, "n 2"], tip: Tips, radius_mm: Float[np.ndarray, "n"]) -> None:
         """Begin at an exposure.
