@@ -62,18 +62,31 @@ def test_skill_against_a_perfect_baseline_is_undefined():
 def test_bootstrap_draws_patients_not_samples():
     # Two patients with errors 1 and 3: each draw's mean is 1, 2 or 3, so the interval is the whole range.
     error = np.repeat([[1.0], [3.0]], 100, axis=0) * np.ones((1, 50))
-    low, high = metrics.bootstrap_mae(error, np.repeat([0, 1], 100), seed=0)
-    assert (low, high) == (1.0, 3.0)
+    found = metrics.bootstrap_intervals(error, np.repeat([0, 1], 100), seed=0)
+    assert found["mae"] == found["rmse"] == found["p95"] == (1.0, 3.0)
+    assert found["sd"] == (0.0, 1.0)  # of ones and threes alike
+
+
+def test_bootstrap_intervals_are_those_of_patients_put_together_again():
+    random = np.random.Generator(np.random.Philox(3))
+    error, anatomy = random.normal(size=(40, 9)) ** 3, np.arange(40) % 7
+    error[5, 3] = error[6] = NAN
+    found = metrics.bootstrap_intervals(error, anatomy, seed=8, draws=60)
+    chosen = np.random.Generator(np.random.Philox(8)).integers(7, size=(60, 7))
+    drawn = [metrics.error_statistics(np.concatenate([error[anatomy == name] for name in row])) for row in chosen]
+    for name in ("mae", "sd", "rmse", "p95"):
+        expected = np.quantile([one[name] for one in drawn], [0.025, 0.975])
+        np.testing.assert_allclose(found[name], expected, rtol=0.1 if name == "p95" else 1e-9)
 
 
 def test_bootstrap_needs_two_patients():
-    assert metrics.bootstrap_mae(np.ones((4, 5)), np.zeros(4, dtype=int), seed=0) is None
+    assert metrics.bootstrap_intervals(np.ones((4, 5)), np.zeros(4, dtype=int), seed=0) is None
 
 
 def test_bootstrap_repeats():
     error = np.random.Generator(np.random.Philox(1)).normal(size=(12, 7))
     anatomy = np.arange(12) % 4
-    assert metrics.bootstrap_mae(error, anatomy, seed=5) == metrics.bootstrap_mae(error, anatomy, seed=5)
+    assert metrics.bootstrap_intervals(error, anatomy, seed=5) == metrics.bootstrap_intervals(error, anatomy, seed=5)
 
 
 def test_diverged_counts_sequences_once_and_lost_ones_too():
@@ -110,7 +123,8 @@ def test_tip_statistics_normalises_by_the_radius_of_each_sample():
     found = metrics.tip_statistics(
         error, radius=radius, baselines={}, anatomy=np.array([0]), sample_period_s=0.5, seed=0
     )
-    assert found["all"]["mae_over_radius"] == pytest.approx(0.625)
+    assert found["all"]["over_radius"]["mae"] == pytest.approx(0.625)
+    assert found["all"]["over_radius"]["sd"] == pytest.approx(0.375)
 
 
 def test_a_tip_that_sticks_slips_or_whips_is_told_from_one_that_goes_along():

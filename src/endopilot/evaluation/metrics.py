@@ -36,6 +36,7 @@ DEPTHS_MM: tuple[float, ...] = (0.0, 30.0, 60.0, 90.0, math.inf)
 _PUSHED_MM, _STUCK_SHARE = 0.5, 0.1
 _SLIP_MM = 1.0
 _WHIP_RAD, _BEND_PER_MM = 0.5, 0.2
+_STEPS = 2000
 
 
 def tip_events(
@@ -133,26 +134,38 @@ def skill(
     return 1.0 - float(np.sqrt(np.sum(error[both] ** 2) / reference))
 
 
-def bootstrap_mae(
+def bootstrap_intervals(
     error: Float[np.ndarray, "episodes samples"], anatomy: Int[np.ndarray, "episodes"], *, seed: int, draws: int = 1000
-) -> tuple[float, float] | None:
-    """Return the 95 % percentile interval of the mean absolute error when anatomies are drawn with replacement.
+) -> dict[str, tuple[float, float]] | None:
+    """Return the 95 % percentile intervals of mae, sd, rmse and p95 when anatomies are drawn with replacement.
 
     Sequences of one patient are alike, so the patient is the unit that is drawn (cluster bootstrap: Davison &
-    Hinkley 1997, §3.8). None with fewer than two anatomies, where nothing can be said of other patients.
+    Hinkley 1997, §3.8). None with fewer than two anatomies, where nothing can be said of other patients. Of p95 the
+    samples count as the next of 2000 evenly filled steps.
     """
     finite = np.isfinite(error)
-    absolute = np.where(finite, np.abs(error), 0.0).sum(axis=1)
-    names = np.unique(anatomy)
-    total = np.array([absolute[anatomy == name].sum() for name in names])
-    count = np.array([finite[anatomy == name].sum() for name in names])
-    total, count = total[count > 0], count[count > 0]
-    if len(count) < 2:
+    absolute = np.abs(error[finite])
+    names, owner = np.unique(np.broadcast_to(anatomy[:, None], error.shape)[finite], return_inverse=True)
+    if len(names) < 2:
         return None
-    drawn = np.random.Generator(np.random.Philox(seed)).integers(len(count), size=(draws, len(count)))
-    means = total[drawn].sum(axis=1) / count[drawn].sum(axis=1)
-    low, high = np.quantile(means, [0.025, 0.975])
-    return float(low), float(high)
+    chosen = np.random.Generator(np.random.Philox(seed)).integers(len(names), size=(draws, len(names)))
+    times = np.zeros((draws, len(names)))
+    np.add.at(times, (np.arange(draws)[:, None], chosen), 1.0)
+    count = times @ np.bincount(owner)
+    mean = times @ np.bincount(owner, absolute) / count
+    square = times @ np.bincount(owner, absolute**2) / count
+    steps = np.unique(np.quantile(absolute, np.linspace(0.0, 1.0, _STEPS + 1), method="higher"))
+    step = np.searchsorted(steps, absolute)
+    filled = np.bincount(owner * len(steps) + step, minlength=len(names) * len(steps)).reshape(len(names), -1)
+    below = np.cumsum(times @ filled, axis=1)
+    drawn = {
+        "mae": mean,
+        "sd": np.sqrt(np.maximum(square - mean**2, 0.0)),
+        "rmse": np.sqrt(square),
+        "p95": steps[(below < 0.95 * count[:, None]).sum(axis=1)],
+    }
+    bounds = {name: np.quantile(values, [0.025, 0.975]) for name, values in drawn.items()}
+    return {name: (float(low), float(high)) for name, (low, high) in bounds.items()}
 
 
 def diverged_share(error: Float[np.ndarray, "episodes samples"], lost: Bool[np.ndarray, "episodes samples"]) -> float:
@@ -232,7 +245,7 @@ def tip_statistics(
 
     Args:
         error: predicted − true Δtip or γtip, mm; NaN where there is nothing to compare.
-        radius: lumen radius at the true tip, mm; `mae_over_radius` is the mean of its absolute value over the radius.
+        radius: lumen radius at the true tip, mm; `over_radius` holds the statistics of the error over the radius.
         baselines: errors of the baselines on the same samples, mm, by name.
         anatomy: which anatomy each sequence belongs to.
         sample_period_s: time between samples, s.
@@ -243,8 +256,8 @@ def tip_statistics(
     for name, samples in spans.items():
         part = error[:, samples]
         statistics[name] = error_statistics(part) | {
-            "mae_interval": bootstrap_mae(part, anatomy, seed=seed),
-            "mae_over_radius": error_statistics(part / radius[:, samples])["mae"],
+            "intervals": bootstrap_intervals(part, anatomy, seed=seed),
+            "over_radius": error_statistics(part / radius[:, samples]),
             "skill": {key: skill(part, other[:, samples]) for key, other in baselines.items()},
         }
     return statistics

@@ -166,12 +166,13 @@ def replay_remark(metrics: Mapping[str, Any], split: str) -> str:
 def interval_remark(metrics: Mapping[str, Any], split: str) -> str:
     """Return the interval of the headline error over patients, or why there is none."""
     record = metrics["splits"][split]
-    interval = record["tip"]["P1"]["abscissa"]["all"]["mae_interval"]
-    if interval is None:
+    intervals = record["tip"]["P1"]["abscissa"]["all"]["intervals"]
+    if intervals is None:
         return f"With {_count(len(record['anatomies']), 'patient')} nothing can be said of the spread between patients."
+    low, high = intervals["mae"]
     return (
         f"Drawing the {len(record['anatomies'])} patients again (bootstrap), the mean error of Δtip in P1 lies between "
-        f"{interval[0]:.2f} and {interval[1]:.2f} mm in 95 % of draws; so few patients bound it only roughly."
+        f"{low:.2f} and {high:.2f} mm in 95 % of draws; so few patients bound it only roughly."
     )
 
 
