@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from endopilot.dataset.loader import Dataset, load_dataset
 from endopilot.evaluation.baselines import hold_slack
-from endopilot.models import play
+from endopilot.models import causal, play
 from endopilot.models.causal import CausalNetwork
 from endopilot.models.config import WINDOW, CausalConfig
 from endopilot.models.sequences import N_INPUTS, Sequences, read_vessels, unfold
@@ -41,24 +41,28 @@ VARIANTS: dict[str, np.ndarray] = {
 Make = Callable[[CausalConfig], CausalNetwork]
 
 
-class Decoder(CausalNetwork):
+class Attention(nn.Module):
     """Attention to all earlier samples, in two layers of four heads, in place of the recurrent layer."""
+
+    def __init__(self, width: int):
+        super().__init__()
+        layer = nn.TransformerEncoderLayer(width, 4, 2 * width, 0.1, F.gelu, batch_first=True)
+        self.layers = nn.TransformerEncoder(layer, 2)
+        self.place = nn.Parameter(0.02 * torch.randn(1000, width))
+
+    def forward(self, tokens: Tensor) -> tuple[Tensor, None]:
+        """Return what is carried to every sample, as a recurrent layer does, and no state."""
+        samples = tokens.shape[1]
+        mask = nn.Transformer.generate_square_subsequent_mask(samples)
+        return self.layers(tokens + self.place[:samples], mask=mask, is_causal=True), None
+
+
+class Decoder(CausalNetwork):
+    """A causal decoder."""
 
     def __init__(self, config: CausalConfig):
         super().__init__(config)
-        layer = nn.TransformerEncoderLayer(config.width, 4, 2 * config.width, 0.1, F.gelu, batch_first=True)
-        self.memory = nn.TransformerEncoder(layer, 2)
-        self.place = nn.Parameter(0.02 * torch.randn(1000, config.width))
-
-    def forward(self, inputs: Tensor) -> Tensor:
-        """Return the medians of both changes, and the scales of their distributions."""
-        scaled = ((inputs - self.input_mean) / self.input_scale).clamp(-6.0, 6.0)
-        tokens = self.embedding(scaled)
-        samples = tokens.shape[1]
-        mask = nn.Transformer.generate_square_subsequent_mask(samples)
-        carried = self.memory(tokens + self.place[:samples], mask=mask, is_causal=True)
-        out = self.output(self.head(torch.cat([carried, tokens], dim=-1)))
-        return torch.cat([out[..., :2] * self.output_scale, F.softplus(out[..., 2:]) * self.output_scale], dim=-1)
+        self.memory = Attention(config.width)
 
 
 class Blunt(CausalNetwork):
@@ -67,7 +71,7 @@ class Blunt(CausalNetwork):
     def loss(self, answer: Tensor, change: Tensor) -> Tensor:
         """Return the absolute error in units of its mean over the training data."""
         weight = torch.ones(change.shape[1], 1)
-        weight[:WINDOW] = 0.3
+        weight[:WINDOW] = causal._GIVEN_WEIGHT
         return (weight * (answer[..., :2] - change).abs() / self.output_scale).mean()
 
 

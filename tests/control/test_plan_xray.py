@@ -57,7 +57,7 @@ def by_network(found, tmp_path, monkeypatch):
 
     def made(predictor):
         monkeypatch.setattr("endopilot.models.rollout.load_run", lambda _: predictor)
-        write_json(tmp_path / "run" / "manifest.json", {})
+        write_json(tmp_path / "run" / "manifest.json", {"config": {}, "networks": {}, "device": {}})
         tip, proximal = found.simulated, np.column_stack([2.0 + 2.0 * np.arange(1, 21), np.zeros(20)])
         return replace(
             found,

@@ -26,7 +26,7 @@ from endopilot.types import TipProjection
 
 CALIBRATED = Path(__file__).parent
 """Where the calibration of the agent's ensemble lies."""
-Foretold = tuple[Float[np.ndarray, "1 2"], Float[np.ndarray, "1 2"], Float[np.ndarray, "1 2"], Float[np.ndarray, "1"]]
+Told = tuple[Float[np.ndarray, "1 2"], Float[np.ndarray, "1 2"], Float[np.ndarray, "1 2"], Float[np.ndarray, "1"]]
 """What an adviser is told of a navigation: (Δ, φ), mm and rad; (Δtip, γtip), mm; the spread (standard deviation) of
 these by the model's own account, mm; and the lumen's radius at the tip, mm."""
 
@@ -229,7 +229,7 @@ class AgentPolicy(_PlanningPolicy):
     def _parameters(self) -> Float[np.ndarray, "members 3"]:
         return Belief.around(np.array([1.0, 1.0, 0.0]), self.config.belief)
 
-    def foretold(self) -> Foretold:
+    def foretold(self) -> Told:
         """Return what the adviser is told, of the likeliest wire; the spread is that of all wires."""
         best, tip = int(np.argmax(self.belief.weight)), self.belief.likeliest_tip()
         wires = self.belief.simulator

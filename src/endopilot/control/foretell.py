@@ -38,7 +38,32 @@ class Foreteller(Protocol):
         ...
 
 
-class TwinForeteller:
+class _SeeingForeteller:
+    """What is common to models that take tips seen at any time: which were shown, and what is foretold from those."""
+
+    def __init__(self, episodes: Dataset) -> None:
+        self._seen = np.tile(np.arange(episodes.valid.shape[1]) < WINDOW, (len(episodes), 1))
+        self._shown = np.stack([episodes.tip_abscissa, episodes.tip_offset], axis=-1).astype(float)
+        self._first = self._told(np.arange(len(episodes)))
+        self.restart()
+
+    def _told(self, episodes: Int[np.ndarray, "some"]) -> tuple[Tips, Tips]:
+        """Return tips and spread, mm, of some navigations, from what was shown of them."""
+        raise NotImplementedError
+
+    def restart(self) -> None:
+        """Forget what was shown after the first `WINDOW` samples."""
+        self._seen[:, WINDOW:] = False
+        self.tip, self.spread = (part.copy() for part in self._first)
+
+    def show(self, episodes: Int[np.ndarray, "shown"], sample: int, tip: Float[np.ndarray, "shown 2"]) -> None:
+        """Take what X-ray shows of some navigations at a sample, mm, and foretell the later ones anew."""
+        self._seen[episodes, sample], self._shown[episodes, sample] = True, tip
+        later = slice(sample + 1, None)
+        self.tip[episodes, later], self.spread[episodes, later] = (part[:, later] for part in self._told(episodes))
+
+
+class TwinForeteller(_SeeingForeteller):
     """A twin, whose ensemble is simulated once and weighed again at every exposure."""
 
     def __init__(self, twin: TwinPredictor, episodes: Dataset) -> None:
@@ -48,26 +73,14 @@ class TwinForeteller:
             twin: the model.
             episodes: their controls, and their tips as they are measured.
         """
-        samples = episodes.valid.shape[1]
-        self._config, self._seen = twin.config, np.tile(np.arange(samples) < WINDOW, (len(episodes), 1))
-        self._shown = np.stack([episodes.tip_abscissa, episodes.tip_offset], axis=-1).astype(float)
-        self._paths = twin.ensemble(episodes, self._seen[0])
-        self.tip, self.spread = weigh(self._paths, self._shown, self._seen, self._config)
+        self._config, self._paths = twin.config, twin.ensemble(episodes, open_loop.given_states(episodes))
+        super().__init__(episodes)
 
-    def restart(self) -> None:
-        """Forget what was shown after the first `WINDOW` samples."""
-        self._seen[:, WINDOW:] = False
-        self.tip, self.spread = weigh(self._paths, self._shown, self._seen, self._config)
-
-    def show(self, episodes: Int[np.ndarray, "shown"], sample: int, tip: Float[np.ndarray, "shown 2"]) -> None:
-        """Take what X-ray shows of some navigations at a sample, mm, and foretell the later ones anew."""
-        self._seen[episodes, sample], self._shown[episodes, sample] = True, tip
-        found = weigh(self._paths[:, episodes], self._shown[episodes], self._seen[episodes], self._config)
-        later = slice(sample + 1, None)
-        self.tip[episodes, later], self.spread[episodes, later] = (part[:, later] for part in found)
+    def _told(self, episodes: Int[np.ndarray, "some"]) -> tuple[Tips, Tips]:
+        return weigh(self._paths[:, episodes], self._shown[episodes], self._seen[episodes], self._config)
 
 
-class CausalForeteller:
+class CausalForeteller(_SeeingForeteller):
     """Our networks, which take tips that are seen at any time, and say how far they may be off."""
 
     def __init__(self, predictor: open_loop.Foreteller, episodes: Dataset) -> None:
@@ -78,29 +91,16 @@ class CausalForeteller:
             episodes: their controls, and their tips as they are measured.
         """
         self._predictor, self._episodes = predictor, episodes
-        samples = episodes.valid.shape[1]
-        self._seen = np.tile(np.arange(samples) < WINDOW, (len(episodes), 1))
-        self._shown = np.stack([episodes.tip_abscissa, episodes.tip_offset], axis=-1).astype(float)
-        found = predictor.foretell(episodes, self._seen[0])
-        self._first = found.tip, found.spread
-        self.tip, self.spread = found.tip.copy(), found.spread.copy()
+        super().__init__(episodes)
 
-    def restart(self) -> None:
-        """Forget what was shown after the first `WINDOW` samples."""
-        self._seen[:, WINDOW:] = False
-        self.tip, self.spread = (part.copy() for part in self._first)
-
-    def show(self, episodes: Int[np.ndarray, "shown"], sample: int, tip: Float[np.ndarray, "shown 2"]) -> None:
-        """Take what X-ray shows of some navigations at a sample, mm, and foretell the later ones anew."""
-        self._seen[episodes, sample], self._shown[episodes, sample] = True, tip
+    def _told(self, episodes: Int[np.ndarray, "some"]) -> tuple[Tips, Tips]:
         shown = replace(
             self._episodes.select(episodes),
             tip_abscissa=self._shown[episodes, :, 0],
             tip_offset=self._shown[episodes, :, 1],
         )
         found = self._predictor.foretell(shown, self._seen[episodes])
-        later = slice(sample + 1, None)
-        self.tip[episodes, later], self.spread[episodes, later] = found.tip[:, later], found.spread[:, later]
+        return found.tip, found.spread
 
 
 class NetworkForeteller:

@@ -22,8 +22,7 @@ from endopilot.control.route import Route
 from endopilot.dataset.loader import Dataset
 from endopilot.dataset.plan import identify
 from endopilot.env.task import Navigation
-from endopilot.files import read_json
-from endopilot.models.config import WINDOW, run_path
+from endopilot.models.config import WINDOW, read_run
 from endopilot.models.open_loop import Predictor
 from endopilot.models.rollout import load_run
 from endopilot.progress import progress
@@ -55,7 +54,7 @@ def with_networks(
     Raises:
         InputError: the run is unfinished or damaged, or has not the network that the method needs.
     """
-    predictor, rest = load_run(model), Rest(navigation, folder, run_path(model))
+    predictor, rest = load_run(model), Rest(navigation, folder, model)
     predictor.rollout_forward(rest.episodes(desired[None, :1], np.zeros((1, 1, 2))))  # a causal model learns the vessel
     ask = _ask if config.method == "inverse" else _sample
     return lambda: ask(predictor, rest, desired, route, config)
@@ -123,10 +122,10 @@ class Rest:
         tip: (Δtip, γtip) at rest, mm.
     """
 
-    def __init__(self, navigation: Navigation, folder: Path, run: Path) -> None:
+    def __init__(self, navigation: Navigation, folder: Path, model: Path) -> None:
         self.navigation, vessel = navigation, str(Path(folder).resolve())
         self._scratch = TemporaryDirectory(prefix="endopilot-plan-")  # where a model keeps what it makes of the patient
-        record = read_json(run / "manifest.json")
+        record = read_run(model)
         self._manifest = {
             "key": f"plan in {vessel}",
             "device": asdict(navigation.device),

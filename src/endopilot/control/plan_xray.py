@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Bool, Float
 
-from endopilot.control.agent import CALIBRATED, AgentPolicy, Foretold
+from endopilot.control.agent import CALIBRATED, AgentPolicy, Told
 from endopilot.control.foretell import foreteller
 from endopilot.control.plan import NETWORK_METHODS, Plan, PlanConfig
 from endopilot.control.policy import TipMeasurement
@@ -75,11 +75,11 @@ def plan_xray(plan: Plan, folder: Path, calibration: Calibration) -> PlannedXray
 class _Watched(Protocol):
     """Foretells the tip along a plan."""
 
-    def start(self) -> Foretold:
+    def start(self) -> Told:
         """Say where the tip is before the first period."""
         ...
 
-    def move(self, period: int) -> Foretold:
+    def move(self, period: int) -> Told:
         """Say where it is at the end of a period, the one after the last."""
         ...
 
@@ -93,10 +93,10 @@ class _Wires:
         self._plan, self._agent = plan, AgentPolicy()
         self._agent.start(plan.navigation, seed=0)
 
-    def start(self) -> Foretold:
+    def start(self) -> Told:
         return self._agent.foretold()
 
-    def move(self, period: int) -> Foretold:
+    def move(self, period: int) -> Told:
         inserted, rotation = self._plan.proximal[period]
         self._agent.belief.follow(inserted, rotation)
         return self._agent.foretold()
@@ -120,22 +120,22 @@ class _Networks:
 
         assert plan.model is not None
         run, navigation = Path(plan.model), plan.navigation
-        rest = Rest(navigation, folder, run_path(run))
+        rest = Rest(navigation, folder, run)
         episodes = rest.episodes(plan.predicted[None], plan.control[None])
         self._model = foreteller(load_run(run), episodes)
         self._route = Route.to(navigation.anatomy, navigation.target)
         self._proximal = np.column_stack([episodes.inserted_length[0], episodes.rotation[0]])
 
-    def start(self) -> Foretold:
+    def start(self) -> Told:
         return self._at(WINDOW - 1)
 
-    def move(self, period: int) -> Foretold:
+    def move(self, period: int) -> Told:
         return self._at(WINDOW + period)
 
     def show(self, period: int) -> None:
         sample = WINDOW + period
         self._model.show(np.array([0]), sample, self._model.tip[:, sample].copy())
 
-    def _at(self, sample: int) -> Foretold:
+    def _at(self, sample: int) -> Told:
         tip = self._model.tip[:, sample]
         return self._proximal[None, sample], tip, self._model.spread[:, sample], self._route.radius(tip[:, 0])
