@@ -17,16 +17,15 @@ from pathlib import Path
 
 import numpy as np
 
-from endopilot.control import xray
 from endopilot.control.agent import AgentConfig, AgentPolicy
-from endopilot.control.navigate import NavigateConfig, Truth, navigate
-from endopilot.control.policy import DECISION_PERIOD_S
-from endopilot.control.xray import Calibration, conformal_scale, fit_spread, spread_of
+from endopilot.control.navigate import ModelMismatch, NavigateConfig, navigate
 from endopilot.env.navigation import CORE
-from endopilot.env.task import Navigation
+from endopilot.env.task import DECISION_PERIOD_S, Navigation
 from endopilot.env.tasks import Task, find_task, ladder_tasks
 from endopilot.files import read_json, write_json
 from endopilot.parallel import each
+from endopilot.xray import adviser as xray
+from endopilot.xray.bands import Calibration, conformal_scale, fit_spread, spread_of
 
 ROOT = Path(__file__).parents[1]
 ROLES = {"fit": range(4), "calibrate": range(4, 9), "test": range(3)}
@@ -35,7 +34,7 @@ LEVEL, EXPOSED_EVERY, SECONDS = 0.9, 20, 30.0
 """Share of the intervals that the bands are to hold; periods of 0.5 s from one exposure to the next; s a navigation."""
 
 
-class Watched(AgentPolicy):
+class Monitored(AgentPolicy):
     """The agent with X-ray at fixed times, which keeps what it foretold before each of them."""
 
     def start(self, navigation: Navigation, seed: int) -> None:
@@ -50,11 +49,11 @@ class Watched(AgentPolicy):
         return len(self.kept) % EXPOSED_EVERY == 0
 
 
-def truth_of(task: Task, place: int, role: str) -> Truth:
+def truth_of(task: Task, place: int, role: str) -> ModelMismatch:
     """Return what a patient's wire and ostium truly are, as far off as the agent holds possible."""
     belief, roles = AgentConfig().belief, list(ROLES)
     off = np.random.default_rng([task.level, place, roles.index(role)]).uniform(-1.0, 1.0, 3)
-    return Truth(
+    return ModelMismatch(
         friction_factor=1 + belief.friction_spread * off[0],
         stiffness_factor=1 + belief.stiffness_spread * off[1],
         ostium_mm=belief.ostium_spread_mm * off[2],
@@ -70,7 +69,7 @@ def watch(path: Path) -> None:
     else:
         turn = np.random.default_rng([task.training.seed, number]).uniform(0.0, 2 * np.pi)
         navigation = task.navigation(task.patient(task.training, number), start_rotation=turn)
-    policy = Watched(AgentConfig(tries=2), calibration=NO_BANDS)
+    policy = Monitored(AgentConfig(tries=2), calibration=NO_BANDS)
     record = navigate(
         replace(navigation, seconds=min(SECONDS, navigation.seconds)),
         policy,

@@ -3,7 +3,7 @@
 The ladder's `agent` keeps its course at an exposure unless the tip is lost or off course; `Anew` searches another one
 from the now likeliest state at every exposure. Both drive the same navigations of the ladder, with the same seeds, one
 process after another, since processor time is measured. CASE, as-told if not given, is one of those of `endopilot
-ladder --off 0.2` (endopilot.evaluation.robustness.CASES). Prints a table a task and over all, as Markdown.
+ladder --off 0.2` (endopilot.ladder.mismatch.CASES). Prints a table a task and over all, as Markdown.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ import numpy as np
 
 from endopilot.control.agent import AgentPolicy
 from endopilot.control.navigate import NavigateConfig, navigate
-from endopilot.control.policy import TipMeasurement
 from endopilot.env.navigation import CORE
 from endopilot.env.tasks import find_task
-from endopilot.evaluation.robustness import truth_of
+from endopilot.ladder.mismatch import truth_of
+from endopilot.xray.fluoroscope import TipMeasurement
 
 TASKS = ("crux", "circumflex", "middle-cerebral", "carotid", "diagonal")
 OFF = 0.2

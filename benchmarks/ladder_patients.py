@@ -20,12 +20,12 @@ from typing import Any
 
 import numpy as np
 
-from endopilot.anatomy.atlas import AtlasConfig, synthesize_tree
+from endopilot.atlas.atlas import AtlasConfig, make_patient_tree
 from endopilot.env.navigation import CORE
 from endopilot.env.task import Navigation, Target
-from endopilot.env.tasks import Task, find_target, ladder_tasks, turn_rad
+from endopilot.env.tasks import Task, ladder_tasks, target_in_section, turn_rad
 from endopilot.errors import InputError
-from endopilot.simulation.stepping import Simulator
+from endopilot.simulation.simulator import Simulator
 from endopilot.types import TipProjection, VesselTree
 
 WANTED = 20
@@ -41,7 +41,7 @@ def _always(tree: VesselTree, truth: dict[str, Any], target: Target) -> bool:
 
 def _turns(section: str, degrees: float) -> Callable[[VesselTree, dict[str, Any], Target], bool]:
     def eligible(tree: VesselTree, truth: dict[str, Any], target: Target) -> bool:
-        first = find_target(tree, section, 0.5).branch
+        first = target_in_section(tree, section, 0.5).branch
         return first > 0 and np.rad2deg(turn_rad(tree, first)) >= degrees
 
     return eligible
@@ -152,9 +152,9 @@ def choose(task: Task, seed: int, *, search: bool) -> tuple[list[int], int, int]
     chosen: list[int] = []
     count = 0
     for number in range(MOST_EXAMINED):
-        tree, truth = synthesize_tree(atlas, number)
+        tree, truth = make_patient_tree(atlas, number)
         try:
-            target = find_target(tree, task.section, task.depth_mm)
+            target = target_in_section(tree, task.section, task.depth_mm)
         except InputError:
             continue
         if not eligible(tree, truth, target):

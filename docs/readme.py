@@ -9,8 +9,8 @@ import shutil
 from pathlib import Path
 
 from endopilot.cli import COMMANDS
-from endopilot.evaluation.report_text import tip_rows
 from endopilot.files import read_json
+from endopilot.report.report_text import tip_rows
 
 ROOT = Path(__file__).parents[1]
 IMAGES = ROOT / "docs" / "images"

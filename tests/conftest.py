@@ -1,6 +1,8 @@
-"""Makes the modules in this folder importable from every test, and gives a small dataset of a toy wire."""
+"""Makes the modules in this folder importable from every test, and gives toy data: a dataset, a vessel, predictions."""
 
 from __future__ import annotations
+
+from unittest.mock import patch
 
 import pytest
 
@@ -13,3 +15,80 @@ def toy_dataset(tmp_path_factory):
     folder = tmp_path_factory.mktemp("toy") / "dataset"
     make_toy_dataset(folder, patients=6, sequences=24)
     return folder
+
+
+@pytest.fixture(scope="session")
+def anatomy():
+    """Return a bent tube with a guiding catheter."""
+    from toy_evaluation import make_anatomy
+
+    return make_anatomy()
+
+
+@pytest.fixture(scope="session")
+def rollout():
+    """Return one world whose wire lies on the axis and goes deeper each sample."""
+    from toy_evaluation import make_rollout
+
+    return make_rollout()
+
+
+@pytest.fixture(scope="session")
+def results():
+    """Return predictions on known and on new patients, whose errors differ by series."""
+    from toy_evaluation import make_result
+
+    return {"seen_test": make_result(), "test": make_result(("c",), seed=4)}
+
+
+@pytest.fixture(scope="session")
+def evaluated(toy_dataset, tmp_path_factory):
+    """Return a folder that holds an untrained run and its evaluation, and the metrics; do not write into it."""
+    import torch
+
+    from endopilot.evaluation.evaluate import EvaluateConfig, evaluate
+    from toy_navigation import make_untrained_run, toy_simulate
+
+    folder = tmp_path_factory.mktemp("evaluated")
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # small batches gain nothing from two, and lose much where cores are shared
+    make_untrained_run(toy_dataset, folder / "run")
+    with patch("endopilot.evaluation.replay.simulate", toy_simulate):
+        settings = EvaluateConfig(sequences=8)
+        metrics = evaluate(folder / "run", folder / "evaluation", settings, other_seeds=[folder / "run"])
+    torch.set_num_threads(threads)
+    return folder, metrics
+
+
+@pytest.fixture(scope="session")
+def fork():
+    """Return a straight vessel with a side branch."""
+    from toy_fork import make_fork
+
+    return make_fork()
+
+
+@pytest.fixture(scope="session")
+def wire():
+    """Return the workhorse wire."""
+    from endopilot.simulation.device import read_device
+
+    return read_device("workhorse-014")
+
+
+@pytest.fixture(scope="session")
+def vessel(fork, tmp_path_factory):
+    """Return the folder of the vessel."""
+    from endopilot.anatomy.io import write_anatomy
+
+    folder = tmp_path_factory.mktemp("vessel") / "fork"
+    write_anatomy(fork, folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def found(vessel):
+    """Return a plan along the vessel, made by trial in the rod core."""
+    from endopilot.control.plan import PlanConfig, plan
+
+    return plan(vessel, "0,0,33", PlanConfig(seconds=30.0, start_rotation=0.1, seed=4))

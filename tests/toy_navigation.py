@@ -6,6 +6,7 @@ The slack s = Δ − Δtip follows a play operator: it grows with insertion and 
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from unittest.mock import patch
 
@@ -13,6 +14,7 @@ import numpy as np
 
 from endopilot.anatomy.io import write_anatomy
 from endopilot.dataset.generate import DatasetConfig, generate_dataset
+from endopilot.files import read_json, write_json
 from endopilot.simulation.device import read_device
 from endopilot.types import (
     SAMPLE_PERIOD_S,
@@ -98,15 +100,15 @@ def write_toy_anatomies(folder: Path, patients: int) -> list[Path]:
 
 
 def toy_navigate(simulate=toy_simulate):
-    """Return what stands in for `navigate`: the drawn controls, driven as they are through a simulator like the toy."""
+    """Return a stand-in for `simulate_navigations`: the drawn controls, driven as they are through the toy."""
 
-    def navigate(anatomy, devices, initial, control, friction, config, *, actuation, advance):
+    def simulate_navigations(anatomy, devices, initial, control, friction, config, *, actuation, advance):
         control = control.astype(np.float32).astype(float)
         rollout = simulate(anatomy, devices[0], control, initial=initial, config=config, friction=friction)
         advance(control.shape[0] * control.shape[1])
         return rollout, control, np.zeros(len(control), dtype=bool)
 
-    return navigate
+    return simulate_navigations
 
 
 def make_toy_dataset(
@@ -122,6 +124,28 @@ def make_toy_dataset(
     """Generate a dataset with the toy wire in place of the rod; two thirds of the patients train, the others test."""
     shares = (2 / 3, 0.0, 1 / 3) if patients > 1 else None
     config = DatasetConfig(**({"sequences": sequences, "anatomy_shares": shares} | settings))
-    with patch("endopilot.dataset.block.navigate", toy_navigate(simulate)):
+    with patch("endopilot.dataset.block.simulate_navigations", toy_navigate(simulate)):
         anatomies = write_toy_anatomies(folder.parent / "anatomies", patients)
         generate_dataset(anatomies, folder, read_device(device), config, scheduler=scheduler)
+
+
+def make_untrained_run(dataset_folder, run_folder):
+    """Write a run whose networks are their simple guesses: slack and offset stay; the drive moves as the tip is to."""
+    from endopilot.models.checkpoint import write_network
+    from endopilot.models.config import TransformerConfig
+    from endopilot.models.transformer import NETWORKS
+
+    size = TransformerConfig(d_model=24, encoder_layers=1, decoder_layers=1)
+    for name, network in NETWORKS.items():
+        write_network(run_folder / f"{name}.safetensors", name, network(size), size, {})
+    device = read_json(dataset_folder / "meta" / "manifest.json")["device"]
+    record = {
+        "config": {"model": "paper"},
+        "inputs": {"dataset": read_json(dataset_folder / "meta" / "manifest.json")["key"]},
+        "dataset": os.path.relpath(dataset_folder, run_folder),
+        "networks": {"ff": {}, "if": {}},
+        "device": device | {"max_velocity_mm_s": 1e3, "max_rotation_rad_s": 1e3},
+    }
+    write_json(run_folder / "manifest.json", record)
+    epoch = {"epoch": 1, "steps": 1, "loss": 1.0, "validation_loss": None}
+    write_json(run_folder / "training.json", {name: {"seconds": 0.0, "curve": [epoch]} for name in NETWORKS})

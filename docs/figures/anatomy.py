@@ -10,9 +10,9 @@ import json
 import sys
 from pathlib import Path
 
-from endopilot.anatomy.atlas import AtlasConfig, synthesize_one
-from endopilot.anatomy.bench import bench_anatomy
-from endopilot.anatomy.picture import draw_anatomy
+from endopilot.anatomy.anatomy_picture import draw_anatomy
+from endopilot.atlas.atlas import AtlasConfig, make_patient
+from endopilot.benchmarks.anatomy import bench_anatomy
 
 DOCS = Path(__file__).parents[1]
 PAGE = DOCS / "anatomy.md"
@@ -50,7 +50,7 @@ def main(arguments: list[str]) -> None:
     begin, end = "<!-- bench:begin -->", "<!-- bench:end -->"
     page = PAGE.read_text(encoding="utf-8")
     PAGE.write_text(f"{page.split(begin)[0]}{begin}\n{tables(rows)}\n{end}{page.split(end)[1]}", encoding="utf-8")
-    draw_anatomy(synthesize_one(AtlasConfig(seed=1), 0), DOCS / "images" / "anatomy.png")
+    draw_anatomy(make_patient(AtlasConfig(seed=1), 0), DOCS / "images" / "anatomy.png")
 
 
 if __name__ == "__main__":

@@ -10,10 +10,10 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 
-from endopilot.anatomy import atlas_shape as shape
-from endopilot.anatomy.atlas import ANATOMIES, AtlasConfig, synthesize_one, synthesize_tree
-from endopilot.anatomy.label_score import measure_labels
-from endopilot.anatomy.phantom import PhantomConfig, make_phantom
+from endopilot.atlas import curves as shape
+from endopilot.atlas.atlas import ANATOMIES, AtlasConfig, make_patient, make_patient_tree
+from endopilot.benchmarks.labels import measure_labels
+from endopilot.phantom.phantom import PhantomConfig, make_phantom
 from endopilot.types import VesselTree
 
 mpl.use("Agg")
@@ -28,7 +28,7 @@ SHOWN = {"rca": (0, 2), "lca": (0, 2), "cerebral": (0, 2), "portal": (0, 2), "ar
 
 def patients_of(anatomy: str, count: int = 60) -> Patients:
     """Return the trees of seed 0."""
-    return [synthesize_tree(AtlasConfig(anatomy=anatomy, seed=0), index) for index in range(count)]
+    return [make_patient_tree(AtlasConfig(anatomy=anatomy, seed=0), index) for index in range(count)]
 
 
 def diameters(patients: Patients, section: str) -> list[float]:
@@ -208,7 +208,7 @@ def cost_table(count: int = 5) -> str:
     for anatomy in ANATOMIES:
         started = time.process_time()
         for index in range(count):
-            synthesize_one(AtlasConfig(anatomy=anatomy, seed=0), index)
+            make_patient(AtlasConfig(anatomy=anatomy, seed=0), index)
         each = (time.process_time() - started) / count
         rows.append(f"| {anatomy} | {each:.2f} | {100 * each / 2 / 60:.1f} |")
     return "\n".join(rows)
@@ -246,7 +246,7 @@ def draw_trees() -> None:
     told = ("dominance", "arch_type", "side", "variant")
     for anatomy, row in zip(ANATOMIES, rows, strict=True):
         for index, axes in enumerate(row):
-            tree, truth = synthesize_tree(AtlasConfig(anatomy=anatomy, seed=1), index)
+            tree, truth = make_patient_tree(AtlasConfig(anatomy=anatomy, seed=1), index)
             draw_tree(axes, tree, anatomy)
             what = next(f"{truth[name]}" for name in told if name in truth)
             axes.set_title(f"{anatomy}: {what}{', bovine' if truth.get('bovine') else ''}", fontsize=8)
@@ -256,7 +256,7 @@ def draw_trees() -> None:
 def draw_phantom() -> None:
     """Draw four views of one phantom."""
     figure = plt.figure(figsize=(12, 3.2), layout="constrained")
-    volume = make_phantom(synthesize_one(AtlasConfig(seed=1), 0), PhantomConfig(), 1)
+    volume = make_phantom(make_patient(AtlasConfig(seed=1), 0), PhantomConfig(), 1)
     voxels, (dx, dy, dz), (x, y, z) = volume.voxels, volume.spacing_mm, volume.origin_mm
     (nz, ny, nx), rows = voxels.shape, [round((at - y) / dy) for at in (-8, -24, 20)]
     axial, coronal = (x, x + nx * dx, y + ny * dy, y), (x, x + nx * dx, z, z + nz * dz)

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from endopilot.anatomy.atlas import AtlasConfig, synthesize_one
-from endopilot.anatomy.phantom import PhantomConfig, make_phantom
+from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.imaging.overlap import compare_masks, mask_like
-from endopilot.imaging.picture import draw_overlay
+from endopilot.imaging.overlay_picture import draw_overlay
 from endopilot.imaging.sample import fetch_sample
 from endopilot.imaging.segment import SegmentConfig, segment
 from endopilot.imaging.volume import read_mask, read_volume
+from endopilot.phantom.phantom import PhantomConfig, make_phantom
 
 IMAGES = Path(__file__).parents[1] / "images"
 SEEDS = ((2.0, -143.0, 543.0), (2.0, -184.0, 657.0))
@@ -35,7 +35,7 @@ def main() -> None:
     print(
         f"of what is cut off {low:.2f} is below 130 HU; most of it lies between z {heights[0]:.0f} and {heights[1]:.0f}"
     )
-    patient = synthesize_one(AtlasConfig(seed=1003), 0)
+    patient = make_patient(AtlasConfig(seed=1003), 0)
     phantom = make_phantom(patient, PhantomConfig(), 1003)
     draw_overlay(phantom, segment(phantom, SegmentConfig()), IMAGES / "imaging-coronary.png")
 

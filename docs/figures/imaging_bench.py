@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from endopilot.evaluation.imaging_bench import BARS, ImagingBenchConfig, bench_imaging
+from endopilot.benchmarks.imaging import BARS, ImagingBenchConfig, bench_imaging
 
 PAGE = Path(__file__).parents[1] / "imaging.md"
 BEGIN, END = "<!-- bench:begin -->", "<!-- bench:end -->"

@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 from endopilot.env.tasks import ladder_tasks
-from endopilot.evaluation.robustness import title_of
+from endopilot.ladder.mismatch import title_of
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "ladder.md"

@@ -16,8 +16,8 @@ import numpy as np
 import torch
 
 from endopilot.dataset.loader import load_dataset
-from endopilot.evaluation.baselines import hold_slack
 from endopilot.evaluation.metrics import OFF_WALL_MM
+from endopilot.evaluation.prediction_baselines import hold_slack
 from endopilot.files import read_json
 from endopilot.models.config import WINDOW
 from endopilot.models.rollout import load_run

@@ -20,7 +20,7 @@ from learning import PAGE, row, written
 from torch import Tensor, nn
 
 from endopilot.dataset.loader import Dataset, load_dataset
-from endopilot.evaluation.baselines import hold_slack
+from endopilot.evaluation.prediction_baselines import hold_slack
 from endopilot.models import causal, play
 from endopilot.models.causal import CausalNetwork
 from endopilot.models.config import WINDOW, CausalConfig

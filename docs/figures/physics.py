@@ -7,7 +7,7 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 
-from endopilot.simulation import scenarios
+from endopilot.verification import scenes as scenarios
 
 mpl.use("Agg")
 import matplotlib.pyplot as plt

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from endopilot.anatomy.atlas import AtlasConfig, synthesize_one
+from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.control.agent import AgentPolicy, TwinPolicy
-from endopilot.control.navigate import Truth, navigate
+from endopilot.control.navigate import ModelMismatch, navigate
 from endopilot.control.policies import make_policy
 from endopilot.control.policy import Policy
 from endopilot.env.task import Navigation, Target
@@ -45,7 +45,7 @@ def shaped(angle_deg: float, length_mm: float) -> Device:
     return replace(wire, tip_bend_length_mm=length_mm)
 
 
-def drive(name: str, navigation: Navigation, truth: Truth) -> tuple[bool, int, float]:
+def drive(name: str, navigation: Navigation, truth: ModelMismatch) -> tuple[bool, int, float]:
     """Return safe success, exposures and processor seconds of one navigation."""
     kinds: dict[str, Policy] = {"twin": TwinPolicy(truth), "agent": AgentPolicy()}
     policy, began = kinds.get(name) or make_policy(name), time.process_time()
@@ -55,7 +55,7 @@ def drive(name: str, navigation: Navigation, truth: Truth) -> tuple[bool, int, f
 
 def measure() -> list[str]:
     """Return the rows of the table."""
-    patients = [synthesize_one(AtlasConfig(anatomy=kind, seed=SEED), number) for kind, number in PATIENTS]
+    patients = [make_patient(AtlasConfig(anatomy=kind, seed=SEED), number) for kind, number in PATIENTS]
     rows = ["| tip | policy | safe success | exposures | processor, s |", "|---|---|---|---|---|"]
     for angle_deg, length_mm in TIPS:
         for name in POLICIES:
@@ -63,7 +63,7 @@ def measure() -> list[str]:
             for anatomy in patients:
                 for target in side_branches(anatomy):
                     friction, stiffness, side = off.choice([-1.0, 1.0], 3)
-                    truth = Truth(
+                    truth = ModelMismatch(
                         friction_factor=1 + 0.2 * friction, stiffness_factor=1 + 0.2 * stiffness, ostium_mm=0.3 * side
                     )
                     navigation = Navigation(

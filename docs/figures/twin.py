@@ -16,8 +16,8 @@ import numpy as np
 from endopilot.dataset.loader import Dataset, load_dataset
 from endopilot.models.config import WINDOW, TwinConfig
 from endopilot.models.twin import TwinPredictor
+from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import Device
-from endopilot.simulation.simulator import SimulatorConfig
 
 PAGE = Path(__file__).parents[1] / "models.md"
 SEED, OFF, DEEPER_MM = 600, 0.2, 0.3

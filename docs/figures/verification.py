@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from endopilot.simulation.verify import run_verification
-from endopilot.simulation.verify_plots import file_name
+from endopilot.verification.plots import file_name
+from endopilot.verification.verify import run_verification
 
 DOCS = Path(__file__).parents[1]
 BEGIN, END = "<!-- table:begin -->", "<!-- table:end -->"

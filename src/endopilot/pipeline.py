@@ -17,10 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from endopilot.anatomy.atlas import AtlasConfig, synthesize_one
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy, read_source
 from endopilot.anatomy.io import read_anatomy, write_anatomy
-from endopilot.anatomy.phantom import PhantomConfig, make_phantom
+from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.dataset.generate import DatasetConfig, generate_dataset
 from endopilot.dataset.loader import load_dataset
 from endopilot.errors import InputError
@@ -31,9 +30,11 @@ from endopilot.imaging.segment import SegmentConfig, segment
 from endopilot.imaging.volume import read_mask, read_volume, write_mask, write_volume
 from endopilot.models.config import PRETRAINED, TrainConfig, run_path
 from endopilot.parallel import each
+from endopilot.phantom.phantom import PhantomConfig, make_phantom
 from endopilot.progress import progress
+from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import Device, read_device
-from endopilot.simulation.simulator import SimulatorConfig, simulate
+from endopilot.simulation.simulate import simulate
 from endopilot.types import Rollout
 
 VOLUME_SUFFIX = ".nii.gz"
@@ -196,7 +197,7 @@ def run_volume(volume: Path, output: Path, config: RunConfig, *, series: str | N
 
 def _make_patient(folder: Path, *, config: AtlasConfig, truths: Sequence[Path]) -> None:
     if not folder.exists():
-        write_anatomy(synthesize_one(config, truths.index(folder)), folder)
+        write_anatomy(make_patient(config, truths.index(folder)), folder)
 
 
 def _make_volume(folder: Path, *, output: Path, seed: int, truths: Sequence[Path]) -> None:
@@ -248,6 +249,7 @@ def _learn(output: Path, anatomies: Sequence[Path], config: StudyConfig, ledger:
     """Simulate navigations, train both networks on them unless the packaged ones are to do, and evaluate these."""
     from endopilot.evaluation.evaluate import EvaluateConfig, evaluate
     from endopilot.models.train import train  # torch takes seconds to import
+    from endopilot.report.evaluation_report import report_evaluation
 
     trains = config.training_seconds > 0
     unseen = len(anatomies) // 3 if trains else len(anatomies) - len(anatomies) // 3  # the others give baselines' means
@@ -268,6 +270,7 @@ def _learn(output: Path, anatomies: Sequence[Path], config: StudyConfig, ledger:
     def measure() -> None:
         settings = EvaluateConfig(sequences=EVALUATED, seed=config.seed)
         evaluate(_run(output, config.training_seconds), output / "evaluation", settings, output / "dataset")
+        report_evaluation(output / "evaluation")
 
     ledger.stage("evaluation", measure)
 
@@ -279,7 +282,7 @@ def _run(output: Path, training_seconds: float) -> Path:
 
 def _report(output: Path, names: Sequence[str], origin: str, command: str, ledger: Ledger) -> None:
     """Write report.html from what the other stages left in `output`."""
-    from endopilot.evaluation.report import PatientContent, ReportContent, write_report  # matplotlib and plotly
+    from endopilot.report.report import PatientContent, ReportContent, write_report  # matplotlib and plotly
 
     anatomy, replay = _replay(output, read_device(ledger.config["device"]))
     scores = _scores(output, names)

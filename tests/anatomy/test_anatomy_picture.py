@@ -6,8 +6,8 @@ import numpy as np
 from analytic_shapes import forked_tree
 from matplotlib.image import imread
 
+from endopilot.anatomy.anatomy_picture import draw_anatomy
 from endopilot.anatomy.extract import extract_anatomy
-from endopilot.anatomy.picture import draw_anatomy
 from endopilot.types import Volume
 
 

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from analytic_shapes import forked_tree
 
-from endopilot.anatomy.atlas import AtlasConfig, synthesize_tree
 from endopilot.anatomy.labels import dominance, label_tree
 from endopilot.anatomy.tree import curvature_torsion, make_centerline
+from endopilot.atlas.atlas import AtlasConfig, make_patient_tree
 from endopilot.errors import InputError
 
 
 def test_right_coronary_sections_agree_with_the_atlas():
     right = total = 0
     for index in range(6):
-        truth, _ = synthesize_tree(AtlasConfig(anatomy="rca", count=6, seed=7), index)
+        truth, _ = make_patient_tree(AtlasConfig(anatomy="rca", count=6, seed=7), index)
         found = label_tree(truth, "rca")
         for one, two in zip(truth.branches, found.branches, strict=True):
             names = [truth.section_names[i] for i in one.section]

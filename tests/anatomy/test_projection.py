@@ -7,9 +7,9 @@ import itertools
 import numpy as np
 from analytic_shapes import forked_tree
 
-from endopilot.anatomy.analytic import tree_of
-from endopilot.anatomy.atlas import AtlasConfig, synthesize_tree
 from endopilot.anatomy.projection import project_tip
+from endopilot.atlas.atlas import AtlasConfig, make_patient_tree
+from endopilot.benchmarks.analytic_lumens import tree_of
 from endopilot.types import Insertion
 
 INSERTION = Insertion(np.zeros(3), np.array([0.0, 0, 1]))
@@ -87,7 +87,7 @@ def test_shapes_follow_the_points():
 
 
 def test_agrees_with_brute_force_on_a_whole_tree():
-    tree, _ = synthesize_tree(AtlasConfig(seed=3), 0)
+    tree, _ = make_patient_tree(AtlasConfig(seed=3), 0)
     rng = np.random.default_rng(0)
     centre, size = (np.concatenate([getattr(b.centerline, n) for b in tree.branches]) for n in ("points", "radius"))
     chosen = rng.integers(0, len(centre), 3000)

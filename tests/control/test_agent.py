@@ -12,11 +12,13 @@ from hypothesis import strategies as st
 from endopilot.control import search
 from endopilot.control.agent import AgentConfig, AgentPolicy, OpenLoopPolicy, TwinPolicy
 from endopilot.control.belief import Belief, BeliefConfig
-from endopilot.control.navigate import Truth, navigate
-from endopilot.control.policy import Decision, Policy, Sight, TipMeasurement
+from endopilot.control.navigate import ModelMismatch, navigate
+from endopilot.control.policy import Decision, Observation, Policy
 from endopilot.control.search import Course, Search
-from endopilot.control.xray import AdvisorConfig, Calibration
 from endopilot.env.task import Navigation, Target
+from endopilot.xray.adviser import AdviserConfig
+from endopilot.xray.bands import Calibration
+from endopilot.xray.fluoroscope import TipMeasurement
 
 QUICK = AgentConfig(belief=BeliefConfig(members=6, time_step_s=0.05))
 
@@ -27,7 +29,7 @@ class Forward:
     def start(self, navigation: Navigation, seed: int) -> None:
         pass
 
-    def decide(self, sight: Sight) -> Decision:
+    def decide(self, observation: Observation) -> Decision:
         return Decision(6.0, 0.0)
 
 
@@ -67,7 +69,7 @@ def test_a_course_is_what_the_simulator_does_under_its_controls(side_branch) -> 
 
 
 def test_the_agent_finds_the_way_though_the_wire_is_another_than_believed(side_branch) -> None:
-    truth = Truth(friction_factor=1.2, stiffness_factor=0.8, ostium_mm=0.3)
+    truth = ModelMismatch(friction_factor=1.2, stiffness_factor=0.8, ostium_mm=0.3)
     record = navigate(side_branch, AgentPolicy(QUICK), seed=2, truth=truth)
     assert record.success and record.safe and record.faults == 0
     assert 1 <= record.exposures < (len(record.time_s) - 1) / 2  # it looks seldom
@@ -103,12 +105,12 @@ def test_a_tip_that_no_wire_explains_is_pulled_back_under_xray(side_branch) -> N
     policy = AgentPolicy(QUICK)
     policy.start(side_branch, 0)
     seen = measured(policy.belief, 0)
-    first = policy.decide(Sight(0.0, 2.0, 0.0, seen))
+    first = policy.decide(Observation(0.0, 2.0, 0.0, seen))
     assert first.translation > 0
     far = replace(seen, position=seen.position + np.array([6.0, 0.0, 5.0]))
-    lost = policy.decide(Sight(0.5, 2.0, 0.0, far))
+    lost = policy.decide(Observation(0.5, 2.0, 0.0, far))
     assert lost.translation < 0 and lost.expose
-    policy.decide(Sight(1.0, 2.0, 0.0, measured(policy.belief, 0)))
+    policy.decide(Observation(1.0, 2.0, 0.0, measured(policy.belief, 0)))
     assert policy.plans == 2  # found again, it searches another way
 
 
@@ -118,9 +120,9 @@ def test_with_a_calibration_the_adviser_says_when_to_look(side_branch) -> None:
         level=0.9, scale=1.0, abscissa_terms=(0.0, 0.5, 0.0, 0.0), offset_terms=(0.0, 0.0, 0.0, 0.0), anatomies=9,
         intervals=9, dataset="",
     )  # fmt: skip
-    policy = AgentPolicy(QUICK, calibration=calibration, advice=AdvisorConfig(abscissa_mm=1.0, wall_ratio=2.0))
+    policy = AgentPolicy(QUICK, calibration=calibration, advice=AdviserConfig(abscissa_mm=1.0, wall_ratio=2.0))
     policy.start(replace(side_branch, target=Target(branch=1, abscissa=39.0)), 0)
-    at = [k for k in range(9) if policy.decide(Sight(0.5 * k, 2.0, 0.0, None)).expose]
+    at = [k for k in range(9) if policy.decide(Observation(0.5 * k, 2.0, 0.0, None)).expose]
     assert at == [3, 7]
 
 
@@ -139,7 +141,7 @@ def test_open_loop_plans_once_and_looks_no_more(side_branch) -> None:
     assert record.success and record.exposures == 1 and policy.plans == 1
     policy.start(side_branch, 0)
     far = replace(measured(policy.belief, 0), position=np.full(3, 50.0))
-    assert policy.decide(Sight(0.0, 2.0, 0.0, far)).translation > 0  # whatever the first exposure shows
+    assert policy.decide(Observation(0.0, 2.0, 0.0, far)).translation > 0  # whatever the first exposure shows
 
 
 NUMBERS = st.floats(allow_nan=True, allow_infinity=True, width=64)
@@ -167,7 +169,7 @@ def test_whatever_the_model_returns_commands_are_finite_and_within_limits(starte
 
     started._search.find, started._course, started._vain = find, None, 0
     for k in range(len(control)):
-        decision = started.decide(Sight(0.5 * k, 2.0, 0.0, None))
+        decision = started.decide(Observation(0.5 * k, 2.0, 0.0, None))
         assert np.isfinite([decision.translation, decision.rotation]).all()
         assert abs(decision.translation) <= shaped.max_velocity_mm_s
         assert abs(decision.rotation) <= shaped.max_rotation_rad_s

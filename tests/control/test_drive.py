@@ -9,11 +9,12 @@ from hypothesis import strategies as some
 
 from endopilot.control.drive import Drive, _Lines
 from endopilot.control.drive_protocol import LONGEST_LINE, SILENCE_S, Message, Signer, read_secret
-from endopilot.control.robot import Limits, RobotConfig
+from endopilot.control.robot import RobotConfig
 from endopilot.errors import InputError
+from endopilot.simulation.drive_limits import DriveLimits
 
 SECRET = b"0123456789abcdef"
-LIMITS = Limits(max_velocity_mm_s=40.0, max_rotation_rad_s=12.0, travel_mm=(0.0, 100.0))
+LIMITS = DriveLimits(max_velocity_mm_s=40.0, max_rotation_rad_s=12.0, travel_mm=(0.0, 100.0))
 QUIET = RobotConfig(latency_s=0.0, encoder_sd_mm=0.0, encoder_sd_rad=0.0)
 
 

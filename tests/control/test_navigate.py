@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from endopilot.control.fluoroscope import FluoroscopeConfig
-from endopilot.control.navigate import NavigateConfig, Truth, navigate
-from endopilot.control.policy import Decision, Policy, Sight
+from endopilot.control.navigate import ModelMismatch, NavigateConfig, navigate
+from endopilot.control.policy import Decision, Observation, Policy
 from endopilot.control.robot import RobotConfig
 from endopilot.env.task import Navigation, Target
+from endopilot.xray.fluoroscope import FluoroscopeConfig
 
 PERFECT = RobotConfig(
     latency_s=0.0,
@@ -27,13 +27,13 @@ class Forward:
 
     def __init__(self, speed: float, expose_every: int = 1000, rotation: float = 0.0) -> None:
         self.speed, self.expose_every, self.rotation = speed, expose_every, rotation
-        self.told: list[Sight] = []
+        self.told: list[Observation] = []
 
     def start(self, navigation: Navigation, seed: int) -> None:
         self.navigation = navigation
 
-    def decide(self, sight: Sight) -> Decision:
-        self.told.append(sight)
+    def decide(self, observation: Observation) -> Decision:
+        self.told.append(observation)
         return Decision(self.speed, self.rotation, expose=len(self.told) % self.expose_every == 0)
 
 
@@ -54,7 +54,7 @@ def test_a_policy_that_pushes_on_reaches_a_target_straight_ahead(straight) -> No
     assert record.seconds == record.time_s[-1] == 0.5 * samples
     # X-ray is on at the start and where the decision before asked for it; only then is a tip told
     on = [index == 0 or index % 3 == 0 for index in range(samples)]
-    assert [sight.tip is not None for sight in policy.told] == on == record.exposed[:-1].tolist()
+    assert [observation.tip is not None for observation in policy.told] == on == record.exposed[:-1].tolist()
     assert record.exposures == sum(on)
     for index in np.flatnonzero(record.exposed):
         assert policy.told[index].tip is record.measured[index]
@@ -76,8 +76,8 @@ def test_it_ends_in_time_and_the_same_seed_repeats_it(straight) -> None:
 
 def test_encoders_count_from_where_the_ostium_is_believed_to_be(straight) -> None:
     policy = Forward(4.0)
-    record = navigate(straight, policy, config=NavigateConfig(robot=PERFECT), truth=Truth(ostium_mm=1.5))
-    encoder = np.array([sight.inserted_length for sight in policy.told])
+    record = navigate(straight, policy, config=NavigateConfig(robot=PERFECT), truth=ModelMismatch(ostium_mm=1.5))
+    encoder = np.array([observation.inserted_length for observation in policy.told])
     np.testing.assert_allclose(record.inserted_length[:-1] - encoder, 1.5, atol=1e-9)
     np.testing.assert_allclose(np.diff(record.inserted_length), 2.0, atol=1e-6)
 
@@ -85,7 +85,7 @@ def test_encoders_count_from_where_the_ostium_is_believed_to_be(straight) -> Non
 def test_friction_and_stiffness_of_the_truth_change_what_happens(straight) -> None:
     config = NavigateConfig(robot=PERFECT)
     plain = navigate(straight, Forward(3.0, rotation=2.0), config=config)
-    for truth in (Truth(friction_factor=2.0), Truth(stiffness_factor=0.5)):
+    for truth in (ModelMismatch(friction_factor=2.0), ModelMismatch(stiffness_factor=0.5)):
         changed = navigate(straight, Forward(3.0, rotation=2.0), config=config, truth=truth)
         both = min(len(plain.time_s), len(changed.time_s))
         assert np.abs(changed.tip_position[:both] - plain.tip_position[:both]).max() > 1e-3

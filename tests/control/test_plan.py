@@ -11,20 +11,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from endopilot.anatomy.io import read_anatomy
+from endopilot.anatomy.projection import safety_ratio
 from endopilot.control import learned
 from endopilot.control import plan as plan_module
-from endopilot.control.cost import Cost, safety_ratio
+from endopilot.control.cost import Cost
 from endopilot.control.desired import read_tips
 from endopilot.control.plan import PlanConfig, plan, within_limits
 from endopilot.control.plan_file import read_plan, write_plan
-from endopilot.control.robot import Limits
 from endopilot.dataset.loader import Dataset
 from endopilot.errors import InputError
 from endopilot.files import read_json, write_json
 from endopilot.models.config import WINDOW
-from endopilot.models.open_loop import OpenLoop, Seen
+from endopilot.models.open_loop import Observed, OpenLoop
+from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import read_controls_csv
-from endopilot.simulation.simulator import SimulatorConfig, simulate
+from endopilot.simulation.drive_limits import DriveLimits
+from endopilot.simulation.simulate import simulate
 
 SLACK = 0.9
 
@@ -124,7 +126,7 @@ class Toy:
         tip = np.stack([SLACK * proximal[..., 0], np.full(proximal.shape[:2], 0.5)], axis=-1)
         return OpenLoop(tip=tip, proximal=proximal, control=episodes.control[:, WINDOW:])
 
-    def rollout_dual(self, episodes: Dataset, seen: Seen | None = None) -> OpenLoop:
+    def rollout_dual(self, episodes: Dataset, seen: Observed | None = None) -> OpenLoop:
         wanted = episodes.tip_abscissa[:, WINDOW:] / SLACK
         before = np.concatenate([episodes.inserted_length[:, WINDOW - 1 : WINDOW], wanted[:, :-1]], axis=1)
         control = np.stack([(wanted - before) / 0.5, np.zeros_like(wanted)], axis=-1)
@@ -196,7 +198,7 @@ NUMBERS = st.floats(allow_nan=True, allow_infinity=True, width=64)
 @given(asked=st.lists(st.tuples(NUMBERS, NUMBERS), min_size=1, max_size=30), start=st.floats(0.0, 60.0))
 @settings(max_examples=150, deadline=None)
 def test_planned_controls_are_finite_and_within_limits_whatever_a_model_asks(asked, start):
-    limits = Limits(max_velocity_mm_s=40.0, max_rotation_rad_s=12.6, travel_mm=(0.0, 60.0))
+    limits = DriveLimits(max_velocity_mm_s=40.0, max_rotation_rad_s=12.6, travel_mm=(0.0, 60.0))
     made = within_limits(np.array(asked), limits, start)
     assert np.isfinite(made).all() and (np.abs(made) <= [40.0, 12.6]).all()
     inserted = start + 0.5 * np.cumsum(made[:, 0])

@@ -13,12 +13,12 @@ from endopilot.control.belief import Belief
 from endopilot.control.plan import PlanConfig
 from endopilot.control.plan_file import read_plan, write_plan
 from endopilot.control.plan_xray import PlannedXray, plan_xray, read_calibration
-from endopilot.control.xray import Calibration
 from endopilot.dataset.loader import Dataset
 from endopilot.errors import InputError
 from endopilot.files import write_json
 from endopilot.models.config import WINDOW
-from endopilot.models.open_loop import Foretold, OpenLoop
+from endopilot.models.open_loop import OpenLoop, Prediction
+from endopilot.xray.bands import Calibration
 
 STILL = (0.0, 0.0, 0.0, 0.0)
 
@@ -43,12 +43,12 @@ class Lagging:
 class Doubting(Lagging):
     """The same, whose spread grows by 0.3 mm a period since it last saw the tip."""
 
-    def foretell(self, episodes: Dataset, seen: np.ndarray) -> Foretold:
+    def foretell(self, episodes: Dataset, seen: np.ndarray) -> Prediction:
         each = np.broadcast_to(seen, episodes.valid.shape)
         last = np.maximum.accumulate(np.where(each, np.arange(each.shape[1]), 0), axis=1)
         spread = 0.3 * (np.arange(each.shape[1]) - last)
         tip = np.stack([0.8 * episodes.inserted_length, np.full(each.shape, 0.1)], axis=-1).astype(float)
-        return Foretold(tip=tip, spread=np.stack([spread, 0.0 * spread], axis=-1))
+        return Prediction(tip=tip, spread=np.stack([spread, 0.0 * spread], axis=-1))
 
 
 @pytest.fixture

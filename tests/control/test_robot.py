@@ -8,12 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as some
 
 from endopilot.control.remote import RemoteRobot
-from endopilot.control.robot import CYCLE_S, DriveMotion, Limits, Robot, RobotConfig, SimulatedRobot
+from endopilot.control.robot import CYCLE_S, DriveMotion, Robot, RobotConfig, SimulatedRobot
 from endopilot.errors import InputError
-from endopilot.simulation.simulator import SimulatorConfig
-from endopilot.simulation.stepping import Simulator
+from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.drive_limits import DriveLimits
+from endopilot.simulation.simulator import Simulator
 
-LIMITS = Limits(max_velocity_mm_s=40.0, max_rotation_rad_s=12.0, travel_mm=(0.0, 100.0))
+LIMITS = DriveLimits(max_velocity_mm_s=40.0, max_rotation_rad_s=12.0, travel_mm=(0.0, 100.0))
 IDEAL = {"latency_s": 0.0, "backlash_mm": 0.0, "backlash_rad": 0.0, "encoder_sd_mm": 0.0, "encoder_sd_rad": 0.0}
 ANYTHING = some.one_of(
     some.floats(), some.integers(), some.none(), some.text(max_size=3), some.booleans(), some.just(np.float32("nan"))
@@ -83,7 +84,7 @@ def test_motion_is_lost_where_it_reverses() -> None:
 def test_the_encoders_read_the_wire_with_noise(fork, wire) -> None:
     simulator = Simulator(fork, wire, config=SimulatorConfig(elements=30, threads=1))
     simulator.reset(inserted_length=[10.0], rotation=[0.3])
-    robot = SimulatedRobot(simulator, Limits.of(wire, fork), RobotConfig(encoder_sd_mm=0.05), seed=3)
+    robot = SimulatedRobot(simulator, DriveLimits.of(wire, fork), RobotConfig(encoder_sd_mm=0.05), seed=3)
     assert isinstance(robot, Robot)
     robot.command(8.0, 0.0)
     robot.run(10 * CYCLE_S)
@@ -96,13 +97,13 @@ def test_the_encoders_read_the_wire_with_noise(fork, wire) -> None:
     robot.command(1e6, np.nan)
     robot.command(40.0, 0.0)
     robot.run(3.0)
-    assert simulator.inserted_length[0] <= Limits.of(wire, fork).travel_mm[1] + 1e-6
+    assert simulator.inserted_length[0] <= DriveLimits.of(wire, fork).travel_mm[1] + 1e-6
 
 
 def test_refuses_bad_settings() -> None:
     for make, message in (
-        (lambda: Limits(max_velocity_mm_s=np.nan, max_rotation_rad_s=1.0), "max_velocity_mm_s: nan"),
-        (lambda: Limits(max_velocity_mm_s=1.0, max_rotation_rad_s=1.0, travel_mm=(3.0, 1.0)), "travel_mm"),
+        (lambda: DriveLimits(max_velocity_mm_s=np.nan, max_rotation_rad_s=1.0), "max_velocity_mm_s: nan"),
+        (lambda: DriveLimits(max_velocity_mm_s=1.0, max_rotation_rad_s=1.0, travel_mm=(3.0, 1.0)), "travel_mm"),
         (lambda: RobotConfig(latency_s=-1.0), "latency_s: -1.0"),
         (lambda: RobotConfig(max_acceleration_mm_s2=0.0), "max_acceleration_mm_s2: 0.0"),
     ):
@@ -111,7 +112,7 @@ def test_refuses_bad_settings() -> None:
 
 
 def test_what_is_possible_stays_within_speed_and_travel_of_all_wires() -> None:
-    limits = Limits(max_velocity_mm_s=20.0, max_rotation_rad_s=3.0, travel_mm=(0.0, 100.0))
+    limits = DriveLimits(max_velocity_mm_s=20.0, max_rotation_rad_s=3.0, travel_mm=(0.0, 100.0))
     asked = np.array([[50.0, -9.0], [-50.0, 1.0], [2.0, 0.0]])
     made = limits.possible(asked, np.array([4.0, 97.0]), 0.5)
     assert made.tolist() == [[6.0, -3.0], [-8.0, 1.0], [2.0, 0.0]]

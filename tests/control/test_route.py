@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from endopilot.anatomy.analytic import tree_of
 from endopilot.anatomy.projection import project_tip
-from endopilot.control.route import Route, check_passable, find_target
+from endopilot.benchmarks.analytic_lumens import tree_of
+from endopilot.control.route import Route, check_passable, parse_target
 from endopilot.env.task import Target
 from endopilot.errors import InputError
 from endopilot.types import Branch, VesselTree
@@ -66,10 +66,10 @@ def named(fork):
 
 def test_targets_by_name_and_by_place(fork):
     anatomy = named(fork)
-    assert find_target(anatomy, "PDA") == find_target(anatomy, "4")
-    target = find_target(anatomy, "4")
+    assert parse_target(anatomy, "PDA") == parse_target(anatomy, "4")
+    target = parse_target(anatomy, "4")
     assert target.branch == 2 and target.abscissa == pytest.approx(30.0, abs=0.5)
-    point = find_target(anatomy, "0.3, 0, 31.9")
+    point = parse_target(anatomy, "0.3, 0, 31.9")
     assert point.branch == 1 and point.abscissa == pytest.approx(32.0, abs=0.3)
 
 
@@ -79,7 +79,7 @@ def test_targets_by_name_and_by_place(fork):
 )
 def test_targets_outside_the_tree_are_refused(fork, text, part):
     with pytest.raises(InputError, match=part):
-        find_target(named(fork), text)
+        parse_target(named(fork), text)
 
 
 def test_a_lumen_narrower_than_the_wire_hides_what_lies_behind_it(fork, wire):

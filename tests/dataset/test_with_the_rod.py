@@ -6,14 +6,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from endopilot.anatomy.atlas import AtlasConfig, synthesize_one
 from endopilot.anatomy.io import read_anatomy, write_anatomy
+from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.dataset.draw import TIP_GROUP, draw_navigations
 from endopilot.dataset.generate import DatasetConfig, generate_dataset
 from endopilot.dataset.loader import load_dataset
-from endopilot.dataset.navigate import PULL_BACK_MM, STOP_SHORT_MM, navigate
+from endopilot.dataset.navigations import PULL_BACK_MM, STOP_SHORT_MM, simulate_navigations
 from endopilot.simulation.device import read_device
-from endopilot.simulation.simulator import simulate
+from endopilot.simulation.simulate import simulate
 
 DEVICE = read_device("workhorse-014")
 
@@ -21,7 +21,7 @@ DEVICE = read_device("workhorse-014")
 @pytest.fixture(scope="module")
 def patient(tmp_path_factory):
     folder = tmp_path_factory.mktemp("anatomies") / "patient"
-    write_anatomy(synthesize_one(AtlasConfig(count=1, seed=4), 0), folder)
+    write_anatomy(make_patient(AtlasConfig(count=1, seed=4), 0), folder)
     return folder
 
 
@@ -80,7 +80,7 @@ def test_wires_stay_inside_what_was_imaged_and_repeat_without_looking(patient):
     control[:, :, 1] = np.linspace(-2, 2, 6)[:, None]
     initial = np.column_stack([np.linspace(70.0, 1.5 * ends[np.isfinite(ends)].max(), 6), np.zeros(6)])
     friction = np.linspace(0.05, 0.2, 6)
-    rollout, applied, stopped = navigate(anatomy, [DEVICE] * 6, initial, control, friction, config)
+    rollout, applied, stopped = simulate_navigations(anatomy, [DEVICE] * 6, initial, control, friction, config)
     assert rollout.valid.all()
     assert stopped.all()
     assert (rollout.tip.abscissa < ends[rollout.tip.branch] - 0.5 * STOP_SHORT_MM).all()

@@ -10,8 +10,8 @@ import pytest
 import SimpleITK as sitk
 from command import refused, run
 
-from endopilot.anatomy.atlas import AtlasConfig, synthesize_one
 from endopilot.anatomy.io import write_anatomy
+from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.cli import main
 from endopilot.files import read_json
 from endopilot.imaging.volume import write_mask, write_volume
@@ -22,7 +22,7 @@ from endopilot.types import Insertion, LumenMask, Volume
 @pytest.fixture(scope="module")
 def patient(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("patient") / "rca"
-    write_anatomy(synthesize_one(AtlasConfig(seed=7), 0), folder)
+    write_anatomy(make_patient(AtlasConfig(seed=7), 0), folder)
     return folder
 
 
@@ -111,7 +111,7 @@ def test_wire_and_controls(tmp_path, capsys, patient):
 
 
 def test_a_lumen_too_narrow_for_the_wire(tmp_path, capsys, patient):
-    anatomy = synthesize_one(AtlasConfig(seed=7), 0)
+    anatomy = make_patient(AtlasConfig(seed=7), 0)
     narrow = replace(anatomy, catheter_radius_mm=0.1, name="narrow")
     write_anatomy(narrow, tmp_path / "narrow")
     assert "catheter" in refused(capsys, "simulate", tmp_path / "narrow", "-o", tmp_path / "rollout.csv")

@@ -10,8 +10,8 @@ import pydicom
 import pytest
 from command import refused, run
 
-from endopilot.anatomy.atlas import AtlasConfig, synthesize_one
 from endopilot.anatomy.io import write_anatomy
+from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.imaging.volume import read_mask, read_volume, write_mask, write_volume
 from endopilot.types import Insertion, LumenMask, Volume
 
@@ -21,7 +21,7 @@ _COARSE = ("--in-plane-mm", "1.0", "--slice-mm", "1.5", "--margin-mm", "8")
 @pytest.fixture(scope="module")
 def patient(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("patient") / "rca"
-    write_anatomy(synthesize_one(AtlasConfig(seed=7), 0), folder)
+    write_anatomy(make_patient(AtlasConfig(seed=7), 0), folder)
     return folder
 
 

@@ -24,7 +24,7 @@ from endopilot.env.single import NavigateEnv
 from endopilot.env.task import Navigation, Target
 from endopilot.env.tasks import reference_navigation
 from endopilot.errors import InputError
-from endopilot.simulation.stepping import Simulator
+from endopilot.simulation.simulator import Simulator
 
 WORLDS, STEPS = 3, 12
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import endopilot.env
-from endopilot.anatomy.atlas import AtlasConfig, synthesize_tree
+from endopilot.atlas.atlas import AtlasConfig, make_patient_tree
 from endopilot.env import tasks
-from endopilot.env.tasks import find_target, find_task, ladder_tasks, read_task
+from endopilot.env.tasks import find_task, ladder_tasks, read_task, target_in_section
 from endopilot.errors import InputError
 
 FILES = sorted((Path(tasks.__file__).parent / "tasks").glob("*.yaml"))
@@ -38,8 +38,8 @@ def test_a_task_has_twenty_patients_and_others_to_learn_on(path):
 def test_the_target_lies_in_its_section(name):
     task = find_task(name)
     atlas = AtlasConfig(anatomy=task.anatomy, seed=task.ladder.seed, stenosis_share=task.stenosis_share)
-    tree, _ = synthesize_tree(atlas, task.ladder.numbers[0])
-    target = find_target(tree, task.section, task.depth_mm)
+    tree, _ = make_patient_tree(atlas, task.ladder.numbers[0])
+    target = target_in_section(tree, task.section, task.depth_mm)
     branch = tree.branches[target.branch]
     at = int(np.searchsorted(branch.centerline.abscissa, target.abscissa))
     assert tree.section_names[branch.section[at]] == task.section
@@ -75,10 +75,10 @@ def test_what_is_wrong_in_a_file_is_named(tmp_path, old, new, told):
 
 
 def test_a_target_outside_the_tree_is_refused():
-    tree, _ = synthesize_tree(AtlasConfig(), 0)
+    tree, _ = make_patient_tree(AtlasConfig(), 0)
     with pytest.raises(InputError, match="section: 'LAD'"):
-        find_target(tree, "LAD", 5.0)
+        target_in_section(tree, "LAD", 5.0)
     with pytest.raises(InputError, match="depth_mm: 500"):
-        find_target(tree, "4", 500.0)
+        target_in_section(tree, "4", 500.0)
     with pytest.raises(InputError, match="patient: 20"):
         find_task("crux").patient(find_task("crux").ladder, 20)

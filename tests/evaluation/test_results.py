@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from endopilot.errors import InputError
-from endopilot.evaluation import tables
 from endopilot.evaluation.results import read_results, write_results
 from endopilot.evaluation.summary import findings, generalisation_gap, over_seeds, summarize
+from endopilot.report import tables
 
 
 def test_results_read_back_as_written(results, tmp_path):

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 import torch
 
-from endopilot.anatomy.atlas import AtlasConfig, synthesize_one
 from endopilot.anatomy.io import write_anatomy
+from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.dataset.generate import DatasetConfig, generate_dataset
 from endopilot.dataset.loader import load_dataset
 from endopilot.errors import InputError
-from endopilot.evaluation.baselines import follow_slack, hold_slack, mean_control
+from endopilot.evaluation.prediction_baselines import follow_slack, hold_slack, mean_control
 from endopilot.files import read_json, sha256
 from endopilot.models.causal import CausalNetwork, CausalPredictor
 from endopilot.models.config import CausalConfig, TrainConfig
-from endopilot.models.open_loop import Foreteller, Predictor
+from endopilot.models.open_loop import Predictor, ProbabilisticPredictor
 from endopilot.models.play import N_FEATURES, mirrored
 from endopilot.models.rollout import load_run
 from endopilot.models.sequences import N_INPUTS, Sequences, read_vessels, unfold
@@ -36,7 +36,7 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("causal")
     patients = []
     for index in range(2):
-        anatomy = synthesize_one(AtlasConfig(seed=910), index)
+        anatomy = make_patient(AtlasConfig(seed=910), index)
         patients.append(folder / anatomy.name)
         write_anatomy(anatomy, patients[-1])
     config = DatasetConfig(sequences=4, seconds=37.5, anatomy_shares=(0.5, 0.0, 0.5), seed=4)
@@ -79,7 +79,7 @@ def miss(tip, episodes) -> np.ndarray:
 
 
 def test_the_packaged_pair_beats_holding_slack_and_offset_on_new_patients(packaged, everyone):
-    assert isinstance(packaged, Predictor) and isinstance(packaged, Foreteller)
+    assert isinstance(packaged, Predictor) and isinstance(packaged, ProbabilisticPredictor)
     ours, held = miss(packaged.rollout_forward(everyone).tip, everyone), miss(hold_slack(everyone, GIVEN), everyone)
     assert ours[..., 0].mean() < 0.35 * held[..., 0].mean()
     assert np.median(ours[..., 0]) < 0.15  # mm

@@ -16,9 +16,9 @@ import torch
 from endopilot.dataset.loader import load_dataset
 from endopilot.errors import InputError
 from endopilot.files import read_json, sha256
-from endopilot.models.board import board
 from endopilot.models.checkpoint import read_network, read_tensors
 from endopilot.models.config import TrainConfig, TransformerConfig
+from endopilot.models.learning_curves import board
 from endopilot.models.rollout import load_run
 from endopilot.models.train import train
 from endopilot.models.transformer import NETWORKS

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from endopilot.anatomy.atlas import AtlasConfig, synthesize_one
 from endopilot.anatomy.io import write_anatomy
+from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.dataset.generate import DatasetConfig, generate_dataset
 from endopilot.dataset.loader import load_dataset
 from endopilot.errors import InputError
@@ -17,7 +17,7 @@ from endopilot.models.config import TrainConfig, TwinConfig
 from endopilot.models.rollout import load_run
 from endopilot.models.train import train
 from endopilot.simulation.device import read_device
-from endopilot.simulation.simulator import simulate
+from endopilot.simulation.simulate import simulate
 
 GIVEN = np.arange(45) < 30
 OSTIUM_MM = 0.3
@@ -27,7 +27,7 @@ OSTIUM_MM = 0.3
 def folder(tmp_path_factory):
     """Return the folder of a twin's run, whose wires grip 14 to 20 % more than the device is said to."""
     folder = tmp_path_factory.mktemp("twin")
-    anatomy = synthesize_one(AtlasConfig(seed=77), 0)
+    anatomy = make_patient(AtlasConfig(seed=77), 0)
     write_anatomy(anatomy, folder / "anatomy")
     config = DatasetConfig(sequences=4, seconds=22.5, friction=(0.114, 0.12), seed=3)
     generate_dataset([folder / "anatomy"], folder / "dataset", read_device("workhorse-014"), config)
@@ -51,7 +51,7 @@ def test_identified_from_the_given_tips_it_foretells_the_others(folder, episodes
     told = twin.foretell(episodes, GIVEN)
     later = slice(30, None)
     miss = np.abs(told.tip[:, later, 0] - episodes.tip_abscissa[:, later])
-    anatomy = synthesize_one(AtlasConfig(seed=77), 0)
+    anatomy = make_patient(AtlasConfig(seed=77), 0)
     control = episodes.control.astype(float)
     drawn_out = -0.5 * np.cumsum(control[..., 0], axis=1).min(axis=1)
     start = np.column_stack([np.maximum(episodes.initial_inserted_length, drawn_out), episodes.initial_rotation])

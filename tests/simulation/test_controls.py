@@ -8,9 +8,10 @@ import pytest
 from bend import vessel
 
 from endopilot.errors import InputError
+from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, free_wire_load, random_controls, read_controls_csv
 from endopilot.simulation.device import read_device
-from endopilot.simulation.simulator import SimulatorConfig, simulate
+from endopilot.simulation.simulate import simulate
 
 
 def test_a_sequence_does_not_depend_on_the_others() -> None:

@@ -1,7 +1,9 @@
-"""The simulator in analytic vessels: kinematics, determinism, forces, refusal of bad input."""
+"""Stepping many worlds: the same bits as `simulate`, saved state, force drive, balance of loads, bad input."""
 
 from __future__ import annotations
 
+import doctest
+import signal
 import subprocess
 import sys
 from dataclasses import replace
@@ -10,15 +12,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bend import vessel
-from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from endopilot.errors import InputError
+from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import read_device
-from endopilot.simulation.simulator import SimulatorConfig, simulate
-from endopilot.types import Anatomy, Insertion
+from endopilot.simulation.simulate import simulate
+from endopilot.simulation.simulator import Simulator
+from endopilot.simulation.state import SimulatorState
+from endopilot.types import Anatomy
 
-WORLDS, SAMPLES = 6, 16
 DEVICE = read_device("workhorse-014")
+STIFF = read_device("stiff-014")
+PERIOD = 0.5
 
 
 @pytest.fixture(scope="module")
@@ -26,161 +32,316 @@ def anatomy() -> Anatomy:
     return vessel()
 
 
-def drive(worlds: int = WORLDS) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n samples 2"]]:
-    random = np.random.default_rng(5)
-    initial = np.column_stack([random.uniform(5, 30, worlds), random.uniform(-3, 3, worlds)])
-    return initial, np.stack(
-        [random.uniform(1, 8, (worlds, SAMPLES)), random.uniform(-3, 3, (worlds, SAMPLES))], axis=-1
+@pytest.fixture(scope="module")
+def wider() -> Anatomy:
+    return vessel(np.pi / 3)
+
+
+def start(worlds: int) -> np.ndarray:
+    random = np.random.default_rng(3)
+    return np.column_stack([random.uniform(5, 30, worlds), random.uniform(-3, 3, worlds)])
+
+
+def controls(samples: int, worlds: int) -> np.ndarray:
+    random = np.random.default_rng(4)
+    return np.stack([random.uniform(-2, 6, (samples, worlds)), random.uniform(-3, 3, (samples, worlds))], axis=-1)
+
+
+def begun(simulator: Simulator, worlds: int) -> Simulator:
+    first = start(worlds)
+    simulator.reset(inserted_length=first[:, 0], rotation=first[:, 1])
+    return simulator
+
+
+def test_steps_are_those_of_simulate_to_the_bit(anatomy: Anatomy) -> None:
+    control = controls(4, 3)
+    whole = simulate(anatomy, DEVICE, control.transpose(1, 0, 2).copy(), initial=start(3))
+    simulator = begun(Simulator(anatomy, DEVICE, worlds=3), 3)
+    for t in range(4):
+        step = simulator.step(control[t], PERIOD)
+        assert np.array_equal(step.tip_position, whole.tip_position[:, t])
+        assert np.array_equal(simulator.base_load[:, 0], whole.base_force[:, t])
+        assert np.array_equal(simulator.contacts.max(axis=1), whole.contact_force_max[:, t])
+        assert np.array_equal(simulator.project().abscissa, whole.tip.abscissa[:, t])
+    assert np.allclose(simulator.inserted_length, whole.inserted_length[:, -1], atol=1e-12)
+
+
+def test_every_world_has_its_own_anatomy_and_device(anatomy: Anatomy, wider: Anatomy) -> None:
+    anatomies, devices = [anatomy, wider, anatomy, wider], [DEVICE, DEVICE, STIFF, STIFF]
+    control = controls(3, 4)
+    together = begun(Simulator(anatomies, devices), 4)
+    for t in range(3):
+        step = together.step(control[t], 0.3)
+    assert together.position.shape == (4, together.nodes, 3)
+    for world in range(4):
+        alone = Simulator(anatomies[world], devices[world])
+        first = start(4)[world]
+        alone.reset(inserted_length=first[:1], rotation=first[1:])
+        for t in range(3):
+            single = alone.step(control[t, world][None], 0.3)
+        assert np.array_equal(step.tip_position[world], single.tip_position[0])
+        nodes = alone.nodes
+        assert np.array_equal(together.position[world, :nodes], alone.position[0])
+        assert np.isnan(together.position[world, nodes:]).all()
+        assert np.array_equal(together.contacts[world, :nodes], alone.contacts[0])
+    assert len({tuple(tip) for tip in step.tip_position}) == 4
+
+
+def test_threads_change_no_bit(anatomy: Anatomy) -> None:
+    tips = []
+    for threads in (1, 2):
+        simulator = begun(Simulator(anatomy, DEVICE, worlds=9, config=SimulatorConfig(threads=threads)), 9)
+        for control in controls(3, 9):
+            step = simulator.step(control, 0.25)
+        tips.append(step.tip_position)
+    assert np.array_equal(*tips)
+
+
+@pytest.mark.parametrize("worlds", [1, 5])
+def test_ctrl_c_stops_a_step_that_has_begun(anatomy: Anatomy, worlds: int) -> None:
+    simulator = begun(Simulator(anatomy, DEVICE, worlds=worlds, config=SimulatorConfig(threads=2)), worlds)
+    inserted = simulator.inserted_length
+    before = signal.signal(signal.SIGALRM, signal.default_int_handler)
+    signal.setitimer(signal.ITIMER_REAL, 0.2)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            simulator.step(np.tile([1e-3, 0.1], (worlds, 1)), 5000.0)
+    finally:
+        signal.signal(signal.SIGALRM, before)
+    assert np.array_equal(simulator.inserted_length, inserted)
+    assert simulator.step(np.ones((worlds, 2)), 0.1).valid.all()
+
+
+def test_restored_state_goes_on_with_the_same_bits(anatomy: Anatomy, tmp_path: Path) -> None:
+    control = controls(6, 3)
+    simulator = begun(Simulator(anatomy, DEVICE, worlds=3), 3)
+    for t in range(3):
+        simulator.step(control[t], 0.2)
+    state = simulator.state
+    state.save(tmp_path / "state.npz")
+    for t in range(3, 6):
+        step = simulator.step(control[t], 0.2)
+    after = simulator.state.values[0]
+
+    simulator.set_state(state)
+    for t in range(3, 6):
+        again = simulator.step(control[t], 0.2)
+    assert np.array_equal(step.tip_position, again.tip_position)
+
+    np.save(tmp_path / "control.npy", control)
+    script = f"""
+import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})
+import numpy as np
+from bend import vessel
+from endopilot.simulation.device import read_device
+from endopilot.simulation.state import SimulatorState
+from endopilot.simulation.simulator import Simulator
+from endopilot.simulation.state import SimulatorState
+from pathlib import Path
+simulator = Simulator(vessel(), read_device("workhorse-014"), worlds=3)
+simulator.set_state(SimulatorState.load(Path("state.npz")))
+for row in np.load("control.npy")[3:]:
+    simulator.step(row, 0.2)
+np.save("after.npy", simulator.state.values[0])
+"""
+    subprocess.run([sys.executable, "-c", script], cwd=tmp_path, check=True)
+    assert np.load(tmp_path / "after.npy").tobytes() == after.tobytes()
+
+
+def test_worlds_go_over_into_another_simulator_of_the_same_kind(anatomy: Anatomy, wider: Anatomy) -> None:
+    first = begun(Simulator(anatomy, [DEVICE, STIFF, DEVICE]), 3)
+    second = Simulator(anatomy, [STIFF, DEVICE], sharing=first)
+    second.copy_worlds([1, 2], of=first)
+    moved = second.step(controls(1, 2)[0], PERIOD)
+    wanted = first.step(controls(1, 2)[0][[0, 0, 1]], PERIOD)  # world 1 and world 2 get the controls of their copies
+    assert np.array_equal(moved.tip_position, wanted.tip_position[[1, 2]])
+    with pytest.raises(InputError, match="world 0 cannot become world 0"):
+        second.copy_worlds([0, 2], of=first)
+    with pytest.raises(InputError, match="world 0 cannot become world 0"):
+        Simulator(wider, DEVICE).copy_worlds([0], of=first)
+    with pytest.raises(InputError, match="other settings"):
+        Simulator(anatomy, DEVICE, config=SimulatorConfig(elements=50)).copy_worlds([0], of=first)
+
+
+def test_a_seed_draws_the_same_start_whatever_the_number_of_worlds(anatomy: Anatomy) -> None:
+    few, many = Simulator(anatomy, DEVICE, worlds=2), Simulator(anatomy, DEVICE, worlds=5)
+    few.reset(seed=7)
+    many.reset(seed=7)
+    assert np.array_equal(few.position, many.position[:2])
+    assert len(set(many.inserted_length)) == 5
+    kept = many.position[[0, 2, 4]]
+    many.reset(seed=8, worlds=[1, 3])
+    assert np.array_equal(many.position[[0, 2, 4]], kept)
+    assert not np.array_equal(many.position[1], few.position[1])
+
+
+def test_forces_replay_a_velocity_run(anatomy: Anatomy) -> None:
+    # The drive's force and torque are the gradient of the step's potential in the drive's motion; taken as loads,
+    # they make that motion the minimum.
+    config, dt = SimulatorConfig(time_step_s=0.02, tolerance_mm=1e-9, largest_jump=1e6), 0.02
+    leading = begun(Simulator(anatomy, DEVICE, worlds=4, config=config), 4)
+    led = begun(Simulator(anatomy, DEVICE, worlds=4, config=config, actuation="force"), 4)
+    random = np.random.default_rng(8)
+    velocity = np.repeat(
+        np.column_stack([random.uniform(1, 8, 8), random.uniform(-3, 3, 8)]).reshape(2, 4, 2), 40, axis=0
     )
+    apart, torques = [], []
+    for control in velocity:
+        step = leading.step(control, dt)
+        follower = led.step(leading.drive_load, dt)
+        apart.append(np.linalg.norm(step.tip_position - follower.tip_position, axis=-1))
+        torques.append(leading.drive_load)
+    assert leading.valid.all() and led.valid.all()
+    travelled = np.abs(velocity[..., 0]).sum(axis=0) * dt
+    assert (travelled > 3).all()
+    assert np.max(apart) < 1e-6
+    assert np.abs(led.inserted_length - leading.inserted_length).max() < 1e-6
+    assert np.abs(led.rotation - leading.rotation).max() < 1e-6
+    assert np.array_equal(led.drive_load, leading.drive_load)
 
 
-def same(a, b, rows) -> None:
-    for name in ("tip_position", "tip_direction", "contact_force_sum", "base_force", "base_torque", "iterations"):
-        assert np.array_equal(getattr(a, name), getattr(b, name)[rows]), name
+def test_no_force_moves_nothing_and_more_force_moves_more(anatomy: Anatomy) -> None:
+    simulator = Simulator(anatomy, DEVICE, worlds=3, actuation="force")
+    simulator.reset(inserted_length=np.full(3, 10.0), rotation=np.zeros(3))
+    for _ in range(10):
+        simulator.step(np.array([[0.0, 0.0], [0.09, 0.0], [0.12, 0.0]]), 0.1)
+    still, slow, fast = simulator.inserted_length - 10
+    assert abs(still) < 0.1  # the bent tip may push itself back a little against the valve's friction
+    assert 1.0 < slow < fast
 
 
-def test_bitwise_equal_whatever_the_company(anatomy: Anatomy) -> None:
-    initial, control = drive()
-    one = simulate(anatomy, DEVICE, control, initial=initial, config=SimulatorConfig(threads=1))
-    two = simulate(anatomy, DEVICE, control, initial=initial, config=SimulatorConfig(threads=2))
-    order = np.array([3, 0, 5, 1, 4, 2])
-    shuffled = simulate(anatomy, DEVICE, control[order], initial=initial[order])
-    alone = simulate(anatomy, DEVICE, control[[4]], initial=initial[[4]])
-    assert one.valid.all()
-    same(two, one, slice(None))
-    same(shuffled, one, order)
-    same(alone, one, [4])
+def test_force_drive_stops_where_the_wire_is_out(anatomy: Anatomy) -> None:
+    simulator = Simulator(anatomy, DEVICE, worlds=1, actuation="force")
+    simulator.reset(inserted_length=np.array([3.0]), rotation=np.array([0.0]))
+    for _ in range(20):
+        simulator.step(np.array([[-0.5, 0.0]]), 0.1)
+    assert simulator.valid.all()
+    # 0.5 N less the valve's 0.05 N on a stop of 100 N/mm
+    assert simulator.inserted_length[0] == pytest.approx(-0.0045, abs=1e-3)
 
 
-def test_kinematics_and_forces(anatomy: Anatomy) -> None:
-    initial, control = drive()
-    rollout = simulate(anatomy, DEVICE, control, initial=initial, record_shape=True)
-    expected = initial[:, None] + 0.5 * np.cumsum(control, axis=1)
-    np.testing.assert_allclose(rollout.inserted_length, expected[..., 0])
-    np.testing.assert_allclose(rollout.rotation, expected[..., 1])
-    assert rollout.shape is not None
-    along = np.linalg.norm(np.diff(rollout.shape, axis=2), axis=-1).sum(axis=-1)
-    np.testing.assert_allclose(along, along[0, 0], rtol=2e-3)  # the wire does not stretch
-    behind = rollout.shape[..., -1, :] - anatomy.insertion.position
-    np.testing.assert_allclose(behind[..., 0], rollout.inserted_length - along[0, 0], atol=0.2)
-    assert (rollout.contact_force_max <= rollout.contact_force_sum + 1e-12).all()
-    assert (rollout.tip.abscissa < rollout.inserted_length + 3).all()
-    assert rollout.contact_force_max.max() / 5.0 < 0.05  # penetration, mm
+def test_base_load_balances_contact_friction_and_drag(anatomy: Anatomy) -> None:
+    """Σ F = 0 along the catheter and Σ M = 0 about it, for the free part of the wire, in a random navigation.
+
+    Forces on node i: the wall's N_i n_i; friction -µN s/√(s² + ε²), with s the displacement of the touching surface in
+    the step; drag -c dx/dt. The couple of friction and spin drag acts on element i.
+    """
+    config = SimulatorConfig(tolerance_mm=1e-9)
+    simulator = begun(Simulator(anatomy, DEVICE, worlds=5, config=config), 5)
+    rod, insertion = simulator._groups[0].rod, anatomy.insertion
+    dt = config.time_step_s
+    axis, checked = insertion.direction, 0
+    for control in controls(6, 5):
+        simulator.step(control, PERIOD)  # the control changes with each period
+        for _ in range(2):
+            before = simulator.state.values[0][:, -21 * simulator.nodes :].reshape(5, -1, 21)
+            simulator.step(control, dt)
+            after = simulator.state.values[0][:, -21 * simulator.nodes :].reshape(5, -1, 21)
+            for world in range(5):
+                active = int((after[world, :, 3:7] != 0).any(axis=1).sum())
+                n = min(active, int((before[world, :, 3:7] != 0).any(axis=1).sum()))
+                x, q, moved, turned = (after[world, :n, a:b] for a, b in ((0, 3), (3, 7), (7, 10), (10, 13)))
+                limit, normal, arm = before[world, :n, 13], before[world, :n, 14:17], before[world, :n, 17:20]
+                wall = after[world, :n, 20, None] * after[world, :n, 14:17]
+                slip = moved - (moved * normal).sum(axis=1, keepdims=True) * normal + turned[:, 2:] * arm
+                size = np.sqrt((slip**2).sum(axis=1) + (config.stick_velocity_mm_s * dt) ** 2)
+                friction = -(limit / size)[:, None] * slip
+                drag = -rod.drag_n_s_mm[:n, None] / dt * moved
+                total = wall + friction + drag
+                half = 0.5 * turned
+                w = np.sqrt(1 - (half**2).sum(axis=1))
+                couple = (friction * arm).sum(axis=1)[:, None] * np.column_stack([-half[:, 1], half[:, 0], w])
+                couple -= (2 * rod.spin_drag_n_mm_s[:n] / dt * w)[:, None] * half
+                about = Rotation.from_quat(q[:, [1, 2, 3, 0]]).apply(couple).sum(axis=0)
+                moment = np.cross(x - insertion.position, total).sum(axis=0) + about
+                force, torque = simulator.base_load[world]
+                # what is left is a Newton step of 1e-9 mm against an axial stiffness of up to 5e4 N/mm
+                assert force + total.sum(axis=0) @ axis == pytest.approx(0, abs=5e-5)
+                assert torque + moment @ axis == pytest.approx(0, abs=5e-5)
+                checked += np.abs(friction).max() > 1e-4 and abs(force) > 1e-3 and abs(torque) > 1e-4
+    assert checked > 10
 
 
-def test_the_wire_moves_on_evenly_while_nodes_are_set_free(anatomy: Anatomy) -> None:
-    """A node passes the place where the wire is held every 1.2 mm; nothing of that may be seen at the tip."""
-    slippery = replace(DEVICE, friction=0.0)
-    control = np.tile([0.25, 0.0], (1, 40, 1))
-    rollout = simulate(anatomy, slippery, control, initial=np.array([[20.0, 0.0]]))
-    steps = np.diff(rollout.tip_position[0, 2:], axis=0)  # mm, for 0.125 mm of wire each
-    turns = np.linalg.norm(np.diff(steps, axis=0), axis=1)
-    np.testing.assert_allclose(turns, turns.mean(), rtol=0.1)  # as an even bend asks
+def test_torch_tensors_go_in_and_out(anatomy: Anatomy) -> None:
+    import torch
+
+    simulator = begun(Simulator(anatomy, DEVICE, worlds=2), 2)
+    step = simulator.step(torch.tensor([[1.0, 0.5], [2.0, 0.0]]), 0.1)
+    assert torch.from_dlpack(step.tip_position).shape == (2, 3)
 
 
-def test_pushes_and_pulls_with_friction(anatomy: Anatomy) -> None:
-    control = np.zeros((1, 24, 2))
-    control[0, :16, 0], control[0, 16:, 0] = 4.0, -1.0
-    rough = simulate(anatomy, DEVICE, control, initial=np.array([[5.0, 0.0]]), friction=np.array([0.3]))
-    smooth = simulate(anatomy, DEVICE, control, initial=np.array([[5.0, 0.0]]), friction=np.array([0.0]))
-    assert rough.base_force[0, 15] > smooth.base_force[0, 15]
-    assert rough.base_force[0, -1] < smooth.base_force[0, -1]
-
-
-def test_survives_the_blind_end_and_full_retraction(anatomy: Anatomy) -> None:
-    control = np.zeros((2, 40, 2))
-    control[0, :10, 0], control[0, 30:, 0] = 2.0, -8.5
-    control[1, :, 0] = -1.0
-    rollout = simulate(anatomy, DEVICE, control, initial=np.array([[66.0, 0.0], [20.0, 1.0]]))
-    assert rollout.valid.all()
-    assert np.isfinite(rollout.tip_position).all()
-    assert rollout.base_force[0, 9] > 0.05
-
-
-def test_the_drive_slips_at_its_push_limit_and_cannot_pull_back_what_it_did_not_push(anatomy: Anatomy) -> None:
-    control = np.zeros((2, 50, 2))
-    control[:, :20, 0], control[:, 25:, 0] = 4.0, -8.0  # 20 s of pushing against the blind end, then out again
-    control[1, 30:, 0] = -0.1
-    initial = np.array([[60.0, 0.0], [60.0, 0.0]])
-    limit_n = 0.5
-    rollout = simulate(anatomy, replace(DEVICE, push_limit_n=limit_n), control, initial=initial)
-    assert rollout.valid.all()
-    assert (rollout.slip[:, 12:20] > 0).all()
-    # One step of 0.02 s at 4 mm/s is 0.08 mm, which adds little to the limit; far beyond lies what is not limited.
-    assert limit_n < rollout.base_force.max() < 1.3 * limit_n
-    free = simulate(anatomy, replace(DEVICE, push_limit_n=5.0), control, initial=initial)
-    assert free.base_force.max() > 1.6 * limit_n
-    # Δ is the integral of the control that was made, and what was asked is that and the slip.
-    made = 60.0 + 0.5 * np.cumsum(rollout.control[..., 0], axis=1)
-    np.testing.assert_allclose(rollout.inserted_length, made, atol=1e-9)
-    np.testing.assert_allclose(0.5 * rollout.control[..., 0] + rollout.slip, 0.5 * control[..., 0], atol=1e-12)
-    assert rollout.inserted_length.min() > -1e-9
-    assert rollout.inserted_length[0, -1] == pytest.approx(0.0, abs=1e-9) and (rollout.slip[0, -3:] < 0).all()
+def test_pulling_out_stops_at_the_ostium(anatomy: Anatomy) -> None:
+    simulator = Simulator(anatomy, DEVICE)
+    simulator.reset(inserted_length=np.array([2.0]), rotation=np.array([0.0]))
+    for _ in range(4):
+        step = simulator.step(np.array([[-6.0, 0.0]]), PERIOD)
+    assert simulator.inserted_length[0] == pytest.approx(0, abs=0.03)
+    assert step.slip[0] < -2.9 and simulator.valid.all()
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("control", "duration", "message"),
     [
-        (lambda c, i: (np.full_like(c, np.nan), i), "finite"),
-        (lambda c, i: (c * 100, i), "exceeds"),
-        (lambda c, i: (-c, i), "negative"),
-        (lambda c, i: (c[:0], i[:0]), "at least one"),
-        (lambda c, i: (c, i * np.inf), "finite"),
+        (np.zeros((1, 2)), 0.1, r"shape \(1, 2\); give \(2, 2\)"),
+        (np.array([[1, 0], [np.nan, 0]]), 0.1, "world 1: .* not finite"),
+        (np.array([[1, 0], [1e3, 0]]), 0.1, "world 1: 1000 mm/s.* the limits of"),
+        (np.array([[40.0, 0], [0, 0]]), 60.0, "world 0: would insert .* push less"),
+        (np.zeros((2, 2)), 0.0, "duration: 0.0; give a positive"),
     ],
 )
-def test_refuses_bad_controls(anatomy: Anatomy, change, message: str) -> None:
-    initial, control = drive()
-    control, initial = change(control, initial)
+def test_bad_controls_move_no_world(anatomy: Anatomy, control: np.ndarray, duration: float, message: str) -> None:
+    simulator = begun(Simulator(anatomy, DEVICE, worlds=2), 2)
+    before = simulator.state.values[0]
     with pytest.raises(InputError, match=message):
-        simulate(anatomy, DEVICE, control, initial=initial)
+        simulator.step(control, duration)
+    assert np.array_equal(simulator.state.values[0], before)
+    simulator.step(np.zeros((2, 2)), 0.1)
 
 
-def test_refuses_bad_anatomies(anatomy: Anatomy) -> None:
-    initial, control = drive(1)
-    field = anatomy.distance_map
-    broken = replace(field, values=np.where(field.values > 1, np.nan, field.values))
-    for bad, message in (
-        (replace(anatomy, distance_map=broken), "not finite"),
-        (replace(anatomy, distance_map=replace(field, values=-field.values)), "positive"),
-        (replace(anatomy, insertion=Insertion(np.array([500.0, 0, 0]), np.array([1.0, 0, 0]))), "positive"),
-        (replace(anatomy, insertion=Insertion(np.array([-5.0, 0, 0]), np.array([2.0, 0, 0]))), "unit vector"),
-        (replace(anatomy, insertion=Insertion(np.array([np.nan, 0, 0]), np.array([1.0, 0, 0]))), "not finite"),
-        (replace(anatomy, insertion=Insertion(np.array([-5.0, 0, 0]), np.array([0.0, 0, 1.0]))), "positive"),
-        (replace(anatomy, distance_map=replace(field, spacing_mm=0.0)), "positive spacing"),
-        (replace(anatomy, catheter_radius_mm=0.1), "wider"),
+def test_bad_starts_and_states_are_refused(anatomy: Anatomy, wider: Anatomy, tmp_path: Path) -> None:
+    simulator = Simulator(anatomy, DEVICE, worlds=2)
+    for arguments, message in (
+        ({}, "seed: none given"),
+        ({"seed": 1, "friction": [0.1, -0.1]}, "friction: world 1"),
+        ({"seed": 1, "inserted_length": [1.0, 1e4]}, "inserted_length: world 1: 10000 mm"),
+        ({"seed": 1, "rotation": [0.0]}, "rotation: shape"),
+        ({"seed": 1, "worlds": [2]}, "there are 2"),
     ):
         with pytest.raises(InputError, match=message):
-            simulate(bad, DEVICE, control, initial=initial)
+            simulator.reset(**arguments)
+    with pytest.raises(InputError, match="made with other anatomies"):
+        simulator.set_state(Simulator(wider, DEVICE, worlds=2).state)
+    with pytest.raises(InputError, match=r"no such file|no saved state"):
+        SimulatorState.load(tmp_path / "absent.npz")
+    with pytest.raises(InputError, match="give fewer"):
+        Simulator(anatomy, DEVICE, worlds=100_000_000)
+    with pytest.raises(InputError, match="wider"):
+        Simulator(replace(anatomy, catheter_radius_mm=0.1), DEVICE)
 
 
-def test_refuses_arrays_of_wrong_shape(anatomy: Anatomy) -> None:
-    # in a process of its own: here the shape checks of the tests would speak first
-    script = """
-import numpy as np, sys
-sys.path.insert(0, sys.argv[1])
-from bend import vessel
-from endopilot.errors import InputError
-from endopilot.simulation.device import read_device
-from endopilot.simulation.simulator import simulate
-anatomy, device, good = vessel(), read_device("workhorse-014"), np.zeros((2, 4, 2))
-for control, others in (
-    (np.zeros((2, 4, 3)), {}),
-    (np.zeros((4, 2)), {}),
-    (good, {"initial": np.zeros((2, 3))}),
-    (good, {"friction": np.zeros((2, 1))}),
-    (np.broadcast_to(0.0, (10_000_000, 10_000, 2)), {}),
-):
-    try:
-        simulate(anatomy, device, control, **others)
-    except InputError as error:
-        print(error)
-"""
-    folder = str(Path(__file__).parent)
-    run = subprocess.run([sys.executable, "-c", script, folder], check=True, capture_output=True, text=True)
-    lines = run.stdout.splitlines()
-    assert lines[0].startswith("control: shape (2, 4, 3); give (worlds, samples, 2)")
-    assert lines[1].startswith("control: shape (4, 2); give")
-    assert lines[2].startswith("initial: shape (2, 3); give (2, 2)")
-    assert lines[3].startswith("friction: shape (2, 1); give one number")
-    assert "need" in lines[4] and lines[4].endswith("simulate fewer at once")
-    assert len(lines) == 5
+def test_every_public_name_has_an_example_that_runs(anatomy: Anatomy) -> None:
+    simulator = Simulator(anatomy, DEVICE, worlds=4)
+    simulator.reset(seed=1)
+    known = {"np": np, "Simulator": Simulator, "anatomy": anatomy, "device": DEVICE, "simulator": simulator}
+    examples = doctest.DocTestFinder(recurse=True).find(Simulator, "Simulator", globs=known)
+    public = {name for name in vars(Simulator) if not name.startswith("_")}
+    assert {test.name.split(".")[-1] for test in examples if test.examples} >= public
+    runner = doctest.DocTestRunner()
+    for test in examples:
+        runner.run(test)
+    assert runner.failures == 0 and runner.tries > 20
+
+
+def test_driven_by_force_a_world_is_the_same_in_any_company() -> None:
+    anatomy, worlds = vessel(), 6
+    random = np.random.default_rng(4)
+    start, load = random.uniform(3, 40, worlds), random.uniform([0.0, -0.02], [0.15, 0.02], (6, worlds, 2))
+
+    def drive(chosen: list[int]) -> np.ndarray:
+        simulator = Simulator(anatomy, DEVICE, worlds=len(chosen), actuation="force")
+        simulator.reset(inserted_length=start[chosen], rotation=np.zeros(len(chosen)))
+        return np.stack([simulator.step(row[chosen], 0.1).tip_position for row in load])
+
+    together = drive(list(range(worlds)))
+    for chosen in ([3], [5, 0, 2]):
+        np.testing.assert_array_equal(drive(chosen), together[:, chosen])

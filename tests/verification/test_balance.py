@@ -5,16 +5,17 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from endopilot.anatomy.atlas import AtlasConfig, synthesize_one
+from endopilot.atlas.atlas import AtlasConfig, make_patient
+from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, random_controls
 from endopilot.simulation.device import read_device
-from endopilot.simulation.simulator import SimulatorConfig, simulate
+from endopilot.simulation.simulate import simulate
 
 
 def test_the_push_balances_the_wall() -> None:
     # At rest and without friction the drive's push along the catheter's axis d and the wall's forces on the wire
     # cancel: push = -d · Σ k (r - φ) ∇φ over the nodes with φ < r, φ being the quadratic spline of the distance map.
-    anatomy, device = synthesize_one(AtlasConfig(), 0), read_device("workhorse-014")
+    anatomy, device = make_patient(AtlasConfig(), 0), read_device("workhorse-014")
     longest = float(anatomy.tree.longest_path().abscissa[-1])
     initial, control = random_controls(
         ControlConfig(), n_sequences=6, n_samples=24, seed=3, max_inserted_length_mm=longest

@@ -6,13 +6,13 @@ import importlib.util
 
 import pytest
 
-from endopilot.simulation import verify_engine
+from endopilot.verification import engine
 
-needs_mujoco = pytest.mark.skipif(importlib.util.find_spec("mujoco") is None, reason=verify_engine.MISSING)
+needs_mujoco = pytest.mark.skipif(importlib.util.find_spec("mujoco") is None, reason=engine.MISSING)
 
 
 @needs_mujoco
-@pytest.mark.parametrize("group", verify_engine.CASES, ids=lambda group: group.__name__)
+@pytest.mark.parametrize("group", engine.CASES, ids=lambda group: group.__name__)
 def test_agrees(group) -> None:
     # A chain of rigid links with joints of stiffness EI/l rests where the rod rests: a curved cantilever under a load
     # across its plane (F L²/EI = 2), and a rod pushed 75° far into a bend of 90° without friction.
@@ -22,7 +22,7 @@ def test_agrees(group) -> None:
 
 def test_skipped_without_mujoco(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    rows = [case.row() for group in verify_engine.CASES for case in group()]
+    rows = [case.row() for group in engine.CASES for case in group()]
     assert len(rows) == 3
     for row in rows:
         assert row["passed"] is None and row["value"] is None

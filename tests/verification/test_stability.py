@@ -1,8 +1,8 @@
-"""Twisted rods that buckle. Derivations stand in `endopilot.simulation.verify_stability`."""
+"""Twisted rods that buckle. Derivations stand in `endopilot.verification.stability`."""
 
 from __future__ import annotations
 
-from endopilot.simulation.verify_stability import greenhill, michell_ring
+from endopilot.verification.stability import greenhill, michell_ring
 
 
 def test_greenhill() -> None:

@@ -1,38 +1,38 @@
-"""Rods in tubes. Derivations stand in `endopilot.simulation.verify_tube`."""
+"""Rods in tubes. Derivations stand in `endopilot.verification.tube`."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from endopilot.simulation import verify_tube
+from endopilot.verification import tube
 
 
 def test_sinusoidal_buckling() -> None:
     # A rod of weight w per length on the bottom of a tube of clearance r begins to snake at F = 2 sqrt(EI w/r)
     # (Dawson and Paslay 1984).
-    (case,) = verify_tube.sinusoidal_buckling()
+    (case,) = tube.sinusoidal_buckling()
     assert case.error <= 0.05
 
 
 def test_helical_buckling() -> None:
     # A helix has the straight rod's energy at F = 2 sqrt(2) sqrt(EI w/r) (Chen, Lin and Cheatham 1990), and the wall
     # holds it with F² r/(4 EI) per length (Lubinski, Althouse and Logan 1962).
-    load, force = verify_tube.helical_buckling()
-    assert np.isclose(load.reference, 2 * np.sqrt(2) * verify_tube.LOAD_N)
+    load, force = tube.helical_buckling()
+    assert np.isclose(load.reference, 2 * np.sqrt(2) * tube.LOAD_N)
     assert load.error <= 0.05
     assert force.error <= 0.05
 
 
 def test_torque_whip() -> None:
     # GJ θ'' = EI k0 kt sin θ; the tip jumps when L sqrt(EI k0 kt/GJ) > π/2.
-    (case,) = verify_tube.torque_whip()
+    (case,) = tube.torque_whip()
     assert case.error <= 0.02
 
 
 def test_a_short_wire_follows_and_a_long_one_whips() -> None:
     # The same equation, far from θ = π: the short wire's tip follows the closed form there and back; the long one's
     # jumps twice in a turn there and back.
-    (case,) = verify_tube.torque_whip()
+    (case,) = tube.torque_whip()
     assert case.picture is not None
     formula, short, _, long = case.picture.curves
     expected = np.interp(short.x, formula.x[np.argsort(formula.x)], np.sort(formula.y))

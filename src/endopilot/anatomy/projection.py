@@ -137,3 +137,12 @@ def _shared_tangents(tree: VesselTree, insertion: Insertion) -> list[Float[np.nd
     if result[0][0] @ insertion.direction > 0.5:
         result[0][0] = insertion.direction
     return result
+
+
+Samples = Float[np.ndarray, "*n"]
+
+
+def safety_ratio(offset: Samples, radius: Samples, wire_radius_mm: float) -> Samples:
+    """Return γ/(r − r_w): 1 where the wire touches the wall; 0 where the lumen is no wider than the wire."""
+    room = radius - wire_radius_mm
+    return np.divide(offset, room, out=np.zeros(np.shape(offset)), where=room > 0)

@@ -7,8 +7,8 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from endopilot.cli.arguments import OutputFolder, existing, show
-from endopilot.evaluation.advice import AdviseConfig
-from endopilot.evaluation.advise import FIGURES_FILE, PICTURE_FILE, advise
+from endopilot.xray.advise import FIGURES_FILE, PICTURE_FILE, advise
+from endopilot.xray.monitoring import AdviseConfig
 
 
 def command(

@@ -65,7 +65,7 @@ def command(
     write_anatomy(anatomy, output)
     figures = {"anatomy": str(output), **describe(anatomy)}
     if picture is not None:
-        from endopilot.anatomy.picture import draw_anatomy  # matplotlib is slow to import
+        from endopilot.anatomy.anatomy_picture import draw_anatomy  # matplotlib is slow to import
 
         draw_anatomy(anatomy, picture, volume=volume)
         figures["picture"] = str(picture)

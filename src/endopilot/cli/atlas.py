@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from endopilot.anatomy.atlas import AtlasConfig, synthesize
 from endopilot.anatomy.io import write_anatomy
+from endopilot.atlas.atlas import AtlasConfig, make_atlas
 from endopilot.cli.arguments import OutputFolder, show_rows
 from endopilot.progress import progress
 
@@ -23,7 +23,7 @@ def command(
     """
     rows = []
     with progress("Synthetic patients", config.count) as advance:
-        for anatomy in synthesize(config):
+        for anatomy in make_atlas(config):
             write_anatomy(anatomy, output / anatomy.name)
             path = anatomy.tree.longest_path()
             rows.append(

@@ -10,8 +10,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from endopilot.benchmarks.robustness import RobustnessConfig
 from endopilot.cli.arguments import OutputFolder, existing, show, show_rows
-from endopilot.simulation.robustness import RobustnessConfig
 
 EXIT_FAILED = 1
 
@@ -22,7 +22,7 @@ def simulation(*, json: bool = False) -> None:
     Args:
         json: print the figures as JSON.
     """
-    from endopilot.simulation.bench import bench_simulation
+    from endopilot.benchmarks.simulation import bench_simulation
 
     show(bench_simulation(), as_json=json)
 
@@ -33,7 +33,7 @@ def scaling(*, json: bool = False) -> None:
     Args:
         json: print the figures as JSON.
     """
-    from endopilot.simulation.bench import bench_scaling
+    from endopilot.benchmarks.simulation import bench_scaling
 
     show_rows(bench_scaling(), as_json=json)
 
@@ -45,7 +45,7 @@ def robustness(*, json: bool = False, config: RobustnessConfig = RobustnessConfi
         json: print the figures as JSON.
         config: the rollouts.
     """
-    from endopilot.simulation.robustness import measure_robustness
+    from endopilot.benchmarks.robustness import measure_robustness
 
     measured = measure_robustness(config)
     if json:
@@ -61,7 +61,7 @@ def env(*, json: bool = False) -> None:
     Args:
         json: print the figures as JSON.
     """
-    from endopilot.env.bench import bench_env
+    from endopilot.benchmarks.env import bench_env
 
     show(bench_env(), as_json=json)
 
@@ -74,7 +74,7 @@ def dataset(*, output: OutputFolder = Path("runs/bench-dataset"), share: float =
         share: of the paper's set, 0 to 1.
         json: print the figures as JSON.
     """
-    from endopilot.dataset.bench import bench_dataset
+    from endopilot.benchmarks.dataset import bench_dataset
 
     show(bench_dataset(output, share=share), as_json=json)
 
@@ -86,7 +86,7 @@ def training(*, folder: Path = Path("runs/bench-training"), json: bool = False) 
         folder: takes the patient and the navigations to train on.
         json: print the figures as JSON.
     """
-    from endopilot.models.bench import bench_training
+    from endopilot.benchmarks.training import bench_training
 
     rows = bench_training(folder)
     show_rows(rows, as_json=json)
@@ -101,7 +101,7 @@ def labels(*, count: int = 40, seed: int = 0, json: bool = False) -> None:
         seed: seed of the atlas.
         json: print the figures as JSON.
     """
-    from endopilot.anatomy.label_score import measure_labels
+    from endopilot.benchmarks.labels import measure_labels
 
     rows = measure_labels(count=count, seed=seed)
     show_rows(rows, as_json=json)
@@ -115,7 +115,7 @@ def anatomy(*, centerlines: Path | None = None, json: bool = False) -> None:
         centerlines: a folder with VMTK's rca_cl.vtp and lca_cl.vtp of a real patient.
         json: print the figures as JSON.
     """
-    from endopilot.anatomy.bench import bench_anatomy
+    from endopilot.benchmarks.anatomy import bench_anatomy
 
     rows = bench_anatomy(None if centerlines is None else existing(centerlines))
     show_rows(rows, as_json=json)
@@ -131,7 +131,7 @@ def imaging(*, cases: int = 50, seed: int = 0, folder: Path = Path("runs/imaging
         folder: where the cases' results are kept; an interrupted run goes on where it stopped.
         json: print the figures as JSON.
     """
-    from endopilot.evaluation.imaging_bench import BARS, ImagingBenchConfig, bench_imaging
+    from endopilot.benchmarks.imaging import BARS, ImagingBenchConfig, bench_imaging
 
     measured = bench_imaging(ImagingBenchConfig(cases=cases, seed=seed, folder=folder))
     if json:

@@ -9,9 +9,10 @@ from pathlib import Path
 
 from endopilot.control.drive import Drive, serve
 from endopilot.control.drive_protocol import read_secret
-from endopilot.control.robot import Limits, RobotConfig
+from endopilot.control.robot import RobotConfig
 from endopilot.errors import InputError
 from endopilot.simulation.device import read_device
+from endopilot.simulation.drive_limits import DriveLimits
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +47,7 @@ def command(
         config: how the drive differs from an ideal one.
     """
     wire = read_device(device)
-    limits = Limits(
+    limits = DriveLimits(
         max_velocity_mm_s=wire.max_velocity_mm_s,
         max_rotation_rad_s=wire.max_rotation_rad_s,
         travel_mm=listen.travel_mm,

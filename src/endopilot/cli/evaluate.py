@@ -8,8 +8,8 @@ from tyro.conf import Positional
 
 from endopilot.cli.arguments import OutputFolder, existing, show, show_rows
 from endopilot.evaluation.evaluate import EvaluateConfig, evaluate
-from endopilot.evaluation.report_text import mean_errors
 from endopilot.evaluation.results import FIGURES_FOLDER, METRICS_FILE, REPORT_FILE, RESULTS_FILE
+from endopilot.report.report_text import mean_errors
 
 
 def command(
@@ -33,7 +33,10 @@ def command(
         json: print the whole of metrics.json.
         config: what to evaluate.
     """
+    from endopilot.report.evaluation_report import report_evaluation  # matplotlib and plotly are slow to import
+
     metrics = evaluate(run, output, config, existing(dataset) if dataset else None, other_seeds)
+    report_evaluation(output)
     if json:
         show(metrics, as_json=True)
         return

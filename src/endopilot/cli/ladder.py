@@ -8,7 +8,7 @@ from typing import Annotated
 from tyro.conf import arg
 
 from endopilot.cli.arguments import show, show_rows
-from endopilot.evaluation.ladder import LadderConfig, climb
+from endopilot.ladder.ladder import LadderConfig, climb
 
 
 def command(
@@ -29,11 +29,11 @@ def command(
         json: print the scores as JSON.
         config: which policy, tasks and patients.
     """
-    from endopilot.evaluation.ladder_page import write_page
-    from endopilot.evaluation.robustness import PICTURE_FILE, degrade
+    from endopilot.ladder.mismatch import PICTURE_FILE, measure_mismatch
+    from endopilot.report.ladder_page import write_page
 
     folder = output or Path("runs") / ("robustness" if off else "ladder") / config.policy
-    rows = degrade(folder, config, off) if off else climb(folder, config)
+    rows = measure_mismatch(folder, config, off) if off else climb(folder, config)
     show_rows(rows, as_json=json)
     made = {"picture": folder / PICTURE_FILE} if off else {"page": write_page(folder)} if page else {}
     if made and not json:

@@ -7,9 +7,9 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from endopilot.anatomy.io import read_anatomy
-from endopilot.anatomy.phantom import PhantomConfig, make_phantom
 from endopilot.cli.arguments import OutputFile, existing, show
 from endopilot.imaging.volume import check_output, write_volume
+from endopilot.phantom.phantom import PhantomConfig, make_phantom
 
 
 def command(

@@ -53,7 +53,7 @@ def command(
     if agreement is not None:
         figures |= {name: round(value, 4) for name, value in asdict(agreement).items()}
     if picture is not None:
-        from endopilot.imaging.picture import draw_overlay  # matplotlib is slow to import
+        from endopilot.imaging.overlay_picture import draw_overlay  # matplotlib is slow to import
 
         draw_overlay(ct, mask, picture, reference=other)
         figures["picture"] = str(picture)

@@ -13,9 +13,10 @@ from endopilot.anatomy.io import read_anatomy
 from endopilot.cli.arguments import OutputFile, existing, show
 from endopilot.control.plan_file import read_plan
 from endopilot.errors import InputError
+from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, random_controls, read_controls_csv
 from endopilot.simulation.device import read_device
-from endopilot.simulation.simulator import SimulatorConfig, simulate
+from endopilot.simulation.simulate import simulate
 from endopilot.simulation.table import write_rollout
 from endopilot.types import SAMPLE_PERIOD_S
 
@@ -97,8 +98,8 @@ def command(
         "largest_base_force_n": _largest(np.abs(rollout.base_force), valid),
     }
     if picture is not None:
-        from endopilot.evaluation.scene import visible_wire  # plotly is slow to import
-        from endopilot.evaluation.still import render_still
+        from endopilot.report.scene import visible_wire  # plotly is slow to import
+        from endopilot.report.still import render_still
 
         missing = render_still(patient, visible_wire(rollout, 0, -1), picture)
         if missing is None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from endopilot.cli.arguments import show_rows
-from endopilot.simulation.verify import run_verification
+from endopilot.verification.verify import run_verification
 
 EXIT_FAILED = 1
 

@@ -14,19 +14,23 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.control.belief import Belief, BeliefConfig
-from endopilot.control.navigate import Truth
-from endopilot.control.policy import DECISION_PERIOD_S, Decision, Sight, TipMeasurement
-from endopilot.control.robot import Limits
+from endopilot.control.navigate import ModelMismatch
+from endopilot.control.policy import Decision, Observation
 from endopilot.control.route import Route, check_passable
 from endopilot.control.search import Course, Search, SearchConfig
-from endopilot.control.xray import AdvisorConfig, Calibration, XrayAdvisor
-from endopilot.env.task import Navigation
+from endopilot.env.task import DECISION_PERIOD_S, Navigation
 from endopilot.progress import Advance
+from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.types import TipProjection
+from endopilot.xray.adviser import AdviserConfig, XrayAdviser
+from endopilot.xray.bands import Calibration
+from endopilot.xray.fluoroscope import TipMeasurement
 
 CALIBRATED = Path(__file__).parent
 """Where the calibration of the agent's ensemble lies."""
-Told = tuple[Float[np.ndarray, "1 2"], Float[np.ndarray, "1 2"], Float[np.ndarray, "1 2"], Float[np.ndarray, "1"]]
+AdviserInput = tuple[
+    Float[np.ndarray, "1 2"], Float[np.ndarray, "1 2"], Float[np.ndarray, "1 2"], Float[np.ndarray, "1"]
+]
 """What an adviser is told of a navigation: (Δ, φ), mm and rad; (Δtip, γtip), mm; the spread (standard deviation) of
 these by the model's own account, mm; and the lumen's radius at the tip, mm."""
 
@@ -86,22 +90,22 @@ class _PlanningPolicy:
             seed=seed,
             sharing=self.belief.simulator,
         )
-        self._limits = Limits.of(navigation.device, navigation.anatomy)
+        self._limits = DriveLimits.of(navigation.device, navigation.anatomy)
         self._course: Course | None = None
         self._at, self._lost, self._began = 0, False, False
         self.plans, self._vain = 0, 0
 
-    def decide(self, sight: Sight) -> Decision:
+    def decide(self, observation: Observation) -> Decision:
         """Follow the course, search another one, or pull back; see the module."""
         if self._began:
-            self.belief.follow(sight.inserted_length, sight.rotation)
+            self.belief.follow(observation.inserted_length, observation.rotation)
         self._began = True
-        if sight.tip is not None:
-            self._look(sight.tip)
+        if observation.tip is not None:
+            self._look(observation.tip)
         if self._lost:
             translation, rotation = -self.config.search.speed_mm_s, 0.0
         else:
-            translation, rotation = self._follow(sight)
+            translation, rotation = self._follow(observation)
         translation, rotation = self._limits.safe(translation, rotation)
         return Decision(translation, rotation, expose=self._lost or self.wants_xray())
 
@@ -114,17 +118,17 @@ class _PlanningPolicy:
             self._course = None
         self._lost = lost
 
-    def _follow(self, sight: Sight) -> tuple[float, float]:
+    def _follow(self, observation: Observation) -> tuple[float, float]:
         """Return the velocities that lead to the next place of the course."""
         if self._course is None or self._at >= len(self._course.control) or self._off_course():
-            self._plan(sight)
+            self._plan(observation)
         if self._course is None or self._at >= len(self._course.control):
             return 0.0, 0.0
         wanted = self._course.inserted[self._at] - self._ostium, self._course.rotation[self._at]
         self._at += 1
         return (
-            (wanted[0] - sight.inserted_length) / DECISION_PERIOD_S,
-            (wanted[1] - sight.rotation) / DECISION_PERIOD_S,
+            (wanted[0] - observation.inserted_length) / DECISION_PERIOD_S,
+            (wanted[1] - observation.rotation) / DECISION_PERIOD_S,
         )
 
     def _off_course(self) -> bool:
@@ -155,8 +159,8 @@ class _PlanningPolicy:
         self._ostium = float(self.belief.parameters[source[0], 2])
         return self._search.find(self.belief.simulator, source, weight, seconds=seconds, advance=advance)
 
-    def _plan(self, sight: Sight) -> None:
-        seconds = self.navigation.seconds - sight.time_s
+    def _plan(self, observation: Observation) -> None:
+        seconds = self.navigation.seconds - observation.time_s
         if self._vain >= self.config.tries:
             self._course = None
             return
@@ -168,7 +172,7 @@ class _PlanningPolicy:
 class TwinPolicy(_PlanningPolicy):
     """Plans in the rod core with the true parameters, X-ray always on: the upper bound of what a model can do."""
 
-    def __init__(self, truth: Truth | None = None, config: AgentConfig | None = None) -> None:
+    def __init__(self, truth: ModelMismatch | None = None, config: AgentConfig | None = None) -> None:
         """Take the truth.
 
         Args:
@@ -176,7 +180,7 @@ class TwinPolicy(_PlanningPolicy):
             config: how to search, believe and look.
         """
         super().__init__(config)
-        self._truth = truth or Truth()
+        self._truth = truth or ModelMismatch()
 
     def _parameters(self) -> Float[np.ndarray, "members 3"]:
         truth = self._truth
@@ -206,30 +210,30 @@ class AgentPolicy(_PlanningPolicy):
         config: AgentConfig | None = None,
         *,
         calibration: Calibration | None = None,
-        advice: AdvisorConfig | None = None,
+        advice: AdviserConfig | None = None,
     ) -> None:
         """Take the settings.
 
         Args:
             config: how to search, believe and look.
-            calibration: of the bands around what the simulated wires foretell, by which `XrayAdvisor` asks for X-ray;
+            calibration: of the bands around what the simulated wires foretell, by which `XrayAdviser` asks for X-ray;
                 the package's own, which `benchmarks/agent_calibration.py` makes, if not given.
             advice: what the adviser must not miss.
         """
         super().__init__(config)
-        self._calibration, self._advice = calibration or Calibration.read(CALIBRATED), advice or AdvisorConfig()
+        self._calibration, self._advice = calibration or Calibration.read(CALIBRATED), advice or AdviserConfig()
 
     def start(self, navigation: Navigation, seed: int) -> None:
         """Lay the simulated wires out, and begin to watch the bands."""
         super().start(navigation, seed)
-        self._advisor = XrayAdvisor(self._calibration, self._advice, navigation.device.tip_radius_mm)
+        self._adviser = XrayAdviser(self._calibration, self._advice, navigation.device.tip_radius_mm)
         proximal, tip, _, radius = self.foretold()
-        self._advisor.start(proximal, tip, radius)
+        self._adviser.start(proximal, tip, radius)
 
     def _parameters(self) -> Float[np.ndarray, "members 3"]:
         return Belief.around(np.array([1.0, 1.0, 0.0]), self.config.belief)
 
-    def foretold(self) -> Told:
+    def foretold(self) -> AdviserInput:
         """Return what the adviser is told, of the likeliest wire; the spread is that of all wires."""
         best, tip = int(np.argmax(self.belief.weight)), self.belief.likeliest_tip()
         wires = self.belief.simulator
@@ -238,4 +242,4 @@ class AgentPolicy(_PlanningPolicy):
 
     def wants_xray(self) -> bool:
         """Ask the adviser."""
-        return bool(self._advisor.advise(*self.foretold())[0])
+        return bool(self._adviser.advise(*self.foretold())[0])

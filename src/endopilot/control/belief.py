@@ -13,12 +13,12 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.stats import qmc
 
-from endopilot.control.policy import DECISION_PERIOD_S, TipMeasurement
-from endopilot.env.task import Navigation
+from endopilot.env.task import DECISION_PERIOD_S, Navigation
 from endopilot.errors import InputError
-from endopilot.simulation.simulator import SimulatorConfig
-from endopilot.simulation.stepping import Simulator
+from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.simulator import Simulator
 from endopilot.types import TipProjection
+from endopilot.xray.fluoroscope import TipMeasurement
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -73,9 +73,3 @@ class Cost:
     ) -> Samples:
         """Return what a change from one control to the next costs, mm."""
         return self.smooth_weight * np.square((after - before) / limits).sum(axis=-1)
-
-
-def safety_ratio(offset: Samples, radius: Samples, wire_radius_mm: float) -> Samples:
-    """Return γ/(r − r_w): 1 where the wire touches the wall; 0 where the lumen is no wider than the wire."""
-    room = radius - wire_radius_mm
-    return np.divide(offset, room, out=np.zeros(np.shape(offset)), where=room > 0)

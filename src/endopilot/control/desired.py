@@ -8,9 +8,8 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from endopilot.control.policy import DECISION_PERIOD_S
 from endopilot.control.route import Route
-from endopilot.env.task import Target
+from endopilot.env.task import DECISION_PERIOD_S, Target
 from endopilot.errors import InputError
 from endopilot.types import Anatomy
 

@@ -15,8 +15,9 @@ from collections.abc import Callable
 import numpy as np
 
 from endopilot.control.drive_protocol import LONGEST_LINE, PROTOCOL, SILENCE_S, Message, Signer
-from endopilot.control.robot import DriveMotion, Limits, RobotConfig
+from endopilot.control.robot import DriveMotion, RobotConfig
 from endopilot.errors import InputError
+from endopilot.simulation.drive_limits import DriveLimits
 
 CYCLE_S = 0.01
 """Period of the process's loop, s."""
@@ -38,7 +39,7 @@ class Drive:
 
     def __init__(
         self,
-        limits: Limits,
+        limits: DriveLimits,
         secret: bytes,
         *,
         now: float,

@@ -16,18 +16,18 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import convolve1d
 
-from endopilot.control.cost import safety_ratio
-from endopilot.control.robot import Limits
+from endopilot.anatomy.projection import safety_ratio
 from endopilot.control.route import Route
 from endopilot.dataset.loader import Dataset
-from endopilot.dataset.plan import identify
+from endopilot.dataset.study import identify
 from endopilot.env.task import Navigation
 from endopilot.models.config import WINDOW, read_run
 from endopilot.models.open_loop import Predictor
 from endopilot.models.rollout import load_run
 from endopilot.progress import progress
-from endopilot.simulation.simulator import SimulatorConfig
-from endopilot.simulation.stepping import Simulator
+from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.drive_limits import DriveLimits
+from endopilot.simulation.simulator import Simulator
 from endopilot.types import SAMPLE_PERIOD_S
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def _ask(predictor: Predictor, rest: Rest, desired: Steps, route: Route, config:
 def _sample(predictor: Predictor, rest: Rest, desired: Steps, route: Route, config: PlanConfig) -> tuple[Steps, Steps]:
     """Sample control sequences around the one that would lead a tip without slack, through the forward network."""
     navigation, sampling = rest.navigation, config.sample
-    limits = Limits.of(navigation.device, navigation.anatomy)
+    limits = DriveLimits.of(navigation.device, navigation.anatomy)
     bound = np.array([limits.max_velocity_mm_s, limits.max_rotation_rad_s])
     random = np.random.default_rng([config.seed, 0x3991])
     mean = np.zeros((len(desired), 2))

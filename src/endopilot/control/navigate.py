@@ -8,15 +8,16 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from endopilot.anatomy.projection import project_tip
-from endopilot.control.fluoroscope import Fluoroscope, FluoroscopeConfig
-from endopilot.control.policy import DECISION_PERIOD_S, Policy, Sight, TipMeasurement
-from endopilot.control.robot import Limits, RobotConfig, SimulatedRobot
+from endopilot.control.policy import Observation, Policy
+from endopilot.control.robot import RobotConfig, SimulatedRobot
 from endopilot.env.observation import tip_direction
-from endopilot.env.task import SUCCESS_MM, Navigation
+from endopilot.env.task import DECISION_PERIOD_S, SUCCESS_MM, Navigation
 from endopilot.errors import InputError
-from endopilot.simulation.simulator import SimulatorConfig
-from endopilot.simulation.stepping import Simulator
+from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.drive_limits import DriveLimits
+from endopilot.simulation.simulator import Simulator
 from endopilot.types import TipProjection
+from endopilot.xray.fluoroscope import Fluoroscope, FluoroscopeConfig, TipMeasurement
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,7 +33,7 @@ class NavigateConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Truth:
+class ModelMismatch:
     """How reality differs from the navigation that the policy is told of."""
 
     friction_factor: float = 1.0
@@ -58,7 +59,7 @@ class Truth:
 
 
 @dataclass(frozen=True, eq=False)
-class Record:
+class NavigationRecord:
     """A navigation as it truly went: a sample at the start and one after each decision period.
 
     Attributes:
@@ -106,8 +107,8 @@ def navigate(
     *,
     config: NavigateConfig | None = None,
     seed: int = 0,
-    truth: Truth | None = None,
-) -> Record:
+    truth: ModelMismatch | None = None,
+) -> NavigationRecord:
     """Let a policy drive one navigation in the simulator, and record what truly happens.
 
     Every `DECISION_PERIOD_S` the policy is told the encoders' readings and, where its last decision asked for it, what
@@ -124,9 +125,9 @@ def navigate(
     Raises:
         InputError: the wire does not fit the vessel, or starts deeper than it is long.
     """
-    config, truth = config or NavigateConfig(), truth or Truth()
+    config, truth = config or NavigateConfig(), truth or ModelMismatch()
     simulator = _start(navigation, truth, config.simulator)
-    limits = Limits.of(navigation.device, navigation.anatomy)
+    limits = DriveLimits.of(navigation.device, navigation.anatomy)
     drive = replace(config.robot, latency_s=config.robot.latency_s * truth.latency_factor)
     robot = SimulatedRobot(simulator, limits, drive, seed=seed, ostium_mm=truth.ostium_mm)
     fluoroscope = Fluoroscope(navigation.anatomy, navigation.device.tip_radius_mm, config.fluoroscope)
@@ -138,8 +139,8 @@ def navigate(
         state, tip = robot.proximal_state(), None
         if expose:
             tip = fluoroscope.expose(simulator.position[0, 0], direction, state.inserted_length, random)
-        sight = Sight(period * DECISION_PERIOD_S, state.inserted_length, state.rotation, tip)
-        decision = policy.decide(sight)
+        observation = Observation(period * DECISION_PERIOD_S, state.inserted_length, state.rotation, tip)
+        decision = policy.decide(observation)
         asked = (decision.translation, decision.rotation)
         control, expose = limits.safe(*asked), bool(decision.expose)
         track.decided(control, tip, fault=control != asked)
@@ -156,7 +157,7 @@ def navigate(
     return track.record(navigation, reason)
 
 
-def _start(navigation: Navigation, truth: Truth, config: SimulatorConfig) -> Simulator:
+def _start(navigation: Navigation, truth: ModelMismatch, config: SimulatorConfig) -> Simulator:
     """Return the world as it truly is, with the wire at the start of the navigation."""
     device = navigation.device
     wire = device.with_tip(bend_rad=device.tip_bend_rad, stiffness_factor=truth.stiffness_factor)
@@ -198,12 +199,12 @@ class _Track:
         self._columns["position"].append(simulator.position[0, 0])
         self._columns["force"].append(peak_n)
 
-    def record(self, navigation: Navigation, reason: str) -> Record:
+    def record(self, navigation: Navigation, reason: str) -> NavigationRecord:
         anatomy = navigation.anatomy
         proximal, position = np.array(self._columns["proximal"]), np.array(self._columns["position"])
         force = np.array(self._columns["force"])
         measured = (*self._measured, None)
-        return Record(
+        return NavigationRecord(
             time_s=DECISION_PERIOD_S * np.arange(len(force)),
             inserted_length=proximal[:, 0],
             rotation=proximal[:, 1],

@@ -12,20 +12,22 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.anatomy.io import read_anatomy
+from endopilot.anatomy.projection import safety_ratio
 from endopilot.control.agent import AgentConfig, TwinPolicy
-from endopilot.control.cost import Cost, safety_ratio
+from endopilot.control.cost import Cost
 from endopilot.control.desired import last_place, read_tips, tips_along
 from endopilot.control.navigate import NavigateConfig, navigate
-from endopilot.control.policy import DECISION_PERIOD_S
-from endopilot.control.robot import Limits, RobotConfig
-from endopilot.control.route import Route, check_passable, find_target
+from endopilot.control.robot import RobotConfig
+from endopilot.control.route import Route, check_passable, parse_target
 from endopilot.control.search import Course, SearchConfig
-from endopilot.env.task import Navigation
+from endopilot.env.task import DECISION_PERIOD_S, Navigation
 from endopilot.errors import InputError
 from endopilot.models.config import read_run
 from endopilot.progress import progress
+from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import Device, read_device
-from endopilot.simulation.simulator import SimulatorConfig, simulate
+from endopilot.simulation.drive_limits import DriveLimits
+from endopilot.simulation.simulate import simulate
 from endopilot.types import TipProjection
 
 Method = Literal["twin", "inverse", "mppi", "forward", "spin", "retract-rotate"]
@@ -198,7 +200,7 @@ def plan(
     tips = (
         read_tips(Path(target), wire.max_velocity_mm_s, config.start_inserted_mm) if target.endswith(".csv") else None
     )
-    goal = find_target(vessel, target) if tips is None else last_place(vessel, tips, target)
+    goal = parse_target(vessel, target) if tips is None else last_place(vessel, tips, target)
     navigation = Navigation(
         anatomy=vessel,
         device=wire,
@@ -324,7 +326,7 @@ def _check_kept(made: Plan) -> None:
 
 def _track(navigation: Navigation, desired: Steps) -> tuple[Steps, Steps]:
     """Lead the rod core along desired tips, one sample at a time."""
-    from endopilot.models.tracking import track
+    from endopilot.models.tip_tracking import track
 
     core = SimulatorConfig(threads=1)
     tip, control = track(
@@ -354,7 +356,7 @@ def _checked(
     control: Steps, predicted: Steps, spent: tuple[float, float],
 ) -> Plan:  # fmt: skip
     """Put the controls within the limits, drive the rod core with them, and return the plan."""
-    limits = Limits.of(navigation.device, navigation.anatomy)
+    limits = DriveLimits.of(navigation.device, navigation.anatomy)
     control = within_limits(control, limits, navigation.start_inserted_mm)
     start = np.array([navigation.start_inserted_mm, navigation.start_rotation])
     rollout = simulate(
@@ -379,7 +381,7 @@ def _checked(
     )
 
 
-def within_limits(control: Steps, limits: Limits, inserted_mm: float) -> Steps:
+def within_limits(control: Steps, limits: DriveLimits, inserted_mm: float) -> Steps:
     """Return controls that are finite and within the drive's limits and its travel, whatever a model asks for.
 
     Args:

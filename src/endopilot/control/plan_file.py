@@ -35,8 +35,7 @@ import pandas as pd
 from endopilot.control.cost import Cost
 from endopilot.control.plan import Plan, PlanConfig, SampleConfig
 from endopilot.control.plan_xray import PlannedXray
-from endopilot.control.policy import DECISION_PERIOD_S
-from endopilot.env.task import Navigation, Target
+from endopilot.env.task import DECISION_PERIOD_S, Navigation, Target
 from endopilot.errors import InputError
 from endopilot.files import json_text, manifest, read_json, sha256, writing
 from endopilot.simulation.device import Device

@@ -13,8 +13,8 @@ from matplotlib.axes import Axes
 
 from endopilot.control.plan import Plan
 from endopilot.control.plan_xray import PlannedXray
-from endopilot.control.policy import DECISION_PERIOD_S
 from endopilot.control.route import Route
+from endopilot.env.task import DECISION_PERIOD_S
 from endopilot.files import writing
 
 

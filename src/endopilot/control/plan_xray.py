@@ -14,13 +14,14 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Bool, Float
 
-from endopilot.control.agent import CALIBRATED, AgentPolicy, Told
-from endopilot.control.foretell import foreteller
+from endopilot.control.agent import CALIBRATED, AdviserInput, AgentPolicy
 from endopilot.control.plan import NETWORK_METHODS, Plan, PlanConfig
-from endopilot.control.policy import TipMeasurement
 from endopilot.control.route import Route
-from endopilot.control.xray import AdvisorConfig, Calibration, XrayAdvisor
 from endopilot.models.config import WINDOW, run_path
+from endopilot.xray.adviser import AdviserConfig, XrayAdviser
+from endopilot.xray.bands import Calibration
+from endopilot.xray.fluoroscope import TipMeasurement
+from endopilot.xray.online_predictors import online_predictor
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,13 +61,13 @@ def plan_xray(plan: Plan, folder: Path, calibration: Calibration) -> PlannedXray
         calibration: of what foretells it, see `read_calibration`.
     """
     watched: _Watched = _Networks(plan, folder) if plan.config.method in NETWORK_METHODS else _Wires(plan)
-    advisor = XrayAdvisor(calibration, AdvisorConfig(), plan.navigation.device.tip_radius_mm)
+    adviser = XrayAdviser(calibration, AdviserConfig(), plan.navigation.device.tip_radius_mm)
     proximal, tip, _, radius = watched.start()
-    advisor.start(proximal, tip, radius)
+    adviser.start(proximal, tip, radius)
     exposure, half_width = np.zeros(len(plan.control), dtype=bool), np.zeros((len(plan.control), 2))
     for period in range(len(plan.control)):
-        exposure[period] = advisor.advise(*watched.move(period))[0]
-        half_width[period] = advisor.half_width[0]
+        exposure[period] = adviser.advise(*watched.move(period))[0]
+        half_width[period] = adviser.half_width[0]
         if exposure[period]:
             watched.show(period)
     return PlannedXray(exposure=exposure, half_width=half_width)
@@ -75,11 +76,11 @@ def plan_xray(plan: Plan, folder: Path, calibration: Calibration) -> PlannedXray
 class _Watched(Protocol):
     """Foretells the tip along a plan."""
 
-    def start(self) -> Told:
+    def start(self) -> AdviserInput:
         """Say where the tip is before the first period."""
         ...
 
-    def move(self, period: int) -> Told:
+    def move(self, period: int) -> AdviserInput:
         """Say where it is at the end of a period, the one after the last."""
         ...
 
@@ -93,10 +94,10 @@ class _Wires:
         self._plan, self._agent = plan, AgentPolicy()
         self._agent.start(plan.navigation, seed=0)
 
-    def start(self) -> Told:
+    def start(self) -> AdviserInput:
         return self._agent.foretold()
 
-    def move(self, period: int) -> Told:
+    def move(self, period: int) -> AdviserInput:
         inserted, rotation = self._plan.proximal[period]
         self._agent.belief.follow(inserted, rotation)
         return self._agent.foretold()
@@ -122,20 +123,20 @@ class _Networks:
         run, navigation = Path(plan.model), plan.navigation
         rest = Rest(navigation, folder, run)
         episodes = rest.episodes(plan.predicted[None], plan.control[None])
-        self._model = foreteller(load_run(run), episodes)
+        self._model = online_predictor(load_run(run), episodes)
         self._route = Route.to(navigation.anatomy, navigation.target)
         self._proximal = np.column_stack([episodes.inserted_length[0], episodes.rotation[0]])
 
-    def start(self) -> Told:
+    def start(self) -> AdviserInput:
         return self._at(WINDOW - 1)
 
-    def move(self, period: int) -> Told:
+    def move(self, period: int) -> AdviserInput:
         return self._at(WINDOW + period)
 
     def show(self, period: int) -> None:
         sample = WINDOW + period
         self._model.show(np.array([0]), sample, self._model.tip[:, sample].copy())
 
-    def _at(self, sample: int) -> Told:
+    def _at(self, sample: int) -> AdviserInput:
         tip = self._model.tip[:, sample]
         return self._proximal[None, sample], tip, self._model.spread[:, sample], self._route.radius(tip[:, 0])

@@ -8,9 +8,9 @@ from endopilot.control.policy import Policy
 from endopilot.errors import InputError
 
 POLICIES = {
-    "forward": "endopilot.control.baselines:Forward",
-    "spin": "endopilot.control.baselines:Spin",
-    "retract-rotate": "endopilot.control.baselines:RetractRotate",
+    "forward": "endopilot.control.baseline_policies:Forward",
+    "spin": "endopilot.control.baseline_policies:Spin",
+    "retract-rotate": "endopilot.control.baseline_policies:RetractRotate",
     "twin": "endopilot.control.agent:TwinPolicy",
     "agent": "endopilot.control.agent:AgentPolicy",
     "open-loop": "endopilot.control.agent:OpenLoopPolicy",

@@ -1,38 +1,16 @@
-"""What decides during a navigation: `Policy`, what it is told (`Sight`) and what it answers (`Decision`)."""
+"""What decides during a navigation: `Policy`, what it is told (`Observation`) and what it answers (`Decision`)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
-import numpy as np
-from jaxtyping import Float
-
 from endopilot.env.task import Navigation
-
-DECISION_PERIOD_S = 0.5
-"""Time between two decisions, s: the paper's sample period, at which its models speak."""
+from endopilot.xray.fluoroscope import TipMeasurement
 
 
 @dataclass(frozen=True, eq=False)
-class TipMeasurement:
-    """What an X-ray exposure says of the tip; a measurement, never the truth.
-
-    Attributes:
-        position: of the tip, LPS mm.
-        abscissa: Δtip of that position on the vessel's tree, mm.
-        offset: γtip, mm.
-        branch: index of the branch that it is seen in.
-    """
-
-    position: Float[np.ndarray, "3"]
-    abscissa: float
-    offset: float
-    branch: int
-
-
-@dataclass(frozen=True, eq=False)
-class Sight:
+class Observation:
     """All that a policy is told at a decision.
 
     Attributes:
@@ -71,6 +49,6 @@ class Policy(Protocol):
         """Prepare for a navigation, as it is believed to be: the truth may have another friction or ostium."""
         ...
 
-    def decide(self, sight: Sight) -> Decision:
+    def decide(self, observation: Observation) -> Decision:
         """Say what to do until the next decision, `DECISION_PERIOD_S` later."""
         ...

@@ -13,9 +13,10 @@ import time
 from types import TracebackType
 
 from endopilot.control.drive_protocol import LONGEST_LINE, PROTOCOL, Message, Signer
-from endopilot.control.policy import DECISION_PERIOD_S
-from endopilot.control.robot import Limits, ProximalState
+from endopilot.control.robot import ProximalState
+from endopilot.env.task import DECISION_PERIOD_S
 from endopilot.errors import InputError
+from endopilot.simulation.drive_limits import DriveLimits
 
 REPEAT_S = 0.05
 """Time between two repetitions of a command, s."""
@@ -113,12 +114,12 @@ class RemoteRobot:
         self._open = False
         self._socket.close()
 
-    def _authenticate(self) -> Limits:
+    def _authenticate(self) -> DriveLimits:
         reply = self._exchange("AUTH", secret_known=False)
         if reply.verb == "BUSY":
             raise InputError(f"host, port: the drive at {self._where} has another client; disconnect that first")
         speed, spin, low, high = (float(number) for number in reply.arguments)
-        return Limits(max_velocity_mm_s=speed, max_rotation_rad_s=spin, travel_mm=(low, high))
+        return DriveLimits(max_velocity_mm_s=speed, max_rotation_rad_s=spin, travel_mm=(low, high))
 
     def _send_wanted(self) -> None:
         self._ask("MOVE", *(repr(number) for number in self._wanted))

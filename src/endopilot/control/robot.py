@@ -9,16 +9,14 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 
 from endopilot.errors import InputError
-from endopilot.simulation.device import Device
-from endopilot.simulation.simulator import SPARE_MM
-from endopilot.simulation.stepping import Simulator
-from endopilot.types import Anatomy
+from endopilot.simulation.drive_limits import DriveLimits
+from endopilot.simulation.simulator import Simulator
 
 CYCLE_S = 0.05
 """Period of the drive's own loop, s."""
@@ -50,80 +48,6 @@ class Robot(Protocol):
     def proximal_state(self) -> ProximalState:
         """Return what the encoders say now."""
         ...
-
-
-@dataclass(frozen=True, kw_only=True)
-class Limits:
-    """What a drive must never exceed.
-
-    Attributes:
-        max_velocity_mm_s: fastest translation, either way, mm/s.
-        max_rotation_rad_s: fastest rotation, either way, rad/s.
-        travel_mm: least and largest inserted length, mm.
-    """
-
-    max_velocity_mm_s: float
-    max_rotation_rad_s: float
-    travel_mm: tuple[float, float] = (0.0, np.inf)
-
-    def __post_init__(self) -> None:
-        """Check every limit.
-
-        Raises:
-            InputError: a limit is not positive, or the travel is no range.
-        """
-        for name in ("max_velocity_mm_s", "max_rotation_rad_s"):
-            if not 0 < getattr(self, name) < np.inf:
-                raise InputError(f"{name}: {getattr(self, name)}; give a positive number")
-        if not self.travel_mm[0] < self.travel_mm[1]:
-            raise InputError(f"travel_mm: {self.travel_mm} is no range; give the smaller first")
-
-    @staticmethod
-    def of(device: Device, anatomy: Anatomy) -> Limits:
-        """Return the limits of a wire in a vessel: the drive's speed, and no more wire than reaches its far end."""
-        reach = float(anatomy.tree.longest_path().abscissa[-1]) + SPARE_MM
-        return Limits(
-            max_velocity_mm_s=device.max_velocity_mm_s,
-            max_rotation_rad_s=device.max_rotation_rad_s,
-            travel_mm=(0.0, reach),
-        )
-
-    def safe(self, translation: Any, rotation: Any) -> tuple[float, float]:
-        """Return a command that is finite and within the speed limits, whatever is asked; what is no number stops.
-
-        Args:
-            translation: mm/s.
-            rotation: rad/s.
-        """
-        try:
-            asked = np.array([float(translation), float(rotation)])
-        except (TypeError, ValueError, OverflowError):
-            return 0.0, 0.0
-        if not np.isfinite(asked).all():
-            return 0.0, 0.0
-        translation_mm_s, rotation_rad_s = np.clip(asked, -self.fastest, self.fastest).tolist()
-        return translation_mm_s, rotation_rad_s
-
-    @property
-    def fastest(self) -> Float[np.ndarray, "2"]:
-        """Largest translation and rotation, mm/s and rad/s."""
-        return np.array([self.max_velocity_mm_s, self.max_rotation_rad_s])
-
-    def possible(
-        self, control: Float[np.ndarray, "n 2"], inserted_length: Float[np.ndarray, "wires"], duration: float
-    ) -> Float[np.ndarray, "n 2"]:
-        """Return what a drive can do of finite controls, mm/s and rad/s, within its speed and its travel.
-
-        Args:
-            control: each is held for the whole time.
-            inserted_length: of the wires that it may hold, mm: neither the shortest nor the longest leaves the travel.
-            duration: s.
-        """
-        made = np.clip(control, -self.fastest, self.fastest)
-        back = (self.travel_mm[0] - float(inserted_length.min())) / duration
-        room = (self.travel_mm[1] - float(inserted_length.max())) / duration
-        made[:, 0] = np.clip(made[:, 0], min(back, 0.0), max(room, 0.0))
-        return made
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,7 +92,7 @@ class DriveMotion:
         velocity: of the motor, mm/s and rad/s.
     """
 
-    def __init__(self, limits: Limits, config: RobotConfig, position: tuple[float, float]) -> None:
+    def __init__(self, limits: DriveLimits, config: RobotConfig, position: tuple[float, float]) -> None:
         """Begin at rest at a position, in the middle of the backlash."""
         self._limits = limits
         self._acceleration = np.array([config.max_acceleration_mm_s2, config.max_acceleration_rad_s2])
@@ -221,7 +145,7 @@ class SimulatedRobot:
     def __init__(
         self,
         simulator: Simulator,
-        limits: Limits,
+        limits: DriveLimits,
         config: RobotConfig | None = None,
         *,
         seed: int = 0,

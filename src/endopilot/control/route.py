@@ -113,7 +113,7 @@ def check_passable(route: Route, device: Device) -> None:
         )
 
 
-def find_target(anatomy: Anatomy, text: str) -> Target:
+def parse_target(anatomy: Anatomy, text: str) -> Target:
     """Return the target that a text names: a section such as "4" or "PDA", or a point "X,Y,Z" in LPS mm.
 
     A section's target is the middle of it, on the branch that holds most of it; the PDA of a coronary tree is its

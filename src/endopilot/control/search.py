@@ -15,15 +15,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from endopilot.control.cost import Cost, safety_ratio
-from endopilot.control.policy import DECISION_PERIOD_S
-from endopilot.control.robot import Limits
+from endopilot.anatomy.projection import safety_ratio
+from endopilot.control.cost import Cost
 from endopilot.control.route import Route
-from endopilot.env.task import Navigation
+from endopilot.env.task import DECISION_PERIOD_S, Navigation
 from endopilot.errors import InputError
 from endopilot.progress import Advance
 from endopilot.simulation.device import Device
-from endopilot.simulation.stepping import Simulator
+from endopilot.simulation.drive_limits import DriveLimits
+from endopilot.simulation.simulator import Simulator
 from endopilot.types import TipProjection
 
 Controls = Float[np.ndarray, "periods 2"]
@@ -137,7 +137,7 @@ class Search:
         anatomy, core = navigation.anatomy, sharing.config
         self.single, self._kept = (Simulator(anatomy, wires, config=core, sharing=sharing) for _ in range(2))
         self._many = Simulator(anatomy, crowd, config=core, sharing=sharing)
-        limits = Limits.of(wires[0], anatomy)
+        limits = DriveLimits.of(wires[0], anatomy)
         self._limits = replace(limits, travel_mm=(limits.travel_mm[0], limits.travel_mm[1] - _SHORT_MM))
         self._wire_radius = wires[0].tip_radius_mm
 

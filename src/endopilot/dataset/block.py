@@ -15,8 +15,8 @@ from jaxtyping import Bool
 from endopilot.anatomy.io import read_anatomy
 from endopilot.dataset import schema
 from endopilot.dataset.draw import Draw, draw_navigations
-from endopilot.dataset.navigate import navigate
-from endopilot.dataset.plan import Block, Plan
+from endopilot.dataset.navigations import simulate_navigations
+from endopilot.dataset.study import Block, Plan
 from endopilot.files import writing
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, Rollout
 
@@ -34,7 +34,7 @@ def write_block(plan: Plan, block: Block, *, threads: int = 1, advance: Callable
     draw = draw_navigations(config, plan.device, anatomy, block.sequences)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # invalid worlds are listed in the dataset's manifest
-        rollout, applied, stopped = navigate(
+        rollout, applied, stopped = simulate_navigations(
             anatomy,
             draw.devices(plan.device),
             draw.initial,

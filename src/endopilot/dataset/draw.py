@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.dataset.plan import DatasetConfig
+from endopilot.dataset.study import DatasetConfig
 from endopilot.simulation.controls import free_wire_load, random_controls
 from endopilot.simulation.device import Device
 from endopilot.types import Anatomy

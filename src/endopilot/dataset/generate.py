@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from endopilot.dataset import schema
-from endopilot.dataset.plan import Block, DatasetConfig, Study, differences, plan_study
 from endopilot.dataset.splits import SPLITS
+from endopilot.dataset.study import Block, DatasetConfig, Study, differences, plan_study
 from endopilot.dataset.workers import work_here, work_on_cluster
 from endopilot.errors import InputError
 from endopilot.files import manifest, read_json, write_json, writing

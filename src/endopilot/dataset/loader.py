@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
-from endopilot.dataset.plan import identify, version
 from endopilot.dataset.schema import (
     INFO_PATH,
     LEROBOT_VERSION,
@@ -20,6 +19,7 @@ from endopilot.dataset.schema import (
     read_table,
     signals,
 )
+from endopilot.dataset.study import identify, version
 from endopilot.errors import InputError
 from endopilot.files import read_json
 

@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 
 from endopilot.errors import InputError
 from endopilot.progress import Advance
-from endopilot.simulation.simulator import Actuation
+from endopilot.simulation.config import Actuation
 from endopilot.types import SAMPLE_PERIOD_S, Rollout
 
 LEROBOT_VERSION = "v3.0"

@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from functools import partial
 
 from endopilot.dataset.block import write_block
-from endopilot.dataset.plan import Block, Plan, version
+from endopilot.dataset.study import Block, Plan, version
 from endopilot.errors import InputError
 from endopilot.parallel import CORES
 

@@ -17,13 +17,13 @@ from numpy.typing import ArrayLike
 
 from endopilot.env import observation
 from endopilot.env.observation import Measured, observe
-from endopilot.env.route import Routes
+from endopilot.env.route_tables import RouteTables
 from endopilot.env.task import Navigation, reached
 from endopilot.env.tasks import reference_navigation, training_navigations
 from endopilot.errors import InputError
-from endopilot.simulation.simulator import SPARE_MM, SimulatorConfig
+from endopilot.simulation.config import SPARE_MM, SimulatorConfig
+from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import SimulatorState
-from endopilot.simulation.stepping import Simulator
 
 CONTROL_PERIOD_S = 2 / 15
 """Time between two actions, s: fluoroscopy's usual 7.5 frames a second."""
@@ -209,7 +209,7 @@ class NavigateVectorEnv(VectorEnv):
             [navigation.device for navigation in navigations],
             config=config,
         )
-        self._routes = Routes.of(navigations)
+        self._routes = RouteTables.of(navigations)
         self._ends = np.array([nav.anatomy.tree.longest_path().abscissa[-1] + SPARE_MM for nav in navigations])
         targets = [navigation.target for navigation in navigations]
         self._target_branch = np.array([target.branch for target in targets])

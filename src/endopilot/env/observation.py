@@ -8,9 +8,9 @@ import numpy as np
 from gymnasium.spaces import Box
 from jaxtyping import Bool, Float
 
-from endopilot.env.route import Routes
+from endopilot.env.route_tables import RouteTables
+from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import Step
-from endopilot.simulation.stepping import Simulator
 from endopilot.types import TipProjection
 
 _BOUND = 10.0
@@ -75,7 +75,7 @@ def tip_direction(simulator: Simulator) -> Float[np.ndarray, "worlds 3"]:
 
 def observe(
     now: Measured,
-    routes: Routes,
+    routes: RouteTables,
     distance_mm: Float[np.ndarray, "worlds"],
     force_limit_n: Float[np.ndarray, "worlds"],
     time_share: Float[np.ndarray, "worlds"],

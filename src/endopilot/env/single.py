@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike
 
 from endopilot.env.navigation import CORE, NavigateVectorEnv, NavigationState
 from endopilot.env.task import Navigation
-from endopilot.simulation.simulator import SimulatorConfig
-from endopilot.simulation.stepping import Simulator
+from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.simulator import Simulator
 
 
 class NavigateEnv(gymnasium.Env):

@@ -11,6 +11,8 @@ from endopilot.errors import InputError
 from endopilot.simulation.device import Device
 from endopilot.types import Anatomy, TipProjection
 
+DECISION_PERIOD_S = 0.5
+"""Time between two decisions, s: the paper's sample period, at which its models speak."""
 SUCCESS_MM = 2.0
 """A target counts as reached when the tip lies in its branch, this near to it along the centerline, mm."""
 

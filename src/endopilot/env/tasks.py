@@ -11,7 +11,7 @@ import numpy as np
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from endopilot.anatomy.atlas import ANATOMIES, AtlasConfig, synthesize_one
+from endopilot.atlas.atlas import ANATOMIES, AtlasConfig, make_patient
 from endopilot.env.task import Navigation, Target
 from endopilot.errors import InputError
 from endopilot.simulation.device import list_devices, read_device
@@ -80,7 +80,7 @@ class Task(BaseModel):
         if not 0 <= place < len(patients.numbers):
             raise InputError(f"patient: {place}; task {self.name} has patients 0 to {len(patients.numbers) - 1}")
         config = AtlasConfig(anatomy=self.anatomy, seed=patients.seed, stenosis_share=self.stenosis_share)
-        return synthesize_one(config, patients.numbers[place])
+        return make_patient(config, patients.numbers[place])
 
     def ladder_navigation(self, place: int) -> Navigation:
         """Return the task in one of the patients that the ladder is scored on, with its own first rotation."""
@@ -97,7 +97,7 @@ class Task(BaseModel):
         return Navigation(
             anatomy=anatomy,
             device=replace(read_device(self.device), **bend),
-            target=find_target(anatomy.tree, self.section, self.depth_mm),
+            target=target_in_section(anatomy.tree, self.section, self.depth_mm),
             start_inserted_mm=self.start_inserted_mm,
             start_rotation=start_rotation,
             seconds=self.seconds,
@@ -105,7 +105,7 @@ class Task(BaseModel):
         )
 
 
-def find_target(tree: VesselTree, section: str, depth_mm: float) -> Target:
+def target_in_section(tree: VesselTree, section: str, depth_mm: float) -> Target:
     """Return the place that lies `depth_mm` beyond the begin of a section, in the branch where it begins.
 
     Where several branches begin the section, it is the one that begins nearest to the ostium. If the section goes on in
@@ -199,11 +199,11 @@ def training_navigations(name: str, first: int, count: int) -> list[Navigation]:
 @lru_cache(maxsize=1)
 def reference_navigation() -> Navigation:
     """Return `endopilot/Navigate-v0`'s navigation: into the posterior descending artery of the reference anatomy."""
-    anatomy = synthesize_one(AtlasConfig(), 0)
+    anatomy = make_patient(AtlasConfig(), 0)
     return Navigation(
         anatomy=anatomy,
         device=read_device("workhorse-014"),
-        target=find_target(anatomy.tree, "4", 15.0),
+        target=target_in_section(anatomy.tree, "4", 15.0),
         start_inserted_mm=5.0,
         seconds=60.0,
     )

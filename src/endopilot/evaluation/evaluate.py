@@ -14,7 +14,6 @@ from endopilot.dataset.loader import Dataset, load_dataset
 from endopilot.errors import InputError
 from endopilot.evaluation.metrics import PAPER_ERRORS
 from endopilot.evaluation.results import (
-    FIGURES_FOLDER,
     METRICS_FILE,
     REPORT_FILE,
     RESULTS_FILE,
@@ -23,10 +22,10 @@ from endopilot.evaluation.results import (
     told,
     write_results,
 )
-from endopilot.evaluation.seen import split_title, trained_patients
-from endopilot.evaluation.summary import findings, generalisation_gap, over_seeds, summarize
-from endopilot.files import manifest, sha256, write_json, writing
+from endopilot.evaluation.summary import findings, generalisation_gap, over_seeds, split_title, summarize
+from endopilot.files import manifest, sha256, write_json
 from endopilot.models.config import PRETRAINED, read_run, run_path
+from endopilot.models.provenance import trained_patients
 from endopilot.progress import progress
 
 
@@ -60,9 +59,8 @@ def evaluate(
 ) -> dict[str, Any]:
     """Evaluate both networks of a run on the navigations and the patients that they never saw.
 
-    Writes `metrics.json` (every figure, and how it was made), `evaluation.npz` (the predictions) and, in `figures/`,
-    the PNG and the CSV of each figure; `report.html`, one page that needs nothing beside it, is made of these and comes
-    last. Every file is written whole or not at all.
+    Writes `evaluation.npz` (the predictions) and `metrics.json` (every number, and how it was made), each whole or not
+    at all. `report.report_evaluation` makes figures and a page of them.
 
     Args:
         run_folder: made by `endopilot train`, or "pretrained", the model of the package.
@@ -98,13 +96,15 @@ def evaluate(
         for split, data in chosen.items():
             results[split] = run_protocols(predictor, data, train, advance)
     metrics = _metrics(results, known, config.seed) | {
+        "run": str(run_folder),
+        "dataset": str(dataset.folder),
         "manifest": manifest(
             config=config,
             seed=config.seed,
             inputs={path.name: sha256(path) for path in sorted(run_path(run_folder).glob("*.safetensors"))}
             | {"dataset": dataset.manifest["key"]},
             wall_seconds=time.perf_counter() - start,
-        )
+        ),
     }
     for split, data in chosen.items() if others else ():
         tips = [results[split].tips["P1"], *(told(other.rollout_forward(data).tip) for other in others)]
@@ -113,10 +113,7 @@ def evaluate(
     for name in (REPORT_FILE, METRICS_FILE):
         (output / name).unlink(missing_ok=True)
     write_results(results, output / RESULTS_FILE)
-    titles = {split: of["title"] for split, of in metrics["splits"].items()}
-    _write_figures(results, titles, output / FIGURES_FOLDER)
     write_json(output / METRICS_FILE, metrics)
-    _write_report(output, run_folder, dataset.folder, metrics["manifest"])
     return metrics
 
 
@@ -160,37 +157,3 @@ def _metrics(results: Mapping[str, SplitResult], known: Collection[str], seed: i
     gap = generalisation_gap(splits)
     metrics |= {"generalisation_gap": gap} if gap else {}
     return metrics | {"findings": findings(metrics)}
-
-
-def _write_figures(results: Mapping[str, SplitResult], titles: Mapping[str, str], folder: Path) -> None:
-    from endopilot.evaluation import figures, tables  # matplotlib and pandas, slow to import
-
-    drawn = {
-        "tip_error": (tables.tip_error_table(results), figures.tip_error_figure),
-        "safety_ratio": (tables.safety_table(results), figures.safety_figure),
-        "control_error": (tables.control_error_table(results), figures.control_error_figure),
-        "drive_difference": (tables.drive_difference_table(results), figures.drive_difference_figure),
-    }
-    for name, (table, draw) in drawn.items():
-        with writing(folder / f"{name}.csv") as partial:
-            table.to_csv(partial, index=False)
-        with writing(folder / f"{name}.png") as partial:
-            partial.write_bytes(figures.png(draw(table, titles)))
-
-
-def _write_report(output: Path, run_folder: Path, dataset_folder: Path, record: Mapping[str, Any]) -> None:
-    from endopilot.evaluation.report import ReportContent, write_report  # matplotlib and plotly, slow to import
-
-    command = ["endopilot", "evaluate", str(run_folder), "-o", str(output), "--dataset", str(dataset_folder)]
-    for option in ("sequences", "seed"):
-        value = record["config"][option]
-        command += [] if value is None else [f"--{option}", str(value)]
-    content = ReportContent(
-        title="endopilot: evaluation of a trained run",
-        origin=f"The run {run_folder}, on the dataset {dataset_folder}.",
-        command=" ".join(command),
-        evaluation=output,
-        run=run_path(run_folder),
-        manifest=record,
-    )
-    write_report(output / REPORT_FILE, content)

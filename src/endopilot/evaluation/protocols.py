@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from endopilot.dataset.loader import Dataset
-from endopilot.evaluation import baselines
+from endopilot.evaluation import prediction_baselines as baselines
 from endopilot.evaluation.metrics import tip_events
 from endopilot.evaluation.replanning import exposures, replanned
 from endopilot.evaluation.replay import Control, Recorded, Samples, replay

@@ -13,8 +13,9 @@ from endopilot.dataset.loader import Dataset
 from endopilot.evaluation.results import REPLAYED, TipSeries
 from endopilot.models.config import WINDOW
 from endopilot.progress import Advance
+from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import Device
-from endopilot.simulation.simulator import SimulatorConfig, simulate
+from endopilot.simulation.simulate import simulate
 from endopilot.types import Anatomy, Rollout
 
 Control = Float[np.ndarray, "episodes samples 2"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -201,3 +201,19 @@ def _verdict(skills: Mapping[str, float | None], symbol: str) -> str:
     hardest = min(known, key=lambda name: known[name])
     verdict = "beats every baseline" if known[hardest] > 0 else "loses to a baseline"
     return f"{symbol} {verdict} (skill {known[hardest]:+.2f} against {BASELINE_WORDS[hardest]})"
+
+
+def split_title(split: str, patients: Collection[str], known: Collection[str]) -> str:
+    """Return what a reader calls a split.
+
+    Args:
+        split: "seen_test" or "test".
+        patients: names of its patients.
+        known: names of those that the run was trained on.
+    """
+    if split == "test":
+        return "New patients"
+    met = len(set(patients) & set(known))
+    if 0 < met < len(patients):
+        return f"New navigations, {met} of {len(patients)} patients known"
+    return "New navigations, known patients" if met else "New navigations, new patients"

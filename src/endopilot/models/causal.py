@@ -26,7 +26,7 @@ from torch import Tensor, nn
 from endopilot.dataset.loader import Dataset
 from endopilot.errors import InputError
 from endopilot.models.config import WINDOW, CausalConfig
-from endopilot.models.open_loop import EachSeen, Foretold, OpenLoop, Seen, Steps2, begin_after, given_states
+from endopilot.models.open_loop import EachObserved, Observed, OpenLoop, Prediction, Steps2, begin_after, given_states
 from endopilot.models.play import Direction, Vessels
 from endopilot.models.sequences import N_INPUTS, read_vessels, unfold
 from endopilot.types import SAMPLE_PERIOD_S
@@ -113,7 +113,7 @@ class CausalPredictor:
     control_limits: Float[np.ndarray, "2"]
     known: dict[tuple[str, ...], Vessels] = field(default_factory=dict, repr=False)
 
-    def foretell(self, episodes: Dataset, seen: Seen | EachSeen) -> Foretold:
+    def foretell(self, episodes: Dataset, seen: Observed | EachObserved) -> Prediction:
         """Predict the tips of episodes under their controls, from those that were seen.
 
         Args:
@@ -126,7 +126,7 @@ class CausalPredictor:
         true = np.stack([episodes.tip_abscissa, episodes.tip_offset], axis=-1).astype(float)
         tip = np.where(given[..., None], true, guess + answer[..., :2])
         spread = np.where(given[..., None], 0.0, math.sqrt(2.0) * answer[..., 2:])
-        return Foretold(tip, spread)
+        return Prediction(tip, spread)
 
     def rollout_forward(self, episodes: Dataset) -> OpenLoop:
         """P1: predict the tip under the true controls."""
@@ -141,7 +141,7 @@ class CausalPredictor:
         proximal, control = _driven(episodes, length, turn, self.control_limits)
         return OpenLoop(desired, proximal, control)
 
-    def rollout_dual(self, episodes: Dataset, seen: Seen | None = None) -> OpenLoop:
+    def rollout_dual(self, episodes: Dataset, seen: Observed | None = None) -> OpenLoop:
         """P3: predict the controls that make the tip go the true way, and the tip that they make.
 
         IF proposes controls, FF foretells what they do, and the inserted length is corrected at every sample by what

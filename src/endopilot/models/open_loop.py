@@ -16,9 +16,9 @@ from jaxtyping import Bool, Float
 from endopilot.dataset.loader import Dataset
 from endopilot.models.config import WINDOW
 
-Seen = Bool[np.ndarray, "samples"]
+Observed = Bool[np.ndarray, "samples"]
 """Samples at which the tip was measured, for example by X-ray."""
-EachSeen = Bool[np.ndarray, "episodes samples"]
+EachObserved = Bool[np.ndarray, "episodes samples"]
 """The same for each episode."""
 Steps2 = Float[np.ndarray, "episodes steps 2"]
 
@@ -39,7 +39,7 @@ class OpenLoop:
 
 
 @dataclass(frozen=True, eq=False)
-class Foretold:
+class Prediction:
     """What a predictor foretells of each episode at every sample, the tips that were seen included.
 
     Attributes:
@@ -52,10 +52,10 @@ class Foretold:
 
 
 @runtime_checkable
-class Foreteller(Protocol):
+class ProbabilisticPredictor(Protocol):
     """A predictor that takes tips seen at any time, and says how sure it is: the causal networks and the twin."""
 
-    def foretell(self, episodes: Dataset, seen: Seen | EachSeen) -> Foretold:
+    def foretell(self, episodes: Dataset, seen: Observed | EachObserved) -> Prediction:
         """Predict the tips of episodes under their controls, from those that were seen.
 
         Args:
@@ -77,7 +77,7 @@ class Predictor(Protocol):
         """P2: predict the controls that make the tip go the true way."""
         ...
 
-    def rollout_dual(self, episodes: Dataset, seen: Seen | None = None) -> OpenLoop:
+    def rollout_dual(self, episodes: Dataset, seen: Observed | None = None) -> OpenLoop:
         """P3: predict the controls that make the tip go the true way, and the tip that they make.
 
         Args:
@@ -89,11 +89,11 @@ class Predictor(Protocol):
         ...
 
 
-def given_states(episodes: Dataset) -> Seen:
+def given_states(episodes: Dataset) -> Observed:
     """Return the samples at which every protocol sees the tip: the first 30."""
     return np.arange(episodes.valid.shape[1]) < WINDOW
 
 
-def begin_after(seen: Seen) -> int:
+def begin_after(seen: Observed) -> int:
     """Return the first sample that is to be predicted: the one after the last that was seen."""
     return int(np.flatnonzero(seen)[-1]) + 1

@@ -18,12 +18,12 @@ from endopilot.errors import InputError
 from endopilot.models.causal import CausalPredictor
 from endopilot.models.checkpoint import read_network
 from endopilot.models.config import WINDOW, TwinConfig, read_run, run_path
-from endopilot.models.open_loop import OpenLoop, Predictor, Seen, Steps2, begin_after
+from endopilot.models.open_loop import Observed, OpenLoop, Predictor, Steps2, begin_after
 from endopilot.models.transformer import Network
 from endopilot.models.twin import TwinPredictor
 from endopilot.models.windows import Episodes
+from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import Device
-from endopilot.simulation.simulator import SimulatorConfig
 from endopilot.types import SAMPLE_PERIOD_S
 
 
@@ -52,7 +52,7 @@ class TransformerPredictor:
         """P2: predict the controls that make the tip go the true way."""
         return self._rollout(episodes, WINDOW, ask=True, foretell=False)
 
-    def rollout_dual(self, episodes: Dataset, seen: Seen | None = None) -> OpenLoop:
+    def rollout_dual(self, episodes: Dataset, seen: Observed | None = None) -> OpenLoop:
         """P3: predict the controls that make the tip go the true way, and the tip that they make.
 
         The networks see the last 30 states only, of which those that were not seen are as `episodes` believes them.

@@ -18,8 +18,8 @@ from endopilot.models.config import WINDOW
 from endopilot.models.patient import prepared
 from endopilot.models.play import PARTIAL_PLAYS, Direction, Vessels
 from endopilot.progress import progress
+from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import Device
-from endopilot.simulation.simulator import SimulatorConfig
 
 PATIENTS_FOLDER = "patients"
 """Folder beside the samples of a dataset in which its patients are kept as they were prepared for its device."""

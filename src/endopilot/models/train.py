@@ -22,7 +22,6 @@ from torch import nn
 from endopilot.dataset.loader import Dataset, load_dataset
 from endopilot.errors import InputError
 from endopilot.files import manifest, read_json, write_json
-from endopilot.models.board import board
 from endopilot.models.causal import CausalNetwork
 from endopilot.models.checkpoint import (
     make_network,
@@ -33,8 +32,9 @@ from endopilot.models.checkpoint import (
     write_tensors,
 )
 from endopilot.models.config import TrainConfig
+from endopilot.models.learning_curves import board
+from endopilot.models.process_group import ProcessGroup, joined
 from endopilot.models.sequences import Sequences, read_vessels
-from endopilot.models.team import Team, joined
 from endopilot.models.transformer import Network
 from endopilot.models.windows import Episodes, check_length
 from endopilot.progress import Advance, progress
@@ -73,7 +73,7 @@ def train(dataset_folder: Path, run_folder: Path, config: TrainConfig) -> None:
         _train(Path(dataset_folder), Path(run_folder), config, team)
 
 
-def _train(dataset_folder: Path, run_folder: Path, config: TrainConfig, team: Team) -> None:
+def _train(dataset_folder: Path, run_folder: Path, config: TrainConfig, team: ProcessGroup) -> None:
     dataset = load_dataset(dataset_folder)
     with team.first():  # which writes the settings and prepares the patients, where need be
         _begin(run_folder, {"train": asdict(config), "dataset": dataset.manifest["key"]})
@@ -160,7 +160,7 @@ class Job:
     training: Examples
     validation: Examples | None
     run_folder: Path
-    team: Team
+    team: ProcessGroup
 
     def run(self) -> dict[str, Any]:
         """Train, or go on training, until the last epoch; return the learning curve and how the steps were planned."""

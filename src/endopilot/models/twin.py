@@ -20,10 +20,11 @@ from scipy.stats import qmc
 from endopilot.anatomy.io import read_anatomy
 from endopilot.dataset.loader import Dataset
 from endopilot.models.config import WINDOW, TwinConfig
-from endopilot.models.open_loop import Foretold, OpenLoop, Seen, begin_after, given_states
-from endopilot.models.tracking import track
+from endopilot.models.open_loop import Observed, OpenLoop, Prediction, begin_after, given_states
+from endopilot.models.tip_tracking import track
+from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import Device
-from endopilot.simulation.simulator import SimulatorConfig, simulate
+from endopilot.simulation.simulate import simulate
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
 LEVELS = 7
@@ -40,7 +41,7 @@ _BELIEVED = np.array([1.0, 1.0, 0.0])
 
 
 @dataclass(frozen=True, eq=False)
-class TwinForetold(Foretold):
+class TwinPrediction(Prediction):
     """What the ensemble foretells: the weighted median of its members, and their weighted deviation from it.
 
     The spread is no smaller than what the median missed each of the last three seen tips by beyond what a good member
@@ -68,10 +69,10 @@ class TwinPredictor:
     device: Device
     simulator: SimulatorConfig
     config: TwinConfig
-    told: WeakKeyDictionary[Dataset, TwinForetold] = field(default_factory=WeakKeyDictionary, repr=False)
+    told: WeakKeyDictionary[Dataset, TwinPrediction] = field(default_factory=WeakKeyDictionary, repr=False)
     led: WeakKeyDictionary[Dataset, OpenLoop] = field(default_factory=WeakKeyDictionary, repr=False)
 
-    def foretell(self, episodes: Dataset, seen: Seen) -> TwinForetold:
+    def foretell(self, episodes: Dataset, seen: Observed) -> TwinPrediction:
         """Predict the tips of episodes under their controls, from those that were seen.
 
         Args:
@@ -88,9 +89,9 @@ class TwinPredictor:
             each = np.broadcast_to(seen, data.valid.shape)
             spread[chosen] = np.hypot(own, _unexplained(tip[chosen], _tips(data), each, self.config))
             parameters[chosen] = members[weight.argmax(axis=0), np.arange(len(data))]
-        return TwinForetold(tip, spread, parameters)
+        return TwinPrediction(tip, spread, parameters)
 
-    def ensemble(self, episodes: Dataset, seen: Seen) -> Float[np.ndarray, "members episodes samples 2"]:
+    def ensemble(self, episodes: Dataset, seen: Observed) -> Float[np.ndarray, "members episodes samples 2"]:
         """Return the tips, mm, of every wire that is likely after the seen ones; NaN from where a simulation fails.
 
         `weigh` says what they foretell, and again, without another simulation, when more tips are seen.
@@ -101,7 +102,7 @@ class TwinPredictor:
         return paths
 
     def _narrowed_ensemble(
-        self, anatomy: Anatomy, data: Dataset, seen: Seen
+        self, anatomy: Anatomy, data: Dataset, seen: Observed
     ) -> tuple[Members, Float[np.ndarray, "members episodes s 2"]]:
         """Return the second ensemble of the episodes of one anatomy, and its tips."""
         members = self._members(np.tile(_BELIEVED, (len(data), 1)), np.tile(self._spread, (len(data), 1)))
@@ -122,7 +123,7 @@ class TwinPredictor:
         found = self.rollout_dual(episodes)
         return OpenLoop(tip=_tips(episodes)[:, WINDOW:], proximal=found.proximal, control=found.control)
 
-    def rollout_dual(self, episodes: Dataset, seen: Seen | None = None) -> OpenLoop:
+    def rollout_dual(self, episodes: Dataset, seen: Observed | None = None) -> OpenLoop:
         """P3: predict the controls that make the tip go the true way, and the tip that they make.
 
         The likeliest member is driven along the desired tips, one sample at a time: see `tracking.track`.
@@ -133,7 +134,7 @@ class TwinPredictor:
             self.led[episodes] = self._lead(episodes, self._told(episodes).parameters, WINDOW)
         return self.led[episodes]
 
-    def _told(self, episodes: Dataset) -> TwinForetold:
+    def _told(self, episodes: Dataset) -> TwinPrediction:
         if episodes not in self.told:
             self.told[episodes] = self.foretell(episodes, given_states(episodes))
         return self.told[episodes]

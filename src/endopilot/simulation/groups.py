@@ -10,18 +10,10 @@ from jaxtyping import Integer
 
 from endopilot import _core
 from endopilot.anatomy.projection import TipProjector
+from endopilot.simulation.config import FREE_BEHIND_MM, SPARE_MM, SimulatorConfig
+from endopilot.simulation.core import check_distance_map, check_memory, core_options, insertion_arguments, make_lumen
 from endopilot.simulation.device import Device, check_fits
 from endopilot.simulation.rod import RodLayout, lay_out
-from endopilot.simulation.simulator import (
-    FREE_BEHIND_MM,
-    SPARE_MM,
-    SimulatorConfig,
-    check_distance_map,
-    check_memory,
-    core_options,
-    insertion_arguments,
-    make_lumen,
-)
 from endopilot.types import Anatomy
 
 

@@ -24,7 +24,7 @@ from endopilot.imaging.contour import lumen_at_half_height
 from endopilot.imaging.grid import LEAST_BLOOD_HU, connected_components, distance_to_outside, interpolate_like, resample
 from endopilot.imaging.ostium import find_ostium
 from endopilot.imaging.segment import SegmentConfig
-from endopilot.imaging.tracking import track_tree
+from endopilot.imaging.vessel_tracking import track_tree
 from endopilot.imaging.vesselness import vesselness
 from endopilot.progress import progress
 from endopilot.types import Insertion, LumenMask, Volume

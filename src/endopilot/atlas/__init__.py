@@ -1,0 +1,1 @@
+"""Synthetic patients: vessel trees drawn from published statistics."""

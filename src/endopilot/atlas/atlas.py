@@ -1,0 +1,92 @@
+"""The atlas: synthetic patients whose vessels are drawn from published statistics."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from endopilot.anatomy import distance
+from endopilot.atlas.arch import make_arch
+from endopilot.atlas.cerebral import make_cerebral
+from endopilot.atlas.curves import tangents
+from endopilot.atlas.lca import make_lca
+from endopilot.atlas.portal import make_portal
+from endopilot.atlas.rca import make_rca
+from endopilot.errors import InputError
+from endopilot.types import Anatomy, Insertion, VesselTree
+
+CATHETER_RADIUS_MM = 0.9
+"""Inner radius of a 6 French guiding catheter (0.071 inch), mm."""
+CATHETER_LENGTH_MM = 30.0
+"""Length of catheter behind the ostium that the distance map holds, mm."""
+
+_KINDS: dict[str, Callable[[np.random.Generator, float], tuple[VesselTree, dict[str, Any]]]] = {
+    "rca": make_rca,
+    "lca": make_lca,
+    "cerebral": make_cerebral,
+    "portal": make_portal,
+    "arch": make_arch,
+}
+
+ANATOMIES = tuple(_KINDS)
+"""Names of the kinds of vessel trees."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AtlasConfig:
+    """Which synthetic patients to make."""
+
+    anatomy: str = "rca"
+    """Kind of vessel tree: rca or lca (right or left coronary artery), cerebral (internal carotid with middle and
+    anterior cerebral arteries), arch (aortic arch with its branches), portal (portal vein)."""
+    count: int = 1
+    """Number of patients."""
+    seed: int = 0
+    """Seed of the atlas: patient i is the same whatever the count."""
+    stenosis_share: float = 0.3
+    """Share of the patients that have a stenosis, 0 to 1."""
+
+    def __post_init__(self) -> None:
+        if self.anatomy not in _KINDS:
+            raise InputError(f"anatomy: the atlas has no '{self.anatomy}'; choose from {', '.join(sorted(_KINDS))}")
+        if self.count < 1:
+            raise InputError(f"count: {self.count} patients; ask for at least 1")
+        if not 0 <= self.seed < 2**64:
+            raise InputError(f"seed: {self.seed}; give a whole number from 0 to 2^64 - 1")
+        if not 0 <= self.stenosis_share <= 1:
+            raise InputError(f"stenosis_share: {self.stenosis_share}; give a share from 0 to 1")
+
+
+def make_atlas(config: AtlasConfig) -> Iterator[Anatomy]:
+    """Yield the patients of an atlas, one after another."""
+    for index in range(config.count):
+        yield make_patient(config, index)
+
+
+def make_patient(config: AtlasConfig, index: int) -> Anatomy:
+    """Return patient `index`, made with the truth of its centerline and radii.
+
+    The random stream is keyed by (seed, index), so that a patient does not depend on the others. `provenance` holds
+    what was drawn: dominance, length, tortuosity, curvature, stenoses.
+    """
+    tree, truth = make_patient_tree(config, index)
+    root = tree.branches[0].centerline
+    insertion = Insertion(position=root.points[0], direction=tangents(root.points)[0])
+    lumen = distance.distance_map_from_spheres(tree)
+    return Anatomy(
+        name=f"{config.anatomy}-{config.seed}-{index:04d}",
+        tree=tree,
+        distance_map=distance.add_catheter(lumen, insertion, CATHETER_RADIUS_MM, CATHETER_LENGTH_MM),
+        insertion=insertion,
+        catheter_radius_mm=CATHETER_RADIUS_MM,
+        provenance={"source": "atlas", "anatomy": config.anatomy, "seed": config.seed, "index": index, **truth},
+    )
+
+
+def make_patient_tree(config: AtlasConfig, index: int) -> tuple[VesselTree, dict[str, Any]]:
+    """Return the centerline tree of patient `index`, and what was drawn for it, without a distance map."""
+    generator = np.random.Generator(np.random.Philox(key=np.array([config.seed, index], dtype=np.uint64)))
+    return _KINDS[config.anatomy](generator, config.stenosis_share)

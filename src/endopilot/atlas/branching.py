@@ -1,0 +1,311 @@
+"""Trees of synthetic vessels: side branches that are drawn until they fit, and the cut into branches."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+from endopilot.atlas import curves as shape
+from endopilot.types import Branch, Centerline, VesselTree
+
+Depth = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n"]]
+"""How deep points lie below the surface that vessels keep to, mm."""
+
+_CLEARANCE_MM = 0.6
+"""Tissue between two lumens that do not belong together, mm: two walls."""
+
+
+class NoShape(Exception):
+    """What was drawn cannot be, or lumens collide: draw again."""
+
+
+@dataclass(frozen=True, eq=False)
+class Vessel:
+    """A vessel of a tree before it is cut at its branching points.
+
+    Attributes:
+        points: positions, evenly spaced, LPS mm; the first one is the parent's point `origin`.
+        radius: lumen radius, mm.
+        section: name of the anatomical section at each point.
+        parent: index of the vessel that it leaves, -1 for the first.
+        origin: index of the parent's point where it leaves.
+    """
+
+    points: Float[np.ndarray, "n 3"]
+    radius: Float[np.ndarray, "n"]
+    section: Sequence[str]
+    parent: int = -1
+    origin: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class SidePlan:
+    """A side branch to be drawn.
+
+    Attributes:
+        section: name of its anatomical section.
+        parent: index of the vessel that it leaves.
+        origin: index of the parent's point where it leaves; -1 for its end.
+        length_mm: its length.
+        diameter_mm: lumen diameter at its origin.
+        courses: (abscissa from which it holds, mm; LPS direction), in order.
+        taper: share of the diameter that is lost on the way to the end.
+        angle_deg: range of the angle at which it leaves.
+        depth: the surface that it follows; none for a branch that runs freely.
+    """
+
+    section: str
+    parent: int = 0
+    origin: int
+    length_mm: float
+    diameter_mm: float
+    courses: tuple[tuple[float, tuple[float, float, float]], ...]
+    taper: float = 0.3
+    angle_deg: tuple[float, float] = (40.0, 70.0)
+    depth: Depth | None = field(default=None, compare=False)
+
+
+def until_it_fits(
+    draw: Callable[[], tuple[VesselTree, dict[str, Any]]], what: str
+) -> tuple[VesselTree, dict[str, Any]]:
+    """Draw a tree until one fits, and tell in its truth how many failed before (`redrawn`).
+
+    Args:
+        draw: draws one tree, and raises `NoShape` if it fails.
+        what: what is drawn, for the error.
+
+    Raises:
+        NoShape: 60 draws failed.
+    """
+    for attempt in range(60):
+        try:
+            tree, truth = draw()
+        except NoShape:
+            continue
+        return tree, truth | {"redrawn": attempt}
+    raise NoShape(f"no {what} found in 60 draws")
+
+
+def truncated(generator: np.random.Generator, mean: float, sd: float, low: float, high: float) -> float:
+    """Draw from a normal distribution cut off at both ends."""
+    while True:
+        value = generator.normal(mean, sd)
+        if low <= value <= high:
+            return float(value)
+
+
+def free_origin(generator: np.random.Generator, mean_mm: float, sd_mm: float, taken: Sequence[int]) -> int:
+    """Draw the index of a branch's origin, 3 mm or more from the vessel's start and from other origins."""
+    while True:
+        drawn = truncated(generator, mean_mm, sd_mm, max(mean_mm - 2 * sd_mm, 3.0), mean_mm + 2 * sd_mm)
+        origin = round(drawn / shape.STEP_MM)
+        if all(abs(origin - other) * shape.STEP_MM >= 3.0 for other in taken):
+            return origin
+
+
+def stenosis(
+    generator: np.random.Generator, along: Float[np.ndarray, "n"], shares: tuple[float, float]
+) -> tuple[dict[str, float], Float[np.ndarray, "n"]]:
+    """Return a narrowing of 30 to 65 % of the diameter over 6 to 14 mm, and the factor on the radius.
+
+    Args:
+        generator: random stream.
+        along: abscissa of the vessel's points, mm.
+        shares: it lies between these shares of the vessel's abscissa.
+    """
+    place, extent = along[0] + generator.uniform(*shares) * (along[-1] - along[0]), generator.uniform(6.0, 14.0)
+    degree = generator.uniform(0.3, 0.65)
+    narrowing = 1 - degree * np.exp(-0.5 * ((along - place) / (extent / 4)) ** 2)
+    truth = {"abscissa_mm": float(place), "length_mm": float(extent), "diameter_reduction": float(degree)}
+    return truth, narrowing
+
+
+def narrowed(
+    generator: np.random.Generator, vessels: Sequence[Vessel], index: int, shares: tuple[float, float]
+) -> tuple[dict[str, Any], list[Vessel]]:
+    """Return a stenosis of one vessel (abscissa from the ostium, and section), and the vessels with it.
+
+    The mouths of its branches, which lie in its lumen, narrow with it.
+    """
+    vessel = vessels[index]
+    along, above = shape.abscissa(vessel.points), vessel
+    while above.parent >= 0:
+        parent = vessels[above.parent]
+        along = along + shape.abscissa(parent.points)[above.origin]
+        above = parent
+    truth, factor = stenosis(generator, along, shares)
+    section = vessel.section[int(np.searchsorted(along, truth["abscissa_mm"]))]
+    changed = []
+    for i, other in enumerate(vessels):
+        scale = factor if i == index else np.ones(len(other.radius))
+        if other.parent == index:
+            inside = np.exp(-((shape.abscissa(other.points) / vessel.radius[other.origin]) ** 2))
+            scale = factor[other.origin] * inside + (1 - inside)
+        changed.append(replace(other, radius=other.radius * scale))
+    return truth | {"section": section}, changed
+
+
+def wiggled(
+    generator: np.random.Generator,
+    points: Float[np.ndarray, "n 3"],
+    amplitude_mm: tuple[float, float],
+    *,
+    quiet_mm: float,
+    wavelengths_mm: tuple[float, float] = (13.0, 60.0),
+) -> Float[np.ndarray, "m 3"]:
+    """Return an evenly spaced curve with a smooth random displacement; its first `quiet_mm` fade in."""
+    wiggle = shape.Wiggle.draw(generator, *wavelengths_mm)
+    normals = shape.parallel_normals(shape.tangents(points))
+    moved = wiggle.apply(points, normals, generator.uniform(*amplitude_mm), quiet_mm)
+    return shape.curve_through(moved[::4])
+
+
+def uneven(generator: np.random.Generator, along: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    """Return the factor on a lumen's radius by which real vessels vary along the way: waves of 2.5 %."""
+    wavelength = generator.uniform(15.0, 60.0, 4)
+    waves = np.sin(2 * np.pi * along[:, None] / wavelength + generator.uniform(0, 2 * np.pi, 4)).sum(axis=1)
+    return 1 + 0.025 * waves
+
+
+def with_side_branches(
+    generator: np.random.Generator, vessels: Sequence[Vessel], plans: Sequence[SidePlan]
+) -> list[Vessel]:
+    """Return the vessels with the planned branches; one that cuts another lumen is drawn again, twelve times at most.
+
+    Raises:
+        NoShape: a branch found no place.
+    """
+    grown = list(vessels)
+    for plan in plans:
+        for _ in range(12):
+            side = _side_branch(generator, grown[plan.parent], plan)
+            if not lumens_collide([*grown, side]):
+                grown.append(side)
+                break
+        else:
+            raise NoShape
+    return grown
+
+
+def _side_branch(generator: np.random.Generator, parent: Vessel, plan: SidePlan) -> Vessel:
+    origin = plan.origin % len(parent.points)
+    start, wide = parent.points[origin], float(parent.radius[origin])
+    turn = Rotation.from_rotvec(np.deg2rad(generator.normal(0, 12, 3)))
+    headed = [(begin, turn.apply(np.array(course) / np.linalg.norm(course))) for begin, course in plan.courses]
+    forward = shape.tangents(parent.points)[origin]
+    across = headed[0][1] - (headed[0][1] @ forward) * forward
+    angle = np.deg2rad(generator.uniform(*plan.angle_deg))
+    direction = np.cos(angle) * forward + np.sin(angle) * across / np.linalg.norm(across)
+    points = shape.steer(start, direction, headed, plan.length_mm, generator.uniform(6.0, 9.0), plan.depth)
+    across = shape.parallel_normals(shape.tangents(points))
+    points = shape.Wiggle.draw(generator, 13.0, 45.0, 6).apply(points, across, generator.uniform(0.3, 0.8), 10.0)
+    points = shape.curve_through(points[:: max(len(points) // 24, 1)])
+    points = np.concatenate([start[None], points[1:]])
+    lumen = 0.5 * plan.diameter_mm * (1 - plan.taper * np.linspace(0.0, 1.0, len(points)))
+    lumen = mouth(np.minimum(lumen, 0.9 * wide), points, forward, wide)
+    return Vessel(points, lumen, [plan.section] * len(points), plan.parent, origin)
+
+
+def mouth(
+    radius: Float[np.ndarray, "n"],
+    points: Float[np.ndarray, "n 3"],
+    parent_direction: Float[np.ndarray, "3"],
+    parent_radius: float,
+) -> Float[np.ndarray, "n"]:
+    """Return a branch's radius with its mouth: inside the parent's lumen the inscribed sphere is the parent's.
+
+    The distance from the parent's axis eats up that sphere; a smooth maximum rounds the carina.
+    """
+    away = points - points[0]
+    off_axis = np.linalg.norm(away - (away @ parent_direction)[:, None] * parent_direction, axis=1)
+    inside = parent_radius - off_axis
+    smooth = np.logaddexp(6.0 * radius, 6.0 * inside) / 6.0
+    far = off_axis > 2 * parent_radius
+    smooth = np.where(far, radius, np.minimum(smooth, parent_radius))
+    smooth[0] = parent_radius
+    return smooth
+
+
+def build_tree(vessels: Sequence[Vessel], section_names: tuple[str, ...]) -> VesselTree:
+    """Cut vessels at their branching points; branches stand in the order in which they leave.
+
+    Args:
+        vessels: parents before their children.
+        section_names: all names, in the order that numbers them.
+    """
+    number = {name: i for i, name in enumerate(section_names)}
+    branches: list[Branch] = []
+
+    def grow(index: int, parent: int, before_mm: float, normal: Float[np.ndarray, "3"] | None) -> None:
+        vessel = vessels[index]
+        along = before_mm + shape.abscissa(vessel.points)
+        normals = shape.parallel_normals(shape.tangents(vessel.points), normal)
+        labels = np.array([number[name] for name in vessel.section])
+        children = [i for i, other in enumerate(vessels) if other.parent == index]
+        begin = 0
+        for end in sorted({vessels[i].origin for i in children} | {len(vessel.points) - 1}):
+            if end > begin:
+                piece = slice(begin, end + 1)
+                label = labels[piece].copy()
+                label[0] = label[1]
+                line = Centerline(vessel.points[piece], vessel.radius[piece], along[piece], normals[piece])
+                branches.append(Branch(line, parent, label))
+                parent, begin = len(branches) - 1, end
+            for child in children:
+                if vessels[child].origin == end:
+                    grow(child, parent, float(along[end]), normals[end])
+
+    grow(0, -1, 0.0, None)
+    return VesselTree(tuple(branches), section_names)
+
+
+def lumens_collide(vessels: Sequence[Vessel]) -> bool:
+    """Tell whether lumens touch that lie far apart along the tree."""
+    points = np.concatenate([vessel.points for vessel in vessels])
+    radii = np.concatenate([vessel.radius for vessel in vessels])
+    place = np.concatenate([shape.abscissa(vessel.points) for vessel in vessels])
+    owner = np.repeat(np.arange(len(vessels)), [len(vessel.points) for vessel in vessels])
+    near = KDTree(points).query_pairs(2 * radii.max() + _CLEARANCE_MM, output_type="ndarray")
+    reach = radii[near].sum(axis=1)
+    gap = np.linalg.norm(points[near[:, 0]] - points[near[:, 1]], axis=1) - reach
+    near, reach = near[gap < _CLEARANCE_MM], reach[gap < _CLEARANCE_MM]
+    common, entry, beyond = _meetings(vessels)
+    ways = []
+    for one, two in (near.T, near.T[::-1]):
+        pair = owner[one], owner[two]
+        direct = common[pair] == owner[one]
+        ways.append((np.where(direct, place[one], entry[pair]), np.where(direct, 0.0, beyond[pair] + place[one])))
+    way = np.abs(ways[0][0] - ways[1][0]) + ways[0][1] + ways[1][1]
+    return bool(np.any(way > 2.2 * reach + 4.0))
+
+
+def _meetings(vessels: Sequence[Vessel]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return for each pair of vessels a, b where their ways to the root meet.
+
+    That is: the vessel that they meet on, the place (mm) where a's way enters it, and the length of a's way between
+    the vessel a itself and that place, mm.
+    """
+    lengths = [shape.abscissa(vessel.points) for vessel in vessels]
+    ways: list[dict[int, tuple[float, float]]] = []
+    for vessel in vessels:
+        way, beyond = {}, 0.0
+        while vessel.parent >= 0:
+            entry = float(lengths[vessel.parent][vessel.origin])
+            way[vessel.parent] = (entry, beyond)
+            beyond += entry
+            vessel = vessels[vessel.parent]
+        ways.append(way)
+    count = len(vessels)
+    common, entry, beyond = np.zeros((count, count), dtype=np.int64), np.zeros((count, count)), np.zeros((count, count))
+    for a in range(count):
+        for b in range(count):
+            meeting = next(vessel for vessel in (a, *ways[a]) if vessel in (b, *ways[b]))
+            common[a, b] = meeting
+            entry[a, b], beyond[a, b] = ways[a].get(meeting, (0.0, 0.0))
+    return common, entry, beyond

@@ -1,0 +1,247 @@
+"""The reference heart: where chambers, great vessels and the right coronary artery lie with respect to each other.
+
+Frame: LPS axes, mm, right coronary ostium at the origin, a normal adult heart in diastole. The artery's course follows
+Dodge JT et al., "Intrathoracic spatial location of specified coronary segments on the normal human heart", Circulation
+1988;78:1167-80 (mean spherical positions of R1 to R4 from the right ostium). Around the crux the paper's azimuth is a
+mean across ±180° and says nothing (its spread is 64°): R3 distal and R4 proximal are interpolated in azimuth. Chambers
+are ellipsoids and tubes that leave the artery its fat; all depths are signed distances in mm, positive inside.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cache
+
+import numpy as np
+from jaxtyping import Float, Float32
+from scipy.ndimage import map_coordinates
+from scipy.spatial.transform import Rotation
+
+from endopilot.atlas import curves as shape
+
+TO_CRUX = np.array(
+    [
+        [0.0, 0.0, 0.0],
+        [-4.4, -1.5, -1.9],
+        [-14.4, -5.8, -6.9],
+        [-20.6, -9.2, -13.0],
+        [-24.7, -9.5, -21.4],
+        [-29.3, -9.5, -34.2],
+        [-31.3, -7.2, -45.9],
+        [-29.0, -3.0, -54.7],
+        [-22.9, 0.4, -59.7],
+        [-13.5, 12.5, -64.0],
+    ]
+)
+"""The right coronary artery from its ostium over R1p m d, R2p m d, R3p m to the crux (R3d), mm."""
+BEYOND_CRUX = {
+    "4": np.array([[-1, 6, -70], [14, -8, -72.5], [32, -25, -71], [50, -43, -66], [66, -60, -58.0]]),
+    "16": np.array([[-1, 25, -58], [7, 34, -53], [17, 39, -55], [29, 37, -64], [43, 30, -72], [58, 20, -76.0]]),
+}
+"""Onwards along the inferior interventricular groove (section 4), or over R4 to the posterolateral wall (16), mm."""
+
+LEFT_VENTRICLE_AXIS, RIGHT_VENTRICLE_AXIS = (38.0, -68.0, -22.0), (46.0, -36.0, -16.0)
+AORTA = [(22, 6, -26), (17, 5.5, -12), (14.5, 5, 0), (12.5, 4, 14), (9, 2, 40), (8, 3, 90)]
+AORTA_RADIUS = (9.0, 13.0, 15.5, 14.5, 15.0, 15.0)
+OUTFLOW = [(8, -28, -30), (16, -29, -12), (24, -27, 4)]
+PULMONARY = [(24, -27, 4), (32, -19, 22), (36, 0, 36)]
+PULMONARY_RADIUS = (12.0, 13.0, 12.0)
+
+Numbers = Sequence[float | int]
+"""Coordinates or sizes, mm."""
+
+_WARP_WIDTH_MM = 22.0
+_GRID_MM = 2.0
+_GRID_LOW, _GRID_HIGH = np.array([-70.0, -110.0, -110.0]), np.array([110.0, 90.0, 70.0])
+
+
+@dataclass(frozen=True, eq=False)
+class HeartFit:
+    """The way from a patient to the reference heart: a similarity about the ostium, then a smooth warp.
+
+    The warp carries the patient's artery onto the reference course, so that chambers keep beside the artery.
+
+    Attributes:
+        origin: the patient's ostium, mm.
+        rotation: from the reference frame to the patient.
+        scale: size of the patient's heart against the reference.
+        knots: points of the patient's artery after the similarity, mm.
+        shifts: what is missing from each knot to the reference course, mm.
+        anchor: where the patient's ostium lies after the similarity, mm: the warp leaves it in its place.
+    """
+
+    origin: Float[np.ndarray, "3"]
+    rotation: Float[np.ndarray, "3 3"]
+    scale: float
+    knots: Float[np.ndarray, "n 3"]
+    shifts: Float[np.ndarray, "n 3"]
+    anchor: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
+
+    def to_reference(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Return the reference position of the patient's points, mm."""
+        aligned = (points - self.origin) @ self.rotation / self.scale
+        # The ostium stays on the aorta's surface: the warp fades out around it.
+        fade = np.exp(((aligned - self.anchor) ** 2).sum(axis=1, keepdims=True) * (-0.5 / _WARP_WIDTH_MM**2))
+        return aligned + self._warp(aligned) - fade * self._warp(self.anchor[None])
+
+    def _warp(self, aligned: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Return the mean of the knots' shifts, weighted by nearness; it vanishes far from the artery."""
+        square = (aligned**2).sum(axis=1)[:, None] + (self.knots**2).sum(axis=1) - 2 * aligned @ self.knots.T
+        weight = np.exp(square * (-0.5 / _WARP_WIDTH_MM**2))
+        return weight @ self.shifts / (weight.sum(axis=1, keepdims=True) + 0.3)
+
+    def from_reference(self, reference: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Return the patient's position of reference points, mm (fixed-point inverse of `to_reference`)."""
+        points = self.origin + self.scale * reference @ self.rotation.T
+        for _ in range(8):
+            points = points + self.scale * (reference - self.to_reference(points)) @ self.rotation.T
+        return points
+
+    def solid_depth(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+        """Return how deep the patient's points lie in the heart or the great vessels' walls, mm, about."""
+        place = (self.to_reference(points) - _GRID_LOW) / _GRID_MM
+        return self.scale * map_coordinates(_solid_grid(), place.T[::-1], order=1, mode="nearest")
+
+
+def fit_heart(main: Float[np.ndarray, "n 3"], crux_mm: float, last_section: str) -> HeartFit:
+    """Fit the reference heart to a right coronary artery.
+
+    Args:
+        main: the artery from the ostium to the farthest tip, LPS mm.
+        crux_mm: abscissa of the crux.
+        last_section: "4" or "16", where the tip lies; anything else ignores what lies beyond the crux.
+    """
+    along = shape.abscissa(main)
+    course = _at(main, along, np.linspace(0.0, crux_mm, 20))
+    to_crux = shape.curve_through(TO_CRUX)
+    reference = _at(to_crux, shape.abscissa(to_crux), np.linspace(0.0, shape.abscissa(to_crux)[-1], 20))
+    rotation, scale = _similarity(course - course[0], reference)
+    if last_section in BEYOND_CRUX:
+        beyond = shape.curve_through(np.concatenate([TO_CRUX, BEYOND_CRUX[last_section]]))
+        start = shape.abscissa(to_crux)[-1]
+        end = min(shape.abscissa(beyond)[-1] - start, (along[-1] - crux_mm) / scale)
+        steps = np.linspace(0.0, end, 12)[1:]
+        course = np.concatenate([course, _at(main, along, crux_mm + steps * scale)])
+        reference = np.concatenate([reference, _at(beyond, shape.abscissa(beyond), start + steps)])
+    knots = (course - course[0]) @ rotation / scale
+    return HeartFit(main[0], rotation, scale, knots, reference - knots)
+
+
+def fit_heart_along(lines: Sequence[Float[np.ndarray, "_ 3"]], courses: Sequence[Float[np.ndarray, "_ 3"]]) -> HeartFit:
+    """Fit the reference heart to the main vessels of a tree, as far as they go.
+
+    A patient's point belongs to the reference point at the same way from the ostium, measured in sizes of the heart.
+
+    Args:
+        lines: the patient's main vessels, each from the ostium, LPS mm.
+        courses: their courses on the reference heart, each from the ostium, mm.
+    """
+    ostium, anchor, scale, rotation = lines[0][0], courses[0][0], 1.0, np.eye(3)
+    found = wanted = np.zeros((0, 3))
+    for _ in range(4):
+        course, reference = [], []
+        for line, ideal in zip(lines, courses, strict=True):
+            along, way = shape.abscissa(line), shape.abscissa(ideal)
+            places = np.linspace(0.0, min(way[-1], along[-1] / scale), 16)
+            course.append(_at(line, along, scale * places))
+            reference.append(_at(ideal, way, places))
+        found, wanted = np.concatenate(course) - ostium, np.concatenate(reference) - anchor
+        rotation, scale = _similarity(found, wanted)
+    origin = ostium - scale * rotation @ anchor
+    knots = anchor + found @ rotation / scale
+    return HeartFit(origin, rotation, scale, knots, anchor + wanted - knots, anchor)
+
+
+def _similarity(
+    course: Float[np.ndarray, "n 3"], reference: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "3 3"], float]:
+    """Return rotation and size that take reference points nearest to the patient's (Umeyama 1991), about the origin."""
+    u, s, vt = np.linalg.svd(course.T @ reference)
+    sign = np.array([1.0, 1.0, np.linalg.det(u @ vt)])
+    return u @ np.diag(sign) @ vt, float(np.clip((s * sign).sum() / (reference**2).sum(), 0.6, 1.6))
+
+
+def ellipsoid(
+    x: Float[np.ndarray, "*n 3"], centre: Numbers, semi_axes: Numbers, long_axis: Numbers
+) -> Float[np.ndarray, "*n"]:
+    """Signed distance to an ellipsoid whose first axis is `long_axis`, exact to first order at the surface."""
+    turn = Rotation.align_vectors([[1.0, 0.0, 0.0]], [np.array(long_axis) / np.linalg.norm(long_axis)])[0]
+    local = (x - np.array(centre, dtype=x.dtype)) @ turn.as_matrix().T.astype(x.dtype)
+    scaled = local / np.array(semi_axes, dtype=x.dtype)
+    level = np.linalg.norm(scaled, axis=-1)
+    slope = np.linalg.norm(scaled / np.array(semi_axes, dtype=x.dtype), axis=-1)
+    return level * (1 - level) / np.maximum(slope, 1e-6)
+
+
+def tube(x: Float[np.ndarray, "*n 3"], waypoints: Sequence[Numbers], radius: Numbers) -> Float[np.ndarray, "*n"]:
+    """Signed distance to a tube through the waypoints, with its radius at each."""
+    line, r = np.array(waypoints, dtype=x.dtype), np.array(radius, dtype=x.dtype)
+    square = np.einsum("...i,...i", x, x)
+    depth = np.full(x.shape[:-1], -np.inf, dtype=x.dtype)
+    for a, b, ra, rb in zip(line[:-1], line[1:], r[:-1], r[1:], strict=True):
+        step = b - a
+        along = x @ step - a @ step
+        share = np.clip(along / (step @ step), 0, 1)
+        distance = square - 2 * (x @ a) + a @ a + share * (share * (step @ step) - 2 * along)
+        np.maximum(depth, ra + share * (rb - ra) - np.sqrt(np.maximum(distance, 0)), out=depth)
+    return depth
+
+
+def left_ventricle_wall(x: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
+    """Depth below the left ventricle's epicardium."""
+    return ellipsoid(x, (44, -21, -37), (47, 28, 28), LEFT_VENTRICLE_AXIS)
+
+
+def left_ventricle(x: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
+    """Depth in the left ventricle's cavity."""
+    return ellipsoid(x, (42, -17, -36), (38, 18.5, 18.5), LEFT_VENTRICLE_AXIS)
+
+
+def right_ventricle(x: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
+    """Depth in the right ventricle's cavity and its outflow tract, the septum not yet taken off."""
+    return np.maximum(ellipsoid(x, (10, -25, -42), (38, 22, 19), RIGHT_VENTRICLE_AXIS), tube(x, OUTFLOW, (12, 11, 12)))
+
+
+def right_atrium(x: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
+    """Depth in the right atrium and its appendage, which lies over the first centimetres of the artery."""
+    body = ellipsoid(x, (-19, 18, -29), (27, 21, 22), (0.1, 0.2, 1.0))
+    return np.maximum(body, ellipsoid(x, (-17, 0, 6), (17, 8, 9), (0.6, -0.7, 0.2)))
+
+
+def left_atrium(x: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
+    """Depth in the left atrium and its appendage, which lies beside the left main artery."""
+    body = ellipsoid(x, (24, 41, -9), (27, 17, 22), (1.0, 0.1, 0.1))
+    return np.maximum(body, ellipsoid(x, (47, 17, 7), (15, 7, 8), (0.3, -0.8, 0.2)))
+
+
+def aorta(x: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
+    """Depth in the left ventricle's outflow, the aortic root and the ascending aorta; the ostium is on its surface."""
+    return tube(x, AORTA, AORTA_RADIUS)
+
+
+def pulmonary_artery(x: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
+    """Depth in the pulmonary trunk."""
+    return tube(x, PULMONARY, PULMONARY_RADIUS)
+
+
+@cache
+def _solid_grid() -> Float32[np.ndarray, "nz ny nx"]:
+    axes = [np.arange(low, high, _GRID_MM) for low, high in zip(_GRID_LOW, _GRID_HIGH, strict=True)]
+    z, y, x = np.meshgrid(*axes[::-1], indexing="ij")
+    at = np.stack([x, y, z], axis=-1).astype(np.float32)
+    walls = (
+        left_ventricle_wall(at),
+        right_ventricle(at) + 3,
+        right_atrium(at) + 2,
+        left_atrium(at) + 2,
+        aorta(at) + 1.3,
+        pulmonary_artery(at) + 1.3,
+    )
+    return np.max(walls, axis=0)
+
+
+def _at(
+    points: Float[np.ndarray, "n 3"], along: Float[np.ndarray, "n"], places: Float[np.ndarray, "m"]
+) -> Float[np.ndarray, "m 3"]:
+    return np.stack([np.interp(places, along, points[:, axis]) for axis in range(3)], axis=1)

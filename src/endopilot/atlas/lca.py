@@ -1,0 +1,312 @@
+"""Left coronary arteries: left main, anterior descending and circumflex with their branches, by dominance.
+
+Facts and their sources: mean courses and origins of branches, Dodge JT et al., Circulation 1988;78:1167-80 (see
+`heart_left`); lumen diameters and the influence of dominance and sex, Dodge JT et al., Circulation 1992;86:232-46 (left
+main 4.5 ± 0.5 mm, anterior descending 3.7 ± 0.4 to 1.9 ± 0.4 mm, circumflex 3.4 ± 0.5 mm, 4.2 ± 0.6 mm where it is
+dominant); left main 13.1 mm long and the circumflex most often 65 to 80 mm, a cadaver study of 80 hearts from Gujarat
+(docs/atlas.md), where the SD of the left main's length, 2.4 mm, is smaller than the 5.2 mm of Reig J, Petit M, Clin
+Anat 2004;17:6-13: drawn with 3.5 mm.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.interpolate import PchipInterpolator
+from scipy.spatial.transform import Rotation
+
+from endopilot.anatomy.labels_tree import LCA_SECTIONS
+from endopilot.atlas import curves as shape
+from endopilot.atlas import heart_left
+from endopilot.atlas.branching import (
+    NoShape,
+    SidePlan,
+    Vessel,
+    build_tree,
+    free_origin,
+    mouth,
+    narrowed,
+    truncated,
+    uneven,
+    until_it_fits,
+    wiggled,
+    with_side_branches,
+)
+from endopilot.atlas.heart_reference import HeartFit
+from endopilot.types import VesselTree
+
+LEFT_MAIN_MM, LEFT_MAIN_SD_MM, LEFT_MAIN_DIAMETER_MM = 13.1, 3.5, 4.5
+LAD_DIAMETER_MM = {0.0: 3.7, 0.06: 3.6, 0.24: 2.5, 0.58: 1.7, 0.79: 1.4, 0.84: 1.25, 1.0: 1.1}
+"""Lumen diameter, mm, along the anterior descending artery's whole course (Dodge 1992: L1p, L1m, L2m, L3m, L4p and on
+to the end of L4)."""
+LCX_DIAMETER_MM = {
+    "right": {0.0: 3.4, 0.25: 3.0, 0.6: 2.2, 1.0: 1.3},
+    "balanced": {0.0: 3.6, 0.25: 3.2, 0.6: 2.5, 1.0: 1.6},
+    "left": {0.0: 4.2, 0.25: 3.9, 0.5: 3.1, 0.65: 2.4, 1.0: 1.6},
+}
+"""The same along the circumflex artery from its origin to its end, by dominance."""
+
+_RIGHT_SHARE, _BALANCED_SHARE = 0.88, 0.06
+"""Shares of right and balanced dominance; the rest is left: as in the right coronary arteries of this atlas."""
+_RAMUS_SHARE = 0.25
+"""Share of patients with a ramus intermedius; the literature reports 15 to 37 %."""
+_FEMALE_CALIBRE = 0.91
+"""Women's lumens against men's (Dodge 1992)."""
+_SIZE_SD, _TURN_SD_DEG, _WIGGLE_MM = 0.085, 6.0, (0.5, 1.3)
+"""Spread of the heart's size, of its position about each axis (from the SD of Dodge's positions), of the wiggles."""
+
+_ENDS = {"right": (66.0, 9.0, 40.0, 76.0), "balanced": (88.0, 4.0, 82.0, 97.0)}
+"""Length of the circumflex artery, mm: mean, SD, least, most, in a heart of mean size. A left-dominant one goes on over
+the crux into the posterior descending artery."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _SideKind:
+    """How a side branch leaves: origin beyond the fork and length, mean and SD in mm; lumen, share, courses."""
+
+    origin_mm: tuple[float, float]
+    length_mm: tuple[float, float]
+    diameter_mm: float
+    share: float
+    courses: tuple[tuple[float, tuple[float, float, float]], ...]
+
+
+_LAD_SIDES = {
+    "9": _SideKind(
+        origin_mm=(20.0, 6.0), length_mm=(55.0, 12.0), diameter_mm=2.1, share=1.0,
+        courses=((0.0, (0.8, -0.3, -0.45)), (18.0, (0.6, -0.4, -0.65)), (40.0, (0.45, -0.55, -0.7))),
+    ),
+    "10": _SideKind(
+        origin_mm=(42.0, 7.0), length_mm=(45.0, 10.0), diameter_mm=1.9, share=0.9,
+        courses=((0.0, (0.75, -0.35, -0.5)), (16.0, (0.45, -0.5, -0.7))),
+    ),
+    "D": _SideKind(
+        origin_mm=(61.0, 6.0), length_mm=(32.0, 8.0), diameter_mm=1.7, share=0.6,
+        courses=((0.0, (0.75, -0.3, -0.6)), (14.0, (0.4, -0.4, -0.8))),
+    ),
+    "septal": _SideKind(
+        origin_mm=(21.0, 7.0), length_mm=(24.0, 5.0), diameter_mm=1.4, share=0.9,
+        courses=((0.0, (-0.5, -0.35, -0.8)), (10.0, (-0.2, -0.55, -0.8))),
+    ),
+    "septal 2": _SideKind(
+        origin_mm=(45.0, 8.0), length_mm=(20.0, 4.0), diameter_mm=1.2, share=0.6,
+        courses=((0.0, (-0.6, -0.2, -0.75)), (9.0, (-0.2, -0.4, -0.9))),
+    ),
+}  # fmt: skip
+_LCX_SIDES = {
+    "12": _SideKind(
+        origin_mm=(15.0, 5.0), length_mm=(55.0, 12.0), diameter_mm=2.4, share=1.0,
+        courses=((0.0, (0.85, -0.05, -0.5)), (18.0, (0.5, -0.3, -0.8)), (40.0, (0.3, -0.55, -0.75))),
+    ),
+    "14": _SideKind(
+        origin_mm=(30.0, 5.0), length_mm=(45.0, 10.0), diameter_mm=2.0, share=0.9,
+        courses=((0.0, (0.65, 0.1, -0.75)), (18.0, (0.4, -0.35, -0.8)), (36.0, (0.4, -0.6, -0.65))),
+    ),
+    "14 third": _SideKind(
+        origin_mm=(46.0, 5.0), length_mm=(36.0, 8.0), diameter_mm=1.7, share=0.6,
+        courses=((0.0, (0.6, 0.0, -0.8)), (14.0, (0.45, -0.5, -0.7))),
+    ),
+    "14 posterior": _SideKind(
+        origin_mm=(68.0, 4.0), length_mm=(40.0, 8.0), diameter_mm=1.9, share=1.0,
+        courses=((0.0, (0.45, -0.35, -0.8)), (12.0, (0.65, -0.7, -0.25))),
+    ),
+}  # fmt: skip
+"""The last one leaves balanced and left-dominant circumflex arteries alone, for the inferior wall (Dodge's CP)."""
+_RAMUS = _SideKind(
+    origin_mm=(0.0, 0.0), length_mm=(55.0, 12.0), diameter_mm=1.9, share=_RAMUS_SHARE,
+    courses=((0.0, (0.9, -0.05, -0.35)), (14.0, (0.7, -0.2, -0.65)), (36.0, (0.4, -0.5, -0.75))),
+)  # fmt: skip
+
+
+_ORDERED = (("9", "10"), ("12",))
+"""Names of the first branches of the anterior descending artery and of the circumflex, septals aside."""
+_SHARPEST_PER_MM = 0.45
+"""Greatest curvature of the main vessels, 1/mm."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Trunk:
+    """A patient's main vessels: course from the ostium and from the fork, indices of fork and crux, the heart's fit."""
+
+    lad: Float[np.ndarray, "n 3"]
+    lcx: Float[np.ndarray, "m 3"]
+    fork: int
+    crux: int | None
+    size: float
+    turn: Rotation
+    heart: HeartFit
+
+
+def make_lca(generator: np.random.Generator, stenosis_share: float) -> tuple[VesselTree, dict[str, Any]]:
+    """Return one left coronary tree and what was drawn for it.
+
+    Args:
+        generator: random stream of this patient.
+        stenosis_share: probability of a stenosis, in the anterior descending artery or the circumflex.
+    """
+    u = generator.random()
+    dominance = "right" if u < _RIGHT_SHARE else "balanced" if u < _RIGHT_SHARE + _BALANCED_SHARE else "left"
+    return until_it_fits(partial(_draw, generator, dominance, stenosis_share), "left coronary artery")
+
+
+def _draw(generator: np.random.Generator, dominance: str, stenosis_share: float) -> tuple[VesselTree, dict[str, Any]]:
+    trunk = _trunk(generator, dominance)
+    calibre = _calibre(generator)
+    lad = _lad(generator, trunk, calibre)
+    vessels, stenoses = [lad, _lcx(generator, trunk, lad, dominance, calibre)], []
+    plans = _plan_branches(generator, trunk, vessels, dominance, calibre)
+    vessels = _with_sections(trunk, vessels, plans)
+    if generator.random() < stenosis_share:
+        fork = trunk.fork / len(lad.points)
+        which, shares = (0, (fork + 0.06, 0.65)) if generator.random() < 0.6 else (1, (0.15, 0.6))
+        stenosis, vessels = narrowed(generator, vessels, which, shares)
+        stenoses.append(stenosis)
+    vessels = with_side_branches(generator, vessels, plans)
+    tree = build_tree(vessels, LCA_SECTIONS)
+    along, bends = shape.abscissa(lad.points), shape.curvature(lad.points)
+    truth = {
+        "dominance": dominance,
+        "ramus": any(plan.section == "16" for plan in plans),
+        "length_mm": float(along[-1]),
+        "left_main_length_mm": float(along[trunk.fork]),
+        "circumflex_length_mm": float(shape.abscissa(vessels[1].points)[-1]),
+        "tortuosity": shape.tortuosity(lad.points),
+        "curvature_mean_per_mm": float(bends.mean()),
+        "curvature_p90_per_mm": float(np.quantile(bends, 0.9)),
+        "stenoses": stenoses,
+    }
+    return tree, truth
+
+
+@cache
+def _templates() -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "m 3"]]:
+    """Return the mean courses of the anterior descending artery, and of circumflex and left posterior descending."""
+    lcx = np.concatenate([heart_left.LCX, heart_left.INFERIOR[1:]])
+    return shape.curve_through(heart_left.LAD, 1.0), shape.curve_through(lcx, 1.0)
+
+
+def _trunk(generator: np.random.Generator, dominance: str) -> _Trunk:
+    """Return the main vessels: the mean courses, sized, turned, moved with the left main's end, and wiggling."""
+    size = float(np.exp(_SIZE_SD * np.clip(generator.normal(), -2.5, 2.5)))
+    turn = Rotation.from_rotvec(np.deg2rad(generator.normal(0, _TURN_SD_DEG, 3)))
+    main_mm = truncated(generator, LEFT_MAIN_MM, LEFT_MAIN_SD_MM, 5.0, 22.0)
+    lad, lcx = ((template - template[0]) * size for template in _templates())
+    end_of_main = main_mm * heart_left.FORK / np.linalg.norm(heart_left.FORK)
+    bow = np.array([[0.0, 0.0, 0.0], 0.5 * end_of_main + main_mm * np.array([0.0, 0.06, 0.08])])
+    stride = round(6.0 * size)
+    lad = wiggled(
+        generator, shape.curve_through(np.concatenate([bow, lad[::stride] + end_of_main])), _WIGGLE_MM, quiet_mm=9.0
+    )
+    fork = round(main_mm / shape.STEP_MM)
+    crux_at = (heart_left.LCX[-1] - heart_left.FORK) * size
+    lcx = wiggled(generator, shape.curve_through(lcx[::stride]), _WIGGLE_MM, quiet_mm=7.0)
+    crux = int(np.argmin(np.linalg.norm(lcx - crux_at, axis=1)))
+    lad, lcx = turn.apply(lad), turn.apply(lcx + lad[fork])
+    heart = heart_left.fit_left_heart(lad, lcx[: crux + 1], lcx[crux:])
+    if dominance == "left":
+        end_mm = shape.STEP_MM * crux + size * truncated(generator, 48.0, 10.0, 28.0, 68.0)
+    else:
+        end_mm = size * truncated(generator, *_ENDS[dominance])
+    # The anterior descending artery ends before, at or beyond the apex.
+    last = fork + round((len(lad) - 1 - fork) * generator.uniform(0.74, 1.0))
+    lad, lcx = lad[: last + 1], lcx[: round(end_mm / shape.STEP_MM) + 1]
+    if max(shape.curvature(lad).max(), shape.curvature(lcx).max()) > _SHARPEST_PER_MM:
+        raise NoShape
+    return _Trunk(lad, lcx, fork, crux if dominance == "left" else None, size, turn, heart)
+
+
+def _calibre(generator: np.random.Generator) -> float:
+    """Return the patient's lumen against the average."""
+    sex = _FEMALE_CALIBRE if generator.random() < 0.5 else 1.0
+    return float(np.clip(sex / (0.5 + 0.5 * _FEMALE_CALIBRE) * (1 + 0.1 * generator.normal()), 0.65, 1.4))
+
+
+def _lad(generator: np.random.Generator, trunk: _Trunk, calibre: float) -> Vessel:
+    along = shape.abscissa(trunk.lad)
+    beyond = along - along[trunk.fork]
+    whole = trunk.size * float(shape.abscissa(_templates()[0])[-1])
+    own = PchipInterpolator(list(LAD_DIAMETER_MM), list(LAD_DIAMETER_MM.values()))(np.clip(beyond / whole, 0, 1))
+    # The left main's lumen gives way to that of the anterior descending artery just behind the fork.
+    share = np.clip((beyond + 1.0) / 4.0, 0.0, 1.0)
+    diameter = LEFT_MAIN_DIAMETER_MM + (own - LEFT_MAIN_DIAMETER_MM) * share**2 * (3 - 2 * share)
+    return Vessel(trunk.lad, 0.5 * diameter * calibre * uneven(generator, along), ())
+
+
+def _lcx(generator: np.random.Generator, trunk: _Trunk, lad: Vessel, dominance: str, calibre: float) -> Vessel:
+    along = shape.abscissa(trunk.lcx)
+    profile = LCX_DIAMETER_MM[dominance]
+    own = PchipInterpolator(list(profile), list(profile.values()))(along / along[-1])
+    radius = np.minimum(0.5 * own * calibre * uneven(generator, along), lad.radius[trunk.fork])
+    forward = shape.tangents(trunk.lad)[trunk.fork]
+    radius = mouth(radius, trunk.lcx, forward, float(lad.radius[trunk.fork]))
+    return Vessel(trunk.lcx, radius, (), 0, trunk.fork)
+
+
+def _plan_branches(
+    generator: np.random.Generator, trunk: _Trunk, vessels: list[Vessel], dominance: str, calibre: float
+) -> list[SidePlan]:
+    """Draw which branches there are, where they leave, how long and how wide they are; named in their order."""
+    plans: list[SidePlan] = []
+    for parent, kinds in enumerate((_LAD_SIDES, _LCX_SIDES)):
+        first = trunk.fork if parent == 0 else 0
+        taken: list[int] = []
+        for name, kind in kinds.items():
+            if generator.random() > kind.share or (name == "14 posterior" and dominance == "right"):
+                continue
+            mean, sd = (trunk.size * value for value in kind.origin_mm)
+            origin = first + free_origin(generator, mean, sd, taken)
+            if origin * shape.STEP_MM > shape.abscissa(vessels[parent].points)[-1] - 8.0:
+                continue
+            taken.append(origin - first)
+            plans.append(_plan(generator, name.split()[0], kind, parent, origin, trunk, calibre))
+        own = sorted((plan for plan in plans if plan.parent == parent and plan.section != "septal"), key=_origin)
+        named = {id(plan): name for plan, name in zip(own, _ORDERED[parent], strict=False)}
+        plans = [replace(plan, section=named.get(id(plan), plan.section)) for plan in plans]
+    if generator.random() < _RAMUS.share:
+        plans.insert(0, _plan(generator, "16", _RAMUS, 0, trunk.fork, trunk, calibre))
+    return plans
+
+
+def _plan(
+    generator: np.random.Generator,
+    section: str,
+    kind: _SideKind,
+    parent: int,
+    origin: int,
+    trunk: _Trunk,
+    calibre: float,
+) -> SidePlan:
+    mean, sd = kind.length_mm
+    septal = section == "septal"
+    return SidePlan(
+        section=section,
+        parent=parent,
+        origin=origin,
+        length_mm=trunk.size * truncated(generator, mean, sd, 0.5 * mean, 1.5 * mean),
+        diameter_mm=kind.diameter_mm * (0.6 + 0.4 * calibre) * (1 + 0.1 * float(generator.normal())),
+        courses=tuple((begin, tuple(trunk.turn.apply(course))) for begin, course in kind.courses),
+        angle_deg=(60.0, 90.0) if septal else (40.0, 70.0),
+        depth=None if septal else trunk.heart.solid_depth,
+    )
+
+
+def _origin(plan: SidePlan) -> int:
+    return plan.origin
+
+
+def _with_sections(trunk: _Trunk, vessels: list[Vessel], plans: list[SidePlan]) -> list[Vessel]:
+    """Name the points of the two main vessels (SCCT): see `labels`."""
+    lad, lcx = vessels
+    place = np.arange(len(lad.points))
+    apex = int(np.argmax(np.linalg.norm(lad.points - lad.points[trunk.fork], axis=1)))
+    proximal = min(plan.origin for plan in plans if plan.parent == 0 and plan.origin > trunk.fork)
+    ends = [place <= trunk.fork, place <= proximal, place <= (proximal + apex) / 2]
+    names = np.select(ends, ["5", "6", "7"], default="8").tolist()
+    marginals = [plan.origin for plan in plans if plan.parent == 1]
+    place = np.arange(len(lcx.points))
+    ends = [place <= min(marginals), place <= (trunk.crux or len(place))]
+    return [replace(lad, section=names), replace(lcx, section=np.select(ends, ["11", "13"], default="15").tolist())]

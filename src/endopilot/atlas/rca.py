@@ -1,0 +1,269 @@
+"""Right coronary arteries: a C around the right atrioventricular groove, drawn from published statistics.
+
+Facts and their sources: the course, see `heart_reference`; lumen diameters by dominance, Dodge JT et al., "Lumen
+diameter of normal human coronary arteries", Circulation 1992;86:232-46; length, tortuosity, curvature, diameter along
+the way and the origins of branches, measured on sixteen manually segmented right coronary arteries (docs/atlas.md).
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.interpolate import PchipInterpolator
+from scipy.optimize import root
+from scipy.spatial.transform import Rotation
+
+from endopilot.anatomy.labels_tree import RCA_SECTIONS
+from endopilot.atlas import curves as shape
+from endopilot.atlas.branching import (
+    NoShape,
+    SidePlan,
+    Vessel,
+    build_tree,
+    free_origin,
+    stenosis,
+    truncated,
+    uneven,
+    until_it_fits,
+    with_side_branches,
+)
+from endopilot.atlas.heart_reference import BEYOND_CRUX, TO_CRUX, HeartFit, fit_heart
+from endopilot.types import VesselTree
+
+LENGTH_MM, LENGTH_SD_MM, LENGTH_RANGE_MM = 164.0, 30.0, (112.0, 223.0)
+TORTUOSITY, TORTUOSITY_SD = 2.07, 0.23
+CURVATURE, CURVATURE_SD = 0.061, 0.017
+DIAMETER_MM = {0.1: 4.0, 0.2: 3.8, 0.5: 3.5, 0.7: 2.7, 0.9: 2.3}
+"""Lumen diameter, mm, at fractions of the way from the ostium to the farthest tip."""
+
+_RIGHT_SHARE, _BALANCED_SHARE = 0.88, 0.06
+"""Shares of right and balanced dominance; the rest is left. Chosen within the range that the literature reports."""
+_CALIBRE = {"right": 1.025, "balanced": 0.9, "left": 0.74}
+"""Lumen against the average of all patients (Dodge 1992: balanced 0.78, left 0.70 of right dominance)."""
+_FEMALE_CALIBRE = 0.91
+"""Women's lumens against men's (Dodge 1992)."""
+
+Courses = tuple[tuple[float, tuple[float, float, float]], ...]
+"""Where a side branch heads: (abscissa from which it holds, mm; LPS direction), in order."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _SideKind:
+    """How a kind of side branch leaves: mean and SD of origin and length, mm; lumen; courses in LPS directions."""
+
+    origin_mm: tuple[float, float]
+    length_mm: tuple[float, float]
+    diameter_mm: float
+    share: float
+    courses: Courses
+
+
+_SIDES = {
+    "conus": _SideKind(
+        origin_mm=(15.0, 6.0), length_mm=(26.0, 6.0), diameter_mm=1.6, share=0.85,
+        courses=((0.0, (0.45, -0.85, 0.3)), (8.0, (0.85, -0.5, 0.0)), (18.0, (0.8, -0.35, -0.5))),
+    ),
+    "SA": _SideKind(
+        origin_mm=(16.0, 6.0), length_mm=(30.0, 7.0), diameter_mm=1.5, share=0.6,
+        courses=((0.0, (-0.25, 0.75, 0.6)), (10.0, (0.15, 0.85, 0.5)), (20.0, (-0.5, 0.6, 0.6))),
+    ),
+    "RV": _SideKind(
+        origin_mm=(29.0, 5.0), length_mm=(36.0, 8.0), diameter_mm=1.7, share=0.8,
+        courses=((0.0, (0.4, -0.9, -0.1)), (10.0, (0.75, -0.55, -0.35)), (22.0, (0.75, -0.2, -0.6))),
+    ),
+    "AM": _SideKind(
+        origin_mm=(42.0, 8.0), length_mm=(50.0, 10.0), diameter_mm=2.0, share=1.0,
+        courses=((0.0, (0.3, -0.85, -0.4)), (12.0, (0.7, -0.5, -0.5)), (30.0, (0.85, -0.3, -0.4))),
+    ),
+}  # fmt: skip
+_DISTAL_COURSES = {
+    "4": ((0.0, (0.72, -0.6, -0.35)), (18.0, (0.73, -0.68, -0.08)), (45.0, (0.7, -0.65, 0.25))),
+    "16": ((0.0, (0.68, 0.65, 0.32)), (16.0, (0.6, 0.7, 0.3)), (26.0, (0.85, 0.1, -0.5)), (45.0, (0.85, -0.4, -0.3))),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Targets:
+    """What a patient's main vessel must have: length in mm, mean curvature in 1/mm, the section its tip lies in."""
+
+    dominance: str
+    length_mm: float
+    tortuosity: float
+    curvature_per_mm: float
+    ends_in: str
+
+
+def make_rca(generator: np.random.Generator, stenosis_share: float) -> tuple[VesselTree, dict[str, Any]]:
+    """Return one right coronary tree and what was drawn for it.
+
+    Targets outlive failed draws of the shape, lest the failures bias the statistics.
+
+    Args:
+        generator: random stream of this patient.
+        stenosis_share: probability of a stenosis.
+    """
+    for _ in range(10):
+        targets = _targets(generator)
+        with suppress(NoShape):
+            return until_it_fits(partial(_draw, generator, targets, stenosis_share), "right coronary artery")
+    raise RuntimeError("no right coronary artery found in 600 draws")
+
+
+def _targets(generator: np.random.Generator) -> _Targets:
+    dominance = _dominance(generator.random())
+    if dominance == "left":
+        # A small right coronary ends before the crux.
+        length, ends_in = 112.0 + abs(float(generator.normal(0, 10))), "3"
+    else:
+        # The mean makes up for the shorter left-dominant arteries.
+        length = truncated(generator, LENGTH_MM + 2.4, LENGTH_SD_MM, *LENGTH_RANGE_MM)
+        ends_in = "4" if dominance == "balanced" or generator.random() < 0.6 else "16"
+    return _Targets(
+        dominance=dominance,
+        length_mm=length,
+        tortuosity=truncated(generator, TORTUOSITY, TORTUOSITY_SD, TORTUOSITY - 0.45, TORTUOSITY + 0.45),
+        curvature_per_mm=truncated(generator, CURVATURE, CURVATURE_SD, CURVATURE - 0.025, CURVATURE + 0.025),
+        ends_in=ends_in,
+    )
+
+
+def _draw(
+    generator: np.random.Generator, targets: _Targets, stenosis_share: float
+) -> tuple[VesselTree, dict[str, Any]]:
+    main, crux = _main_vessel(generator, targets)
+    healthy, calibre = _main_radius(generator, targets.dominance, main)
+    radius, narrowed = healthy, None
+    if generator.random() < stenosis_share:
+        narrowed, narrowing = stenosis(generator, shape.abscissa(main), (0.12, 0.75))
+        radius = healthy * narrowing
+    heart = fit_heart(main, 0.5 * crux, targets.ends_in)
+    plans = _plan_branches(generator, heart, healthy, crux, targets, calibre)
+    vessels = [Vessel(main, radius, _main_sections(main, crux, targets.ends_in))]
+    tree = build_tree(with_side_branches(generator, vessels, plans), RCA_SECTIONS)
+    bends = shape.curvature(main)
+    truth = {
+        "dominance": targets.dominance,
+        "length_mm": float(shape.abscissa(main)[-1]),
+        "tortuosity": shape.tortuosity(main),
+        "curvature_mean_per_mm": float(bends.mean()),
+        "curvature_p90_per_mm": float(np.quantile(bends, 0.9)),
+        "stenoses": [] if narrowed is None else [narrowed],
+    }
+    return tree, truth
+
+
+def _dominance(u: float) -> str:
+    return "right" if u < _RIGHT_SHARE else "balanced" if u < _RIGHT_SHARE + _BALANCED_SHARE else "left"
+
+
+def _main_vessel(generator: np.random.Generator, targets: _Targets) -> tuple[Float[np.ndarray, "n 3"], int]:
+    """Return the way from the ostium to the farthest tip, and the index of the crux on it.
+
+    Size, closure of the C and amplitude of the wiggles are solved for so that length, tortuosity and mean curvature
+    take the drawn values.
+    """
+    length, ends_in = targets.length_mm, targets.ends_in
+    waypoints = TO_CRUX if ends_in == "3" else np.concatenate([TO_CRUX, BEYOND_CRUX[ends_in]])
+    template = shape.curve_through(waypoints, 1.0)
+    template_crux = float(shape.abscissa(shape.curve_through(TO_CRUX))[-1])
+    along = shape.abscissa(template)
+    if ends_in == "3":
+        keep = 0.97 * along[-1]
+    else:
+        # Long arteries reach farther beyond the crux rather than belong to huge hearts.
+        crux_mm = 106.0 * (length / LENGTH_MM) ** 0.65 * (1 + 0.03 * generator.normal())
+        keep = min(template_crux * length / crux_mm, along[-1])
+    template = template[along <= keep]
+    wiggle = shape.Wiggle.draw(generator, 13.0, 70.0)
+    turn = Rotation.from_rotvec(np.deg2rad(generator.normal(0, 7, 3)))
+    centred = TO_CRUX - TO_CRUX.mean(axis=0)
+    axis = np.linalg.svd(centred)[2][2]
+    axis = axis * np.sign(axis @ np.cross(TO_CRUX[4] - TO_CRUX[0], TO_CRUX[-1] - TO_CRUX[4]))
+
+    normals = shape.parallel_normals(shape.tangents(template))
+    wanted = (length, targets.tortuosity, targets.curvature_per_mm)
+
+    def curve(knobs: Float[np.ndarray, "3"]) -> Float[np.ndarray, "n 3"]:
+        bent = shape.bend(template, axis, float(knobs[1])) * np.exp(knobs[0])
+        across = Rotation.from_rotvec(np.linspace(0, knobs[1], len(normals))[:, None] * axis).apply(normals)
+        return turn.apply(shape.curve_through(wiggle.apply(bent, across, float(np.exp(knobs[2])), 8.0)))
+
+    def misfit(knobs: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+        points = curve(np.clip(knobs, (-1, -2, -4), (1, 2, 3)))
+        found = (shape.abscissa(points)[-1], shape.tortuosity(points), shape.curvature(points).mean())
+        return np.log(np.array(found) / wanted)
+
+    solution = root(misfit, np.array([np.log(length / keep) - 0.05, 0.0, 0.5]), tol=1e-3, options={"maxfev": 60})
+    points = curve(np.clip(solution.x, (-1, -2, -4), (1, 2, 3)))
+    if np.abs(misfit(solution.x)).max() > 0.01 or shape.curvature(points).max() > 0.28:
+        raise NoShape
+    crux = len(points) - 1 if ends_in == "3" else round(len(points) * template_crux / keep)
+    return points, crux
+
+
+def _main_radius(
+    generator: np.random.Generator, dominance: str, main: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "n"], float]:
+    """Return the lumen radius along the main vessel, mm, and the patient's calibre against the average."""
+    sex = _FEMALE_CALIBRE if generator.random() < 0.5 else 1.0
+    calibre = _CALIBRE[dominance] * sex / (0.5 + 0.5 * _FEMALE_CALIBRE) * (1 + 0.1 * generator.normal())
+    calibre = float(np.clip(calibre, 0.55, 1.4))
+    share = np.linspace(0.0, 1.0, len(main))
+    diameter = PchipInterpolator([0.0, *DIAMETER_MM, 1.0], [4.1, *DIAMETER_MM.values(), 2.15])(share)
+    if dominance == "left":
+        diameter = diameter * (1 - 0.2 * share)
+    return 0.5 * diameter * calibre * uneven(generator, shape.abscissa(main)), calibre
+
+
+def _main_sections(main: Float[np.ndarray, "n 3"], crux: int, ends_in: str) -> list[str]:
+    """Label the main vessel: the acute margin lies 64 % of the way to the crux (Dodge 1988, R2 distal)."""
+    margin = round(0.64 * crux)
+    place = np.arange(len(main))
+    names = np.select([place <= margin // 2, place <= margin, place <= crux], ["1", "2", "3"], default=ends_in)
+    return [str(name) for name in names]
+
+
+def _plan_branches(
+    generator: np.random.Generator,
+    heart: HeartFit,
+    radius: Float[np.ndarray, "n"],
+    crux: int,
+    targets: _Targets,
+    calibre: float,
+) -> list[SidePlan]:
+    """Draw which branches there are, where they leave, how long and how wide they are."""
+    plans: list[SidePlan] = []
+    end_mm = (len(radius) - 1) * shape.STEP_MM
+    for section, kind in _SIDES.items():
+        if generator.random() > kind.share:
+            continue
+        origin = free_origin(generator, *kind.origin_mm, [plan.origin for plan in plans])
+        length = truncated(generator, *kind.length_mm, 0.5 * kind.length_mm[0], 1.5 * kind.length_mm[0])
+        # The main vessel's tip stays the farthest.
+        length = min(length, 0.95 * end_mm - origin * shape.STEP_MM)
+        diameter = kind.diameter_mm * (0.6 + 0.4 * calibre) * (1 + 0.1 * float(generator.normal()))
+        plans.append(_plan(section, origin, length, diameter, kind.courses, heart))
+    if targets.dominance == "right":
+        other = "16" if targets.ends_in == "4" else "4"
+        length = max((end_mm - crux * shape.STEP_MM) * float(generator.uniform(0.6, 0.92)), 12.0)
+        diameter = 2 * float(radius[crux]) * float(generator.uniform(0.68, 0.8))
+        plans.append(_plan(other, crux, length, diameter, _DISTAL_COURSES[other], heart))
+    return plans
+
+
+def _plan(
+    section: str, origin: int, length_mm: float, diameter_mm: float, courses: Courses, heart: HeartFit
+) -> SidePlan:
+    return SidePlan(
+        section=section,
+        origin=origin,
+        length_mm=length_mm,
+        diameter_mm=diameter_mm,
+        courses=courses,
+        depth=heart.solid_depth,
+    )

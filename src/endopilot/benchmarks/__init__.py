@@ -1,0 +1,1 @@
+"""Speed and accuracy of every stage, each figure beside its bar."""

@@ -1,0 +1,110 @@
+"""Speed of the learning environments, and the accuracy of the core's settings that buys it."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from endopilot.env.navigation import CONTROL_PERIOD_S, CORE, ROTATION_RAD_S, TRANSLATION_MM_S, NavigateVectorEnv
+from endopilot.env.tasks import reference_navigation
+from endopilot.files import processor_name
+from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.controls import ControlConfig, random_controls
+from endopilot.simulation.simulator import Simulator
+from endopilot.types import SAMPLE_PERIOD_S
+
+MANY = 256
+SECONDS = 60.0
+"""Length of the navigations that are timed, s: an episode."""
+SINGLES = 4
+"""Episodes of a single environment that are timed."""
+COMPARED, COMPARED_SECONDS = 8, 30.0
+"""Navigations that the error is measured on, and their length, s."""
+CONVERGED = SimulatorConfig(elements=200, time_step_s=1e-3, tolerance_mm=1e-8)
+
+
+def bench_env() -> dict[str, Any]:
+    """Measure environment steps a second in the reference anatomy, and the tip's error of the settings used for them.
+
+    Two kinds of actions: the random navigations that data are made of (`simulation.controls`: pushes, pulls, turns and
+    pauses of 1 to 6 s, from the ostium to the distal ends), and actions drawn anew at every step, which the core cannot
+    start a step from the last one with.
+
+    Returns:
+        `steps_per_second_256` and `steps_per_second_1`, of 256 environments together and of one, over a minute's
+        navigations, on all cores and everything included; the same with `random_actions_` before them for actions
+        drawn anew; with `processor_` before them, steps a second of processor time; the mean, the 95th percentile and
+        the maximum of the tip's distance from that of a converged core (200 elements, 1 ms, 1e-8 mm), mm, with the
+        environments' settings and with the simulator's default ones; and the share of worlds that stayed valid.
+    """
+    figures: dict[str, Any] = {}
+    valid = []
+    for prefix, drawn_anew in (("", False), ("random_actions_", True)):
+        for count, episodes in ((MANY, 1), (1, SINGLES)):
+            wall, processor, kept = _timed(count, episodes, drawn_anew=drawn_anew)
+            steps = count * episodes * round(SECONDS / CONTROL_PERIOD_S)
+            figures[f"{prefix}steps_per_second_{count}"] = round(steps / wall, 1)
+            figures[f"{prefix}processor_steps_per_second_{count}"] = round(steps / processor, 1)
+            valid.append(kept)
+    exact = _tips(CONVERGED)
+    for prefix, config in (("", CORE), ("default_", SimulatorConfig())):
+        error = np.linalg.norm(_tips(config) - exact, axis=-1)
+        figures[f"{prefix}tip_error_mean_mm"] = round(float(error.mean()), 4)
+        figures[f"{prefix}tip_error_p95_mm"] = round(float(np.percentile(error, 95)), 4)
+        figures[f"{prefix}tip_error_max_mm"] = round(float(error.max()), 4)
+    return figures | {"valid_worlds": round(float(np.mean(valid)), 5), "processor": processor_name()}
+
+
+def _timed(count: int, episodes: int, *, drawn_anew: bool) -> tuple[float, float, float]:
+    """Return wall and processor seconds of some episodes, and the share of valid worlds at their end."""
+    env = NavigateVectorEnv(count)
+    steps = round(SECONDS / CONTROL_PERIOD_S)
+    if drawn_anew:
+        actions = np.random.default_rng(0).uniform(-1.0, 1.0, (episodes, steps, count, 2))
+    else:
+        actions = _navigations(count * episodes, SECONDS).reshape(episodes, count, steps, 2).swapaxes(1, 2)
+    wall = processor = 0.0
+    valid = np.ones(count, dtype=bool)
+    for episode in range(episodes):
+        env.reset(seed=episode)
+        began = time.perf_counter(), time.process_time()
+        for action in actions[episode]:
+            valid &= env.step(action)[4]["valid"]
+        wall, processor = wall + time.perf_counter() - began[0], processor + time.process_time() - began[1]
+    return wall, processor, float(valid.mean())
+
+
+def _navigations(count: int, seconds: float) -> Float[np.ndarray, "count steps 2"]:
+    """Return random navigations as actions."""
+    longest = float(reference_navigation().anatomy.tree.longest_path().abscissa[-1])
+    samples = int(np.ceil(seconds / SAMPLE_PERIOD_S))
+    _, control = random_controls(
+        ControlConfig(), n_sequences=count, n_samples=samples, seed=0, max_inserted_length_mm=longest
+    )
+    at = (np.arange(round(seconds / CONTROL_PERIOD_S)) * CONTROL_PERIOD_S / SAMPLE_PERIOD_S).astype(int)
+    return control[:, at] / (TRANSLATION_MM_S, ROTATION_RAD_S)
+
+
+def _tips(config: SimulatorConfig) -> Float[np.ndarray, "steps worlds 3"]:
+    """Return the tips of navigations that start at places of their own, simulated with some settings."""
+    navigation = reference_navigation()
+    longest = float(navigation.anatomy.tree.longest_path().abscissa[-1])
+    initial, control = random_controls(
+        ControlConfig(),
+        n_sequences=COMPARED,
+        n_samples=round(COMPARED_SECONDS / SAMPLE_PERIOD_S),
+        seed=0,
+        max_inserted_length_mm=longest,
+    )
+    simulator = Simulator(navigation.anatomy, navigation.device, worlds=COMPARED, config=config)
+    simulator.reset(inserted_length=initial[:, 0], rotation=initial[:, 1])
+    tips = []
+    for step in range(round(COMPARED_SECONDS / CONTROL_PERIOD_S)):
+        sample = int(step * CONTROL_PERIOD_S / SAMPLE_PERIOD_S)
+        room = (longest - simulator.inserted_length) / CONTROL_PERIOD_S
+        held = np.column_stack([np.minimum(control[:, sample, 0], room), control[:, sample, 1]])
+        tips.append(simulator.step(held, CONTROL_PERIOD_S).tip_position)
+    return np.array(tips)

@@ -1,0 +1,166 @@
+"""How well the automatic coronary method finds what synthetic CT angiograms were made of: `bench_imaging`."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import endopilot.anatomy
+import endopilot.imaging
+from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
+from endopilot.atlas.atlas import AtlasConfig, make_patient
+from endopilot.errors import InputError
+from endopilot.evaluation.anatomy_score import score_anatomy
+from endopilot.files import manifest, read_json, write_json
+from endopilot.imaging.segment import SegmentConfig, segment
+from endopilot.parallel import each
+from endopilot.phantom.phantom import PhantomConfig, make_phantom
+
+VESSELS = ("rca", "lca")
+"""Coronary trees of the cases, in turn."""
+
+
+@dataclass(frozen=True)
+class Bar:
+    """What a figure must reach: at most or at least `limit`, by the mean of all cases or by the worst of them."""
+
+    limit: float
+    at_least: bool
+    worst: bool = False
+
+
+BARS = {
+    "dice": Bar(0.85, at_least=True),
+    "cldice": Bar(0.90, at_least=True),
+    "overlap": Bar(0.95, at_least=True),
+    "inside_accuracy_mm": Bar(0.25, at_least=False),
+    "radius_mae_mm": Bar(0.15, at_least=False),
+    "ostium_error_mm": Bar(1.0, at_least=False, worst=True),
+    "false_length_mm": Bar(5.0, at_least=False, worst=True),
+}
+"""Bars of the figures; `AnatomyScore` says what each is. An ostium off by more than 1 mm, or a false tree longer than
+5 mm, may not happen in any case; of the others the mean counts."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImagingBenchConfig:
+    """Which cases, and where their results are kept."""
+
+    cases: int = 50
+    """Number of synthetic CT angiograms."""
+    seed: int = 0
+    """Seed of patients, scanners and noise: case i is the same however many there are."""
+    folder: Path = Path("runs/imaging")
+    """Folder of the cases' results; an interrupted run goes on where it stopped."""
+
+    def __post_init__(self) -> None:
+        if self.cases < 1:
+            raise InputError(f"cases: {self.cases}; give at least 1")
+        if not 0 <= self.seed < 2**63:
+            raise InputError(f"seed: {self.seed}; give a whole number from 0 to 2^63 - 1")
+
+
+def bench_imaging(config: ImagingBenchConfig) -> dict[str, Any]:
+    """Segment synthetic CT angiograms from the volume alone and compare with what they were made of.
+
+    Centerlines and radii are those that `extract_anatomy` finds in the mask; its tree begins at the mask's ostium.
+
+    Returns:
+        For each of `BARS` its `mean`, `sd`, `worst` of all cases and `worst_found` of those with a result, `bar`,
+        `counts` (mean or worst) and whether it is `met`; `seconds`
+        and `processor_seconds` of the segmentation a case; `cases`, and `failed`: cases without any result, each with
+        the reason. A failed case counts 0 in the shares, and no bar in mm is met then.
+    """
+    paths = [config.folder / f"{config.seed}-{index:04d}.json" for index in range(config.cases)]
+    method = _method()
+    missing = [path for path in paths if not path.exists() or read_json(path).get("method") != method]
+    bad = each("Synthetic CT angiograms", missing, partial(_measure, seed=config.seed, method=method))
+    if bad:
+        raise next(iter(bad.values()))
+    rows = [read_json(path) for path in paths]
+    failed = {str(row["case"]): row["failed"] for row in rows if row["failed"]}
+    figures: dict[str, Any] = {name: _figure(name, rows) for name in BARS}
+    for name in ("seconds", "processor_seconds"):
+        values = np.array([row[name] for row in rows])
+        figures[name] = {"mean": round(float(values.mean()), 2), "worst": round(float(values.max()), 2)}
+    return figures | {"cases": len(rows), "failed": failed}
+
+
+def draw_case(seed: int, index: int) -> tuple[AtlasConfig, PhantomConfig]:
+    """Return the patient and the scan of a case: voxels, calcium and background vary beside what the phantom draws."""
+    key = np.array([seed, index], dtype=np.uint64)
+    generator = np.random.Generator(np.random.Philox(key=key, counter=1))
+    patients = AtlasConfig(anatomy=VESSELS[index % len(VESSELS)], seed=seed, stenosis_share=0.5)
+    right_heart = float(generator.uniform(0.2, 0.95))
+    scan = PhantomConfig(
+        in_plane_mm=float(generator.uniform(0.32, 0.45)),
+        slice_mm=float(generator.uniform(0.4, 0.7)),
+        calcium=float(generator.uniform(0.0, 6.0)),
+        right_heart=(right_heart, right_heart),
+    )
+    return patients, scan
+
+
+def _measure(path: Path, *, seed: int, method: str) -> None:
+    """Make, segment and score one case, and write its row."""
+    index = int(path.stem.rsplit("-", 1)[1])
+    patients, scan = draw_case(seed, index)
+    truth = make_patient(patients, index)
+    volume = make_phantom(truth, scan, seed * 1_000_003 + index)
+    vessel = "lca" if patients.anatomy == "lca" else "rca"
+    row: dict[str, Any] = {"case": index, "method": method, "failed": None}
+    wall, processor = time.perf_counter(), time.process_time()
+    mask = None
+    try:
+        mask = segment(volume, SegmentConfig(method="coronary", vessel=vessel))
+    except InputError as error:
+        row["failed"] = str(error)
+    row |= {"seconds": time.perf_counter() - wall, "processor_seconds": time.process_time() - processor}
+    if mask is not None:
+        try:
+            extracted = extract_anatomy(mask, name=truth.name, config=AnatomyConfig(vessel=vessel))
+            row |= asdict(score_anatomy(mask, extracted, truth))
+        except InputError as error:
+            row["failed"] = str(error)
+    drawn = {name: truth.provenance.get(name) for name in ("anatomy", "dominance", "stenoses")}
+    write_json(path, row | {"patient": drawn, "scan": scan, "manifest": manifest(config=patients, seed=seed)})
+
+
+def _figure(name: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
+    bar = BARS[name]
+    lost = 0.0 if bar.at_least else float("inf")
+    values = np.array([lost if row["failed"] else row[name] for row in rows], dtype=float)
+    counted = values[np.isfinite(values)]
+    found = np.array([row[name] for row in rows if not row["failed"]], dtype=float)
+    worst = float(values.min() if bar.at_least else values.max())
+    mean = float(counted.mean()) if len(counted) else float("nan")
+    decisive = worst if bar.worst or len(counted) < len(values) else mean
+    return {
+        "mean": _rounded(mean),
+        "sd": _rounded(float(counted.std(ddof=1)) if len(counted) > 1 else 0.0),
+        "worst": _rounded(worst),
+        "worst_found": _rounded(float((found.min() if bar.at_least else found.max()) if len(found) else np.nan)),
+        "bar": bar.limit,
+        "counts": "worst" if bar.worst else "mean",
+        "met": bool(decisive >= bar.limit if bar.at_least else decisive <= bar.limit),
+    }
+
+
+def _rounded(value: float) -> float | None:
+    return round(value, 4) if np.isfinite(value) else None
+
+
+def _method() -> str:
+    """Return a digest of the source of imaging and anatomy: a result of other code is measured anew."""
+    digest = hashlib.sha256()
+    for package in (endopilot.imaging, endopilot.anatomy):
+        folder = Path(next(iter(package.__path__)))
+        for path in sorted(folder.rglob("*.py")):
+            digest.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:16]

@@ -1,0 +1,386 @@
+"""Robustness of the rod core: many rollouts that ask for too much, counted: `measure_robustness`.
+
+Every synthetic anatomy is navigated by every device that fits it, in four manoeuvres of equal share: at random within
+the vessel, at random beyond its end, pushed on and on against its end, and at random and then pulled fully out. A chunk
+is one anatomy and one device; it runs in a process of its own, so that a crash is counted and survived, and leaves one
+small file. A run that was interrupted goes on with the chunks that have none.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import multiprocessing
+import time
+import warnings
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import asdict, dataclass, fields
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from endopilot import _core
+from endopilot.atlas.atlas import AtlasConfig, make_patient
+from endopilot.errors import InputError
+from endopilot.files import read_json, write_json, writing
+from endopilot.parallel import follow_the_parent
+from endopilot.progress import progress
+from endopilot.simulation.config import SimulatorConfig, wall_stiffness
+from endopilot.simulation.controls import ControlConfig, random_controls
+from endopilot.simulation.device import Device, check_fits, list_devices, read_device
+from endopilot.simulation.simulate import simulate, why_invalid
+from endopilot.types import SAMPLE_PERIOD_S, Anatomy, Rollout
+
+MOST_INVALID_SHARE = 1e-3
+"""Bar: share of the worlds that may be invalid."""
+MOST_PENETRATION_MM = 0.05
+"""Bar: 99.9th percentile of the penetration over all valid samples, mm."""
+MANOEUVRES = ("within", "beyond", "against the end", "pulled out")
+"""Rollout i of a chunk is of kind i modulo 4."""
+BEYOND = 1.3
+"""The last three ask for this multiple of the longest path."""
+_PUSH_MM_S = 8.0
+"""Speed of the push against the vessel's end, mm/s."""
+_PULL_MM_S = 20.0
+"""Speed at which a wire is pulled out, mm/s; below every device's limit."""
+_PULL_AT = 0.6
+"""Share of the rollout after which it is pulled out."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobustnessConfig:
+    """How many rollouts, where, and where the results of the chunks are kept."""
+
+    rollouts: int = 10_000
+    """Number of rollouts, spread over the anatomies and the devices that fit; rounded up to whole chunks."""
+    anatomies: int = 100
+    """Number of synthetic anatomies."""
+    seed: int = 0
+    """Seed of the anatomies and the controls."""
+    seconds: float = 60.0
+    """Length of a rollout, s."""
+    threads: int = 0
+    """Threads of the rod core; 0 for one a processor core. The results do not depend on it."""
+    folder: Path = Path("runs/robustness")
+    """Folder of the chunks' results; an interrupted run goes on where it stopped."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            InputError: a field is out of its range.
+        """
+        for name in ("rollouts", "anatomies"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name}: {getattr(self, name)}; give at least 1")
+        if not 0 <= self.seed < 2**63:
+            raise InputError(f"seed: {self.seed}; give a whole number from 0 to 2^63 - 1")
+        if not 5 <= self.seconds <= 3600:
+            raise InputError(f"seconds: {self.seconds:g}; give 5 to 3600")
+        if self.threads < 0:
+            raise InputError(f"threads: {self.threads}; give 0 for all cores, or a positive number")
+
+
+@dataclass(frozen=True, eq=False)
+class Chunk:
+    """What the rollouts of one anatomy and one device did; one file on disk.
+
+    Attributes:
+        penetration_mm: depth of the deepest node in the wall, mm: its contact force over the wall's stiffness.
+        base_force_n: force of the drive, N.
+        to_end_mm: distance of the tip from the end of its branch, mm; negative beyond it.
+        slipped: whether the drive slipped in the sample.
+        valid: whether the world was valid.
+        non_finite: numbers of each rollout that are not finite though its world was valid.
+        seconds: processor time that the chunk took, s.
+    """
+
+    penetration_mm: Float[np.ndarray, "rollouts samples"]
+    base_force_n: Float[np.ndarray, "rollouts samples"]
+    to_end_mm: Float[np.ndarray, "rollouts samples"]
+    slipped: Bool[np.ndarray, "rollouts samples"]
+    valid: Bool[np.ndarray, "rollouts samples"]
+    non_finite: Int[np.ndarray, "rollouts"]
+    seconds: float
+
+
+def measure_robustness(config: RobustnessConfig) -> dict[str, Any]:
+    """Run the rollouts that are not on disk yet, and count what went wrong in all of them.
+
+    Returns:
+        `figures`, one row a bar: figure, value, bar, passed; `rollouts` and `simulated_hours`; `by_device` and
+        `by_manoeuvre`, the penetration's 99.9th percentile and maximum (mm) and the invalid worlds of each; `invalid`
+        and `crashed`, one sentence each: reason, anatomy, device, rollout, seconds.
+
+    Raises:
+        InputError: the folder was begun with other settings or another build of the core, or cannot be written.
+    """
+    _begin(config)
+    devices = [read_device(name) for name in list_devices()]
+    share = -(-config.rollouts // config.anatomies)
+    with progress("Rollouts", total=config.anatomies * len(devices)) as advance, _Worker() as worker:
+        for index in range(config.anatomies):
+            for place, device in enumerate(devices):
+                # the remainder of the share falls to other devices in each anatomy
+                count = (share + (place + index) % len(devices)) // len(devices)
+                path = _path(config, index, device)
+                if count > 0 and not _done(path):
+                    worker.run(path, config, index, device, count)
+                advance(remark=f"{device.name}, patient {index}")
+    return _summarise(config, devices)
+
+
+def robust_controls(
+    anatomy: Anatomy, device: Device, *, rollouts: int, samples: int, seed: int
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n samples 2"]]:
+    """Return initial states and controls of the four manoeuvres in turn; see `MANOEUVRES`.
+
+    Args:
+        anatomy: the vessel.
+        device: the wire, whose limits are kept.
+        rollouts: their number.
+        samples: sample periods of each.
+        seed: key of the random streams.
+    """
+    longest = float(anatomy.tree.longest_path().abscissa[-1])
+    config = ControlConfig(
+        max_velocity_mm_s=min(12.0, device.max_velocity_mm_s), max_rotation_rad_s=min(3.0, device.max_rotation_rad_s)
+    )
+    drawn = [
+        random_controls(config, n_sequences=rollouts, n_samples=samples, seed=seed, max_inserted_length_mm=length)
+        for length in (longest, BEYOND * longest)
+    ]
+    kind = np.arange(rollouts) % len(MANOEUVRES)
+    initial, control = (np.where(_rows(kind == 0, near), near, far) for near, far in zip(*drawn, strict=True))
+    turn = control[..., 1].copy()
+    pull = round(_PULL_AT * samples)
+    for rollout in np.flatnonzero(kind >= 2):
+        if kind[rollout] == 2:
+            control[rollout, :pull, 0] = _PUSH_MM_S
+        control[rollout, pull:, 0] = -_PULL_MM_S
+        inserted = initial[rollout, 0]
+        for sample in control[rollout]:
+            sample[0] = np.clip(sample[0], -inserted / SAMPLE_PERIOD_S, (BEYOND * longest - inserted) / SAMPLE_PERIOD_S)
+            inserted += SAMPLE_PERIOD_S * sample[0]
+    control[..., 1] = turn
+    return initial, control
+
+
+def _rows(chosen: np.ndarray, like: np.ndarray) -> np.ndarray:
+    return chosen.reshape(-1, *[1] * (like.ndim - 1))
+
+
+def run_chunk(path: Path, config: RobustnessConfig, index: int, device: Device, rollouts: int) -> None:
+    """Simulate the rollouts of one anatomy and one device, and write what they did to `path` and beside it.
+
+    Args:
+        path: file of the chunk, `.npz`; a `.json` of the same name tells the invalid worlds.
+        config: length, seed and threads.
+        index: number of the anatomy.
+        device: the wire.
+        rollouts: number of rollouts.
+    """
+    anatomy = _anatomy(config.seed, index)
+    try:
+        check_fits(device, anatomy)
+    except InputError as error:
+        write_json(path.with_suffix(".json"), {"misfit": str(error)})
+        return
+    began = time.process_time()
+    samples = round(config.seconds / SAMPLE_PERIOD_S)
+    seed = int(np.random.SeedSequence([config.seed, index]).generate_state(1, np.uint64)[0])
+    initial, control = robust_controls(anatomy, device, rollouts=rollouts, samples=samples, seed=seed)
+    simulator = SimulatorConfig(threads=config.threads)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # invalid worlds are told below, each with its reason
+        rollout = simulate(anatomy, device, control, initial=initial, config=simulator)
+    chunk = _describe(anatomy, rollout, wall_stiffness(simulator, device.push_limit_n), time.process_time() - began)
+    invalid = [
+        f"{anatomy.name}, {device.name}, rollout {world} ({MANOEUVRES[world % len(MANOEUVRES)]}): "
+        + why_invalid(rollout, world)
+        for world in np.flatnonzero(rollout.reason).tolist()
+    ]
+    with writing(path) as partial:
+        np.savez_compressed(partial, **{field.name: getattr(chunk, field.name) for field in fields(chunk)})
+    write_json(path.with_suffix(".json"), {"invalid": invalid})
+
+
+def _describe(anatomy: Anatomy, rollout: Rollout, wall_n_mm: float, seconds: float) -> Chunk:
+    end = np.array([branch.centerline.abscissa[-1] for branch in anatomy.tree.branches])
+    numbers = np.concatenate(
+        [
+            rollout.tip_position,
+            rollout.tip_direction,
+            *(
+                getattr(rollout, name)[..., None]
+                for name in ("contact_force_max", "contact_force_sum", "base_force", "base_torque", "slip")
+            ),
+            *(getattr(rollout, name)[..., None] for name in ("inserted_length", "rotation", "iterations")),
+            *(getattr(rollout.tip, name)[..., None] for name in ("abscissa", "offset", "radius")),
+        ],
+        axis=-1,
+    )
+    bad = (~np.isfinite(numbers) & rollout.valid[..., None]).sum(axis=(1, 2))
+    return Chunk(
+        penetration_mm=(rollout.contact_force_max / wall_n_mm).astype(np.float32),
+        base_force_n=rollout.base_force.astype(np.float32),
+        to_end_mm=(end[rollout.tip.branch] - rollout.tip.abscissa).astype(np.float32),
+        slipped=rollout.slip != 0,
+        valid=rollout.valid,
+        non_finite=bad,
+        seconds=seconds,
+    )
+
+
+@lru_cache(maxsize=1)
+def _anatomy(seed: int, index: int) -> Anatomy:
+    return make_patient(AtlasConfig(seed=seed), index)
+
+
+class _Worker:
+    """A process that runs chunks; it is replaced when it dies."""
+
+    def __enter__(self) -> _Worker:
+        self._pool: ProcessPoolExecutor | None = None
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._pool is not None:
+            running = list(multiprocessing.active_children())
+            self._pool.shutdown(wait=False, cancel_futures=True)
+            for process in running:
+                process.terminate()
+
+    def run(self, path: Path, config: RobustnessConfig, index: int, device: Device, rollouts: int) -> None:
+        """Run a chunk; where that raises or ends the process, write the chunk down as crashed.
+
+        Raises:
+            InputError: the folder cannot be written.
+        """
+        if self._pool is None:
+            context = multiprocessing.get_context("spawn")
+            self._pool = ProcessPoolExecutor(1, mp_context=context, initializer=follow_the_parent)
+        try:
+            self._pool.submit(run_chunk, path, config, index, device, rollouts).result()
+        except InputError:
+            raise
+        except Exception as error:  # a crash is what is being counted
+            what = "the process died" if isinstance(error, BrokenProcessPool) else f"{type(error).__name__}: {error}"
+            write_json(path.with_suffix(".json"), {"crash": f"patient {index}, {device.name}: {what}"})
+            self._pool.shutdown(wait=False)
+            self._pool = None
+
+
+def _path(config: RobustnessConfig, index: int, device: Device) -> Path:
+    return Path(config.folder) / f"{index:04d}-{device.name}.npz"
+
+
+def _done(path: Path) -> bool:
+    return path.with_suffix(".json").exists()  # written last
+
+
+def _begin(config: RobustnessConfig) -> None:
+    """Claim the folder, or check that it was begun with the same settings and the same core."""
+    asked = {name: value for name, value in asdict(config).items() if name not in ("threads", "folder")}
+    settings = asked | {"core_sha256": hashlib.sha256(Path(_core.__file__).read_bytes()).hexdigest()}
+    path = Path(config.folder) / "settings.json"
+    if path.exists():
+        before = read_json(path)
+        for name, now in settings.items():
+            if before.get(name) != now:
+                raise InputError(
+                    f"{config.folder}: was begun with {name} = {before.get(name)}, now it is {now}; "
+                    "choose another --folder, or remove this one"
+                )
+        return
+    if Path(config.folder).exists() and any(Path(config.folder).iterdir()):
+        raise InputError(f"{config.folder}: is not empty and holds no robustness run; choose another --folder")
+    write_json(path, settings)
+
+
+def _summarise(config: RobustnessConfig, devices: list[Device]) -> dict[str, Any]:
+    tallies: dict[tuple[str, str], _Tally] = {}
+    invalid, crashed, misfits = [], [], []
+    non_finite, seconds = 0, 0.0
+    for device, record, chunk in _results(config, devices):
+        invalid.extend(record.get("invalid", []))
+        crashed.extend([record["crash"]] if "crash" in record else [])
+        misfits.extend([record["misfit"]] if "misfit" in record else [])
+        if chunk is None:
+            continue
+        non_finite += int(chunk.non_finite.sum())
+        seconds += float(chunk.seconds)
+        kind = np.arange(len(chunk.valid)) % len(MANOEUVRES)
+        groups = [("all", "all", slice(None)), ("by_device", device.name, slice(None))]
+        groups += [("by_manoeuvre", name, kind == place) for place, name in enumerate(MANOEUVRES)]
+        for group, name, rows in groups:
+            tally = tallies.setdefault((group, name), _Tally())
+            tally.add(chunk, rows)
+    everything = tallies.get(("all", "all"), _Tally()).row()
+    worlds = everything["rollouts"]
+    measured: list[tuple[str, float, float]] = [
+        ("invalid worlds, share", everything["invalid"] / worlds if worlds else 0.0, MOST_INVALID_SHARE),
+        ("penetration, 99.9th percentile, mm", everything["penetration_p999_mm"] or 0.0, MOST_PENETRATION_MM),
+        ("non-finite numbers in valid worlds", non_finite, 0),
+        ("crashes", len(crashed), 0),
+    ]
+    return {
+        "figures": [
+            {"figure": name, "value": value, "bar": bar, "passed": value <= bar} for name, value, bar in measured
+        ],
+        **everything,
+        "simulated_hours": round(worlds * config.seconds / 3600, 2),
+        "realtime_factor": round(worlds * config.seconds / seconds, 1) if seconds else None,
+        "by_device": {name: t.row() for (group, name), t in tallies.items() if group == "by_device"},
+        "by_manoeuvre": {name: t.row() for (group, name), t in tallies.items() if group == "by_manoeuvre"},
+        "invalid_worlds": invalid,
+        "crashed": crashed,
+        "did_not_fit": misfits,
+    }
+
+
+def _results(config: RobustnessConfig, devices: list[Device]) -> Iterator[tuple[Device, dict[str, Any], Chunk | None]]:
+    """Yield the device, the record and the arrays of every chunk on disk."""
+    for index in range(config.anatomies):
+        for device in devices:
+            path = _path(config, index, device)
+            if not _done(path):
+                continue
+            chunk = None
+            if path.exists():
+                with np.load(path) as arrays:
+                    chunk = Chunk(
+                        **{name: arrays[name] if arrays[name].ndim else arrays[name].item() for name in arrays.files}
+                    )
+            yield device, read_json(path.with_suffix(".json")), chunk
+
+
+class _Tally:
+    """Penetrations and validity of a group of rollouts."""
+
+    def __init__(self) -> None:
+        self.rollouts = self.invalid = 0
+        self.penetration: list[np.ndarray] = []
+
+    def add(self, chunk: Chunk, rows: Any) -> None:
+        valid = chunk.valid[rows]
+        self.rollouts += len(valid)
+        self.invalid += int((~valid.all(axis=1)).sum())
+        self.penetration.append(chunk.penetration_mm[rows][valid])
+
+    def row(self) -> dict[str, Any]:
+        depth = np.concatenate(self.penetration) if self.penetration else np.zeros(0)
+        if len(depth) == 0:
+            return {"rollouts": self.rollouts, "invalid": self.invalid, "penetration_p999_mm": None}
+        return {
+            "rollouts": self.rollouts,
+            "invalid": self.invalid,
+            "penetration_p99_mm": round(float(np.percentile(depth, 99)), 4),
+            "penetration_p999_mm": round(float(np.percentile(depth, 99.9)), 4),
+            "penetration_max_mm": round(float(depth.max()), 4),
+            "share_deeper_than_bar": round(float((depth > MOST_PENETRATION_MM).mean()), 5),
+        }

@@ -1,0 +1,227 @@
+"""What a dataset is to be: its settings, and the blocks of navigations that are simulated and stored one by one."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Shaped
+
+from endopilot import __version__
+from endopilot.dataset.splits import assign_splits
+from endopilot.errors import InputError
+from endopilot.files import json_text, read_json
+from endopilot.simulation.config import Actuation, SimulatorConfig
+from endopilot.simulation.controls import ControlConfig
+from endopilot.simulation.device import Device
+from endopilot.types import SAMPLE_PERIOD_S
+
+FORMAT_VERSION = 3
+"""Counts changes of the columns or of their meaning."""
+
+
+def dataset_simulator() -> SimulatorConfig:
+    """Return the settings that datasets are simulated with: half the elements of the reference and a coarser Newton.
+
+    What they cost in accuracy stands in docs/dataset.md.
+    """
+    return SimulatorConfig(elements=50, tolerance_mm=1e-2, largest_jump=0.3)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DatasetConfig:
+    """How many navigations, how long, how they are driven and how they are split."""
+
+    sequences: int = 1000
+    """Random navigations of each anatomy."""
+    seconds: float = 60.0
+    """Length of a navigation, s; one sample every 0.5 s."""
+    seed: int = 0
+    """Seed of the random controls and parameters."""
+    control: Actuation = "velocity"
+    """What is drawn: the drive's velocity, or its force and torque."""
+    navigation: ControlConfig = field(default_factory=ControlConfig)
+    """Distribution of the random controls."""
+    simulator: SimulatorConfig = field(default_factory=dataset_simulator)
+    """Settings of the rod simulation."""
+    friction: tuple[float, float] | None = None
+    """Range that each navigation's friction coefficient is drawn from uniformly; the device's own if not given."""
+    tip_bend_factor: tuple[float, float] | None = None
+    """Range of a factor on the angle of the device's bent tip, drawn uniformly for each eight navigations."""
+    tip_stiffness_factor: tuple[float, float] | None = None
+    """Range of a factor on the stiffness of the distal 10 mm, drawn likewise."""
+    anatomy_shares: tuple[float, float, float] | None = None
+    """Shares of the anatomies that train, calibrate and test; 0.6 0.2 0.2 if not given, and a single anatomy is then
+    split by sequence alone."""
+    seen_test_share: float = 0.2
+    """Share of the navigations of a train anatomy that are held out as the split seen_test."""
+    sequences_per_file: int = 500
+    """Navigations stored in one file; an interrupted run loses at most one file's work a processor core."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            InputError: a field is out of its range.
+        """
+        for name in ("sequences", "sequences_per_file"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name}: {getattr(self, name)} is not positive; give at least 1")
+        if self.seed < 0:
+            raise InputError(f"seed: {self.seed} is negative; give 0 or more")
+        samples = self.seconds / SAMPLE_PERIOD_S
+        if not samples >= 1 or samples != int(samples):
+            raise InputError(f"seconds: {self.seconds} is not a positive multiple of {SAMPLE_PERIOD_S} s; give e.g. 60")
+        if self.control not in ("velocity", "force"):
+            raise InputError(f"control: {self.control!r}; give 'velocity' or 'force'")
+        for name, least in (("friction", 0.0), ("tip_bend_factor", 0.0), ("tip_stiffness_factor", 0.05)):
+            drawn = getattr(self, name)
+            if drawn is not None and not least <= drawn[0] <= drawn[1] < np.inf:
+                raise InputError(f"{name}: {drawn} is no range; give two numbers, {least:g} or more, the smaller first")
+        shares = self.anatomy_shares
+        if shares is not None and not (min(shares) >= 0 and shares[0] > 0 and abs(sum(shares) - 1) < 1e-3):
+            raise InputError(f"anatomy_shares: {shares} are not three shares that add up to 1, the first positive")
+        if not 0 <= self.seen_test_share < 1:
+            raise InputError(f"seen_test_share: {self.seen_test_share} is not in [0, 1); give e.g. 0.2")
+
+    @property
+    def samples(self) -> int:
+        """Number of samples of a navigation."""
+        return round(self.seconds / SAMPLE_PERIOD_S)
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Navigations of one anatomy that share a file: the unit of work, on this machine or on a cluster.
+
+    Attributes:
+        number: of the file.
+        folder: of the anatomy.
+        anatomy: its name.
+        fingerprint: SHA-256 of what the simulation depends on in it.
+        sequences: indices of the navigations among those of the anatomy.
+        first_episode: index of the first one in the dataset.
+        splits: split of each.
+    """
+
+    number: int
+    folder: Path
+    anatomy: str
+    fingerprint: str
+    sequences: range
+    first_episode: int
+    splits: Shaped[np.ndarray, "n"]
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What all blocks share.
+
+    Attributes:
+        output: folder of the dataset.
+        config: number, length, distribution and split of the navigations.
+        device: the wire.
+        key: marks the files of this dataset; it follows from all settings.
+    """
+
+    output: Path
+    config: DatasetConfig
+    device: Device
+    key: str
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """A plan with the anatomies that it is carried out on.
+
+    Attributes:
+        plan: what all blocks share.
+        folders: of the anatomies.
+        names: theirs.
+        fingerprints: theirs.
+        splits: of every navigation.
+        settings: what a resumed run must share with the run it continues, as plain JSON values.
+    """
+
+    plan: Plan
+    folders: tuple[Path, ...]
+    names: tuple[str, ...]
+    fingerprints: tuple[str, ...]
+    splits: Shaped[np.ndarray, "anatomies sequences"]
+    settings: dict[str, Any]
+
+    def blocks(self) -> list[Block]:
+        """Return the blocks in the order of their files."""
+        n, size, blocks = self.plan.config.sequences, self.plan.config.sequences_per_file, []
+        for row, (folder, name, fingerprint) in enumerate(
+            zip(self.folders, self.names, self.fingerprints, strict=True)
+        ):
+            for first in range(0, n, size):
+                chosen = range(first, min(first + size, n))
+                splits = self.splits[row, chosen.start : chosen.stop]
+                blocks.append(Block(len(blocks), folder, name, fingerprint, chosen, row * n + first, splits))
+        return blocks
+
+
+def plan_study(folders: Sequence[Path], output: Path, device: Device, config: DatasetConfig) -> Study:
+    """Look at the anatomies, and say what the dataset will be.
+
+    Raises:
+        InputError: no anatomy, or a folder that is none; two of one name; too few for the split.
+    """
+    if not folders:
+        raise InputError("anatomies: none given; name at least one folder made by `endopilot anatomy`")
+    names, fingerprints = zip(*(identify(Path(folder)) for folder in folders), strict=True)
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"anatomies: {names.count(name)} are named '{name}'; give each patient a name of its own")
+    splits = assign_splits(
+        names, config.sequences, anatomy_shares=config.anatomy_shares, seen_test_share=config.seen_test_share
+    )
+    described = asdict(config)
+    del described["simulator"]["threads"]  # no bit depends on it
+    settings = {
+        "config": described,
+        "device": asdict(device),
+        "anatomies": dict(zip(names, fingerprints, strict=True)),
+        "version": version(),
+    }
+    settings = json.loads(json_text(settings))  # as a file gives them back, so that they compare equal
+    key = hashlib.sha256(json_text(settings).encode()).hexdigest()
+    plan = Plan(Path(output), config, device, key)
+    return Study(plan, tuple(map(Path, folders)), names, fingerprints, splits, settings)
+
+
+def version() -> str:
+    """Return what the files of a dataset must have been written by to belong together."""
+    return f"endopilot {__version__}, format {FORMAT_VERSION}"
+
+
+def differences(before: Any, now: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Yield (field, value before, value now) for every leaf that differs between two nested mappings."""
+    if isinstance(before, dict) and isinstance(now, dict):
+        for key in sorted(before.keys() | now.keys()):
+            yield from differences(before.get(key, "absent"), now.get(key, "absent"), f"{name}.{key}".lstrip("."))
+    elif before != now:
+        yield name, before, now
+
+
+def identify(folder: Path) -> tuple[str, str]:
+    """Return an anatomy's name and the SHA-256 of what the simulation depends on.
+
+    Raises:
+        InputError: the folder holds no anatomy, or a damaged one.
+    """
+    if not (folder / "anatomy.json").exists():
+        raise InputError(f"{folder}: holds no anatomy.json, so it is not an anatomy; make one with `endopilot anatomy`")
+    record = read_json(folder / "anatomy.json")
+    try:
+        physical = {key: record[key] for key in ("name", "insertion", "catheter_radius_mm", "sha256")}
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{folder / 'anatomy.json'}: damaged ({error!r}); make the anatomy again") from error
+    return str(record["name"]), hashlib.sha256(json_text(physical).encode()).hexdigest()

@@ -1,0 +1,76 @@
+"""What a run has seen: the patients that it was trained on, and its wire."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from endopilot.dataset.loader import Dataset
+from endopilot.errors import InputError
+
+_WIRE = (
+    "diameter_mm",
+    "abscissa_mm",
+    "bend_stiffness_n_mm2",
+    "twist_stiffness_n_mm2",
+    "tip_bend_rad",
+    "tip_bend_length_mm",
+)
+"""What makes a wire another one; friction is the navigation's own, and limits are the drive's."""
+
+
+def check_wire(run: Path, record: Mapping[str, Any], dataset: Dataset) -> None:
+    """Check that a dataset was made with the wire that a run was trained with.
+
+    Args:
+        run: the run, as it is named to the user.
+        record: its manifest.
+        dataset: what it is to be measured on.
+
+    Raises:
+        InputError: it was made with another wire.
+    """
+    ours, theirs = record["device"], dataset.manifest["device"]
+    for name in _WIRE:
+        if not np.array_equal(ours[name], theirs[name]):
+            raise InputError(
+                f"{dataset.folder}: its wire is {theirs['name']}, and that of {run} is {ours['name']}, with another "
+                f"{name}; make a dataset with the run's wire"
+            )
+
+
+def trained_patients(run: Path, record: Mapping[str, Any], dataset: Dataset) -> frozenset[str]:
+    """Return which patients of a dataset a run was trained on, by name, if the dataset can measure the run.
+
+    A patient is known by the SHA-256 of the anatomy.
+
+    Args:
+        run: the run, as it is named to the user.
+        record: its manifest.
+        dataset: what it is to be measured on.
+
+    Raises:
+        InputError: the run is too old to say, a patient that it was trained on is in the dataset's split "test", or
+            the dataset was made with another wire.
+    """
+    check_wire(run, record, dataset)
+    if "patients" in record:
+        known = frozenset(name for name, sha in dataset.patients.items() if sha in set(record["patients"]))
+    elif record["config"]["model"] == "twin":
+        known = frozenset()
+    elif record.get("inputs", {}).get("dataset") == dataset.manifest["key"]:
+        known = frozenset(dataset.of_split("train").anatomy.tolist())
+    else:
+        raise InputError(
+            f"{run}: does not say which patients it was trained on, as it was made by an older version; train it again"
+        )
+    for name in sorted(set(dataset.anatomy[dataset.split == "test"].tolist())):
+        if name in known:
+            raise InputError(
+                f"{dataset.folder}: patient {name} is in the split 'test', but {run} was trained on it; "
+                "make the dataset without this patient, or evaluate on the run's own dataset"
+            )
+    return known

@@ -1,0 +1,84 @@
+"""Controls that lead a simulated tip along desired tip states: `track`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from endopilot.models.open_loop import Steps2
+from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.device import Device
+from endopilot.simulation.simulator import Simulator
+from endopilot.types import SAMPLE_PERIOD_S, Anatomy
+
+TRANSLATIONS_MM_S = (-5.0, -1.5, 0.0, 1.5, 5.0)
+"""Speeds that are tried, beyond the one that would move a tip without slack to where it is desired."""
+ROTATIONS_RAD_S = (-2.0, 0.0, 2.0)
+"""Rotations that are tried with each."""
+
+
+def track(
+    anatomy: Anatomy,
+    wires: Sequence[Device],
+    *,
+    friction: Float[np.ndarray, "episodes"],
+    start: Float[np.ndarray, "episodes 2"],
+    given: Float[np.ndarray, "episodes given 2"],
+    desired: Steps2,
+    config: SimulatorConfig,
+) -> tuple[Steps2, Steps2]:
+    """Drive each episode's wire by its given controls, then sample by sample along the desired tips.
+
+    At every sample each wire tries all combinations of `TRANSLATIONS_MM_S` and `ROTATIONS_RAD_S` from its present state
+    and keeps the one whose tip ends nearest to the desired (Δtip, γtip), in the sum of both distances.
+
+    Args:
+        anatomy: the vessel.
+        wires: the device of each episode; the same object where it is the same.
+        friction: Coulomb friction coefficient of each episode.
+        start: (Δ mm, φ rad) before the first given control.
+        given: controls (mm/s, rad/s) that come first.
+        desired: (Δtip, γtip) mm at the end of each sample period after them.
+        config: settings of the rod core.
+
+    Returns:
+        Tip (Δtip, γtip) mm, and control (mm/s, rad/s) as the drive made it, after the given ones.
+    """
+    tries = np.array([(v, w) for v in TRANSLATIONS_MM_S for w in ROTATIONS_RAD_S])
+    episodes, each = len(wires), len(tries)
+    simulator = Simulator(anatomy, [wire for wire in wires for _ in range(each)], config=config)
+    inserted, rotation = np.repeat(start, each, axis=0).T
+    simulator.reset(inserted_length=inserted.clip(min=0.0), rotation=rotation, friction=np.repeat(friction, each))
+    for sample in np.moveaxis(given, 1, 0):
+        simulator.step(_possible(simulator, np.repeat(sample, each, axis=0), wires, each, anatomy), SAMPLE_PERIOD_S)
+    tip, control = np.empty(desired.shape), np.empty(desired.shape)
+    for k in range(desired.shape[1]):
+        now = simulator.project().abscissa
+        lead = (np.repeat(desired[:, k, 0], each) - now) / SAMPLE_PERIOD_S
+        asked = np.tile(tries, (episodes, 1))
+        asked[:, 0] += lead
+        asked = _possible(simulator, asked, wires, each, anatomy)
+        step = simulator.step(asked, SAMPLE_PERIOD_S)
+        reached = simulator.project()
+        miss = np.abs(reached.abscissa - np.repeat(desired[:, k, 0], each))
+        miss += np.abs(reached.offset - np.repeat(desired[:, k, 1], each))
+        miss[~step.valid] = np.inf
+        best = miss.reshape(episodes, each).argmin(axis=1) + each * np.arange(episodes)
+        tip[:, k] = np.stack([reached.abscissa[best], reached.offset[best]], axis=-1)
+        control[:, k] = np.stack([asked[best, 0] - step.slip[best] / SAMPLE_PERIOD_S, asked[best, 1]], axis=-1)
+        simulator.copy_worlds(np.repeat(best, each))
+    return tip, control
+
+
+def _possible(
+    simulator: Simulator, control: np.ndarray, wires: Sequence[Device], each: int, anatomy: Anatomy
+) -> np.ndarray:
+    """Return what the drive can do of controls: within its speed, the catheter and the vessel."""
+    limits = np.array([(wire.max_velocity_mm_s, wire.max_rotation_rad_s) for wire in wires]).repeat(each, axis=0)
+    made = np.clip(control, -limits, limits)
+    inserted = simulator.inserted_length
+    reach = np.maximum(float(anatomy.tree.longest_path().abscissa[-1]), inserted)
+    made[:, 0] = np.clip(made[:, 0], -inserted / SAMPLE_PERIOD_S, (reach - inserted) / SAMPLE_PERIOD_S)
+    return made

@@ -1,0 +1,1 @@
+"""The synthetic CT angiogram of an anatomy."""

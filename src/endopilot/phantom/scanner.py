@@ -1,0 +1,80 @@
+"""What the scanner does to a phantom: the heart moves under it, noise is added, edges are blurred."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, Float32
+from scipy.ndimage import gaussian_filter1d, shift
+
+from endopilot.phantom.painter import SLAB, Painter
+
+_PHASES = 7
+"""Positions of a moving heart that are averaged."""
+_HELD_MM = 4.0
+"""The motion fades over this depth below the pericardium, mm."""
+
+
+def smear(
+    image: Float32[np.ndarray, "nz ny nx"],
+    painter: Painter,
+    heart: Float[np.ndarray, "mz my mx"],
+    spacing_mm: tuple[float, float, float],
+    motion_mm: float,
+    generator: np.random.Generator,
+) -> None:
+    """Average the heart over the way that it moves along while it is scanned, in place; the chest stays.
+
+    The heart stands longest where the way ends, so that edges across the way show a ghost. The truth is the middle.
+
+    Args:
+        image: HU.
+        painter: of this image.
+        heart: depth below the pericardium on the painter's coarse grid, mm.
+        spacing_mm: voxel size along k, j and i, mm.
+        motion_mm: length of the way, mm; its direction is random.
+        generator: random stream.
+    """
+    way = generator.normal(size=3)
+    way *= motion_mm / (np.linalg.norm(way) * np.array(spacing_mm))
+    still = image.copy()
+    places, weights = np.linspace(-0.5, 0.5, _PHASES), np.linspace(0.5, 1.5, _PHASES)
+    places = places - (weights @ places) / weights.sum()
+    image[...] = 0
+    for place, weight in zip(places, weights / weights.sum(), strict=True):
+        image += np.float32(weight) * shift(still, place * way, order=1, mode="nearest")
+    for begin in range(0, len(image), SLAB):
+        rows = slice(begin, begin + SLAB)
+        found = painter.fine(heart, rows)
+        moves = np.zeros(image[rows].shape, dtype=np.float32)
+        if found is not None:
+            fine, (box_y, box_x) = found
+            moves[:, box_y, box_x] = np.clip(fine / np.float32(_HELD_MM), 0, 1)
+        image[rows] = still[rows] + moves * (image[rows] - still[rows])
+
+
+def scan(
+    image: Float32[np.ndarray, "nz ny nx"],
+    spacing_mm: tuple[float, float, float],
+    psf_mm: float,
+    noise_hu: float,
+    generator: np.random.Generator,
+) -> None:
+    """Add noise and blur, in place: the reconstruction kernel shapes the image and the noise's grain alike.
+
+    Args:
+        image: HU.
+        spacing_mm: voxel size along k, j and i, mm.
+        psf_mm: width of the point-spread function at half its height, mm.
+        noise_hu: standard deviation of the noise in the result, HU.
+        generator: random stream.
+    """
+    sigma_mm = psf_mm / np.sqrt(8 * np.log(2))
+    sigmas = [sigma_mm / step for step in spacing_mm]
+    impulse = np.zeros(33)
+    impulse[16] = 1.0
+    gain = np.prod([np.linalg.norm(gaussian_filter1d(impulse, sigma, truncate=3.0)) for sigma in sigmas])
+    for begin in range(0, len(image), SLAB):
+        slab = image[begin : begin + SLAB]
+        slab += generator.standard_normal(slab.shape, dtype=np.float32) * np.float32(noise_hu / gain)
+    for axis, sigma in enumerate(sigmas):
+        gaussian_filter1d(image, sigma, axis=axis, truncate=3.0, output=image)

@@ -1,0 +1,1 @@
+"""Pages, pictures and tables, made from what the other stages left on disk."""

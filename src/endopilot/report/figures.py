@@ -1,0 +1,347 @@
+"""The figures of an evaluation and of a report, drawn with matplotlib: each function returns one and saves nothing.
+
+`titles` says what a reader calls each split.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from textwrap import fill
+from typing import Any
+
+import matplotlib
+import numpy as np
+import pandas as pd
+from jaxtyping import Bool, Float, Shaped
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+
+from endopilot.evaluation.results import SERIES_TITLES
+from endopilot.plotting import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, STYLE, VERMILLION, YELLOW
+from endopilot.report.tables import distinct, rows, values
+from endopilot.types import Anatomy, LumenMask, Volume
+
+SECTION_COLORS = (
+    BLUE,
+    ORANGE,
+    GREEN,
+    VERMILLION,
+    SKY,
+    PURPLE,
+    YELLOW,
+    "#7f5aa2",
+    "#6b4f2a",
+    "#44aa99",
+    "#882255",
+    GREY,
+)
+
+SERIES_STYLE: dict[str, dict] = {
+    "true": {"color": BLACK, "label": "Recorded"},
+    "P1": {"color": BLUE},
+    "P2": {"color": BLUE},
+    "P3": {"color": ORANGE},
+    "P4": {"color": VERMILLION},
+    "P4_replanned": {"color": PURPLE},
+    "P2_replayed": {"color": SKY},
+    "hold_slack": {"color": GREY, "linestyle": "--"},
+    "training_mean": {"color": GREY, "linestyle": ":"},
+    "hold_control": {"color": "#5d4a3a", "linestyle": "-."},
+    "follow_slack": {"color": GREEN, "linestyle": "--"},
+}
+
+
+WINDOW_HU = (-150.0, 650.0)
+"""Grey window of CTA pictures, HU: from fat to well-filled lumen."""
+
+CROP_MARGIN_MM = 18.0
+"""What is shown of the volume around the vessel, mm."""
+
+
+def tip_error_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:
+    """Draw the mean |error| of Δtip and γtip against time, one row a split (`tables.tip_error_table`)."""
+    splits = distinct(table, "split")
+    panels = (("abscissa_mae_mm", "Mean |error| of Δtip, mm"), ("offset_mae_mm", "Mean |error| of γtip, mm"))
+    with matplotlib.rc_context(STYLE):
+        figure, axes = _grid(len(splits), 2, height=3.0)
+        for row, split in enumerate(splits):
+            part = rows(table, split=split)
+            for ax, (column, label) in zip(axes[row], panels, strict=True):
+                for series in distinct(part, "series"):
+                    line = rows(part, series=series)
+                    ax.plot(values(line, "time_s"), values(line, column), **_style(series))
+                ax.set(xlabel="Time after the given states, s", ylabel=label, xlim=(0, None))
+                ax.set_ylim(0, _upper(part, column))
+                ax.set_title(titles[split])
+        _legend_below(figure, axes)
+    return figure
+
+
+def safety_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:
+    """Draw γ/(r − r_w), below it γ/r, against time: median, quartiles and 95 % quantile (`tables.safety_table`).
+
+    One column a split.
+    """
+    splits = distinct(table, "split")
+    plate = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0}
+    ratios = (("clearance", "γ / (r − r_w)", "the wire touches"), ("radius", "γ / r", "the wire's axis on the wall"))
+    with matplotlib.rc_context(STYLE):
+        figure, axes = _grid(len(ratios), len(splits), height=3.2)
+        for row, (ratio, label, wall) in enumerate(ratios):
+            of_ratio = rows(table, ratio=ratio)
+            for ax, split in zip(axes[row], splits, strict=True):
+                part = rows(of_ratio, split=split)
+                for series in distinct(part, "series"):
+                    line, style = rows(part, series=series), _style(series)
+                    time, quartiles = values(line, "time_s"), (values(line, "q25"), values(line, "q75"))
+                    ax.fill_between(time, *quartiles, color=style["color"], alpha=0.16, lw=0)
+                    ax.plot(time, values(line, "median"), **style)
+                    ax.plot(time, values(line, "p95"), color=style["color"], lw=0.8, ls="-")
+                ax.axhline(1.0, color=BLACK, lw=1.0, ls=(0, (4, 3)))
+                ax.annotate(
+                    wall,
+                    (0.995, 1.0),
+                    xycoords=("axes fraction", "data"),
+                    ha="right",
+                    va="bottom",
+                    size=8.5,
+                    bbox=plate,
+                )
+                ax.set(xlabel="Time after the given states, s", ylabel=f"Safety ratio {label}", xlim=(0, None))
+                ax.set_ylim(0, float(np.clip(_upper(of_ratio, "p95"), 1.25, 1.5)))
+                ax.set_title(titles[split])
+        axes[0, 0].fill_between([], [], [], color=GREY, alpha=0.3, lw=0, label="Quartiles")
+        axes[0, 0].plot([], [], color=GREY, lw=0.8, label="95 % quantile")
+        _legend_below(figure, axes)
+    return figure
+
+
+def control_error_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:
+    """Draw histograms of the control RMSE of each sequence, one row a split (`tables.control_error_table`)."""
+    panels = (("translation_rmse_mm_s", "Translation RMSE, mm/s"), ("rotation_rmse_deg_s", "Rotation RMSE, deg/s"))
+    return _histograms(table, titles, panels)
+
+
+def drive_difference_figure(table: pd.DataFrame, titles: Mapping[str, str]) -> Figure:
+    """Draw histograms of the RMSE of the drive's force and torque of each sequence where controls are simulated.
+
+    One row a split (`tables.drive_difference_table`).
+    """
+    panels = (("force_rmse_n", "Difference in proximal force (RMSE), N"),)
+    return _histograms(table, titles, (*panels, ("torque_rmse_nmm", "Difference in proximal torque (RMSE), N mm")))
+
+
+def _histograms(table: pd.DataFrame, titles: Mapping[str, str], panels: Sequence[tuple[str, str]]) -> Figure:
+    """Draw histograms of columns with one value a sequence, one row a split; the series stand above one another.
+
+    Sequences beyond the 98 % quantile of the second-widest series are counted in the last bar; the tick below a
+    histogram marks its median. The highest bar of each histogram says how many sequences it holds.
+
+    Args:
+        table: with columns `split` and `series`.
+        titles: what a reader calls each split.
+        panels: column and label of each histogram.
+    """
+    splits, series = distinct(table, "split"), distinct(table, "series")
+    with matplotlib.rc_context(STYLE):
+        figure, axes = _grid(len(splits), len(panels), height=0.9 + 0.55 * len(series))
+        for row, split in enumerate(splits):
+            part = rows(table, split=split)
+            most = max(len(rows(part, series=name)) for name in series)
+            bins = int(np.clip(3 * np.sqrt(most), 8, 25))
+            for ax, (column, label) in zip(axes[row], panels, strict=True):
+                of_series = [values(rows(part, series=name), column) for name in series]
+                upper = sorted(float(np.nanquantile(v, 0.98)) for v in of_series if np.isfinite(v).any()) or [1.0]
+                edges = np.linspace(0.0, 1.05 * upper[max(len(upper) - 2, 0)] + 1e-9, bins + 1)
+                for level, (name, each) in enumerate(zip(series, of_series, strict=True)):
+                    _histogram(ax, each[np.isfinite(each)], edges, -float(level), _style(name)["color"])
+                names = [fill(_style(name)["label"].removeprefix("Baseline: "), 27) for name in series]
+                ax.set_yticks([0.3 - level for level in range(len(series))], names if ax is axes[row, 0] else [])
+                ax.set(xlabel=label, xlim=(0, edges[-1]), ylim=(0.75 - len(series), 1.05))
+                ax.tick_params(axis="y", length=0)
+                ax.grid(False, axis="y")
+                ax.set_title(titles[split])
+    return figure
+
+
+def _histogram(ax: Axes, of: Float[np.ndarray, "n"], edges: Float[np.ndarray, "m"], bottom: float, color: str) -> None:
+    """Draw one histogram that stands on `bottom` and is 0.75 high, with its median and the size of its highest bar."""
+    if not len(of):
+        return
+    counts, _ = np.histogram(np.clip(of, 0.0, edges[-1]), edges)
+    top = int(counts.argmax())
+    ax.stairs(0.75 * counts / counts.max() + bottom, edges, baseline=bottom, fill=True, color=color)
+    left = top + 1 > len(counts) / 2  # of the bar, so that the words stay in the picture
+    place, side = (edges[top] if left else edges[top + 1], bottom + 0.73), "right" if left else "left"
+    ax.annotate(f" {counts.max()} of {len(of)} ", place, ha=side, va="top", fontsize=7.5)
+    ax.plot([min(float(np.median(of)), edges[-1])] * 2, [bottom, bottom - 0.12], color=BLACK)
+
+
+def loss_figure(table: pd.DataFrame) -> Figure:
+    """Draw the loss curves, one panel a network; columns `network`, `epoch`, `curve` and `loss`."""
+    networks = distinct(table, "network")
+    with matplotlib.rc_context(STYLE):
+        figure, axes = _grid(1, len(networks), height=2.8)
+        for ax, network in zip(axes[0], networks, strict=True):
+            part = rows(table, network=network)
+            for curve, color in zip(distinct(part, "curve"), (BLUE, ORANGE, GREEN), strict=False):
+                line = rows(part, curve=curve)
+                ax.plot(values(line, "epoch"), values(line, "loss"), color=color, label=curve)
+            ax.set(xlabel="Epoch", ylabel="Loss", yscale="log")
+            ax.set_title(network)
+        _legend_below(figure, axes)
+    return figure
+
+
+def stage_figure(table: pd.DataFrame) -> Figure:
+    """Draw the seconds that each stage took as bars (`tables.stage_table`)."""
+    seconds = values(table, "seconds")
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(9.0, 0.6 + 0.34 * len(table)), layout="constrained")
+        ax = figure.subplots()
+        bars = ax.barh(list(table["stage"]), seconds, color=BLUE, height=0.68)
+        ax.bar_label(bars, labels=[f"{value:.1f} s" for value in seconds], padding=4, fontsize=8.5)
+        ax.set(xlabel="Wall time, s", xlim=(0, 1.12 * max(float(seconds.max()), 1e-3)))
+        ax.invert_yaxis()
+        ax.grid(False, axis="y")
+    return figure
+
+
+def volume_figure(volume: Volume, mask: LumenMask, anatomy: Anatomy | None = None) -> Figure:
+    """Draw the CTA with the segmented lumen's outline (axial and coronal) and, if given, the extracted tree.
+
+    The axial slice goes through the ostium; the coronal picture is the maximum over a slab as deep as the vessel,
+    so that the whole vessel shows. Both are cropped to the vessel and laid out as radiologists read them: the
+    patient's right on the left, the head on top. Volume and mask lie on the same grid.
+    """
+    ostium = mask.ostium or (anatomy.insertion if anatomy is not None else None)
+    voxels, lumen = _along_lps(volume, volume.voxels), _along_lps(volume, mask.volume.voxels).astype(bool)
+    spacing = _along_lps_spacing(volume)
+    inside = [np.flatnonzero(np.any(lumen, axis=others)) for others in ((1, 2), (0, 2), (0, 1))]
+    margin = np.ceil(CROP_MARGIN_MM / spacing[::-1]).astype(int)
+    crop = tuple(slice(max(0, at[0] - m), at[-1] + m + 1) for at, m in zip(inside, margin, strict=True))
+    level = int(np.median(inside[0])) if ostium is None else _level(volume, ostium.position, voxels.shape[0])
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(11.5, 3.9), layout="constrained")
+        axes = figure.subplots(1, 2 if anatomy is None else 3)
+        _picture(
+            axes[0], voxels[level, crop[1], crop[2]], lumen[level, crop[1], crop[2]], spacing[[0, 1]], origin="upper"
+        )
+        axes[0].set_title("Axial slice at the ostium" if ostium is not None else "Axial slice")
+        slab = voxels[crop[0], inside[1][0] : inside[1][-1] + 1, crop[2]].max(axis=1)
+        _picture(axes[1], slab, np.any(lumen, axis=1)[crop[0], crop[2]], spacing[[0, 2]], origin="lower")
+        axes[1].set_title("Coronal maximum projection")
+        if anatomy is not None:
+            draw_tree(axes[2], anatomy)
+            axes[2].set_title("Extracted centerline")
+    return figure
+
+
+def tree_figure(anatomy: Anatomy) -> Figure:
+    """Draw the extracted tree alone, where there is no CT."""
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(6.0, 4.2), layout="constrained")
+        draw_tree(figure.subplots(), anatomy)
+    return figure
+
+
+def draw_tree(ax: Axes, anatomy: Anatomy) -> None:
+    """Draw the centerline tree seen from the front, coloured by section, as thick as the lumen."""
+    tree = anatomy.tree
+    shown: set[int] = set()
+    for branch in tree.branches:
+        line = branch.centerline
+        points = line.points[:, [0, 2]]
+        segments = np.stack([points[:-1], points[1:]], axis=1)
+        sections = branch.section[1:]
+        colors = [section_color(int(section)) for section in sections]
+        ax.add_collection(LineCollection(list(segments), colors=colors, linewidths=1.6 * line.radius[1:], alpha=0.9))
+        shown |= {int(section) for section in sections}
+    for section in sorted(shown):
+        ax.plot([], [], color=section_color(section), lw=4, label=tree.section_names[section])
+    ax.plot(*anatomy.insertion.position[[0, 2]], marker="o", color=BLACK, ms=5, ls="none", label="ostium")
+    ax.set_aspect("equal")
+    ax.autoscale_view()
+    ax.set(xlabel="x (to the patient's left), mm", ylabel="z (to the head), mm")
+    ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), handlelength=1.2)
+
+
+def section_color(section: int) -> str:
+    """Return the colour of a section, the same in all pictures."""
+    return SECTION_COLORS[section % len(SECTION_COLORS)]
+
+
+def _grid(rows: int, columns: int, *, height: float) -> tuple[Figure, Shaped[np.ndarray, "rows columns"]]:
+    figure = Figure(figsize=(5.2 * columns if columns > 1 else 7.0, height * rows), layout="constrained")
+    return figure, figure.subplots(rows, columns, squeeze=False)
+
+
+def _style(series: str) -> dict[str, Any]:
+    return {"color": GREY, "label": SERIES_TITLES.get(series, series)} | SERIES_STYLE.get(series, {})
+
+
+def _upper(table: pd.DataFrame, column: str) -> float:
+    """Return an upper limit that shows every series whole, unless one runs away from all others."""
+    series = [values(rows(table, series=name), column) for name in distinct(table, "series")]
+    highest = sorted(float(np.nanmax(line)) for line in series if np.isfinite(line).any())
+    if not highest:
+        return 1.0
+    return 1.08 * min(highest[-1], 1.5 * highest[max(len(highest) - 2, 0)]) + 1e-6
+
+
+def _legend_below(figure: Figure, axes: Shaped[np.ndarray, "rows columns"]) -> None:
+    entries = {label: handle for ax in axes.flat for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+    columns = min(len(entries), 3)
+    figure.legend(list(entries.values()), list(entries), loc="outside lower center", ncols=max(columns, 1))
+
+
+def _along_lps(volume: Volume, voxels: Shaped[np.ndarray, "nz ny nx"]) -> Shaped[np.ndarray, "a b c"]:
+    """Return voxels with their axes ordered and turned so that [k, j, i] grow to the head, the back and the left."""
+    axes = _lps_axes(volume)
+    turned = voxels.transpose([2 - axis for axis in axes[::-1]])
+    flips = [volume.direction[world, axes[world]] < 0 for world in (2, 1, 0)]
+    return turned[tuple(slice(None, None, -1 if flip else 1) for flip in flips)]
+
+
+def _along_lps_spacing(volume: Volume) -> Float[np.ndarray, "3"]:
+    """Return the spacing along x, y and z of `_along_lps`, mm."""
+    return volume.spacing_mm[_lps_axes(volume)]
+
+
+def _lps_axes(volume: Volume) -> list[int]:
+    """Return for x, y and z the voxel axis (0 for i, 1 for j, 2 for k) that runs most along it."""
+    remaining = [0, 1, 2]
+    axes = []
+    for world in range(3):
+        axes.append(max(remaining, key=lambda axis: abs(volume.direction[world, axis])))
+        remaining.remove(axes[-1])
+    return axes
+
+
+def _level(volume: Volume, point: Float[np.ndarray, "3"], levels: int) -> int:
+    """Return the axial slice of `_along_lps` that a point lies in."""
+    axis = _lps_axes(volume)[2]
+    level = round(float(volume.world_to_index(point)[axis]))
+    level = levels - 1 - level if volume.direction[2, axis] < 0 else level
+    return int(np.clip(level, 0, levels - 1))
+
+
+def _picture(
+    ax: Axes,
+    picture: Shaped[np.ndarray, "rows columns"],
+    lumen: Bool[np.ndarray, "rows columns"],
+    spacing: Float[np.ndarray, "2"],
+    *,
+    origin: Any,
+) -> None:
+    """Show one grey picture with the lumen's outline; `spacing` is (columns, rows), mm."""
+    rows, columns = picture.shape
+    extent = (0.0, columns * spacing[0], rows * spacing[1], 0.0)
+    if origin == "lower":
+        extent = (0.0, columns * spacing[0], 0.0, rows * spacing[1])
+    ax.imshow(picture, cmap="gray", vmin=WINDOW_HU[0], vmax=WINDOW_HU[1], origin=origin, extent=extent)
+    if np.any(lumen):
+        ax.contour(lumen.astype(float), [0.5], colors=[VERMILLION], linewidths=1.1, origin=origin, extent=extent)
+    ax.set(xlabel="mm", ylabel="mm")
+    ax.grid(False)

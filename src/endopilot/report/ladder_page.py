@@ -1,0 +1,172 @@
+"""The ladder's page: scores, the tips' ways in pictures, and a replay of one navigation of each task."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+import plotly.graph_objects as go
+from jaxtyping import Float
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from plotly.offline import get_plotlyjs
+
+from endopilot.env.navigation import CORE
+from endopilot.env.task import Navigation
+from endopilot.env.tasks import Task, find_task
+from endopilot.files import read_json, writing
+from endopilot.ladder.ladder import SCORES_FILE
+from endopilot.plotting import BLACK, BLUE, GREEN, ORANGE, STYLE, VERMILLION, png
+from endopilot.report.report import image, template_text
+from endopilot.report.scene import INK, navigation_scene
+from endopilot.simulation.simulate import simulate
+from endopilot.types import SAMPLE_PERIOD_S, Rollout
+
+PAGE_FILE = "index.html"
+SHOWN = 5
+"""Patients of each task that the pictures show."""
+OUTCOMES = {"safe success": GREEN, "success, but too large a force": ORANGE, "not reached": VERMILLION}
+
+XRAY = {"color": BLACK, "marker": "o", "ms": 4.5, "mfc": "none", "mew": 0.8, "ls": "none"}
+"""How an exposure is drawn."""
+
+
+def write_page(output: Path) -> Path:
+    """Write the page of a folder that `climb` has filled, and the replays beside it.
+
+    Returns:
+        The page, `output`/index.html; it needs the files beside it.
+
+    Raises:
+        InputError: the folder holds no scores.
+    """
+    content = read_json(output / SCORES_FILE)
+    tasks = [find_task(row["task"]) for row in content["scores"] if row["level"] is not None]
+    plotly = output / "plotly.min.js"
+    if not plotly.exists():
+        with writing(plotly) as partial:
+            partial.write_text(get_plotlyjs(), encoding="utf-8")
+    sections = [_section(output, task, content["patients"]) for task in tasks]
+    template = Environment(
+        loader=PackageLoader("endopilot.report", "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    ).get_template("ladder.html.j2")
+    page = template.render(
+        css=Markup(template_text("report.css")),
+        policy=content["policy"],
+        patients=content["patients"],
+        scores=content["scores"],
+        sections=sections,
+        outcomes=OUTCOMES,
+    )
+    with writing(output / PAGE_FILE) as partial:
+        partial.write_text(page, encoding="utf-8")
+    return output / PAGE_FILE
+
+
+def _section(output: Path, task: Task, patients: int) -> dict[str, Any]:
+    results = [read_json(output / task.name / f"{place:02d}.json") for place in range(min(SHOWN, patients))]
+    navigations = [task.ladder_navigation(place) for place in range(len(results))]
+    shown = f"{len(results)} patient{'s' if len(results) > 1 else ''}"
+    picture = image(png(_courses(navigations, results)), f"{task.title}: the tip's way in {shown}")
+    replay = output / f"replay-{task.name}.html"
+    if not replay.exists():
+        figure = _replay_scene(task, navigations[0], results[0])
+        with writing(replay) as partial:
+            figure.write_html(
+                partial,
+                include_plotlyjs="directory",
+                auto_play=False,
+                default_height="97vh",
+                config={"displaylogo": False},
+            )
+    return {"task": task, "picture": picture, "replay": replay.name, "first": results[0]}
+
+
+def _replay_scene(task: Task, navigation: Navigation, result: dict[str, Any]) -> go.Figure:
+    """Return a navigation replayed in space, with its target, what X-ray showed, and what came of it."""
+    course = result["course"]
+    figure = navigation_scene(navigation.anatomy, _replay(navigation, course))
+    seen = np.array(course["tip_position"])[np.array(course["exposed"])]
+    for points, name, marker in (
+        (navigation.target.position(navigation.anatomy)[None], "Target", {"symbol": "diamond", "size": 6}),
+        (seen, "Tip under X-ray", {"symbol": "circle-open", "size": 7}),
+    ):
+        x, y, z = points.T
+        figure.add_trace(go.Scatter3d(x=x, y=y, z=z, mode="markers", marker=marker | {"color": INK}, name=name))
+    told = f"{result['seconds']:g} s, {result['peak_force_n']:.2f} N, exposures: {result['exposures']}"
+    title = f"{task.title}: {navigation.anatomy.name}<br><sup>{_outcome(result)}, {told}</sup>"
+    figure.update_layout(height=None, title={"text": title, "x": 0.02, "y": 0.96, "font": {"size": 18}})
+    return figure
+
+
+def _outcome(result: dict[str, Any]) -> str:
+    """Return one of `OUTCOMES`."""
+    if not result["success"]:
+        return "not reached"
+    return "safe success" if result["safe"] else "success, but too large a force"
+
+
+def _replay(navigation: Navigation, course: dict[str, Any]) -> Rollout:
+    """Return the whole wire over a navigation, by driving its proximal end along the same course again."""
+    proximal = np.column_stack([course["inserted_length"], course["rotation"]])
+    return simulate(
+        navigation.anatomy,
+        navigation.device,
+        (np.diff(proximal, axis=0) / SAMPLE_PERIOD_S)[None],
+        initial=proximal[:1],
+        config=replace(CORE, threads=1),
+        record_shape=True,
+    )
+
+
+def _courses(navigations: list[Navigation], results: list[dict[str, Any]]) -> Figure:
+    """Draw trees, seen across their largest extent, with route, target and the tip's way."""
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(2.4 * SHOWN, 2.9), layout="constrained")
+        for ax, navigation, result in zip(
+            figure.subplots(1, SHOWN, squeeze=False)[0], navigations, results, strict=False
+        ):
+            _draw(ax, navigation, result)
+        for ax in figure.axes:
+            ax.set_axis_off()
+        marks = [Line2D([], [], color=color, lw=2, label=name) for name, color in OUTCOMES.items()]
+        marks.append(Line2D([], [], color=BLUE, lw=4, alpha=0.35, label="route"))
+        marks.append(Line2D([], [], color=BLACK, marker="*", ms=9, ls="none", label="target"))
+        marks.append(Line2D([], [], **XRAY, label="tip under X-ray"))
+        figure.legend(handles=marks, loc="outside lower center", ncols=len(marks))
+    return figure
+
+
+def _draw(ax: Axes, navigation: Navigation, result: dict[str, Any]) -> None:
+    tree = navigation.anatomy.tree
+    everything = np.concatenate([branch.centerline.points for branch in tree.branches])
+    centre = everything.mean(axis=0)
+    axes = np.linalg.svd(everything - centre, full_matrices=False)[2][:2]
+    axes *= np.where(np.abs(axes).max(axis=1) == axes.max(axis=1), 1.0, -1.0)[:, None]
+
+    def seen(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "2 n"]:
+        return axes @ (points - centre).T
+
+    route = tree.route(navigation.target.branch)
+    for index, branch in enumerate(tree.branches):
+        line, chosen = branch.centerline, index in route
+        width = max(1.2, 1.1 * float(line.radius.mean()))
+        ax.plot(
+            *seen(line.points), color=BLUE if chosen else "#c9ced6", lw=width, alpha=0.35 if chosen else 1, zorder=1
+        )
+    way = seen(np.array(result["course"]["tip_position"]))
+    ax.plot(*way, color=OUTCOMES[_outcome(result)], lw=1.3, zorder=2)
+    ax.plot(*way[:, np.array(result["course"]["exposed"])], **XRAY, zorder=3)
+    ax.plot(*seen(navigation.target.position(navigation.anatomy)[None]), color=BLACK, marker="*", ms=9, zorder=4)
+    ax.set_aspect("equal", adjustable="datalim")
+    ax.set_title(f"{navigation.anatomy.name}\n{result['seconds']:g} s, {result['peak_force_n']:.2f} N", fontsize=8)

@@ -1,0 +1,216 @@
+"""The report: one HTML file that needs nothing beside it, for a surgeon or a reviewer to read."""
+
+from __future__ import annotations
+
+import base64
+import html
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+from plotly.offline import get_plotlyjs
+
+from endopilot.anatomy.io import read_anatomy
+from endopilot.evaluation.results import FIGURES_FOLDER, METRICS_FILE
+from endopilot.files import json_text, read_json, writing
+from endopilot.imaging.volume import read_mask, read_volume
+from endopilot.plotting import png
+from endopilot.report import figures, report_text
+from endopilot.report.scene import navigation_scene, visible_wire
+from endopilot.report.still import render_still
+from endopilot.report.tables import stage_table
+from endopilot.types import Anatomy, Rollout
+
+STILL_FILE = "scene.png"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PatientContent:
+    """One patient of a report.
+
+    Attributes:
+        name: the patient's name in the study.
+        anatomy: folder of the extracted anatomy.
+        volume: the CT angiogram, if there is one.
+        mask: the segmented lumen on the same grid, if there is one.
+        scores: agreement with the truth by name, where a truth is known; names end in their unit.
+    """
+
+    name: str
+    anatomy: Path
+    volume: Path | None = None
+    mask: Path | None = None
+    scores: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ReportContent:
+    """Everything that a pipeline has to report; what is None or empty is left out of the report.
+
+    Attributes:
+        title: title of the report.
+        origin: one sentence that says what the patients are: real, or synthetic and how made.
+        command: the command that makes this report again.
+        patients: the patients.
+        evaluation: folder made by `endopilot evaluate`.
+        run: folder made by `endopilot train`.
+        replay: navigations with `shape`, the first of which is shown in space.
+        replay_anatomy: folder of the anatomy that they are in.
+        stage_seconds: seconds that each stage took, in the order of the stages.
+        manifest: how everything was made (`files.manifest`).
+    """
+
+    title: str
+    origin: str
+    command: str
+    patients: tuple[PatientContent, ...] = ()
+    evaluation: Path | None = None
+    run: Path | None = None
+    replay: Rollout | None = None
+    replay_anatomy: Path | None = None
+    stage_seconds: Mapping[str, float] = field(default_factory=dict)
+    manifest: Mapping[str, Any] = field(default_factory=dict)
+
+
+def write_report(output_html: Path, content: ReportContent) -> list[str]:
+    """Write the report as one self-contained HTML file, and the still picture `scene.png` beside it.
+
+    Returns:
+        Remarks for the user, such as which system library is missing for a picture that was left out.
+
+    Raises:
+        InputError: a file that the content names is missing or damaged, or the report cannot be written.
+    """
+    output_html = Path(output_html)
+    remarks: list[str] = []
+    metrics = read_json(content.evaluation / METRICS_FILE) if content.evaluation is not None else None
+    context = {
+        "content": content,
+        "css": Markup(template_text("report.css")),
+        "metrics": metrics,
+        "text": report_text,
+        "patients": [_patient(patient) for patient in content.patients],
+        "scene": _scene(content, output_html.with_name(STILL_FILE), remarks),
+        "figures": {name: _stored_figure(content.evaluation, name) for name in report_text.EVALUATION_FIGURES},
+        "training": _training(content.run),
+        "stages": _stages(content.stage_seconds),
+        "manifest": json_text(content.manifest) if content.manifest else "",
+        "remarks": remarks,
+    }
+    page = _environment().get_template("report.html.j2").render(context)
+    with writing(output_html) as partial:
+        partial.write_text(page, encoding="utf-8")
+    return remarks
+
+
+def _environment() -> Environment:
+    return Environment(
+        loader=PackageLoader("endopilot.report", "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+
+
+def template_text(name: str) -> str:
+    """Return a file of the templates' folder."""
+    return (Path(__file__).parent / "templates" / name).read_text(encoding="utf-8")
+
+
+def _patient(patient: PatientContent) -> dict[str, Any]:
+    anatomy = read_anatomy(patient.anatomy)
+    if patient.volume is not None and patient.mask is not None:
+        figure = figures.volume_figure(read_volume(patient.volume), read_mask(patient.mask), anatomy)
+    else:
+        figure = figures.tree_figure(anatomy)
+    return {
+        "name": patient.name,
+        "picture": image(png(figure), f"{patient.name}: CT with the segmented lumen, and the centerline"),
+        "facts": report_text.anatomy_facts(anatomy),
+        "scores": dict(patient.scores),
+    }
+
+
+def _scene(content: ReportContent, still: Path, remarks: list[str]) -> dict[str, Any] | None:
+    """Return the plotly scene, its library, and the still picture that is printed in its place."""
+    folder = content.replay_anatomy or (content.patients[0].anatomy if content.patients else None)
+    if folder is None:
+        return None
+    anatomy, replay = read_anatomy(folder), content.replay
+    figure = navigation_scene(anatomy, replay)
+    body = figure.to_html(
+        full_html=False,
+        include_plotlyjs=False,
+        auto_play=False,
+        div_id="navigation",
+        config={"displaylogo": False, "responsive": True, "modeBarButtonsToRemove": ["toImage"]},
+    )
+    problem = render_still(anatomy, _farthest_wire(replay), still)
+    if problem is not None:
+        remarks.append(problem)
+    return {
+        "html": Markup(body),
+        "plotly": Markup(get_plotlyjs()),
+        "still": None if problem else image(still.read_bytes(), f"The vessel of {anatomy.name} with the wire in it"),
+        "caption": _scene_caption(anatomy, replay),
+    }
+
+
+def _farthest_wire(replay: Rollout | None) -> np.ndarray | None:
+    """Return the first world's wire where its tip is deepest in the vessel."""
+    if replay is None or replay.shape is None or not replay.valid[0].any():
+        return None
+    depth = np.where(replay.valid[0], replay.tip.abscissa[0], -np.inf)
+    return visible_wire(replay, 0, int(np.argmax(depth)))
+
+
+def _scene_caption(anatomy: Anatomy, replay: Rollout | None) -> str:
+    if replay is None:
+        return f"The vessel of {anatomy.name}."
+    seconds = replay.valid.shape[1] * replay.sample_period_s
+    return f"{seconds:g} s of navigation in {anatomy.name}, simulated with the Cosserat rod core."
+
+
+def _stored_figure(evaluation: Path | None, name: str) -> Markup | None:
+    path = None if evaluation is None else evaluation / FIGURES_FOLDER / f"{name}.png"
+    if path is None or not path.exists():
+        return None
+    return image(path.read_bytes(), report_text.EVALUATION_FIGURES[name])
+
+
+def _training(run: Path | None) -> dict[str, Any] | None:
+    if run is None:
+        return None
+    record = read_json(run / "training.json")
+    if not record:
+        return None  # the twin trains nothing
+    curves = [
+        {"network": report_text.NETWORK_TITLES[network], "epoch": point["epoch"], "curve": title, "loss": point[key]}
+        for network, result in record.items()
+        for key, title in (("loss", "training"), ("validation_loss", "held-out navigations"))
+        for point in result["curve"]
+        if point[key] is not None
+    ]
+    return {
+        "picture": image(png(figures.loss_figure(pd.DataFrame(curves))), "Loss of both networks by epoch"),
+        "budget": report_text.training_budget(record),
+    }
+
+
+def _stages(seconds: Mapping[str, float]) -> dict[str, Any] | None:
+    if not seconds:
+        return None
+    picture = image(png(figures.stage_figure(stage_table(seconds))), "Wall time of each stage")
+    return {"picture": picture, "rows": list(seconds.items()), "total": sum(seconds.values())}
+
+
+def image(png: bytes, description: str) -> Markup:
+    """Return a PNG as an HTML element that needs no file."""
+    data = base64.b64encode(png).decode("ascii")
+    return Markup(f'<img alt="{html.escape(description)}" src="data:image/png;base64,{data}">')

@@ -1,0 +1,208 @@
+"""The vessel tree in space with a navigation in it, for a browser: turned by hand, replayed with a slider."""
+
+from __future__ import annotations
+
+import numpy as np
+import plotly.graph_objects as go
+from jaxtyping import Float
+
+from endopilot.report.figures import section_color
+from endopilot.report.wall_mesh import wall_mesh
+from endopilot.types import Anatomy, Rollout
+
+BACKGROUND, INK, FAINT = "#0d1424", "#dfe6f2", "#31405c"
+WALL, WIRE, TIP = "#d98a8a", "#f6f7fb", "#ffd34d"
+
+SHOWN_BEHIND_MM = 20.0
+"""Length of wire that is shown behind the ostium, in the guiding catheter, mm."""
+
+TRAIL_S = 20.0
+"""How long the way of the tip stays in the picture, s."""
+
+FRAME_MS = 90
+"""Time between two samples when the navigation is played, ms."""
+
+
+def navigation_scene(anatomy: Anatomy, rollout: Rollout | None = None, *, world: int = 0) -> go.Figure:
+    """Return a plotly figure of the wall, the centerline by section, and one world of a rollout replayed.
+
+    Args:
+        anatomy: the vessel.
+        rollout: navigations with `shape`; without one the vessel is shown alone.
+        world: which of its worlds is replayed.
+    """
+    figure = go.Figure([_wall(anatomy), *_centerlines(anatomy)])
+    figure.update_layout(_layout())
+    if rollout is not None and rollout.shape is not None:
+        _add_navigation(figure, anatomy, rollout, world)
+    return figure
+
+
+def visible_wire(rollout: Rollout, world: int, sample: int) -> Float[np.ndarray, "nodes 3"]:
+    """Return the nodes of the wire from its tip to `SHOWN_BEHIND_MM` behind the ostium, LPS mm.
+
+    Raises:
+        ValueError: the rollout was made without `record_shape`.
+    """
+    if rollout.shape is None:
+        raise ValueError("the rollout holds no wire shapes; simulate with record_shape=True")
+    nodes = rollout.shape[world, sample]
+    nodes = nodes[np.isfinite(nodes).all(axis=1)]
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(nodes, axis=0), axis=1))])
+    return nodes[along <= rollout.inserted_length[world, sample] + SHOWN_BEHIND_MM]
+
+
+def _wall(anatomy: Anatomy) -> go.Mesh3d:
+    surface = wall_mesh(anatomy.distance_map)
+    x, y, z = surface.vertices.T.astype(np.float32)
+    i, j, k = surface.triangles.T.astype(np.uint16 if len(surface.vertices) < 2**16 else np.uint32)
+    return go.Mesh3d(
+        x=x,
+        y=y,
+        z=z,
+        i=i,
+        j=j,
+        k=k,
+        color=WALL,
+        opacity=0.22,
+        flatshading=False,
+        lighting={"ambient": 0.55, "diffuse": 0.7, "specular": 0.35, "roughness": 0.5, "fresnel": 0.8},
+        lightposition={"x": 200, "y": -400, "z": 300},
+        name="Vessel wall",
+        hoverinfo="skip",
+        showlegend=True,
+    )
+
+
+def _centerlines(anatomy: Anatomy) -> list[go.Scatter3d]:
+    """Return one line a section; pieces of a section are joined by gaps."""
+    tree = anatomy.tree
+    pieces: dict[int, list[np.ndarray]] = {}
+    for branch in tree.branches:
+        points = branch.centerline.points
+        for section in np.unique(branch.section):
+            at = np.flatnonzero(branch.section == section)
+            # One point before the section joins it to the one that it leaves.
+            chosen = points[max(at[0] - 1, 0) : at[-1] + 1]
+            pieces.setdefault(int(section), []).extend([chosen, np.full((1, 3), np.nan)])
+    lines = []
+    for section, parts in sorted(pieces.items()):
+        x, y, z = np.concatenate(parts).astype(np.float32).T
+        lines.append(
+            go.Scatter3d(
+                x=x,
+                y=y,
+                z=z,
+                mode="lines",
+                line={"color": section_color(section), "width": 5},
+                name=f"Section {tree.section_names[section]}",
+                hovertemplate=f"section {tree.section_names[section]}<extra></extra>",
+            )
+        )
+    return lines
+
+
+def _add_navigation(figure: go.Figure, anatomy: Anatomy, rollout: Rollout, world: int) -> None:
+    samples = np.flatnonzero(rollout.valid[world])
+    first = len(list(figure.data))
+    figure.add_traces(_moving(rollout, world, int(samples[0])))
+    figure.frames = [
+        go.Frame(name=str(sample), data=_moving(rollout, world, int(sample)), traces=list(range(first, first + 3)))
+        for sample in samples
+    ]
+    period = rollout.sample_period_s
+    animate = {"frame": {"duration": FRAME_MS, "redraw": True}, "transition": {"duration": 0}, "fromcurrent": True}
+    stop = {"frame": {"duration": 0, "redraw": True}, "mode": "immediate", "transition": {"duration": 0}}
+    figure.update_layout(
+        updatemenus=[
+            {
+                "type": "buttons",
+                "direction": "left",
+                "showactive": False,
+                "x": 0.0,
+                "xanchor": "left",
+                "y": 0.0,
+                "yanchor": "top",
+                "pad": {"t": 32, "l": 12},
+                "bgcolor": "#1d2a44",
+                "bordercolor": FAINT,
+                "font": {"color": INK},
+                "buttons": [
+                    {"label": "▶ Play", "method": "animate", "args": [None, animate]},
+                    {"label": "❚❚ Pause", "method": "animate", "args": [[None], stop]},
+                ],
+            }
+        ],
+        sliders=[
+            {
+                "x": 0.24,
+                "len": 0.74,
+                "y": 0.0,
+                "pad": {"t": 18, "b": 6},
+                "bgcolor": FAINT,
+                "bordercolor": FAINT,
+                "tickcolor": FAINT,
+                "activebgcolor": TIP,
+                "font": {"color": INK, "size": 11},
+                "currentvalue": {"prefix": "Time ", "suffix": " s", "font": {"color": INK, "size": 13}},
+                "steps": [
+                    {"label": f"{(sample + 1) * period:g}", "method": "animate", "args": [[str(sample)], stop]}
+                    for sample in samples
+                ],
+            }
+        ],
+    )
+
+
+def _moving(rollout: Rollout, world: int, sample: int) -> list[go.Scatter3d]:
+    """Return what changes from frame to frame: wire, tip and the tip's trail."""
+    wire = np.round(visible_wire(rollout, world, sample), 2).astype(np.float32)
+    begin = max(0, sample - round(TRAIL_S / rollout.sample_period_s))
+    trail = np.round(rollout.tip_position[world, begin : sample + 1], 2).astype(np.float32)
+    tip = trail[-1:]
+    told = (
+        f"Δ = {rollout.inserted_length[world, sample]:.1f} mm<br>"
+        f"φ = {np.rad2deg(rollout.rotation[world, sample]):.0f}°<br>"
+        f"Δtip = {rollout.tip.abscissa[world, sample]:.1f} mm<br>"
+        f"γtip = {rollout.tip.offset[world, sample]:.2f} mm<br>"
+        f"lumen radius = {rollout.tip.radius[world, sample]:.2f} mm<br>"
+        f"largest wall force = {rollout.contact_force_max[world, sample]:.3f} N"
+    )
+    hover = f"{told}<extra>{(sample + 1) * rollout.sample_period_s:g} s</extra>"
+
+    def trace(points: np.ndarray, **how: object) -> go.Scatter3d:
+        return go.Scatter3d(x=points[:, 0], y=points[:, 1], z=points[:, 2], **how)
+
+    return [
+        trace(wire, mode="lines", line={"color": WIRE, "width": 7}, name="Guidewire", hovertemplate=hover),
+        trace(trail, mode="lines", line={"color": TIP, "width": 2}, name=f"Tip, last {TRAIL_S:g} s", hoverinfo="skip"),
+        trace(tip, mode="markers", marker={"color": TIP, "size": 5}, name="Tip", hovertemplate=hover),
+    ]
+
+
+def _layout() -> dict:
+    axis = {
+        "backgroundcolor": BACKGROUND,
+        "gridcolor": FAINT,
+        "zerolinecolor": FAINT,
+        "color": INK,
+        "showspikes": False,
+        "title": {"font": {"size": 11}},
+        "tickfont": {"size": 10},
+    }
+    titles = ("x (left), mm", "y (back), mm", "z (head), mm")
+    axes = {f"{name}axis": axis | {"title": {"text": title}} for name, title in zip("xyz", titles, strict=True)}
+    return {
+        # Seen from the front, as a surgeon stands before the patient: the patient's left is on the right.
+        "scene": {
+            "aspectmode": "data",
+            **axes,
+            "camera": {"eye": {"x": 0.4, "y": -2.0, "z": 0.5}, "center": {"x": 0, "y": 0, "z": -0.12}},
+        },
+        "paper_bgcolor": BACKGROUND,
+        "font": {"color": INK, "family": "system-ui, sans-serif"},
+        "legend": {"font": {"size": 11}, "x": 0.99, "xanchor": "right", "y": 0.93, "bgcolor": BACKGROUND},
+        "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
+        "height": 680,
+        "uirevision": "keep",
+    }

@@ -1,0 +1,92 @@
+"""Settings of the rod core: `SimulatorConfig`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from endopilot import _core
+from endopilot.errors import InputError
+from endopilot.parallel import CORES
+from endopilot.types import SAMPLE_PERIOD_S
+
+FREE_BEHIND_MM = 3.0
+"""Nodes farther behind the ostium than this follow the drive exactly, mm."""
+LANES = _core.LANES
+"""Worlds that one thread steps side by side."""
+_DENT_MM = 0.015
+"""Depth to which a node that bears the whole push limit dents the wall, mm, where the stiffness is not given."""
+SPARE_MM = 20.0
+"""Length that a wire can be driven beyond the end of the vessel's longest path, mm, where it is not known how far."""
+Actuation = Literal["velocity", "force"]
+"""What a control is: translation (mm/s) and rotation (rad/s), or the drive's axial force (N) and torque (N·mm)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulatorConfig:
+    """Settings of the rod core."""
+
+    time_step_s: float = 0.0125
+    """Time step, s; it must divide the sample period of 0.5 s. The tip's error grows about linearly with it."""
+    tolerance_mm: float = 1e-3
+    """Newton's method stops when its step moves no node farther than this, mm."""
+    sample_tolerance_mm: float = 1e-6
+    """The same for the time step that ends a sample (no more than `tolerance_mm`): its forces are recorded, and the
+    wire is stiff axially."""
+    elements: int = 100
+    """Elements over the longest path of the anatomy; they are shorter near the tip."""
+    wall_stiffness_n_mm: float | None = None
+    """Stiffness of the vessel wall at a node, N/mm. If not given, the device's push limit dents it by 0.015 mm."""
+    stick_velocity_mm_s: float = 0.05
+    """Slip velocity under which smoothed Coulomb friction falls off, mm/s; a wire at rest creeps more slowly."""
+    approach_velocity_mm_s: float = 20.0
+    """Velocity at which a wire is brought to its first inserted length before the recording, mm/s."""
+    largest_jump: float = 0.1
+    """Motion of a node in a time step beyond the drive's own, mm (rotations: rad), above which the step is shortened:
+    a wire that snaps over is followed in steps of down to 1/64 of `time_step_s`."""
+    introducer_friction_n: float = 0.05
+    """Coulomb friction of the introducer's valve, N; the drive feels it, the wire ahead of the valve does not."""
+    introducer_drag_n_s_mm: float = 0.002
+    """Viscous drag of the introducer's valve, N·s/mm."""
+    threads: int = 0
+    """Threads; 0 for one a processor core. The results do not depend on it."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            InputError: a field is out of its range.
+        """
+        positive = ("time_step_s", "tolerance_mm", "sample_tolerance_mm", "wall_stiffness_n_mm", "stick_velocity_mm_s")
+        for name in (*positive, "largest_jump"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < np.inf:
+                raise InputError(f"{name}: {value}; give a positive number")
+        steps = SAMPLE_PERIOD_S / self.time_step_s
+        if abs(steps - round(steps)) > 1e-6 or steps < 0.5:
+            raise InputError(f"time_step_s: {self.time_step_s} does not divide {SAMPLE_PERIOD_S} s; give e.g. 0.0125")
+        for name in ("introducer_friction_n", "introducer_drag_n_s_mm"):
+            if not 0 <= getattr(self, name) < np.inf:
+                raise InputError(f"{name}: {getattr(self, name)}; give 0 or a positive number")
+        if not 0 < self.approach_velocity_mm_s < np.inf:
+            raise InputError(f"approach_velocity_mm_s: {self.approach_velocity_mm_s}; give a positive velocity")
+        if not 10 <= self.elements <= 2000:
+            raise InputError(f"elements: {self.elements}; give 10 to 2000")
+        if self.threads < 0:
+            raise InputError(f"threads: {self.threads}; give 0 for all cores, or a positive number")
+
+    @property
+    def steps_per_sample(self) -> int:
+        """Time steps in a sample period of 0.5 s."""
+        return round(SAMPLE_PERIOD_S / self.time_step_s)
+
+    def threads_for(self, worlds: int, lanes: int) -> int:
+        """Return how many threads step some worlds, `lanes` of them side by side: no more than have one to step."""
+        return min(self.threads or CORES, -(-worlds // lanes))
+
+
+def wall_stiffness(config: SimulatorConfig, push_limit_n: float) -> float:
+    """Return the stiffness of the wall at a node, N/mm, for a device of some push limit."""
+    return config.wall_stiffness_n_mm or push_limit_n / _DENT_MM

@@ -1,0 +1,186 @@
+"""The way into the C++ core: anatomy, device and settings as the core takes them, and one run of it."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+from jaxtyping import Float
+
+from endopilot import _core
+from endopilot.errors import InputError
+from endopilot.progress import progress
+from endopilot.simulation.config import FREE_BEHIND_MM, LANES, Actuation, SimulatorConfig, wall_stiffness
+from endopilot.simulation.rod import RodLayout
+from endopilot.types import SAMPLE_PERIOD_S, Anatomy, DistanceMap, Insertion
+
+_LARGEST_NEWTON_STEP = 0.3
+"""Displacement of a node (mm) that one Newton step is clamped to; larger ones can tangle the wire for good."""
+_MOST_ITERATIONS = 400
+"""Newton iterations after which a time step is halved, down to 1/64; a wire that snaps over needs some hundred."""
+
+
+def run_core(
+    rod: RodLayout,
+    lumen: _core.Lumen | None,
+    insertion: Insertion,
+    *,
+    config: SimulatorConfig,
+    initial: Float[np.ndarray, "worlds 2"],
+    control: Float[np.ndarray, "worlds samples 2"],
+    friction: Float[np.ndarray, "worlds"],
+    actuation: Actuation = "velocity",
+    loads: _core.Loads | None = None,
+    record_shape: bool = False,
+    record_attitude: bool = False,
+    lanes: int = LANES,
+    approach: bool = True,
+    free_behind_mm: float = FREE_BEHIND_MM,
+    push_limit_n: float = 2.0,
+) -> dict[str, np.ndarray]:
+    """Run the C++ core on checked input. The simulator and the verification both come through here.
+
+    Args:
+        rod: nodes and stiffnesses.
+        lumen: the wall, or None for a rod in the open.
+        insertion: the point and the direction along which the base slides.
+        config: settings.
+        initial: inserted length (mm) and rotation (rad) of each world before the first period.
+        control: mm/s and rad/s, or N and N·mm.
+        friction: Coulomb coefficients.
+        actuation: what the controls are.
+        loads: dead loads and springs.
+        record_shape: record node positions, mm.
+        record_attitude: record element orientations, quaternions w x y z.
+        lanes: worlds stepped side by side by one thread: 1, 4 or 8.
+        approach: bring the wire to its first inserted length from the ostium; else it starts there, straight.
+        free_behind_mm: nodes farther behind the insertion point follow the drive, mm.
+        push_limit_n: force at which the drive slips, N; of the device, where there is one.
+
+    Returns:
+        The arrays of `Rollout` that need no centerline, and `reason`: 0 fine, 1 not finite, 2 not converged.
+    """
+    simulation = _core.Simulation(
+        rod=rod.model(),
+        lumen=lumen,
+        loads=loads,
+        **insertion_arguments(insertion),
+        options=core_options(
+            config,
+            push_limit_n=push_limit_n,
+            approach=approach,
+            free_behind_mm=free_behind_mm,
+        ),
+        worlds=len(control),
+    )
+    simulation.reset(
+        index=np.arange(len(control)),
+        initial=np.ascontiguousarray(initial, dtype=float),
+        friction=np.ascontiguousarray(friction, dtype=float),
+        sample_period=SAMPLE_PERIOD_S,
+    )
+    with progress("Simulating the wire", total=control.shape[0] * control.shape[1]) as advance:
+        result = simulation.run(
+            control=np.ascontiguousarray(control, dtype=float),
+            force_driven=actuation == "force",
+            time_step=config.time_step_s,
+            steps_per_sample=config.steps_per_sample,
+            record_shape=record_shape,
+            record_attitude=record_attitude,
+            threads=config.threads_for(len(control), lanes),
+            lanes=lanes,
+            progress=advance,
+        )
+    return {**result, "reason": simulation.reason().astype(int)}
+
+
+def insertion_arguments(insertion: Insertion) -> dict[str, np.ndarray]:
+    """Return an insertion as the core wants it: `origin`, mm, and `orientation`, a quaternion w x y z."""
+    return {
+        "origin": np.asarray(insertion.position, dtype=float),
+        "orientation": _base_orientation(np.asarray(insertion.direction, dtype=float)),
+    }
+
+
+def core_options(
+    config: SimulatorConfig,
+    *,
+    push_limit_n: float,
+    free_behind_mm: float,
+    approach: bool = True,
+) -> _core.Options:
+    """Return the settings as the core wants them."""
+    options = _core.Options()
+    options.stick_velocity = config.stick_velocity_mm_s
+    options.wall_stiffness = wall_stiffness(config, push_limit_n)
+    options.tolerance = config.tolerance_mm
+    options.sample_tolerance = min(config.sample_tolerance_mm, config.tolerance_mm)
+    options.largest_step = _LARGEST_NEWTON_STEP
+    options.largest_jump = config.largest_jump
+    options.most_iterations = _MOST_ITERATIONS
+    options.free_behind = free_behind_mm
+    options.push_limit = push_limit_n
+    options.approach_velocity = config.approach_velocity_mm_s if approach else 0.0
+    options.introducer_friction = config.introducer_friction_n
+    options.introducer_drag = config.introducer_drag_n_s_mm
+    return options
+
+
+def make_lumen(distance_map: DistanceMap, radius_mm: float) -> _core.Lumen:
+    """Return the wall as the core wants it, a quadratic B-spline through the map, for a wire of some radius."""
+    spacing = float(distance_map.spacing_mm)
+    return _core.make_lumen(
+        values=np.ascontiguousarray(distance_map.values, dtype=np.float32),
+        origin=np.asarray(distance_map.origin_mm, dtype=float),
+        spacing=spacing,
+        near=radius_mm + spacing,
+        far=0.5,
+    )
+
+
+def check_distance_map(anatomy: Anatomy) -> None:
+    """Check that the distance map is finite, and positive at the ostium and around it along the catheter's axis.
+
+    Raises:
+        InputError: it is not.
+    """
+    field, insertion = anatomy.distance_map, anatomy.insertion
+    if not np.isfinite(field.values).all():
+        raise InputError(f"{anatomy.name}: the distance map has values that are not finite; extract it again")
+    if not 0 < field.spacing_mm < np.inf:
+        raise InputError(
+            f"{anatomy.name}: the distance map's spacing_mm is {field.spacing_mm}; give a positive spacing"
+        )
+    if not np.isfinite(insertion.position).all():
+        raise InputError(f"{anatomy.name}: insertion.position = {insertion.position} is not finite; extract it again")
+    if not abs(float(np.linalg.norm(insertion.direction)) - 1) <= 1e-3:
+        raise InputError(f"{anatomy.name}: insertion.direction = {insertion.direction} is no unit vector; normalise it")
+    for along in (-FREE_BEHIND_MM, 0.0, 1.0):
+        point = insertion.position + along * insertion.direction
+        index = np.round((point - field.origin_mm) / field.spacing_mm).astype(int)[::-1]
+        inside = (index >= 0).all() and (index < field.values.shape).all()
+        value = float(field.values[tuple(index)]) if inside else -np.inf
+        if value <= 0:
+            raise InputError(
+                f"{anatomy.name}: the distance map is {value:.2f} mm at {along:+g} mm from the ostium along the "
+                "catheter, where it must be positive (inside); check the insertion and the sign of the map"
+            )
+
+
+def check_memory(needed: int, what: str, mend: str) -> None:
+    """Check that `needed` bytes are at most 0.8 of the machine's memory.
+
+    Raises:
+        InputError: they are more; it begins with `what` needs them and ends with the mend.
+    """
+    available = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if needed > 0.8 * available:
+        raise InputError(f"{what} need {needed / 2**30:.1f} GiB of {available / 2**30:.1f}; {mend}")
+
+
+def _base_orientation(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4"]:
+    """Return the quaternion (w x y z) of the shortest turn that takes the third axis to `direction`."""
+    axis = np.array([-direction[1], direction[0], 0.0])
+    quaternion = np.array([1 + direction[2], *axis])
+    norm = np.linalg.norm(quaternion)
+    return quaternion / norm if norm > 1e-6 else np.array([0.0, 1.0, 0.0, 0.0])

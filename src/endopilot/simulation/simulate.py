@@ -1,0 +1,216 @@
+"""The simulator: one anatomy, one device, many worlds, each with controls of its own.
+
+Every world is a discrete Cosserat rod that slides out of the guiding catheter into the lumen. The time stepper is the
+C++ core in `src/core`; this module checks its input, lays the rod out and gives the answer as a `Rollout`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from endopilot.anatomy.projection import project_tip
+from endopilot.errors import InputError
+from endopilot.simulation.config import FREE_BEHIND_MM, SPARE_MM, Actuation, SimulatorConfig
+from endopilot.simulation.core import check_distance_map, check_memory, make_lumen, run_core
+from endopilot.simulation.device import Device, check_fits
+from endopilot.simulation.rod import lay_out
+from endopilot.types import SAMPLE_PERIOD_S, Anatomy, Rollout
+
+_REASONS = {1: "left the finite numbers", 2: "did not converge"}
+"""What `Rollout.reason` says of an invalid world."""
+_OVERSHOOT_MM = 1e-2
+"""Rounding of controls may carry the inserted length this far below 0, mm."""
+
+
+def simulate(
+    anatomy: Anatomy,
+    device: Device,
+    control: Float[np.ndarray, "worlds samples 2"],
+    *,
+    actuation: Actuation = "velocity",
+    initial: Float[np.ndarray, "worlds 2"] | None = None,
+    config: SimulatorConfig | None = None,
+    record_shape: bool = False,
+    friction: Float[np.ndarray, "worlds"] | None = None,
+) -> Rollout:
+    """Drive a device through an anatomy and record it every 0.5 s.
+
+    The drive slips rather than push harder than the device's push limit, and stops when the wire is pulled out:
+    controls, inserted lengths and the initial state of the answer are those that were made. Where force and torque are
+    given, advance and rotation follow, and the answer's controls are the mean velocities that came of them.
+
+    Results are the same to the last bit whatever the number of worlds, their order and the number of threads.
+
+    Args:
+        anatomy: the vessel.
+        device: the wire.
+        control: proximal velocities (mm/s, rad/s), or force and torque (N, N·mm) of the drive, constant over each
+            sample period.
+        actuation: which of the two: "velocity" or "force".
+        initial: inserted length (mm) and rotation (rad) before the first period; zeros if not given. The wire is
+            pushed there from the ostium at `config.approach_velocity_mm_s`, then rests for one period.
+        config: settings of the rod core.
+        record_shape: record the positions of all nodes too.
+        friction: Coulomb friction coefficient of each world; the device's own if not given.
+
+    Raises:
+        InputError: controls that are not finite, too fast for the device or pull the wire out of the catheter; a
+            device that does not fit; a distance map that is not finite, or negative at the ostium.
+    """
+    config = config or SimulatorConfig()
+    if control.ndim != 3 or control.shape[2] != 2:
+        raise InputError(f"control: shape {control.shape}; give (worlds, samples, 2), in mm/s and rad/s")
+    worlds, samples = control.shape[:2]
+    initial = np.zeros((worlds, 2)) if initial is None else np.asarray(initial, dtype=float)
+    friction = np.full(worlds, device.friction) if friction is None else np.asarray(friction, dtype=float)
+    if initial.shape != (worlds, 2):
+        raise InputError(
+            f"initial: shape {initial.shape}; give ({worlds}, 2), inserted length in mm and rotation in rad"
+        )
+    if friction.shape != (worlds,):
+        raise InputError(f"friction: shape {friction.shape}; give one number for each of the {worlds} worlds")
+    _check_memory(worlds, samples, 0)
+    control = np.ascontiguousarray(control, dtype=float)
+    deepest = _check_controls(device, control, initial, friction, actuation)
+    check_fits(device, anatomy)
+    check_distance_map(anatomy)
+    path_mm = float(anatomy.tree.longest_path().abscissa[-1])
+    rod = lay_out(
+        device,
+        path_mm=path_mm,
+        elements=config.elements,
+        length_mm=max(path_mm, deepest if actuation == "velocity" else path_mm + SPARE_MM) + FREE_BEHIND_MM,
+    )
+    _check_memory(worlds, samples, len(rod.abscissa_mm) if record_shape else 0)
+    result = run_core(
+        rod,
+        make_lumen(anatomy.distance_map, device.tip_radius_mm),
+        anatomy.insertion,
+        config=config,
+        initial=initial,
+        control=control,
+        actuation=actuation,
+        friction=friction,
+        record_shape=record_shape,
+        push_limit_n=device.push_limit_n,
+    )
+    started = initial.copy()
+    started[:, 0] -= result["approach_slip"]
+    rollout = make_rollout(anatomy, actuation, started, control, result)
+    _report_invalid(rollout)
+    return rollout
+
+
+def make_rollout(
+    anatomy: Anatomy,
+    actuation: Actuation,
+    started: Float[np.ndarray, "worlds 2"],
+    control: Float[np.ndarray, "worlds samples 2"],
+    result: Mapping[str, np.ndarray],
+) -> Rollout:
+    """Return what the core recorded as a rollout.
+
+    Args:
+        anatomy: the vessel.
+        actuation: what the controls are.
+        started: inserted length (mm) and rotation (rad) before the first period.
+        control: what was asked of the drive.
+        result: arrays as `run_core` returns them.
+    """
+    start = started[:, None, :]
+    if actuation == "velocity":
+        made = control.copy()
+        made[..., 0] -= result["slip"] / SAMPLE_PERIOD_S
+        proximal = start + np.cumsum(made, axis=1) * SAMPLE_PERIOD_S
+    else:
+        proximal = np.stack([result["inserted_length"], result["rotation"]], axis=-1)
+        made = np.diff(proximal, axis=1, prepend=start) / SAMPLE_PERIOD_S
+    return Rollout(
+        sample_period_s=SAMPLE_PERIOD_S,
+        initial_inserted_length=started[:, 0],
+        initial_rotation=started[:, 1],
+        control=made,
+        inserted_length=proximal[..., 0],
+        rotation=proximal[..., 1],
+        tip=project_tip(anatomy.tree, anatomy.insertion, result["tip_position"]),
+        reason=result["reason"],
+        shape=result.get("shape"),
+        **{name: result[name] for name in RECORDED},
+    )
+
+
+RECORDED = (
+    "tip_position",
+    "tip_direction",
+    "contact_force_max",
+    "contact_force_sum",
+    "base_force",
+    "base_torque",
+    "drive_force",
+    "drive_torque",
+    "slip",
+    "iterations",
+    "valid",
+)
+
+
+def _check_controls(
+    device: Device,
+    control: Float[np.ndarray, "worlds samples 2"],
+    initial: Float[np.ndarray, "worlds 2"],
+    friction: Float[np.ndarray, "worlds"],
+    actuation: Actuation,
+) -> float:
+    """Check controls, initial state and friction, and return the largest inserted length that they name, mm."""
+    if actuation not in ("velocity", "force"):
+        raise InputError(f"actuation: {actuation!r}; give 'velocity' or 'force'")
+    worlds, samples = control.shape[:2]
+    if worlds == 0 or samples == 0:
+        raise InputError(f"control: {worlds} worlds of {samples} samples; give at least one of one")
+    limits = (("translation", device.max_velocity_mm_s, "mm/s"), ("rotation", device.max_rotation_rad_s, "rad/s"))
+    if actuation == "force":
+        limits = (("force", np.inf, "N"), ("torque", np.inf, "N·mm"))
+    for axis, (name, limit, unit) in enumerate(limits):
+        _check(~np.isfinite(control[..., axis]), control[..., axis], f"{name} is no finite number; correct it")
+        fast = np.abs(control[..., axis]) > limit * (1 + 1e-6)
+        _check(fast, control[..., axis], f"{name} in {unit} exceeds {device.name}'s limit of {limit:g}; slow down")
+    _check(~np.isfinite(initial), initial, "initial state is no finite number; correct it")
+    _check(~(np.isfinite(friction) & (friction >= 0)), friction, "friction must be a finite number of 0 or more")
+    advance = SAMPLE_PERIOD_S * control[..., 0] if actuation == "velocity" else np.zeros(control.shape[:2])
+    inserted = np.cumsum(np.column_stack([initial[:, 0], advance]), axis=1)
+    _check(inserted < -_OVERSHOOT_MM, inserted, "inserted length in mm is negative; pull less, or start deeper")
+    return float(inserted.max())
+
+
+def _check(bad: Bool[np.ndarray, "worlds *rest"], values: Float[np.ndarray, "worlds *rest"], what: str) -> None:
+    if bad.any():
+        where = [int(i) for i in np.argwhere(bad)[0]]
+        at = f", sample {where[1]}" if len(where) > 1 else ""
+        raise InputError(f"world {where[0]}{at}: {values[tuple(where)]:g}: {what}")
+
+
+def _check_memory(worlds: int, samples: int, recorded_nodes: int) -> None:
+    needed = 8 * worlds * samples * (20 + 3 * recorded_nodes)
+    check_memory(needed, f"control: {worlds} worlds of {samples} samples", "simulate fewer at once")
+
+
+def why_invalid(rollout: Rollout, world: int) -> str:
+    """Return why and when a world of a rollout became invalid, such as "did not converge after 12.5 s"."""
+    seconds = rollout.sample_period_s * float(np.argmin(rollout.valid[world]))
+    return f"{_REASONS[int(rollout.reason[world])]} after {seconds:g} s"
+
+
+def _report_invalid(rollout: Rollout) -> None:
+    bad = np.flatnonzero(rollout.reason)
+    if len(bad) == 0:
+        return
+    import warnings
+
+    first = int(bad[0])
+    warnings.warn(
+        f"{len(bad)} of {len(rollout.valid)} worlds are invalid; world {first} {why_invalid(rollout, first)}",
+        stacklevel=3,
+    )

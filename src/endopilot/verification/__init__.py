@@ -1,0 +1,1 @@
+"""The rod core beside closed forms and an independent engine."""

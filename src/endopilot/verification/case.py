@@ -1,0 +1,213 @@
+"""One comparison of the rod core with a reference, and the rods that comparisons are made on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from endopilot import _core
+from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.core import run_core
+from endopilot.simulation.rod import RodLayout
+from endopilot.types import Insertion
+
+X_AXIS = Insertion(position=np.zeros(3), direction=np.array([1.0, 0.0, 0.0]))
+"""Free rods are clamped at the origin and point along x."""
+STATIC = SimulatorConfig(time_step_s=0.5, tolerance_mm=1e-8, largest_jump=1e6, threads=1)
+"""One time step a sample: with drag of next to nothing, each sample is a static equilibrium."""
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """One curve of a picture: its name in the legend, its points, and its style: `core`, `reference` or `mark`."""
+
+    name: str
+    x: Float[np.ndarray, "n"]
+    y: Float[np.ndarray, "n"]
+    style: str = "core"
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """What the figure of a case shows: names and units of the axes, curves, and the kind of its scales."""
+
+    horizontal: str
+    vertical: str
+    curves: tuple[Curve, ...]
+    equal: bool = False
+    logarithmic: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """One comparison.
+
+    Attributes:
+        case: what is compared.
+        reference: value of the closed form, or of the other engine.
+        value: value of the core.
+        error: relative error, or absolute where the reference is 0.
+        bar: largest error that passes.
+        picture: the case's figure.
+        skipped: why the comparison could not be made; empty if it was.
+    """
+
+    case: str
+    reference: float
+    value: float
+    error: float
+    bar: float
+    picture: Picture | None = None
+    skipped: str = ""
+
+    def row(self) -> dict[str, Any]:
+        """Return the row that `endopilot verify` prints; `passed` is None where the case was skipped."""
+        if self.skipped:
+            figures = dict.fromkeys(("reference", "value", "error"))
+            return {"case": f"{self.case} (skipped: {self.skipped})", **figures, "bar": self.bar, "passed": None}
+        return {
+            "case": self.case,
+            "reference": self.reference,
+            "value": self.value,
+            "error": self.error,
+            "bar": self.bar,
+            "passed": bool(self.error <= self.bar),
+        }
+
+
+def compare(case: str, reference: float, value: float, bar: float, picture: Picture | None = None) -> Case:
+    """Return the comparison of a value with its reference, which is not 0."""
+    return Case(case, float(reference), float(value), abs(float(value) / float(reference) - 1), bar, picture)
+
+
+def extrapolate_to_zero(stiffness: Float[np.ndarray, "n"], load: Float[np.ndarray, "n"], *, degree: int = 2) -> float:
+    """Return the load at which a stiffness that falls smoothly with it reaches zero, by a polynomial through both."""
+    return float(np.polynomial.Polynomial.fit(stiffness, load, degree)(0.0))
+
+
+def straight_rod(
+    *,
+    elements: int,
+    length_mm: float,
+    bend: float,
+    twist: float,
+    shear: float | None = None,
+    stretch: float | None = None,
+    radius_mm: float = 0.1,
+    drag: float = 1e-12,
+    clamp: int = 3,
+) -> RodLayout:
+    """Return a uniform straight rod whose free length begins in the middle of its first free element.
+
+    A clamped element fixes a direction over its whole length, and the joint behind it stands for half of it: so a rod
+    clamped at a wall has its wall in the middle of the clamped element. The free length is (elements - 1/2) element
+    lengths.
+
+    Args:
+        elements: number of elements, the half clamped one included.
+        length_mm: free length, mm.
+        bend: EI, N·mm².
+        twist: GJ, N·mm².
+        shear: κGA, N; very stiff if not given.
+        stretch: EA, N; very stiff if not given.
+        radius_mm: outer radius, mm.
+        drag: drag of a node, N·s/mm.
+        clamp: nodes behind the wall that the drive holds.
+    """
+    size = length_mm / (elements - 0.5)
+    n = elements + clamp
+    stiff = 1e5 * bend / length_mm**2
+    return RodLayout(
+        abscissa_mm=size * np.arange(n),
+        shear_n=np.full(n, stiff if shear is None else shear),
+        stretch_n=np.full(n, stiff if stretch is None else stretch),
+        bend_n_mm2=np.full(n, bend),
+        twist_n_mm2=np.full(n, twist),
+        rest_curvature=np.zeros((n, 3)),
+        radius_mm=np.full(n, radius_mm),
+        drag_n_s_mm=np.full(n, drag),
+        spin_drag_n_mm_s=np.full(n, drag),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Loading:
+    """Dead loads and springs on a rod; see `Loads` in the core. Entry i belongs to node i or element i."""
+
+    force_n: Float[np.ndarray, "n 3"]
+    moment_n_mm: Float[np.ndarray, "n 3"]
+    spring_n_mm: Float[np.ndarray, "n 3"]
+    anchor_mm: Float[np.ndarray, "n 3"]
+    hold_n_mm: Float[np.ndarray, "n"]
+    attitude: Float[np.ndarray, "n 4"]
+
+    @classmethod
+    def none(cls, nodes: int) -> Loading:
+        """Return no loads on a rod of `nodes` nodes."""
+        zero, attitude = np.zeros((nodes, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (nodes, 1))
+        return cls(zero, zero.copy(), zero.copy(), zero.copy(), np.zeros(nodes), attitude)
+
+    def core(self) -> _core.Loads:
+        """Return the loads as the core wants them."""
+        return _core.make_loads(
+            force=self.force_n,
+            moment=self.moment_n_mm,
+            spring=self.spring_n_mm,
+            anchor=self.anchor_mm,
+            hold=self.hold_n_mm,
+            attitude=self.attitude,
+        )
+
+
+def equilibrium(
+    rod: RodLayout,
+    loading: Loading,
+    *,
+    samples: int = 2,
+    control: Float[np.ndarray, "samples 2"] | None = None,
+    lumen: _core.Lumen | None = None,
+    friction: float = 0.0,
+    config: SimulatorConfig = STATIC,
+    insertion: Insertion = X_AXIS,
+    inserted_mm: float | None = None,
+    free_behind_mm: float = 0.0,
+) -> dict[str, np.ndarray]:
+    """Bring one clamped rod to rest and return the core's arrays, shape and attitude included, without the world axis.
+
+    Args:
+        rod: the rod; all nodes but the last three are free.
+        loading: dead loads and springs.
+        samples: number of samples to run, if no control is given.
+        control: motion of the clamp, mm/s and rad/s.
+        lumen: a wall.
+        friction: Coulomb coefficient.
+        config: settings of the core.
+        insertion: where the wall of the clamp is, and the rod's direction.
+        inserted_mm: free length; the rod's own if not given.
+        free_behind_mm: the rod is held this far behind the wall of the clamp.
+    """
+    size = float(rod.abscissa_mm[1])
+    if inserted_mm is None:
+        inserted_mm = (len(rod.abscissa_mm) - 3 - 0.5) * size
+    control = np.zeros((samples, 2)) if control is None else control
+    result = run_core(
+        rod,
+        lumen,
+        insertion,
+        config=replace(config, sample_tolerance_mm=1e-8),
+        initial=np.array([[inserted_mm, 0.0]]),
+        control=control[None],
+        friction=np.array([friction]),
+        loads=loading.core(),
+        record_shape=True,
+        record_attitude=True,
+        lanes=1,
+        approach=False,
+        free_behind_mm=free_behind_mm,
+    )
+    if not result["valid"].all():
+        raise RuntimeError("a verification case did not converge")
+    return {name: values[0] for name, values in result.items()}

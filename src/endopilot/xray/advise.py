@@ -1,0 +1,135 @@
+"""Calibrate a run's X-ray adviser, and measure it on patients not seen: `advise`."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from endopilot.dataset.loader import load_dataset
+from endopilot.files import manifest, write_json, writing
+from endopilot.models.config import PRETRAINED, read_run
+from endopilot.models.provenance import check_wire
+from endopilot.progress import progress
+from endopilot.xray import monitoring as advice
+from endopilot.xray.bands import CALIBRATION_FILE, check_enough
+from endopilot.xray.monitoring import AdviseConfig
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+FIGURES_FILE, PICTURE_FILE = "advice.json", "advice.png"
+PERIODS = (1, 2, 3, 4, 5, 6, 8, 10, 15, 20, 30, 45, 90)
+"""Samples between two exposures of periodic imaging."""
+WIDTHS = (0.0, 0.1, 0.25, 0.5, 0.75, 1.0, 1.5, 2.5)
+"""Factors on the calibrated bands, for the curve of the adviser."""
+THRESHOLDS = tuple((ratio, mm) for ratio in (0.6, 0.7, 0.8, 0.9) for mm in (1.0, 2.0))
+"""Other values of τ and of δ, mm, that the adviser is measured with."""
+
+
+def advise(run: Path, dataset: Path, output: Path, config: AdviseConfig) -> dict[str, Any]:
+    """Calibrate the X-ray adviser of a run on a dataset's calibration patients, and measure it on its test patients.
+
+    Writes the calibration beside the run (`xray.json`; for "pretrained", to the output), and `advice.json` and
+    `advice.png` to the output, each whole or not at all.
+
+    Args:
+        run: made by `endopilot train`, or "pretrained", the model of the package.
+        dataset: made by `endopilot dataset`; its patients must not be those that the run was trained on, unless they
+            are of its split 'train'.
+        output: where the figures go.
+        config: what is advised.
+
+    Returns:
+        The content of `advice.json`.
+
+    Raises:
+        InputError: the run or the dataset is missing or damaged, they are of different wires, or there are too few
+            calibration patients.
+    """
+    from endopilot.models.rollout import load_run  # brings torch
+    from endopilot.plotting import png  # brings matplotlib, which takes a second to import
+
+    start = time.perf_counter()
+    beside = output if str(run) == PRETRAINED else run
+    episodes, predictor = load_dataset(dataset), load_run(run)
+    check_wire(run, read_run(run), episodes)
+    splits = [episodes.of_split(name) for name in ("train", "calibrate", "test")]
+    check_enough(len(set(splits[1].anatomy)), config.adviser.level)
+    fitted, own, test = (advice.watch(predictor, split, config) for split in splits)
+    calibration = advice.calibrate(fitted, own, config.adviser.level)
+    with progress("Advising", len(PERIODS) + len(WIDTHS) + len(THRESHOLDS) + 1) as advance:
+        curves: dict[str, list[dict[str, float]]] = {"periodic": [], "adviser": []}
+        thresholds: list[dict[str, float]] = []
+        for period in PERIODS:
+            curves["periodic"].append(advice.run(test, advice.periodic(test, period), config.adviser))
+            advance()
+        for width in WIDTHS:
+            bands = replace(calibration, scale=width * calibration.scale)
+            test.model.restart()
+            point = advice.run(test, advice.advised(test, bands, config.adviser), config.adviser)
+            curves["adviser"].append({"width": width, **point})
+            advance()
+        for ratio, mm in THRESHOLDS:
+            other = replace(config.adviser, wall_ratio=ratio, abscissa_mm=mm)
+            test.model.restart()
+            point = advice.run(test, advice.advised(test, calibration, other), other)
+            thresholds.append({"wall_ratio": ratio, "abscissa_mm": mm, **point})
+            advance()
+        curves["oracle"] = [advice.run(test, advice.oracle(test, config.adviser), config.adviser)]
+        advance()
+    at = next(point for point in curves["adviser"] if point["width"] == 1.0)
+    equal = advice.periodic_equal(curves["periodic"], at["missed_share"])
+    content = {
+        "calibration": calibration,
+        "coverage": advice.coverage(test, calibration),
+        "coverage_of_calibration_patients": advice.coverage(own, calibration),
+        "adviser": at,
+        "periodic_exposures_per_minute_with_the_same_missed_share": equal,
+        "share_of_the_exposures_of_periodic_imaging": at["exposures_per_minute"] / equal,
+        "curves": curves,
+        "other_thresholds": thresholds,
+        "manifest": manifest(
+            config=config,
+            seed=config.seed,
+            inputs={"run": str(run), "dataset": episodes.manifest["key"]},
+            wall_seconds=time.perf_counter() - start,
+        ),
+    }
+    (output / FIGURES_FILE).unlink(missing_ok=True)
+    with writing(output / PICTURE_FILE) as partial:
+        partial.write_bytes(png(_picture(content)))
+    calibration.write(beside)
+    write_json(output / FIGURES_FILE, content | {"calibration_file": str(beside / CALIBRATION_FILE)})
+    return content
+
+
+def _picture(content: Mapping[str, Any]) -> Figure:
+    """Draw exposures a minute against the share of events that is missed."""
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    from endopilot.plotting import BLACK, BLUE, GREY, STYLE, VERMILLION
+
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(6.4, 4.0), layout="constrained")
+        axes = figure.add_subplot()
+        lines = (("periodic", GREY, "Periodic imaging"), ("adviser", BLUE, "Adviser, its bands narrowed or widened"))
+        for name, color, label in lines:
+            curve = content["curves"][name]
+            points = sorted((point["exposures_per_minute"], 100 * point["missed_share"]) for point in curve)
+            axes.plot(*zip(*points, strict=True), color=color, marker="o", markersize=3.5, label=label)
+        marks = (
+            (content["adviser"], "o", VERMILLION, f"Adviser as calibrated, level {content['calibration'].level:g}"),
+            (content["curves"]["oracle"][0], "*", BLACK, "Oracle"),
+        )
+        for point, marker, color, label in marks:
+            place = point["exposures_per_minute"], 100 * point["missed_share"]
+            axes.plot(*place, marker, color=color, markersize=9, label=label)
+        axes.axhline(5, color=BLACK, lw=0.9, ls=(0, (4, 3)))
+        axes.set(xlabel="Exposures a minute (fluoroscopy at 7.5 Hz: 450)", ylabel="Events missed, %")
+        axes.set(xlim=(0, 62), ylim=(-1, None))
+        axes.legend()
+    return figure

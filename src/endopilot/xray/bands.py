@@ -1,0 +1,161 @@
+"""Bands around what a model predicts, calibrated to hold over a whole interval without X-ray.
+
+A band is `scale` times a spread. The spread grows from the last exposure with time, travel and the model's own account
+of its uncertainty. The scale is conformal: on calibration patients, each interval scores its worst error in units of
+the spread, over all samples and over Δtip and γtip together. docs/xray.md measures the coverage.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Shaped
+from scipy.optimize import nnls
+
+from endopilot.errors import InputError
+from endopilot.files import read_json, write_json
+
+CALIBRATION_FILE = "xray.json"
+"""Name of a calibration beside the run that it belongs to."""
+TERMS = ("constant_mm", "per_s", "per_mm_of_travel", "per_own_spread")
+"""What a spread is the sum of."""
+Tips = Float[np.ndarray, "*n 2"]
+"""(Δtip, γtip), mm, or something of each of them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Calibration:
+    """How wide the bands of one model are.
+
+    Attributes:
+        level: share of new intervals that the bands are to hold throughout.
+        scale: half-width of a band in units of the spread.
+        abscissa_terms: of the spread of Δtip, its terms as `TERMS` names them.
+        offset_terms: of the spread of γtip.
+        anatomies: patients that it was calibrated on.
+        intervals: intervals of these.
+        dataset: key of the dataset.
+    """
+
+    level: float
+    scale: float
+    abscissa_terms: tuple[float, ...]
+    offset_terms: tuple[float, ...]
+    anatomies: int
+    intervals: int
+    dataset: str
+
+    def half_width(self, seconds: Float[np.ndarray, "*n"], travel_mm: Float[np.ndarray, "*n"], spread: Tips) -> Tips:
+        """Return the half-widths of the bands, mm.
+
+        Args:
+            seconds: since the last exposure, s.
+            travel_mm: translation of the wire since then, there and back, mm.
+            spread: what the model says of itself, mm; 0 where it says nothing.
+        """
+        return self.scale * spread_of((self.abscissa_terms, self.offset_terms), seconds, travel_mm, spread)
+
+    def write(self, run: Path) -> None:
+        """Write it beside a run, whole or not at all."""
+        write_json(Path(run) / CALIBRATION_FILE, asdict(self))
+
+    @staticmethod
+    def read(run: Path) -> Calibration:
+        """Read the calibration of a run.
+
+        Raises:
+            InputError: the run has none, or its file is damaged.
+        """
+        path = Path(run) / CALIBRATION_FILE
+        if not path.exists():
+            raise InputError(
+                f"{run}: the model has no calibration ({CALIBRATION_FILE} is missing); make it with `endopilot advise`"
+            )
+        try:
+            content: dict[str, Any] = read_json(path)
+            for name in ("abscissa_terms", "offset_terms"):
+                content[name] = tuple(content[name])
+            return Calibration(**content)
+        except (TypeError, KeyError) as error:
+            raise InputError(
+                f"{path}: no calibration of this version ({error}); run `endopilot advise` again"
+            ) from None
+
+
+def spread_of(
+    terms: tuple[tuple[float, ...], tuple[float, ...]],
+    seconds: Float[np.ndarray, "*n"],
+    travel_mm: Float[np.ndarray, "*n"],
+    spread: Tips,
+) -> Tips:
+    """Return the spread of Δtip and γtip, mm, of given terms; the arguments are those of `Calibration.half_width`."""
+    parts = [_features(seconds, travel_mm, spread[..., i]) @ np.array(terms[i]) for i in range(2)]
+    return np.maximum(np.stack(parts, axis=-1), 1e-6)
+
+
+def fit_spread(
+    error: Tips, seconds: Float[np.ndarray, "*n"], travel_mm: Float[np.ndarray, "*n"], spread: Tips
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return the terms, none negative, with which the spread is nearest to the size of the errors, by least squares.
+
+    Args:
+        error: of Δtip and γtip, mm, on patients that serve neither for calibration nor for the test.
+        seconds: since the last exposure, s.
+        travel_mm: since then, mm.
+        spread: what the model says of itself, mm.
+    """
+    found = [
+        nnls(_features(seconds, travel_mm, spread[..., i]).reshape(-1, len(TERMS)), np.abs(error[..., i]).ravel())[0]
+        for i in range(2)
+    ]
+    return tuple(found[0].tolist()), tuple(found[1].tolist())
+
+
+def _features(
+    seconds: Float[np.ndarray, "*n"], travel_mm: Float[np.ndarray, "*n"], spread: Float[np.ndarray, "*n"]
+) -> Float[np.ndarray, "*n 4"]:
+    return np.stack([np.ones_like(spread), seconds, travel_mm, spread], axis=-1)
+
+
+def check_enough(patients: int, level: float) -> None:
+    """Check that there are enough patients to calibrate on: with n of them no band is surer than n/(n + 1).
+
+    Raises:
+        InputError: there are too few for that level.
+    """
+    needed = int(np.ceil(level / (1 - level) - 1e-9))
+    if patients < needed:
+        raise InputError(
+            f"level: {level:g} needs at least {needed} patients to calibrate on, and the split 'calibrate' has "
+            f"{patients}; make the dataset with more, or with larger --anatomy-shares"
+        )
+
+
+def conformal_scale(
+    score: Float[np.ndarray, "intervals"], anatomy: Shaped[np.ndarray, "intervals"], level: float
+) -> float:
+    """Return the scale under which bands hold over `level` of the intervals of a new patient.
+
+    Intervals of one patient are alike, so patients count, not intervals. A quantile of all scores serves; which one, is
+    found by leaving each patient out: the smallest whose value on the others covers `level` of the left-out ones.
+
+    Args:
+        score: of each interval, the worst error over the spread.
+        anatomy: whose each is.
+        level: share to be covered.
+
+    Raises:
+        InputError: there are too few patients for that level.
+    """
+    names = np.unique(anatomy)
+    check_enough(len(names), level)
+    shares = np.linspace(0.0, 1.0, 501)
+    covered = np.zeros(len(shares))
+    for name in names:
+        bounds = np.quantile(score[anatomy != name], shares, method="higher")
+        covered += (score[anatomy == name] <= bounds[:, None]).mean(axis=1) / len(names)
+    enough = np.append(shares[covered >= level - 1e-9], 1.0)[0]
+    return float(np.quantile(score, enough, method="higher"))

@@ -1,0 +1,265 @@
+"""What an X-ray exposure says of the wire's tip: a measurement with the errors of a C-arm, never the truth.
+
+The tip is projected onto one or two detectors, is found there with an error in pixels, and is located in space as the
+most likely place given the pixels and the vessel: the tip of a wire lies inside the lumen, mostly on its wall, and no
+deeper than the wire is inserted. The second view or, with a single one, the vessel gives the depth. docs/xray.md says
+where the numbers come from.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from endopilot.anatomy.projection import project_tip
+from endopilot.anatomy.tree import tangents
+from endopilot.dataset.loader import Dataset
+from endopilot.errors import InputError
+from endopilot.types import Anatomy, TipProjection
+
+_CATHETER_MM = 20.0
+"""Length of the catheter's axis behind the ostium in which a tip may be found, mm."""
+_ITERATIONS, _NEAR_ENOUGH_MM = 8, 1e-2
+_HOPELESS = 30.0
+"""Branches whose best vertex is this much less likely than the best of all (twice the log-likelihood) are left out."""
+_NEAR_SHARE = 0.1
+"""Standard deviation of (abscissa of the tip)/(inserted length): curved vessels are cut short, wires snake."""
+
+
+@dataclass(frozen=True, eq=False)
+class TipMeasurement:
+    """What an X-ray exposure says of the tip; a measurement, never the truth.
+
+    Attributes:
+        position: of the tip, LPS mm.
+        abscissa: Δtip of that position on the vessel's tree, mm.
+        offset: γtip, mm.
+        branch: index of the branch that it is seen in.
+    """
+
+    position: Float[np.ndarray, "3"]
+    abscissa: float
+    offset: float
+    branch: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class FluoroscopeConfig:
+    """Geometry of the C-arm and errors of detection."""
+
+    biplane: bool = True
+    """Two views at once; else the first alone."""
+    view_angles_deg: tuple[tuple[float, float], tuple[float, float]] = ((-30.0, 0.0), (60.0, 0.0))
+    """Of each view, LAO (positive) or RAO (negative), and cranial (positive) or caudal (negative), degrees."""
+    source_to_isocenter_mm: float = 765.0
+    """Distance of the X-ray source from the isocenter, mm."""
+    source_to_detector_mm: float = 1100.0
+    """Distance of the X-ray source from the detector, mm."""
+    pixel_mm: float = 0.308
+    """Pixel pitch of the detector in fluoroscopy, mm."""
+    pixel_sd: float = 0.5
+    """Standard deviation of the tip's place in the image across the wire, pixels."""
+    along_sd: float = 2.6
+    """Standard deviation along the wire, pixels: where a thin tip ends is harder to see than where it runs."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            InputError: a field is out of its range.
+        """
+        for name in ("source_to_isocenter_mm", "source_to_detector_mm", "pixel_mm", "pixel_sd", "along_sd"):
+            if not 0 < getattr(self, name) < np.inf:
+                raise InputError(f"{name}: {getattr(self, name)}; give a positive number")
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """One source and its detector.
+
+    Attributes:
+        source: LPS mm.
+        axes: rows: along the image's columns, along its rows, and from the source to the detector; unit vectors.
+        scale: of a point at distance 1 from the source, pixels.
+    """
+
+    source: Float[np.ndarray, "3"]
+    axes: Float[np.ndarray, "3 3"]
+    scale: float
+
+    def project(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 2"]:
+        """Return the pixels of points, LPS mm."""
+        seen = (points - self.source) @ self.axes.T
+        return self.scale * seen[..., :2] / seen[..., 2:]
+
+    def slope(self, point: Float[np.ndarray, "3"]) -> Float[np.ndarray, "2 3"]:
+        """Return the derivative of the pixel by the point, pixels/mm."""
+        seen = self.axes @ (point - self.source)
+        return self.scale / seen[2] * (self.axes[:2] - np.outer(seen[:2] / seen[2], self.axes[2]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Detection:
+    """A tip found in an image.
+
+    Attributes:
+        view: of the image.
+        pixel: where it was found.
+        whiten: turns a miss, pixels, into one along and one across the wire, in standard deviations.
+    """
+
+    view: _View
+    pixel: Float[np.ndarray, "2"]
+    whiten: Float[np.ndarray, "2 2"]
+
+
+def _view(angles_deg: tuple[float, float], isocenter: Float[np.ndarray, "3"], config: FluoroscopeConfig) -> _View:
+    """Return the view under an LAO and a cranial angle: at 0, 0 the beam goes from the back to the front, along −y."""
+    lao, cranial = np.deg2rad(angles_deg)
+    beam = np.array([np.sin(lao) * np.cos(cranial), -np.cos(lao) * np.cos(cranial), np.sin(cranial)])
+    across = np.array([np.cos(lao), np.sin(lao), 0.0])
+    return _View(
+        source=isocenter - config.source_to_isocenter_mm * beam,
+        axes=np.stack([across, np.cross(beam, across), beam]),
+        scale=config.source_to_detector_mm / config.pixel_mm,
+    )
+
+
+class Fluoroscope:
+    """A C-arm around one patient, whose vessel is known from the CT and registered to it."""
+
+    def __init__(self, anatomy: Anatomy, wire_radius_mm: float, config: FluoroscopeConfig | None = None) -> None:
+        """Bring the middle of the vessel to the isocenter.
+
+        Args:
+            anatomy: the vessel.
+            wire_radius_mm: radius of the wire at its tip, mm.
+            config: geometry and errors.
+        """
+        self._anatomy, self._config = anatomy, config or FluoroscopeConfig()
+        lines = [branch.centerline for branch in anatomy.tree.branches]
+        insertion = anatomy.insertion
+        behind = np.linspace(-_CATHETER_MM, -0.5, 40)
+        points = [line.points for line in lines]
+        catheter = insertion.position + behind[:, None] * insertion.direction
+        isocenter = np.concatenate(points).mean(axis=0)
+        shown = self._config.view_angles_deg[: 2 if self._config.biplane else 1]
+        self._views = [_view(angles, isocenter, self._config) for angles in shown]
+        radius = [np.full(len(behind), anatomy.catheter_radius_mm), *(line.radius for line in lines)]
+        # A wire that lies on the wall, anywhere around, is off by clearance/√2 along either axis, root mean square.
+        self._lateral_sd = [np.maximum(r - wire_radius_mm, 0.1) / np.sqrt(2) for r in radius]
+        self._points = [catheter, *points]
+        self._tangents = [np.tile(insertion.direction, (len(behind), 1)), *(tangents(p) for p in points)]
+        self._abscissa = [behind, *(line.abscissa for line in lines)]
+
+    def expose(
+        self,
+        tip_position: Float[np.ndarray, "3"],
+        tip_direction: Float[np.ndarray, "3"],
+        inserted_length: float,
+        random: np.random.Generator,
+    ) -> TipMeasurement:
+        """Take one exposure of every view and say where the tip is. The arguments are those of `locate`."""
+        position = self.locate(tip_position, tip_direction, inserted_length, random)
+        tip = project_tip(self._anatomy.tree, self._anatomy.insertion, position[None])
+        return TipMeasurement(position, float(tip.abscissa[0]), float(tip.offset[0]), int(tip.branch[0]))
+
+    def locate(
+        self,
+        tip_position: Float[np.ndarray, "3"],
+        tip_direction: Float[np.ndarray, "3"],
+        inserted_length: float,
+        random: np.random.Generator,
+    ) -> Float[np.ndarray, "3"]:
+        """Take one exposure of every view and return where the tip is found to be, LPS mm.
+
+        Args:
+            tip_position: where the tip truly is, LPS mm.
+            tip_direction: unit vector along the wire at its tip.
+            inserted_length: Δ by the robot's encoder, mm.
+            random: where the errors are drawn from.
+        """
+        seen = [self._detect(view, tip_position, tip_direction, random) for view in self._views]
+        return self._likeliest(seen, inserted_length)
+
+    def expose_episodes(self, episodes: Dataset, seed: int) -> TipProjection:
+        """Return where an exposure would show the tip, at every sample of episodes of this patient.
+
+        Args:
+            episodes: navigations; Δ, as the encoder says it, helps to find the tip.
+            seed: of the errors; those of a navigation depend on it, the patient and the sequence alone.
+        """
+        position = np.empty((len(episodes), episodes.valid.shape[1], 3))
+        for index, sequence in enumerate(episodes.sequence):
+            random = np.random.default_rng([seed, 3, int(sequence), *self._anatomy.name.encode()])
+            for sample in range(position.shape[1]):
+                position[index, sample] = self.locate(
+                    episodes.tip_position[index, sample].astype(float),
+                    episodes.tip_direction[index, sample].astype(float),
+                    float(episodes.inserted_length[index, sample]),
+                    random,
+                )
+        return project_tip(self._anatomy.tree, self._anatomy.insertion, position)
+
+    def _detect(
+        self,
+        view: _View,
+        position: Float[np.ndarray, "3"],
+        direction: Float[np.ndarray, "3"],
+        random: np.random.Generator,
+    ) -> _Detection:
+        """Return where the tip is found in the image: farther off along the wire than across it."""
+        slope = view.slope(position) @ direction
+        along = slope / max(float(np.linalg.norm(slope)), 1e-9)
+        axes = np.array([along, [-along[1], along[0]]])
+        sd = np.array([self._config.along_sd, self._config.pixel_sd])
+        off = random.standard_normal(2) * sd
+        return _Detection(view, view.project(position) + off @ axes, axes / sd[:, None])
+
+    def _likeliest(self, seen: list[_Detection], inserted_length: float) -> Float[np.ndarray, "3"]:
+        """Return the most likely place of the tip, LPS mm: the best of the likeliest places in every branch."""
+        length_sd = 2.0 + _NEAR_SHARE * max(inserted_length, 0.0)
+        prior = [((abscissa - inserted_length) / length_sd) ** 2 for abscissa in self._abscissa]
+        magnified = self._views[0].scale / self._config.source_to_isocenter_mm
+        first = []
+        for points, sd, unlikely in zip(self._points, self._lateral_sd, prior, strict=True):
+            misses = sum(((one.view.project(points) - one.pixel) ** 2).sum(axis=1) for one in seen)
+            first.append(misses / (self._config.along_sd**2 + (magnified * sd) ** 2) + unlikely)
+        least = min(float(cost.min()) for cost in first)
+        best, found = np.inf, self._points[0][-1]
+        for branch, cost in enumerate(first):
+            if cost.min() > least + _HOPELESS:
+                continue
+            place, miss, nearest = self._refine(seen, branch, int(np.argmin(cost)))
+            miss += float(prior[branch][nearest])
+            if miss < best:
+                best, found = miss, place
+        return found
+
+    def _refine(self, seen: list[_Detection], branch: int, nearest: int) -> tuple[Float[np.ndarray, "3"], float, int]:
+        """Return the likeliest place near one branch, LPS mm, twice its negative log-likelihood, and its vertex.
+
+        Gauss-Newton on the pixels' misses, in units of the detection's error, and on the distance from the line in
+        units of what is usual in that lumen.
+        """
+        points, tangent, sd = self._points[branch], self._tangents[branch], self._lateral_sd[branch]
+        place, cost = points[nearest], np.inf
+        for _ in range(_ITERATIONS):
+            across = (np.eye(3) - np.outer(tangent[nearest], tangent[nearest])) / sd[nearest]
+            rows, misses = [across, 1e-3 * np.eye(3)], [across @ (place - points[nearest]), np.zeros(3)]
+            for one in seen:
+                rows.append(one.whiten @ one.view.slope(place))
+                misses.append(one.whiten @ (one.view.project(place) - one.pixel))
+            jacobian, miss = np.concatenate(rows), np.concatenate(misses)
+            cost = float(miss @ miss)
+            step = np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ miss)
+            place = place - step
+            nearest = int(np.argmin(((points - place) ** 2).sum(axis=1)))
+            if step @ step < _NEAR_ENOUGH_MM**2:
+                break
+        lateral = place - points[nearest]
+        lateral = lateral - (lateral @ tangent[nearest]) * tangent[nearest]
+        beyond = 1 - np.sqrt(2) * sd[nearest] / max(float(np.linalg.norm(lateral)), 1e-9)
+        return place - max(beyond, 0.0) * lateral, cost, nearest  # a tip does not leave the lumen

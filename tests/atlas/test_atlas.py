@@ -1,0 +1,174 @@
+"""Synthetic patients: their statistics against the published ones, their trees, their determinism."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from endopilot.anatomy.distance import sample
+from endopilot.atlas import curves as shape
+from endopilot.atlas.atlas import AtlasConfig, make_atlas, make_patient, make_patient_tree
+from endopilot.atlas.branching import Vessel, lumens_collide
+from endopilot.errors import InputError
+
+COUNT = 60
+
+
+@pytest.fixture(scope="module")
+def patients():
+    config = AtlasConfig(seed=11)
+    return [make_patient_tree(config, index) for index in range(COUNT)]
+
+
+def assert_mean(values, mean, sd):
+    """The sample mean lies within 2.5 standard errors of the published mean, the error taken from the published SD."""
+    assert abs(np.mean(values) - mean) <= 2.5 * sd / np.sqrt(len(values))
+
+
+def test_course_statistics_match_the_published_ones(patients):
+    paths = [tree.longest_path().points for tree, _ in patients]
+    lengths = np.array([shape.abscissa(points)[-1] for points in paths])
+    assert_mean(lengths, 164, 30)
+    assert lengths.min() > 111 and lengths.max() < 224
+    assert_mean([shape.tortuosity(points) for points in paths], 2.07, 0.23)
+    assert_mean([shape.curvature(points).mean() for points in paths], 0.061, 0.017)
+    assert_mean([np.quantile(shape.curvature(points), 0.9) for points in paths], 0.11, 0.04)
+    assert 20 < lengths.std() < 36
+
+
+@pytest.mark.parametrize(("share", "diameter"), [(0.1, 4.0), (0.2, 3.8), (0.5, 3.5), (0.7, 2.7), (0.9, 2.3)])
+def test_diameters_along_the_way_match_the_published_ones(patients, share, diameter):
+    paths = [tree.longest_path() for tree, _ in patients]
+    found = [2 * np.interp(share * path.abscissa[-1], path.abscissa, path.radius) for path in paths]
+    assert_mean(found, diameter, 0.6)
+    assert np.std(found) <= 0.6
+
+
+@pytest.mark.parametrize(("section", "diameter"), [("1", 3.9), ("2", 3.4), ("3", 3.1), ("4", 2.2)])
+def test_diameters_of_segments_agree_with_dodge(patients, section, diameter):
+    # The two published sets contradict each other by up to 0.4 mm; the atlas follows the diameters along the way.
+    found = []
+    for tree, truth in patients:
+        number = tree.section_names.index(section)
+        radii = [b.centerline.radius[b.section == number] for b in tree.branches]
+        if truth["dominance"] == "right":
+            found.append(2 * np.mean(np.concatenate(radii)))
+    assert abs(np.mean(found) - diameter) <= 0.45
+
+
+@pytest.mark.parametrize(("section", "mean", "sd"), [("conus", 15, 6), ("SA", 16, 6), ("AM", 42, 8)])
+def test_branches_leave_where_they_should(patients, section, mean, sd):
+    origins = []
+    for tree, _ in patients:
+        number = tree.section_names.index(section)
+        origins += [b.centerline.abscissa[0] for b in tree.branches if np.all(b.section == number)]
+    assert len(origins) > 0.4 * COUNT
+    assert_mean(origins, mean, sd)
+
+
+def test_trees_are_connected_and_ordered(patients):
+    for tree, _ in patients:
+        assert tree.branches[0].parent == -1 and tree.branches[0].centerline.abscissa[0] == 0
+        for index, branch in enumerate(tree.branches):
+            line = branch.centerline
+            assert line.radius.min() > 0.2
+            steps = np.linalg.norm(np.diff(line.points, axis=0), axis=1)
+            assert np.all(np.abs(steps - 0.5) < 0.03)
+            np.testing.assert_allclose(np.diff(line.abscissa), steps, atol=1e-9)
+            np.testing.assert_allclose(np.linalg.norm(line.normals, axis=1), 1.0, atol=1e-9)
+            if index:
+                parent = tree.branches[branch.parent].centerline
+                assert 0 <= branch.parent < index
+                np.testing.assert_array_equal(line.points[0], parent.points[-1])
+                assert line.abscissa[0] == parent.abscissa[-1]
+                assert line.radius[0] == parent.radius[-1]
+        inner = set(range(len(tree.branches))) - set(tree.leaves())
+        assert all(len(tree.children(index)) == 2 for index in inner)
+
+
+def test_sections_follow_dominance(patients):
+    seen = {truth["dominance"] for _, truth in patients}
+    assert "right" in seen
+    for tree, truth in patients:
+        names = {tree.section_names[i] for branch in tree.branches for i in branch.section}
+        expected = {"right": {"4", "16"}, "left": set()}.get(truth["dominance"])
+        if expected is not None:
+            assert names & {"4", "16"} == expected
+        assert {"1", "2", "3"} <= names
+
+
+def test_lumens_keep_apart():
+    straight = np.stack([np.arange(0, 60, 0.5), np.zeros(120), np.zeros(120)], axis=1)
+    radius = np.full(120, 1.5)
+    back = np.concatenate(
+        [straight, np.stack([59.5 - np.arange(0, 60, 0.5), np.full(120, 3.2), np.zeros(120)], axis=1)]
+    )
+    assert not lumens_collide([Vessel(straight, radius, ())])
+    assert lumens_collide([Vessel(back, np.full(240, 1.5), ())])
+    assert not lumens_collide([Vessel(back, np.full(240, 1.0), ())])
+
+
+def test_a_patient_depends_on_seed_and_index_alone():
+    few, many = AtlasConfig(seed=4, count=1), AtlasConfig(seed=4, count=50)
+    tree, truth = make_patient_tree(few, 3)
+    again, truth_again = make_patient_tree(many, 3)
+    assert truth == truth_again
+    for a, b in zip(tree.branches, again.branches, strict=True):
+        np.testing.assert_array_equal(a.centerline.points, b.centerline.points)
+        np.testing.assert_array_equal(a.centerline.radius, b.centerline.radius)
+    assert make_patient_tree(few, 2)[1]["length_mm"] != truth["length_mm"]
+    assert make_patient_tree(AtlasConfig(seed=5), 3)[1]["length_mm"] != truth["length_mm"]
+
+
+def test_anatomy_holds_lumen_and_catheter():
+    (anatomy,) = make_atlas(AtlasConfig(seed=2, stenosis_share=1.0))
+    path = anatomy.tree.longest_path()
+    depth = sample(anatomy.distance_map, path.points)
+    # Linear interpolation on the grid rounds off the ridge on the axis.
+    assert 0 < np.median(path.radius - depth) < 0.2
+    behind = anatomy.insertion.position - np.outer(np.arange(2.0, 18.0), anatomy.insertion.direction)
+    tube = sample(anatomy.distance_map, behind)
+    assert anatomy.catheter_radius_mm - 0.25 < tube.min() and tube.max() < anatomy.catheter_radius_mm + 0.02
+    assert anatomy.insertion.direction @ (path.points[4] - path.points[0]) > 0
+    (stenosis,) = anatomy.provenance["stenoses"]
+    here = np.interp(stenosis["abscissa_mm"], path.abscissa, path.radius)
+    before = np.interp(stenosis["abscissa_mm"] - stenosis["length_mm"], path.abscissa, path.radius)
+    assert here < 0.85 * before
+    assert make_patient(AtlasConfig(seed=2, stenosis_share=1.0), 0).name == anatomy.name
+
+
+def test_curves_against_closed_forms():
+    turn = np.linspace(0, np.pi, 200)
+    circle = np.stack([20 * np.cos(turn), 20 * np.sin(turn), np.zeros(200)], axis=1)
+    np.testing.assert_allclose(shape.curvature(circle)[2:-2], 1 / 20, rtol=1e-3)
+    assert shape.tortuosity(circle) == pytest.approx(np.pi / 2, rel=1e-3)
+    normals = shape.parallel_normals(shape.tangents(circle), np.array([0.0, 0.0, 1.0]))
+    np.testing.assert_allclose(normals, np.tile([0.0, 0.0, 1.0], (200, 1)), atol=1e-12)
+    line = np.stack([np.arange(100.0), np.zeros(100), np.zeros(100)], axis=1)
+    bent = shape.bend(line, np.array([0.0, 0.0, 1.0]), 1.2)
+    # Tangents that turn in proportion to the way make a circle's arc of radius length / angle.
+    np.testing.assert_allclose(shape.curvature(bent)[2:-2], 1.2 / 99, rtol=1e-3)
+
+
+def test_side_branches_stay_outside_the_heart():
+    def depth(points):
+        return 30.0 - np.linalg.norm(points, axis=1)
+
+    along, down = np.array([0.0, 0.0, 1.0]), np.array([-1.0, 0.0, 0.0])
+    curve = shape.steer(np.array([33.0, 0.0, 0.0]), along, [(0.0, down)], 60.0, 7.0, depth)
+    height = np.linalg.norm(curve, axis=1) - 30.0
+    assert height.min() > 0.5 and height.max() < 9
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"anatomy": "spleen"}, "'spleen'; choose from .*rca"),
+        ({"count": 0}, "count: 0"),
+        ({"seed": -1}, "seed: -1"),
+        ({"stenosis_share": 1.5}, "stenosis_share: 1.5"),
+    ],
+)
+def test_bad_configuration_is_told(options, told):
+    with pytest.raises(InputError, match=told):
+        AtlasConfig(**options)

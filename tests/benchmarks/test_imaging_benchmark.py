@@ -1,0 +1,105 @@
+"""`endopilot bench imaging`: its cases, its figures, and that it goes on where it stopped."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from endopilot.atlas.atlas import make_patient
+from endopilot.benchmarks import imaging as imaging_bench
+from endopilot.benchmarks.imaging import BARS, ImagingBenchConfig, bench_imaging, draw_case
+from endopilot.errors import InputError
+from endopilot.imaging.overlap import mask_like
+from endopilot.types import LumenMask, Volume
+
+GOOD = {
+    "dice": 0.93,
+    "cldice": 0.97,
+    "overlap": 0.99,
+    "inside_accuracy_mm": 0.1,
+    "radius_mae_mm": 0.05,
+    "ostium_error_mm": 0.4,
+    "false_length_mm": 0.0,
+}
+
+
+def write(folder, rows) -> None:
+    folder.mkdir(exist_ok=True)
+    for index, row in enumerate(rows):
+        whole = {"case": index, "method": imaging_bench._method(), "failed": None, "seconds": 2, "processor_seconds": 3}
+        (folder / f"7-{index:04d}.json").write_text(json.dumps(whole | row))
+
+
+def figures(folder, rows):
+    write(folder, rows)
+    return bench_imaging(ImagingBenchConfig(cases=len(rows), seed=7, folder=folder))
+
+
+def test_means_spreads_and_bars(tmp_path):
+    found = figures(tmp_path, [GOOD, GOOD | {"dice": 0.83, "ostium_error_mm": 1.2}])
+    assert found["dice"] == {
+        "mean": 0.88, "sd": 0.0707, "worst": 0.83, "worst_found": 0.83, "bar": 0.85, "counts": "mean", "met": True
+    }  # fmt: skip
+    assert found["ostium_error_mm"]["worst"] == 1.2 and not found["ostium_error_mm"]["met"]
+    assert all(found[name]["met"] for name in BARS if name != "ostium_error_mm")
+    assert found["seconds"] == {"mean": 2.0, "worst": 2.0}
+
+
+def test_a_failed_case_counts_against_every_figure(tmp_path):
+    found = figures(tmp_path, [GOOD] * 9 + [{"failed": "no aorta"}])
+    assert found["failed"] == {"9": "no aorta"}
+    assert found["dice"]["worst"] == 0.0 and found["dice"]["worst_found"] == 0.93
+    assert found["dice"]["mean"] == pytest.approx(0.837)
+    assert not any(found[name]["met"] for name in BARS if name.endswith("_mm"))
+
+
+def test_only_missing_or_outdated_cases_are_measured(tmp_path, monkeypatch):
+    write(tmp_path, [GOOD, GOOD | {"method": "another"}])
+    asked = []
+
+    def measured(title, paths, work):
+        asked.extend(path.name for path in paths)
+        write(tmp_path, [GOOD] * 3)
+        return {}
+
+    monkeypatch.setattr(imaging_bench, "each", measured)
+    bench_imaging(ImagingBenchConfig(cases=3, seed=7, folder=tmp_path))
+    assert asked == ["7-0001.json", "7-0002.json"]
+
+
+def test_a_case_depends_on_seed_and_index_alone():
+    assert draw_case(3, 5) == draw_case(3, 5)
+    assert draw_case(3, 5)[1] != draw_case(3, 6)[1] != draw_case(4, 6)[1]
+
+
+def test_one_case_from_the_volume_to_its_scores(tmp_path, monkeypatch):
+    patients, scan = draw_case(1000, 0)
+    coarse = replace(scan, in_plane_mm=0.9, slice_mm=0.9)
+    truth = make_patient(patients, 0)
+
+    def whole_lumen(volume, config):
+        inside = mask_like(LumenMask(as_volume(truth.distance_map)), volume)
+        return LumenMask(replace(volume, voxels=inside), truth.insertion)
+
+    monkeypatch.setattr(imaging_bench, "draw_case", lambda seed, index: (patients, coarse))
+    monkeypatch.setattr(imaging_bench, "segment", whole_lumen)
+    monkeypatch.setattr(imaging_bench, "extract_anatomy", lambda mask, name, config: truth)
+    found = bench_imaging(ImagingBenchConfig(cases=1, seed=1000, folder=tmp_path))
+    assert found["failed"] == {}
+    assert found["dice"]["mean"] > 0.9 and found["overlap"]["mean"] == 1.0
+    row = json.loads((tmp_path / "1000-0000.json").read_text())
+    assert row["scan"]["in_plane_mm"] == 0.9 and row["manifest"]["seed"] == 1000
+
+
+def as_volume(distance_map):
+    inside = distance_map.values > 0
+    return Volume(inside, np.full(3, distance_map.spacing_mm), distance_map.origin_mm, np.eye(3))
+
+
+@pytest.mark.parametrize(("options", "told"), [({"cases": 0}, "cases: 0"), ({"seed": -1}, "seed: -1")])
+def test_bad_configuration_is_told(options, told):
+    with pytest.raises(InputError, match=told):
+        ImagingBenchConfig(**options)

@@ -1,0 +1,124 @@
+"""A small version of `endopilot bench robustness`, and that it counts what it says it counts."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from endopilot.atlas.atlas import AtlasConfig, make_patient
+from endopilot.benchmarks import robustness
+from endopilot.benchmarks.robustness import MANOEUVRES, RobustnessConfig, measure_robustness, robust_controls
+from endopilot.errors import InputError
+from endopilot.files import read_json
+from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.device import Device, list_devices, read_device
+from endopilot.simulation.simulate import simulate
+
+DEVICE = read_device("workhorse-014")
+
+
+def small(folder: Path) -> RobustnessConfig:
+    return RobustnessConfig(rollouts=20, anatomies=1, seconds=12.0, seed=3, threads=1, folder=folder)
+
+
+@pytest.fixture(scope="module")
+def patient():
+    return make_patient(AtlasConfig(seed=3), 0)
+
+
+def test_a_small_run_holds_its_bars_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
+    measured = measure_robustness(small(tmp_path / "run"))
+    figures = {row["figure"]: row for row in measured["figures"]}
+    assert measured["rollouts"] == 20
+    assert set(measured["by_device"]) == set(list_devices()) and set(measured["by_manoeuvre"]) == set(MANOEUVRES)
+    for name in ("invalid worlds, share", "non-finite numbers in valid worlds", "crashes"):
+        assert figures[name]["value"] == 0 and figures[name]["passed"], measured
+    depth = figures["penetration, 99.9th percentile, mm"]
+    assert depth["value"] == measured["penetration_p999_mm"] > 0
+    assert depth["passed"] == (depth["value"] <= 0.05)
+
+    folder = tmp_path / "run"
+    lost = folder / "0000-j-035"
+    before = {path: path.stat().st_mtime_ns for path in folder.iterdir() if path.stem != lost.name}
+    lost.with_suffix(".json").unlink()
+    again = measure_robustness(small(folder))
+    assert {path: path.stat().st_mtime_ns for path in before} == before  # whole chunks are kept
+    assert {k: v for k, v in again.items() if k != "realtime_factor"} == {
+        k: v for k, v in measured.items() if k != "realtime_factor"
+    }
+    with pytest.raises(InputError, match="was begun with seed = 3, now it is 4"):
+        measure_robustness(replace(small(folder), seed=4))
+
+
+def test_the_manoeuvres_push_beyond_the_end_and_pull_fully_out(patient) -> None:
+    initial, control = robust_controls(patient, DEVICE, rollouts=8, samples=120, seed=0)
+    inserted = initial[:, :1] + 0.5 * np.cumsum(control[..., 0], axis=1)
+    longest = patient.tree.longest_path().abscissa[-1]
+    assert inserted.min() > -1e-9
+    assert inserted[::4].max() <= longest + 1e-9  # within
+    assert (inserted[2::4].max(axis=1) > 1.2 * longest).all()  # against the end
+    for kind in (2, 3):
+        np.testing.assert_allclose(inserted[kind::4, -1], 0, atol=1e-9)  # pulled fully out
+    assert np.ptp(control[..., 1], axis=1).min() > 1  # all turn too
+
+
+def test_non_finite_numbers_in_valid_worlds_are_counted(patient) -> None:
+    initial, control = robust_controls(patient, DEVICE, rollouts=2, samples=2, seed=0)
+    rollout = simulate(patient, DEVICE, control, initial=initial, config=SimulatorConfig(threads=1))
+    torque = rollout.base_torque.copy()
+    torque[:, 1] = np.nan
+    valid = rollout.valid.copy()
+    valid[0, 1] = False
+    chunk = robustness._describe(patient, replace(rollout, base_torque=torque, valid=valid), 5.0, 0.0)
+    assert chunk.non_finite.tolist() == [0, 1]
+    np.testing.assert_allclose(chunk.penetration_mm, rollout.contact_force_max / 5.0, rtol=1e-6)
+
+
+class Fatal(Device):
+    """Ends the process that unpickles it."""
+
+    def __reduce__(self):
+        return os._exit, (3,)
+
+
+def test_a_crash_is_counted_and_survived(tmp_path: Path) -> None:
+    config = small(tmp_path)
+    with robustness._Worker() as worker:
+        worker.run(tmp_path / "0.npz", config, 0, Fatal(**vars(DEVICE)), 1)
+        worker.run(tmp_path / "1.npz", config, 0, DEVICE, 10**12)  # more than any memory holds
+        worker.run(tmp_path / "2.npz", replace(config, seconds=5.0), 0, DEVICE, 1)
+    assert "the process died" in read_json(tmp_path / "0.json")["crash"]
+    assert "MemoryError" in read_json(tmp_path / "1.json")["crash"]
+    assert read_json(tmp_path / "2.json") == {"invalid": []}
+
+
+def test_a_crash_and_an_invalid_world_miss_their_bars(tmp_path: Path) -> None:
+    config = replace(small(tmp_path), rollouts=1)
+    chunk = robustness.Chunk(
+        penetration_mm=np.full((1, 4), 0.2, dtype=np.float32),
+        base_force_n=np.zeros((1, 4), dtype=np.float32),
+        to_end_mm=np.zeros((1, 4), dtype=np.float32),
+        slipped=np.zeros((1, 4), dtype=bool),
+        valid=np.array([[True, True, False, False]]),
+        non_finite=np.array([2]),
+        seconds=1.0,
+    )
+    first, second = (tmp_path / f"0000-{name}.npz" for name in list_devices()[:2])
+    np.savez(first, **vars(chunk))
+    robustness.write_json(first.with_suffix(".json"), {"invalid": ["did not converge"]})
+    robustness.write_json(second.with_suffix(".json"), {"crash": "patient 0: the process died"})
+    measured = robustness._summarise(config, [read_device(name) for name in list_devices()])
+    assert [row["value"] for row in measured["figures"]] == pytest.approx([1.0, 0.2, 2, 1])
+    assert not any(row["passed"] for row in measured["figures"])
+    assert measured["invalid_worlds"] == ["did not converge"]
+    assert measured["crashed"] == ["patient 0: the process died"]
+
+
+@pytest.mark.parametrize("change", [{"rollouts": 0}, {"anatomies": 0}, {"seed": -1}, {"seconds": 1.0}, {"threads": -1}])
+def test_bad_settings_are_refused(change) -> None:
+    with pytest.raises(InputError, match=next(iter(change))):
+        RobustnessConfig(**change)

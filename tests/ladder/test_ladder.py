@@ -1,0 +1,152 @@
+"""Climbing the ladder: scores, files that an interrupted run goes on from, and the page."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from html import unescape
+
+import numpy as np
+import pytest
+
+from endopilot.control.navigate import ModelMismatch
+from endopilot.env.tasks import find_task, ladder_tasks
+from endopilot.errors import InputError
+from endopilot.ladder import ladder
+from endopilot.ladder.ladder import LadderConfig, climb, drive, score
+from endopilot.report.ladder_page import write_page
+from endopilot.types import TipProjection
+
+
+@pytest.fixture(scope="module")
+def climbed(tmp_path_factory):
+    """Return a folder in which `forward` did the lowest task in one patient, and its scores."""
+    folder = tmp_path_factory.mktemp("ladder") / "forward"
+    return folder, climb(folder, LadderConfig(policy="forward", tasks=("straight",), patients=1))
+
+
+def _result(success: bool, safe: bool, seconds: float = 10.0) -> dict:
+    return {
+        "success": success,
+        "safe": safe,
+        "seconds": seconds,
+        "path_ratio": 1.2,
+        "peak_force_n": 0.1,
+        "exposures": 3,
+    }
+
+
+def test_pushing_solves_the_straight_run(climbed):
+    folder, rows = climbed
+    assert [row["task"] for row in rows] == ["straight"]
+    row = rows[0]
+    assert row["safe_success"] == row["success"] == 1.0
+    target = find_task("straight")
+    assert row["seconds"] == pytest.approx((target.depth_mm - target.start_inserted_mm) / 5.0, abs=1.0)
+    assert 0.9 < row["path_ratio"] < 1.1 and 0 < row["peak_force_n"] < target.force_limit_n
+    assert json.loads((folder / "ladder.json").read_text(encoding="utf-8"))["scores"] == rows
+
+
+def test_an_interrupted_run_goes_on_with_what_is_missing(climbed, monkeypatch):
+    folder, rows = climbed
+    asked = []
+    monkeypatch.setattr(ladder, "each", lambda title, items, work: asked.extend(items) or {})
+    assert climb(folder, LadderConfig(policy="forward", tasks=("straight",), patients=1)) == rows
+    assert asked == []
+
+
+def test_a_folder_of_another_policy_or_of_something_else_is_refused(climbed, tmp_path):
+    folder, _ = climbed
+    with pytest.raises(InputError, match="holds the results of policy 'forward'"):
+        climb(folder, LadderConfig(policy="spin", tasks=("straight",), patients=1))
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match="is not empty and holds no ladder"):
+        climb(tmp_path, LadderConfig(tasks=("straight",), patients=1))
+
+
+def test_a_folder_of_another_task_is_refused(climbed, monkeypatch):
+    folder, _ = climbed
+    changed = tuple(task.model_copy(update={"seconds": 1.0}) for task in ladder_tasks())
+    monkeypatch.setattr(ladder, "ladder_tasks", lambda: changed)
+    with pytest.raises(InputError, match="was begun with another task 'straight'"):
+        climb(folder, LadderConfig(policy="forward", tasks=("straight",), patients=1))
+
+
+def test_the_page_shows_the_scores_and_links_the_replay(climbed):
+    folder, _ = climbed
+    text = write_page(folder).read_text(encoding="utf-8")
+    assert "The ladder: forward" in text and find_task("straight").title in text
+    assert "replay-straight.html" in text and "data:image/png;base64," in text
+    replay = (folder / "replay-straight.html").read_text(encoding="utf-8")
+    assert "Guidewire" in replay and 'src="plotly.min.js"' in replay
+    assert all(word in replay for word in ("Target", "Tip under X-ray", "safe success", "exposures: 1"))
+    assert "1 of the ladder's twelve tasks, in 1 synthetic patient of each" in text
+    assert "the tip's way in 1 patient" in unescape(text) and "1 patients" not in text
+    assert (folder / "plotly.min.js").stat().st_size > 1e6
+
+
+def test_safe_success_needs_both_and_medians_are_of_those_that_arrived():
+    task = find_task("crux")
+    results = [_result(True, True, 10.0), _result(True, False, 30.0), _result(False, True, 90.0), _result(False, False)]
+    (row,) = score([task], {"crux": results})
+    assert row["safe_success"] == 0.25 and row["success"] == 0.5
+    assert row["seconds"] == 20.0 and row["exposures"] == 3.0
+    (none,) = score([task], {"crux": [_result(False, True)]})
+    assert none["safe_success"] == 0.0 and none["seconds"] is None and none["path_ratio"] is None
+
+
+def test_missed_events_are_counted_over_all_navigations_of_the_agent():
+    events = [(3, 1), (0, 0), (5, 1)]
+    results = [_result(True, True) | {"events": pair} for pair in events]
+    (row,) = score([find_task("crux")], {"crux": results})
+    assert row["missed_events"] == 0.25
+    (none,) = score([find_task("crux")], {"crux": [*results, _result(True, True)]})
+    assert "missed_events" not in none  # one navigation was not watched
+
+
+def test_the_events_of_a_navigation_are_at_the_wall_and_where_the_agent_is_off():
+    tip = TipProjection(
+        offset=np.array([0.1, 0.1, 0.6, 0.6, 0.1, 0.1, 0.1, 0.6, 0.1]),  # of 0.82: at the wall from sample 2, and at 7
+        radius=np.full(9, 1.0),
+        abscissa=np.arange(9.0),
+        branch=np.zeros(9, dtype=int),
+    )
+    exposed = np.array([1, 0, 0, 0, 0, 0, 1, 0, 0], dtype=bool)
+    foretold = np.arange(8.0)
+    foretold[5] += 2.0
+    assert ladder._events(tip, exposed, foretold, 0.18) == (2, 1)
+    foretold[4] += 2.0  # it begins sooner: nobody looked
+    assert ladder._events(tip, exposed, foretold, 0.18) == (2, 2)
+
+
+def test_the_agent_is_watched_as_it_climbs(tmp_path):
+    task = find_task("straight")
+    navigation = replace(task.ladder_navigation(0), seconds=2.0)
+    for policy in ("agent", "forward"):
+        drive(tmp_path / f"{policy}.json", task, 0, navigation, policy, ModelMismatch())
+    count, missed = json.loads((tmp_path / "agent.json").read_text(encoding="utf-8"))["events"]
+    assert 0 <= missed <= count <= 8
+    assert "events" not in json.loads((tmp_path / "forward.json").read_text(encoding="utf-8"))
+
+
+def test_the_upper_eight_are_summed_only_where_all_were_done():
+    every = {task.name: [_result(task.level <= 6, True)] for task in ladder_tasks()}
+    rows = {row["task"]: row for row in score(ladder_tasks(), every)}
+    assert rows["lower four"]["safe_success"] == 1.0
+    assert rows["upper eight"]["safe_success"] == 0.25
+    assert rows["all twelve"]["safe_success"] == 0.5
+    fewer = [task for task in ladder_tasks() if task.level != 9]
+    assert "upper eight" not in {row["task"] for row in score(fewer, every)}
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"policy": "pray"}, "policy: 'pray'"),
+        ({"tasks": ("moon",)}, "task: 'moon'"),
+        ({"patients": 21}, "patients: 21"),
+    ],
+)
+def test_bad_settings_are_refused(given, told):
+    with pytest.raises(InputError, match=told):
+        LadderConfig(**given)

@@ -1,0 +1,236 @@
+"""Synthetic CT angiograms: what a voxel holds, where the coronary runs, noise, determinism."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.ndimage import map_coordinates, maximum_filter
+
+from endopilot.atlas.atlas import AtlasConfig, make_patient
+from endopilot.atlas.curves import abscissa, curve_through
+from endopilot.atlas.heart_reference import TO_CRUX, aorta, fit_heart
+from endopilot.errors import InputError
+from endopilot.phantom import phantom
+from endopilot.phantom.painter import Grid, Painter
+from endopilot.phantom.phantom import PhantomConfig, make_phantom
+from endopilot.types import Branch, VesselTree
+
+CLEAN = PhantomConfig(
+    in_plane_mm=0.5,
+    slice_mm=0.6,
+    lumen_hu=(400.0, 400.0),
+    noise_hu=(0.0, 0.0),
+    psf_mm=(0.5, 0.5),
+    calcium=0.0,
+    margin_mm=12.0,
+)
+COARSE = PhantomConfig(in_plane_mm=1.0, slice_mm=1.2, margin_mm=10.0, calcium=5.0)
+
+
+@pytest.fixture(scope="module")
+def anatomy():
+    return make_patient(AtlasConfig(seed=3, stenosis_share=0.0), 0)
+
+
+@pytest.fixture(scope="module")
+def clean(anatomy):
+    return make_phantom(anatomy, CLEAN, 0)
+
+
+def at(volume, points):
+    """CT numbers at LPS positions, by trilinear interpolation."""
+    index = volume.world_to_index(points).T[::-1]
+    return map_coordinates(volume.voxels.astype(float), index, order=1, cval=np.nan)
+
+
+def test_volume_is_int16_hu_around_the_tree(anatomy, clean):
+    assert clean.voxels.dtype == np.int16
+    np.testing.assert_array_equal(clean.direction, np.eye(3))
+    points = np.concatenate([branch.centerline.points for branch in anatomy.tree.branches])
+    index = clean.world_to_index(points)
+    room = np.array(clean.voxels.shape[::-1]) - 1 - index
+    margin = 0.98 * CLEAN.margin_mm / clean.spacing_mm
+    assert np.all(index.min(axis=0) > margin) and np.all(room.min(axis=0) > margin - 1)
+
+
+def test_lumen_has_its_ct_number_on_the_axis(anatomy, clean):
+    path = anatomy.tree.longest_path()
+    wide = path.radius > 1.2
+    found = at(clean, path.points[wide])
+    assert np.quantile(found, 0.05) > 370 and found.max() < 402
+
+
+def test_ostium_opens_into_the_aorta(anatomy, clean):
+    steps = np.linspace(-12.0, 4.0, 40)
+    found = at(clean, anatomy.insertion.position + steps[:, None] * anatomy.insertion.direction)
+    assert found.min() > 370
+
+
+def test_artery_runs_in_fat(anatomy, clean):
+    path = anatomy.tree.longest_path()
+    away = (path.abscissa > 8) & (path.radius > 0.8)
+    origins = np.array([branch.centerline.points[-1] for branch in anatomy.tree.branches])
+    near = np.linalg.norm(path.points[:, None] - origins, axis=2).min(axis=1) < 9
+    chosen = np.flatnonzero(away & ~near)[::4]
+    tangent = np.gradient(path.points, axis=0)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    shell = []
+    for angle in np.linspace(0, 2 * np.pi, 12, endpoint=False):
+        out = np.cos(angle) * path.normals + np.sin(angle) * np.cross(tangent, path.normals)
+        shell.append(at(clean, (path.points + (path.radius + 1.6)[:, None] * out)[chosen]))
+    shell = np.array(shell)
+    assert np.median(shell) < -40
+    # No blood pool or vein touches the lumen: the contrasted ones have 120 HU or more.
+    assert np.mean(shell > 120) < 0.02
+
+
+def test_every_tissue_is_there(clean):
+    voxels = clean.voxels
+    assert np.mean(voxels < -700) > 0.05
+    assert np.mean((voxels > -100) & (voxels < -75)) > 0.05
+    assert np.mean((voxels > 85) & (voxels < 115)) > 0.03
+    assert np.mean(voxels > 380) > 0.03
+
+
+def test_partial_volume_of_a_sphere():
+    axis = np.arange(-5.0, 5.0, 0.4)
+    grid = Grid(axis + 0.13, axis - 0.07, axis + 0.02)
+    painter = Painter(grid, grid, in_plane_mm=0.4, slice_mm=0.4)
+    distance = np.sqrt(grid.z[:, None, None] ** 2 + grid.y[:, None] ** 2 + grid.x**2)
+    image = np.zeros(grid.shape, dtype=np.float32)
+    painter.paint(image, (1.5 - distance).astype(np.float32), 1.0)
+    assert image.sum() * 0.4**3 == pytest.approx(4 / 3 * np.pi * 1.5**3, rel=0.02)
+    assert np.mean((image > 0.05) & (image < 0.95)) * grid.x.size**3 / np.sum(image) > 0.1
+
+
+def test_noise_has_its_standard_deviation(anatomy):
+    # The voxels are fine enough for the point-spread function to spread the noise.
+    fine = replace(CLEAN, in_plane_mm=0.4, slice_mm=1.2)
+    quiet = make_phantom(anatomy, fine, 5)
+    noisy = make_phantom(anatomy, replace(fine, noise_hu=(30.0, 30.0)), 5)
+    inside = quiet.voxels > -1000
+    noise = (noisy.voxels.astype(float) - quiet.voxels)[inside]
+    assert noise.std() == pytest.approx(30, rel=0.03)
+    assert abs(noise.mean()) < 0.3
+
+
+def test_same_seed_same_bits_and_contrast_varies(anatomy):
+    first, second, other = (make_phantom(anatomy, COARSE, seed) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first.voxels, second.voxels)
+    assert np.quantile(first.voxels, 0.99) != np.quantile(other.voxels, 0.99)
+
+
+def test_calcium_is_bright_and_leaves_the_lumen_free(anatomy):
+    without = make_phantom(anatomy, replace(CLEAN, in_plane_mm=0.6, slice_mm=1.0), 7)
+    with_it = make_phantom(anatomy, replace(CLEAN, in_plane_mm=0.6, slice_mm=1.0, calcium=6.0), 7)
+    change = with_it.voxels.astype(int) - without.voxels
+    assert change.max() > 250
+    path = anatomy.tree.longest_path()
+    assert np.median(np.abs(at(with_it, path.points) - at(without, path.points))) < 2
+
+
+def test_soft_plaque_lies_around_a_stenosis():
+    ill = make_patient(AtlasConfig(seed=3, stenosis_share=1.0), 1)
+    (stenosis,) = ill.provenance["stenoses"]
+    path = ill.tree.longest_path()
+    here = int(np.searchsorted(path.abscissa, stenosis["abscissa_mm"]))
+    thick = replace(CLEAN, in_plane_mm=0.6, slice_mm=1.0)
+    volume = make_phantom(ill, thick, 0)
+    bare = make_phantom(replace(ill, provenance={}), thick, 0)
+    tangent = path.points[here + 1] - path.points[here - 1]
+    side = np.cross(tangent / np.linalg.norm(tangent), path.normals[here])
+    ring = path.points[here] + (path.radius[here] + 0.8) * np.array(
+        [path.normals[here], -path.normals[here], side, -side]
+    )
+    assert np.mean(at(volume, ring)) > np.mean(at(bare, ring)) + 30
+
+
+def test_a_tree_without_section_labels_will_do(anatomy):
+    branches = tuple(Branch(b.centerline, b.parent, np.zeros_like(b.section)) for b in anatomy.tree.branches)
+    bare = replace(anatomy, tree=VesselTree(branches, ("vessel",)), provenance={})
+    volume = make_phantom(bare, COARSE, 0)
+    assert np.mean(at(volume, anatomy.tree.branches[0].centerline.points)) > 200
+
+
+def test_a_moving_heart_is_smeared_and_the_chest_is_not(anatomy):
+    quiet = replace(CLEAN, in_plane_mm=1.0, slice_mm=1.0)
+    still, moved = (make_phantom(anatomy, replace(quiet, motion_mm=way), 4) for way in (0.0, 4.0))
+    change = np.abs(moved.voxels.astype(int) - still.voxels)
+    lung = maximum_filter(still.voxels, 9) < -700  # farther from the heart than the point-spread function reaches
+    assert lung.sum() > 1000 and change[lung].max() == 0
+    path = anatomy.tree.longest_path()
+    before, after = at(still, path.points), at(moved, path.points)
+    assert np.nanmedian(after) < np.nanmedian(before) - 15
+    # The truth is the mean place: the artery is still the brightest near its axis.
+    beside = at(moved, path.points + (path.radius + 3.0)[:, None] * path.normals)
+    assert np.mean(after > beside + 50) > 0.9
+
+
+def test_the_volume_has_the_voxels_asked_for(anatomy):
+    usual, asked = make_phantom(anatomy, COARSE, 0), make_phantom(anatomy, replace(COARSE, voxels=(90, 80, 70)), 0)
+    assert asked.voxels.shape == (70, 80, 90)
+    middles = [v.index_to_world((np.array(v.voxels.shape[::-1]) - 1) / 2) for v in (usual, asked)]
+    np.testing.assert_allclose(*middles, atol=1.2)
+
+
+def test_the_right_heart_is_as_bright_as_asked(anatomy):
+    washed, full = (make_phantom(anatomy, replace(COARSE, right_heart=(s, s)), 1).voxels for s in (0.2, 0.9))
+    assert np.mean(full > 250) > 1.3 * np.mean(washed > 250)
+
+
+@pytest.fixture(scope="module")
+def left():
+    return make_patient(AtlasConfig(anatomy="lca", seed=1000), 1)
+
+
+def test_a_left_tree_leaves_the_aorta_and_runs_on_its_own_heart(left):
+    volume = make_phantom(left, replace(CLEAN, in_plane_mm=0.7, slice_mm=1.0), 0)
+    steps = np.linspace(-10.0, 2.0, 40)
+    assert at(volume, left.insertion.position + steps[:, None] * left.insertion.direction).min() > 350
+    for path in phantom.chest.main_paths(left.tree):
+        wide = path.radius > 1.2
+        assert np.quantile(at(volume, path.points[wide]), 0.1) > 320
+    heart = phantom.chest.place(left.tree)
+    assert abs(aorta(heart.to_reference(left.insertion.position[None]))[0]) < 0.3
+    (right,) = phantom.chest.other_coronary(heart, left.tree)
+    inside = np.all((volume.world_to_index(right.points) > 0), axis=1)
+    assert np.median(at(volume, right.points[inside][:40])) > 300
+
+
+def test_plaques_of_the_circumflex_lie_on_it(left):
+    lad, lcx = phantom.chest.main_paths(left.tree)
+    spot = {"abscissa_mm": 40.0, "length_mm": 8.0, "diameter_reduction": 0.4, "vessel": "LCx"}
+    grid = phantom._field_of_view(left, COARSE)
+    (plaque,) = phantom._plaques(grid, replace(left, provenance={"stenoses": [spot]}), np.random.default_rng(0), 0.0)
+    k, j, i = np.unravel_index(plaque.depth.argmax(), plaque.depth.shape)
+    centre = [grid.x[plaque.box[2]][i], grid.y[plaque.box[1]][j], grid.z[plaque.box[0]][k]]
+    assert np.linalg.norm(lcx.points - centre, axis=1).min() < 1.5
+    assert np.linalg.norm(lad.points - centre, axis=1).min() > 5.0
+
+
+def test_fit_recovers_a_moved_heart():
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    course = curve_through(TO_CRUX)
+    moved = np.array([10.0, -20, 30]) + 1.2 * course @ turn.T
+    heart = fit_heart(moved, float(abscissa(moved)[-1]), "3")
+    np.testing.assert_allclose(heart.to_reference(moved), course, atol=0.2)
+    np.testing.assert_allclose(heart.from_reference(course), moved, atol=0.3)
+    assert heart.scale == pytest.approx(1.2, rel=1e-2)
+    assert abs(aorta(heart.to_reference(moved[:1]))[0]) < 0.5
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"in_plane_mm": 0.0}, "in_plane_mm: 0.0"),
+        ({"noise_hu": (50.0, 20.0)}, "noise_hu"),
+        ({"calcium": -1.0}, "calcium: -1.0"),
+        ({"motion_mm": -1.0}, "motion_mm: -1.0"),
+        ({"voxels": (512, 512, 3)}, "voxels"),
+    ],
+)
+def test_bad_configuration_is_told(options, told):
+    with pytest.raises(InputError, match=told):
+        PhantomConfig(**options)

@@ -1,0 +1,132 @@
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.figure import Figure
+
+from endopilot.evaluation.results import TIP_BASELINES
+from endopilot.plotting import png
+from endopilot.report import figures, tables
+from endopilot.types import Insertion, LumenMask, Volume
+
+TITLES = {"seen_test": "New navigations, known patients", "test": "New patients"}
+
+
+def make_volume(direction: np.ndarray) -> tuple[Volume, LumenMask]:
+    """A bright rod along z at x = 10, y = 4 mm, from z = 0 to 8 mm, stored along the axes that `direction` gives."""
+    shape = (24, 24, 24)
+    low = np.array([0.0, 0.0, 0.0])
+    corners = np.where(direction.sum(axis=1) < 0, 23.0, 0.0)
+    probe = Volume(np.zeros(shape, dtype=np.int16), np.ones(3), low + corners, direction)
+    k, j, i = np.indices(shape)
+    world = probe.index_to_world(np.stack([i, j, k], axis=-1).astype(float))
+    inside = (np.hypot(world[..., 0] - 10, world[..., 1] - 4) < 2.5) & (world[..., 2] < 8.5)
+    voxels = np.where(inside, 400, 0).astype(np.int16)
+    ostium = Insertion(np.array([10.0, 4.0, 6.0]), np.array([0.0, 0.0, -1.0]))
+    return Volume(voxels, probe.spacing_mm, probe.origin_mm, direction), LumenMask(
+        Volume(inside, probe.spacing_mm, probe.origin_mm, direction), ostium
+    )
+
+
+@pytest.mark.parametrize(
+    "direction",
+    [np.eye(3), np.diag([-1.0, -1.0, 1.0]), np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])],
+    ids=["LPS", "RAS", "sagittal"],
+)
+def test_the_ct_is_shown_as_radiologists_read_it_however_it_is_stored(direction):
+    volume, mask = make_volume(direction)
+    axial, coronal = figures.volume_figure(volume, mask).axes
+    picture = np.asarray(axial.images[0].get_array())
+    rows, columns = np.nonzero(picture > 200)
+    # Nothing is cropped off at low x and y, so pixels are mm: +x to the right, +y downwards.
+    assert columns.mean() == pytest.approx(10.0)
+    assert rows.mean() == pytest.approx(4.0)
+    assert axial.images[0].origin == "upper"
+    rows, columns = np.nonzero(np.asarray(coronal.images[0].get_array()) > 200)
+    assert (rows.min(), rows.max()) == (0, 8)  # +z upwards from the lowest row
+    assert columns.mean() == pytest.approx(10.0)
+    assert coronal.images[0].origin == "lower"
+
+
+def test_the_axial_slice_goes_through_the_ostium():
+    volume, mask = make_volume(np.eye(3))
+    marked = volume.voxels.copy()
+    marked[6, 12, 14] = 999
+    axial = figures.volume_figure(Volume(marked, volume.spacing_mm, volume.origin_mm, volume.direction), mask).axes[0]
+    assert np.asarray(axial.images[0].get_array())[12, 14] == 999
+
+
+def test_the_tree_shows_every_section_in_its_colour(anatomy):
+    ax = figures.tree_figure(anatomy).axes[0]
+    labels = [text.get_text() for text in ax.get_legend().get_texts()]
+    assert labels == ["1", "2", "ostium"]
+
+
+def test_series_are_drawn_with_their_values(results):
+    table = tables.tip_error_table(results)
+    ax = figures.tip_error_figure(table, TITLES).axes[0]
+    line = next(line for line in ax.get_lines() if "P1" in str(line.get_label()))
+    expected = tables.values(tables.rows(table, split="seen_test", series="P1"), "abscissa_mae_mm")
+    np.testing.assert_allclose(np.asarray(line.get_ydata(), dtype=float), expected)
+    assert ax.get_xlabel().endswith(", s")
+    assert ax.get_ylabel().endswith(", mm")
+
+
+def test_a_series_that_runs_away_does_not_hide_the_others():
+    table = pd.DataFrame({"series": ["a", "b", "c"], "v": [1.0, 2.0, 100.0]})
+    assert 2.0 < figures._upper(table, "v") < 5.0
+
+
+def test_the_wall_is_marked_at_one(results):
+    ax = figures.safety_figure(tables.safety_table(results), TITLES).axes[0]
+    assert any(np.allclose(np.asarray(line.get_ydata(), dtype=float), 1.0) for line in ax.get_lines())
+
+
+def test_both_safety_ratios_are_drawn_with_their_95_percent_quantile(results):
+    table = tables.safety_table(results)
+    axes = figures.safety_figure(table, TITLES).axes
+    for ax, ratio in ((axes[1], "clearance"), (axes[3], "radius")):
+        lines = [np.asarray(line.get_ydata(), dtype=float) for line in ax.get_lines()]
+        for series in ("true", "P3", "P4"):
+            part = tables.rows(table, split="test", series=series, ratio=ratio)
+            for column in ("median", "p95"):
+                expected = tables.values(part, column)
+                assert any(len(line) == len(expected) and np.allclose(line, expected) for line in lines)
+    assert axes[3].get_ylabel().endswith("γ / r")
+
+
+@pytest.mark.parametrize("name", ["control_error", "drive_difference"])
+def test_the_histograms_of_few_sequences_do_not_cover_one_another(results, name):
+    table = getattr(tables, f"{name}_table")(results)
+    figure = getattr(figures, f"{name}_figure")(table, TITLES)
+    series = tables.distinct(table, "series")
+    assert len(series) >= 4
+    for ax in figure.axes:
+        spans = sorted((stairs.get_data().baseline, stairs.get_data().values.max()) for stairs in ax.patches)
+        assert len(spans) == len(series)
+        assert all(top < bottom for (_, top), (bottom, _) in pairwise(spans))
+
+
+def test_a_histogram_counts_every_sequence():
+    ax = Figure().subplots()
+    figures._histogram(ax, np.array([0.1, 0.2, 0.3, 1.2, 99.0]), np.array([0.0, 0.5, 1.0, 1.5]), -2.0, "#000000")
+    heights = (ax.patches[0].get_data().values + 2.0) / 0.75
+    np.testing.assert_allclose(heights, [1.0, 0.0, 2 / 3])
+    assert ax.texts[0].get_text().strip() == "3 of 5"
+
+
+def test_no_protocol_looks_like_a_baseline():
+    baselines = {name for names in TIP_BASELINES.values() for name in names}
+    grey = {figures._style(name)["color"] for name in baselines}
+    colors = [figures._style(name)["color"] for name in TIP_BASELINES]
+    assert not grey & set(colors)
+    assert len(set(colors)) == len(colors)
+
+
+def test_stages_are_drawn_in_their_order():
+    ax = figures.stage_figure(tables.stage_table({"first": 2.0, "second": 5.0})).axes[0]
+    assert [bar.get_width() for bar in ax.patches] == [2.0, 5.0]
+    assert png(ax.figure).startswith(b"\x89PNG")

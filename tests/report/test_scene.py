@@ -1,0 +1,104 @@
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from endopilot.report import still
+from endopilot.report.scene import SHOWN_BEHIND_MM, navigation_scene, visible_wire
+from endopilot.report.still import LIBRARIES_MISSING, render_still
+from endopilot.report.wall_mesh import wall_mesh
+from endopilot.types import DistanceMap
+
+CENTRE, SQUEEZE = np.array([1.0, 2.0, 3.0]), np.array([1.0, 2.0, 1.5])
+
+
+def egg(radius_mm: float, spacing_mm: float, origin_mm: np.ndarray) -> DistanceMap:
+    """Return an ellipsoid with three different axes as (about) a distance map."""
+    axes = [np.arange(low, low + 24.0, spacing_mm) for low in origin_mm]
+    z, y, x = np.meshgrid(*axes[::-1], indexing="ij")
+    squeezed = (np.stack([x, y, z], axis=-1) - CENTRE) * SQUEEZE
+    return DistanceMap(radius_mm - np.linalg.norm(squeezed, axis=-1), spacing_mm, origin_mm)
+
+
+@pytest.mark.parametrize("max_triangles", [100_000, 2_000])
+def test_the_wall_lies_where_the_distance_is_zero(max_triangles):
+    surface = wall_mesh(egg(8.0, 0.5, np.array([-11.0, -10.0, -9.0])), max_triangles=max_triangles)
+    assert len(surface.triangles) <= max_triangles
+    distance = np.linalg.norm((surface.vertices - CENTRE) * SQUEEZE, axis=1)
+    np.testing.assert_allclose(distance, 8.0, atol=0.1)
+
+
+def test_a_lumen_that_reaches_the_edge_of_its_map_is_closed_there():
+    surface = wall_mesh(egg(8.0, 0.5, np.array([1.0, -10.0, -9.0])))
+    edges = np.sort(surface.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    _, count = np.unique(edges, axis=0, return_counts=True)
+    assert (count == 2).all()
+
+
+def test_the_wire_is_shown_from_its_tip_to_just_behind_the_ostium(rollout):
+    wire = visible_wire(rollout, 0, 3)
+    np.testing.assert_array_equal(wire[0], rollout.tip_position[0, 3])
+    length = np.linalg.norm(np.diff(wire, axis=0), axis=1).sum()
+    assert (
+        rollout.inserted_length[0, 3] + SHOWN_BEHIND_MM - 2.0
+        < length
+        <= rollout.inserted_length[0, 3] + SHOWN_BEHIND_MM
+    )
+
+
+def test_a_rollout_without_shapes_is_refused(rollout):
+    with pytest.raises(ValueError, match="record_shape"):
+        visible_wire(dataclasses.replace(rollout, shape=None), 0, 0)
+
+
+def test_every_sample_is_a_frame_and_a_step_of_the_slider(anatomy, rollout):
+    figure = navigation_scene(anatomy, rollout)
+    frames = list(figure.frames)
+    assert [frame.name for frame in frames] == [str(sample) for sample in range(6)]
+    steps = figure.layout.sliders[0].steps
+    assert [step.label for step in steps] == ["0.5", "1", "1.5", "2", "2.5", "3"]
+    np.testing.assert_allclose(np.array(frames[4].data[0].z)[0], rollout.tip_position[0, 4, 2])
+    assert "Δtip = 24.0 mm" in frames[4].data[0].hovertemplate
+    # The frames replace the wire, its trail and its tip, not the vessel.
+    assert [figure.data[index].name for index in frames[4].traces] == ["Guidewire", "Tip, last 20 s", "Tip"]
+
+
+def test_samples_after_a_failure_are_not_shown(anatomy, rollout):
+    valid = rollout.valid.copy()
+    valid[0, 4:] = False
+    figure = navigation_scene(anatomy, dataclasses.replace(rollout, valid=valid))
+    assert [frame.name for frame in figure.frames] == ["0", "1", "2", "3"]
+
+
+def test_axes_are_equal_and_in_mm(anatomy):
+    scene = navigation_scene(anatomy).layout.scene
+    assert scene.aspectmode == "data"
+    assert all(axis.title.text.endswith("mm") for axis in (scene.xaxis, scene.yaxis, scene.zaxis))
+
+
+def test_sections_are_lines_of_their_own_and_joined(anatomy):
+    lines = {trace.name: trace for trace in navigation_scene(anatomy).data}
+    first, second = lines["Section 1"], lines["Section 2"]
+    assert first.line.color != second.line.color
+    assert np.nanmin(np.array(first.z)) == pytest.approx(np.nanmax(np.array(second.z)))
+
+
+def test_a_renderer_that_dies_is_one_line_and_no_picture(anatomy, tmp_path, monkeypatch):
+    monkeypatch.setattr(still.sys, "executable", "/bin/false")
+    assert render_still(anatomy, None, tmp_path / "scene.png") == LIBRARIES_MISSING
+    assert "apt-get install" in LIBRARIES_MISSING
+    assert "\n" not in LIBRARIES_MISSING
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_still_picture_shows_the_vessel(anatomy, rollout, tmp_path):
+    from matplotlib.image import imread
+
+    if render_still(anatomy, visible_wire(rollout, 0, 5), tmp_path / "scene.png") is not None:
+        pytest.skip("VTK finds no graphics library here")
+    picture = imread(tmp_path / "scene.png")[..., :3]
+    reddish = (picture[..., 0] > picture[..., 2] + 0.1).mean()
+    assert 0.01 < reddish < 0.6
+    assert (picture.min(axis=-1) > 0.6).mean() > 1e-4  # the wire

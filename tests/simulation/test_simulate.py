@@ -1,0 +1,187 @@
+"""The simulator in analytic vessels: kinematics, determinism, forces, refusal of bad input."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bend import vessel
+from jaxtyping import Float
+
+from endopilot.errors import InputError
+from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.device import read_device
+from endopilot.simulation.simulate import simulate
+from endopilot.types import Anatomy, Insertion
+
+WORLDS, SAMPLES = 6, 16
+DEVICE = read_device("workhorse-014")
+
+
+@pytest.fixture(scope="module")
+def anatomy() -> Anatomy:
+    return vessel()
+
+
+def drive(worlds: int = WORLDS) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n samples 2"]]:
+    random = np.random.default_rng(5)
+    initial = np.column_stack([random.uniform(5, 30, worlds), random.uniform(-3, 3, worlds)])
+    return initial, np.stack(
+        [random.uniform(1, 8, (worlds, SAMPLES)), random.uniform(-3, 3, (worlds, SAMPLES))], axis=-1
+    )
+
+
+def same(a, b, rows) -> None:
+    for name in ("tip_position", "tip_direction", "contact_force_sum", "base_force", "base_torque", "iterations"):
+        assert np.array_equal(getattr(a, name), getattr(b, name)[rows]), name
+
+
+def test_bitwise_equal_whatever_the_company(anatomy: Anatomy) -> None:
+    initial, control = drive()
+    one = simulate(anatomy, DEVICE, control, initial=initial, config=SimulatorConfig(threads=1))
+    two = simulate(anatomy, DEVICE, control, initial=initial, config=SimulatorConfig(threads=2))
+    order = np.array([3, 0, 5, 1, 4, 2])
+    shuffled = simulate(anatomy, DEVICE, control[order], initial=initial[order])
+    alone = simulate(anatomy, DEVICE, control[[4]], initial=initial[[4]])
+    assert one.valid.all()
+    same(two, one, slice(None))
+    same(shuffled, one, order)
+    same(alone, one, [4])
+
+
+def test_kinematics_and_forces(anatomy: Anatomy) -> None:
+    initial, control = drive()
+    rollout = simulate(anatomy, DEVICE, control, initial=initial, record_shape=True)
+    expected = initial[:, None] + 0.5 * np.cumsum(control, axis=1)
+    np.testing.assert_allclose(rollout.inserted_length, expected[..., 0])
+    np.testing.assert_allclose(rollout.rotation, expected[..., 1])
+    assert rollout.shape is not None
+    along = np.linalg.norm(np.diff(rollout.shape, axis=2), axis=-1).sum(axis=-1)
+    np.testing.assert_allclose(along, along[0, 0], rtol=2e-3)  # the wire does not stretch
+    behind = rollout.shape[..., -1, :] - anatomy.insertion.position
+    np.testing.assert_allclose(behind[..., 0], rollout.inserted_length - along[0, 0], atol=0.2)
+    assert (rollout.contact_force_max <= rollout.contact_force_sum + 1e-12).all()
+    assert (rollout.tip.abscissa < rollout.inserted_length + 3).all()
+    assert rollout.contact_force_max.max() / 5.0 < 0.05  # penetration, mm
+
+
+def test_the_wire_moves_on_evenly_while_nodes_are_set_free(anatomy: Anatomy) -> None:
+    """A node passes the place where the wire is held every 1.2 mm; nothing of that may be seen at the tip."""
+    slippery = replace(DEVICE, friction=0.0)
+    control = np.tile([0.25, 0.0], (1, 40, 1))
+    rollout = simulate(anatomy, slippery, control, initial=np.array([[20.0, 0.0]]))
+    steps = np.diff(rollout.tip_position[0, 2:], axis=0)  # mm, for 0.125 mm of wire each
+    turns = np.linalg.norm(np.diff(steps, axis=0), axis=1)
+    np.testing.assert_allclose(turns, turns.mean(), rtol=0.1)  # as an even bend asks
+
+
+def test_pushes_and_pulls_with_friction(anatomy: Anatomy) -> None:
+    control = np.zeros((1, 24, 2))
+    control[0, :16, 0], control[0, 16:, 0] = 4.0, -1.0
+    rough = simulate(anatomy, DEVICE, control, initial=np.array([[5.0, 0.0]]), friction=np.array([0.3]))
+    smooth = simulate(anatomy, DEVICE, control, initial=np.array([[5.0, 0.0]]), friction=np.array([0.0]))
+    assert rough.base_force[0, 15] > smooth.base_force[0, 15]
+    assert rough.base_force[0, -1] < smooth.base_force[0, -1]
+
+
+def test_survives_the_blind_end_and_full_retraction(anatomy: Anatomy) -> None:
+    control = np.zeros((2, 40, 2))
+    control[0, :10, 0], control[0, 30:, 0] = 2.0, -8.5
+    control[1, :, 0] = -1.0
+    rollout = simulate(anatomy, DEVICE, control, initial=np.array([[66.0, 0.0], [20.0, 1.0]]))
+    assert rollout.valid.all()
+    assert np.isfinite(rollout.tip_position).all()
+    assert rollout.base_force[0, 9] > 0.05
+
+
+def test_the_drive_slips_at_its_push_limit_and_cannot_pull_back_what_it_did_not_push(anatomy: Anatomy) -> None:
+    control = np.zeros((2, 50, 2))
+    control[:, :20, 0], control[:, 25:, 0] = 4.0, -8.0  # 20 s of pushing against the blind end, then out again
+    control[1, 30:, 0] = -0.1
+    initial = np.array([[60.0, 0.0], [60.0, 0.0]])
+    limit_n = 0.5
+    rollout = simulate(anatomy, replace(DEVICE, push_limit_n=limit_n), control, initial=initial)
+    assert rollout.valid.all()
+    assert (rollout.slip[:, 12:20] > 0).all()
+    # One step of 0.02 s at 4 mm/s is 0.08 mm, which adds little to the limit; far beyond lies what is not limited.
+    assert limit_n < rollout.base_force.max() < 1.3 * limit_n
+    free = simulate(anatomy, replace(DEVICE, push_limit_n=5.0), control, initial=initial)
+    assert free.base_force.max() > 1.6 * limit_n
+    # Δ is the integral of the control that was made, and what was asked is that and the slip.
+    made = 60.0 + 0.5 * np.cumsum(rollout.control[..., 0], axis=1)
+    np.testing.assert_allclose(rollout.inserted_length, made, atol=1e-9)
+    np.testing.assert_allclose(0.5 * rollout.control[..., 0] + rollout.slip, 0.5 * control[..., 0], atol=1e-12)
+    assert rollout.inserted_length.min() > -1e-9
+    assert rollout.inserted_length[0, -1] == pytest.approx(0.0, abs=1e-9) and (rollout.slip[0, -3:] < 0).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda c, i: (np.full_like(c, np.nan), i), "finite"),
+        (lambda c, i: (c * 100, i), "exceeds"),
+        (lambda c, i: (-c, i), "negative"),
+        (lambda c, i: (c[:0], i[:0]), "at least one"),
+        (lambda c, i: (c, i * np.inf), "finite"),
+    ],
+)
+def test_refuses_bad_controls(anatomy: Anatomy, change, message: str) -> None:
+    initial, control = drive()
+    control, initial = change(control, initial)
+    with pytest.raises(InputError, match=message):
+        simulate(anatomy, DEVICE, control, initial=initial)
+
+
+def test_refuses_bad_anatomies(anatomy: Anatomy) -> None:
+    initial, control = drive(1)
+    field = anatomy.distance_map
+    broken = replace(field, values=np.where(field.values > 1, np.nan, field.values))
+    for bad, message in (
+        (replace(anatomy, distance_map=broken), "not finite"),
+        (replace(anatomy, distance_map=replace(field, values=-field.values)), "positive"),
+        (replace(anatomy, insertion=Insertion(np.array([500.0, 0, 0]), np.array([1.0, 0, 0]))), "positive"),
+        (replace(anatomy, insertion=Insertion(np.array([-5.0, 0, 0]), np.array([2.0, 0, 0]))), "unit vector"),
+        (replace(anatomy, insertion=Insertion(np.array([np.nan, 0, 0]), np.array([1.0, 0, 0]))), "not finite"),
+        (replace(anatomy, insertion=Insertion(np.array([-5.0, 0, 0]), np.array([0.0, 0, 1.0]))), "positive"),
+        (replace(anatomy, distance_map=replace(field, spacing_mm=0.0)), "positive spacing"),
+        (replace(anatomy, catheter_radius_mm=0.1), "wider"),
+    ):
+        with pytest.raises(InputError, match=message):
+            simulate(bad, DEVICE, control, initial=initial)
+
+
+def test_refuses_arrays_of_wrong_shape(anatomy: Anatomy) -> None:
+    # in a process of its own: here the shape checks of the tests would speak first
+    script = """
+import numpy as np, sys
+sys.path.insert(0, sys.argv[1])
+from bend import vessel
+from endopilot.errors import InputError
+from endopilot.simulation.device import read_device
+from endopilot.simulation.simulate import simulate
+anatomy, device, good = vessel(), read_device("workhorse-014"), np.zeros((2, 4, 2))
+for control, others in (
+    (np.zeros((2, 4, 3)), {}),
+    (np.zeros((4, 2)), {}),
+    (good, {"initial": np.zeros((2, 3))}),
+    (good, {"friction": np.zeros((2, 1))}),
+    (np.broadcast_to(0.0, (10_000_000, 10_000, 2)), {}),
+):
+    try:
+        simulate(anatomy, device, control, **others)
+    except InputError as error:
+        print(error)
+"""
+    folder = str(Path(__file__).parent)
+    run = subprocess.run([sys.executable, "-c", script, folder], check=True, capture_output=True, text=True)
+    lines = run.stdout.splitlines()
+    assert lines[0].startswith("control: shape (2, 4, 3); give (worlds, samples, 2)")
+    assert lines[1].startswith("control: shape (4, 2); give")
+    assert lines[2].startswith("initial: shape (2, 3); give (2, 2)")
+    assert lines[3].startswith("friction: shape (2, 1); give one number")
+    assert "need" in lines[4] and lines[4].endswith("simulate fewer at once")
+    assert len(lines) == 5

@@ -1,0 +1,61 @@
+"""The C-arm: how far off a measured tip is, with two views and with one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from endopilot.errors import InputError
+from endopilot.xray.fluoroscope import Fluoroscope, FluoroscopeConfig
+
+RADIUS = 0.18
+PIXEL_MM = 0.308 * 765 / 1100  # at the isocenter
+
+
+def located(fork, config: FluoroscopeConfig, count: int = 120) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return true places inside the straight vessel, along the wire there, and where they are found."""
+    arm, random = Fluoroscope(fork, RADIUS, config), np.random.default_rng(0)
+    height, turn = random.uniform(5, 15, count), random.uniform(0, 2 * np.pi, count)
+    true = np.stack([0.7 * np.cos(turn), 0.7 * np.sin(turn), height], axis=1)
+    along = np.array([0.0, 0.0, 1.0])
+    return true, along, np.array([arm.locate(place, along, place[2], random) for place in true])
+
+
+def test_two_views_without_error_find_the_tip(fork) -> None:
+    true, _, found = located(fork, FluoroscopeConfig(pixel_sd=1e-3, along_sd=1e-3), 20)
+    np.testing.assert_allclose(found, true, atol=0.01)
+
+
+def test_two_views_err_as_their_pixels_do(fork) -> None:
+    config = FluoroscopeConfig()
+    true, _, found = located(fork, config)
+    off = found - true
+    # along the wire both views tell the same coordinate; across it each tells one
+    assert off[:, 2].std() == pytest.approx(config.along_sd * PIXEL_MM / np.sqrt(2), rel=0.2)
+    assert off[:, :2].std() == pytest.approx(config.pixel_sd * PIXEL_MM, rel=0.25)
+    assert np.abs(off.mean(axis=0)).max() < 0.1
+
+
+def test_one_view_knows_the_depth_by_the_vessel_alone(fork) -> None:
+    config = FluoroscopeConfig(biplane=False)
+    true, _, found = located(fork, config)
+    beam = np.array([-0.5, -np.sqrt(0.75), 0.0])  # RAO 30°
+    depth = (found - true) @ beam
+    assert 0.3 < depth.std() < 0.7  # as wide as the lumen is: 0.7 mm in a random direction is 0.5 mm
+    across = (found - true) @ np.array([np.sqrt(0.75), -0.5, 0.0])
+    assert across.std() < 0.15
+    assert np.linalg.norm(found[:, :2], axis=1).max() <= 1.0 - RADIUS + 1e-6  # inside the lumen
+
+
+def test_the_branch_is_seen(fork) -> None:
+    arm, random = Fluoroscope(fork, RADIUS), np.random.default_rng(1)
+    line = fork.tree.branches[2].centerline
+    for index in range(10, len(line.points), 5):
+        tip = arm.expose(line.points[index], np.array([np.sqrt(0.75), 0, 0.5]), float(line.abscissa[index]), random)
+        assert tip.branch == 2
+        assert abs(tip.abscissa - line.abscissa[index]) < 2.0
+
+
+def test_refuses_bad_settings() -> None:
+    with pytest.raises(InputError, match="pixel_sd: 0"):
+        FluoroscopeConfig(pixel_sd=0.0)
