@@ -89,6 +89,7 @@ def vessel(fork, tmp_path_factory):
 @pytest.fixture(scope="session")
 def found(vessel):
     """Return a plan along the vessel, made by trial in the rod core."""
-    from endopilot.control.plan import PlanConfig, plan
+    from endopilot.control.plan import plan
+    from endopilot.control.plan_config import PlanConfig
 
     return plan(vessel, "0,0,33", PlanConfig(seconds=30.0, start_rotation=0.1, seed=4))

@@ -12,11 +12,12 @@ from hypothesis import strategies as st
 
 from endopilot.anatomy.io import read_anatomy
 from endopilot.anatomy.projection import safety_ratio
-from endopilot.control import learned
+from endopilot.control import network_plan
 from endopilot.control import plan as plan_module
 from endopilot.control.cost import Cost
 from endopilot.control.desired import read_tips
-from endopilot.control.plan import PlanConfig, plan, within_limits
+from endopilot.control.plan import plan, within_limits
+from endopilot.control.plan_config import PlanConfig
 from endopilot.control.plan_file import read_plan, write_plan
 from endopilot.dataset.loader import Dataset
 from endopilot.errors import InputError
@@ -142,7 +143,7 @@ def run(found, tmp_path, monkeypatch):
 
     record = {"config": {}, "networks": {}, "device": asdict(found.navigation.device)}
     write_json(tmp_path / "run" / "manifest.json", record)
-    monkeypatch.setattr(learned, "load_run", lambda _: Toy())
+    monkeypatch.setattr(network_plan, "load_run", lambda _: Toy())
     return tmp_path / "run"
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from endopilot.control.agent import AgentPolicy
 from endopilot.control.belief import Belief
-from endopilot.control.plan import PlanConfig
+from endopilot.control.plan_config import PlanConfig
 from endopilot.control.plan_file import read_plan, write_plan
 from endopilot.control.plan_xray import PlannedXray, plan_xray, read_calibration
 from endopilot.dataset.loader import Dataset

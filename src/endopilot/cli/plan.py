@@ -7,7 +7,8 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from endopilot.cli.arguments import OutputFolder, existing, show
-from endopilot.control.plan import PlanConfig, plan
+from endopilot.control.plan import plan
+from endopilot.control.plan_config import PlanConfig
 from endopilot.control.plan_file import write_plan
 from endopilot.control.plan_xray import plan_xray, read_calibration
 

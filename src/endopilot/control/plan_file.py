@@ -33,7 +33,7 @@ import numpy as np
 import pandas as pd
 
 from endopilot.control.cost import Cost
-from endopilot.control.plan import Plan, PlanConfig, SampleConfig
+from endopilot.control.plan_config import Plan, PlanConfig, SampleConfig
 from endopilot.control.plan_xray import PlannedXray
 from endopilot.env.task import DECISION_PERIOD_S, Navigation, Target
 from endopilot.errors import InputError

@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 
-from endopilot.control.plan import Plan
+from endopilot.control.plan_config import Plan
 from endopilot.control.plan_xray import PlannedXray
 from endopilot.control.route import Route
 from endopilot.env.task import DECISION_PERIOD_S

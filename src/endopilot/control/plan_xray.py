@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from endopilot.control.agent import CALIBRATED, AdviserInput, AgentPolicy
-from endopilot.control.plan import NETWORK_METHODS, Plan, PlanConfig
+from endopilot.control.plan_config import NETWORK_METHODS, Plan, PlanConfig
 from endopilot.control.route import Route
 from endopilot.models.config import WINDOW, run_path
 from endopilot.xray.adviser import AdviserConfig, XrayAdviser
@@ -116,7 +116,7 @@ class _Wires:
 
 class _Networks:
     def __init__(self, plan: Plan, folder: Path) -> None:
-        from endopilot.control.learned import Rest  # brings torch, which is slow to import
+        from endopilot.control.network_plan import Rest  # brings torch, which is slow to import
         from endopilot.models.rollout import load_run
 
         assert plan.model is not None

@@ -10,13 +10,13 @@ from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import convolve1d
 
 from endopilot.anatomy.projection import safety_ratio
+from endopilot.control.plan_config import PlanConfig, Steps
 from endopilot.control.route import Route
 from endopilot.dataset.loader import Dataset
 from endopilot.dataset.study import identify
@@ -30,15 +30,11 @@ from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.simulation.simulator import Simulator
 from endopilot.types import SAMPLE_PERIOD_S
 
-if TYPE_CHECKING:
-    from endopilot.control.plan import PlanConfig
-
-Steps = Float[np.ndarray, "samples 2"]
 _SMOOTH = np.array([0.25, 0.5, 0.25])
 """Neighbouring samples of what is drawn are mixed, as a drive's ramps mix them."""
 
 
-def with_networks(
+def network_planner(
     navigation: Navigation, folder: Path, model: Path, desired: Steps, route: Route, config: PlanConfig
 ) -> Callable[[], tuple[Steps, Steps]]:
     """Load networks and return what finds controls with them, and the tips that they foretell.

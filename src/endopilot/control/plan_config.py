@@ -1,0 +1,150 @@
+"""What is asked of a plan, `PlanConfig`, and the plan that comes of it, `Plan`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from endopilot.anatomy.projection import safety_ratio
+from endopilot.control.cost import Cost
+from endopilot.env.task import DECISION_PERIOD_S, Navigation
+from endopilot.errors import InputError
+from endopilot.types import TipProjection
+
+Method = Literal["twin", "inverse", "mppi", "forward", "spin", "retract-rotate"]
+NETWORK_METHODS = ("inverse", "mppi")
+"""Methods that ask a trained network."""
+Steps = Float[np.ndarray, "samples 2"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SampleConfig:
+    """Sampling through the forward network (method mppi), after Williams et al., J. Guid. Control Dyn. 40, 2017."""
+
+    candidates: int = 12
+    """Control sequences that are rolled out together."""
+    iterations: int = 4
+    """Rounds; each draws around the weighted mean of the one before."""
+    translation_sd_mm_s: float = 1.0
+    """Standard deviation of the translation that is drawn, mm/s."""
+    rotation_sd_rad_s: float = 0.5
+    """Standard deviation of the rotation that is drawn, rad/s."""
+    temperature: float = 0.1
+    """Candidates are weighted by exp(−cost/(temperature · standard deviation of the costs))."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            InputError: a field is out of its range.
+        """
+        for name in self.__dataclass_fields__:
+            if not 0 < getattr(self, name) < np.inf:
+                raise InputError(f"sample.{name}: {getattr(self, name)}; give a positive number")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanConfig:
+    """What is asked of a plan."""
+
+    method: Method = "twin"
+    """How the controls are found: twin (tried in the rod core), inverse (the inverse network of --model), mppi
+    (sampled through its forward network), or a baseline: forward, spin, retract-rotate."""
+    seconds: float = 60.0
+    """Time in which the target is to be reached, s."""
+    speed_mm_s: float = 10.0
+    """Speed of the desired tip along the route, mm/s."""
+    start_inserted_mm: float = 2.0
+    """Inserted length at the start, mm."""
+    start_rotation: float = 0.0
+    """Rotation at the start, rad."""
+    force_limit_n: float = 0.5
+    """Largest force of the wall on one node that is safe, N."""
+    seed: int = 0
+    """Seed of what is drawn at random."""
+    cost: Cost = field(default_factory=Cost)
+    """What a good way is."""
+    sample: SampleConfig = field(default_factory=SampleConfig)
+    """Sampling through the forward network."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            InputError: a field is out of its range.
+        """
+        for name in ("seconds", "speed_mm_s", "force_limit_n"):
+            if not 0 < getattr(self, name) < np.inf:
+                raise InputError(f"{name}: {getattr(self, name)}; give a positive number")
+        if not 0 <= self.start_inserted_mm < np.inf or not np.isfinite(self.start_rotation):
+            raise InputError(
+                f"start_inserted_mm, start_rotation: {self.start_inserted_mm}, {self.start_rotation}; "
+                "give 0 or more, and a finite angle"
+            )
+        if self.seed < 0:
+            raise InputError(f"seed: {self.seed} is negative; give 0 or more")
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A planned navigation; row t is the end of sample period t, `DECISION_PERIOD_S` long.
+
+    Attributes:
+        navigation: what is to be done.
+        config: what was asked of it.
+        model: the trained run that it was found with, if any.
+        control: π, mm/s and rad/s.
+        proximal: (Δ mm, φ rad), its integral.
+        desired: desired tip states (Δtip, γtip), mm.
+        predicted: those that the model foretells, mm.
+        simulated: where the rod core, at its own settings, has the tip under these controls.
+        position: of that tip, LPS mm.
+        force: largest wall force on one node in the rod core, N.
+        reached: whether the target is reached at the end of a period in the rod core.
+        seconds_to_plan: wall time that finding the controls took, s.
+        processor_seconds: processor time of it, s.
+    """
+
+    navigation: Navigation
+    config: PlanConfig
+    model: str | None
+    control: Steps
+    proximal: Steps
+    desired: Steps
+    predicted: Steps
+    simulated: TipProjection
+    position: Float[np.ndarray, "samples 3"]
+    force: Float[np.ndarray, "samples"]
+    reached: bool
+    seconds_to_plan: float
+    processor_seconds: float
+
+    @property
+    def ratio(self) -> Float[np.ndarray, "samples"]:
+        """Safety ratio γ/(r − r_w) in the rod core."""
+        tip = self.simulated
+        return safety_ratio(tip.offset, tip.radius, self.navigation.device.tip_radius_mm)
+
+    @property
+    def within_force_limit(self) -> bool:
+        """Whether no node ever presses on the wall with more than the navigation's limit, in the rod core."""
+        return bool(self.force.max() <= self.navigation.force_limit_n)
+
+    def cost_terms(self) -> dict[str, float]:
+        """Return what each term of the cost comes to in the rod core, mm."""
+        device, weights = self.navigation.device, self.config.cost
+        error = np.abs(self.simulated.abscissa - self.desired[:, 0])
+        share = self.force / self.navigation.force_limit_n
+        limits = np.array([device.max_velocity_mm_s, device.max_rotation_rad_s])
+        h = DECISION_PERIOD_S
+        return {
+            "end": abs(float(self.simulated.abscissa[-1]) - self.navigation.target.abscissa),
+            "tip": float(weights.tip_weight * error.sum() * h),
+            "ratio": float(weights.ratio_weight * (np.maximum(self.ratio - weights.safe_ratio, 0) ** 2).sum() * h),
+            "force": float(weights.force_weight * (share**2).sum() * h),
+            "time": float(weights.time_weight * len(error) * h),
+            "smooth": float(weights.roughness(self.control[:-1], self.control[1:], limits).sum()),
+        }
