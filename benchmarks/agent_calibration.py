@@ -19,11 +19,10 @@ import numpy as np
 
 from endopilot.control.agent import AgentConfig, AgentPolicy
 from endopilot.control.navigate import ModelMismatch, NavigateConfig, navigate
-from endopilot.env.navigation import CORE
-from endopilot.env.task import DECISION_PERIOD_S, Navigation
-from endopilot.env.tasks import Task, find_task, ladder_tasks
 from endopilot.files import read_json, write_json
 from endopilot.parallel import each
+from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
+from endopilot.tasks.task import CORE, Task, find_task, ladder_tasks
 from endopilot.xray import adviser as xray
 from endopilot.xray.bands import Calibration, conformal_scale, fit_spread, spread_of
 

@@ -16,9 +16,8 @@ import numpy as np
 
 from endopilot.control.agent import AgentPolicy
 from endopilot.control.navigate import NavigateConfig, navigate
-from endopilot.env.navigation import CORE
-from endopilot.env.tasks import find_task
 from endopilot.ladder.mismatch import truth_of
+from endopilot.tasks.task import CORE, find_task
 from endopilot.xray.fluoroscope import TipMeasurement
 
 TASKS = ("crux", "circumflex", "middle-cerebral", "carotid", "diagonal")

@@ -21,11 +21,10 @@ from typing import Any
 import numpy as np
 
 from endopilot.atlas.atlas import AtlasConfig, make_patient_tree
-from endopilot.env.navigation import CORE
-from endopilot.env.task import Navigation, Target
-from endopilot.env.tasks import Task, ladder_tasks, target_in_section, turn_rad
 from endopilot.errors import InputError
 from endopilot.simulation.simulator import Simulator
+from endopilot.tasks.navigation import Navigation, Target
+from endopilot.tasks.task import CORE, Task, ladder_tasks, target_in_section, turn_rad
 from endopilot.types import TipProjection, VesselTree
 
 WANTED = 20

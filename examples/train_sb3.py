@@ -21,7 +21,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from endopilot.env.navigation import TRANSLATION_MM_S, NavigateVectorEnv
+from endopilot.env.vector import TRANSLATION_MM_S, NavigateVectorEnv
 
 ENVIRONMENTS, STEPS = 64, 64
 

@@ -11,7 +11,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from endopilot.env.navigation import NavigateVectorEnv
+from endopilot.env.vector import NavigateVectorEnv
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "environment.md"

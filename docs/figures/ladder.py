@@ -10,8 +10,8 @@ import json
 import sys
 from pathlib import Path
 
-from endopilot.env.tasks import ladder_tasks
 from endopilot.ladder.mismatch import title_of
+from endopilot.tasks.task import ladder_tasks
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "ladder.md"

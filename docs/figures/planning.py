@@ -17,8 +17,8 @@ from endopilot.control.agent import AgentPolicy, TwinPolicy
 from endopilot.control.navigate import ModelMismatch, navigate
 from endopilot.control.policies import make_policy
 from endopilot.control.policy import Policy
-from endopilot.env.task import Navigation, Target
 from endopilot.simulation.device import Device, read_device
+from endopilot.tasks.navigation import Navigation, Target
 from endopilot.types import Anatomy
 
 PAGE = Path(__file__).parents[1] / "planning.md"

@@ -15,7 +15,7 @@ from endopilot.control.belief import Belief, BeliefConfig
 from endopilot.control.navigate import ModelMismatch, navigate
 from endopilot.control.policy import Decision, Observation, Policy
 from endopilot.control.search import Course, Search
-from endopilot.env.task import Navigation, Target
+from endopilot.tasks.navigation import Navigation, Target
 from endopilot.xray.adviser import AdviserConfig
 from endopilot.xray.bands import Calibration
 from endopilot.xray.fluoroscope import TipMeasurement

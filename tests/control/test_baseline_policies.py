@@ -8,8 +8,8 @@ import pytest
 from endopilot.control.baseline_policies import ADVANCE_MM_S, SPIN_RAD_S, Forward, RetractRotate, Spin
 from endopilot.control.policies import POLICIES, make_policy
 from endopilot.control.policy import Observation, Policy
-from endopilot.env.task import Navigation, Target
 from endopilot.errors import InputError
+from endopilot.tasks.navigation import Navigation, Target
 from endopilot.xray.fluoroscope import TipMeasurement
 
 

@@ -8,7 +8,7 @@ import pytest
 from endopilot.control.navigate import ModelMismatch, NavigateConfig, navigate
 from endopilot.control.policy import Decision, Observation, Policy
 from endopilot.control.robot import RobotConfig
-from endopilot.env.task import Navigation, Target
+from endopilot.tasks.navigation import Navigation, Target
 from endopilot.xray.fluoroscope import FluoroscopeConfig
 
 PERFECT = RobotConfig(

@@ -10,8 +10,8 @@ import pytest
 from endopilot.anatomy.projection import project_tip
 from endopilot.benchmarks.analytic_lumens import tree_of
 from endopilot.control.route import Route, check_passable, parse_target
-from endopilot.env.task import Target
 from endopilot.errors import InputError
+from endopilot.tasks.navigation import Target
 from endopilot.types import Branch, VesselTree
 
 

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from endopilot.control.navigate import ModelMismatch
-from endopilot.env.tasks import find_task, ladder_tasks
 from endopilot.errors import InputError
 from endopilot.ladder import ladder
 from endopilot.ladder.ladder import LadderConfig, climb, drive, score
 from endopilot.report.ladder_page import write_page
+from endopilot.tasks.task import find_task, ladder_tasks
 from endopilot.types import TipProjection
 
 

@@ -6,12 +6,12 @@ import json
 
 import pytest
 
-from endopilot.env.tasks import find_task
 from endopilot.errors import InputError
 from endopilot.ladder import ladder
 from endopilot.ladder import mismatch as robustness
 from endopilot.ladder.ladder import LadderConfig
 from endopilot.ladder.mismatch import CASES, measure_mismatch, title_of, truth_of
+from endopilot.tasks.task import find_task
 
 ONE = LadderConfig(policy="forward", tasks=("straight",), patients=1)
 

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.env.navigation import CONTROL_PERIOD_S, CORE, ROTATION_RAD_S, TRANSLATION_MM_S, NavigateVectorEnv
-from endopilot.env.tasks import reference_navigation
+from endopilot.env.vector import CONTROL_PERIOD_S, ROTATION_RAD_S, TRANSLATION_MM_S, NavigateVectorEnv
 from endopilot.files import processor_name
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, random_controls
 from endopilot.simulation.simulator import Simulator
+from endopilot.tasks.task import CORE, reference_navigation
 from endopilot.types import SAMPLE_PERIOD_S
 
 MANY = 256

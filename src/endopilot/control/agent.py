@@ -18,9 +18,9 @@ from endopilot.control.navigate import ModelMismatch
 from endopilot.control.policy import Decision, Observation
 from endopilot.control.route import Route, check_passable
 from endopilot.control.search import Course, Search, SearchConfig
-from endopilot.env.task import DECISION_PERIOD_S, Navigation
 from endopilot.progress import Advance
 from endopilot.simulation.drive_limits import DriveLimits
+from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.types import TipProjection
 from endopilot.xray.adviser import AdviserConfig, XrayAdviser
 from endopilot.xray.bands import Calibration

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from endopilot.control.policy import Decision, Observation
-from endopilot.env.task import DECISION_PERIOD_S, Navigation
+from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 
 ADVANCE_MM_S = 5.0
 """Velocity of the baselines, mm/s: 2.5 mm between two decisions, less than the 4 mm that a target is wide."""

@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.stats import qmc
 
-from endopilot.env.task import DECISION_PERIOD_S, Navigation
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.simulator import Simulator
+from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.types import TipProjection
 from endopilot.xray.fluoroscope import TipMeasurement
 

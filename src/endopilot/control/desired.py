@@ -9,8 +9,8 @@ import pandas as pd
 from jaxtyping import Float
 
 from endopilot.control.route import Route
-from endopilot.env.task import DECISION_PERIOD_S, Target
 from endopilot.errors import InputError
+from endopilot.tasks.navigation import DECISION_PERIOD_S, Target
 from endopilot.types import Anatomy
 
 _MARGIN_S = 5.0

@@ -10,12 +10,11 @@ from jaxtyping import Bool, Float
 from endopilot.anatomy.projection import project_tip
 from endopilot.control.policy import Observation, Policy
 from endopilot.control.robot import RobotConfig, SimulatedRobot
-from endopilot.env.observation import tip_direction
-from endopilot.env.task import DECISION_PERIOD_S, SUCCESS_MM, Navigation
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.simulation.simulator import Simulator
+from endopilot.tasks.navigation import DECISION_PERIOD_S, SUCCESS_MM, Navigation
 from endopilot.types import TipProjection
 from endopilot.xray.fluoroscope import Fluoroscope, FluoroscopeConfig, TipMeasurement
 
@@ -134,7 +133,7 @@ def navigate(
     random = np.random.default_rng([seed, 2])
     track, periods = _Track(simulator), int(np.ceil(navigation.seconds / DECISION_PERIOD_S - 1e-9))
     policy.start(navigation, seed)
-    reason, expose, direction = "time", True, tip_direction(simulator)[0]
+    reason, expose, direction = "time", True, simulator.tip_direction[0]
     for period in range(periods):
         state, tip = robot.proximal_state(), None
         if expose:
@@ -147,7 +146,7 @@ def navigate(
         robot.command(*control)
         peak = robot.run(DECISION_PERIOD_S)
         track.moved(simulator, peak)
-        direction = tip_direction(simulator)[0]
+        direction = simulator.tip_direction[0]
         if not simulator.valid[0]:
             reason = "invalid"
             break

@@ -20,7 +20,6 @@ from endopilot.control.plan_config import PlanConfig, Steps
 from endopilot.control.route import Route
 from endopilot.dataset.loader import Dataset
 from endopilot.dataset.study import identify
-from endopilot.env.task import Navigation
 from endopilot.models.config import WINDOW, read_run
 from endopilot.models.open_loop import Predictor
 from endopilot.models.rollout import load_run
@@ -28,6 +27,7 @@ from endopilot.progress import progress
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.simulation.simulator import Simulator
+from endopilot.tasks.navigation import Navigation
 from endopilot.types import SAMPLE_PERIOD_S
 
 _SMOOTH = np.array([0.25, 0.5, 0.25])

@@ -18,7 +18,6 @@ from endopilot.control.plan_config import NETWORK_METHODS, Plan, PlanConfig, Ste
 from endopilot.control.robot import RobotConfig
 from endopilot.control.route import Route, check_passable, parse_target
 from endopilot.control.search import Course, SearchConfig
-from endopilot.env.task import DECISION_PERIOD_S, Navigation
 from endopilot.errors import InputError
 from endopilot.models.config import read_run
 from endopilot.progress import progress
@@ -26,6 +25,7 @@ from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import Device, read_device
 from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.simulation.simulate import simulate
+from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.types import TipProjection
 
 _IDEAL = RobotConfig(

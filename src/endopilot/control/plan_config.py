@@ -10,8 +10,8 @@ from jaxtyping import Float
 
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.control.cost import Cost
-from endopilot.env.task import DECISION_PERIOD_S, Navigation
 from endopilot.errors import InputError
+from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.types import TipProjection
 
 Method = Literal["twin", "inverse", "mppi", "forward", "spin", "retract-rotate"]

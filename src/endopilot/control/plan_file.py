@@ -35,10 +35,10 @@ import pandas as pd
 from endopilot.control.cost import Cost
 from endopilot.control.plan_config import Plan, PlanConfig, SampleConfig
 from endopilot.control.plan_xray import PlannedXray
-from endopilot.env.task import DECISION_PERIOD_S, Navigation, Target
 from endopilot.errors import InputError
 from endopilot.files import json_text, manifest, read_json, sha256, writing
 from endopilot.simulation.device import Device
+from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target
 from endopilot.types import Anatomy, TipProjection
 
 _TABLE, _RECORD, PICTURE = "plan.csv", "manifest.json", "plan.png"

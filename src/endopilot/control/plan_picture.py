@@ -14,8 +14,8 @@ from matplotlib.axes import Axes
 from endopilot.control.plan_config import Plan
 from endopilot.control.plan_xray import PlannedXray
 from endopilot.control.route import Route
-from endopilot.env.task import DECISION_PERIOD_S
 from endopilot.files import writing
+from endopilot.tasks.navigation import DECISION_PERIOD_S
 
 
 def draw_plan(plan: Plan, path: Path, xray: PlannedXray | None = None) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
-from endopilot.env.task import Navigation
+from endopilot.tasks.navigation import Navigation
 from endopilot.xray.fluoroscope import TipMeasurement
 
 

@@ -14,9 +14,9 @@ from types import TracebackType
 
 from endopilot.control.drive_protocol import LONGEST_LINE, PROTOCOL, Message, Signer
 from endopilot.control.robot import ProximalState
-from endopilot.env.task import DECISION_PERIOD_S
 from endopilot.errors import InputError
 from endopilot.simulation.drive_limits import DriveLimits
+from endopilot.tasks.navigation import DECISION_PERIOD_S
 
 REPEAT_S = 0.05
 """Time between two repetitions of a command, s."""

@@ -8,9 +8,9 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from endopilot.env.task import Target
 from endopilot.errors import InputError
 from endopilot.simulation.device import Device
+from endopilot.tasks.navigation import Target
 from endopilot.types import Anatomy, Centerline, TipProjection
 
 BEYOND_MM = 1.5

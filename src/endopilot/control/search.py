@@ -18,12 +18,12 @@ from jaxtyping import Bool, Float, Int
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.control.cost import Cost
 from endopilot.control.route import Route
-from endopilot.env.task import DECISION_PERIOD_S, Navigation
 from endopilot.errors import InputError
 from endopilot.progress import Advance
 from endopilot.simulation.device import Device
 from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.simulation.simulator import Simulator
+from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.types import TipProjection
 
 Controls = Float[np.ndarray, "periods 2"]

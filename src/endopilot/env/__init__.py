@@ -1,4 +1,4 @@
-"""Navigation as a task: what is to be reached, and when it is reached; and as environments for learning.
+"""Navigation as environments for learning.
 
 Importing this package registers `endopilot/Navigate-v0` and one environment for each task of the ladder with Gymnasium.
 """
@@ -25,6 +25,6 @@ for _name, _task in (("Navigate", None), *((name, name.lower()) for name in TASK
     gymnasium.register(
         id=f"endopilot/{_name}-v0",
         entry_point="endopilot.env.single:NavigateEnv",
-        vector_entry_point="endopilot.env.navigation:NavigateVectorEnv",
+        vector_entry_point="endopilot.env.vector:NavigateVectorEnv",
         kwargs={} if _task is None else {"task": _task},
     )

@@ -59,18 +59,12 @@ class Measured:
         return cls(
             tip=simulator.project(),
             position=simulator.position[:, 0],
-            direction=tip_direction(simulator),
+            direction=simulator.tip_direction,
             contact_force=simulator.contacts.max(axis=1),
             inserted_length=simulator.inserted_length,
             rotation=simulator.rotation,
             valid=simulator.valid,
         )
-
-
-def tip_direction(simulator: Simulator) -> Float[np.ndarray, "worlds 3"]:
-    """Return the unit vectors along the wires at their tips: the third axes of the last elements."""
-    w, x, y, z = simulator.orientation[:, 0].T
-    return np.column_stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
 
 
 def observe(

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from endopilot.anatomy.tree import parallel_transport, tangents
-from endopilot.env.task import Navigation
+from endopilot.tasks.navigation import Navigation
 from endopilot.types import TipProjection
 
 STEP_MM = 0.5

@@ -10,10 +10,11 @@ from gymnasium.vector import AutoresetMode
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from endopilot.env.navigation import CORE, NavigateVectorEnv, NavigationState
-from endopilot.env.task import Navigation
+from endopilot.env.vector import NavigateVectorEnv, NavigationState
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.simulator import Simulator
+from endopilot.tasks.navigation import Navigation
+from endopilot.tasks.task import CORE
 
 
 class NavigateEnv(gymnasium.Env):

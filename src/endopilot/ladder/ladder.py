@@ -17,12 +17,11 @@ from endopilot.control.agent import AgentPolicy
 from endopilot.control.navigate import ModelMismatch, NavigateConfig, NavigationRecord, navigate
 from endopilot.control.policies import POLICIES, make_policy
 from endopilot.control.policy import Decision, Observation
-from endopilot.env.navigation import CORE
-from endopilot.env.task import Navigation
-from endopilot.env.tasks import Task, find_task, ladder_tasks
 from endopilot.errors import InputError
 from endopilot.files import read_json, write_json
 from endopilot.parallel import each
+from endopilot.tasks.navigation import Navigation
+from endopilot.tasks.task import CORE, Task, find_task, ladder_tasks
 from endopilot.types import TipProjection
 from endopilot.xray.adviser import AdviserConfig, count_events, near_exposures
 

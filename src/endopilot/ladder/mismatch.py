@@ -10,11 +10,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from endopilot.control.navigate import ModelMismatch
-from endopilot.env.task import Navigation
-from endopilot.env.tasks import Task, find_task
 from endopilot.errors import InputError
 from endopilot.files import read_json, write_json, writing
 from endopilot.ladder.ladder import LadderConfig, claim, do_missing, drive, summary
+from endopilot.tasks.navigation import Navigation
+from endopilot.tasks.task import Task, find_task
 
 ROBUSTNESS_FILE, PICTURE_FILE = "robustness.json", "robustness.png"
 QUANTITIES = ("friction", "stiffness", "latency", "ostium")

@@ -17,15 +17,14 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from plotly.offline import get_plotlyjs
 
-from endopilot.env.navigation import CORE
-from endopilot.env.task import Navigation
-from endopilot.env.tasks import Task, find_task
 from endopilot.files import read_json, writing
 from endopilot.ladder.ladder import SCORES_FILE
 from endopilot.plotting import BLACK, BLUE, GREEN, ORANGE, STYLE, VERMILLION, png
 from endopilot.report.report import image, template_text
 from endopilot.report.scene import INK, navigation_scene
 from endopilot.simulation.simulate import simulate
+from endopilot.tasks.navigation import Navigation
+from endopilot.tasks.task import CORE, Task, find_task
 from endopilot.types import SAMPLE_PERIOD_S, Rollout
 
 PAGE_FILE = "index.html"

@@ -333,6 +333,17 @@ class Simulator:
         return self._per_node("attitudes", np.nan)
 
     @property
+    def tip_direction(self) -> Float[np.ndarray, "worlds 3"]:
+        """Unit vectors along the wires at their tips: the third directors of the last elements.
+
+        Example:
+            >>> bool(np.allclose(np.linalg.norm(simulator.tip_direction, axis=-1), 1.0))
+            True
+        """
+        w, x, y, z = self.orientation[:, 0].T
+        return np.column_stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
+
+    @property
     def contacts(self) -> Float[np.ndarray, "worlds nodes"]:
         """Force of the wall on each node, N.
 

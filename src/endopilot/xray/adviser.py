@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from endopilot.env.task import DECISION_PERIOD_S, SUCCESS_MM
 from endopilot.errors import InputError
+from endopilot.tasks.navigation import DECISION_PERIOD_S, SUCCESS_MM
 from endopilot.xray.bands import Calibration, Tips
 
 _SPACING = 3

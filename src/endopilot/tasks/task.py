@@ -12,12 +12,16 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from endopilot.atlas.atlas import ANATOMIES, AtlasConfig, make_patient
-from endopilot.env.task import Navigation, Target
 from endopilot.errors import InputError
+from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import list_devices, read_device
+from endopilot.tasks.navigation import Navigation, Target
 from endopilot.types import Anatomy, VesselTree
 
-_FOLDER = Path(__file__).parent / "tasks"
+CORE = SimulatorConfig(elements=50, time_step_s=1 / 14, sample_tolerance_mm=1e-4)
+"""Settings of the rod core on the ladder and in the environments: half the elements, two time steps a control period,
+and forces that are exact to a micronewton; docs/environment.md states the accuracy that they keep."""
+_FOLDER = Path(__file__).parent / "ladder"
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 _STRICT = ConfigDict(extra="forbid", frozen=True)
 

@@ -10,11 +10,11 @@ import pytest
 
 import endopilot.env
 from endopilot.atlas.atlas import AtlasConfig, make_patient_tree
-from endopilot.env import tasks
-from endopilot.env.tasks import find_task, ladder_tasks, read_task, target_in_section
 from endopilot.errors import InputError
+from endopilot.tasks import task
+from endopilot.tasks.task import find_task, ladder_tasks, read_task, target_in_section
 
-FILES = sorted((Path(tasks.__file__).parent / "tasks").glob("*.yaml"))
+FILES = sorted((Path(task.__file__).parent / "ladder").glob("*.yaml"))
 
 
 def test_there_are_twelve_tasks_one_a_level_each_with_its_environment():
@@ -66,7 +66,7 @@ def test_a_ladder_navigation_is_the_same_every_time():
     ],
 )
 def test_what_is_wrong_in_a_file_is_named(tmp_path, old, new, told):
-    text = (Path(tasks.__file__).parent / "tasks" / "crux.yaml").read_text(encoding="utf-8")
+    text = (Path(task.__file__).parent / "ladder" / "crux.yaml").read_text(encoding="utf-8")
     assert old in text
     (tmp_path / "task.yaml").write_text(text.replace(old, new), encoding="utf-8")
     with pytest.raises(InputError) as error:

@@ -12,7 +12,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
-from endopilot.env.navigation import (
+from endopilot.env.single import NavigateEnv
+from endopilot.env.vector import (
     CONTROL_PERIOD_S,
     FORCE_REWARD,
     PROGRESS_REWARD,
@@ -20,11 +21,10 @@ from endopilot.env.navigation import (
     SUCCESS_REWARD,
     NavigateVectorEnv,
 )
-from endopilot.env.single import NavigateEnv
-from endopilot.env.task import Navigation, Target
-from endopilot.env.tasks import reference_navigation
 from endopilot.errors import InputError
 from endopilot.simulation.simulator import Simulator
+from endopilot.tasks.navigation import Navigation, Target
+from endopilot.tasks.task import reference_navigation
 
 WORLDS, STEPS = 3, 12
 

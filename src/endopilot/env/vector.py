@@ -18,21 +18,18 @@ from numpy.typing import ArrayLike
 from endopilot.env import observation
 from endopilot.env.observation import Measured, observe
 from endopilot.env.route_tables import RouteTables
-from endopilot.env.task import Navigation, reached
-from endopilot.env.tasks import reference_navigation, training_navigations
 from endopilot.errors import InputError
 from endopilot.simulation.config import SPARE_MM, SimulatorConfig
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import SimulatorState
+from endopilot.tasks.navigation import Navigation, reached
+from endopilot.tasks.task import CORE, reference_navigation, training_navigations
 
 CONTROL_PERIOD_S = 2 / 15
 """Time between two actions, s: fluoroscopy's usual 7.5 frames a second."""
 TRANSLATION_MM_S, ROTATION_RAD_S = 12.0, 3.14
 """Velocities of an action of 1: the fastest of the random navigations of `ControlConfig`, and half a turn a second."""
 _FASTEST = np.array([TRANSLATION_MM_S, ROTATION_RAD_S])
-CORE = SimulatorConfig(elements=50, time_step_s=1 / 14, sample_tolerance_mm=1e-4)
-"""Settings of the rod core in a learning environment: half the elements, two time steps a control period, and forces
-that are exact to a micronewton; docs/environment.md states the accuracy that they keep."""
 PROGRESS_REWARD, STEP_REWARD, FORCE_REWARD, SUCCESS_REWARD = 0.1, -0.01, -0.1, 5.0
 """A mm nearer to the target, every step, every step with too large a force, and the target."""
 
