@@ -15,7 +15,8 @@ from endopilot.benchmarks.robustness import MANOEUVRES, RobustnessConfig, measur
 from endopilot.errors import InputError
 from endopilot.files import read_json
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.device import Device, list_devices, read_device
+from endopilot.simulation.device import Device, read_device
+from endopilot.simulation.device_files import list_devices
 from endopilot.simulation.simulate import simulate
 
 DEVICE = read_device("workhorse-014")

@@ -15,7 +15,7 @@ from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.cli import main
 from endopilot.files import read_json
 from endopilot.imaging.volume import write_mask, write_volume
-from endopilot.simulation.device import device_yaml
+from endopilot.simulation.device_files import device_yaml
 from endopilot.types import Insertion, LumenMask, Volume
 
 

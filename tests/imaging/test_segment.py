@@ -1,35 +1,50 @@
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import pytest
 from shapes import BLOOD_HU, empty_grid, positions
 
 from endopilot.errors import InputError
-from endopilot.imaging import methods
 from endopilot.imaging import segment as segmentation
-from endopilot.imaging.segment import SegmentConfig, available_methods, segment
+from endopilot.imaging.segment import METHODS, SegmentConfig, segment
 from endopilot.types import Volume
 
 _METHOD = """
 import numpy as np
+from endopilot.imaging.segment import SegmentationMethod
 from endopilot.types import Insertion, LumenMask, Volume
 
 OPTIONS = {"above": "200"}
 
-def segment_lumen(volume, config):
+def above(volume, config):
     inside = volume.voxels > float(config.settings(OPTIONS)["above"])
     ostium = Insertion(np.array(config.seeds[0] if config.seeds else (0.0, 0.0, 0.0)), np.array([0.0, 0.0, 1.0]))
     return LumenMask(Volume(inside, volume.spacing_mm, volume.origin_mm, volume.direction), ostium)
+
+plain = SegmentationMethod(segment_lumen=above, options=OPTIONS)
+head = SegmentationMethod(segment_lumen=above, blood_pools=False)
+
+def voxels(volume, config):
+    return volume.voxels > 200
+
+def coarse(volume, config):
+    return LumenMask(Volume(volume.voxels[::2] > 200, volume.spacing_mm, volume.origin_mm, volume.direction))
+
+words = "no method"
 """
+PLAIN = "plain_method:plain"
 
 
 @pytest.fixture
 def plain_method(tmp_path, monkeypatch):
-    """Add a method by adding one file: what is bright is lumen."""
-    (tmp_path / "plain.py").write_text(_METHOD)
-    monkeypatch.setattr(methods, "__path__", [*methods.__path__, str(tmp_path)])
+    """Put a module of methods into the current directory: what is bright is lumen."""
+    (tmp_path / "plain_method.py").write_text(_METHOD)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
     yield
-    monkeypatch.delitem(__import__("sys").modules, f"{methods.__name__}.plain", raising=False)
+    sys.modules.pop("plain_method", None)
 
 
 def _ball(radius_mm: float = 16.0) -> Volume:
@@ -39,35 +54,61 @@ def _ball(radius_mm: float = 16.0) -> Volume:
     return Volume(np.where(inside, BLOOD_HU, -90.0), grid.spacing_mm, grid.origin_mm, grid.direction)
 
 
-def test_a_method_is_a_module_of_the_methods_package():
-    assert available_methods() == ("aorta", "coronary", "nnunet", "totalsegmentator")
+def test_every_shipped_method_is_found_by_its_name():
+    assert METHODS.names() == ("aorta", "coronary", "nnunet", "totalsegmentator")
+    assert all(callable(segmentation._method(name).segment_lumen) for name in METHODS.names())
 
 
-def test_one_file_adds_a_method(plain_method):
-    assert "plain" in available_methods()
-    mask = segment(_ball(), SegmentConfig(method="plain"))
-    assert mask.method == "plain"
+def test_a_method_of_one_s_own_segments_from_a_file_beside_the_user(plain_method):
+    mask = segment(_ball(), SegmentConfig(method=PLAIN))
+    assert mask.method == PLAIN
     np.testing.assert_array_equal(mask.volume.voxels, _ball().voxels > 0)
-    with pytest.raises(InputError, match="method='plain' found no lumen"):
-        segment(_ball(), SegmentConfig(method="plain", options=("above=500",)))
+    with pytest.raises(InputError, match="method: 'plain_method:plain' found no lumen"):
+        segment(_ball(), SegmentConfig(method=PLAIN, options=("above=500",)))
+    function = segment(_ball(), SegmentConfig(method="plain_method:above"))
+    np.testing.assert_array_equal(function.volume.voxels, mask.volume.voxels)
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("voxels", "returned ndarray; return a LumenMask"),
+        ("coarse", r"returned bool voxels of shape \(15, 30, 30\); return bool voxels on the volume's grid"),
+        ("words", "is no function and no SegmentationMethod"),
+        ("missing", "plain_method.py holds no missing"),
+    ],
+)
+def test_a_method_that_returns_no_mask_of_the_volume_is_refused(plain_method, name, expected):
+    with pytest.raises(InputError, match=expected):
+        segment(_ball(), SegmentConfig(method=f"plain_method:{name}"))
+
+
+def test_a_method_says_whether_the_volume_must_hold_contrast(plain_method):
+    grid = empty_grid((20, 20, 20), 1.0, (0.0, 0.0, 0.0))
+    grid.voxels[:] = -90
+    grid.voxels[8:12, 8:12, 8:12] = 300  # 0.06 ml
+    with pytest.raises(InputError, match="no contrast"):
+        segment(grid, SegmentConfig(method=PLAIN))
+    with pytest.raises(InputError, match="begins 0 mm from the volume's edge"):  # it ran: its ostium is a corner
+        segment(grid, SegmentConfig(method="plain_method:head"))
 
 
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
-        (("below=3",), r"'below=3' is no setting of method 'plain'; give above=…"),
+        (("below=3",), r"'below=3' is no setting of method 'plain_method:plain'; give above=…"),
         (("above",), "'above' is no setting"),
     ],
 )
 def test_a_setting_that_a_method_does_not_know_is_refused(plain_method, options, expected):
     with pytest.raises(InputError, match=expected):
-        SegmentConfig(method="plain", options=options)
+        SegmentConfig(method=PLAIN, options=options)
 
 
 @pytest.mark.parametrize(
     ("values", "expected"),
     [
-        ({"method": "magic"}, "method='magic' is unknown; choose one of aorta, coronary, nnunet, totalsegmentator"),
+        ({"method": "magic"}, "method: 'magic'; choose from aorta, coronary, nnunet, totalsegmentator, or give MODULE"),
         ({"seeds": ((0.0, float("nan"), 0.0),)}, "three finite numbers"),
         ({"options": ("device=cpu",)}, "no setting of method 'coronary'; leave --options out"),
     ],
@@ -89,7 +130,7 @@ def test_a_lost_rescale_is_told(plain_method):
     ball = _ball()
     raw = Volume(ball.voxels + 1024, ball.spacing_mm, ball.origin_mm, ball.direction)
     with pytest.raises(InputError, match=r"from 934 to 1424, but fat, lung and air are below 0 HU"):
-        segment(raw, SegmentConfig(method="plain", seeds=((0.0, 0.0, 0.0),)))
+        segment(raw, SegmentConfig(method=PLAIN, seeds=((0.0, 0.0, 0.0),)))
 
 
 def test_contrast_is_told_by_the_histogram(plain_method):
@@ -99,11 +140,11 @@ def test_contrast_is_told_by_the_histogram(plain_method):
     hu = np.where(radius < 22.0, 50.0, -90.0)
     hu[(radius > 17.0) & (radius < 20.0)] = 600.0
     noise = np.random.default_rng(0).normal(0.0, 25.0, hu.shape)
-    config = SegmentConfig(method="plain")
+    config = SegmentConfig(method=PLAIN)
     unenhanced = Volume(hu + noise, grid.spacing_mm, grid.origin_mm, grid.direction)
     with pytest.raises(InputError, match=r"no contrast: homogeneous soft tissue peaks at (45|55) HU, .*has 0.\d ml"):
         segment(unenhanced, config)
-    seeded = segment(unenhanced, SegmentConfig(method="plain", seeds=((30.0, 30.0, 25.0),)))
+    seeded = segment(unenhanced, SegmentConfig(method=PLAIN, seeds=((30.0, 30.0, 25.0),)))
     assert seeded.volume.voxels.any()  # a seed says where blood is: the method looks there
     hu[radius < 15.0] = 200.0
     enhanced = Volume(hu + noise, grid.spacing_mm, grid.origin_mm, grid.direction)

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from endopilot.errors import InputError
-from endopilot.simulation.device import Device, list_devices, read_device
+from endopilot.simulation.device import Device, read_device
+from endopilot.simulation.device_files import list_devices
 
 SHIPPED = Path(__file__).parents[2] / "src/endopilot/simulation/devices"
 

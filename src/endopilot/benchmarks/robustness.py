@@ -31,7 +31,8 @@ from endopilot.parallel import follow_the_parent
 from endopilot.progress import progress
 from endopilot.simulation.config import SimulatorConfig, wall_stiffness
 from endopilot.simulation.controls import ControlConfig, random_controls
-from endopilot.simulation.device import Device, check_fits, list_devices, read_device
+from endopilot.simulation.device import Device, check_fits, read_device
+from endopilot.simulation.device_files import list_devices
 from endopilot.simulation.simulate import simulate, why_invalid
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, Rollout
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import sys
+from typing import Any
 
 from tyro.conf import Positional
 
 from endopilot.cli.arguments import show_rows
 from endopilot.errors import InputError
-from endopilot.simulation.device import Device, device_yaml, list_devices, read_device
+from endopilot.simulation.device import read_device
+from endopilot.simulation.device_files import device_file, device_yaml, is_shipped, list_devices, user_devices
 from endopilot.simulation.tip_load import tip_load_row
 
 EXIT_FAILED = 1
@@ -19,21 +21,28 @@ def command(
 ) -> None:
     """List devices: diameter, bending stiffness EI and torsional stiffness GJ at tip and shaft, tip load, tip shape.
 
+    A device is shipped, or a YAML file in ~/.config/endopilot/devices or in the folder that ENDOPILOT_DEVICES names; it
+    is called by its file's name.
+
     Args:
-        devices: names of shipped devices or paths of YAML files; all shipped ones by default.
-        tip_load: simulate the tip-load test instead, and leave with exit code 1 if one misses its catalogue's load.
-        yaml: print the file of the device instead, to be changed into one of your own.
+        devices: names of devices or paths of YAML files; all known devices by default.
+        tip_load: simulate the tip-load test instead; exit code 1 if a device's error exceeds the bar.
+        yaml: print the file of one device instead, to start one of your own from.
         json: print the rows as JSON.
     """
-    chosen = devices or list_devices()
     if yaml:
         if len(devices) != 1:
             raise InputError(f"--yaml: {len(devices)} devices; name the one to print")
         read_device(devices[0])
         print(device_yaml(devices[0])[1], end="")
         return
-    row_of = tip_load_row if tip_load else Device.summary
-    rows = [row_of(read_device(name)) for name in chosen]
+    names = devices or (*list_devices(), *user_devices())
+    rows = [tip_load_row(read_device(name)) if tip_load else _row(name) for name in names]
     show_rows(rows, as_json=json)
     if any(row.get("passed") is False for row in rows):
         sys.exit(EXIT_FAILED)
+
+
+def _row(name: str) -> dict[str, Any]:
+    path = device_file(name)
+    return read_device(name).summary() | {"origin": "endopilot" if is_shipped(path) else str(path)}

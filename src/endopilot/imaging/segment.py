@@ -1,28 +1,29 @@
-"""Segmentation of one vessel's lumen: the entry of the imaging stage, its configuration and the registry of methods.
-
-A method is a module of `endopilot.imaging.methods` with a function `segment_lumen(volume, config)`; its name is the
-module's. Adding a method adds one file and touches no other. A module may also say
-
-- `OPTIONS`, its own settings with their defaults, which `config.settings(OPTIONS)` returns as the user gave them;
-- `BLOOD_POOLS = False`, if it needs no aorta or heart chamber in the volume: contrast is then not looked for.
-"""
+"""Segmentation of one vessel's lumen: the entry function of the imaging stage, its settings and its methods."""
 
 from __future__ import annotations
 
-import importlib
-import pkgutil
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from types import ModuleType
-from typing import Literal
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Literal, cast
 
 import numpy as np
 
 from endopilot.errors import InputError
-from endopilot.imaging import methods as method_modules
 from endopilot.imaging.contrast import refuse_other_units, refuse_without_contrast
+from endopilot.plugins import Registry
 from endopilot.types import Insertion, LumenMask, Volume
 
+METHODS = Registry(
+    setting="method",
+    shipped={
+        "aorta": "endopilot.imaging.methods.aorta:segment_lumen",
+        "coronary": "endopilot.imaging.methods.coronary:segment_lumen",
+        "nnunet": "endopilot.imaging.methods.nnunet:METHOD",
+        "totalsegmentator": "endopilot.imaging.methods.totalsegmentator:METHOD",
+    },
+    group="endopilot.segmentation",
+)
+"""Where the segmentation methods are. Each is a `SegmentationMethod`, or just its function `segment_lumen`."""
 _ROOT_MM = 5.0
 """An ostium is on an aorta of 9 mm radius or more: where it is nearer to the volume's edge, the root is cut off."""
 
@@ -32,9 +33,10 @@ class SegmentConfig:
     """How the lumen is segmented."""
 
     method: str = "coronary"
-    """coronary (automatic, one coronary tree), aorta (from seeds), or your own totalsegmentator or nnunet."""
+    """coronary (automatic, one coronary tree), aorta (from seeds), totalsegmentator or nnunet (your own installation),
+    or MODULE:OBJECT of a method of your own."""
     seeds: tuple[tuple[float, float, float], ...] = ()
-    """Points inside the lumen, LPS mm: first where the device enters, then farther along. Only aorta needs them."""
+    """Points inside the lumen, LPS mm: first where the device enters, then farther along. aorta needs them."""
     vessel: Literal["rca", "lca"] = "rca"
     """Which coronary tree the coronary method segments."""
     options: tuple[str, ...] = ()
@@ -42,12 +44,11 @@ class SegmentConfig:
 
     def __post_init__(self) -> None:
         """Refuse what no method could use."""
-        if self.method not in available_methods():
-            raise InputError(f"method={self.method!r} is unknown; choose one of {', '.join(available_methods())}")
+        METHODS.check(self.method)
         for seed in self.seeds:
             if not np.isfinite(seed).all():
                 raise InputError(f"seeds: {seed} is no point; give three finite numbers x y z in LPS mm")
-        known = getattr(_method(self.method), "OPTIONS", {}) if self.options else {}
+        known = _method(self.method).options if self.options else {}
         for option in self.options:
             name, sign, _ = option.partition("=")
             if not sign or name not in known:
@@ -59,13 +60,30 @@ class SegmentConfig:
         return {**defaults, **dict(option.split("=", 1) for option in self.options)}
 
 
-def _method(name: str) -> ModuleType:
-    return importlib.import_module(f"{method_modules.__name__}.{name}")
+@dataclass(frozen=True, kw_only=True)
+class SegmentationMethod:
+    """A way to find a lumen in a CT angiogram.
+
+    Attributes:
+        segment_lumen: takes the volume (HU) and the settings, and returns the mask of the lumen on the volume's grid,
+            with the ostium if it finds one.
+        options: the method's own settings with their defaults; `config.settings(options)` returns them as given.
+        blood_pools: whether the method needs an aorta or a heart chamber in the volume; contrast is then looked for
+            before it runs.
+    """
+
+    segment_lumen: Callable[[Volume, SegmentConfig], LumenMask]
+    options: Mapping[str, str] = field(default_factory=dict)
+    blood_pools: bool = True
 
 
-def available_methods() -> tuple[str, ...]:
-    """Return the names of the segmentation methods."""
-    return tuple(sorted(module.name for module in pkgutil.iter_modules(method_modules.__path__)))
+def _method(name: str) -> SegmentationMethod:
+    found = METHODS.load(name)
+    if isinstance(found, SegmentationMethod):
+        return found
+    if callable(found):
+        return SegmentationMethod(segment_lumen=cast(Callable[[Volume, SegmentConfig], LumenMask], found))
+    raise InputError(f"method: {name!r} is no function and no SegmentationMethod; name one")
 
 
 def segment(volume: Volume, config: SegmentConfig) -> LumenMask:
@@ -84,14 +102,27 @@ def segment(volume: Volume, config: SegmentConfig) -> LumenMask:
     refuse_other_units(volume)
     _refuse_seeds_outside(volume, config)
     method = _method(config.method)
-    if not config.seeds and getattr(method, "BLOOD_POOLS", True):
+    if not config.seeds and method.blood_pools:
         refuse_without_contrast(volume)
-    mask: LumenMask = method.segment_lumen(volume, config)
+    mask = method.segment_lumen(volume, config)
+    _refuse_no_mask(mask, volume, config.method)
     if not mask.volume.voxels.any():
-        raise InputError(f"method={config.method!r} found no lumen; give seeds inside the vessel")
+        raise InputError(f"method: {config.method!r} found no lumen; give seeds inside the vessel")
     if not config.seeds and mask.ostium is not None:
         _refuse_cut_root(volume, mask.ostium)
     return replace(mask, method=config.method)
+
+
+def _refuse_no_mask(mask: object, volume: Volume, name: str) -> None:
+    """Refuse what a method of one's own may return in place of a mask of the volume."""
+    if not isinstance(mask, LumenMask):
+        raise InputError(f"method: {name!r} returned {type(mask).__name__}; return a LumenMask")
+    voxels = mask.volume.voxels
+    if voxels.shape != volume.voxels.shape or voxels.dtype != bool:
+        raise InputError(
+            f"method: {name!r} returned {voxels.dtype} voxels of shape {voxels.shape}; return bool voxels on the "
+            f"volume's grid, {volume.voxels.shape}"
+        )
 
 
 def _refuse_seeds_outside(volume: Volume, config: SegmentConfig) -> None:

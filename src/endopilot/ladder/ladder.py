@@ -47,8 +47,7 @@ class LadderConfig:
         Raises:
             InputError: no such policy or task, or more patients than there are.
         """
-        if self.policy not in POLICIES:
-            raise InputError(f"policy: {self.policy!r}; choose from {', '.join(POLICIES)}")
+        POLICIES.check(self.policy)
         for name in self.tasks:
             find_task(name)
         if not 1 <= self.patients <= 20:

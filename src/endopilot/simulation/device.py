@@ -17,9 +17,9 @@ import yaml
 from jaxtyping import Float
 
 from endopilot.errors import InputError
+from endopilot.simulation.device_files import device_yaml
 from endopilot.types import Anatomy
 
-_FOLDER = Path(__file__).parent / "devices"
 _SCALARS = ("diameter_mm", "friction", "max_velocity_mm_s", "max_rotation_rad_s", "push_limit_n")
 _PROFILES = ("abscissa_mm", "bend_stiffness_n_mm2", "twist_stiffness_n_mm2")
 _FIELDS = ("name", *_SCALARS, *_PROFILES, "tip_load_n", "tip_bend")
@@ -165,32 +165,8 @@ class Device:
         }
 
 
-def list_devices() -> tuple[str, ...]:
-    """Return the names of the shipped devices."""
-    return tuple(sorted(path.stem for path in _FOLDER.glob("*.yaml")))
-
-
-def device_yaml(name_or_path: str | Path) -> tuple[Path, str]:
-    """Return the YAML file of a device, by its shipped name or its path, and the text in it.
-
-    Raises:
-        InputError: no such device, or a file that is no text.
-    """
-    shipped = _FOLDER / f"{name_or_path}.yaml"
-    path = shipped if shipped.is_file() else Path(name_or_path)
-    try:
-        return path, path.read_text(encoding="utf-8")
-    except OSError as error:
-        names = ", ".join(list_devices())
-        raise InputError(
-            f"device '{name_or_path}': no such device or file; give a path, or choose from {names}"
-        ) from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: is no text in UTF-8; give a device's YAML file") from error
-
-
 def read_device(name_or_path: str | Path) -> Device:
-    """Read a device by its shipped name, or from a YAML file.
+    """Read a device by its name (`endopilot.simulation.device_files`), or from a YAML file.
 
     Raises:
         InputError: no such device, or a file that is not a device; the line names file, field, value and mend.

@@ -14,7 +14,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from endopilot.atlas.atlas import ANATOMIES, AtlasConfig, make_patient
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.device import list_devices, read_device
+from endopilot.simulation.device import read_device
+from endopilot.simulation.device_files import list_devices
 from endopilot.tasks.navigation import Navigation, Target
 from endopilot.types import Anatomy, VesselTree
 

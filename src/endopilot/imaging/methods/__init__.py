@@ -1,1 +1,1 @@
-"""Segmentation methods: each module here is one, named after it, and holds `segment_lumen(volume, config)`."""
+"""Segmentation methods: each module holds one, as a function `segment_lumen(volume, config)`."""

@@ -7,15 +7,12 @@ from pathlib import Path
 from endopilot.errors import InputError
 from endopilot.files import read_json
 from endopilot.imaging.external import ostium_at_seeds, segment_by_program
-from endopilot.imaging.segment import SegmentConfig
+from endopilot.imaging.segment import SegmentationMethod, SegmentConfig
 from endopilot.imaging.volume import SUFFIXES
 from endopilot.types import LumenMask, Volume
 
 OPTIONS = {"model": "", "device": "", "label": ""}
 """Folder of the trained model, that with dataset.json and fold_0, fold_1, …; device: cuda, cpu, mps; label wanted."""
-
-BLOOD_POOLS = False
-"""What the model was trained on is its owner's affair: a head has no pool of blood."""
 
 
 def segment_lumen(volume: Volume, config: SegmentConfig) -> LumenMask:
@@ -53,3 +50,7 @@ def segment_lumen(volume: Volume, config: SegmentConfig) -> LumenMask:
         f"{model}` runs; without a GPU, give --options device=cpu",
     )
     return LumenMask(mask.volume, ostium_at_seeds(mask, config.seeds))
+
+
+METHOD = SegmentationMethod(segment_lumen=segment_lumen, options=OPTIONS, blood_pools=False)
+"""A model may be trained on any part of the body: a CT of the head holds no aorta and no heart chamber."""

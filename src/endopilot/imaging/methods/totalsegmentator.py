@@ -6,7 +6,7 @@ Its task `coronary_arteries` needs a licence of the user's own; `--options task=
 from __future__ import annotations
 
 from endopilot.imaging.external import ostium_at_seeds, segment_by_program
-from endopilot.imaging.segment import SegmentConfig
+from endopilot.imaging.segment import SegmentationMethod, SegmentConfig
 from endopilot.types import LumenMask, Volume
 
 OPTIONS = {"task": "coronary_arteries", "structure": "", "device": ""}
@@ -38,3 +38,6 @@ def segment_lumen(volume: Volume, config: SegmentConfig) -> LumenMask:
         f"`TotalSegmentator -i ct.nii.gz -o out --task {task}` runs",
     )
     return LumenMask(mask.volume, ostium_at_seeds(mask, config.seeds))
+
+
+METHOD = SegmentationMethod(segment_lumen=segment_lumen, options=OPTIONS)

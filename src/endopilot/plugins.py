@@ -1,0 +1,138 @@
+"""What a user may add without touching the package: `Registry` finds an implementation by its name.
+
+A name is one of the package's own, one that an installed package offers as an entry point, or MODULE:OBJECT, an object
+of a module in the current directory or on Python's path.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import traceback
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from endopilot import __version__
+from endopilot.errors import InputError
+from endopilot.files import sha256
+
+
+@dataclass(frozen=True)
+class Registry:
+    """Implementations of one thing by name.
+
+    Attributes:
+        setting: name of the setting that chooses one; error messages begin with it.
+        shipped: name of each implementation of the package, and its MODULE:OBJECT. Only the one that is asked for is
+            imported.
+        group: group of the entry points by which installed packages offer theirs.
+    """
+
+    setting: str
+    shipped: Mapping[str, str]
+    group: str
+
+    def names(self) -> tuple[str, ...]:
+        """Return the names of the package's own implementations, then those of installed packages."""
+        offered = sorted({point.name for point in entry_points(group=self.group)} - set(self.shipped))
+        return (*self.shipped, *offered)
+
+    def load(self, name: str) -> Any:
+        """Return the object behind a name.
+
+        Raises:
+            InputError: no such name, a name that two packages offer, a module that cannot be imported, or an object
+                that it does not hold.
+        """
+        point = self._entry_point(name)
+        if point is not None:
+            return self._import(name, point.value)
+        if name in self.shipped:
+            module, _, attribute = self.shipped[name].partition(":")
+            return getattr(importlib.import_module(module), attribute)
+        return self._import(name, name)
+
+    def check(self, name: str) -> None:
+        """Refuse a name that `load` would refuse, without importing what the package ships.
+
+        Raises:
+            InputError: as for `load`.
+        """
+        if self._entry_point(name) is not None or name not in self.shipped:
+            self.load(name)
+
+    def origin(self, name: str) -> str:
+        """Return where an implementation comes from: package and version, or a module's file and its SHA-256.
+
+        Raises:
+            InputError: as for `load`.
+        """
+        point = self._entry_point(name)
+        if point is not None:
+            return f"{point.dist.name} {point.dist.version}" if point.dist else point.value
+        if name in self.shipped:
+            return f"endopilot {__version__}"
+        self.load(name)
+        file = Path(sys.modules[name.partition(":")[0]].__file__ or "")
+        return f"{file.name} sha256:{sha256(file)}" if file.is_file() else name
+
+    def _entry_point(self, name: str) -> EntryPoint | None:
+        """Return the entry point of a name, or None if the package ships it or no installed package offers it."""
+        points = {point.value: point for point in entry_points(group=self.group) if point.name == name}
+        owners = [point.dist.name if point.dist else value for value, point in points.items()]
+        owners = ["endopilot", *owners] if name in self.shipped else owners
+        if len(owners) > 1:
+            raise InputError(
+                f"{self.setting}: {name!r} is offered by {' and by '.join(owners)}; uninstall all but one, "
+                "or give MODULE:OBJECT"
+            )
+        return next(iter(points.values()), None) if name not in self.shipped else None
+
+    def _import(self, name: str, target: str) -> Any:
+        """Return an object of a module that is not the package's own."""
+        module_name, _, attribute = target.partition(":")
+        if not attribute or not all(part.isidentifier() for part in (*module_name.split("."), attribute)):
+            raise InputError(
+                f"{self.setting}: {name!r}; choose from {', '.join(self.names())}, "
+                "or give MODULE:OBJECT, such as my_module:MyClass, of a module of your own"
+            )
+        module = self._module(name, module_name)
+        if not hasattr(module, attribute):
+            raise InputError(
+                f"{self.setting}: {name!r}: {module.__file__ or module_name} holds no {attribute}; correct the name"
+            )
+        return getattr(module, attribute)
+
+    def _module(self, name: str, module_name: str) -> ModuleType:
+        here = str(Path.cwd())
+        if here not in sys.path:  # the `endopilot` command does not look there by itself
+            sys.path.append(here)
+        importlib.invalidate_caches()
+        try:
+            return importlib.import_module(module_name)
+        except ModuleNotFoundError as error:
+            if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
+                raise self._unusable(name, module_name, error) from error
+            raise InputError(
+                f"{self.setting}: {name!r}: there is no module {error.name} in the current directory or on Python's "
+                "path; go to its folder, or add that to PYTHONPATH"
+            ) from error
+        except (Exception, SystemExit) as error:
+            raise self._unusable(name, module_name, error) from error
+
+    def _unusable(self, name: str, module_name: str, error: BaseException) -> InputError:
+        return InputError(f"{self.setting}: {name!r}: {module_name} cannot be imported ({described(error)}); mend it")
+
+
+def described(error: BaseException) -> str:
+    """Return an error of a user's own code in one line: kind, message, and the place where it was raised."""
+    if isinstance(error, SyntaxError):
+        place = f"{Path(error.filename or '').name} line {error.lineno}"
+        return f"{type(error).__name__}: {error.msg}, {place}"
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    message = " ".join(str(error).split())
+    return f"{type(error).__name__}: {message}, {Path(last.filename).name} line {last.lineno}"
