@@ -19,8 +19,10 @@ import numpy as np
 
 from endopilot.control.agent import AgentConfig, AgentPolicy
 from endopilot.control.navigate import ModelMismatch, NavigateConfig, navigate
+from endopilot.errors import InputError
 from endopilot.files import read_json, write_json
-from endopilot.parallel import each
+from endopilot.ladder.ladder import identity
+from endopilot.runs import claim, make_missing
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.tasks.task import CORE, Task, find_task, ladder_tasks
 from endopilot.xray import adviser as xray
@@ -157,9 +159,11 @@ def main() -> None:
         for task in ladder_tasks()
         for place in places
     ]
-    bad = each("Calibrating the agent's adviser", [path for path in wanted if not path.exists()], watch)
-    if bad:
-        raise SystemExit("\n".join(f"{path}: {error}" for path, error in bad.items()))
+    try:
+        claim(folder, "benchmarks/agent_calibration.py", **identity("agent"), agent=AgentConfig())
+        make_missing("Calibrating the agent's adviser", wanted, watch)
+    except InputError as error:
+        raise SystemExit(str(error)) from error
     calibration, lines = calibrate(folder)
     print(calibration, *lines, sep="\n")
     if "--write" in sys.argv:

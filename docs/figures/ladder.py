@@ -1,7 +1,7 @@
 """Write tasks and scores into docs/ladder.md: `python docs/figures/ladder.py [FOLDER [ROBUSTNESS]]`.
 
-FOLDER, runs/ladder if not given, holds what `endopilot ladder` made of each policy, and ROBUSTNESS, runs/robustness if
-not given, what it made with `--off 0.2`; a folder that is not there leaves its table as it is.
+FOLDER, runs/ladder if not given, holds what `endopilot ladder` made of each policy, and ROBUSTNESS,
+runs/ladder-mismatch if not given, what it made with `--off 0.2`; a folder that is not there leaves its table as it is.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def robustness(folder: Path) -> list[str]:
 def main() -> None:
     """Fill the page."""
     given = [Path(argument) for argument in sys.argv[1:]]
-    ladder, off = [*given, *[ROOT / "runs" / name for name in ("ladder", "robustness")][len(given) :]]
+    ladder, off = [*given, *[ROOT / "runs" / name for name in ("ladder", "ladder-mismatch")][len(given) :]]
     fill("tasks", tasks())
     if ladder.is_dir():
         fill("scores", scores(ladder))

@@ -14,7 +14,7 @@ from typing import Any
 from endopilot.files import read_json
 
 PACKAGED = Path(__file__).parents[2] / "src" / "endopilot" / "models" / "pretrained"
-FILES = ("ff.safetensors", "if.safetensors", "config.json", "manifest.json", "training.json", "xray.json")
+FILES = ("ff.safetensors", "if.safetensors", "manifest.json", "training.json", "xray.json")
 CARD = """# Model card: `pretrained`
 
 A forward and an inverse causal network (`endopilot.models.causal`) for the device {device} in right coronary arteries.

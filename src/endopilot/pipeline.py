@@ -1,15 +1,15 @@
 """All stages in a row: a CT angiogram goes in, a report comes out.
 
-`run_demo` makes its own patients first; `run_volume` takes one volume of yours. Both keep a ledger of finished stages,
-so that an interrupted run goes on where it stopped, and both end with report.html, metrics.json and manifest.json.
+`run_demo` makes its own patients first; `run_volume` takes one volume of yours. Both record the finished stages, so
+that an interrupted run goes on where it stopped, and both end with report.html, metrics.json and manifest.json.
 """
 
 from __future__ import annotations
 
-import json
+import hashlib
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from endopilot import __version__
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy, read_source
 from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
@@ -25,17 +26,18 @@ from endopilot.dataset.loader import load_dataset
 from endopilot.errors import InputError
 from endopilot.evaluation.anatomy_score import score_anatomy
 from endopilot.evaluation.results import REPORT_FILE
-from endopilot.files import input_hash, json_text, manifest, read_json, write_json
-from endopilot.imaging.segment import SegmentConfig, segment
+from endopilot.files import input_hash, manifest, read_json, write_json
+from endopilot.imaging.segment import METHODS, SegmentConfig, segment
 from endopilot.imaging.volume import read_mask, read_volume, write_mask, write_volume
 from endopilot.models.config import PRETRAINED, TrainConfig, run_path
 from endopilot.parallel import each
 from endopilot.phantom.phantom import PhantomConfig, make_phantom
 from endopilot.progress import progress
+from endopilot.runs import claim
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import Device, read_device
 from endopilot.simulation.simulate import simulate
-from endopilot.types import Rollout
+from endopilot.types import Rollout, Volume
 
 VOLUME_SUFFIX = ".nii.gz"
 EVALUATED = 48
@@ -97,34 +99,21 @@ class RunConfig(StudyConfig):
             raise InputError(f"--training-seconds {self.training_seconds}: give a positive number")
 
 
-class Ledger:
-    """What a run has behind it, kept in `stages.json`: finished stages, their seconds, rejected patients.
+class _Stages:
+    """The finished stages of a run, their seconds and the rejected patients, kept in `stages.json`.
 
     Args:
-        folder: the run's folder.
-        config: the run's configuration; a folder begun with another one is refused.
-
-    Raises:
-        InputError: the folder holds a run with another configuration.
+        folder: the run's folder, which the run has claimed.
     """
 
-    def __init__(self, folder: Path, config: Any) -> None:
-        self.path = folder / "stages.json"
-        self.config = json.loads(json_text(asdict(config)))
-        self.finished: list[str] = []
-        self.seconds: dict[str, float] = {}
-        self.rejected: dict[str, str] = {}
-        self.inputs: dict[str, str] = {}
-        if self.path.exists():
-            record = read_json(self.path)
-            different = [key for key, value in self.config.items() if record["config"].get(key) != value]
-            if different:
-                raise InputError(
-                    f"{folder}: holds a run with another {', '.join(different)}; remove it or choose another --output"
-                )
-            self.finished, self.seconds, self.rejected = (record[key] for key in ("finished", "seconds", "rejected"))
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / "stages.json"
+        record = read_json(self._path) if self._path.exists() else {}
+        self.finished: list[str] = record.get("finished", [])
+        self.seconds: dict[str, float] = record.get("seconds", {})
+        self.rejected: dict[str, str] = record.get("rejected", {})
 
-    def stage(self, name: str, work: Callable[[], None]) -> None:
+    def do(self, name: str, work: Callable[[], None]) -> None:
         """Do the work of a stage unless it is finished; time spent before an interruption counts too."""
         if name in self.finished:
             return
@@ -134,18 +123,53 @@ class Ledger:
             self.finished.append(name)
         finally:
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
-            write_json(self.path, {key: value for key, value in vars(self).items() if key != "path"})
+            record = {"finished": self.finished, "seconds": self.seconds, "rejected": self.rejected}
+            write_json(self._path, record)
 
-    def each(self, title: str, items: Sequence[Path], work: Callable[[Path], None]) -> None:
-        """Do a stage's work for every item; one whose input is bad is rejected, and told, unless it is the only one."""
-        bad = each(title, items, work)
-        if len(items) == 1 and bad:
-            raise bad[items[0]]
-        self.rejected.update({item.name: str(error) for item, error in bad.items()})
+    def do_each(self, name: str, title: str, items: Sequence[Path], work: Callable[[Path], None]) -> None:
+        """Do a stage's work for every item. A bad item is rejected and recorded; a bad only item ends the run."""
+
+        def work_on_all() -> None:
+            bad = each(title, items, work)
+            if len(items) == 1 and bad:
+                raise bad[items[0]]
+            self.rejected.update({item.name: str(error) for item, error in bad.items()})
+
+        self.do(name, work_on_all)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Run:
+    """What the stages share.
+
+    Attributes:
+        output: folder of everything that is made.
+        config: device and size of the study.
+        segmentation: how to segment.
+        device: the wire.
+        stages: what is finished.
+        origin: where the patients come from, for the report.
+        command: what was typed, for the report.
+        inputs: SHA-256 of the input files, by name.
+    """
+
+    output: Path
+    config: StudyConfig
+    segmentation: SegmentConfig
+    device: Device
+    stages: _Stages
+    origin: str
+    command: str
+    inputs: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def trained(self) -> Path:
+        """The run whose networks are evaluated: this study's, or that of the package."""
+        return self.output / "training" if self.config.training_seconds > 0 else Path(PRETRAINED)
 
 
 def run_demo(output: Path, config: DemoConfig) -> dict[str, Any]:
-    """Go the whole way with synthetic patients and write `output`/report.html.
+    """Run all stages on synthetic patients and write `output`/report.html.
 
     Everything after the CT volumes is made from them alone; the generator's truth only scores the result.
 
@@ -157,23 +181,30 @@ def run_demo(output: Path, config: DemoConfig) -> dict[str, Any]:
         The report's path and the figures of its summary.
 
     Raises:
-        InputError: the folder holds a demo with other settings, or too few patients could be segmented.
+        InputError: the folder belongs to another run, or too few patients could be segmented.
     """
-    ledger = Ledger(output, config)
+    device = read_device(config.device)
+    claim(output, "endopilot demo", config=config, device=device, version=__version__)
+    run = _Run(
+        output=output,
+        config=config,
+        segmentation=SegmentConfig(method="coronary", vessel="rca"),
+        device=device,
+        stages=_Stages(output),
+        origin=DEMO_ORIGIN,
+        command="endopilot demo",
+    )
     atlas = AtlasConfig(anatomy="rca", count=config.patients, seed=config.seed)
     truths = [output / "truth" / f"patient-{index + 1}" for index in range(config.patients)]
-
     make_patient = partial(_make_patient, config=atlas, truths=truths)
     make_volume = partial(_make_volume, output=output, seed=config.seed, truths=truths)
-    ledger.stage("atlas", lambda: ledger.each("Synthetic patients", truths, make_patient))
-    ledger.stage("phantom", lambda: ledger.each("Synthetic CT angiograms", truths, make_volume))
-    volumes = [output / "ct" / f"{folder.name}{VOLUME_SUFFIX}" for folder in truths]
-    segmentation = SegmentConfig(method="coronary", vessel="rca")
-    return _study(output, volumes, config, segmentation, ledger, origin=DEMO_ORIGIN, command="endopilot demo")
+    run.stages.do_each("atlas", "Synthetic patients", truths, make_patient)
+    run.stages.do_each("phantom", "Synthetic CT angiograms", truths, make_volume)
+    return _study(run, [output / "ct" / f"{folder.name}{VOLUME_SUFFIX}" for folder in truths])
 
 
 def run_volume(volume: Path, output: Path, config: RunConfig, *, series: str | None = None) -> dict[str, Any]:
-    """Go the whole way with one CT angiogram and write `output`/report.html.
+    """Run all stages on one CT angiogram and write `output`/report.html.
 
     Args:
         volume: DICOM folder or file, NIfTI, NRRD or MHA, in HU.
@@ -182,17 +213,52 @@ def run_volume(volume: Path, output: Path, config: RunConfig, *, series: str | N
         series: number or instance UID of the series, where a DICOM folder holds several.
 
     Returns:
-        The report's path and the figures of its summary.
+        As `run_demo` does.
 
     Raises:
-        InputError: the volume cannot be read or segmented, or the folder holds another run.
+        InputError: the volume cannot be read or segmented, or the folder belongs to another run, such as that of
+            another volume.
     """
-    ledger = Ledger(output, config)
+    device = read_device(config.device)
     copy = output / "ct" / f"patient{VOLUME_SUFFIX}"
-    ledger.stage("read", lambda: write_volume(read_volume(volume, series=series), copy))
-    ledger.inputs = input_hash(volume)
-    command = f"endopilot run {volume} -o {output}"
-    return _study(output, [copy], config, config.segmentation, ledger, origin=RUN_ORIGIN, command=command)
+    run = _Run(
+        output=output,
+        config=config,
+        segmentation=config.segmentation,
+        device=device,
+        stages=_begin_with(volume, copy, output, config, device, series),
+        origin=RUN_ORIGIN,
+        command=f"endopilot run {volume} -o {output}" + (f" --series {series}" if series else ""),
+        inputs=input_hash(volume),
+    )
+    return _study(run, [copy])
+
+
+def _begin_with(
+    volume: Path, copy: Path, output: Path, config: RunConfig, device: Device, series: str | None
+) -> _Stages:
+    """Read a volume, claim the folder for it and keep a copy there."""
+    content = read_volume(volume, series=series)
+    claim(
+        output,
+        "endopilot run",
+        volume_sha256=_digest(content),
+        config=config,
+        method=METHODS.origin(config.segmentation.method),
+        device=device,
+        version=__version__,
+    )
+    stages = _Stages(output)
+    stages.do("read", lambda: write_volume(content, copy))
+    return stages
+
+
+def _digest(volume: Volume) -> str:
+    """Return the SHA-256 of voxels and geometry: of what is used, whichever files, names and series it came from."""
+    digest = hashlib.sha256()
+    for part in (volume.voxels, volume.spacing_mm, volume.origin_mm, volume.direction):
+        digest.update(f"{part.dtype} {part.shape} ".encode() + np.ascontiguousarray(part).tobytes())
+    return digest.hexdigest()
 
 
 def _make_patient(folder: Path, *, config: AtlasConfig, truths: Sequence[Path]) -> None:
@@ -221,36 +287,28 @@ def _make_anatomy(volume: Path, *, output: Path, config: AnatomyConfig) -> None:
         write_anatomy(extract_anatomy(read_source(mask), name=name, config=config), folder)
 
 
-def _study(
-    output: Path,
-    volumes: Sequence[Path],
-    config: StudyConfig,
-    segmentation: SegmentConfig,
-    ledger: Ledger,
-    *,
-    origin: str,
-    command: str,
-) -> dict[str, Any]:
+def _study(run: _Run, volumes: Sequence[Path]) -> dict[str, Any]:
     """Take volumes to a report: the part that synthetic and real patients share."""
+    output, stages, segmentation = run.output, run.stages, run.segmentation
     scheme = segmentation.vessel if segmentation.method == "coronary" else "generic"
-
     make_mask = partial(_make_mask, output=output, config=segmentation)
     make_anatomy = partial(_make_anatomy, output=output, config=AnatomyConfig(vessel=scheme))
-    ledger.stage("segmentation", lambda: ledger.each("Segmentation", volumes, make_mask))
-    ledger.stage("anatomy", lambda: ledger.each("Centerlines and distance maps", volumes, make_anatomy))
+    stages.do_each("segmentation", "Segmentation", volumes, make_mask)
+    stages.do_each("anatomy", "Centerlines and distance maps", volumes, make_anatomy)
     names = [volume.name.removesuffix(VOLUME_SUFFIX) for volume in volumes]
     names = [name for name in names if (output / "anatomies" / name).exists()]
-    _learn(output, [output / "anatomies" / name for name in names], config, ledger)
-    ledger.stage("report", lambda: _report(output, names, origin, command, ledger))
-    return _finish(output, config, ledger)
+    _learn(run, [output / "anatomies" / name for name in names])
+    stages.do("report", lambda: _report(run, names))
+    return _finish(run)
 
 
-def _learn(output: Path, anatomies: Sequence[Path], config: StudyConfig, ledger: Ledger) -> None:
+def _learn(run: _Run, anatomies: Sequence[Path]) -> None:
     """Simulate navigations, train both networks on them unless the packaged ones are to do, and evaluate these."""
     from endopilot.evaluation.evaluate import EvaluateConfig, evaluate
     from endopilot.models.train import train  # torch takes seconds to import
     from endopilot.report.evaluation_report import report_evaluation
 
+    output, config = run.output, run.config
     trains = config.training_seconds > 0
     unseen = len(anatomies) // 3 if trains else len(anatomies) - len(anatomies) // 3  # the others give baselines' means
     shares = (1 - unseen / len(anatomies), 0.0, unseen / len(anatomies)) if unseen else None
@@ -261,30 +319,25 @@ def _learn(output: Path, anatomies: Sequence[Path], config: StudyConfig, ledger:
         anatomy_shares=shares,
         seen_test_share=DatasetConfig.seen_test_share if trains else 0.0,  # the packaged networks know none of them
     )
-    device = read_device(config.device)
-    ledger.stage("dataset", lambda: generate_dataset(anatomies, output / "dataset", device, dataset))
+    run.stages.do("dataset", lambda: generate_dataset(anatomies, output / "dataset", run.device, dataset))
     if trains:
         training = TrainConfig(model="paper", max_seconds=config.training_seconds, seed=config.seed)
-        ledger.stage("training", lambda: train(output / "dataset", output / "training", training))
+        run.stages.do("training", lambda: train(output / "dataset", output / "training", training))
 
     def measure() -> None:
         settings = EvaluateConfig(sequences=EVALUATED, seed=config.seed)
-        evaluate(_run(output, config.training_seconds), output / "evaluation", settings, output / "dataset")
+        evaluate(run.trained, output / "evaluation", settings, output / "dataset")
         report_evaluation(output / "evaluation")
 
-    ledger.stage("evaluation", measure)
+    run.stages.do("evaluation", measure)
 
 
-def _run(output: Path, training_seconds: float) -> Path:
-    """Return the run whose networks are evaluated."""
-    return output / "training" if training_seconds > 0 else Path(PRETRAINED)
-
-
-def _report(output: Path, names: Sequence[str], origin: str, command: str, ledger: Ledger) -> None:
-    """Write report.html from what the other stages left in `output`."""
+def _report(run: _Run, names: Sequence[str]) -> None:
+    """Write report.html from what the other stages left in the run's folder."""
     from endopilot.report.report import PatientContent, ReportContent, write_report  # matplotlib and plotly
 
-    anatomy, replay = _replay(output, read_device(ledger.config["device"]))
+    output = run.output
+    anatomy, replay = _replay(output, run.device)
     scores = _scores(output, names)
     patients = tuple(
         PatientContent(
@@ -298,15 +351,15 @@ def _report(output: Path, names: Sequence[str], origin: str, command: str, ledge
     )
     content = ReportContent(
         title="endopilot: from a CT angiogram to guidewire control",
-        origin=origin,
-        command=command,
+        origin=run.origin,
+        command=run.command,
         patients=patients,
         evaluation=output / "evaluation",
-        run=run_path(_run(output, ledger.config["training_seconds"])),
+        run=run_path(run.trained),
         replay=replay,
         replay_anatomy=anatomy,
-        stage_seconds=ledger.seconds,
-        manifest=manifest(config=ledger.config, seed=ledger.config["seed"], rejected=ledger.rejected),
+        stage_seconds=run.stages.seconds,
+        manifest=manifest(config=run.config, seed=run.config.seed, inputs=run.inputs, rejected=run.stages.rejected),
     )
     for remark in write_report(output / REPORT_FILE, content):
         print(remark, file=sys.stderr)
@@ -339,31 +392,23 @@ def _replay(output: Path, device: Device) -> tuple[Path, Rollout]:
     initial = np.stack([one.initial_inserted_length, one.initial_rotation], axis=-1)
     anatomy = read_anatomy(folder)
     settings = SimulatorConfig(**dataset.manifest["config"]["simulator"])
-    rollout = simulate(
-        anatomy, device, one.control, initial=initial, config=settings, friction=one.friction, record_shape=True
-    )
-    return folder, rollout
+    options = {"initial": initial, "config": settings, "friction": one.friction, "record_shape": True}
+    return folder, simulate(anatomy, device, one.control, **options)
 
 
-def _finish(output: Path, config: StudyConfig, ledger: Ledger) -> dict[str, Any]:
-    """Write metrics.json and manifest.json, and return what the command prints."""
+def _finish(run: _Run) -> dict[str, Any]:
+    """Write metrics.json and manifest.json unless they are there, and return what the command prints."""
+    output, stages = run.output, run.stages
     metrics = read_json(output / "evaluation" / "metrics.json")
-    write_json(output / "metrics.json", {**metrics, "anatomy_scores": read_json(output / "scores.json")})
-    wall_seconds = sum(ledger.seconds.values())
-    write_json(
-        output / "manifest.json",
-        manifest(
-            config=config,
-            seed=config.seed,
-            inputs=ledger.inputs,
-            wall_seconds=wall_seconds,
-            stages=ledger.seconds,
-            rejected=ledger.rejected,
-        ),
-    )
+    wall_seconds = sum(stages.seconds.values())
+    if not (output / "manifest.json").exists():
+        write_json(output / "metrics.json", {**metrics, "anatomy_scores": read_json(output / "scores.json")})
+        facts = {"wall_seconds": wall_seconds, "stages": stages.seconds, "rejected": stages.rejected}
+        record = manifest(config=run.config, seed=run.config.seed, inputs=run.inputs, **facts)
+        write_json(output / "manifest.json", record)
     return {
         "report": str(output / REPORT_FILE),
         "wall_seconds": round(wall_seconds, 1),
-        "rejected": ledger.rejected,
+        "rejected": stages.rejected,
         "findings": metrics["findings"],
     }

@@ -8,11 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from endopilot import runs
 from endopilot.atlas.atlas import make_patient
 from endopilot.benchmarks import imaging as imaging_bench
 from endopilot.benchmarks.imaging import BARS, ImagingBenchConfig, bench_imaging, draw_case
 from endopilot.errors import InputError
 from endopilot.imaging.overlap import mask_like
+from endopilot.runs import claim
 from endopilot.types import LumenMask, Volume
 
 GOOD = {
@@ -27,10 +29,10 @@ GOOD = {
 
 
 def write(folder, rows) -> None:
-    folder.mkdir(exist_ok=True)
+    claim(folder, "endopilot bench imaging", **imaging_bench._identity(7))
     for index, row in enumerate(rows):
-        whole = {"case": index, "method": imaging_bench._method(), "failed": None, "seconds": 2, "processor_seconds": 3}
-        (folder / f"7-{index:04d}.json").write_text(json.dumps(whole | row))
+        whole = {"case": index, "failed": None, "seconds": 2, "processor_seconds": 3}
+        (folder / f"{index:04d}.json").write_text(json.dumps(whole | row))
 
 
 def figures(folder, rows):
@@ -56,8 +58,8 @@ def test_a_failed_case_counts_against_every_figure(tmp_path):
     assert not any(found[name]["met"] for name in BARS if name.endswith("_mm"))
 
 
-def test_only_missing_or_outdated_cases_are_measured(tmp_path, monkeypatch):
-    write(tmp_path, [GOOD, GOOD | {"method": "another"}])
+def test_only_missing_cases_are_measured(tmp_path, monkeypatch):
+    write(tmp_path, [GOOD])
     asked = []
 
     def measured(title, paths, work):
@@ -65,9 +67,20 @@ def test_only_missing_or_outdated_cases_are_measured(tmp_path, monkeypatch):
         write(tmp_path, [GOOD] * 3)
         return {}
 
-    monkeypatch.setattr(imaging_bench, "each", measured)
+    monkeypatch.setattr(runs, "each", measured)
     bench_imaging(ImagingBenchConfig(cases=3, seed=7, folder=tmp_path))
-    assert asked == ["7-0001.json", "7-0002.json"]
+    assert asked == ["0001.json", "0002.json"]
+
+
+def test_cases_of_another_seed_or_by_other_code_are_refused(tmp_path, monkeypatch):
+    write(tmp_path, [GOOD])
+    with pytest.raises(InputError, match="was begun with seed = 7, now it is 8"):
+        bench_imaging(ImagingBenchConfig(cases=1, seed=8, folder=tmp_path))
+    other = imaging_bench._identity(7)
+    other["sources"]["endopilot.phantom"] = "another"
+    monkeypatch.setattr(imaging_bench, "_identity", lambda seed: other)
+    with pytest.raises(InputError, match=r"was begun with sources\.endopilot\.phantom = "):
+        bench_imaging(ImagingBenchConfig(cases=1, seed=7, folder=tmp_path))
 
 
 def test_a_case_depends_on_seed_and_index_alone():
@@ -90,7 +103,7 @@ def test_one_case_from_the_volume_to_its_scores(tmp_path, monkeypatch):
     found = bench_imaging(ImagingBenchConfig(cases=1, seed=1000, folder=tmp_path))
     assert found["failed"] == {}
     assert found["dice"]["mean"] > 0.9 and found["overlap"]["mean"] == 1.0
-    row = json.loads((tmp_path / "1000-0000.json").read_text())
+    row = json.loads((tmp_path / "0000.json").read_text())
     assert row["scan"]["in_plane_mm"] == 0.9 and row["manifest"]["seed"] == 1000
 
 

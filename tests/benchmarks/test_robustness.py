@@ -51,7 +51,7 @@ def test_a_small_run_holds_its_bars_and_goes_on_where_it_stopped(tmp_path: Path)
     assert {k: v for k, v in again.items() if k != "realtime_factor"} == {
         k: v for k, v in measured.items() if k != "realtime_factor"
     }
-    with pytest.raises(InputError, match="was begun with seed = 3, now it is 4"):
+    with pytest.raises(InputError, match=r"was begun with config\.seed = 3, now it is 4"):
         measure_robustness(replace(small(folder), seed=4))
 
 

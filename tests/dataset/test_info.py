@@ -16,6 +16,7 @@ from toy_navigation import make_toy_dataset, toy_simulate
 def failing(*args, **kwargs):
     rollout = toy_simulate(*args, **kwargs)
     rollout.valid[1, 5:] = False
+    rollout.reason[1] = 2
     return rollout
 
 
@@ -59,7 +60,7 @@ def test_manoeuvres_are_those_that_were_driven(folder):
 def test_failures_are_counted_with_their_reason(folder):
     figures = describe_dataset(folder).figures
     assert figures["invalid"] == 6  # the second navigation of each of six files
-    assert figures["invalid_reasons"] == {"did not converge or left the finite numbers": 6}
+    assert figures["invalid_reasons"] == {"did not converge": 6}
 
 
 def test_every_distribution_has_a_picture(folder, tmp_path):

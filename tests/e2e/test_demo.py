@@ -8,7 +8,11 @@ import subprocess
 import sys
 import time
 
+from endopilot import __version__
 from endopilot.files import read_json
+from endopilot.pipeline import DemoConfig
+from endopilot.runs import claim
+from endopilot.simulation.device import read_device
 
 SIZE = ("--patients", "3", "--sequences", "6", "--seconds", "25")
 STAGES = ["atlas", "phantom", "segmentation", "anatomy", "dataset", "evaluation", "report"]
@@ -68,10 +72,16 @@ def test_settings_that_the_packaged_networks_do_not_fit_are_refused(tmp_path):
 
 
 def test_another_size_in_the_same_folder_is_refused(tmp_path):
-    (tmp_path / "stages.json").write_text(
-        json.dumps({"config": {"patients": 6}, "finished": [], "seconds": {}, "rejected": {}})
+    claim(
+        tmp_path,
+        "endopilot demo",
+        config=DemoConfig(patients=6),
+        device=read_device("workhorse-014"),
+        version=__version__,
     )
+    (tmp_path / "stages.json").write_text("{}")
     command = [sys.executable, "-m", "endopilot.cli", "demo", "-o", str(tmp_path), *SIZE]
     result = subprocess.run(command, capture_output=True, text=True)
     assert result.returncode == 2
-    assert len(result.stderr.strip().splitlines()) == 1 and "patients" in result.stderr
+    assert len(result.stderr.strip().splitlines()) == 1
+    assert "was begun with config.sequences = 60, now it is 6" in result.stderr

@@ -9,6 +9,7 @@ from html import unescape
 import numpy as np
 import pytest
 
+from endopilot import runs
 from endopilot.control.navigate import ModelMismatch
 from endopilot.errors import InputError
 from endopilot.ladder import ladder
@@ -50,17 +51,17 @@ def test_pushing_solves_the_straight_run(climbed):
 def test_an_interrupted_run_goes_on_with_what_is_missing(climbed, monkeypatch):
     folder, rows = climbed
     asked = []
-    monkeypatch.setattr(ladder, "each", lambda title, items, work: asked.extend(items) or {})
+    monkeypatch.setattr(runs, "each", lambda title, items, work: asked.extend(items) or {})
     assert climb(folder, LadderConfig(policy="forward", tasks=("straight",), patients=1)) == rows
     assert asked == []
 
 
 def test_a_folder_of_another_policy_or_of_something_else_is_refused(climbed, tmp_path):
     folder, _ = climbed
-    with pytest.raises(InputError, match="holds the results of policy 'forward'"):
+    with pytest.raises(InputError, match="was begun with policy = forward, now it is spin"):
         climb(folder, LadderConfig(policy="spin", tasks=("straight",), patients=1))
     (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(InputError, match="is not empty and holds no ladder"):
+    with pytest.raises(InputError, match=r"is not empty and holds no run\.json"):
         climb(tmp_path, LadderConfig(tasks=("straight",), patients=1))
 
 
@@ -68,7 +69,7 @@ def test_a_folder_of_another_task_is_refused(climbed, monkeypatch):
     folder, _ = climbed
     changed = tuple(task.model_copy(update={"seconds": 1.0}) for task in ladder_tasks())
     monkeypatch.setattr(ladder, "ladder_tasks", lambda: changed)
-    with pytest.raises(InputError, match="was begun with another task 'straight'"):
+    with pytest.raises(InputError, match=r"was begun with tasks\.straight = "):
         climb(folder, LadderConfig(policy="forward", tasks=("straight",), patients=1))
 
 

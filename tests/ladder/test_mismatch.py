@@ -6,8 +6,8 @@ import json
 
 import pytest
 
+from endopilot import runs
 from endopilot.errors import InputError
-from endopilot.ladder import ladder
 from endopilot.ladder import mismatch as robustness
 from endopilot.ladder.ladder import LadderConfig
 from endopilot.ladder.mismatch import CASES, measure_mismatch, title_of, truth_of
@@ -29,7 +29,7 @@ def degraded(tmp_path_factory):
     folder = tmp_path_factory.mktemp("robustness") / "forward"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(robustness, "CASES", ("as-told", "ostium-more", "all"))
-        patch.setattr(ladder, "each", here)
+        patch.setattr(runs, "each", here)
         return folder, measure_mismatch(folder, ONE, 0.2)
 
 
@@ -65,9 +65,9 @@ def test_an_interrupted_run_goes_on_and_another_share_needs_another_folder(degra
     folder, rows = degraded
     monkeypatch.setattr(robustness, "CASES", ("as-told", "ostium-more", "all"))
     asked = []
-    monkeypatch.setattr(ladder, "each", lambda title, items, work: asked.extend(items) or {})
+    monkeypatch.setattr(runs, "each", lambda title, items, work: asked.extend(items) or {})
     assert measure_mismatch(folder, ONE, 0.2) == rows and asked == []
-    with pytest.raises(InputError, match=r"holds the results of off 0\.2"):
+    with pytest.raises(InputError, match=r"was begun with off = 0\.2, now it is 0\.3"):
         measure_mismatch(folder, ONE, 0.3)
 
 

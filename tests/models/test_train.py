@@ -69,7 +69,7 @@ def test_overfits_one_batch(toy_dataset, name):
 def test_writes_what_a_run_holds(short_run, toy_dataset):
     names = {path.name for path in short_run.iterdir()}
     networks = {"ff.safetensors", "if.safetensors"}
-    assert names == networks | {"config.json", "training.json", "manifest.json", "checkpoints", "tensorboard"}
+    assert names == networks | {"run.json", "training.json", "manifest.json", "checkpoints", "tensorboard"}
     record = read_json(short_run / "manifest.json")
     assert (short_run / record["dataset"]).resolve() == toy_dataset.resolve()
     assert record["networks"]["ff"]["parameters"] == sum(p.numel() for p in NETWORKS["ff"](SMALL).parameters())
@@ -151,7 +151,7 @@ def test_a_finished_run_returns_at_once(short_run, toy_dataset):
 
 
 def test_other_settings_are_refused(short_run, toy_dataset):
-    with pytest.raises(InputError, match="begun with epochs = 3, now it is 4"):
+    with pytest.raises(InputError, match=r"begun with config\.epochs = 3, now it is 4"):
         train(toy_dataset, short_run, TrainConfig(**(SHORT | {"epochs": 4})))
 
 

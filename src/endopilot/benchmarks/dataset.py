@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from endopilot import __version__
 from endopilot.anatomy.io import write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.dataset.generate import DatasetConfig, generate_dataset
@@ -12,6 +13,7 @@ from endopilot.dataset.schema import MANIFEST_PATH
 from endopilot.errors import InputError
 from endopilot.files import processor_name, read_json
 from endopilot.progress import progress
+from endopilot.runs import claim
 from endopilot.simulation.device import read_device
 
 PAPER_ANATOMIES, PAPER_SEQUENCES = 100, 1000
@@ -44,6 +46,7 @@ def bench_dataset(output: Path, *, share: float = 0.05) -> dict[str, Any]:
         raise InputError(f"share: {share}; give a share of the full set, more than 0 and up to 1")
     size = DatasetConfig().sequences_per_file
     count = max(1, round(share * PAPER_ANATOMIES * PAPER_SEQUENCES / size))
+    claim(output, "endopilot bench dataset", share=share, version=__version__)
     folders = [output / "anatomies" / f"rca-{index:04d}" for index in range(count)]
     with progress("Synthetic patients", count) as advance:
         for index, folder in enumerate(folders):

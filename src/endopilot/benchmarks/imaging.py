@@ -12,15 +12,19 @@ from typing import Any
 import numpy as np
 
 import endopilot.anatomy
+import endopilot.atlas
+import endopilot.evaluation
 import endopilot.imaging
+import endopilot.phantom
+from endopilot import __version__
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.errors import InputError
 from endopilot.evaluation.anatomy_score import score_anatomy
 from endopilot.files import manifest, read_json, write_json
 from endopilot.imaging.segment import SegmentConfig, segment
-from endopilot.parallel import each
 from endopilot.phantom.phantom import PhantomConfig, make_phantom
+from endopilot.runs import claim, make_missing
 
 VESSELS = ("rca", "lca")
 """Coronary trees of the cases, in turn."""
@@ -56,7 +60,7 @@ class ImagingBenchConfig:
     """Number of synthetic CT angiograms."""
     seed: int = 0
     """Seed of patients, scanners and noise: case i is the same however many there are."""
-    folder: Path = Path("runs/imaging")
+    folder: Path = Path("runs/bench-imaging")
     """Folder of the cases' results; an interrupted run goes on where it stopped."""
 
     def __post_init__(self) -> None:
@@ -76,13 +80,13 @@ def bench_imaging(config: ImagingBenchConfig) -> dict[str, Any]:
         `counts` (mean or worst) and whether it is `met`; `seconds`
         and `processor_seconds` of the segmentation a case; `cases`, and `failed`: cases without any result, each with
         the reason. A failed case counts 0 in the shares, and no bar in mm is met then.
+
+    Raises:
+        InputError: the folder belongs to another run, such as one of another seed or by other source code.
     """
-    paths = [config.folder / f"{config.seed}-{index:04d}.json" for index in range(config.cases)]
-    method = _method()
-    missing = [path for path in paths if not path.exists() or read_json(path).get("method") != method]
-    bad = each("Synthetic CT angiograms", missing, partial(_measure, seed=config.seed, method=method))
-    if bad:
-        raise next(iter(bad.values()))
+    claim(config.folder, "endopilot bench imaging", **_identity(config.seed))
+    paths = [config.folder / f"{index:04d}.json" for index in range(config.cases)]
+    make_missing("Synthetic CT angiograms", paths, partial(_measure, seed=config.seed))
     rows = [read_json(path) for path in paths]
     failed = {str(row["case"]): row["failed"] for row in rows if row["failed"]}
     figures: dict[str, Any] = {name: _figure(name, rows) for name in BARS}
@@ -107,14 +111,14 @@ def draw_case(seed: int, index: int) -> tuple[AtlasConfig, PhantomConfig]:
     return patients, scan
 
 
-def _measure(path: Path, *, seed: int, method: str) -> None:
+def _measure(path: Path, *, seed: int) -> None:
     """Make, segment and score one case, and write its row."""
-    index = int(path.stem.rsplit("-", 1)[1])
+    index = int(path.stem)
     patients, scan = draw_case(seed, index)
     truth = make_patient(patients, index)
     volume = make_phantom(truth, scan, seed * 1_000_003 + index)
     vessel = "lca" if patients.anatomy == "lca" else "rca"
-    row: dict[str, Any] = {"case": index, "method": method, "failed": None}
+    row: dict[str, Any] = {"case": index, "failed": None}
     wall, processor = time.perf_counter(), time.process_time()
     mask = None
     try:
@@ -156,11 +160,12 @@ def _rounded(value: float) -> float | None:
     return round(value, 4) if np.isfinite(value) else None
 
 
-def _method() -> str:
-    """Return a digest of the source of imaging and anatomy: a result of other code is measured anew."""
-    digest = hashlib.sha256()
-    for package in (endopilot.imaging, endopilot.anatomy):
-        folder = Path(next(iter(package.__path__)))
+def _identity(seed: int) -> dict[str, Any]:
+    """Return what the results of the cases follow from: the seed, and the source of every package that they need."""
+    sources = {}
+    for package in (endopilot.imaging, endopilot.anatomy, endopilot.atlas, endopilot.phantom, endopilot.evaluation):
+        folder, digest = Path(next(iter(package.__path__))), hashlib.sha256()
         for path in sorted(folder.rglob("*.py")):
             digest.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes())
-    return digest.hexdigest()[:16]
+        sources[package.__name__] = digest.hexdigest()
+    return {"seed": seed, "sources": sources, "version": __version__}

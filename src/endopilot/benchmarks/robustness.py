@@ -8,7 +8,6 @@ small file. A run that was interrupted goes on with the chunks that have none.
 
 from __future__ import annotations
 
-import hashlib
 import multiprocessing
 import time
 import warnings
@@ -23,12 +22,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from endopilot import _core
+from endopilot import __version__, _core
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.errors import InputError
-from endopilot.files import read_json, write_json, writing
+from endopilot.files import read_json, sha256, write_json, writing
 from endopilot.parallel import follow_the_parent
 from endopilot.progress import progress
+from endopilot.runs import claim
 from endopilot.simulation.config import SimulatorConfig, wall_stiffness
 from endopilot.simulation.controls import ControlConfig, random_controls
 from endopilot.simulation.device import Device, check_fits, read_device
@@ -66,7 +66,7 @@ class RobustnessConfig:
     """Length of a rollout, s."""
     threads: int = 0
     """Threads of the rod core; 0 for one a processor core. The results do not depend on it."""
-    folder: Path = Path("runs/robustness")
+    folder: Path = Path("runs/bench-robustness")
     """Folder of the chunks' results; an interrupted run goes on where it stopped."""
 
     def __post_init__(self) -> None:
@@ -118,10 +118,10 @@ def measure_robustness(config: RobustnessConfig) -> dict[str, Any]:
         and `crashed`, one sentence each: reason, anatomy, device, rollout, seconds.
 
     Raises:
-        InputError: the folder was begun with other settings or another build of the core, or cannot be written.
+        InputError: the folder belongs to another run, such as one of another build of the core, or cannot be written.
     """
-    _begin(config)
     devices = [read_device(name) for name in list_devices()]
+    claim(config.folder, "endopilot bench robustness", **_identity(config, devices))
     share = -(-config.rollouts // config.anatomies)
     with progress("Rollouts", total=config.anatomies * len(devices)) as advance, _Worker() as worker:
         for index in range(config.anatomies):
@@ -284,23 +284,14 @@ def _done(path: Path) -> bool:
     return path.with_suffix(".json").exists()  # written last
 
 
-def _begin(config: RobustnessConfig) -> None:
-    """Claim the folder, or check that it was begun with the same settings and the same core."""
-    asked = {name: value for name, value in asdict(config).items() if name not in ("threads", "folder")}
-    settings = asked | {"core_sha256": hashlib.sha256(Path(_core.__file__).read_bytes()).hexdigest()}
-    path = Path(config.folder) / "settings.json"
-    if path.exists():
-        before = read_json(path)
-        for name, now in settings.items():
-            if before.get(name) != now:
-                raise InputError(
-                    f"{config.folder}: was begun with {name} = {before.get(name)}, now it is {now}; "
-                    "choose another --folder, or remove this one"
-                )
-        return
-    if Path(config.folder).exists() and any(Path(config.folder).iterdir()):
-        raise InputError(f"{config.folder}: is not empty and holds no robustness run; choose another --folder")
-    write_json(path, settings)
+def _identity(config: RobustnessConfig, devices: list[Device]) -> dict[str, Any]:
+    """Return what the chunks follow from."""
+    return {
+        "config": {name: value for name, value in asdict(config).items() if name not in ("threads", "folder")},
+        "devices": {device.name: device for device in devices},
+        "core_sha256": sha256(Path(_core.__file__)),
+        "version": __version__,
+    }
 
 
 def _summarise(config: RobustnessConfig, devices: list[Device]) -> dict[str, Any]:

@@ -11,6 +11,7 @@ import torch
 from torch import nn
 from torch.utils.data import DataLoader, TensorDataset
 
+from endopilot import __version__
 from endopilot.anatomy.io import write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.dataset.generate import DatasetConfig, generate_dataset
@@ -19,6 +20,7 @@ from endopilot.models.checkpoint import make_network
 from endopilot.models.config import TrainConfig
 from endopilot.models.process_group import ProcessGroup
 from endopilot.models.train import AnyNetwork, Examples, Job, examples_of
+from endopilot.runs import claim
 from endopilot.simulation.device import read_device
 
 STEPS = 20
@@ -40,6 +42,7 @@ def bench_training(folder: Path) -> list[dict[str, Any]]:
     Returns:
         One row a model: samples a second of either loop, and the median over the rounds of their ratio, with its bar.
     """
+    claim(folder, "endopilot bench training", version=__version__)
     patient = folder / "patient"
     if not patient.exists():
         write_anatomy(make_patient(AtlasConfig(), 0), patient)

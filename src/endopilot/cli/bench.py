@@ -122,7 +122,7 @@ def anatomy(*, centerlines: Path | None = None, json: bool = False) -> None:
     _leave(all(row["passed"] is not False for row in rows))
 
 
-def imaging(*, cases: int = 50, seed: int = 0, folder: Path = Path("runs/imaging"), json: bool = False) -> None:
+def imaging(*, cases: int = 50, seed: int = 0, folder: Path = Path("runs/bench-imaging"), json: bool = False) -> None:
     """Segment synthetic CT angiograms from the volume alone, and compare with the truth.
 
     Args:

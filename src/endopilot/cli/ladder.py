@@ -22,7 +22,7 @@ def command(
     """Let a policy climb the ladder: twelve tasks, each in twenty synthetic patients. An interrupted run goes on.
 
     Args:
-        output: folder of the results; runs/ladder/POLICY if not given, or runs/robustness/POLICY with --off.
+        output: folder of the results; runs/ladder/POLICY if not given, or runs/ladder-mismatch/POLICY with --off.
         off: share, such as 0.2, by which friction, tip stiffness, latency and ostium are off from what the policy is
             told, one after another and together; a table of how its scores degrade takes the place of the ladder's.
         page: write index.html with pictures and replays.
@@ -32,7 +32,7 @@ def command(
     from endopilot.ladder.mismatch import PICTURE_FILE, measure_mismatch
     from endopilot.report.ladder_page import write_page
 
-    folder = output or Path("runs") / ("robustness" if off else "ladder") / config.policy
+    folder = output or Path("runs") / ("ladder-mismatch" if off else "ladder") / config.policy
     rows = measure_mismatch(folder, config, off) if off else climb(folder, config)
     show_rows(rows, as_json=json)
     made = {"picture": folder / PICTURE_FILE} if off else {"page": write_page(folder)} if page else {}

@@ -18,7 +18,8 @@ from endopilot.dataset.draw import Draw, draw_navigations
 from endopilot.dataset.navigations import simulate_navigations
 from endopilot.dataset.study import Block, Plan
 from endopilot.files import writing
-from endopilot.types import SAMPLE_PERIOD_S, Anatomy, Rollout
+from endopilot.simulation.simulate import why_invalid
+from endopilot.types import Anatomy, Rollout
 
 
 def write_block(plan: Plan, block: Block, *, threads: int = 1, advance: Callable[[int], None] = lambda _: None) -> None:
@@ -63,6 +64,7 @@ def _read(folder: Path, fingerprint: str) -> Anatomy:
 def _episodes(plan: Plan, block: Block, draw: Draw, rollout: Rollout, stopped: Bool[np.ndarray, "n"]) -> dict[str, Any]:
     """Return the columns of the episode table; the first seven and the last two are LeRobot's."""
     n, samples = rollout.valid.shape
+    whole = rollout.valid.all(axis=1).tolist()
     episode = block.first_episode + np.arange(n)
     chunk, file = divmod(block.number, schema.FILES_PER_CHUNK)
     return {
@@ -84,18 +86,8 @@ def _episodes(plan: Plan, block: Block, draw: Draw, rollout: Rollout, stopped: B
         "initial_inserted_length_mm": rollout.initial_inserted_length,
         "initial_rotation_rad": rollout.initial_rotation,
         "stopped_short": stopped,
-        "valid": rollout.valid.all(axis=1),
-        "invalid_reason": _reasons(rollout),
+        "valid": whole,
+        "invalid_reason": ["" if valid else why_invalid(rollout, world) for world, valid in enumerate(whole)],
         "meta/episodes/chunk_index": np.full(n, chunk),
         "meta/episodes/file_index": np.full(n, file),
     }
-
-
-def _reasons(rollout: Rollout) -> list[str]:
-    """Return why each world is invalid, "" for the valid ones."""
-    return [
-        ""
-        if valid.all()
-        else f"did not converge or left the finite numbers after {np.argmin(valid) * SAMPLE_PERIOD_S:g} s"
-        for valid in rollout.valid
-    ]

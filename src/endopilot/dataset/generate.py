@@ -17,11 +17,11 @@ from typing import Any
 
 from endopilot.dataset import schema
 from endopilot.dataset.splits import SPLITS
-from endopilot.dataset.study import Block, DatasetConfig, Study, differences, plan_study
+from endopilot.dataset.study import Block, DatasetConfig, Study, plan_study
 from endopilot.dataset.workers import work_here, work_on_cluster
-from endopilot.errors import InputError
 from endopilot.files import manifest, read_json, write_json, writing
 from endopilot.progress import progress
+from endopilot.runs import claim
 from endopilot.simulation.device import Device
 
 _WORK_PATH = "meta/work.json"
@@ -54,8 +54,10 @@ def generate_dataset(
     """
     study = plan_study(anatomy_folders, Path(output), device, config)
     blocks = study.blocks()
-    if _begin(study, blocks):
+    claim(study.plan.output, "endopilot dataset", **study.settings)
+    if _is_finished(study, blocks):
         return
+    (study.plan.output / schema.MANIFEST_PATH).unlink(missing_ok=True)
     missing = [block for block in blocks if not schema.paths_of_file(study.plan.output, block.number)[0].exists()]
     samples, to_do = (sum(len(block.sequences) for block in some) * config.samples for some in (blocks, missing))
     with progress("Simulating navigations", total=samples) as advance:
@@ -104,29 +106,12 @@ def read_work(output: Path) -> dict[str, Any]:
     return read_json(path) if path.exists() else {"samples": 0, "processor_seconds": 0.0, "wall_seconds": 0.0}
 
 
-def _begin(study: Study, blocks: Sequence[Block]) -> bool:
-    """Claim the output folder, or check that it was begun with the same settings; return true if it is finished."""
+def _is_finished(study: Study, blocks: Sequence[Block]) -> bool:
+    """Return whether the manifest, which is written last, and all other files are there."""
     output = study.plan.output
-    path = output / schema.MANIFEST_PATH
-    if path.exists():
-        before = read_json(path)
-        nothing_yet = not before["complete"] and not any(output.rglob("*.parquet"))
-        changes = () if nothing_yet else differences(before.get("settings", {}), study.settings)
-        for field_name, then, now in changes:
-            raise InputError(
-                f"{output}: was begun with {field_name} = {then}, now it is {now}; "
-                "choose another output folder or go back to the first settings"
-            )
-        files = [file for block in blocks for file in schema.paths_of_file(output, block.number)]
-        files += [output / name for name in (schema.INFO_PATH, schema.STATS_PATH, schema.TASKS_PATH)]
-        if before["complete"] and all(file.exists() for file in files):
-            return True
-    elif output.exists() and any(output.iterdir()):
-        raise InputError(f"{output}: is not empty and holds no dataset; choose another output folder")
-    for partial in output.rglob(".part-*"):  # left behind by a process that was killed
-        partial.unlink(missing_ok=True)
-    write_json(path, {"complete": False, "key": study.plan.key, "settings": study.settings})
-    return False
+    files = [file for block in blocks for file in schema.paths_of_file(output, block.number)]
+    described = (schema.INFO_PATH, schema.STATS_PATH, schema.TASKS_PATH, schema.MANIFEST_PATH)
+    return all(file.exists() for file in (*files, *(output / name for name in described)))
 
 
 def _finish(study: Study, blocks: Sequence[Block]) -> None:
@@ -155,7 +140,6 @@ def _finish(study: Study, blocks: Sequence[Block]) -> None:
         config=plan.config,
         seed=plan.config.seed,
         inputs=dict(zip(study.names, study.fingerprints, strict=True)),
-        complete=True,
         key=plan.key,
         settings=study.settings,
         files=len(files),

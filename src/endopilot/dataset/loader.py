@@ -22,6 +22,7 @@ from endopilot.dataset.schema import (
 from endopilot.dataset.study import identify, version
 from endopilot.errors import InputError
 from endopilot.files import read_json
+from endopilot.runs import RECORD_FILE
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,12 +151,12 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         InputError: the folder holds no finished dataset, or one of another version.
     """
     if not (folder / MANIFEST_PATH).exists():
+        if (folder / RECORD_FILE).exists():
+            raise InputError(f"{folder}: the dataset is unfinished; run the same `endopilot dataset` command again")
         raise InputError(f"{folder}: no dataset here ({MANIFEST_PATH} is missing); make one with `endopilot dataset`")
     manifest = read_json(folder / MANIFEST_PATH)
-    if not isinstance(manifest, dict) or not {"complete", "key", "settings"} <= manifest.keys():
+    if not isinstance(manifest, dict) or not {"key", "settings"} <= manifest.keys():
         raise InputError(f"{folder / MANIFEST_PATH}: damaged; make the dataset again")
-    if not manifest["complete"]:
-        raise InputError(f"{folder}: the dataset is unfinished; run the same `endopilot dataset` command again")
     made = manifest["settings"].get("version")
     if made != version():
         raise InputError(f"{folder}: made by {made}, which {version()} cannot read; make the dataset again")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -200,15 +200,6 @@ def plan_study(folders: Sequence[Path], output: Path, device: Device, config: Da
 def version() -> str:
     """Return what the files of a dataset must have been written by to belong together."""
     return f"endopilot {__version__}, format {FORMAT_VERSION}"
-
-
-def differences(before: Any, now: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Yield (field, value before, value now) for every leaf that differs between two nested mappings."""
-    if isinstance(before, dict) and isinstance(now, dict):
-        for key in sorted(before.keys() | now.keys()):
-            yield from differences(before.get(key, "absent"), now.get(key, "absent"), f"{name}.{key}".lstrip("."))
-    elif before != now:
-        yield name, before, now
 
 
 def identify(folder: Path) -> tuple[str, str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -12,20 +12,22 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from endopilot import __version__
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.control.agent import AgentPolicy
 from endopilot.control.navigate import ModelMismatch, NavigateConfig, NavigationRecord, navigate
 from endopilot.control.policies import POLICIES, make_policy
 from endopilot.control.policy import Decision, Observation
 from endopilot.errors import InputError
-from endopilot.files import read_json, write_json
-from endopilot.parallel import each
+from endopilot.files import json_text, read_json, write_json
+from endopilot.runs import claim, make_missing
+from endopilot.simulation.device import read_device
 from endopilot.tasks.navigation import Navigation
 from endopilot.tasks.task import CORE, Task, find_task, ladder_tasks
 from endopilot.types import TipProjection
 from endopilot.xray.adviser import AdviserConfig, count_events, near_exposures
 
-SCORES_FILE, SETTINGS_FILE = "ladder.json", "settings.json"
+SCORES_FILE = "ladder.json"
 UPPER = range(5, 13)
 """Levels of the upper eight tasks, which pushing alone must not solve."""
 
@@ -72,12 +74,12 @@ def climb(output: Path, config: LadderConfig) -> list[dict[str, Any]]:
         A row a task and then rows over several tasks, see `score`.
 
     Raises:
-        InputError: the folder holds the results of another policy or of other tasks, or a navigation cannot be begun.
+        InputError: the folder belongs to another run, such as that of another policy, or a navigation cannot be begun.
     """
     tasks = config.chosen
-    claim(output, tasks, policy=config.policy)
+    claim(output, "endopilot ladder", **identity(config.policy))
     paths = [output / task.name / f"{place:02d}.json" for task in tasks for place in range(config.patients)]
-    do_missing(f"Ladder, {config.policy}", paths, partial(_navigate, policy=config.policy))
+    make_missing(f"Ladder, {config.policy}", paths, partial(_navigate, policy=config.policy))
     results = {task.name: [read_json(path) for path in paths if path.parent.name == task.name] for task in tasks}
     rows = score(tasks, results)
     write_json(output / SCORES_FILE, {"policy": config.policy, "patients": config.patients, "scores": rows})
@@ -122,42 +124,15 @@ def summary(results: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def claim(output: Path, tasks: Sequence[Task], **settings: Any) -> None:
-    """Claim a folder, or check that it was begun with the same settings and the same tasks.
-
-    Raises:
-        InputError: it holds the results of other settings, or something else.
-    """
-    path = output / SETTINGS_FILE
-    now = {**settings, "tasks": {task.name: _digest(task) for task in tasks}}
-    if path.exists():
-        before = read_json(path)
-        for name, value in settings.items():
-            if before.get(name) != value:
-                raise InputError(f"{output}: holds the results of {name} {before.get(name)!r}; choose another --output")
-        for name, digest in now["tasks"].items():
-            if before["tasks"].get(name, digest) != digest:
-                raise InputError(f"{output}: was begun with another task {name!r}; choose another --output")
-        now["tasks"] = before["tasks"] | now["tasks"]
-    elif output.exists() and any(output.iterdir()):
-        raise InputError(f"{output}: is not empty and holds no ladder; choose another --output")
-    write_json(path, now)
-
-
-def do_missing(title: str, paths: Sequence[Path], work: Callable[[Path], None]) -> None:
-    """Do the navigations TASK/PATIENT.json whose files are not there yet, in several processes.
-
-    Raises:
-        InputError: one of them cannot be begun; the others are done.
-    """
-    bad = each(title, [path for path in paths if not path.exists()], work)
-    if bad:
-        path, error = next(iter(bad.items()))
-        raise InputError(f"task {path.parent.name}, patient {int(path.stem)}: {error}")
+def identity(policy: str) -> dict[str, Any]:
+    """Return what a policy's results follow from: its source, every task with its device, and the package's version."""
+    tasks = {task.name: _digest(task) for task in ladder_tasks()}
+    return {"policy": policy, "origin": POLICIES.origin(policy), "tasks": tasks, "version": __version__}
 
 
 def _digest(task: Task) -> str:
-    return hashlib.sha256(task.model_dump_json().encode()).hexdigest()
+    content = task.model_dump_json() + json_text(read_device(task.device))
+    return hashlib.sha256(content.encode()).hexdigest()
 
 
 def _navigate(path: Path, *, policy: str) -> None:

@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 from endopilot.control.navigate import ModelMismatch
 from endopilot.errors import InputError
 from endopilot.files import read_json, write_json, writing
-from endopilot.ladder.ladder import LadderConfig, claim, do_missing, drive, summary
+from endopilot.ladder.ladder import LadderConfig, drive, identity, summary
+from endopilot.runs import claim, make_missing
 from endopilot.tasks.navigation import Navigation
 from endopilot.tasks.task import Task, find_task
 
@@ -39,18 +40,18 @@ def measure_mismatch(output: Path, config: LadderConfig, off: float) -> list[dic
         `exposures_per_minute`.
 
     Raises:
-        InputError: `off` is no share, the folder holds other results, or a navigation cannot be begun.
+        InputError: `off` is no share, the folder belongs to another run, or a navigation cannot be begun.
     """
     if not 0 < off < 1:
         raise InputError(f"off: {off} is not in (0, 1); give e.g. 0.2")
     tasks = config.chosen
-    claim(output, tasks, policy=config.policy, off=off)
+    claim(output, "endopilot ladder --off", **identity(config.policy), off=off)
     paths = {
         case: [output / case / task.name / f"{place:02d}.json" for task in tasks for place in range(config.patients)]
         for case in CASES
     }
     every = [path for of_case in paths.values() for path in of_case]
-    do_missing(f"Robustness, {config.policy}", every, partial(_navigate, policy=config.policy, off=off))
+    make_missing(f"Robustness, {config.policy}", every, partial(_navigate, policy=config.policy, off=off))
     rows = [{"case": case} | _scores([read_json(path) for path in paths[case]]) for case in CASES]
     with writing(output / PICTURE_FILE) as partly:
         partly.write_bytes(_picture(rows, config.policy, off))

@@ -11,7 +11,7 @@ import copy
 import math
 import os
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +19,10 @@ import numpy as np
 import torch
 from torch import nn
 
+from endopilot import __version__
 from endopilot.dataset.loader import Dataset, load_dataset
 from endopilot.errors import InputError
-from endopilot.files import manifest, read_json, write_json
+from endopilot.files import manifest, write_json
 from endopilot.models.causal import CausalNetwork
 from endopilot.models.checkpoint import (
     make_network,
@@ -38,6 +39,7 @@ from endopilot.models.sequences import Sequences, read_vessels
 from endopilot.models.transformer import Network
 from endopilot.models.windows import Episodes, check_length
 from endopilot.progress import Advance, progress
+from endopilot.runs import claim
 
 VALIDATION_WINDOWS = 512
 """Windows of held-out navigations that the loss is checked on after every epoch."""
@@ -56,8 +58,8 @@ def train(dataset_folder: Path, run_folder: Path, config: TrainConfig) -> None:
 
     The twin has no networks: its run is a folder with settings alone.
 
-    Writes `ff.safetensors` and `if.safetensors` (weights and scales), `config.json`, `training.json` (learning
-    curves) and `manifest.json`. A run that was interrupted goes on where it stopped when it is started again with the
+    Writes `ff.safetensors` and `if.safetensors` (weights and scales), `training.json` (learning curves) and
+    `manifest.json`. A run that was interrupted goes on where it stopped when it is started again with the
     same arguments; a finished one returns at once.
 
     Args:
@@ -66,7 +68,7 @@ def train(dataset_folder: Path, run_folder: Path, config: TrainConfig) -> None:
         config: what is trained, and how long.
 
     Raises:
-        InputError: the dataset cannot be used, the run folder was begun with other settings, or the loss left the
+        InputError: the dataset cannot be used, the run folder belongs to another run, or the loss left the
             finite numbers (the last good checkpoint stays).
     """
     with joined(config.processor) as team:
@@ -76,7 +78,9 @@ def train(dataset_folder: Path, run_folder: Path, config: TrainConfig) -> None:
 def _train(dataset_folder: Path, run_folder: Path, config: TrainConfig, team: ProcessGroup) -> None:
     dataset = load_dataset(dataset_folder)
     with team.first():  # which writes the settings and prepares the patients, where need be
-        _begin(run_folder, {"train": asdict(config), "dataset": dataset.manifest["key"]})
+        if team.writes:
+            identity = {"config": config, "dataset": dataset.manifest["key"], "version": __version__}
+            claim(run_folder, "endopilot train", **identity)
         training = examples_of(dataset, "train", config)
         validation = examples_of(dataset, "seen_test", config) if "seen_test" in dataset.split else None
     start = time.perf_counter()
@@ -112,26 +116,6 @@ def _patients(dataset: Dataset, config: TrainConfig) -> list[str]:
     """Return the SHA-256 of each patient that was trained on, by which it is known in any dataset."""
     trained = set(dataset.of_split("train").anatomy.tolist()) if config.networks else set()
     return sorted(sha for name, sha in dataset.patients.items() if name in trained)
-
-
-def _begin(run_folder: Path, settings: dict[str, Any]) -> None:
-    """Claim the run folder, or check that it was begun with the same settings."""
-    path = run_folder / "config.json"
-    if not path.exists():
-        write_json(path, settings)
-        return
-    before = read_json(path)
-    for part, values in settings.items():
-        then = before.get(part)
-        if then == values:
-            continue
-        if isinstance(then, dict):
-            part = next(key for key in values if then.get(key) != values[key])
-            then, values = then.get(part), values[part]
-        raise InputError(
-            f"{run_folder}: was begun with {part} = {then}, now it is {values}; "
-            "choose another output folder or go back to the first settings"
-        )
 
 
 def examples_of(dataset: Dataset, split: str, config: TrainConfig) -> Examples:

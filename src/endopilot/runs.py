@@ -1,0 +1,97 @@
+"""Run folders: which run a folder belongs to (`claim`), and what is still missing in it (`make_missing`)."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from endopilot.errors import InputError
+from endopilot.files import json_text, read_json, write_json
+from endopilot.parallel import each
+
+RECORD_FILE = "run.json"
+_LONGEST_VALUE = 60
+
+
+def claim(folder: Path, command: str, **identity: Any) -> None:
+    """Claim a folder for a run, or check that the run that began in it is the same one.
+
+    The first run of a folder writes `run.json`: the command, and everything that its results follow from. A later run
+    may go on only where all of that is equal. Half-written files that a killed run left behind are removed. A folder
+    in which nothing but `run.json` stands goes to the new run.
+
+    Args:
+        folder: the run's folder; it is made if need be.
+        command: what makes the results, such as "endopilot dataset".
+        identity: what the results follow from, by name: settings, the hash of every input's content, the content of
+            the device, the package's version. Dataclasses, paths and numpy values are understood.
+
+    Raises:
+        InputError: the folder belongs to another run, or holds something else.
+    """
+    folder = Path(folder)
+    now = json.loads(json_text({"command": command} | identity))  # as a file gives it back, so that it compares equal
+    record = folder / RECORD_FILE
+    if record.exists():
+        before = read_json(record)
+        change = next(_changes(before, now), None)
+        if change is None:
+            _remove_partial_files(folder)
+            return
+        if any(_results(folder)):
+            name, then, value = change
+            raise InputError(
+                f"{folder}: was begun with {name} = {_short(then)}, now it is {_short(value)}; "
+                "choose another folder, or remove this one"
+            )
+    elif folder.is_dir() and any(_results(folder)):
+        raise InputError(f"{folder}: is not empty and holds no {RECORD_FILE}; choose another folder")
+    write_json(record, now)
+    _remove_partial_files(folder)
+
+
+def make_missing(title: str, paths: Sequence[Path], make: Callable[[Path], None]) -> None:
+    """Make those result files of a run that are not there yet, in several processes.
+
+    Args:
+        title: what is being done, for the progress bar.
+        paths: all files of the run.
+        make: writes one of them; a function of a module, or a `functools.partial` of one.
+
+    Raises:
+        InputError: some could not be made, of which the first is named; the others are there.
+    """
+    bad = each(title, [path for path in paths if not path.exists()], make)
+    if bad:
+        path, error = next(iter(bad.items()))
+        raise InputError(f"{path}: {error}")
+
+
+def _changes(before: Any, now: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Yield (field, value before, value now) for every value that differs between two nested mappings."""
+    if isinstance(before, dict) and isinstance(now, dict):
+        for key in [*now, *(key for key in before if key not in now)]:
+            yield from _changes(before.get(key, "absent"), now.get(key, "absent"), f"{name}.{key}".lstrip("."))
+    elif before != now:
+        yield name or "its record", before, now
+
+
+def _results(folder: Path) -> Iterator[Path]:
+    """Yield what stands in a folder beside the record and half-written files."""
+    return (path for path in folder.iterdir() if path.name != RECORD_FILE and not path.name.startswith(".part-"))
+
+
+def _remove_partial_files(folder: Path) -> None:
+    for path in list(folder.rglob(".part-*")):
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+
+
+def _short(value: Any) -> str:
+    text = str(value)
+    return text if len(text) <= _LONGEST_VALUE else f"{text[:_LONGEST_VALUE]}…"

@@ -1,0 +1,139 @@
+"""`endopilot run`, small: killed and continued to the report; then nobody else may go on in its folder."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import command
+import numpy as np
+import pydicom
+import pytest
+
+from endopilot import pipeline
+from endopilot.atlas.atlas import AtlasConfig, make_patient
+from endopilot.files import input_hash, read_json
+from endopilot.imaging.volume import write_volume
+from endopilot.phantom.phantom import PhantomConfig, make_phantom
+from endopilot.simulation.device_files import device_yaml
+from endopilot.types import Volume
+
+STAGES = ["read", "segmentation", "anatomy", "dataset", "training", "evaluation", "report"]
+SIZE = ("--sequences", "5", "--seconds", "20", "--training-seconds", "0.5")
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory):
+    """Return a folder with the CT of a patient, a wire's file, and a run on both that was killed on its way."""
+    folder = tmp_path_factory.mktemp("case")
+    patient = make_patient(AtlasConfig(anatomy="rca", count=1, seed=1), 0)
+    write_volume(make_phantom(patient, PhantomConfig(in_plane_mm=0.6, slice_mm=0.7), 1), folder / "ct.nii.gz")
+    shutil.copy(device_yaml("workhorse-014")[0], folder / "wire.yaml")
+    line = [sys.executable, "-m", "endopilot.cli", *map(str, arguments(folder))]
+    with subprocess.Popen(line, stderr=subprocess.DEVNULL) as first:
+        deadline = time.monotonic() + 120
+        while not masks(folder):
+            assert first.poll() is None and time.monotonic() < deadline
+            time.sleep(0.05)
+        first.send_signal(signal.SIGKILL)
+    return folder
+
+
+def arguments(folder: Path, volume: Path | None = None) -> tuple[str | Path, ...]:
+    return ("run", volume or folder / "ct.nii.gz", "-o", folder / "run", "--device", folder / "wire.yaml", *SIZE)
+
+
+def masks(folder: Path) -> dict[Path, int]:
+    """Return when each finished mask was written."""
+    return {path: path.stat().st_mtime_ns for path in (folder / "run" / "masks").glob("[!.]*.nii.gz")}
+
+
+def test_a_killed_run_goes_on_to_its_report_and_is_then_left_alone(case, capsys):
+    before = masks(case)
+    assert before and not (case / "run" / "report.html").exists()
+    found = command.run(capsys, *arguments(case))
+    assert masks(case) == before  # finished work is not done twice
+
+    assert found["report"] == str(case / "run" / "report.html") and found["rejected"] == {}
+    page = (case / "run" / "report.html").read_text(encoding="utf-8")
+    for part in ("data:image/png;base64,", "Plotly.newPlot", "One CT angiogram, given by the user", "Kim et al. 2023"):
+        assert part in page
+    manifest, metrics = read_json(case / "run" / "manifest.json"), read_json(case / "run" / "metrics.json")
+    assert list(manifest["stages"]) == STAGES and manifest["inputs"] == input_hash(case / "ct.nii.gz")
+    assert list(metrics["splits"]) == ["seen_test"] and metrics["findings"] == found["findings"]
+    assert metrics["splits"]["seen_test"]["episodes"] == 1
+    assert [path for path in case.rglob("*") if path.name.startswith(".part")] == []
+
+    written = {path: path.stat().st_mtime_ns for path in case.rglob("*")}
+    assert command.run(capsys, *arguments(case)) == found
+    assert {path: path.stat().st_mtime_ns for path in case.rglob("*")} == written
+
+
+@pytest.fixture
+def untouched(case):
+    """Check that a test left the run as it was."""
+    before = {path: path.stat().st_mtime_ns for path in (case / "run").rglob("*")}
+    yield
+    assert {path: path.stat().st_mtime_ns for path in (case / "run").rglob("*")} == before
+
+
+@pytest.mark.parametrize("name", ["other.nii.gz", "ct.nii.gz"])
+def test_another_patient_is_refused_whatever_the_file_s_name(case, untouched, tmp_path, capsys, name):
+    write_volume(tiny_ct(2), tmp_path / name)
+    line = command.refused(capsys, *arguments(case, tmp_path / name))
+    assert f"{case / 'run'}: was begun with volume_sha256 = " in line
+
+
+def test_another_content_of_the_same_file_is_refused(case, untouched, capsys):
+    kept = (case / "ct.nii.gz").read_bytes()
+    write_volume(tiny_ct(2), case / "ct.nii.gz")
+    try:
+        assert "was begun with volume_sha256 = " in command.refused(capsys, *arguments(case))
+    finally:
+        (case / "ct.nii.gz").write_bytes(kept)
+
+
+def test_another_device_in_the_same_file_is_refused(case, untouched, capsys):
+    text = (case / "wire.yaml").read_text()
+    (case / "wire.yaml").write_text(text.replace("value: 0.36", "value: 0.35", 1))
+    assert (case / "wire.yaml").read_text() != text
+    try:
+        line = command.refused(capsys, *arguments(case))
+        assert "was begun with device.diameter_mm = 0.36, now it is 0.35" in line
+    finally:
+        (case / "wire.yaml").write_text(text)
+
+
+def test_another_version_of_the_package_is_refused(case, untouched, monkeypatch, capsys):
+    monkeypatch.setattr(pipeline, "__version__", "99.0")
+    assert "was begun with version = 0.1.0, now it is 99.0" in command.refused(capsys, *arguments(case))
+
+
+def test_another_setting_is_refused(case, untouched, capsys):
+    line = command.refused(capsys, *arguments(case), "--seed", "7")
+    assert "was begun with config.seed = 1, now it is 7" in line
+
+
+def test_another_series_is_refused(tmp_path, capsys):
+    study = tmp_path / "study"
+    for number in (1, 2):
+        write_volume(tiny_ct(number), study / f"series-{number}")
+        for file in (study / f"series-{number}").iterdir():
+            slice_ = pydicom.dcmread(file)
+            slice_.SeriesNumber = number
+            slice_.save_as(file)
+    line = ("run", study, "-o", tmp_path / "run", *SIZE)
+    first = command.refused(capsys, *line, "--series", "1")  # no vessel is in it: the run ends after the first stage
+    assert "was begun" not in first and (tmp_path / "run" / "ct" / "patient.nii.gz").exists()
+    assert "was begun with volume_sha256 = " in command.refused(capsys, *line, "--series", "2")
+    assert command.refused(capsys, *line, "--series", "1") == first
+
+
+def tiny_ct(seed: int) -> Volume:
+    """Return a volume of noise."""
+    voxels = np.random.default_rng(seed).integers(-1000, 1000, (8, 8, 8)).astype(np.int16)
+    return Volume(voxels, np.ones(3), np.zeros(3), np.eye(3))
