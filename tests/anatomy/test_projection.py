@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 from analytic_shapes import forked_tree
 
-from endopilot.anatomy.projection import project_tip
+from endopilot.anatomy.projection import project_tip, safety_ratio
 from endopilot.atlas.atlas import AtlasConfig, make_patient_tree
 from endopilot.benchmarks.analytic_lumens import tree_of
 from endopilot.types import Insertion
@@ -145,3 +145,19 @@ def test_a_step_into_a_branch_is_no_longer_than_the_shortcut():
         change = np.flatnonzero(np.diff(found.branch))
         assert found.branch[-1] == 2 and np.delete(jump, change).max() < 0.02
         assert (jump[change] <= found.offset[change] + found.offset[change + 1] + 0.02).all()
+
+
+def test_the_safety_ratio_is_the_share_of_the_room_between_centerline_and_wall():
+    offset, radius = np.array([0.0, 0.75, 1.32, 1.4]), np.full(4, 1.5)
+    np.testing.assert_allclose(safety_ratio(offset, radius, 0.18), [0.0, 0.75 / 1.32, 1.0, 1.4 / 1.32])
+    np.testing.assert_allclose(safety_ratio(offset, radius, 0.0), offset / 1.5)
+
+
+def test_where_the_wire_fills_the_lumen_the_wall_is_reached_wherever_the_wire_lies():
+    offset, radius = np.array([0.0, 0.1, 0.0, 0.1]), np.array([0.18, 0.18, 0.1, 0.1])
+    assert safety_ratio(offset, radius, 0.18).tolist() == [1.0, 1.0, 1.0, 1.0]
+
+
+def test_the_safety_ratio_of_what_is_unknown_is_unknown():
+    offset, radius = np.array([np.nan, np.nan, 0.1]), np.array([1.0, 0.1, np.nan])
+    assert np.isnan(safety_ratio(offset, radius, 0.18)).all()

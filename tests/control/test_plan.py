@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from endopilot.anatomy.io import read_anatomy
-from endopilot.anatomy.projection import safety_ratio
 from endopilot.control import network_plan
 from endopilot.control import plan as plan_module
 from endopilot.control.cost import Cost
@@ -53,8 +52,6 @@ def test_cost_charges_what_is_unsafe():
     )
     assert charge[0] == cost.time_weight and (np.diff(charge[[0, 1]]) > 0).all() and charge[0] < charge[2] < charge[3]
     assert charge[3] > 10 * charge[2]  # near the limit no time that is saved outweighs it
-    ratio = safety_ratio(np.array([0.4, 0.4]), np.array([1.0, 0.1]), 0.2)
-    assert np.allclose(ratio, [0.5, 0.0])
 
 
 def test_a_written_plan_is_read_back_and_drives_the_simulator(found, vessel, tmp_path):

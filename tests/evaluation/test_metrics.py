@@ -94,16 +94,6 @@ def test_diverged_counts_sequences_once_and_lost_ones_too():
     assert metrics.diverged_share(error, np.isnan(error)) == 0.75
 
 
-def test_safety_ratio_is_one_where_the_wire_touches():
-    offset, radius = np.array([1.32, 0.75]), np.array([1.5, 1.5])
-    np.testing.assert_allclose(metrics.safety_ratio(offset, radius, wire_radius_mm=0.18), [1.0, 0.75 / 1.32])
-    np.testing.assert_allclose(metrics.safety_ratio(offset, radius), [0.88, 0.5])
-
-
-def test_safety_ratio_is_unknown_where_the_wire_does_not_fit():
-    assert np.isnan(metrics.safety_ratio(np.array([0.1]), np.array([0.1]), wire_radius_mm=0.18)).all()
-
-
 def test_quantiles_over_time_are_over_sequences():
     values = np.array([[0.0, NAN], [1.0, NAN], [2.0, NAN], [3.0, NAN], [4.0, NAN]])
     found = metrics.quantiles_over_time(values)

@@ -107,3 +107,14 @@ def test_safety_table_holds_both_ratios(results):
     over_radius = tables.values(tables.rows(table, ratio="radius"), "median")
     over_clearance = tables.values(tables.rows(table, ratio="clearance"), "median")
     np.testing.assert_allclose(over_radius * 1.5, over_clearance * 1.32)
+
+
+def test_a_wire_that_fills_the_lumen_is_at_the_wall_and_a_lost_tip_is_nowhere(results):
+    true = results["test"].true
+    filled = replace(true, radius=np.full_like(true.radius, 0.1), offset=true.offset.copy())
+    filled.offset[:, 7] = np.nan
+    table = tables.safety_table({"test": replace(results["test"], true=filled)})
+    clearance = tables.rows(tables.rows(table, split="test", series="true"), ratio="clearance")
+    for name in ("median", "p95"):
+        values = tables.values(clearance, name)
+        assert np.isnan(values[7]) and (np.delete(values, 7) == 1.0).all()

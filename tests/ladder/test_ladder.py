@@ -120,6 +120,12 @@ def test_the_events_of_a_navigation_are_at_the_wall_and_where_the_agent_is_off()
     assert ladder._events(tip, exposed, foretold, 0.18) == (2, 2)
 
 
+def test_a_wire_that_begins_to_fill_the_lumen_is_an_event():
+    radius = np.array([1.0, 1.0, 0.18, 0.18, 1.0, 1.0])
+    tip = TipProjection(offset=np.zeros(6), radius=radius, abscissa=np.arange(6.0), branch=np.zeros(6, dtype=int))
+    assert ladder._events(tip, np.zeros(6, dtype=bool), np.arange(5.0), 0.18) == (1, 1)
+
+
 def test_the_agent_is_watched_as_it_climbs(tmp_path):
     task = find_task("straight")
     navigation = replace(task.ladder_navigation(0), seconds=2.0)

@@ -102,6 +102,15 @@ def test_an_exposure_is_due_where_the_band_meets_the_wall() -> None:
     assert advices(offset, [10.0] * 25, config=AdviserConfig(wall_ratio=0.9), abscissa=0.0) == []
 
 
+def test_an_exposure_is_due_where_the_wire_begins_to_fill_the_lumen() -> None:
+    adviser = XrayAdviser(calibration(abscissa=0.0, offset=0.0), AdviserConfig(), wire_radius_mm=0.2)
+    still, centred = np.zeros((1, 2)), np.zeros((1, 2))
+    adviser.start(still, centred, np.full(1, 1.2))
+    radius = [1.2, 1.2, 1.2, 0.2, 0.1, 0.1, 0.1]
+    due = [bool(adviser.advise(still, centred, np.zeros((1, 2)), np.full(1, r))[0]) for r in radius]
+    assert due == [False, False, False, True, False, False, False]
+
+
 def test_exposures_keep_their_distance() -> None:
     offset = [0.3, 0.58, 0.62, 0.66, 0.66, 0.3, 0.3, 0.9, 0.3, 0.9, 0.3, 0.9, 0.9]
     due = advices(offset, [10.0] * len(offset), config=AdviserConfig(wall_ratio=0.6), abscissa=0.0, offset=0.01)

@@ -143,6 +143,16 @@ Samples = Float[np.ndarray, "*n"]
 
 
 def safety_ratio(offset: Samples, radius: Samples, wire_radius_mm: float) -> Samples:
-    """Return γ/(r − r_w): 1 where the wire touches the wall; 0 where the lumen is no wider than the wire."""
+    """Return γ/(r − r_w): 0 on the centerline, 1 where the wire touches the wall of a round lumen.
+
+    Where the lumen is no wider than the wire, the wire touches the wall wherever it lies: the ratio is 1. What is NaN
+    stays NaN. With a wire radius of 0 it is the paper's ratio γ/r, which is 1 − r_w/r where the wire touches.
+
+    Args:
+        offset: γ of the wire's axis, mm.
+        radius: of the lumen there, r, mm.
+        wire_radius_mm: r_w, mm.
+    """
     room = radius - wire_radius_mm
-    return np.divide(offset, room, out=np.zeros(np.shape(offset)), where=room > 0)
+    filled = room <= 0
+    return np.where(filled & ~np.isnan(offset), 1.0, offset / np.where(filled, 1.0, room))

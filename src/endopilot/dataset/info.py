@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from endopilot.anatomy.projection import safety_ratio
 from endopilot.dataset import schema
 from endopilot.dataset.loader import read_manifest
 from endopilot.files import read_json, writing
@@ -136,7 +137,7 @@ def _count(table, wire_mm: float, histograms: dict[str, Histogram], visits: Coun
     radius = schema.column_values(table, "lumen_radius_mm")[valid].astype(float)
     histograms["insertion"].add(state[:, 0])
     histograms["offset-ratio"].add(state[:, 3] / radius)
-    histograms["wall-ratio"].add(state[:, 3] / np.maximum(radius - wire_mm, 1e-3))
+    histograms["wall-ratio"].add(safety_ratio(state[:, 3], radius, wire_mm))
     histograms["contact-force"].add(schema.column_values(table, "contact_force_max_n")[valid].astype(float))
     branch = np.sort(schema.column_values(table, "branch").reshape(-1, samples), axis=1)
     distinct = 1 + (np.diff(branch, axis=1) != 0).sum(axis=1)

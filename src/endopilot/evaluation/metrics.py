@@ -174,18 +174,6 @@ def diverged_share(error: Float[np.ndarray, "episodes samples"], lost: Bool[np.n
     return float(np.mean((large | lost).any(axis=1)))
 
 
-def safety_ratio(
-    offset: Float[np.ndarray, "*n"], radius: Float[np.ndarray, "*n"], *, wire_radius_mm: float = 0.0
-) -> Float[np.ndarray, "*n"]:
-    """Return γ/(r − r_w): how far the tip has gone from the centerline towards the wall.
-
-    With `wire_radius_mm` 0 this is the paper's ratio γ/r, which a wire that touches the wall holds at 1 − r_w/r.
-    With the wire's radius it is 1 where the wire touches. Where the wire does not fit it is NaN.
-    """
-    clearance = radius - wire_radius_mm
-    return np.divide(offset, clearance, out=np.full_like(offset, np.nan), where=clearance > 0)
-
-
 def quantiles_over_time(values: Float[np.ndarray, "episodes samples"]) -> dict[str, Float[np.ndarray, "samples"]]:
     """Return q25, median, q75 and p95 over the sequences at each time; NaN where no sequence has a value."""
     levels = {"q25": 0.25, "median": 0.5, "q75": 0.75, "p95": 0.95}

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from endopilot.anatomy.projection import safety_ratio
 from endopilot.evaluation.metrics import (
     OFF_WALL_MM,
     by_depth,
@@ -15,7 +16,6 @@ from endopilot.evaluation.metrics import (
     diverged_share,
     error_statistics,
     rmse_of_sequences,
-    safety_ratio,
     skill,
     span_slices,
     tip_statistics,
@@ -109,10 +109,8 @@ def _control(result: SplitResult) -> dict[str, Any]:
 def _safety(result: SplitResult, series: str) -> dict[str, Any]:
     tip = result.true if series == "true" else result.tips[series]
     return {
-        "over_radius": distribution(safety_ratio(tip.offset, tip.radius).ravel()),
-        "over_clearance": distribution(
-            safety_ratio(tip.offset, tip.radius, wire_radius_mm=result.wire_radius_mm).ravel()
-        ),
+        "over_radius": distribution(safety_ratio(tip.offset, tip.radius, 0.0).ravel()),
+        "over_clearance": distribution(safety_ratio(tip.offset, tip.radius, result.wire_radius_mm).ravel()),
     }
 
 

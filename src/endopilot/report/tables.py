@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from endopilot.anatomy.projection import safety_ratio
 from endopilot.evaluation.metrics import (
     control_rmse,
     mean_over_time,
     quantiles_over_time,
     rmse_of_sequences,
-    safety_ratio,
 )
 from endopilot.evaluation.results import CONTROL_BASELINES, TIP_BASELINES, SplitResult
 
@@ -42,7 +42,7 @@ def safety_table(results: Mapping[str, SplitResult]) -> pd.DataFrame:
         for series in _ordered({"true": None, **result.tips}, SAFETY_SERIES):
             tip = result.true if series == "true" else result.tips[series]
             for ratio, wire_radius in (("radius", 0.0), ("clearance", result.wire_radius_mm)):
-                values = quantiles_over_time(safety_ratio(tip.offset, tip.radius, wire_radius_mm=wire_radius))
+                values = quantiles_over_time(safety_ratio(tip.offset, tip.radius, wire_radius))
                 keys = {"split": split, "series": series, "ratio": ratio, "time_s": result.time_s}
                 pieces.append(pd.DataFrame({**keys, **values}))
     return pd.concat(pieces, ignore_index=True)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from endopilot.anatomy.projection import safety_ratio
 from endopilot.errors import InputError
 from endopilot.tasks.navigation import DECISION_PERIOD_S, SUCCESS_MM
 from endopilot.xray.bands import Calibration, Tips
@@ -120,4 +121,4 @@ class XrayAdviser:
         return due
 
     def _ratio(self, offset_mm: Float[np.ndarray, "n"], radius_mm: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-        return offset_mm / np.maximum(radius_mm - self._wire_radius_mm, 1e-3)
+        return safety_ratio(offset_mm, radius_mm, self._wire_radius_mm)

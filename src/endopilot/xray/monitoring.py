@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from endopilot.anatomy.io import read_anatomy
+from endopilot.anatomy.projection import safety_ratio
 from endopilot.dataset.loader import Dataset
 from endopilot.errors import InputError
 from endopilot.models.config import WINDOW
@@ -156,7 +157,7 @@ def watch(predictor: Predictor, episodes: Dataset, config: AdviseConfig) -> Moni
             advance()
     return Monitored(
         truth=np.stack([episodes.tip_abscissa, episodes.tip_offset], axis=-1).astype(float),
-        ratio=(episodes.tip_offset / np.maximum(episodes.lumen_radius - wire_radius, 1e-3)).astype(float),
+        ratio=safety_ratio(episodes.tip_offset, episodes.lumen_radius, wire_radius).astype(float),
         told=told,
         model=online_predictor(predictor, told),
         lumen=Lumen(trees, owner),
