@@ -20,7 +20,7 @@ from endopilot.evaluation.metrics import OFF_WALL_MM
 from endopilot.evaluation.prediction_baselines import hold_slack
 from endopilot.files import read_json
 from endopilot.models.config import WINDOW
-from endopilot.models.rollout import load_run
+from endopilot.models.rollout import load_model
 from endopilot.models.sequences import read_vessels, unfold
 from endopilot.simulation.device import read_device
 
@@ -49,7 +49,7 @@ def headline_rows(folder: Path) -> Iterator[str]:
     seen = np.broadcast_to(np.arange(data.valid.shape[1]) < WINDOW, data.valid.shape)
     played = unfold("forward", vessels, patient, data, seen)
     there = {name: folder / run for name, run in RUNS.items() if (folder / run / "manifest.json").is_file()}
-    tips = {name: load_run(run).rollout_forward(data).tip for name, run in there.items()}
+    tips = {name: load_model(run).rollout_forward(data).tip for name, run in there.items()}
     seeds = [tips[name] for name in RUNS if name in tips and "seed" in name]
     if len(seeds) == 3:
         tips["mean of the three seeds"] = np.mean(seeds, axis=0)
@@ -67,7 +67,7 @@ def headline_rows(folder: Path) -> Iterator[str]:
         f"| `pretrained`, samples in the branch that it believes ({right.mean():.0%}) | "
         f"all {ours[right][:, 0].mean():.3f} | all {ours[right][:, 1].mean():.3f} | | |"
     )
-    spread = load_run(folder / RUNS[OURS]).foretell(data, seen[0]).spread[:, WINDOW:]
+    spread = load_model(folder / RUNS[OURS]).foretell(data, seen[0]).spread[:, WINDOW:]
     within = (ours < spread).mean(axis=(0, 1))
     yield (
         f"| `pretrained`, share of errors within one spread (76 % of a Laplace distribution) | "
@@ -81,7 +81,7 @@ def headline_rows(folder: Path) -> Iterator[str]:
 
 def speed_rows(folder: Path) -> Iterator[str]:
     """Yield the processor time of a rollout, ms a step and sequence, on one thread."""
-    data, run = load_dataset(folder / "dataset").of_split("test"), load_run(folder / RUNS[OURS])
+    data, run = load_dataset(folder / "dataset").of_split("test"), load_model(folder / RUNS[OURS])
     for count, repeats in ((1, 5), (256, 1)):
         few = data.select(np.arange(count) % len(data))
         run.rollout_forward(few)  # reads the patients

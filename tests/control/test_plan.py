@@ -140,7 +140,7 @@ def run(found, tmp_path, monkeypatch):
 
     record = {"config": {}, "networks": {}, "device": asdict(found.navigation.device)}
     write_json(tmp_path / "run" / "manifest.json", record)
-    monkeypatch.setattr(network_plan, "load_run", lambda _: Toy())
+    monkeypatch.setattr(network_plan, "load_model", lambda _: Toy())
     return tmp_path / "run"
 
 

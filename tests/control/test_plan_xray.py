@@ -56,7 +56,7 @@ def by_network(found, tmp_path, monkeypatch):
     """Return what makes a plan of 20 periods at 4 mm/s by a run that answers as it is told."""
 
     def made(predictor):
-        monkeypatch.setattr("endopilot.models.rollout.load_run", lambda _: predictor)
+        monkeypatch.setattr("endopilot.models.rollout.load_model", lambda _: predictor)
         write_json(tmp_path / "run" / "manifest.json", {"config": {}, "networks": {}, "device": {}})
         tip, proximal = found.simulated, np.column_stack([2.0 + 2.0 * np.arange(1, 21), np.zeros(20)])
         return replace(

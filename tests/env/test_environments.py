@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import pickle
+import subprocess
+import sys
 import warnings
 from dataclasses import replace
 
@@ -55,6 +57,16 @@ def test_the_registered_environment_passes_gymnasiums_check():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(gymnasium.make("endopilot/Navigate-v0").unwrapped)
+
+
+def test_a_process_that_imported_nothing_makes_environments_by_name():
+    code = (
+        "import gymnasium\n"
+        "gymnasium.make('endopilot.env:endopilot/Navigate-v0').reset(seed=0)\n"
+        "gymnasium.make_vec('endopilot.env:endopilot/Straight-v0', num_envs=2).reset(seed=0)\n"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
 
 
 def test_a_vector_environment_is_made_by_its_name(near):

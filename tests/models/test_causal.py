@@ -20,11 +20,10 @@ from endopilot.models.causal import CausalNetwork, CausalPredictor
 from endopilot.models.config import CausalConfig, TrainConfig
 from endopilot.models.open_loop import Predictor, ProbabilisticPredictor
 from endopilot.models.play import N_FEATURES, mirrored
-from endopilot.models.rollout import load_run
+from endopilot.models.rollout import load_model
 from endopilot.models.sequences import N_INPUTS, Sequences, read_vessels, unfold
 from endopilot.models.train import train
 from endopilot.simulation.device import read_device
-from endopilot.simulation.drive_limits import DriveLimits
 
 GIVEN = 30
 SMALL = CausalConfig(width=8)
@@ -60,7 +59,7 @@ def brief(everyone):
 
 @pytest.fixture(scope="module")
 def packaged():
-    return load_run(Path("pretrained"))
+    return load_model(Path("pretrained"))
 
 
 def untrained() -> CausalPredictor:
@@ -68,7 +67,7 @@ def untrained() -> CausalPredictor:
     networks = CausalNetwork(SMALL).eval(), CausalNetwork(SMALL).eval()
     for network in networks:
         torch.nn.init.normal_(network.output.weight, std=0.5)
-    return CausalPredictor(*networks, limits=DriveLimits(max_velocity_mm_s=40.0, max_rotation_rad_s=12.6))
+    return CausalPredictor(*networks, control_limits=np.array([40.0, 12.6]))
 
 
 def given(episodes) -> np.ndarray:
@@ -110,7 +109,7 @@ def test_the_loop_of_both_leads_the_foretold_tip_along(packaged, everyone):
     found = packaged.rollout_dual(everyone)
     start = np.stack([everyone.inserted_length, everyone.rotation], axis=-1)[:, GIVEN - 1 : GIVEN].astype(float)
     np.testing.assert_allclose(found.proximal, start + 0.5 * np.cumsum(found.control, axis=1), atol=1e-9)
-    assert (np.abs(found.control) <= packaged.limits.fastest).all()
+    assert (np.abs(found.control) <= packaged.control_limits).all()
     assert found.proximal[..., 0].min() > -1e-6
     assert miss(found.tip, everyone)[..., 0].mean() < 0.4  # mm
 
@@ -274,7 +273,7 @@ def test_a_seed_repeats_to_the_bit_and_an_interrupted_run_goes_on(folder, tmp_pa
         train(folder, tmp_path / "cut", SHORT)
     train(folder, tmp_path / "cut", SHORT)
     assert sha256(tmp_path / "cut/ff.safetensors") == sha256(tmp_path / "once/ff.safetensors")
-    assert isinstance(load_run(tmp_path / "cut"), CausalPredictor)
+    assert isinstance(load_model(tmp_path / "cut"), CausalPredictor)
 
 
 def test_bad_input_is_named(brief, tmp_path):
@@ -283,4 +282,4 @@ def test_bad_input_is_named(brief, tmp_path):
     with pytest.raises(InputError, match=r"^width: 0"):
         CausalConfig(width=0)
     with pytest.raises(InputError, match="no such run; give a folder made by `endopilot train`, or 'pretrained'"):
-        load_run(tmp_path / "nothing")
+        load_model(tmp_path / "nothing")

@@ -11,10 +11,9 @@ import torch
 from endopilot.dataset.loader import load_dataset
 from endopilot.errors import InputError
 from endopilot.models.config import TrainConfig, TransformerConfig
-from endopilot.models.rollout import TransformerPredictor, load_run
+from endopilot.models.rollout import TransformerPredictor, load_model
 from endopilot.models.train import train
 from endopilot.models.transformer import ForwardNetwork, InverseNetwork
-from endopilot.simulation.drive_limits import DriveLimits
 
 GIVEN = 30
 SMALL = TransformerConfig(d_model=24, heads=2, encoder_layers=1, decoder_layers=1, feedforward=32)
@@ -27,7 +26,7 @@ def learnt(toy_dataset, tmp_path_factory):
     train(
         toy_dataset, run, TrainConfig(epochs=6, windows_per_epoch=4000, batch_size=32, learning_rate=3e-3, size=SMALL)
     )
-    return load_run(run)
+    return load_model(run)
 
 
 @pytest.fixture(scope="module")
@@ -41,9 +40,7 @@ def untrained(limits=(1e9, 1e9)) -> TransformerPredictor:
     networks = ForwardNetwork(SMALL).eval(), InverseNetwork(SMALL).eval()
     for network in networks:
         torch.nn.init.normal_(network.transformer.head.weight, std=0.1)
-    return TransformerPredictor(
-        *networks, limits=DriveLimits(max_velocity_mm_s=limits[0], max_rotation_rad_s=limits[1])
-    )
+    return TransformerPredictor(*networks, control_limits=np.array(limits))
 
 
 def true_tip(data):

@@ -19,7 +19,7 @@ from endopilot.files import read_json, sha256
 from endopilot.models.checkpoint import read_network, read_tensors
 from endopilot.models.config import TrainConfig, TransformerConfig
 from endopilot.models.learning_curves import board
-from endopilot.models.rollout import load_run
+from endopilot.models.rollout import load_model
 from endopilot.models.train import train
 from endopilot.models.transformer import NETWORKS
 from endopilot.models.windows import Episodes
@@ -203,10 +203,10 @@ def test_damaged_checkpoints_are_named(short_run, tmp_path):
     file = tmp_path / "run/ff.safetensors"
     file.write_bytes(file.read_bytes()[:1000])
     with pytest.raises(InputError, match=r"ff\.safetensors: damaged"):
-        load_run(tmp_path / "run")
+        load_model(tmp_path / "run")
     file.unlink()
     with pytest.raises(InputError, match=r"ff\.safetensors: no such checkpoint"):
-        load_run(tmp_path / "run")
+        load_model(tmp_path / "run")
 
 
 def test_episodes_without_a_future_are_refused(tmp_path):

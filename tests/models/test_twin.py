@@ -14,7 +14,7 @@ from endopilot.dataset.loader import load_dataset
 from endopilot.errors import InputError
 from endopilot.models import twin as twin_module
 from endopilot.models.config import TrainConfig, TwinConfig
-from endopilot.models.rollout import load_run
+from endopilot.models.rollout import load_model
 from endopilot.models.train import train
 from endopilot.simulation.device import read_device
 from endopilot.simulation.simulate import simulate
@@ -47,7 +47,7 @@ def episodes(folder):
 
 
 def test_identified_from_the_given_tips_it_foretells_the_others(folder, episodes) -> None:
-    twin = load_run(folder / "run")
+    twin = load_model(folder / "run")
     told = twin.foretell(episodes, GIVEN)
     later = slice(30, None)
     miss = np.abs(told.tip[:, later, 0] - episodes.tip_abscissa[:, later])
@@ -69,7 +69,7 @@ def test_identified_from_the_given_tips_it_foretells_the_others(folder, episodes
 
 
 def test_wires_that_agree_on_what_is_wrong_are_not_sure_of_it(folder, episodes) -> None:
-    few, twin = episodes.select(np.array([0, 1])), load_run(folder / "run")
+    few, twin = episodes.select(np.array([0, 1])), load_model(folder / "run")
     own = twin.foretell(few, GIVEN).spread
     elsewhere, once = few.tip_abscissa.copy(), few.tip_abscissa.copy()
     elsewhere[0] += 30.0  # whatever friction, stiffness and ostium
@@ -81,7 +81,7 @@ def test_wires_that_agree_on_what_is_wrong_are_not_sure_of_it(folder, episodes) 
 
 
 def test_it_finds_controls_that_lead_the_tip_along(folder, episodes) -> None:
-    twin = load_run(folder / "run")
+    twin = load_model(folder / "run")
     found = twin.rollout_dual(episodes)
     later = slice(30, None)
     assert np.abs(found.tip[..., 0] - episodes.tip_abscissa[:, later]).mean() < 0.4  # mm
@@ -97,7 +97,7 @@ def test_under_way_it_drives_on_from_what_was_driven(folder, episodes) -> None:
     few, now = episodes.select(np.array([0, 1])), 37
     seen = GIVEN.copy()
     seen[now] = True
-    found = load_run(folder / "run").rollout_dual(few, seen)
+    found = load_model(folder / "run").rollout_dual(few, seen)
     assert np.abs(found.tip[..., 0] - few.tip_abscissa[:, now + 1 :]).mean() < 0.4  # mm
     start = np.stack([few.inserted_length, few.rotation], axis=-1)[:, now].astype(float)
     np.testing.assert_allclose(found.proximal[:, 0], start + 0.5 * found.control[:, 0], atol=1e-9)
@@ -118,7 +118,7 @@ def test_all_protocols_share_one_ensemble_and_one_search(folder, episodes, monke
     for name in calls:
         monkeypatch.setattr(twin_module, name, counted(name))
     few = episodes.select(np.array([0]))
-    twin = load_run(folder / "run")
+    twin = load_model(folder / "run")
     forward = twin.rollout_forward(few)
     simulated = calls["simulate"]
     inverse, dual = twin.rollout_inverse(few), twin.rollout_dual(few)

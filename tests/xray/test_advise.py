@@ -60,7 +60,7 @@ def folder(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def hold_slack(monkeypatch) -> None:
-    monkeypatch.setattr("endopilot.models.rollout.load_run", lambda run: HoldSlack())
+    monkeypatch.setattr("endopilot.models.rollout.load_model", lambda run: HoldSlack())
 
 
 @pytest.fixture(scope="module")

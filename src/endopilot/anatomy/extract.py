@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -78,23 +79,27 @@ class AnatomyConfig:
 
 
 def extract_anatomy(
-    source: AnatomySource | LumenMask | Surface | Polylines | VesselTree,
+    source: str | Path | AnatomySource | LumenMask | Surface | Polylines | VesselTree,
     *,
-    name: str,
+    name: str | None = None,
     config: AnatomyConfig = AnatomyConfig(),
 ) -> Anatomy:
     """Make an anatomy: centerline tree with section labels, distance map with guiding catheter, insertion.
 
     Args:
-        source: what `read_source` returned, or its content alone.
-        name: short name of the patient.
+        source: a file with a mask, a surface or centerlines, as `read_source` reads it; or what was read or made.
+        name: short name of the patient; that of the file, or "patient", if not given.
         config: how to make it.
 
     Raises:
-        InputError: the source is empty, is no vessel, is not where the ostium is, or cannot be closed.
+        InputError: the file cannot be read, or the source is empty, is no vessel, is not where the ostium is, or
+            cannot be closed.
     """
+    if isinstance(source, str | Path):
+        source = read_source(source)
     wrapped = source if isinstance(source, AnatomySource) else AnatomySource(source)
     wrapped = transformed(wrapped, scale=config.scale, coordinates=config.coordinates)
+    name = name or wrapped.file.partition(".")[0] or "patient"
     content, notes = wrapped.content, []
     given = content.ostium if isinstance(content, LumenMask) else None
     if config.ostium_mm is not None:

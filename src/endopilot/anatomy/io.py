@@ -28,7 +28,7 @@ SCHEMA_VERSION = 1
 _CENTERLINE, _LUMEN, _RECORD = "centerline.vtp", "lumen.nrrd", "anatomy.json"
 
 
-def write_anatomy(anatomy: Anatomy, folder: Path) -> None:
+def write_anatomy(anatomy: Anatomy, folder: str | Path) -> None:
     """Write an anatomy as a folder, whole or not at all; an anatomy that stands there already is replaced.
 
     Raises:
@@ -56,7 +56,7 @@ def write_anatomy(anatomy: Anatomy, folder: Path) -> None:
             shutil.rmtree(folder)
 
 
-def read_anatomy(folder: Path) -> Anatomy:
+def read_anatomy(folder: str | Path) -> Anatomy:
     """Read an anatomy that `write_anatomy` wrote.
 
     Raises:

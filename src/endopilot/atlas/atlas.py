@@ -60,7 +60,7 @@ class AtlasConfig:
             raise InputError(f"stenosis_share: {self.stenosis_share}; give a share from 0 to 1")
 
 
-def make_atlas(config: AtlasConfig) -> Iterator[Anatomy]:
+def make_atlas(config: AtlasConfig = AtlasConfig()) -> Iterator[Anatomy]:
     """Yield the patients of an atlas, one after another."""
     for index in range(config.count):
         yield make_patient(config, index)

@@ -14,6 +14,7 @@ from typing import Any
 
 from endopilot import __version__
 from endopilot.errors import InputError
+from endopilot.extras import what_is_missing
 
 COMMANDS = {
     "demo": "six synthetic patients, the whole way from CTA to report",
@@ -48,7 +49,7 @@ EXIT_UNREAD = 141
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run `endopilot` with `arguments` (those of the process by default) and leave with its exit code.
 
-    Bad input gives one line on standard error and exit code 2; Ctrl-C gives 130.
+    Bad input, or an extra that is not installed, gives one line on standard error and exit code 2; Ctrl-C gives 130.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     name = arguments[0] if arguments else "--help"
@@ -90,10 +91,10 @@ def overview() -> str:
 def _run(name: str, arguments: Sequence[str]) -> int:
     import tyro
 
-    module = importlib.import_module(f"endopilot.cli.{module_of(name)}")
-    subjects: dict[str, Any] | None = getattr(module, "SUBJECTS", None)
-    call: Any = tyro.cli if subjects is None else tyro.extras.subcommand_cli_from_dict
     try:
+        module = importlib.import_module(f"endopilot.cli.{module_of(name)}")
+        subjects: dict[str, Any] | None = getattr(module, "SUBJECTS", None)
+        call: Any = tyro.cli if subjects is None else tyro.extras.subcommand_cli_from_dict
         call(
             subjects or module.command,
             prog=f"endopilot {name}",
@@ -102,6 +103,12 @@ def _run(name: str, arguments: Sequence[str]) -> int:
         )
     except InputError as error:
         print(f"endopilot {name}: {error}", file=sys.stderr)
+        return EXIT_BAD_INPUT
+    except ModuleNotFoundError as error:
+        missing = what_is_missing(error)
+        if missing is None:
+            raise
+        print(f"endopilot {name}: {missing}", file=sys.stderr)
         return EXIT_BAD_INPUT
     except KeyboardInterrupt:
         print(f"endopilot {name}: interrupted", file=sys.stderr)

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from endopilot.anatomy.projection import project_tip
+from endopilot.control.policies import make_policy
 from endopilot.control.policy import Observation, Policy
 from endopilot.control.robot import RobotConfig, SimulatedRobot
 from endopilot.errors import InputError
@@ -102,7 +103,7 @@ class NavigationRecord:
 
 def navigate(
     navigation: Navigation,
-    policy: Policy,
+    policy: Policy | str,
     *,
     config: NavigateConfig | None = None,
     seed: int = 0,
@@ -116,15 +117,16 @@ def navigate(
 
     Args:
         navigation: as the policy is told of it.
-        policy: what decides.
+        policy: what decides, or the name of a policy, such as "agent".
         config: robot, C-arm and rod core.
         seed: of encoder noise, detection errors and the policy.
         truth: how reality differs; not at all if not given.
 
     Raises:
-        InputError: the wire does not fit the vessel, or starts deeper than it is long.
+        InputError: there is no such policy, or the wire does not fit the vessel, or starts deeper than it is long.
     """
     config, truth = config or NavigateConfig(), truth or ModelMismatch()
+    policy = make_policy(policy) if isinstance(policy, str) else policy
     simulator = _start(navigation, truth, config.simulator)
     limits = DriveLimits.of(navigation.device, navigation.anatomy)
     drive = replace(config.robot, latency_s=config.robot.latency_s * truth.latency_factor)

@@ -117,13 +117,13 @@ class _Wires:
 class _Networks:
     def __init__(self, plan: Plan, folder: Path) -> None:
         from endopilot.control.network_plan import Rest  # brings torch, which is slow to import
-        from endopilot.models.rollout import load_run
+        from endopilot.models.rollout import load_model
 
         assert plan.model is not None
         run, navigation = Path(plan.model), plan.navigation
         rest = Rest(navigation, folder, run)
         episodes = rest.episodes(plan.predicted[None], plan.control[None])
-        self._model = online_predictor(load_run(run), episodes)
+        self._model = online_predictor(load_model(run), episodes)
         self._route = Route.to(navigation.anatomy, navigation.target)
         self._proximal = np.column_stack([episodes.inserted_length[0], episodes.rotation[0]])
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from endopilot.anatomy.io import read_anatomy
-from endopilot.dataset import schema
+from endopilot.dataset import parquet, schema
 from endopilot.dataset.draw import Draw, draw_navigations
 from endopilot.dataset.navigations import simulate_navigations
 from endopilot.dataset.study import Block, Plan
@@ -46,13 +46,13 @@ def write_block(plan: Plan, block: Block, *, threads: int = 1, advance: Callable
             advance=advance,
         )
     data_path, episodes_path = schema.paths_of_file(plan.output, block.number)
-    samples = schema.sample_table(rollout, applied, config.control, block.first_episode, plan.key)
+    samples = parquet.sample_table(rollout, applied, config.control, block.first_episode, plan.key)
     for path, table in (
-        (episodes_path, schema.episode_table(_episodes(plan, block, draw, rollout, stopped), plan.key)),
+        (episodes_path, parquet.episode_table(_episodes(plan, block, draw, rollout, stopped), plan.key)),
         (data_path, samples),
     ):
         with writing(path) as partial:
-            partial.write_bytes(schema.parquet_bytes(table))
+            partial.write_bytes(parquet.parquet_bytes(table))
 
 
 @lru_cache(maxsize=4)

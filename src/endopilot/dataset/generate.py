@@ -15,7 +15,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from endopilot.dataset import schema
+from endopilot.dataset import parquet, schema
 from endopilot.dataset.splits import SPLITS
 from endopilot.dataset.study import Block, DatasetConfig, Study, plan_study
 from endopilot.dataset.workers import work_here, work_on_cluster
@@ -29,10 +29,10 @@ _WORK_PATH = "meta/work.json"
 
 
 def generate_dataset(
-    anatomy_folders: Sequence[Path],
-    output: Path,
+    anatomy_folders: Sequence[str | Path],
+    output: str | Path,
     device: Device,
-    config: DatasetConfig,
+    config: DatasetConfig | None = None,
     *,
     scheduler: str | None = None,
 ) -> None:
@@ -45,14 +45,15 @@ def generate_dataset(
         anatomy_folders: anatomies on disk, with different names.
         output: folder of the dataset.
         device: the wire.
-        config: number, length, distribution and split of the navigations.
+        config: number, length, distribution and split of the navigations; the defaults if not given.
         scheduler: address of a Dask scheduler whose workers simulate; the cores of this machine if not given.
 
     Raises:
         InputError: too few anatomies for the split, two anatomies of one name, an output folder that holds something
             else or was begun with other settings, a scheduler that cannot be reached, or a full disk.
     """
-    study = plan_study(anatomy_folders, Path(output), device, config)
+    config = config or DatasetConfig()
+    study = plan_study([Path(folder) for folder in anatomy_folders], Path(output), device, config)
     blocks = study.blocks()
     claim(study.plan.output, "endopilot dataset", **study.settings)
     if _is_finished(study, blocks):
@@ -121,10 +122,10 @@ def _finish(study: Study, blocks: Sequence[Block]) -> None:
     plan = study.plan
     files = [schema.paths_of_file(plan.output, block.number) for block in blocks]
     columns = ("episode_index", "anatomy", "sequence", "split", "stopped_short", "valid", "invalid_reason")
-    episodes = [row for _, path in files for row in schema.read_table(path, plan.key).select(columns).to_pylist()]
+    episodes = [row for _, path in files for row in parquet.read_table(path, plan.key).select(columns).to_pylist()]
     started = time.process_time()
     with progress("Describing the dataset", total=len(files)) as advance:
-        stats, shares = schema.statistics(plan.config.control, [path for path, _ in files], plan.key, advance)
+        stats, shares = parquet.statistics(plan.config.control, [path for path, _ in files], plan.key, advance)
     work = read_work(plan.output)
     work["processor_seconds"] += time.process_time() - started
     write_json(plan.output / schema.STATS_PATH, stats)

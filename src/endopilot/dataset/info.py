@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.anatomy.projection import safety_ratio
-from endopilot.dataset import schema
+from endopilot.dataset import parquet, schema
 from endopilot.dataset.loader import read_manifest
 from endopilot.files import read_json, writing
 from endopilot.progress import progress
@@ -84,9 +84,9 @@ def describe_dataset(folder: Path) -> Description:
     with progress("Reading the dataset", total=manifest["files"]) as advance:
         for number in range(manifest["files"]):
             data_path, episodes_path = schema.paths_of_file(folder, number)
-            for name, values in schema.read_table(episodes_path, manifest["key"]).to_pydict().items():
+            for name, values in parquet.read_table(episodes_path, manifest["key"]).to_pydict().items():
                 episodes.setdefault(name, []).extend(values)
-            table = schema.read_table(data_path, manifest["key"])
+            table = parquet.read_table(data_path, manifest["key"])
             _count(table, wire_mm, histograms, visits, manifest["samples_per_episode"])
             advance()
     total = max(sum(visits.values()), 1)
@@ -132,14 +132,14 @@ def _empty(deepest_mm: float) -> dict[str, Histogram]:
 
 def _count(table, wire_mm: float, histograms: dict[str, Histogram], visits: Counter[int], samples: int) -> None:
     """Count one file's valid samples, and the branches that each valid navigation came to."""
-    valid = schema.column_values(table, "valid")
-    state = schema.column_values(table, "observation.state")[valid].astype(float)
-    radius = schema.column_values(table, "lumen_radius_mm")[valid].astype(float)
+    valid = parquet.column_values(table, "valid")
+    state = parquet.column_values(table, "observation.state")[valid].astype(float)
+    radius = parquet.column_values(table, "lumen_radius_mm")[valid].astype(float)
     histograms["insertion"].add(state[:, 0])
     histograms["offset-ratio"].add(state[:, 3] / radius)
     histograms["wall-ratio"].add(safety_ratio(state[:, 3], radius, wire_mm))
-    histograms["contact-force"].add(schema.column_values(table, "contact_force_max_n")[valid].astype(float))
-    branch = np.sort(schema.column_values(table, "branch").reshape(-1, samples), axis=1)
+    histograms["contact-force"].add(parquet.column_values(table, "contact_force_max_n")[valid].astype(float))
+    branch = np.sort(parquet.column_values(table, "branch").reshape(-1, samples), axis=1)
     distinct = 1 + (np.diff(branch, axis=1) != 0).sum(axis=1)
     visits.update(distinct[valid.reshape(-1, samples).all(axis=1)].tolist())
 

@@ -14,13 +14,12 @@ from endopilot.dataset.schema import (
     LEROBOT_VERSION,
     MANIFEST_PATH,
     actuation_of,
-    column_values,
     paths_of_file,
-    read_table,
     signals,
 )
 from endopilot.dataset.study import identify, version
 from endopilot.errors import InputError
+from endopilot.extras import extra_named
 from endopilot.files import read_json
 from endopilot.runs import RECORD_FILE
 
@@ -177,6 +176,9 @@ def load_dataset(folder: Path) -> Dataset:
     Raises:
         InputError: the folder holds no finished dataset, or a file of it is missing, damaged or of another version.
     """
+    with extra_named("reading a dataset"):
+        from endopilot.dataset.parquet import column_values, read_table
+
     folder = Path(folder)
     manifest, info = read_manifest(folder)
     samples, total = manifest["samples_per_episode"], info["total_episodes"]

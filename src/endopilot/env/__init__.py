@@ -1,6 +1,7 @@
 """Navigation as environments for learning.
 
-Importing this package registers `endopilot/Navigate-v0` and one environment for each task of the ladder with Gymnasium.
+Importing this package registers `endopilot/Navigate-v0` and one environment for each task of the ladder with Gymnasium,
+which does so itself where the package stands before the name: `gymnasium.make("endopilot.env:endopilot/Navigate-v0")`.
 """
 
 import gymnasium

@@ -77,12 +77,12 @@ def evaluate(
             dataset was made with another wire, or a patient that a run was trained on is among its test patients.
     """
     from endopilot.evaluation.protocols import count_steps, run_protocols  # brings torch, which takes seconds to import
-    from endopilot.models.rollout import load_run
+    from endopilot.models.rollout import load_model
 
     start = time.perf_counter()
     dataset = load_dataset(Path(dataset_folder or _own_dataset(run_folder, read_run(run_folder))).resolve())
     known, *_ = [trained_patients(run, read_run(run), dataset) for run in (run_folder, *other_seeds)]
-    predictor, others = load_run(run_folder), [load_run(other) for other in other_seeds]
+    predictor, others = load_model(run_folder), [load_model(other) for other in other_seeds]
     train = dataset.of_split("train")
     chosen = {split: _chosen(dataset.of_split(split), config.sequences) for split in SPLITS if split in dataset.split}
     if not chosen:

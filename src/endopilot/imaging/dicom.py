@@ -96,12 +96,6 @@ class _Slice:
     orientation: tuple[float, ...]
 
 
-def is_dicom(path: Path) -> bool:
-    """Tell whether a file starts as DICOM Part 10 files do: 128 bytes of preamble, then DICM."""
-    with path.open("rb") as stream:
-        return stream.read(132)[128:] == b"DICM"
-
-
 def read_series(path: Path, series: str | None) -> Volume:
     """Read a CT series in HU.
 

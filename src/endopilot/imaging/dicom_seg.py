@@ -17,7 +17,6 @@ from jaxtyping import Bool, Integer
 from endopilot import __version__
 from endopilot.errors import InputError
 from endopilot.files import writing
-from endopilot.imaging.dicom_write import slice_headers
 from endopilot.types import LumenMask, Volume
 
 SUFFIX = ".dcm"
@@ -45,6 +44,8 @@ def write_seg(mask: LumenMask, path: Path) -> None:
     """
     hd = need_highdicom(path)
     from pydicom.sr.codedict import codes
+
+    from endopilot.imaging.dicom_write import slice_headers  # pydicom comes with an extra
 
     volume = mask.volume
     header = slice_headers(volume)[0]

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Literal, cast
 
 import numpy as np
 
 from endopilot.errors import InputError
 from endopilot.imaging.contrast import refuse_other_units, refuse_without_contrast
+from endopilot.imaging.volume import read_volume
 from endopilot.plugins import Registry
 from endopilot.types import Insertion, LumenMask, Volume
 
@@ -86,19 +88,22 @@ def _method(name: str) -> SegmentationMethod:
     raise InputError(f"method: {name!r} is no function and no SegmentationMethod; name one")
 
 
-def segment(volume: Volume, config: SegmentConfig) -> LumenMask:
+def segment(volume: Volume | str | Path, config: SegmentConfig = SegmentConfig()) -> LumenMask:
     """Segment the lumen of one vessel tree from a CT angiogram.
 
     Args:
-        volume: CT in HU.
+        volume: CT in HU, or where it is: a DICOM folder or file, NIfTI, NRRD or MHA.
         config: method, vessel and seeds.
 
     Returns:
         The mask on the grid of `volume`, with the ostium and the direction into the vessel.
 
     Raises:
-        InputError: a seed lies outside the volume, there is no contrast, or the vessel was not found.
+        InputError: the CT cannot be read, a seed lies outside the volume, there is no contrast, or the vessel was
+            not found.
     """
+    if not isinstance(volume, Volume):
+        volume = read_volume(volume)
     refuse_other_units(volume)
     _refuse_seeds_outside(volume, config)
     method = _method(config.method)

@@ -19,8 +19,6 @@ import SimpleITK as sitk
 from endopilot.errors import InputError
 from endopilot.files import read_json, write_json, writing
 from endopilot.imaging import dicom_seg
-from endopilot.imaging.dicom import is_dicom, read_series
-from endopilot.imaging.dicom_write import write_series
 from endopilot.imaging.grid import from_image, to_image
 from endopilot.imaging.nifti import check_nifti
 from endopilot.types import Insertion, LumenMask, Volume
@@ -56,7 +54,9 @@ def read_volume(path: str | Path, *, series: str | None = None) -> Volume:
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; check the path")
     try:
-        if path.is_dir() or (_suffix(path) is None and is_dicom(path)):
+        if path.is_dir() or (_suffix(path) is None and _is_dicom(path)):
+            from endopilot.imaging.dicom import read_series  # pydicom comes with an extra
+
             return read_series(path, series)
     except PermissionError as error:
         raise InputError(f"{path}: may not be read ({error.strerror}); ask for access to it") from error
@@ -66,6 +66,12 @@ def read_volume(path: str | Path, *, series: str | None = None) -> Volume:
     if not np.isfinite(volume.voxels).all():
         raise InputError(f"{path}: some voxels are not finite numbers; write it again with −1024 HU in their place")
     return volume
+
+
+def _is_dicom(path: Path) -> bool:
+    """Tell whether a file starts as DICOM Part 10 files do: 128 bytes of preamble, then DICM."""
+    with path.open("rb") as stream:
+        return stream.read(132)[128:] == b"DICM"
 
 
 def check_output(path: str | Path, *, mask: bool = False) -> None:
@@ -104,6 +110,8 @@ def write_volume(volume: Volume, path: str | Path) -> None:
     path = Path(path)
     check_output(path)
     if path.suffix == "":
+        from endopilot.imaging.dicom_write import write_series  # pydicom comes with an extra
+
         write_series(volume, path)
         return
     with writing(path) as partial:

@@ -20,7 +20,7 @@ PRETRAINED = "pretrained"
 """Name of the trained causal model that comes with the package, in place of a run's folder."""
 
 
-def run_path(run: Path) -> Path:
+def run_path(run: str | Path) -> Path:
     """Return the folder of a run: the package's own for `PRETRAINED`, else `run` itself.
 
     Raises:
@@ -33,7 +33,7 @@ def run_path(run: Path) -> Path:
     return Path(run)
 
 
-def read_run(run: Path) -> dict[str, Any]:
+def read_run(run: str | Path) -> dict[str, Any]:
     """Return the manifest of a finished run, or of the packaged one, named "pretrained".
 
     Raises:

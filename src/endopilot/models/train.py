@@ -53,7 +53,7 @@ _TIMED_STEPS = 12
 _GRADIENT_NORM = 1.0
 
 
-def train(dataset_folder: Path, run_folder: Path, config: TrainConfig) -> None:
+def train(dataset_folder: str | Path, run_folder: str | Path, config: TrainConfig | None = None) -> None:
     """Train the forward and the inverse network on the split "train" and write them into a run folder.
 
     The twin has no networks: its run is a folder with settings alone.
@@ -65,12 +65,13 @@ def train(dataset_folder: Path, run_folder: Path, config: TrainConfig) -> None:
     Args:
         dataset_folder: dataset made by `endopilot dataset`.
         run_folder: where the result goes.
-        config: what is trained, and how long.
+        config: what is trained, and how long; the paper's networks if not given.
 
     Raises:
         InputError: the dataset cannot be used, the run folder belongs to another run, or the loss left the
             finite numbers (the last good checkpoint stays).
     """
+    config = config or TrainConfig()
     with joined(config.processor) as team:
         _train(Path(dataset_folder), Path(run_folder), config, team)
 

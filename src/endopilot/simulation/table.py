@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 
 from endopilot.errors import InputError
+from endopilot.extras import extra_named
 from endopilot.files import writing
 from endopilot.types import Rollout
 
@@ -47,12 +48,16 @@ def write_rollout(rollout: Rollout, path: Path) -> None:
 
     Raises:
         InputError: another suffix, or wire shapes for a table.
+        ModuleNotFoundError: .parquet without the extra `learn`.
     """
     path = Path(path)
     if path.suffix not in (".parquet", ".csv", ".npz"):
         raise InputError(f"{path}: a rollout is written as .parquet, .csv or .npz; choose one of these suffixes")
     if rollout.shape is not None and path.suffix != ".npz":
         raise InputError(f"{path}: wire shapes do not fit a table; write them as .npz")
+    if path.suffix == ".parquet":
+        with extra_named(f"{path}"):
+            pass  # with which pandas writes it
     with writing(path) as partial:
         if path.suffix == ".parquet":
             rollout_table(rollout).to_parquet(partial, index=False)

@@ -49,12 +49,12 @@ def advise(run: Path, dataset: Path, output: Path, config: AdviseConfig) -> dict
         InputError: the run or the dataset is missing or damaged, they are of different wires, or there are too few
             calibration patients.
     """
-    from endopilot.models.rollout import load_run  # brings torch
+    from endopilot.models.rollout import load_model  # brings torch
     from endopilot.plotting import png  # brings matplotlib, which takes a second to import
 
     start = time.perf_counter()
     beside = output if str(run) == PRETRAINED else run
-    episodes, predictor = load_dataset(dataset), load_run(run)
+    episodes, predictor = load_dataset(dataset), load_model(run)
     check_wire(run, read_run(run), episodes)
     splits = [episodes.of_split(name) for name in ("train", "calibrate", "test")]
     check_enough(len(set(splits[1].anatomy)), config.adviser.level)

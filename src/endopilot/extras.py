@@ -1,0 +1,51 @@
+"""Which extra of the package brings a library that is not installed."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+
+def requirements_of_extras() -> dict[str, tuple[str, ...]]:
+    """Return the names of the libraries that each extra brings, as the package's metadata lists them."""
+    from importlib import metadata  # slow to import, and only needed here
+
+    found: dict[str, tuple[str, ...]] = {}
+    for line in metadata.requires("endopilot") or ():
+        parts = re.match(r"([\w.-]+).*\bextra == ['\"]([\w-]+)['\"]", line)
+        if parts and parts[1] != "endopilot":  # `all` only repeats the others
+            found[parts[2]] = (*found.get(parts[2], ()), _normal(parts[1]))
+    return found
+
+
+def what_is_missing(error: ModuleNotFoundError) -> str | None:
+    """Return what to install, in one line, where an extra brings the module; None if the error is a defect."""
+    module = (error.name or "").partition(".")[0]
+    for extra, libraries in requirements_of_extras().items():
+        if extra != "dev" and _normal(module) in libraries:
+            return f"needs {module}; install it with: pip install 'endopilot[{extra}]'"
+    return None
+
+
+@contextmanager
+def extra_named(what: str) -> Iterator[None]:
+    """Say which extra to install where an import inside fails for want of it.
+
+    Args:
+        what: what needs the library; the message begins with it.
+
+    Raises:
+        ModuleNotFoundError: as the import raised it, with the mend in its message.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        missing = what_is_missing(error)
+        if missing is None:
+            raise
+        raise ModuleNotFoundError(f"{what} {missing}", name=error.name) from None
+
+
+def _normal(name: str) -> str:
+    return re.sub(r"[-_.]+", "-", name).lower()
