@@ -1,10 +1,10 @@
 """Calibrate the X-ray adviser of the ladder's `agent`: `python benchmarks/agent_calibration.py [FOLDER] [--write]`.
 
-In patients to learn on of every task of the ladder the agent drives wires whose friction, stiffness of the tip and
-ostium are off by as much as it holds possible. X-ray is on every 10 s; between, what it foretells is held against the
-truth. The spread is fitted in the first four patients of each task, the bands are scaled in the next five, and three
-patients of each task that the ladder is scored on tell whether they hold. FOLDER, runs/agent-calibration if not given,
-holds a file a navigation; an interrupted run goes on with the others.
+The agent navigates in training patients of every task of the ladder. Friction, tip stiffness and ostium differ from
+its model by up to the spread of its ensemble. There is one exposure every 10 s; in between, its predictions are
+compared with the truth. The spread is fitted in the first four patients of each task and the bands are scaled in the
+next five. Three patients of each task that the ladder is scored on test whether the bands hold. FOLDER,
+runs/agent-calibration if not given, gets one file a navigation; an interrupted run goes on with the others.
 
 With `--write` the calibration goes into the package, and the figures into docs/xray.md.
 """
@@ -30,28 +30,28 @@ from endopilot.xray.bands import Calibration, conformal_scale, fit_spread, sprea
 
 ROOT = Path(__file__).parents[1]
 ROLES = {"fit": range(4), "calibrate": range(4, 9), "test": range(3)}
-"""Places of the patients in the task's lists: to learn on, and for the test those of the ladder."""
+"""Places of the patients in the task's lists: in the training list, and for the test in the ladder's."""
 LEVEL, EXPOSED_EVERY, SECONDS = 0.9, 20, 30.0
-"""Share of the intervals that the bands are to hold; periods of 0.5 s from one exposure to the next; s a navigation."""
+"""Share of the intervals that the bands shall cover; periods of 0.5 s between exposures; seconds of a navigation."""
 
 
 class Monitored(AgentPolicy):
-    """The agent with X-ray at fixed times, which keeps what it foretold before each of them."""
+    """The agent with exposures at fixed times; it keeps every prediction."""
 
     def start(self, navigation: Navigation, seed: int) -> None:
-        """Begin to keep."""
+        """Begin a navigation without predictions."""
         self.kept: list[np.ndarray] = []
         super().start(navigation, seed)
 
     def wants_xray(self) -> bool:
-        """Keep what is foretold now, and ask for X-ray when it is time."""
+        """Keep the prediction, and ask for X-ray at the fixed times."""
         proximal, tip, spread, _ = self.foretold()
         self.kept.append(np.concatenate([proximal[0], tip[0], spread[0]]))
         return len(self.kept) % EXPOSED_EVERY == 0
 
 
 def truth_of(task: Task, place: int, role: str) -> ModelMismatch:
-    """Return what a patient's wire and ostium truly are, as far off as the agent holds possible."""
+    """Return a patient's model mismatch, drawn within the spread of the agent's ensemble."""
     belief, roles = AgentConfig().belief, list(ROLES)
     off = np.random.default_rng([task.level, place, roles.index(role)]).uniform(-1.0, 1.0, 3)
     return ModelMismatch(
@@ -61,8 +61,8 @@ def truth_of(task: Task, place: int, role: str) -> ModelMismatch:
     )
 
 
-def watch(path: Path) -> None:
-    """Navigate in a patient, and write what was foretold and what was true at each period after the first."""
+def measure(path: Path) -> None:
+    """Navigate in a patient, and write prediction and truth of each period after the first."""
     task, role, place = find_task(path.parent.name), *path.stem.split("-")
     number = int(place)
     if role == "test":
@@ -81,7 +81,7 @@ def watch(path: Path) -> None:
     kept, count = np.array(policy.kept), len(policy.kept)
     true = np.column_stack([record.tip.abscissa, record.tip.offset])[:count]
     exposed = record.exposed[:count]
-    write_json(path, {"told": kept.tolist(), "true": true.tolist(), "exposed": exposed.tolist()})
+    write_json(path, {"predicted": kept.tolist(), "true": true.tolist(), "exposed": exposed.tolist()})
 
 
 NO_BANDS = Calibration(
@@ -91,20 +91,20 @@ NO_BANDS = Calibration(
 
 def intervals(content: dict) -> list[tuple[np.ndarray, ...]]:
     """Return error (mm), time (s) and travel (mm) since the exposure, and spread (mm), of each interval without one."""
-    told, true, exposed = np.array(content["told"]), np.array(content["true"]), np.array(content["exposed"])
+    predicted, true, exposed = np.array(content["predicted"]), np.array(content["true"]), np.array(content["exposed"])
     begins = np.flatnonzero(exposed)
     found = []
     for begin, end in zip(begins, np.append(begins[1:], len(exposed)), strict=True):
-        part = slice(begin + 1, end)  # what is foretold at an exposure is what it shows
+        part = slice(begin + 1, end)  # the prediction at an exposure is the measurement
         if end - begin < 2:
             continue
         seconds = DECISION_PERIOD_S * np.arange(1, end - begin)
-        travel = np.cumsum(np.abs(np.diff(told[begin:end, 0])))
-        found.append((true[part] - told[part, 2:4], seconds, travel, told[part, 4:6]))
+        travel = np.cumsum(np.abs(np.diff(predicted[begin:end, 0])))
+        found.append((true[part] - predicted[part, 2:4], seconds, travel, predicted[part, 4:6]))
     return found
 
 
-def gathered(folder: Path, role: str) -> tuple[list[tuple[np.ndarray, ...]], np.ndarray]:
+def gather(folder: Path, role: str) -> tuple[list[tuple[np.ndarray, ...]], np.ndarray]:
     """Return the intervals of a role, and the patient of each."""
     rows, owner = [], []
     for path in sorted(folder.glob(f"*/{role}-*.json")):
@@ -120,10 +120,10 @@ def scores(rows: list[tuple[np.ndarray, ...]], terms: tuple[tuple[float, ...], t
 
 
 def calibrate(folder: Path) -> tuple[Calibration, list[str]]:
-    """Return the calibration, and a table of how well it holds."""
-    fitted, _ = gathered(folder, "fit")
+    """Return the calibration, and a table of its coverage as lines of Markdown."""
+    fitted, _ = gather(folder, "fit")
     terms = fit_spread(*(np.concatenate(column) for column in zip(*fitted, strict=True)))
-    rows, owner = gathered(folder, "calibrate")
+    rows, owner = gather(folder, "calibrate")
     calibration = Calibration(
         level=LEVEL,
         scale=conformal_scale(scores(rows, terms), owner, LEVEL),
@@ -134,8 +134,8 @@ def calibrate(folder: Path) -> tuple[Calibration, list[str]]:
         dataset="patients to learn on of the ladder's tasks",
     )
     lines = ["| patients | intervals without X-ray | in which both bands hold throughout |", "|---|---|---|"]
-    for title, role in (("calibrated on", "calibrate"), ("the ladder's, not seen", "test")):
-        rows, owner = gathered(folder, role)
+    for title, role in (("calibrated on", "calibrate"), ("the ladder's, not calibrated on", "test")):
+        rows, owner = gather(folder, role)
         held = float(np.mean(scores(rows, terms) <= calibration.scale))
         lines.append(f"| {title}: {len(np.unique(owner))} | {len(rows)} | {100 * held:.1f} % |")
     half = calibration.scale * np.concatenate([spread_of(terms, *rest) for _, *rest in rows])
@@ -150,7 +150,7 @@ def calibrate(folder: Path) -> tuple[Calibration, list[str]]:
 
 
 def main() -> None:
-    """Drive what is missing, calibrate, print, and write if asked to."""
+    """Run the missing navigations, calibrate, print, and write if asked to."""
     folders = [argument for argument in sys.argv[1:] if not argument.startswith("--")]
     folder = Path(folders[0]) if folders else ROOT / "runs" / "agent-calibration"
     wanted = [
@@ -161,7 +161,7 @@ def main() -> None:
     ]
     try:
         claim(folder, "benchmarks/agent_calibration.py", **identity("agent"), agent=AgentConfig())
-        make_missing("Calibrating the agent's adviser", wanted, watch)
+        make_missing("Calibrating the agent's adviser", wanted, measure)
     except InputError as error:
         raise SystemExit(str(error)) from error
     calibration, lines = calibrate(folder)

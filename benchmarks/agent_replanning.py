@@ -1,9 +1,9 @@
-"""Compare two rules for planning anew: `python benchmarks/agent_replanning.py [CASE [PATIENTS [TASK ...]]]`.
+"""Compare two rules for replanning: `python benchmarks/agent_replanning.py [CASE [PATIENTS [TASK ...]]]`.
 
-The ladder's `agent` keeps its course at an exposure unless the tip is lost or off course; `Anew` searches another one
-from the now likeliest state at every exposure. Both drive the same navigations of the ladder, with the same seeds, one
-process after another, since processor time is measured. CASE, as-told if not given, is one of those of `endopilot
-ladder --off 0.2` (endopilot.ladder.mismatch.CASES). Prints a table a task and over all, as Markdown.
+The ladder's `agent` keeps its course at an exposure unless the tip is lost or off course. `AlwaysReplanning` plans from
+the likeliest state at every exposure. Both drive the same navigations of the ladder with the same seeds, in one
+process, since processor time is measured. CASE is one of `endopilot.ladder.mismatch.CASES`, the first if not given.
+Prints a table of each task and of all together, as Markdown.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 
 from endopilot.control.agent import AgentPolicy
 from endopilot.control.navigate import NavigateConfig, navigate
-from endopilot.ladder.mismatch import truth_of
+from endopilot.ladder.mismatch import CASES, truth_of
 from endopilot.tasks.task import CORE, find_task
 from endopilot.xray.fluoroscope import TipMeasurement
 
@@ -24,15 +24,15 @@ TASKS = ("crux", "circumflex", "middle-cerebral", "carotid", "diagonal")
 OFF = 0.2
 
 
-class Anew(AgentPolicy):
-    """The agent, which drops its course at every exposure."""
+class AlwaysReplanning(AgentPolicy):
+    """The agent, but it drops its course at every exposure."""
 
     def _look(self, measured: TipMeasurement) -> None:
         super()._look(measured)
         self._course = None
 
 
-RULES: dict[str, type[AgentPolicy]] = {"where off course": AgentPolicy, "at every exposure": Anew}
+RULES: dict[str, type[AgentPolicy]] = {"where off course": AgentPolicy, "at every exposure": AlwaysReplanning}
 COLUMNS = ("safe success", "exposures", "time, s", "plans", "processor, s")
 
 
@@ -50,9 +50,9 @@ def drive(name: str, place: int, case: str, rule: type[AgentPolicy]) -> list[flo
 def main() -> None:
     """Drive and print."""
     given = sys.argv[1:]
-    case, patients, tasks = given[0] if given else "as-told", int(given[1]) if given[1:] else 6, given[2:] or TASKS
+    case, patients, tasks = given[0] if given else CASES[0], int(given[1]) if given[1:] else 6, given[2:] or TASKS
     found: dict[tuple[str, str], list[list[float]]] = {}
-    print("| task | plans anew | " + " | ".join(COLUMNS) + " |\n|---|---|" + "---|" * len(COLUMNS))
+    print("| task | replans | " + " | ".join(COLUMNS) + " |\n|---|---|" + "---|" * len(COLUMNS))
     for task in (*tasks, "all"):
         for rule, policy in RULES.items():
             if task == "all":

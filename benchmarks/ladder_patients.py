@@ -1,10 +1,9 @@
 """Choose the patients of the ladder's tasks: `python benchmarks/ladder_patients.py [TASK ...] [--write]`.
 
-Of each task's atlas the first twenty patients are taken that are eligible by the task's `chosen_for` and, from level 5
-on, in which the target can be reached at all: a search that may look and try again finds a way on which the wall's
-force stays below the task's limit. It knows the whole state of the wire, and at each fork tries twelve directions of
-the tip from a little way before it; what turns the tip for good, without looking, is the policies' business. The
-patients to learn on are the first twenty eligible ones of another atlas, without the search.
+The ladder gets the first twenty patients of a task's atlas that are eligible by the task's `chosen_for`. From level 5
+on, a search must also reach the target with a wall force below the task's limit. The search knows the full state of
+the wire. It stops before each fork and tries twelve directions of the tip; a policy has neither advantage. The training
+patients are the first twenty eligible ones of another atlas, without the search.
 
 With `--write` the numbers go into the tasks' files.
 """
@@ -30,7 +29,7 @@ from endopilot.types import TipProjection, VesselTree
 WANTED = 20
 MOST_EXAMINED = 400
 TRIES = 12
-"""Directions of the tip that are tried at a fork."""
+"""Directions of the tip that the search tries at a fork."""
 PUSH_MM_S, PERIOD_S = 4.0, 0.5
 
 
@@ -78,7 +77,7 @@ class _Search:
         self.peak, self.seconds = np.zeros(TRIES), np.zeros(TRIES)
 
     def reachable(self) -> bool:
-        """Return whether a way to the target was found, below the force limit and in time."""
+        """Return whether the search reached the target below the force limit and in time."""
         navigation, tree = self.navigation, self.navigation.anatomy.tree
         route = tree.route(navigation.target.branch)
         for place, branch in enumerate(route[:-1]):
@@ -95,7 +94,7 @@ class _Search:
         return bool(self.done().any())
 
     def enter(self, wanted: tuple[int, ...], inside: float, beyond: float) -> bool:
-        """Try the directions; all worlds become the one that entered with the least force, if one did."""
+        """Try the directions, and copy the world that entered with the smallest force to all others, if one entered."""
         kept, peak, seconds = self.simulator.state, self.peak.copy(), self.seconds.copy()
         for attempt in range(3):
             self.simulator.set_state(kept)
@@ -117,7 +116,7 @@ class _Search:
         return False
 
     def done(self) -> np.ndarray:
-        """Return which worlds stand at the target, safely and in time."""
+        """Return which worlds are at the target, below the force limit and in time."""
         navigation = self.navigation
         in_time = self.seconds <= navigation.seconds
         return navigation.reached(self.simulator.project()) & (self.peak <= navigation.force_limit_n) & in_time
@@ -125,7 +124,7 @@ class _Search:
     def drive(
         self, translation: float, rotation: float | np.ndarray, most_s: float, enough: Callable[[TipProjection], Any]
     ) -> None:
-        """Drive every world until it has had enough, stands at the target, or the time is over."""
+        """Drive every world until `enough` holds for it, it is at the target, or `most_s` seconds are over."""
         tip = self.simulator.project()
         still = enough(tip) | self.navigation.reached(tip)
         for _ in range(round(most_s / PERIOD_S)):
@@ -164,7 +163,7 @@ def choose(task: Task, seed: int, *, search: bool) -> tuple[list[int], int, int]
             chosen.append(number)
             if len(chosen) == WANTED:
                 return chosen, count, number + 1
-    raise SystemExit(f"{task.name}: only {len(chosen)} of {MOST_EXAMINED} patients will do; choose others")
+    raise SystemExit(f"{task.name}: only {len(chosen)} of {MOST_EXAMINED} patients qualify; choose another seed")
 
 
 def main() -> None:
@@ -173,7 +172,7 @@ def main() -> None:
     for task in ladder_tasks():
         if names and task.name not in names:
             continue
-        path = Path(__file__).parents[1] / "src" / "endopilot" / "env" / "tasks" / f"{task.name}.yaml"
+        path = Path(__file__).parents[1] / "src" / "endopilot" / "tasks" / "ladder" / f"{task.name}.yaml"
         text = path.read_text(encoding="utf-8")
         for role, patients, search in (("ladder", task.ladder, task.level >= 5), ("training", task.training, False)):
             chosen, eligible, examined = choose(task, patients.seed, search=search)

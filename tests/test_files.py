@@ -38,13 +38,13 @@ def test_a_failing_block_removes_a_half_written_folder(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_full_disk_is_told_in_one_line(tmp_path: Path) -> None:
+def test_a_full_disk_is_reported_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="disk is full"), writing(tmp_path / "a.bin"):
         raise OSError(errno.ENOSPC, "No space left on device")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_file_in_the_place_of_a_folder_is_told_in_one_line(tmp_path: Path) -> None:
+def test_a_file_in_the_place_of_a_folder_is_reported_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "taken").write_text("")
     with pytest.raises(InputError, match="cannot be written"), writing(tmp_path / "taken" / "a.txt"):
         pass
@@ -56,7 +56,7 @@ def test_json_takes_numpy_values_and_paths(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", [None, "{"])
-def test_missing_or_broken_json_is_told_in_one_line(tmp_path: Path, text: str | None) -> None:
+def test_missing_or_broken_json_is_reported_in_one_line(tmp_path: Path, text: str | None) -> None:
     if text is not None:
         (tmp_path / "a.json").write_text(text)
     with pytest.raises(InputError, match=r"a\.json"):

@@ -23,7 +23,7 @@ def write_process(item: Path) -> None:
     item.write_text(str(os.getpid()))
 
 
-def test_every_item_is_worked_on_and_bad_ones_are_told(tmp_path):
+def test_every_item_is_worked_on_and_bad_ones_are_returned(tmp_path):
     items = [tmp_path / name for name in ("a", "bad", "c")]
     bad = each("Test", items, write_process)
     assert list(bad) == [items[1]] and str(bad[items[1]]).endswith("mend it")

@@ -1,11 +1,11 @@
-"""The one exception that a user is meant to read."""
+"""`InputError`, the exception for what a user can correct."""
 
 from __future__ import annotations
 
 
 class InputError(Exception):
-    """Bad input, told in one line that names the file or field, the value found, and the mend.
+    """Bad input; the message is one line that names the file or field, the value found, and the remedy.
 
-    The command line prints it without a traceback and leaves with exit code 2. Raise it for anything the
-    user can mend; leave other exceptions for defects of endopilot itself.
+    The command line prints the message without a traceback and exits with code 2. Raise it for anything that the
+    user can correct. Other exceptions are defects of endopilot itself.
     """

@@ -1,4 +1,4 @@
-"""Writing results whole or not at all, and the manifest that says how each was made."""
+"""Atomic writes, JSON files, content hashes, and the manifest that says how a result was made."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def manifest(*, config: Any, seed: int | None = None, inputs: Mapping[str, str] 
         config: the configuration of the run, a dataclass or a mapping.
         seed: the seed of the run's random streams, if it has any.
         inputs: name of each input file and its SHA-256.
-        facts: what else is worth knowing, such as `wall_seconds` or what was rejected and why.
+        facts: further entries, such as `wall_seconds` or what was rejected and why.
     """
     packages = ("numpy", "scipy", "SimpleITK", "torch", "pyarrow")
     return {

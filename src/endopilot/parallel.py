@@ -1,4 +1,4 @@
-"""The same work on several items at once, one process each: `each`."""
+"""The same work on several items at once, in several processes: `each`."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from endopilot.progress import progress, silence
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 """Processor cores that this process may use: a batch system may leave it fewer than the machine has."""
 MOST_PROCESSES = 8
-"""A volume under work takes some 1 GB of memory."""
+"""A volume being processed takes some 1 GB of memory."""
 
 
 def each(title: str, items: Sequence[Path], work: Callable[[Path], None]) -> dict[Path, InputError]:
-    """Do the same work for every item, under one progress bar, on as many processes as there are cores.
+    """Do the same work for every item, in as many processes as there are cores, under one progress bar.
 
     Args:
-        title: what is being done.
-        items: what it is done to.
-        work: a function of a module, or a `functools.partial` of one, since other processes must find it.
+        title: name of the work, for the progress bar.
+        items: files or folders to work on.
+        work: a function of a module, or a `functools.partial` of one, since other processes import it.
 
     Returns:
-        The items whose input was bad, each with what was wrong. Any other exception ends the work and is raised.
+        The items whose work raised `InputError`, each with its error. Any other exception ends the work and is raised.
     """
     bad: dict[Path, InputError] = {}
 
@@ -45,7 +45,7 @@ def each(title: str, items: Sequence[Path], work: Callable[[Path], None]) -> dic
                 settle(item, lambda item=item: work(item))
                 advance(remark=item.name)
             return bad
-        # Started afresh, since a fork of a process with running threads can lock up.
+        # Spawned, since a fork of a process with running threads can deadlock.
         context = multiprocessing.get_context("spawn")
         with ProcessPoolExecutor(processes, mp_context=context, initializer=follow_the_parent) as pool:
             futures: dict[Future[None], Path] = {pool.submit(work, item): item for item in items}
@@ -62,7 +62,7 @@ def each(title: str, items: Sequence[Path], work: Callable[[Path], None]) -> dic
 
 
 def follow_the_parent() -> None:
-    """Leave interrupts and the screen to the parent, and end with it even where it is killed."""
+    """Leave interrupts and progress bars to the parent process, and end when it ends, even if it is killed."""
     silence()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()

@@ -41,7 +41,7 @@ from endopilot.types import Rollout, Volume
 
 VOLUME_SUFFIX = ".nii.gz"
 EVALUATED = 48
-"""Navigations of each split that are evaluated; each is simulated seven times."""
+"""Navigations that are evaluated in each split; each is simulated seven times."""
 _PRETRAINED_DEVICE = "workhorse-014"
 DEMO_ORIGIN = (
     "The patients are synthetic: right coronary arteries drawn from published statistics, and a CT angiogram of each, "
@@ -52,7 +52,7 @@ RUN_ORIGIN = "One CT angiogram, given by the user; everything is made from it al
 
 @dataclass(frozen=True, kw_only=True)
 class StudyConfig:
-    """What happens to patients once their volumes are there."""
+    """What is simulated and trained on the patients' volumes."""
 
     device: str = "workhorse-014"
     """Name of a shipped device (`endopilot devices`) or a YAML file."""
@@ -68,7 +68,7 @@ class StudyConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class DemoConfig(StudyConfig):
-    """The demo: synthetic right-coronary patients that the networks which are evaluated have never seen."""
+    """The demo: synthetic right-coronary patients that the evaluated networks were not trained on."""
 
     patients: int = 6
     """Number of patients, at least 3."""
@@ -77,12 +77,12 @@ class DemoConfig(StudyConfig):
 
     def __post_init__(self) -> None:
         if self.patients < 3:
-            raise InputError(f"--patients {self.patients}: at least 3 are needed, so that one can be kept unseen")
+            raise InputError(f"--patients {self.patients}: give at least 3, so that one is left for testing")
         if not self.training_seconds >= 0:
             raise InputError(f"--training-seconds {self.training_seconds}: give 0 or more")
         if self.training_seconds == 0 and self.device != _PRETRAINED_DEVICE:
             raise InputError(
-                f"--device {self.device}: the networks of the package know {_PRETRAINED_DEVICE} alone; "
+                f"--device {self.device}: the networks of the package were trained on {_PRETRAINED_DEVICE} alone; "
                 "train others, for example with --training-seconds 100"
             )
 
@@ -219,14 +219,18 @@ def run_volume(volume: Path, output: Path, config: RunConfig, *, series: str | N
         InputError: the volume cannot be read or segmented, or the folder belongs to another run, such as that of
             another volume.
     """
-    device = read_device(config.device)
-    copy = output / "ct" / f"patient{VOLUME_SUFFIX}"
+    content, device = read_volume(volume, series=series), read_device(config.device)
+    identity = {"volume_sha256": _digest(content), "method": METHODS.origin(config.segmentation.method)}
+    claim(output, "endopilot run", **identity, config=config, device=device, version=__version__)
+    copy, stages = output / "ct" / f"patient{VOLUME_SUFFIX}", _Stages(output)
+    stages.do("read", lambda: write_volume(content, copy))
+    del content  # up to a gigabyte
     run = _Run(
         output=output,
         config=config,
         segmentation=config.segmentation,
         device=device,
-        stages=_begin_with(volume, copy, output, config, device, series),
+        stages=stages,
         origin=RUN_ORIGIN,
         command=f"endopilot run {volume} -o {output}" + (f" --series {series}" if series else ""),
         inputs=input_hash(volume),
@@ -234,27 +238,8 @@ def run_volume(volume: Path, output: Path, config: RunConfig, *, series: str | N
     return _study(run, [copy])
 
 
-def _begin_with(
-    volume: Path, copy: Path, output: Path, config: RunConfig, device: Device, series: str | None
-) -> _Stages:
-    """Read a volume, claim the folder for it and keep a copy there."""
-    content = read_volume(volume, series=series)
-    claim(
-        output,
-        "endopilot run",
-        volume_sha256=_digest(content),
-        config=config,
-        method=METHODS.origin(config.segmentation.method),
-        device=device,
-        version=__version__,
-    )
-    stages = _Stages(output)
-    stages.do("read", lambda: write_volume(content, copy))
-    return stages
-
-
 def _digest(volume: Volume) -> str:
-    """Return the SHA-256 of voxels and geometry: of what is used, whichever files, names and series it came from."""
+    """Return the SHA-256 of voxels and geometry: of what the run uses, whatever file or series it came from."""
     digest = hashlib.sha256()
     for part in (volume.voxels, volume.spacing_mm, volume.origin_mm, volume.direction):
         digest.update(f"{part.dtype} {part.shape} ".encode() + np.ascontiguousarray(part).tobytes())
@@ -288,7 +273,7 @@ def _make_anatomy(volume: Path, *, output: Path, config: AnatomyConfig) -> None:
 
 
 def _study(run: _Run, volumes: Sequence[Path]) -> dict[str, Any]:
-    """Take volumes to a report: the part that synthetic and real patients share."""
+    """Run the stages that synthetic and real patients share, from the volumes to the report."""
     output, stages, segmentation = run.output, run.stages, run.segmentation
     scheme = segmentation.vessel if segmentation.method == "coronary" else "generic"
     make_mask = partial(_make_mask, output=output, config=segmentation)
@@ -303,21 +288,21 @@ def _study(run: _Run, volumes: Sequence[Path]) -> dict[str, Any]:
 
 
 def _learn(run: _Run, anatomies: Sequence[Path]) -> None:
-    """Simulate navigations, train both networks on them unless the packaged ones are to do, and evaluate these."""
+    """Simulate navigations, train networks on them or take those of the package, and evaluate the networks."""
     from endopilot.evaluation.evaluate import EvaluateConfig, evaluate
     from endopilot.models.train import train  # torch takes seconds to import
     from endopilot.report.evaluation_report import report_evaluation
 
     output, config = run.output, run.config
     trains = config.training_seconds > 0
-    unseen = len(anatomies) // 3 if trains else len(anatomies) - len(anatomies) // 3  # the others give baselines' means
-    shares = (1 - unseen / len(anatomies), 0.0, unseen / len(anatomies)) if unseen else None
+    tested = len(anatomies) // 3 if trains else len(anatomies) - len(anatomies) // 3  # the others give baselines' means
+    shares = (1 - tested / len(anatomies), 0.0, tested / len(anatomies)) if tested else None
     dataset = DatasetConfig(
         sequences=config.sequences,
         seconds=config.seconds,
         seed=config.seed,
         anatomy_shares=shares,
-        seen_test_share=DatasetConfig.seen_test_share if trains else 0.0,  # the packaged networks know none of them
+        seen_test_share=DatasetConfig.seen_test_share if trains else 0.0,  # all are new to the packaged networks
     )
     run.stages.do("dataset", lambda: generate_dataset(anatomies, output / "dataset", run.device, dataset))
     if trains:
@@ -366,7 +351,7 @@ def _report(run: _Run, names: Sequence[str]) -> None:
 
 
 def _scores(output: Path, names: Sequence[str]) -> dict[str, dict[str, float]]:
-    """Return how well each patient's anatomy matches the truth that its volume was made of, where there is one."""
+    """Return how well each synthetic patient's anatomy matches the truth that its volume was made from."""
     path = output / "scores.json"
     if path.exists():
         return read_json(path)
@@ -383,7 +368,7 @@ def _scores(output: Path, names: Sequence[str]) -> dict[str, dict[str, float]]:
 
 
 def _replay(output: Path, device: Device) -> tuple[Path, Rollout]:
-    """Simulate again, wire shapes recorded, the navigation not trained on whose tip travelled farthest."""
+    """Simulate one test navigation again with the wire's shape, that in which the tip travelled farthest."""
     dataset = load_dataset(output / "dataset")
     held_out = dataset.of_split("test" if "test" in dataset.split else "seen_test")
     best = int(np.ptp(held_out.tip_abscissa, axis=1).argmax())

@@ -1,4 +1,4 @@
-"""The look of all pictures: colours, matplotlib style, and a figure as PNG."""
+"""Colours and matplotlib style of all pictures, and a figure as PNG."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-# Okabe & Ito, "Color universal design" (2008): told apart with any kind of colour vision.
+# Okabe & Ito, "Color universal design" (2008): distinguishable with any kind of colour vision.
 BLACK, ORANGE, SKY, GREEN = "#1a1a1a", "#E69F00", "#56B4E9", "#009E73"
 YELLOW, BLUE, VERMILLION, PURPLE, GREY = "#F0E442", "#0072B2", "#D55E00", "#CC79A7", "#8a8f98"
 

@@ -1,4 +1,4 @@
-"""A progress bar with the time left, for every piece of work that may take more than two seconds."""
+"""A progress bar with the time left, for work that may take more than two seconds."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ class Advance(Protocol):
 
 
 _shown = False
-"""Whether a bar is on the screen."""
+"""Whether a bar is shown."""
 
 
 @contextmanager
 def progress(title: str, total: int | float) -> Iterator[Advance]:
     """Show a bar on standard error while the block runs.
 
-    Standard output stays free for results. Where standard error is no terminal, one line is printed when work of more
-    than two seconds ends, so that logs stay short. A bar within a bar is not shown.
+    Standard output stays free for results. If standard error is no terminal, one line is printed at the end of work
+    that took more than two seconds. A bar within a bar is not shown.
 
     Args:
-        title: what is being done.
+        title: name of the work.
         total: number of units of work.
     """
     global _shown
@@ -71,6 +71,6 @@ def progress(title: str, total: int | float) -> Iterator[Advance]:
 
 
 def silence() -> None:
-    """Show no bar from now on: for processes that work under another one's bar."""
+    """Show no bar from now on; for worker processes, whose parent shows one."""
     global _shown
     _shown = True

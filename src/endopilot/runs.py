@@ -57,7 +57,7 @@ def make_missing(title: str, paths: Sequence[Path], make: Callable[[Path], None]
     """Make those result files of a run that are not there yet, in several processes.
 
     Args:
-        title: what is being done, for the progress bar.
+        title: name of the work, for the progress bar.
         paths: all files of the run.
         make: writes one of them; a function of a module, or a `functools.partial` of one.
 

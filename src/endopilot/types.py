@@ -1,4 +1,4 @@
-"""The records that cross from one stage to the next, and nothing else.
+"""The records that pass from one stage to the next.
 
 Symbols of the paper (Kim et al. 2023), once for the whole package:
 
@@ -144,7 +144,7 @@ class VesselTree:
         return tuple(reversed(route))
 
     def departures(self, branch: int) -> Float[np.ndarray, "branches"]:
-        """Return the abscissa, mm, where the way into each branch leaves the route to `branch`; infinite on it."""
+        """Return the abscissa, mm, where the route to each branch leaves the route to `branch`; infinite on it."""
         route, at = self.route(branch), np.full(len(self.branches), np.inf)
         for index in set(range(len(self.branches))) - set(route):
             first = next(b for b in self.route(index) if b not in route)
@@ -223,7 +223,7 @@ class TipProjection:
 
 @dataclass(frozen=True, eq=False)
 class Rollout:
-    """What a set of simulated worlds did, one sample every `sample_period_s`.
+    """The recorded motion of simulated worlds, one sample every `sample_period_s`.
 
     Sample t is the state at the end of period t, and `control[:, t]` is the mean control over that period, so that
     inserted_length[:, t] = initial_inserted_length + sample_period_s · Σ control[:, :t+1, 0], and likewise for the
@@ -245,11 +245,11 @@ class Rollout:
         base_torque: torque that the drive must apply about the wire's axis, N·mm.
         drive_force: axial force of the drive, N: `base_force` and what the introducer's valve takes.
         drive_torque: torque of the drive, N·mm, likewise.
-        slip: advance that was asked of the drive and not made in the period, mm; 0 unless the wire was caught.
+        slip: advance that was commanded and not made in the period, mm; 0 unless the drive slipped.
         iterations: mean Newton iterations a time step over the period.
         valid: false from the sample in which a world failed to converge or left the finite numbers.
-        reason: why a world became invalid: 0 it did not, 1 it left the finite numbers, 2 it did not converge.
-        shape: positions of all nodes from tip to base, LPS mm, if asked for.
+        reason: why a world became invalid: 0 it is valid, 1 it left the finite numbers, 2 it did not converge.
+        shape: positions of all nodes from tip to base, LPS mm, if they were recorded.
     """
 
     sample_period_s: float

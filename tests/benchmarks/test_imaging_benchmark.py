@@ -112,7 +112,7 @@ def as_volume(distance_map):
     return Volume(inside, np.full(3, distance_map.spacing_mm), distance_map.origin_mm, np.eye(3))
 
 
-@pytest.mark.parametrize(("options", "told"), [({"cases": 0}, "cases: 0"), ({"seed": -1}, "seed: -1")])
-def test_bad_configuration_is_told(options, told):
-    with pytest.raises(InputError, match=told):
+@pytest.mark.parametrize(("options", "message"), [({"cases": 0}, "cases: 0"), ({"seed": -1}, "seed: -1")])
+def test_bad_configuration_is_refused(options, message):
+    with pytest.raises(InputError, match=message):
         ImagingBenchConfig(**options)

@@ -19,10 +19,12 @@ import pytest
 
 from endopilot.anatomy.io import write_anatomy
 from endopilot.cli import main
+from endopilot.dataset import study
 from endopilot.dataset.generate import DatasetConfig
 from endopilot.dataset.loader import load_dataset
 from endopilot.errors import InputError
 from endopilot.files import read_json, sha256
+from endopilot.simulation.device_files import device_yaml
 from toy_navigation import make_toy_dataset, toy_anatomy, toy_simulate
 
 
@@ -317,6 +319,23 @@ def test_files_of_two_devices_are_not_mixed(tmp_path):
         load_dataset(tmp_path / "d")
     with pytest.raises(InputError, match=r"was begun with device\.name = workhorse-014, now it is stiff-014"):
         make_toy_dataset(tmp_path / "d", patients=1, sequences=4, sequences_per_file=2, device="stiff-014")
+
+
+def test_a_changed_device_of_the_same_name_is_refused(tmp_path):
+    file = tmp_path / "wire.yaml"
+    text = device_yaml("workhorse-014")[1]
+    file.write_text(text)
+    make_toy_dataset(tmp_path / "d", patients=1, sequences=4, device=str(file))
+    file.write_text(text.replace("value: 0.36", "value: 0.35", 1))
+    with pytest.raises(InputError, match=r"was begun with device\.diameter_mm = 0\.36, now it is 0\.35"):
+        make_toy_dataset(tmp_path / "d", patients=1, sequences=4, device=str(file))
+
+
+def test_another_version_of_the_package_is_refused(tmp_path, monkeypatch):
+    make_toy_dataset(tmp_path / "d", patients=1, sequences=4)
+    monkeypatch.setattr(study, "__version__", "99.0")
+    with pytest.raises(InputError, match=r"was begun with version = endopilot 0\.1\.0, .*now it is endopilot 99\.0"):
+        make_toy_dataset(tmp_path / "d", patients=1, sequences=4)
 
 
 def test_bad_datasets_are_one_line_at_the_command_line(tmp_path, capsys):

@@ -61,7 +61,10 @@ def test_killed_and_started_again_it_ends_with_a_report(tmp_path):
 
 def test_settings_that_the_packaged_networks_do_not_fit_are_refused(tmp_path):
     for arguments, message in (
-        (("demo", "--device", "j-035"), "--device j-035: the networks of the package know workhorse-014 alone"),
+        (
+            ("demo", "--device", "j-035"),
+            "--device j-035: the networks of the package were trained on workhorse-014 alone",
+        ),
         (("demo", "--training-seconds", "-1"), "--training-seconds -1.0: give 0 or more"),
         (("run", "ct.nii.gz", "--training-seconds", "0"), "--training-seconds 0.0: give a positive number"),
     ):

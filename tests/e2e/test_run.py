@@ -1,4 +1,4 @@
-"""`endopilot run`, small: killed and continued to the report; then nobody else may go on in its folder."""
+"""`endopilot run`, small: killed, continued to the report, and then protected from any other run."""
 
 from __future__ import annotations
 

@@ -15,6 +15,7 @@ from endopilot.errors import InputError
 from endopilot.ladder import ladder
 from endopilot.ladder.ladder import LadderConfig, climb, drive, score
 from endopilot.report.ladder_page import write_page
+from endopilot.simulation.device import read_device
 from endopilot.tasks.task import find_task, ladder_tasks
 from endopilot.types import TipProjection
 
@@ -71,6 +72,30 @@ def test_a_folder_of_another_task_is_refused(climbed, monkeypatch):
     monkeypatch.setattr(ladder, "ladder_tasks", lambda: changed)
     with pytest.raises(InputError, match=r"was begun with tasks\.straight = "):
         climb(folder, LadderConfig(policy="forward", tasks=("straight",), patients=1))
+
+
+def test_another_wire_of_the_same_name_or_another_version_is_refused(climbed, monkeypatch):
+    folder, _ = climbed
+    one = LadderConfig(policy="forward", tasks=("straight",), patients=1)
+    monkeypatch.setattr(ladder, "read_device", lambda name: replace(read_device(name), friction=0.5))
+    with pytest.raises(InputError, match=r"was begun with tasks\.straight = "):
+        climb(folder, one)
+    monkeypatch.undo()
+    monkeypatch.setattr(ladder, "__version__", "99.0")
+    with pytest.raises(InputError, match=r"was begun with version = 0\.1\.0, now it is 99\.0"):
+        climb(folder, one)
+
+
+def test_a_changed_policy_of_one_s_own_is_refused(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    policy = tmp_path / "my_changing_policy.py"
+    policy.write_text("from endopilot.control.baseline_policies import Forward as Mine\n")
+    one = LadderConfig(policy="my_changing_policy:Mine", tasks=("straight",), patients=1)
+    monkeypatch.setattr(runs, "each", lambda title, items, work: [work(item) for item in items] and {})
+    climb(tmp_path / "runs", one)
+    policy.write_text("from endopilot.control.baseline_policies import Spin as Mine\n")
+    with pytest.raises(InputError, match=r"was begun with origin = my_changing_policy\.py sha256:"):
+        climb(tmp_path / "runs", one)
 
 
 def test_the_page_shows_the_scores_and_links_the_replay(climbed):

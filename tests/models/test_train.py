@@ -155,6 +155,22 @@ def test_other_settings_are_refused(short_run, toy_dataset):
         train(toy_dataset, short_run, TrainConfig(**(SHORT | {"epochs": 4})))
 
 
+def test_another_dataset_or_version_is_refused(short_run, toy_dataset, tmp_path, monkeypatch):
+    make_toy_dataset(tmp_path / "other", patients=6, sequences=24, seed=9)
+    with pytest.raises(InputError, match="was begun with dataset = "):
+        train(tmp_path / "other", short_run, TrainConfig(**SHORT))
+    monkeypatch.setattr(sys.modules["endopilot.models.train"], "__version__", "99.0")
+    with pytest.raises(InputError, match=r"was begun with version = 0\.1\.0, now it is 99\.0"):
+        train(toy_dataset, short_run, TrainConfig(**SHORT))
+
+
+def test_a_folder_of_other_things_is_refused(toy_dataset, tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match=r"is not empty and holds no run\.json"):
+        train(toy_dataset, tmp_path, TrainConfig(**SHORT))
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
 def test_the_first_bad_loss_stops_and_the_last_good_checkpoint_stays(toy_dataset, tmp_path, monkeypatch):
     config = TrainConfig(**SHORT, network="ff")
     real = Episodes.window

@@ -1,4 +1,4 @@
-"""Measures of extraction on lumens whose truth is known: analytic tubes, and real trees rebuilt and found again."""
+"""Errors of extraction on lumens whose truth is known: analytic tubes, and lumens rebuilt from real centerlines."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from endopilot.progress import progress
 from endopilot.types import Anatomy, LumenMask, VesselTree, Volume
 
 VOXELS_MM = ((0.35, 0.35, 0.35), (0.5, 0.5, 0.5), (0.35, 0.35, 0.5), (0.4, 0.4, 0.8))
-"""Voxel edges of the masks, mm. Errors are told in the shortest edge."""
+"""Voxel edges of the masks, mm. Errors are given in units of the shortest edge."""
 
 POSE = (Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix(), np.array([0.13, -0.21, 0.17]))
-"""The shapes are turned and shifted off the voxels' own axes and symmetry."""
+"""Rotation and shift (mm) of the shapes, so that they are not aligned with the voxels."""
 
 FORK_DEG = (30.0, 60.0, 90.0)
 NEAR_WALL_MM = 2.0
@@ -52,7 +52,7 @@ def bench_anatomy(centerlines: Path | None = None) -> list[dict[str, Any]]:
             them; their lumen is rebuilt from the radii and extracted again.
 
     Returns:
-        Rows of case, figure, value, bar and passed; figures without a bar are there to compare with. Axis and radius
+        Rows of case, figure, value, bar and passed; figures without a bar are for comparison. Axis and radius
         errors are means over the centerline's points against the tubes' true axes and radii, in the shortest voxel
         edge; the distance map's is the root mean square within 2 mm of the wall, ends left out, in the same unit.
 

@@ -1,4 +1,4 @@
-"""How long and how large the paper's full set would be, from a slice of it that is made: `bench_dataset`."""
+"""Time and size of the paper's full dataset, extrapolated from a part of it: `bench_dataset`."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from endopilot.simulation.device import read_device
 PAPER_ANATOMIES, PAPER_SEQUENCES = 100, 1000
 """Kim et al. 2023: random navigations of 60 s in each of 100 anatomies."""
 CORES = 2
-"""Cores that the full set is foretold for."""
+"""Cores that the time of the full set is extrapolated to."""
 _DEVICE = "workhorse-014"
 
 
 def bench_dataset(output: Path, *, share: float = 0.05) -> dict[str, Any]:
-    """Make a slice of the paper's set in synthetic right coronary arteries, and say what all of it would take.
+    """Make a part of the paper's dataset in synthetic right coronary arteries, and extrapolate to all of it.
 
-    The slice consists of whole files: 500 navigations of 60 s in each of some anatomies. An interrupted run goes on
-    where it stopped; a finished one answers at once.
+    The part consists of whole files: 500 navigations of 60 s in each of some anatomies. An interrupted run goes on
+    where it stopped; a finished one returns at once.
 
     Args:
         output: folder that takes the anatomies and the dataset.
@@ -36,11 +36,11 @@ def bench_dataset(output: Path, *, share: float = 0.05) -> dict[str, Any]:
     Returns:
         What was measured: `navigations`, `samples`, `measured_share` of the full set, `processor_seconds`,
         `wall_seconds`, `simulated_seconds_per_processor_second`, `samples_per_processor_second`, `bytes_per_sample`,
-        `invalid_navigations`; and what follows for the full set if all of it were like the slice:
+        `invalid_navigations`; and extrapolated to the full set:
         `full_set_samples`, `extrapolated_minutes_on_2_cores` (from processor time), and `extrapolated_gigabytes`.
 
     Raises:
-        InputError: a share out of its range, or a folder that holds something else.
+        InputError: the share is out of its range, or the folder belongs to another run.
     """
     if not 0 < share <= 1:
         raise InputError(f"share: {share}; give a share of the full set, more than 0 and up to 1")

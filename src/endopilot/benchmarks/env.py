@@ -1,4 +1,4 @@
-"""Speed of the learning environments, and the accuracy of the core's settings that buys it."""
+"""Speed of the learning environments, and the error of the settings that they simulate with: `bench_env`."""
 
 from __future__ import annotations
 
@@ -29,22 +29,22 @@ CONVERGED = SimulatorConfig(elements=200, time_step_s=1e-3, tolerance_mm=1e-8)
 def bench_env() -> dict[str, Any]:
     """Measure environment steps a second in the reference anatomy, and the tip's error of the settings used for them.
 
-    Two kinds of actions: the random navigations that data are made of (`simulation.controls`: pushes, pulls, turns and
-    pauses of 1 to 6 s, from the ostium to the distal ends), and actions drawn anew at every step, which the core cannot
-    start a step from the last one with.
+    There are two kinds of actions: the random navigations of datasets (`simulation.controls`: pushes, pulls, turns and
+    pauses of 1 to 6 s, from the ostium to the distal ends), and actions drawn independently at every step, for which
+    the core cannot extrapolate its last step.
 
     Returns:
         `steps_per_second_256` and `steps_per_second_1`, of 256 environments together and of one, over a minute's
-        navigations, on all cores and everything included; the same with `random_actions_` before them for actions
-        drawn anew; with `processor_` before them, steps a second of processor time; the mean, the 95th percentile and
-        the maximum of the tip's distance from that of a converged core (200 elements, 1 ms, 1e-8 mm), mm, with the
+        navigations, on all cores and with all overhead; the same with the prefix `random_actions_` for actions drawn
+        independently, and with `processor_` for steps a second of processor time; the mean, the 95th percentile and the
+        maximum of the tip's distance from that of a converged core (200 elements, 1 ms, 1e-8 mm), mm, with the
         environments' settings and with the simulator's default ones; and the share of worlds that stayed valid.
     """
     figures: dict[str, Any] = {}
     valid = []
-    for prefix, drawn_anew in (("", False), ("random_actions_", True)):
+    for prefix, independent in (("", False), ("random_actions_", True)):
         for count, episodes in ((MANY, 1), (1, SINGLES)):
-            wall, processor, kept = _timed(count, episodes, drawn_anew=drawn_anew)
+            wall, processor, kept = _timed(count, episodes, independent=independent)
             steps = count * episodes * round(SECONDS / CONTROL_PERIOD_S)
             figures[f"{prefix}steps_per_second_{count}"] = round(steps / wall, 1)
             figures[f"{prefix}processor_steps_per_second_{count}"] = round(steps / processor, 1)
@@ -58,11 +58,11 @@ def bench_env() -> dict[str, Any]:
     return figures | {"valid_worlds": round(float(np.mean(valid)), 5), "processor": processor_name()}
 
 
-def _timed(count: int, episodes: int, *, drawn_anew: bool) -> tuple[float, float, float]:
+def _timed(count: int, episodes: int, *, independent: bool) -> tuple[float, float, float]:
     """Return wall and processor seconds of some episodes, and the share of valid worlds at their end."""
     env = NavigateVectorEnv(count)
     steps = round(SECONDS / CONTROL_PERIOD_S)
-    if drawn_anew:
+    if independent:
         actions = np.random.default_rng(0).uniform(-1.0, 1.0, (episodes, steps, count, 2))
     else:
         actions = _navigations(count * episodes, SECONDS).reshape(episodes, count, steps, 2).swapaxes(1, 2)
@@ -89,7 +89,7 @@ def _navigations(count: int, seconds: float) -> Float[np.ndarray, "count steps 2
 
 
 def _tips(config: SimulatorConfig) -> Float[np.ndarray, "steps worlds 3"]:
-    """Return the tips of navigations that start at places of their own, simulated with some settings."""
+    """Return the tips of navigations from different initial states, simulated with some settings."""
     navigation = reference_navigation()
     longest = float(navigation.anatomy.tree.longest_path().abscissa[-1])
     initial, control = random_controls(

@@ -1,4 +1,4 @@
-"""How well the automatic coronary method finds what synthetic CT angiograms were made of: `bench_imaging`."""
+"""Errors of the automatic coronary method on synthetic CT angiograms, whose truth is known: `bench_imaging`."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ VESSELS = ("rca", "lca")
 
 @dataclass(frozen=True)
 class Bar:
-    """What a figure must reach: at most or at least `limit`, by the mean of all cases or by the worst of them."""
+    """Bar of a figure: at most or at least `limit`, for the mean of all cases or for the worst of them."""
 
     limit: float
     at_least: bool
@@ -48,13 +48,13 @@ BARS = {
     "ostium_error_mm": Bar(1.0, at_least=False, worst=True),
     "false_length_mm": Bar(5.0, at_least=False, worst=True),
 }
-"""Bars of the figures; `AnatomyScore` says what each is. An ostium off by more than 1 mm, or a false tree longer than
-5 mm, may not happen in any case; of the others the mean counts."""
+"""Bars of the figures; `AnatomyScore` says what each is. An ostium error above 1 mm or a false tree longer than
+5 mm may not happen in any case; the other bars hold for the mean."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImagingBenchConfig:
-    """Which cases, and where their results are kept."""
+    """Number and seed of the cases, and the folder of their results."""
 
     cases: int = 50
     """Number of synthetic CT angiograms."""
@@ -71,7 +71,7 @@ class ImagingBenchConfig:
 
 
 def bench_imaging(config: ImagingBenchConfig) -> dict[str, Any]:
-    """Segment synthetic CT angiograms from the volume alone and compare with what they were made of.
+    """Segment synthetic CT angiograms from the volume alone and compare with the truth.
 
     Centerlines and radii are those that `extract_anatomy` finds in the mask; its tree begins at the mask's ostium.
 
@@ -97,7 +97,7 @@ def bench_imaging(config: ImagingBenchConfig) -> dict[str, Any]:
 
 
 def draw_case(seed: int, index: int) -> tuple[AtlasConfig, PhantomConfig]:
-    """Return the patient and the scan of a case: voxels, calcium and background vary beside what the phantom draws."""
+    """Return the patient and the scan of a case: voxels, calcium, background and all that the phantom draws."""
     key = np.array([seed, index], dtype=np.uint64)
     generator = np.random.Generator(np.random.Philox(key=key, counter=1))
     patients = AtlasConfig(anatomy=VESSELS[index % len(VESSELS)], seed=seed, stenosis_share=0.5)
@@ -161,7 +161,7 @@ def _rounded(value: float) -> float | None:
 
 
 def _identity(seed: int) -> dict[str, Any]:
-    """Return what the results of the cases follow from: the seed, and the source of every package that they need."""
+    """Return what the results follow from: the seed, and the source of every package that the cases need."""
     sources = {}
     for package in (endopilot.imaging, endopilot.anatomy, endopilot.atlas, endopilot.phantom, endopilot.evaluation):
         folder, digest = Path(next(iter(package.__path__))), hashlib.sha256()

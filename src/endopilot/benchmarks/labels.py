@@ -1,4 +1,4 @@
-"""How much of the atlas's vessels the labels name right."""
+"""Share of the atlas's vessels that is labelled correctly: `measure_labels`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from endopilot.atlas.atlas import ANATOMIES, AtlasConfig, make_patient_tree
 from endopilot.types import VesselTree
 
 BAR = 0.95
-"""Least share of the centerline length that must be labelled right, in every anatomy."""
+"""Bar: share of the centerline length that must be labelled correctly in every anatomy."""
 
 
 def measure_labels(*, count: int, seed: int) -> list[dict[str, Any]]:
@@ -25,7 +25,7 @@ def measure_labels(*, count: int, seed: int) -> list[dict[str, Any]]:
     Returns:
         One row an anatomy: `right` (share of the centerline length, all patients together), `worst_patient` (share in
         the worst one), `dominance_right` (share of patients, None where there is none), `confusions` (the three pairs
-        "truth as label" that cost most, with their share of the length) and `passed` (`right` reaches `BAR`).
+        "truth as label" with the largest shares of the length) and `passed` (`right` reaches `BAR`).
     """
     return [_measure(anatomy, count, seed) for anatomy in ANATOMIES]
 

@@ -1,9 +1,9 @@
-"""Robustness of the rod core: many rollouts that ask for too much, counted: `measure_robustness`.
+"""Failures of the rod core in many rollouts beyond normal use: `measure_robustness`.
 
-Every synthetic anatomy is navigated by every device that fits it, in four manoeuvres of equal share: at random within
-the vessel, at random beyond its end, pushed on and on against its end, and at random and then pulled fully out. A chunk
-is one anatomy and one device; it runs in a process of its own, so that a crash is counted and survived, and leaves one
-small file. A run that was interrupted goes on with the chunks that have none.
+Every device is driven through every synthetic anatomy that it fits, with four kinds of controls in equal shares: random
+within the vessel, random beyond its end, pushed against its end, and random and then pulled out. A chunk is one anatomy
+and one device. It runs in a separate process, so that a crash is counted and survived, and writes one small file. An
+interrupted run goes on with the missing chunks.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ MOST_PENETRATION_MM = 0.05
 MANOEUVRES = ("within", "beyond", "against the end", "pulled out")
 """Rollout i of a chunk is of kind i modulo 4."""
 BEYOND = 1.3
-"""The last three ask for this multiple of the longest path."""
+"""The last three kinds insert up to this multiple of the longest path."""
 _PUSH_MM_S = 8.0
 """Speed of the push against the vessel's end, mm/s."""
 _PULL_MM_S = 20.0
@@ -54,7 +54,7 @@ _PULL_AT = 0.6
 
 @dataclass(frozen=True, kw_only=True)
 class RobustnessConfig:
-    """How many rollouts, where, and where the results of the chunks are kept."""
+    """Number and length of the rollouts, the anatomies, and the folder of the results."""
 
     rollouts: int = 10_000
     """Number of rollouts, spread over the anatomies and the devices that fit; rounded up to whole chunks."""
@@ -88,7 +88,7 @@ class RobustnessConfig:
 
 @dataclass(frozen=True, eq=False)
 class Chunk:
-    """What the rollouts of one anatomy and one device did; one file on disk.
+    """Results of the rollouts of one anatomy and one device; one file on disk.
 
     Attributes:
         penetration_mm: depth of the deepest node in the wall, mm: its contact force over the wall's stiffness.
@@ -110,7 +110,7 @@ class Chunk:
 
 
 def measure_robustness(config: RobustnessConfig) -> dict[str, Any]:
-    """Run the rollouts that are not on disk yet, and count what went wrong in all of them.
+    """Simulate the missing rollouts, and count the failures in all of them.
 
     Returns:
         `figures`, one row a bar: figure, value, bar, passed; `rollouts` and `simulated_hours`; `by_device` and
@@ -176,10 +176,10 @@ def _rows(chosen: np.ndarray, like: np.ndarray) -> np.ndarray:
 
 
 def run_chunk(path: Path, config: RobustnessConfig, index: int, device: Device, rollouts: int) -> None:
-    """Simulate the rollouts of one anatomy and one device, and write what they did to `path` and beside it.
+    """Simulate the rollouts of one anatomy and one device, and write the results to `path` and beside it.
 
     Args:
-        path: file of the chunk, `.npz`; a `.json` of the same name tells the invalid worlds.
+        path: file of the chunk, `.npz`; a `.json` of the same name lists the invalid worlds.
         config: length, seed and threads.
         index: number of the anatomy.
         device: the wire.
@@ -197,7 +197,7 @@ def run_chunk(path: Path, config: RobustnessConfig, index: int, device: Device, 
     initial, control = robust_controls(anatomy, device, rollouts=rollouts, samples=samples, seed=seed)
     simulator = SimulatorConfig(threads=config.threads)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # invalid worlds are told below, each with its reason
+        warnings.simplefilter("ignore")  # invalid worlds are listed below, each with its reason
         rollout = simulate(anatomy, device, control, initial=initial, config=simulator)
     chunk = _describe(anatomy, rollout, wall_stiffness(simulator, device.push_limit_n), time.process_time() - began)
     invalid = [
@@ -243,7 +243,7 @@ def _anatomy(seed: int, index: int) -> Anatomy:
 
 
 class _Worker:
-    """A process that runs chunks; it is replaced when it dies."""
+    """A process that simulates chunks; it is replaced when it dies."""
 
     def __enter__(self) -> _Worker:
         self._pool: ProcessPoolExecutor | None = None
@@ -257,7 +257,7 @@ class _Worker:
                 process.terminate()
 
     def run(self, path: Path, config: RobustnessConfig, index: int, device: Device, rollouts: int) -> None:
-        """Run a chunk; where that raises or ends the process, write the chunk down as crashed.
+        """Simulate a chunk; if that raises or ends the process, record the chunk as crashed.
 
         Raises:
             InputError: the folder cannot be written.
@@ -285,7 +285,7 @@ def _done(path: Path) -> bool:
 
 
 def _identity(config: RobustnessConfig, devices: list[Device]) -> dict[str, Any]:
-    """Return what the chunks follow from."""
+    """Return what the results of the chunks follow from."""
     return {
         "config": {name: value for name, value in asdict(config).items() if name not in ("threads", "folder")},
         "devices": {device.name: device for device in devices},

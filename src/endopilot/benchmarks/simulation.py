@@ -31,8 +31,8 @@ def bench_simulation() -> dict[str, Any]:
     """Measure the rod core: a synthetic right coronary artery, the 0.014-inch workhorse wire, 60 s of random controls.
 
     Returns:
-        `realtime_factor_per_core` (simulated seconds per second of processor time on one thread, everything that
-        `simulate` does included),
+        `realtime_factor_per_core` (simulated seconds per second of processor time on one thread, including
+        everything that `simulate` does),
         `tip_error_mean_mm`, `tip_error_p95_mm` and `tip_error_max_mm` against the same scenario at a time step of 1 ms
         and a Newton tolerance of 1e-8 mm, `threads_speedup` (two threads against one), and beside them the iterations a
         time step, the share of valid worlds, the largest wall forces and `seconds_for_first_call`: of one world and

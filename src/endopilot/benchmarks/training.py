@@ -26,21 +26,21 @@ from endopilot.simulation.device import read_device
 STEPS = 20
 """Steps of each loop in one round."""
 ROUNDS = 7
-"""Both loops take turns so often; the middle of the ratios is told, since a machine has its moods."""
+"""Rounds in which both loops take turns; the median ratio is reported, since the speed of a machine varies."""
 _SEQUENCES = 48
 
 
 def bench_training(folder: Path) -> list[dict[str, Any]]:
-    """Train the paper's and our forward network for some steps by `train` and by a plain loop, on one thread.
+    """Train the paper's and the causal forward network for some steps by `train` and by a plain loop, on one thread.
 
-    The plain loop is what a tutorial has: a shuffled `DataLoader` over a `TensorDataset`, Adam, backward, the same
-    clipping of gradients. Processor time is counted, not the clock's.
+    The plain loop is that of a tutorial: a shuffled `DataLoader` over a `TensorDataset`, Adam, backward, the same
+    clipping of gradients. Processor time is measured, not wall time.
 
     Args:
-        folder: takes one synthetic patient and its navigations, some seconds' work.
+        folder: gets one synthetic patient and its navigations, which take some seconds to make.
 
     Returns:
-        One row a model: samples a second of either loop, and the median over the rounds of their ratio, with its bar.
+        One row a model: samples a second of each loop, and the median over the rounds of their ratio, with its bar.
     """
     claim(folder, "endopilot bench training", version=__version__)
     patient = folder / "patient"
