@@ -109,12 +109,3 @@ def test_refuses_bad_settings() -> None:
     ):
         with pytest.raises(InputError, match=message):
             make()
-
-
-def test_what_is_possible_stays_within_speed_and_travel_of_all_wires() -> None:
-    limits = DriveLimits(max_velocity_mm_s=20.0, max_rotation_rad_s=3.0, travel_mm=(0.0, 100.0))
-    asked = np.array([[50.0, -9.0], [-50.0, 1.0], [2.0, 0.0]])
-    made = limits.possible(asked, np.array([4.0, 97.0]), 0.5)
-    assert made.tolist() == [[6.0, -3.0], [-8.0, 1.0], [2.0, 0.0]]
-    beyond = limits.possible(asked, np.array([101.0]), 0.5)  # it may only come back
-    assert beyond[:, 0].tolist() == [0.0, -20.0, 0.0]

@@ -24,6 +24,7 @@ from endopilot.models.rollout import load_model
 from endopilot.models.sequences import N_INPUTS, Sequences, read_vessels, unfold
 from endopilot.models.train import train
 from endopilot.simulation.device import read_device
+from endopilot.simulation.drive_limits import DriveLimits
 
 GIVEN = 30
 SMALL = CausalConfig(width=8)
@@ -67,7 +68,7 @@ def untrained() -> CausalPredictor:
     networks = CausalNetwork(SMALL).eval(), CausalNetwork(SMALL).eval()
     for network in networks:
         torch.nn.init.normal_(network.output.weight, std=0.5)
-    return CausalPredictor(*networks, control_limits=np.array([40.0, 12.6]))
+    return CausalPredictor(*networks, limits=DriveLimits(max_velocity_mm_s=40.0, max_rotation_rad_s=12.6))
 
 
 def given(episodes) -> np.ndarray:
@@ -109,7 +110,7 @@ def test_the_loop_of_both_leads_the_foretold_tip_along(packaged, everyone):
     found = packaged.rollout_dual(everyone)
     start = np.stack([everyone.inserted_length, everyone.rotation], axis=-1)[:, GIVEN - 1 : GIVEN].astype(float)
     np.testing.assert_allclose(found.proximal, start + 0.5 * np.cumsum(found.control, axis=1), atol=1e-9)
-    assert (np.abs(found.control) <= packaged.control_limits).all()
+    assert (np.abs(found.control) <= packaged.limits.fastest).all()
     assert found.proximal[..., 0].min() > -1e-6
     assert miss(found.tip, everyone)[..., 0].mean() < 0.4  # mm
 

@@ -14,6 +14,7 @@ from endopilot.models.config import TrainConfig, TransformerConfig
 from endopilot.models.rollout import TransformerPredictor, load_model
 from endopilot.models.train import train
 from endopilot.models.transformer import ForwardNetwork, InverseNetwork
+from endopilot.simulation.drive_limits import DriveLimits
 
 GIVEN = 30
 SMALL = TransformerConfig(d_model=24, heads=2, encoder_layers=1, decoder_layers=1, feedforward=32)
@@ -40,7 +41,9 @@ def untrained(limits=(1e9, 1e9)) -> TransformerPredictor:
     networks = ForwardNetwork(SMALL).eval(), InverseNetwork(SMALL).eval()
     for network in networks:
         torch.nn.init.normal_(network.transformer.head.weight, std=0.1)
-    return TransformerPredictor(*networks, control_limits=np.array(limits))
+    return TransformerPredictor(
+        *networks, limits=DriveLimits(max_velocity_mm_s=limits[0], max_rotation_rad_s=limits[1])
+    )
 
 
 def true_tip(data):

@@ -33,6 +33,7 @@ from endopilot.simulation.config import SimulatorConfig, wall_stiffness
 from endopilot.simulation.controls import ControlConfig, random_controls
 from endopilot.simulation.device import Device, check_fits, read_device
 from endopilot.simulation.device_files import list_devices
+from endopilot.simulation.drive_limits import within_travel
 from endopilot.simulation.simulate import simulate, why_invalid
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, Rollout
 
@@ -165,7 +166,7 @@ def robust_controls(
         control[rollout, pull:, 0] = -_PULL_MM_S
         inserted = initial[rollout, 0]
         for sample in control[rollout]:
-            sample[0] = np.clip(sample[0], -inserted / SAMPLE_PERIOD_S, (BEYOND * longest - inserted) / SAMPLE_PERIOD_S)
+            sample[0] = within_travel(sample[0], inserted, SAMPLE_PERIOD_S, travel_mm=(0.0, BEYOND * longest))
             inserted += SAMPLE_PERIOD_S * sample[0]
     control[..., 1] = turn
     return initial, control

@@ -15,6 +15,7 @@ from scipy.stats import qmc
 
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.types import TipProjection
@@ -93,7 +94,7 @@ class Belief:
             rotation=np.full(len(parameters), navigation.start_rotation),
             friction=device.friction * parameters[:, 0],
         )
-        self._limits = np.array([device.max_velocity_mm_s, device.max_rotation_rad_s])
+        self._limits = DriveLimits.of(device, navigation.anatomy)
         self._score = np.zeros(len(parameters))
         self.tip = self.simulator.project()
 
@@ -124,7 +125,7 @@ class Belief:
                 rotation - simulator.rotation,
             ]
         )
-        control = np.clip(motion / DECISION_PERIOD_S, -self._limits, self._limits)
+        control = self._limits.clip(motion / DECISION_PERIOD_S, simulator.inserted_length, DECISION_PERIOD_S)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a member that fails has no weight
             simulator.step(control, DECISION_PERIOD_S)

@@ -68,7 +68,6 @@ def _sample(predictor: Predictor, rest: Rest, desired: Steps, route: Route, conf
     """Sample control sequences around the one that would lead a tip without slack, through the forward network."""
     navigation, sampling = rest.navigation, config.sample
     limits = DriveLimits.of(navigation.device, navigation.anatomy)
-    bound = np.array([limits.max_velocity_mm_s, limits.max_rotation_rad_s])
     random = np.random.default_rng([config.seed, 0x3991])
     mean = np.zeros((len(desired), 2))
     mean[:, 0] = np.diff(desired[:, 0], prepend=rest.tip[0]) / SAMPLE_PERIOD_S
@@ -79,10 +78,10 @@ def _sample(predictor: Predictor, rest: Rest, desired: Steps, route: Route, conf
             drawn = random.standard_normal((sampling.candidates, *mean.shape))
             drawn = convolve1d(drawn, _SMOOTH, axis=1, mode="constant") * sd
             drawn[0] = 0.0
-            control = np.clip(mean + drawn, -bound, bound)
+            control = limits.clip_sequence(mean + drawn, navigation.start_inserted_mm, SAMPLE_PERIOD_S)
             wanted = np.repeat(desired[None], len(control), axis=0)
             tip = predictor.rollout_forward(rest.episodes(wanted, control)).tip
-            cost = _cost(tip, control, desired, route, bound, navigation.device.tip_radius_mm, config)
+            cost = _cost(tip, control, desired, route, limits.fastest, navigation.device.tip_radius_mm, config)
             if cost.min() < best:
                 best, found = float(cost.min()), (control[cost.argmin()], tip[cost.argmin()])
             scale = sampling.temperature * max(float(cost.std()), 1e-9)

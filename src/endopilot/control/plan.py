@@ -253,11 +253,5 @@ def within_limits(control: Steps, limits: DriveLimits, inserted_mm: float) -> St
         limits: of the drive.
         inserted_mm: inserted length at the start, mm.
     """
-    made = np.empty((len(control), 2))
-    low, high = limits.travel_mm
-    for row, asked in zip(made, control, strict=True):
-        row[:] = limits.safe(*asked)
-        ahead = np.clip(inserted_mm + row[0] * DECISION_PERIOD_S, low, high) if row[0] else inserted_mm
-        row[0] = np.clip((ahead - inserted_mm) / DECISION_PERIOD_S, -limits.max_velocity_mm_s, limits.max_velocity_mm_s)
-        inserted_mm += row[0] * DECISION_PERIOD_S
-    return made
+    finite = np.isfinite(control).all(axis=1, keepdims=True)
+    return limits.clip_sequence(np.where(finite, control, 0.0), inserted_mm, DECISION_PERIOD_S)

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.control.cost import Cost
 from endopilot.errors import InputError
+from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.types import TipProjection
 
@@ -138,7 +139,7 @@ class Plan:
         device, weights = self.navigation.device, self.config.cost
         error = np.abs(self.simulated.abscissa - self.desired[:, 0])
         share = self.force / self.navigation.force_limit_n
-        limits = np.array([device.max_velocity_mm_s, device.max_rotation_rad_s])
+        fastest = DriveLimits.of(device).fastest
         h = DECISION_PERIOD_S
         return {
             "end": abs(float(self.simulated.abscissa[-1]) - self.navigation.target.abscissa),
@@ -146,5 +147,5 @@ class Plan:
             "ratio": float(weights.ratio_weight * (np.maximum(self.ratio - weights.safe_ratio, 0) ** 2).sum() * h),
             "force": float(weights.force_weight * (share**2).sum() * h),
             "time": float(weights.time_weight * len(error) * h),
-            "smooth": float(weights.roughness(self.control[:-1], self.control[1:], limits).sum()),
+            "smooth": float(weights.roughness(self.control[:-1], self.control[1:], fastest).sum()),
         }

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.errors import InputError
-from endopilot.simulation.drive_limits import DriveLimits
+from endopilot.simulation.drive_limits import DriveLimits, within_travel
 from endopilot.simulation.simulator import Simulator
 
 CYCLE_S = 0.05
@@ -179,11 +179,13 @@ class SimulatedRobot:
         """Let the robot and its wire run for some time, s, and return the largest wall force on a node, N."""
         cycles = max(1, round(duration / CYCLE_S))
         period, peak = duration / cycles, 0.0
+        travel_mm = (-np.inf, self._limits.travel_mm[1])  # at the ostium the simulator stops the drive by itself
         for _ in range(cycles):
             moved = self._drive.advance(period)
-            longest = self._limits.travel_mm[1] - float(self._simulator.inserted_length[0])
-            moved[0] = min(moved[0], max(longest, 0.0))
-            step = self._simulator.step(moved[None] / period, period)
+            control = moved[None] / period
+            inserted = self._simulator.inserted_length
+            control[:, 0] = within_travel(control[:, 0], inserted, period, travel_mm=travel_mm)
+            step = self._simulator.step(control, period)
             self._drive.position = np.array(self._encoder())
             peak = max(peak, float(step.contact_force_max[0]))
         return peak

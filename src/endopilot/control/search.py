@@ -230,7 +230,11 @@ class Search:
         log.add(made, tip, step.tip_position, step.contact_force_max, step.inserted_length, step.rotation)
 
     def _possible(self, control: Float[np.ndarray, "n 2"], simulator: Simulator) -> Float[np.ndarray, "n 2"]:
-        return self._limits.possible(control, simulator.inserted_length, DECISION_PERIOD_S)
+        """Return what the drive can do of controls: neither the shortest nor the longest wire leaves the travel."""
+        inserted = simulator.inserted_length
+        for length in (inserted.min(), inserted.max()):
+            control = self._limits.clip(control, length, DECISION_PERIOD_S)
+        return control
 
     def _pressed(self, log: _Log) -> bool:
         limit = self.config.cost.forbidden_share * self.navigation.force_limit_n

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from endopilot.dataset.study import DatasetConfig
 from endopilot.simulation.controls import free_wire_load, random_controls
 from endopilot.simulation.device import Device
+from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.types import Anatomy
 
 TIP_GROUP = 8
@@ -94,9 +95,9 @@ def _loads(
     config: DatasetConfig, device: Device, velocity: Float[np.ndarray, "n samples 2"]
 ) -> Float[np.ndarray, "n samples 2"]:
     """Return the drive's loads (N, N·mm) that would move a free wire at these velocities, or as fast as it may go."""
-    limit = np.array([device.max_velocity_mm_s, device.max_rotation_rad_s])
+    fastest = DriveLimits.of(device).fastest
     return free_wire_load(
-        np.clip(velocity, -limit, limit),
+        np.clip(velocity, -fastest, fastest),
         radius_mm=device.tip_radius_mm,
         friction_n=config.simulator.introducer_friction_n,
         drag_n_s_mm=config.simulator.introducer_drag_n_s_mm,

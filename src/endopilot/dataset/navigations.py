@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 
 from endopilot.simulation.config import Actuation, SimulatorConfig
 from endopilot.simulation.device import Device
+from endopilot.simulation.drive_limits import within_travel
 from endopilot.simulation.simulate import RECORDED, make_rollout
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import Step
@@ -72,7 +73,7 @@ def simulate_navigations(
         room = watch.room(simulator.project(), inserted, needed, caught)
         held = np.where(room > 0, drawn[:, 0], -np.abs(drawn[:, 0]))
         if actuation == "velocity":
-            held = np.clip(held, -inserted / SAMPLE_PERIOD_S, room / SAMPLE_PERIOD_S)
+            held = within_travel(np.minimum(held, room / SAMPLE_PERIOD_S), inserted, SAMPLE_PERIOD_S)
         applied[:, sample] = np.column_stack([held, drawn[:, 1]]).astype(np.float32)
         stopped |= (drawn[:, 0] > 0) & (held < drawn[:, 0])
         step = simulator.step(applied[:, sample], SAMPLE_PERIOD_S)

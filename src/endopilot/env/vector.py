@@ -19,7 +19,8 @@ from endopilot.env import observation
 from endopilot.env.observation import Measured, observe
 from endopilot.env.route_tables import RouteTables
 from endopilot.errors import InputError
-from endopilot.simulation.config import SPARE_MM, SimulatorConfig
+from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.drive_limits import far_end_mm, within_travel
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import SimulatorState
 from endopilot.tasks.navigation import Navigation, reached
@@ -207,7 +208,7 @@ class NavigateVectorEnv(VectorEnv):
             config=config,
         )
         self._routes = RouteTables.of(navigations)
-        self._ends = np.array([nav.anatomy.tree.longest_path().abscissa[-1] + SPARE_MM for nav in navigations])
+        self._far_ends = np.array([far_end_mm(navigation.anatomy) for navigation in navigations])
         targets = [navigation.target for navigation in navigations]
         self._target_branch = np.array([target.branch for target in targets])
         self._target_abscissa = np.array([target.abscissa for target in targets])
@@ -269,8 +270,9 @@ class NavigateVectorEnv(VectorEnv):
         fresh = self._ended & (self.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP)
         control = np.minimum(np.maximum(control, -1.0), 1.0) * _FASTEST
         control[fresh] = 0.0
-        room = (self._ends - self._simulator.inserted_length) / CONTROL_PERIOD_S
-        control[:, 0] = np.minimum(control[:, 0], room)
+        travel_mm = (-np.inf, self._far_ends)  # at the ostium the simulator stops the drive by itself
+        inserted = self._simulator.inserted_length
+        control[:, 0] = within_travel(control[:, 0], inserted, CONTROL_PERIOD_S, travel_mm=travel_mm)
         step = self._simulator.step(control, CONTROL_PERIOD_S)
         now = Measured.after(step, self._simulator)
         if fresh.any():

@@ -15,6 +15,7 @@ from endopilot.models.config import WINDOW
 from endopilot.progress import Advance
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import Device
+from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.simulation.simulate import simulate
 from endopilot.types import Anatomy, Rollout
 
@@ -57,15 +58,10 @@ class Recorded:
 
         Controls that are not finite stay so.
         """
-        limits = np.array([self.device.max_velocity_mm_s, self.device.max_rotation_rad_s])
-        driven, period = np.clip(control, -limits, limits), self.data.sample_period_s
-        inserted = self.data.inserted_length[:, WINDOW - 1].astype(float)
-        reach_mm = np.array([a.tree.longest_path().abscissa[-1] for a in self.anatomies])[self.anatomy_of]
-        reach_mm = np.maximum(reach_mm, inserted)
-        for sample in range(driven.shape[1]):
-            after = np.clip(inserted + period * driven[:, sample, 0], 0.0, reach_mm)
-            driven[:, sample, 0] = (after - inserted) / period
-            inserted = after
+        driven, inserted = np.empty(control.shape), self.data.inserted_length[:, WINDOW - 1].astype(float)
+        for index, anatomy in enumerate(self.anatomies):
+            mine, limits = self.anatomy_of == index, DriveLimits.of(self.device, anatomy)
+            driven[mine] = limits.clip_sequence(control[mine], inserted[mine], self.data.sample_period_s)
         return driven
 
     def simulated(

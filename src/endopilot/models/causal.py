@@ -29,6 +29,7 @@ from endopilot.models.config import WINDOW, CausalConfig
 from endopilot.models.open_loop import EachObserved, Observed, OpenLoop, Prediction, Steps2, begin_after, given_states
 from endopilot.models.play import Direction, Vessels
 from endopilot.models.sequences import N_INPUTS, read_vessels, unfold
+from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.types import SAMPLE_PERIOD_S
 
 _GIVEN_WEIGHT = 0.3
@@ -104,13 +105,13 @@ class CausalPredictor:
     Attributes:
         forward: FF, if it was trained.
         inverse: IF, if it was trained.
-        control_limits: the device's largest translation speed, mm/s, and rotation speed, rad/s.
+        limits: of the drive.
         known: the patients that it has been asked about, by dataset and names.
     """
 
     forward: CausalNetwork | None
     inverse: CausalNetwork | None
-    control_limits: Float[np.ndarray, "2"]
+    limits: DriveLimits
     known: dict[tuple[str, ...], Vessels] = field(default_factory=dict, repr=False)
 
     def foretell(self, episodes: Dataset, seen: Observed | EachObserved) -> Prediction:
@@ -138,7 +139,7 @@ class CausalPredictor:
         """P2: predict the controls that make the tip go the true way."""
         desired = np.stack([episodes.tip_abscissa, episodes.tip_offset], axis=-1).astype(float)[:, WINDOW:]
         length, turn = self._asked(episodes, WINDOW)
-        proximal, control = _driven(episodes, length, turn, self.control_limits)
+        proximal, control = _driven(episodes, length, turn, self.limits)
         return OpenLoop(desired, proximal, control)
 
     def rollout_dual(self, episodes: Dataset, seen: Observed | None = None) -> OpenLoop:
@@ -151,11 +152,11 @@ class CausalPredictor:
         begin = begin_after(seen)
         desired = episodes.tip_abscissa[:, begin:].astype(float)
         length, turn = self._asked(episodes, begin)
-        proximal, control = _driven(episodes, length, turn, self.control_limits)
+        proximal, control = _driven(episodes, length, turn, self.limits)
         tip = self.foretell(_along(episodes, proximal, control), seen).tip[:, begin:]
         for _ in range(_REFINEMENTS):
             length = proximal[..., 0] + desired - tip[..., 0]
-            proximal, control = _driven(episodes, length, turn, self.control_limits)
+            proximal, control = _driven(episodes, length, turn, self.limits)
             tip = self.foretell(_along(episodes, proximal, control), seen).tip[:, begin:]
         return OpenLoop(tip, proximal, control)
 
@@ -200,16 +201,15 @@ def _driven(
     episodes: Dataset,
     length: Float[np.ndarray, "episodes samples"],
     turn: Float[np.ndarray, "episodes samples"],
-    limits: Float[np.ndarray, "2"],
+    limits: DriveLimits,
 ) -> tuple[Steps2, Steps2]:
     """Return x^prox and control of a drive that is led along the last lengths and turns as far as it can follow."""
     control = np.empty((*length.shape, 2))
     last = episodes.valid.shape[1] - length.shape[1] - 1
     inserted = episodes.inserted_length[:, last].astype(float)
-    control[..., 1] = np.clip(turn / SAMPLE_PERIOD_S, -limits[1], limits[1])
     for t in range(length.shape[1]):
-        speed = np.clip((length[:, t] - inserted) / SAMPLE_PERIOD_S, -limits[0], limits[0])
-        control[:, t, 0] = np.maximum(speed, -inserted / SAMPLE_PERIOD_S)  # not out of the catheter
+        asked = np.column_stack([length[:, t] - inserted, turn[:, t]]) / SAMPLE_PERIOD_S
+        control[:, t] = limits.clip(asked, inserted, SAMPLE_PERIOD_S)
         inserted = inserted + SAMPLE_PERIOD_S * control[:, t, 0]
     start = np.stack([episodes.inserted_length, episodes.rotation], axis=-1)[:, last : last + 1].astype(float)
     return start + SAMPLE_PERIOD_S * np.cumsum(control, axis=1), control

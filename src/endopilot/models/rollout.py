@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
 
 from endopilot.dataset.loader import Dataset
 from endopilot.errors import InputError
@@ -24,6 +23,7 @@ from endopilot.models.twin import TwinPredictor
 from endopilot.models.windows import Episodes
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import Device
+from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.types import SAMPLE_PERIOD_S
 
 
@@ -34,14 +34,13 @@ class TransformerPredictor:
     Attributes:
         forward: FF, if it was trained.
         inverse: IF, if it was trained.
-        control_limits: the device's largest translation speed, mm/s, and rotation speed, rad/s; IF's controls are
-            clipped to them, and to a wire that is not pulled out of the catheter.
+        limits: of the drive; IF's controls are clipped to them.
         batch_size: episodes that are rolled out together.
     """
 
     forward: Network | None
     inverse: Network | None
-    control_limits: Float[np.ndarray, "2"]
+    limits: DriveLimits
     batch_size: int = 256
 
     def rollout_forward(self, episodes: Dataset) -> OpenLoop:
@@ -68,7 +67,7 @@ class TransformerPredictor:
         for first in range(0, len(episodes), self.batch_size):
             chosen = np.arange(first, min(first + self.batch_size, len(episodes)))
             batch = Episodes.of(episodes.select(chosen))
-            parts.append(_rollout_batch(forward, inverse, self.control_limits, batch, begin))
+            parts.append(_rollout_batch(forward, inverse, self.limits, batch, begin))
         tip, proximal, control = (np.concatenate(signal) for signal in zip(*parts, strict=True))
         return OpenLoop(tip=tip, proximal=proximal, control=control)
 
@@ -80,20 +79,19 @@ class TransformerPredictor:
 
 
 def _rollout_batch(
-    forward: Network | None, inverse: Network | None, limits: Float[np.ndarray, "2"], episodes: Episodes, begin: int
+    forward: Network | None, inverse: Network | None, limits: DriveLimits, episodes: Episodes, begin: int
 ) -> tuple[Steps2, Steps2, Steps2]:
     """Return tip, x^prox and control of one batch from a sample on."""
     desired = episodes.tip
     tip, control = desired.clone(), episodes.control.clone()
     proximal = episodes.proximal.double()  # float64, so that x^prox stays the integral of the controls
-    bound = torch.as_tensor(limits, dtype=torch.float32)
     for k in range(begin, tip.shape[1]):
         if inverse is not None:
             asked = torch.cat([tip[:, k - WINDOW + 1 : k], desired[:, k : k + 1]], dim=1)
             given = slice(k - WINDOW, k)
-            control[:, k] = inverse(asked, proximal[:, given].float(), control[:, given]).clamp(-bound, bound)
-            out_of_the_catheter = -proximal[:, k - 1, 0].float() / SAMPLE_PERIOD_S
-            control[:, k, 0] = torch.maximum(control[:, k, 0], out_of_the_catheter)
+            wanted = inverse(asked, proximal[:, given].float(), control[:, given])
+            inserted = proximal[:, k - 1, 0].float()
+            control[:, k] = torch.from_numpy(limits.clip(wanted.numpy(), inserted.numpy(), SAMPLE_PERIOD_S))
             proximal[:, k] = proximal[:, k - 1] + SAMPLE_PERIOD_S * control[:, k].double()
         if forward is not None:
             moved = slice(k - WINDOW + 1, k + 1)
@@ -121,5 +119,5 @@ def load_model(run_folder: str | Path = PRETRAINED) -> Predictor:
     return kind(
         forward=networks.get("ff"),
         inverse=networks.get("if"),
-        control_limits=np.array([device.max_velocity_mm_s, device.max_rotation_rad_s]),
+        limits=DriveLimits.of(device),
     )

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from endopilot.models.open_loop import Steps2
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import Device
+from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.simulation.simulator import Simulator
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
@@ -51,15 +52,17 @@ def track(
     simulator = Simulator(anatomy, [wire for wire in wires for _ in range(each)], config=config)
     inserted, rotation = np.repeat(start, each, axis=0).T
     simulator.reset(inserted_length=inserted.clip(min=0.0), rotation=rotation, friction=np.repeat(friction, each))
+    limits = DriveLimits.of(wires[0], anatomy)
     for sample in np.moveaxis(given, 1, 0):
-        simulator.step(_possible(simulator, np.repeat(sample, each, axis=0), wires, each, anatomy), SAMPLE_PERIOD_S)
+        asked = np.repeat(sample, each, axis=0)
+        simulator.step(limits.clip(asked, simulator.inserted_length, SAMPLE_PERIOD_S), SAMPLE_PERIOD_S)
     tip, control = np.empty(desired.shape), np.empty(desired.shape)
     for k in range(desired.shape[1]):
         now = simulator.project().abscissa
         lead = (np.repeat(desired[:, k, 0], each) - now) / SAMPLE_PERIOD_S
         asked = np.tile(tries, (episodes, 1))
         asked[:, 0] += lead
-        asked = _possible(simulator, asked, wires, each, anatomy)
+        asked = limits.clip(asked, simulator.inserted_length, SAMPLE_PERIOD_S)
         step = simulator.step(asked, SAMPLE_PERIOD_S)
         reached = simulator.project()
         miss = np.abs(reached.abscissa - np.repeat(desired[:, k, 0], each))
@@ -70,15 +73,3 @@ def track(
         control[:, k] = np.stack([asked[best, 0] - step.slip[best] / SAMPLE_PERIOD_S, asked[best, 1]], axis=-1)
         simulator.copy_worlds(np.repeat(best, each))
     return tip, control
-
-
-def _possible(
-    simulator: Simulator, control: np.ndarray, wires: Sequence[Device], each: int, anatomy: Anatomy
-) -> np.ndarray:
-    """Return what the drive can do of controls: within its speed, the catheter and the vessel."""
-    limits = np.array([(wire.max_velocity_mm_s, wire.max_rotation_rad_s) for wire in wires]).repeat(each, axis=0)
-    made = np.clip(control, -limits, limits)
-    inserted = simulator.inserted_length
-    reach = np.maximum(float(anatomy.tree.longest_path().abscissa[-1]), inserted)
-    made[:, 0] = np.clip(made[:, 0], -inserted / SAMPLE_PERIOD_S, (reach - inserted) / SAMPLE_PERIOD_S)
-    return made

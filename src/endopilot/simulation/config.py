@@ -18,8 +18,6 @@ LANES = _core.LANES
 """Worlds that one thread steps side by side."""
 _DENT_MM = 0.015
 """Depth to which a node that bears the whole push limit dents the wall, mm, where the stiffness is not given."""
-SPARE_MM = 20.0
-"""Length that a wire can be driven beyond the end of the vessel's longest path, mm, where it is not known how far."""
 Actuation = Literal["velocity", "force"]
 """What a control is: translation (mm/s) and rotation (rad/s), or the drive's axial force (N) and torque (N·mm)."""
 

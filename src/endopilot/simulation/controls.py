@@ -13,6 +13,7 @@ import pandas as pd
 from jaxtyping import Float
 
 from endopilot.errors import InputError
+from endopilot.simulation.drive_limits import within_travel
 from endopilot.types import SAMPLE_PERIOD_S
 
 _COLUMNS = ("time_s", "translation_mm_s", "rotation_rad_s")
@@ -102,8 +103,7 @@ def random_controls(
         initial[index], control[index] = _navigation(config, generator, n_samples, max_inserted_length_mm)
     inserted = initial[:, 0].copy()
     for sample in np.moveaxis(control, 1, 0):
-        left = max_inserted_length_mm - inserted
-        sample[:, 0] = np.clip(sample[:, 0], -inserted / SAMPLE_PERIOD_S, left / SAMPLE_PERIOD_S)
+        sample[:, 0] = within_travel(sample[:, 0], inserted, SAMPLE_PERIOD_S, travel_mm=(0.0, max_inserted_length_mm))
         inserted += sample[:, 0] * SAMPLE_PERIOD_S
     return initial, control
 

@@ -10,9 +10,10 @@ from jaxtyping import Integer
 
 from endopilot import _core
 from endopilot.anatomy.projection import TipProjector
-from endopilot.simulation.config import FREE_BEHIND_MM, SPARE_MM, SimulatorConfig
+from endopilot.simulation.config import FREE_BEHIND_MM, SimulatorConfig
 from endopilot.simulation.core import check_distance_map, check_memory, core_options, insertion_arguments, make_lumen
 from endopilot.simulation.device import Device, check_fits
+from endopilot.simulation.drive_limits import far_end_mm
 from endopilot.simulation.rod import RodLayout, lay_out
 from endopilot.types import Anatomy
 
@@ -75,7 +76,7 @@ def make_groups(
         if id(anatomy) not in projectors:
             projectors[id(anatomy)] = TipProjector(anatomy.tree, anatomy.insertion)
         path_mm = float(anatomy.tree.longest_path().abscissa[-1])
-        longest_mm = path_mm + SPARE_MM
+        longest_mm = far_end_mm(anatomy)
         rod = lay_out(device, path_mm=path_mm, elements=config.elements, length_mm=longest_mm + FREE_BEHIND_MM)
         check_memory(8 * len(worlds) * (25 * len(rod.abscissa_mm) + 40), f"worlds: {len(worlds)}", "give fewer")
         simulation = _core.Simulation(

@@ -13,9 +13,10 @@ from jaxtyping import Bool, Float
 
 from endopilot.anatomy.projection import project_tip
 from endopilot.errors import InputError
-from endopilot.simulation.config import FREE_BEHIND_MM, SPARE_MM, Actuation, SimulatorConfig
+from endopilot.simulation.config import FREE_BEHIND_MM, Actuation, SimulatorConfig
 from endopilot.simulation.core import check_distance_map, check_memory, make_lumen, run_core
 from endopilot.simulation.device import Device, check_fits
+from endopilot.simulation.drive_limits import far_end_mm
 from endopilot.simulation.rod import lay_out
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, Rollout
 
@@ -82,7 +83,7 @@ def simulate(
         device,
         path_mm=path_mm,
         elements=config.elements,
-        length_mm=max(path_mm, deepest if actuation == "velocity" else path_mm + SPARE_MM) + FREE_BEHIND_MM,
+        length_mm=max(path_mm, deepest if actuation == "velocity" else far_end_mm(anatomy)) + FREE_BEHIND_MM,
     )
     _check_memory(worlds, samples, len(rod.abscissa_mm) if record_shape else 0)
     result = run_core(

@@ -16,9 +16,10 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from endopilot.errors import InputError
-from endopilot.simulation.config import LANES, SPARE_MM, Actuation, SimulatorConfig
+from endopilot.simulation.config import LANES, Actuation, SimulatorConfig
 from endopilot.simulation.core import check_memory
 from endopilot.simulation.device import Device
+from endopilot.simulation.drive_limits import SPARE_MM
 from endopilot.simulation.groups import Group, make_groups, merge
 from endopilot.simulation.state import SimulatorState, Step, SupportsDLPack
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, TipProjection
