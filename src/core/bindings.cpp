@@ -4,6 +4,7 @@
 
 #include <chrono>
 #include <memory>
+#include <string>
 #include <thread>
 #include <tuple>
 
@@ -15,6 +16,21 @@
 using namespace endopilot;
 
 namespace {
+
+// The levels that are built and that this processor runs, slowest first. Ask the baseline module, which runs everywhere.
+nb::list supported_levels() {
+    nb::list levels;
+    levels.append("baseline");
+#ifdef __x86_64__
+    __builtin_cpu_init();
+    const bool avx2 = __builtin_cpu_supports("avx2");
+    if (avx2) levels.append("avx2");
+    if (avx2 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512cd") &&
+        __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl"))
+        levels.append("avx512");
+#endif
+    return levels;
+}
 
 // All arrays have one entry a node; entries without a meaning (the last element, the first joint) are ignored.
 RodModel make_rod(const Array<1>& abscissa, const Array<1>& shear, const Array<1>& stretch, const Array<1>& bend,
@@ -170,6 +186,8 @@ public:
         const std::size_t worlds = worlds_.size(), samples = control.shape(1), n = worlds * samples, nodes = std::size_t(rod_.nodes);
         require(control.shape(0) == worlds && control.shape(2) == 2, "control needs two numbers a world and sample");
         require(steps_per_sample >= 1 && time_step > 0, "time step and steps per sample must be positive");
+        if (lanes != 1 && lanes != 4 && lanes != 8)
+            throw std::invalid_argument("lanes: " + std::to_string(lanes) + "; give 1, 4 or 8");
         Result<double> inserted(n), rotation(n), tip(3 * n), direction(3 * n), force_max(n), force_sum(n), base_force(n),
             base_torque(n), drive_force(n), drive_torque(n), iterations(n), slip(n), approach_slip(worlds);
         Result<bool> valid(n);
@@ -201,10 +219,10 @@ public:
                           record_shape ? shape.data : nullptr, record_attitude ? attitude.data : nullptr};
         if (lanes == 1)
             step<double>(in, out, std::max(1, threads), progress);
-        else if (lanes == 8)
-            step<double8>(in, out, std::max(1, threads), progress);
-        else
+        else if (lanes == 4)
             step<double4>(in, out, std::max(1, threads), progress);
+        else
+            step<double8>(in, out, std::max(1, threads), progress);
         return result;
     }
 
@@ -334,9 +352,11 @@ private:
 
 }  // namespace
 
-NB_MODULE(_core, module) {
+NB_MODULE(ENDOPILOT_MODULE, module) {
     module.doc() = "The core of endopilot: Cosserat rods, and projection to centerlines.";
+    module.attr("LEVEL") = ENDOPILOT_LEVEL;
     module.attr("LANES") = kLanes;
+    module.def("supported_levels", &supported_levels);
     nb::class_<RodModel>(module, "RodModel")
         .def_ro("nodes", &RodModel::nodes);
     module.def("make_rod", &make_rod, nb::kw_only(), nb::arg("abscissa"), nb::arg("shear"), nb::arg("stretch"),

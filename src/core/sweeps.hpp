@@ -164,7 +164,7 @@ V Stepper<V>::solve(int n) {
     const Vec3<double> axis = frame(base_.orientation).d3;
     const Vec3<V> drive_x{axis.x * drive_a_, axis.y * drive_a_, axis.z * drive_a_}, drive_t{zero, zero, drive_r_};
     Vec3<V> x = drive_x, t = drive_t;
-    V largest = drive_a_ * drive_a_ + drive_r_ * drive_r_;
+    V largest = dot(x, x) + dot(t, t);  // rounded as for the nodes of a shorter wire, which follow the drive
     for (int i = n - 1; i >= 0; --i) {
         const Mask<V> on = active_ > broadcast<V>(i);
         substitute(factor_[i], x, t);

@@ -1,4 +1,4 @@
-"""The core (C++): Cosserat rods and projection to centerlines; see `endopilot.simulation`, `anatomy.projection`."""
+"""The core (C++): Cosserat rods and projection to centerlines; see `src/core/README.md`."""
 
 from collections.abc import Callable
 from typing import Any
@@ -32,8 +32,10 @@ class Options:
     introducer_friction: float
     introducer_drag: float
 
+LEVEL: str
 LANES: int
 
+def supported_levels() -> list[str]: ...
 def make_rod(
     *,
     abscissa: np.ndarray,

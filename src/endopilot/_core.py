@@ -1,0 +1,33 @@
+"""The C++ core, in the build that suits this processor.
+
+The same sources are built for up to three levels of x86-64 instructions: `baseline`, `avx2` and `avx512`
+(F, BW, CD, DQ, VL). On other processors there is `baseline` alone. All give the same results to the bit. The highest
+level that the processor supports is taken, or the one that the environment variable `ENDOPILOT_CORE` names. Importing
+this module gives the module of that level; its `LEVEL` says which it is.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from importlib import import_module
+
+from endopilot.errors import InputError
+
+_LEVELS = ("baseline", "avx2", "avx512")
+_VARIABLE = "ENDOPILOT_CORE"
+
+
+def _choose() -> str:
+    supported: list[str] = import_module("endopilot._core_baseline").supported_levels()
+    asked = os.environ.get(_VARIABLE)
+    if not asked:
+        return supported[-1]
+    if asked not in _LEVELS:
+        raise InputError(f"{_VARIABLE}: {asked!r} is no level of the core; give one of {', '.join(_LEVELS)}")
+    if asked not in supported:
+        raise InputError(f"{_VARIABLE}: this processor does not run {asked!r}; give one of {', '.join(supported)}")
+    return asked
+
+
+sys.modules[__name__] = import_module(f"endopilot._core_{_choose()}")

@@ -1,0 +1,102 @@
+"""The core's builds for different processors: the same bits from all of them, and a choice that can be made by hand."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from importlib import import_module
+from pathlib import Path
+
+import navigations
+import numpy as np
+import pytest
+
+BASELINE = import_module("endopilot._core_baseline")
+SUPPORTED: list[str] = BASELINE.supported_levels()
+HERE = Path(__file__).parent
+
+
+def python(*arguments: str | Path, level: str | None = None) -> subprocess.CompletedProcess[str]:
+    """Run Python in a fresh process, with the level asked for in its environment."""
+    environment = {name: value for name, value in os.environ.items() if name != "ENDOPILOT_CORE"}
+    if level is not None:
+        environment["ENDOPILOT_CORE"] = level
+    return subprocess.run([sys.executable, *map(str, arguments)], env=environment, capture_output=True, text=True)
+
+
+def test_every_level_and_every_number_of_lanes_gives_the_same_bits() -> None:
+    found: dict[str, set[str]] = {"velocity": set(), "force": set()}
+    for level in SUPPORTED:
+        ran = python(HERE / "navigations.py", level=level)
+        assert ran.returncode == 0, ran.stderr
+        answer = json.loads(ran.stdout)
+        assert answer["level"] == level
+        assert len(answer["digests"]) == 6
+        for name, digest in answer["digests"].items():
+            found[name.split(",")[0]].add(digest)
+    assert {actuation: len(digests) for actuation, digests in found.items()} == {"velocity": 1, "force": 1}
+
+
+@pytest.mark.parametrize("lanes", [4, 8])
+def test_a_wire_driven_by_force_does_not_depend_on_the_wires_beside_it(lanes: int) -> None:
+    # without a wall the drive makes the longest move of a Newton step, which all moves are scaled by
+    together = navigations.navigate("force", lanes, walled=False)
+    for world in range(navigations.WORLDS):
+        alone = navigations.navigate("force", lanes, worlds=slice(world, world + 1), walled=False)
+        for name in ("tip_position", "inserted_length", "rotation", "base_force", "iterations"):
+            assert np.array_equal(alone[name][0], together[name][world]), f"{name} of world {world}"
+
+
+def test_the_highest_level_that_the_processor_supports_is_taken() -> None:
+    code = "from endopilot import _core; print(_core.LEVEL)"
+    assert python("-c", code).stdout.split() == [SUPPORTED[-1]]
+    assert python("-c", code, level="baseline").stdout.split() == ["baseline"]
+
+
+def test_a_level_that_does_not_exist_is_refused() -> None:
+    ran = python("-m", "endopilot.cli", "info", level="avx3")
+    assert ran.returncode == 2
+    assert ran.stderr == (
+        "endopilot info: ENDOPILOT_CORE: 'avx3' is no level of the core; give one of baseline, avx2, avx512\n"
+    )
+
+
+def test_a_level_that_the_processor_lacks_is_refused() -> None:
+    code = (
+        "import endopilot._core_baseline as baseline\n"
+        "baseline.supported_levels = lambda: ['baseline']\n"
+        "import endopilot._core\n"
+    )
+    ran = python("-c", code, level="avx2")
+    assert ran.returncode != 0
+    assert "ENDOPILOT_CORE: this processor does not run 'avx2'; give one of baseline" in ran.stderr
+
+
+def test_info_names_the_level() -> None:
+    ran = python("-m", "endopilot.cli", "info", "--json", level="baseline")
+    assert json.loads(ran.stdout)["core"] == "baseline", ran.stderr
+
+
+@pytest.mark.parametrize("level", SUPPORTED)
+def test_a_level_holds_its_own_instructions_and_no_fused_ones(level: str) -> None:
+    objdump = shutil.which("objdump")
+    if objdump is None or SUPPORTED == ["baseline"]:
+        pytest.skip("needs objdump, and an x86-64 processor with AVX2")
+    module = import_module(f"endopilot._core_{level}").__file__
+    assert module is not None
+    listing = subprocess.run([objdump, "-d", "--no-show-raw-insn", module], capture_output=True, text=True, check=True)
+    names = set(re.findall(r"^\s*[0-9a-f]+:\t(\w+)", listing.stdout, re.MULTILINE))
+    assert "sqrtsd" in names or "vsqrtsd" in names  # the listing is of the core
+    assert not {name for name in names if re.match(r"vfn?m(add|sub)", name)}
+    assert any(name.startswith("v") for name in names) == (level != "baseline")
+    assert ("%zmm" in listing.stdout) == (level == "avx512")
+
+
+@pytest.mark.parametrize("lanes", [2, 3, 16, -1])
+def test_another_number_of_lanes_is_refused(lanes: int) -> None:
+    with pytest.raises(ValueError, match=f"lanes: {lanes}; give 1, 4 or 8"):
+        navigations.navigate("velocity", lanes)
