@@ -16,12 +16,12 @@ import numpy as np
 
 from endopilot.control.agent import AgentPolicy
 from endopilot.control.navigate import NavigateConfig, navigate
-from endopilot.ladder.mismatch import CASES, truth_of
+from endopilot.ladder.mismatch import CASES, mismatch_of
 from endopilot.tasks.task import CORE, find_task
 from endopilot.xray.fluoroscope import TipMeasurement
 
 TASKS = ("crux", "circumflex", "middle-cerebral", "carotid", "diagonal")
-OFF = 0.2
+MISMATCH = 0.2
 
 
 class AlwaysReplanning(AgentPolicy):
@@ -40,9 +40,9 @@ def drive(name: str, place: int, case: str, rule: type[AgentPolicy]) -> list[flo
     """Return the figures of one navigation, as `COLUMNS` names them."""
     task, policy = find_task(name), rule()
     navigation = task.ladder_navigation(place)
-    truth = truth_of(case, OFF, navigation, task, place)
+    mismatch = mismatch_of(case, MISMATCH, navigation, task, place)
     config, began = NavigateConfig(simulator=replace(CORE, threads=1)), time.process_time()
-    record = navigate(navigation, policy, config=config, seed=100 * task.level + place, truth=truth)
+    record = navigate(navigation, policy, config=config, seed=100 * task.level + place, truth=mismatch)
     spent = time.process_time() - began
     return [record.success and record.safe, record.exposures, record.seconds, policy.plans, spent]
 

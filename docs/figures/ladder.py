@@ -1,7 +1,8 @@
-"""Write tasks and scores into docs/ladder.md: `python docs/figures/ladder.py [FOLDER [ROBUSTNESS]]`.
+"""Write tasks and scores into docs/ladder.md: `python docs/figures/ladder.py [FOLDER [MISMATCH]]`.
 
-FOLDER, runs/ladder if not given, holds what `endopilot ladder` made of each policy, and ROBUSTNESS,
-runs/ladder-mismatch if not given, what it made with `--off 0.2`; a folder that is not there leaves its table as it is.
+FOLDER, runs/ladder if not given, holds what `endopilot ladder` made of each policy, and MISMATCH,
+runs/ladder-mismatch if not given, what it made with `--mismatch 0.2`. A folder that is not there leaves its table as
+it is.
 """
 
 from __future__ import annotations
@@ -66,13 +67,13 @@ def _kept() -> dict[str, dict[str, str]]:
     return {policy: {row[0]: row[1 + place] for row in body} for place, policy in enumerate(head)}
 
 
-def robustness(folder: Path) -> list[str]:
-    """Return a table of how the policies degrade: safe success, in brackets success, %, and exposures."""
-    done = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(folder.glob("*/robustness.json"))]
+def mismatch(folder: Path) -> list[str]:
+    """Return a table of scores under model mismatch: safe success, in brackets success, %, and exposures."""
+    done = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(folder.glob("*/mismatch.json"))]
     names = [name for content in done for name in (f"`{content['policy']}`, safe success", "exposures")]
-    lines = ["| off | " + " | ".join(names) + " |", "|---|" + "---|" * len(names)]
+    lines = ["| mismatch | " + " | ".join(names) + " |", "|---|" + "---|" * len(names)]
     for rows in zip(*(content["cases"] for content in done), strict=True):
-        cells = [title_of(rows[0]["case"], done[0]["off"])]
+        cells = [title_of(rows[0]["case"], done[0]["mismatch"])]
         for row in rows:
             cells += [f"{100 * row['safe_success']:.0f} ({100 * row['success']:.0f})", f"{row['exposures']:g}"]
         lines.append("| " + " | ".join(cells) + " |")
@@ -82,12 +83,12 @@ def robustness(folder: Path) -> list[str]:
 def main() -> None:
     """Fill the page."""
     given = [Path(argument) for argument in sys.argv[1:]]
-    ladder, off = [*given, *[ROOT / "runs" / name for name in ("ladder", "ladder-mismatch")][len(given) :]]
+    ladder, mismatched = [*given, *[ROOT / "runs" / name for name in ("ladder", "ladder-mismatch")][len(given) :]]
     fill("tasks", tasks())
     if ladder.is_dir():
         fill("scores", scores(ladder))
-    if off.is_dir():
-        fill("robustness", robustness(off))
+    if mismatched.is_dir():
+        fill("mismatch", mismatch(mismatched))
 
 
 if __name__ == "__main__":

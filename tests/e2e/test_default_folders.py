@@ -9,7 +9,7 @@ from endopilot import runs
 from endopilot.benchmarks import robustness
 from endopilot.ladder import mismatch
 
-LADDER = ("ladder", "--off", "0.2", "--policy", "forward", "--tasks", "straight", "--patients", "1")
+LADDER = ("ladder", "--mismatch", "0.2", "--policy", "forward", "--tasks", "straight", "--patients", "1")
 BENCH = ("bench", "robustness", "--rollouts", "1", "--anatomies", "1", "--seconds", "5", "--threads", "1")
 
 
@@ -25,7 +25,7 @@ def test_the_ladder_with_a_model_mismatch_and_the_robustness_benchmark_run_one_a
     tmp_path, monkeypatch, capsys, order
 ):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(mismatch, "CASES", ("as-told",))
+    monkeypatch.setattr(mismatch, "CASES", ("matched",))
     monkeypatch.setattr(runs, "each", here)
     monkeypatch.setattr(robustness, "MOST_PENETRATION_MM", 1.0)  # what is measured is not judged here
     for line in (*order, *order):  # and again, where each goes on in its own folder

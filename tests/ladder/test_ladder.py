@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 
 from endopilot import runs
-from endopilot.control.navigate import ModelMismatch
 from endopilot.errors import InputError
+from endopilot.ladder import attempt as attempts
 from endopilot.ladder import ladder
-from endopilot.ladder.ladder import LadderConfig, climb, drive, score
+from endopilot.ladder.attempt import attempt
+from endopilot.ladder.ladder import LadderConfig, climb
+from endopilot.ladder.scores import score
 from endopilot.report.ladder_page import write_page
 from endopilot.simulation.device import read_device
 from endopilot.tasks.task import find_task, ladder_tasks
@@ -130,7 +132,7 @@ def test_missed_events_are_counted_over_all_navigations_of_the_agent():
     assert "missed_events" not in none  # one navigation was not watched
 
 
-def test_the_events_of_a_navigation_are_at_the_wall_and_where_the_agent_is_off():
+def test_the_events_of_a_navigation_are_at_the_wall_and_where_the_agent_errs():
     tip = TipProjection(
         offset=np.array([0.1, 0.1, 0.6, 0.6, 0.1, 0.1, 0.1, 0.6, 0.1]),  # of 0.82: at the wall from sample 2, and at 7
         radius=np.full(9, 1.0),
@@ -138,27 +140,24 @@ def test_the_events_of_a_navigation_are_at_the_wall_and_where_the_agent_is_off()
         branch=np.zeros(9, dtype=int),
     )
     exposed = np.array([1, 0, 0, 0, 0, 0, 1, 0, 0], dtype=bool)
-    foretold = np.arange(8.0)
-    foretold[5] += 2.0
-    assert ladder._events(tip, exposed, foretold, 0.18) == (2, 1)
-    foretold[4] += 2.0  # it begins sooner: nobody looked
-    assert ladder._events(tip, exposed, foretold, 0.18) == (2, 2)
+    believed = np.arange(8.0)
+    believed[5] += 2.0
+    assert attempts._events(tip, exposed, believed, 0.18) == (2, 1)
+    believed[4] += 2.0  # it begins sooner, before the exposure
+    assert attempts._events(tip, exposed, believed, 0.18) == (2, 2)
 
 
 def test_a_wire_that_begins_to_fill_the_lumen_is_an_event():
     radius = np.array([1.0, 1.0, 0.18, 0.18, 1.0, 1.0])
     tip = TipProjection(offset=np.zeros(6), radius=radius, abscissa=np.arange(6.0), branch=np.zeros(6, dtype=int))
-    assert ladder._events(tip, np.zeros(6, dtype=bool), np.arange(5.0), 0.18) == (1, 1)
+    assert attempts._events(tip, np.zeros(6, dtype=bool), np.arange(5.0), 0.18) == (1, 1)
 
 
-def test_the_agent_is_watched_as_it_climbs(tmp_path):
-    task = find_task("straight")
-    navigation = replace(task.ladder_navigation(0), seconds=2.0)
-    for policy in ("agent", "forward"):
-        drive(tmp_path / f"{policy}.json", task, 0, navigation, policy, ModelMismatch())
-    count, missed = json.loads((tmp_path / "agent.json").read_text(encoding="utf-8"))["events"]
+def test_events_are_counted_for_the_agent_alone():
+    navigation = replace(find_task("straight").ladder_navigation(0), seconds=2.0)
+    count, missed = attempt("agent", navigation, seed=100)["events"]
     assert 0 <= missed <= count <= 8
-    assert "events" not in json.loads((tmp_path / "forward.json").read_text(encoding="utf-8"))
+    assert "events" not in attempt("forward", navigation, seed=100)
 
 
 def test_the_upper_eight_are_summed_only_where_all_were_done():
@@ -172,13 +171,13 @@ def test_the_upper_eight_are_summed_only_where_all_were_done():
 
 
 @pytest.mark.parametrize(
-    ("given", "told"),
+    ("given", "message"),
     [
         ({"policy": "pray"}, "policy: 'pray'"),
         ({"tasks": ("moon",)}, "task: 'moon'"),
         ({"patients": 21}, "patients: 21"),
     ],
 )
-def test_bad_settings_are_refused(given, told):
-    with pytest.raises(InputError, match=told):
+def test_bad_settings_are_refused(given, message):
+    with pytest.raises(InputError, match=message):
         LadderConfig(**given)

@@ -1,4 +1,4 @@
-"""A policy on the ladder while reality is off from what it was told."""
+"""A policy on the ladder under model mismatch."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import pytest
 
 from endopilot import runs
 from endopilot.errors import InputError
-from endopilot.ladder import mismatch as robustness
+from endopilot.ladder import mismatch as mismatches
 from endopilot.ladder.ladder import LadderConfig
-from endopilot.ladder.mismatch import CASES, measure_mismatch, title_of, truth_of
+from endopilot.ladder.mismatch import CASES, measure_mismatch, mismatch_of, title_of
 from endopilot.tasks.task import find_task
 
 ONE = LadderConfig(policy="forward", tasks=("straight",), patients=1)
@@ -24,60 +24,60 @@ def here(title, items, work):
 
 
 @pytest.fixture(scope="module")
-def degraded(tmp_path_factory):
+def measured(tmp_path_factory):
     """Return a folder in which `forward` did the lowest task in one patient in three of the cases, and the rows."""
-    folder = tmp_path_factory.mktemp("robustness") / "forward"
+    folder = tmp_path_factory.mktemp("mismatch") / "forward"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(robustness, "CASES", ("as-told", "ostium-more", "all"))
+        patch.setattr(mismatches, "CASES", ("matched", "ostium-more", "all"))
         patch.setattr(runs, "each", here)
         return folder, measure_mismatch(folder, ONE, 0.2)
 
 
-def test_one_quantity_is_off_at_a_time_then_all():
+def test_one_quantity_differs_at_a_time_then_all():
     task = find_task("straight")
     navigation = task.ladder_navigation(0)
     assert len(CASES) == 10
-    told = vars(truth_of("as-told", 0.2, navigation, task, 0))
-    assert told == {"friction_factor": 1.0, "stiffness_factor": 1.0, "ostium_mm": 0.0, "latency_factor": 1.0}
+    matched = vars(mismatch_of("matched", 0.2, navigation, task, 0))
+    assert matched == {"friction_factor": 1.0, "stiffness_factor": 1.0, "ostium_mm": 0.0, "latency_factor": 1.0}
     for case in CASES[1:-1]:
-        now = vars(truth_of(case, 0.2, navigation, task, 0))
-        assert sum(now[name] != told[name] for name in told) == 1
+        now = vars(mismatch_of(case, 0.2, navigation, task, 0))
+        assert sum(now[name] != matched[name] for name in matched) == 1
     wide = 2 * navigation.anatomy.tree.branches[0].centerline.radius[0]
-    assert truth_of("ostium-less", 0.2, navigation, task, 0).ostium_mm == pytest.approx(-0.2 * wide)
-    assert truth_of("stiffness-more", 0.2, navigation, task, 0).stiffness_factor == 1.2
-    every = [vars(truth_of("all", 0.1, navigation, task, place)) for place in range(6)]
-    assert {round(abs(truth["friction_factor"] - 1), 9) for truth in every} == {0.1}
-    assert {truth["latency_factor"] for truth in every} == {0.9, 1.1}
+    assert mismatch_of("ostium-less", 0.2, navigation, task, 0).ostium_mm == pytest.approx(-0.2 * wide)
+    assert mismatch_of("stiffness-more", 0.2, navigation, task, 0).stiffness_factor == 1.2
+    every = [vars(mismatch_of("all", 0.1, navigation, task, place)) for place in range(6)]
+    assert {round(abs(one["friction_factor"] - 1), 9) for one in every} == {0.1}
+    assert {one["latency_factor"] for one in every} == {0.9, 1.1}
 
 
-def test_a_row_a_case_and_a_deeper_wire_arrives_sooner(degraded):
-    folder, rows = degraded
-    assert [row["case"] for row in rows] == ["as-told", "ostium-more", "all"]
+def test_a_row_a_case_and_a_deeper_wire_arrives_sooner(measured):
+    folder, rows = measured
+    assert [row["case"] for row in rows] == ["matched", "ostium-more", "all"]
     assert all(row["navigations"] == 1 and row["safe_success"] == 1.0 for row in rows)
     assert rows[1]["seconds"] < rows[0]["seconds"]
     assert rows[0]["exposures_per_minute"] == pytest.approx(60 / rows[0]["seconds"], abs=0.1)
-    content = json.loads((folder / "robustness.json").read_text(encoding="utf-8"))
-    assert content["cases"] == rows and content["off"] == 0.2
-    assert (folder / "robustness.png").read_bytes()[:4] == b"\x89PNG"
+    content = json.loads((folder / "mismatch.json").read_text(encoding="utf-8"))
+    assert content["cases"] == rows and content["mismatch"] == 0.2
+    assert (folder / "mismatch.png").read_bytes()[:4] == b"\x89PNG"
 
 
-def test_an_interrupted_run_goes_on_and_another_share_needs_another_folder(degraded, monkeypatch):
-    folder, rows = degraded
-    monkeypatch.setattr(robustness, "CASES", ("as-told", "ostium-more", "all"))
+def test_an_interrupted_run_goes_on_and_another_share_needs_another_folder(measured, monkeypatch):
+    folder, rows = measured
+    monkeypatch.setattr(mismatches, "CASES", ("matched", "ostium-more", "all"))
     asked = []
     monkeypatch.setattr(runs, "each", lambda title, items, work: asked.extend(items) or {})
     assert measure_mismatch(folder, ONE, 0.2) == rows and asked == []
-    with pytest.raises(InputError, match=r"was begun with off = 0\.2, now it is 0\.3"):
+    with pytest.raises(InputError, match=r"was begun with mismatch = 0\.2, now it is 0\.3"):
         measure_mismatch(folder, ONE, 0.3)
 
 
 def test_a_share_beyond_its_range_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"off: 1\.5"):
+    with pytest.raises(InputError, match=r"mismatch: 1\.5"):
         measure_mismatch(tmp_path / "new", ONE, 1.5)
     assert not (tmp_path / "new").exists()
 
 
 def test_cases_in_words():
-    assert [title_of(case, 0.2) for case in ("as-told", "friction-less", "all")] == [
-        "as told", "friction −20 %", "all, ±20 %",
+    assert [title_of(case, 0.2) for case in ("matched", "friction-less", "all")] == [
+        "matched", "friction −20 %", "all, ±20 %",
     ]  # fmt: skip

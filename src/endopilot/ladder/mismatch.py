@@ -1,4 +1,4 @@
-"""How a policy does where reality is not what it was told: `measure_mismatch`."""
+"""Scores of a policy under model mismatch: reality differs from the navigation that it is given; `measure_mismatch`."""
 
 from __future__ import annotations
 
@@ -10,77 +10,83 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from endopilot.control.navigate import ModelMismatch
+from endopilot.control.policies import make_policy
 from endopilot.errors import InputError
 from endopilot.files import read_json, write_json, writing
-from endopilot.ladder.ladder import LadderConfig, drive, identity, summary
+from endopilot.ladder.attempt import attempt, navigation_seed
+from endopilot.ladder.ladder import LadderConfig, identity
+from endopilot.ladder.scores import summary
 from endopilot.runs import claim, make_missing
 from endopilot.tasks.navigation import Navigation
 from endopilot.tasks.task import Task, find_task
 
-ROBUSTNESS_FILE, PICTURE_FILE = "robustness.json", "robustness.png"
+MISMATCH_FILE, PICTURE_FILE = "mismatch.json", "mismatch.png"
 QUANTITIES = ("friction", "stiffness", "latency", "ostium")
-"""What is off: friction coefficient, stiffness of the tip, the robot's latency, and the place of the ostium along the
-catheter's axis, the last in units of the lumen's diameter there."""
-CASES = ("as-told", *(f"{name}-{way}" for name in QUANTITIES for way in ("less", "more")), "all")
-"""What is told is right; one quantity is off; all are, to sides that are drawn for each patient."""
+"""What differs: friction coefficient, stiffness of the tip, the robot's latency, and the position of the ostium along
+the catheter's axis, the last in units of the lumen's diameter there."""
+CASES = ("matched", *(f"{name}-{side}" for name in QUANTITIES for side in ("less", "more")), "all")
+"""No quantity differs; one does; all do, each to a side that is drawn for the patient."""
 
 
-def measure_mismatch(output: Path, config: LadderConfig, off: float) -> list[dict[str, Any]]:
-    """Let a policy do tasks of the ladder while reality is off from what it was told, and score it in each case.
+def measure_mismatch(output: Path, config: LadderConfig, share: float) -> list[dict[str, Any]]:
+    """Let a policy do tasks of the ladder under model mismatch, and score it in each case.
 
     Each navigation leaves one file, `output`/CASE/TASK/PATIENT.json; an interrupted run goes on with the others.
 
     Args:
-        output: folder of the results; `robustness.json` and `robustness.png` in it show the scores.
+        output: folder of the results; `mismatch.json` and `mismatch.png` in it show the scores.
         config: what climbs.
-        off: share by which each of `QUANTITIES` is off, up and down.
+        share: by which each of `QUANTITIES` differs, up and down, between 0 and 1.
 
     Returns:
-        A row for each of `CASES`: `case`, and over all navigations what `endopilot.ladder.ladder.score` gives, with
+        A row for each of `CASES`: `case`, and over all navigations what `endopilot.ladder.scores.score` gives, with
         `exposures_per_minute`.
 
     Raises:
-        InputError: `off` is no share, the folder belongs to another run, or a navigation cannot be begun.
+        InputError: `share` is out of its range, the folder belongs to another run, or a navigation cannot be begun.
     """
-    if not 0 < off < 1:
-        raise InputError(f"off: {off} is not in (0, 1); give e.g. 0.2")
+    if not 0 < share < 1:
+        raise InputError(f"mismatch: {share} is not in (0, 1); give e.g. 0.2")
+    make_policy(config.policy)
     tasks = config.chosen
-    claim(output, "endopilot ladder --off", **identity(config.policy), off=off)
+    claim(output, "endopilot ladder --mismatch", **identity(config.policy), mismatch=share)
     paths = {
         case: [output / case / task.name / f"{place:02d}.json" for task in tasks for place in range(config.patients)]
         for case in CASES
     }
     every = [path for of_case in paths.values() for path in of_case]
-    make_missing(f"Robustness, {config.policy}", every, partial(_navigate, policy=config.policy, off=off))
+    make_missing(f"Model mismatch, {config.policy}", every, partial(_navigate, policy=config.policy, share=share))
     rows = [{"case": case} | _scores([read_json(path) for path in paths[case]]) for case in CASES]
     with writing(output / PICTURE_FILE) as partly:
-        partly.write_bytes(_picture(rows, config.policy, off))
-    content = {"policy": config.policy, "off": off, "tasks": [task.name for task in tasks]}
-    write_json(output / ROBUSTNESS_FILE, content | {"patients": config.patients, "cases": rows})
+        partly.write_bytes(_picture(rows, config.policy, share))
+    content = {"policy": config.policy, "mismatch": share, "tasks": [task.name for task in tasks]}
+    write_json(output / MISMATCH_FILE, content | {"patients": config.patients, "cases": rows})
     return rows
 
 
-def truth_of(case: str, off: float, navigation: Navigation, task: Task, place: int) -> ModelMismatch:
-    """Return how reality differs from what is told, in one case and one patient."""
-    share: dict[str, float] = dict.fromkeys(QUANTITIES, 0.0)
+def mismatch_of(case: str, share: float, navigation: Navigation, task: Task, place: int) -> ModelMismatch:
+    """Return how reality differs from the navigation in one case and one patient."""
+    change: dict[str, float] = dict.fromkeys(QUANTITIES, 0.0)
     if case == "all":
         sides = np.random.default_rng([task.ladder.seed, task.ladder.numbers[place], 1]).choice([-1.0, 1.0], 4)
-        share = dict(zip(QUANTITIES, (off * sides).tolist(), strict=True))
-    elif case != "as-told":
-        name, way = case.split("-")
-        share[name] = off if way == "more" else -off
+        change = dict(zip(QUANTITIES, (share * sides).tolist(), strict=True))
+    elif case != "matched":
+        name, side = case.split("-")
+        change[name] = share if side == "more" else -share
     return ModelMismatch(
-        friction_factor=1 + share["friction"],
-        stiffness_factor=1 + share["stiffness"],
-        latency_factor=1 + share["latency"],
-        ostium_mm=share["ostium"] * 2 * float(navigation.anatomy.tree.branches[0].centerline.radius[0]),
+        friction_factor=1 + change["friction"],
+        stiffness_factor=1 + change["stiffness"],
+        latency_factor=1 + change["latency"],
+        ostium_mm=change["ostium"] * 2 * float(navigation.anatomy.tree.branches[0].centerline.radius[0]),
     )
 
 
-def _navigate(path: Path, *, policy: str, off: float) -> None:
+def _navigate(path: Path, *, policy: str, share: float) -> None:
     case, task, place = path.parents[1].name, find_task(path.parent.name), int(path.stem)
     navigation = task.ladder_navigation(place)
-    drive(path, task, place, navigation, policy, truth_of(case, off, navigation, task, place))
+    mismatch = mismatch_of(case, share, navigation, task, place)
+    result = attempt(policy, navigation, seed=navigation_seed(task, place), mismatch=mismatch)
+    write_json(path, {"task": task.name, "patient": navigation.anatomy.name} | result)
 
 
 def _scores(results: list[dict[str, Any]]) -> dict[str, Any]:
@@ -89,7 +95,7 @@ def _scores(results: list[dict[str, Any]]) -> dict[str, Any]:
     return {"navigations": len(results)} | summary(results) | {"exposures_per_minute": round(exposures / minutes, 1)}
 
 
-def _picture(rows: list[dict[str, Any]], policy: str, off: float) -> bytes:
+def _picture(rows: list[dict[str, Any]], policy: str, share: float) -> bytes:
     """Draw safe success and exposures of each case."""
     import matplotlib
 
@@ -98,7 +104,7 @@ def _picture(rows: list[dict[str, Any]], policy: str, off: float) -> bytes:
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(7.2, 3.4), layout="constrained")
         left, right = figure.subplots(1, 2, sharey=True)
-        place, names = np.arange(len(rows))[::-1], [title_of(row["case"], off) for row in rows]
+        place, names = np.arange(len(rows))[::-1], [title_of(row["case"], share) for row in rows]
         for axes, values, color, label in (
             (left, [100 * row["safe_success"] for row in rows], BLUE, "Safe success, %"),
             (right, [row["exposures"] for row in rows], ORANGE, "Exposures, mean"),
@@ -109,13 +115,13 @@ def _picture(rows: list[dict[str, Any]], policy: str, off: float) -> bytes:
             axes.axvline(values[0], color="black", lw=0.8, ls=(0, (4, 3)))
             axes.set(xlabel=label, xlim=(0, 1.18 * max(*values, 0.01)))
         left.set_yticks(place, names)
-        figure.suptitle(f"{policy}: what it is told is off", fontsize=10)
+        figure.suptitle(f"{policy} under model mismatch", fontsize=10)
         return png(figure)
 
 
-def title_of(case: str, off: float) -> str:
+def title_of(case: str, share: float) -> str:
     """Return a case in words."""
-    if case in ("as-told", "all"):
-        return {"as-told": "as told", "all": f"all, ±{100 * off:g} %"}[case]
-    name, way = case.split("-")
-    return f"{name} {'+' if way == 'more' else '−'}{100 * off:g} %"
+    if case in ("matched", "all"):
+        return {"matched": "matched", "all": f"all, ±{100 * share:g} %"}[case]
+    name, side = case.split("-")
+    return f"{name} {'+' if side == 'more' else '−'}{100 * share:g} %"

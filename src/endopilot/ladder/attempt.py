@@ -1,0 +1,230 @@
+"""One navigation of the ladder: `attempt` lets a policy drive it, `repeat` drives its recording again."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import hashlib
+import zlib
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from endopilot.anatomy.projection import safety_ratio
+from endopilot.control.agent import AgentPolicy
+from endopilot.control.navigate import ModelMismatch, NavigateConfig, NavigationRecord, navigate
+from endopilot.control.policies import make_policy
+from endopilot.control.policy import Decision, Observation, Policy
+from endopilot.errors import InputError
+from endopilot.tasks.navigation import Navigation
+from endopilot.tasks.task import CORE, Task
+from endopilot.types import TipProjection
+from endopilot.xray.adviser import AdviserConfig, count_events, near_exposures
+
+_MOST_BYTES = 1 << 20
+"""No array of a recording is larger, bytes; one that claims to be is cut off."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """What was decided during a navigation, in full precision: it is enough to drive the navigation again.
+
+    Attributes:
+        control: velocities of each decision within the drive's limits, mm/s and rad/s.
+        exposed: whether X-ray was on at each decision.
+        believed_mm: where the agent believed the tip to be (Δtip) at each decision, mm; None for other policies.
+    """
+
+    control: Float[np.ndarray, "decisions 2"]
+    exposed: Bool[np.ndarray, "decisions"]
+    believed_mm: Float[np.ndarray, "decisions"] | None
+
+    def packed(self) -> dict[str, str | None]:
+        """Return the recording as text: little-endian arrays, compressed by zlib, in base64."""
+        believed = self.believed_mm
+        return {
+            "control": _pack(self.control, "<f8"),
+            "exposed": _pack(self.exposed, "|u1"),
+            "believed_mm": None if believed is None else _pack(believed, "<f8"),
+        }
+
+    @staticmethod
+    def unpacked(text: dict[str, str | None]) -> Recording:
+        """Return the recording that `packed` made a text of.
+
+        Raises:
+            InputError: an array cannot be read, is not finite, or has another length than the others.
+        """
+        control, exposed = _unpack(text, "control", "<f8"), _unpack(text, "exposed", "|u1") != 0
+        believed = None if text["believed_mm"] is None else _unpack(text, "believed_mm", "<f8")
+        count = len(exposed)
+        for name, size in (
+            ("control", len(control) / 2),
+            ("believed_mm", count if believed is None else len(believed)),
+        ):
+            if size != count or count == 0:
+                raise InputError(f"{name}: {size:g} decisions, exposed: {count}; each must have one value a decision")
+        if not exposed[0]:
+            raise InputError("exposed: X-ray is off at the first decision, where it is always on")
+        return Recording(control.reshape(-1, 2), exposed, believed)
+
+
+def navigation_seed(task: Task, place: int) -> int:
+    """Return the seed of the navigation in the patient at some place of a task's list."""
+    return 100 * task.level + place
+
+
+def attempt(policy: str, navigation: Navigation, *, seed: int, mismatch: ModelMismatch | None = None) -> dict[str, Any]:
+    """Let a policy drive a navigation, and return its figures, its course and its recording.
+
+    Args:
+        policy: its name.
+        navigation: what is to be done, as the policy is given it.
+        seed: of encoder noise, detection errors and the policy.
+        mismatch: how the simulated reality differs from the navigation; not at all if not given.
+
+    Raises:
+        InputError: there is no such policy, or the wire does not fit the vessel.
+    """
+    driver = make_policy(policy)
+    watched = _Watched(driver) if isinstance(driver, AgentPolicy) else None
+    record = _drive(navigation, watched or driver, seed, mismatch)
+    believed = None if watched is None else np.array(watched.abscissa)
+    recording = Recording(record.control[:-1], record.exposed[:-1], believed)
+    return (
+        {"seed": seed}
+        | _figures(navigation, record, recording)
+        | {"course": _course(record), "recording": recording.packed()}
+    )
+
+
+def repeat(recording: Recording, navigation: Navigation, *, seed: int) -> dict[str, Any]:
+    """Drive the recorded velocities through the same robot and simulator, without the policy.
+
+    Returns:
+        The figures, as `attempt` returned them if the recording is that of this navigation.
+
+    Raises:
+        InputError: the recording is longer or shorter than the navigation.
+    """
+    record = _drive(navigation, _Repeated(recording), seed, None)
+    given, needed = len(recording.control), len(record.control) - 1
+    if given != needed:
+        raise InputError(f"control: holds {given} decisions, and the navigation ends after {needed}")
+    return _figures(navigation, record, recording)
+
+
+def _drive(navigation: Navigation, policy: Policy, seed: int, mismatch: ModelMismatch | None) -> NavigationRecord:
+    config = NavigateConfig(simulator=replace(CORE, threads=1))
+    return navigate(navigation, policy, config=config, seed=seed, truth=mismatch)
+
+
+class _Watched:
+    """The agent, and where it believed the tip to be (Δtip, mm) at each decision."""
+
+    def __init__(self, agent: AgentPolicy) -> None:
+        self._agent = agent
+
+    def start(self, navigation: Navigation, seed: int) -> None:
+        self._agent.start(navigation, seed)
+        self.abscissa: list[float] = []
+
+    def decide(self, observation: Observation) -> Decision:
+        decision = self._agent.decide(observation)
+        self.abscissa.append(float(self._agent.belief.likeliest_tip().abscissa[0]))
+        return decision
+
+
+class _Repeated:
+    """Decides what was recorded."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._control = recording.control.tolist()
+        self._expose_next = [*recording.exposed[1:].tolist(), False]
+        self._at = 0
+
+    def start(self, navigation: Navigation, seed: int) -> None:
+        self._at = 0
+
+    def decide(self, observation: Observation) -> Decision:
+        if self._at == len(self._control):
+            raise InputError(f"control: holds {self._at} decisions, and the navigation goes on")
+        decision = Decision(*self._control[self._at], expose=self._expose_next[self._at])
+        self._at += 1
+        return decision
+
+
+def _figures(navigation: Navigation, record: NavigationRecord, recording: Recording) -> dict[str, Any]:
+    """Return what a navigation is scored by, and the hash of all that was recorded of it and of how it went."""
+    length_mm = navigation.target.abscissa - float(record.tip.abscissa[0])
+    figures = {
+        "success": record.success,
+        "safe": record.safe,
+        "reason": record.reason,
+        "seconds": record.seconds,
+        "path_ratio": record.path_mm / length_mm,
+        "peak_force_n": record.peak_force_n,
+        "exposures": record.exposures,
+    }
+    if recording.believed_mm is not None:
+        radius = navigation.device.tip_radius_mm
+        figures["events"] = list(_events(record.tip, record.exposed, recording.believed_mm, radius))
+    return figures | {"sha256": _digest(record, recording)}
+
+
+def _events(
+    tip: TipProjection,
+    exposed: Bool[np.ndarray, "samples"],
+    believed_mm: Float[np.ndarray, "decisions"],
+    wire_radius_mm: float,
+) -> tuple[int, int]:
+    """Return how many events a navigation had, as `AdviserConfig` defines them, and how many X-ray did not show."""
+    count, advice = len(believed_mm), AdviserConfig()
+    at_wall = safety_ratio(tip.offset, tip.radius, wire_radius_mm)[:count] >= advice.wall_ratio
+    errs = np.abs(believed_mm - tip.abscissa[:count]) >= advice.abscissa_mm
+    found = np.array([count_events(state, near_exposures(exposed[:count])) for state in (at_wall, errs)])
+    return int(found[:, 0].sum()), int(found[:, 1].sum())
+
+
+def _digest(record: NavigationRecord, recording: Recording) -> str:
+    """Return the SHA-256 of the decisions and of the wire's course under them, to the bit."""
+    digest = hashlib.sha256(f"{len(record.time_s)}".encode())
+    course = (record.inserted_length, record.rotation, record.tip_position, record.contact_force_max)
+    for array in (recording.control, recording.exposed, recording.believed_mm, record.exposed, *course):
+        if array is not None:
+            digest.update(array.astype(array.dtype.newbyteorder("<")).tobytes())
+    return digest.hexdigest()
+
+
+def _course(record: NavigationRecord) -> dict[str, list]:
+    """Return how a navigation went, for pictures: a value at the start and one after each decision period."""
+    return {
+        "time_s": record.time_s.tolist(),
+        "inserted_length": record.inserted_length.round(4).tolist(),
+        "rotation": record.rotation.round(4).tolist(),
+        "tip_position": record.tip_position.round(3).tolist(),
+        "contact_force_max": record.contact_force_max.round(5).tolist(),
+        "exposed": record.exposed.tolist(),
+    }
+
+
+def _pack(values: np.ndarray, kind: str) -> str:
+    return base64.b64encode(zlib.compress(values.astype(kind).tobytes(), 9)).decode("ascii")
+
+
+def _unpack(text: dict[str, str | None], name: str, kind: str) -> np.ndarray:
+    """Return an array of a recording, flat.
+
+    Raises:
+        InputError: it cannot be read, or holds what is not finite.
+    """
+    try:
+        packed = base64.b64decode(text[name] or "", validate=True)
+        values = np.frombuffer(zlib.decompressobj().decompress(packed, _MOST_BYTES), kind)
+    except (binascii.Error, zlib.error, ValueError) as error:
+        raise InputError(f"{name}: no recorded array ({error})") from error
+    if not np.isfinite(values).all():
+        raise InputError(f"{name}: holds what is no finite number")
+    return values

@@ -1,0 +1,51 @@
+"""Scores of navigations of the ladder: `score`, whose figure is safe success."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from endopilot.tasks.task import Task
+
+UPPER = range(5, 13)
+"""Levels of the upper eight tasks, which pushing alone must not solve."""
+
+
+def score(tasks: Sequence[Task], results: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:
+    """Return the scores of tasks, and over the lower four, the upper eight and all, where all of these were done.
+
+    Each row has `level`; `task`; `safe_success`, the share of navigations that reached the target with a wall force
+    that never exceeded the task's limit; `success`, the share that reached it; of those that did, the medians of
+    `seconds` and `path_ratio` (length of the tip's path over that of the centerline); and of all the median of
+    `peak_force_n` (N) and the mean of `exposures`. Rows of `agent` have `missed_events`, the share of the events of all
+    their navigations that X-ray did not show (docs/xray.md).
+    """
+    rows = [{"level": task.level, "task": task.name} | summary(results[task.name]) for task in tasks]
+    levels = {task.level: task.name for task in tasks}
+    for title, wanted in (("lower four", range(1, 5)), ("upper eight", UPPER), ("all twelve", range(1, 13))):
+        if all(level in levels for level in wanted):
+            together = [result for level in wanted for result in results[levels[level]]]
+            rows.append({"level": None, "task": title} | summary(together))
+    return rows
+
+
+def summary(results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the scores of some navigations together, see `score`."""
+    reached = [result for result in results if result["success"]]
+
+    def median(name: str, of: Sequence[Mapping[str, Any]], digits: int) -> float | None:
+        return round(float(np.median([result[name] for result in of])), digits) if of else None
+
+    events = [result["events"] for result in results if "events" in result]
+    missed = round(sum(unseen for _, unseen in events) / max(sum(count for count, _ in events), 1), 4)
+    return {
+        "safe_success": round(float(np.mean([result["success"] and result["safe"] for result in results])), 4),
+        "success": round(len(reached) / len(results), 4),
+        "seconds": median("seconds", reached, 1),
+        "path_ratio": median("path_ratio", reached, 3),
+        "peak_force_n": median("peak_force_n", results, 4),
+        "exposures": round(float(np.mean([result["exposures"] for result in results])), 1),
+        **({"missed_events": missed} if len(events) == len(results) else {}),
+    }

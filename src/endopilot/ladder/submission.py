@@ -1,0 +1,256 @@
+"""The file by which others can confirm scores of the ladder: `write_submission`, `check_submission`.
+
+It holds the scores, the results and the recording of every navigation, and what they were made with. The check drives
+every recording through the same robot and simulator, without the policy, and compares all figures to the bit.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import zip_longest
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from endopilot import __version__, _core
+from endopilot.control.policies import POLICIES
+from endopilot.errors import InputError
+from endopilot.files import json_text, manifest, read_json, write_json
+from endopilot.ladder.attempt import Recording, navigation_seed, repeat
+from endopilot.ladder.scores import score
+from endopilot.parallel import each
+from endopilot.simulation.device import read_device
+from endopilot.tasks.task import Task, find_task, ladder_tasks
+
+SUBMISSION_FILE = "submission.json"
+MOST_PATIENTS = 20
+"""Patients of each task."""
+_STRICT = ConfigDict(extra="forbid", frozen=True)
+_Count = Annotated[int, Field(ge=0)]
+
+
+class PackedRecording(BaseModel):
+    """A `Recording` as text."""
+
+    model_config = _STRICT
+    control: str
+    exposed: str
+    believed_mm: str | None = None
+
+
+class NavigationEntry(BaseModel):
+    """One navigation: its figures (`endopilot.ladder.attempt.attempt`) and its recording."""
+
+    model_config = _STRICT
+    patient: str
+    seed: _Count
+    success: bool
+    safe: bool
+    reason: Literal["reached", "time", "invalid"]
+    seconds: float
+    path_ratio: float
+    peak_force_n: float
+    exposures: _Count
+    events: tuple[_Count, _Count] | None = None
+    sha256: str
+    recording: PackedRecording
+
+    def figures(self) -> dict[str, Any]:
+        """Return what driving the recording again must give."""
+        return self.model_dump(mode="json", exclude={"seed", "recording"} | (set() if self.events else {"events"}))
+
+
+class Submission(BaseModel):
+    """What a policy did on the ladder, and how that can be done again.
+
+    Attributes:
+        format: version of this form.
+        policy: name of the policy.
+        origin: package and version that it comes from, or its file and the SHA-256 of that.
+        versions: of endopilot, Python and libraries.
+        core: processor level that the rod core was built for.
+        tasks: name of each task and the SHA-256 of its definition with its device.
+        navigations: by the task's name, in the order of the task's patients.
+        scores: what `endopilot.ladder.scores.score` makes of them.
+    """
+
+    model_config = _STRICT
+    format: Literal[1] = 1
+    policy: str
+    origin: str
+    versions: dict[str, str | None]
+    core: str
+    tasks: dict[str, str]
+    navigations: dict[str, tuple[NavigationEntry, ...]]
+    scores: tuple[dict[str, Any], ...]
+
+
+@dataclass(frozen=True)
+class SubmissionCheck:
+    """What came of the check of a submission.
+
+    Attributes:
+        policy: name of the policy.
+        origin: where the policy comes from, as the file says.
+        navigations: their number.
+        difference: the first that differs from the file, in words; None where all scores are confirmed to the bit.
+        remarks: in what this installation differs from the one that made the file.
+    """
+
+    policy: str
+    origin: str
+    navigations: int
+    difference: str | None
+    remarks: tuple[str, ...]
+
+
+def task_digest(task: Task) -> str:
+    """Return the SHA-256 of what a task's navigations follow from: its definition and its device."""
+    content = task.model_dump_json() + json_text(read_device(task.device))
+    return hashlib.sha256(content.encode()).hexdigest()
+
+
+def write_submission(
+    path: Path, policy: str, results: Mapping[str, Sequence[Mapping[str, Any]]], scores: Sequence[Mapping[str, Any]]
+) -> None:
+    """Write the submission file of a policy.
+
+    Args:
+        path: the file.
+        policy: name of the policy.
+        results: by the task's name, the results of its navigations (`attempt`) in the order of the task's patients.
+        scores: what `score` made of them.
+    """
+    fields = NavigationEntry.model_fields
+    submission = Submission(
+        policy=policy,
+        origin=POLICIES.origin(policy),
+        versions=manifest(config=None)["versions"],
+        core=str(_core.LANES),
+        tasks={name: task_digest(find_task(name)) for name in results},
+        navigations={
+            name: tuple(NavigationEntry(**{key: value for key, value in one.items() if key in fields}) for one in done)
+            for name, done in results.items()
+        },
+        scores=tuple(dict(row) for row in scores),
+    )
+    write_json(path, submission.model_dump(mode="json"))
+
+
+def check_submission(path: Path) -> SubmissionCheck:
+    """Drive all recordings of a submission file again, without the policy, and compare every figure to the bit.
+
+    Args:
+        path: the file.
+
+    Raises:
+        InputError: the file is no submission, or its tasks or seeds are not those of this ladder.
+    """
+    submission = _read(path)
+    _refuse_another_ladder(path, submission)
+    with tempfile.TemporaryDirectory(prefix="endopilot-") as folder:
+        difference = _first_difference(submission, Path(folder))
+    return SubmissionCheck(
+        policy=submission.policy,
+        origin=submission.origin,
+        navigations=sum(map(len, submission.navigations.values())),
+        difference=difference,
+        remarks=_remarks(submission),
+    )
+
+
+def _read(path: Path) -> Submission:
+    try:
+        return Submission.model_validate(read_json(path))
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(str(part) for part in first["loc"]) or "file"
+        given = "" if first["type"] == "missing" else f" = {str(first['input'])[:60]!r}"
+        raise InputError(
+            f"{path}: {field}{given}: {first['msg']}; give a submission.json of `endopilot ladder`"
+        ) from error
+
+
+def _refuse_another_ladder(path: Path, submission: Submission) -> None:
+    """Refuse tasks, patients or seeds that are not those of this ladder: the replay alone would not show a seed."""
+    if set(submission.tasks) != set(submission.navigations):
+        raise InputError(f"{path}: tasks and navigations name different tasks; give the file as it was written")
+    counts = {name: len(entries) for name, entries in submission.navigations.items()}
+    if not counts or len(set(counts.values())) != 1 or not 1 <= max(counts.values()) <= MOST_PATIENTS:
+        raise InputError(f"{path}: navigations: {counts}; each task needs the same first 1 to {MOST_PATIENTS} patients")
+    for name, entries in submission.navigations.items():
+        try:
+            task = find_task(name)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
+        if submission.tasks[name] != task_digest(task):
+            raise InputError(
+                f"{path}: task {name!r} is not the one of endopilot {__version__}; the file was made with endopilot "
+                f"{submission.versions.get('endopilot')}, check it with that"
+            )
+        for place, entry in enumerate(entries):
+            if entry.seed != (seed := navigation_seed(task, place)):
+                raise InputError(f"{path}: task {name}, patient {place}: seed {entry.seed}; the ladder's is {seed}")
+
+
+def _first_difference(submission: Submission, folder: Path) -> str | None:
+    """Return where the file first differs from its recordings driven again, in words."""
+    entries = {
+        folder / name / f"{place:02d}.json": entry
+        for name, done in sorted(submission.navigations.items(), key=lambda item: find_task(item[0]).level)
+        for place, entry in enumerate(done)
+    }
+    for path, entry in entries.items():
+        write_json(path, entry.recording.model_dump())
+    bad = each(f"Checking {submission.policy}", list(entries), _repeat)
+    differing = []
+    for path, entry in entries.items():
+        remark = str(bad[path]) if path in bad else _difference(entry.figures(), read_json(path))
+        if remark is not None:
+            differing.append(f"task {path.parent.name}, patient {int(path.stem)}: {remark}")
+    if differing:
+        return f"{differing[0]} ({len(differing)} of {len(entries)} navigations differ)"
+    results = {
+        name: [read_json(folder / name / f"{place:02d}.json") for place in range(len(done))]
+        for name, done in submission.navigations.items()
+    }
+    rows = score([task for task in ladder_tasks() if task.name in results], results)
+    for given, again in zip_longest(submission.scores, rows, fillvalue={}):
+        remark = _difference(given, again)
+        if remark is not None:
+            return f"scores, {again.get('task') or given.get('task')}: {remark}"
+    return None
+
+
+def _repeat(path: Path) -> None:
+    """Drive the recording in a file again, and put the figures in its place."""
+    task, place = find_task(path.parent.name), int(path.stem)
+    navigation = task.ladder_navigation(place)
+    figures = repeat(Recording.unpacked(read_json(path)), navigation, seed=navigation_seed(task, place))
+    write_json(path, {"patient": navigation.anatomy.name} | figures)
+
+
+def _difference(given: Mapping[str, Any], again: Mapping[str, Any]) -> str | None:
+    """Return the first value that differs, in words; as text, so that a NaN equals a NaN."""
+    for name in [*again, *given]:
+        before, now = (json_text(values.get(name, "absent")) for values in (given, again))
+        if before != now and name == "sha256":
+            return "decisions or course are not those that the file's hash was made of"
+        if before != now:
+            return f"{name} is {before} in the file and {now} when driven again"
+    return None
+
+
+def _remarks(submission: Submission) -> tuple[str, ...]:
+    """Return in what this installation differs from the one that made the file."""
+    here = {**manifest(config=None)["versions"], "core": str(_core.LANES)}
+    made = {**submission.versions, "core": submission.core}
+    return tuple(
+        f"made with {name} {made.get(name)}, checked with {value}"
+        for name, value in here.items()
+        if made.get(name) != value
+    )
