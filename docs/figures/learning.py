@@ -20,8 +20,9 @@ from endopilot.evaluation.metrics import OFF_WALL_MM
 from endopilot.evaluation.prediction_baselines import hold_slack
 from endopilot.files import read_json
 from endopilot.models.config import WINDOW
+from endopilot.models.episodes import Episodes
 from endopilot.models.rollout import load_model
-from endopilot.models.sequences import read_vessels, unfold
+from endopilot.models.sequences import prepare_vessels, unfold
 from endopilot.simulation.device import read_device
 
 PAGE = Path(__file__).parents[1] / "learning.md"
@@ -45,11 +46,12 @@ def headline_rows(folder: Path) -> Iterator[str]:
     data = load_dataset(folder / "dataset").of_split("test")
     truth = np.stack([data.tip_abscissa, data.tip_offset], axis=-1)[:, WINDOW:].astype(float)
     clear = (data.lumen_radius - data.tip_offset)[:, WINDOW:] - RADIUS_MM > OFF_WALL_MM
-    vessels, patient = read_vessels(data), np.unique(data.anatomy, return_inverse=True)[1]
-    seen = np.broadcast_to(np.arange(data.valid.shape[1]) < WINDOW, data.valid.shape)
-    played = unfold("forward", vessels, patient, data, seen)
+    episodes = Episodes.of_dataset(data)
+    vessels, patient = prepare_vessels(episodes), np.unique(data.anatomy, return_inverse=True)[1]
+    observed = np.broadcast_to(np.arange(data.valid.shape[1]) < WINDOW, data.valid.shape)
+    played = unfold("forward", vessels, patient, episodes, observed)
     there = {name: folder / run for name, run in RUNS.items() if (folder / run / "manifest.json").is_file()}
-    tips = {name: load_model(run).rollout_forward(data).tip for name, run in there.items()}
+    tips = {name: load_model(run).rollout_forward(episodes).tip for name, run in there.items()}
     seeds = [tips[name] for name in RUNS if name in tips and "seed" in name]
     if len(seeds) == 3:
         tips["mean of the three seeds"] = np.mean(seeds, axis=0)
@@ -58,8 +60,8 @@ def headline_rows(folder: Path) -> Iterator[str]:
     for name, tip in tips.items():
         off = np.abs(tip - truth)
         skills = 1 - np.sqrt((off**2).mean(axis=(0, 1))) / held
-        told = row(name, np.pad(off, ((0, 0), (WINDOW, 0), (0, 0))))
-        yield f"{told} {off[clear][:, 1].mean():.3f} | {skills[0]:.2f} {skills[1]:.2f} |"
+        cells = row(name, np.pad(off, ((0, 0), (WINDOW, 0), (0, 0))))
+        yield f"{cells} {off[clear][:, 1].mean():.3f} | {skills[0]:.2f} {skills[1]:.2f} |"
     ours = np.abs(tips[OURS] - truth)
     right = (played.branch == data.branch)[:, WINDOW:]
     few = ours[..., 0] < np.quantile(ours[..., 0], 0.95)
@@ -67,7 +69,7 @@ def headline_rows(folder: Path) -> Iterator[str]:
         f"| `pretrained`, samples in the branch that it believes ({right.mean():.0%}) | "
         f"all {ours[right][:, 0].mean():.3f} | all {ours[right][:, 1].mean():.3f} | | |"
     )
-    spread = load_model(folder / RUNS[OURS]).foretell(data, seen[0]).spread[:, WINDOW:]
+    spread = load_model(folder / RUNS[OURS]).predict(episodes, observed[0]).spread[:, WINDOW:]
     within = (ours < spread).mean(axis=(0, 1))
     yield (
         f"| `pretrained`, share of errors within one spread (76 % of a Laplace distribution) | "
@@ -81,14 +83,15 @@ def headline_rows(folder: Path) -> Iterator[str]:
 
 def speed_rows(folder: Path) -> Iterator[str]:
     """Yield the processor time of a rollout, ms a step and sequence, on one thread."""
-    data, run = load_dataset(folder / "dataset").of_split("test"), load_model(folder / RUNS[OURS])
+    data = Episodes.of_dataset(load_dataset(folder / "dataset").of_split("test"))
+    run = load_model(folder / RUNS[OURS])
     for count, repeats in ((1, 5), (256, 1)):
         few = data.select(np.arange(count) % len(data))
-        run.rollout_forward(few)  # reads the patients
+        run.rollout_forward(few)  # prepares the patients
         start = time.process_time()
         for _ in range(repeats):
             run.rollout_forward(few)
-        spent = 1e3 * (time.process_time() - start) / (repeats * count * few.valid.shape[1])
+        spent = 1e3 * (time.process_time() - start) / (repeats * count * few.samples)
         yield f"| {count} | {spent:.3f} |"
 
 

@@ -24,7 +24,8 @@ from endopilot.evaluation.prediction_baselines import hold_slack
 from endopilot.models import causal, play
 from endopilot.models.causal import CausalNetwork
 from endopilot.models.config import WINDOW, CausalConfig
-from endopilot.models.sequences import N_INPUTS, Sequences, read_vessels, unfold
+from endopilot.models.episodes import Episodes
+from endopilot.models.sequences import N_INPUTS, Sequences, prepare_vessels, unfold
 
 PATIENTS, EPOCHS, BATCH, RATE = 60, 3, 32, 2e-3
 ENVELOPES = np.r_[2:8, 11:27]
@@ -77,24 +78,25 @@ class Blunt(CausalNetwork):
 
 def play_rows(data: Dataset) -> Iterator[str]:
     """Yield what the play operator does alone, as it is and with variations."""
-    vessels, patient = read_vessels(data), np.unique(data.anatomy, return_inverse=True)[1]
-    seen = np.broadcast_to(np.arange(data.valid.shape[1]) < WINDOW, data.valid.shape)
+    episodes = Episodes.of_dataset(data)
+    vessels, patient = prepare_vessels(episodes), np.unique(data.anatomy, return_inverse=True)[1]
+    observed = np.broadcast_to(np.arange(data.valid.shape[1]) < WINDOW, data.valid.shape)
     truth = np.stack([data.tip_abscissa, data.tip_offset], axis=-1).astype(float)
     held = np.abs(hold_slack(data, WINDOW) - truth[:, WINDOW:])
     yield row("hold slack and offset", np.pad(held, ((0, 0), (WINDOW, 0), (0, 0))))
 
-    def guessed(episodes: Dataset) -> np.ndarray:
-        return np.abs(unfold("forward", vessels, patient, episodes, seen).guess - truth)
+    def guessed(episodes: Episodes) -> np.ndarray:
+        return np.abs(unfold("forward", vessels, patient, episodes, observed).guess - truth)
 
-    yield row("play operator, nothing learned", guessed(data))
+    yield row("play operator, nothing learned", guessed(episodes))
     yield row(
         "play operator, the tip's rotation lags by up to 0.003 rad a mm",
-        guessed(replace(data, rotation=_lagging(data))),
+        guessed(replace(episodes, proximal=np.stack([data.inserted_length, _lagging(data)], axis=-1))),
     )
     before = play._SHARPNESS
     for sharpness in (4.0, 80.0):
         play._SHARPNESS = sharpness
-        yield row(f"play operator, nominal wires mixed with a concentration of {sharpness:g}", guessed(data))
+        yield row(f"play operator, nominal wires mixed with a concentration of {sharpness:g}", guessed(episodes))
     play._SHARPNESS = before
 
 
@@ -108,20 +110,25 @@ def _lagging(data: Dataset) -> np.ndarray:
     return out
 
 
+def _sequences(data: Dataset) -> Sequences:
+    episodes = Episodes.of_dataset(data)
+    return Sequences.of(episodes, prepare_vessels(episodes), ("ff",), 0)
+
+
 def variant_rows(training: Dataset, held_out: Dataset) -> Iterator[str]:
     """Yield what short trainings reach, each without some of the inputs, another size or other data."""
     names = np.unique(training.anatomy)
     few = training.select(np.isin(training.anatomy, names[:PATIENTS]))
     fewer = training.select(np.isin(training.anatomy, names[: PATIENTS // 3]))
-    test = Sequences.of(held_out, read_vessels(held_out), ("ff",), 0)
-    made = Sequences.of(few, read_vessels(few), ("ff",), 0)
+    test = _sequences(held_out)
+    made = _sequences(few)
     for name, hidden in VARIANTS.items():
         yield row(f"network: {name}", _trained(made, test, hidden=hidden))
     yield row("network: half as wide", _trained(made, test, width=48))
     yield row("network: no mirror images, as many steps", _trained(made, test, forms=2))
     yield row("network: absolute error alone, no spread", _trained(made, test, Blunt))
     yield row("network: causal decoder of two layers in place of the GRU", _trained(made, test, Decoder))
-    made = Sequences.of(fewer, read_vessels(fewer), ("ff",), 0)
+    made = _sequences(fewer)
     yield row("network: a third of the patients, as many steps", _trained(made, test, longer=3))
 
 
@@ -131,7 +138,7 @@ def varied_rows(data: Dataset) -> Iterator[str]:
     truth = np.stack([test.tip_abscissa, test.tip_offset], axis=-1)[:, WINDOW:].astype(float)
     held = np.abs(hold_slack(test, WINDOW) - truth)
     yield row("varied wires: hold slack and offset", np.pad(held, ((0, 0), (WINDOW, 0), (0, 0))))
-    known, unknown = (Sequences.of(part, read_vessels(part), ("ff",), 0) for part in (training, test))
+    known, unknown = (_sequences(part) for part in (training, test))
     yield row("varied wires: network: all", _trained(known, unknown))
     for part, made in ((training, known), (test, unknown)):
         wire = np.stack([part.friction, part.tip_stiffness_factor], axis=-1)

@@ -15,6 +15,7 @@ import numpy as np
 
 from endopilot.dataset.loader import Dataset, load_dataset
 from endopilot.models.config import WINDOW, TwinConfig
+from endopilot.models.episodes import Episodes
 from endopilot.models.twin import TwinPredictor
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import Device
@@ -28,9 +29,9 @@ def believed(episodes: Dataset, index: int) -> TwinPredictor:
     """Return a twin whose friction and tip stiffness are so far from the truth as the index of a patient says."""
     device = Device.from_record(episodes.manifest["device"])
     friction, stiffness = np.random.Generator(np.random.Philox([SEED, index])).uniform(1 - OFF, 1 + OFF, 2)
-    told = replace(device, friction=device.friction / friction)
+    nominal = replace(device, friction=device.friction / friction)
     return TwinPredictor(
-        device=told.with_tip(bend_rad=told.tip_bend_rad, stiffness_factor=1 / stiffness),
+        device=nominal.with_tip(bend_rad=nominal.tip_bend_rad, stiffness_factor=1 / stiffness),
         simulator=SimulatorConfig(**episodes.manifest["config"]["simulator"]),
         config=TwinConfig(),
     )
@@ -41,12 +42,12 @@ def rows(episodes: Dataset, sequences: int, deeper_mm: float) -> Iterator[str]:
     along, off, found = [], [], []
     for index, name in enumerate(np.unique(episodes.anatomy)):
         one = episodes.select(np.flatnonzero(episodes.anatomy == name)[:sequences])
-        told = replace(one, initial_inserted_length=one.initial_inserted_length - deeper_mm)
+        given = Episodes.of_dataset(replace(one, initial_inserted_length=one.initial_inserted_length - deeper_mm))
         twin = believed(one, index)
-        seen = twin.foretell(told, np.arange(one.valid.shape[1]) < WINDOW)
-        along.append(np.abs(seen.tip[..., 0] - one.tip_abscissa))
-        off.append(np.abs(seen.tip[..., 1] - one.tip_offset))
-        found.append(np.abs(seen.parameters[:, 0] * twin.device.friction / one.friction - 1))
+        predicted = twin.predict(given, np.arange(one.valid.shape[1]) < WINDOW)
+        along.append(np.abs(predicted.tip[..., 0] - one.tip_abscissa))
+        off.append(np.abs(predicted.tip[..., 1] - one.tip_offset))
+        found.append(np.abs(predicted.parameters[:, 0] * twin.device.friction / one.friction - 1))
         print(f"{name}: {along[-1][:, WINDOW:].mean():.4f} mm, {off[-1][:, WINDOW:].mean():.4f} mm", file=sys.stderr)
     delta, gamma = np.concatenate(along), np.concatenate(off)
     count = f"{len(delta)} of {len(along)} patients"

@@ -18,10 +18,10 @@ from endopilot.control.desired import read_tips
 from endopilot.control.plan import plan, within_limits
 from endopilot.control.plan_config import PlanConfig
 from endopilot.control.plan_file import read_plan, write_plan
-from endopilot.dataset.loader import Dataset
 from endopilot.errors import InputError
 from endopilot.files import read_json, write_json
 from endopilot.models.config import WINDOW
+from endopilot.models.episodes import Episodes
 from endopilot.models.open_loop import Observed, OpenLoop
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import read_controls_csv
@@ -118,15 +118,15 @@ class Toy:
 
     asked: int = 0
 
-    def rollout_forward(self, episodes: Dataset) -> OpenLoop:
+    def rollout_forward(self, episodes: Episodes) -> OpenLoop:
         self.asked += len(episodes)
-        proximal = np.stack([episodes.inserted_length, episodes.rotation], axis=-1)[:, WINDOW:]
+        proximal = episodes.proximal[:, WINDOW:]
         tip = np.stack([SLACK * proximal[..., 0], np.full(proximal.shape[:2], 0.5)], axis=-1)
         return OpenLoop(tip=tip, proximal=proximal, control=episodes.control[:, WINDOW:])
 
-    def rollout_dual(self, episodes: Dataset, seen: Observed | None = None) -> OpenLoop:
-        wanted = episodes.tip_abscissa[:, WINDOW:] / SLACK
-        before = np.concatenate([episodes.inserted_length[:, WINDOW - 1 : WINDOW], wanted[:, :-1]], axis=1)
+    def rollout_dual(self, episodes: Episodes, observed: Observed | None = None) -> OpenLoop:
+        wanted = episodes.tip[:, WINDOW:, 0] / SLACK
+        before = np.concatenate([episodes.proximal[:, WINDOW - 1 : WINDOW, 0], wanted[:, :-1]], axis=1)
         control = np.stack([(wanted - before) / 0.5, np.zeros_like(wanted)], axis=-1)
         tip = np.stack([SLACK * wanted, np.full_like(wanted, 0.5)], axis=-1)
         return OpenLoop(tip=tip, proximal=np.zeros_like(tip), control=control)
@@ -150,7 +150,7 @@ def test_the_inverse_network_is_asked_for_the_desired_tips(vessel, run):
     assert made.proximal[-1, 0] == pytest.approx(made.desired[-1, 0] / SLACK, abs=1e-6)
 
 
-def test_sampling_brings_the_foretold_tip_nearer_to_the_desired_one(vessel, run):
+def test_sampling_brings_the_predicted_tip_nearer_to_the_desired_one(vessel, run):
     settings = {"method": "mppi", "seconds": 30.0}
     few = PlanConfig(**settings)
     few = replace(few, sample=replace(few.sample, iterations=1, candidates=1))

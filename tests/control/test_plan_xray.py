@@ -1,4 +1,4 @@
-"""X-ray that a plan will need: as the agent's simulated wires foretell it, and as a run does."""
+"""X-ray that a plan will need: as the agent's simulated wires predict it, and as a run does."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from endopilot.control.belief import Belief
 from endopilot.control.plan_config import PlanConfig
 from endopilot.control.plan_file import read_plan, write_plan
 from endopilot.control.plan_xray import PlannedXray, plan_xray, read_calibration
-from endopilot.dataset.loader import Dataset
+from endopilot.control.route import Route
 from endopilot.errors import InputError
 from endopilot.files import write_json
 from endopilot.models.config import WINDOW
+from endopilot.models.episodes import Episodes
 from endopilot.models.open_loop import OpenLoop, Prediction
 from endopilot.xray.bands import Calibration
 
@@ -32,28 +33,28 @@ def calibration(abscissa=STILL, offset=STILL) -> Calibration:
 class Lagging:
     """A network whose tip is at 0.8 Δ, in the middle of the lumen."""
 
-    def rollout_forward(self, episodes: Dataset) -> OpenLoop:
-        proximal = np.stack([episodes.inserted_length, episodes.rotation], axis=-1)[:, WINDOW:].astype(float)
+    def rollout_forward(self, episodes: Episodes) -> OpenLoop:
+        proximal = episodes.proximal[:, WINDOW:]
         tip = np.stack([0.8 * proximal[..., 0], np.full(proximal.shape[:2], 0.1)], axis=-1)
-        return OpenLoop(tip=tip, proximal=proximal, control=episodes.control[:, WINDOW:].astype(float))
+        return OpenLoop(tip=tip, proximal=proximal, control=episodes.control[:, WINDOW:])
 
     rollout_inverse = rollout_dual = rollout_forward
 
 
-class Doubting(Lagging):
-    """The same, whose spread grows by 0.3 mm a period since it last saw the tip."""
+class Unsure(Lagging):
+    """The same, whose spread grows by 0.3 mm a period since the tip was last observed."""
 
-    def foretell(self, episodes: Dataset, seen: np.ndarray) -> Prediction:
-        each = np.broadcast_to(seen, episodes.valid.shape)
+    def predict(self, episodes: Episodes, observed: np.ndarray) -> Prediction:
+        each = np.broadcast_to(observed, episodes.branch.shape)
         last = np.maximum.accumulate(np.where(each, np.arange(each.shape[1]), 0), axis=1)
         spread = 0.3 * (np.arange(each.shape[1]) - last)
-        tip = np.stack([0.8 * episodes.inserted_length, np.full(each.shape, 0.1)], axis=-1).astype(float)
+        tip = np.stack([0.8 * episodes.proximal[..., 0], np.full(each.shape, 0.1)], axis=-1)
         return Prediction(tip=tip, spread=np.stack([spread, 0.0 * spread], axis=-1))
 
 
 @pytest.fixture
 def by_network(found, tmp_path, monkeypatch):
-    """Return what makes a plan of 20 periods at 4 mm/s by a run that answers as it is told."""
+    """Return what makes a plan of 20 periods at 4 mm/s by a run that predicts as the given predictor does."""
 
     def made(predictor):
         monkeypatch.setattr("endopilot.models.rollout.load_model", lambda _: predictor)
@@ -79,34 +80,55 @@ def due(xray: PlannedXray) -> list[int]:
     return (1 + np.flatnonzero(xray.exposure)).tolist()
 
 
-def test_a_networks_band_grows_from_exposure_to_exposure(by_network, vessel):
+def test_a_networks_band_grows_from_exposure_to_exposure(by_network):
     # half-width 0.15 mm a mm of travel: 2 mm are reached after 14 mm, which are 7 periods of 2 mm
-    xray = plan_xray(by_network(Lagging()), vessel, calibration(abscissa=(0.0, 0.0, 0.15, 0.0)))
+    xray = plan_xray(by_network(Lagging()), calibration(abscissa=(0.0, 0.0, 0.15, 0.0)))
     assert due(xray) == [7, 14]
     travel = 2.0 * np.array([*range(1, 8), *range(1, 8), *range(1, 7)])
     np.testing.assert_allclose(xray.half_width[:, 0], 0.15 * travel, atol=1e-5)
 
 
-def test_a_networks_own_doubt_widens_its_band_until_it_sees_the_tip(by_network, vessel):
+def test_a_networks_own_spread_widens_its_band_until_the_tip_is_observed(by_network):
     # 0.3 mm a period: 2 mm are reached after 7 of them
-    xray = plan_xray(by_network(Doubting()), vessel, calibration(abscissa=(0.0, 0.0, 0.0, 1.0)))
+    xray = plan_xray(by_network(Unsure()), calibration(abscissa=(0.0, 0.0, 0.0, 1.0)))
     assert due(xray) == [7, 14]
     np.testing.assert_allclose(xray.half_width[:, 0], 0.3 * np.array([*range(1, 8), *range(1, 8), *range(1, 7)]))
 
 
-def test_a_networks_band_of_the_offset_reaches_the_wall(by_network, vessel):
+def test_a_networks_band_of_the_offset_reaches_the_wall(by_network):
     plan = by_network(Lagging())
     # clearance 1 − r_w mm: γ + 0.05 mm a period reaches 0.7 of it
     first = int(np.ceil((0.7 * (1.0 - plan.navigation.device.tip_radius_mm) - 0.1) / 0.05))
-    assert due(plan_xray(plan, vessel, calibration(offset=(0.0, 0.1, 0.0, 0.0))))[0] == first
+    assert due(plan_xray(plan, calibration(offset=(0.0, 0.1, 0.0, 0.0))))[0] == first
 
 
-def test_the_agents_wires_follow_the_plan_and_see_its_tip(found, vessel, monkeypatch):
-    seen, followed = [], []
+class Branched(Lagging):
+    """Keeps the branches that the tip was observed in."""
+
+    def __init__(self) -> None:
+        self.branches = []
+
+    def predict(self, episodes: Episodes, observed: np.ndarray) -> Prediction:
+        self.branches.append(episodes.branch[np.broadcast_to(observed, episodes.branch.shape)][WINDOW:].tolist())
+        tip = np.stack([0.8 * episodes.proximal[..., 0], np.full(episodes.branch.shape, 0.1)], axis=-1)
+        return Prediction(tip=tip, spread=np.zeros_like(tip))
+
+
+def test_a_network_observes_the_tip_in_the_branch_that_the_route_takes(by_network):
+    model = Branched()
+    plan = by_network(model)
+    xray = plan_xray(plan, calibration(abscissa=(0.0, 0.0, 0.15, 0.0)))
+    route = Route.to(plan.navigation.anatomy, plan.navigation.target)
+    beyond = plan.predicted[xray.exposure, 0] > route.junctions[0]
+    assert model.branches[-1] == np.where(beyond, *route.branches[::-1]).tolist() and len(set(model.branches[-1])) == 2
+
+
+def test_the_agents_wires_follow_the_plan_and_observe_its_tip(found, monkeypatch):
+    observed, followed = [], []
     weigh, follow = Belief.weigh, Belief.follow
 
     def watched_weigh(self, measured):
-        seen.append(measured.position)
+        observed.append(measured.position)
         weigh(self, measured)
 
     def watched_follow(self, inserted, rotation):
@@ -115,16 +137,16 @@ def test_the_agents_wires_follow_the_plan_and_see_its_tip(found, vessel, monkeyp
 
     monkeypatch.setattr(Belief, "weigh", watched_weigh)
     monkeypatch.setattr(Belief, "follow", watched_follow)
-    xray = plan_xray(found, vessel, calibration(abscissa=(5.0, 0.0, 0.0, 0.0)))  # wider than 2 mm from the start
+    xray = plan_xray(found, calibration(abscissa=(5.0, 0.0, 0.0, 0.0)))  # wider than 2 mm from the start
     assert due(xray) == list(range(3, 1 + len(found.control), 3))  # not sooner than 1.5 s after the last
-    np.testing.assert_array_equal(seen, found.position[xray.exposure])
+    np.testing.assert_array_equal(observed, found.position[xray.exposure])
     np.testing.assert_allclose(followed, found.proximal)
 
 
-def test_the_agents_own_calibration_asks_seldom_along_a_straight_vessel(found, vessel):
+def test_the_agents_own_calibration_asks_seldom_along_a_straight_vessel(found):
     own = read_calibration(found.config, None)
     assert own == AgentPolicy()._calibration
-    xray = plan_xray(found, vessel, own)
+    xray = plan_xray(found, own)
     assert (xray.half_width > 0).all()
     assert xray.exposure.sum() < len(found.control) / 3
 
@@ -134,7 +156,7 @@ def test_it_is_written_beside_the_plan(found, vessel, tmp_path):
 
     from endopilot.anatomy.io import read_anatomy
 
-    xray = plan_xray(found, vessel, calibration(abscissa=(5.0, 0.0, 0.0, 0.0)))
+    xray = plan_xray(found, calibration(abscissa=(5.0, 0.0, 0.0, 0.0)))
     figures = write_plan(found, tmp_path / "plan", xray)
     table = pd.read_csv(tmp_path / "plan" / "plan.csv")
     assert (

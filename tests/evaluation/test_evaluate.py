@@ -13,7 +13,8 @@ from endopilot.errors import InputError
 from endopilot.evaluation.evaluate import EvaluateConfig, evaluate
 from endopilot.evaluation.results import read_results
 from endopilot.files import read_json, write_json
-from toy_navigation import toy_simulate
+from endopilot.simulation.drive_limits import SPARE_MM
+from toy_navigation import LENGTH_MM, toy_simulate
 
 
 def test_metrics_are_on_disk_as_returned(evaluated):
@@ -121,7 +122,7 @@ def test_replayed_controls_are_simulated_from_the_start_of_the_episode(evaluated
     episode = data.select(np.flatnonzero((data.anatomy == name) & (data.sequence == sequence)))
     held = np.repeat(episode.control[:, 29:30], 90, axis=1)
     inserted = episode.inserted_length[:, 29, None] + 0.5 * np.cumsum(held[..., 0], axis=1)
-    inserted = np.minimum(np.maximum(inserted, 0.0), np.maximum(100.0, episode.inserted_length[:, 29]))
+    inserted = np.minimum(np.maximum(inserted, 0.0), LENGTH_MM + SPARE_MM)
     slack = inserted - result.tips["hold_control"].abscissa[:1]
     curliness = 0.02 + 0.005 * (len(name) % 3)
     assert (slack >= curliness * inserted - 1e-3).all()

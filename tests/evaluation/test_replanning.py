@@ -1,4 +1,4 @@
-"""P4 with replanning: what each new plan is told, and that X-ray images help."""
+"""P4 with replanning: what each new plan is given, and that X-ray images help."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from endopilot.dataset.loader import Dataset, load_dataset
+from endopilot.dataset.loader import load_dataset
 from endopilot.evaluation.replanning import EXPOSURE_PERIOD_S, exposures, replanned
 from endopilot.evaluation.replay import Recorded, replay
+from endopilot.models.episodes import Episodes
 from endopilot.models.open_loop import OpenLoop, begin_after, given_states
 from toy_navigation import toy_simulate
 
@@ -19,15 +20,15 @@ GIVEN = 30
 
 @dataclass
 class HoldSlack:
-    """Drives as if the slack stayed as it was last seen, and foretells that the tip goes as desired, 1 mm aside."""
+    """Drives as if the slack stayed as last observed, and predicts that the tip goes as desired, 1 mm aside."""
 
-    told: list[tuple[Dataset, np.ndarray]] = field(default_factory=list)
+    given: list[tuple[Episodes, np.ndarray]] = field(default_factory=list)
 
-    def rollout_dual(self, episodes: Dataset, seen: np.ndarray | None = None) -> OpenLoop:
-        seen = given_states(episodes) if seen is None else seen
-        self.told.append((episodes, seen))
-        begin = begin_after(seen)
-        desired = episodes.tip_abscissa.astype(float)
+    def rollout_dual(self, episodes: Episodes, observed: np.ndarray | None = None) -> OpenLoop:
+        observed = given_states(episodes) if observed is None else observed
+        self.given.append((episodes, observed))
+        begin = begin_after(observed)
+        desired = episodes.tip[..., 0].astype(float)
         control = np.zeros((len(episodes), desired.shape[1] - begin, 2))
         control[..., 0] = np.diff(desired, axis=1)[:, begin - 1 :] / 0.5
         tip = np.stack([desired[:, begin:], np.ones(control.shape[:2])], axis=-1)
@@ -42,37 +43,43 @@ def recorded(toy_dataset) -> Recorded:
 
 
 def planned(recorded, predictor):
-    first = predictor.rollout_dual(recorded.data)
-    control = replanned(predictor, recorded, first, lambda *_: None)
+    episodes = Episodes.of_dataset(recorded.data)
+    first = predictor.rollout_dual(episodes)
+    control = replanned(predictor, recorded, episodes, first, lambda *_: None)
     return first, control
 
 
-def test_each_plan_is_told_of_the_drive_and_of_what_was_exposed_and_of_nothing_else(recorded) -> None:
+def test_each_plan_is_given_the_drive_and_what_was_exposed_and_nothing_else(recorded) -> None:
     predictor, data = HoldSlack(), recorded.data
     with patch("endopilot.evaluation.replay.simulate", toy_simulate):
         _, control = planned(recorded, predictor)
         done = replay(recorded, {"P4": recorded.drivable(control)}, lambda *_: None)["P4"]
-    assert [begin_after(seen) - 1 for _, seen in predictor.told] == [29, *exposures(data)] == [29, 49, 69, 89, 109]
-    for episodes, seen in predictor.told[1:]:
-        now = begin_after(seen) - 1
+    assert (
+        [begin_after(observed) - 1 for _, observed in predictor.given]
+        == [29, *exposures(data)]
+        == [29, 49, 69, 89, 109]
+    )
+    desired = Episodes.of_dataset(data)
+    for episodes, observed in predictor.given[1:]:
+        now = begin_after(observed) - 1
         exposed = [sample for sample in exposures(data) if sample <= now]
-        assert np.flatnonzero(seen).tolist() == [*range(GIVEN), *exposed]
-        # where it was exposed, the tip as it went; in between, as it was foretold; later, as it is desired
+        assert np.flatnonzero(observed).tolist() == [*range(GIVEN), *exposed]
+        # where it was exposed, the tip as it went; in between, as it was predicted; later, as it is desired
         at = np.array(exposed)
-        np.testing.assert_allclose(episodes.tip_abscissa[:, at], done.tip.abscissa[:, at - GIVEN], atol=1e-4)
-        np.testing.assert_allclose(episodes.tip_offset[:, at], done.tip.offset[:, at - GIVEN], atol=1e-4)
+        np.testing.assert_allclose(episodes.tip[:, at, 0], done.tip.abscissa[:, at - GIVEN], atol=1e-4)
+        np.testing.assert_allclose(episodes.tip[:, at, 1], done.tip.offset[:, at - GIVEN], atol=1e-4)
         between = np.setdiff1d(np.arange(GIVEN, now), at)
-        assert (episodes.tip_offset[:, between] == 1.0).all()
-        for name in ("tip_abscissa", "tip_offset", "branch", "inserted_length"):
-            np.testing.assert_array_equal(getattr(episodes, name)[:, now + 1 :], getattr(data, name)[:, now + 1 :])
+        assert (episodes.tip[:, between, 1] == 1.0).all()
+        for name in ("tip", "branch", "proximal"):
+            np.testing.assert_array_equal(getattr(episodes, name)[:, now + 1 :], getattr(desired, name)[:, now + 1 :])
         # the drive's motion, as it was made
         driven = recorded.drivable(control)[:, : now + 1 - GIVEN]
         np.testing.assert_allclose(episodes.control[:, GIVEN : now + 1], driven, atol=1e-4)
         inserted = data.inserted_length[:, 29, None] + 0.5 * np.cumsum(driven[..., 0], axis=1)
-        np.testing.assert_allclose(episodes.inserted_length[:, GIVEN : now + 1], inserted, atol=1e-3)
+        np.testing.assert_allclose(episodes.proximal[:, GIVEN : now + 1, 0], inserted, atol=1e-3)
 
 
-def test_x_ray_brings_the_tip_back_to_its_way(recorded) -> None:
+def test_x_ray_brings_the_tip_back_to_its_desired_path(recorded) -> None:
     predictor, data = HoldSlack(), recorded.data
     with patch("endopilot.evaluation.replay.simulate", toy_simulate):
         first, control = planned(recorded, predictor)

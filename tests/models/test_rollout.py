@@ -11,6 +11,7 @@ import torch
 from endopilot.dataset.loader import load_dataset
 from endopilot.errors import InputError
 from endopilot.models.config import TrainConfig, TransformerConfig
+from endopilot.models.episodes import Episodes
 from endopilot.models.rollout import TransformerPredictor, load_model
 from endopilot.models.train import train
 from endopilot.models.transformer import ForwardNetwork, InverseNetwork
@@ -33,7 +34,7 @@ def learnt(toy_dataset, tmp_path_factory):
 @pytest.fixture(scope="module")
 def unseen(toy_dataset):
     """Return navigations of patients that were not trained on."""
-    return load_dataset(toy_dataset).of_split("test").select(np.arange(16))
+    return Episodes.of_dataset(load_dataset(toy_dataset).of_split("test").select(np.arange(16)))
 
 
 def untrained(limits=(1e9, 1e9)) -> TransformerPredictor:
@@ -46,8 +47,12 @@ def untrained(limits=(1e9, 1e9)) -> TransformerPredictor:
     )
 
 
-def true_tip(data):
-    return np.stack([data.tip_abscissa, data.tip_offset], axis=-1)[:, GIVEN:].astype(float)
+def changed(episodes, value, samples, *names):
+    """Return the episodes with another value in some samples of the named fields."""
+    copies = {name: getattr(episodes, name).copy() for name in names}
+    for copy in copies.values():
+        copy[:, samples] = value
+    return replace(episodes, **copies)
 
 
 def test_shapes(unseen):
@@ -58,20 +63,15 @@ def test_shapes(unseen):
         assert all(np.isfinite(signal).all() for signal in (result.tip, result.proximal, result.control))
 
 
-def test_forward_sees_no_tip_after_the_given_ones(unseen):
-    blind = replace(unseen, tip_abscissa=unseen.tip_abscissa.copy(), tip_offset=unseen.tip_offset.copy())
-    blind.tip_abscissa[:, GIVEN:] = np.nan
-    blind.tip_offset[:, GIVEN:] = np.nan
+def test_forward_reads_no_tip_after_the_given_ones(unseen):
+    blind = changed(unseen, np.nan, slice(GIVEN, None), "tip")
     predictor = untrained()
     np.testing.assert_array_equal(predictor.rollout_forward(unseen).tip, predictor.rollout_forward(blind).tip)
 
 
 @pytest.mark.parametrize("k", [30, 31, 77, 118])
 def test_predictions_do_not_depend_on_later_controls(unseen, k):
-    control, length, rotation = unseen.control.copy(), unseen.inserted_length.copy(), unseen.rotation.copy()
-    for later in (control, length, rotation):
-        later[:, k + 1 :] = np.nan
-    cut = replace(unseen, control=control, inserted_length=length, rotation=rotation)
+    cut = changed(unseen, np.nan, slice(k + 1, None), "control", "proximal")
     predictor = untrained()
     whole, partial = predictor.rollout_forward(unseen).tip, predictor.rollout_forward(cut).tip
     np.testing.assert_array_equal(whole[:, : k + 1 - GIVEN], partial[:, : k + 1 - GIVEN])
@@ -79,20 +79,15 @@ def test_predictions_do_not_depend_on_later_controls(unseen, k):
 
 
 @pytest.mark.parametrize("protocol", ["rollout_inverse", "rollout_dual"])
-def test_inverse_sees_no_motion_after_the_given_ones(unseen, protocol):
-    control, length, rotation = unseen.control.copy(), unseen.inserted_length.copy(), unseen.rotation.copy()
-    for later in (control, length, rotation):
-        later[:, GIVEN:] = np.nan
-    blind = replace(unseen, control=control, inserted_length=length, rotation=rotation)
+def test_inverse_reads_no_motion_after_the_given_ones(unseen, protocol):
+    blind = changed(unseen, np.nan, slice(GIVEN, None), "control", "proximal")
     rollout = getattr(untrained(), protocol)
     np.testing.assert_array_equal(rollout(unseen).control, rollout(blind).control)
 
 
 @pytest.mark.parametrize("k", [30, 60, 118])
-def test_inverse_does_not_see_beyond_the_desired_tip(unseen, k):
-    cut = replace(unseen, tip_abscissa=unseen.tip_abscissa.copy(), tip_offset=unseen.tip_offset.copy())
-    cut.tip_abscissa[:, k + 1 :] = np.nan
-    cut.tip_offset[:, k + 1 :] = np.nan
+def test_inverse_reads_no_later_desired_tip(unseen, k):
+    cut = changed(unseen, np.nan, slice(k + 1, None), "tip")
     predictor = untrained()
     whole, partial = predictor.rollout_inverse(unseen).control, predictor.rollout_inverse(cut).control
     np.testing.assert_array_equal(whole[:, : k + 1 - GIVEN], partial[:, : k + 1 - GIVEN])
@@ -101,11 +96,11 @@ def test_inverse_does_not_see_beyond_the_desired_tip(unseen, k):
 @pytest.mark.parametrize("protocol", ["rollout_inverse", "rollout_dual"])
 def test_motion_is_the_exact_integral_of_the_control(unseen, protocol):
     result = getattr(untrained(), protocol)(unseen)
-    start = np.stack([unseen.inserted_length, unseen.rotation], axis=-1)[:, GIVEN - 1 : GIVEN].astype(float)
+    start = unseen.proximal[:, GIVEN - 1 : GIVEN].astype(float)
     np.testing.assert_allclose(result.proximal, start + 0.5 * np.cumsum(result.control, axis=1), atol=1e-10)
 
 
-def test_dual_feeds_the_foretold_tip_back(unseen):
+def test_dual_feeds_the_predicted_tip_back(unseen):
     predictor = untrained()
     dual, inverse = predictor.rollout_dual(unseen), predictor.rollout_inverse(unseen)
     np.testing.assert_array_equal(dual.control[:, 0], inverse.control[:, 0])
@@ -113,40 +108,36 @@ def test_dual_feeds_the_foretold_tip_back(unseen):
     along = replace(
         unseen,
         control=np.concatenate([unseen.control[:, :GIVEN], dual.control], axis=1),
-        inserted_length=np.concatenate([unseen.inserted_length[:, :GIVEN], dual.proximal[..., 0]], axis=1),
-        rotation=np.concatenate([unseen.rotation[:, :GIVEN], dual.proximal[..., 1]], axis=1),
+        proximal=np.concatenate([unseen.proximal[:, :GIVEN], dual.proximal], axis=1),
     )
     np.testing.assert_allclose(predictor.rollout_forward(along).tip, dual.tip, atol=1e-3)
 
 
-def test_a_plan_under_way_sees_the_last_thirty_states(unseen):
+def test_a_plan_under_way_takes_the_last_thirty_states(unseen):
     predictor, now = untrained(), 69
-    seen = np.arange(120) < GIVEN
-    seen[now] = True
-    plan = predictor.rollout_dual(unseen, seen)
+    observed = np.arange(120) < GIVEN
+    observed[now] = True
+    plan = predictor.rollout_dual(unseen, observed)
     assert plan.control.shape == (len(unseen), 120 - now - 1, 2)
-    start = np.stack([unseen.inserted_length, unseen.rotation], axis=-1)[:, now].astype(float)
+    start = unseen.proximal[:, now].astype(float)
     np.testing.assert_allclose(plan.proximal[:, 0], start + 0.5 * plan.control[:, 0], atol=1e-9)
 
-    def planned(**changed):
-        return predictor.rollout_dual(replace(unseen, **changed), seen).control
+    def planned(episodes):
+        return predictor.rollout_dual(episodes, observed).control
 
-    tip = unseen.tip_abscissa.copy()
-    tip[:, : now - 29] = np.nan  # before the window
-    np.testing.assert_array_equal(planned(tip_abscissa=tip), plan.control)
-    tip = unseen.tip_abscissa.copy()
-    tip[:, now] += 1.0
-    assert np.abs(planned(tip_abscissa=tip) - plan.control).max() > 1e-3
-    motion = unseen.control.copy()
-    motion[:, now + 1 :] = np.nan
-    np.testing.assert_array_equal(planned(control=motion), plan.control)
+    before_the_window = changed(unseen, np.nan, slice(0, now - 29), "tip")
+    np.testing.assert_array_equal(planned(before_the_window), plan.control)
+    elsewhere = changed(unseen, unseen.tip[:, now] + 1.0, now, "tip")
+    assert np.abs(planned(elsewhere) - plan.control).max() > 1e-3
+    np.testing.assert_array_equal(planned(changed(unseen, np.nan, slice(now + 1, None), "control")), plan.control)
 
 
 def test_controls_stay_within_the_device_s_limits_and_in_the_catheter(unseen):
     result = untrained((0.7, 0.2)).rollout_inverse(unseen)
     assert np.abs(result.control[..., 0]).max() == pytest.approx(0.7)
     assert np.abs(result.control[..., 1]).max() == pytest.approx(0.2)
-    away = replace(unseen, tip_abscissa=unseen.tip_abscissa - np.float32(3.0) * np.arange(120, dtype=np.float32))
+    outward = np.stack([3.0 * np.arange(120), np.zeros(120)], axis=-1).astype(np.float32)
+    away = replace(unseen, tip=unseen.tip - outward)
     result = untrained().rollout_inverse(away)
     assert result.proximal[..., 0].min() > -1e-4
     assert (result.proximal[..., 0] < 1e-3).any()
@@ -164,9 +155,9 @@ def test_a_missing_network_is_named(unseen):
 
 
 def test_forward_beats_holding_the_slack_on_unseen_patients(learnt, unseen):
-    slack = unseen.inserted_length - unseen.tip_abscissa
-    held = unseen.inserted_length[:, GIVEN:] - slack[:, GIVEN - 1 : GIVEN]
-    truth = true_tip(unseen)
+    length, truth = unseen.proximal[..., 0], unseen.tip[:, GIVEN:].astype(float)
+    slack = length - unseen.tip[..., 0]
+    held = length[:, GIVEN:] - slack[:, GIVEN - 1 : GIVEN]
     error = np.abs(learnt.rollout_forward(unseen).tip - truth)
     assert error[..., 0].mean() < 0.7 * np.abs(held - truth[..., 0]).mean()
 

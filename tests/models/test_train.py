@@ -18,11 +18,12 @@ from endopilot.errors import InputError
 from endopilot.files import read_json, sha256
 from endopilot.models.checkpoint import read_network, read_tensors
 from endopilot.models.config import TrainConfig, TransformerConfig
+from endopilot.models.episodes import Episodes
 from endopilot.models.learning_curves import board
 from endopilot.models.rollout import load_model
 from endopilot.models.train import train
 from endopilot.models.transformer import NETWORKS
-from endopilot.models.windows import Episodes
+from endopilot.models.windows import Windows
 from toy_navigation import make_toy_dataset
 
 SMALL = TransformerConfig(d_model=24, heads=2, encoder_layers=1, decoder_layers=1, feedforward=32)
@@ -40,7 +41,9 @@ def short_run(toy_dataset, tmp_path_factory):
 @pytest.mark.parametrize("name", ["ff", "if"])
 def test_windows_hold_what_the_paper_says(toy_dataset, name):
     data = load_dataset(toy_dataset).of_split("train")
-    tip, proximal, control, truth = Episodes.of(data).window(name, torch.tensor([[2, 30], [5, 119]]))
+    tip, proximal, control, truth = Windows.of(Episodes.of_dataset(data)).window(
+        name, torch.tensor([[2, 30], [5, 119]])
+    )
     first = slice(0, 30) if name == "ff" else slice(1, 31)
     np.testing.assert_array_equal(tip[0, :, 0], data.tip_abscissa[2, first])
     first = slice(1, 31) if name == "ff" else slice(0, 30)
@@ -52,8 +55,8 @@ def test_windows_hold_what_the_paper_says(toy_dataset, name):
 
 @pytest.mark.parametrize("name", ["ff", "if"])
 def test_overfits_one_batch(toy_dataset, name):
-    episodes = Episodes.of(load_dataset(toy_dataset).of_split("train"))
-    *window, truth = episodes.window(name, episodes.targets()[:: len(episodes.targets()) // 16][:16])
+    windows = Windows.of(Episodes.of_dataset(load_dataset(toy_dataset).of_split("train")))
+    *window, truth = windows.window(name, windows.targets()[:: len(windows.targets()) // 16][:16])
     torch.manual_seed(0)
     network = NETWORKS[name](replace(SMALL, dropout=0.0))
     network.fit_scales(*window, truth)
@@ -173,7 +176,7 @@ def test_a_folder_of_other_things_is_refused(toy_dataset, tmp_path):
 
 def test_the_first_bad_loss_stops_and_the_last_good_checkpoint_stays(toy_dataset, tmp_path, monkeypatch):
     config = TrainConfig(**SHORT, network="ff")
-    real = Episodes.window
+    real = Windows.window
     drawn = []
 
     def window(self, name, target):
@@ -183,7 +186,7 @@ def test_the_first_bad_loss_stops_and_the_last_good_checkpoint_stays(toy_dataset
             truth = truth * torch.nan
         return (*given, truth)
 
-    monkeypatch.setattr(Episodes, "window", window)
+    monkeypatch.setattr(Windows, "window", window)
     with pytest.raises(InputError, match=r"loss of ff became nan in epoch 2, batch 2 .* checkpoint of epoch 1 is kept"):
         train(toy_dataset, tmp_path / "run", config)
     monkeypatch.undo()

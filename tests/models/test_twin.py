@@ -1,4 +1,4 @@
-"""The twin: what it finds out from the given tips, and how well it then predicts and follows."""
+"""The twin: which parameters it identifies from the given tips, and how well it then predicts and tracks."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from endopilot.dataset.loader import load_dataset
 from endopilot.errors import InputError
 from endopilot.models import twin as twin_module
 from endopilot.models.config import TrainConfig, TwinConfig
+from endopilot.models.episodes import Episodes
 from endopilot.models.rollout import load_model
 from endopilot.models.train import train
 from endopilot.simulation.device import read_device
@@ -25,7 +26,7 @@ OSTIUM_MM = 0.3
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Return the folder of a twin's run, whose wires grip 14 to 20 % more than the device is said to."""
+    """Return the folder of a twin's run, whose wires have 14 to 20 % more friction than the nominal device."""
     folder = tmp_path_factory.mktemp("twin")
     anatomy = make_patient(AtlasConfig(seed=77), 0)
     write_anatomy(anatomy, folder / "anatomy")
@@ -37,56 +38,53 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def episodes(folder):
-    """Return navigations whose ostium is believed to lie 0.3 mm less deep than it does."""
-    told = load_dataset(folder / "dataset")
-    return replace(
-        told,
-        initial_inserted_length=told.initial_inserted_length - OSTIUM_MM,
-        inserted_length=told.inserted_length - OSTIUM_MM,
-    )
+    """Return navigations whose ostium lies 0.3 mm deeper than the predictor is given it."""
+    true = Episodes.of_dataset(load_dataset(folder / "dataset"))
+    error = np.array([OSTIUM_MM, 0.0], dtype=true.proximal.dtype)
+    return replace(true, initial=true.initial - error, proximal=true.proximal - error)
 
 
-def test_identified_from_the_given_tips_it_foretells_the_others(folder, episodes) -> None:
+def test_identified_from_the_given_tips_it_predicts_the_others(folder, episodes) -> None:
     twin = load_model(folder / "run")
-    told = twin.foretell(episodes, GIVEN)
+    found = twin.predict(episodes, GIVEN)
     later = slice(30, None)
-    miss = np.abs(told.tip[:, later, 0] - episodes.tip_abscissa[:, later])
+    error = np.abs(found.tip - episodes.tip)[:, later]
     anatomy = make_patient(AtlasConfig(seed=77), 0)
     control = episodes.control.astype(float)
     drawn_out = -0.5 * np.cumsum(control[..., 0], axis=1).min(axis=1)
-    start = np.column_stack([np.maximum(episodes.initial_inserted_length, drawn_out), episodes.initial_rotation])
-    believed = simulate(anatomy, twin.device, control, initial=start).tip.abscissa[:, later]
-    believed_miss = np.abs(believed - episodes.tip_abscissa[:, later])
-    # of the middle navigation: where a snap falls on the other side of its edge, one of four is off by a millimetre
-    assert np.median(miss.mean(axis=1)) < 0.1  # mm
-    assert np.median(miss.mean(axis=1)) < 0.35 * np.median(believed_miss.mean(axis=1))
-    assert np.abs(told.tip[:, later, 1] - episodes.tip_offset[:, later]).mean() < 0.03
-    assert np.median(np.abs(told.parameters[:, 2] - OSTIUM_MM)) < 0.1
-    # what is not seen is not looked at
-    blind = replace(episodes, tip_abscissa=episodes.tip_abscissa.copy(), tip_offset=episodes.tip_offset.copy())
-    blind.tip_abscissa[:, later] = blind.tip_offset[:, later] = np.nan
-    np.testing.assert_array_equal(twin.foretell(blind, GIVEN).tip, told.tip)
+    start = np.column_stack([np.maximum(episodes.initial[:, 0], drawn_out), episodes.initial[:, 1]])
+    nominal = simulate(anatomy, twin.device, control, initial=start).tip.abscissa[:, later]
+    nominal_error = np.abs(nominal - episodes.tip[:, later, 0])
+    # of the middle navigation: where a snap falls on the other side of its edge, one of four errs by a millimetre
+    assert np.median(error[..., 0].mean(axis=1)) < 0.1  # mm
+    assert np.median(error[..., 0].mean(axis=1)) < 0.35 * np.median(nominal_error.mean(axis=1))
+    assert error[..., 1].mean() < 0.03
+    assert np.median(np.abs(found.parameters[:, 2] - OSTIUM_MM)) < 0.1
+    # a tip that is not observed is not read
+    blind = replace(episodes, tip=episodes.tip.copy())
+    blind.tip[:, later] = np.nan
+    np.testing.assert_array_equal(twin.predict(blind, GIVEN).tip, found.tip)
 
 
-def test_wires_that_agree_on_what_is_wrong_are_not_sure_of_it(folder, episodes) -> None:
+def test_members_that_err_alike_have_a_wide_spread(folder, episodes) -> None:
     few, twin = episodes.select(np.array([0, 1])), load_model(folder / "run")
-    own = twin.foretell(few, GIVEN).spread
-    elsewhere, once = few.tip_abscissa.copy(), few.tip_abscissa.copy()
-    elsewhere[0] += 30.0  # whatever friction, stiffness and ostium
-    once[0, 29] += 30.0  # a measurement that went wrong
-    doubtful = twin.foretell(replace(few, tip_abscissa=elsewhere), GIVEN).spread
+    own = twin.predict(few, GIVEN).spread
+    elsewhere, once = few.tip.copy(), few.tip.copy()
+    elsewhere[0, :, 0] += 30.0  # whatever friction, stiffness and ostium
+    once[0, 29, 0] += 30.0  # a measurement that went wrong
+    doubtful = twin.predict(replace(few, tip=elsewhere), GIVEN).spread
     assert (doubtful[0, 30:, 0] > 20.0).all()
     np.testing.assert_array_equal(doubtful[1], own[1])
-    assert twin.foretell(replace(few, tip_abscissa=once), GIVEN).spread[0, 30:].max() < 5.0
+    assert twin.predict(replace(few, tip=once), GIVEN).spread[0, 30:].max() < 5.0
 
 
 def test_it_finds_controls_that_lead_the_tip_along(folder, episodes) -> None:
     twin = load_model(folder / "run")
     found = twin.rollout_dual(episodes)
     later = slice(30, None)
-    assert np.abs(found.tip[..., 0] - episodes.tip_abscissa[:, later]).mean() < 0.4  # mm
+    assert np.abs(found.tip - episodes.tip[:, later])[..., 0].mean() < 0.4  # mm
     # the controls are what the drive does: their integral is its state
-    given = np.stack([episodes.inserted_length, episodes.rotation], axis=-1)[:, 29:30].astype(float)
+    given = episodes.proximal[:, 29:30].astype(float)
     np.testing.assert_allclose(given + 0.5 * np.cumsum(found.control, axis=1), found.proximal, atol=1e-9)
     assert (np.abs(found.control) <= [twin.device.max_velocity_mm_s, twin.device.max_rotation_rad_s]).all()
     # and not those that were recorded
@@ -95,11 +93,11 @@ def test_it_finds_controls_that_lead_the_tip_along(folder, episodes) -> None:
 
 def test_under_way_it_drives_on_from_what_was_driven(folder, episodes) -> None:
     few, now = episodes.select(np.array([0, 1])), 37
-    seen = GIVEN.copy()
-    seen[now] = True
-    found = load_model(folder / "run").rollout_dual(few, seen)
-    assert np.abs(found.tip[..., 0] - few.tip_abscissa[:, now + 1 :]).mean() < 0.4  # mm
-    start = np.stack([few.inserted_length, few.rotation], axis=-1)[:, now].astype(float)
+    observed = GIVEN.copy()
+    observed[now] = True
+    found = load_model(folder / "run").rollout_dual(few, observed)
+    assert np.abs(found.tip - few.tip[:, now + 1 :])[..., 0].mean() < 0.4  # mm
+    start = few.proximal[:, now].astype(float)
     np.testing.assert_allclose(found.proximal[:, 0], start + 0.5 * found.control[:, 0], atol=1e-9)
 
 

@@ -19,7 +19,7 @@ from endopilot.models.twin import TwinPredictor
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import read_device
 from endopilot.xray import advise as advise_module
-from endopilot.xray import monitoring as advice
+from endopilot.xray import monitoring
 from endopilot.xray.advise import advise
 from endopilot.xray.adviser import AdviserConfig
 from endopilot.xray.bands import Calibration
@@ -31,18 +31,18 @@ EVENTS = AdviserConfig(wall_ratio=0.7, abscissa_mm=0.8)
 
 
 class HoldSlack:
-    """Foretells that slack and offset stay as they were last given."""
+    """Predicts that slack and offset stay as they were last given."""
 
     def rollout_forward(self, episodes) -> OpenLoop:
-        length = episodes.inserted_length.astype(float)
-        slack = (length - episodes.tip_abscissa)[:, WINDOW - 1 : WINDOW]
-        offset = np.broadcast_to(episodes.tip_offset[:, WINDOW - 1 : WINDOW], length[:, WINDOW:].shape)
+        length = episodes.proximal[..., 0].astype(float)
+        slack = (length - episodes.tip[..., 0])[:, WINDOW - 1 : WINDOW]
+        offset = np.broadcast_to(episodes.tip[:, WINDOW - 1 : WINDOW, 1], length[:, WINDOW:].shape)
         tip = np.stack([length[:, WINDOW:] - slack, offset.astype(float)], axis=-1)
         return OpenLoop(tip=tip, proximal=tip, control=tip)
 
     rollout_inverse = rollout_forward
 
-    def rollout_dual(self, episodes, seen=None) -> OpenLoop:
+    def rollout_dual(self, episodes, observed=None) -> OpenLoop:
         return self.rollout_forward(episodes)
 
 
@@ -64,90 +64,89 @@ def hold_slack(monkeypatch) -> None:
 
 
 @pytest.fixture(scope="module")
-def watched(folder) -> advice.Monitored:
-    return advice.watch(HoldSlack(), load_dataset(folder / "dataset").of_split("calibrate"), AdviseConfig())
+def split(folder) -> monitoring.Monitored:
+    return monitoring.monitor(HoldSlack(), load_dataset(folder / "dataset").of_split("calibrate"), AdviseConfig())
 
 
-def test_what_is_told_is_measured(watched) -> None:
-    off = watched.told.tip_abscissa - watched.truth[..., 0]
-    assert 0.1 < off.std() < 0.8
-    deeper = watched.told.inserted_length - np.round(watched.told.initial_inserted_length[:, None], 9)
-    assert np.isfinite(deeper).all()
-    truth = load_dataset(watched.told.folder).of_split("calibrate")
-    ostium = truth.inserted_length - watched.told.inserted_length
+def test_tips_are_given_as_x_ray_measures_them_and_lengths_as_the_encoder_does(split, folder) -> None:
+    error = split.episodes.tip[..., 0] - split.truth[..., 0]
+    assert 0.1 < error.std() < 0.8
+    truth = load_dataset(folder / "dataset").of_split("calibrate")
+    ostium = truth.inserted_length - split.episodes.proximal[..., 0]
     assert np.ptp(ostium, axis=1).max() < 1e-4 and 0.1 < np.abs(ostium).max() <= 0.3
+    np.testing.assert_allclose(truth.initial_inserted_length - split.episodes.initial[:, 0], ostium[:, 0], atol=1e-4)
+    np.testing.assert_array_equal(split.episodes.proximal[..., 1], truth.rotation)
 
 
-def test_imaging_often_enough_misses_nothing_and_none_misses_all(watched) -> None:
-    often = advice.run(watched, advice.periodic(watched, 3), EVENTS)
-    never = advice.run(watched, lambda sample, tip, spread: np.zeros(len(tip), dtype=bool), EVENTS)
-    knowing = advice.run(watched, advice.oracle(watched, EVENTS), EVENTS)
+def test_imaging_often_enough_misses_nothing_and_none_misses_all(split) -> None:
+    often = monitoring.measure_policy(split, monitoring.periodic_policy(split, 3), EVENTS)
+    never = monitoring.measure_policy(split, lambda sample, tip, spread: np.zeros(len(tip), dtype=bool), EVENTS)
+    knowing = monitoring.measure_policy(split, monitoring.oracle_policy(split, EVENTS), EVENTS)
     assert often["missed_share"] == 0.0 and often["exposures_per_minute"] == pytest.approx(40.0, rel=0.02)
-    assert 0.7 < never["missed_share"] < 1.0  # what begins at the first sample was seen by the X-ray before
+    assert 0.7 < never["missed_share"] < 1.0  # X-ray was on until the first sample
     assert never["exposures_per_minute"] == 0.0
     assert never["events_per_minute"] > 1.0 and never["fewer_frames_than_fluoroscopy"] == 1.0
     assert knowing["missed_share"] == 0.0
     assert knowing["exposures_per_minute"] <= knowing["events_per_minute"]  # one exposure may show two events
 
 
-def test_what_is_shown_changes_what_is_foretold_later_and_nothing_before(watched) -> None:
-    model = OnlineWindowed(HoldSlack(), watched.told)
+def test_an_observation_changes_later_predictions_and_nothing_before(split) -> None:
+    model = OnlineWindowed(HoldSlack(), split.episodes)
     before = model.tip.copy()
-    model.show(np.array([1]), 34, np.array([[20.0, 0.4]]))
+    model.observe(np.array([1]), 34, np.array([[20.0, 0.4]]), np.array([0]))
     np.testing.assert_array_equal(model.tip[:, :35], before[:, :35])
     np.testing.assert_array_equal(model.tip[[0, 2]], before[[0, 2]])
-    length = watched.told.inserted_length[1]
+    length = split.episodes.proximal[1, :, 0]
     np.testing.assert_allclose(model.tip[1, 35:, 0], length[35:] - (length[34] - 20.0), rtol=1e-5)
     np.testing.assert_allclose(model.tip[1, 35:, 1], 0.4, rtol=1e-5)
-    model.restart()
+    model.reset()
     np.testing.assert_array_equal(model.tip, before)
 
 
-class Doubtful(HoldSlack):
-    """Holds the slack of the last tip that was seen, and doubts it by 0.1 mm for each sample since."""
+class Unsure(HoldSlack):
+    """Holds the slack of the last observed tip; its spread is 0.1 mm for each sample since."""
 
-    def foretell(self, episodes, seen) -> Prediction:
-        each = np.broadcast_to(seen, episodes.valid.shape)
+    def predict(self, episodes, observed) -> Prediction:
+        each = np.broadcast_to(observed, episodes.branch.shape)
         here = np.arange(each.shape[1])
         last = np.maximum.accumulate(np.where(each, here, 0), axis=1)
         row = np.arange(len(episodes))[:, None]
-        abscissa = episodes.inserted_length - (episodes.inserted_length - episodes.tip_abscissa)[row, last]
-        tip = np.stack([abscissa, episodes.tip_offset[row, last]], axis=-1).astype(float)
+        length = episodes.proximal[..., 0]
+        abscissa = length - (length - episodes.tip[..., 0])[row, last]
+        tip = np.stack([abscissa, episodes.tip[row, last, 1]], axis=-1).astype(float)
         return Prediction(tip, np.repeat(0.1 * (here - last)[..., None], 2, axis=-1))
 
 
-def test_a_model_that_says_how_sure_it_is_is_asked_so(watched) -> None:
-    model = online_predictor(Doubtful(), watched.told)
+def test_a_probabilistic_model_keeps_its_own_spread(split) -> None:
+    model = online_predictor(Unsure(), split.episodes)
     before = model.tip.copy(), model.spread.copy()
     np.testing.assert_allclose(model.spread[:, WINDOW:, 0], np.tile(0.1 * np.arange(1, 21), (len(before[0]), 1)))
-    model.show(np.array([1]), 34, np.array([[20.0, 0.4]]))
+    model.observe(np.array([1]), 34, np.array([[20.0, 0.4]]), np.array([0]))
     np.testing.assert_array_equal(model.tip[:, :35], before[0][:, :35])
     np.testing.assert_array_equal(model.tip[[0, 2]], before[0][[0, 2]])
-    length = watched.told.inserted_length[1]
+    length = split.episodes.proximal[1, :, 0]
     np.testing.assert_allclose(model.tip[1, 35:, 0], length[35:] - (length[34] - 20.0), rtol=1e-5)
     np.testing.assert_allclose(model.spread[1, 35:, 1], 0.1 * np.arange(1, 16))
-    model.show(np.array([0, 1]), 45, np.array([[30.0, 0.4], [31.0, 0.5]]))
+    model.observe(np.array([0, 1]), 45, np.array([[30.0, 0.4], [31.0, 0.5]]), np.array([0, 0]))
     assert (model.spread[:2, 46] == 0.1).all() and model.spread[2, 46, 0] > 1.5
-    model.restart()
+    model.reset()
     np.testing.assert_array_equal(model.tip, before[0])
     np.testing.assert_array_equal(model.spread, before[1])
 
 
-def test_a_twin_weighs_its_wires_by_what_is_shown(watched, monkeypatch) -> None:
-    samples, count = watched.truth.shape[1], len(watched.truth)
+def test_a_twin_weights_its_wires_by_what_is_observed(split, monkeypatch) -> None:
+    samples, count = split.truth.shape[1], len(split.truth)
     slack = np.array([0.0, 1.0, 2.0])[:, None, None] * (np.arange(samples) >= WINDOW)
     paths = np.stack([np.broadcast_to(20.0 - slack, (3, count, samples)), np.full((3, count, samples), 0.5)], axis=-1)
-    given = replace(
-        watched.told, tip_abscissa=np.full((count, samples), 20.0), tip_offset=np.full((count, samples), 0.5)
-    )
-    monkeypatch.setattr(TwinPredictor, "ensemble", lambda self, episodes, seen: paths)
+    given = replace(split.episodes, tip=np.tile([20.0, 0.5], (count, samples, 1)))
+    monkeypatch.setattr(TwinPredictor, "ensemble", lambda self, episodes, observed: paths)
     config = TwinConfig(members=3, abscissa_sd_mm=0.05)
     model = OnlineTwin(
         TwinPredictor(device=read_device("workhorse-014"), simulator=SimulatorConfig(), config=config), given
     )
     assert (model.tip[:, WINDOW:, 0] == 19.0).all()  # all alike so far: the middle one
     assert model.spread[0, -1, 0] == pytest.approx(np.sqrt(2 / 3))
-    model.show(np.array([0]), 33, np.array([[18.0, 0.5]]))
+    model.observe(np.array([0]), 33, np.array([[18.0, 0.5]]), np.array([0]))
     assert (model.tip[0, 34:, 0] == 18.0).all() and (model.tip[0, WINDOW:34, 0] == 19.0).all()
     assert (model.tip[1:, WINDOW:, 0] == 19.0).all()
     assert model.spread[0, -1, 0] < 0.2
@@ -170,9 +169,9 @@ def test_the_command_calibrates_measures_and_draws(folder, hold_slack, capsys) -
 
 
 def test_the_calibration_of_the_model_of_the_package_goes_to_the_output(
-    folder, watched, hold_slack, tmp_path, monkeypatch
+    folder, split, hold_slack, tmp_path, monkeypatch
 ) -> None:
-    monkeypatch.setattr(advice, "watch", lambda *_: watched)
+    monkeypatch.setattr(monitoring, "monitor", lambda *_: split)
     monkeypatch.setattr(advise_module, "PERIODS", (1, 90))
     monkeypatch.setattr(advise_module, "WIDTHS", (1.0,))
     monkeypatch.setattr(advise_module, "THRESHOLDS", ())

@@ -42,5 +42,5 @@ def command(
     """
     calibration = read_calibration(config, model) if xray else None
     found = plan(existing(anatomy), target, config, model=model, device=device)
-    needed = None if calibration is None else plan_xray(found, anatomy, calibration)
+    needed = None if calibration is None else plan_xray(found, calibration)
     show(write_plan(found, output, needed), as_json=json)

@@ -88,9 +88,9 @@ def plan(
         )
     else:
         desired = tips[["abscissa", "offset"]].to_numpy(float)
-    way = _method(navigation, config, anatomy, model, desired, route, follow=tips is not None)
+    find = _method(navigation, config, model, desired, route, follow=tips is not None)
     began, worked = time.perf_counter(), time.process_time()
-    control, predicted = way()
+    control, predicted = find()
     spent = time.perf_counter() - began, time.process_time() - worked
     made = _checked(navigation, config, model, desired, control, predicted, spent)
     if config.method == "twin":
@@ -99,15 +99,15 @@ def plan(
 
 
 def _method(
-    navigation: Navigation, config: PlanConfig, anatomy: Path, model: Path | None, desired: Steps, route: Route, *,
+    navigation: Navigation, config: PlanConfig, model: Path | None, desired: Steps, route: Route, *,
     follow: bool,
 ) -> Callable[[], tuple[Steps, Steps]]:  # fmt: skip
-    """Return what finds controls and foretells tips; what it takes to load a model is over then."""
+    """Return a function that finds controls and predicts their tips; loading a model is done before it is called."""
     if config.method in NETWORK_METHODS:
         from endopilot.control.network_plan import network_planner  # torch is slow to import
 
         assert model is not None
-        return network_planner(navigation, anatomy, model, desired, route, config)
+        return network_planner(navigation, model, desired, route, config)
     if config.method != "twin":
         return lambda: _by_policy(navigation, config)
     return lambda: _track(navigation, desired) if follow else _search(navigation, config)

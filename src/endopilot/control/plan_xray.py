@@ -1,8 +1,9 @@
 """The X-ray that a plan will need if all goes as planned: `plan_xray`.
 
-Who foretells the tip is watched, as on the way. The ladder's agent believes in an ensemble of simulated wires; they
-follow the plan's proximal end, and each exposure shows them the tip where the plan has it. A run that made the plan is
-shown what it foretold itself.
+The adviser monitors the model that predicts the tip, as it does during a navigation. For a plan that no network made,
+that model is the ensemble of simulated wires of the ladder's agent: they follow the plan's proximal end, and each
+exposure shows the tip where the plan has it. For a plan by networks it is the same run, and each exposure shows the tip
+that the run itself predicts.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ class PlannedXray:
 
     Attributes:
         exposure: whether an exposure is due then.
-        half_width: of the bands of (Δtip, γtip) around what is foretold, mm, before that exposure.
+        half_width: of the bands of (Δtip, γtip) around the predicted tip, mm, before that exposure.
     """
 
     exposure: Bool[np.ndarray, "samples"]
@@ -38,7 +39,7 @@ class PlannedXray:
 
 
 def read_calibration(config: PlanConfig, model: Path | None) -> Calibration:
-    """Return the calibration of what foretells a plan: of the run that makes it, or else of the agent's wires.
+    """Return the calibration of the model that predicts a plan's tip: the run that makes it, or else the agent's wires.
 
     Args:
         config: what is asked of the plan; its method says whether a network makes it.
@@ -52,39 +53,38 @@ def read_calibration(config: PlanConfig, model: Path | None) -> Calibration:
     return Calibration.read(CALIBRATED)
 
 
-def plan_xray(plan: Plan, folder: Path, calibration: Calibration) -> PlannedXray:
-    """Return the X-ray that a plan will need if all goes as planned; the tip is seen as it starts.
+def plan_xray(plan: Plan, calibration: Calibration) -> PlannedXray:
+    """Return the X-ray that a plan will need if all goes as planned; the tip is observed at the start.
 
     Args:
         plan: the plan.
-        folder: of the anatomy.
-        calibration: of what foretells it, see `read_calibration`.
+        calibration: of the model that predicts its tip, see `read_calibration`.
     """
-    watched: _Watched = _Networks(plan, folder) if plan.config.method in NETWORK_METHODS else _Wires(plan)
+    model: _Model = _Networks(plan) if plan.config.method in NETWORK_METHODS else _Wires(plan)
     adviser = XrayAdviser(calibration, AdviserConfig(), plan.navigation.device.tip_radius_mm)
-    proximal, tip, _, radius = watched.start()
+    proximal, tip, _, radius = model.start()
     adviser.start(proximal, tip, radius)
     exposure, half_width = np.zeros(len(plan.control), dtype=bool), np.zeros((len(plan.control), 2))
     for period in range(len(plan.control)):
-        exposure[period] = adviser.advise(*watched.move(period))[0]
+        exposure[period] = adviser.advise(*model.move(period))[0]
         half_width[period] = adviser.half_width[0]
         if exposure[period]:
-            watched.show(period)
+            model.observe(period)
     return PlannedXray(exposure=exposure, half_width=half_width)
 
 
-class _Watched(Protocol):
-    """Foretells the tip along a plan."""
+class _Model(Protocol):
+    """Predicts the tip along a plan."""
 
     def start(self) -> AdviserInput:
-        """Say where the tip is before the first period."""
+        """Return where the tip is before the first period."""
         ...
 
     def move(self, period: int) -> AdviserInput:
-        """Say where it is at the end of a period, the one after the last."""
+        """Return where it is predicted to be at the end of the next period."""
         ...
 
-    def show(self, period: int) -> None:
+    def observe(self, period: int) -> None:
         """Take what an exposure shows at the end of that period."""
         ...
 
@@ -102,7 +102,7 @@ class _Wires:
         self._agent.belief.follow(inserted, rotation)
         return self._agent.foretold()
 
-    def show(self, period: int) -> None:
+    def observe(self, period: int) -> None:
         tip = self._plan.simulated
         self._agent.belief.weigh(
             TipMeasurement(
@@ -115,17 +115,16 @@ class _Wires:
 
 
 class _Networks:
-    def __init__(self, plan: Plan, folder: Path) -> None:
-        from endopilot.control.network_plan import Rest  # brings torch, which is slow to import
+    def __init__(self, plan: Plan) -> None:
+        from endopilot.control.network_plan import RestingStart  # brings torch, which is slow to import
         from endopilot.models.rollout import load_model
 
         assert plan.model is not None
         run, navigation = Path(plan.model), plan.navigation
-        rest = Rest(navigation, folder, run)
-        episodes = rest.episodes(plan.predicted[None], plan.control[None])
+        episodes = RestingStart(navigation, run).episodes(plan.predicted[None], plan.control[None])
         self._model = online_predictor(load_model(run), episodes)
         self._route = Route.to(navigation.anatomy, navigation.target)
-        self._proximal = np.column_stack([episodes.inserted_length[0], episodes.rotation[0]])
+        self._proximal = episodes.proximal[0]
 
     def start(self) -> AdviserInput:
         return self._at(WINDOW - 1)
@@ -133,9 +132,10 @@ class _Networks:
     def move(self, period: int) -> AdviserInput:
         return self._at(WINDOW + period)
 
-    def show(self, period: int) -> None:
+    def observe(self, period: int) -> None:
         sample = WINDOW + period
-        self._model.show(np.array([0]), sample, self._model.tip[:, sample].copy())
+        tip = self._model.tip[:, sample].copy()
+        self._model.observe(np.array([0]), sample, tip, self._route.branch(tip[:, 0]))
 
     def _at(self, sample: int) -> AdviserInput:
         tip = self._model.tip[:, sample]

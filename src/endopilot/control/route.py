@@ -90,6 +90,10 @@ class Route:
         """Return a place on the route, LPS mm."""
         return np.array([np.interp(abscissa, self.line.abscissa, axis) for axis in self.line.points.T])
 
+    def branch(self, abscissa: Float[np.ndarray, "*n"]) -> Int[np.ndarray, "*n"]:
+        """Return the index of the branch that the route lies in at some abscissae, mm."""
+        return np.array(self.branches)[np.searchsorted(self.junctions, abscissa)]
+
     def radius(self, abscissa: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
         """Return the lumen radius along the route, mm."""
         return np.interp(abscissa, self.line.abscissa, self.line.radius)

@@ -101,9 +101,7 @@ class Dataset:
         Simulated again it gives the same navigation to the bit, which `control` does not: a drive that pushes at one
         speed until it slips strains the wire otherwise than one that is slower from the start.
         """
-        asked = self.control.astype(float)
-        asked[..., 0] += self.slip / self.sample_period_s
-        return asked.astype(self.control.dtype).astype(float)
+        return commanded(self.control, self.slip, self.sample_period_s)
 
     def select(self, episodes: Shaped[np.ndarray, "chosen"]) -> Dataset:
         """Return the chosen episodes, given as a mask or as indices."""
@@ -141,6 +139,15 @@ class Dataset:
         if identify(folder) != (name, record["sha256"]):
             raise InputError(f"{folder}: is not the anatomy that {self.folder} was made in; make the dataset again")
         return folder
+
+
+def commanded(
+    control: Float[np.ndarray, "*n 2"], slip_mm: Float[np.ndarray, "*n"], sample_period_s: float
+) -> Float[np.ndarray, "*n 2"]:
+    """Return the control that was commanded (mm/s, rad/s), from what the drive made of it and what it slipped by."""
+    command = control.astype(float)
+    command[..., 0] += slip_mm / sample_period_s
+    return command.astype(control.dtype).astype(float)
 
 
 def read_manifest(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -19,7 +19,7 @@ from endopilot.evaluation.results import (
     RESULTS_FILE,
     SPLITS,
     SplitResult,
-    told,
+    tip_series,
     write_results,
 )
 from endopilot.evaluation.summary import findings, generalisation_gap, over_seeds, split_title, summarize
@@ -77,6 +77,7 @@ def evaluate(
             dataset was made with another wire, or a patient that a run was trained on is among its test patients.
     """
     from endopilot.evaluation.protocols import count_steps, run_protocols  # brings torch, which takes seconds to import
+    from endopilot.models.episodes import Episodes
     from endopilot.models.rollout import load_model
 
     start = time.perf_counter()
@@ -107,7 +108,8 @@ def evaluate(
         ),
     }
     for split, data in chosen.items() if others else ():
-        tips = [results[split].tips["P1"], *(told(other.rollout_forward(data).tip) for other in others)]
+        episodes = Episodes.of_dataset(data)
+        tips = [results[split].tips["P1"], *(tip_series(other.rollout_forward(episodes).tip) for other in others)]
         runs = [str(run_folder), *map(str, other_seeds)]
         metrics["splits"][split]["seeds"] = {"runs": runs, "P1": over_seeds(results[split], tips)}
     for name in (REPORT_FILE, METRICS_FILE):

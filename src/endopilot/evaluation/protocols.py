@@ -14,34 +14,35 @@ from endopilot.evaluation.replanning import exposures, replanned
 from endopilot.evaluation.replay import Control, Recorded, Samples, replay
 from endopilot.evaluation.results import REPLAYED, SplitResult, TipSeries
 from endopilot.models.config import WINDOW
+from endopilot.models.episodes import Episodes
 from endopilot.models.open_loop import Predictor
 from endopilot.progress import Advance
 from endopilot.types import VesselTree
 
 
 def count_steps(data: Dataset) -> int:
-    """Return how often `run_protocols` tells of its advance."""
+    """Return how often `run_protocols` calls its `advance`."""
     return 3 + len(exposures(data)) + len(np.unique(data.anatomy))
 
 
 def run_protocols(predictor: Predictor, data: Dataset, train: Dataset, advance: Advance) -> SplitResult:
-    """Predict the samples after the 30 given states in every way, and simulate the controls that were chosen.
+    """Predict the samples after the 30 given states by every protocol, and simulate the controls that were chosen.
 
     P1 is the forward network under the true controls; P2 the inverse network with the true tip as desired; P3 the
     paper's loop of both; P4 the controls of P3 simulated again from the start of the episode, in the anatomy and with
-    the device and friction that it was recorded with; what the drive cannot do it does as far as it can. P4 is driven
-    once more with plans made anew at X-ray images (`replanning`).
+    the device and friction that it was recorded with, within the limits of the drive. P4 is driven once more with plans
+    made anew at X-ray images (`replanning`).
 
     Args:
         predictor: the networks of a run.
         data: the episodes of one split.
         train: the episodes that the networks were trained on, for the baselines that are means.
-        advance: told after each protocol, each new plan and each anatomy's simulation.
+        advance: called after each protocol, each new plan and each anatomy's simulation.
     """
-    recorded = Recorded.of(data)
+    recorded, episodes = Recorded.of(data), Episodes.of_dataset(data)
     predicted = {}
     for protocol in ("forward", "inverse", "dual"):
-        predicted[protocol] = getattr(predictor, f"rollout_{protocol}")(data)
+        predicted[protocol] = getattr(predictor, f"rollout_{protocol}")(episodes)
         advance(1, protocol)
     controls: dict[str, Control] = {
         "P2": predicted["inverse"].control,
@@ -50,18 +51,18 @@ def run_protocols(predictor: Predictor, data: Dataset, train: Dataset, advance: 
         "training_mean": baselines.mean_control(train, data, WINDOW),
         "follow_slack": baselines.follow_slack(data, WINDOW),
     }
-    foretold = {
+    predicted_tips = {
         "P1": predicted["forward"].tip,
         "P3": predicted["dual"].tip,
         "hold_slack": baselines.hold_slack(data, WINDOW),
         "training_mean": baselines.mean_tip(train, data, WINDOW),
     }
     trees = [anatomy.tree for anatomy in recorded.anatomies]
-    tips = {name: _series(tip, trees, recorded.anatomy_of, data.branch) for name, tip in foretold.items()}
+    tips = {name: _series(tip, trees, recorded.anatomy_of, data.branch) for name, tip in predicted_tips.items()}
     replayed = {"P4": "P3", "P2_replayed": "P2", "hold_control": "hold_control", "follow_slack": "follow_slack"}
-    asked = {name: controls[source] for name, source in replayed.items()}
-    asked["P4_replanned"] = replanned(predictor, recorded, predicted["dual"], advance)
-    driven = {name: recorded.drivable(control) for name, control in asked.items()}
+    planned = {name: controls[source] for name, source in replayed.items()}
+    planned["P4_replanned"] = replanned(predictor, recorded, episodes, predicted["dual"], advance)
+    driven = {name: recorded.drivable(control) for name, control in planned.items()}
     replays = replay(recorded, driven | dict.fromkeys(REPLAYED, data.asked[:, WINDOW:]), advance)
     return SplitResult(
         sample_period_s=data.sample_period_s,

@@ -67,8 +67,8 @@ class TipSeries:
     radius: Float[np.ndarray, "episodes samples"]
 
 
-def told(tip: Float[np.ndarray, "episodes samples 2"]) -> TipSeries:
-    """Return a foretold (Δtip, γtip), mm, as a series whose radius nobody asks for."""
+def tip_series(tip: Float[np.ndarray, "episodes samples 2"]) -> TipSeries:
+    """Return a predicted (Δtip, γtip), mm, as a series; its radius is left NaN."""
     return TipSeries(tip[..., 0], tip[..., 1], np.full(tip.shape[:2], np.nan))
 
 

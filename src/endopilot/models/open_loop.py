@@ -1,8 +1,8 @@
-"""Open loop: the first 30 states of an episode are given, then a predictor goes on alone.
+"""Open-loop prediction: the first 30 states of an episode are given, and a predictor goes on without measurements.
 
-P1, `rollout_forward`: the tip under the true controls. P2, `rollout_inverse`: the controls that make the true tip, as
-desired. P3, `rollout_dual`: those controls, and the tip that the predictor believes they make; it may also begin later,
-from a navigation under way whose tip was seen now and then.
+P1, `rollout_forward`: the tip under the true controls. P2, `rollout_inverse`: the controls that bring about the true
+tip, taken as desired. P3, `rollout_dual`: those controls, and the tip that the predictor expects of them; it may also
+begin later, in a navigation under way whose tip was observed now and then.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float
 
-from endopilot.dataset.loader import Dataset
 from endopilot.models.config import WINDOW
+from endopilot.models.episodes import Episodes
 
 Observed = Bool[np.ndarray, "samples"]
-"""Samples at which the tip was measured, for example by X-ray."""
+"""Samples at which the tip was observed, for example by X-ray; the same for all episodes."""
 EachObserved = Bool[np.ndarray, "episodes samples"]
 """The same for each episode."""
 Steps2 = Float[np.ndarray, "episodes steps 2"]
@@ -25,7 +25,7 @@ Steps2 = Float[np.ndarray, "episodes steps 2"]
 
 @dataclass(frozen=True, eq=False)
 class OpenLoop:
-    """What a predictor foretells of each episode for the samples after the given ones.
+    """What is predicted of each episode for the samples after the given ones.
 
     Attributes:
         tip: (Δtip, γtip), mm; the true tip in P2, where none is predicted.
@@ -40,11 +40,11 @@ class OpenLoop:
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """What a predictor foretells of each episode at every sample, the tips that were seen included.
+    """The predicted tip of each episode at every sample; where the tip was observed, that is the prediction.
 
     Attributes:
         tip: (Δtip, γtip), mm.
-        spread: how far they may be off: one standard deviation, mm.
+        spread: one standard deviation of its error as the model estimates it, mm.
     """
 
     tip: Float[np.ndarray, "episodes samples 2"]
@@ -53,47 +53,47 @@ class Prediction:
 
 @runtime_checkable
 class ProbabilisticPredictor(Protocol):
-    """A predictor that takes tips seen at any time, and says how sure it is: the causal networks and the twin."""
+    """A predictor that takes tips observed at any time and estimates its own error: causal networks and the twin."""
 
-    def foretell(self, episodes: Dataset, seen: Observed | EachObserved) -> Prediction:
-        """Predict the tips of episodes under their controls, from those that were seen.
+    def predict(self, episodes: Episodes, observed: Observed | EachObserved) -> Prediction:
+        """Predict the tips of episodes from their controls and from the observed tips.
 
         Args:
-            episodes: their controls, and the tips where `seen`; no other tip is looked at.
-            seen: samples at which the tip was measured, for example by X-ray, of all episodes alike or of each.
+            episodes: their controls, and their tips where `observed`; no other tip is read.
+            observed: samples at which the tip was observed, of all episodes alike or of each.
         """
         ...
 
 
 @runtime_checkable
 class Predictor(Protocol):
-    """Whatever rolls episodes out: the networks of a run, the twin, or a baseline."""
+    """Whatever predicts episodes: the networks of a run, the twin, or a baseline."""
 
-    def rollout_forward(self, episodes: Dataset) -> OpenLoop:
+    def rollout_forward(self, episodes: Episodes) -> OpenLoop:
         """P1: predict the tip under the true controls."""
         ...
 
-    def rollout_inverse(self, episodes: Dataset) -> OpenLoop:
-        """P2: predict the controls that make the tip go the true way."""
+    def rollout_inverse(self, episodes: Episodes) -> OpenLoop:
+        """P2: predict the controls that bring about the true tip."""
         ...
 
-    def rollout_dual(self, episodes: Dataset, seen: Observed | None = None) -> OpenLoop:
-        """P3: predict the controls that make the tip go the true way, and the tip that they make.
+    def rollout_dual(self, episodes: Episodes, observed: Observed | None = None) -> OpenLoop:
+        """P3: predict the controls that bring about the true tip, and the tip that they lead to.
 
         Args:
-            episodes: up to the last seen sample the drive's motion as it was, and the tip as it was seen or else is
-                believed to have been; after it, the desired tip.
-            seen: the 30 given states if not given, and later samples at which the tip was measured too; what comes
-                after the last of them is predicted.
+            episodes: up to the last observed sample, the motion of the drive as it was, and the tip as observed or
+                else as predicted at the time; after it, the desired tip.
+            observed: the 30 given states if not given; else also later samples at which the tip was observed. What
+                comes after the last of them is predicted.
         """
         ...
 
 
-def given_states(episodes: Dataset) -> Observed:
-    """Return the samples at which every protocol sees the tip: the first 30."""
-    return np.arange(episodes.valid.shape[1]) < WINDOW
+def given_states(episodes: Episodes) -> Observed:
+    """Return the samples at which the tip is observed in every protocol: the first 30."""
+    return np.arange(episodes.samples) < WINDOW
 
 
-def begin_after(seen: Observed) -> int:
-    """Return the first sample that is to be predicted: the one after the last that was seen."""
-    return int(np.flatnonzero(seen)[-1]) + 1
+def begin_after(observed: Observed) -> int:
+    """Return the first sample that is to be predicted: the one after the last observed one."""
+    return int(np.flatnonzero(observed)[-1]) + 1

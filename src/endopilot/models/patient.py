@@ -52,9 +52,9 @@ class Patient:
         pull_offset: γtip of the pulled wire, mm.
         deepest: largest inserted length of each wire, mm.
         leaf: row of `geometry` on which each wire came to its end.
-        on_route: whether a branch lies on the way of a wire.
+        on_route: whether a branch lies on the path of a wire.
         leaf_of_branch: for each branch, a row of `geometry` that it lies on.
-        geometry: for each way to a distal end, over the abscissa in steps of `STEP_MM`: curvature along the two
+        geometry: for each path to a distal end, over the abscissa in steps of `STEP_MM`: curvature along the two
             transported normals and torsion (1/mm), radius (mm), integrals of curvature and of absolute torsion (rad),
             distance to the next branching point (mm).
         branch: branch at each place of `geometry`.
@@ -107,7 +107,7 @@ def prepare(anatomy: Anatomy, device: Device, config: SimulatorConfig) -> Patien
     tree = anatomy.tree
     every = range(len(tree.branches))
     below = np.array([[b in tree.route(leaf) for leaf in tree.leaves()] for b in every])
-    geometry, branches = _ways(anatomy)
+    geometry, branches = _paths(anatomy)
     return Patient(
         **_tabulated(tree, recorded),
         deepest=inserted.max(axis=0),
@@ -135,15 +135,15 @@ def _tabulated(tree: VesselTree, rows: Sequence[np.ndarray]) -> dict[str, Float[
     tables = {name: np.empty((inserted.shape[1], len(lengths))) for name in names}
     turn = pushing.sum(axis=0) - 1  # sample at which each wire is at its deepest
     for k, last in enumerate(turn):
-        for way, part in (("push", np.arange(last + 1)), ("pull", np.arange(last, len(inserted))[::-1])):
+        for motion, part in (("push", np.arange(last + 1)), ("pull", np.arange(last, len(inserted))[::-1])):
             at = inserted[part, k]
-            tables[f"{way}_tip"][k] = lengths - np.interp(lengths, at, at - tip[part, k])
-            tables[f"{way}_offset"][k] = np.interp(lengths, at, offset[part, k])
+            tables[f"{motion}_tip"][k] = lengths - np.interp(lengths, at, at - tip[part, k])
+            tables[f"{motion}_offset"][k] = np.interp(lengths, at, offset[part, k])
     return tables
 
 
-def _ways(anatomy: Anatomy) -> tuple[Float[np.ndarray, "leaves places 7"], Int[np.ndarray, "leaves places"]]:
-    """Return geometry and branch along the way to every distal end, at steps of `STEP_MM`."""
+def _paths(anatomy: Anatomy) -> tuple[Float[np.ndarray, "leaves places 7"], Int[np.ndarray, "leaves places"]]:
+    """Return geometry and branch along the path to every distal end, at steps of `STEP_MM`."""
     places = np.arange(0.0, float(anatomy.tree.longest_path().abscissa[-1]) + 2 * STEP_MM, STEP_MM)
     tables, branches = [], []
     for leaf in anatomy.tree.leaves():
@@ -186,24 +186,24 @@ def first_normal(insertion: Insertion) -> Float[np.ndarray, "3"]:
     return np.array([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)])
 
 
-def prepared(
-    folder: Path, name: str, fingerprint: str, device: Device, config: SimulatorConfig, read: Callable[[], Anatomy]
+def read_or_prepare(
+    folder: Path, name: str, identity: str, device: Device, config: SimulatorConfig, read: Callable[[], Anatomy]
 ) -> Patient:
-    """Return a patient prepared for a device, made when first asked for and kept in a folder.
+    """Return a patient prepared for a device: read from a folder, or prepared now and kept there.
 
     Args:
         folder: where patients are kept, one file for each patient and device.
         name: of the patient.
-        fingerprint: SHA-256 of what the simulation depends on in the anatomy.
+        identity: SHA-256 of what the simulation depends on in the anatomy.
         device: the wire.
         config: settings of the rod core.
-        read: gives the anatomy, where it is needed.
+        read: reads the anatomy, where it is needed.
 
     Raises:
         InputError: the patient cannot be prepared, or the folder cannot be written.
     """
     settings = (
-        fingerprint,
+        identity,
         asdict(replace(config, threads=0)),
         asdict(device),
         WIRES,

@@ -1,6 +1,6 @@
 """Open-loop rollouts of the paper's networks, which feed back on themselves after the 30 given states.
 
-In P3 IF asks for a control, FF foretells what it does, and IF sees that in place of an X-ray image.
+In P3 IF proposes a control, FF predicts the tip that it leads to, and IF takes that tip in place of an X-ray image.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ from typing import Any
 import numpy as np
 import torch
 
-from endopilot.dataset.loader import Dataset
 from endopilot.errors import InputError
 from endopilot.models.causal import CausalPredictor
 from endopilot.models.checkpoint import read_network
 from endopilot.models.config import PRETRAINED, WINDOW, TwinConfig, read_run, run_path
+from endopilot.models.episodes import Episodes
 from endopilot.models.open_loop import Observed, OpenLoop, Predictor, Steps2, begin_after
 from endopilot.models.transformer import Network
 from endopilot.models.twin import TwinPredictor
-from endopilot.models.windows import Episodes
+from endopilot.models.windows import Windows
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import Device
 from endopilot.simulation.drive_limits import DriveLimits
@@ -43,31 +43,31 @@ class TransformerPredictor:
     limits: DriveLimits
     batch_size: int = 256
 
-    def rollout_forward(self, episodes: Dataset) -> OpenLoop:
+    def rollout_forward(self, episodes: Episodes) -> OpenLoop:
         """P1: predict the tip under the true controls."""
-        return self._rollout(episodes, WINDOW, ask=False, foretell=True)
+        return self._rollout(episodes, WINDOW, inverse=False, forward=True)
 
-    def rollout_inverse(self, episodes: Dataset) -> OpenLoop:
-        """P2: predict the controls that make the tip go the true way."""
-        return self._rollout(episodes, WINDOW, ask=True, foretell=False)
+    def rollout_inverse(self, episodes: Episodes) -> OpenLoop:
+        """P2: predict the controls that bring about the true tip."""
+        return self._rollout(episodes, WINDOW, inverse=True, forward=False)
 
-    def rollout_dual(self, episodes: Dataset, seen: Observed | None = None) -> OpenLoop:
-        """P3: predict the controls that make the tip go the true way, and the tip that they make.
+    def rollout_dual(self, episodes: Episodes, observed: Observed | None = None) -> OpenLoop:
+        """P3: predict the controls that bring about the true tip, and the tip that they lead to.
 
-        The networks see the last 30 states only, of which those that were not seen are as `episodes` believes them.
+        The networks take the last 30 states only; those not observed are as they were predicted at the time.
         """
-        begin = WINDOW if seen is None else begin_after(seen)
-        return self._rollout(episodes, begin, ask=True, foretell=True)
+        begin = WINDOW if observed is None else begin_after(observed)
+        return self._rollout(episodes, begin, inverse=True, forward=True)
 
     @torch.inference_mode()
-    def _rollout(self, episodes: Dataset, begin: int, *, ask: bool, foretell: bool) -> OpenLoop:
-        """Roll out from a sample on, with controls that IF asks for or the true ones; likewise the tip and FF."""
-        forward, inverse = self._network("forward", foretell), self._network("inverse", ask)
+    def _rollout(self, episodes: Episodes, begin: int, *, forward: bool, inverse: bool) -> OpenLoop:
+        """Roll out from a sample on: controls by IF or the true ones, tips by FF or the true ones."""
+        networks = self._network("forward", forward), self._network("inverse", inverse)
         parts = []
         for first in range(0, len(episodes), self.batch_size):
             chosen = np.arange(first, min(first + self.batch_size, len(episodes)))
-            batch = Episodes.of(episodes.select(chosen))
-            parts.append(_rollout_batch(forward, inverse, self.limits, batch, begin))
+            batch = Windows.of(episodes.select(chosen))
+            parts.append(_rollout_batch(*networks, self.limits, batch, begin))
         tip, proximal, control = (np.concatenate(signal) for signal in zip(*parts, strict=True))
         return OpenLoop(tip=tip, proximal=proximal, control=control)
 
@@ -79,19 +79,19 @@ class TransformerPredictor:
 
 
 def _rollout_batch(
-    forward: Network | None, inverse: Network | None, limits: DriveLimits, episodes: Episodes, begin: int
+    forward: Network | None, inverse: Network | None, limits: DriveLimits, batch: Windows, begin: int
 ) -> tuple[Steps2, Steps2, Steps2]:
     """Return tip, x^prox and control of one batch from a sample on."""
-    desired = episodes.tip
-    tip, control = desired.clone(), episodes.control.clone()
-    proximal = episodes.proximal.double()  # float64, so that x^prox stays the integral of the controls
+    desired = batch.tip
+    tip, control = desired.clone(), batch.control.clone()
+    proximal = batch.proximal.double()  # float64, so that x^prox stays the integral of the controls
     for k in range(begin, tip.shape[1]):
         if inverse is not None:
-            asked = torch.cat([tip[:, k - WINDOW + 1 : k], desired[:, k : k + 1]], dim=1)
+            wanted = torch.cat([tip[:, k - WINDOW + 1 : k], desired[:, k : k + 1]], dim=1)
             given = slice(k - WINDOW, k)
-            wanted = inverse(asked, proximal[:, given].float(), control[:, given])
+            proposed = inverse(wanted, proximal[:, given].float(), control[:, given])
             inserted = proximal[:, k - 1, 0].float()
-            control[:, k] = torch.from_numpy(limits.clip(wanted.numpy(), inserted.numpy(), SAMPLE_PERIOD_S))
+            control[:, k] = torch.from_numpy(limits.clip(proposed.numpy(), inserted.numpy(), SAMPLE_PERIOD_S))
             proximal[:, k] = proximal[:, k - 1] + SAMPLE_PERIOD_S * control[:, k].double()
         if forward is not None:
             moved = slice(k - WINDOW + 1, k + 1)

@@ -33,11 +33,12 @@ from endopilot.models.checkpoint import (
     write_tensors,
 )
 from endopilot.models.config import TrainConfig
+from endopilot.models.episodes import Episodes
 from endopilot.models.learning_curves import board
 from endopilot.models.process_group import ProcessGroup, joined
-from endopilot.models.sequences import Sequences, read_vessels
+from endopilot.models.sequences import Sequences, prepare_vessels
 from endopilot.models.transformer import Network
-from endopilot.models.windows import Episodes, check_length
+from endopilot.models.windows import Windows
 from endopilot.progress import Advance, progress
 from endopilot.runs import claim
 
@@ -45,7 +46,7 @@ VALIDATION_WINDOWS = 512
 """Windows of held-out navigations that the loss is checked on after every epoch."""
 WARM_UP_EPOCHS = 0.5
 """Epochs over which the learning rate rises to its peak; afterwards it falls to zero along a cosine."""
-Examples = Episodes | Sequences
+Examples = Windows | Sequences
 """What is trained on: windows for the paper's networks, whole sequences for ours."""
 AnyNetwork = Network | CausalNetwork
 _SCALE_WINDOWS = 16384
@@ -130,10 +131,10 @@ def examples_of(dataset: Dataset, split: str, config: TrainConfig) -> Examples:
                 f"{dataset.folder}: {name} of {chosen.anatomy[bad]}, sequence {chosen.sequence[bad]}, is not finite "
                 "though the episode is marked valid; make the dataset again"
             )
+    episodes = Episodes.of_dataset(chosen)
     if config.model != "causal":
-        return Episodes.of(chosen)
-    check_length(chosen)
-    return Sequences.of(chosen, read_vessels(chosen), config.networks, config.seed)
+        return Windows.of(episodes)
+    return Sequences.of(episodes, prepare_vessels(episodes), config.networks, config.seed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,7 +184,7 @@ class Job:
             together: the same, as all processes of the team run it.
             optimizer: of its parameters.
             state: `seconds` and `curve` so far.
-            advance: told after every step.
+            advance: called after every step.
         """
         epoch, epochs, start = len(state["curve"]), self.config.epochs, time.perf_counter()
         batches = self.batches(epoch, self._steps(network, state))
@@ -267,7 +268,7 @@ class Job:
         return whole
 
     def _window(self, examples: Examples, targets: torch.Tensor) -> list[torch.Tensor]:
-        """Return what the network is told of some targets, and the truth, where this process computes."""
+        """Return the network's inputs of some targets, and the truth, where this process computes."""
         return [part.to(self.team.device) for part in examples.window(self.name, targets)]
 
     def _fit_scales(self, network: AnyNetwork) -> None:

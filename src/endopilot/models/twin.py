@@ -1,7 +1,7 @@
-"""The digital twin: the rod core itself as a model, with what is uncertain about it found from the given tips.
+"""The digital twin: the rod core itself as a model, whose uncertain parameters are identified from the given tips.
 
 An ensemble of wires differs in friction, in the stiffness of the tip and in where along the catheter's axis the ostium
-lies. All are driven by the known controls; each is weighted by how well it retraces the tips that were seen. A second
+lies. All are driven by the known controls; each is weighted by how well it retraces the observed tips. A second
 ensemble, drawn closer around the best of the first, is weighted likewise; its weighted median is the prediction, its
 weighted spread the uncertainty. There is nothing to train.
 """
@@ -17,9 +17,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.stats import qmc
 
-from endopilot.anatomy.io import read_anatomy
-from endopilot.dataset.loader import Dataset
 from endopilot.models.config import WINDOW, TwinConfig
+from endopilot.models.episodes import Episodes
 from endopilot.models.open_loop import Observed, OpenLoop, Prediction, begin_after, given_states
 from endopilot.models.tip_tracking import track
 from endopilot.simulation.config import SimulatorConfig
@@ -32,20 +31,20 @@ LEVELS = 7
 NARROWEST = 0.15
 """The second ensemble is spread over this share of the first at least; and over two standard deviations of it."""
 GOOD = 3.0
-"""A good member misses a seen tip by this many of the scales of `TwinConfig` at most."""
-_MISSES = 3
-"""Times in a row that the foretold tip must have missed the seen one to be doubted."""
+"""A good member errs by this many of the scales of `TwinConfig` at most where the tip is observed."""
+_PERSISTENT = 3
+"""Observations in a row that the predicted tip must have differed from before it is doubted."""
 Members = Float[np.ndarray, "members episodes 3"]
 """Friction factor, tip stiffness factor and depth of the ostium (mm) of each member, for each episode."""
-_BELIEVED = np.array([1.0, 1.0, 0.0])
+_NOMINAL = np.array([1.0, 1.0, 0.0])
 
 
 @dataclass(frozen=True, eq=False)
 class TwinPrediction(Prediction):
-    """What the ensemble foretells: the weighted median of its members, and their weighted deviation from it.
+    """The prediction of the ensemble: the weighted median of its members, and their weighted deviation from it.
 
-    The spread is no smaller than what the median missed each of the last three seen tips by beyond what a good member
-    does.
+    The spread is no smaller than the median's error at each of the last three observed tips, less the error of a good
+    member.
 
     Attributes:
         parameters: friction factor, tip stiffness factor and depth of the ostium (mm) of the likeliest member.
@@ -59,89 +58,89 @@ class TwinPredictor:
     """The rod core as a predictor.
 
     Attributes:
-        device: the wire as it is believed to be.
+        device: the nominal wire.
         simulator: settings of the rod core.
         config: size and spread of the ensemble.
-        told: what the given states of the episodes foretell that it has been asked about; all protocols share it.
-        led: the controls that lead the tip along the desired one, likewise.
+        predicted: predictions from the given states, by episodes; all protocols share them.
+        tracked: controls that lead the tip along the desired one, likewise.
     """
 
     device: Device
     simulator: SimulatorConfig
     config: TwinConfig
-    told: WeakKeyDictionary[Dataset, TwinPrediction] = field(default_factory=WeakKeyDictionary, repr=False)
-    led: WeakKeyDictionary[Dataset, OpenLoop] = field(default_factory=WeakKeyDictionary, repr=False)
+    predicted: WeakKeyDictionary[Episodes, TwinPrediction] = field(default_factory=WeakKeyDictionary, repr=False)
+    tracked: WeakKeyDictionary[Episodes, OpenLoop] = field(default_factory=WeakKeyDictionary, repr=False)
 
-    def foretell(self, episodes: Dataset, seen: Observed) -> TwinPrediction:
-        """Predict the tips of episodes under their controls, from those that were seen.
+    def predict(self, episodes: Episodes, observed: Observed) -> TwinPrediction:
+        """Predict the tips of episodes from their controls and from the observed tips.
 
         Args:
-            episodes: their controls, and the tips where `seen`; no other tip is looked at.
-            seen: samples at which the tip was measured, for example by X-ray.
+            episodes: their controls, and their tips where `observed`; no other tip is read.
+            observed: samples at which the tip was observed.
         """
-        shape = (len(episodes), episodes.valid.shape[1], 2)
-        tip, spread, parameters = np.full(shape, np.nan), np.full(shape, np.nan), np.full((len(episodes), 3), np.nan)
+        tip, spread = np.full(episodes.tip.shape, np.nan), np.full(episodes.tip.shape, np.nan)
+        parameters = np.full((len(episodes), 3), np.nan)
         for anatomy, chosen in _by_anatomy(episodes):
             data = episodes.select(chosen)
-            members, paths = self._narrowed_ensemble(anatomy, data, seen)
-            weight = _weights(paths, _tips(data), seen, self.config)
+            members, paths = self._narrowed_ensemble(anatomy, data, observed)
+            weight = _weights(paths, data.tip.astype(float), observed, self.config)
             tip[chosen], own = _median_and_spread(paths, weight)
-            each = np.broadcast_to(seen, data.valid.shape)
-            spread[chosen] = np.hypot(own, _unexplained(tip[chosen], _tips(data), each, self.config))
+            each = np.broadcast_to(observed, data.branch.shape)
+            beyond = _unexplained(tip[chosen], data.tip.astype(float), each, self.config)
+            spread[chosen] = np.hypot(own, beyond)
             parameters[chosen] = members[weight.argmax(axis=0), np.arange(len(data))]
         return TwinPrediction(tip, spread, parameters)
 
-    def ensemble(self, episodes: Dataset, seen: Observed) -> Float[np.ndarray, "members episodes samples 2"]:
-        """Return the tips, mm, of every wire that is likely after the seen ones; NaN from where a simulation fails.
+    def ensemble(self, episodes: Episodes, observed: Observed) -> Float[np.ndarray, "members episodes samples 2"]:
+        """Return the tips, mm, of every wire that is likely after the observed ones; NaN from where a simulation fails.
 
-        `weigh` says what they foretell, and again, without another simulation, when more tips are seen.
+        `weigh` makes a prediction of them, and again, without another simulation, when more tips are observed.
         """
-        paths = np.full((self.config.members, len(episodes), episodes.valid.shape[1], 2), np.nan)
+        paths = np.full((self.config.members, *episodes.tip.shape), np.nan)
         for anatomy, chosen in _by_anatomy(episodes):
-            paths[:, chosen] = self._narrowed_ensemble(anatomy, episodes.select(chosen), seen)[1]
+            paths[:, chosen] = self._narrowed_ensemble(anatomy, episodes.select(chosen), observed)[1]
         return paths
 
     def _narrowed_ensemble(
-        self, anatomy: Anatomy, data: Dataset, seen: Observed
+        self, anatomy: Anatomy, data: Episodes, observed: Observed
     ) -> tuple[Members, Float[np.ndarray, "members episodes s 2"]]:
         """Return the second ensemble of the episodes of one anatomy, and its tips."""
-        members = self._members(np.tile(_BELIEVED, (len(data), 1)), np.tile(self._spread, (len(data), 1)))
-        paths = self._simulate(anatomy, data, members, int(np.flatnonzero(seen).max(initial=0)) + 1)
-        weight = _weights(paths, _tips(data), seen, self.config)
+        members = self._members(np.tile(_NOMINAL, (len(data), 1)), np.tile(self._spread, (len(data), 1)))
+        paths = self._simulate(anatomy, data, members, int(np.flatnonzero(observed).max(initial=0)) + 1)
+        weight = _weights(paths, data.tip.astype(float), observed, self.config)
         members = self._members(*_narrowed(members, weight, self._spread))
-        return members, self._simulate(anatomy, data, members, data.valid.shape[1])
+        return members, self._simulate(anatomy, data, members, data.samples)
 
-    def rollout_forward(self, episodes: Dataset) -> OpenLoop:
+    def rollout_forward(self, episodes: Episodes) -> OpenLoop:
         """P1: predict the tip under the true controls."""
-        tip = self._told(episodes).tip
-        return OpenLoop(
-            tip=tip[:, WINDOW:], proximal=_proximal(episodes)[:, WINDOW:], control=_control(episodes)[:, WINDOW:]
-        )
+        later = slice(WINDOW, None)
+        tip = self._from_given(episodes).tip[:, later]
+        return OpenLoop(tip, episodes.proximal[:, later].astype(float), episodes.control[:, later].astype(float))
 
-    def rollout_inverse(self, episodes: Dataset) -> OpenLoop:
-        """P2: predict the controls that make the tip go the true way."""
+    def rollout_inverse(self, episodes: Episodes) -> OpenLoop:
+        """P2: predict the controls that bring about the true tip."""
         found = self.rollout_dual(episodes)
-        return OpenLoop(tip=_tips(episodes)[:, WINDOW:], proximal=found.proximal, control=found.control)
+        return OpenLoop(tip=episodes.tip[:, WINDOW:].astype(float), proximal=found.proximal, control=found.control)
 
-    def rollout_dual(self, episodes: Dataset, seen: Observed | None = None) -> OpenLoop:
-        """P3: predict the controls that make the tip go the true way, and the tip that they make.
+    def rollout_dual(self, episodes: Episodes, observed: Observed | None = None) -> OpenLoop:
+        """P3: predict the controls that bring about the true tip, and the tip that they lead to.
 
-        The likeliest member is driven along the desired tips, one sample at a time: see `tracking.track`.
+        The likeliest member is driven along the desired tips, one sample at a time: see `tip_tracking.track`.
         """
-        if seen is not None:
-            return self._lead(episodes, self.foretell(episodes, seen).parameters, begin_after(seen))
-        if episodes not in self.led:
-            self.led[episodes] = self._lead(episodes, self._told(episodes).parameters, WINDOW)
-        return self.led[episodes]
+        if observed is not None:
+            return self._track(episodes, self.predict(episodes, observed).parameters, begin_after(observed))
+        if episodes not in self.tracked:
+            self.tracked[episodes] = self._track(episodes, self._from_given(episodes).parameters, WINDOW)
+        return self.tracked[episodes]
 
-    def _told(self, episodes: Dataset) -> TwinPrediction:
-        if episodes not in self.told:
-            self.told[episodes] = self.foretell(episodes, given_states(episodes))
-        return self.told[episodes]
+    def _from_given(self, episodes: Episodes) -> TwinPrediction:
+        if episodes not in self.predicted:
+            self.predicted[episodes] = self.predict(episodes, given_states(episodes))
+        return self.predicted[episodes]
 
-    def _lead(self, episodes: Dataset, likeliest: Float[np.ndarray, "episodes 3"], begin: int) -> OpenLoop:
+    def _track(self, episodes: Episodes, likeliest: Float[np.ndarray, "episodes 3"], begin: int) -> OpenLoop:
         """Drive wires of these parameters along the desired tips from a sample on."""
-        desired = _tips(episodes)[:, begin:]
+        desired = episodes.tip[:, begin:].astype(float)
         tip, control = np.empty(desired.shape), np.empty(desired.shape)
         wires = {stiffness: self._wire(stiffness) for stiffness in np.unique(likeliest[:, 1])}
         for anatomy, chosen in _by_anatomy(episodes):
@@ -150,12 +149,13 @@ class TwinPredictor:
                 anatomy,
                 [wires[stiffness] for stiffness in ours[:, 1]],
                 friction=self.device.friction * ours[:, 0],
-                start=np.column_stack([data.initial_inserted_length + ours[:, 2], data.initial_rotation]),
-                given=data.asked[:, :begin],
+                start=np.column_stack([data.initial[:, 0] + ours[:, 2], data.initial[:, 1]]),
+                given=data.command[:, :begin],
                 desired=desired[chosen],
                 config=self.simulator,
             )
-        proximal = _proximal(episodes)[:, begin - 1 : begin] + SAMPLE_PERIOD_S * np.cumsum(control, axis=1)
+        start = episodes.proximal[:, begin - 1 : begin].astype(float)
+        proximal = start + SAMPLE_PERIOD_S * np.cumsum(control, axis=1)
         return OpenLoop(tip=tip, proximal=proximal, control=control)
 
     @property
@@ -168,7 +168,7 @@ class TwinPredictor:
         count = self.config.members  # the point after 0 is the middle
         unit = qmc.Sobol(3, scramble=False).random_base2(count.bit_length())[1 : count + 1]
         members = center + (2 * unit[:, None] - 1) * spread
-        members = np.clip(members, _BELIEVED - self._spread, _BELIEVED + self._spread)
+        members = np.clip(members, _NOMINAL - self._spread, _NOMINAL + self._spread)
         level = np.linspace(1 - self.config.stiffness_spread, 1 + self.config.stiffness_spread, LEVELS)
         members[..., 1] = level[np.abs(members[..., 1, None] - level).argmin(axis=-1)]
         return members
@@ -177,22 +177,22 @@ class TwinPredictor:
         return self.device.with_tip(bend_rad=self.device.tip_bend_rad, stiffness_factor=float(stiffness))
 
     def _simulate(
-        self, anatomy: Anatomy, data: Dataset, members: Members, samples: int
+        self, anatomy: Anatomy, data: Episodes, members: Members, samples: int
     ) -> Float[np.ndarray, "members episodes s 2"]:
         """Return (Δtip, γtip) of every member over the first samples, mm; NaN from where a simulation fails."""
         paths = np.full((*members.shape[:2], samples, 2), np.nan)
         for stiffness in np.unique(members[..., 1]):
             member, episode = np.nonzero(members[..., 1] == stiffness)
-            control = data.asked[episode, :samples]
+            control = data.command[episode, :samples]
             least = -(SAMPLE_PERIOD_S * np.cumsum(control[..., 0], axis=1)).min(axis=1).clip(max=0.0)
-            start = np.maximum(data.initial_inserted_length[episode] + members[member, episode, 2], least)
+            start = np.maximum(data.initial[episode, 0] + members[member, episode, 2], least)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # a member that fails has no weight
                 rollout = simulate(
                     anatomy,
                     self._wire(stiffness),
                     control,
-                    initial=np.column_stack([start, data.initial_rotation[episode]]),
+                    initial=np.column_stack([start, data.initial[episode, 1]]),
                     config=self.simulator,
                     friction=self.device.friction * members[member, episode, 0],
                 )
@@ -204,55 +204,55 @@ class TwinPredictor:
 def weigh(
     paths: Float[np.ndarray, "members episodes samples 2"],
     tips: Float[np.ndarray, "episodes samples 2"],
-    seen: Bool[np.ndarray, "episodes samples"],
+    observed: Bool[np.ndarray, "episodes samples"],
     config: TwinConfig,
 ) -> tuple[Float[np.ndarray, "episodes samples 2"], Float[np.ndarray, "episodes samples 2"]]:
-    """Return what an ensemble foretells, and its spread, mm, from the tips that were seen of each episode.
+    """Return the tip that an ensemble predicts, and its spread, mm, from the observed tips of each episode.
 
     Args:
         paths: of the members, mm, as `TwinPredictor.ensemble` gives them.
-        tips: (Δtip, γtip) where `seen`, mm; no other is looked at.
-        seen: samples at which the tip was measured.
-        config: scales of what a good member misses a seen tip by.
+        tips: (Δtip, γtip) where `observed`, mm; no other is read.
+        observed: samples at which the tip was observed.
+        config: scales of the error of a good member.
     """
-    return _median_and_spread(paths, _weights(paths, tips, seen, config))
+    return _median_and_spread(paths, _weights(paths, tips, observed, config))
 
 
 def _unexplained(
     middle: Float[np.ndarray, "episodes samples 2"],
     tips: Float[np.ndarray, "episodes samples 2"],
-    seen: Bool[np.ndarray, "episodes samples"],
+    observed: Bool[np.ndarray, "episodes samples"],
     config: TwinConfig,
 ) -> Float[np.ndarray, "episodes samples 2"]:
-    """Return by how much more than a good member it missed the tip each of the last times it was seen, mm.
+    """Return by how much more than a good member the median erred at every one of the last observations, mm.
 
-    Where something else than the ensemble's parameters is off, all members may agree on what is wrong: their spread
-    does not tell. A single miss may be one of the measurement.
+    Where something else than the ensemble's parameters is wrong, all members may err alike: their spread does not show
+    it. A single error may be one of the measurement.
     """
-    off = np.nan_to_num(np.abs(middle - np.where(seen[..., None], tips, middle)))
-    beyond = np.maximum(off - GOOD * np.array([config.abscissa_sd_mm, config.offset_sd_mm]), 0.0)
-    count = np.cumsum(seen, axis=1)
-    order = np.argsort(~seen, axis=1, kind="stable")  # seen samples first
-    last = np.maximum(count[..., None] - 1 - np.arange(_MISSES), 0)
-    episode = np.arange(len(seen))[:, None, None]
+    error = np.nan_to_num(np.abs(middle - np.where(observed[..., None], tips, middle)))
+    beyond = np.maximum(error - GOOD * np.array([config.abscissa_sd_mm, config.offset_sd_mm]), 0.0)
+    count = np.cumsum(observed, axis=1)
+    order = np.argsort(~observed, axis=1, kind="stable")  # observed samples first
+    last = np.maximum(count[..., None] - 1 - np.arange(_PERSISTENT), 0)
+    episode = np.arange(len(observed))[:, None, None]
     persistent = beyond[episode, order[episode, last]].min(axis=2)
-    return np.where(count[..., None] >= _MISSES, persistent, 0.0)
+    return np.where(count[..., None] >= _PERSISTENT, persistent, 0.0)
 
 
 def _weights(
     paths: Float[np.ndarray, "members episodes s 2"],
     tips: Float[np.ndarray, "episodes samples 2"],
-    seen: Bool[np.ndarray, "*episodes samples"],
+    observed: Bool[np.ndarray, "*episodes samples"],
     config: TwinConfig,
 ) -> Float[np.ndarray, "members episodes"]:
-    """Return the members' weights: the product of Cauchy densities of what they miss the seen tips by.
+    """Return the members' weights: the product of Cauchy densities of their errors at the observed tips.
 
-    Heavy tails, because a snap that comes a moment too early is off by a millimetre and says little about friction.
+    Heavy tails, because a snap that comes a moment too early errs by a millimetre and says little about friction.
     """
-    at = np.flatnonzero(seen.any(axis=tuple(range(seen.ndim - 1))))
+    at = np.flatnonzero(observed.any(axis=tuple(range(observed.ndim - 1))))
     at = at[at < paths.shape[2]]
-    off = (paths[:, :, at] - tips[:, at]) / np.array([config.abscissa_sd_mm, config.offset_sd_mm])
-    score = np.where(seen[..., at, None], np.nan_to_num(-np.log1p(off**2), nan=-1e3), 0.0).sum(axis=(2, 3))
+    error = (paths[:, :, at] - tips[:, at]) / np.array([config.abscissa_sd_mm, config.offset_sd_mm])
+    score = np.where(observed[..., at, None], np.nan_to_num(-np.log1p(error**2), nan=-1e3), 0.0).sum(axis=(2, 3))
     weight = np.exp(score - score.max(axis=0))
     return weight / weight.sum(axis=0)
 
@@ -281,18 +281,6 @@ def _median_and_spread(
     return np.where(left, middle, np.nan), spread
 
 
-def _by_anatomy(episodes: Dataset) -> Iterator[tuple[Anatomy, Int[np.ndarray, "chosen"]]]:
+def _by_anatomy(episodes: Episodes) -> Iterator[tuple[Anatomy, Int[np.ndarray, "chosen"]]]:
     for name in np.unique(episodes.anatomy):
-        yield read_anatomy(episodes.anatomy_folder(str(name))), np.flatnonzero(episodes.anatomy == name)
-
-
-def _tips(episodes: Dataset) -> Float[np.ndarray, "episodes samples 2"]:
-    return np.stack([episodes.tip_abscissa, episodes.tip_offset], axis=-1).astype(float)
-
-
-def _proximal(episodes: Dataset) -> Float[np.ndarray, "episodes samples 2"]:
-    return np.stack([episodes.inserted_length, episodes.rotation], axis=-1).astype(float)
-
-
-def _control(episodes: Dataset) -> Float[np.ndarray, "episodes samples 2"]:
-    return episodes.control.astype(float)
+        yield episodes.setup.anatomies[str(name)](), np.flatnonzero(episodes.anatomy == name)

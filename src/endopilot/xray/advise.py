@@ -1,4 +1,4 @@
-"""Calibrate a run's X-ray adviser, and measure it on patients not seen: `advise`."""
+"""Calibrate a run's X-ray adviser, and measure it on new patients: `advise`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from endopilot.files import manifest, write_json, writing
 from endopilot.models.config import PRETRAINED, read_run
 from endopilot.models.provenance import check_wire
 from endopilot.progress import progress
-from endopilot.xray import monitoring as advice
+from endopilot.xray import monitoring
 from endopilot.xray.bands import CALIBRATION_FILE, check_enough
 from endopilot.xray.monitoring import AdviseConfig
 
@@ -58,34 +58,39 @@ def advise(run: Path, dataset: Path, output: Path, config: AdviseConfig) -> dict
     check_wire(run, read_run(run), episodes)
     splits = [episodes.of_split(name) for name in ("train", "calibrate", "test")]
     check_enough(len(set(splits[1].anatomy)), config.adviser.level)
-    fitted, own, test = (advice.watch(predictor, split, config) for split in splits)
-    calibration = advice.calibrate(fitted, own, config.adviser.level)
+    fitted, own, test = (monitoring.monitor(predictor, split, config) for split in splits)
+    calibration = monitoring.calibrate(fitted, own, config.adviser.level)
     with progress("Advising", len(PERIODS) + len(WIDTHS) + len(THRESHOLDS) + 1) as advance:
         curves: dict[str, list[dict[str, float]]] = {"periodic": [], "adviser": []}
         thresholds: list[dict[str, float]] = []
         for period in PERIODS:
-            curves["periodic"].append(advice.run(test, advice.periodic(test, period), config.adviser))
+            curves["periodic"].append(
+                monitoring.measure_policy(test, monitoring.periodic_policy(test, period), config.adviser)
+            )
             advance()
         for width in WIDTHS:
             bands = replace(calibration, scale=width * calibration.scale)
-            test.model.restart()
-            point = advice.run(test, advice.advised(test, bands, config.adviser), config.adviser)
+            test.model.reset()
+            policy = monitoring.adviser_policy(test, bands, config.adviser)
+            point = monitoring.measure_policy(test, policy, config.adviser)
             curves["adviser"].append({"width": width, **point})
             advance()
         for ratio, mm in THRESHOLDS:
             other = replace(config.adviser, wall_ratio=ratio, abscissa_mm=mm)
-            test.model.restart()
-            point = advice.run(test, advice.advised(test, calibration, other), other)
+            test.model.reset()
+            policy = monitoring.adviser_policy(test, calibration, other)
+            point = monitoring.measure_policy(test, policy, other)
             thresholds.append({"wall_ratio": ratio, "abscissa_mm": mm, **point})
             advance()
-        curves["oracle"] = [advice.run(test, advice.oracle(test, config.adviser), config.adviser)]
+        oracle = monitoring.oracle_policy(test, config.adviser)
+        curves["oracle"] = [monitoring.measure_policy(test, oracle, config.adviser)]
         advance()
     at = next(point for point in curves["adviser"] if point["width"] == 1.0)
-    equal = advice.periodic_equal(curves["periodic"], at["missed_share"])
+    equal = monitoring.periodic_equal(curves["periodic"], at["missed_share"])
     content = {
         "calibration": calibration,
-        "coverage": advice.coverage(test, calibration),
-        "coverage_of_calibration_patients": advice.coverage(own, calibration),
+        "coverage": monitoring.coverage(test, calibration),
+        "coverage_of_calibration_patients": monitoring.coverage(own, calibration),
         "adviser": at,
         "periodic_exposures_per_minute_with_the_same_missed_share": equal,
         "share_of_the_exposures_of_periodic_imaging": at["exposures_per_minute"] / equal,

@@ -184,21 +184,24 @@ class Fluoroscope:
         seen = [self._detect(view, tip_position, tip_direction, random) for view in self._views]
         return self._likeliest(seen, inserted_length)
 
-    def expose_episodes(self, episodes: Dataset, seed: int) -> TipProjection:
+    def expose_episodes(
+        self, episodes: Dataset, inserted_length: Float[np.ndarray, "episodes samples"], seed: int
+    ) -> TipProjection:
         """Return where an exposure would show the tip, at every sample of episodes of this patient.
 
         Args:
-            episodes: navigations; Δ, as the encoder says it, helps to find the tip.
+            episodes: navigations, with the tip as it truly is.
+            inserted_length: Δ by the robot's encoder, mm, which helps to find the tip.
             seed: of the errors; those of a navigation depend on it, the patient and the sequence alone.
         """
-        position = np.empty((len(episodes), episodes.valid.shape[1], 3))
+        position = np.zeros_like(episodes.tip_position, dtype=float)
         for index, sequence in enumerate(episodes.sequence):
             random = np.random.default_rng([seed, 3, int(sequence), *self._anatomy.name.encode()])
             for sample in range(position.shape[1]):
                 position[index, sample] = self.locate(
                     episodes.tip_position[index, sample].astype(float),
                     episodes.tip_direction[index, sample].astype(float),
-                    float(episodes.inserted_length[index, sample]),
+                    float(inserted_length[index, sample]),
                     random,
                 )
         return project_tip(self._anatomy.tree, self._anatomy.insertion, position)

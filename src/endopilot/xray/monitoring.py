@@ -1,4 +1,4 @@
-"""X-ray advice on patients not seen: do the bands hold, what is missed, and how many exposures does it take?"""
+"""X-ray advice on new patients: do the bands hold, which events are missed, and how many exposures does it take?"""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from endopilot.anatomy.io import read_anatomy
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.dataset.loader import Dataset
 from endopilot.errors import InputError
 from endopilot.models.config import WINDOW
+from endopilot.models.episodes import Episodes
 from endopilot.models.open_loop import Predictor
 from endopilot.progress import progress
 from endopilot.simulation.device import Device
@@ -26,20 +26,20 @@ from endopilot.xray.online_predictors import OnlinePredictor, online_predictor
 FLUOROSCOPY_HZ = 7.5
 """Frame rate of the fluoroscopy that advice is compared with."""
 _GRID_MM = 0.25
-Decide = Callable[[int, Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]], Bool[np.ndarray, "n"]]
-"""From sample, foretold tip and its spread (mm), for which navigations X-ray is on."""
+ExposurePolicy = Callable[[int, Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]], Bool[np.ndarray, "n"]]
+"""From sample, predicted tip and its spread (mm), which navigations are exposed."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class AdviseConfig:
-    """What is advised, and how far what the model is told is from the truth."""
+    """What the adviser must not miss, and how far the model is from the truth."""
 
     adviser: AdviserConfig = field(default_factory=AdviserConfig)
     """What X-ray must not miss."""
     fluoroscope: FluoroscopeConfig = field(default_factory=FluoroscopeConfig)
     """The C-arm."""
     ostium_mm: float = 0.3
-    """Each patient's ostium lies up to this much deeper or less deep than the model is told, mm."""
+    """Each patient's ostium lies up to this much deeper or less deep than in the model, mm."""
     seed: int = 0
     """Seed of the detection errors and of the ostia."""
 
@@ -57,39 +57,41 @@ class AdviseConfig:
 
 @dataclass(frozen=True, eq=False)
 class Monitored:
-    """The navigations of one split, as they are and as they are told.
+    """The navigations of one split, as they are and as the model is given them.
 
     Attributes:
         truth: true (Δtip, γtip), mm.
         ratio: true γtip/(lumen radius − wire radius).
-        told: the episodes with tips as X-ray would show them and Δ as the encoder says it.
-        model: what foretells them.
+        episodes: Δ by the encoder, and tips as X-ray would show them.
+        model: what predicts them.
         lumen: radii of the lumen, to look up.
         wire_radius_mm: radius of the wire, mm.
+        dataset: key of the dataset.
     """
 
     truth: Float[np.ndarray, "episodes samples 2"]
     ratio: Float[np.ndarray, "episodes samples"]
-    told: Dataset
+    episodes: Episodes
     model: OnlinePredictor
     lumen: Lumen
     wire_radius_mm: float
+    dataset: str
 
     @property
     def proximal(self) -> Float[np.ndarray, "episodes samples 2"]:
         """(Δ mm, φ rad) by the encoder."""
-        return np.stack([self.told.inserted_length, self.told.rotation], axis=-1).astype(float)
+        return self.episodes.proximal.astype(float)
 
     @property
     def since(self) -> tuple[Float[np.ndarray, "episodes later"], Float[np.ndarray, "episodes later"]]:
         """Time, s, and travel, mm, since the last of the given samples, at the samples after it."""
-        length = self.told.inserted_length[:, WINDOW - 1 :].astype(float)
+        length = self.proximal[:, WINDOW - 1 :, 0]
         travel = np.abs(np.diff(length, axis=1)).cumsum(axis=1)
         return SAMPLE_PERIOD_S * np.arange(1, length.shape[1]) + 0 * travel, travel
 
 
 class Lumen:
-    """The lumen's radius where a tip is foretold: on the way through the branch that it was last seen in."""
+    """The lumen's radius at a predicted tip: on the path through the branch that it was last observed in."""
 
     def __init__(self, trees: Sequence[VesselTree], owner: Int[np.ndarray, "episodes"]) -> None:
         """Tabulate the radii.
@@ -110,7 +112,7 @@ class Lumen:
     def radius(
         self, branch: Int[np.ndarray, "episodes"], abscissa_mm: Float[np.ndarray, "episodes"]
     ) -> Float[np.ndarray, "episodes"]:
-        """Return the radius, mm, at a Δtip, mm, on the way through a branch."""
+        """Return the radius, mm, at a Δtip, mm, on the path through a branch."""
         place = np.clip(np.rint(np.nan_to_num(abscissa_mm) / _GRID_MM).astype(int), 0, self._table.shape[2] - 1)
         return self._table[self._owner, branch, place]
 
@@ -123,45 +125,42 @@ def _onwards(tree: VesselTree, branch: int) -> tuple[np.ndarray, np.ndarray]:
     return line.abscissa, line.radius
 
 
-def watch(predictor: Predictor, episodes: Dataset, config: AdviseConfig) -> Monitored:
-    """Return the navigations of a split, with the model that watches them.
+def monitor(predictor: Predictor, dataset: Dataset, config: AdviseConfig) -> Monitored:
+    """Return the navigations of a split with an online predictor of their tips.
 
     Args:
         predictor: the model.
-        episodes: the navigations as they truly went.
-        config: how they are told.
+        dataset: the navigations as they truly went.
+        config: the C-arm, and the model mismatch.
     """
-    names, owner = np.unique(episodes.anatomy, return_inverse=True)
-    wire_radius = Device.from_record(episodes.manifest["device"]).tip_radius_mm
-    trees = []
+    names, owner = np.unique(dataset.anatomy, return_inverse=True)
+    wire_radius = Device.from_record(dataset.manifest["device"]).tip_radius_mm
     deeper = np.array(
         [np.random.default_rng([config.seed, 4, *str(name).encode()]).uniform(-1.0, 1.0) for name in names]
     )
-    off = (config.ostium_mm * deeper)[owner]
-    told = replace(
-        episodes,
-        initial_inserted_length=episodes.initial_inserted_length - off,
-        inserted_length=episodes.inserted_length - off[:, None],
-        tip_abscissa=episodes.tip_abscissa.astype(float),
-        tip_offset=episodes.tip_offset.astype(float),
-        branch=episodes.branch.copy(),
-    )
+    by_encoder = np.zeros((len(dataset), 2))
+    by_encoder[:, 0] = -(config.ostium_mm * deeper)[owner]
+    true = Episodes.of_dataset(dataset)
+    proximal, trees = true.proximal + by_encoder[:, None], []
+    tip, branch = true.tip.astype(float), true.branch.copy()
     with progress("Exposing", len(names)) as advance:
         for index, name in enumerate(names):
-            anatomy = read_anatomy(episodes.anatomy_folder(str(name)))  # one at a time: a distance map takes memory
+            anatomy = true.setup.anatomies[str(name)]()  # one at a time: a distance map takes memory
             trees.append(anatomy.tree)
             mine = np.flatnonzero(owner == index)
             arm = Fluoroscope(anatomy, wire_radius, config.fluoroscope)
-            tip = arm.expose_episodes(told.select(mine), config.seed)
-            told.tip_abscissa[mine], told.tip_offset[mine], told.branch[mine] = tip.abscissa, tip.offset, tip.branch
+            shown = arm.expose_episodes(dataset.select(mine), proximal[mine, :, 0], config.seed)
+            tip[mine], branch[mine] = np.stack([shown.abscissa, shown.offset], axis=-1), shown.branch
             advance()
+    episodes = replace(true, initial=true.initial + by_encoder, proximal=proximal, tip=tip, branch=branch)
     return Monitored(
-        truth=np.stack([episodes.tip_abscissa, episodes.tip_offset], axis=-1).astype(float),
-        ratio=safety_ratio(episodes.tip_offset, episodes.lumen_radius, wire_radius).astype(float),
-        told=told,
-        model=online_predictor(predictor, told),
+        truth=true.tip.astype(float),
+        ratio=safety_ratio(dataset.tip_offset, dataset.lumen_radius, wire_radius).astype(float),
+        episodes=episodes,
+        model=online_predictor(predictor, episodes),
         lumen=Lumen(trees, owner),
         wire_radius_mm=wire_radius,
+        dataset=dataset.manifest["key"],
     )
 
 
@@ -176,30 +175,30 @@ def calibrate(fitted: Monitored, own: Monitored, level: float) -> Calibration:
     Raises:
         InputError: there are too few calibration patients for that level.
     """
-    fitted.model.restart()
+    fitted.model.reset()
     seconds, travel = fitted.since
     error = (fitted.model.tip - fitted.truth)[:, WINDOW:]
     terms = fit_spread(error, seconds, travel, fitted.model.spread[:, WINDOW:])
-    own.model.restart()
+    own.model.reset()
     score = np.abs((own.model.tip - own.truth)[:, WINDOW:] / spread_of(terms, *own.since, own.model.spread[:, WINDOW:]))
     return Calibration(
         level=level,
-        scale=conformal_scale(score.max(axis=(1, 2)), own.told.anatomy, level),
+        scale=conformal_scale(score.max(axis=(1, 2)), own.episodes.anatomy, level),
         abscissa_terms=terms[0],
         offset_terms=terms[1],
-        anatomies=len(np.unique(own.told.anatomy)),
+        anatomies=len(np.unique(own.episodes.anatomy)),
         intervals=len(score),
-        dataset=own.told.manifest["key"],
+        dataset=own.dataset,
     )
 
 
-def coverage(watched: Monitored, calibration: Calibration) -> dict[str, Any]:
+def coverage(monitored: Monitored, calibration: Calibration) -> dict[str, Any]:
     """Return how often the bands hold: over whole intervals of 45 s, sample by sample, and in the worst patients."""
-    watched.model.restart()
-    half = calibration.half_width(*watched.since, watched.model.spread[:, WINDOW:])
-    inside: np.ndarray = np.less_equal(np.abs((watched.model.tip - watched.truth)[:, WINDOW:]), half)
+    monitored.model.reset()
+    half = calibration.half_width(*monitored.since, monitored.model.spread[:, WINDOW:])
+    inside: np.ndarray = np.less_equal(np.abs((monitored.model.tip - monitored.truth)[:, WINDOW:]), half)
     whole: np.ndarray = np.asarray(inside.all(axis=(1, 2)))
-    anatomy = watched.told.anatomy
+    anatomy = monitored.episodes.anatomy
     each = np.sort([whole[anatomy == name].mean() for name in np.unique(anatomy)])
     worst = each[: max(1, round(len(each) / 10))]
     return {
@@ -207,81 +206,81 @@ def coverage(watched: Monitored, calibration: Calibration) -> dict[str, Any]:
         "worst_decile_of_patients": float(worst.mean()),
         "samplewise": float(inside.all(axis=2).mean()),
         "median_half_width_mm": np.median(half, axis=(0, 1)).tolist(),
-        "error_mae_mm": np.abs((watched.model.tip - watched.truth)[:, WINDOW:]).mean(axis=(0, 1)).tolist(),
+        "error_mae_mm": np.abs((monitored.model.tip - monitored.truth)[:, WINDOW:]).mean(axis=(0, 1)).tolist(),
         "intervals": len(whole),
         "patients": len(each),
     }
 
 
-def run(watched: Monitored, decide: Decide, config: AdviserConfig) -> dict[str, float]:
-    """Let something decide when X-ray is on, show the model what it shows, and count.
+def measure_policy(monitored: Monitored, policy: ExposurePolicy, config: AdviserConfig) -> dict[str, float]:
+    """Let a policy decide when X-ray is on, let the model observe what it shows, and count exposures and events.
 
-    An event begins where the true ratio reaches τ, or the error of the foretold Δtip δ, after a sample at which it had
-    not. It is missed where no exposure is within 0.5 s, a sample, of its beginning.
+    An event begins where the true ratio reaches τ, or the error of the predicted Δtip reaches δ, after a sample at
+    which it had not. It is missed where no exposure is within 0.5 s, a sample, of its beginning.
     """
-    model, truth, samples = watched.model, watched.truth, watched.truth.shape[1]
-    model.restart()
+    model, truth, samples = monitored.model, monitored.truth, monitored.truth.shape[1]
+    model.reset()
     exposed = np.zeros(truth.shape[:2], dtype=bool)
-    shown = np.stack([watched.told.tip_abscissa, watched.told.tip_offset], axis=-1)
+    episodes = monitored.episodes
     for sample in range(WINDOW, samples):
-        on = np.flatnonzero(decide(sample, model.tip[:, sample], model.spread[:, sample]))
+        on = np.flatnonzero(policy(sample, model.tip[:, sample], model.spread[:, sample]))
         exposed[on, sample] = True
         if len(on):
-            model.show(on, sample, shown[on, sample])
+            model.observe(on, sample, episodes.tip[on, sample], episodes.branch[on, sample])
     near = near_exposures(exposed)
     near[:, WINDOW] = True  # X-ray was on until the sample before
-    wall = watched.ratio >= config.wall_ratio
-    off = np.abs(model.tip[..., 0] - truth[..., 0]) >= config.abscissa_mm
-    off[:, WINDOW - 1] = False
-    counts = [count_events(state[:, WINDOW - 1 :], near[:, WINDOW - 1 :]) for state in (wall, off)]
-    (at_wall, unseen_at_wall), (astray, unseen_astray) = counts
+    wall = monitored.ratio >= config.wall_ratio
+    astray = np.abs(model.tip[..., 0] - truth[..., 0]) >= config.abscissa_mm
+    astray[:, WINDOW - 1] = False
+    counts = [count_events(state[:, WINDOW - 1 :], near[:, WINDOW - 1 :]) for state in (wall, astray)]
+    (wall_events, missed_wall), (abscissa_events, missed_abscissa) = counts
     minutes = exposed[:, WINDOW:].size * SAMPLE_PERIOD_S / 60
-    events = at_wall + astray
+    events = wall_events + abscissa_events
     rate = float(exposed.sum() / minutes)
     return {
         "exposures_per_minute": rate,
-        "missed_share": (unseen_at_wall + unseen_astray) / max(events, 1),
+        "missed_share": (missed_wall + missed_abscissa) / max(events, 1),
         "events_per_minute": events / minutes,
-        "wall_events_per_minute": at_wall / minutes,
-        "missed_wall_share": unseen_at_wall / max(at_wall, 1),
-        "missed_abscissa_share": unseen_astray / max(astray, 1),
+        "wall_events_per_minute": wall_events / minutes,
+        "missed_wall_share": missed_wall / max(wall_events, 1),
+        "missed_abscissa_share": missed_abscissa / max(abscissa_events, 1),
         "fewer_frames_than_fluoroscopy": 1 - rate / (60 * FLUOROSCOPY_HZ),
         "wall_samples_without_exposure_share": float((wall & ~near)[:, WINDOW:].sum() / max(wall[:, WINDOW:].sum(), 1)),
     }
 
 
-def advised(watched: Monitored, calibration: Calibration, config: AdviserConfig) -> Decide:
-    """Return the adviser as something that decides."""
-    adviser = XrayAdviser(calibration, config, watched.wire_radius_mm)
-    proximal, last = watched.proximal, WINDOW - 1
-    branch = watched.told.branch[:, last].astype(int)
-    tip = watched.model.tip[:, last]
-    adviser.start(proximal[:, last], tip, watched.lumen.radius(branch, tip[:, 0]))
+def adviser_policy(monitored: Monitored, calibration: Calibration, config: AdviserConfig) -> ExposurePolicy:
+    """Return the adviser as an exposure policy."""
+    adviser = XrayAdviser(calibration, config, monitored.wire_radius_mm)
+    proximal, last = monitored.proximal, WINDOW - 1
+    branch = monitored.episodes.branch[:, last].astype(int)
+    tip = monitored.model.tip[:, last]
+    adviser.start(proximal[:, last], tip, monitored.lumen.radius(branch, tip[:, 0]))
 
     def decide(sample: int, tip: np.ndarray, spread: np.ndarray) -> np.ndarray:
-        radius = watched.lumen.radius(branch, tip[:, 0])
+        radius = monitored.lumen.radius(branch, tip[:, 0])
         due = adviser.advise(proximal[:, sample], tip, spread, radius)
-        branch[due] = watched.told.branch[due, sample]
+        branch[due] = monitored.episodes.branch[due, sample]
         return due
 
     return decide
 
 
-def periodic(watched: Monitored, period: int) -> Decide:
-    """Return periodic imaging, each navigation with a phase of its own."""
-    phase = np.arange(len(watched.truth))
+def periodic_policy(monitored: Monitored, period: int) -> ExposurePolicy:
+    """Return periodic imaging, each navigation with a phase of its own; `period` counts samples."""
+    phase = np.arange(len(monitored.truth))
     return lambda sample, tip, spread: (sample + phase) % period == 0
 
 
-def oracle(watched: Monitored, config: AdviserConfig) -> Decide:
-    """Return what knows the truth, and exposes where an event begins."""
-    wall = watched.ratio >= config.wall_ratio
-    was_off = np.zeros(len(watched.truth), dtype=bool)
+def oracle_policy(monitored: Monitored, config: AdviserConfig) -> ExposurePolicy:
+    """Return a policy that knows the truth, and exposes where an event begins."""
+    wall = monitored.ratio >= config.wall_ratio
+    was_astray = np.zeros(len(monitored.truth), dtype=bool)
 
     def decide(sample: int, tip: np.ndarray, spread: np.ndarray) -> np.ndarray:
-        off = np.abs(tip[:, 0] - watched.truth[:, sample, 0]) >= config.abscissa_mm
-        due = (wall[:, sample] & ~wall[:, sample - 1]) | (off & ~was_off)
-        was_off[:] = off
+        astray = np.abs(tip[:, 0] - monitored.truth[:, sample, 0]) >= config.abscissa_mm
+        due = (wall[:, sample] & ~wall[:, sample - 1]) | (astray & ~was_astray)
+        was_astray[:] = astray
         return due
 
     return decide

@@ -1,0 +1,197 @@
+"""What a predictor is given of navigations: `Episodes`.
+
+A dataset gives them by `Episodes.of_dataset`, a plan by `Episodes.of_controls`. A navigation under way fills the fields
+with what its encoder and its X-ray images have measured so far; `Setup.of_anatomy` holds its vessel in memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int, Shaped
+
+from endopilot.anatomy.io import read_anatomy
+from endopilot.dataset.loader import Dataset, commanded
+from endopilot.errors import InputError
+from endopilot.models.config import WINDOW
+from endopilot.models.patient import Patient, prepare, read_or_prepare
+from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.device import Device
+from endopilot.types import SAMPLE_PERIOD_S, Anatomy
+
+PATIENTS_FOLDER = "patients"
+"""Folder of a dataset in which its patients are kept as they were prepared for its device."""
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """What episodes have in common: the vessels that they may lie in, and the wire.
+
+    Attributes:
+        anatomies: what reads each anatomy, by the anatomy's name; a distance map takes memory, so none is held here.
+        device: the wire.
+        simulator: settings of the rod core that patients are prepared with.
+        patients_folder: where prepared patients are kept for the next time; nowhere if None.
+        identities: SHA-256 of what a simulation depends on in each anatomy, by name; needed with `patients_folder`.
+    """
+
+    anatomies: Mapping[str, Callable[[], Anatomy]]
+    device: Device
+    simulator: SimulatorConfig
+    patients_folder: Path | None = None
+    identities: Mapping[str, str] | None = None
+
+    @staticmethod
+    def of_anatomy(anatomy: Anatomy, device: Device, simulator: SimulatorConfig) -> Setup:
+        """Return the setup of navigations in one vessel that is in memory."""
+        return Setup({anatomy.name: lambda: anatomy}, device, simulator)
+
+    @staticmethod
+    def of_dataset(dataset: Dataset) -> Setup:
+        """Return the setup of a dataset, which keeps its prepared patients in its folder."""
+
+        def read(name: str) -> Anatomy:
+            return read_anatomy(dataset.anatomy_folder(name))
+
+        return Setup(
+            anatomies={name: partial(read, name) for name in dataset.patients},
+            device=Device.from_record(dataset.manifest["device"]),
+            simulator=SimulatorConfig(**dataset.manifest["config"]["simulator"]),
+            patients_folder=dataset.folder / PATIENTS_FOLDER,
+            identities=dataset.patients,
+        )
+
+    def patient(self, name: str) -> Patient:
+        """Return a patient prepared for the wire; what is kept on disk is read, all else is prepared now.
+
+        Raises:
+            InputError: the anatomy cannot be read or prepared, or the folder cannot be written.
+        """
+        if self.patients_folder is None or self.identities is None:
+            return prepare(self.anatomies[name](), self.device, self.simulator)
+        return read_or_prepare(
+            self.patients_folder, name, self.identities[name], self.device, self.simulator, self.anatomies[name]
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Episodes:
+    """Navigations of equal length as a predictor is given them. Sample t is the state at the end of period t.
+
+    What a predictor may look at depends on what it predicts; see `models.open_loop`. A sample without a known tip may
+    hold anything there, such as the tip that is desired.
+
+    Attributes:
+        setup: the vessels and the wire.
+        anatomy: name of each episode's anatomy.
+        initial: (Δ mm, φ rad) before the first period.
+        control: π = (mm/s, rad/s) that the drive made, the mean over each period.
+        slip: advance that the drive was commanded and did not make over the period, mm.
+        proximal: x^prox = (Δ mm, φ rad).
+        tip: (Δtip, γtip), mm.
+        branch: index of the branch that the tip lies in.
+    """
+
+    setup: Setup
+    anatomy: Shaped[np.ndarray, "episodes"]
+    initial: Float[np.ndarray, "episodes 2"]
+    control: Float[np.ndarray, "episodes samples 2"]
+    slip: Float[np.ndarray, "episodes samples"]
+    proximal: Float[np.ndarray, "episodes samples 2"]
+    tip: Float[np.ndarray, "episodes samples 2"]
+    branch: Int[np.ndarray, "episodes samples"]
+
+    @staticmethod
+    def of_dataset(dataset: Dataset) -> Episodes:
+        """Return the navigations of a dataset, with their true tips.
+
+        Raises:
+            InputError: they are no longer than the states that a predictor is given.
+        """
+        samples = dataset.valid.shape[1]
+        if samples <= WINDOW:
+            seconds = (WINDOW + 1) * dataset.sample_period_s
+            raise InputError(
+                f"{dataset.folder}: episodes of {samples} samples leave nothing to predict after {WINDOW} given ones; "
+                f"make the dataset with seconds of {seconds:g} or more"
+            )
+        return Episodes(
+            setup=Setup.of_dataset(dataset),
+            anatomy=dataset.anatomy,
+            initial=np.stack([dataset.initial_inserted_length, dataset.initial_rotation], axis=-1),
+            control=dataset.control,
+            slip=dataset.slip,
+            proximal=np.stack([dataset.inserted_length, dataset.rotation], axis=-1),
+            tip=np.stack([dataset.tip_abscissa, dataset.tip_offset], axis=-1),
+            branch=dataset.branch,
+        )
+
+    @staticmethod
+    def of_controls(
+        setup: Setup,
+        *,
+        initial: Float[np.ndarray, "2"],
+        control: Float[np.ndarray, "episodes samples 2"],
+        tip: Float[np.ndarray, "episodes samples 2"],
+    ) -> Episodes:
+        """Return planned navigations in a setup's only vessel; the drive makes exactly what it is commanded.
+
+        Args:
+            setup: of one anatomy.
+            initial: (Δ mm, φ rad) before the first period.
+            control: π = (mm/s, rad/s).
+            tip: (Δtip, γtip), mm: at rest in the first branch, then as desired or predicted.
+        """
+        (name,) = setup.anatomies
+        count, samples = control.shape[:2]
+        return Episodes(
+            setup=setup,
+            anatomy=np.full(count, name),
+            initial=np.tile(initial, (count, 1)),
+            control=control,
+            slip=np.zeros((count, samples)),
+            proximal=initial + SAMPLE_PERIOD_S * np.cumsum(control, axis=1),
+            tip=tip,
+            branch=np.zeros((count, samples), dtype=np.int64),
+        )
+
+    def __len__(self) -> int:
+        """Return the number of episodes."""
+        return len(self.anatomy)
+
+    @property
+    def samples(self) -> int:
+        """Number of samples of each episode."""
+        return self.tip.shape[1]
+
+    @property
+    def command(self) -> Float[np.ndarray, "episodes samples 2"]:
+        """Control that the drive was commanded (mm/s, rad/s), see `Dataset.asked`."""
+        return commanded(self.control, self.slip, SAMPLE_PERIOD_S)
+
+    def select(self, chosen: Shaped[np.ndarray, "chosen"]) -> Episodes:
+        """Return the chosen episodes, given as a mask or as indices."""
+        names = [field.name for field in fields(self) if field.name != "setup"]
+        return replace(self, **{name: getattr(self, name)[chosen] for name in names})
+
+    def from_sample(self, first: int) -> Episodes:
+        """Return the episodes from a sample on; the state before it is their initial one."""
+        if first == 0:
+            return self
+        names = ("control", "slip", "proximal", "tip", "branch")
+        later = {name: getattr(self, name)[:, first:] for name in names}
+        return replace(self, initial=self.proximal[:, first - 1], **later)
+
+    def driven(
+        self, proximal: Float[np.ndarray, "episodes later 2"], control: Float[np.ndarray, "episodes later 2"]
+    ) -> Episodes:
+        """Return the episodes with another motion of the drive in their last samples."""
+
+        def then(before: np.ndarray, later: np.ndarray) -> np.ndarray:
+            return np.concatenate([before[:, : -later.shape[1]], later.astype(before.dtype)], axis=1)
+
+        return replace(self, control=then(self.control, control), proximal=then(self.proximal, proximal))
