@@ -196,10 +196,10 @@ def run_demo(output: Path, config: DemoConfig) -> dict[str, Any]:
     )
     atlas = AtlasConfig(anatomy="rca", count=config.patients, seed=config.seed)
     truths = [output / "truth" / f"patient-{index + 1}" for index in range(config.patients)]
-    make_patient = partial(_make_patient, config=atlas, truths=truths)
-    make_volume = partial(_make_volume, output=output, seed=config.seed, truths=truths)
-    run.stages.do_each("atlas", "Synthetic patients", truths, make_patient)
-    run.stages.do_each("phantom", "Synthetic CT angiograms", truths, make_volume)
+    draw = partial(_make_patient, config=atlas, truths=truths)
+    scan = partial(_make_volume, output=output, seed=config.seed, truths=truths)
+    run.stages.do_each("atlas", "Synthetic patients", truths, draw)
+    run.stages.do_each("phantom", "Synthetic CT angiograms", truths, scan)
     return _study(run, [output / "ct" / f"{folder.name}{VOLUME_SUFFIX}" for folder in truths])
 
 

@@ -64,7 +64,7 @@ def _read(folder: Path, fingerprint: str) -> Anatomy:
 def _episodes(plan: Plan, block: Block, draw: Draw, rollout: Rollout, stopped: Bool[np.ndarray, "n"]) -> dict[str, Any]:
     """Return the columns of the episode table; the first seven and the last two are LeRobot's."""
     n, samples = rollout.valid.shape
-    whole = rollout.valid.all(axis=1).tolist()
+    whole = [bool(valid.all()) for valid in rollout.valid]
     episode = block.first_episode + np.arange(n)
     chunk, file = divmod(block.number, schema.FILES_PER_CHUNK)
     return {
