@@ -4,13 +4,27 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
-.PHONY: demo test check cta readme docs roofline recipe-laptop recipe-gpu clean
+.PHONY: demo test test-wheel check cta readme docs roofline recipe-laptop recipe-gpu clean
 
 demo: $(INSTALLED)
 	$(BIN)/endopilot demo
 
 test: $(INSTALLED)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
+
+# Wheel from sdist, installed into an environment of its own; the tests run against it, with no source of the package near.
+CLEAN := build/test-wheel
+test-wheel: $(INSTALLED)
+	rm -rf dist $(CLEAN)
+	mkdir -p $(CLEAN)/source
+	$(BIN)/python -m build
+	$(PYTHON) -m venv $(CLEAN)/venv
+	$(CLEAN)/venv/bin/pip install -q -c constraints.txt torch
+	$(CLEAN)/venv/bin/pip install -q -c constraints.txt "endopilot[dev] @ file://$$(ls $(CURDIR)/dist/*.whl)"
+	tar -xzf dist/*.tar.gz --strip-components 1 -C $(CLEAN)/source
+	rm -r $(CLEAN)/source/src/endopilot
+	cd $(CLEAN)/source && OMP_NUM_THREADS=1 ../venv/bin/python -m pytest -n auto --dist loadfile --no-loadscope-reorder \
+	  --ignore tests/e2e/test_wheel.py
 
 check: $(INSTALLED)
 	$(BIN)/ruff check .

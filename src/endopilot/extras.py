@@ -6,6 +6,9 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+FOR_DEVELOPERS = ("dev", "docs")
+"""Extras that no command needs."""
+
 
 def requirements_of_extras() -> dict[str, tuple[str, ...]]:
     """Return the names of the libraries that each extra brings, as the package's metadata lists them."""
@@ -19,11 +22,22 @@ def requirements_of_extras() -> dict[str, tuple[str, ...]]:
     return found
 
 
+def extras_present() -> dict[str, bool]:
+    """Return whether every library of each extra is installed; none is imported."""
+    from importlib.util import find_spec
+
+    return {
+        extra: all(find_spec(library.replace("-", "_")) is not None for library in libraries)
+        for extra, libraries in requirements_of_extras().items()
+        if extra not in FOR_DEVELOPERS
+    }
+
+
 def what_is_missing(error: ModuleNotFoundError) -> str | None:
     """Return what to install, in one line, where an extra brings the module; None if the error is a defect."""
     module = (error.name or "").partition(".")[0]
     for extra, libraries in requirements_of_extras().items():
-        if extra != "dev" and _normal(module) in libraries:
+        if extra not in FOR_DEVELOPERS and _normal(module) in libraries:
             return f"needs {module}; install it with: pip install 'endopilot[{extra}]'"
     return None
 

@@ -12,10 +12,12 @@ from pathlib import Path
 import pytest
 import tyro
 
+import endopilot
 from endopilot.cli import main, module_of
 
 ROOT = Path(__file__).parents[2]
-PAGES = ["README.md", "Makefile", "src/endopilot/models/pretrained/MODEL_CARD.md"]
+CARD = str(Path(endopilot.__file__).parent / "models/pretrained/MODEL_CARD.md")
+PAGES = ["README.md", "Makefile", CARD]
 PAGES += [f"docs/{page.name}" for page in sorted((ROOT / "docs").glob("*.md"))]
 COMMAND = re.compile(r"endopilot ((?:bench )?[a-z][a-z-]*)((?: [^\n`|&;]*)?)")
 OPTION = re.compile(r"(?<=\s)(--[a-z][a-z0-9-]*|-[a-z](?=\s))")

@@ -10,6 +10,7 @@ import pytest
 import SimpleITK as sitk
 from command import refused, run
 
+import endopilot
 from endopilot.anatomy.io import write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.cli import main
@@ -93,9 +94,7 @@ def test_centerline_without_radii(tmp_path, capsys):
 
 
 def test_wire_and_controls(tmp_path, capsys, patient):
-    device = (Path(__file__).parents[2] / "src/endopilot/simulation/devices/workhorse-014.yaml").read_text(
-        encoding="utf-8"
-    )
+    device = (Path(endopilot.__file__).parent / "simulation/devices/workhorse-014.yaml").read_text(encoding="utf-8")
     assert "value: 0.36" in device
     (tmp_path / "thick.yaml").write_text(device.replace("value: 0.36", "value: 9.0", 1), encoding="utf-8")
     header = "time_s,translation_mm_s,rotation_rad_s\n"

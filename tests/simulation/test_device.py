@@ -6,11 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import endopilot
 from endopilot.errors import InputError
 from endopilot.simulation.device import Device, read_device
 from endopilot.simulation.device_files import list_devices
 
-SHIPPED = Path(__file__).parents[2] / "src/endopilot/simulation/devices"
+SHIPPED = Path(endopilot.__file__).parent / "simulation/devices"
 
 
 @pytest.mark.parametrize("name", list_devices())

@@ -26,7 +26,7 @@ from endopilot.simulation.device import Device, read_device
 from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.simulation.simulate import simulate
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
-from endopilot.types import TipProjection
+from endopilot.types import Anatomy, TipProjection
 
 _IDEAL = RobotConfig(
     latency_s=0.0, max_acceleration_mm_s2=1e6, max_acceleration_rad_s2=1e6, backlash_mm=0.0, backlash_rad=0.0,
@@ -36,22 +36,22 @@ _IDEAL = RobotConfig(
 
 
 def plan(
-    anatomy: Path,
+    anatomy: Anatomy | str | Path,
     target: str,
     config: PlanConfig | None = None,
     *,
-    model: Path | None = None,
-    device: str | None = None,
+    model: str | Path | None = None,
+    device: Device | str | Path | None = None,
 ) -> Plan:
     """Plan a navigation.
 
     Args:
-        anatomy: folder of the vessel.
+        anatomy: the vessel, or its folder.
         target: a section such as "4" or "PDA", a point "X,Y,Z" in LPS mm, or the path of a CSV of desired tips.
         config: method, time, limits and cost.
         model: run made by `endopilot train`, or "pretrained", the model of the package; needed for the methods inverse
             and mppi.
-        device: name or YAML file of the wire; the model's if not given, the workhorse if there is none.
+        device: the wire, its name or its YAML file; the model's if not given, the workhorse if there is none.
 
     Raises:
         InputError: a target outside the tree, behind an occlusion or too far for the time; a model of another device or
@@ -59,7 +59,8 @@ def plan(
             at its own settings breaks the force limit or does not reach the target.
     """
     config = config or PlanConfig()
-    vessel = read_anatomy(anatomy)
+    vessel = anatomy if isinstance(anatomy, Anatomy) else read_anatomy(anatomy)
+    model = None if model is None else Path(model)
     wire = _wire(model, device, config.method)
     tips = (
         read_tips(Path(target), wire.max_velocity_mm_s, config.start_inserted_mm) if target.endswith(".csv") else None
@@ -113,18 +114,19 @@ def _method(
     return lambda: _track(navigation, desired) if follow else _search(navigation, config)
 
 
-def _wire(model: Path | None, device: str | None, method: str) -> Device:
+def _wire(model: Path | None, device: Device | str | Path | None, method: str) -> Device:
     """Return the wire: the one that is asked for, else the model's; both must be the same."""
+    asked = device if isinstance(device, Device | None) else read_device(device)
     if model is None:
         if method in NETWORK_METHODS:
             raise InputError(
                 f"--model: none given, and method {method} needs one; give a run of `endopilot train`, or pretrained"
             )
-        return read_device(device or "workhorse-014")
+        return asked or read_device("workhorse-014")
     trained = Device.from_record(read_run(model)["device"])
-    if device is not None and replace(read_device(device), sources={}) != replace(trained, sources={}):
+    if asked is not None and replace(asked, sources={}) != replace(trained, sources={}):
         raise InputError(
-            f"--device {device}: {model} was trained with {trained.name}; leave --device out or train anew"
+            f"--device {asked.name}: {model} was trained with {trained.name}; leave --device out or train anew"
         )
     return trained
 

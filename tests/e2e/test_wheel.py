@@ -1,0 +1,89 @@
+"""The wheel, built from the sdist and installed into a clean environment, does what the base install promises."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+UNREACHABLE = re.compile(
+    "NewConnectionError|NameResolutionError|ConnectTimeout|ReadTimeout|Network is unreachable|Connection refused"
+)
+
+
+def install(*arguments: str | Path) -> None:
+    """Run pip, and skip the test where no package index can be reached."""
+    result = subprocess.run([*map(str, arguments)], capture_output=True, text=True)
+    if result.returncode and UNREACHABLE.search(result.stdout + result.stderr):
+        pytest.skip("no package index can be reached, and the wheel needs one for its build and its libraries")
+    assert result.returncode == 0, result.stdout + result.stderr
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a wheel that was built from an sdist."""
+    folder = tmp_path_factory.mktemp("dist")
+    install(sys.executable, "-m", "build", "--outdir", folder, ROOT)
+    assert len(list(folder.glob("*.tar.gz"))) == 1
+    (made,) = folder.glob("*.whl")
+    return made
+
+
+@pytest.fixture(scope="module")
+def clean(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the `bin` folder of an environment that holds the wheel and its base libraries alone."""
+    folder = tmp_path_factory.mktemp("clean")
+    venv.create(folder, with_pip=True)
+    pip = (folder / "bin" / "python", "-m", "pip", "install", "-q", "--no-compile", "-c", ROOT / "constraints.txt")
+    install(*pip, wheel)
+    return folder / "bin"
+
+
+def run(clean: Path, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    """Run a program of the clean environment, away from the source tree."""
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+    program, *rest = map(str, arguments)
+    return subprocess.run(
+        [str(clean / program), *rest], capture_output=True, text=True, cwd=clean.parent, env=kept, timeout=300
+    )
+
+
+def test_the_wheel_holds_the_whole_package(wheel: Path) -> None:
+    package = ROOT / "src" / "endopilot"
+    files = {
+        path.relative_to(package.parent).as_posix()
+        for path in package.rglob("*")
+        if path.is_file() and path.suffix not in (".pyc", ".so")
+    }
+    held = {name for name in zipfile.ZipFile(wheel).namelist() if name.startswith("endopilot/")}
+    assert files - held == set()
+    core = held - files
+    assert core and all(re.fullmatch(r"endopilot/_core\w*\.[\w.-]+\.so", name) for name in core)
+    for needed in ("py.typed", "__init__.pyi", "simulation/devices/workhorse-014.yaml", "tasks/ladder/crux.yaml"):
+        assert f"endopilot/{needed}" in held
+
+
+def test_it_simulates_and_plans(clean: Path) -> None:
+    result = run(clean, "python", ROOT / "tests" / "e2e" / "installed.py")
+    assert result.returncode == 0, result.stderr
+    assert Path(result.stdout.strip()).is_relative_to(clean.parent)
+
+
+def test_the_command_line_answers(clean: Path) -> None:
+    assert "endopilot COMMAND" in run(clean, "endopilot", "--help").stdout
+    extras = json.loads(run(clean, "endopilot", "info", "--json").stdout)["extras"]
+    assert not any(extras.values())
+
+
+def test_a_command_without_its_extra_says_so_in_one_line(clean: Path) -> None:
+    result = run(clean, "endopilot", "train", "dataset", "-o", "run")
+    assert result.returncode == 2
+    assert result.stderr == "endopilot train: needs torch; install it with: pip install 'endopilot[learn]'\n"
