@@ -7,6 +7,7 @@ The slack s = Δ − Δtip follows a play operator: it grows with insertion and 
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
 
@@ -91,11 +92,13 @@ def toy_simulate(anatomy: Anatomy, device, control, *, initial, config, friction
 
 
 def write_toy_anatomies(folder: Path, patients: int) -> list[Path]:
-    """Write straight vessels with names of different length, and return their folders."""
+    """Write straight vessels that differ in name and catheter, and return their folders."""
     folders = [folder / f"patient-{i}" for i in range(patients)]
     for i, where in enumerate(folders):
         if not where.exists():
-            write_anatomy(toy_anatomy(f"patient-{i}{'x' * i}"), where)
+            vessel = toy_anatomy(f"patient-{i}{'x' * i}")
+            catheter_mm = vessel.catheter_radius_mm + 1e-3 * i  # the toy wire does not feel it
+            write_anatomy(replace(vessel, catheter_radius_mm=catheter_mm), where)
     return folders
 
 

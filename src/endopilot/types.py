@@ -18,7 +18,9 @@ indexed `voxels[k, j, i]`, where (i, j, k) count voxels along the first, second 
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -203,6 +205,26 @@ class Anatomy:
     catheter_radius_mm: float
     provenance: dict[str, Any] = field(default_factory=dict)
 
+    @cached_property
+    def identity(self) -> str:
+        """SHA-256 of the vessel itself: centerlines, distance map, insertion and catheter.
+
+        It is computed once, so change no array in place after that. Name, section labels and provenance do not count.
+        An anatomy has the same identity in memory as on disk, where the distance map is float32.
+        """
+        digest = hashlib.sha256()
+        for branch in self.tree.branches:
+            line = branch.centerline
+            for values in (line.points, line.radius, line.abscissa, line.normals):
+                _add(digest, values, np.float64)
+            _add(digest, np.array(branch.parent), np.int64)
+        _add(digest, self.distance_map.values, np.float32)
+        for values in (self.distance_map.spacing_mm, self.distance_map.origin_mm):
+            _add(digest, np.asarray(values), np.float64)
+        for values in (self.insertion.position, self.insertion.direction, self.catheter_radius_mm):
+            _add(digest, np.asarray(values), np.float64)
+        return digest.hexdigest()
+
 
 @dataclass(frozen=True, eq=False)
 class TipProjection:
@@ -272,6 +294,12 @@ class Rollout:
     valid: Bool[np.ndarray, "worlds samples"]
     reason: Int[np.ndarray, "worlds"]
     shape: Float[np.ndarray, "worlds samples nodes 3"] | None = None
+
+
+def _add(digest: hashlib._Hash, values: np.ndarray, kind: type[np.generic]) -> None:
+    """Add an array to a hash, with its shape, as little-endian numbers of one kind."""
+    digest.update(repr(values.shape).encode())
+    digest.update(np.ascontiguousarray(values, dtype=np.dtype(kind).newbyteorder("<")).data)
 
 
 def _without_first_point(line: Centerline) -> Centerline:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -35,6 +36,43 @@ def test_round_trip_is_exact(anatomy, tmp_path):
         assert one.parent == two.parent and np.array_equal(one.section, two.section)
         for name in ("points", "radius", "abscissa", "normals"):
             assert np.array_equal(getattr(one.centerline, name), getattr(two.centerline, name))
+
+
+def test_identity_is_that_of_the_vessel_in_memory_as_on_disk(anatomy, tmp_path):
+    double = replace(anatomy.distance_map, values=anatomy.distance_map.values.astype(float) * (1 + 1e-12))
+    made = replace(anatomy, distance_map=double)  # more digits than the disk keeps
+    write_anatomy(made, tmp_path / "a")
+    assert read_anatomy(tmp_path / "a").identity == made.identity == anatomy.identity
+    assert replace(anatomy, name="other", provenance={}).identity == anatomy.identity
+
+
+def test_identity_changes_with_all_that_a_wire_could_feel(anatomy):
+    field, insertion, (root, *others) = anatomy.distance_map, anatomy.insertion, anatomy.tree.branches
+    values = field.values.copy()
+    values[2, 3, 4] += 1e-3
+    wider = replace(root, centerline=replace(root.centerline, radius=root.centerline.radius + 1e-3))
+    changed = [
+        replace(anatomy, distance_map=replace(field, values=values)),
+        replace(anatomy, distance_map=replace(field, spacing_mm=field.spacing_mm * 1.001)),
+        replace(anatomy, distance_map=replace(field, origin_mm=field.origin_mm + 1e-3)),
+        replace(anatomy, distance_map=replace(field, values=field.values.reshape(field.values.shape[::-1]))),
+        replace(anatomy, insertion=replace(insertion, position=insertion.position + 1e-3)),
+        replace(anatomy, insertion=replace(insertion, direction=-insertion.direction)),
+        replace(anatomy, catheter_radius_mm=1.4),
+        replace(anatomy, tree=replace(anatomy.tree, branches=(wider, *others))),
+    ]
+    assert len({anatomy.identity, *(other.identity for other in changed)}) == 1 + len(changed)
+
+
+def test_a_record_of_another_vessel_is_refused(anatomy, tmp_path):
+    write_anatomy(anatomy, tmp_path / "a")
+    path = tmp_path / "a" / "anatomy.json"
+    record = json.loads(path.read_text())
+    assert record["identity"] == anatomy.identity
+    record["insertion"]["position_mm"][0] += 0.5
+    path.write_text(json.dumps(record))
+    with pytest.raises(InputError, match=r"anatomy\.json: identity is not that of the vessel in it"):
+        read_anatomy(tmp_path / "a")
 
 
 def test_other_programs_read_it(anatomy, tmp_path):

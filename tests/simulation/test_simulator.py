@@ -163,6 +163,34 @@ def test_worlds_go_over_into_another_simulator_of_the_same_kind(anatomy: Anatomy
         Simulator(anatomy, DEVICE, config=SimulatorConfig(elements=50)).copy_worlds([0], of=first)
 
 
+def test_equal_anatomies_and_devices_are_stepped_together(anatomy: Anatomy) -> None:
+    again = replace(anatomy, name="read again", distance_map=replace(anatomy.distance_map))
+    bent = replace(DEVICE, tip_bend_rad=0.5)
+    devices = [DEVICE, read_device("workhorse-014"), replace(DEVICE, name="mine", sources={}), bent]
+    simulator = begun(Simulator([anatomy, again, anatomy, again], devices), 4)
+    assert [group.index.tolist() for group in simulator._groups] == [[0, 1, 2], [3]]
+    shared = begun(Simulator(anatomy, [DEVICE, DEVICE, DEVICE, bent]), 4)
+    for control in controls(2, 4):
+        step, wanted = simulator.step(control, PERIOD), shared.step(control, PERIOD)
+        assert np.array_equal(step.tip_position, wanted.tip_position)
+    elsewhere = Simulator(again, read_device("workhorse-014"), worlds=2, sharing=simulator)
+    assert elsewhere._groups[0].lumen is simulator._groups[0].lumen
+    elsewhere.copy_worlds([2, 1], of=simulator)
+    assert np.array_equal(elsewhere.position, simulator.position[[2, 1]])
+    simulator.set_state(shared.state)
+
+
+def test_a_state_is_taken_without_reading_the_anatomy_again(anatomy: Anatomy, monkeypatch: pytest.MonkeyPatch) -> None:
+    simulator = begun(Simulator(replace(anatomy), DEVICE, worlds=2), 2)
+    simulator.set_state(simulator.state)
+
+    def hashed(*_) -> None:
+        raise AssertionError("an anatomy is hashed again")
+
+    monkeypatch.setattr("endopilot.types.hashlib.sha256", hashed)
+    simulator.set_state(simulator.state)
+
+
 def test_a_seed_draws_the_same_start_whatever_the_number_of_worlds(anatomy: Anatomy) -> None:
     few, many = Simulator(anatomy, DEVICE, worlds=2), Simulator(anatomy, DEVICE, worlds=5)
     few.reset(seed=7)
@@ -311,6 +339,12 @@ def test_bad_starts_and_states_are_refused(anatomy: Anatomy, wider: Anatomy, tmp
             simulator.reset(**arguments)
     with pytest.raises(InputError, match="made with other anatomies"):
         simulator.set_state(Simulator(wider, DEVICE, worlds=2).state)
+    state = Simulator(anatomy, DEVICE, worlds=2).state
+    with pytest.raises(InputError, match="state: format version 7, not 1; make the state again"):
+        Simulator(anatomy, DEVICE, worlds=2).set_state(replace(state, format_version=7))
+    replace(state, format_version=7).save(tmp_path / "new.npz")
+    with pytest.raises(InputError, match=r"new\.npz: format version 7, not 1; make the state again"):
+        SimulatorState.load(tmp_path / "new.npz")
     with pytest.raises(InputError, match=r"no such file|no saved state"):
         SimulatorState.load(tmp_path / "absent.npz")
     with pytest.raises(InputError, match="give fewer"):

@@ -6,7 +6,8 @@ file               content
 `centerline.vtp`   one polyline a branch, LPS mm; point data MaximumInscribedSphereRadius (mm), Abscissa (mm), Normals,
                    Section (index into the section names); cell data Branch and Parent
 `lumen.nrrd`       signed distance to the wall, mm, positive inside, guiding catheter included; compressed float32
-`anatomy.json`     schema version, name, insertion, catheter radius, section names, provenance, SHA-256 of both files
+`anatomy.json`     schema version, name, insertion, catheter radius, section names, provenance, identity (SHA-256 of the
+                   vessel itself, `Anatomy.identity`), SHA-256 of both files
 =================  ================================================================================================
 """
 
@@ -46,6 +47,7 @@ def write_anatomy(anatomy: Anatomy, folder: str | Path) -> None:
             "name": anatomy.name,
             "insertion": {"position_mm": anatomy.insertion.position, "direction": anatomy.insertion.direction},
             "catheter_radius_mm": float(anatomy.catheter_radius_mm),
+            "identity": anatomy.identity,
             "section_names": list(anatomy.tree.section_names),
             "coordinates": "LPS, mm",
             "sha256": {name: files.sha256(partial / name) for name in (_CENTERLINE, _LUMEN)},
@@ -84,7 +86,7 @@ def read_anatomy(folder: str | Path) -> Anatomy:
             raise InputError(f"{folder / file}: is missing; make the anatomy again")
         if files.sha256(folder / file) != hashes.get(file):
             raise InputError(f"{folder / file}: differs from what anatomy.json records; make the anatomy again")
-    return Anatomy(
+    anatomy = Anatomy(
         name=name,
         tree=_read_tree(folder / _CENTERLINE, names),
         distance_map=_read_distance_map(folder / _LUMEN),
@@ -92,6 +94,9 @@ def read_anatomy(folder: str | Path) -> Anatomy:
         catheter_radius_mm=radius,
         provenance=provenance,
     )
+    if record.get("identity", anatomy.identity) != anatomy.identity:
+        raise InputError(f"{folder / _RECORD}: identity is not that of the vessel in it; make the anatomy again")
+    return anatomy
 
 
 def _write_tree(tree: VesselTree, path: Path) -> None:

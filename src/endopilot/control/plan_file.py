@@ -23,9 +23,8 @@ The last three are there if X-ray was foreseen.
 
 from __future__ import annotations
 
-import hashlib
 import shutil
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -48,18 +47,6 @@ _COLUMNS = (
     "tip_abscissa_mm", "tip_offset_mm", "branch", "tip_x_mm", "tip_y_mm", "tip_z_mm",
     "lumen_radius_mm", "safety_ratio", "contact_force_n",
 )  # fmt: skip
-
-
-def fingerprint(anatomy: Anatomy) -> str:
-    """Return a hash of an anatomy's centerlines, distance map and insertion."""
-    digest = hashlib.sha256()
-    lines = [
-        array for branch in anatomy.tree.branches for array in (branch.centerline.points, branch.centerline.radius)
-    ]
-    for array in (*lines, anatomy.insertion.position, anatomy.insertion.direction, anatomy.distance_map.origin_mm):
-        digest.update(np.ascontiguousarray(array, dtype=np.float32).tobytes())
-    digest.update(np.ascontiguousarray(anatomy.distance_map.values, dtype=np.float32).tobytes())
-    return digest.hexdigest()
 
 
 def write_plan(plan: Plan, folder: Path, xray: PlannedXray | None = None) -> dict[str, Any]:
@@ -114,7 +101,7 @@ def write_plan(plan: Plan, folder: Path, xray: PlannedXray | None = None) -> dic
             config=plan.config,
             seed=plan.config.seed,
             inputs={},
-            anatomy={"name": navigation.anatomy.name, "sha256": fingerprint(navigation.anatomy)},
+            anatomy={"name": navigation.anatomy.name, "identity": navigation.anatomy.identity},
             device=asdict(navigation.device),
             model=plan.model,
             target=asdict(navigation.target),
@@ -141,12 +128,12 @@ def read_plan(folder: Path, anatomy: Anatomy, device: Device) -> Plan:
         raise InputError(f"{folder / _RECORD}: is not the manifest of a plan; make one with `endopilot plan`")
     config = _config(folder / _RECORD, record["config"])
     made = record["anatomy"]
-    if made["sha256"] != fingerprint(anatomy):
+    if made.get("identity") != anatomy.identity:
         raise InputError(
             f"{folder}: the plan is for another anatomy ({made['name']}), not for this {anatomy.name}; plan anew"
         )
     planned = Device.from_record(record["device"])
-    if replace(planned, sources={}) != replace(device, sources={}):
+    if planned.constants != device.constants:
         raise InputError(f"{folder}: the plan is for another device ({planned.name}), not for {device.name}; plan anew")
     if not (folder / _TABLE).exists() or sha256(folder / _TABLE) != record["table_sha256"]:
         raise InputError(f"{folder / _TABLE}: is missing or differs from what {_RECORD} records; plan anew")

@@ -57,8 +57,15 @@ def write_block(plan: Plan, block: Block, *, threads: int = 1, advance: Callable
 
 @lru_cache(maxsize=4)
 def _read(folder: Path, fingerprint: str) -> Anatomy:
-    """Read an anatomy; the blocks of one come one after the other."""
-    return read_anatomy(folder)
+    """Read an anatomy; the blocks of one come one after the other.
+
+    Raises:
+        InputError: it is another one than the dataset was begun with.
+    """
+    anatomy = read_anatomy(folder)
+    if anatomy.identity != fingerprint:
+        raise InputError(f"{folder}: is another anatomy than the dataset was begun with; put that one back")
+    return anatomy
 
 
 def _episodes(plan: Plan, block: Block, draw: Draw, rollout: Rollout, stopped: Bool[np.ndarray, "n"]) -> dict[str, Any]:

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Shaped
 
 from endopilot import __version__
+from endopilot.anatomy.io import read_anatomy
 from endopilot.dataset.splits import assign_splits
 from endopilot.errors import InputError
 from endopilot.files import json_text, read_json
@@ -21,7 +22,7 @@ from endopilot.simulation.controls import ControlConfig
 from endopilot.simulation.device import Device
 from endopilot.types import SAMPLE_PERIOD_S
 
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 """Counts changes of the columns or of their meaning."""
 
 
@@ -203,16 +204,14 @@ def version() -> str:
 
 
 def identify(folder: Path) -> tuple[str, str]:
-    """Return an anatomy's name and the SHA-256 of what the simulation depends on.
+    """Return an anatomy's name and its identity, from its record; one that does not state it is read whole.
 
     Raises:
         InputError: the folder holds no anatomy, or a damaged one.
     """
-    if not (folder / "anatomy.json").exists():
-        raise InputError(f"{folder}: holds no anatomy.json, so it is not an anatomy; make one with `endopilot anatomy`")
-    record = read_json(folder / "anatomy.json")
-    try:
-        physical = {key: record[key] for key in ("name", "insertion", "catheter_radius_mm", "sha256")}
-    except (KeyError, TypeError) as error:
-        raise InputError(f"{folder / 'anatomy.json'}: damaged ({error!r}); make the anatomy again") from error
-    return str(record["name"]), hashlib.sha256(json_text(physical).encode()).hexdigest()
+    path = folder / "anatomy.json"
+    record = read_json(path) if path.exists() else {}
+    if isinstance(record, dict) and {"name", "identity"} <= record.keys():
+        return str(record["name"]), str(record["identity"])
+    anatomy = read_anatomy(folder)
+    return anatomy.name, anatomy.identity

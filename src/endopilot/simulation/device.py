@@ -8,7 +8,7 @@ beyond the last one.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -103,6 +103,12 @@ class Device:
         abscissa = [float(value) for value in self.abscissa_mm]
         if abscissa[0] != 0 or (np.diff(abscissa) <= 0).any():
             raise InputError(f"device {self.name}: abscissa_mm = {abscissa} must begin at 0, the tip, and increase")
+
+    @property
+    def constants(self) -> tuple[Any, ...]:
+        """All numbers of the device, in the order of its fields: devices with the same constants behave the same."""
+        values = [getattr(self, field.name) for field in fields(self) if field.name not in ("name", "sources")]
+        return tuple(tuple(map(float, value)) if isinstance(value, Sequence) else value for value in values)
 
     @property
     def tip_radius_mm(self) -> float:

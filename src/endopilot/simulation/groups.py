@@ -1,9 +1,10 @@
-"""Worlds in groups: those that share an anatomy and a device are stepped by one simulation of the core."""
+"""Worlds in groups: those with an equal anatomy and an equal device are stepped by one simulation of the core."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Integer
@@ -17,14 +18,17 @@ from endopilot.simulation.drive_limits import far_end_mm
 from endopilot.simulation.rod import RodLayout, lay_out
 from endopilot.types import Anatomy
 
+GroupKey = tuple[str, tuple[Any, ...]]
+"""Identity of an anatomy, and constants of a device."""
+
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """The worlds that share an anatomy and a device.
+    """The worlds with an equal anatomy and an equal device.
 
     Attributes:
-        anatomy: the vessel.
-        device: the wire.
+        anatomy: the vessel, as the first of them has it.
+        device: the wire, as the first of them has it.
         rod: its nodes and stiffnesses.
         lumen: the wall, as the core has it.
         simulation: the worlds, as the core has them.
@@ -45,6 +49,11 @@ class Group:
     project: TipProjector
 
 
+def group_key(anatomy: Anatomy, device: Device) -> GroupKey:
+    """Return what worlds have in common that are stepped together."""
+    return anatomy.identity, device.constants
+
+
 def make_groups(
     anatomies: Sequence[Anatomy], devices: Sequence[Device], config: SimulatorConfig, sharing: Sequence[Group]
 ) -> list[Group]:
@@ -60,21 +69,21 @@ def make_groups(
         InputError: a device that does not fit its anatomy; a distance map that is not finite, or negative at the
             ostium; more worlds than the memory holds.
     """
-    lumens = {(id(group.anatomy), group.device.tip_radius_mm): group.lumen for group in sharing}
-    projectors = {id(group.anatomy): group.project for group in sharing}
-    members: dict[tuple[int, int], list[int]] = {}
+    lumens = {(group.anatomy.identity, group.device.tip_radius_mm): group.lumen for group in sharing}
+    projectors = {group.anatomy.identity: group.project for group in sharing}
+    members: dict[GroupKey, list[int]] = {}
     for world, pair in enumerate(zip(anatomies, devices, strict=True)):
-        members.setdefault((id(pair[0]), id(pair[1])), []).append(world)
+        members.setdefault(group_key(*pair), []).append(world)
     groups = []
     for worlds in members.values():
         anatomy, device = anatomies[worlds[0]], devices[worlds[0]]
         check_fits(device, anatomy)
-        key = (id(anatomy), device.tip_radius_mm)
+        key = (anatomy.identity, device.tip_radius_mm)
         if key not in lumens:
             check_distance_map(anatomy)
             lumens[key] = make_lumen(anatomy.distance_map, device.tip_radius_mm)
-        if id(anatomy) not in projectors:
-            projectors[id(anatomy)] = TipProjector(anatomy.tree, anatomy.insertion)
+        if anatomy.identity not in projectors:
+            projectors[anatomy.identity] = TipProjector(anatomy.tree, anatomy.insertion)
         path_mm = float(anatomy.tree.longest_path().abscissa[-1])
         longest_mm = far_end_mm(anatomy)
         rod = lay_out(device, path_mm=path_mm, elements=config.elements, length_mm=longest_mm + FREE_BEHIND_MM)
@@ -87,7 +96,7 @@ def make_groups(
             options=core_options(config, push_limit_n=device.push_limit_n, free_behind_mm=FREE_BEHIND_MM),
             worlds=len(worlds),
         )
-        index, project = np.array(worlds), projectors[id(anatomy)]
+        index, project = np.array(worlds), projectors[anatomy.identity]
         groups.append(Group(anatomy, device, rod, lumens[key], simulation, index, path_mm, longest_mm, project))
     return groups
 

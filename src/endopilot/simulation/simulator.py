@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from endopilot.simulation.config import LANES, Actuation, SimulatorConfig
 from endopilot.simulation.core import check_memory
 from endopilot.simulation.device import Device
 from endopilot.simulation.drive_limits import SPARE_MM
-from endopilot.simulation.groups import Group, make_groups, merge
+from endopilot.simulation.groups import Group, group_key, make_groups, merge
 from endopilot.simulation.state import SimulatorState, Step, SupportsDLPack
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, TipProjection
 
@@ -426,13 +427,14 @@ class Simulator:
         Example:
             >>> kept = simulator.state  # kept.save(path) writes it to a file
         """
-        return SimulatorState(tuple(group.simulation.state() for group in self._groups), self._fingerprint())
+        return SimulatorState(tuple(group.simulation.state() for group in self._groups), self._fingerprint)
 
     def set_state(self, state: SimulatorState) -> None:
         """Restore all worlds, bit by bit.
 
         Raises:
-            InputError: the state is that of other anatomies, devices or settings, or of another number of worlds.
+            InputError: the state is that of other anatomies, devices or settings, of another number of worlds, or of
+                another version of endopilot.
 
         Example:
             >>> kept, control = simulator.state, np.tile([5.0, 0.5], (4, 1))
@@ -441,7 +443,8 @@ class Simulator:
             >>> np.array_equal(simulator.step(control, 0.1).tip_position, once.tip_position)
             True
         """
-        if state.fingerprint != self._fingerprint():
+        state.check_version()
+        if state.fingerprint != self._fingerprint:
             raise InputError(
                 "state: made with other anatomies, devices or settings; restore it in a simulator like its own"
             )
@@ -453,7 +456,7 @@ class Simulator:
 
         Args:
             source: for each world, the number of the one that it becomes a copy of; its own to stay as it is.
-            of: the simulator that the numbers belong to, made with the very same anatomies, devices and settings but
+            of: the simulator that the numbers belong to, made with equal anatomies, devices and settings but
                 maybe another number of worlds; this one if not given.
 
         Raises:
@@ -470,11 +473,11 @@ class Simulator:
             raise InputError(f"source: {source}; give the number of a world for each of the {self.worlds} worlds")
         if (self._by_force, _settings(self._config)) != (of._by_force, _settings(of._config)):
             raise InputError("of: a simulator with other settings; make both with the same actuation and config")
-        originals = {(id(group.anatomy), id(group.device)): group for group in of._groups}
+        originals = {group_key(group.anatomy, group.device): group for group in of._groups}
         states = []
         for group in self._groups:
             wanted = chosen[group.index]
-            original = originals.get((id(group.anatomy), id(group.device)))
+            original = originals.get(group_key(group.anatomy, group.device))
             strange = ~np.isin(wanted, original.index if original else [])
             if original is None or strange.any():
                 world = int(group.index[np.argmax(strange)])
@@ -487,12 +490,11 @@ class Simulator:
         for group, state in zip(self._groups, states, strict=True):
             group.simulation.set_state(state)
 
+    @cached_property
     def _fingerprint(self) -> str:
-        digest = hashlib.sha256(repr((self._by_force, _settings(self._config))).encode())
-        for group in self._groups:
-            for array in (group.index, *vars(group.rod).values(), *vars(group.anatomy.distance_map).values()):
-                digest.update(np.ascontiguousarray(array).tobytes())
-        return digest.hexdigest()
+        """Hash of all that a state belongs to."""
+        groups = [(group.index.tolist(), group_key(group.anatomy, group.device)) for group in self._groups]
+        return hashlib.sha256(repr((self._by_force, _settings(self._config), groups)).encode()).hexdigest()
 
 
 def _settings(config: SimulatorConfig) -> tuple[Any, ...]:

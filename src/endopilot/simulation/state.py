@@ -5,12 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
+from zipfile import BadZipFile
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from endopilot.errors import InputError
 from endopilot.files import writing
+
+FORMAT_VERSION = 1
+"""Of `SimulatorState`: raised when its values or its fingerprint come to mean something else."""
 
 
 @runtime_checkable
@@ -55,29 +59,54 @@ class SimulatorState:
     Attributes:
         values: one array of float64 for each pair of anatomy and device, a row a world.
         fingerprint: hash of the anatomies, devices and settings that the state belongs to.
+        format_version: of the meaning of both.
     """
 
     values: tuple[Float[np.ndarray, "_ _"], ...]
     fingerprint: str
+    format_version: int = FORMAT_VERSION
+
+    def check_version(self, where: str = "state") -> None:
+        """Check that this version of endopilot knows what the values mean.
+
+        Args:
+            where: what a person would look for: a file, or "state".
+
+        Raises:
+            InputError: the state has another format version.
+        """
+        if self.format_version != FORMAT_VERSION:
+            raise InputError(
+                f"{where}: format version {self.format_version}, not {FORMAT_VERSION}; make the state again"
+            )
 
     def save(self, path: Path) -> None:
         """Write the state to an .npz file, whole or not at all."""
         arrays = {f"values_{k}": v for k, v in enumerate(self.values)}
         with writing(path) as temporary, temporary.open("wb") as file:
-            np.savez(file, fingerprint=np.array(self.fingerprint), **arrays)  # pyright: ignore[reportArgumentType]
+            about = {"fingerprint": np.array(self.fingerprint), "format_version": np.array(self.format_version)}
+            np.savez(file, **about, **arrays)  # pyright: ignore[reportArgumentType]
 
     @staticmethod
     def load(path: Path) -> SimulatorState:
         """Read a state.
 
         Raises:
-            InputError: the file is missing or is no saved state.
+            InputError: the file is missing, is no saved state, or is one of another format version.
         """
         try:
             with np.load(path, allow_pickle=False) as stored:
-                count = len(stored.files) - 1
-                return SimulatorState(tuple(stored[f"values_{k}"] for k in range(count)), str(stored["fingerprint"]))
-        except (OSError, ValueError, KeyError) as error:
+                fingerprint = str(stored["fingerprint"])
+                version = int(stored["format_version"]) if "format_version" in stored else 0
+                names = sorted((name for name in stored.files if name.startswith("values_")), key=_number)
+                state = SimulatorState(tuple(stored[name] for name in names), fingerprint, version)
+        except (OSError, ValueError, KeyError, BadZipFile) as error:
             raise InputError(
                 f"{path}: no saved state of a simulator ({error}); save one with SimulatorState.save"
             ) from None
+        state.check_version(str(path))
+        return state
+
+
+def _number(name: str) -> int:
+    return int(name.removeprefix("values_"))
