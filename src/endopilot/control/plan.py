@@ -19,6 +19,7 @@ from endopilot.control.robot import RobotConfig
 from endopilot.control.route import Route, check_passable, parse_target
 from endopilot.control.search import Course, SearchConfig
 from endopilot.errors import InputError
+from endopilot.extras import extra_named
 from endopilot.models.config import read_run
 from endopilot.progress import progress
 from endopilot.simulation.config import SimulatorConfig
@@ -105,7 +106,8 @@ def _method(
 ) -> Callable[[], tuple[Steps, Steps]]:  # fmt: skip
     """Return a function that finds controls and predicts their tips; loading a model is done before it is called."""
     if config.method in NETWORK_METHODS:
-        from endopilot.control.network_plan import network_planner  # torch is slow to import
+        with extra_named(f"plan by {config.method}"):
+            from endopilot.control.network_plan import network_planner  # torch is slow to import
 
         assert model is not None
         return network_planner(navigation, model, desired, route, config)

@@ -23,6 +23,7 @@ from endopilot.evaluation.results import (
     write_results,
 )
 from endopilot.evaluation.summary import findings, generalisation_gap, over_seeds, split_title, summarize
+from endopilot.extras import extra_named
 from endopilot.files import manifest, sha256, write_json
 from endopilot.models.config import PRETRAINED, read_run, run_path
 from endopilot.models.provenance import trained_patients
@@ -51,11 +52,11 @@ class EvaluateConfig:
 
 
 def evaluate(
-    run_folder: Path,
-    output: Path,
-    config: EvaluateConfig,
-    dataset_folder: Path | None = None,
-    other_seeds: Sequence[Path] = (),
+    run_folder: str | Path,
+    output: str | Path,
+    config: EvaluateConfig = EvaluateConfig(),
+    dataset_folder: str | Path | None = None,
+    other_seeds: Sequence[str | Path] = (),
 ) -> dict[str, Any]:
     """Evaluate both networks of a run on the navigations and the patients that they never saw.
 
@@ -76,11 +77,13 @@ def evaluate(
         InputError: the run, its dataset or one of its anatomies is missing or damaged, nothing was held out, the
             dataset was made with another wire, or a patient that a run was trained on is among its test patients.
     """
-    from endopilot.evaluation.protocols import count_steps, run_protocols  # brings torch, which takes seconds to import
-    from endopilot.models.episodes import Episodes
-    from endopilot.models.rollout import load_model
+    with extra_named("evaluate"):
+        from endopilot.evaluation.protocols import count_steps, run_protocols  # brings torch, slow to import
+        from endopilot.models.episodes import Episodes
+        from endopilot.models.rollout import load_model
 
-    start = time.perf_counter()
+    start, run_folder, output = time.perf_counter(), Path(run_folder), Path(output)
+    other_seeds = [Path(run) for run in other_seeds]
     dataset = load_dataset(Path(dataset_folder or _own_dataset(run_folder, read_run(run_folder))).resolve())
     known, *_ = [trained_patients(run, read_run(run), dataset) for run in (run_folder, *other_seeds)]
     predictor, others = load_model(run_folder), [load_model(other) for other in other_seeds]
