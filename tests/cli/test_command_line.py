@@ -96,12 +96,12 @@ def test_info_is_json_and_imports_nothing_heavy() -> None:
         ("run", "missing.nii.gz", "-o", "out"),
     ],
 )
-def test_a_missing_input_is_told_in_one_line(arguments: tuple[str, ...], tmp_path: Path) -> None:
+def test_a_missing_input_is_reported_in_one_line(arguments: tuple[str, ...], tmp_path: Path) -> None:
     assert_one_line(run(*arguments, cwd=tmp_path), "missing")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_output_that_nobody_reads_is_no_error() -> None:
+def test_a_closed_output_is_no_error() -> None:
     with subprocess.Popen(
         [sys.executable, "-m", "endopilot.cli", "evaluate", "--help"],
         stdout=subprocess.PIPE,
@@ -109,6 +109,6 @@ def test_output_that_nobody_reads_is_no_error() -> None:
         text=True,
     ) as process:
         process.stdout.close()  # as `head` does
-        told = process.stderr.read()
-    assert told == ""
+        errors = process.stderr.read()
+    assert errors == ""
     assert process.returncode == 141

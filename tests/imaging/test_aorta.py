@@ -66,7 +66,7 @@ def test_the_mask_lies_on_the_grid_of_any_orientation(arch):
     assert dice(back, straight.volume.voxels) > 0.99
 
 
-def test_seeds_that_cannot_be_used_are_told(arch):
+def test_seeds_that_cannot_be_used_are_refused(arch):
     volume, _ = arch
     for seeds, expected in {
         (): "needs one or two points",
@@ -77,13 +77,13 @@ def test_seeds_that_cannot_be_used_are_told(arch):
             segment(volume, SegmentConfig(method="aorta", seeds=seeds))
 
 
-def test_seeds_in_separate_vessels_are_told():
+def test_seeds_in_separate_vessels_are_refused():
     grid = empty_grid((30, 30, 40), 2.0, (0.0, 0.0, 0.0))
     along = np.linspace(-10, 80, 200)[:, None] * [0.0, 0.0, 1.0]
     hu = np.full(grid.voxels.shape, 40.0)
     for x in (20.0, 60.0):
         hu[inside_tube(grid, along + np.array([x, 30.0, 0.0]), 8.0)] = BLOOD_HU
-    with pytest.raises(InputError, match="no contrast-filled way"):
+    with pytest.raises(InputError, match="no contrast-filled path"):
         segment(scan(grid, hu), SegmentConfig(method="aorta", seeds=((20.0, 30.0, 10.0), (60.0, 30.0, 10.0))))
 
 

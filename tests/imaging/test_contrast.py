@@ -23,7 +23,7 @@ def thorax() -> Volume:
 
 
 @pytest.mark.parametrize("noise_hu", [0.0, 40.0])
-def test_blood_is_told_from_bone(thorax, noise_hu):
+def test_blood_is_distinguished_from_bone(thorax, noise_hu):
     """The whole thorax holds contrast; a box around ten vertebrae, in front of which the aorta is cut off, does not."""
     noise = np.random.default_rng(0).normal(0.0, noise_hu, thorax.voxels.shape)
     noisy = Volume(thorax.voxels + noise, thorax.spacing_mm, thorax.origin_mm, thorax.direction)

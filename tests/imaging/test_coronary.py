@@ -90,25 +90,25 @@ def test_a_seed_serves_where_the_aorta_is_not_in_the_volume(heart, right_tree):
     lower = segment(bottom, SegmentConfig(seeds=(tuple(_axis()[70]),)))
     assert lower.ostium is not None
     assert np.linalg.norm(lower.ostium.position - _axis()[70]) < 2.5
-    seen = (positions(bottom) - lower.ostium.position) @ lower.ostium.direction > 1.0
-    assert dice(lower.volume.voxels & seen, right_tree.volume.voxels[:70] & seen) > 0.85
+    inside = (positions(bottom) - lower.ostium.position) @ lower.ostium.direction > 1.0
+    assert dice(lower.volume.voxels & inside, right_tree.volume.voxels[:70] & inside) > 0.85
 
 
-def test_a_volume_without_contrast_is_told(heart):
+def test_a_volume_without_contrast_is_refused(heart):
     volume, _ = heart
     plain = Volume(np.minimum(volume.voxels, 60), volume.spacing_mm, volume.origin_mm, volume.direction)
     with pytest.raises(InputError, match="no contrast: homogeneous soft tissue peaks at 65 HU"):
         segment(plain, SegmentConfig())
 
 
-def test_a_volume_without_aorta_is_told():
+def test_a_volume_without_aorta_is_refused():
     grid = empty_grid((60, 60, 60), 1.0, (0.0, 0.0, 0.0))
     ball = np.linalg.norm(positions(grid) - 30.0, axis=-1) < 28.0
     with pytest.raises(InputError, match="ascending aorta was not found"):
         segment(scan(grid, np.where(ball, BLOOD_HU, FAT_HU)), SegmentConfig())
 
 
-def test_an_aorta_without_artery_is_told():
+def test_an_aorta_without_artery_is_refused():
     grid = empty_grid((50, 60, 60), 1.0, (0.0, 0.0, 0.0))
     x = positions(grid)
     tube = np.hypot(x[..., 0] - 30, x[..., 1] - 30) < AORTA_RADIUS_MM

@@ -152,7 +152,7 @@ def test_empty_and_impossible_values_in_the_header(series, values, expected):
         read_volume(series)
 
 
-def test_a_header_that_is_no_number_is_told_without_its_content(series):
+def test_a_header_field_that_is_no_number_is_refused_without_its_content(series):
     file = sorted(series.glob("*.dcm"))[1]
     content = file.read_bytes()
     at = content.index(b"\x28\x00\x30\x00DS") + 8  # PixelSpacing
@@ -270,7 +270,7 @@ def _assert_no_identifier(text):
 def test_no_identifier_reaches_an_output_or_a_log(series, tmp_path, caplog, capfd):
     _change(series, PatientAge="not an age: Doe^Jane")  # an invalid value, which pydicom quotes in its warnings
     caplog.clear(), capfd.readouterr()
-    with warnings.catch_warnings(record=True) as told, caplog.at_level(logging.DEBUG):
+    with warnings.catch_warnings(record=True) as warned, caplog.at_level(logging.DEBUG):
         warnings.simplefilter("always")
         volume = read_volume(series)
     write_volume(volume, tmp_path / "ct.nrrd")
@@ -281,7 +281,7 @@ def test_no_identifier_reaches_an_output_or_a_log(series, tmp_path, caplog, capf
     written = [tmp_path / name for name in ("ct.nrrd", "ct.nii", "mask.mha", "mask.json")]
     contents = [file.read_bytes().decode("latin-1") for file in (*written, *(tmp_path / "again").iterdir())]
     _assert_no_identifier(
-        " ".join(contents) + caplog.text + "".join(capfd.readouterr()) + str([str(w.message) for w in told])
+        " ".join(contents) + caplog.text + "".join(capfd.readouterr()) + str([str(w.message) for w in warned])
     )
     assert json.loads((tmp_path / "mask.json").read_text())["ostium"] is None
 

@@ -75,7 +75,7 @@ def test_one_segment_of_several_is_chosen(tmp_path):
         np.testing.assert_allclose(_places(read_mask(tmp_path / "two.dcm", label=label)), _places(expected), atol=1e-6)
 
 
-def test_what_is_no_segmentation_is_told(tmp_path):
+def test_what_is_no_segmentation_is_refused(tmp_path):
     write_volume(Volume(np.zeros((4, 8, 8), np.int16), np.ones(3), np.zeros(3), np.eye(3)), tmp_path / "ct")
     write_mask(_mask(), tmp_path / "rca.dcm", manifest={})
     (tmp_path / "cut.dcm").write_bytes((tmp_path / "rca.dcm").read_bytes()[:900])
@@ -85,7 +85,7 @@ def test_what_is_no_segmentation_is_told(tmp_path):
             read_mask(path)
 
 
-def test_without_highdicom_the_mend_is_told_and_nothing_written(tmp_path, monkeypatch):
+def test_without_highdicom_the_error_names_the_mend_and_nothing_is_written(tmp_path, monkeypatch):
     write_mask(_mask(), tmp_path / "rca.dcm", manifest={})
     monkeypatch.setitem(sys.modules, "highdicom", None)
     with pytest.raises(InputError, match=r"pip install 'endopilot\[dicom-seg\]'"):

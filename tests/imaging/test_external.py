@@ -112,7 +112,7 @@ def test_nnunet_is_run_with_all_folds_in_the_model_s_own_format(program, ct, tmp
 
 
 @pytest.mark.parametrize("options", [(), ("model=/nowhere",)])
-def test_nnunet_without_a_model_is_told(ct, options):
+def test_nnunet_without_a_model_is_refused(ct, options):
     with pytest.raises(InputError, match=r"holds no trained nnU-Net; give --options model=FOLDER"):
         segment(ct, SegmentConfig(method="nnunet", options=options))
 
@@ -134,7 +134,7 @@ def test_nnunet_without_a_model_is_told(ct, options):
     ],
     ids=["missing", "fails", "writes nothing", "finds nothing", "writes rubbish"],
 )
-def test_a_program_that_does_not_answer_is_told_in_one_line(program, ct, text, expected):
+def test_a_program_that_does_not_answer_is_reported_in_one_line(program, ct, text, expected):
     if text is not None:
         program("TotalSegmentator", text)
     with pytest.raises(InputError, match=expected) as caught:

@@ -104,10 +104,10 @@ def test_files_that_do_not_say_where_their_voxels_are(tmp_path, capfd):
     (tmp_path / "lost.mhd").write_bytes(meta + b"lost.raw\n")
     (tmp_path / "cut.mha").write_bytes(meta + b"LOCAL\n" + _RAMP.tobytes()[:-60])
     for path, expected in {
-        _nifti(tmp_path / "nowhere.nii"): "says no orientation .its sform and qform codes are 0",
+        _nifti(tmp_path / "nowhere.nii"): "has no orientation .its sform and qform codes are 0",
         _nifti(tmp_path / "two.nii", upright, sizes=(1, 1, 1)): r"voxels of 0.4×0.5×1.25, its pixdim 1×1×1",
         _nifti(tmp_path / "sheared.nii", sheared): "not at right angles",
-        _nrrd(tmp_path / "nowhere.nrrd", "spacings: 0.4 0.5 1.25"): "says no orientation .no space",
+        _nrrd(tmp_path / "nowhere.nrrd", "spacings: 0.4 0.5 1.25"): "has no orientation .no space",
         tmp_path / "cut.nrrd": "truncated or damaged",
         tmp_path / "cut.mha": "truncated or damaged",
         tmp_path / "lost.nhdr": "the file of voxels that it names is missing",

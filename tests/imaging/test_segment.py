@@ -119,21 +119,21 @@ def test_a_bad_configuration_is_refused(values, expected):
 
 
 @pytest.mark.parametrize("method", ["aorta", "coronary"])
-def test_a_seed_outside_the_volume_is_told_with_the_volume_s_extent(method):
+def test_a_seed_outside_the_volume_is_refused_with_the_volume_s_extent(method):
     grid = empty_grid((10, 20, 30), (1.0, 2.0, 3.0), (-5.0, 0.0, 100.0))
     grid.voxels[:] = -50
     with pytest.raises(InputError, match=r"outside the volume.*x -5…24, y 0…38, z 100…127"):
         segment(grid, SegmentConfig(method=method, seeds=((0.0, 50.0, 110.0),)))
 
 
-def test_a_lost_rescale_is_told(plain_method):
+def test_a_lost_rescale_is_refused(plain_method):
     ball = _ball()
     raw = Volume(ball.voxels + 1024, ball.spacing_mm, ball.origin_mm, ball.direction)
     with pytest.raises(InputError, match=r"from 934 to 1424, but fat, lung and air are below 0 HU"):
         segment(raw, SegmentConfig(method=PLAIN, seeds=((0.0, 0.0, 0.0),)))
 
 
-def test_contrast_is_told_by_the_histogram(plain_method):
+def test_contrast_is_found_by_the_histogram(plain_method):
     """Muscle at 50 HU with bone: a shell of 3 mm and noise fill no millilitre of homogeneous bright tissue."""
     grid = empty_grid((50, 60, 60), 1.0, (0.0, 0.0, 0.0))
     radius = np.linalg.norm(positions(grid) - [30.0, 30.0, 25.0], axis=-1)
@@ -145,7 +145,7 @@ def test_contrast_is_told_by_the_histogram(plain_method):
     with pytest.raises(InputError, match=r"no contrast: homogeneous soft tissue peaks at (45|55) HU, .*has 0.\d ml"):
         segment(unenhanced, config)
     seeded = segment(unenhanced, SegmentConfig(method=PLAIN, seeds=((30.0, 30.0, 25.0),)))
-    assert seeded.volume.voxels.any()  # a seed says where blood is: the method looks there
+    assert seeded.volume.voxels.any()  # a seed says where blood is
     hu[radius < 15.0] = 200.0
     enhanced = Volume(hu + noise, grid.spacing_mm, grid.origin_mm, grid.direction)
     with pytest.raises(InputError, match="begins 0 mm from the volume's edge"):  # the plain method's ostium is a corner

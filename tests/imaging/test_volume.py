@@ -95,7 +95,7 @@ def test_bad_volumes_are_refused_in_one_line(tmp_path):
         "cut.nii": "truncated or damaged",
         "cut.mha": "truncated or damaged",
         "cut.nrrd": "truncated or damaged",
-        "text.nii.gz": "not what its suffix says",
+        "text.nii.gz": "does not match its suffix",
         "photo.jpg": "unknown format",
         "nan.nrrd": "not finite",
         "empty": "no DICOM image",
@@ -160,7 +160,7 @@ def test_a_mask_without_sidecar_or_with_a_stranger_beside_it_has_no_ostium(tmp_p
     assert read_mask(tmp_path / "rca.nrrd").method == "given"
 
 
-def test_a_broken_sidecar_is_told(tmp_path):
+def test_a_broken_sidecar_is_refused(tmp_path):
     write_volume(_mask().volume, tmp_path / "rca.nrrd")
     for ostium in ('{"position_mm": [1, 2]}', '{"position_mm": [1, 2, 3], "direction": [0, 0, 0]}', "5"):
         (tmp_path / "rca.json").write_text(f'{{"ostium": {ostium}}}')

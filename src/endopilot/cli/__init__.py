@@ -1,6 +1,6 @@
 """The command line: one file a command, each a thin wrapper of a stage's entry function.
 
-Only the command that is called is imported, so that `endopilot --help` and `endopilot info` answer at once.
+Only the command that is called is imported, so that `endopilot --help` and `endopilot info` are fast.
 """
 
 from __future__ import annotations
@@ -17,29 +17,28 @@ from endopilot.errors import InputError
 from endopilot.extras import what_is_missing
 
 COMMANDS = {
-    "demo": "six synthetic patients, the whole way from CTA to report",
-    "run": "one CT angiogram, the whole way to a report",
+    "demo": "six synthetic patients -> everything from the CT angiogram to the report",
+    "run": "one CT angiogram -> everything up to the report",
     "segment": "CT angiogram -> mask of the vessel lumen",
     "anatomy": "mask, mesh or centerline -> centerline tree, section labels, distance map",
     "atlas": "synthetic patients",
     "phantom": "anatomy -> synthetic CT angiogram",
-    "simulate": "anatomy and proximal controls -> what the wire does",
+    "simulate": "anatomy and proximal controls -> motion of the wire and its contact forces",
     "dataset": "anatomies -> many random navigations on disk",
-    "dataset-info": "what a dataset holds, with pictures",
+    "dataset-info": "dataset -> its content in figures and pictures",
     "train": "dataset -> forward and inverse networks: the paper's, ours, or the rod core as a twin",
     "evaluate": "trained run -> errors beside the paper's and the baselines'",
     "plan": "anatomy and target -> controls that bring the tip there",
-    "advise": "trained run -> when X-ray is needed: calibrated bands, exposures against missed events",
-    "drive": "a simulated drive behind TCP, with a watchdog",
-    "ladder": "a policy on twelve tasks in unseen patients -> scores and a page",
-    "verify": "the rod core against closed forms",
-    "bench": "figures beside their bars: speed, environments, robustness, anatomy, imaging, labels, dataset, training",
-    "devices": "the guidewires that endopilot knows",
-    "sample": "fetch a real CT angiogram to try",
+    "advise": "trained run -> calibrated X-ray adviser: exposures against missed events",
+    "drive": "a simulated robotic drive that takes commands over TCP, with a watchdog",
+    "ladder": "a policy on twelve tasks in unseen patients -> scores, a page and a submission",
+    "verify": "the rod core compared with closed forms and an independent engine",
+    "bench": "benchmarks: speed, environments, robustness, anatomy, imaging, labels, dataset, training",
+    "devices": "the known guidewires and their properties",
+    "sample": "download a real CT angiogram to try",
     "info": "versions and machine",
 }
-"""Name of each command and what it turns into what. The module of the same name in this package holds it, see
-`module_of`."""
+"""Name of each command: what it takes -> what it makes. `module_of` names its module."""
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
@@ -113,7 +112,7 @@ def _run(name: str, arguments: Sequence[str]) -> int:
     except KeyboardInterrupt:
         print(f"endopilot {name}: interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
-    except BrokenPipeError:  # who read the output has left, as `head` does
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing to flush into any more
+    except BrokenPipeError:  # the reader has closed the output, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing is left to flush into
         return EXIT_UNREAD
     return 0

@@ -20,15 +20,17 @@ def command(
     json: bool = False,
     config: AdviseConfig = AdviseConfig(),
 ) -> None:
-    """Calibrate the X-ray adviser of a run, and measure what it misses on patients not seen.
+    """Calibrate the X-ray adviser of a run, and measure on unseen patients which events it misses.
+
+    The adviser asks for X-ray before the tip may be at the wall or far from where the model predicts it.
 
     Args:
-        run: folder made by `endopilot train`, which takes the calibration, xray.json; or `pretrained`, the model that
-            comes with endopilot, whose calibration goes to the output.
+        run: folder made by `endopilot train`; the calibration, xray.json, is written into it. Or `pretrained`, the
+            model that comes with endopilot; the calibration is then written to the output.
         dataset: folder made by `endopilot dataset`, with at least 9 patients in its split 'calibrate'.
         output: folder of advice.json and advice.png.
         json: print the figures as JSON.
-        config: what X-ray must not miss, and how it errs.
+        config: the events that X-ray must show, and the errors of X-ray.
     """
     found = advise(run, existing(dataset), output, config)
     if json:

@@ -28,20 +28,20 @@ def command(
     json: bool = False,
     config: AnatomyConfig = AnatomyConfig(),
 ) -> None:
-    """Make an anatomy: centerline tree with section labels, distance map, ostium.
+    """Make an anatomy: centerline tree with section labels, distance map and ostium.
 
     The folder holds centerline.vtp, lumen.nrrd (distance to the wall, mm, positive inside) and anatomy.json; 3D Slicer
-    and ParaView open them. Of several files, each that can be used becomes a folder in the output folder; the others
-    are listed with what is wrong with them.
+    and ParaView open them. Given several files, the command makes a folder of each in the output folder, and lists the
+    files that cannot be used, each with the reason.
 
     Args:
         sources: masks (NIfTI, NRRD, MHA, DICOM-SEG), surfaces (STL, OBJ, PLY, VTP), or centerlines with radii (VTP,
             Slicer .mrk.json).
-        output: folder of the anatomy; of several, the folder that takes theirs.
-        name: name of the patient in datasets and reports; that of the folder by default.
-        label: which label of a mask with several to take.
-        picture: PNG of the tree by section and radius, its longest path straightened, and cross-sections.
-        ct: the CT angiogram to show in the picture behind the walls, in HU.
+        output: folder of the anatomy; for several files, the folder that takes one of each.
+        name: name of the patient in datasets and reports; the folder's name by default.
+        label: label to take, where a mask holds several.
+        picture: PNG of the tree by section and by radius, its longest path straightened, and cross-sections.
+        ct: CT angiogram in HU, shown behind the walls in the picture.
         json: print the figures as JSON.
         config: how to extract.
     """
@@ -73,9 +73,9 @@ def command(
 
 
 def describe(anatomy: Anatomy) -> dict[str, object]:
-    """Return the figures by which an anatomy is recognised: extent, calibre, ostium, and what was repaired."""
+    """Return the figures of an anatomy: extent, calibre, ostium, and what was repaired."""
     path, found = anatomy.tree.longest_path(), anatomy.provenance
-    told = {name: found[name] for name in ("ostium_rule", "notes") if found.get(name)}
+    notes = {name: found[name] for name in ("ostium_rule", "notes") if found.get(name)}
     return {
         "branches": len(anatomy.tree.branches),
         "longest_path_mm": round(float(path.abscissa[-1]), 1),
@@ -88,5 +88,5 @@ def describe(anatomy: Anatomy) -> dict[str, object]:
         "ostium_lps_mm": anatomy.insertion.position.round(2).tolist(),
         "insertion_direction": anatomy.insertion.direction.round(3).tolist(),
         "map_spacing_mm": round(anatomy.distance_map.spacing_mm, 3),
-        **told,
+        **notes,
     }

@@ -14,12 +14,12 @@ def command(
     json: bool = False,
     config: AtlasConfig = AtlasConfig(),
 ) -> None:
-    """Make synthetic patients whose vessels match published statistics; one folder each.
+    """Make synthetic patients whose vessels match published statistics: an anatomy folder for each.
 
     Args:
-        output: folder that takes one anatomy folder a patient.
+        output: folder that takes an anatomy folder for each patient.
         json: print the figures as JSON.
-        config: which patients.
+        config: the patients to make.
     """
     rows = []
     with progress("Synthetic patients", config.count) as advance:

@@ -1,6 +1,6 @@
-"""`endopilot bench SUBJECT`: figures beside their bars, one function for each subject.
+"""`endopilot bench SUBJECT`: benchmarks, one function for each subject.
 
-Where every figure has a bar, the command leaves with exit code 1 if one is missed.
+Where figures have bars, the command leaves with exit code 1 if a figure does not meet its bar.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ EXIT_FAILED = 1
 
 
 def simulation(*, json: bool = False) -> None:
-    """Measure the speed of the rod core on its reference scenario, with the error that goes with it.
+    """Measure the speed of the rod core on its reference scenario, and the tip's error at that speed.
 
     Args:
         json: print the figures as JSON.
@@ -39,11 +39,11 @@ def scaling(*, json: bool = False) -> None:
 
 
 def robustness(*, json: bool = False, config: RobustnessConfig = RobustnessConfig()) -> None:
-    """Drive every device through many anatomies and beyond their ends, and count what goes wrong.
+    """Drive every shipped device through many anatomies and beyond their ends, and count failures.
 
     Args:
         json: print the figures as JSON.
-        config: the rollouts.
+        config: which rollouts.
     """
     from endopilot.benchmarks.robustness import measure_robustness
 
@@ -56,7 +56,7 @@ def robustness(*, json: bool = False, config: RobustnessConfig = RobustnessConfi
 
 
 def env(*, json: bool = False) -> None:
-    """Measure the steps a second of the learning environments in the reference anatomy, and the tip's error with them.
+    """Measure the steps per second of the learning environments in the reference anatomy, and the tip's error.
 
     Args:
         json: print the figures as JSON.
@@ -67,11 +67,11 @@ def env(*, json: bool = False) -> None:
 
 
 def dataset(*, output: OutputFolder = Path("runs/bench-dataset"), share: float = 0.05, json: bool = False) -> None:
-    """Make a slice of the paper's set of 100 000 navigations, and say what all of it would take.
+    """Make a share of the paper's set of 100 000 navigations, and extrapolate time and size of all of it.
 
     Args:
-        output: folder of the slice; an interrupted run goes on where it stopped.
-        share: of the paper's set, 0 to 1.
+        output: folder of this share; an interrupted run goes on where it stopped.
+        share: share of the paper's set, 0 to 1.
         json: print the figures as JSON.
     """
     from endopilot.benchmarks.dataset import bench_dataset
@@ -80,10 +80,10 @@ def dataset(*, output: OutputFolder = Path("runs/bench-dataset"), share: float =
 
 
 def training(*, folder: Path = Path("runs/bench-training"), json: bool = False) -> None:
-    """Measure the speed of training on one core beside a plain PyTorch loop over the same model and data.
+    """Compare the speed of training on one core with a plain PyTorch loop over the same model and data.
 
     Args:
-        folder: takes the patient and the navigations to train on.
+        folder: folder of the patient and of the navigations to train on.
         json: print the figures as JSON.
     """
     from endopilot.benchmarks.training import bench_training
@@ -94,7 +94,7 @@ def training(*, folder: Path = Path("runs/bench-training"), json: bool = False) 
 
 
 def labels(*, count: int = 40, seed: int = 0, json: bool = False) -> None:
-    """Name the sections of synthetic patients of every kind, and compare with the truth.
+    """Label the sections of synthetic patients of every kind, and compare with the truth.
 
     Args:
         count: patients of each kind.
@@ -109,10 +109,10 @@ def labels(*, count: int = 40, seed: int = 0, json: bool = False) -> None:
 
 
 def anatomy(*, centerlines: Path | None = None, json: bool = False) -> None:
-    """Extract lumens whose truth is known, and print each error beside its bar.
+    """Extract lumens whose centerlines are known, and print each error beside its bar.
 
     Args:
-        centerlines: a folder with VMTK's rca_cl.vtp and lca_cl.vtp of a real patient.
+        centerlines: folder with VMTK's rca_cl.vtp and lca_cl.vtp of a real patient; left out if not given.
         json: print the figures as JSON.
     """
     from endopilot.benchmarks.anatomy import bench_anatomy
@@ -128,7 +128,7 @@ def imaging(*, cases: int = 50, seed: int = 0, folder: Path = Path("runs/bench-i
     Args:
         cases: number of CT angiograms.
         seed: seed of the patients and their scans.
-        folder: where the cases' results are kept; an interrupted run goes on where it stopped.
+        folder: folder of the cases' results; an interrupted run goes on where it stopped.
         json: print the figures as JSON.
     """
     from endopilot.benchmarks.imaging import BARS, ImagingBenchConfig, bench_imaging

@@ -29,8 +29,8 @@ def command(
     Args:
         anatomies: folders made by `endopilot anatomy` or `endopilot atlas`.
         output: folder of the dataset.
-        device: name of a shipped device (`endopilot devices`) or a YAML file.
-        scheduler: address of a Dask scheduler (tcp://host:8786) whose workers simulate, and see the same folders; the
+        device: name of a device (`endopilot devices`) or a YAML file.
+        scheduler: address of a Dask scheduler (tcp://host:8786) whose workers simulate and share these folders; the
             cores of this machine if not given.
         json: print the figures as JSON.
         config: how many navigations, how long, and how they are split.

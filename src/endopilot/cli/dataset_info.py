@@ -1,4 +1,4 @@
-"""`endopilot dataset-info`: what a dataset holds."""
+"""`endopilot dataset-info`: dataset -> its content in figures and pictures."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ def command(
     output: Annotated[Path | None, arg(name="output", aliases=("-o",), metavar="DIR")] = None,
     json: bool = False,
 ) -> None:
-    """Count what a dataset holds: distributions of depth, offset and force, branches, failures and why.
+    """Describe a dataset: distributions of depth, offset and force, branches, failures with their reasons.
 
     Args:
         dataset: folder made by `endopilot dataset`.
-        output: folder that takes a picture of each distribution; none is drawn if not given.
+        output: folder of the pictures, one of each distribution; none is drawn if not given.
         json: print the figures as JSON.
     """
     description = describe_dataset(existing(dataset))

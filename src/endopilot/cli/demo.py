@@ -1,4 +1,4 @@
-"""`endopilot demo`: six synthetic patients, the whole way from CTA to report."""
+"""`endopilot demo`: six synthetic patients -> everything from the CT angiogram to the report."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ def command(
     json: bool = False,
     config: DemoConfig = DemoConfig(),
 ) -> None:
-    """Go the whole way once on synthetic patients: CTA, segmentation, anatomy, simulation, learning, report.
+    """Run every stage once on synthetic patients: CT angiogram, segmentation, anatomy, simulation, training, report.
 
     An interrupted demo goes on where it stopped when the same command is given again.
 
     Args:
-        output: folder of everything the demo makes; the report is report.html in it.
+        output: folder of all results; the report is report.html.
         json: print the figures as JSON.
         config: size of the demo.
     """

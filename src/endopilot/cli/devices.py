@@ -1,4 +1,4 @@
-"""`endopilot devices`: the guidewires that endopilot knows."""
+"""`endopilot devices`: the known guidewires and their properties."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`endopilot drive`: a simulated drive behind TCP."""
+"""`endopilot drive`: a simulated robotic drive that takes commands over TCP."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from endopilot.simulation.drive_limits import DriveLimits
 
 @dataclass(frozen=True, kw_only=True)
 class ListenConfig:
-    """Where the drive listens, and how far it may move."""
+    """The drive's address and travel."""
 
     host: str = "127.0.0.1"
-    """Address to listen on; this machine alone if not given."""
+    """Address to listen on; by default only this machine can connect."""
     port: int = 7345
     """TCP port; 0 for a free one."""
     travel_mm: tuple[float, float] = (0.0, 300.0)
@@ -38,13 +38,13 @@ def command(
     listen: ListenConfig = ListenConfig(),
     config: RobotConfig = RobotConfig(),
 ) -> None:
-    """Run a simulated drive that one client commands over TCP (docs/robot.md), until Ctrl-C. It is no medical device.
+    """Run a simulated robotic drive until Ctrl-C; one client commands it over TCP (docs/robot.md). No medical device.
 
     Args:
-        secret: file that holds what drive and client share, at least 16 bytes, readable by you alone.
-        device: name of a shipped device (`endopilot devices`) or a YAML file; it gives the speed limits.
-        listen: where it listens, and how far it may move.
-        config: how the drive differs from an ideal one.
+        secret: file with the secret that drive and client share, at least 16 bytes, readable by you alone.
+        device: name of a device (`endopilot devices`) or a YAML file; it sets the speed limits.
+        listen: address and travel.
+        config: latency, accelerations, backlash and encoder noise.
     """
     wire = read_device(device)
     limits = DriveLimits(

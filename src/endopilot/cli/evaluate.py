@@ -22,15 +22,15 @@ def command(
     json: bool = False,
     config: EvaluateConfig = EvaluateConfig(),
 ) -> None:
-    """Roll the networks of a run out open loop (protocols P1 to P4) and measure their errors.
+    """Roll the networks of a run out in open loop (protocols P1 to P4) and measure their errors.
 
     Args:
         run: folder made by `endopilot train`, or `pretrained`, the causal model that comes with endopilot.
         output: folder of report.html, metrics.json, figures and tables.
         dataset: dataset to evaluate on; the one that the run was trained on if not given.
-        other_seeds: runs of the same training with other seeds; their errors in P1 stand beside the run's, with mean
-            and standard deviation.
-        json: print the whole of metrics.json.
+        other_seeds: runs of the same training with other seeds; their errors in P1 are reported beside the run's, with
+            mean and standard deviation.
+        json: print all of metrics.json.
         config: what to evaluate.
     """
     from endopilot.report.evaluation_report import report_evaluation  # matplotlib and plotly are slow to import

@@ -1,4 +1,4 @@
-"""`endopilot info`: what a bug report needs."""
+"""`endopilot info`: versions and machine, for a bug report."""
 
 from __future__ import annotations
 

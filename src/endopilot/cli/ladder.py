@@ -36,7 +36,7 @@ def command(
             printed instead of the ladder's.
         check: a submission.json. Its recorded controls are driven again, without the policy, and its scores confirmed
             to the bit; exit code 1 if one differs. Nothing else is done.
-        page: write index.html with pictures and replays.
+        page: write index.html with pictures and replays; --no-page leaves it out.
         json: print the scores as JSON.
         config: which policy, tasks and patients.
     """

@@ -21,12 +21,12 @@ def command(
     json: bool = False,
     config: PhantomConfig = PhantomConfig(),
 ) -> None:
-    """Make the CT angiogram that a scanner would have made of an anatomy.
+    """Make a synthetic CT angiogram of an anatomy.
 
     Args:
         anatomy: folder made by `endopilot anatomy` or `endopilot atlas`.
         output: the volume in HU: .nii.gz, .nrrd, .mha, or a new folder without suffix for DICOM slices.
-        seed: seed of noise and of the surroundings.
+        seed: seed of the noise and of the surrounding tissue.
         json: print the figures as JSON.
         config: scanner and contrast.
     """

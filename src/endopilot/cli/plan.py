@@ -34,9 +34,10 @@ def command(
         output: folder of plan.csv, plan.png and manifest.json.
         model: folder made by `endopilot train`, or `pretrained`, the causal model that comes with endopilot; needed for
             the methods inverse and mppi.
-        device: name of a shipped device or a YAML file; the model's by default, workhorse-014 without one.
-        xray: also foresee when X-ray will be due, by the calibration that `endopilot advise` gave the run (inverse,
-            mppi), or by that of the agent's simulated wires (other methods).
+        device: name of a device (`endopilot devices`) or a YAML file; by default the model's device, or workhorse-014
+            without a model.
+        xray: also predict when X-ray will be needed, with the calibration that `endopilot advise` wrote into the run
+            (inverse, mppi), or with that of the agent's simulated wires (other methods).
         json: print the figures as JSON.
         config: method, limits and cost.
     """

@@ -1,4 +1,4 @@
-"""`endopilot run`: one CT angiogram, the whole way to a report."""
+"""`endopilot run`: one CT angiogram -> everything up to the report."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ def command(
     json: bool = False,
     config: RunConfig = RunConfig(),
 ) -> None:
-    """Go the whole way with one patient: CT angiogram in, report out.
+    """Run every stage on one patient, from the CT angiogram to the report.
 
     An interrupted run goes on where it stopped when the same command is given again.
 
     Args:
         volume: DICOM folder or file, NIfTI, NRRD or MHA, in HU.
-        output: folder of everything the run makes; the report is report.html in it.
+        output: folder of all results; the report is report.html.
         series: number or instance UID of the series, where a DICOM folder holds several.
         json: print the figures as JSON.
         config: segmentation, device and size of the study.

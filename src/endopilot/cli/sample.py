@@ -1,4 +1,4 @@
-"""`endopilot sample`: fetch a real CT angiogram to try."""
+"""`endopilot sample`: download a real CT angiogram to try."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from endopilot.imaging.sample import fetch_sample
 
 
 def command(name: Positional[Literal["cta-thorax"]] = "cta-thorax", /) -> None:
-    """Fetch a real thoracic CT angiogram, check it, and print where it lies, its licence and its source.
+    """Download a real thoracic CT angiogram, check it, and print its path, licence and source.
 
     Args:
         name: which sample.

@@ -28,16 +28,16 @@ def command(
 ) -> None:
     """Segment the lumen of a vessel tree in a CT angiogram.
 
-    The ostium that was found, and how, is written beside the mask as JSON.
+    A JSON file beside the mask holds the ostium, the method and the manifest.
 
     Args:
         volume: DICOM folder or file, NIfTI, NRRD or MHA, in HU.
-        output: the mask: .nii.gz, .nrrd, .mha, or .dcm for DICOM-SEG (needs the extra dicom-seg).
+        output: mask: .nii.gz, .nrrd, .mha, or .dcm for DICOM-SEG (needs the extra dicom-seg).
         series: number or instance UID of the series, where a DICOM folder holds several.
-        reference: another mask of the same vessel; how far both agree is printed, and it is red in the picture.
+        reference: another mask of the same vessel; the agreement is printed, and its outline is red in the picture.
         picture: PNG of three slices with the mask's outline in green.
         json: print the figures as JSON.
-        config: how to segment.
+        config: method, vessel and seeds.
     """
     check_output(output, mask=True)
     if picture is not None and picture.suffix.lower() != ".png":

@@ -1,4 +1,4 @@
-"""`endopilot simulate`: anatomy and proximal controls -> what the wire does."""
+"""`endopilot simulate`: anatomy and proximal controls -> motion of the wire and its contact forces."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from endopilot.types import SAMPLE_PERIOD_S
 
 @dataclass(frozen=True, kw_only=True)
 class RandomConfig:
-    """The random navigations that are simulated where no controls are given."""
+    """The random navigations that are simulated if no controls are given."""
 
     sequences: int = 8
-    """Number of navigations, each in a world of its own."""
+    """Number of navigations."""
     seconds: float = 60.0
     """Length of a navigation, s."""
     seed: int = 0
@@ -56,15 +56,15 @@ def command(
 
     Args:
         anatomy: folder made by `endopilot anatomy` or `endopilot atlas`.
-        output: one row a sample as .parquet or .csv, or all arrays as .npz.
-        device: name of a shipped device (`endopilot devices`) or a YAML file.
+        output: .parquet or .csv with a row for each sample, or .npz with all arrays.
+        device: name of a device (`endopilot devices`) or a YAML file.
         controls: CSV of scripted proximal velocities, or folder made by `endopilot plan` for this anatomy and device;
             random ones by default.
-        shape: record the positions of all nodes too (.npz only).
-        picture: PNG of the vessel and of the first world's wire at the end.
+        shape: also record the positions of all nodes, mm (.npz only).
+        picture: PNG of the vessel and of the first navigation's wire at its end.
         json: print the figures as JSON.
-        random: the random controls.
-        config: the rod core.
+        random: the random controls, if no others are given.
+        config: settings of the rod core.
     """
     patient = read_anatomy(existing(anatomy))
     wire = read_device(device)

@@ -1,4 +1,4 @@
-"""`endopilot train`: dataset -> forward and inverse transformers."""
+"""`endopilot train`: dataset -> forward and inverse networks."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ def command(
     from endopilot.models.train import train  # torch takes seconds to import; --help must not wait for it
 
     train(existing(dataset), output, config)
-    if os.environ.get("RANK", "0") != "0":  # torchrun runs several; one tells
+    if os.environ.get("RANK", "0") != "0":  # torchrun runs several processes; one of them prints
         return
     training = read_json(output / "training.json")
     if json:
         show({"run": str(output), "training": training}, as_json=True)
         return
-    ends = {name.upper(): {"epochs": len(told["curve"])} | told["curve"][-1] for name, told in training.items()}
+    ends = {name.upper(): {"epochs": len(of["curve"])} | of["curve"][-1] for name, of in training.items()}
     shown = ("epochs", "loss", "validation_loss", "samples_per_second")
     show({"run": str(output)} | {name: {key: end[key] for key in shown} for name, end in ends.items()}, as_json=False)

@@ -1,4 +1,4 @@
-"""`endopilot verify`: the rod core against closed forms and an independent engine."""
+"""`endopilot verify`: the rod core compared with closed forms and an independent engine."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ EXIT_FAILED = 1
 
 
 def command(*, plots: Path | None = None, json: bool = False) -> None:
-    """Run the rod core through cases whose answers are known, and print case, reference, value, error, bar, verdict.
+    """Compare the rod core with known solutions; print case, reference, value, error, bar and verdict.
 
-    Leaves with exit code 1 if a case misses its bar. Comparisons with MuJoCo are skipped where it is not installed.
+    The exit code is 1 if an error exceeds its bar. Comparisons with MuJoCo are skipped where it is not installed.
 
     Args:
-        plots: folder for a figure a case.
+        plots: folder that takes a figure of each case; none is drawn if not given.
         json: print the rows as JSON.
     """
     rows = run_verification(plots)

@@ -21,7 +21,7 @@ _ROUND_SHARE = 0.6
 _FEWEST_SLICES_MM = 10.0
 """Length over which the disc must persist, mm."""
 _MOST_ROOTS = 3
-"""Chains of discs that are told: the pulmonary trunk may be one, and the descending aorta."""
+"""Chains of discs that are returned at most: the pulmonary trunk may be one, and the descending aorta."""
 _DIRECTIONS = 32
 _BRIGHTEST_HU = 600.0
 """Undiluted contrast in the superior vena cava is brighter than this, and no more likely to be the aorta."""

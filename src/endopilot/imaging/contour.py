@@ -1,4 +1,4 @@
-"""The wall of a vessel at half height: where HU pass half way between the lumen and what lies beside it."""
+"""The wall of a vessel at half height: where HU lie midway between those of the lumen and of what is beside it."""
 
 from __future__ import annotations
 

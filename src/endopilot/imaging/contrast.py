@@ -1,4 +1,4 @@
-"""Whether a CT is in HU and its blood holds contrast, told by its histogram before anything is sought in it."""
+"""Checks by the histogram that a CT is in HU and that its blood holds contrast, before a method searches it."""
 
 from __future__ import annotations
 

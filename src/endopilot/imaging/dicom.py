@@ -1,7 +1,7 @@
 """CT from DICOM: one series of axial-like slices, its geometry checked, its identifiers left behind.
 
 Headers are read with pydicom, restricted to the tags below, so that nothing that names a patient is ever asked for.
-Pixels are decoded by GDCM through SimpleITK, which knows more compressions than pydicom alone; but for RLE, where GDCM
+Pixels are decoded by GDCM through SimpleITK, which reads more compressions than pydicom alone; but for RLE, where GDCM
 does not come back from some damaged files.
 """
 
@@ -63,7 +63,7 @@ _FEWEST_SLICES = 4
 
 @dataclass(frozen=True, eq=False)
 class _Slice:
-    """What the header of one file says, identifiers left out; None and empty where it says nothing.
+    """The geometry in the header of one file, without identifiers; None and empty where a field is absent.
 
     Attributes:
         path: the file.
@@ -135,13 +135,13 @@ def _read_headers(files: Sequence[Path]) -> list[_Slice]:
             except InvalidDicomError:
                 continue
             except Exception:
-                # Whatever pydicom says may quote the header: it ends here.
+                # pydicom's message may quote the header, so it is not passed on.
                 raise InputError(f"{file}: its DICOM header is damaged; copy or export the series again") from None
     return found
 
 
 def _slice(file: Path, header: Dataset) -> _Slice:
-    """Take what is needed out of a header; any error speaks for a damaged one."""
+    """Take what is needed out of a header; any error means that it is damaged."""
 
     def numbers(tag: str) -> tuple[float, ...]:
         value = header.get(tag)
@@ -222,7 +222,7 @@ def _check_slices(slices: Sequence[_Slice], folder: Path) -> None:
             ("RescaleSlope and RescaleIntercept", slice_.rescale, 2),
         ):
             if len(value) != count or not np.isfinite(value).all():
-                raise InputError(f"{path}: no {tag} in its header; export the series anew with its whole header")
+                raise InputError(f"{path}: no {tag} in its header; export the series again with its complete header")
         if min(slice_.spacing_mm) <= 0 or slice_.rescale[0] == 0 or not _is_rotation(slice_.orientation):
             raise InputError(f"{path}: PixelSpacing, RescaleSlope or ImageOrientationPatient is wrong; export it anew")
         needed = slice_.size[0] * slice_.size[1] * slice_.bytes_per_value
@@ -296,7 +296,7 @@ def _read_pixels(slices: Sequence[_Slice]) -> np.ndarray:
             try:
                 plane[:] = _decoded(slice_, reader).reshape(plane.shape)
             except Exception:
-                # What the decoder says may quote the header: it ends here.
+                # The decoder's message may quote the header, so it is not passed on.
                 raise InputError(
                     f"{slice_.path}: its pixels cannot be decoded (truncated or damaged); "
                     "copy or export the series again"
@@ -309,7 +309,7 @@ def _read_pixels(slices: Sequence[_Slice]) -> np.ndarray:
 
 
 def _decoded(slice_: _Slice, reader: sitk.ImageFileReader) -> np.ndarray:
-    """Return the HU of one slice; any error speaks for damaged pixels."""
+    """Return the HU of one slice; any error means that its pixels are damaged."""
     if slice_.transfer_syntax in _ENCAPSULATED:
         content = slice_.path.read_bytes()
         begin = max(content.rfind(mark) for mark in _PIXELS_BEGIN)

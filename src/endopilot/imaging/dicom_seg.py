@@ -79,7 +79,7 @@ def write_seg(mask: LumenMask, path: Path) -> None:
         content_label="LUMEN",
         omit_empty_frames=False,
     )
-    # highdicom asks for a source image; there is none that may be named.
+    # highdicom needs a source image; there is none that may be named.
     del content.ReferencedSeriesSequence
     del content.SourceImageSequence
     with writing(path) as partial:
@@ -100,7 +100,7 @@ def read_seg(path: Path) -> Volume:
             stack = content.get_volume(skip_overlap_checks=True)
             numbers = np.array(content.segment_numbers)
     except Exception:
-        # Whatever is said of it may quote the header: it ends here.
+        # The message may quote the header, so it is not passed on.
         raise InputError(
             f"{path}: cannot be read as a DICOM-SEG of parallel, evenly spaced slices; export the mask as .nii.gz"
         ) from None

@@ -1,6 +1,6 @@
 """CT to DICOM: one series of uncompressed slices that names no patient.
 
-The attributes are those that DICOM asks of a CT image (PS3.3 A.3.3); those of type 2 are there and empty.
+The attributes are those that DICOM requires of a CT image (PS3.3 A.3.3); those of type 2 are present and empty.
 """
 
 from __future__ import annotations

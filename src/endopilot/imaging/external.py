@@ -24,7 +24,7 @@ _SEED_MM = 5.0
 """A seed belongs to the lumen within this distance."""
 _MOUTH_MM = 8.0
 """The vessel's direction at the first seed is that to the middle of the lumen within this distance."""
-_LONGEST_TOLD = 200
+_LONGEST_MESSAGE = 200
 
 
 def segment_by_program(
@@ -74,7 +74,7 @@ def segment_by_program(
 
 
 def ostium_at_seeds(mask: LumenMask, seeds: Sequence[tuple[float, float, float]]) -> Insertion | None:
-    """Return the ostium that the first seed tells, with the direction into the lumen; None without seeds.
+    """Return the ostium at the first seed, with the direction into the lumen; None without seeds.
 
     Raises:
         InputError: a seed lies farther than 5 mm from the lumen.
@@ -99,7 +99,7 @@ def _inward(points: Float[np.ndarray, "n 3"], place: Float[np.ndarray, "3"]) -> 
 
 
 def _run(command: Sequence[str], mend: str) -> None:
-    """Run a program and wait for it; what it prints is told only if it fails."""
+    """Run a program and wait for it; its output is reported only if it fails."""
     program = Path(command[0]).name
     if shutil.which(command[0]) is None:
         raise InputError(f"the program {program} is not on the PATH; {mend}")
@@ -112,7 +112,7 @@ def _run(command: Sequence[str], mend: str) -> None:
     if answer.returncode != 0:
         lines = [line.strip() for line in (answer.stderr + "\n" + answer.stdout).splitlines() if line.strip()]
         said = [line for line in lines if "error" in line.lower()] or lines or ["nothing"]
-        raise InputError(f"{program} failed with exit code {answer.returncode}: {said[-1][:_LONGEST_TOLD]}; {mend}")
+        raise InputError(f"{program} failed with exit code {answer.returncode}: {said[-1][:_LONGEST_MESSAGE]}; {mend}")
 
 
 def _labelled(found: Volume, label: int | None, program: str) -> Bool[np.ndarray, "nz ny nx"]:

@@ -10,7 +10,7 @@ from scipy import ndimage
 from endopilot.types import Volume
 
 LEAST_BLOOD_HU = 130.0
-"""Without contrast, blood measures 30-60 HU; below this value no method here can tell lumen from wall."""
+"""Without contrast, blood measures 30-60 HU; below this value no method here can separate lumen from wall."""
 
 
 def to_image(volume: Volume) -> sitk.Image:

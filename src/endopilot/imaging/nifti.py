@@ -1,4 +1,4 @@
-"""What ITK reads from NIfTI files without a word although it must not: truncated voxels, and places that nobody knows.
+"""Checks of NIfTI files that ITK does not make: truncated voxels, and voxels without a position in the world.
 
 Offsets are those of the NIfTI-1 and NIfTI-2 headers (https://nifti.nimh.nih.gov).
 """
@@ -37,7 +37,7 @@ _NIFTI_2 = _Layout(("h", 14), ("8q", 16), ("8d", 104), ("q", 168), ("2i", 344), 
 
 
 def check_nifti(path: Path) -> None:
-    """Refuse a NIfTI file that ends before its voxels do, or that does not say where they are.
+    """Refuse a NIfTI file that ends before its voxels do, or that has no orientation.
 
     Of a truncated file, ITK would fill the rest with whatever is in memory; without sform and qform it would guess.
 
@@ -64,14 +64,14 @@ def check_nifti(path: Path) -> None:
     if missing > 0:
         raise InputError(f"{path}: truncated or damaged (its voxels are incomplete); copy or export it again")
     if max(codes) <= 0:
-        raise InputError(f"{path}: says no orientation (its sform and qform codes are 0); export it with its affine")
+        raise InputError(f"{path}: has no orientation (its sform and qform codes are 0); export it with its affine")
     lengths = np.linalg.norm(np.array(rows).reshape(3, 4)[:, :3], axis=0)
     if codes[1] > 0 and not np.allclose(lengths, np.abs(sizes[1:4]), rtol=_SPACING_TOLERANCE):
         raise InputError(
-            f"{path}: its affine says voxels of {_told(lengths)}, its pixdim {_told(np.abs(sizes[1:4]))}; "
+            f"{path}: its affine gives voxels of {_text(lengths)}, its pixdim {_text(np.abs(sizes[1:4]))}; "
             "one of them is wrong: export it again"
         )
 
 
-def _told(lengths: np.ndarray) -> str:
+def _text(lengths: np.ndarray) -> str:
     return "×".join(f"{length:.3g}" for length in lengths)

@@ -23,9 +23,9 @@ _NEAR_MM = 4.5
 _MOUTH_MM = 3.0
 """Nearer than this to the artery's axis, the opened aorta bulges into the mouth."""
 _WALL_MM = 3.0
-"""Width of the wall around the mouth that tells where the wall would be without the mouth, mm."""
+"""Width of the wall around the mouth from which the wall without the mouth is estimated, mm."""
 _FEWEST_OF_WALL = 100
-"""Fewer voxels of wall around the mouth tell nothing."""
+"""With fewer voxels of wall around the mouth, the wall is not estimated."""
 _DEEPEST_MM = 1.0
 """A ball that opens the aorta bulges no deeper into a mouth: its cap of 3.5 mm radius is 0.9 mm high."""
 
@@ -82,7 +82,7 @@ def _height_of_wall(
 ) -> float:
     """Return where the aortic wall goes on under the artery's mouth, mm of height: below 0, as the ball bulges in.
 
-    A quadric through the wall around the mouth tells it; what lies off it, such as another vessel's mouth, is left out.
+    A quadric through the wall around the mouth estimates it; outliers, such as another vessel's mouth, are left out.
     """
     spacing = float(grid.spacing_mm[0])
     near = np.argwhere(np.abs(height) < 0.8 * spacing)
@@ -103,8 +103,8 @@ def _height_of_wall(
     place = (above - level)[around]
     found = np.linalg.lstsq(terms, place, rcond=None)[0]
     for _ in range(2):
-        miss = np.abs(place - terms @ found)
-        kept = miss <= max(2.5 * float(np.median(miss)), 0.2)
+        error = np.abs(place - terms @ found)
+        kept = error <= max(2.5 * float(np.median(error)), 0.2)
         found = np.linalg.lstsq(terms[kept], place[kept], rcond=None)[0]
     return float(np.clip(found[0], -_DEEPEST_MM, 0.0))
 

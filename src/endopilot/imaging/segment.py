@@ -64,7 +64,7 @@ class SegmentConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class SegmentationMethod:
-    """A way to find a lumen in a CT angiogram.
+    """A method that finds the lumen of a vessel in a CT angiogram.
 
     Attributes:
         segment_lumen: takes the volume (HU) and the settings, and returns the mask of the lumen on the volume's grid,

@@ -16,7 +16,7 @@ from endopilot.imaging.grid import distance_to_outside
 _SHORTEST_BRANCH_MM = 4.0
 """Shorter side branches are bumps of the wall."""
 _COST_FLOOR = 0.05
-"""Added to the vesselness, so that a way through a gap has a finite cost."""
+"""Added to the vesselness, so that a path through a gap has a finite cost."""
 _SMOOTHING_MM = 1.5
 """Width of the Gaussian that takes the voxel steps out of a path, mm."""
 
@@ -31,7 +31,7 @@ def track_tree(
     """Return the paths from `start` to every distal end of the tree, each from where it leaves those before it.
 
     The farthest end is reached first; what its path covers is taken away, and so on until what is left is shorter than
-    a branch (after TEASAR, Sato et al. 2000). A path is the cheapest way; a strong response makes a step cheap.
+    a branch (after TEASAR, Sato et al. 2000). A path has the least cost; a strong response makes a step cheap.
 
     Args:
         response: vesselness.
@@ -66,7 +66,7 @@ def track_tree(
         if asked or not paths or length[path[-1]] - length[path[0]] >= _SHORTEST_BRANCH_MM:
             paths.append(voxels[path])
             on_path[path] = True
-        # What lies within the lumen around the path is told by it, and so is a bump too short to be a branch.
+        # The path stands for what lies within the lumen around it, and for a bump too short to be a branch.
         left[tip] = False
         remaining = np.flatnonzero(left)
         distance, nearest = KDTree(voxels[path]).query(voxels[remaining])

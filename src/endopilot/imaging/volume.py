@@ -132,7 +132,7 @@ def read_mask(path: str | Path, *, label: int | None = None) -> LumenMask:
         label: which value to take where the file holds several.
 
     Returns:
-        The mask; its ostium is None where no sidecar tells it.
+        The mask; its ostium is None where no sidecar holds it.
 
     Raises:
         InputError: the file is missing, damaged or no mask, the label is not in it, or nothing is inside.
@@ -187,7 +187,7 @@ def _sidecar(path: Path) -> Path:
 
 
 def _read_file(path: Path) -> Volume:
-    """Read one file that SimpleITK knows by its suffix, refusing what is not a scalar volume."""
+    """Read one file whose suffix SimpleITK supports, refusing what is not a scalar volume."""
     if path.is_dir() or _suffix(path) is None:
         raise InputError(f"{path}: unknown format; give one of {', '.join(SUFFIXES)}, or a folder of DICOM slices")
     reader = sitk.ImageFileReader()
@@ -209,7 +209,7 @@ def _read_file(path: Path) -> Volume:
     if path.name.lower().endswith((".nii", ".nii.gz")):
         check_nifti(path)
     if path.name.lower().endswith((".nrrd", ".nhdr")) and not reader.HasMetaDataKey("NRRD_space"):
-        raise InputError(f"{path}: says no orientation (no space in its header); export it with its space directions")
+        raise InputError(f"{path}: has no orientation (no space in its header); export it with its space directions")
     try:
         with _quiet_itk():
             image = reader.Execute()
@@ -235,7 +235,7 @@ def _reason(error: RuntimeError, path: Path) -> str:
     if "orthonormal" in text.lower():
         return "its axes are not at right angles (a sheared affine)"
     if "Unable to determine ImageIO reader" in text:
-        return "its content is not what its suffix says, or its header is damaged"
+        return "its content does not match its suffix, or its header is damaged"
     if path.suffix.lower() in _READ_ONLY_SUFFIXES:
         return "the file of voxels that it names is missing, incomplete or damaged"
     return "its header or voxels cannot be read"
@@ -273,7 +273,7 @@ def _inside(values: np.ndarray, label: int | None, path: Path) -> np.ndarray:
 
 
 def _read_sidecar(path: Path) -> tuple[Insertion | None, str]:
-    """Return ostium and method from a sidecar; JSON files that others put beside a mask tell neither."""
+    """Return ostium and method from a sidecar; JSON files that others put beside a mask have neither."""
     content = read_json(path)
     if not isinstance(content, dict) or "ostium" not in content:
         return None, "given"

@@ -130,7 +130,7 @@ def write_submission(
         policy=policy,
         origin=POLICIES.origin(policy),
         versions=manifest(config=None)["versions"],
-        core=str(_core.LANES),
+        core=_core.LEVEL,
         tasks={name: task_digest(find_task(name)) for name in results},
         navigations={
             name: tuple(NavigationEntry(**{key: value for key, value in one.items() if key in fields}) for one in done)
@@ -247,7 +247,7 @@ def _difference(given: Mapping[str, Any], again: Mapping[str, Any]) -> str | Non
 
 def _remarks(submission: Submission) -> tuple[str, ...]:
     """Return in what this installation differs from the one that made the file."""
-    here = {**manifest(config=None)["versions"], "core": str(_core.LANES)}
+    here = {**manifest(config=None)["versions"], "core": _core.LEVEL}
     made = {**submission.versions, "core": submission.core}
     return tuple(
         f"made with {name} {made.get(name)}, checked with {value}"

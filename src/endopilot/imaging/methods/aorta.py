@@ -7,7 +7,7 @@
    bone and branches go to the other side.
 3. Branch stumps and leaks thinner than the aorta go by a morphological opening; planes across the path at the first and
    last seed cut the ends.
-4. The wall is where the HU pass half way between the blood nearby and soft tissue.
+4. The wall is where the HU lie midway between those of the blood nearby and of soft tissue.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _REACH_MM = 30.0
 _CORE = 0.6
 """Share of the inscribed radius around the path that is aorta without question."""
 _WIDEST_MM = 18.0
-"""With one seed the far end is free; a wider inscribed sphere than this tells that a heart chamber was entered."""
+"""With one seed the far end is free; a wider inscribed sphere than this means that a heart chamber was entered."""
 _THINNEST_MM = 3.0
 """Radius of the opening: branches and leaks thinner than this go."""
 _SEED_MM = 6.0
@@ -57,7 +57,7 @@ def segment_lumen(volume: Volume, config: SegmentConfig) -> LumenMask:
     Further seeds in between guide the path. With one seed, the lumen is followed to its far end.
 
     Raises:
-        InputError: there is no seed, no contrast at a seed, or no contrast-filled way between seeds.
+        InputError: there is no seed, no contrast at a seed, or no contrast-filled path between seeds.
     """
     if not config.seeds:
         raise InputError("seeds: the aorta method needs one or two points in the lumen, LPS mm; give --seeds x y z")
@@ -106,18 +106,18 @@ def _blood_hu(grid: Volume, centre: tuple[int, int, int], seed: tuple[float, flo
 def _find_path(
     hu: Float[np.ndarray, "nz ny nx"], seeds: list[tuple[int, int, int]], blood: float
 ) -> tuple[Int[np.ndarray, "n 3"], Float[np.ndarray, "n"]]:
-    """Return the voxels (k, j, i) of the widest way through all seeds, and the inscribed radius along it, mm."""
+    """Return the voxels (k, j, i) of the widest path through all seeds, and the inscribed radius along it, mm."""
     for level in _PATH_LEVELS:
         wall_distance = distance_to_outside(hu > level * blood, _GRID_MM)
         stops = [_widest_nearby(wall_distance, seed) for seed in seeds]
         if len(stops) == 1:
             stops.append(_far_end(wall_distance, stops[0]))
-        pieces = [_widest_way(wall_distance, a, b) for a, b in pairwise(stops)]
+        pieces = [_widest_path(wall_distance, a, b) for a, b in pairwise(stops)]
         if all(piece is not None for piece in pieces):
             path = np.concatenate([piece for piece in pieces if piece is not None])
             if len(path) > 2:
                 return path, wall_distance[tuple(path.T)]
-    raise InputError("seeds: no contrast-filled way leads from seed to seed; put them in one lumen, or add one between")
+    raise InputError("seeds: no contrast-filled path from seed to seed; put them in one lumen, or add one between")
 
 
 def _widest_nearby(wall_distance: np.ndarray, seed: tuple[int, int, int]) -> tuple[int, int, int]:
@@ -141,10 +141,10 @@ def _far_end(wall_distance: np.ndarray, start: tuple[int, int, int]) -> tuple[in
     return int(k), int(j), int(i)
 
 
-def _widest_way(
+def _widest_path(
     wall_distance: np.ndarray, start: tuple[int, int, int], end: tuple[int, int, int]
 ) -> Int[np.ndarray, "n 3"] | None:
-    """Return the way whose narrowest place is widest, kept to the middle of the lumen; None if there is none."""
+    """Return the path whose narrowest place is widest, kept to the middle of the lumen; None if there is none."""
     low, high = 0.0, float(min(wall_distance[start], wall_distance[end]))
     while high - low > _GRID_MM / 20:
         middle = (low + high) / 2
@@ -203,7 +203,7 @@ def _trim(inside: np.ndarray, path: np.ndarray, radius: np.ndarray) -> Bool[np.n
 def _at_half_height(
     hu: np.ndarray, inside: np.ndarray, beyond: np.ndarray, grid: Volume, volume: Volume
 ) -> Bool[np.ndarray, "nz ny nx"]:
-    """Return the mask on the grid of `volume`, its wall where HU pass half way between blood nearby and soft tissue."""
+    """Return the mask on the grid of `volume`, its wall where HU lie midway between nearby blood and soft tissue."""
     sigma = 4.0 / _GRID_MM
     weight = ndimage.gaussian_filter(inside.astype(np.float32), sigma)
     blood = ndimage.gaussian_filter(np.where(inside, hu, np.float32(0)), sigma) / np.maximum(weight, 1e-3)

@@ -1,12 +1,12 @@
 """One coronary tree, from its ostium to its distal ends, in a cardiac CT angiogram: automatic.
 
 1. The ascending aorta is found as the largest round bright disc that persists from slice to slice and that an artery
-   opens into; its median HU tell how bright contrast-filled lumen is in this scan.
+   opens into; its median HU are those of contrast-filled lumen in this scan.
 2. Bright voxels that a ball of 3.5 mm fits in are aorta, chambers and large veins. Of the others, those that look like
    the middle of a bright tube at some scale are vessels.
 3. The connected vessel that comes to the aorta's wall on the right side of it is the tree wanted; its paths are tracked
    to the distal ends, and its axis is drawn back to the aortic wall, which is the ostium.
-4. Around the paths, the wall is where HU pass half way from the lumen to what lies beside it.
+4. Around the paths, the wall is where HU lie midway between those of the lumen and of what is beside it.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _MUSCLE_HU = 100.0
 _FAT_HU = -90.0
 """Epicardial fat."""
 _LOW_SHARE = 0.25
-"""A vessel's voxels rise this share of the way from what surrounds them to lumen; the blur dims small vessels."""
+"""A vessel's voxels rise by this share of the step from what surrounds them to lumen; the blur dims small vessels."""
 _POOL_RADIUS_MM = 3.5
 """A ball of this radius fits in chambers and great vessels, and in no coronary artery."""
 _RESPONSE = 0.15
@@ -92,7 +92,7 @@ class _Scan:
 
     @property
     def blood_hu(self) -> float:
-        """HU half way from the aortic wall to lumen: what is brighter is blood."""
+        """HU midway between the aortic wall and lumen: what is brighter is blood."""
         return 0.5 * (self.lumen_hu + _WALL_HU)
 
 
@@ -128,7 +128,7 @@ def segment_lumen(volume: Volume, config: SegmentConfig) -> LumenMask:
 
 
 def _find_roots(grid: Volume, config: SegmentConfig) -> list[AorticRoot]:
-    """Return what may be the ascending aorta; nothing where it is not in the volume and a seed tells what it would."""
+    """Return what may be the ascending aorta; nothing where it is not in the volume and a seed is given."""
     try:
         return find_aortic_roots(resample(grid, _ROOT_GRID_MM))
     except InputError:
@@ -157,7 +157,7 @@ def _find_vessels(grid: Volume, lumen_hu: float) -> _Scan:
     above_muscle = _MUSCLE_HU + _LOW_SHARE * (lumen_hu - _MUSCLE_HU)
     above_fat = _FAT_HU + _LOW_SHARE * (lumen_hu - _FAT_HU)
     pools = _thick(body, above_muscle, grid)
-    # A small vessel in fat is dimmer than muscle, and seen all the same, where no thick tissue is.
+    # A small vessel in fat is dimmer than muscle, but visible where no thick tissue is.
     thin = ((hu > above_muscle) & ~pools) | ((hu > above_fat) & ~_thick(body, above_fat, grid))
     response = vesselness(
         np.clip(grid.voxels, _FAT_HU / 2, 1.1 * lumen_hu),
@@ -215,7 +215,7 @@ def _unseeded_tree(grid: Volume, roots: list[AorticRoot], vessel: str) -> _Tree:
         if _opens_into(scan, aorta, *found):
             return scan, aorta, *found
         passing = passing or (scan, aorta, *found)
-    if passing is not None:  # a narrow ostium may be too dim to be seen open
+    if passing is not None:  # a narrow ostium may be too dim to look open
         return passing
     raise InputError(
         f"vessel={vessel!r}: no such artery comes to the aorta's wall in this volume; "

@@ -12,7 +12,7 @@ from endopilot.imaging.volume import SUFFIXES
 from endopilot.types import LumenMask, Volume
 
 OPTIONS = {"model": "", "device": "", "label": ""}
-"""Folder of the trained model, that with dataset.json and fold_0, fold_1, …; device: cuda, cpu, mps; label wanted."""
+"""Folder of the trained model, with dataset.json and fold_0, fold_1, …; device: cuda, cpu, mps; label of the lumen."""
 
 
 def segment_lumen(volume: Volume, config: SegmentConfig) -> LumenMask:
