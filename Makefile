@@ -96,4 +96,4 @@ $(INSTALLED): pyproject.toml constraints.txt CMakeLists.txt $(wildcard src/core/
 	touch $@
 
 clean:
-	rm -rf $(VENV) build runs docs/_build
+	rm -rf $(VENV) build runs docs/_build docs/generated

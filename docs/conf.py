@@ -1,14 +1,41 @@
-"""Configuration of the documentation: `make docs` builds it into docs/_build."""
+"""Configuration of the documentation: `make docs` builds it into docs/_build and runs every tutorial and example."""
+
+import os
+import sys
+from pathlib import Path
 
 from endopilot import __version__
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # torch's threads slow each other down on a busy machine
+sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))  # for the processes that tutorial 4 starts
 
 project = "endopilot"
 author = "the endopilot authors"
 release = __version__
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
+    "sphinx_gallery.gen_gallery",
+]
 myst_enable_extensions = ["dollarmath", "amsmath"]
 myst_heading_anchors = 3  # links to headings, as GitHub has them
 html_theme = "furo"
-exclude_patterns = ["_build"]
+html_title = "endopilot"
+exclude_patterns = ["_build", "tutorials", "gallery"]  # sphinx-gallery reads these two and writes into generated/
 autodoc_typehints = "none"
-suppress_warnings = ["myst.header"]
+suppress_warnings = ["myst.header", "config.cache"]
+
+sphinx_gallery_conf = {
+    "examples_dirs": ["tutorials", "gallery"],
+    "gallery_dirs": ["generated/tutorials", "generated/gallery"],
+    "filename_pattern": r"\.py$",  # run all of them
+    "run_stale_examples": True,  # a tutorial can break although its own text did not change
+    "within_subsection_order": "FileNameSortKey",
+    "capture_repr": (),
+    "download_all_examples": False,
+    "show_signature": False,
+    "min_reported_time": 1000,
+    "write_computation_times": False,
+}
