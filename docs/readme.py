@@ -52,8 +52,8 @@ def _demo(run: Path) -> str:
     dice, ostium = ([score[name] for score in scores] for name in ("dice", "ostium_error_mm"))
     lines = [
         f"Tip error, mm (mean ± SD), over {split['episodes']} navigations of {len(split['anatomies'])} patients that "
-        "were never trained on; Δtip is the way along the vessel, γtip the distance from its centerline. Skill is "
-        "1 − RMSE/RMSE of the baseline that is hardest to beat.",
+        "were never trained on. Δtip is the tip's distance from the ostium along the vessel, γtip its distance from "
+        "the centerline. Skill is 1 − RMSE/RMSE of the baseline that is hardest to beat.",
         "",
         "| | Δ 0–10 s | Δ 10–30 s | Δ 30–45 s | skill | γ 0–10 s | γ 10–30 s | γ 30–45 s | skill |",
         "| --- " * 9 + "|",
@@ -64,7 +64,7 @@ def _demo(run: Path) -> str:
         [
             *lines,
             "",
-            f"Segmentation from the CT alone: Dice {min(dice):.2f}–{max(dice):.2f}, ostium off by "
+            f"Segmentation from the CT alone: Dice {min(dice):.2f}–{max(dice):.2f}, the ostium errs by "
             f"{min(ostium):.1f}–{max(ostium):.1f} mm in {len(scores)} patients.",
             "",
             f"{record['wall_seconds']:.0f} s on {record['machine']['cores']} cores ({record['machine']['processor']}): "
@@ -77,13 +77,13 @@ def _cta(run: Path) -> str:
     """Return agreement and navigation in the real CT angiogram."""
     mask, wire = read_json(run / "segment.json"), read_json(run / "simulate.json")
     return (
-        f"Dice {mask['dice']:.2f} against the aorta of a segmentation network (no human's truth): "
+        f"Dice {mask['dice']:.2f} against the aorta of a segmentation network (not a human reader): "
         f"{100 * mask['share_inside_reference']:.0f} % of our lumen lies inside theirs, {mask['cut_off_ml']:.0f} ml of "
-        "theirs are cut off (mostly false lumen that contrast does not reach), "
-        f"{mask['beyond_ml']:.0f} ml lie beyond it (stumps of arch branches). The 0.035″ J wire comes "
-        f"{wire['deepest_tip_mm']:.0f} mm far up the descending aorta: a neck of the dissected lumen stops it, it "
+        "theirs are outside ours (mostly false lumen without contrast), "
+        f"{mask['beyond_ml']:.0f} ml of ours are outside theirs (stumps of arch branches). The 0.035″ J wire advances "
+        f"{wire['deepest_tip_mm']:.0f} mm up the descending aorta. There a neck of the dissected lumen stops it: it "
         "folds back, and the drive slips at its limit of 2 N "
-        f"({wire['largest_base_force_n']:.1f} N in the step that found out).\n\n"
+        f"({wire['largest_base_force_n']:.1f} N in the step in which it slipped).\n\n"
         "![The CT in three slices, our lumen in green, the network's aorta in red](docs/images/cta-mask.png)\n\n"
         "![The J wire in the extracted lumen of the aorta](docs/images/cta-wire.png)"
     )

@@ -37,7 +37,7 @@ def tables(rows: list[dict]) -> str:
 
 
 def text(row: dict) -> str:
-    """Return a value, in bold where it misses its bar."""
+    """Return a value, in bold where it exceeds its bar."""
     return f"**{row['value']:.3g}**" if row["passed"] is False else f"{row['value']:.3g}"
 
 

@@ -102,7 +102,7 @@ def rca_table() -> str:
     ]
     for share, published in ((0.1, 4.0), (0.2, 3.8), (0.5, 3.5), (0.7, 2.7), (0.9, 2.3)):
         found = [2 * float(np.interp(share * p.abscissa[-1], p.abscissa, p.radius)) for p in paths]
-        rows.append(line(f"diameter at {share:.0%} of the way, mm", found, f"{published} ± at most 0.6", 2))
+        rows.append(line(f"diameter at {share:.0%} of the path, mm", found, f"{published} ± at most 0.6", 2))
     for section, published in (("1", "3.9"), ("2", "3.4"), ("3", "3.1"), ("4", "2.2")):
         rows.append(
             line(f"diameter of segment {section}, mm (right dominance)", diameters(right, section), published, 2)
@@ -243,12 +243,12 @@ def draw_tree(axes: Any, tree: VesselTree, anatomy: str) -> None:
 def draw_trees() -> None:
     """Draw six patients of each anatomy."""
     figure, rows = plt.subplots(len(ANATOMIES), 6, figsize=(12, 12), layout="constrained")
-    told = ("dominance", "arch_type", "side", "variant")
+    drawn = ("dominance", "arch_type", "side", "variant")
     for anatomy, row in zip(ANATOMIES, rows, strict=True):
         for index, axes in enumerate(row):
             tree, truth = make_patient_tree(AtlasConfig(anatomy=anatomy, seed=1), index)
             draw_tree(axes, tree, anatomy)
-            what = next(f"{truth[name]}" for name in told if name in truth)
+            what = next(f"{truth[name]}" for name in drawn if name in truth)
             axes.set_title(f"{anatomy}: {what}{', bovine' if truth.get('bovine') else ''}", fontsize=8)
     figure.savefig(PICTURES / "atlas.png", dpi=75)
 

@@ -36,9 +36,9 @@ VARIANTS: dict[str, np.ndarray] = {
     "all": np.array([], dtype=int),
     "without the vessel's geometry": VESSEL,
     "without envelopes and play among the inputs": ENVELOPES,
-    "without what was seen a sample ago": SEEN,
+    "without the observation a sample ago": SEEN,
 }
-"""What a network is not told, by the name of the row."""
+"""Inputs that a network does not get, by the name of the row."""
 Make = Callable[[CausalConfig], CausalNetwork]
 
 
@@ -143,7 +143,7 @@ def varied_rows(data: Dataset) -> Iterator[str]:
     for part, made in ((training, known), (test, unknown)):
         wire = np.stack([part.friction, part.tip_stiffness_factor], axis=-1)
         made.inputs["ff"][..., SEEN[:2]] = torch.as_tensor(wire, dtype=torch.float32)[:, None, None]
-    yield row("varied wires: network: told friction and stiffness", _trained(known, unknown))
+    yield row("varied wires: network: given friction and stiffness", _trained(known, unknown))
 
 
 def _trained(
@@ -163,7 +163,7 @@ def _trained(
         test: to measure with.
         network_of: what is trained.
         width: of the network.
-        hidden: inputs that it is not told.
+        hidden: inputs that it does not get.
         forms: of every sequence to train on; the first two are no mirror images.
         longer: times that the training is longer.
     """

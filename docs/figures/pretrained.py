@@ -51,11 +51,12 @@ P3 and P4 (its controls, simulated): Δ {p3:.3f} and {p4:.3f} mm over all 45 s; 
 
 X-ray advice by `xray.json`, calibrated on {calibrated} patients: on {advised} others the bands of level {level:g}
 hold throughout {coverage:.0f} % of the intervals of 45 s; {missed:.1f} % of the events are missed with {exposures:.1f}
-exposures a minute, of 40 that are possible (docs/xray.md tells why a network asks so often).
+exposures a minute, of 40 that are possible (docs/xray.md explains why a network asks so often).
 
-**Meant for** research with this device or one much like it, in right coronary arteries of the atlas's kind. It is told
-of each patient by simulations of the device (`models/patient.py`), and has seen one device and one friction
-coefficient. Wires that snag or prolapse are rare and badly foretold: the mean errors are several times the medians.
+**Meant for** research with this device or one much like it, in right coronary arteries of the atlas's kind. It gets
+each patient's vessel from simulations of the device (`models/patient.py`). It was trained on one device and one
+friction coefficient. Wires that snag or prolapse are rare and badly predicted: the mean errors are
+several times the medians.
 **No medical device.**
 """
 

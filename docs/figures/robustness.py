@@ -29,8 +29,8 @@ def text(measured: dict) -> str:
         for name, row in measured[group].items():
             depths = (row[f"penetration_{which}_mm"] for which in ("p99", "p999", "max"))
             lines.append(f"| {name} | {row['rollouts']} | {row['invalid']} | " + " | ".join(map(str, depths)) + " |")
-    told = measured["invalid_worlds"] + measured["crashed"]
-    return "\n".join([*lines, "", "Invalid worlds:", "", *(f"- {line}" for line in told or ["none"])])
+    failed = measured["invalid_worlds"] + measured["crashed"]
+    return "\n".join([*lines, "", "Invalid worlds:", "", *(f"- {line}" for line in failed or ["none"])])
 
 
 def main(file: str) -> None:

@@ -1,7 +1,7 @@
 """Measure the twin on the new patients of docs/learning.md and write its table into docs/models.md.
 
 `python docs/figures/twin.py FOLDER`: FOLDER holds `dataset`, made by the commands of the packaged model's card. The
-twin is told a friction and a stiffness of the tip from which the truth is up to 20 % off, other ones for each patient.
+twin gets a friction and a tip stiffness from which the truth differs by up to 20 %, other ones for each patient.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def rows(episodes: Dataset, sequences: int, deeper_mm: float) -> Iterator[str]:
             f"| {count}, ostium {deeper_mm:g} mm deeper | {name} | {delta[:, a:b].mean():.3f}, "
             f"{np.median(delta[:, a:b]):.3f} | {gamma[:, a:b].mean():.3f} |"
         )
-    yield f"| the friction that it finds | | off by {np.concatenate(found).mean():.1%} in the mean | |"
+    yield f"| the friction that it finds | | errs by {np.concatenate(found).mean():.1%} on average | |"
 
 
 def measure(folder: Path) -> Iterator[str]:
