@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from unittest.mock import patch
 
@@ -13,8 +14,9 @@ from endopilot.errors import InputError
 from endopilot.evaluation.evaluate import EvaluateConfig, evaluate
 from endopilot.evaluation.results import read_results
 from endopilot.files import read_json, write_json
+from endopilot.report.evaluation_report import report_evaluation
 from endopilot.simulation.drive_limits import SPARE_MM
-from toy_navigation import LENGTH_MM, toy_simulate
+from toy_navigation import LENGTH_MM, make_toy_dataset, toy_simulate
 
 
 def test_metrics_are_on_disk_as_returned(evaluated):
@@ -26,7 +28,7 @@ def test_metrics_are_on_disk_as_returned(evaluated):
     )
 
 
-def test_both_splits_are_evaluated_on_episodes_that_no_network_saw(evaluated, toy_dataset):
+def test_both_splits_are_evaluated_on_navigations_that_were_not_trained_on(evaluated, toy_dataset):
     folder, metrics = evaluated
     dataset = load_dataset(toy_dataset)
     assert list(metrics["splits"]) == ["seen_test", "test"]
@@ -81,12 +83,94 @@ def test_the_core_is_replayed_with_other_friction(toy_dataset, evaluated):
     assert {"friction_90", "friction_110"} <= metrics["splits"]["test"]["tip"].keys()
 
 
-def test_patients_that_were_trained_on_are_told_from_new_ones(evaluated):
+def test_patients_that_were_trained_on_are_kept_apart_from_new_ones(evaluated):
     splits = evaluated[1]["splits"]
     assert [split["title"] for split in splits.values()] == ["New navigations, known patients", "New patients"]
     assert splits["seen_test"]["known_patients"] == len(splits["seen_test"]["anatomies"])
     gap, tip = evaluated[1]["generalisation_gap"]["P1"]["abscissa"]["all"], [s["tip"]["P1"] for s in splits.values()]
     assert gap["difference"] == pytest.approx(tip[1]["abscissa"]["all"]["mae"] - tip[0]["abscissa"]["all"]["mae"])
+
+
+@pytest.fixture(scope="module")
+def elsewhere(tmp_path_factory) -> Path:
+    """Return a dataset of twelve patients; the first six are those of the toy dataset."""
+    folder = tmp_path_factory.mktemp("elsewhere") / "dataset"
+    make_toy_dataset(folder, patients=12, sequences=5, anatomy_shares=(0.5, 0.25, 0.25))
+    return folder
+
+
+@pytest.fixture
+def trained_on(evaluated, tmp_path):
+    """Return what makes a run that was trained on some patients of a dataset."""
+
+    def made(dataset: Path, names: set[str], name: str = "run") -> Path:
+        run = tmp_path / name
+        shutil.copytree(evaluated[0] / "run", run)
+        patients = [sha for patient, sha in load_dataset(dataset).patients.items() if patient in names]
+        write_json(run / "manifest.json", read_json(run / "manifest.json") | {"patients": patients})
+        return run
+
+    return made
+
+
+def rows(result) -> set[tuple[str, int]]:
+    return set(zip(np.array(result.anatomies)[result.anatomy].tolist(), result.sequence.tolist(), strict=True))
+
+
+def chosen(dataset, mask) -> set[tuple[str, int]]:
+    return set(zip(dataset.anatomy[mask].tolist(), dataset.sequence[mask].tolist(), strict=True))
+
+
+def test_all_navigations_of_a_dataset_of_new_patients_are_evaluated(elsewhere, trained_on, tmp_path):
+    dataset, out = load_dataset(elsewhere), tmp_path / "out"
+    with patch("endopilot.evaluation.replay.simulate", toy_simulate):
+        metrics = evaluate(trained_on(elsewhere, set()), out, EvaluateConfig(), elsewhere)
+    results = read_results(out / "evaluation.npz")
+    assert {"train", "calibrate", "test"} <= set(dataset.split.tolist())
+    assert list(metrics["splits"]) == list(results) == ["test"]
+    assert rows(results["test"]) == chosen(dataset, np.ones(len(dataset), dtype=bool)) and len(dataset) == 60
+    assert metrics["splits"]["test"]["known_patients"] == 0
+    # there is no navigation that the run was trained on, and so no mean over them
+    assert metrics["training_mean"] is None and "generalisation_gap" not in metrics
+    assert "training_mean" not in results["test"].tips.keys() | results["test"].controls.keys()
+    assert metrics["splits"]["test"]["tip"]["P1"]["abscissa"]["all"]["skill"].keys() == {"hold_slack"}
+    report_evaluation(out)
+    assert "training mean" not in (out / "report.html").read_text(encoding="utf-8").lower()
+
+
+def test_known_patients_among_new_ones_stay_known(elsewhere, trained_on, tmp_path):
+    dataset = load_dataset(elsewhere)
+    names = {str(dataset.anatomy[dataset.split == split][0]) for split in ("train", "calibrate", "test")}
+    known, training = np.isin(dataset.anatomy, sorted(names)), dataset.split == "train"
+    with patch("endopilot.evaluation.replay.simulate", toy_simulate):
+        metrics = evaluate(trained_on(elsewhere, names), tmp_path / "out", EvaluateConfig(), elsewhere)
+    results = read_results(tmp_path / "out" / "evaluation.npz")
+    assert rows(results["test"]) == chosen(dataset, ~known)
+    assert rows(results["seen_test"]) == chosen(dataset, known & ~training)
+    assert [metrics["splits"][split]["known_patients"] for split in ("seen_test", "test")] == [3, 0]
+    assert "P1" in metrics["generalisation_gap"]
+    # the mean is taken where the run was trained, not over what is evaluated
+    trained = dataset.select(known & training)
+    assert metrics["training_mean"] == {"navigations": len(trained), "patients": 1}
+    for result in results.values():
+        mean = trained.control.mean(axis=(0, 1), dtype=float)
+        np.testing.assert_allclose(result.controls["training_mean"][0, 0], mean)
+        np.testing.assert_allclose(result.tips["training_mean"].offset, trained.tip_offset.mean(dtype=float))
+
+
+def test_seeds_of_other_patients_are_refused(elsewhere, trained_on, tmp_path):
+    first, second = (str(name) for name in np.unique(load_dataset(elsewhere).anatomy)[:2])
+    run, other = trained_on(elsewhere, {first}), trained_on(elsewhere, {second}, "other")
+    with pytest.raises(InputError, match=r"other: was trained on other patients than .*run; give runs of one training"):
+        evaluate(run, tmp_path / "out", EvaluateConfig(), elsewhere, [other])
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_dataset_that_was_trained_on_as_a_whole_is_refused(trained_on, tmp_path):
+    make_toy_dataset(tmp_path / "all", patients=1, sequences=3, seen_test_share=0.0)
+    names = set(load_dataset(tmp_path / "all").anatomy.tolist())
+    with pytest.raises(InputError, match=r"was trained on all its navigations; make it with seen_test_share above 0"):
+        evaluate(trained_on(tmp_path / "all", names), tmp_path / "out", EvaluateConfig(), tmp_path / "all")
 
 
 def test_the_command_prints_errors_findings_and_paths(evaluated, monkeypatch, capsys):
@@ -109,9 +193,9 @@ def test_the_command_prints_errors_findings_and_paths(evaluated, monkeypatch, ca
 
 
 def test_another_seed_stands_beside_the_run(evaluated):
-    told = evaluated[1]["splits"]["test"]
-    assert told["seeds"]["P1"]["abscissa"]["0-10"]["mae"] == [told["tip"]["P1"]["abscissa"]["0-10"]["mae"]] * 2
-    assert told["seeds"]["P1"]["abscissa"]["0-10"]["sd"] == 0.0
+    split = evaluated[1]["splits"]["test"]
+    assert split["seeds"]["P1"]["abscissa"]["0-10"]["mae"] == [split["tip"]["P1"]["abscissa"]["0-10"]["mae"]] * 2
+    assert split["seeds"]["P1"]["abscissa"]["0-10"]["sd"] == 0.0
 
 
 def test_replayed_controls_are_simulated_from_the_start_of_the_episode(evaluated, toy_dataset):
@@ -129,7 +213,7 @@ def test_replayed_controls_are_simulated_from_the_start_of_the_episode(evaluated
     assert (slack <= curliness * inserted + 1.5 + 1e-3).all()
 
 
-def test_a_run_without_its_dataset_is_told(evaluated, tmp_path):
+def test_a_run_without_its_dataset_is_refused(evaluated, tmp_path):
     folder = evaluated[0]
     record = read_json(folder / "run" / "manifest.json")
     write_json(tmp_path / "manifest.json", record | {"dataset": "elsewhere"})
@@ -144,7 +228,7 @@ def test_the_packaged_model_asks_for_a_dataset(tmp_path):
 
 
 @pytest.mark.parametrize("record", [None, {"config": {}, "stages": {}}])
-def test_a_folder_that_is_no_run_is_told(tmp_path, record):
+def test_a_folder_that_is_no_run_is_refused(tmp_path, record):
     if record is not None:
         write_json(tmp_path / "manifest.json", record)
     with pytest.raises(InputError, match=r"no finished run here .* make one with `endopilot train`"):

@@ -22,7 +22,7 @@ from endopilot.evaluation.results import (
     tip_series,
     write_results,
 )
-from endopilot.evaluation.summary import findings, generalisation_gap, over_seeds, split_title, summarize
+from endopilot.evaluation.summary import SPLIT_TITLES, findings, generalisation_gap, over_seeds, summarize
 from endopilot.extras import extra_named
 from endopilot.files import manifest, sha256, write_json
 from endopilot.models.config import PRETRAINED, read_run, run_path
@@ -58,7 +58,12 @@ def evaluate(
     dataset_folder: str | Path | None = None,
     other_seeds: Sequence[str | Path] = (),
 ) -> dict[str, Any]:
-    """Evaluate both networks of a run on the navigations and the patients that they never saw.
+    """Evaluate a run on navigations and on patients that it was not trained on.
+
+    Every navigation of a patient that the run was not trained on counts, whatever its split in the dataset; together
+    they are the split "test" of the result. Of patients that the run was trained on, the navigations outside the split
+    "train" count; they are the split "seen_test". The baseline "training mean" is taken over the split "train" of the
+    patients that the run was trained on, and left out where the dataset has none of them.
 
     Writes `evaluation.npz` (the predictions) and `metrics.json` (every number, and how it was made), each whole or not
     at all. `report.report_evaluation` makes figures and a page of them.
@@ -75,7 +80,7 @@ def evaluate(
 
     Raises:
         InputError: the run, its dataset or one of its anatomies is missing or damaged, nothing was held out, the
-            dataset was made with another wire, or a patient that a run was trained on is among its test patients.
+            dataset was made with another wire, or another seed was trained on other patients.
     """
     with extra_named("evaluate"):
         from endopilot.evaluation.protocols import count_steps, run_protocols  # brings torch, slow to import
@@ -85,23 +90,29 @@ def evaluate(
     start, run_folder, output = time.perf_counter(), Path(run_folder), Path(output)
     other_seeds = [Path(run) for run in other_seeds]
     dataset = load_dataset(Path(dataset_folder or _own_dataset(run_folder, read_run(run_folder))).resolve())
-    known, *_ = [trained_patients(run, read_run(run), dataset) for run in (run_folder, *other_seeds)]
+    known = trained_patients(run_folder, read_run(run_folder), dataset)
+    for other in other_seeds:
+        if trained_patients(other, read_run(other), dataset) != known:
+            raise InputError(f"{other}: was trained on other patients than {run_folder}; give runs of one training")
     predictor, others = load_model(run_folder), [load_model(other) for other in other_seeds]
-    train = dataset.of_split("train")
-    chosen = {split: _chosen(dataset.of_split(split), config.sequences) for split in SPLITS if split in dataset.split}
-    if not chosen:
+    held_out, training = _parted(dataset, known)
+    if not held_out:
         raise InputError(
-            f"{dataset.folder}: holds neither of the splits {', '.join(SPLITS)}; "
+            f"{dataset.folder}: {run_folder} was trained on all its navigations; "
             "make it with seen_test_share above 0 or with more patients"
         )
+    chosen = {split: _chosen(data, config.sequences) for split, data in held_out.items()}
     results: dict[str, SplitResult] = {}
     steps = sum(count_steps(data) for data in chosen.values())
     with progress("Evaluating", total=steps) as advance:
         for split, data in chosen.items():
-            results[split] = run_protocols(predictor, data, train, advance)
+            results[split] = run_protocols(predictor, data, training, advance)
     metrics = _metrics(results, known, config.seed) | {
         "run": str(run_folder),
         "dataset": str(dataset.folder),
+        "training_mean": None
+        if training is None
+        else {"navigations": len(training), "patients": len(set(training.anatomy.tolist()))},
         "manifest": manifest(
             config=config,
             seed=config.seed,
@@ -120,6 +131,20 @@ def evaluate(
     write_results(results, output / RESULTS_FILE)
     write_json(output / METRICS_FILE, metrics)
     return metrics
+
+
+def _parted(dataset: Dataset, known: Collection[str]) -> tuple[dict[str, Dataset], Dataset | None]:
+    """Return the valid navigations that a run was not trained on, by split of the result, and those that it was.
+
+    Args:
+        dataset: whatever its splits.
+        known: patients that the run was trained on.
+    """
+    valid, of_known = dataset.valid.all(axis=1), np.isin(dataset.anatomy, sorted(known))
+    trained = of_known & (dataset.split == "train")
+    masks = dict(zip(SPLITS, (valid & of_known & ~trained, valid & ~of_known), strict=True))
+    held_out = {split: dataset.select(mask) for split, mask in masks.items() if mask.any()}
+    return held_out, dataset.select(valid & trained) if (valid & trained).any() else None
 
 
 def _chosen(data: Dataset, sequences: int | None) -> Dataset:
@@ -147,7 +172,7 @@ def _metrics(results: Mapping[str, SplitResult], known: Collection[str], seed: i
     """Return the content of metrics.json but for its manifest; `known` names the patients that were trained on."""
     splits = {
         split: {
-            "title": split_title(split, result.anatomies, known),
+            "title": SPLIT_TITLES[split],
             "known_patients": len(set(result.anatomies) & set(known)),
         }
         | summarize(result, seed=seed)

@@ -25,7 +25,7 @@ def count_steps(data: Dataset) -> int:
     return 3 + len(exposures(data)) + len(np.unique(data.anatomy))
 
 
-def run_protocols(predictor: Predictor, data: Dataset, train: Dataset, advance: Advance) -> SplitResult:
+def run_protocols(predictor: Predictor, data: Dataset, training: Dataset | None, advance: Advance) -> SplitResult:
     """Predict the samples after the 30 given states by every protocol, and simulate the controls that were chosen.
 
     P1 is the forward network under the true controls; P2 the inverse network with the true tip as desired; P3 the
@@ -36,7 +36,8 @@ def run_protocols(predictor: Predictor, data: Dataset, train: Dataset, advance: 
     Args:
         predictor: the networks of a run.
         data: the episodes of one split.
-        train: the episodes that the networks were trained on, for the baselines that are means.
+        training: the episodes that the run was trained on, over which the baselines that are means are taken; these
+            are left out if there are none.
         advance: called after each protocol, each new plan and each anatomy's simulation.
     """
     recorded, episodes = Recorded.of(data), Episodes.of_dataset(data)
@@ -48,15 +49,16 @@ def run_protocols(predictor: Predictor, data: Dataset, train: Dataset, advance: 
         "P2": predicted["inverse"].control,
         "P3": predicted["dual"].control,
         "hold_control": baselines.hold_control(data, WINDOW),
-        "training_mean": baselines.mean_control(train, data, WINDOW),
         "follow_slack": baselines.follow_slack(data, WINDOW),
     }
     predicted_tips = {
         "P1": predicted["forward"].tip,
         "P3": predicted["dual"].tip,
         "hold_slack": baselines.hold_slack(data, WINDOW),
-        "training_mean": baselines.mean_tip(train, data, WINDOW),
     }
+    if training is not None:
+        controls["training_mean"] = baselines.mean_control(training, data, WINDOW)
+        predicted_tips["training_mean"] = baselines.mean_tip(training, data, WINDOW)
     trees = [anatomy.tree for anatomy in recorded.anatomies]
     tips = {name: _series(tip, trees, recorded.anatomy_of, data.branch) for name, tip in predicted_tips.items()}
     replayed = {"P4": "P3", "P2_replayed": "P2", "hold_control": "hold_control", "follow_slack": "follow_slack"}

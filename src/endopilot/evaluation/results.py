@@ -16,7 +16,7 @@ METRICS_FILE, RESULTS_FILE, FIGURES_FOLDER, REPORT_FILE = "metrics.json", "evalu
 """What an evaluation writes into its folder."""
 
 SPLITS: tuple[str, ...] = ("seen_test", "test")
-"""Splits of a dataset that are evaluated."""
+"""Splits of a result: navigations of patients that the run was trained on, and of all other patients."""
 
 SERIES_TITLES: Mapping[str, str] = {
     "P1": "Forward network, true controls (P1)",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,9 @@ from endopilot.evaluation.metrics import (
     worst_anatomy,
 )
 from endopilot.evaluation.results import CONTROL_BASELINES, REPLAYED, TIP_BASELINES, SplitResult, TipSeries
+
+SPLIT_TITLES: Mapping[str, str] = {"seen_test": "New navigations, known patients", "test": "New patients"}
+"""What a reader calls the splits of a result."""
 
 
 def summarize(result: SplitResult, *, seed: int) -> dict[str, Any]:
@@ -134,27 +137,25 @@ def generalisation_gap(splits: Mapping[str, Any]) -> dict[str, Any]:
     """
     if not {"seen_test", "test"} <= splits.keys():
         return {}
-    seen, new = splits["seen_test"], splits["test"]
-    if seen["known_patients"] < len(seen["anatomies"]):
-        return {}
+    known, new = splits["seen_test"], splits["test"]
     return {
         series: {
             coordinate: {
-                span: _gap(seen["tip"][series][coordinate][span]["mae"], new["tip"][series][coordinate][span]["mae"])
+                span: _gap(known["tip"][series][coordinate][span]["mae"], new["tip"][series][coordinate][span]["mae"])
                 for span in new["tip"][series][coordinate]
                 if span != "by_depth"
             }
             for coordinate in ("abscissa", "offset")
         }
         for series in TIP_BASELINES
-        if series in seen["tip"] and series in new["tip"]
+        if series in known["tip"] and series in new["tip"]
     }
 
 
-def _gap(seen: float | None, new: float | None) -> dict[str, float | None]:
-    if seen is None or new is None:
+def _gap(known: float | None, new: float | None) -> dict[str, float | None]:
+    if known is None or new is None:
         return {"difference": None, "ratio": None}
-    return {"difference": new - seen, "ratio": new / seen if seen else None}
+    return {"difference": new - known, "ratio": new / known if known else None}
 
 
 BASELINE_WORDS: Mapping[str, str] = {
@@ -176,18 +177,18 @@ def findings(metrics: Mapping[str, Any]) -> list[str]:
                 _verdict(split["tip"][series][coordinate]["all"]["skill"], symbol)
                 for coordinate, symbol in (("abscissa", "Δtip"), ("offset", "γtip"))
             ]
-            told = "; ".join(part for part in parts if part)
-            if told:
-                sentences.append(f"{split['title']}, {series.replace('_', ' ')}: {told}.")
+            verdicts = "; ".join(part for part in parts if part)
+            if verdicts:
+                sentences.append(f"{split['title']}, {series.replace('_', ' ')}: {verdicts}.")
     for series, gap in metrics.get("generalisation_gap", {}).items():
-        told = " and ".join(
+        gaps = " and ".join(
             f"{gap[coordinate]['all']['difference']:+.2f} mm for {symbol} ({gap[coordinate]['all']['ratio']:.2f} times)"
             for coordinate, symbol in (("abscissa", "Δtip"), ("offset", "γtip"))
             if gap[coordinate]["all"]["ratio"] is not None
         )
-        if told:
+        if gaps:
             words = series.replace("_", " ")
-            sentences.append(f"Generalisation gap, {words}: mean error in new patients against known ones {told}.")
+            sentences.append(f"Generalisation gap, {words}: mean error in new patients against known ones {gaps}.")
     return sentences
 
 
@@ -199,19 +200,3 @@ def _verdict(skills: Mapping[str, float | None], symbol: str) -> str:
     hardest = min(known, key=lambda name: known[name])
     verdict = "beats every baseline" if known[hardest] > 0 else "loses to a baseline"
     return f"{symbol} {verdict} (skill {known[hardest]:+.2f} against {BASELINE_WORDS[hardest]})"
-
-
-def split_title(split: str, patients: Collection[str], known: Collection[str]) -> str:
-    """Return what a reader calls a split.
-
-    Args:
-        split: "seen_test" or "test".
-        patients: names of its patients.
-        known: names of those that the run was trained on.
-    """
-    if split == "test":
-        return "New patients"
-    met = len(set(patients) & set(known))
-    if 0 < met < len(patients):
-        return f"New navigations, {met} of {len(patients)} patients known"
-    return "New navigations, known patients" if met else "New navigations, new patients"

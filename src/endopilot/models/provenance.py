@@ -1,4 +1,4 @@
-"""What a run has seen: the patients that it was trained on, and its wire."""
+"""What a run was trained on: its patients and its wire."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def check_wire(run: Path, record: Mapping[str, Any], dataset: Dataset) -> None:
 
 
 def trained_patients(run: Path, record: Mapping[str, Any], dataset: Dataset) -> frozenset[str]:
-    """Return which patients of a dataset a run was trained on, by name, if the dataset can measure the run.
+    """Return the names of the patients of a dataset that a run was trained on.
 
     A patient is known by the SHA-256 of the anatomy.
 
@@ -53,24 +53,15 @@ def trained_patients(run: Path, record: Mapping[str, Any], dataset: Dataset) -> 
         dataset: what it is to be measured on.
 
     Raises:
-        InputError: the run is too old to say, a patient that it was trained on is in the dataset's split "test", or
-            the dataset was made with another wire.
+        InputError: the run is too old to name its patients, or the dataset was made with another wire.
     """
     check_wire(run, record, dataset)
     if "patients" in record:
-        known = frozenset(name for name, sha in dataset.patients.items() if sha in set(record["patients"]))
-    elif record["config"]["model"] == "twin":
-        known = frozenset()
-    elif record.get("inputs", {}).get("dataset") == dataset.manifest["key"]:
-        known = frozenset(dataset.of_split("train").anatomy.tolist())
-    else:
-        raise InputError(
-            f"{run}: does not say which patients it was trained on, as it was made by an older version; train it again"
-        )
-    for name in sorted(set(dataset.anatomy[dataset.split == "test"].tolist())):
-        if name in known:
-            raise InputError(
-                f"{dataset.folder}: patient {name} is in the split 'test', but {run} was trained on it; "
-                "make the dataset without this patient, or evaluate on the run's own dataset"
-            )
-    return known
+        return frozenset(name for name, sha in dataset.patients.items() if sha in set(record["patients"]))
+    if record["config"]["model"] == "twin":
+        return frozenset()
+    if record.get("inputs", {}).get("dataset") == dataset.manifest["key"]:
+        return frozenset(dataset.of_split("train").anatomy.tolist())
+    raise InputError(
+        f"{run}: does not name the patients that it was trained on, as it was made by an older version; train it again"
+    )
