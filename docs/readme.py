@@ -1,4 +1,4 @@
-"""Write the figures and pictures of README.md from what the commands left in `runs/`.
+"""Write the figures and pictures of README.md, docs/demo.md and docs/commands.md from what the commands left in `runs/`.
 
 `make readme` runs it, after `make demo` and `make cta`. A part whose run is not there stays as it is.
 """
@@ -18,24 +18,24 @@ SPLIT = "test"
 
 
 def main() -> None:
-    """Replace each part of README.md between its markers."""
-    readme = ROOT / "README.md"
-    text = _replace(readme.read_text(encoding="utf-8"), "commands", _commands())
+    """Replace each part of the pages between its markers."""
+    _replace("docs/commands.md", "commands", _commands())
     demo, cta = ROOT / "runs" / "demo", ROOT / "runs" / "cta-thorax"
     if (demo / "manifest.json").exists():
         shutil.copyfile(demo / "scene.png", IMAGES / "demo.png")
-        text = _replace(text, "demo", _demo(demo))
+        metrics, record = read_json(demo / "metrics.json"), read_json(demo / "manifest.json")
+        _replace("README.md", "demo", _demo(metrics, record))
+        _replace("docs/demo.md", "demo-table", _demo_table(metrics, record))
     if (cta / "simulate.json").exists():
         shutil.copyfile(cta / "mask.png", IMAGES / "cta-mask.png")
         shutil.copyfile(cta / "wire.png", IMAGES / "cta-wire.png")
-        text = _replace(text, "cta", _cta(cta))
-    readme.write_text(text, encoding="utf-8")
+        _replace("README.md", "cta", _cta(cta))
 
 
-def _replace(text: str, name: str, content: str) -> str:
-    begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
-    head, rest = text.split(begin)
-    return f"{head}{begin}\n{content}\n{end}{rest.split(end)[1]}"
+def _replace(page: str, name: str, content: str) -> None:
+    path, begin, end = ROOT / page, f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
+    head, rest = path.read_text(encoding="utf-8").split(begin)
+    path.write_text(f"{head}{begin}\n{content}\n{end}{rest.split(end)[1]}", encoding="utf-8")
 
 
 def _commands() -> str:
@@ -43,13 +43,40 @@ def _commands() -> str:
     return "\n".join(["| command | what it does |", "| --- | --- |", *rows])
 
 
-def _demo(run: Path) -> str:
-    """Return the demo's time, the tip errors in new patients and the scores of the anatomies."""
-    metrics, record = read_json(run / "metrics.json"), read_json(run / "manifest.json")
+def _demo(metrics: dict, record: dict) -> str:
+    """Return in three lines what the demo found."""
+    split = metrics["splits"][SPLIT]
+    dice, ostium = _anatomy_errors(metrics)
+    ours, hold = (split["tip"][name]["abscissa"] for name in ("P1", "hold_slack"))
+    error, baseline = ([of[span]["mae"] for span in ("0-10", "10-30", "30-45")] for of in (ours, hold))
+    return "\n".join(
+        [
+            f"- **Segmentation** from the CT alone: Dice {min(dice):.2f}–{max(dice):.2f}; the ostium errs by "
+            f"{min(ostium):.1f}–{max(ostium):.1f} mm.",
+            f"- **Prediction** of the tip in patients never trained on: mean error {_list(error)} mm after 0–10, 10–30 and "
+            f"30–45 s without X-ray; the best simple baseline errs by {_list(baseline)} mm.",
+            f"- **Time**: {record['wall_seconds']:.0f} s on {record['machine']['cores']} cores "
+            f"({record['machine']['processor']}). The page is `runs/demo/report.html`; "
+            "[the demo](docs/demo.md) explains every figure.",
+        ]
+    )
+
+
+def _list(values: list[float]) -> str:
+    return ", ".join(f"{value:.2f}" for value in values)
+
+
+def _anatomy_errors(metrics: dict) -> list[list[float]]:
+    """Return the Dice coefficients and the errors of the ostium, mm, of the patients."""
+    scores = metrics["anatomy_scores"].values()
+    return [[score[name] for score in scores] for name in ("dice", "ostium_error_mm")]
+
+
+def _demo_table(metrics: dict, record: dict) -> str:
+    """Return the tip errors in new patients, the scores of the anatomies and the time of each stage."""
     split = metrics["splits"][SPLIT]
     stages = ", ".join(f"{name} {seconds:.0f}" for name, seconds in record["stages"].items())
-    scores = list(metrics["anatomy_scores"].values())
-    dice, ostium = ([score[name] for score in scores] for name in ("dice", "ostium_error_mm"))
+    dice, ostium = _anatomy_errors(metrics)
     lines = [
         f"Tip error, mm (mean ± SD), over {split['episodes']} navigations of {len(split['anatomies'])} patients that "
         "were never trained on. Δtip is the tip's distance from the ostium along the vessel, γtip its distance from "
@@ -65,7 +92,7 @@ def _demo(run: Path) -> str:
             *lines,
             "",
             f"Segmentation from the CT alone: Dice {min(dice):.2f}–{max(dice):.2f}, the ostium errs by "
-            f"{min(ostium):.1f}–{max(ostium):.1f} mm in {len(scores)} patients.",
+            f"{min(ostium):.1f}–{max(ostium):.1f} mm in {len(dice)} patients.",
             "",
             f"{record['wall_seconds']:.0f} s on {record['machine']['cores']} cores ({record['machine']['processor']}): "
             f"{stages}.",
