@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import shlex
 from collections.abc import Callable, Iterator
@@ -86,6 +87,16 @@ def test_whole_commands_are_understood(page: str, capsys, monkeypatch) -> None:
             if leave.code != 0:  # --help and --version leave too
                 wrong.append(f"endopilot {shlex.join(arguments)}: {said.err or said.out}")
     assert not wrong
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if page.endswith(".md")])
+def test_python_imports_what_is_there(page: str) -> None:
+    blocks = re.findall(r"^```python\n(.*?)^```", (ROOT / page).read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+    for node in ast.walk(ast.Module([line for block in blocks for line in ast.parse(block).body], [])):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            exec(ast.unparse(node), {})
+        elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "endopilot":
+            assert hasattr(endopilot, node.attr), f"{page}: endopilot.{node.attr}"
 
 
 def test_some_are_found() -> None:
