@@ -13,9 +13,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import model_validator
 
 from endopilot import __version__
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy, read_source
@@ -23,7 +24,6 @@ from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.dataset.generate import DatasetConfig, generate_dataset
 from endopilot.dataset.loader import load_dataset
-from endopilot.errors import InputError
 from endopilot.evaluation.anatomy_score import score_anatomy
 from endopilot.evaluation.results import REPORT_FILE
 from endopilot.files import input_hash, manifest, read_json, write_json
@@ -34,6 +34,7 @@ from endopilot.parallel import each
 from endopilot.phantom.phantom import PhantomConfig, make_phantom
 from endopilot.progress import progress
 from endopilot.runs import claim
+from endopilot.settings import Count, NonNegative, Positive, Seed, Within, settings
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import Device, read_device
 from endopilot.simulation.simulate import simulate
@@ -50,53 +51,47 @@ DEMO_ORIGIN = (
 RUN_ORIGIN = "One CT angiogram, given by the user; everything is made from it alone."
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class StudyConfig:
     """What is simulated and trained on the patients' volumes."""
 
     device: str = "workhorse-014"
     """Name of a shipped device (`endopilot devices`) or a YAML file."""
-    sequences: int = 60
+    sequences: Count = 60
     """Random navigations simulated in each patient."""
-    seconds: float = 60.0
+    seconds: Positive = 60.0
     """Length of a navigation, s."""
-    training_seconds: float = 100.0
+    training_seconds: Positive = 100.0
     """Training time of each of the paper's two networks, s."""
-    seed: int = 1
+    seed: Seed = 1
     """Seed of everything random."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class DemoConfig(StudyConfig):
     """The demo: synthetic right-coronary patients that the evaluated networks were not trained on."""
 
-    patients: int = 6
+    patients: Annotated[int, Within(3)] = 6
     """Number of patients, at least 3."""
-    training_seconds: float = 0.0
+    training_seconds: NonNegative = 0.0
     """Training time of each of the paper's two networks, s; 0 takes the trained networks that come with the package."""
 
-    def __post_init__(self) -> None:
-        if self.patients < 3:
-            raise InputError(f"--patients {self.patients}: give at least 3, so that one is left for testing")
-        if not self.training_seconds >= 0:
-            raise InputError(f"--training-seconds {self.training_seconds}: give 0 or more")
+    @model_validator(mode="after")
+    def _consistent(self) -> DemoConfig:
         if self.training_seconds == 0 and self.device != _PRETRAINED_DEVICE:
-            raise InputError(
-                f"--device {self.device}: the networks of the package were trained on {_PRETRAINED_DEVICE} alone; "
+            raise ValueError(
+                f"device: {self.device!r}; the networks of the package know {_PRETRAINED_DEVICE} alone: "
                 "train others, for example with --training-seconds 100"
             )
+        return self
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class RunConfig(StudyConfig):
     """One patient's volume."""
 
     segmentation: SegmentConfig = field(default_factory=SegmentConfig)
     """How to segment."""
-
-    def __post_init__(self) -> None:
-        if not self.training_seconds > 0:
-            raise InputError(f"--training-seconds {self.training_seconds}: give a positive number")
 
 
 class _Stages:

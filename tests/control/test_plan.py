@@ -75,7 +75,7 @@ def test_a_plan_whose_manifest_lacks_what_was_asked_is_refused(found, vessel, tm
     record = read_json(path)
     assert record["seed"] == 4 and record["config"]["seconds"] == 30.0
     write_json(path, record | {"config": {"cost": record["config"]["cost"]}})
-    with pytest.raises(InputError, match=r"manifest\.json: config is not that of this version"):
+    with pytest.raises(InputError, match=r"manifest\.json: config: method: missing; .* plan anew"):
         read_plan(tmp_path / "plan", read_anatomy(vessel), found.navigation.device)
 
 

@@ -267,7 +267,7 @@ def test_invalid_worlds_are_listed_and_never_trained_on(tmp_path):
     ],
 )
 def test_bad_settings_are_named(field, value):
-    with pytest.raises(InputError, match=f"^{field}: "):
+    with pytest.raises(InputError, match=rf"^{field}[:\[]"):
         DatasetConfig(**{field: value})
 
 

@@ -109,7 +109,7 @@ def test_a_setting_that_a_method_does_not_know_is_refused(plain_method, options,
     ("values", "expected"),
     [
         ({"method": "magic"}, "method: 'magic'; choose from aorta, coronary, nnunet, totalsegmentator, or give MODULE"),
-        ({"seeds": ((0.0, float("nan"), 0.0),)}, "three finite numbers"),
+        ({"seeds": ((0.0, float("nan"), 0.0),)}, r"seeds\[0\]\[1\]: nan; give a finite number"),
         ({"options": ("device=cpu",)}, "no setting of method 'coronary'; leave --options out"),
     ],
 )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Literal
 
@@ -29,6 +29,7 @@ from endopilot.anatomy.surface import Surface, surface_from_mask
 from endopilot.anatomy.tree import tree_from_lines
 from endopilot.errors import InputError
 from endopilot.progress import progress
+from endopilot.settings import Finite, Positive, settings
 from endopilot.types import Anatomy, DistanceMap, Insertion, LumenMask, VesselTree
 
 __all__ = ["AnatomyConfig", "extract_anatomy", "read_source"]
@@ -46,36 +47,24 @@ SHORTEST_IN_DIAMETERS = 1.5
 """A lumen whose longest path is shorter than this many of its own mean diameters is no vessel."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class AnatomyConfig:
     """How an anatomy is made."""
 
     vessel: Literal["rca", "lca", "generic"] = "generic"
     """Section names: AHA/SCCT segments of the right or left coronary artery, or generation and branch order."""
-    ostium_mm: tuple[float, float, float] | None = None
+    ostium_mm: tuple[Finite, Finite, Finite] | None = None
     """Where the device enters, LPS mm; by default the mask's own ostium, or else the widest open end."""
-    catheter_radius_mm: float | None = None
+    catheter_radius_mm: Positive | None = None
     """Inner radius of the guiding catheter, mm; by default the lumen's radius at the ostium."""
-    spacing_mm: float | None = None
+    spacing_mm: Positive | None = None
     """Grid spacing of the distance map, mm; by default 0.45 times the narrow vessels' radius, from 0.3 to 1.5 mm."""
-    minimum_branch_length_mm: float = 4.0
+    minimum_branch_length_mm: Positive = 4.0
     """Side branches shorter than this beyond their parent's lumen are dropped, mm."""
-    scale: float = 1.0
+    scale: Positive = 1.0
     """Factor that turns the file's unit into mm: 10 for cm, 1000 for m."""
     coordinates: Literal["lps", "ras"] = "lps"
     """Axes of a surface or VTP file, which cannot say itself; masks and Slicer markups do, and ignore this."""
-
-    def __post_init__(self) -> None:
-        for name in ("catheter_radius_mm", "spacing_mm", "minimum_branch_length_mm", "scale"):
-            value = getattr(self, name)
-            if value is not None and not (np.isfinite(value) and value > 0):
-                raise InputError(f"{name}={value}: must be a positive number")
-        if self.ostium_mm is not None and not np.isfinite(self.ostium_mm).all():
-            raise InputError(f"ostium_mm={self.ostium_mm}: must be three finite numbers, LPS mm")
-        if self.vessel not in ("rca", "lca", "generic"):
-            raise InputError(f"vessel={self.vessel!r}: must be rca, lca or generic")
-        if self.coordinates not in ("lps", "ras"):
-            raise InputError(f"coordinates={self.coordinates!r}: must be lps or ras")
 
 
 def extract_anatomy(

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from pydantic import model_validator
 
 from endopilot.anatomy import distance
 from endopilot.atlas.arch import make_arch
@@ -15,7 +15,7 @@ from endopilot.atlas.curves import tangents
 from endopilot.atlas.lca import make_lca
 from endopilot.atlas.portal import make_portal
 from endopilot.atlas.rca import make_rca
-from endopilot.errors import InputError
+from endopilot.settings import Count, Seed, Share, settings
 from endopilot.types import Anatomy, Insertion, VesselTree
 
 CATHETER_RADIUS_MM = 0.9
@@ -35,29 +35,25 @@ ANATOMIES = tuple(_KINDS)
 """Names of the kinds of vessel trees."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class AtlasConfig:
     """Which synthetic patients to make."""
 
     anatomy: str = "rca"
     """Kind of vessel tree: rca or lca (right or left coronary artery), cerebral (internal carotid with middle and
     anterior cerebral arteries), arch (aortic arch with its branches), portal (portal vein)."""
-    count: int = 1
+    count: Count = 1
     """Number of patients."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the atlas: patient i is the same whatever the count."""
-    stenosis_share: float = 0.3
+    stenosis_share: Share = 0.3
     """Share of the patients that have a stenosis, 0 to 1."""
 
-    def __post_init__(self) -> None:
+    @model_validator(mode="after")
+    def _consistent(self) -> AtlasConfig:
         if self.anatomy not in _KINDS:
-            raise InputError(f"anatomy: the atlas has no '{self.anatomy}'; choose from {', '.join(sorted(_KINDS))}")
-        if self.count < 1:
-            raise InputError(f"count: {self.count} patients; ask for at least 1")
-        if not 0 <= self.seed < 2**64:
-            raise InputError(f"seed: {self.seed}; give a whole number from 0 to 2^64 - 1")
-        if not 0 <= self.stenosis_share <= 1:
-            raise InputError(f"stenosis_share: {self.stenosis_share}; give a share from 0 to 1")
+            raise ValueError(f"anatomy: {self.anatomy!r}; choose from {', '.join(sorted(_KINDS))}")
+        return self
 
 
 def make_atlas(config: AtlasConfig = AtlasConfig()) -> Iterator[Anatomy]:

@@ -7,7 +7,7 @@ import time
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from endopilot.files import manifest, read_json, write_json
 from endopilot.imaging.segment import SegmentConfig, segment
 from endopilot.phantom.phantom import PhantomConfig, make_phantom
 from endopilot.runs import claim, make_missing
+from endopilot.settings import Count, Within, settings
 
 VESSELS = ("rca", "lca")
 """Coronary trees of the cases, in turn."""
@@ -52,22 +53,16 @@ BARS = {
 5 mm may not happen in any case; the other bars hold for the mean."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class ImagingBenchConfig:
     """Number and seed of the cases, and the folder of their results."""
 
-    cases: int = 50
+    cases: Count = 50
     """Number of synthetic CT angiograms."""
-    seed: int = 0
+    seed: Annotated[int, Within(0, 2**63 - 1)] = 0
     """Seed of patients, scanners and noise: case i is the same however many there are."""
     folder: Path = Path("runs/bench-imaging")
     """Folder of the cases' results; an interrupted run goes on where it stopped."""
-
-    def __post_init__(self) -> None:
-        if self.cases < 1:
-            raise InputError(f"cases: {self.cases}; give at least 1")
-        if not 0 <= self.seed < 2**63:
-            raise InputError(f"seed: {self.seed}; give a whole number from 0 to 2^63 - 1")
 
 
 def bench_imaging(config: ImagingBenchConfig) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, fields
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -29,6 +29,7 @@ from endopilot.files import read_json, sha256, write_json, writing
 from endopilot.parallel import follow_the_parent
 from endopilot.progress import progress
 from endopilot.runs import claim
+from endopilot.settings import Count, CountOrZero, Within, settings
 from endopilot.simulation.config import SimulatorConfig, wall_stiffness
 from endopilot.simulation.controls import ControlConfig, random_controls
 from endopilot.simulation.device import Device, check_fits, read_device
@@ -53,38 +54,22 @@ _PULL_AT = 0.6
 """Share of the rollout after which it is pulled out."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class RobustnessConfig:
     """Number and length of the rollouts, the anatomies, and the folder of the results."""
 
-    rollouts: int = 10_000
+    rollouts: Count = 10_000
     """Number of rollouts, spread over the anatomies and the devices that fit; rounded up to whole chunks."""
-    anatomies: int = 100
+    anatomies: Count = 100
     """Number of synthetic anatomies."""
-    seed: int = 0
+    seed: Annotated[int, Within(0, 2**63 - 1)] = 0
     """Seed of the anatomies and the controls."""
-    seconds: float = 60.0
+    seconds: Annotated[float, Within(5, 3600)] = 60.0
     """Length of a rollout, s."""
-    threads: int = 0
+    threads: CountOrZero = 0
     """Threads of the rod core; 0 for one a processor core. The results do not depend on it."""
     folder: Path = Path("runs/bench-robustness")
     """Folder of the chunks' results; an interrupted run goes on where it stopped."""
-
-    def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            InputError: a field is out of its range.
-        """
-        for name in ("rollouts", "anatomies"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name}: {getattr(self, name)}; give at least 1")
-        if not 0 <= self.seed < 2**63:
-            raise InputError(f"seed: {self.seed}; give a whole number from 0 to 2^63 - 1")
-        if not 5 <= self.seconds <= 3600:
-            raise InputError(f"seconds: {self.seconds:g}; give 5 to 3600")
-        if self.threads < 0:
-            raise InputError(f"threads: {self.threads}; give 0 for all cores, or a positive number")
 
 
 @dataclass(frozen=True, eq=False)

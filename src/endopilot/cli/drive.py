@@ -4,31 +4,27 @@ from __future__ import annotations
 
 import asyncio
 import time
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from endopilot.control.drive import Drive, serve
 from endopilot.control.drive_protocol import read_secret
 from endopilot.control.robot import RobotConfig
-from endopilot.errors import InputError
+from endopilot.settings import Finite, Within, settings
 from endopilot.simulation.device import read_device
 from endopilot.simulation.drive_limits import DriveLimits
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class ListenConfig:
     """The drive's address and travel."""
 
     host: str = "127.0.0.1"
     """Address to listen on; by default only this machine can connect."""
-    port: int = 7345
+    port: Annotated[int, Within(0, 65535)] = 7345
     """TCP port; 0 for a free one."""
-    travel_mm: tuple[float, float] = (0.0, 300.0)
+    travel_mm: tuple[Finite, Finite] = (0.0, 300.0)
     """Least and largest inserted length, mm."""
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.port <= 65535:
-            raise InputError(f"port: {self.port}; give 0 to 65535")
 
 
 def command(

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from tyro.conf import Positional
@@ -12,7 +13,7 @@ from tyro.conf import Positional
 from endopilot.anatomy.io import read_anatomy
 from endopilot.cli.arguments import OutputFile, existing, show
 from endopilot.control.plan_file import read_plan
-from endopilot.errors import InputError
+from endopilot.settings import Count, Seed, Within, settings
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, random_controls, read_controls_csv
 from endopilot.simulation.device import read_device
@@ -21,22 +22,16 @@ from endopilot.simulation.table import write_rollout
 from endopilot.types import SAMPLE_PERIOD_S
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class RandomConfig:
     """The random navigations that are simulated if no controls are given."""
 
-    sequences: int = 8
+    sequences: Count = 8
     """Number of navigations."""
-    seconds: float = 60.0
+    seconds: Annotated[float, Within(SAMPLE_PERIOD_S)] = 60.0
     """Length of a navigation, s."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the random controls."""
-
-    def __post_init__(self) -> None:
-        if self.sequences < 1:
-            raise InputError(f"--sequences {self.sequences}: must be at least 1")
-        if not self.seconds >= SAMPLE_PERIOD_S:
-            raise InputError(f"--seconds {self.seconds:g}: must be at least one sample period, {SAMPLE_PERIOD_S} s")
 
 
 def command(

@@ -7,7 +7,7 @@ with X-ray on, until one agrees with what is seen, and another way is searched f
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ from endopilot.control.policy import Decision, Observation
 from endopilot.control.route import Route, check_passable
 from endopilot.control.search import Course, Search, SearchConfig
 from endopilot.progress import Advance
+from endopilot.settings import Count, Positive, settings
 from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.types import TipProjection
@@ -35,7 +36,7 @@ AdviserInput = tuple[
 these by the model's own account, mm; and the lumen's radius at the tip, mm."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class AgentConfig:
     """How an agent searches, believes and looks."""
 
@@ -43,13 +44,13 @@ class AgentConfig:
     """The search for a way."""
     belief: BeliefConfig = field(default_factory=BeliefConfig)
     """The simulated wires."""
-    off_course_mm: float = 2.5
+    off_course_mm: Positive = 2.5
     """Another way is searched when the likeliest tip is this far along the centerline from where it should be, mm."""
-    tries: int = 8
+    tries: Count = 8
     """Searches in vain, one after another, before the wire is left where it is."""
-    lost_along_mm: float = 4.0
+    lost_along_mm: Positive = 4.0
     """A measured tip this far along the wire from all simulated ones is explained by none, mm."""
-    lost_across_mm: float = 1.5
+    lost_across_mm: Positive = 1.5
     """The same across the wire, mm."""
 
 

@@ -7,13 +7,13 @@ Its members differ in what is uncertain: friction, the stiffness of the tip, and
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.stats import qmc
 
-from endopilot.errors import InputError
+from endopilot.settings import Count, NonNegative, Positive, ShareBelowOne, Within, settings
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.simulation.simulator import Simulator
@@ -22,43 +22,28 @@ from endopilot.types import TipProjection
 from endopilot.xray.fluoroscope import TipMeasurement
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class BeliefConfig:
     """The ensemble, and how far measurements are trusted."""
 
-    members: int = 12
+    members: Count = 12
     """Simulated wires."""
-    stiffness_levels: int = 3
+    stiffness_levels: Count = 3
     """Different stiffnesses of the tip among them."""
-    friction_spread: float = 0.2
+    friction_spread: ShareBelowOne = 0.2
     """The friction coefficient may be off by this share, either way."""
-    stiffness_spread: float = 0.2
+    stiffness_spread: ShareBelowOne = 0.2
     """The stiffness of the tip may be off by this share, either way."""
-    ostium_spread_mm: float = 0.5
+    ostium_spread_mm: NonNegative = 0.5
     """The ostium may lie this much deeper or less deep along the catheter's axis, mm."""
-    along_sd_mm: float = 0.6
+    along_sd_mm: Positive = 0.6
     """Scale of what a good member's tip misses a measured one by along the wire, mm: a tip's end is hard to see."""
-    across_sd_mm: float = 0.3
+    across_sd_mm: Positive = 0.3
     """The same across the wire, mm."""
-    elements: int = 50
+    elements: Annotated[int, Within(10, 2000)] = 50
     """Elements of the rod core over the longest path."""
-    time_step_s: float = 0.025
+    time_step_s: Positive = 0.025
     """Time step of the rod core, s."""
-
-    def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            InputError: a field is out of its range.
-        """
-        for name in ("members", "stiffness_levels", "along_sd_mm", "across_sd_mm"):
-            if not 0 < getattr(self, name) < np.inf:
-                raise InputError(f"{name}: {getattr(self, name)}; give a positive number")
-        for name in ("friction_spread", "stiffness_spread"):
-            if not 0 <= getattr(self, name) < 1:
-                raise InputError(f"{name}: {getattr(self, name)} is not in [0, 1); give e.g. 0.2")
-        if not 0 <= self.ostium_spread_mm < np.inf:
-            raise InputError(f"ostium_spread_mm: {self.ostium_spread_mm}; give 0 or more")
 
     @property
     def core(self) -> SimulatorConfig:

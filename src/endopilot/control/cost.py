@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.errors import InputError
+from endopilot.settings import NonNegative, settings
 
 _OVERLOAD = 100.0
 """What each share of the force limit beyond `forbidden_share` costs, mm/s."""
 Samples = Float[np.ndarray, "*n"]
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class Cost:
     """Weights of the cost of a navigation. One unit is one mm of tip error at the end.
 
@@ -24,31 +22,20 @@ class Cost:
     wall force on a node over the limit and f₀ the forbidden share, v and ω the controls.
     """
 
-    tip_weight: float = 0.1
+    tip_weight: NonNegative = 0.1
     """Tip error on the way, 1/s."""
-    ratio_weight: float = 0.05
+    ratio_weight: NonNegative = 0.05
     """Safety ratio above `safe_ratio`, mm/s. A wire lies on the wall most of the time, which is no harm by itself."""
-    safe_ratio: float = 0.8
+    safe_ratio: NonNegative = 0.8
     """Safety ratio below which nothing is charged."""
-    force_weight: float = 8.0
+    force_weight: NonNegative = 8.0
     """Contact force, as a share of the limit squared, mm/s."""
-    time_weight: float = 1.0
+    time_weight: NonNegative = 1.0
     """Time, mm/s."""
-    smooth_weight: float = 0.05
+    smooth_weight: NonNegative = 0.05
     """Changes of the control, as a share of the drive's limits squared, mm."""
-    forbidden_share: float = 0.7
+    forbidden_share: NonNegative = 0.7
     """Share of the force limit above which a way is not taken where there is another."""
-
-    def __post_init__(self) -> None:
-        """Check every weight.
-
-        Raises:
-            InputError: a weight is negative or not finite.
-        """
-        for name in self.__dataclass_fields__:
-            value = getattr(self, name)
-            if not 0 <= value < np.inf:
-                raise InputError(f"cost.{name}: {value}; give 0 or a positive number")
 
     def running(self, *, error: Samples, ratio: Samples, force_share: Samples | float = 0.0) -> Samples:
         """Return what a second in some states costs, mm/s.

@@ -11,7 +11,7 @@ from endopilot.anatomy.projection import project_tip
 from endopilot.control.policies import make_policy
 from endopilot.control.policy import Observation, Policy
 from endopilot.control.robot import RobotConfig, SimulatedRobot
-from endopilot.errors import InputError
+from endopilot.settings import Finite, NonNegative, Positive, settings
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.simulation.simulator import Simulator
@@ -20,7 +20,7 @@ from endopilot.types import TipProjection
 from endopilot.xray.fluoroscope import Fluoroscope, FluoroscopeConfig, TipMeasurement
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class NavigateConfig:
     """What the policy acts through and sees with, and how the truth is simulated."""
 
@@ -32,30 +32,18 @@ class NavigateConfig:
     """The rod core."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class ModelMismatch:
     """How reality differs from the navigation that the policy is told of."""
 
-    friction_factor: float = 1.0
+    friction_factor: NonNegative = 1.0
     """Factor on the friction coefficient."""
-    stiffness_factor: float = 1.0
+    stiffness_factor: Positive = 1.0
     """Factor on the stiffness of the wire's distal 10 mm."""
-    ostium_mm: float = 0.0
+    ostium_mm: Finite = 0.0
     """The wire is inserted this much deeper than the encoder says, mm: the ostium lies elsewhere along the catheter."""
-    latency_factor: float = 1.0
+    latency_factor: NonNegative = 1.0
     """Factor on the robot's latency."""
-
-    def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            InputError: a field is out of its range.
-        """
-        if not np.isfinite(self.ostium_mm):
-            raise InputError(f"ostium_mm: {self.ostium_mm} is not finite; give a length in mm")
-        for name in ("friction_factor", "stiffness_factor", "latency_factor"):
-            if not 0 <= getattr(self, name) < np.inf or (name == "stiffness_factor" and self.stiffness_factor == 0):
-                raise InputError(f"{name}: {getattr(self, name)}; give a positive number")
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.control.cost import Cost
-from endopilot.errors import InputError
+from endopilot.settings import Count, Finite, NonNegative, Positive, Seed, settings
 from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.types import TipProjection
@@ -21,72 +21,45 @@ NETWORK_METHODS = ("inverse", "mppi")
 Steps = Float[np.ndarray, "samples 2"]
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class SampleConfig:
     """Sampling through the forward network (method mppi), after Williams et al., J. Guid. Control Dyn. 40, 2017."""
 
-    candidates: int = 12
+    candidates: Count = 12
     """Control sequences that are rolled out together."""
-    iterations: int = 4
+    iterations: Count = 4
     """Rounds; each draws around the weighted mean of the one before."""
-    translation_sd_mm_s: float = 1.0
+    translation_sd_mm_s: Positive = 1.0
     """Standard deviation of the translation that is drawn, mm/s."""
-    rotation_sd_rad_s: float = 0.5
+    rotation_sd_rad_s: Positive = 0.5
     """Standard deviation of the rotation that is drawn, rad/s."""
-    temperature: float = 0.1
+    temperature: Positive = 0.1
     """Candidates are weighted by exp(−cost/(temperature · standard deviation of the costs))."""
 
-    def __post_init__(self) -> None:
-        """Check every field.
 
-        Raises:
-            InputError: a field is out of its range.
-        """
-        for name in self.__dataclass_fields__:
-            if not 0 < getattr(self, name) < np.inf:
-                raise InputError(f"sample.{name}: {getattr(self, name)}; give a positive number")
-
-
-@dataclass(frozen=True, kw_only=True)
+@settings
 class PlanConfig:
     """What is asked of a plan."""
 
     method: Method = "twin"
     """How the controls are found: twin (tried in the rod core), inverse (the inverse network of --model), mppi
     (sampled through its forward network), or a baseline: forward, spin, retract-rotate."""
-    seconds: float = 60.0
+    seconds: Positive = 60.0
     """Time in which the target is to be reached, s."""
-    speed_mm_s: float = 10.0
+    speed_mm_s: Positive = 10.0
     """Speed of the desired tip along the route, mm/s."""
-    start_inserted_mm: float = 2.0
+    start_inserted_mm: NonNegative = 2.0
     """Inserted length at the start, mm."""
-    start_rotation: float = 0.0
+    start_rotation: Finite = 0.0
     """Rotation at the start, rad."""
-    force_limit_n: float = 0.5
+    force_limit_n: Positive = 0.5
     """Largest force of the wall on one node that is safe, N."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of what is drawn at random."""
     cost: Cost = field(default_factory=Cost)
     """What a good way is."""
     sample: SampleConfig = field(default_factory=SampleConfig)
     """Sampling through the forward network."""
-
-    def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            InputError: a field is out of its range.
-        """
-        for name in ("seconds", "speed_mm_s", "force_limit_n"):
-            if not 0 < getattr(self, name) < np.inf:
-                raise InputError(f"{name}: {getattr(self, name)}; give a positive number")
-        if not 0 <= self.start_inserted_mm < np.inf or not np.isfinite(self.start_rotation):
-            raise InputError(
-                f"start_inserted_mm, start_rotation: {self.start_inserted_mm}, {self.start_rotation}; "
-                "give 0 or more, and a finite angle"
-            )
-        if self.seed < 0:
-            raise InputError(f"seed: {self.seed} is negative; give 0 or more")
 
 
 @dataclass(frozen=True, eq=False)

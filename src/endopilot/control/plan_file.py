@@ -31,11 +31,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from endopilot.control.cost import Cost
-from endopilot.control.plan_config import Plan, PlanConfig, SampleConfig
+from endopilot.control.plan_config import Plan, PlanConfig
 from endopilot.control.plan_xray import PlannedXray
 from endopilot.errors import InputError
 from endopilot.files import json_text, manifest, read_json, sha256, writing
+from endopilot.settings import from_record
 from endopilot.simulation.device import Device
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target
 from endopilot.types import Anatomy, TipProjection
@@ -126,7 +126,10 @@ def read_plan(folder: Path, anatomy: Anatomy, device: Device) -> Plan:
     record = read_json(folder / _RECORD)
     if not isinstance(record, dict) or "table_sha256" not in record:
         raise InputError(f"{folder / _RECORD}: is not the manifest of a plan; make one with `endopilot plan`")
-    config = _config(folder / _RECORD, record["config"])
+    try:
+        config = from_record(PlanConfig, record["config"])
+    except InputError as error:
+        raise InputError(f"{folder / _RECORD}: config: {error}, or plan anew") from None
     made = record["anatomy"]
     if made.get("identity") != anatomy.identity:
         raise InputError(
@@ -171,10 +174,3 @@ def read_plan(folder: Path, anatomy: Anatomy, device: Device) -> Plan:
         seconds_to_plan=record["seconds_to_plan"],
         processor_seconds=record["processor_seconds"],
     )
-
-
-def _config(path: Path, record: dict[str, Any]) -> PlanConfig:
-    """Return what was asked of a plan, as its manifest has it."""
-    if set(record) != set(PlanConfig.__dataclass_fields__):
-        raise InputError(f"{path}: config is not that of this version's `endopilot plan`; plan anew")
-    return PlanConfig(**record | {"cost": Cost(**record["cost"]), "sample": SampleConfig(**record["sample"])})

@@ -14,7 +14,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.errors import InputError
+from endopilot.settings import NonNegative, Positive, settings
 from endopilot.simulation.drive_limits import DriveLimits, within_travel
 from endopilot.simulation.simulator import Simulator
 
@@ -50,37 +50,24 @@ class Robot(Protocol):
         ...
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class RobotConfig:
     """How a real drive differs from an ideal one. docs/robot.md says where the numbers come from."""
 
-    latency_s: float = 0.05
+    latency_s: NonNegative = 0.05
     """Time from a command to the motion, s."""
-    max_acceleration_mm_s2: float = 200.0
+    max_acceleration_mm_s2: Positive = 200.0
     """Largest change of the translation's speed, mm/s²."""
-    max_acceleration_rad_s2: float = 60.0
+    max_acceleration_rad_s2: Positive = 60.0
     """Largest change of the rotation's speed, rad/s²."""
-    backlash_mm: float = 0.1
+    backlash_mm: NonNegative = 0.1
     """Motion that is lost where the translation reverses, mm."""
-    backlash_rad: float = 0.035
+    backlash_rad: NonNegative = 0.035
     """Motion that is lost where the rotation reverses, rad."""
-    encoder_sd_mm: float = 0.02
+    encoder_sd_mm: NonNegative = 0.02
     """Standard deviation of a reading of the inserted length, mm."""
-    encoder_sd_rad: float = 0.005
+    encoder_sd_rad: NonNegative = 0.005
     """Standard deviation of a reading of the rotation, rad."""
-
-    def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            InputError: a field is out of its range.
-        """
-        for name in ("max_acceleration_mm_s2", "max_acceleration_rad_s2"):
-            if not 0 < getattr(self, name) < np.inf:
-                raise InputError(f"{name}: {getattr(self, name)}; give a positive number")
-        for name in ("latency_s", "backlash_mm", "backlash_rad", "encoder_sd_mm", "encoder_sd_rad"):
-            if not 0 <= getattr(self, name) < np.inf:
-                raise InputError(f"{name}: {getattr(self, name)}; give 0 or a positive number")
 
 
 class DriveMotion:

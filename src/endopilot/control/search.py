@@ -18,8 +18,8 @@ from jaxtyping import Bool, Float, Int
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.control.cost import Cost
 from endopilot.control.route import Route
-from endopilot.errors import InputError
 from endopilot.progress import Advance
+from endopilot.settings import Count, OpenShare, Positive, settings
 from endopilot.simulation.device import Device
 from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.simulation.simulator import Simulator
@@ -43,40 +43,28 @@ _LEAD_RADII = 1.4
 """In a wide vessel a search begins this many lumen radii before the junction: a branch's mouth is about as wide."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class SearchConfig:
     """How hard is searched."""
 
-    candidates: int = 32
+    candidates: Count = 32
     """Candidates that are tried side by side where the way is not clear."""
-    rounds: int = 6
+    rounds: Count = 6
     """Rounds of one attempt, at most."""
-    attempts: int = 4
+    attempts: Count = 4
     """Attempts, each from the same state, before a search is given up."""
-    round_periods: int = 2
+    round_periods: Count = 2
     """Decision periods of 0.5 s in a round."""
-    keep_share: float = 0.25
+    keep_share: OpenShare = 0.25
     """Share of the candidates that a round keeps."""
-    speed_mm_s: float = 10.0
+    speed_mm_s: Positive = 10.0
     """Translation on a clear way, mm/s."""
-    turn_rad_s: float = 7.0
+    turn_rad_s: Positive = 7.0
     """Fastest rotation that is tried, rad/s."""
-    lead_mm: float = 4.0
+    lead_mm: Positive = 4.0
     """A search begins this far before a junction, mm, or 1.4 lumen radii where that is more."""
     cost: Cost = field(default_factory=Cost)
     """What the candidates are compared by."""
-
-    def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            InputError: a field is out of its range.
-        """
-        for name in ("candidates", "rounds", "attempts", "round_periods", "speed_mm_s", "turn_rad_s", "lead_mm"):
-            if not 0 < getattr(self, name) < np.inf:
-                raise InputError(f"{name}: {getattr(self, name)}; give a positive number")
-        if not 0 < self.keep_share < 1:
-            raise InputError(f"keep_share: {self.keep_share}; give a share between 0 and 1")
 
 
 @dataclass(frozen=True, eq=False)

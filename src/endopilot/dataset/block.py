@@ -17,6 +17,7 @@ from endopilot.dataset import parquet, schema
 from endopilot.dataset.draw import Draw, draw_navigations
 from endopilot.dataset.navigations import simulate_navigations
 from endopilot.dataset.study import Block, Plan
+from endopilot.errors import InputError
 from endopilot.files import writing
 from endopilot.simulation.simulate import why_invalid
 from endopilot.types import Anatomy, Rollout

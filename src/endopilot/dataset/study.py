@@ -7,16 +7,18 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Shaped
+from pydantic import model_validator
 
 from endopilot import __version__
 from endopilot.anatomy.io import read_anatomy
 from endopilot.dataset.splits import assign_splits
 from endopilot.errors import InputError
 from endopilot.files import json_text, read_json
+from endopilot.settings import Ascending, Count, NonNegative, Positive, Seed, Share, ShareBelowOne, Within, settings
 from endopilot.simulation.config import Actuation, SimulatorConfig
 from endopilot.simulation.controls import ControlConfig
 from endopilot.simulation.device import Device
@@ -34,15 +36,18 @@ def dataset_simulator() -> SimulatorConfig:
     return SimulatorConfig(elements=50, tolerance_mm=1e-2, largest_jump=0.3)
 
 
-@dataclass(frozen=True, kw_only=True)
+_Stiffness = Annotated[float, Within(0.05)]
+
+
+@settings
 class DatasetConfig:
     """How many navigations, how long, how they are driven and how they are split."""
 
-    sequences: int = 1000
+    sequences: Count = 1000
     """Random navigations of each anatomy."""
-    seconds: float = 60.0
+    seconds: Positive = 60.0
     """Length of a navigation, s; one sample every 0.5 s."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the random controls and parameters."""
     control: Actuation = "velocity"
     """What is drawn: the drive's velocity, or its force and torque."""
@@ -50,45 +55,29 @@ class DatasetConfig:
     """Distribution of the random controls."""
     simulator: SimulatorConfig = field(default_factory=dataset_simulator)
     """Settings of the rod simulation."""
-    friction: tuple[float, float] | None = None
+    friction: Annotated[tuple[NonNegative, NonNegative], Ascending] | None = None
     """Range that each navigation's friction coefficient is drawn from uniformly; the device's own if not given."""
-    tip_bend_factor: tuple[float, float] | None = None
+    tip_bend_factor: Annotated[tuple[NonNegative, NonNegative], Ascending] | None = None
     """Range of a factor on the angle of the device's bent tip, drawn uniformly for each eight navigations."""
-    tip_stiffness_factor: tuple[float, float] | None = None
+    tip_stiffness_factor: Annotated[tuple[_Stiffness, _Stiffness], Ascending] | None = None
     """Range of a factor on the stiffness of the distal 10 mm, drawn likewise."""
-    anatomy_shares: tuple[float, float, float] | None = None
+    anatomy_shares: tuple[Share, Share, Share] | None = None
     """Shares of the anatomies that train, calibrate and test; 0.6 0.2 0.2 if not given, and a single anatomy is then
     split by sequence alone."""
-    seen_test_share: float = 0.2
+    seen_test_share: ShareBelowOne = 0.2
     """Share of the navigations of a train anatomy that are held out as the split seen_test."""
-    sequences_per_file: int = 500
+    sequences_per_file: Count = 500
     """Navigations stored in one file; an interrupted run loses at most one file's work a processor core."""
 
-    def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            InputError: a field is out of its range.
-        """
-        for name in ("sequences", "sequences_per_file"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name}: {getattr(self, name)} is not positive; give at least 1")
-        if self.seed < 0:
-            raise InputError(f"seed: {self.seed} is negative; give 0 or more")
+    @model_validator(mode="after")
+    def _consistent(self) -> DatasetConfig:
         samples = self.seconds / SAMPLE_PERIOD_S
-        if not samples >= 1 or samples != int(samples):
-            raise InputError(f"seconds: {self.seconds} is not a positive multiple of {SAMPLE_PERIOD_S} s; give e.g. 60")
-        if self.control not in ("velocity", "force"):
-            raise InputError(f"control: {self.control!r}; give 'velocity' or 'force'")
-        for name, least in (("friction", 0.0), ("tip_bend_factor", 0.0), ("tip_stiffness_factor", 0.05)):
-            drawn = getattr(self, name)
-            if drawn is not None and not least <= drawn[0] <= drawn[1] < np.inf:
-                raise InputError(f"{name}: {drawn} is no range; give two numbers, {least:g} or more, the smaller first")
+        if samples != int(samples):
+            raise ValueError(f"seconds: {self.seconds} is no multiple of {SAMPLE_PERIOD_S} s; give e.g. 60")
         shares = self.anatomy_shares
-        if shares is not None and not (min(shares) >= 0 and shares[0] > 0 and abs(sum(shares) - 1) < 1e-3):
-            raise InputError(f"anatomy_shares: {shares} are not three shares that add up to 1, the first positive")
-        if not 0 <= self.seen_test_share < 1:
-            raise InputError(f"seen_test_share: {self.seen_test_share} is not in [0, 1); give e.g. 0.2")
+        if shares is not None and not (shares[0] > 0 and abs(sum(shares) - 1) < 1e-3):
+            raise ValueError(f"anatomy_shares: {shares}; give three shares that add up to 1, the first positive")
+        return self
 
     @property
     def samples(self) -> int:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,27 +27,17 @@ from endopilot.files import manifest, sha256, write_json
 from endopilot.models.config import PRETRAINED, read_run, run_path
 from endopilot.models.provenance import trained_patients
 from endopilot.progress import progress
+from endopilot.settings import Count, Seed, settings
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class EvaluateConfig:
     """How much is evaluated."""
 
-    sequences: int | None = None
+    sequences: Count | None = None
     """Navigations of each split that are evaluated, spread evenly over its patients; all if not given."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the bootstrap that gives the intervals over patients."""
-
-    def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            InputError: a field is out of its range.
-        """
-        if self.sequences is not None and self.sequences < 1:
-            raise InputError(f"sequences: {self.sequences} is not positive; give at least 1")
-        if self.seed < 0:
-            raise InputError(f"seed: {self.seed} is negative; give 0 or more")
 
 
 def evaluate(

@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import Literal, cast
 
 import numpy as np
+from pydantic import model_validator
 
 from endopilot.errors import InputError
 from endopilot.imaging.contrast import refuse_other_units, refuse_without_contrast
 from endopilot.imaging.volume import read_volume
 from endopilot.plugins import Registry
+from endopilot.settings import Finite, settings
 from endopilot.types import Insertion, LumenMask, Volume
 
 METHODS = Registry(
@@ -30,32 +32,30 @@ _ROOT_MM = 5.0
 """An ostium is on an aorta of 9 mm radius or more: where it is nearer to the volume's edge, the root is cut off."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class SegmentConfig:
     """How the lumen is segmented."""
 
     method: str = "coronary"
     """coronary (automatic, one coronary tree), aorta (from seeds), totalsegmentator or nnunet (your own installation),
     or MODULE:OBJECT of a method of your own."""
-    seeds: tuple[tuple[float, float, float], ...] = ()
+    seeds: tuple[tuple[Finite, Finite, Finite], ...] = ()
     """Points inside the lumen, LPS mm: first where the device enters, then farther along. aorta needs them."""
     vessel: Literal["rca", "lca"] = "rca"
     """Which coronary tree the coronary method segments."""
     options: tuple[str, ...] = ()
     """Settings of the method's own, each NAME=VALUE: model=FOLDER (nnunet), task=… structure=… (totalsegmentator)."""
 
-    def __post_init__(self) -> None:
-        """Refuse what no method could use."""
+    @model_validator(mode="after")
+    def _consistent(self) -> SegmentConfig:
         METHODS.check(self.method)
-        for seed in self.seeds:
-            if not np.isfinite(seed).all():
-                raise InputError(f"seeds: {seed} is no point; give three finite numbers x y z in LPS mm")
         known = _method(self.method).options if self.options else {}
         for option in self.options:
             name, sign, _ = option.partition("=")
             if not sign or name not in known:
                 listed = f"give {'=…, '.join(known)}=…" if known else "leave --options out"
-                raise InputError(f"options: {option!r} is no setting of method {self.method!r}; {listed}")
+                raise ValueError(f"options: {option!r} is no setting of method {self.method!r}; {listed}")
+        return self
 
     def settings(self, defaults: Mapping[str, str]) -> dict[str, str]:
         """Return a method's own settings: its defaults, and what `options` puts in their place."""

@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import model_validator
 
 from endopilot import __version__
 from endopilot.control.policies import POLICIES, make_policy
-from endopilot.errors import InputError
 from endopilot.files import read_json, write_json
 from endopilot.ladder.attempt import attempt, navigation_seed
 from endopilot.ladder.scores import score
 from endopilot.ladder.submission import MOST_PATIENTS, SUBMISSION_FILE, task_digest, write_submission
 from endopilot.runs import claim, make_missing
+from endopilot.settings import Within, settings
 from endopilot.tasks.task import Task, find_task, ladder_tasks
 
 SCORES_FILE = "ladder.json"
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class LadderConfig:
     """What climbs the ladder, and how much of it."""
 
@@ -29,20 +30,15 @@ class LadderConfig:
     MODULE:OBJECT of a policy of your own."""
     tasks: tuple[str, ...] = ()
     """Names of the tasks; all if none is given."""
-    patients: int = MOST_PATIENTS
+    patients: Annotated[int, Within(1, MOST_PATIENTS)] = MOST_PATIENTS
     """Patients of each task, the first of its list: 1 to 20."""
 
-    def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            InputError: no such policy or task, or more patients than there are.
-        """
+    @model_validator(mode="after")
+    def _consistent(self) -> LadderConfig:
         POLICIES.check(self.policy)
         for name in self.tasks:
             find_task(name)
-        if not 1 <= self.patients <= MOST_PATIENTS:
-            raise InputError(f"patients: {self.patients}; give 1 to {MOST_PATIENTS}")
+        return self
 
     @property
     def chosen(self) -> list[Task]:

@@ -8,16 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float32
 from scipy.spatial import KDTree
 
 from endopilot.atlas.heart_reference import HeartFit
-from endopilot.errors import InputError
 from endopilot.phantom import chest
 from endopilot.phantom.painter import COARSE_MM, SLAB, Grid, Painter, smooth_min, window
 from endopilot.phantom.scanner import scan, smear
+from endopilot.settings import Ascending, NonNegative, Positive, Within, settings
 from endopilot.types import Anatomy, Centerline, Volume
 
 _REACH_MM = 5.0
@@ -28,45 +29,33 @@ _WALL_MM = 0.5
 """Thickness of a coronary wall, mm."""
 
 
-@dataclass(frozen=True, kw_only=True)
+_Side = Annotated[int, Within(16)]
+
+
+@settings
 class PhantomConfig:
     """Scanner, contrast and disease of a synthetic CT angiogram. Two numbers: a value is drawn between."""
 
-    in_plane_mm: float = 0.4
+    in_plane_mm: Positive = 0.4
     """Voxel size in the axial plane, mm."""
-    slice_mm: float = 0.5
+    slice_mm: Positive = 0.5
     """Distance between slices, mm."""
-    lumen_hu: tuple[float, float] = (300.0, 550.0)
+    lumen_hu: Annotated[tuple[NonNegative, NonNegative], Ascending] = (300.0, 550.0)
     """CT number of the contrasted arterial lumen, HU."""
-    noise_hu: tuple[float, float] = (20.0, 50.0)
+    noise_hu: Annotated[tuple[NonNegative, NonNegative], Ascending] = (20.0, 50.0)
     """Standard deviation of the image noise, HU."""
-    psf_mm: tuple[float, float] = (0.5, 0.7)
+    psf_mm: Annotated[tuple[NonNegative, NonNegative], Ascending] = (0.5, 0.7)
     """Width of the point-spread function at half its height, mm."""
-    calcium: float = 2.0
+    calcium: NonNegative = 2.0
     """Mean number of calcified plaques."""
-    right_heart: tuple[float, float] = (0.35, 0.8)
+    right_heart: Annotated[tuple[NonNegative, NonNegative], Ascending] = (0.35, 0.8)
     """CT number of the right ventricle's blood as a share of the lumen's: less where saline has washed it out."""
-    motion_mm: float = 0.0
+    motion_mm: Annotated[float, Within(0, 10)] = 0.0
     """How far the heart moves while it is scanned, mm: it is smeared along that way, more where it moved last."""
-    margin_mm: float = 16.0
+    margin_mm: Positive = 16.0
     """Width of surroundings beyond the tree on every side, mm."""
-    voxels: tuple[int, int, int] | None = None
+    voxels: tuple[_Side, _Side, _Side] | None = None
     """Voxels along x, y and z about the middle of what the margin asks for; by default as many as that takes."""
-
-    def __post_init__(self) -> None:
-        for name in ("in_plane_mm", "slice_mm", "margin_mm"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"{name}: {getattr(self, name)} mm; give a length above 0")
-        for name in ("lumen_hu", "noise_hu", "psf_mm", "right_heart"):
-            low, high = getattr(self, name)
-            if not 0 <= low <= high:
-                raise InputError(f"{name}: ({low}, {high}); give two numbers from 0 up, the smaller one first")
-        if self.calcium < 0:
-            raise InputError(f"calcium: {self.calcium} plaques; give 0 or more")
-        if not 0 <= self.motion_mm <= 10:
-            raise InputError(f"motion_mm: {self.motion_mm} mm; give 0 to 10")
-        if self.voxels is not None and min(self.voxels) < 16:
-            raise InputError(f"voxels: {self.voxels}; give at least 16 along each axis")
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
-import numpy as np
+from pydantic import model_validator
 
 from endopilot import _core
-from endopilot.errors import InputError
 from endopilot.parallel import CORES
+from endopilot.settings import CountOrZero, NonNegative, Positive, Within, settings
 from endopilot.types import SAMPLE_PERIOD_S
 
 FREE_BEHIND_MM = 3.0
@@ -22,58 +21,41 @@ Actuation = Literal["velocity", "force"]
 """What a control is: translation (mm/s) and rotation (rad/s), or the drive's axial force (N) and torque (N·mm)."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class SimulatorConfig:
     """Settings of the rod core."""
 
-    time_step_s: float = 0.0125
+    time_step_s: Positive = 0.0125
     """Time step, s; it must divide the sample period of 0.5 s. The tip's error grows about linearly with it."""
-    tolerance_mm: float = 1e-3
+    tolerance_mm: Positive = 1e-3
     """Newton's method stops when its step moves no node farther than this, mm."""
-    sample_tolerance_mm: float = 1e-6
+    sample_tolerance_mm: Positive = 1e-6
     """The same for the time step that ends a sample (no more than `tolerance_mm`): its forces are recorded, and the
     wire is stiff axially."""
-    elements: int = 100
+    elements: Annotated[int, Within(10, 2000)] = 100
     """Elements over the longest path of the anatomy; they are shorter near the tip."""
-    wall_stiffness_n_mm: float | None = None
+    wall_stiffness_n_mm: Positive | None = None
     """Stiffness of the vessel wall at a node, N/mm. If not given, the device's push limit dents it by 0.015 mm."""
-    stick_velocity_mm_s: float = 0.05
+    stick_velocity_mm_s: Positive = 0.05
     """Slip velocity under which smoothed Coulomb friction falls off, mm/s; a wire at rest creeps more slowly."""
-    approach_velocity_mm_s: float = 20.0
+    approach_velocity_mm_s: Positive = 20.0
     """Velocity at which a wire is brought to its first inserted length before the recording, mm/s."""
-    largest_jump: float = 0.1
+    largest_jump: Positive = 0.1
     """Motion of a node in a time step beyond the drive's own, mm (rotations: rad), above which the step is shortened:
     a wire that snaps over is followed in steps of down to 1/64 of `time_step_s`."""
-    introducer_friction_n: float = 0.05
+    introducer_friction_n: NonNegative = 0.05
     """Coulomb friction of the introducer's valve, N; the drive feels it, the wire ahead of the valve does not."""
-    introducer_drag_n_s_mm: float = 0.002
+    introducer_drag_n_s_mm: NonNegative = 0.002
     """Viscous drag of the introducer's valve, N·s/mm."""
-    threads: int = 0
+    threads: CountOrZero = 0
     """Threads; 0 for one a processor core. The results do not depend on it."""
 
-    def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            InputError: a field is out of its range.
-        """
-        positive = ("time_step_s", "tolerance_mm", "sample_tolerance_mm", "wall_stiffness_n_mm", "stick_velocity_mm_s")
-        for name in (*positive, "largest_jump"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < np.inf:
-                raise InputError(f"{name}: {value}; give a positive number")
+    @model_validator(mode="after")
+    def _consistent(self) -> SimulatorConfig:
         steps = SAMPLE_PERIOD_S / self.time_step_s
         if abs(steps - round(steps)) > 1e-6 or steps < 0.5:
-            raise InputError(f"time_step_s: {self.time_step_s} does not divide {SAMPLE_PERIOD_S} s; give e.g. 0.0125")
-        for name in ("introducer_friction_n", "introducer_drag_n_s_mm"):
-            if not 0 <= getattr(self, name) < np.inf:
-                raise InputError(f"{name}: {getattr(self, name)}; give 0 or a positive number")
-        if not 0 < self.approach_velocity_mm_s < np.inf:
-            raise InputError(f"approach_velocity_mm_s: {self.approach_velocity_mm_s}; give a positive velocity")
-        if not 10 <= self.elements <= 2000:
-            raise InputError(f"elements: {self.elements}; give 10 to 2000")
-        if self.threads < 0:
-            raise InputError(f"threads: {self.threads}; give 0 for all cores, or a positive number")
+            raise ValueError(f"time_step_s: {self.time_step_s} does not divide {SAMPLE_PERIOD_S} s; give e.g. 0.0125")
+        return self
 
     @property
     def steps_per_sample(self) -> int:

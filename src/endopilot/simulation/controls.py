@@ -5,14 +5,16 @@ A control π is the mean velocity (dΔ/dt mm/s, dφ/dt rad/s) over one sample pe
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import pandas as pd
 from jaxtyping import Float
+from pydantic import model_validator
 
 from endopilot.errors import InputError
+from endopilot.settings import NonNegative, Share, Within, settings
 from endopilot.simulation.drive_limits import within_travel
 from endopilot.types import SAMPLE_PERIOD_S
 
@@ -20,50 +22,39 @@ _COLUMNS = ("time_s", "translation_mm_s", "rotation_rad_s")
 _KINDS = ("insertion", "retraction", "spin", "pause")
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class ControlConfig:
     """Random navigations: manoeuvres of random kind, length and speed, joined smoothly."""
 
-    max_velocity_mm_s: float = 12.0
+    max_velocity_mm_s: NonNegative = 12.0
     """Fastest translation, mm/s."""
-    max_rotation_rad_s: float = 3.0
+    max_rotation_rad_s: NonNegative = 3.0
     """Fastest rotation, rad/s."""
-    insertion_share: float = 0.45
+    insertion_share: Share = 0.45
     """Share of the manoeuvres that push."""
-    retraction_share: float = 0.3
+    retraction_share: Share = 0.3
     """Share of the manoeuvres that pull."""
-    spin_share: float = 0.15
+    spin_share: Share = 0.15
     """Share of the manoeuvres that only rotate; what is left over are pauses."""
-    rotation_share: float = 0.6
+    rotation_share: Share = 0.6
     """Share of the pushing and pulling manoeuvres that rotate too."""
-    shortest_s: float = 1.0
+    shortest_s: Annotated[float, Within(SAMPLE_PERIOD_S)] = 1.0
     """Shortest manoeuvre, s."""
-    longest_s: float = 6.0
+    longest_s: Annotated[float, Within(SAMPLE_PERIOD_S)] = 6.0
     """Longest manoeuvre, s."""
-    first_inserted_length_mm: float = 5.0
+    first_inserted_length_mm: NonNegative = 5.0
     """Least inserted length that a navigation starts with, mm."""
-    start_spread: float = 0.6
+    start_spread: Share = 0.6
     """Starts are spread from there over this share of the largest inserted length."""
 
-    def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            InputError: a field is out of its range.
-        """
-        for name in ("max_velocity_mm_s", "max_rotation_rad_s", "first_inserted_length_mm"):
-            if not 0 <= getattr(self, name) < np.inf:
-                raise InputError(f"{name}: {getattr(self, name)}; give a number of 0 or more")
-        for name in ("insertion_share", "retraction_share", "spin_share", "rotation_share", "start_spread"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise InputError(f"{name}: {getattr(self, name)}; give a share from 0 to 1")
+    @model_validator(mode="after")
+    def _consistent(self) -> ControlConfig:
         total = self.insertion_share + self.retraction_share + self.spin_share
         if total > 1 + 1e-9:
-            raise InputError(f"insertion_share + retraction_share + spin_share: {total:g}; keep their sum at 1 or less")
-        if not SAMPLE_PERIOD_S <= self.shortest_s <= self.longest_s < np.inf:
-            raise InputError(
-                f"shortest_s, longest_s: {self.shortest_s}, {self.longest_s}; give {SAMPLE_PERIOD_S} or more, in order"
-            )
+            raise ValueError(f"insertion_share + retraction_share + spin_share: {total:g}; keep their sum at 1 or less")
+        if self.shortest_s > self.longest_s:
+            raise ValueError(f"shortest_s, longest_s: {self.shortest_s}, {self.longest_s}; give the shorter time first")
+        return self
 
 
 def random_controls(

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from pydantic import model_validator
 
-from endopilot.errors import InputError
+from endopilot.settings import Finite, Positive, settings
 from endopilot.simulation.device import Device
 from endopilot.types import Anatomy
 
@@ -46,7 +46,7 @@ def within_travel(
     return np.clip(translation, back, ahead)
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class DriveLimits:
     """What a drive must never exceed.
 
@@ -56,21 +56,15 @@ class DriveLimits:
         travel_mm: least and largest inserted length, mm.
     """
 
-    max_velocity_mm_s: float
-    max_rotation_rad_s: float
-    travel_mm: tuple[float, float] = (0.0, np.inf)
+    max_velocity_mm_s: Positive
+    max_rotation_rad_s: Positive
+    travel_mm: tuple[Finite, float] = (0.0, np.inf)
 
-    def __post_init__(self) -> None:
-        """Check every limit.
-
-        Raises:
-            InputError: a limit is not positive, or the travel is no range.
-        """
-        for name in ("max_velocity_mm_s", "max_rotation_rad_s"):
-            if not 0 < getattr(self, name) < np.inf:
-                raise InputError(f"{name}: {getattr(self, name)}; give a positive number")
+    @model_validator(mode="after")
+    def _consistent(self) -> DriveLimits:
         if not self.travel_mm[0] < self.travel_mm[1]:
-            raise InputError(f"travel_mm: {self.travel_mm} is no range; give the smaller first")
+            raise ValueError(f"travel_mm: {self.travel_mm} is no range; give the smaller first")
+        return self
 
     @staticmethod
     def of(device: Device, anatomy: Anatomy | None = None) -> DriveLimits:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Bool, Float
 
 from endopilot.anatomy.projection import safety_ratio
-from endopilot.errors import InputError
+from endopilot.settings import OpenShare, Positive, settings
 from endopilot.tasks.navigation import DECISION_PERIOD_S, SUCCESS_MM
 from endopilot.xray.bands import Calibration, Tips
 
@@ -16,28 +14,16 @@ _SPACING = 3
 """Periods from one exposure to the next, at least."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class AdviserConfig:
     """What X-ray must not miss, and how sure the bands are to be."""
 
-    level: float = 0.9
+    level: OpenShare = 0.9
     """Share of the intervals without X-ray in which the bands shall hold throughout."""
-    wall_ratio: float = 0.7
+    wall_ratio: Positive = 0.7
     """τ: an event begins where γtip/(lumen radius − wire radius) reaches it; 1 is the wall."""
-    abscissa_mm: float = SUCCESS_MM
+    abscissa_mm: Positive = SUCCESS_MM
     """δ: an event begins where Δtip is off by this much, mm; as near as a target counts as reached if not given."""
-
-    def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            InputError: a field is out of its range.
-        """
-        if not 0 < self.level < 1:
-            raise InputError(f"level: {self.level} is not in (0, 1); give e.g. 0.9")
-        for name in ("wall_ratio", "abscissa_mm"):
-            if not 0 < getattr(self, name) < np.inf:
-                raise InputError(f"{name}: {getattr(self, name)}; give a positive number")
 
 
 def near_exposures(exposed: Bool[np.ndarray, "*n samples"]) -> Bool[np.ndarray, "*n samples"]:

@@ -7,26 +7,29 @@ the spread, over all samples and over Δtip and γtip together. docs/xray.md mea
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Shaped
+from pydantic import Field
 from scipy.optimize import nnls
 
 from endopilot.errors import InputError
-from endopilot.files import read_json, write_json
+from endopilot.files import write_json
+from endopilot.settings import Count, NonNegative, OpenShare, read_settings, settings
 
 CALIBRATION_FILE = "xray.json"
 """Name of a calibration beside the run that it belongs to."""
 TERMS = ("constant_mm", "per_s", "per_mm_of_travel", "per_own_spread")
 """What a spread is the sum of."""
+_Terms = Annotated[tuple[NonNegative, ...], Field(min_length=len(TERMS), max_length=len(TERMS))]
 Tips = Float[np.ndarray, "*n 2"]
 """(Δtip, γtip), mm, or something of each of them."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class Calibration:
     """How wide the bands of one model are.
 
@@ -40,12 +43,12 @@ class Calibration:
         dataset: key of the dataset.
     """
 
-    level: float
-    scale: float
-    abscissa_terms: tuple[float, ...]
-    offset_terms: tuple[float, ...]
-    anatomies: int
-    intervals: int
+    level: OpenShare
+    scale: NonNegative
+    abscissa_terms: _Terms
+    offset_terms: _Terms
+    anatomies: Count
+    intervals: Count
     dataset: str
 
     def half_width(self, seconds: Float[np.ndarray, "*n"], travel_mm: Float[np.ndarray, "*n"], spread: Tips) -> Tips:
@@ -74,15 +77,7 @@ class Calibration:
             raise InputError(
                 f"{run}: the model has no calibration ({CALIBRATION_FILE} is missing); make it with `endopilot advise`"
             )
-        try:
-            content: dict[str, Any] = read_json(path)
-            for name in ("abscissa_terms", "offset_terms"):
-                content[name] = tuple(content[name])
-            return Calibration(**content)
-        except (TypeError, KeyError) as error:
-            raise InputError(
-                f"{path}: no calibration of this version ({error}); run `endopilot advise` again"
-            ) from None
+        return read_settings(path, Calibration, remedy="run `endopilot advise` again")
 
 
 def spread_of(

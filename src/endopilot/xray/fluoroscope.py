@@ -16,7 +16,7 @@ from jaxtyping import Float
 from endopilot.anatomy.projection import project_tip
 from endopilot.anatomy.tree import tangents
 from endopilot.dataset.loader import Dataset
-from endopilot.errors import InputError
+from endopilot.settings import Finite, Positive, settings
 from endopilot.types import Anatomy, TipProjection
 
 _CATHETER_MM = 20.0
@@ -45,34 +45,24 @@ class TipMeasurement:
     branch: int
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class FluoroscopeConfig:
     """Geometry of the C-arm and errors of detection."""
 
     biplane: bool = True
     """Two views at once; else the first alone."""
-    view_angles_deg: tuple[tuple[float, float], tuple[float, float]] = ((-30.0, 0.0), (60.0, 0.0))
+    view_angles_deg: tuple[tuple[Finite, Finite], tuple[Finite, Finite]] = ((-30.0, 0.0), (60.0, 0.0))
     """Of each view, LAO (positive) or RAO (negative), and cranial (positive) or caudal (negative), degrees."""
-    source_to_isocenter_mm: float = 765.0
+    source_to_isocenter_mm: Positive = 765.0
     """Distance of the X-ray source from the isocenter, mm."""
-    source_to_detector_mm: float = 1100.0
+    source_to_detector_mm: Positive = 1100.0
     """Distance of the X-ray source from the detector, mm."""
-    pixel_mm: float = 0.308
+    pixel_mm: Positive = 0.308
     """Pixel pitch of the detector in fluoroscopy, mm."""
-    pixel_sd: float = 0.5
+    pixel_sd: Positive = 0.5
     """Standard deviation of the tip's place in the image across the wire, pixels."""
-    along_sd: float = 2.6
+    along_sd: Positive = 2.6
     """Standard deviation along the wire, pixels: where a thin tip ends is harder to see than where it runs."""
-
-    def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            InputError: a field is out of its range.
-        """
-        for name in ("source_to_isocenter_mm", "source_to_detector_mm", "pixel_mm", "pixel_sd", "along_sd"):
-            if not 0 < getattr(self, name) < np.inf:
-                raise InputError(f"{name}: {getattr(self, name)}; give a positive number")
 
 
 @dataclass(frozen=True, eq=False)

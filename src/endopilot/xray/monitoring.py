@@ -11,11 +11,11 @@ from jaxtyping import Bool, Float, Int
 
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.dataset.loader import Dataset
-from endopilot.errors import InputError
 from endopilot.models.config import WINDOW
 from endopilot.models.episodes import Episodes
 from endopilot.models.open_loop import Predictor
 from endopilot.progress import progress
+from endopilot.settings import NonNegative, Seed, settings
 from endopilot.simulation.device import Device
 from endopilot.types import SAMPLE_PERIOD_S, VesselTree
 from endopilot.xray.adviser import AdviserConfig, XrayAdviser, count_events, near_exposures
@@ -30,7 +30,7 @@ ExposurePolicy = Callable[[int, Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2
 """From sample, predicted tip and its spread (mm), which navigations are exposed."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class AdviseConfig:
     """What the adviser must not miss, and how far the model is from the truth."""
 
@@ -38,21 +38,10 @@ class AdviseConfig:
     """What X-ray must not miss."""
     fluoroscope: FluoroscopeConfig = field(default_factory=FluoroscopeConfig)
     """The C-arm."""
-    ostium_mm: float = 0.3
+    ostium_mm: NonNegative = 0.3
     """Each patient's ostium lies up to this much deeper or less deep than in the model, mm."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the detection errors and of the ostia."""
-
-    def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            InputError: a field is out of its range.
-        """
-        if not 0 <= self.ostium_mm < np.inf:
-            raise InputError(f"ostium_mm: {self.ostium_mm}; give 0 or a length in mm")
-        if self.seed < 0:
-            raise InputError(f"seed: {self.seed} is negative; give 0 or more")
 
 
 @dataclass(frozen=True, eq=False)

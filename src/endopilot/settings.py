@@ -1,0 +1,267 @@
+"""Settings classes that check themselves, and the files that hold them.
+
+`@settings` makes a frozen, keyword-only dataclass whose fields pydantic validates:
+
+    @settings
+    class RodConfig:
+        friction: NonNegative = 0.1
+        elements: Annotated[int, Within(10, 2000)] = 100
+
+A bad value raises `InputError` in one line: the field, its value, and what to give instead. A check of several fields
+is a `pydantic.model_validator(mode="after")` that raises `ValueError("field: value; what to give")`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import wraps
+from pathlib import Path
+from typing import Annotated, Any, TypeVar, dataclass_transform, get_args, get_origin, overload
+
+import numpy as np
+import yaml
+from pydantic import AfterValidator, ConfigDict, GetCoreSchemaHandler, ValidationError
+from pydantic.dataclasses import dataclass
+from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, core_schema
+
+from endopilot.errors import InputError
+from endopilot.files import read_json
+
+T = TypeVar("T")
+Number = int | float
+_STRICT = ConfigDict(extra="forbid")
+_UNKNOWN = ("unexpected_keyword_argument", "extra_forbidden")
+_MENDS = {
+    "string_type": "give text",
+    "bool_type": "give true or false",
+    "bool_parsing": "give true or false",
+    "tuple_type": "give a list of values",
+    "path_type": "give a path",
+    "dict_type": "give a mapping of names and values",
+    "too_short": "give at least {min_length} values",
+    "too_long": "give {max_length} values",
+    "literal_error": "choose from {expected}",
+    "is_instance_of": "give a {class}",
+}
+"""What to give instead, by pydantic's kind of error."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Within:
+    """The range of a number, as an annotation of `int` (whole numbers alone) or `float` (finite numbers).
+
+    Attributes:
+        low: least value.
+        high: largest value.
+        above_low: whether `low` itself is refused.
+        below_high: whether `high` itself is refused.
+    """
+
+    low: Number = -math.inf
+    high: Number = math.inf
+    above_low: bool = False
+    below_high: bool = False
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        """Return the schema that pydantic checks by; all that it refuses is answered by one sentence."""
+        low, high = ("gt" if self.above_low else "ge"), ("lt" if self.below_high else "le")
+        bounds: dict[str, Any] = {
+            name: bound for name, bound in ((low, self.low), (high, self.high)) if math.isfinite(bound)
+        }
+        if source is int:
+            number: CoreSchema = core_schema.int_schema(strict=True, **bounds)
+        else:
+            number = core_schema.float_schema(strict=True, allow_inf_nan=False, **bounds)
+        plain = core_schema.no_info_before_validator_function(_without_numpy, number)
+        return core_schema.custom_error_schema(plain, "range", custom_error_message=self.mend(whole=source is int))
+
+    def mend(self, *, whole: bool) -> str:
+        """Return what to give, in words; `whole` says whether it must be a whole number."""
+        number, low, high = ("whole number" if whole else "number"), _bound(self.low), _bound(self.high)
+        if math.isfinite(self.low) and math.isfinite(self.high):
+            if self.above_low and self.below_high:
+                return f"give a {number} between {low} and {high}"
+            if self.above_low:
+                return f"give a {number} above {low}, at most {high}"
+            return f"give a {number} from {low} to {'below ' if self.below_high else ''}{high}"
+        if math.isfinite(self.low):
+            if not self.above_low:
+                return f"give a {number} of {low} or more"
+            return f"give a positive {number}" if self.low == 0 else f"give a {number} above {low}"
+        if math.isfinite(self.high):
+            return f"give a {number} {'below' if self.below_high else 'of at most'} {high}"
+        return f"give a {number}" if whole else "give a finite number"
+
+
+def _ascending(pair: tuple[Number, Number]) -> tuple[Number, Number]:
+    if not pair[0] <= pair[1]:
+        raise PydanticCustomError("range", "give two numbers, the smaller first")
+    return pair
+
+
+Finite = Annotated[float, Within()]
+"""Any finite number."""
+Positive = Annotated[float, Within(0, above_low=True)]
+"""A number above 0."""
+NonNegative = Annotated[float, Within(0)]
+"""A number of 0 or more."""
+Share = Annotated[float, Within(0, 1)]
+"""A number from 0 to 1."""
+OpenShare = Annotated[float, Within(0, 1, above_low=True, below_high=True)]
+"""A number between 0 and 1, neither included."""
+ShareBelowOne = Annotated[float, Within(0, 1, below_high=True)]
+"""A number from 0 to below 1."""
+Count = Annotated[int, Within(1)]
+"""A whole number of 1 or more."""
+CountOrZero = Annotated[int, Within(0)]
+"""A whole number of 0 or more."""
+Seed = Annotated[int, Within(0, 2**64 - 1)]
+"""Seed of a random stream."""
+Ascending = AfterValidator(_ascending)
+"""Annotation of a pair of numbers: the first is not above the second."""
+
+
+@overload
+@dataclass_transform(kw_only_default=True, frozen_default=True, field_specifiers=(dataclasses.field,))
+def settings(cls: type[T], /) -> type[T]: ...
+
+
+@overload
+@dataclass_transform(kw_only_default=True, frozen_default=True, field_specifiers=(dataclasses.field,))
+def settings(*, eq: bool) -> Callable[[type[T]], type[T]]: ...
+
+
+def settings(cls: type[T] | None = None, /, *, eq: bool = True) -> Any:
+    """Make a class of annotated fields a frozen, keyword-only dataclass that checks them.
+
+    Its construction raises `InputError`, in one line that names the field, its value and what to give instead. It takes
+    mappings for fields that are settings classes themselves, and lists for tuples, as JSON and YAML files have them.
+
+    Args:
+        cls: the class.
+        eq: whether instances of equal fields are equal.
+    """
+    if cls is None:
+        return lambda decorated: _made(decorated, eq)
+    return _made(cls, eq)
+
+
+def from_record(cls: type[T], record: Any) -> T:
+    """Return settings from the names and values of all their fields, as `dataclasses.asdict` or a file gives them.
+
+    Raises:
+        InputError: it is no such record; the line names field, value and what to give instead.
+    """
+    if not isinstance(record, Mapping) or not all(isinstance(name, str) for name in record):
+        raise InputError(f"holds no mapping of fields; the fields are {', '.join(_fields(cls))}")
+    read = cls(**record)
+    for name in _fields(cls):
+        if name not in record:
+            raise InputError(f"{name}: missing; add it")
+    return read
+
+
+def read_settings(path: Path, cls: type[T], *, remedy: str = "") -> T:
+    """Read settings from a JSON file (by its suffix) or a YAML file.
+
+    Args:
+        path: the file.
+        cls: the class of the settings.
+        remedy: what else to do about a bad file, such as "run `endopilot advise` again".
+
+    Raises:
+        InputError: the file is missing or holds no such settings; the line names file, field, value and what to give.
+    """
+    content = read_json(path) if Path(path).suffix == ".json" else _read_yaml(path)
+    try:
+        return from_record(cls, content)
+    except InputError as error:
+        raise InputError(f"{path}: {error}{', or ' if remedy else ''}{remedy}") from None
+
+
+def _made(cls: type[T], eq: bool) -> type[T]:
+    made: Any = dataclass(frozen=True, kw_only=True, eq=eq, config=_STRICT)(cls)
+    validate = made.__init__
+
+    @wraps(validate)
+    def init(self: Any, **values: Any) -> None:
+        try:
+            validate(self, **values)
+        except ValidationError as error:
+            raise InputError(_sentence(made, error)) from None
+
+    made.__init__ = init
+    return made
+
+
+def _sentence(cls: type, error: ValidationError) -> str:
+    """Return the one line about the worst of pydantic's errors: an unknown field, else the first."""
+    problem = min(error.errors(include_url=False), key=lambda found: found["type"] not in _UNKNOWN)
+    kind, place, context = problem["type"], problem["loc"], problem.get("ctx", {})
+    if kind == "value_error":
+        return f"{_path(place)}{'.' if place else ''}{context['error']}"
+    if kind in _UNKNOWN:
+        known = _fields_at(cls, place[:-1])
+        near = difflib.get_close_matches(str(place[-1]), known, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"the fields are {', '.join(known)}"
+        return f"{_path(place)}: no such field; {hint}"
+    if kind.startswith("missing"):
+        if isinstance(place[-1], int):
+            return f"{_path(place[:-1])}: {_shown(problem)}; give more values"
+        return f"{_path(place)}: missing; add it"
+    if kind == "dataclass_type":
+        mend = f"give a mapping of {', '.join(_fields_at(cls, place))}"
+    elif kind == "range":
+        mend = problem["msg"]
+    else:
+        mend = _MENDS[kind].format(**context) if kind in _MENDS else f"correct it ({problem['msg']})"
+    return f"{_path(place)}: {_shown(problem)}; {mend}"
+
+
+def _shown(problem: ErrorDetails) -> str:
+    value = problem["input"]
+    text = repr(value) if isinstance(value, str) else str(value)
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def _path(place: Sequence[int | str]) -> str:
+    """Return where a field is, such as "cost.tip_weight" or "seeds[0][2]"."""
+    return "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in place).removeprefix(".")
+
+
+def _fields(cls: type) -> list[str]:
+    return list(getattr(cls, "__pydantic_fields__", ()))
+
+
+def _fields_at(cls: Any, place: Sequence[int | str]) -> list[str]:
+    """Return the names of the fields of the settings class that lies at a place within another."""
+    for part in place:
+        inner = cls if isinstance(part, int) else cls.__pydantic_fields__[part].annotation
+        kinds = (get_origin(kind) or kind for kind in (inner, *get_args(inner)))
+        cls = next((kind for kind in kinds if _fields(kind)), inner)
+    return _fields(cls)
+
+
+def _bound(value: Number) -> str:
+    return f"2^{value.bit_length()} - 1" if isinstance(value, int) and value >= 2**32 else f"{value:g}"
+
+
+def _without_numpy(value: Any) -> Any:
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _read_yaml(path: Path) -> Any:
+    try:
+        return yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: no such file, or it cannot be read; check the path") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is no text in UTF-8; give a YAML file") from error
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f"line {mark.line + 1}: " if mark else ""
+        problem = getattr(error, "problem", None) or str(error).splitlines()[0]
+        raise InputError(f"{path}: {line}not valid YAML ({problem}); correct the file") from error
