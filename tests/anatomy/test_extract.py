@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from endopilot.anatomy.line_ends import to_cut
 from endopilot.anatomy.sources import Polylines
 from endopilot.anatomy.surface import Surface, surface_from_mask
 from endopilot.errors import InputError
+from endopilot.imaging.volume import write_volume
 from endopilot.types import DistanceMap, Insertion, LumenMask, Volume
 
 REAL = Path(__file__).parents[3] / "shared" / "data" / "coronary_centerlines"
@@ -81,6 +83,17 @@ def test_fork_is_found_with_its_root(fork_mask):
     assert KDTree(tips).query(truth)[0].max() < 1.5
     place = anatomy.tree.branches[0].centerline.points[-1]
     assert np.linalg.norm(place) < 1.5
+
+
+def test_one_label_of_a_mask_file_is_chosen(fork_mask, tmp_path):
+    volume = fork_mask.volume
+    labels = 2 * np.asarray(volume.voxels, dtype=np.uint8)
+    labels[:, :2] = 1  # a slab that is no vessel
+    write_volume(replace(volume, voxels=labels), tmp_path / "labels.nii.gz")
+    with pytest.raises(InputError, match="holds 2 labels"):
+        extract_anatomy(tmp_path / "labels.nii.gz")
+    anatomy = extract_anatomy(tmp_path / "labels.nii.gz", label=2)
+    assert len(anatomy.tree.leaves()) == 2 and is_sound(anatomy)
 
 
 def test_given_ostium_is_the_root_and_mid_vessel_ostium_looks_onwards(fork_mask):

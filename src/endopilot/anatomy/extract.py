@@ -71,6 +71,7 @@ def extract_anatomy(
     source: str | Path | AnatomySource | LumenMask | Surface | Polylines | VesselTree,
     *,
     name: str | None = None,
+    label: int | None = None,
     config: AnatomyConfig = AnatomyConfig(),
 ) -> Anatomy:
     """Make an anatomy: centerline tree with section labels, distance map with guiding catheter, insertion.
@@ -78,6 +79,7 @@ def extract_anatomy(
     Args:
         source: a file with a mask, a surface or centerlines, as `read_source` reads it; or what was read or made.
         name: short name of the patient; that of the file, or "patient", if not given.
+        label: which label of a mask file with several is the lumen.
         config: how to make it.
 
     Raises:
@@ -85,7 +87,7 @@ def extract_anatomy(
             cannot be closed.
     """
     if isinstance(source, str | Path):
-        source = read_source(source)
+        source = read_source(source, label=label)
     wrapped = source if isinstance(source, AnatomySource) else AnatomySource(source)
     wrapped = transformed(wrapped, scale=config.scale, coordinates=config.coordinates)
     name = name or wrapped.file.partition(".")[0] or "patient"
