@@ -1,4 +1,4 @@
-"""Write the figures and pictures of README.md, docs/demo.md and docs/commands.md from what the commands left in `runs/`.
+"""Write the measured parts of README.md, docs/demo.md and docs/commands.md from what the commands left in `runs/`.
 
 `make readme` runs it, after `make demo` and `make cta`. A part whose run is not there stays as it is.
 """
@@ -53,8 +53,8 @@ def _demo(metrics: dict, record: dict) -> str:
         [
             f"- **Segmentation** from the CT alone: Dice {min(dice):.2f}–{max(dice):.2f}; the ostium errs by "
             f"{min(ostium):.1f}–{max(ostium):.1f} mm.",
-            f"- **Prediction** of the tip in patients never trained on: mean error {_list(error)} mm after 0–10, 10–30 and "
-            f"30–45 s without X-ray; the best simple baseline errs by {_list(baseline)} mm.",
+            f"- **Prediction** of the tip in patients never trained on: mean error {_list(error)} mm after 0–10, "
+            f"10–30 and 30–45 s without X-ray; the best simple baseline errs by {_list(baseline)} mm.",
             f"- **Time**: {record['wall_seconds']:.0f} s on {record['machine']['cores']} cores "
             f"({record['machine']['processor']}). The page is `runs/demo/report.html`; "
             "[the demo](docs/demo.md) explains every figure.",
