@@ -63,9 +63,8 @@ class RecordedAgent(AgentPolicy):
         super().start(navigation, seed)
 
     def wants_xray(self):
-        _, tip, _, radius = self.foretold()
-        asked = super().wants_xray()
-        self.log.append((*tip[0], *self._adviser.half_width[0], radius[0]))
+        asked, tip = super().wants_xray(), self.belief.likeliest_tip()
+        self.log.append((tip.abscissa[0], tip.offset[0], *self._adviser.half_width[0], tip.radius[0]))
         return asked
 
 
