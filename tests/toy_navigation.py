@@ -1,7 +1,7 @@
 """A wire with a closed form, for tests of what comes after the simulator.
 
 The slack s = Δ − Δtip follows a play operator: it grows with insertion and shrinks with retraction, at the rate
-`GRIP`, within an envelope that widens with depth. The offset is a function of depth and rotation.
+`SLACK_RATE`, within an envelope that widens with depth. The offset is a function of depth and rotation.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from endopilot.types import (
     VesselTree,
 )
 
-GRIP = 0.6
+SLACK_RATE = 0.6
 LENGTH_MM = 100.0
 
 
@@ -58,7 +58,7 @@ def toy_simulate(anatomy: Anatomy, device, control, *, initial, config, friction
     now = curliness * initial[:, 0]
     for t in range(samples):
         low = curliness * np.maximum(proximal[:, t, 0], 0)
-        now = np.clip(now + GRIP * advance[:, t], low, low + 1.5)
+        now = np.clip(now + SLACK_RATE * advance[:, t], low, low + 1.5)
         slack[:, t] = now
     abscissa = proximal[..., 0] - slack
     offset = 0.8 + 0.5 * np.sin(0.1 * abscissa + proximal[..., 1])

@@ -117,7 +117,7 @@ def test_tip_statistics_normalises_by_the_radius_of_each_sample():
     assert found["all"]["over_radius"]["sd"] == pytest.approx(0.375)
 
 
-def test_a_tip_that_sticks_slips_or_whips_is_told_from_one_that_goes_along():
+def test_a_tip_that_sticks_slips_or_whips_is_distinguished_from_one_that_follows():
     # goes along; stays behind; springs ahead; all rest; the drive turns and the tip with it; the tip swings alone
     inserted = np.array([[0.0, 1.0, 2.0, 3.0, 3.0, 3.0, 3.0]])
     abscissa = np.array([[0.0, 1.0, 1.05, 3.2, 3.2, 3.2, 3.2]])

@@ -23,7 +23,7 @@ def test_results_read_back_as_written(results, tmp_path):
     np.testing.assert_array_equal(after.base_force["true"], before.base_force["true"])
 
 
-def test_damaged_results_are_told_in_one_line(tmp_path):
+def test_damaged_results_are_refused_in_one_line(tmp_path):
     path = tmp_path / "evaluation.npz"
     path.write_bytes(b"nothing")
     with pytest.raises(InputError, match=r"evaluation\.npz: damaged"):
@@ -34,7 +34,7 @@ def test_summary_is_plain_json_without_nan(results):
     json.dumps(summarize(results["test"], seed=0), allow_nan=False)
 
 
-def test_several_seeds_are_told_with_their_mean_and_spread(results):
+def test_several_seeds_stand_with_their_mean_and_spread(results):
     result = results["test"]
     tips = [replace(result.true, abscissa=result.true.abscissa + off) for off in (0.1, -0.2, 0.6)]
     found = over_seeds(result, tips)["abscissa"]["10-30"]
@@ -42,7 +42,7 @@ def test_several_seeds_are_told_with_their_mean_and_spread(results):
     assert (found["mean"], found["sd"]) == (pytest.approx(0.3), pytest.approx(np.sqrt(0.07)))
 
 
-def test_shares_of_events_are_told(results):
+def test_shares_of_events_are_reported(results):
     shares = summarize(results["test"], seed=0)["event_shares"]
     assert shares["stick"] == results["test"].events["stick"].mean() > shares["whip"] == 0.0
 

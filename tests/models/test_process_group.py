@@ -47,17 +47,17 @@ def test_two_processes_train_what_one_does(plain, toy_dataset, tmp_path):
 
 
 def test_mixed_precision_multiplies_in_bfloat16_and_keeps_float32(plain, toy_dataset, tmp_path):
-    seen = set()
+    dtypes = set()
     real = torch.nn.functional.scaled_dot_product_attention
 
     def watched(query, key, value):
-        seen.add(query.dtype)
+        dtypes.add(query.dtype)
         return real(query, key, value)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(torch.nn.functional, "scaled_dot_product_attention", watched)
         train(toy_dataset, tmp_path / "run", TrainConfig(**{**vars(SHORT), "precision": "bfloat16"}))
-    assert torch.bfloat16 in seen
+    assert torch.bfloat16 in dtypes
     ours, theirs = (read_tensors(run / "ff.safetensors")[0] for run in (tmp_path / "run", plain))
     assert {weights.dtype for weights in ours.values()} == {torch.float32}
     assert any(not torch.equal(ours[name], theirs[name]) for name in theirs)
@@ -66,7 +66,7 @@ def test_mixed_precision_multiplies_in_bfloat16_and_keeps_float32(plain, toy_dat
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU here")
-def test_a_gpu_that_is_not_there_is_told(toy_dataset, tmp_path):
+def test_a_gpu_that_is_not_there_is_refused(toy_dataset, tmp_path):
     with pytest.raises(InputError, match="torch finds no GPU here"):
         train(toy_dataset, tmp_path / "run", TrainConfig(processor="cuda"))
     assert not (tmp_path / "run").exists()

@@ -32,7 +32,7 @@ def learnt(toy_dataset, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def unseen(toy_dataset):
+def episodes(toy_dataset):
     """Return navigations of patients that were not trained on."""
     return Episodes.of_dataset(load_dataset(toy_dataset).of_split("test").select(np.arange(16)))
 
@@ -55,116 +55,116 @@ def changed(episodes, value, samples, *names):
     return replace(episodes, **copies)
 
 
-def test_shapes(unseen):
+def test_shapes(episodes):
     predictor = untrained()
     for rollout in (predictor.rollout_forward, predictor.rollout_inverse, predictor.rollout_dual):
-        result = rollout(unseen)
+        result = rollout(episodes)
         assert result.tip.shape == result.proximal.shape == result.control.shape == (16, 90, 2)
         assert all(np.isfinite(signal).all() for signal in (result.tip, result.proximal, result.control))
 
 
-def test_forward_reads_no_tip_after_the_given_ones(unseen):
-    blind = changed(unseen, np.nan, slice(GIVEN, None), "tip")
+def test_forward_reads_no_tip_after_the_given_ones(episodes):
+    blind = changed(episodes, np.nan, slice(GIVEN, None), "tip")
     predictor = untrained()
-    np.testing.assert_array_equal(predictor.rollout_forward(unseen).tip, predictor.rollout_forward(blind).tip)
+    np.testing.assert_array_equal(predictor.rollout_forward(episodes).tip, predictor.rollout_forward(blind).tip)
 
 
 @pytest.mark.parametrize("k", [30, 31, 77, 118])
-def test_predictions_do_not_depend_on_later_controls(unseen, k):
-    cut = changed(unseen, np.nan, slice(k + 1, None), "control", "proximal")
+def test_predictions_do_not_depend_on_later_controls(episodes, k):
+    cut = changed(episodes, np.nan, slice(k + 1, None), "control", "proximal")
     predictor = untrained()
-    whole, partial = predictor.rollout_forward(unseen).tip, predictor.rollout_forward(cut).tip
+    whole, partial = predictor.rollout_forward(episodes).tip, predictor.rollout_forward(cut).tip
     np.testing.assert_array_equal(whole[:, : k + 1 - GIVEN], partial[:, : k + 1 - GIVEN])
     assert np.isnan(partial[:, k + 1 - GIVEN :]).all()
 
 
 @pytest.mark.parametrize("protocol", ["rollout_inverse", "rollout_dual"])
-def test_inverse_reads_no_motion_after_the_given_ones(unseen, protocol):
-    blind = changed(unseen, np.nan, slice(GIVEN, None), "control", "proximal")
+def test_inverse_reads_no_motion_after_the_given_ones(episodes, protocol):
+    blind = changed(episodes, np.nan, slice(GIVEN, None), "control", "proximal")
     rollout = getattr(untrained(), protocol)
-    np.testing.assert_array_equal(rollout(unseen).control, rollout(blind).control)
+    np.testing.assert_array_equal(rollout(episodes).control, rollout(blind).control)
 
 
 @pytest.mark.parametrize("k", [30, 60, 118])
-def test_inverse_reads_no_later_desired_tip(unseen, k):
-    cut = changed(unseen, np.nan, slice(k + 1, None), "tip")
+def test_inverse_reads_no_later_desired_tip(episodes, k):
+    cut = changed(episodes, np.nan, slice(k + 1, None), "tip")
     predictor = untrained()
-    whole, partial = predictor.rollout_inverse(unseen).control, predictor.rollout_inverse(cut).control
+    whole, partial = predictor.rollout_inverse(episodes).control, predictor.rollout_inverse(cut).control
     np.testing.assert_array_equal(whole[:, : k + 1 - GIVEN], partial[:, : k + 1 - GIVEN])
 
 
 @pytest.mark.parametrize("protocol", ["rollout_inverse", "rollout_dual"])
-def test_motion_is_the_exact_integral_of_the_control(unseen, protocol):
-    result = getattr(untrained(), protocol)(unseen)
-    start = unseen.proximal[:, GIVEN - 1 : GIVEN].astype(float)
+def test_motion_is_the_exact_integral_of_the_control(episodes, protocol):
+    result = getattr(untrained(), protocol)(episodes)
+    start = episodes.proximal[:, GIVEN - 1 : GIVEN].astype(float)
     np.testing.assert_allclose(result.proximal, start + 0.5 * np.cumsum(result.control, axis=1), atol=1e-10)
 
 
-def test_dual_feeds_the_predicted_tip_back(unseen):
+def test_dual_feeds_the_predicted_tip_back(episodes):
     predictor = untrained()
-    dual, inverse = predictor.rollout_dual(unseen), predictor.rollout_inverse(unseen)
+    dual, inverse = predictor.rollout_dual(episodes), predictor.rollout_inverse(episodes)
     np.testing.assert_array_equal(dual.control[:, 0], inverse.control[:, 0])
     assert np.abs(dual.control[:, 5:] - inverse.control[:, 5:]).max() > 1e-4
     along = replace(
-        unseen,
-        control=np.concatenate([unseen.control[:, :GIVEN], dual.control], axis=1),
-        proximal=np.concatenate([unseen.proximal[:, :GIVEN], dual.proximal], axis=1),
+        episodes,
+        control=np.concatenate([episodes.control[:, :GIVEN], dual.control], axis=1),
+        proximal=np.concatenate([episodes.proximal[:, :GIVEN], dual.proximal], axis=1),
     )
     np.testing.assert_allclose(predictor.rollout_forward(along).tip, dual.tip, atol=1e-3)
 
 
-def test_a_plan_under_way_takes_the_last_thirty_states(unseen):
+def test_a_plan_under_way_takes_the_last_thirty_states(episodes):
     predictor, now = untrained(), 69
     observed = np.arange(120) < GIVEN
     observed[now] = True
-    plan = predictor.rollout_dual(unseen, observed)
-    assert plan.control.shape == (len(unseen), 120 - now - 1, 2)
-    start = unseen.proximal[:, now].astype(float)
+    plan = predictor.rollout_dual(episodes, observed)
+    assert plan.control.shape == (len(episodes), 120 - now - 1, 2)
+    start = episodes.proximal[:, now].astype(float)
     np.testing.assert_allclose(plan.proximal[:, 0], start + 0.5 * plan.control[:, 0], atol=1e-9)
 
     def planned(episodes):
         return predictor.rollout_dual(episodes, observed).control
 
-    before_the_window = changed(unseen, np.nan, slice(0, now - 29), "tip")
+    before_the_window = changed(episodes, np.nan, slice(0, now - 29), "tip")
     np.testing.assert_array_equal(planned(before_the_window), plan.control)
-    elsewhere = changed(unseen, unseen.tip[:, now] + 1.0, now, "tip")
+    elsewhere = changed(episodes, episodes.tip[:, now] + 1.0, now, "tip")
     assert np.abs(planned(elsewhere) - plan.control).max() > 1e-3
-    np.testing.assert_array_equal(planned(changed(unseen, np.nan, slice(now + 1, None), "control")), plan.control)
+    np.testing.assert_array_equal(planned(changed(episodes, np.nan, slice(now + 1, None), "control")), plan.control)
 
 
-def test_controls_stay_within_the_device_s_limits_and_in_the_catheter(unseen):
-    result = untrained((0.7, 0.2)).rollout_inverse(unseen)
+def test_controls_stay_within_the_device_s_limits_and_in_the_catheter(episodes):
+    result = untrained((0.7, 0.2)).rollout_inverse(episodes)
     assert np.abs(result.control[..., 0]).max() == pytest.approx(0.7)
     assert np.abs(result.control[..., 1]).max() == pytest.approx(0.2)
     outward = np.stack([3.0 * np.arange(120), np.zeros(120)], axis=-1).astype(np.float32)
-    away = replace(unseen, tip=unseen.tip - outward)
+    away = replace(episodes, tip=episodes.tip - outward)
     result = untrained().rollout_inverse(away)
     assert result.proximal[..., 0].min() > -1e-4
     assert (result.proximal[..., 0] < 1e-3).any()
 
 
-def test_batches_do_not_matter(unseen):
+def test_batches_do_not_matter(episodes):
     predictor = untrained()
     small = replace(predictor, batch_size=5)
-    np.testing.assert_allclose(predictor.rollout_dual(unseen).tip, small.rollout_dual(unseen).tip, atol=1e-3)
+    np.testing.assert_allclose(predictor.rollout_dual(episodes).tip, small.rollout_dual(episodes).tip, atol=1e-3)
 
 
-def test_a_missing_network_is_named(unseen):
+def test_a_missing_network_is_named(episodes):
     with pytest.raises(InputError, match="no inverse network; train it with --network both"):
-        replace(untrained(), inverse=None).rollout_dual(unseen)
+        replace(untrained(), inverse=None).rollout_dual(episodes)
 
 
-def test_forward_beats_holding_the_slack_on_unseen_patients(learnt, unseen):
-    length, truth = unseen.proximal[..., 0], unseen.tip[:, GIVEN:].astype(float)
-    slack = length - unseen.tip[..., 0]
+def test_forward_beats_holding_the_slack_on_new_patients(learnt, episodes):
+    length, truth = episodes.proximal[..., 0], episodes.tip[:, GIVEN:].astype(float)
+    slack = length - episodes.tip[..., 0]
     held = length[:, GIVEN:] - slack[:, GIVEN - 1 : GIVEN]
-    error = np.abs(learnt.rollout_forward(unseen).tip - truth)
+    error = np.abs(learnt.rollout_forward(episodes).tip - truth)
     assert error[..., 0].mean() < 0.7 * np.abs(held - truth[..., 0]).mean()
 
 
-def test_inverse_beats_the_mean_and_the_held_control_on_unseen_patients(learnt, unseen, toy_dataset):
-    truth = unseen.control[:, GIVEN:, 0]
-    error = np.abs(learnt.rollout_inverse(unseen).control[..., 0] - truth).mean()
+def test_inverse_beats_the_mean_and_the_held_control_on_new_patients(learnt, episodes, toy_dataset):
+    truth = episodes.control[:, GIVEN:, 0]
+    error = np.abs(learnt.rollout_inverse(episodes).control[..., 0] - truth).mean()
     mean = load_dataset(toy_dataset).of_split("train").control[..., 0].mean()
-    assert error < 0.5 * np.abs(unseen.control[:, GIVEN - 1 : GIVEN, 0] - truth).mean()
+    assert error < 0.5 * np.abs(episodes.control[:, GIVEN - 1 : GIVEN, 0] - truth).mean()
     assert error < 0.5 * np.abs(mean - truth).mean()

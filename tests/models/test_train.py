@@ -19,7 +19,7 @@ from endopilot.files import read_json, sha256
 from endopilot.models.checkpoint import read_network, read_tensors
 from endopilot.models.config import TrainConfig, TransformerConfig
 from endopilot.models.episodes import Episodes
-from endopilot.models.learning_curves import board
+from endopilot.models.learning_curves import tensorboard_writer
 from endopilot.models.rollout import load_model
 from endopilot.models.train import train
 from endopilot.models.transformer import NETWORKS
@@ -136,13 +136,13 @@ def test_an_epoch_that_was_shown_but_not_kept_is_shown_as_it_was_trained_again(t
         return {"epoch": number, "loss": loss, "validation_loss": None, "learning_rate": 0.5, "samples_per_second": 9.0}
 
     for losses in ({1: 1.0, 2: 0.9}, {2: 0.5, 3: 0.25}):
-        with board(tmp_path / "ff") as show:
+        with tensorboard_writer(tmp_path / "ff") as write:
             for number, loss in losses.items():
-                show(epoch(number, loss))
+                write(epoch(number, loss))
     assert scalars(tmp_path / "ff", "loss") == {1: 1.0, 2: 0.5, 3: 0.25}
-    with board(None) as show:
-        show(epoch(1, 1.0))
-    with board(tmp_path / "none"):
+    with tensorboard_writer(None) as write:
+        write(epoch(1, 1.0))
+    with tensorboard_writer(tmp_path / "none"):
         pass
     assert [path.name for path in tmp_path.iterdir()] == ["ff"]
 

@@ -133,7 +133,7 @@ def test_the_numbers_of_the_tables_are_those_of_metrics_json(page, material):
         assert shown == pytest.approx(scale * value, abs=0.51 if scale == 100 else 0.0051), key
 
 
-def test_the_generalisation_gap_is_told_for_every_protocol_and_span(page, material):
+def test_the_generalisation_gap_is_shown_for_every_protocol_and_span(page, material):
     gap = read_json(material / "evaluation" / "metrics.json")["generalisation_gap"]
     for series in ("P1", "P3", "P4", "P2_replayed"):
         for coordinate in ("abscissa", "offset"):
@@ -143,7 +143,7 @@ def test_the_generalisation_gap_is_told_for_every_protocol_and_span(page, materi
     assert "Generalisation gap, P1: mean error in new patients against known ones" in page.words
 
 
-def test_the_drives_force_and_torque_are_told(page, material):
+def test_the_drives_force_and_torque_are_shown(page, material):
     drive = read_json(material / "evaluation" / "metrics.json")["splits"]["test"]["drive"]["P4"]
     force, torque = (drive[key]["rmse_of_sequences"]["median"] for key in ("force_n", "torque_nmm"))
     assert f"P4 {force:.3f} N and {torque:.3f} N mm" in page.words
@@ -154,7 +154,7 @@ def test_the_papers_errors_stand_beside_ours(page):
     assert page.cells["paper/0-10/offset/mae"] == "0.09 ± 0.10"
 
 
-def test_losses_are_told_in_words(page):
+def test_losses_are_named_in_words(page):
     assert "New patients, P4: Δtip loses to a baseline" in page.words
     assert "forward network 3 epochs, in all 60 steps in 12 s" in page.words
 
@@ -168,7 +168,7 @@ def test_names_cannot_break_the_page(page):
     assert "tube <1>" in page.words
 
 
-def test_a_missing_graphics_library_is_told_and_the_report_goes_on(material, rollout, tmp_path, no_still):
+def test_a_missing_graphics_library_is_named_and_the_report_goes_on(material, rollout, tmp_path, no_still):
     remarks = write_report(tmp_path / "report.html", make_content(material, rollout))
     assert remarks == [LIBRARIES_MISSING]
     assert "apt-get install libegl1" in (tmp_path / "report.html").read_text(encoding="utf-8")
@@ -189,12 +189,12 @@ def test_a_model_that_trains_nothing_has_no_training_section(material, tmp_path,
     assert "training" not in write_page(tmp_path, content).sections
 
 
-def test_one_patient_without_unseen_ones_is_reported(material, results, tmp_path, no_still):
+def test_one_known_patient_alone_is_reported(material, results, tmp_path, no_still):
     write_json(tmp_path / "e" / "metrics.json", evaluate._metrics({"seen_test": results["test"]}, {"c"}, 0))
     content = ReportContent(title="T", origin="O", command="C", evaluation=tmp_path / "e")
     page = write_page(tmp_path, content)
-    assert "that the networks know" in page.words
-    assert "With 1 patient nothing can be said" in page.words
+    assert "that the run was trained on" in page.words
+    assert "With 1 patient the spread between patients is unknown" in page.words
 
 
 def test_a_failed_report_leaves_nothing_behind(material, rollout, tmp_path, no_still):
@@ -206,4 +206,4 @@ def test_a_failed_report_leaves_nothing_behind(material, rollout, tmp_path, no_s
 
 def test_the_summary_speaks_of_new_patients_where_there_are_any(results):
     metrics = evaluate._metrics(results, {"a", "b"}, 0)
-    assert "6 new navigations in 1 patient that neither network has seen" in report_text.summary(metrics)
+    assert "6 new navigations in 1 patient that the run was not trained on" in report_text.summary(metrics)

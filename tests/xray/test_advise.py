@@ -1,4 +1,4 @@
-"""X-ray advice on a toy wire: what counts as an event, what as missed, and the whole command."""
+"""X-ray advice on a toy wire: what counts as an event, which are missed, and the whole command."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_tips_are_given_as_x_ray_measures_them_and_lengths_as_the_encoder_does(s
     np.testing.assert_array_equal(split.episodes.proximal[..., 1], truth.rotation)
 
 
-def test_imaging_often_enough_misses_nothing_and_none_misses_all(split) -> None:
+def test_imaging_often_enough_shows_every_event_and_none_shows_no_event(split) -> None:
     often = monitoring.measure_policy(split, monitoring.periodic_policy(split, 3), EVENTS)
     never = monitoring.measure_policy(split, lambda sample, tip, spread: np.zeros(len(tip), dtype=bool), EVENTS)
     knowing = monitoring.measure_policy(split, monitoring.oracle_policy(split, EVENTS), EVENTS)

@@ -46,7 +46,7 @@ def test_an_event_is_where_a_state_begins_and_an_exposure_beside_it_shows_it() -
     assert count_events(state, near_exposures(exposed)) == (3, 1)
 
 
-def test_too_few_patients_are_told() -> None:
+def test_too_few_patients_are_refused() -> None:
     with pytest.raises(InputError, match=r"needs at least 9 patients.* has 8"):
         conformal_scale(np.ones(16), np.repeat(np.arange(8), 2), 0.9)
     assert conformal_scale(np.arange(9.0), np.arange(9), 0.9) == 8.0
@@ -64,7 +64,7 @@ def test_the_spread_is_fitted_to_the_errors() -> None:
     assert (np.array(fit_spread(error, seconds, travel, np.zeros_like(own))) >= 0).all()
 
 
-def test_a_calibration_is_read_again_and_its_absence_told(tmp_path) -> None:
+def test_a_calibration_is_read_again_and_its_absence_named(tmp_path) -> None:
     with pytest.raises(InputError, match=r"the model has no calibration.*endopilot advise"):
         Calibration.read(tmp_path)
     calibration().write(tmp_path)

@@ -47,7 +47,7 @@ def test_one_view_knows_the_depth_by_the_vessel_alone(fork) -> None:
     assert np.linalg.norm(found[:, :2], axis=1).max() <= 1.0 - RADIUS + 1e-6  # inside the lumen
 
 
-def test_the_branch_is_seen(fork) -> None:
+def test_the_branch_is_observed(fork) -> None:
     arm, random = Fluoroscope(fork, RADIUS), np.random.default_rng(1)
     line = fork.tree.branches[2].centerline
     for index in range(10, len(line.points), 5):

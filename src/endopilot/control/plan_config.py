@@ -1,4 +1,4 @@
-"""What is asked of a plan, `PlanConfig`, and the plan that comes of it, `Plan`."""
+"""Settings of a plan, `PlanConfig`, and the plan itself, `Plan`."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class SampleConfig:
 
 @settings
 class PlanConfig:
-    """What is asked of a plan."""
+    """Method, limits and cost of a plan."""
 
     method: Method = "twin"
     """How the controls are found: twin (tried in the rod core), inverse (the inverse network of --model), mppi
@@ -57,7 +57,7 @@ class PlanConfig:
     seed: Seed = 0
     """Seed of what is drawn at random."""
     cost: Cost = field(default_factory=Cost)
-    """What a good way is."""
+    """Weights of the cost."""
     sample: SampleConfig = field(default_factory=SampleConfig)
     """Sampling through the forward network."""
 
@@ -68,12 +68,12 @@ class Plan:
 
     Attributes:
         navigation: what is to be done.
-        config: what was asked of it.
+        config: its settings.
         model: the trained run that it was found with, if any.
         control: π, mm/s and rad/s.
         proximal: (Δ mm, φ rad), its integral.
         desired: desired tip states (Δtip, γtip), mm.
-        predicted: those that the model foretells, mm.
+        predicted: tip states that the model predicts, mm.
         simulated: where the rod core, at its own settings, has the tip under these controls.
         position: of that tip, LPS mm.
         force: largest wall force on one node in the rod core, N.

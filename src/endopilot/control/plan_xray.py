@@ -42,7 +42,7 @@ def read_calibration(config: PlanConfig, model: Path | None) -> Calibration:
     """Return the calibration of the model that predicts a plan's tip: the run that makes it, or else the agent's wires.
 
     Args:
-        config: what is asked of the plan; its method says whether a network makes it.
+        config: of the plan; its method says whether a network makes it.
         model: the trained run, or "pretrained".
 
     Raises:

@@ -1,4 +1,4 @@
-"""What anyone could predict without learning: the baselines that stand beside every figure."""
+"""Predictions that need no learning: the baselines that stand beside every result."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def mean_control(train: Dataset, data: Dataset, given: int) -> Float[np.ndarray,
 
 
 def follow_slack(data: Dataset, given: int) -> Float[np.ndarray, "episodes samples 2"]:
-    """Return the control that moves the drive as far as the tip is to move, and does not turn it, (mm/s, rad/s).
+    """Return the control that moves the drive as far as the tip is to move, without rotation, (mm/s, rad/s).
 
     With the slack of the last given state held this puts the tip where it is desired.
     """

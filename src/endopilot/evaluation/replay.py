@@ -73,7 +73,7 @@ class Recorded:
 
         Args:
             controls: after the given states, by series, all of one length.
-            advance: told after each anatomy.
+            advance: called after each anatomy.
 
         Yields:
             Episodes that one simulation serves, and the simulation: a world for each series and episode, series by
@@ -98,7 +98,7 @@ class Recorded:
                 advance(1, anatomy.name)
 
     def _whole(self, control: Control) -> Float[np.ndarray, "episodes all_samples 2"]:
-        """Return what was asked of the drive while states are given, followed by `control`."""
+        """Return the recorded commands while states are given, followed by `control`."""
         return np.concatenate([self.data.asked[:, :WINDOW], control], axis=1)
 
 
@@ -121,13 +121,13 @@ def replay(recorded: Recorded, controls: Mapping[str, Control], advance: Advance
     Args:
         recorded: the episodes.
         controls: mm/s and rad/s after the given states, by series.
-        advance: told after each anatomy.
+        advance: called after each anatomy.
     """
     shape = recorded.data.control[:, WINDOW:].shape[:2]
     out = {name: {key: np.full(shape, np.nan) for key in _SIGNALS} for name in controls}
     for chosen, rollout in recorded.simulated(controls, advance):
-        asked = np.concatenate([control[chosen] for control in controls.values()])
-        usable = rollout.valid[:, WINDOW:] & np.isfinite(asked).all(axis=-1).cumprod(axis=1).astype(bool)
+        commanded = np.concatenate([control[chosen] for control in controls.values()])
+        usable = rollout.valid[:, WINDOW:] & np.isfinite(commanded).all(axis=-1).cumprod(axis=1).astype(bool)
         true_tip = recorded.data.tip_position[np.tile(chosen, len(controls))]
         distance = np.linalg.norm(rollout.tip_position - true_tip, axis=-1)
         tip = (rollout.tip.abscissa, rollout.tip.offset, rollout.tip.radius)

@@ -13,7 +13,7 @@ from endopilot.files import read_json
 from endopilot.settings import Count, NonNegative, Positive, Seed, ShareBelowOne, settings
 
 WINDOW = 30
-"""States that each prediction sees: the paper gives 30 states in and one out."""
+"""States that each prediction is made from: the paper gives 30 states in and one out."""
 
 
 Processor = Literal["auto", "cpu", "cuda"]
@@ -88,18 +88,18 @@ class CausalConfig:
 
 @settings
 class TwinConfig:
-    """The ensemble of rod simulations that the twin is, and how far it is from the truth at most."""
+    """The ensemble of rod simulations that the twin is, and its largest model mismatch."""
 
     members: Count = 32
     """Simulations of each navigation."""
     friction_spread: ShareBelowOne = 0.2
-    """The friction coefficient may be off by this share, either way."""
+    """Largest relative error of the friction coefficient, in either direction."""
     stiffness_spread: ShareBelowOne = 0.2
-    """The stiffness of the tip may be off by this share, either way."""
+    """Largest relative error of the stiffness of the tip, in either direction."""
     ostium_spread_mm: NonNegative = 0.5
     """The ostium may lie this much deeper or less deep along the catheter's axis, mm."""
     abscissa_sd_mm: Positive = 0.05
-    """Scale of what a good member misses a seen tip by along the centerline, mm."""
+    """Scale of a good member's error at an observed tip along the centerline, mm."""
     offset_sd_mm: Positive = 0.025
     """The same away from the centerline, mm."""
 
@@ -109,7 +109,7 @@ class TrainConfig:
     """Which networks are trained, and how long."""
 
     model: Literal["paper", "causal", "twin"] = "paper"
-    """Kind of model: the paper's pair of Transformers; ours, a pair of recurrent networks that are told of the vessel;
+    """Kind of model: the paper's pair of Transformers; ours, a pair of recurrent networks that also take the vessel;
     or the rod core itself, which needs no training."""
     network: Literal["both", "ff", "if"] = "both"
     """Forward network (ff), inverse network (if), or both."""

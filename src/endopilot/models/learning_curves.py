@@ -13,10 +13,10 @@ SCALARS = ("loss", "validation_loss", "learning_rate", "samples_per_second")
 
 
 @contextmanager
-def board(folder: Path | None) -> Iterator[Callable[[Mapping[str, Any]], None]]:
-    """Yield what adds an epoch of a network's learning curve to its event files.
+def tensorboard_writer(folder: Path | None) -> Iterator[Callable[[Mapping[str, Any]], None]]:
+    """Yield a function that adds an epoch of a network's learning curve to its event files.
 
-    AdviserInput of an epoch that a killed training had shown already, TensorBoard drops that one and what followed.
+    If a killed training had already written an epoch, TensorBoard drops the old one and what followed it.
 
     Args:
         folder: of the event files, one for each time that training was begun; none is written if not given.

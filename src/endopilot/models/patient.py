@@ -2,9 +2,9 @@
 
 A wire that is pushed lies on the outer side of every bend, one that is pulled on the inner side; its tip is then as far
 behind or ahead of the proximal end as it can be. Between the two the tip stays where it is until the drive has taken up
-the play. A few nominal wires, each turned another way, are pushed to the end of the vessel and pulled back; what their
-tips did is kept by inserted length. It is made once for a patient and a device, by the rod core, before the first
-navigation.
+the play. A few nominal wires, each at another rotation, are pushed to the end of the vessel and pulled back; the motion
+of their tips is tabulated over the inserted length. The rod core does this once for a patient and a device, before the
+first navigation.
 """
 
 from __future__ import annotations

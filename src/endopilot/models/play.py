@@ -1,9 +1,9 @@
-"""What a network is told of the vessel and the wire at every sample: geometry, envelopes, and the play between them.
+"""Inputs of a network at every sample: geometry of the vessel, envelopes of the wire, and the play between them.
 
 The play operator is the simplest hysteresis there is: an output that stays where it is until one of two curves takes it
 along. Forward, the tip stays between the envelopes of a pushed and of a pulled wire as the inserted length changes;
 inverse, the inserted length stays between theirs as the tip is to move. Both are one operator with the roles exchanged,
-and so both networks are told the same things, `FEATURES` of them.
+so both networks have the same inputs, `N_FEATURES` of them.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from endopilot.models.patient import STEP_MM, Patient
 from endopilot.simulation.device import Device
 
 Direction = Literal["forward", "inverse"]
-"""Forward: the drive is known and the tip follows. Inverse: the tip is known and the drive is asked for."""
+"""Forward: the drive is known and the tip follows. Inverse: the tip is known and the drive's motion is predicted."""
 WINDOW_MM = (-40.0, -25.0, -15.0, -10.0, -6.0, -3.0, 0.0, 3.0, 6.0, 10.0, 15.0)
 """Where along the centerline, from the tip on, the vessel is looked at."""
 PARTIAL_PLAYS = (0.25, 0.5, 0.75)
@@ -32,7 +32,7 @@ _SHARPNESS = 20.0
 
 @dataclass(frozen=True, eq=False)
 class PlayState:
-    """Where each wire is believed to be.
+    """Where the play operator puts each wire.
 
     Attributes:
         tip: Δtip, mm.
@@ -71,9 +71,9 @@ class Vessels:
     @staticmethod
     def of(patients: Sequence[Patient], device: Device) -> Vessels:
         """Return the tables of patients that were prepared for a device."""
-        ways = ("push", "pull")
-        push, pull = ([getattr(p, f"{way}_tip") for p in patients] for way in ways)
-        clearance = (_padded([_clearance(p, way, device.tip_radius_mm) for p in patients]) for way in ways)
+        motions = ("push", "pull")
+        push, pull = ([getattr(p, f"{motion}_tip") for p in patients] for motion in motions)
+        clearance = (_padded([_clearance(p, motion, device.tip_radius_mm) for p in patients]) for motion in motions)
         return Vessels(
             known={
                 "forward": (_padded(push), _padded(pull)),
@@ -121,7 +121,7 @@ class Vessels:
             turned: by how much it has changed, rad.
 
         Returns:
-            The state after it, what the network is told, and γtip by the nominal wires' clearance, mm.
+            The state after it, the network's features, and γtip by the nominal wires' clearance, mm.
         """
         forward = direction == "forward"
         before, output = (state.inserted, state.tip) if forward else (state.tip, state.inserted)
@@ -167,7 +167,7 @@ class Vessels:
             nearest[1] - high,
             *nearest_clearance,
             self.deepest[patient].max(axis=1) - inserted,
-            *self._seen_geometry(patient, leaf, tip, rotation).T,
+            *self._nearby_geometry(patient, leaf, tip, rotation).T,
         ]
         return after, np.stack(columns, axis=-1), off_axis
 
@@ -182,7 +182,7 @@ class Vessels:
         return weight / weight.sum(axis=1, keepdims=True)
 
     def _leaf(self, patient, branch, weight) -> Int[np.ndarray, "n"]:
-        """Return the way to a distal end that each wire is on."""
+        """Return the path to a distal end that each wire is on."""
         likeliest = weight.argmax(axis=1)
         led = self.on_route[patient, branch, likeliest]
         return np.where(led, self.leaf[patient, likeliest], self.leaf_of_branch[patient, branch])
@@ -198,7 +198,7 @@ class Vessels:
         rows = patient[:, None], leaf[:, None]
         return (1 - share) * self.geometry[*rows, index] + share * self.geometry[*rows, index + 1]
 
-    def _seen_geometry(self, patient, leaf, tip, rotation) -> Float[np.ndarray, "n columns"]:
+    def _nearby_geometry(self, patient, leaf, tip, rotation) -> Float[np.ndarray, "n columns"]:
         found = self._geometry(patient, leaf, tip[:, None] + np.array(WINDOW_MM))
         cosine, sine = np.cos(rotation)[:, None], np.sin(rotation)[:, None]
         along = found[..., 0] * cosine + found[..., 1] * sine
@@ -240,7 +240,7 @@ def _mixed(weight, values) -> Float[np.ndarray, "n *places"]:
 
 
 def _spread(weight, values) -> Float[np.ndarray, "n"]:
-    """Return how far nominal wires differ that could be in the same place, turned any way, mm."""
+    """Return how far nominal wires differ that could be in the same place, turned by any angle, mm."""
     share = np.sqrt(weight)  # a wider kernel
     share = share / share.sum(axis=1, keepdims=True)
     mean = (share * values).sum(axis=1, keepdims=True)
@@ -259,9 +259,9 @@ def _inverted(tip: Float[np.ndarray, "wires lengths"]) -> Float[np.ndarray, "wir
     )
 
 
-def _clearance(patient: Patient, way: str, wire_radius_mm: float) -> Float[np.ndarray, "wires lengths"]:
+def _clearance(patient: Patient, motion: str, wire_radius_mm: float) -> Float[np.ndarray, "wires lengths"]:
     """Return the distance between wire and wall at the tips of nominal wires, mm, pushed or pulled."""
-    tip, offset = getattr(patient, f"{way}_tip"), getattr(patient, f"{way}_offset")
+    tip, offset = getattr(patient, f"{motion}_tip"), getattr(patient, f"{motion}_offset")
     radius = patient.geometry[patient.leaf, :, 3]
     places = STEP_MM * np.arange(radius.shape[1])
     return np.stack([np.interp(row, places, r) for row, r in zip(tip, radius, strict=True)]) - wire_radius_mm - offset

@@ -1,7 +1,7 @@
 """The processes that train together, as `torchrun` starts them, and the processor that each of them computes on.
 
 Data parallel: every process takes its share of each batch, gradients are averaged (`DistributedDataParallel`), and the
-first process alone writes. Without `torchrun` a team has one member, and nothing is different from plain training.
+first process alone writes. Without `torchrun` the group has one process, and nothing differs from plain training.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _PATIENCE = timedelta(hours=12)
 
 @dataclass(frozen=True)
 class ProcessGroup:
-    """One member's view of the processes that train together.
+    """The processes that train together, from the point of view of one of them.
 
     Attributes:
         rank: index of this process; 0 writes.
@@ -63,9 +63,9 @@ class ProcessGroup:
         """Return the number that the first process has."""
         if self.size == 1:
             return number
-        told = torch.tensor(number, device=self.device)
-        distributed.broadcast(told, 0)
-        return int(told)
+        shared = torch.tensor(number, device=self.device)
+        distributed.broadcast(shared, 0)
+        return int(shared)
 
     @contextmanager
     def first(self) -> Iterator[None]:
@@ -85,7 +85,7 @@ def joined(processor: Processor) -> Iterator[ProcessGroup]:
         processor: what to compute on; "auto" takes a GPU where there is one.
 
     Raises:
-        InputError: a GPU is asked for and there is none, or more processes than GPUs were started.
+        InputError: a GPU is required and there is none, or more processes than GPUs were started.
     """
     gpus = torch.cuda.device_count()
     if processor == "cuda" and not gpus:
@@ -102,9 +102,9 @@ def joined(processor: Processor) -> Iterator[ProcessGroup]:
         torch.cuda.set_device(device)
     distributed.init_process_group("nccl" if on_gpu else "gloo", timeout=_PATIENCE)
     try:
-        team = ProcessGroup(distributed.get_rank(), distributed.get_world_size(), device)
-        if not team.writes:
+        group = ProcessGroup(distributed.get_rank(), distributed.get_world_size(), device)
+        if not group.writes:
             silence()
-        yield team
+        yield group
     finally:
         distributed.destroy_process_group()

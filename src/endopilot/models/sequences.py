@@ -75,7 +75,7 @@ def unfold(
     if not forward:
         state = replace(state, partial=np.repeat(state.inserted[:, None], len(PARTIAL_PLAYS), axis=1))
     inputs = np.zeros((*tip.shape, N_INPUTS), dtype=np.float32)
-    guess, believed = np.zeros((*tip.shape, 2)), np.zeros(tip.shape, dtype=np.int64)
+    guess, branches = np.zeros((*tip.shape, 2)), np.zeros(tip.shape, dtype=np.int64)
     angle, turn = initial_angle, np.zeros(len(tip))
     for t in range(tip.shape[1]):
         if forward:
@@ -85,7 +85,7 @@ def unfold(
         known = inserted[:, t] if forward else tip[:, t]
         state, features, off_axis = vessels.step(direction, patient, state, known, angle, turn)
         inputs[:, t, : play.N_FEATURES] = features
-        believed[:, t] = state.branch
+        branches[:, t] = state.branch
         guess[:, t, 0] = state.tip if forward else state.inserted
         if forward:
             guess[:, t, 1] = off_axis
@@ -105,7 +105,7 @@ def unfold(
             turn, angle = np.where(now, rotation[:, t] - angle, 0.0), np.where(now, rotation[:, t], angle)
     turned = np.diff(rotation, axis=1, prepend=initial_angle[:, None])
     truth = np.stack([tip, offset] if forward else [inserted, turned], axis=-1)
-    return Unfolded(inputs, guess, believed, truth)
+    return Unfolded(inputs, guess, branches, truth)
 
 
 @dataclass(frozen=True, eq=False)

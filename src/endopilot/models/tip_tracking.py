@@ -54,22 +54,22 @@ def track(
     simulator.reset(inserted_length=inserted.clip(min=0.0), rotation=rotation, friction=np.repeat(friction, each))
     limits = DriveLimits.of(wires[0], anatomy)
     for sample in np.moveaxis(given, 1, 0):
-        asked = np.repeat(sample, each, axis=0)
-        simulator.step(limits.clip(asked, simulator.inserted_length, SAMPLE_PERIOD_S), SAMPLE_PERIOD_S)
+        command = np.repeat(sample, each, axis=0)
+        simulator.step(limits.clip(command, simulator.inserted_length, SAMPLE_PERIOD_S), SAMPLE_PERIOD_S)
     tip, control = np.empty(desired.shape), np.empty(desired.shape)
     for k in range(desired.shape[1]):
         now = simulator.project().abscissa
         lead = (np.repeat(desired[:, k, 0], each) - now) / SAMPLE_PERIOD_S
-        asked = np.tile(tries, (episodes, 1))
-        asked[:, 0] += lead
-        asked = limits.clip(asked, simulator.inserted_length, SAMPLE_PERIOD_S)
-        step = simulator.step(asked, SAMPLE_PERIOD_S)
+        command = np.tile(tries, (episodes, 1))
+        command[:, 0] += lead
+        command = limits.clip(command, simulator.inserted_length, SAMPLE_PERIOD_S)
+        step = simulator.step(command, SAMPLE_PERIOD_S)
         reached = simulator.project()
-        miss = np.abs(reached.abscissa - np.repeat(desired[:, k, 0], each))
-        miss += np.abs(reached.offset - np.repeat(desired[:, k, 1], each))
-        miss[~step.valid] = np.inf
-        best = miss.reshape(episodes, each).argmin(axis=1) + each * np.arange(episodes)
+        error = np.abs(reached.abscissa - np.repeat(desired[:, k, 0], each))
+        error += np.abs(reached.offset - np.repeat(desired[:, k, 1], each))
+        error[~step.valid] = np.inf
+        best = error.reshape(episodes, each).argmin(axis=1) + each * np.arange(episodes)
         tip[:, k] = np.stack([reached.abscissa[best], reached.offset[best]], axis=-1)
-        control[:, k] = np.stack([asked[best, 0] - step.slip[best] / SAMPLE_PERIOD_S, asked[best, 1]], axis=-1)
+        control[:, k] = np.stack([command[best, 0] - step.slip[best] / SAMPLE_PERIOD_S, command[best, 1]], axis=-1)
         simulator.copy_worlds(np.repeat(best, each))
     return tip, control

@@ -34,7 +34,7 @@ from endopilot.models.checkpoint import (
 )
 from endopilot.models.config import TrainConfig
 from endopilot.models.episodes import Episodes
-from endopilot.models.learning_curves import board
+from endopilot.models.learning_curves import tensorboard_writer
 from endopilot.models.process_group import ProcessGroup, joined
 from endopilot.models.sequences import Sequences, prepare_vessels
 from endopilot.models.transformer import Network
@@ -73,14 +73,14 @@ def train(dataset_folder: str | Path, run_folder: str | Path, config: TrainConfi
             finite numbers (the last good checkpoint stays).
     """
     config = config or TrainConfig()
-    with joined(config.processor) as team:
-        _train(Path(dataset_folder), Path(run_folder), config, team)
+    with joined(config.processor) as group:
+        _train(Path(dataset_folder), Path(run_folder), config, group)
 
 
-def _train(dataset_folder: Path, run_folder: Path, config: TrainConfig, team: ProcessGroup) -> None:
+def _train(dataset_folder: Path, run_folder: Path, config: TrainConfig, group: ProcessGroup) -> None:
     dataset = load_dataset(dataset_folder)
-    with team.first():  # which writes the settings and prepares the patients, where need be
-        if team.writes:
+    with group.first():  # which writes the settings and prepares the patients, where need be
+        if group.writes:
             identity = {"config": config, "dataset": dataset.manifest["key"], "version": __version__}
             claim(run_folder, "endopilot train", **identity)
         training = examples_of(dataset, "train", config)
@@ -88,11 +88,11 @@ def _train(dataset_folder: Path, run_folder: Path, config: TrainConfig, team: Pr
     start = time.perf_counter()
     results: dict[str, Any] = {}
     for name in config.networks:
-        job = Job(name, config, training, validation, run_folder, team)
+        job = Job(name, config, training, validation, run_folder, group)
         results[name] = job.run()
-        if team.writes:
+        if group.writes:
             write_json(run_folder / "training.json", results)
-    if not team.writes:
+    if not group.writes:
         return
     write_json(run_folder / "training.json", results)  # of a model that trains nothing too
     record = manifest(
@@ -107,8 +107,8 @@ def _train(dataset_folder: Path, run_folder: Path, config: TrainConfig, team: Pr
         simulator=dataset.manifest["config"]["simulator"],
         networks={name: {key: result[key] for key in result if key != "curve"} for name, result in results.items()},
         threads=torch.get_num_threads(),
-        processes=team.size,
-        processor=team.device.type,
+        processes=group.size,
+        processor=group.device.type,
         wall_seconds=time.perf_counter() - start,
     )
     write_json(run_folder / "manifest.json", record)
@@ -139,14 +139,14 @@ def examples_of(dataset: Dataset, split: str, config: TrainConfig) -> Examples:
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """The training of one network, by one process of a team."""
+    """The training of one network, by one process of a group."""
 
     name: str
     config: TrainConfig
     training: Examples
     validation: Examples | None
     run_folder: Path
-    team: ProcessGroup
+    group: ProcessGroup
 
     def run(self) -> dict[str, Any]:
         """Train, or go on training, until the last epoch; return the learning curve and how the steps were planned."""
@@ -155,17 +155,20 @@ class Job:
             torch.manual_seed(_seed(config.seed, self.name, "weights"))
             network = make_network(self.name, config.network_size)
             self._fit_scales(network)
-            network.to(self.team.device)
+            network.to(self.group.device)
             optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate, fused=True)
             state = self._resume(network, optimizer) or {"seconds": 0.0, "curve": []}
-            shown = self.run_folder / "tensorboard" / self.name if self.team.writes else None
-            with progress(f"Training {self.name.upper()}", total=config.epochs) as advance, board(shown) as show:
+            folder = self.run_folder / "tensorboard" / self.name if self.group.writes else None
+            with (
+                progress(f"Training {self.name.upper()}", total=config.epochs) as advance,
+                tensorboard_writer(folder) as write,
+            ):
                 advance(len(state["curve"]))
-                together = self.team.together(network)
+                together = self.group.together(network)
                 while len(state["curve"]) < config.epochs:
                     self._epoch(network, together, optimizer, state, advance)
-                    show(state["curve"][-1])
-                    if self.team.writes:
+                    write(state["curve"][-1])
+                    if self.group.writes:
                         self._save(network, optimizer, state)
         return {"parameters": sum(p.numel() for p in network.parameters())} | state
 
@@ -181,14 +184,14 @@ class Job:
 
         Args:
             network: what is trained.
-            together: the same, as all processes of the team run it.
+            together: the same, as all processes of the group run it.
             optimizer: of its parameters.
             state: `seconds` and `curve` so far.
             advance: called after every step.
         """
         epoch, epochs, start = len(state["curve"]), self.config.epochs, time.perf_counter()
         batches = self.batches(epoch, self._steps(network, state))
-        torch.manual_seed(_seed(self.config.seed, self.name, epoch, *([self.team.rank] if self.team.rank else [])))
+        torch.manual_seed(_seed(self.config.seed, self.name, epoch, *([self.group.rank] if self.group.rank else [])))
         network.train()
         total, rate, steps, first = 0.0, 0.0, len(batches), time.perf_counter()
         for step, targets in enumerate(batches):
@@ -229,15 +232,16 @@ class Job:
         rate: float,
     ) -> float:
         """Take one step along the gradient and return the loss before it; a loss that is not finite takes no step."""
-        team, ours = self.team, self.team.share(targets)
+        group, ours = self.group, self.group.share(targets)
         *window, truth = self._window(self.training, ours)
-        with torch.autocast(team.device.type, torch.bfloat16, enabled=self.config.precision == "bfloat16"):
+        with torch.autocast(group.device.type, torch.bfloat16, enabled=self.config.precision == "bfloat16"):
             answer = together(*window)
         loss = network.loss(answer.float(), truth)
-        value = team.mean(loss, len(ours), len(targets))
+        value = group.mean(loss, len(ours), len(targets))
         if math.isfinite(value):
             optimizer.zero_grad()
-            (loss * (len(ours) * team.size / len(targets))).backward()  # the team's mean is then that over the batch
+            share = len(ours) * group.size / len(targets)  # the mean over the group is then that over the batch
+            (loss * share).backward()
             torch.nn.utils.clip_grad_norm_(network.parameters(), _GRADIENT_NORM)
             optimizer.param_groups[0]["lr"] = rate
             optimizer.step()
@@ -262,14 +266,14 @@ class Job:
         generator = torch.Generator().manual_seed(_seed(self.config.seed, self.name, "order", epoch))
         order = torch.randperm(len(targets), generator=generator)
         batches = targets[order].split(self.config.batch_size)[:steps]
-        whole = [batch for batch in batches if len(batch) >= self.team.size]
+        whole = [batch for batch in batches if len(batch) >= self.group.size]
         if not whole:
-            raise InputError(f"batch_size: {len(batches[0])} samples for {self.team.size} processes; give more")
+            raise InputError(f"batch_size: {len(batches[0])} samples for {self.group.size} processes; give more")
         return whole
 
     def _window(self, examples: Examples, targets: torch.Tensor) -> list[torch.Tensor]:
         """Return the network's inputs of some targets, and the truth, where this process computes."""
-        return [part.to(self.team.device) for part in examples.window(self.name, targets)]
+        return [part.to(self.group.device) for part in examples.window(self.name, targets)]
 
     def _fit_scales(self, network: AnyNetwork) -> None:
         targets = self.training.targets()
@@ -290,7 +294,7 @@ class Job:
         else:
             a_step, validation = self._time(network)
         seconds_left = (config.max_seconds - state["seconds"]) / (config.epochs - len(curve)) - validation
-        return self.team.agreed(max(min(steps, int(seconds_left / a_step)), 1))
+        return self.group.agreed(max(min(steps, int(seconds_left / a_step)), 1))
 
     def _time(self, network: AnyNetwork) -> tuple[float, float]:
         """Return how long a training step and a validation take, s, tried out on a copy of the network."""
@@ -319,7 +323,7 @@ class Job:
         network.load_state_dict(weights)
         restore_optimizer(optimizer, tensors)
         # A kill between the two files of an epoch leaves the second one behind by an epoch.
-        if self.team.writes:
+        if self.group.writes:
             write_network(
                 self.run_folder / f"{self.name}.safetensors", self.name, network, self.config.network_size, {}
             )

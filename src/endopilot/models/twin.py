@@ -33,7 +33,7 @@ NARROWEST = 0.15
 GOOD = 3.0
 """A good member errs by this many of the scales of `TwinConfig` at most where the tip is observed."""
 _PERSISTENT = 3
-"""Observations in a row that the predicted tip must have differed from before it is doubted."""
+"""Observations in a row that the predicted tip must have differed from before the spread is widened."""
 Members = Float[np.ndarray, "members episodes 3"]
 """Friction factor, tip stiffness factor and depth of the ostium (mm) of each member, for each episode."""
 _NOMINAL = np.array([1.0, 1.0, 0.0])

@@ -247,7 +247,7 @@ def tree_figure(anatomy: Anatomy) -> Figure:
 
 
 def draw_tree(ax: Axes, anatomy: Anatomy) -> None:
-    """Draw the centerline tree seen from the front, coloured by section, as thick as the lumen."""
+    """Draw the centerline tree from the front, coloured by section, as thick as the lumen."""
     tree = anatomy.tree
     shown: set[int] = set()
     for branch in tree.branches:

@@ -1,4 +1,4 @@
-"""The ladder's page: scores, the tips' ways in pictures, and a replay of one navigation of each task."""
+"""The ladder's page: scores, pictures of the tips' paths, and a replay of one navigation of each task."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def _section(output: Path, task: Task, patients: int) -> dict[str, Any]:
     results = [read_json(output / task.name / f"{place:02d}.json") for place in range(min(SHOWN, patients))]
     navigations = [task.ladder_navigation(place) for place in range(len(results))]
     shown = f"{len(results)} patient{'s' if len(results) > 1 else ''}"
-    picture = image(png(_courses(navigations, results)), f"{task.title}: the tip's way in {shown}")
+    picture = image(png(_courses(navigations, results)), f"{task.title}: the tip's path in {shown}")
     replay = output / f"replay-{task.name}.html"
     if not replay.exists():
         figure = _replay_scene(task, navigations[0], results[0])
@@ -95,15 +95,15 @@ def _replay_scene(task: Task, navigation: Navigation, result: dict[str, Any]) ->
     """Return a navigation replayed in space, with its target, what X-ray showed, and what came of it."""
     course = result["course"]
     figure = navigation_scene(navigation.anatomy, _replay(navigation, course))
-    seen = np.array(course["tip_position"])[np.array(course["exposed"])]
+    observed = np.array(course["tip_position"])[np.array(course["exposed"])]
     for points, name, marker in (
         (navigation.target.position(navigation.anatomy)[None], "Target", {"symbol": "diamond", "size": 6}),
-        (seen, "Tip under X-ray", {"symbol": "circle-open", "size": 7}),
+        (observed, "Tip under X-ray", {"symbol": "circle-open", "size": 7}),
     ):
         x, y, z = points.T
         figure.add_trace(go.Scatter3d(x=x, y=y, z=z, mode="markers", marker=marker | {"color": INK}, name=name))
-    told = f"{result['seconds']:g} s, {result['peak_force_n']:.2f} N, exposures: {result['exposures']}"
-    title = f"{task.title}: {navigation.anatomy.name}<br><sup>{_outcome(result)}, {told}</sup>"
+    figures = f"{result['seconds']:g} s, {result['peak_force_n']:.2f} N, exposures: {result['exposures']}"
+    title = f"{task.title}: {navigation.anatomy.name}<br><sup>{_outcome(result)}, {figures}</sup>"
     figure.update_layout(height=None, title={"text": title, "x": 0.02, "y": 0.96, "font": {"size": 18}})
     return figure
 
@@ -129,7 +129,7 @@ def _replay(navigation: Navigation, course: dict[str, Any]) -> Rollout:
 
 
 def _courses(navigations: list[Navigation], results: list[dict[str, Any]]) -> Figure:
-    """Draw trees, seen across their largest extent, with route, target and the tip's way."""
+    """Draw trees, viewed across their largest extent, with route, target and the tip's path."""
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(2.4 * SHOWN, 2.9), layout="constrained")
         for ax, navigation, result in zip(
@@ -153,7 +153,7 @@ def _draw(ax: Axes, navigation: Navigation, result: dict[str, Any]) -> None:
     axes = np.linalg.svd(everything - centre, full_matrices=False)[2][:2]
     axes *= np.where(np.abs(axes).max(axis=1) == axes.max(axis=1), 1.0, -1.0)[:, None]
 
-    def seen(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "2 n"]:
+    def projected(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "2 n"]:
         return axes @ (points - centre).T
 
     route = tree.route(navigation.target.branch)
@@ -161,11 +161,15 @@ def _draw(ax: Axes, navigation: Navigation, result: dict[str, Any]) -> None:
         line, chosen = branch.centerline, index in route
         width = max(1.2, 1.1 * float(line.radius.mean()))
         ax.plot(
-            *seen(line.points), color=BLUE if chosen else "#c9ced6", lw=width, alpha=0.35 if chosen else 1, zorder=1
+            *projected(line.points),
+            color=BLUE if chosen else "#c9ced6",
+            lw=width,
+            alpha=0.35 if chosen else 1,
+            zorder=1,
         )
-    way = seen(np.array(result["course"]["tip_position"]))
-    ax.plot(*way, color=OUTCOMES[_outcome(result)], lw=1.3, zorder=2)
-    ax.plot(*way[:, np.array(result["course"]["exposed"])], **XRAY, zorder=3)
-    ax.plot(*seen(navigation.target.position(navigation.anatomy)[None]), color=BLACK, marker="*", ms=9, zorder=4)
+    path = projected(np.array(result["course"]["tip_position"]))
+    ax.plot(*path, color=OUTCOMES[_outcome(result)], lw=1.3, zorder=2)
+    ax.plot(*path[:, np.array(result["course"]["exposed"])], **XRAY, zorder=3)
+    ax.plot(*projected(navigation.target.position(navigation.anatomy)[None]), color=BLACK, marker="*", ms=9, zorder=4)
     ax.set_aspect("equal", adjustable="datalim")
     ax.set_title(f"{navigation.anatomy.name}\n{result['seconds']:g} s, {result['peak_force_n']:.2f} N", fontsize=8)

@@ -53,15 +53,15 @@ def summary(metrics: Mapping[str, Any]) -> str:
     split = metrics["splits"][headline_split(metrics)]
     tip = split["tip"]
     patients = _count(len(split["anatomies"]), "patient")
-    whose = "that the networks know" if split["known_patients"] else "that neither network has seen"
+    whose = "that the run was trained on" if split["known_patients"] else "that the run was not trained on"
     parts = [
         f"On {_count(split['episodes'], 'new navigation')} in {patients} {whose}, after 15 s of given states:",
-        f"knowing the drive's motion, the forward network foretells the tip's way along the vessel with a mean error "
+        f"given the drive's motion, the forward network predicts the tip's position along the vessel with a mean error "
         f"of {_mm(tip['P1'], 'abscissa')} over the next 45 s ({_mm(tip['P1'], 'offset')} across the vessel);",
         f"holding the slack, which needs no learning, errs by {_mm(tip['hold_slack'], 'abscissa')} "
         f"({_mm(tip['hold_slack'], 'offset')}).",
-        f"When the inverse network chooses the controls and they are simulated, the tip misses its desired way by "
-        f"{_mm(tip['P4'], 'abscissa')} on average; driving by the held slack misses it by "
+        f"When the inverse network chooses the controls and they are simulated, the tip errs by "
+        f"{_mm(tip['P4'], 'abscissa')} on average; driving by the held slack, by "
         f"{_mm(tip['follow_slack'], 'abscissa')}.",
     ]
     return " ".join(parts)
@@ -80,13 +80,13 @@ def tiles(metrics: Mapping[str, Any]) -> list[tuple[str, str, str]]:
         ),
         (
             _mm(tip["P4"], "abscissa"),
-            "miss of the desired Δtip, controls simulated (P4)",
+            "error of the desired Δtip, controls simulated (P4)",
             f"baseline {_mm(tip['follow_slack'], 'abscissa')}",
         ),
         (_signed(skill), "skill for Δtip over holding the slack (P1)", "1 is perfect, 0 no better, below 0 worse"),
         (
             f"{100 * tip['P4']['diverged_share']:.0f} %",
-            f"of simulated navigations miss by over {DIVERGED_MM:g} mm once (P4)",
+            f"of simulated navigations err by over {DIVERGED_MM:g} mm at some time (P4)",
             f"baseline {100 * tip['follow_slack']['diverged_share']:.0f} %",
         ),
     ]
@@ -168,7 +168,7 @@ def interval_remark(metrics: Mapping[str, Any], split: str) -> str:
     record = metrics["splits"][split]
     intervals = record["tip"]["P1"]["abscissa"]["all"]["intervals"]
     if intervals is None:
-        return f"With {_count(len(record['anatomies']), 'patient')} nothing can be said of the spread between patients."
+        return f"With {_count(len(record['anatomies']), 'patient')} the spread between patients is unknown."
     low, high = intervals["mae"]
     return (
         f"Drawing the {len(record['anatomies'])} patients again (bootstrap), the mean error of Δtip in P1 lies between "
@@ -215,15 +215,15 @@ def drive_remark(metrics: Mapping[str, Any], split: str) -> str:
 
 
 def anatomy_facts(anatomy: Anatomy) -> list[tuple[str, str]]:
-    """Return what a reader wants to know of a vessel at a glance."""
+    """Return the key facts of a vessel."""
     tree = anatomy.tree
     longest = tree.longest_path()
     present = {int(section) for branch in tree.branches for section in np.unique(branch.section)}
     chord = float(np.linalg.norm(longest.points[-1] - longest.points[0]))
     return [
-        ("longest way", f"{longest.abscissa[-1]:.0f} mm"),
+        ("longest path", f"{longest.abscissa[-1]:.0f} mm"),
         ("branches", f"{len(tree.branches)}"),
-        ("lumen radius", f"{np.median(longest.radius):.1f} mm (median on that way)"),
+        ("lumen radius", f"{np.median(longest.radius):.1f} mm (median on that path)"),
         ("tortuosity", f"{longest.abscissa[-1] / max(chord, 1e-6):.2f}"),
         ("sections", ", ".join(tree.section_names[section] for section in sorted(present))),
     ]

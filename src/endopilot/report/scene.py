@@ -17,7 +17,7 @@ SHOWN_BEHIND_MM = 20.0
 """Length of wire that is shown behind the ostium, in the guiding catheter, mm."""
 
 TRAIL_S = 20.0
-"""How long the way of the tip stays in the picture, s."""
+"""How long the path of the tip stays in the picture, s."""
 
 FRAME_MS = 90
 """Time between two samples when the navigation is played, ms."""
@@ -160,7 +160,7 @@ def _moving(rollout: Rollout, world: int, sample: int) -> list[go.Scatter3d]:
     begin = max(0, sample - round(TRAIL_S / rollout.sample_period_s))
     trail = np.round(rollout.tip_position[world, begin : sample + 1], 2).astype(np.float32)
     tip = trail[-1:]
-    told = (
+    label = (
         f"Δ = {rollout.inserted_length[world, sample]:.1f} mm<br>"
         f"φ = {np.rad2deg(rollout.rotation[world, sample]):.0f}°<br>"
         f"Δtip = {rollout.tip.abscissa[world, sample]:.1f} mm<br>"
@@ -168,7 +168,7 @@ def _moving(rollout: Rollout, world: int, sample: int) -> list[go.Scatter3d]:
         f"lumen radius = {rollout.tip.radius[world, sample]:.2f} mm<br>"
         f"largest wall force = {rollout.contact_force_max[world, sample]:.3f} N"
     )
-    hover = f"{told}<extra>{(sample + 1) * rollout.sample_period_s:g} s</extra>"
+    hover = f"{label}<extra>{(sample + 1) * rollout.sample_period_s:g} s</extra>"
 
     def trace(points: np.ndarray, **how: object) -> go.Scatter3d:
         return go.Scatter3d(x=points[:, 0], y=points[:, 1], z=points[:, 2], **how)
@@ -193,7 +193,7 @@ def _layout() -> dict:
     titles = ("x (left), mm", "y (back), mm", "z (head), mm")
     axes = {f"{name}axis": axis | {"title": {"text": title}} for name, title in zip("xyz", titles, strict=True)}
     return {
-        # Seen from the front, as a surgeon stands before the patient: the patient's left is on the right.
+        # View from the front, as a surgeon stands before the patient: the patient's left is on the right.
         "scene": {
             "aspectmode": "data",
             **axes,

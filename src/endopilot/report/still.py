@@ -85,7 +85,7 @@ def _render(scene: Path, path: Path) -> None:
         plotter.add_mesh(tip, color="#ffd34d", ambient=0.5, smooth_shading=True)
     plotter.enable_depth_peeling(8)
     plotter.enable_anti_aliasing("ssaa")
-    # From the front, a little from the left and above, as someone who stands before the patient sees it.
+    # From the front, a little from the left and above, as from someone who stands before the patient.
     centre = np.mean([arrays["vertices"].min(axis=0), arrays["vertices"].max(axis=0)], axis=0)
     plotter.camera_position = [centre + np.array([0.35, -1.0, 0.22]) * size, centre, (0.0, 0.0, 1.0)]
     plotter.reset_camera()

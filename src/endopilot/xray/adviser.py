@@ -23,7 +23,7 @@ class AdviserConfig:
     wall_ratio: Positive = 0.7
     """τ: an event begins where γtip/(lumen radius − wire radius) reaches it; 1 is the wall."""
     abscissa_mm: Positive = SUCCESS_MM
-    """δ: an event begins where Δtip is off by this much, mm; as near as a target counts as reached if not given."""
+    """δ: an event begins where Δtip errs by this much, mm; as near as a target counts as reached if not given."""
 
 
 def near_exposures(exposed: Bool[np.ndarray, "*n samples"]) -> Bool[np.ndarray, "*n samples"]:
@@ -41,7 +41,7 @@ def count_events(state: Bool[np.ndarray, "*n samples"], near: Bool[np.ndarray, "
     sample is left out: the exposure that would show it may come after the end.
 
     Args:
-        state: whether the tip is at the wall, or Δtip is off by δ.
+        state: whether the tip is at the wall, or Δtip errs by δ.
         near: which samples have an exposure near, see `near_exposures`.
     """
     begins = state[..., 1:-1] & ~state[..., :-2]
@@ -53,7 +53,7 @@ class XrayAdviser:
 
     Between exposures it watches two bands. Where that of Δtip is as wide as δ, an exposure is due. That of γtip, over
     the clearance of the lumen there, lies below τ, above it, or across it. Below, nothing threatens; above, the tip is
-    known to be at the wall; across, either may be. An exposure is due where the band reaches τ, where the foretold tip
+    known to be at the wall; across, either may be. An exposure is due where the band reaches τ, where the predicted tip
     crosses it, and where the band has left it below. It shows what is within 0.5 s of it, so none follows another
     sooner than after 1.5 s.
 
@@ -77,7 +77,7 @@ class XrayAdviser:
 
         Args:
             proximal: Δ, mm, and φ, rad, of each navigation.
-            tip: where the model holds the tip to be, mm.
+            tip: where the model has the tip, mm.
             radius_mm: of the lumen there, mm.
         """
         self._proximal, self._travel = proximal, np.zeros(len(proximal))
@@ -91,9 +91,9 @@ class XrayAdviser:
 
         Args:
             proximal: Δ, mm, and φ, rad.
-            tip: what the model foretells for now, mm.
-            spread: what it says of itself, mm.
-            radius_mm: of the lumen at the foretold Δtip, mm.
+            tip: predicted for now, mm.
+            spread: the model's estimate of its own error, mm.
+            radius_mm: of the lumen at the predicted Δtip, mm.
         """
         self._since, self._travel = self._since + 1, self._travel + np.abs(proximal[:, 0] - self._proximal[:, 0])
         self._proximal = proximal

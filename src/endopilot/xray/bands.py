@@ -1,7 +1,7 @@
 """Bands around what a model predicts, calibrated to hold over a whole interval without X-ray.
 
-A band is `scale` times a spread. The spread grows from the last exposure with time, travel and the model's own account
-of its uncertainty. The scale is conformal: on calibration patients, each interval scores its worst error in units of
+A band is `scale` times a spread. The spread grows from the last exposure with time, travel and the model's own
+estimate of its error. The scale is conformal: on calibration patients, each interval scores its worst error in units of
 the spread, over all samples and over Δtip and γtip together. docs/xray.md measures the coverage.
 """
 
@@ -57,7 +57,7 @@ class Calibration:
         Args:
             seconds: since the last exposure, s.
             travel_mm: translation of the wire since then, there and back, mm.
-            spread: what the model says of itself, mm; 0 where it says nothing.
+            spread: the model's estimate of its own error, mm; 0 where it makes none.
         """
         return self.scale * spread_of((self.abscissa_terms, self.offset_terms), seconds, travel_mm, spread)
 
@@ -100,7 +100,7 @@ def fit_spread(
         error: of Δtip and γtip, mm, on patients that serve neither for calibration nor for the test.
         seconds: since the last exposure, s.
         travel_mm: since then, mm.
-        spread: what the model says of itself, mm.
+        spread: the model's estimate of its own error, mm.
     """
     found = [
         nnls(_features(seconds, travel_mm, spread[..., i]).reshape(-1, len(TERMS)), np.abs(error[..., i]).ravel())[0]

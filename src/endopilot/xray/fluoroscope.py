@@ -36,7 +36,7 @@ class TipMeasurement:
         position: of the tip, LPS mm.
         abscissa: Δtip of that position on the vessel's tree, mm.
         offset: γtip, mm.
-        branch: index of the branch that it is seen in.
+        branch: index of the branch that it is observed in.
     """
 
     position: Float[np.ndarray, "3"]
@@ -81,13 +81,13 @@ class _View:
 
     def project(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 2"]:
         """Return the pixels of points, LPS mm."""
-        seen = (points - self.source) @ self.axes.T
-        return self.scale * seen[..., :2] / seen[..., 2:]
+        in_view = (points - self.source) @ self.axes.T
+        return self.scale * in_view[..., :2] / in_view[..., 2:]
 
     def slope(self, point: Float[np.ndarray, "3"]) -> Float[np.ndarray, "2 3"]:
         """Return the derivative of the pixel by the point, pixels/mm."""
-        seen = self.axes @ (point - self.source)
-        return self.scale / seen[2] * (self.axes[:2] - np.outer(seen[:2] / seen[2], self.axes[2]))
+        in_view = self.axes @ (point - self.source)
+        return self.scale / in_view[2] * (self.axes[:2] - np.outer(in_view[:2] / in_view[2], self.axes[2]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +97,7 @@ class _Detection:
     Attributes:
         view: of the image.
         pixel: where it was found.
-        whiten: turns a miss, pixels, into one along and one across the wire, in standard deviations.
+        whiten: turns an error, pixels, into its parts along and across the wire, in standard deviations.
     """
 
     view: _View
@@ -138,7 +138,7 @@ class Fluoroscope:
         shown = self._config.view_angles_deg[: 2 if self._config.biplane else 1]
         self._views = [_view(angles, isocenter, self._config) for angles in shown]
         radius = [np.full(len(behind), anatomy.catheter_radius_mm), *(line.radius for line in lines)]
-        # A wire that lies on the wall, anywhere around, is off by clearance/√2 along either axis, root mean square.
+        # A wire that lies on the wall, anywhere around, lies clearance/√2 from it along either axis, root mean square.
         self._lateral_sd = [np.maximum(r - wire_radius_mm, 0.1) / np.sqrt(2) for r in radius]
         self._points = [catheter, *points]
         self._tangents = [np.tile(insertion.direction, (len(behind), 1)), *(tangents(p) for p in points)]
@@ -171,8 +171,8 @@ class Fluoroscope:
             inserted_length: Δ by the robot's encoder, mm.
             random: where the errors are drawn from.
         """
-        seen = [self._detect(view, tip_position, tip_direction, random) for view in self._views]
-        return self._likeliest(seen, inserted_length)
+        detections = [self._detect(view, tip_position, tip_direction, random) for view in self._views]
+        return self._likeliest(detections, inserted_length)
 
     def expose_episodes(
         self, episodes: Dataset, inserted_length: Float[np.ndarray, "episodes samples"], seed: int
@@ -203,51 +203,53 @@ class Fluoroscope:
         direction: Float[np.ndarray, "3"],
         random: np.random.Generator,
     ) -> _Detection:
-        """Return where the tip is found in the image: farther off along the wire than across it."""
+        """Return where the tip is found in the image: the error is larger along the wire than across it."""
         slope = view.slope(position) @ direction
         along = slope / max(float(np.linalg.norm(slope)), 1e-9)
         axes = np.array([along, [-along[1], along[0]]])
         sd = np.array([self._config.along_sd, self._config.pixel_sd])
-        off = random.standard_normal(2) * sd
-        return _Detection(view, view.project(position) + off @ axes, axes / sd[:, None])
+        error = random.standard_normal(2) * sd
+        return _Detection(view, view.project(position) + error @ axes, axes / sd[:, None])
 
-    def _likeliest(self, seen: list[_Detection], inserted_length: float) -> Float[np.ndarray, "3"]:
+    def _likeliest(self, detections: list[_Detection], inserted_length: float) -> Float[np.ndarray, "3"]:
         """Return the most likely place of the tip, LPS mm: the best of the likeliest places in every branch."""
         length_sd = 2.0 + _NEAR_SHARE * max(inserted_length, 0.0)
         prior = [((abscissa - inserted_length) / length_sd) ** 2 for abscissa in self._abscissa]
         magnified = self._views[0].scale / self._config.source_to_isocenter_mm
         first = []
         for points, sd, unlikely in zip(self._points, self._lateral_sd, prior, strict=True):
-            misses = sum(((one.view.project(points) - one.pixel) ** 2).sum(axis=1) for one in seen)
-            first.append(misses / (self._config.along_sd**2 + (magnified * sd) ** 2) + unlikely)
+            squared = sum(((one.view.project(points) - one.pixel) ** 2).sum(axis=1) for one in detections)
+            first.append(squared / (self._config.along_sd**2 + (magnified * sd) ** 2) + unlikely)
         least = min(float(cost.min()) for cost in first)
         best, found = np.inf, self._points[0][-1]
         for branch, cost in enumerate(first):
             if cost.min() > least + _HOPELESS:
                 continue
-            place, miss, nearest = self._refine(seen, branch, int(np.argmin(cost)))
-            miss += float(prior[branch][nearest])
-            if miss < best:
-                best, found = miss, place
+            place, cost_there, nearest = self._refine(detections, branch, int(np.argmin(cost)))
+            cost_there += float(prior[branch][nearest])
+            if cost_there < best:
+                best, found = cost_there, place
         return found
 
-    def _refine(self, seen: list[_Detection], branch: int, nearest: int) -> tuple[Float[np.ndarray, "3"], float, int]:
+    def _refine(
+        self, detections: list[_Detection], branch: int, nearest: int
+    ) -> tuple[Float[np.ndarray, "3"], float, int]:
         """Return the likeliest place near one branch, LPS mm, twice its negative log-likelihood, and its vertex.
 
-        Gauss-Newton on the pixels' misses, in units of the detection's error, and on the distance from the line in
-        units of what is usual in that lumen.
+        Gauss-Newton on the errors of the pixels, in units of the detection's error, and on the distance from the line,
+        in units of what is usual in that lumen.
         """
         points, tangent, sd = self._points[branch], self._tangents[branch], self._lateral_sd[branch]
         place, cost = points[nearest], np.inf
         for _ in range(_ITERATIONS):
             across = (np.eye(3) - np.outer(tangent[nearest], tangent[nearest])) / sd[nearest]
-            rows, misses = [across, 1e-3 * np.eye(3)], [across @ (place - points[nearest]), np.zeros(3)]
-            for one in seen:
+            rows, residuals = [across, 1e-3 * np.eye(3)], [across @ (place - points[nearest]), np.zeros(3)]
+            for one in detections:
                 rows.append(one.whiten @ one.view.slope(place))
-                misses.append(one.whiten @ (one.view.project(place) - one.pixel))
-            jacobian, miss = np.concatenate(rows), np.concatenate(misses)
-            cost = float(miss @ miss)
-            step = np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ miss)
+                residuals.append(one.whiten @ (one.view.project(place) - one.pixel))
+            jacobian, residual = np.concatenate(rows), np.concatenate(residuals)
+            cost = float(residual @ residual)
+            step = np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ residual)
             place = place - step
             nearest = int(np.argmin(((points - place) ** 2).sum(axis=1)))
             if step @ step < _NEAR_ENOUGH_MM**2:

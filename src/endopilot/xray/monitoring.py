@@ -276,7 +276,7 @@ def oracle_policy(monitored: Monitored, config: AdviserConfig) -> ExposurePolicy
 
 
 def periodic_equal(curve: Sequence[dict[str, float]], missed_share: float) -> float:
-    """Return the exposures a minute at which periodic imaging misses no more than a share, between its points."""
+    """Return the exposures a minute at which the missed share of periodic imaging is no larger, between its points."""
     points = sorted((point["exposures_per_minute"], point["missed_share"]) for point in curve)
     rate, missed = (np.array(column) for column in zip(*points, strict=True))
     missed = np.minimum.accumulate(missed)  # np.interp needs it monotone
