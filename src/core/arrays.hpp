@@ -38,8 +38,8 @@ inline void require(bool fine, const char* what) {
 
 // An array that will belong to Python.
 template <class T>
-struct Result {
-    explicit Result(std::size_t size) : data(new T[size]()) {}
+struct OutputArray {
+    explicit OutputArray(std::size_t size) : data(new T[size]()) {}
     T* data;
     template <class... Shape>
     nb::object array(Shape... shape) {

@@ -1,36 +1,20 @@
-// Python bindings: numpy in, numpy out; worlds spread over threads with the interpreter lock released.
+// Python bindings: numpy in, numpy out.
 #include <nanobind/nanobind.h>
 #include <nanobind/stl/shared_ptr.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
 
-#include <chrono>
 #include <memory>
-#include <string>
-#include <thread>
-#include <tuple>
 
 #include "arrays.hpp"
+#include "levels.hpp"
 #include "projection.hpp"
+#include "simulation.hpp"
 #include "spline.hpp"
-#include "stepper.hpp"
 
 using namespace endopilot;
 
 namespace {
-
-// The levels that are built and that this processor runs, slowest first. Ask the baseline module, which runs everywhere.
-nb::list supported_levels() {
-    nb::list levels;
-    levels.append("baseline");
-#ifdef __x86_64__
-    __builtin_cpu_init();
-    const bool avx2 = __builtin_cpu_supports("avx2");
-    if (avx2) levels.append("avx2");
-    if (avx2 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512cd") &&
-        __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl"))
-        levels.append("avx512");
-#endif
-    return levels;
-}
 
 // All arrays have one entry a node; entries without a meaning (the last element, the first joint) are ignored.
 RodModel make_rod(const Array<1>& abscissa, const Array<1>& shear, const Array<1>& stretch, const Array<1>& bend,
@@ -77,7 +61,12 @@ Loads make_loads(const Array<2>& force, const Array<2>& moment, const Array<2>& 
     require(force.shape(1) == 3 && moment.shape(1) == 3 && spring.shape(1) == 3 && anchor.shape(1) == 3 &&
                 attitude.shape(1) == 4,
             "loads need three components, attitudes four");
-    Loads loads{vectors(force), vectors(moment), vectors(spring), vectors(anchor), values(hold), {}};
+    Loads loads{.force = vectors(force),
+                .moment = vectors(moment),
+                .spring = vectors(spring),
+                .anchor = vectors(anchor),
+                .hold = values(hold),
+                .attitude = {}};
     for (std::size_t i = 0; i < n; ++i) loads.attitude.push_back(quaternion(attitude.data() + 4 * i));
     return loads;
 }
@@ -94,18 +83,24 @@ Projector make_projector(const Array<2>& point, const Array<2>& tangent, const A
     require(ostium.size() == 3 && axis.size() == 3, "the catheter needs a position and a direction");
     std::vector<Vertex> vertices;
     for (std::size_t v = 0; v < n; ++v)
-        vertices.push_back({vec3(point.data() + 3 * v), vec3(tangent.data() + 3 * v), abscissa.data()[v], radius.data()[v],
-                            first.data()[v], last.data()[v], branch.data()[v]});
-    std::vector<Rival> rivals;
-    for (std::size_t i = 0; i < n * branches; ++i) rivals.push_back({rival.data()[i], entry.data()[i]});
-    return {std::move(vertices), std::move(rivals), {vec3(ostium.data()), vec3(axis.data()), catheter_radius}};
+        vertices.push_back({.point = vec3(point.data() + 3 * v),
+                            .tangent = vec3(tangent.data() + 3 * v),
+                            .abscissa = abscissa.data()[v],
+                            .radius = radius.data()[v],
+                            .first = first.data()[v],
+                            .last = last.data()[v],
+                            .branch = branch.data()[v]});
+    std::vector<Candidate> candidates;
+    for (std::size_t i = 0; i < n * branches; ++i) candidates.push_back({.from = rival.data()[i], .entry = entry.data()[i]});
+    const Catheter catheter{.ostium = vec3(ostium.data()), .axis = vec3(axis.data()), .radius = catheter_radius};
+    return {std::move(vertices), std::move(candidates), catheter};
 }
 
 nb::tuple project(const Projector& projector, const Array<2>& points, const Indices<1>& nearest, const Array<1>& distance) {
     const std::size_t n = points.shape(0);
     require(points.shape(1) == 3 && nearest.size() == n && distance.size() == n, "project needs one row a point");
-    Result<double> abscissa(n), offset(n), radius(n);
-    Result<std::int64_t> branch(n);
+    OutputArray<double> abscissa(n), offset(n), radius(n);
+    OutputArray<std::int64_t> branch(n);
     const nb::tuple result = nb::make_tuple(abscissa.array(n), offset.array(n), branch.array(n), radius.array(n));
     for (std::size_t i = 0; i < n; ++i) {
         const std::int64_t at = nearest.data()[i];
@@ -115,240 +110,6 @@ nb::tuple project(const Projector& projector, const Array<2>& points, const Indi
     }
     return result;
 }
-
-// Calls `work(thread, until)` on `threads` threads, of which this is number 0, until it says that all is done. On this one
-// it is called with a moment to come back at, so that the interpreter's signals and the progress callback stay served.
-template <class Work>
-void run_threads(int threads, const nb::object& progress, const std::atomic<long>& done, std::atomic<bool>& stop, const Work& work) {
-    std::exception_ptr failure;
-    long reported = 0;
-    const auto serve = [&] {
-        try {
-            if (PyErr_CheckSignals() != 0) throw nb::python_error();
-            const long now = done.load();
-            if (!progress.is_none() && now > reported) progress(now - reported);
-            reported = now;
-        } catch (...) {
-            failure = std::current_exception();
-            stop.store(true);
-        }
-    };
-    {
-        nb::gil_scoped_release release;
-        std::vector<std::thread> others;
-        for (int t = 1; t < threads; ++t) others.emplace_back([&work, t] { work(t, Moment::max()); });
-        while (!work(0, std::chrono::steady_clock::now() + std::chrono::milliseconds(100))) {
-            nb::gil_scoped_acquire acquire;
-            serve();
-        }
-        for (std::thread& thread : others) thread.join();
-    }
-    if (!failure) serve();
-    if (failure) std::rethrow_exception(failure);
-}
-
-// Many worlds of one device in one lumen.
-class Simulation {
-public:
-    Simulation(RodModel rod, std::shared_ptr<Lumen> lumen, std::shared_ptr<Loads> loads, const Array<1>& origin,
-               const Array<1>& orientation, const Options& options, int worlds)
-        : rod_(std::move(rod)), lumen_(std::move(lumen)), loads_(std::move(loads)), options_(options) {
-        require(worlds >= 1, "a simulation needs at least one world");
-        require(origin.size() == 3 && orientation.size() == 4, "the base needs a position and a quaternion");
-        require(!loads_ || int(loads_->force.size()) == rod_.nodes, "loads need one entry a node of the rod");
-        base_ = {vec3(origin.data()), quaternion(orientation.data())};
-        worlds_.assign(std::size_t(worlds), World(rod_.nodes));
-    }
-
-    Simulation(const Simulation&) = delete;  // the steppers hold on to this one's rod and worlds
-
-    // Puts worlds at the ostium, ready to be pushed to their first inserted length by the next run.
-    void reset(const Indices<1>& index, const Array<2>& initial, const Array<1>& friction, double sample_period) {
-        const std::size_t n = index.size();
-        require(initial.shape(0) == n && initial.shape(1) == 2 && friction.size() == n, "reset needs one row a world");
-        for (std::size_t k = 0; k < n; ++k) {
-            require(index.data()[k] >= 0 && std::size_t(index.data()[k]) < worlds_.size(), "reset names no such world");
-            World& w = worlds_[std::size_t(index.data()[k])];
-            const double depth = initial.data()[2 * k], speed = options_.approach_velocity;
-            std::fill(w.values.begin(), w.values.end(), 0.0);
-            w[World::kInserted] = speed > 0 ? 0.0 : depth;
-            w[World::kRotation] = initial.data()[2 * k + 1];
-            w[World::kApproach] = speed > 0 ? std::ceil(depth / (speed * sample_period)) + 1 : 0.0;
-            w[World::kDepth] = depth;
-            w[World::kFriction] = friction.data()[k];
-            w[World::kStride] = kTicks;
-            lay_straight(w);
-        }
-    }
-
-    nb::dict run(const Array<3>& control, bool force_driven, double time_step, int steps_per_sample, bool record_shape,
-                 bool record_attitude, int threads, int lanes, const nb::object& progress) {
-        const std::size_t worlds = worlds_.size(), samples = control.shape(1), n = worlds * samples, nodes = std::size_t(rod_.nodes);
-        require(control.shape(0) == worlds && control.shape(2) == 2, "control needs two numbers a world and sample");
-        require(steps_per_sample >= 1 && time_step > 0, "time step and steps per sample must be positive");
-        if (lanes != 1 && lanes != 4 && lanes != 8)
-            throw std::invalid_argument("lanes: " + std::to_string(lanes) + "; give 1, 4 or 8");
-        Result<double> inserted(n), rotation(n), tip(3 * n), direction(3 * n), force_max(n), force_sum(n), base_force(n),
-            base_torque(n), drive_force(n), drive_torque(n), iterations(n), slip(n), approach_slip(worlds);
-        Result<bool> valid(n);
-        Result<double> shape(record_shape ? 3 * n * nodes : 0), attitude(record_attitude ? 4 * n * nodes : 0);
-        nb::dict result;
-        result["inserted_length"] = inserted.array(worlds, samples);
-        result["rotation"] = rotation.array(worlds, samples);
-        result["tip_position"] = tip.array(worlds, samples, 3);
-        result["tip_direction"] = direction.array(worlds, samples, 3);
-        result["contact_force_max"] = force_max.array(worlds, samples);
-        result["contact_force_sum"] = force_sum.array(worlds, samples);
-        result["base_force"] = base_force.array(worlds, samples);
-        result["base_torque"] = base_torque.array(worlds, samples);
-        result["drive_force"] = drive_force.array(worlds, samples);
-        result["drive_torque"] = drive_torque.array(worlds, samples);
-        result["iterations"] = iterations.array(worlds, samples);
-        result["slip"] = slip.array(worlds, samples);
-        result["approach_slip"] = approach_slip.array(worlds);
-        result["valid"] = valid.array(worlds, samples);
-        nb::object shapes = shape.array(record_shape ? worlds : 0, samples, nodes, 3);
-        nb::object attitudes = attitude.array(record_attitude ? worlds : 0, samples, nodes, 4);
-        if (record_shape) result["shape"] = shapes;
-        if (record_attitude) result["attitude"] = attitudes;
-
-        const Inputs in{int(samples), steps_per_sample, time_step, force_driven, control.data()};
-        const Outputs out{inserted.data,    rotation.data,    tip.data,          direction.data,    force_max.data,
-                          force_sum.data,   base_force.data,  base_torque.data,  drive_force.data,  drive_torque.data,
-                          iterations.data,  slip.data,        valid.data,        approach_slip.data,
-                          record_shape ? shape.data : nullptr, record_attitude ? attitude.data : nullptr};
-        if (lanes == 1)
-            step<double>(in, out, std::max(1, threads), progress);
-        else if (lanes == 4)
-            step<double4>(in, out, std::max(1, threads), progress);
-        else
-            step<double8>(in, out, std::max(1, threads), progress);
-        return result;
-    }
-
-    nb::object state() const {
-        const std::size_t width = worlds_[0].values.size();
-        Result<double> all(worlds_.size() * width);
-        for (std::size_t w = 0; w < worlds_.size(); ++w)
-            std::copy(worlds_[w].values.begin(), worlds_[w].values.end(), all.data + w * width);
-        return all.array(worlds_.size(), width);
-    }
-
-    void set_state(const Array<2>& all) {
-        const std::size_t width = worlds_[0].values.size();
-        require(all.shape(0) == worlds_.size() && all.shape(1) == width, "the state has another shape");
-        for (std::size_t w = 0; w < worlds_.size(); ++w)
-            std::copy_n(all.data() + w * width, width, worlds_[w].values.begin());
-    }
-
-    // A number of each world.
-    nb::object scalar(World::Scalar which) const {
-        Result<double> out(worlds_.size());
-        for (std::size_t w = 0; w < worlds_.size(); ++w) out.data[w] = worlds_[w][which];
-        return out.array(worlds_.size());
-    }
-
-    // Positions of the first nodes.
-    nb::object tips() const {
-        Result<double> out(3 * worlds_.size());
-        double* to = out.data;
-        for (const World& w : worlds_) to = std::copy_n(w.node(0) + World::kX, 3, to);
-        return out.array(worlds_.size(), 3);
-    }
-
-    // `size` numbers of each node, from `offset` on; those of nodes that follow the drive from `behind(world, node)`.
-    template <class Behind>
-    nb::object per_node(int offset, int size, const Behind& behind) const {
-        const std::size_t nodes = std::size_t(rod_.nodes);
-        Result<double> out(worlds_.size() * nodes * std::size_t(size));
-        double* to = out.data;
-        for (const World& w : worlds_)
-            for (int i = 0; i < rod_.nodes; ++i, to += size) {
-                if (i < int(w[World::kActive]))
-                    std::copy_n(w.node(i) + offset, size, to);
-                else
-                    behind(w, i, to);
-            }
-        return size == 1 ? out.array(worlds_.size(), nodes) : out.array(worlds_.size(), nodes, size);
-    }
-
-    nb::object positions() const {
-        return per_node(World::kX, 3, [this](const World& w, int i, double* to) {
-            const Vec3<double> x = base_.position(rod_, i, w[World::kInserted]);
-            to[0] = x.x, to[1] = x.y, to[2] = x.z;
-        });
-    }
-
-    nb::object attitudes() const {
-        return per_node(World::kQ, 4, [this](const World& w, int, double* to) {
-            const Quaternion<double> q = base_.attitude(w[World::kRotation]);
-            to[0] = q.w, to[1] = q.v.x, to[2] = q.v.y, to[3] = q.v.z;
-        });
-    }
-
-    nb::object contacts() const {
-        return per_node(World::kForce, 1, [](const World&, int, double* to) { *to = 0.0; });
-    }
-
-    int nodes() const { return rod_.nodes; }
-
-private:
-    RodModel rod_;
-    std::shared_ptr<Lumen> lumen_;
-    std::shared_ptr<Loads> loads_;
-    Base base_;
-    Options options_;
-    std::vector<World> worlds_;
-    template <class V>
-    using Steppers = std::vector<std::unique_ptr<Stepper<V>>>;  // one a thread, kept from call to call
-    std::tuple<Steppers<double>, Steppers<double4>, Steppers<double8>> steppers_;
-
-    template <class V>
-    void step(const Inputs& in, const Outputs& out, int threads, const nb::object& progress) {
-        Steppers<V>& steppers = std::get<Steppers<V>>(steppers_);
-        while (int(steppers.size()) < threads)
-            steppers.push_back(std::make_unique<Stepper<V>>(rod_, lumen_.get(), loads_.get(), base_, options_, worlds_));
-        for (const auto& stepper : steppers) stepper->prepare(in, out);
-        Crew crew = assemble(in, threads);
-        std::atomic<long> done{0};
-        std::atomic<bool> stop{false};
-        run_threads(threads, progress, done, stop, [&](int thread, Moment until) {
-            return steppers[std::size_t(thread)]->run(crew, done, stop, until);
-        });
-    }
-
-    void lay_straight(World& w) const {
-        const double inserted = w[World::kInserted];
-        const Quaternion<double> q = base_.attitude(w[World::kRotation]);
-        const int active = base_.count_active(rod_, inserted, options_.free_behind);
-        w[World::kActive] = active;
-        for (int i = 0; i < active; ++i) {
-            const Vec3<double> x = base_.position(rod_, i, inserted);
-            double* p = w.node(i);
-            p[World::kX] = x.x, p[World::kX + 1] = x.y, p[World::kX + 2] = x.z;
-            p[World::kQ] = q.w, p[World::kQ + 1] = q.v.x, p[World::kQ + 2] = q.v.y, p[World::kQ + 3] = q.v.z;
-        }
-    }
-
-    // Worlds in the order of their mean inserted length, so that those under way together are of like length.
-    Crew assemble(const Inputs& in, int threads) const {
-        std::vector<double> length, depth;
-        std::vector<int> order;
-        for (std::size_t w = 0; w < worlds_.size(); ++w) {
-            double inserted = worlds_[w][World::kApproach] > 0 ? worlds_[w][World::kDepth] : worlds_[w][World::kInserted], sum = inserted;
-            for (int s = 0; s < in.samples && !in.force_driven; ++s) {
-                inserted += in.control[2 * (w * std::size_t(in.samples) + std::size_t(s))] * in.time_step * in.steps_per_sample;
-                sum += inserted;
-            }
-            depth.push_back(sum);
-            length.push_back(worlds_[w][World::kActive]);
-            order.push_back(int(w));
-        }
-        std::stable_sort(order.begin(), order.end(), [&](int a, int b) { return depth[std::size_t(a)] > depth[std::size_t(b)]; });
-        return Crew(std::move(order), std::move(length), kCrew * threads);
-    }
-    static constexpr int kCrew = 64;  // worlds under way for each thread: enough to find four of like length
-};
 
 }  // namespace
 
@@ -380,7 +141,7 @@ NB_MODULE(ENDOPILOT_MODULE, module) {
         .def_rw("sample_tolerance", &Options::sample_tolerance)
         .def_rw("largest_step", &Options::largest_step)
         .def_rw("largest_jump", &Options::largest_jump)
-        .def_rw("most_iterations", &Options::most_iterations)
+        .def_rw("max_iterations", &Options::max_iterations)
         .def_rw("free_behind", &Options::free_behind)
         .def_rw("approach_velocity", &Options::approach_velocity)
         .def_rw("push_limit", &Options::push_limit)

@@ -90,9 +90,9 @@ private:
 
 template <class V>
 struct Distance {
-    V value;         // mm
-    Vec3<V> slope;   // its gradient
-    Sym3<V> curve;   // its Hessian, 1/mm
+    V value;            // mm
+    Vec3<V> gradient;
+    Sym3<V> hessian;    // 1/mm
 };
 
 // Three neighbouring coefficients per lane, starting at `offset`.
@@ -195,24 +195,24 @@ template <class V>
     return {f, {s * fx, s * fy, s * fz}, {ss * fxx, ss * fyy, ss * fzz, ss * fxy, ss * fxz, ss * fyz}};
 }
 
-// The wall as a node last saw it.
+// The distance to the wall where a node was last evaluated.
 template <class V>
-struct Wall {
-    V distance;       // mm
-    Vec3<V> slope;    // gradient of the distance
+struct WallState {
+    V distance;          // mm
+    Vec3<V> gradient;    // of the distance
 };
 
-// What friction at a node needs, frozen at the start of a time step.
+// The lagged state of friction at a node: frozen at the start of a time step, so that the step has a potential.
 template <class V>
-struct Grip {
-    V limit;          // friction coefficient × normal force, N
-    Vec3<V> normal;   // unit normal of the wall, into the lumen
-    Vec3<V> spin;     // displacement of the touching surface for a unit rotation about the wire's axis, mm/rad
+struct FrictionState {
+    V limit;            // friction coefficient × normal force, N
+    Vec3<V> normal;     // unit normal of the wall, into the lumen
+    Vec3<V> spin_arm;   // displacement of the touching surface for a unit rotation about the wire's axis, mm/rad
 };
 
 // Adds the wall's elastic reaction, energy k/2 (radius - distance)² where positive. Returns the energy. Where `sticky`,
-// gradient and Hessian are those of a wall that can also pull: a node that has just lost touch would otherwise set off
-// freely and hit the wall behind the next Newton step.
+// gradient and Hessian are those of a wall that can also pull: otherwise a node that has just lost contact would move
+// freely in the next Newton step and hit the wall.
 template <class V>
 ENDOPILOT_DEVICE inline V add_wall(double stiffness, double radius, const V& geometric, Mask<V> sticky, const Distance<V>& d,
                   Diagonal<V>& own) {
@@ -221,15 +221,15 @@ ENDOPILOT_DEVICE inline V add_wall(double stiffness, double radius, const V& geo
     const V touch = select<V>(clear, V{}, gap);
     const V depth = select<V>(sticky, gap, touch);
     const V k = select<V>(clear, select<V>(sticky, broadcast<V>(stiffness), V{}), broadcast<V>(stiffness));
-    const V pressure = stiffness * depth;
-    own.force -= pressure * d.slope;
-    const V bend = geometric * pressure;
-    own.xx.xx += k * d.slope.x * d.slope.x - bend * d.curve.xx;
-    own.xx.yy += k * d.slope.y * d.slope.y - bend * d.curve.yy;
-    own.xx.zz += k * d.slope.z * d.slope.z - bend * d.curve.zz;
-    own.xx.xy += k * d.slope.x * d.slope.y - bend * d.curve.xy;
-    own.xx.xz += k * d.slope.x * d.slope.z - bend * d.curve.xz;
-    own.xx.yz += k * d.slope.y * d.slope.z - bend * d.curve.yz;
+    const V reaction = stiffness * depth;  // N, of the wall on the wire
+    own.gradient_x -= reaction * d.gradient;
+    const V bend = geometric * reaction;
+    own.xx.xx += k * d.gradient.x * d.gradient.x - bend * d.hessian.xx;
+    own.xx.yy += k * d.gradient.y * d.gradient.y - bend * d.hessian.yy;
+    own.xx.zz += k * d.gradient.z * d.gradient.z - bend * d.hessian.zz;
+    own.xx.xy += k * d.gradient.x * d.gradient.y - bend * d.hessian.xy;
+    own.xx.xz += k * d.gradient.x * d.gradient.z - bend * d.hessian.xz;
+    own.xx.yz += k * d.gradient.y * d.gradient.z - bend * d.hessian.yz;
     return 0.5 * stiffness * touch * touch;
 }
 
@@ -237,28 +237,29 @@ ENDOPILOT_DEVICE inline V add_wall(double stiffness, double radius, const V& geo
 // displacement of that surface since the start of the step: of the node, and by rotation about the wire's own axis.
 // `moved` is the node's displacement, `p` the element's rotation since the start of the step. Returns the energy.
 template <class V>
-ENDOPILOT_DEVICE inline V add_friction(const Grip<V>& grip, const V& eps, const Vec3<V>& moved, const Quaternion<V>& p, Diagonal<V>& own) {
-    const Vec3<V>& n = grip.normal;
+ENDOPILOT_DEVICE inline V add_friction(const FrictionState<V>& friction, const V& eps, const Vec3<V>& moved,
+                                       const Quaternion<V>& p, Diagonal<V>& own) {
+    const Vec3<V>& n = friction.normal;
     const V twist = 2.0 * p.v.z;
-    const Vec3<V> s = moved - dot(moved, n) * n + twist * grip.spin;
+    const Vec3<V> s = moved - dot(moved, n) * n + twist * friction.spin_arm;
     const V size = square_root(dot(s, s) + eps * eps);
     const V a = 1.0 / size;
-    const V pull = grip.limit * a;
-    const Vec3<V> force = pull * s;
+    const V secant = friction.limit * a;  // N/mm; the force of friction on the wire is -secant s
+    const Vec3<V> gradient = secant * s;
     const Vec3<V> turn{-p.v.y, p.v.x, p.w};  // d twist / d theta
-    own.force += force;
-    const V torque = dot(force, grip.spin);
-    own.moment += torque * turn;
+    own.gradient_x += gradient;
+    const V gradient_twist = dot(gradient, friction.spin_arm);
+    own.gradient_theta += gradient_twist * turn;
 
-    const V c = pull * a * a;
-    own.xx.xx += pull * (1.0 - n.x * n.x) - c * s.x * s.x;
-    own.xx.yy += pull * (1.0 - n.y * n.y) - c * s.y * s.y;
-    own.xx.zz += pull * (1.0 - n.z * n.z) - c * s.z * s.z;
-    own.xx.xy -= pull * n.x * n.y + c * s.x * s.y;
-    own.xx.xz -= pull * n.x * n.z + c * s.x * s.z;
-    own.xx.yz -= pull * n.y * n.z + c * s.y * s.z;
-    const Vec3<V> mixed = pull * grip.spin - (c * dot(s, grip.spin)) * s;  // spin is perpendicular to n
-    const V rotary = dot(mixed, grip.spin);
+    const V c = secant * a * a;
+    own.xx.xx += secant * (1.0 - n.x * n.x) - c * s.x * s.x;
+    own.xx.yy += secant * (1.0 - n.y * n.y) - c * s.y * s.y;
+    own.xx.zz += secant * (1.0 - n.z * n.z) - c * s.z * s.z;
+    own.xx.xy -= secant * n.x * n.y + c * s.x * s.y;
+    own.xx.xz -= secant * n.x * n.z + c * s.x * s.z;
+    own.xx.yz -= secant * n.y * n.z + c * s.y * s.z;
+    const Vec3<V> mixed = secant * friction.spin_arm - (c * dot(s, friction.spin_arm)) * s;  // spin is perpendicular to n
+    const V rotary = dot(mixed, friction.spin_arm);
     const V t[3] = {turn.x, turn.y, turn.z};
     for (int r = 0; r < 3; ++r) {
         own.tx[r][0] += t[r] * mixed.x;
@@ -271,7 +272,7 @@ ENDOPILOT_DEVICE inline V add_friction(const Grip<V>& grip, const V& eps, const 
     own.tt.xy += rotary * turn.x * turn.y;
     own.tt.xz += rotary * turn.x * turn.z;
     own.tt.yz += rotary * turn.y * turn.z;
-    return grip.limit * (size - eps);
+    return friction.limit * (size - eps);
 }
 
 }  // namespace endopilot

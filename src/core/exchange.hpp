@@ -1,4 +1,4 @@
-// Between lanes and worlds: a lane takes a parked world, steps it for a sample, records it and parks it again.
+// Between lanes and worlds: a lane takes a world from the queue, steps it for a sample, records it and stores it again.
 #pragma once
 
 #include "stepper.hpp"
@@ -8,7 +8,7 @@ namespace endopilot {
 constexpr double kOvershoot = 0.02;  // mm that rounded controls may pull the wire behind the ostium
 
 template <class V>
-void Stepper<V>::take(int l, Crew& crew) {
+void Stepper<V>::take(int l, WorkQueue& queue) {
     double length = 0;
     int others = 0;
     for (const Lane& lane : lane_)
@@ -16,7 +16,7 @@ void Stepper<V>::take(int l, Crew& crew) {
     Lane& lane = lane_[l];
     for (;;) {
         int sample = 0;
-        const int world = crew.take(others > 0 ? length / others : -1.0, sample);
+        const int world = queue.take(others > 0 ? length / others : -1.0, sample);
         if (world < 0) return;
         World& w = world_[world];
         if (w[World::kApproach] > 0) sample = -int(w[World::kApproach]);
@@ -28,7 +28,7 @@ void Stepper<V>::take(int l, Crew& crew) {
             return;
         }
         for (sample = std::max(0, sample); sample < in_.samples; ++sample) record(world, sample, 0.0, 0.0);
-        crew.finish();
+        queue.finish();
     }
 }
 
@@ -41,10 +41,10 @@ void Stepper<V>::place(int l, int i) {
     put(n.start_q, l, base_.attitude(lane.start.rotation));
     put(n.last, l, lane.last.advance * frame(base_.orientation).d3);
     put(n.last_turn, l, {0, 0, lane.last.rotation});
-    set(n.grip.limit, l, 0);
-    put(n.grip.normal, l, {0, 0, 0});
-    put(n.grip.spin, l, {0, 0, 0});
-    set(n.force, l, 0);
+    set(n.friction.limit, l, 0);
+    put(n.friction.normal, l, {0, 0, 0});
+    put(n.friction.spin_arm, l, {0, 0, 0});
+    set(n.normal_force, l, 0);
     place_base(l, i);
 }
 
@@ -85,22 +85,22 @@ void Stepper<V>::load(int l) {
         put(n.last, l, last);
         put(n.last_turn, l, turn);
         put(n.x, l, x + weight * last);
-        put(n.q, l, turned(q, weight * turn));
+        put(n.q, l, rotated(q, weight * turn));
         put(n.from, l, take(n.x, l));
         put(n.from_q, l, take(n.q, l));
         put(n.step, l, {0, 0, 0});
         put(n.turn, l, {0, 0, 0});
-        set(n.grip.limit, l, p[World::kLimit]);
-        put(n.grip.normal, l, vec(p + World::kNormal));
-        put(n.grip.spin, l, vec(p + World::kSpinArm));
-        set(n.force, l, p[World::kForce]);
+        set(n.friction.limit, l, p[World::kLimit]);
+        put(n.friction.normal, l, vec(p + World::kNormal));
+        put(n.friction.spin_arm, l, vec(p + World::kSpinArm));
+        set(n.normal_force, l, p[World::kNormalForce]);
     }
     begin(l, weight == 0.0);
 }
 
 // Keeps the lane's world as it was at the end of the last step that converged.
 template <class V>
-void Stepper<V>::park(int l) {
+void Stepper<V>::store(int l) {
     const Lane& lane = lane_[l];
     World& w = world_[lane.world];
     w[World::kInserted] = lane.inserted;
@@ -124,10 +124,10 @@ void Stepper<V>::park(int l) {
         write(p + World::kQ + 1, take(n.start_q.v, l));
         write(p + World::kLast, take(n.last, l));
         write(p + World::kLastTurn, take(n.last_turn, l));
-        p[World::kLimit] = get(n.grip.limit, l);
-        write(p + World::kNormal, take(n.grip.normal, l));
-        write(p + World::kSpinArm, take(n.grip.spin, l));
-        p[World::kForce] = get(n.force, l);
+        p[World::kLimit] = get(n.friction.limit, l);
+        write(p + World::kNormal, take(n.friction.normal, l));
+        write(p + World::kSpinArm, take(n.friction.spin_arm, l));
+        p[World::kNormalForce] = get(n.normal_force, l);
     }
 }
 
@@ -156,7 +156,7 @@ void Stepper<V>::read_control(int l) {
 }
 
 template <class V>
-void Stepper<V>::end_sample(int l, Crew& crew) {
+void Stepper<V>::end_sample(int l, WorkQueue& queue) {
     Lane& lane = lane_[l];
     World& w = world_[lane.world];
     if (lane.by_force) {
@@ -172,17 +172,17 @@ void Stepper<V>::end_sample(int l, Crew& crew) {
         w[World::kDepth] -= lane.slip;
         if (lane.sample == -1) lane.inserted = w[World::kDepth];  // exactly
     }
-    park(l);
-    const DriveTerms valve = introducer(lane.last, l);
+    store(l);
+    const DriveEnergy valve = introducer(lane.last, l);
     w[World::kBaseForce] = get(base_force_, l);
     w[World::kBaseTorque] = get(base_torque_, l);
-    w[World::kDriveForce] = lane.by_force ? lane.speed : w[World::kBaseForce] + valve.pull_a;
-    w[World::kDriveTorque] = lane.by_force ? lane.spin : w[World::kBaseTorque] + valve.pull_r;
+    w[World::kDriveForce] = lane.by_force ? lane.speed : w[World::kBaseForce] + valve.gradient_a;
+    w[World::kDriveTorque] = lane.by_force ? lane.spin : w[World::kBaseTorque] + valve.gradient_r;
     if (lane.sample >= 0) record(lane.world, lane.sample, double(lane.total_iterations) / lane.steps, lane.slip + lane.refused);
     if (lane.sample + 1 < in_.samples)
-        crew.give_back(lane.world, lane.sample + 1, lane.active);
+        queue.put_back(lane.world, lane.sample + 1, lane.active);
     else
-        crew.finish();
+        queue.finish();
     lane.world = -1;
 }
 
@@ -192,7 +192,7 @@ void Stepper<V>::fail(int l) {
     Lane& lane = lane_[l];
     lane.inserted = lane.start.advance;
     lane.rotation = lane.start.rotation;
-    park(l);
+    store(l);
     world_[lane.world][World::kReason] = lane.finite ? kNotConverged : kNotFinite;
     for (int sample = std::max(0, lane.sample); sample < in_.samples; ++sample) record(lane.world, sample, 0.0, 0.0);
     lane.world = -1;
@@ -207,7 +207,7 @@ void Stepper<V>::record(int world, int sample, double iterations, double slip) c
     out_.rotation[at] = w[World::kRotation];
     double largest = 0, sum = 0;
     for (int i = 0; i < active; ++i) {
-        const double force = w.node(i)[World::kForce];
+        const double force = w.node(i)[World::kNormalForce];
         largest = std::max(largest, force);
         sum += force;
     }

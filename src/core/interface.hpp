@@ -1,4 +1,4 @@
-// What the core is asked and what it answers: options, the drive's base, loads, inputs and outputs.
+// The core's interface: options, the base of the wire, loads, inputs and outputs.
 #pragma once
 
 #include <algorithm>
@@ -12,20 +12,20 @@ namespace endopilot {
 struct Options {
     double stick_velocity;     // slip velocity below which friction falls off, mm/s
     double wall_stiffness;     // N/mm
-    double tolerance;          // largest displacement of a last Newton step, mm (rotations: rad)
-    double sample_tolerance;   // the same for the step that ends a sample, whose forces are recorded
+    double tolerance;          // a step has converged when Newton's step moves no node farther, mm (rotations: rad)
+    double sample_tolerance;   // the same for the step that ends a sample: its forces are recorded
     double largest_step;       // displacement that one Newton step is clamped to, mm (rotations: rad)
     double largest_jump;       // motion of a node in a time step beyond the drive's, mm (rotations: rad); the step is shortened
-    int most_iterations;       // for one step; then the step is halved, and the shortest may take kPatience times as many
-    double free_behind;        // the wire is held, and follows the drive, this far behind the ostium, mm
+    int max_iterations;        // of one step; then the step is halved (the shortest may take kSnapIterations times as many)
+    double free_behind;        // nodes farther than this behind the ostium follow the drive, mm
     double approach_velocity;  // at which a wire is brought to its first inserted length, mm/s; 0: it is put there, straight
     double push_limit;         // the drive slips rather than push the wire harder than this, N
     double introducer_friction;  // Coulomb friction of the introducer's valve, N
     double introducer_drag;      // its viscous drag, N s/mm
 };
 
-// The guiding catheter: wire enters at `origin` along the third director of `orientation`. Nodes more than a little
-// behind the origin follow the drive exactly.
+// The guiding catheter: wire enters at `origin` along the third director of `orientation`. Nodes more than
+// `free_behind` mm behind the origin follow the drive exactly.
 struct Base {
     Vec3<double> origin;
     Quaternion<double> orientation;
@@ -39,16 +39,16 @@ struct Base {
         return orientation * Quaternion<double>{std::cos(0.5 * rotation), {0, 0, std::sin(0.5 * rotation)}};
     }
 
-    // Nodes that do not follow the drive: those whose element's middle is ahead of where the wire is held, `free_behind` mm
-    // behind the origin; one at least, and all but two at most.
+    // The number of active nodes, which do not follow the drive: the middle of their element is ahead of the point
+    // `free_behind` mm behind the origin. One at least, and all but two at most.
     static int count_active(const RodModel& rod, double inserted, double free_behind) {
         int n = 1;
         while (n < rod.nodes - 2 && inserted - middle(rod, n) + free_behind > 0) ++n;
         return n;
     }
 
-    // How much of the joint between the last active element and the first that follows the drive lies ahead of where the
-    // wire is held, 0 to 1: it is set free little by little, else each node that is set free would jolt the wire.
+    // The share (0 to 1) of the joint between the last active element and the first that follows the drive that lies ahead
+    // of that point: the joint is freed gradually, since freeing a whole node at once would jolt the wire.
     static double share_of_last_joint(const RodModel& rod, double inserted, double free_behind, int active) {
         const double ahead = middle(rod, active - 1), behind = middle(rod, active);
         return std::clamp((inserted - ahead + free_behind) / (behind - ahead), kLeastShare, 1.0);
@@ -70,7 +70,7 @@ struct Loads {
     std::vector<Quaternion<double>> attitude;
 };
 
-// What one call asks of all worlds: samples of equal length, each with one control a world.
+// The inputs of one run: samples of equal length, each with one control for each world.
 struct Inputs {
     int samples, steps_per_sample;
     double time_step;         // s
@@ -80,14 +80,14 @@ struct Inputs {
 
 enum Reason : std::uint8_t { kFine = 0, kNotFinite = 1, kNotConverged = 2 };
 
-// Arrays of worlds × samples (× 3, × nodes × 3). `slip` is the advance (mm) that was asked for and not made, and
+// Arrays of worlds × samples (× 3, × nodes × 3). `slip` is the commanded advance (mm) that was not made, and
 // `approach_slip` that before the first sample.
 struct Outputs {
     double *inserted, *rotation;                 // mm, rad
     double *tip_position, *tip_direction;        // mm, unit vector
     double *force_max, *force_sum;               // of the wall on a node, N
-    double *base_force, *base_torque;            // of the wire on the drive's side of the catheter, N, N mm
-    double *drive_force, *drive_torque;          // of the drive, which also moves the wire through the introducer, N, N mm
+    double *base_force, *base_torque;            // of the base on the wire, forwards positive, N, N mm
+    double *drive_force, *drive_torque;          // of the drive: that of the base and the introducer's resistance, N, N mm
     double *iterations, *slip;
     bool* valid;
     double* approach_slip;    // worlds

@@ -175,10 +175,10 @@ ENDOPILOT_DEVICE inline Quaternion<V> select(Mask<V> mask, const Quaternion<V>& 
     return {select<V>(mask, yes.w, no.w), select(mask, yes.v, no.v)};
 }
 
-// q turned by the rotation vector `angle` (rad, in the frame of q). (1, angle/2) normalised agrees with the
+// q rotated by the rotation vector `angle` (rad, in the frame of q). (1, angle/2) normalised agrees with the
 // exponential map to second order, which is all that Newton's method needs, and has no trigonometry.
 template <class V>
-ENDOPILOT_DEVICE inline Quaternion<V> turned(const Quaternion<V>& q, const Vec3<V>& angle) {
+ENDOPILOT_DEVICE inline Quaternion<V> rotated(const Quaternion<V>& q, const Vec3<V>& angle) {
     const V half = broadcast<V>(0.5);
     const Vec3<V> h = half * angle;
     const Quaternion<V> p = q * Quaternion<V>{broadcast<V>(1.0), h};

@@ -20,7 +20,7 @@ struct Vertex {
 };
 
 // The other branches that a point may lie deeper in, by the vertex that is nearest to it.
-struct Rival {
+struct Candidate {
     double from;          // mm that the point must be away from the vertex; infinite where it cannot be
     std::int64_t entry;   // the branch's vertex that is nearest to this one
 };
@@ -38,10 +38,10 @@ struct Catheter {
 
 class Projector {
 public:
-    // `rivals`: for each vertex, one a branch.
-    Projector(std::vector<Vertex> vertices, std::vector<Rival> rivals, const Catheter& catheter)
-        : vertex_(std::move(vertices)), rival_(std::move(rivals)), catheter_(catheter), branches_(rival_.size() / vertex_.size()) {
-        for (std::size_t v = 0; v < vertex_.size(); ++v) slab_.push_back(make_slab(std::int64_t(v)));
+    // `candidates`: for each vertex, one for each branch.
+    Projector(std::vector<Vertex> vertices, std::vector<Candidate> candidates, const Catheter& catheter)
+        : vertex_(std::move(vertices)), candidate_(std::move(candidates)), catheter_(catheter), branches_(candidate_.size() / vertex_.size()) {
+        for (std::size_t v = 0; v < vertex_.size(); ++v) segment_.push_back(make_segment(std::int64_t(v)));
     }
 
     std::size_t vertices() const { return vertex_.size(); }
@@ -49,10 +49,10 @@ public:
     // Projects a point whose nearest vertex is `nearest`, `distance` mm away: onto the branch whose lumen it lies deepest in.
     Projected operator()(const Vec3<double>& point, std::int64_t nearest, double distance) const {
         Projected best = onto(point, nearest);
-        const Rival* rival = &rival_[std::size_t(nearest) * branches_];
+        const Candidate* candidate = &candidate_[std::size_t(nearest) * branches_];
         for (std::size_t b = 0; b < branches_; ++b)
-            if (rival[b].from < distance) {
-                const Projected other = onto(point, walked(point, rival[b].entry));
+            if (candidate[b].from < distance) {
+                const Projected other = onto(point, nearest_on_branch(point, candidate[b].entry));
                 if (other.offset * best.radius < best.offset * other.radius) best = other;
             }
         const Vec3<double> relative = point - catheter_.ostium;
@@ -64,41 +64,50 @@ public:
     }
 
 private:
-    static constexpr int kWalk = 4;  // a vertex is corrected at most this often, by the point's distance to its plane
+    static constexpr int kMaxCorrections = 4;  // of a vertex, by the point's distance to its plane
 
-    // The segment from a vertex to the next; the last one of a branch has that before it.
-    struct Slab {
+    // The segment from a vertex to the next; the last vertex of a branch has the segment before it.
+    struct Segment {
         Vec3<double> ahead;                         // the vertex's tangent over the segment's length, 1/mm
         Vec3<double> start, edge, tangent, change;  // of the segment; its tangent turns by `change` along it
-        double along, bend;                         // edge · tangent, edge · change
-        double abscissa, longer, radius, wider;     // at its start, and their changes along it
+        double edge_tangent, edge_change;           // edge · tangent, edge · change
+        double abscissa, abscissa_change, radius, radius_change;  // at its start, and their changes along it
     };
 
     std::vector<Vertex> vertex_;
-    std::vector<Rival> rival_;
-    std::vector<Slab> slab_;
+    std::vector<Candidate> candidate_;
+    std::vector<Segment> segment_;
     Catheter catheter_;
     std::size_t branches_;
 
-    Slab make_slab(std::int64_t v) const {
+    Segment make_segment(std::int64_t v) const {
         const Vertex& here = vertex_[std::size_t(v)];
         const std::int64_t start = v == here.last ? std::max(v - 1, here.first) : v;
         const Vertex &a = vertex_[std::size_t(start)], &b = vertex_[std::size_t(std::min(start + 1, here.last))];
         const Vec3<double> edge = b.point - a.point, change = b.tangent - a.tangent;
         const double length = std::max(std::sqrt(dot(edge, edge)), 1e-9);
-        return {(1.0 / length) * here.tangent, a.point, edge, a.tangent, change, dot(edge, a.tangent), dot(edge, change),
-                a.abscissa, b.abscissa - a.abscissa, a.radius, b.radius - a.radius};
+        return {.ahead = (1.0 / length) * here.tangent,
+                .start = a.point,
+                .edge = edge,
+                .tangent = a.tangent,
+                .change = change,
+                .edge_tangent = dot(edge, a.tangent),
+                .edge_change = dot(edge, change),
+                .abscissa = a.abscissa,
+                .abscissa_change = b.abscissa - a.abscissa,
+                .radius = a.radius,
+                .radius_change = b.radius - a.radius};
     }
 
     // How far a point lies before the plane of a vertex, in segments.
     double ahead(const Vec3<double>& point, std::int64_t v) const {
-        return dot(point - vertex_[std::size_t(v)].point, slab_[std::size_t(v)].ahead);
+        return dot(point - vertex_[std::size_t(v)].point, segment_[std::size_t(v)].ahead);
     }
 
     // Walks along a branch from a vertex to the one that is nearest to a point.
-    std::int64_t walked(const Vec3<double>& point, std::int64_t v) const {
+    std::int64_t nearest_on_branch(const Vec3<double>& point, std::int64_t v) const {
         const double first = double(vertex_[std::size_t(v)].first), last = double(vertex_[std::size_t(v)].last);
-        for (int i = 0; i < kWalk; ++i) {
+        for (int i = 0; i < kMaxCorrections; ++i) {
             const auto next = std::int64_t(std::clamp(double(v) + std::nearbyint(ahead(point, v)), first, last));
             if (next == v) break;
             v = next;
@@ -111,13 +120,16 @@ private:
     // whose roots the one that stays finite as D vanishes is wanted.
     Projected onto(const Vec3<double>& point, std::int64_t v) const {
         const Vertex& here = vertex_[std::size_t(v)];
-        const Slab& s = slab_[std::size_t(ahead(point, v) < 0 ? std::max(v - 1, here.first) : v)];
+        const Segment& s = segment_[std::size_t(ahead(point, v) < 0 ? std::max(v - 1, here.first) : v)];
         const Vec3<double> q = point - s.start;
-        const double depth = dot(q, s.tangent), slope = s.along - dot(q, s.change);
-        const double root = std::sqrt(std::max(slope * slope + 4.0 * s.bend * depth, 0.0));
+        const double depth = dot(q, s.tangent), slope = s.edge_tangent - dot(q, s.change);
+        const double root = std::sqrt(std::max(slope * slope + 4.0 * s.edge_change * depth, 0.0));
         const double share = std::clamp(2.0 * depth / std::max(slope + root, 1e-12), 0.0, 1.0);
         const Vec3<double> off = q - share * s.edge;
-        return {s.abscissa + share * s.longer, std::sqrt(dot(off, off)), s.radius + share * s.wider, here.branch};
+        return {.abscissa = s.abscissa + share * s.abscissa_change,
+                .offset = std::sqrt(dot(off, off)),
+                .radius = s.radius + share * s.radius_change,
+                .branch = here.branch};
     }
 };
 

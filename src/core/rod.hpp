@@ -40,10 +40,10 @@ struct RodModel {
 // Order of the six unknowns: x, y, z, theta1, theta2, theta3.
 template <class V>
 struct Diagonal {
-    Vec3<V> force;    // dE/dx
-    Vec3<V> moment;   // dE/dtheta
+    Vec3<V> gradient_x;       // dE/dx, N: the negative of the force on the node
+    Vec3<V> gradient_theta;   // dE/dtheta, N mm: the negative of the moment on the element
     Sym3<V> xx;
-    V tx[3][3];       // rows theta, columns x
+    V tx[3][3];               // rows theta, columns x
     Sym3<V> tt;
 };
 
@@ -55,8 +55,8 @@ struct Coupling {
     V tt[3][3];       // d2E / dtheta_i dtheta_{i+1}
 };
 
-// Adds element i to its own block `own`; sets its part of the next block `next` and of the coupling. `geometric` is 1 for the full
-// Hessian and 0 for its Gauss-Newton part. Returns the energy.
+// Adds element i to its own block `own`; sets its part of the next block `next` and of the coupling. `geometric` is 1 for
+// the full Hessian and 0 for its Gauss-Newton part. Returns the energy.
 template <class V>
 ENDOPILOT_DEVICE inline V add_element(const RodModel& rod, int i, const V& geometric, const Vec3<V>& near_tip, const Vec3<V>& near_base,
                      const Frame<V>& R, Diagonal<V>& own, Diagonal<V>& next, Coupling<V>& coupling) {
@@ -66,10 +66,10 @@ ENDOPILOT_DEVICE inline V add_element(const RodModel& rod, int i, const V& geome
     const Vec3<V> n{a * y.x, a * y.y, c * (y.z - 1.0)};
     const V energy = 0.5 * l * (n.x * y.x + n.y * y.y + n.z * (y.z - 1.0));
 
-    const Vec3<V> force = n.x * R.d1 + n.y * R.d2 + n.z * R.d3;
-    own.force += force;
-    next.force = {-force.x, -force.y, -force.z};
-    own.moment += broadcast<V>(l) * cross(n, y);
+    const Vec3<V> gradient = n.x * R.d1 + n.y * R.d2 + n.z * R.d3;
+    own.gradient_x += gradient;
+    next.gradient_x = {-gradient.x, -gradient.y, -gradient.z};
+    own.gradient_theta += broadcast<V>(l) * cross(n, y);
 
     const double isotropic = a / l, axial = (c - a) / l;
     const Vec3<V>& t = R.d3;
@@ -118,18 +118,18 @@ ENDOPILOT_DEVICE inline V add_joint(const RodModel& rod, int joint, const V& geo
     const V u = dot(v, v);
     // asin(s)/s = 1 + u/6 + 3u²/40 + 5u³/112 + 35u⁴/1152, u = s², and its derivative with respect to u
     const V g = 1.0 + u * (1.0 / 6 + u * (3.0 / 40 + u * (5.0 / 112 + u * (35.0 / 1152))));
-    const V slope = 1.0 / 6 + u * (3.0 / 20 + u * (15.0 / 112 + u * (35.0 / 288)));
+    const V dg = 1.0 / 6 + u * (3.0 / 20 + u * (15.0 / 112 + u * (35.0 / 288)));
     const V scale = (2.0 / L) * g;
     const Vec3<V> bent{scale * v.x - share * rest.x, scale * v.y - share * rest.y, scale * v.z - share * rest.z};
     const Vec3<V> n{eb * bent.x, eb * bent.y, et * bent.z};
     const V energy = 0.5 * L * dot(n, bent);
 
     // h = dE/dv; a rotation b of the distal and a of the proximal element give dv = (w (b - a) + v × (b + a)) / 2
-    const Vec3<V> h = (2.0 * g) * n + (4.0 * slope * dot(v, n)) * v;
+    const Vec3<V> h = (2.0 * g) * n + (4.0 * dg * dot(v, n)) * v;
     const V half = broadcast<V>(0.5);
     const Vec3<V> turn = half * cross(h, v), push = (0.5 * w) * h;
-    own.moment += push + turn;
-    next.moment = turn - push;
+    own.gradient_theta += push + turn;
+    next.gradient_theta = turn - push;
 
     // Gauss-Newton: L K^T B K with K = (g/L) (±w + [v]x)
     const V sb = (g * g) * (eb / L), st = (g * g) * (et / L);

@@ -1,4 +1,4 @@
-// Block-tridiagonal Cholesky factorisation, one block row at a time, from tip to base.
+// Block-tridiagonal LDLᵀ factorisation, one block row at a time, from tip to base.
 #pragma once
 
 #include <type_traits>
@@ -33,9 +33,11 @@ struct Elimination {
     V smallest_pivot, descent;
 };
 
-// Factors block `own` and eliminates it from block `next`. Row by row, so that work on the coupling hides the latency of the division by the row's pivot.
+// Factors block `own` and eliminates it from block `next`, row by row: work on the coupling hides the latency of the
+// division by the row's pivot.
 template <class V>
-[[gnu::always_inline]] ENDOPILOT_DEVICE inline Elimination<V> eliminate(const Diagonal<V>& own, const Coupling<V>& coupling, Factor<V>& f, Diagonal<V>& next) {
+[[gnu::always_inline]] ENDOPILOT_DEVICE inline Elimination<V> eliminate(const Diagonal<V>& own, const Coupling<V>& coupling,
+                                                                         Factor<V>& f, Diagonal<V>& next) {
     const V d[6][6] = {{own.xx.xx},
                        {own.xx.xy, own.xx.yy},
                        {own.xx.xz, own.xx.yz, own.xx.zz},
@@ -48,7 +50,8 @@ template <class V>
                         {coupling.tx[0][0], coupling.tx[0][1], coupling.tx[0][2]},
                         {coupling.tx[1][0], coupling.tx[1][1], coupling.tx[1][2]},
                         {coupling.tx[2][0], coupling.tx[2][1], coupling.tx[2][2]}};
-    const V g[6] = {own.force.x, own.force.y, own.force.z, own.moment.x, own.moment.y, own.moment.z};
+    const V g[6] = {own.gradient_x.x,     own.gradient_x.y,     own.gradient_x.z,
+                    own.gradient_theta.x, own.gradient_theta.y, own.gradient_theta.z};
     V lower[6][6], inverse[6], x[6][3], t[6][3], z[6], smallest = d[0][0];
     unroll<0, 6>([&](auto r_) {
         constexpr int r = decltype(r_)::value;
@@ -143,8 +146,8 @@ template <class V>
             next.tx[r][c] -= t[3][r] * f.wx[3][c] + t[4][r] * f.wx[4][c] + t[5][r] * f.wx[5][c];
         });
     });
-    next.force += Vec3<V>{xz(X), xz(Y), xz(Z)};
-    next.moment += Vec3<V>{tz(0), tz(1), tz(2)};
+    next.gradient_x += Vec3<V>{xz(X), xz(Y), xz(Z)};
+    next.gradient_theta += Vec3<V>{tz(0), tz(1), tz(2)};
     V descent = z[0] * f.z[0];
     for (int r = 1; r < 6; ++r) descent += z[r] * f.z[r];
     return {smallest, descent};

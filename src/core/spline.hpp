@@ -35,18 +35,18 @@ inline void filter_lines(float* data, std::ptrdiff_t n, std::ptrdiff_t step, std
     }
 }
 
-// The same along x, whose values lie side by side: eight lines at a time are turned.
+// The same along x, whose values lie side by side: eight lines at a time are transposed.
 inline void filter_rows(float* data, std::ptrdiff_t n, std::ptrdiff_t rows) {
     constexpr std::ptrdiff_t kTogether = 8;
-    std::vector<float> turned(std::size_t(n * kTogether));
+    std::vector<float> transposed(std::size_t(n * kTogether));
     for (std::ptrdiff_t row = 0; row < rows; row += kTogether) {
         const std::ptrdiff_t m = rows - row < kTogether ? rows - row : kTogether;
         float* from = data + row * n;
         for (std::ptrdiff_t r = 0; r < m; ++r)
-            for (std::ptrdiff_t k = 0; k < n; ++k) turned[std::size_t(k * m + r)] = from[r * n + k];
-        filter_lines(turned.data(), n, m, m);
+            for (std::ptrdiff_t k = 0; k < n; ++k) transposed[std::size_t(k * m + r)] = from[r * n + k];
+        filter_lines(transposed.data(), n, m, m);
         for (std::ptrdiff_t r = 0; r < m; ++r)
-            for (std::ptrdiff_t k = 0; k < n; ++k) from[r * n + k] = turned[std::size_t(k * m + r)];
+            for (std::ptrdiff_t k = 0; k < n; ++k) from[r * n + k] = transposed[std::size_t(k * m + r)];
     }
 }
 

@@ -1,5 +1,5 @@
 // The stepper's sweeps over the nodes of all lanes at once: evaluation with elimination, back substitution, update, and
-// the passage to the next step.
+// the end of a step.
 #pragma once
 
 #include "stepper.hpp"
@@ -10,7 +10,7 @@ template <class V>
 V Stepper<V>::add_loads(int i, const Node& node, Diagonal<V>& own) const {
     const Vec3<double>&f = loads_->force[i], &m = loads_->moment[i], &k = loads_->spring[i], &a = loads_->anchor[i];
     const Vec3<V> off{node.x.x - a.x, node.x.y - a.y, node.x.z - a.z};
-    own.force += Vec3<V>{k.x * off.x - f.x, k.y * off.y - f.y, k.z * off.z - f.z};
+    own.gradient_x += Vec3<V>{k.x * off.x - f.x, k.y * off.y - f.y, k.z * off.z - f.z};
     own.xx.xx += k.x;
     own.xx.yy += k.y;
     own.xx.zz += k.z;
@@ -20,7 +20,7 @@ V Stepper<V>::add_loads(int i, const Node& node, Diagonal<V>& own) const {
     const Quaternion<V> p = relative(node.start_q, node.q);
     const Vec3<V> b{broadcast<V>(m.x), broadcast<V>(m.y), broadcast<V>(m.z)};
     energy -= 2.0 * dot(b, p.v);
-    own.moment -= p.w * b + cross(b, p.v);
+    own.gradient_theta -= p.w * b + cross(b, p.v);
     const V bent = 0.5 * dot(b, p.v);
     own.tt.xx += bent;
     own.tt.yy += bent;
@@ -30,7 +30,7 @@ V Stepper<V>::add_loads(int i, const Node& node, Diagonal<V>& own) const {
     const Quaternion<V> attitude{broadcast<V>(c.w), {broadcast<V>(c.v.x), broadcast<V>(c.v.y), broadcast<V>(c.v.z)}};
     const Quaternion<V> r = relative(attitude, node.q);
     energy += 2.0 * h * dot(r.v, r.v);
-    own.moment += (2.0 * h * r.w) * r.v;
+    own.gradient_theta += (2.0 * h * r.w) * r.v;
     own.tt.xx += h;
     own.tt.yy += h;
     own.tt.zz += h;
@@ -54,7 +54,7 @@ void Stepper<V>::evaluate(int n) {
     }
 }
 
-// Elements and joints of `count` nodes from `first` on; what the wire asks of its base.
+// Elements and joints of `count` nodes from `first` on; the force and torque that the base exerts on the wire.
 template <class V>
 void Stepper<V>::add_rod(int first, int count) {
     const Vec3<double> axis = frame(base_.orientation).d3;
@@ -67,19 +67,24 @@ void Stepper<V>::add_rod(int first, int count) {
         const V share = select<V>(last, share_, broadcast<V>(1.0));
         energy += add_joint(rod_, i + 1, geometric_, share, node.q, behind.q, own, next, coupling_[k]);
         energy_ += select<V>(active_ > broadcast<V>(i), energy, V{});
-        base_force_ = select<V>(last, axis.x * next.force.x + axis.y * next.force.y + axis.z * next.force.z, base_force_);
-        base_torque_ = select<V>(last, next.moment.z, base_torque_);
-        if (in_.force_driven) drive_ = select(last, along_drive(next), drive_);
+        const Vec3<V>& at_base = next.gradient_x;  // its component along the axis is the force that the base must exert
+        base_force_ = select<V>(last, axis.x * at_base.x + axis.y * at_base.y + axis.z * at_base.z, base_force_);
+        base_torque_ = select<V>(last, next.gradient_theta.z, base_torque_);
+        if (in_.force_driven) drive_ = select(last, drive_block(next), drive_);
     }
 }
 
-// A block's gradient and Hessian in the drive's advance and rotation, had its node to follow the drive.
+// A block's gradient and Hessian with respect to the drive's advance and rotation, if its node follows the drive.
 template <class V>
-typename Stepper<V>::DriveRows Stepper<V>::along_drive(const Diagonal<V>& block) const {
+typename Stepper<V>::DriveBlock Stepper<V>::drive_block(const Diagonal<V>& block) const {
     const Vec3<double> d = frame(base_.orientation).d3;
     const Vec3<V> axis{broadcast<V>(d.x), broadcast<V>(d.y), broadcast<V>(d.z)};
     const Vec3<V> across{block.tx[2][0], block.tx[2][1], block.tx[2][2]};
-    return {dot(axis, block.force), block.moment.z, dot(axis, block.xx * axis), dot(axis, across), block.tt.zz};
+    return {.gradient_a = dot(axis, block.gradient_x),
+            .gradient_r = block.gradient_theta.z,
+            .aa = dot(axis, block.xx * axis),
+            .ar = dot(axis, across),
+            .rr = block.tt.zz};
 }
 
 // The wall's reaction and friction.
@@ -90,14 +95,14 @@ void Stepper<V>::add_lumen(int first, int count) {
         const int i = first + k;
         Node& node = node_[i];
         const Distance<V> d = distance_to_wall(*lumen_, node.x);
-        node.wall = {d.value, d.slope};
-        const Mask<V> sticky = (first_ > zero) & (node.grip.limit > zero) & (d.value < rod_.radius[i] + kReach);
+        node.wall = {d.value, d.gradient};
+        const Mask<V> sticky = (first_ > zero) & (node.friction.limit > zero) & (d.value < rod_.radius[i] + kStickyReach);
         const V energy = add_wall<V>(options_.wall_stiffness, rod_.radius[i], geometric_, sticky, d, block_[k]);
         energy_ += select<V>(active_ > broadcast<V>(i), energy, zero);
     }
     for (int k = 0; k < count; ++k) {
         const Node& node = node_[first + k];
-        const V energy = add_friction(node.grip, eps_, node.x - node.start, relative(node.start_q, node.q), block_[k]);
+        const V energy = add_friction(node.friction, eps_, node.x - node.start, relative(node.start_q, node.q), block_[k]);
         energy_ += select<V>(active_ > broadcast<V>(first + k), energy, zero);
     }
 }
@@ -112,15 +117,15 @@ void Stepper<V>::add_drag(int first, int count) {
         const Mask<V> on = active_ > broadcast<V>(i);
         const Vec3<V> moved = node.x - node.start;
         const Quaternion<V> turned_by = relative(node.start_q, node.q);
-        const V way = dot(moved, moved), swing = dot(turned_by.v, turned_by.v);
-        jump_ = select<V>(on, maximum<V>(jump_, maximum<V>(way_ * way, swing_ * swing)), jump_);
+        const V moved2 = dot(moved, moved), turned2 = dot(turned_by.v, turned_by.v);
+        jump_ = select<V>(on, maximum<V>(jump_, maximum<V>(jump_scale_x_ * moved2, jump_scale_theta_ * turned2)), jump_);
         const V drag = rod_.drag[i] * inverse_dt_, spin_drag = rod_.spin_drag[i] * inverse_dt_;
-        V energy = 0.5 * drag * way + 2.0 * spin_drag * swing;
+        V energy = 0.5 * drag * moved2 + 2.0 * spin_drag * turned2;
         if (loads_) energy += add_loads(i, node, own);
         energy_ += select<V>(on, energy, V{});
         const V stiffen = drag + damping_, spin_stiffen = spin_drag + damping_;
-        own.force += drag * moved;
-        own.moment += (2.0 * spin_drag * turned_by.w) * turned_by.v;
+        own.gradient_x += drag * moved;
+        own.gradient_theta += (2.0 * spin_drag * turned_by.w) * turned_by.v;
         own.xx.xx += stiffen;
         own.xx.yy += stiffen;
         own.xx.zz += stiffen;
@@ -130,13 +135,13 @@ void Stepper<V>::add_drag(int first, int count) {
     }
 }
 
-// Empties what `along_drive` reads of a base's block: of what is there only the part that is eliminated into it counts.
-// What lies behind follows the drive, and is there only where the wire of another lane is longer.
+// Clears what `drive_block` reads of the base's block before the nodes ahead are eliminated into it. Its own energy was
+// counted before, and elements behind it are there only for the longer wires of other lanes.
 template <class V>
-void Stepper<V>::clear_drive_rows(Mask<V> mask, Diagonal<V>& block) const {
+void Stepper<V>::clear_drive_entries(Mask<V> mask, Diagonal<V>& block) const {
     const V zero{};
-    for (V* entry : {&block.force.x, &block.force.y, &block.force.z, &block.moment.z, &block.xx.xx, &block.xx.yy, &block.xx.zz,
-                     &block.xx.xy, &block.xx.xz, &block.xx.yz, &block.tx[2][0], &block.tx[2][1], &block.tx[2][2], &block.tt.zz})
+    for (V* entry : {&block.gradient_x.x, &block.gradient_x.y, &block.gradient_x.z, &block.gradient_theta.z, &block.xx.xx,
+                     &block.xx.yy, &block.xx.zz, &block.xx.xy, &block.xx.xz, &block.xx.yz, &block.tx[2][0], &block.tx[2][1], &block.tx[2][2], &block.tt.zz})
         *entry = select<V>(mask, zero, *entry);
 }
 
@@ -148,12 +153,12 @@ void Stepper<V>::eliminate_nodes(int first, int count) {
         const Mask<V> on = active_ > broadcast<V>(i);
         Diagonal<V>& next = block_[k + 1];
         const Mask<V> base_next = active_ == broadcast<V>(i + 1);
-        if (in_.force_driven) clear_drive_rows(base_next, next);
+        if (in_.force_driven) clear_drive_entries(base_next, next);
         const Elimination<V> eliminated = eliminate(block_[k], coupling_[k], factor_[i], next);
         descent_ += select<V>(on, eliminated.descent, zero);
         const Mask<V> sound = eliminated.smallest_pivot > zero;
         pivot_ = select<V>(on, select<V>(sound, pivot_, zero), pivot_);
-        if (in_.force_driven) drive_ = select(base_next, drive_ + along_drive(next), drive_);
+        if (in_.force_driven) drive_ = select(base_next, drive_ + drive_block(next), drive_);
     }
 }
 
@@ -183,15 +188,15 @@ V Stepper<V>::solve(int n) {
     return square_root(largest);
 }
 
-// Moves each lane's trial point as its verdict says: by `factor` times Newton's step where that is accepted, back to
+// Moves each lane's trial point by its decision: by `factor` times Newton's step where that is accepted, back to
 // `factor` times its last move where that is shortened.
 template <class V>
-void Stepper<V>::update(int n, const Verdict (&verdict)[W], const V& factor) {
+void Stepper<V>::update(int n, const Decision (&decision)[W], const V& factor) {
     Mask<V> accept{}, shorten{}, repeat{};
     for (int l = 0; l < W; ++l) {
-        set_mask<V>(accept, l, verdict[l] == Verdict::accept || verdict[l] == Verdict::converged);
-        set_mask<V>(shorten, l, verdict[l] == Verdict::shorten);
-        set_mask<V>(repeat, l, verdict[l] == Verdict::repeat);
+        set_mask<V>(accept, l, decision[l] == Decision::accept || decision[l] == Decision::converged);
+        set_mask<V>(shorten, l, decision[l] == Decision::shorten);
+        set_mask<V>(repeat, l, decision[l] == Decision::repeat);
     }
     for (int i = 0; i < n; ++i) {
         Node& node = node_[i];
@@ -204,17 +209,17 @@ void Stepper<V>::update(int n, const Verdict (&verdict)[W], const V& factor) {
         node.step = select(take, {factor * z[0], factor * z[1], factor * z[2]}, select(shrink, factor * node.step, node.step));
         node.turn = select(take, {factor * z[3], factor * z[4], factor * z[5]}, select(shrink, factor * node.turn, node.turn));
         node.x = select(moves, node.from + node.step, node.x);
-        node.q = select(moves, turned(node.from_q, node.turn), node.q);
+        node.q = select(moves, rotated(node.from_q, node.turn), node.q);
     }
     for (int l = 0; l < W; ++l) {
         Lane& lane = lane_[l];
         if (!lane.by_force || lane.world < 0) continue;
         const double f = get(factor, l);
-        const bool takes = verdict[l] == Verdict::accept || verdict[l] == Verdict::converged;
-        if (takes || verdict[l] == Verdict::repeat) lane.from = lane.end;
+        const bool takes = decision[l] == Decision::accept || decision[l] == Decision::converged;
+        if (takes || decision[l] == Decision::repeat) lane.from = lane.end;
         if (takes) lane.move = {f * get(drive_a_, l), f * get(drive_r_, l)};
-        if (verdict[l] == Verdict::shorten) lane.move = {f * lane.move.advance, f * lane.move.rotation};
-        if (!takes && verdict[l] != Verdict::shorten) continue;
+        if (decision[l] == Decision::shorten) lane.move = {f * lane.move.advance, f * lane.move.rotation};
+        if (!takes && decision[l] != Decision::shorten) continue;
         lane.end = {lane.from.advance + lane.move.advance, lane.from.rotation + lane.move.rotation};
         place_base(l, lane.active);
     }
@@ -235,25 +240,25 @@ void Stepper<V>::finish_step(int n, Mask<V> mask, Mask<V> restart, const V& weig
         node.start = select(on, node.x, node.start);
         node.start_q = select(on, node.q, node.start_q);
         if (lumen_) {
-            const Vec3<V>& slope = node.wall.slope;
-            const V distance = node.wall.distance + dot(slope, node.step);
-            const V steepness = square_root(dot(slope, slope));
-            const Mask<V> touches = (distance < rod_.radius[i]) & (steepness > 1e-3);
-            const V push = select<V>(touches, options_.wall_stiffness * (rod_.radius[i] - distance) * steepness, zero);
+            const Vec3<V>& gradient = node.wall.gradient;
+            const V distance = node.wall.distance + dot(gradient, node.step);
+            const V norm = square_root(dot(gradient, gradient));
+            const Mask<V> touches = (distance < rod_.radius[i]) & (norm > 1e-3);
+            const V push = select<V>(touches, options_.wall_stiffness * (rod_.radius[i] - distance) * norm, zero);
             // friction in the coming step acts with the normal force at its middle, extrapolated
-            V ahead = push + select<V>(node.force > zero, 0.5 * weight * (push - node.force), zero);
+            V ahead = push + select<V>(node.normal_force > zero, 0.5 * weight * (push - node.normal_force), zero);
             ahead = select<V>(ahead > 2.0 * push, 2.0 * push, ahead);
             ahead = select<V>(ahead > zero, ahead, zero);
-            node.force = select<V>(on, push, node.force);
-            const V inverse = select<V>(touches, one / steepness, zero);
-            const Vec3<V> normal = inverse * slope;
+            node.normal_force = select<V>(on, push, node.normal_force);
+            const V inverse = select<V>(touches, one / norm, zero);
+            const Vec3<V> normal = inverse * gradient;
             const Frame<V> axes = frame(node.start_q);
-            node.grip.limit = select<V>(on, friction_ * ahead, node.grip.limit);
-            node.grip.normal = select(on, normal, node.grip.normal);
-            node.grip.spin = select(on, broadcast<V>(rod_.radius[i]) * cross(normal, axes.d3), node.grip.spin);
+            node.friction.limit = select<V>(on, friction_ * ahead, node.friction.limit);
+            node.friction.normal = select(on, normal, node.friction.normal);
+            node.friction.spin_arm = select(on, broadcast<V>(rod_.radius[i]) * cross(normal, axes.d3), node.friction.spin_arm);
         }
         node.x = select(on, node.start + weight * node.last, select(back, node.start, node.x));
-        node.q = select(on, turned(node.start_q, weight * node.last_turn), select(back, node.start_q, node.q));
+        node.q = select(on, rotated(node.start_q, weight * node.last_turn), select(back, node.start_q, node.q));
         node.step = select(on, {zero, zero, zero}, node.step);
         node.turn = select(on, {zero, zero, zero}, node.turn);
     }

@@ -1,4 +1,4 @@
-// Worlds at rest between samples, and who is stepped next.
+// Worlds at rest between samples, and the queue that hands them to lanes.
 #pragma once
 
 #include <algorithm>
@@ -24,7 +24,9 @@ struct World {
         kScalars
     };
     // last increments of position and rotation; friction limit, wall normal, spin arm; normal force, N
-    enum NodeQuantity { kX = 0, kQ = 3, kLast = 7, kLastTurn = 10, kLimit = 13, kNormal = 14, kSpinArm = 17, kForce = 20, kNodeSize = 21 };
+    enum NodeQuantity {
+        kX = 0, kQ = 3, kLast = 7, kLastTurn = 10, kLimit = 13, kNormal = 14, kSpinArm = 17, kNormalForce = 20, kNodeSize = 21
+    };
 
     std::vector<double> values;
 
@@ -36,13 +38,13 @@ struct World {
     bool valid() const { return values[kReason] == double(kFine); }
 };
 
-// Hands worlds to lanes, one sample at a time. Lanes of a stepper sweep over the nodes of the longest wire among them, so
-// they are given worlds of like length. Which lane steps a world changes nothing in its result.
-class Crew {
+// A work queue: hands worlds to lanes, one sample at a time. Lanes of a stepper sweep over the nodes of the longest wire
+// among them, so they are given worlds of similar length. A world's result does not depend on the lane that steps it.
+class WorkQueue {
 public:
-    // `order`: the worlds, those of like length next to each other, and `length` their active nodes. At most `size` of
-    // them are under way.
-    Crew(std::vector<int> order, std::vector<double> length, int size)
+    // `order`: the worlds, those of similar length next to each other; `length`: their active nodes. At most `size` of them
+    // are under way at a time.
+    WorkQueue(std::vector<int> order, std::vector<double> length, int size)
         : order_(std::move(order)), length_(std::move(length)), size_(size) {}
 
     // Takes a world whose number of active nodes is near `length` (any, if negative); -1 where none is ready. `sample` is
@@ -70,7 +72,7 @@ public:
         return taken.world;
     }
 
-    void give_back(int world, int sample, double length) {
+    void put_back(int world, int sample, double length) {
         const std::lock_guard<std::mutex> lock(mutex_);
         ready_.push_back({world, sample, length});
     }

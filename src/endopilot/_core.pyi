@@ -25,7 +25,7 @@ class Options:
     sample_tolerance: float
     largest_step: float
     largest_jump: float
-    most_iterations: int
+    max_iterations: int
     free_behind: float
     approach_velocity: float
     push_limit: float

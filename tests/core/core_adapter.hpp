@@ -38,8 +38,8 @@ struct Single {
 
 template <class V>
 Vector gradient_of(const Diagonal<V>& d, int lane = 0) {
-    return {get(d.force.x, lane),  get(d.force.y, lane),  get(d.force.z, lane),
-            get(d.moment.x, lane), get(d.moment.y, lane), get(d.moment.z, lane)};
+    return {get(d.gradient_x.x, lane),  get(d.gradient_x.y, lane),  get(d.gradient_x.z, lane),
+            get(d.gradient_theta.x, lane), get(d.gradient_theta.y, lane), get(d.gradient_theta.z, lane)};
 }
 
 template <class V>
@@ -85,10 +85,10 @@ inline Single wall_energy(const Lumen& lumen, double stiffness, double radius, c
     return {energy, gradient_of(own), hessian_of(own)};
 }
 
-inline Single friction_energy(const Grip<double>& grip, double eps, const Vec3<double>& start,
+inline Single friction_energy(const FrictionState<double>& friction, double eps, const Vec3<double>& start,
                               const Quaternion<double>& start_q, const Pose& now) {
     Diagonal<double> own{};
-    const double energy = add_friction<double>(grip, eps, now.x - start, relative(start_q, now.q), own);
+    const double energy = add_friction<double>(friction, eps, now.x - start, relative(start_q, now.q), own);
     return {energy, gradient_of(own), hessian_of(own)};
 }
 
@@ -114,8 +114,8 @@ std::array<std::vector<Vector>, kWidth<V>> solve_chain(const std::vector<Matrix>
         V g[6];
         for (int r = 0; r < 6; ++r)
             for (int l = 0; l < W; ++l) set(g[r], l, gradient[i][r] * (l + 1));
-        block.force = Vec3<V>{g[0], g[1], g[2]} + carried.force;
-        block.moment = Vec3<V>{g[3], g[4], g[5]} + carried.moment;
+        block.gradient_x = Vec3<V>{g[0], g[1], g[2]} + carried.gradient_x;
+        block.gradient_theta = Vec3<V>{g[3], g[4], g[5]} + carried.gradient_theta;
         for (int r = 0; r < 3; ++r)
             for (int c = 0; c < 3; ++c) block.tx[r][c] = broadcast<V>(own[i][3 + r][c]) + carried.tx[r][c];
         const auto add = [](Sym3<V>& a, const Sym3<V>& b) {

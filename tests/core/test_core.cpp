@@ -41,7 +41,7 @@ V random_lanes(double low, double high) {
 template <class V>
 Quaternion<V> random_rotation() {
     const Vec3<V> angle{random_lanes<V>(-1, 1), random_lanes<V>(-1, 1), random_lanes<V>(-1, 1)};
-    return turned(Quaternion<V>{broadcast<V>(1.0), {V{}, V{}, V{}}}, angle);
+    return rotated(Quaternion<V>{broadcast<V>(1.0), {V{}, V{}, V{}}}, angle);
 }
 
 Vec3<double> lane_of(const auto& v, int l) { return {get(v.x, l), get(v.y, l), get(v.z, l)}; }
@@ -144,7 +144,7 @@ Pose moved(const Pose& pose, int unknown, double by) {
     double step[6] = {};
     step[unknown] = by;
     out.x += Vec3<double>{step[0], step[1], step[2]};
-    // exactly the rotation vector `step`, where turned() agrees with it to second order
+    // exactly the rotation vector `step`, where rotated() agrees with it to second order
     const double half = 0.5 * by;
     const Quaternion<double> turn{unknown < 3 ? 1.0 : std::cos(half), {unknown == 3 ? std::sin(half) : 0, unknown == 4 ? std::sin(half) : 0,
                                                                       unknown == 5 ? std::sin(half) : 0}};
@@ -193,7 +193,7 @@ void test_elastic_energy(double bent, double rest, double tolerance, double shar
         const auto start = random_rotation<double>();
         const Vec3<double> bend{uniform(-bent, bent), uniform(-bent, bent), uniform(-bent, bent)};
         const Vec3<double> along = 0.8 * frame(start).d3, off{uniform(-0.2, 0.2), uniform(-0.2, 0.2), uniform(-0.2, 0.2)};
-        const Pose poses[2] = {{along + off, turned(start, bend)}, {{0, 0, 0}, start}};
+        const Pose poses[2] = {{along + off, rotated(start, bend)}, {{0, 0, 0}, start}};
         const auto energy = [&](const Pose (&p)[2]) { return elastic_energy(rod, p[0], p[1], 1.0, share).energy; };
         const Pair exact = elastic_energy(rod, poses[0], poses[1], 1.0, share);
         expect(exact.energy > 0, "a strained rod has energy");
@@ -263,16 +263,16 @@ void test_distance() {
         const Distance<V> d = distance_to_wall<V>(lumen, x);
         for (int axis = 0; axis < 3; ++axis) {
             const Distance<V> up = value(axis, h), down = value(axis, -h);
-            const Vec3<V> columns[3] = {{d.curve.xx, d.curve.xy, d.curve.xz}, {d.curve.xy, d.curve.yy, d.curve.yz}, {d.curve.xz, d.curve.yz, d.curve.zz}};
+            const Vec3<V> columns[3] = {{d.hessian.xx, d.hessian.xy, d.hessian.xz}, {d.hessian.xy, d.hessian.yy, d.hessian.yz}, {d.hessian.xz, d.hessian.yz, d.hessian.zz}};
             for (int l = 0; l < kWidth<V>; ++l) {
-                const Vec3<double> slope = lane_of(d.slope, l), column = lane_of(columns[axis], l);
+                const Vec3<double> slope = lane_of(d.gradient, l), column = lane_of(columns[axis], l);
                 const double s[3] = {slope.x, slope.y, slope.z};
                 expect_near(s[axis], (get(up.value, l) - get(down.value, l)) / (2 * h), 1e-3 * h + 1e-8, "slope of the distance");
                 // the spline's second derivative jumps between cells: stay off their borders
                 const double places[3] = {get(x.x, l) + 2.0, get(x.y, l) + 4.0, get(x.z, l) + 3.0};
                 const double place = places[axis] / kSpacing + 0.5;
                 if (std::abs(place - std::round(place)) < 4 * h) continue;
-                const Vec3<double> change = (1 / (2 * h)) * (lane_of(up.slope, l) - lane_of(down.slope, l));
+                const Vec3<double> change = (1 / (2 * h)) * (lane_of(up.gradient, l) - lane_of(down.gradient, l));
                 expect_near(column.x, change.x, 1e-8, "curve of the distance");
                 expect_near(column.y, change.y, 1e-8, "curve of the distance");
                 expect_near(column.z, change.z, 1e-8, "curve of the distance");
@@ -350,23 +350,23 @@ void test_friction() {
         Vec3<double> n = cross(axis, other);
         n = (1 / std::sqrt(dot(n, n))) * n;  // the wall's normal, square to the wire
         const double limit = 0.7, eps = 0.02, radius = 0.18;
-        const Grip<double> grip{limit, n, radius * cross(n, axis)};
+        const FrictionState<double> friction{limit, n, radius * cross(n, axis)};
         const Vec3<double> start{0.1, -0.2, 0.3};
         const Pose now{start + Vec3<double>{uniform(-.1, .1), uniform(-.1, .1), uniform(-.1, .1)},
-                       turned(start_q, {uniform(-.1, .1), uniform(-.1, .1), uniform(-.3, .3)})};
-        const Single exact = friction_energy(grip, eps, start, start_q, now);
+                       rotated(start_q, {uniform(-.1, .1), uniform(-.1, .1), uniform(-.3, .3)})};
+        const Single exact = friction_energy(friction, eps, start, start_q, now);
         const double force = std::hypot(exact.gradient[0], exact.gradient[1], exact.gradient[2]);
         expect(force <= limit * (1 + 1e-12), "friction is at most its limit");
         expect_near(exact.gradient[0] * n.x + exact.gradient[1] * n.y + exact.gradient[2] * n.z, 0, 1e-14, "friction acts along the wall");
         const double h = 1e-5;
         for (int a = 0; a < 6; ++a) {
-            const Single up = friction_energy(grip, eps, start, start_q, moved(now, a, h));
-            const Single down = friction_energy(grip, eps, start, start_q, moved(now, a, -h));
+            const Single up = friction_energy(friction, eps, start, start_q, moved(now, a, h));
+            const Single down = friction_energy(friction, eps, start, start_q, moved(now, a, -h));
             expect_near(exact.gradient[a], (up.energy - down.energy) / (2 * h), 1e-7, "gradient of friction");
             for (int b = 0; b < 3; ++b)  // the rows of rotations leave out the second derivative of the turn
                 expect_near(exact.hessian[a][b], (up.gradient[b] - down.gradient[b]) / (2 * h), 1e-5, "Hessian of friction");
         }
-        const Single still = friction_energy(grip, eps, start, start_q, {start, start_q});
+        const Single still = friction_energy(friction, eps, start, start_q, {start, start_q});
         expect_near(still.energy, 0, 1e-16, "friction at rest holds no energy");
     }
 }
@@ -389,10 +389,10 @@ void test_projection() {
     for (int i = 0; i < straight; ++i)
         vertex.push_back({fork + (0.5 * i) * onwards, onwards, vertex[middle].abscissa + 0.5 * i, 1.5, n, n + straight - 1, 1});
     constexpr double never = std::numeric_limits<double>::infinity();
-    std::vector<Rival> rival(2 * vertex.size(), {never, 0});
-    for (int i = 0; i < n; ++i) rival[2 * i + 1] = {0.0, n + std::clamp(2 * (i - middle), 0, straight - 1)};
-    for (int i = 0; i < straight; ++i) rival[2 * (n + i)] = {0.0, std::min(middle + i, n - 1)};
-    const Projector project(vertex, rival, {{0, 0, 0}, {1, 0, 0}, 2.0});
+    std::vector<Candidate> candidate(2 * vertex.size(), {never, 0});
+    for (int i = 0; i < n; ++i) candidate[2 * i + 1] = {0.0, n + std::clamp(2 * (i - middle), 0, straight - 1)};
+    for (int i = 0; i < straight; ++i) candidate[2 * (n + i)] = {0.0, std::min(middle + i, n - 1)};
+    const Projector project(vertex, candidate, {{0, 0, 0}, {1, 0, 0}, 2.0});
     const auto nearest = [&](const Vec3<double>& point) {
         std::pair<double, std::int64_t> best{never, 0};
         for (std::size_t v = 0; v < vertex.size(); ++v) {

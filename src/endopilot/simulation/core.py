@@ -16,7 +16,7 @@ from endopilot.types import SAMPLE_PERIOD_S, Anatomy, DistanceMap, Insertion
 
 _LARGEST_NEWTON_STEP = 0.3
 """Displacement of a node (mm) that one Newton step is clamped to; larger ones can tangle the wire for good."""
-_MOST_ITERATIONS = 400
+_MAX_ITERATIONS = 400
 """Newton iterations after which a time step is halved, down to 1/64; a wire that snaps over needs some hundred."""
 
 
@@ -117,7 +117,7 @@ def core_options(
     options.sample_tolerance = min(config.sample_tolerance_mm, config.tolerance_mm)
     options.largest_step = _LARGEST_NEWTON_STEP
     options.largest_jump = config.largest_jump
-    options.most_iterations = _MOST_ITERATIONS
+    options.max_iterations = _MAX_ITERATIONS
     options.free_behind = free_behind_mm
     options.push_limit = push_limit_n
     options.approach_velocity = config.approach_velocity_mm_s if approach else 0.0
