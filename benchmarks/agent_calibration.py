@@ -45,7 +45,7 @@ class Monitored(AgentPolicy):
 
     def wants_xray(self) -> bool:
         """Keep the prediction, and ask for X-ray at the fixed times."""
-        proximal, tip, spread, _ = self.foretold()
+        proximal, tip, spread, _ = self.adviser_input()
         self.kept.append(np.concatenate([proximal[0], tip[0], spread[0]]))
         return len(self.kept) % EXPOSED_EVERY == 0
 

@@ -1,4 +1,4 @@
-"""Searching a way in the rod core, believing in an ensemble, and the policies made of both."""
+"""The search for a path in the rod core, the belief as an ensemble, and the policies made of both."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ def side_branch(fork, shaped) -> Navigation:
 
 
 def test_the_twin_gets_into_a_side_branch_that_pushing_misses(side_branch) -> None:
-    missed = navigate(replace(side_branch, seconds=8.0), Forward(), seed=1)
-    assert not missed.success
+    failed = navigate(replace(side_branch, seconds=8.0), Forward(), seed=1)
+    assert not failed.success
     policy = TwinPolicy(config=QUICK)
     assert isinstance(policy, Policy)
     record = navigate(side_branch, policy, seed=1)
@@ -104,14 +104,14 @@ def test_measurements_weigh_the_member_that_they_are_of(side_branch) -> None:
 def test_a_tip_that_no_wire_explains_is_pulled_back_under_xray(side_branch) -> None:
     policy = AgentPolicy(QUICK)
     policy.start(side_branch, 0)
-    seen = measured(policy.belief, 0)
-    first = policy.decide(Observation(0.0, 2.0, 0.0, seen))
+    shown = measured(policy.belief, 0)
+    first = policy.decide(Observation(0.0, 2.0, 0.0, shown))
     assert first.translation > 0
-    far = replace(seen, position=seen.position + np.array([6.0, 0.0, 5.0]))
+    far = replace(shown, position=shown.position + np.array([6.0, 0.0, 5.0]))
     lost = policy.decide(Observation(0.5, 2.0, 0.0, far))
     assert lost.translation < 0 and lost.expose
     policy.decide(Observation(1.0, 2.0, 0.0, measured(policy.belief, 0)))
-    assert policy.plans == 2  # found again, it searches another way
+    assert policy.plans == 2  # found again, it searches another path
 
 
 def test_with_a_calibration_the_adviser_says_when_to_look(side_branch) -> None:
@@ -167,7 +167,7 @@ def test_whatever_the_model_returns_commands_are_finite_and_within_limits(starte
             position=np.zeros((*tip.shape, 3)), force=tip, inserted=wild[:, 2], rotation=wild[:, 3], reached=0.0,
         )  # fmt: skip
 
-    started._search.find, started._course, started._vain = find, None, 0
+    started._search.find, started._course, started._failed = find, None, 0
     for k in range(len(control)):
         decision = started.decide(Observation(0.5 * k, 2.0, 0.0, None))
         assert np.isfinite([decision.translation, decision.rotation]).all()

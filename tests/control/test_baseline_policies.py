@@ -14,7 +14,7 @@ from endopilot.xray.fluoroscope import TipMeasurement
 
 @pytest.fixture
 def navigation(fork, wire) -> Navigation:
-    """Return the way into the side branch, which leaves after 20 mm."""
+    """Return the navigation into the side branch, which leaves after 20 mm."""
     side = min(fork.tree.leaves(), key=lambda leaf: fork.tree.branches[leaf].centerline.radius[-1])
     return Navigation(anatomy=fork, device=wire, target=Target(branch=side, abscissa=30.0))
 
@@ -24,7 +24,7 @@ def _sight(inserted: float, rotation: float = 0.0, tip: TipMeasurement | None = 
 
 
 def _seen(navigation: Navigation, abscissa: float, *, wrong: bool = False) -> TipMeasurement:
-    """Return a tip that is seen on the way, or in the other branch."""
+    """Return a measured tip on the route, or in the other branch."""
     tree, target = navigation.anatomy.tree, navigation.target.branch
     other = next(leaf for leaf in tree.leaves() if leaf != target)
     branch = 0 if abscissa <= 20.0 else other if wrong else target

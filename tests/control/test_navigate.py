@@ -1,4 +1,4 @@
-"""One navigation: what the policy is told, what is recorded, and how it ends."""
+"""One navigation: what the policy is given, what is recorded, and how it ends."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ class Forward:
 
     def __init__(self, speed: float, expose_every: int = 1000, rotation: float = 0.0) -> None:
         self.speed, self.expose_every, self.rotation = speed, expose_every, rotation
-        self.told: list[Observation] = []
+        self.given: list[Observation] = []
 
     def start(self, navigation: Navigation, seed: int) -> None:
         self.navigation = navigation
 
     def decide(self, observation: Observation) -> Decision:
-        self.told.append(observation)
-        return Decision(self.speed, self.rotation, expose=len(self.told) % self.expose_every == 0)
+        self.given.append(observation)
+        return Decision(self.speed, self.rotation, expose=len(self.given) % self.expose_every == 0)
 
 
 @pytest.fixture
@@ -49,17 +49,17 @@ def test_a_policy_that_pushes_on_reaches_a_target_straight_ahead(straight) -> No
     assert record.reason == "reached" and record.success
     assert abs(record.tip.abscissa[-1] - 30.0) <= 2.0 and record.tip.branch[-1] == 1
     assert (np.abs(record.tip.abscissa[:-1] - 30.0) > 2.0).all()  # it ends at once
-    samples = len(policy.told)
+    samples = len(policy.given)
     assert len(record.time_s) == len(record.inserted_length) == len(record.tip.abscissa) == samples + 1
     assert record.seconds == record.time_s[-1] == 0.5 * samples
-    # X-ray is on at the start and where the decision before asked for it; only then is a tip told
+    # X-ray is on at the start and where the decision before asked for it; only then is a tip given
     on = [index == 0 or index % 3 == 0 for index in range(samples)]
-    assert [observation.tip is not None for observation in policy.told] == on == record.exposed[:-1].tolist()
+    assert [observation.tip is not None for observation in policy.given] == on == record.exposed[:-1].tolist()
     assert record.exposures == sum(on)
     for index in np.flatnonzero(record.exposed):
-        assert policy.told[index].tip is record.measured[index]
-        off = np.linalg.norm(record.measured[index].position - record.tip_position[index])
-        assert 0.0 < off < 1.5
+        assert policy.given[index].tip is record.measured[index]
+        error = np.linalg.norm(record.measured[index].position - record.tip_position[index])
+        assert 0.0 < error < 1.5
     assert record.peak_force_n == record.contact_force_max.max()
     assert record.safe == (record.peak_force_n <= straight.force_limit_n)
     assert 20 < record.path_mm < 40
@@ -77,7 +77,7 @@ def test_it_ends_in_time_and_the_same_seed_repeats_it(straight) -> None:
 def test_encoders_count_from_where_the_ostium_is_believed_to_be(straight) -> None:
     policy = Forward(4.0)
     record = navigate(straight, policy, config=NavigateConfig(robot=PERFECT), truth=ModelMismatch(ostium_mm=1.5))
-    encoder = np.array([observation.inserted_length for observation in policy.told])
+    encoder = np.array([observation.inserted_length for observation in policy.given])
     np.testing.assert_allclose(record.inserted_length[:-1] - encoder, 1.5, atol=1e-9)
     np.testing.assert_allclose(np.diff(record.inserted_length), 2.0, atol=1e-6)
 
@@ -103,6 +103,6 @@ def test_what_a_policy_asks_is_kept_within_the_limits(straight) -> None:
 def test_one_view_alone_locates_the_tip_by_the_vessel(straight) -> None:
     config = NavigateConfig(fluoroscope=FluoroscopeConfig(biplane=False))
     record = navigate(straight, Forward(5.0, expose_every=1), config=config)
-    seen = [measured for measured in record.measured if measured is not None]
-    off = np.array([tip.abscissa for tip in seen]) - record.tip.abscissa[: len(seen)]
-    assert np.abs(off).max() < 2.0
+    shown = [measured for measured in record.measured if measured is not None]
+    error = np.array([tip.abscissa for tip in shown]) - record.tip.abscissa[: len(shown)]
+    assert np.abs(error).max() < 2.0

@@ -105,7 +105,7 @@ def test_a_plan_for_another_vessel_or_wire_is_refused(found, vessel, tmp_path):
         read_plan(folder, other, device)
     with pytest.raises(InputError, match="another device"):
         read_plan(folder, anatomy, replace(device, friction=0.2))
-    read_plan(folder, anatomy, replace(device, sources={}))  # the same wire, told in other words
+    read_plan(folder, anatomy, replace(device, sources={}))  # the same wire with other sources
     table = folder / "plan.csv"
     table.write_text(table.read_text().replace("10.0,", "11.0,", 1))
     with pytest.raises(InputError, match=r"plan\.csv.* differs"):
@@ -156,11 +156,11 @@ def test_sampling_brings_the_predicted_tip_nearer_to_the_desired_one(vessel, run
     few = replace(few, sample=replace(few.sample, iterations=1, candidates=1))
     many = PlanConfig(**settings)
     many = replace(many, sample=replace(many.sample, iterations=6, candidates=24))
-    off = [
+    error = [
         np.abs(made.predicted - made.desired).mean()
         for made in (plan(vessel, "0,0,33", c, model=run) for c in (few, many))
     ]
-    assert off[1] < 0.8 * off[0]
+    assert error[1] < 0.8 * error[0]
 
 
 def test_the_model_of_the_package_plans_to_a_target_and_leaves_the_patients_folder_alone(vessel):

@@ -1,4 +1,4 @@
-"""The way to a target: progress along it, leaving it, and targets that do not lie in the vessel."""
+"""The route to a target: progress along it, leaving it, and targets that do not lie in the vessel."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_a_tip_in_the_wrong_branch_has_come_as_far_as_the_junction(route):
     side = np.array([0, 0, 20.0]) + 8.0 * np.array([np.sin(np.pi / 3), 0, np.cos(np.pi / 3)])
     tip = tips(route, [0, 0, 12.0], [0, 0, 27.0], side)
     assert np.allclose(route.progress(tip), [12.0, 20.0, 28.0], atol=0.2)
-    assert np.allclose(route.astray(tip), [0.0, 7.0, 0.0], atol=0.2)
+    assert np.allclose(route.off_route(tip), [0.0, 7.0, 0.0], atol=0.2)
 
 
 def test_a_waypoint_is_passed_in_the_right_branch_alone(route):

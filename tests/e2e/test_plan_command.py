@@ -127,5 +127,5 @@ def test_a_branch_that_the_wire_does_not_get_into(patient, tmp_path, capsys):
     line = refused(
         capsys, "plan", patient, "--target", target, "-o", tmp_path / "plan", "--device", tmp_path / "straight.yaml"
     )
-    assert "no way found to branch 2" in line and "tip bend" in line
+    assert "no path found to branch 2" in line and "tip bend" in line
     assert not (tmp_path / "plan").exists()

@@ -196,10 +196,10 @@ def test_a_world_that_fails_terminates_and_says_so(near, monkeypatch):
 def test_too_large_a_force_is_told_and_remembered(near):
     env = NavigateEnv(navigation=replace(near, force_limit_n=1e-4))
     env.reset(seed=0)
-    told = [env.step(np.array([1.0, 0.0]))[4] for _ in range(15)]
-    unsafe = np.array([info["contact_force_max"] > 1e-4 for info in told])
+    infos = [env.step(np.array([1.0, 0.0]))[4] for _ in range(15)]
+    unsafe = np.array([info["contact_force_max"] > 1e-4 for info in infos])
     assert unsafe.any()
-    assert [info["safe"] for info in told] == (~np.maximum.accumulate(unsafe)).tolist()
+    assert [info["safe"] for info in infos] == (~np.maximum.accumulate(unsafe)).tolist()
 
 
 def test_a_wrong_branch_lengthens_the_way():
@@ -211,8 +211,8 @@ def test_a_wrong_branch_lengthens_the_way():
     side = next(i for i in range(len(tree.branches)) if i not in route and tree.branches[i].parent == 0)
     fork = tree.branches[0].centerline.abscissa[-1]
     tip = replace(env.simulator.project(), abscissa=np.array([fork + 7.0]), branch=np.array([side]), offset=np.zeros(1))
-    way = env._worlds._routes.distance(tip)
-    assert way == pytest.approx(7.0 + navigation.target.abscissa - fork)
+    length = env._worlds._routes.distance(tip)
+    assert length == pytest.approx(7.0 + navigation.target.abscissa - fork)
     assert not env._worlds._routes.place(tip).on_route.any()
 
 

@@ -70,7 +70,7 @@ def test_kinematics_and_forces(anatomy: Anatomy) -> None:
 
 
 def test_the_wire_moves_on_evenly_while_nodes_are_set_free(anatomy: Anatomy) -> None:
-    """A node passes the place where the wire is held every 1.2 mm; nothing of that may be seen at the tip."""
+    """A node passes the place where the wire is held every 1.2 mm; the tip must not feel it."""
     slippery = replace(DEVICE, friction=0.0)
     control = np.tile([0.25, 0.0], (1, 40, 1))
     rollout = simulate(anatomy, slippery, control, initial=np.array([[20.0, 0.0]]))

@@ -10,7 +10,7 @@ from endopilot.verification import scenes as scenarios
 
 
 def test_a_string_is_dragged_as_the_capstan_equation_says() -> None:
-    # T2/T1 = exp(µ θ), θ the sum of all angles that the string turns by, whichever way
+    # T2/T1 = exp(µ θ), θ the sum of all angles that the string turns by, whatever their direction
     for bends, friction in ((0, 0.2), (3, 0.2), (6, 0.2), (4, 0.4)):
         run = scenarios.drag_through_bends(bends, friction=friction)
         assert run.ratio == pytest.approx(np.exp(friction * run.wire_turning_rad), rel=0.01)
@@ -49,7 +49,7 @@ def test_a_short_curved_wire_lags_and_a_long_one_whips() -> None:
     drive, torque = scenarios.whip_theory(45.0, tip)
     assert whipping.drive_rad[jump] == pytest.approx(drive.max(), rel=0.04)
     assert whipping.torque_n_mm.max() == pytest.approx(torque.max(), rel=0.04)
-    # the short wire follows its curve all the way
+    # the short wire follows its whole curve
     drive, _ = scenarios.whip_theory(20.0, np.linspace(0, 2 * np.pi, 100))
     expected = np.interp(smooth.drive_rad, drive, np.linspace(0, 2 * np.pi, 100))
     np.testing.assert_allclose(smooth.tip_rad, expected, atol=0.12)
@@ -65,7 +65,7 @@ def test_a_tip_buckles_on_a_plate_as_its_hold_allows() -> None:
     # π² EI/(4 L²) where the tip slides, 20.19 EI/L² where it sticks; the tip is bent by 1°, which takes 6 to 10 %
     assert load(0.0, 1.0) == pytest.approx(np.pi**2 / 4 * stiffness, rel=0.10)
     assert load(0.3, 1.0) == pytest.approx(20.19 * stiffness, rel=0.12)
-    # a shaped tip gives way far below either
+    # a shaped tip buckles far below either
     assert load(0.1, 45.0) < 0.9 * np.pi**2 / 4 * stiffness
     # where it sticks and buckles, it slips in the end, and the force falls to the sliding one's
     run = scenarios.push_against_a_plate(friction=0.1, tip_bend_deg=1.0)

@@ -14,7 +14,7 @@ def test_greenhill() -> None:
 
 def test_michell() -> None:
     # A ring of a straight rod leaves its plane under the twist Tw = 2π sqrt(3) EI/GJ (Michell 1890), and its stiffness
-    # against cos 2θ falls on the way there as 1 - (Tw/Tw_critical)².
+    # against cos 2θ falls towards it as 1 - (Tw/Tw_critical)².
     (case,) = michell_ring()
     assert case.error <= 0.01
     assert case.picture is not None

@@ -31,8 +31,8 @@ def test_rows_and_figures(cases: list[Case], tmp_path: Path) -> None:
     assert [path.name for path in (tmp_path / "plots").iterdir()] == ["Timoshenko-tip.png"]
 
 
-def test_a_missed_bar_fails_the_command(cases: list[Case], capsys: pytest.CaptureFixture[str]) -> None:
-    cases.append(compare("missed", 1.0, 1.1, 0.01))
+def test_an_exceeded_bar_fails_the_command(cases: list[Case], capsys: pytest.CaptureFixture[str]) -> None:
+    cases.append(compare("failed", 1.0, 1.1, 0.01))
     with pytest.raises(SystemExit) as left:
         command.command(json=True)
     assert left.value.code == command.EXIT_FAILED

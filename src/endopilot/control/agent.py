@@ -1,8 +1,8 @@
-"""The policies that plan in the rod core: `TwinPolicy`, which is told the truth, and `AgentPolicy`, which finds it out.
+"""The policies that plan in the rod core: `TwinPolicy`, which is given the true parameters, and `AgentPolicy`.
 
-Both search a way from where they believe the wire to be, and follow it by the encoders. Between exposures only their
-simulated wires speak. An exposure weighs these, and shows where none of them is right: then the wire is pulled back,
-with X-ray on, until one agrees with what is seen, and another way is searched from there.
+Both search a path from the believed state of the wire, and follow it by the encoders. Between exposures the simulated
+wires alone give the tip. An exposure weights these wires, and shows where none of them is right: then the real wire is
+pulled back, with X-ray on, until one agrees with the image, and another path is searched from there.
 """
 
 from __future__ import annotations
@@ -32,22 +32,22 @@ CALIBRATED = Path(__file__).parent
 AdviserInput = tuple[
     Float[np.ndarray, "1 2"], Float[np.ndarray, "1 2"], Float[np.ndarray, "1 2"], Float[np.ndarray, "1"]
 ]
-"""What an adviser is told of a navigation: (Δ, φ), mm and rad; (Δtip, γtip), mm; the spread (standard deviation) of
-these by the model's own account, mm; and the lumen's radius at the tip, mm."""
+"""What an adviser is given of a navigation: (Δ, φ), mm and rad; (Δtip, γtip), mm; the spread (standard deviation) of
+these as the model states it, mm; and the lumen's radius at the tip, mm."""
 
 
 @settings
 class AgentConfig:
-    """How an agent searches, believes and looks."""
+    """Settings of an agent: search, belief, and when the plan or the wire counts as lost."""
 
     search: SearchConfig = field(default_factory=SearchConfig)
-    """The search for a way."""
+    """The search for a path."""
     belief: BeliefConfig = field(default_factory=BeliefConfig)
     """The simulated wires."""
     off_course_mm: Positive = 2.5
-    """Another way is searched when the likeliest tip is this far along the centerline from where it should be, mm."""
+    """Another path is searched when the likeliest tip is this far along the centerline from where it should be, mm."""
     tries: Count = 8
-    """Searches in vain, one after another, before the wire is left where it is."""
+    """Failed searches, one after another, after which the wire is left where it is."""
     lost_along_mm: Positive = 4.0
     """A measured tip this far along the wire from all simulated ones is explained by none, mm."""
     lost_across_mm: Positive = 1.5
@@ -61,7 +61,7 @@ class _PlanningPolicy:
         """Take the settings.
 
         Args:
-            config: how to search, believe and look.
+            config: search and belief.
         """
         self.config = config or AgentConfig()
 
@@ -70,11 +70,11 @@ class _PlanningPolicy:
         raise NotImplementedError
 
     def wants_xray(self) -> bool:
-        """Return whether the tip is to be looked at at the next decision."""
+        """Return whether X-ray is to be on at the next decision."""
         raise NotImplementedError
 
     def start(self, navigation: Navigation, seed: int) -> None:
-        """Lay the simulated wires out. What is believed of reality is the navigation's device and ostium.
+        """Lay out the simulated wires, around the navigation's device and ostium.
 
         Raises:
             InputError: the lumen is narrower than the wire on the route.
@@ -94,15 +94,15 @@ class _PlanningPolicy:
         self._limits = DriveLimits.of(navigation.device, navigation.anatomy)
         self._course: Course | None = None
         self._at, self._lost, self._began = 0, False, False
-        self.plans, self._vain = 0, 0
+        self.plans, self._failed = 0, 0
 
     def decide(self, observation: Observation) -> Decision:
-        """Follow the course, search another one, or pull back; see the module."""
+        """Follow the course, search another one, or pull back, as the module describes."""
         if self._began:
             self.belief.follow(observation.inserted_length, observation.rotation)
         self._began = True
         if observation.tip is not None:
-            self._look(observation.tip)
+            self._update(observation.tip)
         if self._lost:
             translation, rotation = -self.config.search.speed_mm_s, 0.0
         else:
@@ -110,10 +110,10 @@ class _PlanningPolicy:
         translation, rotation = self._limits.safe(translation, rotation)
         return Decision(translation, rotation, expose=self._lost or self.wants_xray())
 
-    def _look(self, measured: TipMeasurement) -> None:
-        """Let a measurement tell which wires are likely, and whether all are wrong."""
+    def _update(self, measured: TipMeasurement) -> None:
+        """Weight the simulated wires by a measurement, and note whether all are wrong."""
         self.belief.weigh(measured)
-        along, across = self.belief.misses(measured)[int(np.argmax(self.belief.weight))]
+        along, across = self.belief.errors(measured)[int(np.argmax(self.belief.weight))]
         lost = bool(along > self.config.lost_along_mm or across > self.config.lost_across_mm)
         if lost or self._lost:
             self._course = None
@@ -137,9 +137,9 @@ class _PlanningPolicy:
         if self._course is None or self._at == 0:
             return False
         tip = self.belief.likeliest_tip()
-        strayed = self.route.astray(tip)[0] > 0 and np.all(self.route.astray(self._planned_tip()) == 0)
-        off = np.abs(self._course.abscissa[self._at - 1] - tip.abscissa[0]).min()
-        return bool(strayed or off > self.config.off_course_mm)
+        left = self.route.off_route(tip)[0] > 0 and np.all(self.route.off_route(self._planned_tip()) == 0)
+        error = np.abs(self._course.abscissa[self._at - 1] - tip.abscissa[0]).min()
+        return bool(left or error > self.config.off_course_mm)
 
     def _planned_tip(self) -> TipProjection:
         """Return where the course has the tips of its wires now."""
@@ -150,11 +150,11 @@ class _PlanningPolicy:
         )
 
     def find_course(self, seconds: float, advance: Advance | None = None) -> Course:
-        """Search a way from where the likeliest wires are.
+        """Search a path from where the likeliest wires are.
 
         Args:
             seconds: time that is left, s.
-            advance: told of every millimetre along the route.
+            advance: called with every millimetre along the route.
         """
         source, weight = self.belief.likeliest()
         self._ostium = float(self.belief.parameters[source[0], 2])
@@ -162,23 +162,23 @@ class _PlanningPolicy:
 
     def _plan(self, observation: Observation) -> None:
         seconds = self.navigation.seconds - observation.time_s
-        if self._vain >= self.config.tries:
+        if self._failed >= self.config.tries:
             self._course = None
             return
         self._at, self.plans = 0, self.plans + 1
         self._course = self.find_course(seconds) if seconds >= DECISION_PERIOD_S else None
-        self._vain = self._vain + 1 if self._course is not None and self._course.reached < 0.5 else 0
+        self._failed = self._failed + 1 if self._course is not None and self._course.reached < 0.5 else 0
 
 
 class TwinPolicy(_PlanningPolicy):
     """Plans in the rod core with the true parameters, X-ray always on: the upper bound of what a model can do."""
 
     def __init__(self, truth: ModelMismatch | None = None, config: AgentConfig | None = None) -> None:
-        """Take the truth.
+        """Take the true parameters.
 
         Args:
             truth: how reality differs from the navigation; not at all if not given.
-            config: how to search, believe and look.
+            config: search and belief.
         """
         super().__init__(config)
         self._truth = truth or ModelMismatch()
@@ -193,10 +193,10 @@ class TwinPolicy(_PlanningPolicy):
 
 
 class OpenLoopPolicy(TwinPolicy):
-    """Plans once, with what it is told, and follows the plan by the encoders: what is planned is replayed, unseen."""
+    """Plans once with the given parameters, and follows the plan by the encoders without X-ray."""
 
-    def _look(self, measured: TipMeasurement) -> None:
-        """Learn nothing from the first exposure."""
+    def _update(self, measured: TipMeasurement) -> None:
+        """Ignore the first exposure."""
 
     def wants_xray(self) -> bool:
         """X-ray stays off."""
@@ -204,7 +204,7 @@ class OpenLoopPolicy(TwinPolicy):
 
 
 class AgentPolicy(_PlanningPolicy):
-    """Plans in an ensemble of rod cores that it weighs by what it sees, and looks only when its adviser asks."""
+    """Plans in an ensemble of rod cores, weighted by X-ray, which is on only when the adviser asks for it."""
 
     def __init__(
         self,
@@ -216,26 +216,26 @@ class AgentPolicy(_PlanningPolicy):
         """Take the settings.
 
         Args:
-            config: how to search, believe and look.
-            calibration: of the bands around what the simulated wires foretell, by which `XrayAdviser` asks for X-ray;
-                the package's own, which `benchmarks/agent_calibration.py` makes, if not given.
-            advice: what the adviser must not miss.
+            config: search and belief.
+            calibration: of the bands around what the simulated wires predict, by which `XrayAdviser` asks for
+                X-ray; the package's own, which `benchmarks/agent_calibration.py` makes, if not given.
+            advice: which events the adviser watches for.
         """
         super().__init__(config)
         self._calibration, self._advice = calibration or Calibration.read(CALIBRATED), advice or AdviserConfig()
 
     def start(self, navigation: Navigation, seed: int) -> None:
-        """Lay the simulated wires out, and begin to watch the bands."""
+        """Lay out the simulated wires, and start the adviser."""
         super().start(navigation, seed)
         self._adviser = XrayAdviser(self._calibration, self._advice, navigation.device.tip_radius_mm)
-        proximal, tip, _, radius = self.foretold()
+        proximal, tip, _, radius = self.adviser_input()
         self._adviser.start(proximal, tip, radius)
 
     def _parameters(self) -> Float[np.ndarray, "members 3"]:
         return Belief.around(np.array([1.0, 1.0, 0.0]), self.config.belief)
 
-    def foretold(self) -> AdviserInput:
-        """Return what the adviser is told, of the likeliest wire; the spread is that of all wires."""
+    def adviser_input(self) -> AdviserInput:
+        """Return what the adviser is given: the likeliest wire, and the spread of all wires."""
         best, tip = int(np.argmax(self.belief.weight)), self.belief.likeliest_tip()
         wires = self.belief.simulator
         proximal = np.array([[wires.inserted_length[best], wires.rotation[best]]])
@@ -243,4 +243,4 @@ class AgentPolicy(_PlanningPolicy):
 
     def wants_xray(self) -> bool:
         """Ask the adviser."""
-        return bool(self._adviser.advise(*self.foretold())[0])
+        return bool(self._adviser.advise(*self.adviser_input())[0])

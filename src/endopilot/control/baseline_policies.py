@@ -12,9 +12,9 @@ ADVANCE_MM_S = 5.0
 SPIN_RAD_S = 3.0
 """Rotation of `Spin`, rad/s, about half a turn a second."""
 _SLACK_MM = 20.0
-"""A wire that is inserted this much deeper than the target without reaching it waits: it is elsewhere, mm."""
+"""A wire that is inserted this much deeper than the target without reaching it is in another branch and waits, mm."""
 _RETRACT_MM = 5.0
-"""`RetractRotate` pulls its tip back to this far before the fork that it missed, mm."""
+"""`RetractRotate` pulls its tip back to this far before the fork where it took the wrong branch, mm."""
 _CAUGHT_S, _CAUGHT_MM = 3.0, 1.0
 """A wire whose tip advances by less than this in this time is caught, s and mm."""
 
@@ -29,7 +29,7 @@ class Forward:
         self._deepest = navigation.target.abscissa + _SLACK_MM
 
     def decide(self, observation: Observation) -> Decision:
-        """Push on, or wait."""
+        """Push, or wait."""
         going = observation.inserted_length < self._deepest
         return Decision(ADVANCE_MM_S, self._rotation) if going else Decision(0.0, 0.0)
 
@@ -41,7 +41,7 @@ class Spin(Forward):
 
 
 class RetractRotate:
-    """Pushes, with X-ray always on; where the tip takes a wrong branch, retracts, rotates by 180° and advances again.
+    """Pushes, with X-ray always on; where the tip enters a wrong branch, retracts, rotates by 180° and advances again.
 
     The rule of Madder et al. 2017, which robotic drives offer as rotate-on-retract: a wire turns more freely while it
     is retracted, and its tip comes back to the mouth of the branch with another direction. A wire that is caught is
@@ -57,15 +57,15 @@ class RetractRotate:
         self._deepest: list[float] = []
 
     def decide(self, observation: Observation) -> Decision:
-        """Push on, retract, or rotate, by what X-ray shows."""
+        """Push, retract or rotate, depending on what X-ray shows."""
         tip = observation.tip
         if tip is None:
             return Decision(0.0, 0.0, expose=True)
         if self._back_to is None and self._turn_to is None:
-            missed = self._missed(tip.branch, tip.abscissa)
-            if missed is None:
+            retract_to = self._retract_to(tip.branch, tip.abscissa)
+            if retract_to is None:
                 return Decision(ADVANCE_MM_S, 0.0, expose=True)
-            self._back_to = missed
+            self._back_to = retract_to
         if self._back_to is not None:
             if tip.abscissa > self._back_to and observation.inserted_length > 0:
                 return Decision(-ADVANCE_MM_S, 0.0, expose=True)
@@ -76,8 +76,8 @@ class RetractRotate:
         self._turn_to, self._deepest = None, []
         return Decision(ADVANCE_MM_S, 0.0, expose=True)
 
-    def _missed(self, branch: int, abscissa: float) -> float | None:
-        """Return how far the tip is to be retracted, as an abscissa, or None where it is well on its way."""
+    def _retract_to(self, branch: int, abscissa: float) -> float | None:
+        """Return how far the tip is to be retracted, as an abscissa, or None where it advances on the route."""
         if np.isfinite(self._fork[branch]):
             return float(self._fork[branch]) - _RETRACT_MM
         if abscissa > self._target + _RETRACT_MM:

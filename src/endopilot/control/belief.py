@@ -1,7 +1,7 @@
-"""What is believed of the wire between X-ray exposures: an ensemble of simulated wires, driven as the real one is.
+"""The belief about the wire between X-ray exposures: an ensemble of simulated wires, driven like the real one.
 
 Its members differ in what is uncertain: friction, the stiffness of the tip, and how deep the ostium lies (as
-`models/twin.py` has it). Each follows the robot's encoders. A measurement of the tip weighs them by how near theirs is.
+`models/twin.py` has it). Each follows the robot's encoders. A measurement of the tip weights them by their errors.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from endopilot.xray.fluoroscope import TipMeasurement
 
 @settings
 class BeliefConfig:
-    """The ensemble, and how far measurements are trusted."""
+    """The ensemble, and the accuracy of measurements."""
 
     members: Count = 12
     """Simulated wires."""
     stiffness_levels: Count = 3
     """Different stiffnesses of the tip among them."""
     friction_spread: ShareBelowOne = 0.2
-    """The friction coefficient may be off by this share, either way."""
+    """The friction coefficient may differ from the given one by this share, up or down."""
     stiffness_spread: ShareBelowOne = 0.2
-    """The stiffness of the tip may be off by this share, either way."""
+    """The stiffness of the tip may differ from the given one by this share, up or down."""
     ostium_spread_mm: NonNegative = 0.5
     """The ostium may lie this much deeper or less deep along the catheter's axis, mm."""
     along_sd_mm: Positive = 0.6
-    """Scale of what a good member's tip misses a measured one by along the wire, mm: a tip's end is hard to see."""
+    """Scale of a good member's error along the wire, mm: X-ray shows the end of a tip badly."""
     across_sd_mm: Positive = 0.3
     """The same across the wire, mm."""
     elements: Annotated[int, Within(10, 2000)] = 50
@@ -84,11 +84,11 @@ class Belief:
         self.tip = self.simulator.project()
 
     @staticmethod
-    def around(told: Float[np.ndarray, "3"], config: BeliefConfig) -> Float[np.ndarray, "members 3"]:
-        """Return members evenly around what is told: friction and ostium from a Sobol sequence, every stiffness."""
+    def around(given: Float[np.ndarray, "3"], config: BeliefConfig) -> Float[np.ndarray, "members 3"]:
+        """Return members evenly around given parameters: friction and ostium from a Sobol sequence, every stiffness."""
         levels = np.linspace(-1.0, 1.0, config.stiffness_levels) if config.stiffness_levels > 1 else np.zeros(1)
         unit = 2 * qmc.Sobol(2, scramble=False).random_base2(config.members.bit_length())[1 : config.members + 1] - 1
-        parameters = np.tile(told, (config.members, 1)).astype(float)
+        parameters = np.tile(given, (config.members, 1)).astype(float)
         parameters[:, 0] *= 1 + config.friction_spread * unit[:, 0]
         parameters[:, 1] *= 1 + config.stiffness_spread * np.resize(levels, config.members)
         parameters[:, 2] += config.ostium_spread_mm * unit[:, 1]
@@ -116,21 +116,22 @@ class Belief:
             simulator.step(control, DECISION_PERIOD_S)
         self.tip = simulator.project()
 
-    def misses(self, measured: TipMeasurement) -> Float[np.ndarray, "members 2"]:
-        """Return how far the members' tips are from a measured one, along and across each wire, mm."""
+    def errors(self, measured: TipMeasurement) -> Float[np.ndarray, "members 2"]:
+        """Return the distances of the members' tips from a measured one, along and across each wire, mm."""
         nodes = self.simulator.position[:, :2]
         along = nodes[:, 0] - nodes[:, 1]
         along /= np.linalg.norm(along, axis=1, keepdims=True)
-        off = measured.position - nodes[:, 0]
-        shift = np.einsum("mi,mi->m", off, along)
-        return np.column_stack([np.abs(shift), np.linalg.norm(off - shift[:, None] * along, axis=1)])
+        error = measured.position - nodes[:, 0]
+        shift = np.einsum("mi,mi->m", error, along)
+        return np.column_stack([np.abs(shift), np.linalg.norm(error - shift[:, None] * along, axis=1)])
 
     def weigh(self, measured: TipMeasurement) -> None:
-        """Let a measurement change the likelihoods.
+        """Update the likelihoods by a measurement.
 
-        By a Cauchy density, whose tails are heavy: a tip that snapped a moment too early says little about friction.
+        The density is a Cauchy density. Its tails are heavy: a tip that snapped a moment too early says little about
+        friction.
         """
-        scaled = self.misses(measured) / np.array([self._config.along_sd_mm, self._config.across_sd_mm])
+        scaled = self.errors(measured) / np.array([self._config.along_sd_mm, self._config.across_sd_mm])
         self._score = self._score - np.log1p((scaled**2).sum(axis=1))
 
     def likeliest(self) -> tuple[Int[np.ndarray, "levels"], Float[np.ndarray, "levels"]]:

@@ -1,4 +1,4 @@
-"""What a good way to drive is, as one number: `Cost`. The sampling planners minimise it."""
+"""The cost of a navigation as one number: `Cost`. The sampling planners minimise it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Cost:
     """
 
     tip_weight: NonNegative = 0.1
-    """Tip error on the way, 1/s."""
+    """Tip error before the end, 1/s."""
     ratio_weight: NonNegative = 0.05
     """Safety ratio above `safe_ratio`, mm/s. A wire lies on the wall most of the time, which is no harm by itself."""
     safe_ratio: NonNegative = 0.8
@@ -35,7 +35,7 @@ class Cost:
     smooth_weight: NonNegative = 0.05
     """Changes of the control, as a share of the drive's limits squared, mm."""
     forbidden_share: NonNegative = 0.7
-    """Share of the force limit above which a way is not taken where there is another."""
+    """Share of the force limit above which a path is not taken where there is another."""
 
     def running(self, *, error: Samples, ratio: Samples, force_share: Samples | float = 0.0) -> Samples:
         """Return what a second in some states costs, mm/s.
@@ -43,7 +43,7 @@ class Cost:
         Args:
             error: distance of the tip from where it is to be, mm.
             ratio: safety ratio.
-            force_share: contact force over its limit; 0 where a model does not foretell it.
+            force_share: contact force over its limit; 0 where a model does not predict it.
         """
         excess = np.maximum(ratio - self.safe_ratio, 0.0)
         overload = _OVERLOAD * np.maximum(np.asarray(force_share) - self.forbidden_share, 0.0)

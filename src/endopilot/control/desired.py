@@ -53,11 +53,11 @@ def read_tips(path: Path, fastest_mm_s: float, start_mm: float) -> pd.DataFrame:
     if len(late):
         row = int(late[0])
         raise InputError(f"{path}: row {row + 2}: time_s = {table['time_s'].iloc[row]:g}; count 0.5, 1.0, 1.5, ...")
-    way, seconds = float(table["tip_abscissa_mm"].iloc[-1]) - start_mm, DECISION_PERIOD_S * len(table)
-    if way > fastest_mm_s * seconds:
+    length_mm, seconds = float(table["tip_abscissa_mm"].iloc[-1]) - start_mm, DECISION_PERIOD_S * len(table)
+    if length_mm > fastest_mm_s * seconds:
         raise InputError(
-            f"{path}: {seconds:g} s are too few for the {way:.0f} mm to the last tip at the device's {fastest_mm_s:g} "
-            f"mm/s; give rows up to {way / fastest_mm_s:.1f} s or more"
+            f"{path}: {seconds:g} s are too few for the {length_mm:.0f} mm to the last tip at the device's "
+            f"{fastest_mm_s:g} mm/s; give rows up to {length_mm / fastest_mm_s:.1f} s or more"
         )
     return table.rename(columns={"tip_abscissa_mm": "abscissa", "tip_offset_mm": "offset"})
 
@@ -87,15 +87,15 @@ def tips_along(
     """Return desired tips that go along a route at some speed, as near to the wall as is safe, and rest at its end.
 
     Args:
-        route: the way.
+        route: the path to the target.
         wire_radius_mm: of the wire, mm.
         start_mm: Δtip at the start, mm.
         speed_mm_s: mm/s.
         seconds: most time that they take, s.
         safe_ratio: γ/(r − r_w) of the desired tips.
     """
-    way = max(route.target.abscissa - start_mm, 0.0)
-    periods = int(np.ceil(min(way / speed_mm_s + _MARGIN_S, seconds) / DECISION_PERIOD_S))
+    length_mm = max(route.target.abscissa - start_mm, 0.0)
+    periods = int(np.ceil(min(length_mm / speed_mm_s + _MARGIN_S, seconds) / DECISION_PERIOD_S))
     ahead = start_mm + speed_mm_s * DECISION_PERIOD_S * np.arange(1, periods + 1)
     abscissa = np.minimum(ahead, route.target.abscissa)
     room = np.maximum(route.radius(abscissa) - wire_radius_mm, 0.0)

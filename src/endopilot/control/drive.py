@@ -1,4 +1,4 @@
-"""A simulated drive with a clock of its own, behind TCP: takes signed commands from one client, and stops in doubt.
+"""A simulated drive with its own clock, behind TCP: one client sends signed commands; the drive stops on any error.
 
 `Drive` is the machine: time and lines come in as arguments, so that it can be tested without either. `serve` gives it a
 socket and the clock of this process. A drive that stopped stays so until it is armed again.
@@ -21,9 +21,9 @@ from endopilot.simulation.drive_limits import DriveLimits
 
 CYCLE_S = 0.01
 """Period of the process's loop, s."""
-STRANGER_S = 2.0
+AUTHENTICATE_S = 2.0
 """Time in which a client must authenticate, s."""
-MOST_STRANGERS = 8
+MOST_WAITING = 8
 """Connections that may wait to authenticate; one more is closed at once."""
 
 
@@ -80,7 +80,7 @@ class Drive:
         return Session(self, Signer(self._secret, secrets.token_hex(16)))
 
     def tick(self, now: float) -> None:
-        """Let the time pass up to now, s; the watchdog bites when it is due, however late the call."""
+        """Let the time pass up to now, s; the watchdog stops the drive when it is due, even if the call comes late."""
         due = self._commanded + SILENCE_S
         if self.stopped is None and now >= due:
             self._advance(max(due, self._now))
@@ -126,10 +126,10 @@ class Drive:
         return tuple(repr(float(number)) for number in numbers)
 
     def lose_owner(self) -> None:
-        """Stop, for the connection of the owner is gone."""
+        """Stop, because the connection of the owner is closed."""
         self.stop("connection")
         self.owner = None
-        self._report("the client is gone")
+        self._report("the client has disconnected")
 
     def _advance(self, until: float) -> None:
         self._motion.advance(until - self._now)
@@ -153,7 +153,7 @@ class Session:
         return f"{PROTOCOL} {self._signer.nonce}\n".encode("ascii")
 
     def receive(self, line: bytes, now: float) -> bytes | None:
-        """Take one line, without its newline, and return the reply, if it deserves one.
+        """Take one line, without its newline, and return the reply; None for a line that gets none.
 
         Args:
             line: as it came.
@@ -172,14 +172,14 @@ class Session:
         return self._signer.line(reply, of_drive=True)
 
     def close(self, now: float) -> None:
-        """Take note that the connection is gone: its owner's drive stops."""
+        """Note that the connection is closed; a drive that it owned stops."""
         self._drive.tick(now)
         self.closed = True
         if self._drive.owner is self:
             self._drive.lose_owner()
 
     def _answer(self, message: Message) -> Message | None:
-        """Do what a genuine message asks and return the reply; None where it makes no sense."""
+        """Do what a genuine message asks and return the reply; None for a message without meaning."""
         drive, verb, arguments = self._drive, message.verb, message.arguments
         if verb == "AUTH" and not arguments and drive.owner is None:
             return Message(message.number, "OK", drive.greet(self))
@@ -236,7 +236,7 @@ async def serve(drive: Drive, host: str, port: int, ready: Callable[[int], None]
     connections: set[asyncio.StreamWriter] = set()
 
     async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if len(connections) > MOST_STRANGERS:
+        if len(connections) > MOST_WAITING:
             writer.close()
             return
         connections.add(writer)
@@ -244,8 +244,8 @@ async def serve(drive: Drive, host: str, port: int, ready: Callable[[int], None]
         try:
             writer.write(session.greeting)
             while not session.closed:
-                stranger = drive.owner is not session
-                left = began + STRANGER_S - time.monotonic() if stranger else None
+                waiting = drive.owner is not session
+                left = began + AUTHENTICATE_S - time.monotonic() if waiting else None
                 data = await asyncio.wait_for(reader.read(4096), timeout=left)
                 if not data:
                     break

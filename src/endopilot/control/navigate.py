@@ -22,7 +22,7 @@ from endopilot.xray.fluoroscope import Fluoroscope, FluoroscopeConfig, TipMeasur
 
 @settings
 class NavigateConfig:
-    """What the policy acts through and sees with, and how the truth is simulated."""
+    """Robot and C-arm of the policy, and the settings of the simulated reality."""
 
     robot: RobotConfig = field(default_factory=RobotConfig)
     """The drive."""
@@ -34,7 +34,7 @@ class NavigateConfig:
 
 @settings
 class ModelMismatch:
-    """How reality differs from the navigation that the policy is told of."""
+    """How reality differs from the navigation that the policy is given."""
 
     friction_factor: NonNegative = 1.0
     """Factor on the friction coefficient."""
@@ -99,12 +99,12 @@ def navigate(
 ) -> NavigationRecord:
     """Let a policy drive one navigation in the simulator, and record what truly happens.
 
-    Every `DECISION_PERIOD_S` the policy is told the encoders' readings and, where its last decision asked for it, what
+    Every `DECISION_PERIOD_S` the policy is given the encoders' readings and, where its last decision asked for it, what
     X-ray shows; at the first decision X-ray is always on. It ends when the target is reached at the end of a period,
     when the time is over, or when the simulation fails.
 
     Args:
-        navigation: as the policy is told of it.
+        navigation: as the policy is given it.
         policy: what decides, or the name of a policy, such as "agent".
         config: robot, C-arm and rod core.
         seed: of encoder noise, detection errors and the policy.

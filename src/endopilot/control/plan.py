@@ -1,4 +1,4 @@
-"""`plan`: the controls that bring a wire's tip along the vessel to a target, found before anything moves."""
+"""`plan`: the controls that bring a wire's tip along the vessel to a target, found before the wire moves."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _IDEAL = RobotConfig(
     latency_s=0.0, max_acceleration_mm_s2=1e6, max_acceleration_rad_s2=1e6, backlash_mm=0.0, backlash_rad=0.0,
     encoder_sd_mm=0.0, encoder_sd_rad=0.0,
 )  # fmt: skip
-"""A drive that does what it is told."""
+"""A drive that makes every commanded motion exactly."""
 
 
 def plan(
@@ -56,7 +56,7 @@ def plan(
 
     Raises:
         InputError: a target outside the tree, behind an occlusion or too far for the time; a model of another device or
-            without the network that the method needs; with the method twin, no way found, or one that in the rod core
+            without the network that the method needs; with the method twin, no path found, or one that in the rod core
             at its own settings breaks the force limit or does not reach the target.
     """
     config = config or PlanConfig()
@@ -134,29 +134,29 @@ def _wire(model: Path | None, device: Device | str | Path | None, method: str) -
 
 
 def _check_time(navigation: Navigation, config: PlanConfig) -> None:
-    way = navigation.target.abscissa - navigation.start_inserted_mm
+    length_mm = navigation.target.abscissa - navigation.start_inserted_mm
     fastest = min(navigation.device.max_velocity_mm_s, config.speed_mm_s)
-    if way / fastest > navigation.seconds:
+    if length_mm / fastest > navigation.seconds:
         raise InputError(
-            f"seconds: {navigation.seconds:g} s are too few for the {way:.0f} mm to the target at {fastest:g} mm/s; "
-            f"give {way / fastest:.0f} s or more, or a larger speed_mm_s (the device's limit is "
+            f"seconds: {navigation.seconds:g} s are too few for the {length_mm:.0f} mm to the target at {fastest:g} "
+            f"mm/s; give {length_mm / fastest:.0f} s or more, or a larger speed_mm_s (the device's limit is "
             f"{navigation.device.max_velocity_mm_s:g} mm/s)"
         )
 
 
 def _search(navigation: Navigation, config: PlanConfig) -> tuple[Steps, Steps]:
-    """Search a way in the rod core."""
+    """Search a path in the rod core."""
     policy = TwinPolicy(config=AgentConfig(search=SearchConfig(speed_mm_s=config.speed_mm_s, cost=config.cost)))
     policy.start(navigation, config.seed)
-    with progress("plan: trying in the rod core", total=navigation.target.abscissa) as advance:
+    with progress("plan: searching in the rod core", total=navigation.target.abscissa) as advance:
         course = policy.find_course(navigation.seconds, advance)
     if course.reached < 0.5:
-        raise InputError(_no_way(navigation, course))
+        raise InputError(_no_path(navigation, course))
     return course.control, np.column_stack([course.abscissa[:, 0], course.offset[:, 0]])
 
 
-def _no_way(navigation: Navigation, course: Course) -> str:
-    """Say how far a search came, and which limit it met."""
+def _no_path(navigation: Navigation, course: Course) -> str:
+    """Return how far a search came, and which limit it met, as one line."""
     if course.force.max() > navigation.force_limit_n:
         mend = f"pressing with {course.force.max():.3g} N; give a larger force_limit_n or a softer wire"
     elif DECISION_PERIOD_S * (len(course.control) + 2) > navigation.seconds:  # a round of the search is 2 periods
@@ -164,14 +164,14 @@ def _no_way(navigation: Navigation, course: Course) -> str:
     else:
         mend = "and no further; give a wire of larger tip bend"
     return (
-        f"target: no way found to branch {navigation.target.branch} of {navigation.anatomy.name} in "
+        f"target: no path found to branch {navigation.target.branch} of {navigation.anatomy.name} in "
         f"{navigation.seconds:g} s under {navigation.force_limit_n:g} N with {navigation.device.name}; the tip came to "
         f"{course.abscissa[-1, 0]:.0f} of {navigation.target.abscissa:.0f} mm, {mend}"
     )
 
 
 def _check_kept(made: Plan) -> None:
-    """Check that a plan which was tried in the rod core keeps the force limit there, and reaches the target.
+    """Check that a plan which was found in the rod core keeps the force limit there, and reaches the target.
 
     Raises:
         InputError: it does not; the line says which.
@@ -180,20 +180,20 @@ def _check_kept(made: Plan) -> None:
     goal = f"branch {navigation.target.branch} of {navigation.anatomy.name} with {wire}"
     if not made.within_force_limit:
         raise InputError(
-            f"force_limit_n: {navigation.force_limit_n:g} N is broken on the way found to {goal}, which presses "
+            f"force_limit_n: {navigation.force_limit_n:g} N is exceeded on the path found to {goal}, which presses "
             f"with {made.force.max():.3g} N; give a larger force_limit_n, another seed or a softer wire"
         )
     if not made.reached:
         far = float(made.simulated.abscissa[-1])
         raise InputError(
-            f"target: not reached in {navigation.seconds:g} s on the way found to {goal}: in the rod core the "
+            f"target: not reached in {navigation.seconds:g} s on the path found to {goal}: in the rod core the "
             f"tip ends at {far:.1f} of {navigation.target.abscissa:.1f} mm; give another seed, more seconds or a wire "
             "of larger tip bend"
         )
 
 
 def _track(navigation: Navigation, desired: Steps) -> tuple[Steps, Steps]:
-    """Lead the rod core along desired tips, one sample at a time."""
+    """Track desired tips in the rod core, one sample at a time."""
     from endopilot.models.tip_tracking import track
 
     core = SimulatorConfig(threads=1)
@@ -210,7 +210,7 @@ def _track(navigation: Navigation, desired: Steps) -> tuple[Steps, Steps]:
 
 
 def _by_policy(navigation: Navigation, config: PlanConfig) -> tuple[Steps, Steps]:
-    """Let a policy drive the rod core with an ideal drive, and take down what it did."""
+    """Let a policy drive the rod core with an ideal drive, and record what it did."""
     from endopilot.control.policies import make_policy
 
     record = navigate(navigation, make_policy(config.method), config=NavigateConfig(robot=_IDEAL), seed=config.seed)
@@ -250,7 +250,7 @@ def _checked(
 
 
 def within_limits(control: Steps, limits: DriveLimits, inserted_mm: float) -> Steps:
-    """Return controls that are finite and within the drive's limits and its travel, whatever a model asks for.
+    """Return controls that are finite and within the drive's limits and its travel, whatever a model proposes.
 
     Args:
         control: mm/s and rad/s of each period.

@@ -42,7 +42,7 @@ class PlanConfig:
     """Method, limits and cost of a plan."""
 
     method: Method = "twin"
-    """How the controls are found: twin (tried in the rod core), inverse (the inverse network of --model), mppi
+    """How the controls are found: twin (searched in the rod core), inverse (the inverse network of --model), mppi
     (sampled through its forward network), or a baseline: forward, spin, retract-rotate."""
     seconds: Positive = 60.0
     """Time in which the target is to be reached, s."""

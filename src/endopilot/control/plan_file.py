@@ -10,15 +10,15 @@ time_s                                            end of the period, s
 translation_mm_s, rotation_rad_s                  control π over the period
 inserted_length_mm, rotation_rad                  Δ and φ at its end
 desired_tip_abscissa_mm, desired_tip_offset_mm    desired Δtip and γtip
-predicted_tip_abscissa_mm, …_offset_mm            those that the model of the method foretells
+predicted_tip_abscissa_mm, …_offset_mm            those that the method's model predicts
 tip_abscissa_mm, tip_offset_mm, branch            where the rod core has the tip under these controls
 tip_x_mm, tip_y_mm, tip_z_mm                      likewise, LPS
 lumen_radius_mm, safety_ratio, contact_force_n    lumen radius r there, γ/(r − r_w), largest wall force on one node
 xray                                              1 where an exposure will be due at the end of the period, else 0
-band_tip_abscissa_mm, band_tip_offset_mm          half-widths of the adviser's bands around what is foretold
+band_tip_abscissa_mm, band_tip_offset_mm          half-widths of the adviser's bands around the prediction
 ================================================  ====================================================================
 
-The last three are there if X-ray was foreseen.
+The last three are there if the plan holds X-ray.
 """
 
 from __future__ import annotations

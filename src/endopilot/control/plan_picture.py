@@ -1,4 +1,4 @@
-"""A picture of a plan: the route, the tip's way, desired and predicted tip, safety ratio, force and controls."""
+"""A picture of a plan: the route, the tip's path, desired and predicted tip, safety ratio, force and controls."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def draw_plan(plan: Plan, path: Path, xray: PlannedXray | None = None) -> None:
 
 
 def _draw_route(plan: Plan, axes: Axes) -> None:
-    """Draw the tree from the front with the route and the tip's way."""
+    """Draw the tree from the front with the route and the tip's path."""
     navigation = plan.navigation
     tree, route = navigation.anatomy.tree, Route.to(navigation.anatomy, navigation.target)
     for branch in tree.branches:
@@ -73,12 +73,12 @@ def _draw_route(plan: Plan, axes: Axes) -> None:
 def _draw_tip(plan: Plan, time_s: np.ndarray, axes: Axes) -> None:
     tip = plan.simulated
     route = Route.to(plan.navigation.anatomy, plan.navigation.target)
-    astray = route.astray(tip) > 0
+    off_route = route.off_route(tip) > 0
     axes.plot(time_s, plan.desired[:, 0], color="tab:green", label="desired")
-    axes.plot(time_s, plan.predicted[:, 0], color="tab:orange", linestyle="--", label="foretold by the model")
+    axes.plot(time_s, plan.predicted[:, 0], color="tab:orange", linestyle="--", label="predicted by the model")
     axes.plot(time_s, tip.abscissa, color="tab:blue", linewidth=1, label="in the rod core")
-    if astray.any():
-        axes.plot(time_s[astray], tip.abscissa[astray], "x", color="tab:red", label="in a wrong branch")
+    if off_route.any():
+        axes.plot(time_s[off_route], tip.abscissa[off_route], "x", color="tab:red", label="in a wrong branch")
     for junction in route.junctions:
         axes.axhline(float(junction), color="0.8", linewidth=0.8, zorder=0)
     axes.set_ylabel("Δtip, mm")
@@ -86,7 +86,7 @@ def _draw_tip(plan: Plan, time_s: np.ndarray, axes: Axes) -> None:
 
 
 def _draw_xray(plan: Plan, xray: PlannedXray, time_s: np.ndarray, panels: list[Axes]) -> None:
-    """Draw the adviser's bands around what is foretold, and a line where an exposure will be due."""
+    """Draw the adviser's bands around the prediction, and a line where an exposure will be due."""
     middle, half = plan.predicted[:, 0], xray.half_width[:, 0]
     panels[0].fill_between(time_s, middle - half, middle + half, color="tab:orange", alpha=0.25, linewidth=0)
     for panel in panels:

@@ -95,12 +95,12 @@ class _Wires:
         self._agent.start(plan.navigation, seed=0)
 
     def start(self) -> AdviserInput:
-        return self._agent.foretold()
+        return self._agent.adviser_input()
 
     def move(self, period: int) -> AdviserInput:
         inserted, rotation = self._plan.proximal[period]
         self._agent.belief.follow(inserted, rotation)
-        return self._agent.foretold()
+        return self._agent.adviser_input()
 
     def observe(self, period: int) -> None:
         tip = self._plan.simulated

@@ -1,4 +1,4 @@
-"""What decides during a navigation: `Policy`, what it is told (`Observation`) and what it answers (`Decision`)."""
+"""The interface of a policy: `Policy`, what it observes (`Observation`) and what it commands (`Decision`)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from endopilot.xray.fluoroscope import TipMeasurement
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """All that a policy is told at a decision.
+    """All that a policy is given at a decision.
 
     Attributes:
         time_s: since the start of the navigation, s.
@@ -46,9 +46,9 @@ class Policy(Protocol):
     """Drives one navigation."""
 
     def start(self, navigation: Navigation, seed: int) -> None:
-        """Prepare for a navigation, as it is believed to be: the truth may have another friction or ostium."""
+        """Prepare for a navigation as it is known: reality may have another friction or ostium."""
         ...
 
     def decide(self, observation: Observation) -> Decision:
-        """Say what to do until the next decision, `DECISION_PERIOD_S` later."""
+        """Return what to do until the next decision, `DECISION_PERIOD_S` later."""
         ...

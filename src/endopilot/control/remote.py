@@ -30,7 +30,7 @@ class RemoteRobot:
     """Commands a drive process, and reads its encoders.
 
     Attributes:
-        limits: of the drive, as it told them; no command beyond them is ever sent.
+        limits: of the drive, as it reported them; no command beyond them is ever sent.
         status: "armed", or "stopped:" and why, as the drive last said.
     """
 

@@ -1,4 +1,4 @@
-"""What moves the wire: the interface of a robot, its limits, the motion of a drive, and a robot in the simulator.
+"""The robot: the interface of a robot, its limits, the motion of a drive, and a robot in the simulator.
 
 A drive follows a velocity command late (latency), no faster and no more suddenly than its limits, and with lost motion
 where it reverses (backlash). `DriveMotion` is that and nothing else; the simulated robot puts a simulated wire behind
@@ -24,7 +24,7 @@ CYCLE_S = 0.05
 
 @dataclass(frozen=True)
 class ProximalState:
-    """What a robot's encoders say of the wire's proximal end.
+    """A reading of a robot's encoders: the state of the wire's proximal end.
 
     Attributes:
         time_s: by the robot's clock, s.
@@ -39,14 +39,14 @@ class ProximalState:
 
 @runtime_checkable
 class Robot(Protocol):
-    """Whatever drives a wire."""
+    """A robot that drives a wire."""
 
     def command(self, translation: float, rotation: float) -> None:
         """Move on at a velocity, mm/s and rad/s, until the next command. What is not finite stops the wire."""
         ...
 
     def proximal_state(self) -> ProximalState:
-        """Return what the encoders say now."""
+        """Return the readings of the encoders."""
         ...
 
 
@@ -125,8 +125,8 @@ class DriveMotion:
 class SimulatedRobot:
     """A robot whose wire is the one world of a simulator.
 
-    The encoders sit on the wire, behind the gears: they see what backlash and a slipping drive leave of a command.
-    They count from where the ostium is believed to be.
+    The encoders sit on the wire, behind the gears: they measure what backlash and a slipping drive leave of a command.
+    They count from the assumed position of the ostium.
     """
 
     def __init__(
@@ -138,7 +138,7 @@ class SimulatedRobot:
         seed: int = 0,
         ostium_mm: float = 0.0,
     ) -> None:
-        """Take hold of the wire as it lies.
+        """Grasp the wire where it is.
 
         Args:
             simulator: of one world, driven by velocity.
@@ -158,7 +158,7 @@ class SimulatedRobot:
         self._drive.command(translation, rotation)
 
     def proximal_state(self) -> ProximalState:
-        """Return what the encoders say now; every reading has a noise of its own."""
+        """Return the readings of the encoders; every reading has a noise of its own."""
         inserted, rotation = np.array(self._encoder()) + self._noise * self._random.standard_normal(2)
         return ProximalState(self._drive.time_s, float(inserted), float(rotation))
 

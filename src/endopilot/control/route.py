@@ -1,4 +1,4 @@
-"""The way along the tree to a target: its branches, its junctions, and how far a tip still has to go."""
+"""The route along the tree to a target: its branches and junctions, and how far a tip has come."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Route:
         branches: indices of its branches, the root first.
         line: the connected centerline through them.
         junctions: abscissae of the branching points before the target, mm.
-        waypoints: abscissa beyond each junction at which a tip is seen to have taken the right branch, then that of
+        waypoints: abscissa beyond each junction at which a tip has clearly taken the right branch, then that of
             the target, mm.
     """
 
@@ -63,20 +63,20 @@ class Route:
 
     @cached_property
     def _leaves_at(self) -> Float[np.ndarray, "branches"]:
-        """Abscissa at which the way to each branch of the tree leaves the route; infinite for those on it."""
+        """Abscissa at which the path to each branch of the tree leaves the route; infinite for those on it."""
         return self.anatomy.tree.departures(self.target.branch)
 
-    def astray(self, tip: TipProjection) -> Float[np.ndarray, "..."]:
+    def off_route(self, tip: TipProjection) -> Float[np.ndarray, "..."]:
         """Return how far tips are in branches that do not lie on the route, mm; 0 for those on it."""
         return np.maximum(tip.abscissa - self._leaves_at[tip.branch], 0.0)
 
     def progress(self, tip: TipProjection) -> Float[np.ndarray, "..."]:
-        """Return how far along the route tips have come, mm; those astray, as far as where they left it."""
+        """Return how far along the route tips have come, mm; for tips off the route, as far as where they left it."""
         return np.minimum(tip.abscissa, self._leaves_at[tip.branch])
 
     def passed(self, tip: TipProjection, waypoint: float) -> Bool[np.ndarray, "..."]:
         """Return which tips have entered the branch of a waypoint, or reached the target if it is the last."""
-        on_route = self.astray(tip) == 0
+        on_route = self.off_route(tip) == 0
         if waypoint >= self.target.abscissa:
             return on_route & (tip.branch == self.target.branch) & (np.abs(tip.abscissa - waypoint) <= ENTERED_MM)
         return on_route & (tip.abscissa >= min(waypoint + ENTERED_MM, self.target.abscissa))
@@ -100,7 +100,7 @@ class Route:
 
 
 def check_passable(route: Route, device: Device) -> None:
-    """Check that the wire fits through the lumen all the way to the target.
+    """Check that the wire fits through the lumen everywhere up to the target.
 
     Raises:
         InputError: the lumen is narrower than the wire somewhere on the route; the line says where.

@@ -1,10 +1,10 @@
-"""Finding a way to a target by trying it in the rod core: `Search`.
+"""Search for a path to a target in the rod core: `Search`.
 
-One wire, or several that differ in what is uncertain, is driven from its present state. On a clear way it is pushed
-straight on. Where that would lead into a wrong branch, or the tip stops, the wires go back to where they were before
-and a population of candidates tries other motions: every round each candidate draws a constant control for a second,
-and those nearest to the waypoint, in the mean over the wires and with the cost of what they did on the way, are kept
-and copied over the others, until one of them has entered the wanted branch.
+One wire, or several that differ in what is uncertain, is driven from its present state. It is pushed straight on as
+long as the tip advances along the route. Where the tip enters a wrong branch, or stops, the wires go back to where they
+were before, and a population of candidates tries other motions. Every round each candidate draws a constant control for
+a second. Those nearest to the waypoint, in the mean over the wires and with the cost of their motion, are kept and
+copied over the others, until one of them has entered the wanted branch.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ Controls = Float[np.ndarray, "periods 2"]
 _BACK_MM_S = 2.0
 """Speed at which a wire that has gone past its target is pulled back, mm/s."""
 _SHORT_MM = 1.0
-"""No way is planned that needs the last of the wire, mm: encoders err."""
+"""A path leaves this much of the travel unused, mm: encoders err."""
 _STALL_PERIODS = 4
 """A tip that has come forward by less than `_STALL_SHARE` of the wire's advance in this many periods has stopped."""
 _STALL_SHARE = 0.25
 _LEFT_BEHIND = 0.2
-"""Each attempt is content with a way that leaves this much more of the wires, by weight, behind."""
+"""Each further attempt accepts a path that this much more of the wires, by weight, do not follow."""
 _LOOKOUT_MM, _LOOKOUT_RADII = 12.0, 3.0
 """A waypoint that is searched for lies no farther ahead than this, mm, or lumen radii where that is more: beyond, a
 chord says little."""
@@ -45,10 +45,10 @@ _LEAD_RADII = 1.4
 
 @settings
 class SearchConfig:
-    """How hard is searched."""
+    """Settings of the search."""
 
     candidates: Count = 32
-    """Candidates that are tried side by side where the way is not clear."""
+    """Candidates that are tried side by side where pushing straight on fails."""
     rounds: Count = 6
     """Rounds of one attempt, at most."""
     attempts: Count = 4
@@ -58,7 +58,7 @@ class SearchConfig:
     keep_share: OpenShare = 0.25
     """Share of the candidates that a round keeps."""
     speed_mm_s: Positive = 10.0
-    """Translation on a clear way, mm/s."""
+    """Translation while it is pushed straight on, mm/s."""
     turn_rad_s: Positive = 7.0
     """Fastest rotation that is tried, rad/s."""
     lead_mm: Positive = 4.0
@@ -97,7 +97,7 @@ class Course:
 
 
 class Search:
-    """Searches ways for a navigation, from any state of its wires."""
+    """Searches paths for a navigation, from any state of its wires."""
 
     def __init__(
         self,
@@ -113,18 +113,18 @@ class Search:
 
         Args:
             navigation: where, and how hard the wall may be pressed.
-            route: the way to its target.
-            wires: as they may be; the same object where two have the same stiffness.
-            config: how hard is searched.
+            route: to its target.
+            wires: as they may be.
+            config: settings of the search.
             seed: of the random candidates.
-            sharing: the simulator that ways will be searched from; its wires are among `wires`, its settings are taken.
+            sharing: the simulator that paths are searched from; its wires are among `wires`, its settings are taken.
         """
         self.navigation, self.route, self.config = navigation, route, config
         self._random = np.random.default_rng([seed, 0x5EA])
-        crowd = [wire for wire in wires for _ in range(config.candidates)]
+        candidates = [wire for wire in wires for _ in range(config.candidates)]
         anatomy, core = navigation.anatomy, sharing.config
         self.single, self._kept = (Simulator(anatomy, wires, config=core, sharing=sharing) for _ in range(2))
-        self._many = Simulator(anatomy, crowd, config=core, sharing=sharing)
+        self._many = Simulator(anatomy, candidates, config=core, sharing=sharing)
         limits = DriveLimits.of(wires[0], anatomy)
         self._limits = replace(limits, travel_mm=(limits.travel_mm[0], limits.travel_mm[1] - _SHORT_MM))
         self._wire_radius = wires[0].tip_radius_mm
@@ -138,24 +138,24 @@ class Search:
         seconds: float,
         advance: Advance | None = None,
     ) -> Course:
-        """Find a way from a state of the wires to the target.
+        """Find a path from a state of the wires to the target.
 
         Args:
             start: a simulator of the same wires.
             source: which of its worlds each wire is.
             weight: how much each wire counts; their sum is 1.
             seconds: time that is left, s.
-            advance: told of every millimetre along the route.
+            advance: called with every millimetre along the route.
         """
         self.single.copy_worlds(source, of=start)
         self._weight, same = weight, np.arange(len(weight))
-        log, told = _Log(), 0.0
+        log, reported = _Log(), 0.0
         periods = max(1, int(seconds / DECISION_PERIOD_S))
         while log.periods < periods:
             here = float(self.route.progress(self.single.project()) @ weight)
             if advance is not None:
-                advance(max(here - told, 0.0))
-                told = max(here, told)
+                advance(max(here - reported, 0.0))
+                reported = max(here, reported)
             waypoint, before = self.route.next_waypoint(here), log.periods
             self._kept.copy_worlds(same, of=self.single)
             if self._push_on(log, periods, waypoint):
@@ -167,7 +167,7 @@ class Search:
             self.single.copy_worlds(same, of=self._kept)
             log.cut(before)
             self._approach(log, periods, waypoint)
-            if not self._try_others(log, periods) or log.periods == before:
+            if not self._search_candidates(log, periods) or log.periods == before:
                 break
         return log.course(len(weight), self._reached())
 
@@ -175,13 +175,13 @@ class Search:
         return float(self.navigation.reached(self.single.project()) @ self._weight)
 
     def _push_on(self, log: _Log, periods: int, waypoint: float) -> bool:
-        """Push straight on past a waypoint; False if a wire goes astray, stops or presses too hard."""
+        """Push straight on past a waypoint; False if a wire leaves the route, stops or presses too hard."""
         begun = log.periods
         while log.periods < periods:
             tip = self.single.project()
             if self._all(self.route.passed(tip, waypoint)):
                 return True
-            if not self._all(self.route.astray(tip) == 0):
+            if not self._all(self.route.off_route(tip) == 0):
                 return False
             left = waypoint - float(self.route.progress(tip) @ self._weight)
             last = waypoint >= self.route.target.abscissa
@@ -201,7 +201,7 @@ class Search:
             begin = float(before[-1]) - max(self.config.lead_mm, _LEAD_RADII * radius)
         for _ in range(periods - log.periods):
             tip = self.single.project()
-            here, on_route = self.route.progress(tip) @ self._weight, self._all(self.route.astray(tip) == 0)
+            here, on_route = self.route.progress(tip) @ self._weight, self._all(self.route.off_route(tip) == 0)
             if not on_route and self.single.inserted_length.min() > 1.0:
                 self._drive(log, np.array([-self.config.speed_mm_s, 0.0]))
             elif here < begin - 1.0 and not (log.periods >= _STALL_PERIODS and log.stalled(self._weight > 0)):
@@ -232,10 +232,10 @@ class Search:
         """Return whether something holds for all wires that have not been left behind."""
         return bool(holds[self._weight > 0].all())
 
-    def _try_others(self, log: _Log, periods: int) -> bool:
-        """Search with the whole population for a way past the next waypoint; append the best to the log.
+    def _search_candidates(self, log: _Log, periods: int) -> bool:
+        """Search with the whole population for a path past the next waypoint; append the best to the log.
 
-        What is searched in vain is begun anew from the same state, so that a plan holds no vain motion.
+        Every attempt begins from the same state, so that a plan holds no motion of a failed one.
         """
         progress = float(self.route.progress(self.single.project()) @ self._weight)
         lookout = max(_LOOKOUT_MM, _LOOKOUT_RADII * float(self.route.radius(np.array([progress]))[0]))
@@ -254,7 +254,7 @@ class Search:
         return False
 
     def _leave_behind(self, passed: Bool[np.ndarray, "wires"]) -> None:
-        """Go on without the wires that a way does not bring past a waypoint."""
+        """Go on without the wires that a path does not bring past a waypoint."""
         left = np.where(passed, self._weight, 0.0)
         if left.sum() > 0:
             self._weight = left / left.sum()
@@ -337,7 +337,7 @@ class Search:
     ) -> tuple[Float[np.ndarray, "candidates"], Float[np.ndarray, "candidates"]]:
         """Return each candidate's cost so far and to go, and the share of its wires that have passed the waypoint."""
         tip, wires = self._many.project(), self.single.worlds
-        to_go = self._distance(self._many.position[:, 0], waypoint) + 0.5 * self.route.astray(tip)
+        to_go = self._distance(self._many.position[:, 0], waypoint) + 0.5 * self.route.off_route(tip)
         passed = (self.route.passed(tip, waypoint) & self._many.valid).reshape(wires, -1)
         score = self._weight @ to_go.reshape(wires, -1) + spent
         return score, self._weight @ passed

@@ -1,4 +1,4 @@
-"""What a learning agent is shown of a world: `observe`, whose table stands at `NavigateVectorEnv`."""
+"""What a learning agent observes of a world: `observe`; the table is in `NavigateVectorEnv`."""
 
 from __future__ import annotations
 
@@ -54,8 +54,8 @@ class Measured:
         )
 
     @classmethod
-    def standing(cls, simulator: Simulator) -> Measured:
-        """Return the worlds as they stand."""
+    def current(cls, simulator: Simulator) -> Measured:
+        """Return the worlds as they are now."""
         return cls(
             tip=simulator.project(),
             position=simulator.position[:, 0],
@@ -78,8 +78,8 @@ def observe(
 
     Args:
         now: the worlds.
-        routes: the ways to their targets.
-        distance_mm: what is left of them.
+        routes: the paths to their targets.
+        distance_mm: path length that is left.
         force_limit_n: their force limits.
         time_share: share of the time limit that is used up.
     """

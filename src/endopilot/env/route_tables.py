@@ -1,4 +1,4 @@
-"""The way to a target along the tree, as tables that many worlds look places up in at once."""
+"""The path to a target along the tree, as tables in which many worlds look up places at once."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class RouteTables:
     Attributes:
         places: of each route, a row for each place, every `STEP_MM` along it, as `Place` has it; a shorter route is
             padded with its last place.
-        leave: of each route, for each branch of the tree, the abscissa where the way into it leaves the route, mm;
+        leave: of each route, for each branch of the tree, the abscissa where the path into it leaves the route, mm;
             infinite for the branches of the route and for those that the tree does not have.
         route: which of these routes each world has.
         target: abscissa of each world's target, mm.
@@ -72,7 +72,7 @@ class RouteTables:
         )
 
     def distance(self, tip: TipProjection) -> Float[np.ndarray, "worlds"]:
-        """Return the way that each tip still has to go, mm, back out of a wrong branch first."""
+        """Return the path length from each tip to its target, mm, back out of a wrong branch first."""
         leave = self.leave[self.route, tip.branch]
         fork = np.minimum(leave, tip.abscissa)
         return (tip.abscissa - fork) + np.abs(self.target - fork)

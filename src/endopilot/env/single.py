@@ -72,7 +72,7 @@ class NavigateEnv(gymnasium.Env):
 
     @property
     def simulator(self) -> Simulator:
-        """The world, for pictures of the wire; stepping it goes past the environment."""
+        """The world, for pictures of the wire; stepping it bypasses the environment."""
         return self._worlds.simulator
 
     @property

@@ -51,7 +51,7 @@ class NavigationState:
     Attributes:
         simulator: the worlds.
         steps: steps of each world since its reset.
-        distance: way that each tip still had to go at the last step, mm.
+        distance: path length from each tip to its target at the last step, mm.
         safe: worlds whose force has not been too large since their reset.
         ended: worlds whose episode has ended, which the next step resets.
         generators: state of each world's random generator.
@@ -90,7 +90,7 @@ class NavigateVectorEnv(VectorEnv):
 
     `Box(-10, 10, (31,), float32)`, a row a world; values beyond are cut off. The route runs along the centerline from
     the ostium to the target; its frame is its tangent and two normals carried along it without twist, at the place
-    that is nearest to the tip along the tree. All of it is the truth, as if X-ray were always on.
+    that is nearest to the tip along the tree. All values are true ones, as if X-ray were always on.
 
     | index | observation | unit of 1 |
     |---|---|---|
@@ -98,7 +98,7 @@ class NavigateVectorEnv(VectorEnv):
     | 1, 2 | cosine and sine of the rotation φ | |
     | 3 | abscissa of the tip Δtip | 100 mm |
     | 4 | offset of the tip from the centerline γtip | the lumen's radius |
-    | 5 | way to the target along the tree, back out of a wrong branch first | 100 mm |
+    | 5 | path length to the target along the tree, back out of a wrong branch first | 100 mm |
     | 6 | 1 on the route, 0 in a wrong branch | |
     | 7 | largest force of the wall on a node | the navigation's force limit |
     | 8 | time that is used up | the time limit |
@@ -114,7 +114,7 @@ class NavigateVectorEnv(VectorEnv):
 
     | what | reward |
     |---|---|
-    | every mm by which the way to the target has become shorter (longer: negative) | 0.1 |
+    | every mm by which the path to the target has become shorter (longer: negative) | 0.1 |
     | every step | −0.01 |
     | every step that ends with a force of the wall beyond the navigation's limit | −0.1 |
     | the target | 5 |
@@ -136,9 +136,9 @@ class NavigateVectorEnv(VectorEnv):
     ## Info
 
     Arrays with an entry a world, each with its mask `_name`: `contact_force_max` (N, the largest force of the wall on
-    one node at the end of the step), `valid`, `success`, `safe` (no force beyond the limit so far), `distance_mm` (way
-    to the target), `inserted_length` (mm), `rotation` (rad), `tip_abscissa` (mm), `tip_offset` (mm), `tip_branch`,
-    `time_s`. In a single environment they are numbers.
+    one node at the end of the step), `valid`, `success`, `safe` (no force beyond the limit so far), `distance_mm` (path
+    length to the target), `inserted_length` (mm), `rotation` (rad), `tip_abscissa` (mm), `tip_offset` (mm),
+    `tip_branch`, `time_s`. In a single environment they are numbers.
 
     ## Arguments
 
@@ -241,7 +241,7 @@ class NavigateVectorEnv(VectorEnv):
             for world in np.flatnonzero(mask).tolist():
                 self._generators[world] = seeding.np_random(seeds[world])[0]
         self._begin(mask)
-        now = Measured.standing(self._simulator)
+        now = Measured.current(self._simulator)
         return self._observe(now), self._infos(now, self._distance)
 
     def step(
@@ -277,7 +277,7 @@ class NavigateVectorEnv(VectorEnv):
         now = Measured.after(step, self._simulator)
         if fresh.any():
             self._begin(fresh)
-            now = Measured.standing(self._simulator)
+            now = Measured.current(self._simulator)
         return self._judge(now, fresh)
 
     def _judge(self, now: Measured, fresh: Bool[np.ndarray, "worlds"]) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
@@ -354,7 +354,7 @@ class NavigateVectorEnv(VectorEnv):
 
     @property
     def simulator(self) -> Simulator:
-        """The worlds, for pictures of the wires; stepping it goes past the environment."""
+        """The worlds, for pictures of the wires; stepping it bypasses the environment."""
         return self._simulator
 
     def __getstate__(self) -> dict[str, Any]:

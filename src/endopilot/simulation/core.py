@@ -1,4 +1,4 @@
-"""The way into the C++ core: anatomy, device and settings as the core takes them, and one run of it."""
+"""The interface to the C++ core: anatomy, device and settings as the core takes them, and one run of it."""
 
 from __future__ import annotations
 

@@ -162,9 +162,9 @@ class Simulator:
         start = start if inserted_length is None else self._per_world("inserted_length", inserted_length)
         turn = turn if rotation is None else self._per_world("rotation", rotation)
         own = np.array([device.friction for device in self._device])
-        grip = own if friction is None else self._per_world("friction", friction)
-        if (grip < 0).any():
-            raise InputError(f"friction: world {int(np.argmin(grip))}: {grip.min():g}; give 0 or more")
+        coefficient = own if friction is None else self._per_world("friction", friction)
+        if (coefficient < 0).any():
+            raise InputError(f"friction: world {int(np.argmin(coefficient))}: {coefficient.min():g}; give 0 or more")
         for group in self._groups:
             bad = (start[group.index] < 0) | (start[group.index] > group.longest_mm)
             if bad.any():
@@ -178,7 +178,7 @@ class Simulator:
             group.simulation.reset(
                 index=np.flatnonzero(mine),
                 initial=np.column_stack([start, turn])[index],
-                friction=np.ascontiguousarray(grip[index]),
+                friction=np.ascontiguousarray(coefficient[index]),
                 sample_period=SAMPLE_PERIOD_S,
             )
             no_control = np.zeros((len(group.index), 0, 2))

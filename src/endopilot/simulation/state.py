@@ -1,4 +1,4 @@
-"""What goes into and comes out of the stepping simulator."""
+"""What `Simulator` takes and returns: a control array, a step's results and a saved state."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FORMAT_VERSION = 1
 
 @runtime_checkable
 class SupportsDLPack(Protocol):
-    """An array of another library that numpy can look into without a copy."""
+    """An array of another library that numpy can read without a copy."""
 
     def __dlpack__(self, **arguments: Any) -> Any: ...
     def __dlpack_device__(self) -> tuple[int, int]: ...
@@ -67,7 +67,7 @@ class SimulatorState:
     format_version: int = FORMAT_VERSION
 
     def check_version(self, where: str = "state") -> None:
-        """Check that this version of endopilot knows what the values mean.
+        """Check that this version of endopilot can read the values.
 
         Args:
             where: what a person would look for: a file, or "state".

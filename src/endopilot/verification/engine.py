@@ -1,6 +1,6 @@
 """Verification against an independent engine, MuJoCo: a free cantilever, and a rod pushed into a bend.
 
-MuJoCo sees a chain of rigid links with sprung joints, in joint coordinates, and its own contacts. Only rest is
+MuJoCo simulates a chain of rigid links with sprung joints, in joint coordinates, and its own contacts. Only rest is
 compared, so its joints get an inertia and a damping that make all of them settle alike, in about a unit of its time.
 """
 
@@ -42,7 +42,7 @@ BEND_STEP_S = 0.005
 
 
 def cantilever_shape_mujoco(links: int) -> Float[np.ndarray, "links 3"]:
-    """Return where MuJoCo sees the nodes of the loaded cantilever come to rest, from the clamp on; the last is the tip.
+    """Return where the nodes of MuJoCo's loaded cantilever come to rest, from the clamp on; the last is the tip.
 
     Ball joints of stiffness EI/l join links of length l; the first joint stands half a link in front of the wall.
     """

@@ -39,7 +39,7 @@ def draw(cases: Sequence[Case], folder: Path) -> None:
             axes.bar(["reference", "core"], [case.reference, case.value], color=["0.7", "tab:blue"])
         else:
             _fill(axes, case.picture)
-        verdict = "passed" if case.error <= case.bar else "MISSED"
+        verdict = "passed" if case.error <= case.bar else "FAILED"
         axes.set_title(f"{case.case}\nerror {case.error:.2g}, bar {case.bar:.2g}: {verdict}", fontsize=10)
         figure.savefig(folder / f"{file_name(case.case)}.png", dpi=110)
         plt.close(figure)

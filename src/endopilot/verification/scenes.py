@@ -43,7 +43,7 @@ _WHIP_LEAD_MM = 3.0
 def tortuous_axis(
     turns_rad: Float[np.ndarray, "bends"], *, bend_radius_mm: float, lead_mm: float, tail_mm: float
 ) -> Float[np.ndarray, "n 3"]:
-    """Return the axis of a planar vessel: straight along x up to the origin, bends in turn, and straight on.
+    """Return the axis of a planar vessel: straight along x up to the origin, bends one after another, and straight on.
 
     Args:
         turns_rad: angle of each bend, positive towards +y, rad.
@@ -109,11 +109,11 @@ class Dragged:
 def drag_through_bends(bends: int, *, friction: float = 0.2, bend_n_mm2: float = 0.1) -> Dragged:
     """Pull a wire back through a vessel of alternating bends, against 0.1 N on its tip.
 
-    A string obeys Euler's capstan equation T2/T1 = exp(µ θ), with θ the angle by which it turns in all, whichever way;
-    a stiff wire presses on the wall even without tension, and is dragged more.
+    A string obeys Euler's capstan equation T2/T1 = exp(µ θ), with θ the sum of the angles by which it turns,
+    whatever their direction; a stiff wire presses on the wall even without tension, and is dragged more.
 
     Args:
-        bends: number of bends of 60° each, left and right in turn.
+        bends: number of bends of 60° each, left and right alternately.
         friction: Coulomb coefficient µ.
         bend_n_mm2: EI of the wire, N·mm²; 0.1 makes a string of it at this load and this radius.
     """
@@ -203,7 +203,7 @@ def stick_slip(*, friction: float = 0.1) -> Pushed:
 
 
 def push_against_a_plate(*, friction: float, tip_bend_deg: float) -> Pushed:
-    """Push the workhorse wire, held 10 mm behind its tip, against a plate that stands across its way.
+    """Push the workhorse wire, held 10 mm behind its tip, against a plate that stands across its path.
 
     A tip that slides buckles as a clamped-free column, at π² EI/(4 L²), its tip load; a tip that friction holds in its
     place as a clamped-pinned one, at 20.19 EI/L², eight times as much (S. P. Timoshenko and J. M. Gere, Theory of

@@ -182,7 +182,7 @@ def helical_buckling() -> list[Case]:
 
     Y.-C. Chen, Y.-H. Lin and J. B. Cheatham, J. Petroleum Technology 42 (1990) 214-220. A helix of wave number k has
     the energy EI r² k⁴/2 - F r² k²/2 + w r over the straight rod's, per length, which is w r - F² r²/(8 EI) at its
-    best k² = F/(2 EI) and vanishes at that load. For some way above it the snaking rod is stable too: so the helix
+    best k² = F/(2 EI) and vanishes at that load. For some range above it the snaking rod is stable too: so the helix
     is measured where the rod coils up by itself, and continued. The weight makes the turns uneven, which lowers the
     load by 1.3 %. The energy hardly feels a wrong balance of forces, so the wall's force is compared too: it is
     r k² (F - EI k²) per length, F² r/(4 EI) at that wave number (A. Lubinski, W. S. Althouse and J. L. Logan, J.
@@ -244,7 +244,7 @@ def whip(
     inward = np.cross(up, frames[:, :, 2])
     tip = -np.arctan2((frames[:, :, 0] * inward).sum(axis=1), frames[:, :, 0] @ up)
     base = np.pi + 0.5 * np.cumsum(control[:, 1])
-    return base, base + np.mod(tip - base + np.pi, 2 * np.pi) - np.pi  # the tip is less than half a turn off
+    return base, base + np.mod(tip - base + np.pi, 2 * np.pi) - np.pi  # the tip lags by less than half a turn
 
 
 def torque_whip() -> list[Case]:
