@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import os
-
 import numpy as np
 from jaxtyping import Float
 
 from endopilot import _core
-from endopilot.errors import InputError
 from endopilot.progress import progress
 from endopilot.simulation.config import FREE_BEHIND_MM, LANES, Actuation, SimulatorConfig, wall_stiffness
 from endopilot.simulation.rod import RodLayout
-from endopilot.types import SAMPLE_PERIOD_S, Anatomy, DistanceMap, Insertion
+from endopilot.types import SAMPLE_PERIOD_S, DistanceMap, Insertion
 
 _LARGEST_NEWTON_STEP = 0.3
 """Displacement of a node (mm) that one Newton step is clamped to; larger ones can tangle the wire for good."""
@@ -136,46 +133,6 @@ def make_lumen(distance_map: DistanceMap, radius_mm: float) -> _core.Lumen:
         near=radius_mm + spacing,
         far=0.5,
     )
-
-
-def check_distance_map(anatomy: Anatomy) -> None:
-    """Check that the distance map is finite, and positive at the ostium and around it along the catheter's axis.
-
-    Raises:
-        InputError: it is not.
-    """
-    field, insertion = anatomy.distance_map, anatomy.insertion
-    if not np.isfinite(field.values).all():
-        raise InputError(f"{anatomy.name}: the distance map has values that are not finite; extract it again")
-    if not 0 < field.spacing_mm < np.inf:
-        raise InputError(
-            f"{anatomy.name}: the distance map's spacing_mm is {field.spacing_mm}; give a positive spacing"
-        )
-    if not np.isfinite(insertion.position).all():
-        raise InputError(f"{anatomy.name}: insertion.position = {insertion.position} is not finite; extract it again")
-    if not abs(float(np.linalg.norm(insertion.direction)) - 1) <= 1e-3:
-        raise InputError(f"{anatomy.name}: insertion.direction = {insertion.direction} is no unit vector; normalise it")
-    for along in (-FREE_BEHIND_MM, 0.0, 1.0):
-        point = insertion.position + along * insertion.direction
-        index = np.round((point - field.origin_mm) / field.spacing_mm).astype(int)[::-1]
-        inside = (index >= 0).all() and (index < field.values.shape).all()
-        value = float(field.values[tuple(index)]) if inside else -np.inf
-        if value <= 0:
-            raise InputError(
-                f"{anatomy.name}: the distance map is {value:.2f} mm at {along:+g} mm from the ostium along the "
-                "catheter, where it must be positive (inside); check the insertion and the sign of the map"
-            )
-
-
-def check_memory(needed: int, what: str, mend: str) -> None:
-    """Check that `needed` bytes are at most 0.8 of the machine's memory.
-
-    Raises:
-        InputError: they are more; it begins with `what` needs them and ends with the mend.
-    """
-    available = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    if needed > 0.8 * available:
-        raise InputError(f"{what} need {needed / 2**30:.1f} GiB of {available / 2**30:.1f}; {mend}")
 
 
 def _base_orientation(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4"]:

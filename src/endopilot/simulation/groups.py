@@ -11,8 +11,9 @@ from jaxtyping import Integer
 
 from endopilot import _core
 from endopilot.anatomy.projection import TipProjector
+from endopilot.simulation.checks import check_distance_map, check_memory
 from endopilot.simulation.config import FREE_BEHIND_MM, SimulatorConfig
-from endopilot.simulation.core import check_distance_map, check_memory, core_options, insertion_arguments, make_lumen
+from endopilot.simulation.core import core_options, insertion_arguments, make_lumen
 from endopilot.simulation.device import Device, check_fits
 from endopilot.simulation.drive_limits import far_end_mm
 from endopilot.simulation.rod import RodLayout, lay_out

@@ -1,7 +1,7 @@
-"""The simulator: one anatomy, one device, many worlds, each with controls of its own.
+"""`simulate`: whole sequences of controls of many worlds, with one anatomy and one device.
 
 Every world is a discrete Cosserat rod that slides out of the guiding catheter into the lumen. The time stepper is the
-C++ core in `src/core`; this module checks its input, lays the rod out and gives the answer as a `Rollout`.
+C++ core in `src/core`; this module checks its input, lays out the rod and returns what happened as a `Rollout`.
 """
 
 from __future__ import annotations
@@ -9,21 +9,20 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from endopilot.anatomy.projection import project_tip
 from endopilot.errors import InputError
+from endopilot.simulation.checks import check_distance_map, check_memory, check_sequences
 from endopilot.simulation.config import FREE_BEHIND_MM, Actuation, SimulatorConfig
-from endopilot.simulation.core import check_distance_map, check_memory, make_lumen, run_core
+from endopilot.simulation.core import make_lumen, run_core
 from endopilot.simulation.device import Device, check_fits
 from endopilot.simulation.drive_limits import far_end_mm
 from endopilot.simulation.rod import lay_out
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, Rollout
 
 _REASONS = {1: "left the finite numbers", 2: "did not converge"}
-"""What `Rollout.reason` says of an invalid world."""
-_OVERSHOOT_MM = 1e-2
-"""Rounding of controls may carry the inserted length this far below 0, mm."""
+"""Meaning of `Rollout.reason` for an invalid world."""
 
 
 def simulate(
@@ -75,7 +74,7 @@ def simulate(
         raise InputError(f"friction: shape {friction.shape}; give one number for each of the {worlds} worlds")
     _check_memory(worlds, samples, 0)
     control = np.ascontiguousarray(control, dtype=float)
-    deepest = _check_controls(device, control, initial, friction, actuation)
+    deepest = check_sequences(device, control, initial, friction, actuation)
     check_fits(device, anatomy)
     check_distance_map(anatomy)
     path_mm = float(anatomy.tree.longest_path().abscissa[-1])
@@ -156,41 +155,6 @@ RECORDED = (
     "iterations",
     "valid",
 )
-
-
-def _check_controls(
-    device: Device,
-    control: Float[np.ndarray, "worlds samples 2"],
-    initial: Float[np.ndarray, "worlds 2"],
-    friction: Float[np.ndarray, "worlds"],
-    actuation: Actuation,
-) -> float:
-    """Check controls, initial state and friction, and return the largest inserted length that they name, mm."""
-    if actuation not in ("velocity", "force"):
-        raise InputError(f"actuation: {actuation!r}; give 'velocity' or 'force'")
-    worlds, samples = control.shape[:2]
-    if worlds == 0 or samples == 0:
-        raise InputError(f"control: {worlds} worlds of {samples} samples; give at least one of one")
-    limits = (("translation", device.max_velocity_mm_s, "mm/s"), ("rotation", device.max_rotation_rad_s, "rad/s"))
-    if actuation == "force":
-        limits = (("force", np.inf, "N"), ("torque", np.inf, "N·mm"))
-    for axis, (name, limit, unit) in enumerate(limits):
-        _check(~np.isfinite(control[..., axis]), control[..., axis], f"{name} is no finite number; correct it")
-        fast = np.abs(control[..., axis]) > limit * (1 + 1e-6)
-        _check(fast, control[..., axis], f"{name} in {unit} exceeds {device.name}'s limit of {limit:g}; slow down")
-    _check(~np.isfinite(initial), initial, "initial state is no finite number; correct it")
-    _check(~(np.isfinite(friction) & (friction >= 0)), friction, "friction must be a finite number of 0 or more")
-    advance = SAMPLE_PERIOD_S * control[..., 0] if actuation == "velocity" else np.zeros(control.shape[:2])
-    inserted = np.cumsum(np.column_stack([initial[:, 0], advance]), axis=1)
-    _check(inserted < -_OVERSHOOT_MM, inserted, "inserted length in mm is negative; pull less, or start deeper")
-    return float(inserted.max())
-
-
-def _check(bad: Bool[np.ndarray, "worlds *rest"], values: Float[np.ndarray, "worlds *rest"], what: str) -> None:
-    if bad.any():
-        where = [int(i) for i in np.argwhere(bad)[0]]
-        at = f", sample {where[1]}" if len(where) > 1 else ""
-        raise InputError(f"world {where[0]}{at}: {values[tuple(where)]:g}: {what}")
 
 
 def _check_memory(worlds: int, samples: int, recorded_nodes: int) -> None:

@@ -17,18 +17,15 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from endopilot.errors import InputError
+from endopilot.simulation.checks import check_control, check_memory, check_travel
 from endopilot.simulation.config import LANES, Actuation, SimulatorConfig
-from endopilot.simulation.core import check_memory
 from endopilot.simulation.device import Device
-from endopilot.simulation.drive_limits import SPARE_MM
 from endopilot.simulation.groups import Group, group_key, make_groups, merge
 from endopilot.simulation.state import SimulatorState, Step, SupportsDLPack
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, TipProjection
 
 _DEEPEST_START = 0.8
 """Share of the longest path that a random start may lie at."""
-
-
 _LEAST_BYTES = 4000
 """No world takes less memory, bytes; a number of worlds that needs more is refused before they are listed."""
 
@@ -92,36 +89,6 @@ class Simulator:
         self._longest = self._merge([np.full(len(group.index), group.longest_mm) for group in self._groups])
         self.reset(inserted_length=np.zeros(len(devices)), rotation=np.zeros(len(devices)))
 
-    @property
-    def config(self) -> SimulatorConfig:
-        """Settings of the rod core.
-
-        Example:
-            >>> simulator.config.elements
-            100
-        """
-        return self._config
-
-    @property
-    def worlds(self) -> int:
-        """Number of worlds.
-
-        Example:
-            >>> simulator.worlds
-            4
-        """
-        return len(self._device)
-
-    @property
-    def nodes(self) -> int:
-        """Nodes of the longest wire; arrays with a row a node are padded to this.
-
-        Example:
-            >>> simulator.contacts.shape == (4, simulator.nodes)
-            True
-        """
-        return max(group.simulation.nodes for group in self._groups)
-
     def reset(
         self,
         seed: int | None = None,
@@ -184,15 +151,6 @@ class Simulator:
             no_control = np.zeros((len(group.index), 0, 2))
             self._run(group, no_control, self._config.time_step_s, self._config.steps_per_sample, by_force=False)
 
-    def _random_start(self, seed: int | None) -> tuple[np.ndarray, np.ndarray]:
-        if seed is None:
-            return np.zeros(self.worlds), np.zeros(self.worlds)
-        draw = np.array([np.random.default_rng([seed, world]).random(2) for world in range(self.worlds)])
-        deepest = np.empty(self.worlds)
-        for group in self._groups:
-            deepest[group.index] = _DEEPEST_START * group.path_mm
-        return draw[:, 0] * deepest, draw[:, 1] * 2 * np.pi
-
     def step(self, control: ArrayLike | SupportsDLPack, duration: float) -> Step:
         """Drive every world for some time with a constant control.
 
@@ -218,7 +176,11 @@ class Simulator:
         if not isinstance(array, np.ndarray) and hasattr(array, "__dlpack__"):
             array = np.from_dlpack(array)
         array = np.ascontiguousarray(array, dtype=float)
-        self._check_control(array, duration)
+        if not (math.isfinite(duration) and duration > 0):
+            raise InputError(f"duration: {duration}; give a positive number of seconds")
+        check_control(array, self._largest, self._device)
+        if not self._by_force:
+            check_travel(self.inserted_length + array[:, 0] * duration, self._longest)
         steps = max(1, int(np.ceil(duration / self._config.time_step_s - 1e-9)))
         results = [
             self._run(group, array[group.index][:, None], duration / steps, steps, by_force=self._by_force)
@@ -228,70 +190,117 @@ class Simulator:
             **{name: self._merge([result[name][:, 0] for result in results]) for name in Step.__dataclass_fields__}
         )
 
-    def _run(
-        self, group: Group, control: np.ndarray, time_step: float, steps: int, *, by_force: bool
-    ) -> dict[str, Any]:
-        return group.simulation.run(
-            control=control,
-            force_driven=by_force,
-            time_step=time_step,
-            steps_per_sample=steps,
-            record_shape=False,
-            record_attitude=False,
-            threads=self._config.threads_for(len(group.index), LANES),
-            lanes=LANES,
-            progress=None,
-        )
+    def project(self) -> TipProjection:
+        """Project the tips to the centerline: Δtip (mm), γtip (mm), branch and lumen radius (mm), a row a world.
 
-    def _per_world(self, name: str, values: Any) -> Float[np.ndarray, "worlds"]:
-        array = np.asarray(values, dtype=float)
-        if array.shape != (self.worlds,):
-            raise InputError(f"{name}: shape {array.shape}; give one number for each of the {self.worlds} worlds")
-        if not np.isfinite(array).all():
-            raise InputError(f"{name}: world {int(np.argmin(np.isfinite(array)))}: not a finite number; correct it")
-        return array
+        Example:
+            >>> tip = simulator.project()
+            >>> bool((tip.offset < tip.radius).all())
+            True
+        """
+        tips = [group.project(group.simulation.tips()) for group in self._groups]
+        names = TipProjection.__dataclass_fields__
+        return TipProjection(**{name: self._merge([getattr(tip, name) for tip in tips]) for name in names})
 
-    def _check_control(self, control: np.ndarray, duration: float) -> None:
-        if control.shape != (self.worlds, 2):
-            raise InputError(f"control: shape {control.shape}; give ({self.worlds}, 2), a row a world")
-        if not (math.isfinite(duration) and duration > 0):
-            raise InputError(f"duration: {duration}; give a positive number of seconds")
-        if not (np.abs(control) <= self._largest).all():
-            self._refuse(control)
-        if self._by_force:
-            return
-        end = self.inserted_length + control[:, 0] * duration
-        if (end > self._longest).any():
-            world = int(np.argmax(end - self._longest))
+    @property
+    def state(self) -> SimulatorState:
+        """The worlds' state, to be kept and given to `set_state`.
+
+        Example:
+            >>> kept = simulator.state  # kept.save(path) writes it to a file
+        """
+        return SimulatorState(tuple(group.simulation.state() for group in self._groups), self._fingerprint)
+
+    def set_state(self, state: SimulatorState) -> None:
+        """Restore all worlds, bit by bit.
+
+        Raises:
+            InputError: the state is that of other anatomies, devices or settings, of another number of worlds, or of
+                another version of endopilot.
+
+        Example:
+            >>> kept, control = simulator.state, np.tile([5.0, 0.5], (4, 1))
+            >>> once = simulator.step(control, 0.1)
+            >>> simulator.set_state(kept)
+            >>> np.array_equal(simulator.step(control, 0.1).tip_position, once.tip_position)
+            True
+        """
+        state.check_version()
+        if state.fingerprint != self._fingerprint:
             raise InputError(
-                f"control: world {world}: would insert {end[world]:.1f} mm, and the wire is laid out for "
-                f"{self._longest[world]:.1f} mm, {SPARE_MM:g} mm more than the vessel's longest path; push less"
+                "state: made with other anatomies, devices or settings; restore it in a simulator like its own"
             )
+        for group, values in zip(self._groups, state.values, strict=True):
+            group.simulation.set_state(np.ascontiguousarray(values))
 
-    def _refuse(self, control: np.ndarray) -> None:
-        """Say which control is not finite, or too large."""
-        world = int(np.argmin((np.abs(control) <= self._largest).all(axis=1)))
-        if not np.isfinite(control[world]).all():
-            raise InputError(f"control: world {world}: {control[world]} is not finite; correct it")
-        device = self._device[world]
-        raise InputError(
-            f"control: world {world}: {control[world, 0]:g} mm/s, {control[world, 1]:g} rad/s exceed "
-            f"{device.max_velocity_mm_s:g} mm/s, {device.max_rotation_rad_s:g} rad/s, the limits of "
-            f"{device.name}; slow down"
-        )
+    def copy_worlds(self, source: ArrayLike, *, of: Simulator | None = None) -> None:
+        """Put every world where another one, of the same anatomy and device, is now; friction goes with it.
 
-    def _merge(self, parts: Sequence[np.ndarray]) -> np.ndarray:
-        return merge(self._groups, parts)
+        Args:
+            source: for each world, the number of the one that it becomes a copy of; its own to stay as it is.
+            of: the simulator that the numbers belong to, made with equal anatomies, devices and settings but
+                maybe another number of worlds; this one if not given.
 
-    def _gather(self, name: str) -> Float[np.ndarray, "worlds"]:
-        return self._merge([getattr(group.simulation, name)() for group in self._groups])
+        Raises:
+            InputError: not one number for each world, or a world of another anatomy or device, or other settings.
 
-    def _per_node(self, name: str, pad: float) -> np.ndarray:
-        parts = [getattr(group.simulation, name)() for group in self._groups]
-        out = np.full((self.worlds, self.nodes, *parts[0].shape[2:]), pad)
-        for group, part in zip(self._groups, parts, strict=True):
-            out[group.index, : part.shape[1]] = part
-        return out
+        Example:
+            >>> simulator.copy_worlds([0, 0, 2, 2])
+            >>> bool((simulator.position[1] == simulator.position[0])[simulator.contacts[0] >= 0].all())
+            True
+        """
+        of = of or self
+        chosen = np.asarray(source)
+        if chosen.shape != (self.worlds,) or not np.issubdtype(chosen.dtype, np.integer):
+            raise InputError(f"source: {source}; give the number of a world for each of the {self.worlds} worlds")
+        if (self._by_force, _settings(self._config)) != (of._by_force, _settings(of._config)):
+            raise InputError("of: a simulator with other settings; make both with the same actuation and config")
+        originals = {group_key(group.anatomy, group.device): group for group in of._groups}
+        states = []
+        for group in self._groups:
+            wanted = chosen[group.index]
+            original = originals.get(group_key(group.anatomy, group.device))
+            strange = ~np.isin(wanted, original.index if original else [])
+            if original is None or strange.any():
+                world = int(group.index[np.argmax(strange)])
+                raise InputError(
+                    f"source: world {world} cannot become world {chosen[world]}, which is none or has another anatomy "
+                    "or device; give one like it"
+                )
+            rows = np.searchsorted(original.index, wanted)
+            states.append(np.ascontiguousarray(original.simulation.state()[rows]))
+        for group, state in zip(self._groups, states, strict=True):
+            group.simulation.set_state(state)
+
+    @property
+    def config(self) -> SimulatorConfig:
+        """Settings of the rod core.
+
+        Example:
+            >>> simulator.config.elements
+            100
+        """
+        return self._config
+
+    @property
+    def worlds(self) -> int:
+        """Number of worlds.
+
+        Example:
+            >>> simulator.worlds
+            4
+        """
+        return len(self._device)
+
+    @property
+    def nodes(self) -> int:
+        """Nodes of the longest wire; arrays with a row a node are padded to this.
+
+        Example:
+            >>> simulator.contacts.shape == (4, simulator.nodes)
+            True
+        """
+        return max(group.simulation.nodes for group in self._groups)
 
     @property
     def inserted_length(self) -> Float[np.ndarray, "worlds"]:
@@ -408,87 +417,50 @@ class Simulator:
         """
         return self._gather("reason").astype(int)
 
-    def project(self) -> TipProjection:
-        """Project the tips to the centerline: Δtip (mm), γtip (mm), branch and lumen radius (mm), a row a world.
-
-        Example:
-            >>> tip = simulator.project()
-            >>> bool((tip.offset < tip.radius).all())
-            True
-        """
-        tips = [group.project(group.simulation.tips()) for group in self._groups]
-        names = TipProjection.__dataclass_fields__
-        return TipProjection(**{name: self._merge([getattr(tip, name) for tip in tips]) for name in names})
-
-    @property
-    def state(self) -> SimulatorState:
-        """The worlds' state, to be kept and given to `set_state`.
-
-        Example:
-            >>> kept = simulator.state  # kept.save(path) writes it to a file
-        """
-        return SimulatorState(tuple(group.simulation.state() for group in self._groups), self._fingerprint)
-
-    def set_state(self, state: SimulatorState) -> None:
-        """Restore all worlds, bit by bit.
-
-        Raises:
-            InputError: the state is that of other anatomies, devices or settings, of another number of worlds, or of
-                another version of endopilot.
-
-        Example:
-            >>> kept, control = simulator.state, np.tile([5.0, 0.5], (4, 1))
-            >>> once = simulator.step(control, 0.1)
-            >>> simulator.set_state(kept)
-            >>> np.array_equal(simulator.step(control, 0.1).tip_position, once.tip_position)
-            True
-        """
-        state.check_version()
-        if state.fingerprint != self._fingerprint:
-            raise InputError(
-                "state: made with other anatomies, devices or settings; restore it in a simulator like its own"
-            )
-        for group, values in zip(self._groups, state.values, strict=True):
-            group.simulation.set_state(np.ascontiguousarray(values))
-
-    def copy_worlds(self, source: ArrayLike, *, of: Simulator | None = None) -> None:
-        """Put every world where another one, of the same anatomy and device, is now; friction goes with it.
-
-        Args:
-            source: for each world, the number of the one that it becomes a copy of; its own to stay as it is.
-            of: the simulator that the numbers belong to, made with equal anatomies, devices and settings but
-                maybe another number of worlds; this one if not given.
-
-        Raises:
-            InputError: not one number for each world, or a world of another anatomy or device, or other settings.
-
-        Example:
-            >>> simulator.copy_worlds([0, 0, 2, 2])
-            >>> bool((simulator.position[1] == simulator.position[0])[simulator.contacts[0] >= 0].all())
-            True
-        """
-        of = of or self
-        chosen = np.asarray(source)
-        if chosen.shape != (self.worlds,) or not np.issubdtype(chosen.dtype, np.integer):
-            raise InputError(f"source: {source}; give the number of a world for each of the {self.worlds} worlds")
-        if (self._by_force, _settings(self._config)) != (of._by_force, _settings(of._config)):
-            raise InputError("of: a simulator with other settings; make both with the same actuation and config")
-        originals = {group_key(group.anatomy, group.device): group for group in of._groups}
-        states = []
+    def _random_start(self, seed: int | None) -> tuple[np.ndarray, np.ndarray]:
+        if seed is None:
+            return np.zeros(self.worlds), np.zeros(self.worlds)
+        draw = np.array([np.random.default_rng([seed, world]).random(2) for world in range(self.worlds)])
+        deepest = np.empty(self.worlds)
         for group in self._groups:
-            wanted = chosen[group.index]
-            original = originals.get(group_key(group.anatomy, group.device))
-            strange = ~np.isin(wanted, original.index if original else [])
-            if original is None or strange.any():
-                world = int(group.index[np.argmax(strange)])
-                raise InputError(
-                    f"source: world {world} cannot become world {chosen[world]}, which is none or has another anatomy "
-                    "or device; give one like it"
-                )
-            rows = np.searchsorted(original.index, wanted)
-            states.append(np.ascontiguousarray(original.simulation.state()[rows]))
-        for group, state in zip(self._groups, states, strict=True):
-            group.simulation.set_state(state)
+            deepest[group.index] = _DEEPEST_START * group.path_mm
+        return draw[:, 0] * deepest, draw[:, 1] * 2 * np.pi
+
+    def _run(
+        self, group: Group, control: np.ndarray, time_step: float, steps: int, *, by_force: bool
+    ) -> dict[str, Any]:
+        return group.simulation.run(
+            control=control,
+            force_driven=by_force,
+            time_step=time_step,
+            steps_per_sample=steps,
+            record_shape=False,
+            record_attitude=False,
+            threads=self._config.threads_for(len(group.index), LANES),
+            lanes=LANES,
+            progress=None,
+        )
+
+    def _per_world(self, name: str, values: Any) -> Float[np.ndarray, "worlds"]:
+        array = np.asarray(values, dtype=float)
+        if array.shape != (self.worlds,):
+            raise InputError(f"{name}: shape {array.shape}; give one number for each of the {self.worlds} worlds")
+        if not np.isfinite(array).all():
+            raise InputError(f"{name}: world {int(np.argmin(np.isfinite(array)))}: not a finite number; correct it")
+        return array
+
+    def _merge(self, parts: Sequence[np.ndarray]) -> np.ndarray:
+        return merge(self._groups, parts)
+
+    def _gather(self, name: str) -> Float[np.ndarray, "worlds"]:
+        return self._merge([getattr(group.simulation, name)() for group in self._groups])
+
+    def _per_node(self, name: str, pad: float) -> np.ndarray:
+        parts = [getattr(group.simulation, name)() for group in self._groups]
+        out = np.full((self.worlds, self.nodes, *parts[0].shape[2:]), pad)
+        for group, part in zip(self._groups, parts, strict=True):
+            out[group.index, : part.shape[1]] = part
+        return out
 
     @cached_property
     def _fingerprint(self) -> str:
