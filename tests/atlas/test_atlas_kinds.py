@@ -66,7 +66,7 @@ def test_a_patient_depends_on_seed_and_index_alone(atlas, kind):
 
 
 def test_left_coronary_courses_pass_dodges_mean_positions(atlas):
-    at = heart_left.from_ostium
+    at = heart_left.place_from_ostium
     # Azimuth, elevation and distance of L1m, L2m, L3m, L4p on the LAD, C1m, C2m, C3m on the LCx; SD of distance in mm.
     means = {
         "LAD": [(at(2.3, 63.0, -5.0), 8.0), (at(5.3, 44.0, -12.0), 8.0), (at(10.1, 30.0, -32.0), 9.0)],

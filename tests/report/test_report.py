@@ -206,4 +206,4 @@ def test_a_failed_report_leaves_nothing_behind(material, rollout, tmp_path, no_s
 
 def test_the_summary_speaks_of_new_patients_where_there_are_any(results):
     metrics = evaluate._metrics(results, {"a", "b"}, 0)
-    assert "6 new navigations in 1 patient that the run was not trained on" in report_text.summary(metrics)
+    assert "6 new navigations in 1 patient that the run was not trained on" in report_text.opening(metrics)

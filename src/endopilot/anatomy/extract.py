@@ -95,22 +95,22 @@ def extract_anatomy(
     given = content.ostium if isinstance(content, LumenMask) else None
     if config.ostium_mm is not None:
         given = Insertion(np.array(config.ostium_mm, dtype=float), np.zeros(3))
-    label = wrapped.file or name
+    source_name = wrapped.file or name
     with progress(f"anatomy {name}", 4) as advance:
         if isinstance(content, (Polylines, VesselTree)):
-            tree, rule = polylines.tree_from_polylines(content, given, label)
+            tree, rule = polylines.tree_from_polylines(content, given, source_name)
             advance(2)
             distance_map = distance_map_from_spheres(tree, spacing_mm=config.spacing_mm)
         else:
             if isinstance(content, LumenMask):
-                mask, remarks = repair.connected_mask(content.volume, given, label, config.vessel)
+                mask, remarks = repair.connected_mask(content.volume, given, source_name, config.vessel)
                 surface, finest = surface_from_mask(mask), float(mask.spacing_mm.min())
             else:
-                surface, remarks = repair.closed_surface(content, given, label, config.vessel)
+                surface, remarks = repair.closed_surface(content, given, source_name, config.vessel)
                 finest = 0.0
             notes += remarks
             advance()
-            tree, rule = _tree(surface, finest, given, config, label)
+            tree, rule = _tree(surface, finest, given, config, source_name)
             advance()
             distance_map = _final_map(surface, tree, config)
         advance()

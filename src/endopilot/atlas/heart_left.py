@@ -24,7 +24,7 @@ _HEIGHT_MM = 3.0
 """The reference courses lie this far above the reference heart's surface, mm: in epicardial fat."""
 
 
-def from_ostium(distance_cm: float, azimuth_deg: float, elevation_deg: float) -> Float[np.ndarray, "3"]:
+def place_from_ostium(distance_cm: float, azimuth_deg: float, elevation_deg: float) -> Float[np.ndarray, "3"]:
     """Return the LPS position of one of Dodge's points with respect to its ostium, mm.
 
     Azimuth counts from the front to the patient's left, elevation towards the head.
@@ -37,18 +37,18 @@ def from_ostium(distance_cm: float, azimuth_deg: float, elevation_deg: float) ->
 FORK = np.array([13.0, -3.0, -1.2])
 """End of the left main artery: halfway between the first points of LAD (L1p) and circumflex (C1p), mm."""
 
-LEFT_MAIN = np.array([[0.0, 0.0, 0.0], from_ostium(0.7, 80.0, 4.0), FORK])
+LEFT_MAIN = np.array([[0.0, 0.0, 0.0], place_from_ostium(0.7, 80.0, 4.0), FORK])
 
 LAD = np.array(
     [
         FORK,
-        from_ostium(2.3, 63.0, -5.0),
-        from_ostium(3.25, 59.0, -8.5),
-        from_ostium(5.15, 44.0, -12.0),
-        from_ostium(6.8, 38.5, -18.5),
-        from_ostium(10.1, 30.0, -32.0),
-        from_ostium(12.2, 32.0, -46.0),
-        from_ostium(11.8, 33.0, -49.0),
+        place_from_ostium(2.3, 63.0, -5.0),
+        place_from_ostium(3.25, 59.0, -8.5),
+        place_from_ostium(5.15, 44.0, -12.0),
+        place_from_ostium(6.8, 38.5, -18.5),
+        place_from_ostium(10.1, 30.0, -32.0),
+        place_from_ostium(12.2, 32.0, -46.0),
+        place_from_ostium(11.8, 33.0, -49.0),
         [26.0, -44.0, -84.0],
     ]
 )
@@ -58,11 +58,11 @@ along the inferior interventricular groove, mm from the left ostium."""
 LCX = np.array(
     [
         FORK,
-        from_ostium(1.8, 94.0, -24.0),
-        from_ostium(2.2, 102.0, -31.0),
-        from_ostium(3.25, 117.0, -39.0),
-        from_ostium(4.75, 132.0, -50.0),
-        from_ostium(6.0, 156.0, -66.0),
+        place_from_ostium(1.8, 94.0, -24.0),
+        place_from_ostium(2.2, 102.0, -31.0),
+        place_from_ostium(3.25, 117.0, -39.0),
+        place_from_ostium(4.75, 132.0, -50.0),
+        place_from_ostium(6.0, 156.0, -66.0),
         [-16.0, 9.0, -64.4],
     ]
 )

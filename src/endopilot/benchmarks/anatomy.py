@@ -21,6 +21,7 @@ from endopilot.anatomy.projection import project_tip
 from endopilot.anatomy.tree import sampled
 from endopilot.benchmarks import analytic_lumens as analytic
 from endopilot.errors import InputError
+from endopilot.evaluation.anatomy_score import compare_trees
 from endopilot.progress import progress
 from endopilot.types import Anatomy, LumenMask, VesselTree, Volume
 
@@ -81,22 +82,6 @@ def bench_anatomy(centerlines: Path | None = None) -> list[dict[str, Any]]:
     return rows
 
 
-def agreement(true: VesselTree, found: VesselTree) -> tuple[float, float, float]:
-    """Return overlap OV, average inside accuracy AI (mm) and mean absolute error of the radius (mm) of two trees.
-
-    OV is the share of both centerlines that lies within the true radius of the other, AI the mean distance of the found
-    centerline from the true one where they overlap (Schaap et al., Med. Image Anal. 13, 2009).
-    """
-    one, size = sampled(true)
-    two, radius = sampled(found)
-    gap, nearest = (np.asarray(value) for value in KDTree(one).query(two))
-    back = np.asarray(KDTree(two).query(one)[0])
-    inside, reached = gap < size[nearest], back < size
-    overlap = float((inside.sum() + reached.sum()) / (len(one) + len(two)))
-    error = np.abs(radius - size[nearest])[inside]
-    return overlap, float(gap[inside].mean()), float(error.mean())
-
-
 def _centerline_files(folder: Path | None) -> list[Path]:
     if folder is None:
         return []
@@ -130,7 +115,7 @@ def _axis_and_radius(tree: VesselTree, mask: LumenMask) -> dict[str, tuple[float
     gap = np.min([analytic.distance_to_line(b.centerline.points, points) for b in tree.branches], axis=0)
     axis, _ = sampled(tree)
     true_radius = analytic.tree_distance(tree, axis)[np.asarray(KDTree(axis).query(points)[1])]
-    overlap, _, _ = agreement(tree, found.tree)
+    overlap = compare_trees(found.tree, tree, smallest_radius_mm=0.0).overlap
     return {
         "axis error, voxels": (float(gap.mean()) / voxel, VOXEL_BAR),
         "radius error, voxels": (float(np.abs(radius - true_radius).mean()) / voxel, VOXEL_BAR),
@@ -180,14 +165,14 @@ def _found_again(truth: Anatomy, name: str) -> dict[str, tuple[float, float | No
     inside = sample(lumen, volume.index_to_world(index.astype(float))).reshape(volume.voxels.shape) > 0
     mask = LumenMask(Volume(inside, size, lumen.origin_mm, np.eye(3)), truth.insertion)
     found = extract_anatomy(mask, name=name, config=AnatomyConfig(vessel=name))  # pyright: ignore[reportArgumentType]
-    overlap, accuracy, radius = agreement(truth.tree, found.tree)
+    agreement = compare_trees(found.tree, truth.tree, smallest_radius_mm=0.0)
     with tempfile.TemporaryDirectory() as folder:
         write_anatomy(found, Path(folder) / name)
         stored = (Path(folder) / name / "lumen.nrrd").stat().st_size / 1e6
     return {
-        "overlap OV": (overlap, OVERLAP_BAR),
-        "inside accuracy AI, mm": (accuracy, INSIDE_ACCURACY_BAR_MM),
-        "radius error, mm": (radius, RADIUS_BAR_MM),
+        "overlap OV": (agreement.overlap, OVERLAP_BAR),
+        "inside accuracy AI, mm": (agreement.inside_accuracy_mm, INSIDE_ACCURACY_BAR_MM),
+        "radius error, mm": (agreement.radius_mae_mm, RADIUS_BAR_MM),
         "stored distance map, MB": (stored, STORED_MB_BAR),
     }
 

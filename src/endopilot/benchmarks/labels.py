@@ -34,7 +34,7 @@ Lengths = dict[tuple[str, str], float]
 """Length in mm for pairs of true and found section."""
 
 
-def agreement(truth: VesselTree, found: VesselTree) -> Lengths:
+def label_agreement(truth: VesselTree, found: VesselTree) -> Lengths:
     """Return the length in mm for every pair of true and found section; both trees have the same branches."""
     lengths: defaultdict[tuple[str, str], float] = defaultdict(float)
     for one, two in zip(truth.branches, found.branches, strict=True):
@@ -51,7 +51,7 @@ def _measure(anatomy: str, count: int, seed: int) -> dict[str, Any]:
     for index in range(count):
         truth, drawn = make_patient_tree(config, index)
         found = label_tree(truth, cast(Scheme, anatomy))
-        lengths = agreement(truth, found)
+        lengths = label_agreement(truth, found)
         shares.append(_right(lengths))
         for pair, length in lengths.items():
             total[pair] += length

@@ -53,14 +53,16 @@ def bench_training(folder: Path) -> list[dict[str, Any]]:
     torch.set_num_threads(1)
     try:
         return [
-            compare(folder / "dataset", TrainConfig(model=model, network="ff", processor="cpu"), model, rounds=ROUNDS)
+            compare_with_plain_loop(
+                folder / "dataset", TrainConfig(model=model, network="ff", processor="cpu"), model, rounds=ROUNDS
+            )
             for model in ("paper", "causal")
         ]
     finally:
         torch.set_num_threads(threads)
 
 
-def compare(dataset: Path, config: TrainConfig, name: str, *, rounds: int) -> dict[str, Any]:
+def compare_with_plain_loop(dataset: Path, config: TrainConfig, name: str, *, rounds: int) -> dict[str, Any]:
     """Return the row of one model: both loops by turns on the split "train" of a dataset."""
     examples = examples_of(load_dataset(dataset), "train", config)
     targets = examples.targets()

@@ -81,13 +81,21 @@ def score_anatomy(mask: LumenMask, extracted: Anatomy, truth: Anatomy) -> Anatom
     )
 
 
-def compare_trees(extracted: VesselTree, truth: VesselTree) -> Agreement:
-    """Return how far an extracted centerline tree agrees with the true one."""
+def compare_trees(
+    extracted: VesselTree, truth: VesselTree, *, smallest_radius_mm: float = SMALLEST_RADIUS_MM
+) -> Agreement:
+    """Return how far an extracted centerline tree agrees with the true one.
+
+    Args:
+        extracted: the tree to be measured.
+        truth: the true tree.
+        smallest_radius_mm: true points of a smaller radius are not counted, mm.
+    """
     true_points, true_radius = sampled(truth)
     points, radius = sampled(extracted)
     distance, nearest = KDTree(true_points).query(points)
-    follows, scored = distance <= true_radius[nearest], true_radius[nearest] >= SMALLEST_RADIUS_MM
-    large = true_radius >= SMALLEST_RADIUS_MM
+    follows, scored = distance <= true_radius[nearest], true_radius[nearest] >= smallest_radius_mm
+    large = true_radius >= smallest_radius_mm
     to_extracted, _ = KDTree(points).query(true_points[large])
     found, right = to_extracted <= true_radius[large], follows & scored
     agreeing = int(found.sum() + right.sum())

@@ -15,7 +15,7 @@ from endopilot.errors import InputError
 from endopilot.files import read_json, write_json, writing
 from endopilot.ladder.attempt import attempt, navigation_seed
 from endopilot.ladder.ladder import LadderConfig, identity
-from endopilot.ladder.scores import summary
+from endopilot.ladder.scores import score_navigations
 from endopilot.runs import claim, make_missing
 from endopilot.tasks.navigation import Navigation
 from endopilot.tasks.task import Task, find_task
@@ -92,7 +92,11 @@ def _navigate(path: Path, *, policy: str, share: float) -> None:
 def _scores(results: list[dict[str, Any]]) -> dict[str, Any]:
     minutes = sum(result["seconds"] for result in results) / 60
     exposures = sum(result["exposures"] for result in results)
-    return {"navigations": len(results)} | summary(results) | {"exposures_per_minute": round(exposures / minutes, 1)}
+    return (
+        {"navigations": len(results)}
+        | score_navigations(results)
+        | {"exposures_per_minute": round(exposures / minutes, 1)}
+    )
 
 
 def _picture(rows: list[dict[str, Any]], policy: str, share: float) -> bytes:

@@ -22,16 +22,16 @@ def score(tasks: Sequence[Task], results: Mapping[str, Sequence[Mapping[str, Any
     `peak_force_n` (N) and the mean of `exposures`. Rows of `agent` have `missed_events`, the share of the events of all
     their navigations that X-ray did not show (docs/xray.md).
     """
-    rows = [{"level": task.level, "task": task.name} | summary(results[task.name]) for task in tasks]
+    rows = [{"level": task.level, "task": task.name} | score_navigations(results[task.name]) for task in tasks]
     levels = {task.level: task.name for task in tasks}
     for title, wanted in (("lower four", range(1, 5)), ("upper eight", UPPER), ("all twelve", range(1, 13))):
         if all(level in levels for level in wanted):
             together = [result for level in wanted for result in results[levels[level]]]
-            rows.append({"level": None, "task": title} | summary(together))
+            rows.append({"level": None, "task": title} | score_navigations(together))
     return rows
 
 
-def summary(results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def score_navigations(results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return the scores of some navigations together, see `score`."""
     reached = [result for result in results if result["success"]]
 

@@ -48,7 +48,7 @@ def headline_split(metrics: Mapping[str, Any]) -> str:
     return "test" if "test" in metrics["splits"] else next(iter(metrics["splits"]))
 
 
-def summary(metrics: Mapping[str, Any]) -> str:
+def opening(metrics: Mapping[str, Any]) -> str:
     """Return the key result as a paragraph."""
     split = metrics["splits"][headline_split(metrics)]
     tip = split["tip"]
