@@ -26,6 +26,7 @@ from endopilot.errors import InputError
 from endopilot.files import json_text
 from endopilot.settings import Ascending, Count, Finite, NonNegative, Positive, Within, from_record, read_settings
 from endopilot.settings import settings as settings_class
+from endopilot.simulation.device import Device, read_device
 
 ENDLESS = {("DriveLimits", "travel_mm[1]")}
 """Numbers that may be infinite."""
@@ -50,11 +51,19 @@ class Rod:
 
 
 @settings_class
+class Tie:
+    """What holds a bundle."""
+
+    knots: Count = 1
+
+
+@settings_class
 class Bundle:
     """A bundle of rods."""
 
     rod: Rod
     count: Count
+    tie: Tie | None = None
 
 
 def package_classes() -> list[type]:
@@ -126,8 +135,10 @@ def valid(hint: Any) -> Any:
         return arguments[0]
     if origin is not None and issubclass(origin, Mapping):
         return {}
+    if hint is Device:
+        return read_device("workhorse-014")
     if is_settings(hint):
-        return {name: valid(of) for name, of in get_type_hints(hint, include_extras=True).items()}
+        return hint(**{name: valid(hints_of(hint)[name]) for name in required(hint)})
     return "text" if hint is str else object.__new__(hint)
 
 
@@ -258,10 +269,13 @@ def test_a_bad_value_is_named(values: dict[str, Any], line: str) -> None:
         ({"rod": {"radius_mm": 0}, "count": 1}, "rod.radius_mm: 0; give a positive number"),
         ({"rod": {"nodes": 11}, "count": 1}, "rod.nodes: 11; give an even number"),
         ({"rod": {"nodez": 11}, "count": 1}, "rod.nodez: no such field; did you mean nodes?"),
-        ({"rod": 3, "count": 1}, "rod: 3; give a mapping of radius_mm, nodes, material, bend_mm, points"),
+        (
+            {"rod": 3, "count": 1},
+            "rod: 3; write it as {radius_mm: ..., nodes: ..., material: ..., bend_mm: ..., points: ...}",
+        ),
         ({"rod": {}}, "count: missing; add it"),
-        ([1], "holds no mapping of fields; the fields are rod, count"),
-        ({1: 2}, "holds no mapping of fields; the fields are rod, count"),
+        ([1], "holds no mapping of fields; the fields are rod, count, tie"),
+        ({1: 2}, "holds no mapping of fields; the fields are rod, count, tie"),
     ],
 )
 def test_a_bad_record_is_named_with_the_path_of_its_field(record: Any, line: str) -> None:
@@ -284,7 +298,7 @@ def test_numbers_of_numpy_become_plain_ones() -> None:
 @pytest.mark.parametrize("suffix", [".yaml", ".json"])
 def test_a_file_is_read_and_its_faults_are_named(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"bundle{suffix}"
-    path.write_text('{"rod": {"bend_mm": [1, 2]}, "count": 3}')
+    path.write_text('{"rod": {"bend_mm": [1, 2]}, "count": 3, "tie": null}')
     assert read_settings(path, Bundle) == Bundle(rod=Rod(bend_mm=(1.0, 2.0)), count=3)
     path.write_text('{"rod": {}, "count": 0}')
     with pytest.raises(InputError) as error:

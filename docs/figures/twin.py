@@ -17,6 +17,7 @@ from endopilot.dataset.loader import Dataset, load_dataset
 from endopilot.models.config import WINDOW, TwinConfig
 from endopilot.models.episodes import Episodes
 from endopilot.models.twin import TwinPredictor
+from endopilot.settings import from_record
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import Device
 
@@ -27,7 +28,7 @@ SPANS = (("0-10 s", 30, 50), ("10-30 s", 50, 90), ("30-45 s", 90, 120))
 
 def believed(episodes: Dataset, index: int) -> TwinPredictor:
     """Return a twin whose friction and tip stiffness are so far from the truth as the index of a patient says."""
-    device = Device.from_record(episodes.manifest["device"])
+    device = from_record(Device, episodes.manifest["device"])
     friction, stiffness = np.random.Generator(np.random.Philox([SEED, index])).uniform(1 - OFF, 1 + OFF, 2)
     nominal = replace(device, friction=device.friction / friction)
     return TwinPredictor(

@@ -23,7 +23,7 @@ from typing import Annotated, Any, TypeVar, dataclass_transform, get_args, get_o
 
 import numpy as np
 import yaml
-from pydantic import AfterValidator, ConfigDict, GetCoreSchemaHandler, ValidationError
+from pydantic import AfterValidator, ConfigDict, GetCoreSchemaHandler, StringConstraints, ValidationError
 from pydantic.dataclasses import dataclass
 from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, core_schema
 
@@ -36,6 +36,7 @@ _STRICT = ConfigDict(extra="forbid")
 _UNKNOWN = ("unexpected_keyword_argument", "extra_forbidden")
 _MENDS = {
     "string_type": "give text",
+    "string_too_short": "give some text",
     "bool_type": "give true or false",
     "bool_parsing": "give true or false",
     "tuple_type": "give a list of values",
@@ -120,6 +121,8 @@ CountOrZero = Annotated[int, Within(0)]
 """A whole number of 0 or more."""
 Seed = Annotated[int, Within(0, 2**64 - 1)]
 """Seed of a random stream."""
+Text = Annotated[str, StringConstraints(strip_whitespace=True, min_length=1)]
+"""Text that is not empty."""
 Ascending = AfterValidator(_ascending)
 """Annotation of a pair of numbers: the first is not above the second."""
 
@@ -213,7 +216,7 @@ def _sentence(cls: type, error: ValidationError) -> str:
             return f"{_path(place[:-1])}: {_shown(problem)}; give more values"
         return f"{_path(place)}: missing; add it"
     if kind == "dataclass_type":
-        mend = f"give a mapping of {', '.join(_fields_at(cls, place))}"
+        mend = "write it as {" + ", ".join(f"{name}: ..." for name in _fields_at(cls, place)) + "}"
     elif kind == "range":
         mend = problem["msg"]
     else:

@@ -105,7 +105,7 @@ def test_wire_and_controls(tmp_path, capsys, patient):
     line = refused(capsys, "simulate", patient, *output, "--controls", tmp_path / "nan.csv")
     assert "nan.csv" in line and "row 3" in line and "translation_mm_s" in line
     assert "limit" in refused(capsys, "simulate", patient, *output, "--controls", tmp_path / "fast.csv")
-    assert "--sequences" in refused(capsys, "simulate", patient, *output, "--sequences", "0")
+    assert "sequences: 0; give" in refused(capsys, "simulate", patient, *output, "--sequences", "0")
     assert not (tmp_path / "rollout.parquet").exists()
 
 
@@ -118,7 +118,7 @@ def test_a_lumen_too_narrow_for_the_wire(tmp_path, capsys, patient):
 
 def test_devices(patient, tmp_path, capsys):
     """A wire of one's own needs no code: it is read by its path; a bad one is refused by every command alike."""
-    main_line = "bend_stiffness_n_mm2 holds -0.3; every value must be positive"
+    main_line = "bend_stiffness_n_mm2.value[1]: -0.3; give a positive number"
     text = device_yaml("workhorse-014")[1]
     bad = tmp_path / "bad.yaml"
     bad.write_text(text.replace("[0.30, 0.30", "[0.30, -0.30"))

@@ -12,7 +12,7 @@ import pytest
 from endopilot import runs
 from endopilot.errors import InputError
 from endopilot.ladder import attempt as attempts
-from endopilot.ladder import ladder
+from endopilot.ladder import ladder, submission
 from endopilot.ladder.attempt import attempt
 from endopilot.ladder.ladder import LadderConfig, climb
 from endopilot.ladder.scores import score
@@ -70,7 +70,7 @@ def test_a_folder_of_another_policy_or_of_something_else_is_refused(climbed, tmp
 
 def test_a_folder_of_another_task_is_refused(climbed, monkeypatch):
     folder, _ = climbed
-    changed = tuple(task.model_copy(update={"seconds": 1.0}) for task in ladder_tasks())
+    changed = tuple(replace(task, seconds=1.0) for task in ladder_tasks())
     monkeypatch.setattr(ladder, "ladder_tasks", lambda: changed)
     with pytest.raises(InputError, match=r"was begun with tasks\.straight = "):
         climb(folder, LadderConfig(policy="forward", tasks=("straight",), patients=1))
@@ -79,7 +79,7 @@ def test_a_folder_of_another_task_is_refused(climbed, monkeypatch):
 def test_another_wire_of_the_same_name_or_another_version_is_refused(climbed, monkeypatch):
     folder, _ = climbed
     one = LadderConfig(policy="forward", tasks=("straight",), patients=1)
-    monkeypatch.setattr(ladder, "read_device", lambda name: replace(read_device(name), friction=0.5))
+    monkeypatch.setattr(submission, "read_device", lambda name: replace(read_device(name), friction=0.5))
     with pytest.raises(InputError, match=r"was begun with tasks\.straight = "):
         climb(folder, one)
     monkeypatch.undo()

@@ -32,26 +32,32 @@ def test_shipped_devices_are_whole(name: str) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("value: 0.36", "value: -0.36", "diameter_mm = -0.36"),
-        ("value: 0.36", "value: thick", "diameter_mm = 'thick'"),
-        ("value: 0.1\n", "value: -0.1\n", "friction = -0.1 is not a number of 0 or more"),
-        ("friction:", "frixion:", "friction is missing"),
-        ('source: "0.05', '# "0.05', "friction has no source"),
-        ('source: "0.05', 'note: "0.05', "friction note is unknown"),
-        ("  value: 0.0074", "  # 0.0074", "tip_load_n has no value"),
-        ("value: 0.0074", "value: -0.0074", "tip_load_n = -0.0074"),
-        ("length_mm: 3", "length_mm: -3", "tip_bend length_mm = -3"),
-        ("length_mm: 3", "length_cm: 3", "tip_bend length_cm is unknown"),
-        ("angle_deg: 45", "angle_deg: 450", "tip_bend angle_deg = 450"),
-        ("[0.30, 0.30, 1.2", "[0.30, 1.2", "bend_stiffness_n_mm2 holds 5 values and abscissa_mm 6"),
-        ("[0.30, 0.30, 1.2", "[0.30, -0.30, 1.2", "bend_stiffness_n_mm2 holds -0.3; every value must be positive"),
-        ("value: [0.23, 0.23, 0.92, 6.2, 23, 62]", "value: 5", "twist_stiffness_n_mm2 = 5 is not a list"),
-        ("62]", ".nan]", "twist_stiffness_n_mm2 holds nan"),
-        ("name: workhorse-014", "name: 14", "name = 14 is no text"),
+        ("value: 0.36", "value: -0.36", "diameter_mm.value: -0.36; give a positive number"),
+        ("value: 0.36", "value: thick", "diameter_mm.value: 'thick'; give a positive number"),
+        ("value: 0.36", "value: true", "diameter_mm.value: True; give a positive number"),
+        ("value: 0.1\n", "value: -0.1\n", "friction.value: -0.1; give a number of 0 or more"),
+        ("friction:", "frixion:", "frixion: no such field; did you mean friction?"),
+        ("  value: 0.1\n", "", "friction.value: missing; add it"),
+        ('source: "0.05', '# "0.05', "friction.source: missing; add it"),
+        ('source: "0.05 hydrophilic to 0.2 bare"', 'source: " "', "friction.source: ' '; give some text"),
+        ('source: "0.05', 'sources: "0.05', "friction.sources: no such field; did you mean source?"),
+        ("\n  value: 0.36\n", " 0.36\n# ", "diameter_mm: 0.36; write it as {value: ..., source: ...}"),
+        ("  value: 0.0074", "  # 0.0074", "tip_load_n.value: missing; add it"),
+        ("value: 0.0074", "value: -0.0074", "tip_load_n.value: -0.0074; give a positive number"),
+        ("length_mm: 3", "length_mm: -3", "tip_bend.length_mm: -3; give a number of 0 or more"),
+        ("length_mm: 3", "length_mm: 0", "tip_bend: length_mm is 0; give a bent tip a positive length"),
+        ("length_mm: 3", "length_cm: 3", "tip_bend.length_cm: no such field; did you mean length_mm?"),
+        ("angle_deg: 45", "angle_deg: 450", "tip_bend.angle_deg: 450; give a number from -360 to 360"),
+        ("[0.30, 0.30, 1.2", "[0.30, 1.2", "bend_stiffness_n_mm2: 5 values, but abscissa_mm has 6; give one for each"),
+        ("[0.30, 0.30, 1.2", "[0.30, -0.30, 1.2", "bend_stiffness_n_mm2.value[1]: -0.3; give a positive number"),
+        ("[0.30, 0.30, 1.2", "[0.30, 0.0, 1.2", "bend_stiffness_n_mm2.value[1]: 0.0; give a positive number"),
+        ("[0.23, 0.23, 0.92, 6.2, 23, 62]", "5", "twist_stiffness_n_mm2.value: 5; give a list of values"),
+        ("62]", ".nan]", "twist_stiffness_n_mm2.value[5]: nan; give a positive number"),
+        ("name: workhorse-014", "name: 14", "name: 14; give text"),
         ("name: workhorse-014", "name: [", "line 4: not valid YAML"),
-        ("[0, 10, 20, 60", "[0, 20, 10, 60", "abscissa_mm"),
-        ("[0.30, 0.30, 1.2", "[0.30, 0.0, 1.2", "bend_stiffness_n_mm2"),
-        ("name: work", "extra: 1\nname: work", "extra is unknown"),
+        ("[0, 10, 20, 60", "[0, 20, 10, 60", "abscissa_mm: [0.0, 20.0, 10.0, 60.0, 150.0, 300.0]; begin at 0, the tip"),
+        ("[0, 10, 20, 60", "[1, 10, 20, 60", "abscissa_mm: [1.0, 10.0, 20.0, 60.0, 150.0, 300.0]; begin at 0, the tip"),
+        ("name: work", "extra: 1\nname: work", "extra: no such field; the fields are name, diameter_mm, friction"),
     ],
 )
 def test_bad_file_is_refused(tmp_path: Path, old: str, new: str, message: str) -> None:
@@ -59,9 +65,9 @@ def test_bad_file_is_refused(tmp_path: Path, old: str, new: str, message: str) -
     assert old in text
     path = tmp_path / "wire.yaml"
     path.write_text(text.replace(old, new, 1), encoding="utf-8")
-    with pytest.raises(InputError, match=message) as error:
+    with pytest.raises(InputError) as error:
         read_device(path)
-    assert str(error.value).startswith(f"{path}: ")
+    assert str(error.value).startswith(f"{path}: {message}")
     assert "\n" not in str(error.value)
 
 

@@ -1,4 +1,4 @@
-"""The ladder's tasks are whole, and what is wrong in a task's file is told in one line."""
+"""The ladder's tasks are whole, and one line names what is wrong in a task's file."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ import pytest
 import endopilot.env
 from endopilot.atlas.atlas import AtlasConfig, make_patient_tree
 from endopilot.errors import InputError
+from endopilot.settings import read_settings
 from endopilot.tasks import task
-from endopilot.tasks.task import find_task, ladder_tasks, read_task, target_in_section
+from endopilot.tasks.task import Task, find_task, ladder_tasks, target_in_section
 
 FILES = sorted((Path(task.__file__).parent / "ladder").glob("*.yaml"))
 
@@ -27,7 +28,7 @@ def test_there_are_twelve_tasks_one_a_level_each_with_its_environment():
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
 def test_a_task_has_twenty_patients_and_others_to_learn_on(path):
-    task = read_task(path)
+    task = read_settings(path, Task)
     assert len(set(task.ladder.numbers)) == len(set(task.training.numbers)) == 20
     assert task.ladder.seed != task.training.seed
     seeds = [other.ladder.seed for other in ladder_tasks()]
@@ -54,24 +55,25 @@ def test_a_ladder_navigation_is_the_same_every_time():
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "told"),
+    ("old", "new", "line"),
     [
-        ("level: 6", "level: 13", "level = 13"),
-        ("seconds: 90", "seconds: -1", "seconds = -1"),
-        ("force_limit_n: 0.2", "force_limit_n: .nan", "force_limit_n"),
-        ("anatomy: rca", "anatomy: knee", "anatomy = 'knee'; choose from"),
-        ("device: workhorse-014", "device: rope", "device = 'rope'; choose from"),
-        ("level: 6", "level: 6\nlength: 3", "length"),
-        ("name: crux", "name: [", "not valid YAML"),
+        ("level: 6", "level: 13", "level: 13; give a whole number from 1 to 12"),
+        ("seconds: 90", "seconds: -1", "seconds: -1; give a positive number"),
+        ("force_limit_n: 0.2", "force_limit_n: .nan", "force_limit_n: nan; give a positive number"),
+        ("anatomy: rca", "anatomy: knee", "anatomy: 'knee'; choose from"),
+        ("device: workhorse-014", "device: rope", "device: 'rope'; choose from"),
+        ("level: 6", "level: 6\nlength: 3", "length: no such field; the fields are name, level,"),
+        ("name: crux", "name: [", "line 4: not valid YAML"),
     ],
 )
-def test_what_is_wrong_in_a_file_is_named(tmp_path, old, new, told):
+def test_what_is_wrong_in_a_file_is_named(tmp_path, old, new, line):
     text = (Path(task.__file__).parent / "ladder" / "crux.yaml").read_text(encoding="utf-8")
     assert old in text
-    (tmp_path / "task.yaml").write_text(text.replace(old, new), encoding="utf-8")
+    path = tmp_path / "task.yaml"
+    path.write_text(text.replace(old, new), encoding="utf-8")
     with pytest.raises(InputError) as error:
-        read_task(tmp_path / "task.yaml")
-    assert told in str(error.value) and "\n" not in str(error.value)
+        read_settings(path, Task)
+    assert str(error.value).startswith(f"{path}: {line}") and "\n" not in str(error.value)
 
 
 def test_a_target_outside_the_tree_is_refused():

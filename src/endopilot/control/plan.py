@@ -22,6 +22,7 @@ from endopilot.errors import InputError
 from endopilot.extras import extra_named
 from endopilot.models.config import read_run
 from endopilot.progress import progress
+from endopilot.settings import from_record
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import Device, read_device
 from endopilot.simulation.drive_limits import DriveLimits
@@ -125,7 +126,7 @@ def _wire(model: Path | None, device: Device | str | Path | None, method: str) -
                 f"--model: none given, and method {method} needs one; give a run of `endopilot train`, or pretrained"
             )
         return asked or read_device("workhorse-014")
-    trained = Device.from_record(read_run(model)["device"])
+    trained = from_record(Device, read_run(model)["device"])
     if asked is not None and replace(asked, sources={}) != replace(trained, sources={}):
         raise InputError(
             f"--device {asked.name}: {model} was trained with {trained.name}; leave --device out or train anew"

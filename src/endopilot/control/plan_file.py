@@ -135,7 +135,7 @@ def read_plan(folder: Path, anatomy: Anatomy, device: Device) -> Plan:
         raise InputError(
             f"{folder}: the plan is for another anatomy ({made['name']}), not for this {anatomy.name}; plan anew"
         )
-    planned = Device.from_record(record["device"])
+    planned = from_record(Device, record["device"])
     if planned.constants != device.constants:
         raise InputError(f"{folder}: the plan is for another device ({planned.name}), not for {device.name}; plan anew")
     if not (folder / _TABLE).exists() or sha256(folder / _TABLE) != record["table_sha256"]:

@@ -13,6 +13,7 @@ from endopilot.dataset.loader import Dataset
 from endopilot.evaluation.results import REPLAYED, TipSeries
 from endopilot.models.config import WINDOW
 from endopilot.progress import Advance
+from endopilot.settings import from_record
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import Device
 from endopilot.simulation.drive_limits import DriveLimits
@@ -50,7 +51,7 @@ class Recorded:
         """
         names, anatomy_of = np.unique(data.anatomy, return_inverse=True)
         anatomies = tuple(read_anatomy(data.anatomy_folder(str(name))) for name in names)
-        device = Device.from_record(data.manifest["device"])
+        device = from_record(Device, data.manifest["device"])
         return Recorded(data, tuple(map(str, names)), anatomies, anatomy_of, device)
 
     def drivable(self, control: Control) -> Control:

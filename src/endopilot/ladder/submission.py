@@ -110,7 +110,7 @@ class SubmissionCheck:
 
 def task_digest(task: Task) -> str:
     """Return the SHA-256 of what a task's navigations follow from: its definition and its device."""
-    content = task.model_dump_json() + json_text(read_device(task.device))
+    content = json_text(task) + json_text(read_device(task.device))
     return hashlib.sha256(content.encode()).hexdigest()
 
 

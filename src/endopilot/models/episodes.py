@@ -19,6 +19,7 @@ from endopilot.dataset.loader import Dataset, commanded
 from endopilot.errors import InputError
 from endopilot.models.config import WINDOW
 from endopilot.models.patient import Patient, prepare, read_or_prepare
+from endopilot.settings import from_record
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import Device
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
@@ -59,7 +60,7 @@ class Setup:
 
         return Setup(
             anatomies={name: partial(read, name) for name in dataset.patients},
-            device=Device.from_record(dataset.manifest["device"]),
+            device=from_record(Device, dataset.manifest["device"]),
             simulator=SimulatorConfig(**dataset.manifest["config"]["simulator"]),
             patients_folder=dataset.folder / PATIENTS_FOLDER,
             identities=dataset.patients,

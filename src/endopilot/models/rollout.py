@@ -21,6 +21,7 @@ from endopilot.models.open_loop import Observed, OpenLoop, Predictor, Steps2, be
 from endopilot.models.transformer import Network
 from endopilot.models.twin import TwinPredictor
 from endopilot.models.windows import Windows
+from endopilot.settings import from_record
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import Device
 from endopilot.simulation.drive_limits import DriveLimits
@@ -106,7 +107,7 @@ def load_model(run_folder: str | Path = PRETRAINED) -> Predictor:
         InputError: the run is unfinished, or a file of it is damaged or of another version.
     """
     record, run_folder = read_run(run_folder), run_path(run_folder)
-    device = Device.from_record(record["device"])
+    device = from_record(Device, record["device"])
     if record["config"]["model"] == "twin":
         return TwinPredictor(
             device=device,

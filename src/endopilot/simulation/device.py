@@ -7,31 +7,29 @@ beyond the last one.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+import math
+from dataclasses import fields, replace
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Generic, TypeVar
 
 import numpy as np
-import yaml
 from jaxtyping import Float
+from pydantic import model_validator
 
 from endopilot.errors import InputError
+from endopilot.settings import NonNegative, Positive, Text, Within, read_settings, settings
 from endopilot.simulation.device_files import device_yaml
 from endopilot.types import Anatomy
-
-_SCALARS = ("diameter_mm", "friction", "max_velocity_mm_s", "max_rotation_rad_s", "push_limit_n")
-_PROFILES = ("abscissa_mm", "bend_stiffness_n_mm2", "twist_stiffness_n_mm2")
-_FIELDS = ("name", *_SCALARS, *_PROFILES, "tip_load_n", "tip_bend")
-_VALUE_KEYS, _TIP_BEND_KEYS = ("value", "source"), ("angle_deg", "length_mm", "source")
 
 TIP_LENGTH_MM = 10.0
 """Length of the floppy tip, mm: the buckling length of catalogues' tip loads, and the distal coil of coronary wires."""
 GRAM_FORCE_N = 9.80665e-3
 """One gram-force in N, by the standard acceleration of gravity; catalogues give tip loads in it."""
+Value = TypeVar("Value")
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class Device:
     """A guidewire, or another slender device driven at its proximal end.
 
@@ -52,63 +50,37 @@ class Device:
         sources: where each constant comes from.
     """
 
-    name: str
-    diameter_mm: float
-    abscissa_mm: Sequence[float]
-    bend_stiffness_n_mm2: Sequence[float]
-    twist_stiffness_n_mm2: Sequence[float]
-    tip_bend_rad: float
-    tip_bend_length_mm: float
-    tip_load_n: float | None
-    friction: float
-    max_velocity_mm_s: float
-    max_rotation_rad_s: float
-    push_limit_n: float
-    sources: Mapping[str, str]
+    name: Text
+    diameter_mm: Positive
+    abscissa_mm: tuple[NonNegative, ...]
+    bend_stiffness_n_mm2: tuple[Positive, ...]
+    twist_stiffness_n_mm2: tuple[Positive, ...]
+    tip_bend_rad: Annotated[float, Within(-2 * math.pi, 2 * math.pi)]
+    tip_bend_length_mm: NonNegative
+    tip_load_n: Positive | None
+    friction: NonNegative
+    max_velocity_mm_s: Positive
+    max_rotation_rad_s: Positive
+    push_limit_n: Positive
+    sources: dict[str, str]
 
-    def __post_init__(self) -> None:
-        """Check every constant.
-
-        Raises:
-            InputError: a constant is missing, not finite or out of its range.
-        """
-        for name in _SCALARS:
-            value = getattr(self, name)
-            if not (np.isfinite(value) and (value > 0 or (name == "friction" and value == 0))):
-                wanted = "a number of 0 or more" if name == "friction" else "a positive number"
-                raise InputError(f"device {self.name}: {name} = {value:g} is not {wanted}; correct it")
-        self._check_profiles()
-        if self.tip_load_n is not None and not (np.isfinite(self.tip_load_n) and self.tip_load_n > 0):
-            raise InputError(
-                f"device {self.name}: tip_load_n = {self.tip_load_n:g}; give a positive load in N, or null"
-            )
-        bend, length = self.tip_bend_rad, self.tip_bend_length_mm
-        if not (np.isfinite(bend) and abs(bend) <= 2 * np.pi):
-            raise InputError(f"device {self.name}: tip_bend angle_deg = {np.rad2deg(bend):g}; give -360 to 360 degrees")
-        if not (np.isfinite(length) and (length > 0 or length == bend == 0)):
-            raise InputError(f"device {self.name}: tip_bend length_mm = {length:g}; a bent tip needs a positive length")
-
-    def _check_profiles(self) -> None:
-        count = len(self.abscissa_mm)
-        for name in _PROFILES:
-            values = np.asarray(getattr(self, name), dtype=float)
-            if values.ndim != 1 or len(values) != count or count == 0:
-                raise InputError(
-                    f"device {self.name}: {name} holds {values.size} values and abscissa_mm {count}; give one for each"
-                )
-            least = "0 or more" if name == "abscissa_mm" else "positive"
-            bad = ~np.isfinite(values) | ((values <= 0) if least == "positive" else (values < 0))
-            if bad.any():
-                raise InputError(f"device {self.name}: {name} holds {values[bad][0]:g}; every value must be {least}")
-        abscissa = [float(value) for value in self.abscissa_mm]
-        if abscissa[0] != 0 or (np.diff(abscissa) <= 0).any():
-            raise InputError(f"device {self.name}: abscissa_mm = {abscissa} must begin at 0, the tip, and increase")
+    @model_validator(mode="after")
+    def _consistent(self) -> Device:
+        at = self.abscissa_mm
+        if at[:1] != (0.0,) or any(after <= before for before, after in pairwise(at)):
+            raise ValueError(f"abscissa_mm: {list(at)}; begin at 0, the tip, and increase")
+        for name in ("bend_stiffness_n_mm2", "twist_stiffness_n_mm2"):
+            count = len(getattr(self, name))
+            if count != len(at):
+                raise ValueError(f"{name}: {count} values, but abscissa_mm has {len(at)}; give one for each")
+        if self.tip_bend_rad and not self.tip_bend_length_mm:
+            raise ValueError(f"tip_bend: length_mm is {self.tip_bend_length_mm:g}; give a bent tip a positive length")
+        return self
 
     @property
     def constants(self) -> tuple[Any, ...]:
         """All numbers of the device, in the order of its fields: devices with the same constants behave the same."""
-        values = [getattr(self, field.name) for field in fields(self) if field.name not in ("name", "sources")]
-        return tuple(tuple(map(float, value)) if isinstance(value, Sequence) else value for value in values)
+        return tuple(getattr(self, field.name) for field in fields(self) if field.name not in ("name", "sources"))
 
     @property
     def tip_radius_mm(self) -> float:
@@ -122,12 +94,6 @@ class Device:
     def twist_stiffness(self, abscissa_mm: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
         """Return GJ in N·mm² at distances from the tip."""
         return np.interp(abscissa_mm, self.abscissa_mm, self.twist_stiffness_n_mm2)
-
-    @staticmethod
-    def from_record(record: Mapping[str, Any]) -> Device:
-        """Return the device that `dataclasses.asdict` made a record of, as manifests hold it."""
-        constants: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in record.items()}
-        return Device(**constants)
 
     def with_tip(self, *, bend_rad: float, stiffness_factor: float) -> Device:
         """Return the device with another tip.
@@ -171,24 +137,60 @@ class Device:
         }
 
 
+@settings
+class _Sourced(Generic[Value]):
+    """A constant in a device's file, and where it comes from."""
+
+    value: Value
+    source: Text
+
+
+@settings
+class _TipBend:
+    """The bend of the tip in a device's file, and where it comes from."""
+
+    angle_deg: Annotated[float, Within(-360, 360)]
+    length_mm: NonNegative
+    source: Text
+
+
+@settings
+class _DeviceFile:
+    """What a device's file holds; `Device` says what each constant means."""
+
+    name: Text
+    diameter_mm: _Sourced[Positive]
+    friction: _Sourced[NonNegative]
+    max_velocity_mm_s: _Sourced[Positive]
+    max_rotation_rad_s: _Sourced[Positive]
+    push_limit_n: _Sourced[Positive]
+    abscissa_mm: _Sourced[tuple[NonNegative, ...]]
+    bend_stiffness_n_mm2: _Sourced[tuple[Positive, ...]]
+    twist_stiffness_n_mm2: _Sourced[tuple[Positive, ...]]
+    tip_load_n: _Sourced[Positive | None]
+    tip_bend: _TipBend
+
+
 def read_device(name_or_path: str | Path) -> Device:
     """Read a device by its name (`endopilot.simulation.device_files`), or from a YAML file.
 
     Raises:
         InputError: no such device, or a file that is not a device; the line names file, field, value and mend.
     """
-    path, text = device_yaml(name_or_path)
+    path, _ = device_yaml(name_or_path)
+    content = read_settings(path, _DeviceFile)
+    entries = {field.name: getattr(content, field.name) for field in fields(content) if field.name != "name"}
+    constants = {name: entry.value for name, entry in entries.items() if isinstance(entry, _Sourced)}
     try:
-        content = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        where = getattr(error, "problem_mark", None)
-        line = f"line {where.line + 1}: " if where else ""
-        problem = getattr(error, "problem", None) or str(error).splitlines()[0]
-        raise InputError(f"{path}: {line}not valid YAML ({problem}); correct the file") from error
-    try:
-        return _parse(content)
+        return Device(
+            name=content.name,
+            **constants,
+            tip_bend_rad=math.radians(content.tip_bend.angle_deg),
+            tip_bend_length_mm=content.tip_bend.length_mm,
+            sources={name: entry.source for name, entry in entries.items()},
+        )
     except InputError as error:
-        raise InputError(f"{path}: {error}") from error
+        raise InputError(f"{path}: {error}") from None
 
 
 def check_fits(device: Device, anatomy: Anatomy) -> None:
@@ -204,61 +206,3 @@ def check_fits(device: Device, anatomy: Anatomy) -> None:
                 f"device {device.name}: diameter_mm = {device.diameter_mm:g} is wider than the {what} of "
                 f"{anatomy.name}, {2 * radius:.2f} mm; choose a thinner device"
             )
-
-
-def _parse(content: Any) -> Device:
-    if not isinstance(content, dict):
-        raise InputError(
-            "holds no mapping of fields; copy the form of a shipped device (`endopilot devices NAME --yaml`)"
-        )
-    for name in _FIELDS:
-        if name not in content:
-            raise InputError(f"field {name} is missing; add it")
-    _refuse_unknown("", content, _FIELDS)
-    if not isinstance(content["name"], str) or not content["name"].strip():
-        raise InputError(f"name = {content['name']!r} is no text; give the device a name")
-    sources = {name: _source(name, content[name]) for name in _FIELDS[1:]}
-    tip, load = content["tip_bend"], content["tip_load_n"]["value"]
-    constants: dict[str, Any] = {name: _number(name, content[name]["value"]) for name in _SCALARS}
-    constants |= {name: _numbers(name, content[name]["value"]) for name in _PROFILES}
-    return Device(
-        name=content["name"],
-        **constants,
-        tip_bend_rad=float(np.deg2rad(_number("tip_bend angle_deg", tip["angle_deg"]))),
-        tip_bend_length_mm=_number("tip_bend length_mm", tip["length_mm"]),
-        tip_load_n=None if load is None else _number("tip_load_n", load),
-        sources=sources,
-    )
-
-
-def _source(name: str, entry: Any) -> str:
-    """Check that a field's entry is whole, and return its source."""
-    keys = _TIP_BEND_KEYS if name == "tip_bend" else _VALUE_KEYS
-    form = "{" + ", ".join(f"{key}: ..." for key in keys) + "}"
-    if not isinstance(entry, dict):
-        raise InputError(f"field {name} = {entry!r} has no source; write it as {form}")
-    _refuse_unknown(f"{name} ", entry, keys)
-    if not str(entry.get("source") or "").strip():
-        raise InputError(f"field {name} has no source; write it as {form}")
-    missing = [key for key in keys if key not in entry]
-    if missing:
-        raise InputError(f"field {name} has no {missing[0]}; write it as {form}")
-    return str(entry["source"])
-
-
-def _refuse_unknown(of: str, content: dict[Any, Any], fields: Sequence[str]) -> None:
-    unknown = sorted(str(key) for key in set(content) - set(fields))
-    if unknown:
-        raise InputError(f"field {of}{unknown[0]} is unknown; the fields are {', '.join(fields)}")
-
-
-def _number(name: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise InputError(f"{name} = {value!r} is not a number; correct it")
-    return float(value)
-
-
-def _numbers(name: str, values: Any) -> tuple[float, ...]:
-    if not isinstance(values, list):
-        raise InputError(f"{name} = {values!r} is not a list of numbers; correct it")
-    return tuple(_number(name, value) for value in values)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from pydantic import InstanceOf, model_validator
 
-from endopilot.errors import InputError
+from endopilot.settings import CountOrZero, Finite, NonNegative, Positive, settings
 from endopilot.simulation.device import Device
 from endopilot.types import Anatomy, TipProjection
 
@@ -17,7 +16,7 @@ SUCCESS_MM = 2.0
 """A target counts as reached when the tip lies in its branch, this near to it along the centerline, mm."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class Target:
     """A place on the centerline.
 
@@ -26,8 +25,8 @@ class Target:
         abscissa: distance from the ostium along the path, mm; it lies on that branch.
     """
 
-    branch: int
-    abscissa: float
+    branch: CountOrZero
+    abscissa: NonNegative
 
     def position(self, anatomy: Anatomy) -> Float[np.ndarray, "3"]:
         """Return the target's place on the centerline, LPS mm."""
@@ -35,7 +34,7 @@ class Target:
         return np.array([np.interp(self.abscissa, line.abscissa, axis) for axis in line.points.T])
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@settings(eq=False)
 class Navigation:
     """One wire that is to be brought to one target.
 
@@ -49,34 +48,28 @@ class Navigation:
         force_limit_n: largest force of the wall on one node that is safe, N.
     """
 
-    anatomy: Anatomy
+    anatomy: InstanceOf[Anatomy]
     device: Device
     target: Target
-    start_inserted_mm: float = 2.0
-    start_rotation: float = 0.0
-    seconds: float = 60.0
-    force_limit_n: float = 0.5
+    start_inserted_mm: NonNegative = 2.0
+    start_rotation: Finite = 0.0
+    seconds: Positive = 60.0
+    force_limit_n: Positive = 0.5
 
-    def __post_init__(self) -> None:
-        """Check the target and the limits.
-
-        Raises:
-            InputError: the target does not lie on the tree, or a limit is not positive.
-        """
+    @model_validator(mode="after")
+    def _consistent(self) -> Navigation:
         branches = self.anatomy.tree.branches
         if not 0 <= self.target.branch < len(branches):
-            raise InputError(
+            raise ValueError(
                 f"target.branch: {self.target.branch}; {self.anatomy.name} has branches 0 to {len(branches) - 1}"
             )
         line = branches[self.target.branch].centerline.abscissa
         if not line[0] <= self.target.abscissa <= line[-1]:
-            raise InputError(
+            raise ValueError(
                 f"target.abscissa: {self.target.abscissa:g} mm; branch {self.target.branch} of {self.anatomy.name} "
                 f"runs from {line[0]:.1f} to {line[-1]:.1f} mm"
             )
-        for name in ("seconds", "force_limit_n"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"{name}: {getattr(self, name)} is not positive; give a positive number")
+        return self
 
     def reached(self, tip: TipProjection) -> Bool[np.ndarray, "..."]:
         """Return which tips have reached the target: in its branch, within `SUCCESS_MM` of it along the centerline."""

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, model_validator
 
 from endopilot.atlas.atlas import ANATOMIES, AtlasConfig, make_patient
 from endopilot.errors import InputError
+from endopilot.settings import CountOrZero, NonNegative, Positive, Seed, Share, Within, read_settings, settings
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import read_device
 from endopilot.simulation.device_files import list_devices
@@ -23,11 +23,10 @@ CORE = SimulatorConfig(elements=50, time_step_s=1 / 14, sample_tolerance_mm=1e-4
 """Settings of the rod core on the ladder and in the environments: half the elements, two time steps a control period,
 and forces that are exact to a micronewton; docs/environment.md states the accuracy that they keep."""
 _FOLDER = Path(__file__).parent / "ladder"
-_Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-_STRICT = ConfigDict(extra="forbid", frozen=True)
 
 
-class Patients(BaseModel):
+@settings
+class Patients:
     """Patients of an atlas.
 
     Attributes:
@@ -35,12 +34,12 @@ class Patients(BaseModel):
         numbers: of the patients in it.
     """
 
-    model_config = _STRICT
-    seed: Annotated[int, Field(ge=0, lt=2**64)]
-    numbers: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
+    seed: Seed
+    numbers: Annotated[tuple[CountOrZero, ...], Field(min_length=1)]
 
 
-class Task(BaseModel):
+@settings
+class Task:
     """One task of the ladder.
 
     Attributes:
@@ -62,23 +61,29 @@ class Task(BaseModel):
         training: patients to learn on.
     """
 
-    model_config = _STRICT
     name: str
-    level: Annotated[int, Field(ge=1, le=12)]
+    level: Annotated[int, Within(1, 12)]
     title: str
     anatomy: str
     device: str
-    tip_bend_deg: Annotated[float, Field(ge=0, le=180)]
-    tip_bend_mm: _Positive
+    tip_bend_deg: Annotated[float, Within(0, 180)]
+    tip_bend_mm: Positive
     section: str
-    depth_mm: _Positive
-    start_inserted_mm: Annotated[float, Field(ge=0, allow_inf_nan=False)]
-    seconds: _Positive
-    force_limit_n: _Positive
-    stenosis_share: Annotated[float, Field(ge=0, le=1)]
+    depth_mm: Positive
+    start_inserted_mm: NonNegative
+    seconds: Positive
+    force_limit_n: Positive
+    stenosis_share: Share
     chosen_for: str
     ladder: Patients
     training: Patients
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Task:
+        for name, known in (("anatomy", ANATOMIES), ("device", list_devices())):
+            if getattr(self, name) not in known:
+                raise ValueError(f"{name}: {getattr(self, name)!r}; choose from {', '.join(known)}")
+        return self
 
     def patient(self, patients: Patients, place: int) -> Anatomy:
         """Return the anatomy of one of the task's patients, by its place in the list."""
@@ -149,33 +154,10 @@ def turn_rad(tree: VesselTree, branch: int) -> float:
     return float(np.arccos(np.clip(into @ onto / (np.linalg.norm(into) * np.linalg.norm(onto)), -1.0, 1.0)))
 
 
-def read_task(path: Path) -> Task:
-    """Read a task from a YAML file.
-
-    Raises:
-        InputError: the file is no task; the line names file, field, value and mend.
-    """
-    try:
-        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-        task = Task.model_validate(content)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; give a task's YAML file") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not valid YAML ({str(error).splitlines()[0]}); correct the file") from error
-    except ValidationError as error:
-        first = error.errors()[0]
-        field = ".".join(str(part) for part in first["loc"]) or "file"
-        raise InputError(f"{path}: {field} = {first['input']!r}: {first['msg']}; correct it") from error
-    for name, known in (("anatomy", ANATOMIES), ("device", list_devices())):
-        if getattr(task, name) not in known:
-            raise InputError(f"{path}: {name} = {getattr(task, name)!r}; choose from {', '.join(known)}")
-    return task
-
-
 @lru_cache(maxsize=1)
 def ladder_tasks() -> tuple[Task, ...]:
     """Return the ladder's tasks, the lowest first."""
-    tasks = (read_task(path) for path in _FOLDER.glob("*.yaml"))
+    tasks = (read_settings(path, Task) for path in _FOLDER.glob("*.yaml"))
     return tuple(sorted(tasks, key=lambda task: task.level))
 
 

@@ -15,7 +15,7 @@ from endopilot.models.config import WINDOW
 from endopilot.models.episodes import Episodes
 from endopilot.models.open_loop import Predictor
 from endopilot.progress import progress
-from endopilot.settings import NonNegative, Seed, settings
+from endopilot.settings import NonNegative, Seed, from_record, settings
 from endopilot.simulation.device import Device
 from endopilot.types import SAMPLE_PERIOD_S, VesselTree
 from endopilot.xray.adviser import AdviserConfig, XrayAdviser, count_events, near_exposures
@@ -123,7 +123,7 @@ def monitor(predictor: Predictor, dataset: Dataset, config: AdviseConfig) -> Mon
         config: the C-arm, and the model mismatch.
     """
     names, owner = np.unique(dataset.anatomy, return_inverse=True)
-    wire_radius = Device.from_record(dataset.manifest["device"]).tip_radius_mm
+    wire_radius = from_record(Device, dataset.manifest["device"]).tip_radius_mm
     deeper = np.array(
         [np.random.default_rng([config.seed, 4, *str(name).encode()]).uniform(-1.0, 1.0) for name in names]
     )
