@@ -26,8 +26,7 @@ class _Stopped(Exception):
 def work_here(plan: Plan, blocks: Sequence[Block], done: Done, advance: Callable[[int], None]) -> None:
     """Write blocks with one thread each, as many at a time as there are cores.
 
-    Where there are fewer blocks than cores, the rod core has the others; but not where it is driven by force, of which
-    the last bits depend on the worlds that a thread steps side by side.
+    Where there are fewer blocks than cores, the rod core has the others.
 
     Args:
         plan: what all blocks share.
@@ -37,7 +36,7 @@ def work_here(plan: Plan, blocks: Sequence[Block], done: Done, advance: Callable
     """
     cores = plan.config.simulator.threads or CORES
     workers = max(1, min(cores, len(blocks)))
-    threads = 1 if plan.config.control == "force" else cores // workers
+    threads = cores // workers
     stop = threading.Event()
 
     def go_on(samples: int) -> None:
