@@ -62,7 +62,7 @@ def test_it_stops_when_its_client_is_killed(drive) -> None:
     client.send_signal(signal.SIGKILL)
     client.wait()
     client.stdout.close()
-    wait_for(process, "the client is gone")
+    wait_for(process, "the client has disconnected")
     with RemoteRobot("127.0.0.1", port, SECRET) as robot:
         readings = [robot.proximal_state()]
         while readings[-1].time_s < readings[0].time_s + 1.0:
