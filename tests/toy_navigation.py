@@ -14,7 +14,8 @@ from unittest.mock import patch
 import numpy as np
 
 from endopilot.anatomy.io import write_anatomy
-from endopilot.dataset.generate import DatasetConfig, generate_dataset
+from endopilot.dataset.config import DatasetConfig
+from endopilot.dataset.generate import generate_dataset
 from endopilot.files import read_json, write_json
 from endopilot.simulation.device import read_device
 from endopilot.types import (

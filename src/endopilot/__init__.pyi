@@ -13,8 +13,8 @@ from .control.plan_config import PlanConfig as PlanConfig
 from .control.policy import Decision as Decision
 from .control.policy import Observation as Observation
 from .control.policy import Policy as Policy
+from .dataset.config import DatasetConfig as DatasetConfig
 from .dataset.generate import generate_dataset as generate_dataset
-from .dataset.study import DatasetConfig as DatasetConfig
 from .errors import InputError as InputError
 from .evaluation.evaluate import EvaluateConfig as EvaluateConfig
 from .evaluation.evaluate import evaluate as evaluate

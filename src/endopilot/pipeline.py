@@ -22,7 +22,8 @@ from endopilot import __version__
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy, read_source
 from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.dataset.generate import DatasetConfig, generate_dataset
+from endopilot.dataset.config import DatasetConfig
+from endopilot.dataset.generate import generate_dataset
 from endopilot.dataset.loader import load_dataset
 from endopilot.evaluation.anatomy_score import score_anatomy
 from endopilot.evaluation.results import REPORT_FILE

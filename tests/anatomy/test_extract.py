@@ -96,7 +96,7 @@ def test_one_label_of_a_mask_file_is_chosen(fork_mask, tmp_path):
     assert len(anatomy.tree.leaves()) == 2 and is_sound(anatomy)
 
 
-def test_given_ostium_is_the_root_and_mid_vessel_ostium_looks_onwards(fork_mask):
+def test_given_ostium_is_the_root_and_mid_vessel_ostium_points_distally(fork_mask):
     side_tip = forked_tree().branches[2].centerline.points[-1] - [0, 0, 20]
     anatomy = extract_anatomy(fork_mask, name="x", config=AnatomyConfig(ostium_mm=tuple(side_tip)))
     assert np.linalg.norm(anatomy.insertion.position - side_tip) < 2.0
@@ -112,7 +112,7 @@ def test_the_tree_begins_at_the_ostium_that_the_segmentation_found(fork_mask):
     assert np.linalg.norm(root.points[far, :2], axis=1).max() < 0.2
 
 
-def test_flaws_of_masks_are_mended(fork_mask):
+def test_flaws_of_masks_are_repaired(fork_mask):
     rng = np.random.default_rng(1)
     voxels = fork_mask.volume.voxels.copy()
     voxels[20:22] = False  # a gap across the root vessel
@@ -231,17 +231,17 @@ def noise(volume):
 
 
 @pytest.mark.parametrize(
-    ("make", "told"), [(empty, "empty"), (block, "solid block"), (ball, "no vessel"), (noise, "noise")]
+    ("make", "message"), [(empty, "empty"), (block, "solid block"), (ball, "no vessel"), (noise, "noise")]
 )
-def test_what_is_no_vessel_is_refused(fork_mask, make, told):
+def test_what_is_no_vessel_is_refused(fork_mask, make, message):
     volume = fork_mask.volume
     mask = LumenMask(Volume(make(volume), volume.spacing_mm, volume.origin_mm, volume.direction))
-    with pytest.raises(InputError, match=told) as error:
+    with pytest.raises(InputError, match=message) as error:
         extract_anatomy(mask, name="bad")
     assert "\n" not in str(error.value)
 
 
-def test_a_known_ostium_beside_the_axis_is_led_to_in_a_straight_line():
+def test_a_known_ostium_beside_the_axis_is_joined_by_a_straight_line():
     def wide_tube(points):
         return np.minimum(6.0 - np.hypot(points[..., 0], points[..., 1]), points[..., 2])
 
@@ -258,7 +258,7 @@ def test_a_known_ostium_beside_the_axis_is_led_to_in_a_straight_line():
     assert (bend[1:] * bend[:-1]).sum(axis=1).min() > 0.95
 
 
-def test_a_line_is_drawn_out_only_as_far_as_the_vessel_is_round():
+def test_a_line_is_extended_only_as_far_as_the_vessel_is_round():
     axis = np.arange(-6.0, 6.2, 0.2)
     height = np.arange(-10.0, 10.2, 0.2)
     z, y, x = np.meshgrid(height, axis, axis, indexing="ij")
@@ -277,7 +277,7 @@ def test_mask_away_from_the_ostium_is_refused(fork_mask):
         extract_anatomy(fork_mask, name="far", config=AnatomyConfig(ostium_mm=(90.0, 0.0, 0.0)))
 
 
-def test_bad_files_are_told_in_one_line(tmp_path):
+def test_bad_files_give_one_line(tmp_path):
     points = forked_tree().path(1).points
     save_lines(tmp_path / "bare.vtp", [points], None)
     for name, content in (("empty.stl", b""), ("text.ply", b"hello, world, this is no mesh\n"), ("x.dat", b"1")):
@@ -285,8 +285,8 @@ def test_bad_files_are_told_in_one_line(tmp_path):
     (tmp_path / "cl.mrk.json").write_text("{}")
     cases = {"bare.vtp": "without radii", "empty.stl": "empty", "text.ply": "text.ply", "x.dat": "unknown kind",
              "cl.mrk.json": "no Slicer markups", "missing.stl": "no such file"}  # fmt: skip
-    for name, told in cases.items():
-        with pytest.raises(InputError, match=told) as error:
+    for name, message in cases.items():
+        with pytest.raises(InputError, match=message) as error:
             read_source(tmp_path / name)
         assert "\n" not in str(error.value)
 
@@ -299,7 +299,7 @@ def test_spheres_that_do_not_touch_are_refused():
 
 @pytest.mark.parametrize("field", ["catheter_radius_mm", "spacing_mm", "minimum_branch_length_mm", "scale"])
 def test_config_names_field_and_value(field):
-    with pytest.raises(InputError, match=f"{field}=-1"):
+    with pytest.raises(InputError, match=rf"^{field}: -1\.0; give a positive number"):
         AnatomyConfig(**{field: -1.0})
 
 

@@ -46,7 +46,7 @@ def test_identity_is_that_of_the_vessel_in_memory_as_on_disk(anatomy, tmp_path):
     assert replace(anatomy, name="other", provenance={}).identity == anatomy.identity
 
 
-def test_identity_changes_with_all_that_a_wire_could_feel(anatomy):
+def test_identity_changes_with_everything_that_affects_a_wire(anatomy):
     field, insertion, (root, *others) = anatomy.distance_map, anatomy.insertion, anatomy.tree.branches
     values = field.values.copy()
     values[2, 3, 4] += 1e-3
@@ -100,16 +100,16 @@ def test_writing_again_replaces_an_anatomy_but_nothing_else(anatomy, tmp_path):
 
 @pytest.mark.parametrize("file", ["centerline.vtp", "lumen.nrrd", "anatomy.json"])
 @pytest.mark.parametrize("damage", ["missing", "truncated"])
-def test_damage_is_told_in_one_line(anatomy, tmp_path, file, damage):
+def test_damage_gives_one_line(anatomy, tmp_path, file, damage):
     write_anatomy(anatomy, tmp_path / "a")
     path = tmp_path / "a" / file
     content = path.read_bytes()
     path.unlink()
     if damage == "truncated":
         path.write_bytes(content[: len(content) // 2])
-    with pytest.raises(InputError, match="anatomy") as told:
+    with pytest.raises(InputError, match="anatomy") as error:
         read_anatomy(tmp_path / "a")
-    assert "\n" not in str(told.value) and "a" in str(told.value)
+    assert "\n" not in str(error.value) and "a" in str(error.value)
 
 
 def test_other_versions_and_missing_fields_are_refused(anatomy, tmp_path):

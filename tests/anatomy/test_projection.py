@@ -70,7 +70,7 @@ def test_wall_of_a_wide_vessel_is_not_given_to_a_thin_neighbour():
     assert found.radius[0] == 2.0
 
 
-def test_a_point_is_projected_to_the_same_bits_in_any_company():
+def test_a_point_is_projected_to_the_same_bits_whatever_the_others():
     tree = forked_tree()
     points = np.random.default_rng(1).uniform((-2, -1, -4), (8, 1, 30), (500, 3))  # behind the ostium too
     together = project_tip(tree, INSERTION, points)
@@ -158,6 +158,6 @@ def test_where_the_wire_fills_the_lumen_the_wall_is_reached_wherever_the_wire_li
     assert safety_ratio(offset, radius, 0.18).tolist() == [1.0, 1.0, 1.0, 1.0]
 
 
-def test_the_safety_ratio_of_what_is_unknown_is_unknown():
+def test_the_safety_ratio_of_nan_is_nan():
     offset, radius = np.array([np.nan, np.nan, 0.1]), np.array([1.0, 0.1, np.nan])
     assert np.isnan(safety_ratio(offset, radius, 0.18)).all()

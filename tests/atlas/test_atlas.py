@@ -37,7 +37,7 @@ def test_course_statistics_match_the_published_ones(patients):
 
 
 @pytest.mark.parametrize(("share", "diameter"), [(0.1, 4.0), (0.2, 3.8), (0.5, 3.5), (0.7, 2.7), (0.9, 2.3)])
-def test_diameters_along_the_way_match_the_published_ones(patients, share, diameter):
+def test_diameters_along_the_artery_match_the_published_ones(patients, share, diameter):
     paths = [tree.longest_path() for tree, _ in patients]
     found = [2 * np.interp(share * path.abscissa[-1], path.abscissa, path.radius) for path in paths]
     assert_mean(found, diameter, 0.6)
@@ -46,7 +46,7 @@ def test_diameters_along_the_way_match_the_published_ones(patients, share, diame
 
 @pytest.mark.parametrize(("section", "diameter"), [("1", 3.9), ("2", 3.4), ("3", 3.1), ("4", 2.2)])
 def test_diameters_of_segments_agree_with_dodge(patients, section, diameter):
-    # The two published sets contradict each other by up to 0.4 mm; the atlas follows the diameters along the way.
+    # The two published sets contradict each other by up to 0.4 mm; the atlas follows the diameters along the artery.
     found = []
     for tree, truth in patients:
         number = tree.section_names.index(section)
@@ -57,7 +57,7 @@ def test_diameters_of_segments_agree_with_dodge(patients, section, diameter):
 
 
 @pytest.mark.parametrize(("section", "mean", "sd"), [("conus", 15, 6), ("SA", 16, 6), ("AM", 42, 8)])
-def test_branches_leave_where_they_should(patients, section, mean, sd):
+def test_branches_leave_at_the_published_places(patients, section, mean, sd):
     origins = []
     for tree, _ in patients:
         number = tree.section_names.index(section)
@@ -87,8 +87,8 @@ def test_trees_are_connected_and_ordered(patients):
 
 
 def test_sections_follow_dominance(patients):
-    seen = {truth["dominance"] for _, truth in patients}
-    assert "right" in seen
+    drawn = {truth["dominance"] for _, truth in patients}
+    assert "right" in drawn
     for tree, truth in patients:
         names = {tree.section_names[i] for branch in tree.branches for i in branch.section}
         expected = {"right": {"4", "16"}, "left": set()}.get(truth["dominance"])
@@ -146,7 +146,7 @@ def test_curves_against_closed_forms():
     np.testing.assert_allclose(normals, np.tile([0.0, 0.0, 1.0], (200, 1)), atol=1e-12)
     line = np.stack([np.arange(100.0), np.zeros(100), np.zeros(100)], axis=1)
     bent = shape.bend(line, np.array([0.0, 0.0, 1.0]), 1.2)
-    # Tangents that turn in proportion to the way make a circle's arc of radius length / angle.
+    # Tangents that turn in proportion to the length make a circle's arc of radius length / angle.
     np.testing.assert_allclose(shape.curvature(bent)[2:-2], 1.2 / 99, rtol=1e-3)
 
 
@@ -161,7 +161,7 @@ def test_side_branches_stay_outside_the_heart():
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "message"),
     [
         ({"anatomy": "spleen"}, "'spleen'; choose from .*rca"),
         ({"count": 0}, "count: 0"),
@@ -169,6 +169,6 @@ def test_side_branches_stay_outside_the_heart():
         ({"stenosis_share": 1.5}, "stenosis_share: 1.5"),
     ],
 )
-def test_bad_configuration_is_told(options, told):
-    with pytest.raises(InputError, match=told):
+def test_a_bad_configuration_is_refused(options, message):
+    with pytest.raises(InputError, match=message):
         AtlasConfig(**options)

@@ -9,7 +9,7 @@ from endopilot.anatomy.distance import sample
 from endopilot.anatomy.labels import dominance, label_tree
 from endopilot.atlas import heart_left
 from endopilot.atlas.atlas import AtlasConfig, make_patient, make_patient_tree
-from endopilot.benchmarks.labels import agreement
+from endopilot.benchmarks.labels import label_agreement
 
 COUNT = 12
 KINDS = ("lca", "arch", "cerebral", "portal")
@@ -142,7 +142,7 @@ def test_sections_agree_with_the_atlas(atlas, kind):
     right, total, dominances = 0.0, 0.0, []
     for tree, truth in atlas[kind]:
         found = label_tree(tree, kind)
-        lengths = agreement(tree, found)
+        lengths = label_agreement(tree, found)
         right += sum(length for (a, b), length in lengths.items() if a == b)
         total += sum(lengths.values())
         dominances.append(dominance(found) == truth.get("dominance"))

@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 from test_generate import data_hashes
 
-from endopilot.dataset.generate import DatasetConfig, generate_dataset
+from endopilot.dataset.config import DatasetConfig
+from endopilot.dataset.generate import generate_dataset
 from endopilot.errors import InputError
 from endopilot.files import read_json
 from endopilot.simulation.device import read_device
@@ -85,7 +86,7 @@ def test_a_cluster_gives_the_same_bits_though_a_worker_dies(tmp_path, monkeypatc
 
 @needs_dask
 def test_a_scheduler_that_is_not_there_is_named(tmp_path, monkeypatch):
-    monkeypatch.setattr("endopilot.dataset.workers._PATIENCE_S", 1)
+    monkeypatch.setattr("endopilot.dataset.workers._CONNECT_TIMEOUT_S", 1)
     with pytest.raises(InputError, match=r"tcp://127\.0\.0\.1:9 cannot be reached"):
         make_toy_dataset(tmp_path / "d", patients=1, sequences=4, scheduler="tcp://127.0.0.1:9")
     make_toy_dataset(tmp_path / "d", patients=1, sequences=8)  # and the same folder can be used after, for another too

@@ -19,8 +19,8 @@ import pytest
 
 from endopilot.anatomy.io import write_anatomy
 from endopilot.cli import main
-from endopilot.dataset import study
-from endopilot.dataset.generate import DatasetConfig
+from endopilot.dataset import layout
+from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.loader import load_dataset
 from endopilot.errors import InputError
 from endopilot.files import read_json, sha256
@@ -161,7 +161,7 @@ def test_a_lost_file_is_made_again(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["info.json", "stats.json", "tasks.parquet"])
-def test_what_describes_a_dataset_is_made_again(tmp_path, name):
+def test_a_lost_description_is_made_again(tmp_path, name):
     make_toy_dataset(tmp_path / "d", patients=1, sequences=4)
     before = (tmp_path / "d/meta" / name).read_bytes()
     (tmp_path / "d/meta" / name).unlink()
@@ -172,7 +172,7 @@ def test_what_describes_a_dataset_is_made_again(tmp_path, name):
     assert (tmp_path / "d/meta" / name).read_bytes() == before
 
 
-def test_another_anatomy_in_the_place_of_a_dataset_s_is_refused(tmp_path):
+def test_another_anatomy_in_the_place_of_the_dataset_s_own_is_refused(tmp_path):
     make_toy_dataset(tmp_path / "d", patients=1, sequences=4)
     data, folder = load_dataset(tmp_path / "d"), tmp_path / "anatomies/patient-0"
     assert data.anatomy_folder("patient-0") == folder.resolve()
@@ -206,7 +206,7 @@ def test_two_anatomies_of_one_name_are_refused(tmp_path):
     assert not (tmp_path / "d").exists()
 
 
-def test_a_full_disk_is_one_line_and_can_be_resumed(tmp_path, monkeypatch):
+def test_a_full_disk_gives_one_line_and_the_run_can_be_resumed(tmp_path, monkeypatch):
     settings = {"patients": 1, "sequences": 4, "sequences_per_file": 2}
     make_toy_dataset(tmp_path / "whole", **settings)
     write = Path.write_bytes
@@ -333,12 +333,12 @@ def test_a_changed_device_of_the_same_name_is_refused(tmp_path):
 
 def test_another_version_of_the_package_is_refused(tmp_path, monkeypatch):
     make_toy_dataset(tmp_path / "d", patients=1, sequences=4)
-    monkeypatch.setattr(study, "__version__", "99.0")
+    monkeypatch.setattr(layout, "__version__", "99.0")
     with pytest.raises(InputError, match=r"was begun with version = endopilot 0\.1\.0, .*now it is endopilot 99\.0"):
         make_toy_dataset(tmp_path / "d", patients=1, sequences=4)
 
 
-def test_bad_datasets_are_one_line_at_the_command_line(tmp_path, capsys):
+def test_a_bad_dataset_gives_one_line_at_the_command_line(tmp_path, capsys):
     make_toy_dataset(tmp_path / "d", patients=2, sequences=4, sequences_per_file=2)
     anatomies = [str(tmp_path / f"anatomies/patient-{i}") for i in range(2)]
 

@@ -56,12 +56,12 @@ def test_one_patient_is_split_by_sequence():
     assert sorted(splits[0].tolist()) == ["seen_test"] * 2 + ["train"] * 8
 
 
-def test_every_split_asked_for_gets_an_anatomy():
+def test_every_requested_split_gets_an_anatomy():
     splits = assign_splits(NAMES[:3], 5)
     assert {"train", "calibrate", "test"} <= set(splits.ravel().tolist())
 
 
-def test_too_few_anatomies_name_the_mend():
+def test_too_few_anatomies_are_refused_with_advice():
     with pytest.raises(InputError, match=r"2 anatomies cannot fill 3 splits.*at least 3"):
         assign_splits(NAMES[:2], 5)
 

@@ -8,8 +8,9 @@ import pytest
 
 from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
+from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.draw import TIP_GROUP, draw_navigations
-from endopilot.dataset.generate import DatasetConfig, generate_dataset
+from endopilot.dataset.generate import generate_dataset
 from endopilot.dataset.loader import load_dataset
 from endopilot.dataset.navigations import PULL_BACK_MM, STOP_SHORT_MM, simulate_navigations
 from endopilot.simulation.device import read_device
@@ -51,7 +52,7 @@ def test_an_episode_simulated_from_the_disk_repeats_to_the_bit(tmp_path, patient
         np.testing.assert_array_equal(again.drive_force.astype(np.float32), one.drive_force)
 
 
-def test_where_the_drive_slipped_what_was_asked_of_it_retraces_the_navigation(tmp_path, patient):
+def test_where_the_drive_slipped_its_commands_repeat_the_navigation(tmp_path, patient):
     config = DatasetConfig(sequences=6, seconds=30.0, seed=5, friction=(0.2, 0.3))
     generate_dataset([patient], tmp_path / "dataset", DEVICE, config)
     data = load_dataset(tmp_path / "dataset")
@@ -64,14 +65,14 @@ def test_where_the_drive_slipped_what_was_asked_of_it_retraces_the_navigation(tm
             read_anatomy(patient), DEVICE, control, initial=initial, config=config.simulator, friction=data.friction
         )
 
-    again = retraced(data.asked)
+    again = retraced(data.command)
     np.testing.assert_array_equal(again.tip.abscissa.astype(np.float32), data.tip_abscissa)
     np.testing.assert_array_equal(again.slip, data.slip)
     # what was made of it, driven evenly, does not
     assert np.abs(retraced(data.control.astype(float)).tip.abscissa - data.tip_abscissa)[caught].max() > 0.01
 
 
-def test_wires_stay_inside_what_was_imaged_and_repeat_without_looking(patient):
+def test_wires_stay_inside_the_imaged_vessel_and_repeat_from_the_recorded_controls(patient):
     anatomy, config = read_anatomy(patient), DatasetConfig().simulator
     leaves = anatomy.tree.leaves()
     ends = np.array([b.centerline.abscissa[-1] if i in leaves else np.inf for i, b in enumerate(anatomy.tree.branches)])
@@ -85,7 +86,7 @@ def test_wires_stay_inside_what_was_imaged_and_repeat_without_looking(patient):
     assert stopped.all()
     assert (rollout.tip.abscissa < ends[rollout.tip.branch] - 0.5 * STOP_SHORT_MM).all()
     pulled = applied[..., 0] < 0
-    assert pulled.any(axis=1).all()  # pushed into a dead end, every wire is pulled back some way
+    assert pulled.any(axis=1).all()  # pushed into a dead end, every wire is pulled back
     longest = max(len(run) for world in pulled for run in "".join("x" if p else " " for p in world).split())
     assert 0.5 * 12.0 * longest == pytest.approx(PULL_BACK_MM, abs=6.1)
     free = ~pulled & (applied[..., 0] == 12.0)

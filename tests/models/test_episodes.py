@@ -32,7 +32,7 @@ def test_a_dataset_gives_its_navigations_to_the_bit(dataset):
     np.testing.assert_array_equal(episodes.tip[..., 0], dataset.tip_abscissa)
     np.testing.assert_array_equal(episodes.tip[..., 1], dataset.tip_offset)
     np.testing.assert_array_equal(episodes.initial[:, 0], dataset.initial_inserted_length)
-    np.testing.assert_array_equal(episodes.command, slipped.asked)
+    np.testing.assert_array_equal(episodes.command, slipped.command)
     assert np.abs(episodes.command - episodes.control).max() > 1.0
     names = set(dataset.anatomy.tolist())
     assert names == set(episodes.setup.anatomies) == set(episodes.setup.identities)

@@ -9,7 +9,8 @@ import pytest
 
 from endopilot.anatomy.io import write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.dataset.generate import DatasetConfig, generate_dataset
+from endopilot.dataset.config import DatasetConfig
+from endopilot.dataset.generate import generate_dataset
 from endopilot.dataset.loader import load_dataset
 from endopilot.errors import InputError
 from endopilot.models import twin as twin_module

@@ -147,7 +147,7 @@ def test_soft_plaque_lies_around_a_stenosis():
     assert np.mean(at(volume, ring)) > np.mean(at(bare, ring)) + 30
 
 
-def test_a_tree_without_section_labels_will_do(anatomy):
+def test_a_tree_without_section_labels_is_accepted(anatomy):
     branches = tuple(Branch(b.centerline, b.parent, np.zeros_like(b.section)) for b in anatomy.tree.branches)
     bare = replace(anatomy, tree=VesselTree(branches, ("vessel",)), provenance={})
     volume = make_phantom(bare, COARSE, 0)
@@ -168,14 +168,14 @@ def test_a_moving_heart_is_smeared_and_the_chest_is_not(anatomy):
     assert np.mean(after > beside + 50) > 0.9
 
 
-def test_the_volume_has_the_voxels_asked_for(anatomy):
+def test_the_volume_has_the_requested_voxels(anatomy):
     usual, asked = make_phantom(anatomy, COARSE, 0), make_phantom(anatomy, replace(COARSE, voxels=(90, 80, 70)), 0)
     assert asked.voxels.shape == (70, 80, 90)
     middles = [v.index_to_world((np.array(v.voxels.shape[::-1]) - 1) / 2) for v in (usual, asked)]
     np.testing.assert_allclose(*middles, atol=1.2)
 
 
-def test_the_right_heart_is_as_bright_as_asked(anatomy):
+def test_the_right_heart_is_as_bright_as_requested(anatomy):
     washed, full = (make_phantom(anatomy, replace(COARSE, right_heart=(s, s)), 1).voxels for s in (0.2, 0.9))
     assert np.mean(full > 250) > 1.3 * np.mean(washed > 250)
 
@@ -222,7 +222,7 @@ def test_fit_recovers_a_moved_heart():
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "message"),
     [
         ({"in_plane_mm": 0.0}, "in_plane_mm: 0.0"),
         ({"noise_hu": (50.0, 20.0)}, "noise_hu"),
@@ -231,6 +231,6 @@ def test_fit_recovers_a_moved_heart():
         ({"voxels": (512, 512, 3)}, "voxels"),
     ],
 )
-def test_bad_configuration_is_told(options, told):
-    with pytest.raises(InputError, match=told):
+def test_a_bad_configuration_is_refused(options, message):
+    with pytest.raises(InputError, match=message):
         PhantomConfig(**options)

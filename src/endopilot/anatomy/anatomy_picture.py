@@ -78,8 +78,8 @@ def _draw_tree(anatomy: Anatomy, figure: Any) -> None:
         colour = palette(number % palette.N) if title == "sections" else plt.get_cmap("viridis")(scale(radius))
         colour = np.where(catheter[:, None], [0.75, 0.75, 0.75, 1.0], colour)
         colour[:, :3] *= shade[:, None]
-        seen = list(corners[order][:, :, [0, 2]])
-        axes.add_collection(PolyCollection(seen, facecolors=colour[order], edgecolors="none"))
+        visible = list(corners[order][:, :, [0, 2]])
+        axes.add_collection(PolyCollection(visible, facecolors=colour[order], edgecolors="none"))
         axes.set(aspect="equal", title=title, xlabel="x (left), mm", ylabel="z (head), mm")
         axes.autoscale_view()
         if title == "sections":

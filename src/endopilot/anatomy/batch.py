@@ -1,4 +1,4 @@
-"""Many patients at once: an anatomy of each file that can be read, and a list of the others with what was wrong."""
+"""Many patients at once: an anatomy of each file that can be read, and a list of the others with the reasons."""
 
 from __future__ import annotations
 

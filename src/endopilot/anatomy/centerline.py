@@ -22,10 +22,10 @@ ROUNDNESS = 0.05
 
 _RING = 12
 _FEWEST_DIRECTIONS = 5
-"""In fewer directions of the ring a vessel has too little wall of its own to be centred by it."""
+"""With fewer directions than this on the ring, a vessel has too little wall of its own to be centred by."""
 
 _STRAIGHT = 10
-"""This many steps of a branch from where it leaves its parent tell where it comes from."""
+"""This many steps of a branch from where it leaves its parent show where it comes from."""
 
 _NEAR_WALL = 0.8
 """The ring on which the radius is measured, in distances to the wall."""
@@ -113,11 +113,11 @@ def _walled(
 def _harmonics(
     around: Float[np.ndarray, "r n"], ring: Float[np.ndarray, "r n 3"], walled: Bool[np.ndarray, "r n"]
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
-    """Fit a mean and a first harmonic to the wall distances around each point; return it and the way to the centre."""
+    """Fit a mean and a first harmonic to the wall distances around each point; return the offset of the centre too."""
     angle = 2 * np.pi * np.arange(_RING) / _RING
     basis = np.stack([np.ones(_RING), np.cos(angle), np.sin(angle)], axis=1)
     matrix = np.einsum("rn,ri,rj->nij", walled.astype(float), basis, basis)
-    matrix[:, [1, 2], [1, 2]] += 0.1 * (~walled).sum(axis=0)[:, None]  # a half ring alone tells the way poorly
+    matrix[:, [1, 2], [1, 2]] += 0.1 * (~walled).sum(axis=0)[:, None]  # half a ring alone gives the direction poorly
     fit = np.linalg.solve(matrix, np.einsum("rn,ri,rn->ni", walled.astype(float), basis, around)[..., None])[..., 0]
     return fit[:, 0], fit[:, 1, None] * ring[0] + fit[:, 2, None] * ring[_RING // 4]
 
@@ -128,8 +128,8 @@ def _inscribed_radius(
     """Return inscribed-sphere radii that the wall's voxel noise does not shrink.
 
     The distance at the axis is the least over the whole circumference, and so reads the deepest ripple of the wall.
-    Instead, each direction is asked on its own on a ring near the wall. Their mean is the radius of a round lumen; the
-    second harmonic's amplitude, where it is more than ripple, leads from it to the small half-axis of a flat one.
+    Instead, each direction is measured by itself on a ring near the wall. Their mean is the radius of a round lumen;
+    the second harmonic's amplitude, where it is more than ripple, leads from it to the small half-axis of a flat one.
     """
     clearance = surface.distance(points)
     around, ring = _ring_distance(surface, points, _NEAR_WALL * clearance)
@@ -151,7 +151,7 @@ def _ring_distance(
 
 
 def _twice_smooth(points: Float[np.ndarray, "n 3"], width: float) -> Float[np.ndarray, "n 3"]:
-    """Blur a line and give back what the blur took of its curvature (Tukey's twicing)."""
+    """Blur a line and restore the curvature that the blur removed (Tukey's twicing)."""
     once = smoothed(points, width)
     return once + smoothed(points - once, width)
 

@@ -145,7 +145,7 @@ def add_catheter(
 ) -> DistanceMap:
     """Return the map joined with a straight guiding catheter that ends at the ostium.
 
-    The catheter is a tube of constant radius with a round end centred on the ostium, so the way into the vessel is
+    The catheter is a tube of constant radius with a round end centred on the ostium, so the passage into the vessel is
     open by at least `radius_mm`. The grid grows as needed.
 
     Args:

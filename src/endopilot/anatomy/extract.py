@@ -35,7 +35,7 @@ from endopilot.types import Anatomy, DistanceMap, Insertion, LumenMask, VesselTr
 __all__ = ["AnatomyConfig", "extract_anatomy", "read_source"]
 
 SMALLEST_MEAN_RADIUS_MM, LARGEST_MEAN_RADIUS_MM = 0.25, 40.0
-"""Vessels that a guidewire enters have mean radii between these; others speak for a wrong unit."""
+"""Vessels that a guidewire enters have mean radii between these; others suggest a wrong unit."""
 
 CORONARY_RADIUS_MM = 1.6
 """Mean radius of a coronary tree at most: what counts for the grid where a lumen holds a piece of the aorta too."""
@@ -64,7 +64,7 @@ class AnatomyConfig:
     scale: Positive = 1.0
     """Factor that turns the file's unit into mm: 10 for cm, 1000 for m."""
     coordinates: Literal["lps", "ras"] = "lps"
-    """Axes of a surface or VTP file, which cannot say itself; masks and Slicer markups do, and ignore this."""
+    """Axes of a surface or VTP file, which does not state them. Masks and Slicer markups do, and ignore this."""
 
 
 def extract_anatomy(
@@ -280,15 +280,15 @@ def _directed(
     given: Insertion,
     config: AnatomyConfig,
 ) -> Insertion:
-    """Return an ostium inside a vessel with the direction away from the inlet; one near an end stays without."""
+    """Return an ostium inside a vessel with the direction away from the inlet; one near an end gets no direction."""
     inlet = _widest_open_end(distance_map, points, clearance, config)
     graph = lumen_graph(points, clearance, distance_map.spacing_mm, inlet)
     node = int(np.linalg.norm(graph.points - given.position, axis=1).argmin())
     reach = ENTRANCE_RADII * float(clearance[np.linalg.norm(points - given.position, axis=1) < 3.0].max(initial=1.0))
-    way = [node]
-    while graph.predecessor[way[-1]] >= 0 and graph.length[node] - graph.length[way[-1]] < reach:
-        way.append(int(graph.predecessor[way[-1]]))
-    direction = graph.points[node] - graph.points[way[-1]]
+    path = [node]
+    while graph.predecessor[path[-1]] >= 0 and graph.length[node] - graph.length[path[-1]] < reach:
+        path.append(int(graph.predecessor[path[-1]]))
+    direction = graph.points[node] - graph.points[path[-1]]
     length = float(np.linalg.norm(direction))
     ahead = (graph.points - graph.points[node]) @ direction > length * reach
     beyond = ahead & (graph.length > graph.length[node] + reach)
@@ -331,7 +331,7 @@ def _widest_open_end(
 
 
 def _tapering(points: Float[np.ndarray, "n 3"], radius: Float[np.ndarray, "n"], tip: Float[np.ndarray, "3"]) -> float:
-    """Return how steadily a tree narrows away from an end: its rank correlation, −1 where it widens all the way."""
+    """Return how steadily a tree narrows away from an end: its rank correlation, −1 where it widens throughout."""
     distance = np.linalg.norm(points - tip, axis=1)
     ranks = np.stack([rankdata(distance), rankdata(radius)])
     return -float(np.corrcoef(ranks)[0, 1]) if len(points) > 3 else 0.0

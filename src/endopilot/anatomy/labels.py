@@ -85,7 +85,7 @@ def dominance(tree: VesselTree) -> str | None:
 
 
 def _feeds_inferior_wall(tree: VesselTree) -> bool:
-    """Tell whether a posterolateral branch of a labelled left coronary tree leaves from the lower end of the groove."""
+    """Return whether a posterolateral branch of a left coronary tree leaves from the lower end of the groove."""
     number = {name: index for index, name in enumerate(tree.section_names)}
     fork = next((b.centerline.points[-1] for b in tree.branches if b.section[-1] == number["5"]), None)
     descending = [b.centerline.points for b in tree.branches if b.section[-1] in (number["7"], number["8"])]

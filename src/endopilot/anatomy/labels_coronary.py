@@ -7,14 +7,14 @@ import numpy as np
 from endopilot.anatomy.labels_tree import Labeller
 
 ACUTE_MARGIN = 0.64
-"""The acute margin lies at this share of the way from the ostium to the crux (Dodge et al., Circulation
-1988;78:1167-80, R2 distal); segment 1 ends half the way to it."""
+"""The acute margin lies at this share of the path from the ostium to the crux (Dodge et al., Circulation
+1988;78:1167-80, R2 distal); segment 1 ends halfway to it."""
 
 MAJOR_MM = 6.0
 """A branch with at least this much length behind it counts as a named end vessel, mm."""
 
 _EARLY, _LATE = 0.22, 0.4
-"""A conus branch leaves within the first share of the way to the crux, a sinus node branch within the second."""
+"""A conus branch leaves within the first share of the path to the crux, a sinus node branch within the second."""
 
 _RAMUS_MM = 4.0
 """Where LAD and LCx divide again this near the left main's end, the middle branch is the ramus intermedius."""

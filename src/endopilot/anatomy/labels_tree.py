@@ -1,4 +1,4 @@
-"""The anatomical sections of every kind of vessel tree, and the questions that labelling asks of a tree."""
+"""The anatomical sections of every kind of vessel tree, and the queries of a tree that labelling needs."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ PORTAL_SECTIONS = ("MPV", "RPV", "LPV", "RAPV", "RPPV", "S2", "S3", "S4", "S5", 
 
 
 class Labeller:
-    """A tree with the questions that the schemes ask of it."""
+    """A tree with the queries that the schemes need."""
 
     def __init__(self, tree: VesselTree, names: tuple[str, ...], sections: list[np.ndarray]) -> None:
         self.tree, self.names, self.sections = tree, names, sections
@@ -73,7 +73,7 @@ class Labeller:
         return [leaf for leaf in self.tree.leaves() if branch in self.tree.route(leaf)]
 
     def own(self, leaf: int) -> int:
-        """The first branch on the way to a distal end that leads to no other."""
+        """The first branch on the path to a distal end that leads to no other."""
         return next(branch for branch in self.tree.route(leaf) if self.ends(branch) == [leaf])
 
     def leftward(self, leaf: int) -> float:
@@ -89,7 +89,7 @@ class Labeller:
         return [child for child in self.tree.children(branch) if self.length_behind(child) >= length_mm]
 
     def fork(self, branch: int, length_mm: float) -> int:
-        """The branch, on the way along major children, at whose end more than one of them leaves, or none."""
+        """The branch, along major children, at whose end more than one of them leaves, or none."""
         while len(onwards := self.major(branch, length_mm)) == 1:
             branch = onwards[0]
         return branch

@@ -56,7 +56,7 @@ def label_cerebral(labeller: Labeller) -> None:
             labeller.fill(side, "ophthalmic" if float(labeller.heading(side, 15.0) @ FRONT) > 0 else "PCom")
     if len(parted) < 2:
         return
-    # The carotid has come from the side towards the midline; the anterior cerebral artery goes on that way.
+    # The carotid has come from the side towards the midline; the anterior cerebral artery continues in that direction.
     line = labeller.tree.path(terminus)
     inwards = np.sign(line.points[-1] - line.points[0]) * LEFT
     anterior = max(parted, key=lambda child: float(labeller.heading(child, 12.0) @ inwards))
@@ -94,7 +94,7 @@ def label_portal(labeller: Labeller) -> None:
     if len(leaves) < 2:
         return
     low, high = labeller.leftward(leaves[0]), labeller.leftward(leaves[-1])
-    # What parts from the way to the leftmost end no later than the veins that end far right leads to the right lobe.
+    # A branch that leaves the path to the leftmost end before the veins of the far right do leads to the right lobe.
     part = {leaf: _parting(labeller, leaf, leaves[-1]) for leaf in leaves[:-1]}
     last = max(part[leaf] for leaf in part if labeller.leftward(leaf) <= low + _RIGHT_SHARE * (high - low))
     right = {leaf for leaf in part if part[leaf] <= last}
@@ -120,7 +120,7 @@ def label_portal(labeller: Labeller) -> None:
 
 
 def _parting(labeller: Labeller, one: int, other: int) -> float:
-    """Abscissa at which the ways to two ends part, mm."""
+    """Abscissa at which the paths to two ends separate, mm."""
     common = [branch for branch in labeller.tree.route(one) if branch in labeller.tree.route(other)]
     return float(labeller.tree.branches[common[-1]].centerline.abscissa[-1])
 

@@ -19,7 +19,7 @@ _FLAT = 0.75
 """A vessel whose smaller half-axis falls below this share of its radius is not drawn out any farther."""
 
 _ROUND = 0.9
-"""A half-axis is told apart from the radius where it is smaller than this share of it."""
+"""A half-axis counts as different from the radius where it is smaller than this share of it."""
 
 _AHEAD = 0.87
 """Cosine of the largest angle at which a line may leave a known ostium off the catheter's axis."""
@@ -67,7 +67,7 @@ def to_cut(
     """Draw a line out as long as the lumen keeps its width, to the cut of a vessel that ends flat.
 
     Each step goes on along the last ones, bent as they are, and is centred by the walls beside it alone: the cut ahead
-    does not draw it back. Where the lumen grows narrow or flat, it is no longer the same vessel on its way to a cut.
+    does not draw it back. Where the lumen grows narrow or flat, it is no longer the same vessel that runs to a cut.
     """
     width = float(radius[-1])
     back = max(3, round(1.5 * width / step_mm))
@@ -118,14 +118,14 @@ def from_ostium(
     if np.linalg.norm(shift) <= 2 * width[0] and np.linalg.norm(beside) <= 0.5 * width[0]:
         share = np.clip(1 - along / (3 * width[0]), 0.0, 1.0)
         return drawn + (share**2 * (3 - 2 * share))[:, None] * shift, width
-    way = points - ostium.position
-    length = np.linalg.norm(way, axis=1)
-    ahead = np.flatnonzero(way @ ostium.direction > _AHEAD * length)
+    offset = points - ostium.position
+    length = np.linalg.norm(offset, axis=1)
+    ahead = np.flatnonzero(offset @ ostium.direction > _AHEAD * length)
     if len(ahead) == 0 or length[ahead[0]] > _LONGEST_BRIDGE * radius[ahead[0]]:
         return None
     first = int(ahead[0])
     count = max(2, round(float(length[first]) / step_mm))
-    bridge = ostium.position + np.arange(count)[:, None] / count * way[first]
+    bridge = ostium.position + np.arange(count)[:, None] / count * offset[first]
     clearance = sample(distance_map, bridge)
     if clearance[1:].min() <= 0:
         return None
@@ -139,8 +139,8 @@ def from_ostium(
 def without_inlets(distance_map: DistanceMap, lines: list[Line], ostium: Insertion) -> list[Line]:
     """Leave out lines that lead back to the ostium's own cut: the other side of a wide inlet, and no branch.
 
-    Such a line ends in the plane of the ostium, and there the first line is seen from it straight through the lumen. In
-    the merged lumens of a dissection, a wire beside the first line would seem to lie far ahead, on its way back.
+    Such a line ends in the plane of the ostium, and there the lumen joins it to the first line in a straight line. In
+    the merged lumens of a dissection, a wire beside the first line would seem to lie far ahead, on the returning part.
 
     Args:
         distance_map: the wall.

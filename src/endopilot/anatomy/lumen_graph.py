@@ -28,13 +28,13 @@ _HALF_NEIGHBOURHOOD = np.array(
 
 @dataclass(frozen=True, eq=False)
 class LumenGraph:
-    """The inside of a lumen as a graph, with the cheapest way from every node to the root.
+    """The inside of a lumen as a graph, with the cheapest path from every node to the root.
 
     Attributes:
         points: grid points inside the connected lumen at the root, LPS mm.
         clearance: their distance to the wall, mm.
-        predecessor: next node on the way to the root, -1 at the root itself.
-        length: length of the way to the root, mm.
+        predecessor: next node on the path to the root, -1 at the root itself.
+        length: length of the path to the root, mm.
         spacing_mm: grid spacing, mm.
     """
 
@@ -48,7 +48,7 @@ class LumenGraph:
 def lumen_graph(
     points: Float[np.ndarray, "n 3"], clearance: Float[np.ndarray, "n"], spacing_mm: float, root: int
 ) -> LumenGraph:
-    """Return the graph of grid points inside one lumen, with the ways to `root`."""
+    """Return the graph of grid points inside one lumen, with the paths to `root`."""
     from scipy.sparse import csr_matrix
     from scipy.sparse.csgraph import dijkstra
 
@@ -105,7 +105,7 @@ def trace_branches(graph: LumenGraph, *, minimum_length_mm: float) -> list[Int[n
 
 
 def _length_to_root(points: Float[np.ndarray, "n 3"], predecessor: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-    """Sum the steps of every way to the root at once, by pointer doubling."""
+    """Sum the steps of every path to the root at once, by pointer doubling."""
     jump = np.where(predecessor >= 0, predecessor, np.arange(len(points)))
     length = np.linalg.norm(points - points[jump], axis=1)
     while True:

@@ -61,7 +61,7 @@ def parent_region(
     Args:
         distance_map: distance to the wall.
         inside: which of its grid points belong to the lumen.
-        graph: that lumen, with the ways to the inlet as root.
+        graph: that lumen, with the paths to the inlet as root.
         usual_mm: median radius along the tree, mm.
     """
     from scipy.ndimage import distance_transform_edt, label
@@ -98,7 +98,7 @@ def ostium_beyond(
         distance_map: distance to the wall.
         inside: which of its grid points belong to the lumen.
         parent: which belong to the parent vessel.
-        graph: the lumen with the ways to the inlet as root.
+        graph: the lumen with the paths to the inlet as root.
         vessel: which vessel is wanted.
     """
     from scipy.ndimage import center_of_mass, label
@@ -109,16 +109,16 @@ def ostium_beyond(
         return None
     places = np.rint((graph.points - origin) / spacing).astype(int)[:, ::-1]
     piece = labels[tuple(places.T)]
-    # How far a piece reaches beyond the parent tells a vessel from a crust of the parent's wall.
+    # How far a piece reaches beyond the parent distinguishes a vessel from a crust of the parent's wall.
     reach = np.array(
         [np.ptp(graph.length[piece == i]) if (piece == i).any() else 0.0 for i in range(1, count + 1)], dtype=float
     )
     centres = np.array(center_of_mass(labels > 0, labels, range(1, count + 1)))[:, ::-1]
     chosen, _ = piece_on_side(reach, origin + spacing * centres, vessel)
     tip = int(np.where(piece == chosen + 1, graph.length, -1.0).argmax())
-    way = [tip]
-    while graph.predecessor[way[-1]] >= 0 and piece[way[-1]] == chosen + 1:
-        way.append(int(graph.predecessor[way[-1]]))
-    line = graph.points[way[::-1]]
-    # The direction is left open: the refined centerline tells it better than this grid.
+    path = [tip]
+    while graph.predecessor[path[-1]] >= 0 and piece[path[-1]] == chosen + 1:
+        path.append(int(graph.predecessor[path[-1]]))
+    line = graph.points[path[::-1]]
+    # The direction is left open: the refined centerline gives it better than this grid.
     return Insertion(line[0].copy(), np.zeros(3)) if len(line) >= 3 else None

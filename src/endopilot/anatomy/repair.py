@@ -1,4 +1,4 @@
-"""Mending what masks and surfaces of other origins come with: blobs, gaps, cavities, holes, inverted normals.
+"""Repairs of the flaws that masks and surfaces from elsewhere have: blobs, gaps, cavities, holes, inverted normals.
 
 Every repair returns remarks, which `extract_anatomy` writes into the provenance.
 """
@@ -38,7 +38,7 @@ SMALLEST_PIECE = 12
 def connected_mask(
     mask: Volume, given: Insertion | None, label: str, vessel: Vessel = "generic"
 ) -> tuple[Volume, list[str]]:
-    """Return the one lumen at the ostium, or the largest: gaps of a few voxels bridged, cavities filled, blobs gone.
+    """Return the one lumen at the ostium, or the largest: gaps of a few voxels bridged, cavities filled, blobs removed.
 
     Where a mask holds both coronary arteries and no ostium is given, `vessel` decides by the patient's side.
 
@@ -118,7 +118,7 @@ def closed_surface(
         gap = float(KDTree(mesh.points).query(given.position)[0])
         if gap > max(NEAR_OSTIUM_MM, 0.15 * float(np.ptp(mesh.points, axis=0).max())):
             raise InputError(
-                f"{label}: the surface is {gap:.1f} mm from the ostium at {_told(given)}; check coordinates"
+                f"{label}: the surface is {gap:.1f} mm from the ostium at {_position_text(given)}; check coordinates"
             )
     open_edges = mesh.n_open_edges
     if open_edges:
@@ -159,7 +159,7 @@ def _nearest_piece(mask: Volume, labels: np.ndarray, sizes: np.ndarray, given: I
         nearest = mask.index_to_world(index[gap.argmin()][::-1].astype(float))
         place = ", ".join(f"{value:.1f}" for value in nearest)
         raise InputError(
-            f"{label}: the mask touches nothing near the ostium at {_told(given)}; "
+            f"{label}: the mask touches nothing near the ostium at {_position_text(given)}; "
             f"its nearest voxel is {gap.min():.1f} mm away at ({place})"
         )
     return int(labels[tuple(index[gap.argmin()])])
@@ -168,7 +168,7 @@ def _nearest_piece(mask: Volume, labels: np.ndarray, sizes: np.ndarray, given: I
 def _left_out(
     mask: Volume, result: Bool[np.ndarray, "nz ny nx"], labels: np.ndarray, sizes: np.ndarray, count: int
 ) -> str:
-    """Tell how much was left out, and of the largest piece where it lies, since a real vessel may be lost with it."""
+    """Say how much was left out and where the largest piece lies, since a real vessel may be lost with it."""
     lost = np.where(np.isin(np.arange(len(sizes)), labels[result]), 0, sizes)
     largest = np.argwhere(labels == int(lost.argmax()))
     place = mask.index_to_world(largest[:, ::-1].astype(float))
@@ -226,8 +226,8 @@ def _carries_on(voxels: Int[np.ndarray, "n 3"], end: Int[np.ndarray, "3"], beyon
     spread, axes = np.linalg.eigh(np.cov(near.T)) if len(near) > 3 else (np.ones(3), np.eye(3))
     if spread[2] < 3.0 * spread[1]:
         return True
-    way = (beyond - end) / max(float(np.linalg.norm(beyond - end)), 1e-9)
-    return bool(abs(axes[:, 2] @ way) > _ONWARDS)
+    direction = (beyond - end) / max(float(np.linalg.norm(beyond - end)), 1e-9)
+    return bool(abs(axes[:, 2] @ direction) > _ONWARDS)
 
 
 def _widest(clearance: np.ndarray, place: np.ndarray) -> float:
@@ -274,7 +274,7 @@ def _other_pieces(vessel: Vessel, count: int) -> str:
 
 
 def _without_duplicates(mesh):
-    """Drop triangles that are there twice, as where a surface was exported together with its own copy."""
+    """Drop triangles that occur twice, as where a surface was exported together with its own copy."""
     import pyvista
 
     faces = np.asarray(mesh.faces.reshape(-1, 4)[:, 1:])
@@ -328,5 +328,5 @@ def _from_shell(surface: Surface, label: str) -> Surface:
     raise InputError(f"{label}: the surface has holes that cannot be closed; cap it or make it watertight")
 
 
-def _told(given: Insertion) -> str:
+def _position_text(given: Insertion) -> str:
     return "(" + ", ".join(f"{value:.1f}" for value in given.position) + ") mm"

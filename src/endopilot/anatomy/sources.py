@@ -109,7 +109,7 @@ def transformed(source: AnatomySource, *, scale: float, coordinates: str) -> Ana
 def _read_polydata(path: Path) -> Surface | Polylines:
     import pyvista
 
-    # Some readers crash or hang on an empty or foreign file; the first bytes tell.
+    # Some readers crash or hang on an empty or foreign file; the first bytes identify it.
     if path.stat().st_size < 16:
         raise InputError(f"{path}: is empty or truncated; export it again")
     data: Any

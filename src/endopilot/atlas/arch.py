@@ -49,7 +49,7 @@ DIAMETER_MM = {
 DIAMETER_MM_BEYOND = {"right common carotid": 7.0, "right subclavian": 9.0}
 """Beyond the trunk: a little less than its area together."""
 GAP_MM = {"left common carotid": (4.39, 2.49), "left subclavian": (6.43, 3.98)}
-"""Between the wall of a branch and that of the one before it on the way of the blood, mm."""
+"""Between the wall of a branch and that of the one before it in the direction of flow, mm."""
 TRUNK_MM = (38.2, 9.5)
 
 _DESCENDING_MM, _ASCENDING_MM = 100.0, 35.0
@@ -108,7 +108,7 @@ def _draw(
         index = [vessel.section[-1] for vessel in vessels].index(where)
         stenosis, vessels = narrowed(generator, vessels, index, (0.4, 0.8))
         stenoses.append(stenosis)
-    truth = {
+    drawn = {
         "arch_type": kind,
         "bovine": bovine,
         "sex": sex,
@@ -117,7 +117,7 @@ def _draw(
         "trunk_drop_mm": drop,
         "stenoses": stenoses,
     }
-    return build_tree(vessels, ARCH_SECTIONS), truth
+    return build_tree(vessels, ARCH_SECTIONS), drawn
 
 
 def _aorta(generator: np.random.Generator, height_mm: float, width_mm: float) -> Float[np.ndarray, "n 3"]:
@@ -143,8 +143,8 @@ def _origins(
 ) -> dict[str, int]:
     """Return where the branches leave the aorta, as indices of its points.
 
-    The brachiocephalic trunk leaves `drop_mm` below the top of the arch, the others on the way from there to the
-    descending aorta.
+    The brachiocephalic trunk leaves `drop_mm` below the top of the arch, the others between there and the descending
+    aorta.
     """
     top = int(points[:, 2].argmax())
     last = top + int(np.searchsorted(points[top, 2] - points[top:, 2], drop_mm))

@@ -63,12 +63,12 @@ def make_atlas(config: AtlasConfig = AtlasConfig()) -> Iterator[Anatomy]:
 
 
 def make_patient(config: AtlasConfig, index: int) -> Anatomy:
-    """Return patient `index`, made with the truth of its centerline and radii.
+    """Return patient `index`, made from its exact centerline and radii.
 
     The random stream is keyed by (seed, index), so that a patient does not depend on the others. `provenance` holds
     what was drawn: dominance, length, tortuosity, curvature, stenoses.
     """
-    tree, truth = make_patient_tree(config, index)
+    tree, drawn = make_patient_tree(config, index)
     root = tree.branches[0].centerline
     insertion = Insertion(position=root.points[0], direction=tangents(root.points)[0])
     lumen = distance.distance_map_from_spheres(tree)
@@ -78,7 +78,7 @@ def make_patient(config: AtlasConfig, index: int) -> Anatomy:
         distance_map=distance.add_catheter(lumen, insertion, CATHETER_RADIUS_MM, CATHETER_LENGTH_MM),
         insertion=insertion,
         catheter_radius_mm=CATHETER_RADIUS_MM,
-        provenance={"source": "atlas", "anatomy": config.anatomy, "seed": config.seed, "index": index, **truth},
+        provenance={"source": "atlas", "anatomy": config.anatomy, "seed": config.seed, "index": index, **drawn},
     )
 
 

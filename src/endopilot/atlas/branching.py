@@ -22,7 +22,7 @@ _CLEARANCE_MM = 0.6
 
 
 class NoShape(Exception):
-    """What was drawn cannot be, or lumens collide: draw again."""
+    """The drawn shape is impossible, or lumens collide: draw again."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +55,7 @@ class SidePlan:
         length_mm: its length.
         diameter_mm: lumen diameter at its origin.
         courses: (abscissa from which it holds, mm; LPS direction), in order.
-        taper: share of the diameter that is lost on the way to the end.
+        taper: share of the diameter that is lost towards the end.
         angle_deg: range of the angle at which it leaves.
         depth: the surface that it follows; none for a branch that runs freely.
     """
@@ -74,7 +74,7 @@ class SidePlan:
 def until_it_fits(
     draw: Callable[[], tuple[VesselTree, dict[str, Any]]], what: str
 ) -> tuple[VesselTree, dict[str, Any]]:
-    """Draw a tree until one fits, and tell in its truth how many failed before (`redrawn`).
+    """Draw trees until one fits; its record states how many failed before (`redrawn`).
 
     Args:
         draw: draws one tree, and raises `NoShape` if it fails.
@@ -85,10 +85,10 @@ def until_it_fits(
     """
     for attempt in range(60):
         try:
-            tree, truth = draw()
+            tree, drawn = draw()
         except NoShape:
             continue
-        return tree, truth | {"redrawn": attempt}
+        return tree, drawn | {"redrawn": attempt}
     raise NoShape(f"no {what} found in 60 draws")
 
 
@@ -122,8 +122,8 @@ def stenosis(
     place, extent = along[0] + generator.uniform(*shares) * (along[-1] - along[0]), generator.uniform(6.0, 14.0)
     degree = generator.uniform(0.3, 0.65)
     narrowing = 1 - degree * np.exp(-0.5 * ((along - place) / (extent / 4)) ** 2)
-    truth = {"abscissa_mm": float(place), "length_mm": float(extent), "diameter_reduction": float(degree)}
-    return truth, narrowing
+    drawn = {"abscissa_mm": float(place), "length_mm": float(extent), "diameter_reduction": float(degree)}
+    return drawn, narrowing
 
 
 def narrowed(
@@ -139,8 +139,8 @@ def narrowed(
         parent = vessels[above.parent]
         along = along + shape.abscissa(parent.points)[above.origin]
         above = parent
-    truth, factor = stenosis(generator, along, shares)
-    section = vessel.section[int(np.searchsorted(along, truth["abscissa_mm"]))]
+    drawn, factor = stenosis(generator, along, shares)
+    section = vessel.section[int(np.searchsorted(along, drawn["abscissa_mm"]))]
     changed = []
     for i, other in enumerate(vessels):
         scale = factor if i == index else np.ones(len(other.radius))
@@ -148,7 +148,7 @@ def narrowed(
             inside = np.exp(-((shape.abscissa(other.points) / vessel.radius[other.origin]) ** 2))
             scale = factor[other.origin] * inside + (1 - inside)
         changed.append(replace(other, radius=other.radius * scale))
-    return truth | {"section": section}, changed
+    return drawn | {"section": section}, changed
 
 
 def wiggled(
@@ -167,7 +167,7 @@ def wiggled(
 
 
 def uneven(generator: np.random.Generator, along: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-    """Return the factor on a lumen's radius by which real vessels vary along the way: waves of 2.5 %."""
+    """Return the factor on a lumen's radius by which real vessels vary along their length: waves of 2.5 %."""
     wavelength = generator.uniform(15.0, 60.0, 4)
     waves = np.sin(2 * np.pi * along[:, None] / wavelength + generator.uniform(0, 2 * np.pi, 4)).sum(axis=1)
     return 1 + 0.025 * waves
@@ -220,7 +220,7 @@ def mouth(
 ) -> Float[np.ndarray, "n"]:
     """Return a branch's radius with its mouth: inside the parent's lumen the inscribed sphere is the parent's.
 
-    The distance from the parent's axis eats up that sphere; a smooth maximum rounds the carina.
+    The distance from the parent's axis is taken off that sphere; a smooth maximum rounds the carina.
     """
     away = points - points[0]
     off_axis = np.linalg.norm(away - (away @ parent_direction)[:, None] * parent_direction, axis=1)
@@ -233,7 +233,7 @@ def mouth(
 
 
 def build_tree(vessels: Sequence[Vessel], section_names: tuple[str, ...]) -> VesselTree:
-    """Cut vessels at their branching points; branches stand in the order in which they leave.
+    """Cut vessels at their branching points; branches are in the order in which they leave.
 
     Args:
         vessels: parents before their children.
@@ -266,7 +266,7 @@ def build_tree(vessels: Sequence[Vessel], section_names: tuple[str, ...]) -> Ves
 
 
 def lumens_collide(vessels: Sequence[Vessel]) -> bool:
-    """Tell whether lumens touch that lie far apart along the tree."""
+    """Return whether lumens touch that lie far apart along the tree."""
     points = np.concatenate([vessel.points for vessel in vessels])
     radii = np.concatenate([vessel.radius for vessel in vessels])
     place = np.concatenate([shape.abscissa(vessel.points) for vessel in vessels])
@@ -276,36 +276,36 @@ def lumens_collide(vessels: Sequence[Vessel]) -> bool:
     gap = np.linalg.norm(points[near[:, 0]] - points[near[:, 1]], axis=1) - reach
     near, reach = near[gap < _CLEARANCE_MM], reach[gap < _CLEARANCE_MM]
     common, entry, beyond = _meetings(vessels)
-    ways = []
+    paths = []
     for one, two in (near.T, near.T[::-1]):
         pair = owner[one], owner[two]
         direct = common[pair] == owner[one]
-        ways.append((np.where(direct, place[one], entry[pair]), np.where(direct, 0.0, beyond[pair] + place[one])))
-    way = np.abs(ways[0][0] - ways[1][0]) + ways[0][1] + ways[1][1]
-    return bool(np.any(way > 2.2 * reach + 4.0))
+        paths.append((np.where(direct, place[one], entry[pair]), np.where(direct, 0.0, beyond[pair] + place[one])))
+    distance = np.abs(paths[0][0] - paths[1][0]) + paths[0][1] + paths[1][1]
+    return bool(np.any(distance > 2.2 * reach + 4.0))
 
 
 def _meetings(vessels: Sequence[Vessel]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return for each pair of vessels a, b where their ways to the root meet.
+    """Return for each pair of vessels a, b where their paths to the root meet.
 
-    That is: the vessel that they meet on, the place (mm) where a's way enters it, and the length of a's way between
+    That is: the vessel that they meet on, the place (mm) where a's path enters it, and the length of a's path between
     the vessel a itself and that place, mm.
     """
     lengths = [shape.abscissa(vessel.points) for vessel in vessels]
-    ways: list[dict[int, tuple[float, float]]] = []
+    paths: list[dict[int, tuple[float, float]]] = []
     for vessel in vessels:
-        way, beyond = {}, 0.0
+        path, beyond = {}, 0.0
         while vessel.parent >= 0:
             entry = float(lengths[vessel.parent][vessel.origin])
-            way[vessel.parent] = (entry, beyond)
+            path[vessel.parent] = (entry, beyond)
             beyond += entry
             vessel = vessels[vessel.parent]
-        ways.append(way)
+        paths.append(path)
     count = len(vessels)
     common, entry, beyond = np.zeros((count, count), dtype=np.int64), np.zeros((count, count)), np.zeros((count, count))
     for a in range(count):
         for b in range(count):
-            meeting = next(vessel for vessel in (a, *ways[a]) if vessel in (b, *ways[b]))
+            meeting = next(vessel for vessel in (a, *paths[a]) if vessel in (b, *paths[b]))
             common[a, b] = meeting
-            entry[a, b], beyond[a, b] = ways[a].get(meeting, (0.0, 0.0))
+            entry[a, b], beyond[a, b] = paths[a].get(meeting, (0.0, 0.0))
     return common, entry, beyond

@@ -57,7 +57,7 @@ _COURSES = {
     "PCom": ((0.0, (-0.15, 0.95, 0.1)), (8.0, (-0.1, 1.0, 0.05))),
 }
 _PCOM_SHARE = 0.6
-"""Share of patients in whom the posterior communicating artery is wide enough to be seen: an assumption."""
+"""Share of patients in whom the posterior communicating artery is wide enough to be visible: an assumption."""
 _SHARPEST_PER_MM = 0.4
 """Greatest curvature of the carotid's axis, 1/mm: its wall must not fold."""
 
@@ -103,7 +103,7 @@ def _draw(
         vessels = [replace(vessel, points=vessel.points * np.array([-1.0, 1.0, 1.0])) for vessel in vessels]
     along = shape.abscissa(points)
     carotid = points[: marks["terminus"] + 1]
-    truth = {
+    drawn = {
         "side": side,
         "trunks": trunks,
         "siphon_length_mm": float(along[marks["terminus"]] - along[marks["cavernous"]]),
@@ -113,7 +113,7 @@ def _draw(
         "carotid_curvature_mean_per_mm": float(shape.curvature(carotid).mean()),
         "stenoses": stenoses,
     }
-    return build_tree(vessels, CEREBRAL_SECTIONS), truth
+    return build_tree(vessels, CEREBRAL_SECTIONS), drawn
 
 
 def _main(

@@ -66,7 +66,7 @@ def parallel_normals(
 
 
 def bend(points: Float[np.ndarray, "n 3"], axis: Float[np.ndarray, "3"], angle_rad: float) -> Float[np.ndarray, "n 3"]:
-    """Turn the tangents of a curve about `axis`, in proportion to the way along it, by `angle_rad` at its end."""
+    """Turn the tangents of a curve about `axis`, in proportion to the length along it, by `angle_rad` at its end."""
     share = (np.arange(len(points) - 1) + 0.5) / (len(points) - 1)
     steps = Rotation.from_rotvec(angle_rad * share[:, None] * axis).apply(np.diff(points, axis=0))
     return np.concatenate([points[:1], points[0] + np.cumsum(steps, axis=0)])
@@ -76,7 +76,7 @@ def bend(points: Float[np.ndarray, "n 3"], axis: Float[np.ndarray, "3"], angle_r
 class Wiggle:
     """A smooth random displacement along a curve: a sum of sines of random wavelength and phase.
 
-    Amplitudes grow as the wavelength to the power 1.5, so that no single wavelength rules the curvature.
+    Amplitudes grow as the wavelength to the power 1.5, so that no single wavelength dominates the curvature.
 
     Attributes:
         wave_number: 1/mm, one a mode.
@@ -126,7 +126,7 @@ def steer(
         direction: unit tangent there.
         courses: (abscissa from which it holds, mm; unit direction), in order.
         length_mm: length of the curve.
-        relaxation_mm: way over which the direction approaches the course by a factor e.
+        relaxation_mm: length over which the direction approaches the course by a factor e.
         depth: how deep points lie below the surface, mm; the curve seeks a height of `_HEIGHT_MM` above it. None for
             no surface.
     """

@@ -58,7 +58,7 @@ _GRID_LOW, _GRID_HIGH = np.array([-70.0, -110.0, -110.0]), np.array([110.0, 90.0
 
 @dataclass(frozen=True, eq=False)
 class HeartFit:
-    """The way from a patient to the reference heart: a similarity about the ostium, then a smooth warp.
+    """The map from a patient to the reference heart: a similarity about the ostium, then a smooth warp.
 
     The warp carries the patient's artery onto the reference course, so that chambers keep beside the artery.
 
@@ -99,7 +99,7 @@ class HeartFit:
         return points
 
     def solid_depth(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-        """Return how deep the patient's points lie in the heart or the great vessels' walls, mm, about."""
+        """Return how deep the patient's points lie in the heart or the great vessels' walls, approximately, mm."""
         place = (self.to_reference(points) - _GRID_LOW) / _GRID_MM
         return self.scale * map_coordinates(_solid_grid(), place.T[::-1], order=1, mode="nearest")
 
@@ -131,7 +131,7 @@ def fit_heart(main: Float[np.ndarray, "n 3"], crux_mm: float, last_section: str)
 def fit_heart_along(lines: Sequence[Float[np.ndarray, "_ 3"]], courses: Sequence[Float[np.ndarray, "_ 3"]]) -> HeartFit:
     """Fit the reference heart to the main vessels of a tree, as far as they go.
 
-    A patient's point belongs to the reference point at the same way from the ostium, measured in sizes of the heart.
+    A patient's point belongs to the reference point at the same length from the ostium, relative to the heart's size.
 
     Args:
         lines: the patient's main vessels, each from the ostium, LPS mm.
@@ -142,10 +142,10 @@ def fit_heart_along(lines: Sequence[Float[np.ndarray, "_ 3"]], courses: Sequence
     for _ in range(4):
         course, reference = [], []
         for line, ideal in zip(lines, courses, strict=True):
-            along, way = shape.abscissa(line), shape.abscissa(ideal)
-            places = np.linspace(0.0, min(way[-1], along[-1] / scale), 16)
+            along, ideal_along = shape.abscissa(line), shape.abscissa(ideal)
+            places = np.linspace(0.0, min(ideal_along[-1], along[-1] / scale), 16)
             course.append(_at(line, along, scale * places))
-            reference.append(_at(ideal, way, places))
+            reference.append(_at(ideal, ideal_along, places))
         found, wanted = np.concatenate(course) - ostium, np.concatenate(reference) - anchor
         rotation, scale = _similarity(found, wanted)
     origin = ostium - scale * rotation @ anchor

@@ -168,7 +168,7 @@ def _draw(generator: np.random.Generator, dominance: str, stenosis_share: float)
     vessels = with_side_branches(generator, vessels, plans)
     tree = build_tree(vessels, LCA_SECTIONS)
     along, bends = shape.abscissa(lad.points), shape.curvature(lad.points)
-    truth = {
+    drawn = {
         "dominance": dominance,
         "ramus": any(plan.section == "16" for plan in plans),
         "length_mm": float(along[-1]),
@@ -179,7 +179,7 @@ def _draw(generator: np.random.Generator, dominance: str, stenosis_share: float)
         "curvature_p90_per_mm": float(np.quantile(bends, 0.9)),
         "stenoses": stenoses,
     }
-    return tree, truth
+    return tree, drawn
 
 
 @cache
@@ -230,7 +230,7 @@ def _lad(generator: np.random.Generator, trunk: _Trunk, calibre: float) -> Vesse
     beyond = along - along[trunk.fork]
     whole = trunk.size * float(shape.abscissa(_templates()[0])[-1])
     own = PchipInterpolator(list(LAD_DIAMETER_MM), list(LAD_DIAMETER_MM.values()))(np.clip(beyond / whole, 0, 1))
-    # The left main's lumen gives way to that of the anterior descending artery just behind the fork.
+    # The left main's lumen changes into that of the anterior descending artery just behind the fork.
     share = np.clip((beyond + 1.0) / 4.0, 0.0, 1.0)
     diameter = LEFT_MAIN_DIAMETER_MM + (own - LEFT_MAIN_DIAMETER_MM) * share**2 * (3 - 2 * share)
     return Vessel(trunk.lad, 0.5 * diameter * calibre * uneven(generator, along), ())

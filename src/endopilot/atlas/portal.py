@@ -2,7 +2,7 @@
 
 This is the tree that a device explores once it stands in the portal vein, through a transjugular intrahepatic
 portosystemic shunt (TIPS), the spleen or the liver: it enters at the confluence of the splenic and the superior
-mesenteric vein and runs with the blood. The way there, vena cava, hepatic vein and the tract through the liver, is left
+mesenteric vein and runs with the blood. The access, vena cava, hepatic vein and the tract through the liver, is left
 out: it is no vessel before it is made.
 
 Facts and their sources: the portal vein is about 80 mm long and up to 13 mm wide (Gray's Anatomy); it bifurcates in
@@ -104,13 +104,13 @@ def _draw(
         which, shares = (0, (0.3 * share, 0.8 * share)) if generator.random() < 0.6 else (1, (0.3, 0.5))
         stenosis, vessels = narrowed(generator, vessels, which, shares)
         stenoses.append(stenosis)
-    truth = {
+    drawn = {
         "variant": variant,
         "main_length_mm": float(shape.abscissa(points)[min(left, posterior)]),
         "main_diameter_mm": diameter,
         "stenoses": stenoses,
     }
-    return build_tree(vessels, PORTAL_SECTIONS), truth
+    return build_tree(vessels, PORTAL_SECTIONS), drawn
 
 
 def _main(generator: np.random.Generator, main_mm: float, size: float) -> tuple[Float[np.ndarray, "n 3"], int]:

@@ -2,7 +2,7 @@
 
 Facts and their sources: the course, see `heart_reference`; lumen diameters by dominance, Dodge JT et al., "Lumen
 diameter of normal human coronary arteries", Circulation 1992;86:232-46; length, tortuosity, curvature, diameter along
-the way and the origins of branches, measured on sixteen manually segmented right coronary arteries (docs/atlas.md).
+the artery and the origins of branches, measured on sixteen manually segmented right coronary arteries (docs/atlas.md).
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ LENGTH_MM, LENGTH_SD_MM, LENGTH_RANGE_MM = 164.0, 30.0, (112.0, 223.0)
 TORTUOSITY, TORTUOSITY_SD = 2.07, 0.23
 CURVATURE, CURVATURE_SD = 0.061, 0.017
 DIAMETER_MM = {0.1: 4.0, 0.2: 3.8, 0.5: 3.5, 0.7: 2.7, 0.9: 2.3}
-"""Lumen diameter, mm, at fractions of the way from the ostium to the farthest tip."""
+"""Lumen diameter, mm, at fractions of the path from the ostium to the farthest tip."""
 
 _RIGHT_SHARE, _BALANCED_SHARE = 0.88, 0.06
 """Shares of right and balanced dominance; the rest is left. Chosen within the range that the literature reports."""
@@ -101,7 +101,7 @@ class _Targets:
 def make_rca(generator: np.random.Generator, stenosis_share: float) -> tuple[VesselTree, dict[str, Any]]:
     """Return one right coronary tree and what was drawn for it.
 
-    Targets outlive failed draws of the shape, lest the failures bias the statistics.
+    Targets are kept when a shape fails, so that failures do not bias the statistics.
 
     Args:
         generator: random stream of this patient.
@@ -146,7 +146,7 @@ def _draw(
     vessels = [Vessel(main, radius, _main_sections(main, crux, targets.ends_in))]
     tree = build_tree(with_side_branches(generator, vessels, plans), RCA_SECTIONS)
     bends = shape.curvature(main)
-    truth = {
+    drawn = {
         "dominance": targets.dominance,
         "length_mm": float(shape.abscissa(main)[-1]),
         "tortuosity": shape.tortuosity(main),
@@ -154,7 +154,7 @@ def _draw(
         "curvature_p90_per_mm": float(np.quantile(bends, 0.9)),
         "stenoses": [] if narrowed is None else [narrowed],
     }
-    return tree, truth
+    return tree, drawn
 
 
 def _dominance(u: float) -> str:
@@ -162,7 +162,7 @@ def _dominance(u: float) -> str:
 
 
 def _main_vessel(generator: np.random.Generator, targets: _Targets) -> tuple[Float[np.ndarray, "n 3"], int]:
-    """Return the way from the ostium to the farthest tip, and the index of the crux on it.
+    """Return the path from the ostium to the farthest tip, and the index of the crux on it.
 
     Size, closure of the C and amplitude of the wiggles are solved for so that length, tortuosity and mean curvature
     take the drawn values.
@@ -221,7 +221,7 @@ def _main_radius(
 
 
 def _main_sections(main: Float[np.ndarray, "n 3"], crux: int, ends_in: str) -> list[str]:
-    """Label the main vessel: the acute margin lies 64 % of the way to the crux (Dodge 1988, R2 distal)."""
+    """Label the main vessel: the acute margin lies 64 % of the path to the crux (Dodge 1988, R2 distal)."""
     margin = round(0.64 * crux)
     place = np.arange(len(main))
     names = np.select([place <= margin // 2, place <= margin, place <= crux], ["1", "2", "3"], default=ends_in)

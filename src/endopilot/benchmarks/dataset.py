@@ -8,7 +8,8 @@ from typing import Any
 from endopilot import __version__
 from endopilot.anatomy.io import write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.dataset.generate import DatasetConfig, generate_dataset
+from endopilot.dataset.config import DatasetConfig
+from endopilot.dataset.generate import generate_dataset
 from endopilot.dataset.schema import MANIFEST_PATH
 from endopilot.errors import InputError
 from endopilot.files import processor_name, read_json

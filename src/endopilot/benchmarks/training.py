@@ -14,7 +14,8 @@ from torch.utils.data import DataLoader, TensorDataset
 from endopilot import __version__
 from endopilot.anatomy.io import write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.dataset.generate import DatasetConfig, generate_dataset
+from endopilot.dataset.config import DatasetConfig
+from endopilot.dataset.generate import generate_dataset
 from endopilot.dataset.loader import load_dataset
 from endopilot.models.checkpoint import make_network
 from endopilot.models.config import TrainConfig

@@ -7,7 +7,8 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from endopilot.cli.arguments import OutputFolder, existing, show
-from endopilot.dataset.generate import DatasetConfig, generate_dataset
+from endopilot.dataset.config import DatasetConfig
+from endopilot.dataset.generate import generate_dataset
 from endopilot.files import read_json
 from endopilot.simulation.device import read_device
 

@@ -1,4 +1,4 @@
-"""One block of navigations, from the draw to its two files: `write_block`, the work of a thread or of a cluster."""
+"""One block of navigations, drawn, simulated and written to two files: `write_block`."""
 
 from __future__ import annotations
 
@@ -15,30 +15,32 @@ from jaxtyping import Bool
 from endopilot.anatomy.io import read_anatomy
 from endopilot.dataset import parquet, schema
 from endopilot.dataset.draw import Draw, draw_navigations
+from endopilot.dataset.layout import Block, BlockContext
 from endopilot.dataset.navigations import simulate_navigations
-from endopilot.dataset.study import Block, Plan
 from endopilot.errors import InputError
 from endopilot.files import writing
 from endopilot.simulation.simulate import why_invalid
 from endopilot.types import Anatomy, Rollout
 
 
-def write_block(plan: Plan, block: Block, *, threads: int = 1, advance: Callable[[int], None] = lambda _: None) -> None:
-    """Simulate one block and write its episodes, then its samples: the sample file says that both are whole.
+def write_block(
+    context: BlockContext, block: Block, *, threads: int = 1, advance: Callable[[int], None] = lambda _: None
+) -> None:
+    """Simulate one block and write its episodes, then its samples: the sample file marks both as complete.
 
     Args:
-        plan: what all blocks share.
+        context: what all blocks share.
         block: which navigations.
         threads: of the rod core.
         advance: called with the number of samples that were simulated since the last call.
     """
-    config, anatomy = plan.config, _read(block.folder, block.fingerprint)
-    draw = draw_navigations(config, plan.device, anatomy, block.sequences)
+    config, anatomy = context.config, _read(block.folder, block.identity)
+    draw = draw_navigations(config, context.device, anatomy, block.sequences)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # invalid worlds are listed in the dataset's manifest
         rollout, applied, stopped = simulate_navigations(
             anatomy,
-            draw.devices(plan.device),
+            draw.devices(context.device),
             draw.initial,
             draw.control,
             draw.friction,
@@ -46,10 +48,10 @@ def write_block(plan: Plan, block: Block, *, threads: int = 1, advance: Callable
             actuation=config.control,
             advance=advance,
         )
-    data_path, episodes_path = schema.paths_of_file(plan.output, block.number)
-    samples = parquet.sample_table(rollout, applied, config.control, block.first_episode, plan.key)
+    data_path, episodes_path = schema.paths_of_file(context.output, block.number)
+    samples = parquet.sample_table(rollout, applied, config.control, block.first_episode, context.key)
     for path, table in (
-        (episodes_path, parquet.episode_table(_episodes(plan, block, draw, rollout, stopped), plan.key)),
+        (episodes_path, parquet.episode_table(_episodes(context, block, draw, rollout, stopped), context.key)),
         (data_path, samples),
     ):
         with writing(path) as partial:
@@ -57,19 +59,21 @@ def write_block(plan: Plan, block: Block, *, threads: int = 1, advance: Callable
 
 
 @lru_cache(maxsize=4)
-def _read(folder: Path, fingerprint: str) -> Anatomy:
-    """Read an anatomy; the blocks of one come one after the other.
+def _read(folder: Path, identity: str) -> Anatomy:
+    """Read an anatomy; the blocks of one anatomy follow each other.
 
     Raises:
-        InputError: it is another one than the dataset was begun with.
+        InputError: it is not the anatomy that the dataset was begun with.
     """
     anatomy = read_anatomy(folder)
-    if anatomy.identity != fingerprint:
-        raise InputError(f"{folder}: is another anatomy than the dataset was begun with; put that one back")
+    if anatomy.identity != identity:
+        raise InputError(f"{folder}: is not the anatomy that the dataset was begun with; restore that anatomy")
     return anatomy
 
 
-def _episodes(plan: Plan, block: Block, draw: Draw, rollout: Rollout, stopped: Bool[np.ndarray, "n"]) -> dict[str, Any]:
+def _episodes(
+    context: BlockContext, block: Block, draw: Draw, rollout: Rollout, stopped: Bool[np.ndarray, "n"]
+) -> dict[str, Any]:
     """Return the columns of the episode table; the first seven and the last two are LeRobot's."""
     n, samples = rollout.valid.shape
     whole = [bool(valid.all()) for valid in rollout.valid]
@@ -84,10 +88,10 @@ def _episodes(plan: Plan, block: Block, draw: Draw, rollout: Rollout, stopped: B
         "data/chunk_index": np.full(n, chunk),
         "data/file_index": np.full(n, file),
         "anatomy": [block.anatomy] * n,
-        "anatomy_sha256": [block.fingerprint] * n,
+        "anatomy_sha256": [block.identity] * n,
         "sequence": np.array(block.sequences),
         "split": block.splits.tolist(),
-        "device": [plan.device.name] * n,
+        "device": [context.device.name] * n,
         "friction": draw.friction,
         "tip_bend_rad": draw.tip_bend_rad,
         "tip_stiffness_factor": draw.tip_stiffness_factor,

@@ -1,4 +1,4 @@
-"""The random part of a dataset: what every navigation is driven with, and through which wire.
+"""The random part of a dataset: controls, friction and tip of every navigation.
 
 Everything follows from the seed, the anatomy's name and the navigation's index, through random streams of their own.
 """
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.dataset.study import DatasetConfig
+from endopilot.dataset.config import DatasetConfig
 from endopilot.simulation.controls import free_wire_load, random_controls
 from endopilot.simulation.device import Device
 from endopilot.simulation.drive_limits import DriveLimits
@@ -26,7 +26,7 @@ than a free wire needs. It is drawn uniformly, and the result kept within the de
 
 @dataclass(frozen=True, eq=False)
 class Draw:
-    """What navigations are driven with.
+    """The drawn controls, friction and tips of navigations.
 
     Attributes:
         initial: Δ (mm) and φ (rad) before the first period.
@@ -94,7 +94,7 @@ def _within(bounds: tuple[float, float] | None, share: Float[np.ndarray, "n"]) -
 def _loads(
     config: DatasetConfig, device: Device, velocity: Float[np.ndarray, "n samples 2"]
 ) -> Float[np.ndarray, "n samples 2"]:
-    """Return the drive's loads (N, N·mm) that would move a free wire at these velocities, or as fast as it may go."""
+    """Return the drive's loads (N, N·mm) that would move a free wire at these velocities, within the drive's limits."""
     fastest = DriveLimits.of(device).fastest
     return free_wire_load(
         np.clip(velocity, -fastest, fastest),

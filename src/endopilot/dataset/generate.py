@@ -16,16 +16,17 @@ from pathlib import Path
 from typing import Any
 
 from endopilot.dataset import parquet, schema
+from endopilot.dataset.config import DatasetConfig
+from endopilot.dataset.layout import Block, Layout, make_layout
 from endopilot.dataset.splits import SPLITS
-from endopilot.dataset.study import Block, DatasetConfig, Study, plan_study
-from endopilot.dataset.workers import work_here, work_on_cluster
+from endopilot.dataset.workers import run_locally, run_on_cluster
 from endopilot.files import manifest, read_json, write_json, writing
 from endopilot.progress import progress
 from endopilot.runs import claim
 from endopilot.simulation.device import Device
 
 _WORK_PATH = "meta/work.json"
-"""What the files that are there have cost so far; it goes into the manifest when the dataset is whole."""
+"""What the files written so far have cost; it moves into the manifest when the dataset is complete."""
 
 
 def generate_dataset(
@@ -53,43 +54,43 @@ def generate_dataset(
             else or was begun with other settings, a scheduler that cannot be reached, or a full disk.
     """
     config = config or DatasetConfig()
-    study = plan_study([Path(folder) for folder in anatomy_folders], Path(output), device, config)
-    blocks = study.blocks()
-    claim(study.plan.output, "endopilot dataset", **study.settings)
-    if _is_finished(study, blocks):
+    layout = make_layout([Path(folder) for folder in anatomy_folders], Path(output), device, config)
+    blocks = layout.blocks()
+    claim(layout.context.output, "endopilot dataset", **layout.settings)
+    if _is_finished(layout, blocks):
         return
-    (study.plan.output / schema.MANIFEST_PATH).unlink(missing_ok=True)
-    missing = [block for block in blocks if not schema.paths_of_file(study.plan.output, block.number)[0].exists()]
+    (layout.context.output / schema.MANIFEST_PATH).unlink(missing_ok=True)
+    missing = [block for block in blocks if not schema.paths_of_file(layout.context.output, block.number)[0].exists()]
     samples, to_do = (sum(len(block.sequences) for block in some) * config.samples for some in (blocks, missing))
     with progress("Simulating navigations", total=samples) as advance:
         advance(samples - to_do)
-        ledger = _Ledger(study)
+        ledger = _Ledger(layout)
         simulated, start = 0, time.perf_counter()
 
-        def tell(amount: int) -> None:
+        def report(amount: int) -> None:
             nonlocal simulated
             simulated += amount
             advance(amount, f"{simulated / (time.perf_counter() - start):,.0f} samples/s")
 
-        def done_there(block: Block, seconds: float) -> None:
+        def done_remotely(block: Block, seconds: float) -> None:
             ledger.add(block, seconds)
-            tell(len(block.sequences) * config.samples)
+            report(len(block.sequences) * config.samples)
 
         if scheduler is None:
-            work_here(study.plan, missing, ledger.add, tell)
+            run_locally(layout.context, missing, ledger.add, report)
         else:
-            there = [replace(block, folder=block.folder.resolve()) for block in missing]
-            plan = replace(study.plan, output=study.plan.output.resolve())
-            work_on_cluster(plan, there, done_there, scheduler)
-    _finish(study, blocks)
+            remote = [replace(block, folder=block.folder.resolve()) for block in missing]
+            context = replace(layout.context, output=layout.context.output.resolve())
+            run_on_cluster(context, remote, done_remotely, scheduler)
+    _finish(layout, blocks)
 
 
 class _Ledger:
-    """Keeps what the files have cost, also over interruptions."""
+    """The cost of the files, kept over interruptions."""
 
-    def __init__(self, study: Study) -> None:
-        self._path, self._samples = study.plan.output / _WORK_PATH, study.plan.config.samples
-        self._cost = read_work(study.plan.output)
+    def __init__(self, layout: Layout) -> None:
+        self._path, self._samples = layout.context.output / _WORK_PATH, layout.context.config.samples
+        self._cost = read_work(layout.context.output)
         self._then = time.perf_counter()
 
     def add(self, block: Block, processor_seconds: float) -> None:
@@ -107,57 +108,57 @@ def read_work(output: Path) -> dict[str, Any]:
     return read_json(path) if path.exists() else {"samples": 0, "processor_seconds": 0.0, "wall_seconds": 0.0}
 
 
-def _is_finished(study: Study, blocks: Sequence[Block]) -> bool:
+def _is_finished(layout: Layout, blocks: Sequence[Block]) -> bool:
     """Return whether the manifest, which is written last, and all other files are there."""
-    output = study.plan.output
+    output = layout.context.output
     files = [file for block in blocks for file in schema.paths_of_file(output, block.number)]
     described = (schema.INFO_PATH, schema.STATS_PATH, schema.TASKS_PATH, schema.MANIFEST_PATH)
     return all(file.exists() for file in (*files, *(output / name for name in described)))
 
 
-def _finish(study: Study, blocks: Sequence[Block]) -> None:
-    """Write what describes the whole: statistics, task, info, and last the manifest."""
+def _finish(layout: Layout, blocks: Sequence[Block]) -> None:
+    """Write what describes the whole dataset: statistics, task, info, and last the manifest."""
     import pandas as pd  # slow to import, and only needed here
 
-    plan = study.plan
-    files = [schema.paths_of_file(plan.output, block.number) for block in blocks]
+    context = layout.context
+    files = [schema.paths_of_file(context.output, block.number) for block in blocks]
     columns = ("episode_index", "anatomy", "sequence", "split", "stopped_short", "valid", "invalid_reason")
-    episodes = [row for _, path in files for row in parquet.read_table(path, plan.key).select(columns).to_pylist()]
+    episodes = [row for _, path in files for row in parquet.read_table(path, context.key).select(columns).to_pylist()]
     started = time.process_time()
     with progress("Describing the dataset", total=len(files)) as advance:
-        stats, shares = parquet.statistics(plan.config.control, [path for path, _ in files], plan.key, advance)
-    work = read_work(plan.output)
+        stats, shares = parquet.statistics(context.config.control, [path for path, _ in files], context.key, advance)
+    work = read_work(context.output)
     work["processor_seconds"] += time.process_time() - started
-    write_json(plan.output / schema.STATS_PATH, stats)
+    write_json(context.output / schema.STATS_PATH, stats)
     tasks = pd.DataFrame({"task_index": [0]}, index=pd.Index([schema.TASK], name="task"))
-    with writing(plan.output / schema.TASKS_PATH) as partial:
+    with writing(context.output / schema.TASKS_PATH) as partial:
         tasks.to_parquet(partial)
-    samples = plan.config.samples
-    write_json(plan.output / schema.INFO_PATH, schema.info(plan.config.control, len(episodes), samples))
-    told = ("episode_index", "anatomy", "sequence", "invalid_reason")
-    invalid = [{name: row[name] for name in told} for row in episodes if not row["valid"]]
+    samples = context.config.samples
+    write_json(context.output / schema.INFO_PATH, schema.info(context.config.control, len(episodes), samples))
+    reported = ("episode_index", "anatomy", "sequence", "invalid_reason")
+    invalid = [{name: row[name] for name in reported} for row in episodes if not row["valid"]]
     counts = Counter(row["split"] for row in episodes)
     record = manifest(
-        config=plan.config,
-        seed=plan.config.seed,
-        inputs=dict(zip(study.names, study.fingerprints, strict=True)),
-        key=plan.key,
-        settings=study.settings,
+        config=context.config,
+        seed=context.config.seed,
+        inputs=dict(zip(layout.names, layout.identities, strict=True)),
+        key=context.key,
+        settings=layout.settings,
         files=len(files),
         samples_per_episode=samples,
-        device=asdict(plan.device),
-        anatomies=[_anatomy_record(study, i) for i in range(len(study.names))],
+        device=asdict(context.device),
+        anatomies=[_anatomy_record(layout, i) for i in range(len(layout.names))],
         splits={name: counts[name] for name in SPLITS if counts[name]},
         manoeuvres=shares,
         stopped_short=sum(row["stopped_short"] for row in episodes),
         invalid={"episodes": len(invalid), "which": invalid},
         work=work,
     )
-    write_json(plan.output / schema.MANIFEST_PATH, record)
-    (plan.output / _WORK_PATH).unlink(missing_ok=True)
+    write_json(context.output / schema.MANIFEST_PATH, record)
+    (context.output / _WORK_PATH).unlink(missing_ok=True)
 
 
-def _anatomy_record(study: Study, index: int) -> dict[str, Any]:
-    """Return name, folder as seen from the dataset, and fingerprint of an anatomy."""
-    folder = os.path.relpath(study.folders[index].resolve(), study.plan.output.resolve())
-    return {"name": study.names[index], "folder": folder, "sha256": study.fingerprints[index]}
+def _anatomy_record(layout: Layout, index: int) -> dict[str, Any]:
+    """Return name, folder relative to the dataset, and identity of an anatomy."""
+    folder = os.path.relpath(layout.folders[index].resolve(), layout.context.output.resolve())
+    return {"name": layout.names[index], "folder": folder, "sha256": layout.identities[index]}

@@ -44,7 +44,7 @@ class Histogram:
         self.counts[:] += np.histogram(inside, self.edges)[0]
 
     def quantiles(self) -> dict[str, float]:
-        """Return the 5th, 50th, 95th and 99th percentile, as exact as the bins are fine."""
+        """Return the 5th, 50th, 95th and 99th percentile, to within a bin."""
         below = np.append(0.0, np.cumsum(self.counts)) / max(self.counts.sum(), 1.0)
         return {name: round(float(np.interp(q, below, self.edges)), 5) for name, q in _QUANTILES.items()}
 
@@ -131,7 +131,7 @@ def _empty(deepest_mm: float) -> dict[str, Histogram]:
 
 
 def _count(table, wire_mm: float, histograms: dict[str, Histogram], visits: Counter[int], samples: int) -> None:
-    """Count one file's valid samples, and the branches that each valid navigation came to."""
+    """Count one file's valid samples, and the branches that each valid navigation reached."""
     valid = parquet.column_values(table, "valid")
     state = parquet.column_values(table, "observation.state")[valid].astype(float)
     radius = parquet.column_values(table, "lumen_radius_mm")[valid].astype(float)
@@ -177,7 +177,7 @@ def _histogram_figure(histogram: Histogram, *, logarithmic: bool):
     wide = histogram.edges[::8] if not logarithmic else np.append(0.0, histogram.edges[1::8])
     counts = np.add.reduceat(histogram.counts, np.searchsorted(histogram.edges, wide[:-1]))
     share = 100 * counts / max(counts.sum(), 1)
-    if logarithmic:  # the first bin, without any force, has no place on the axis: it is told
+    if logarithmic:  # the first bin, without any force, has no place on the axis: the title states it
         wide, none, share = wide[1:], share[0], share[1:]
         axes.set_xscale("log")
         axes.set_title(f"below {1e3 * wide[0]:g} mN in {none:.1f} % of the samples", fontsize=10)

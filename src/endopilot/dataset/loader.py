@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
+from endopilot.dataset.layout import identify, version
 from endopilot.dataset.schema import (
     INFO_PATH,
     LEROBOT_VERSION,
@@ -17,7 +18,6 @@ from endopilot.dataset.schema import (
     paths_of_file,
     signals,
 )
-from endopilot.dataset.study import identify, version
 from endopilot.errors import InputError
 from endopilot.extras import extra_named
 from endopilot.files import read_json
@@ -41,7 +41,7 @@ class Dataset:
         tip_stiffness_factor: factor on the stiffness of the device's distal 10 mm.
         initial_inserted_length: Δ before the first period, mm.
         initial_rotation: φ before the first period, rad.
-        control: π = (dΔ/dt mm/s, dφ/dt rad/s): what was applied, or what came of the force and torque that were.
+        control: π = (dΔ/dt mm/s, dφ/dt rad/s): the applied velocity, or that which resulted from force and torque.
         inserted_length: Δ, mm.
         rotation: φ, rad, unwrapped.
         tip_abscissa: Δtip, mm.
@@ -56,7 +56,7 @@ class Dataset:
         base_torque: torque of the drive, N·mm.
         drive_force: axial force of the drive with what the introducer's valve takes, N.
         drive_torque: torque of the drive, likewise, N·mm.
-        slip: advance that was asked of the drive and not made over the period, mm; nearly always 0.
+        slip: advance that was commanded and not made over the period, mm; nearly always 0.
         valid: false from the sample in which the simulation of that episode failed.
     """
 
@@ -95,8 +95,8 @@ class Dataset:
         return len(self.anatomy)
 
     @property
-    def asked(self) -> Float[np.ndarray, "episodes samples 2"]:
-        """Control that was asked of the drive (mm/s, rad/s): `control`, and what the drive slipped by.
+    def command(self) -> Float[np.ndarray, "episodes samples 2"]:
+        """Control that the drive was commanded (mm/s, rad/s): `control` and the slip of the drive.
 
         Simulated again it gives the same navigation to the bit, which `control` does not: a drive that pushes at one
         speed until it slips strains the wire otherwise than one that is slower from the start.
@@ -132,7 +132,7 @@ class Dataset:
         """Return the folder of an anatomy of the dataset.
 
         Raises:
-            InputError: there is no anatomy any more, or another one than the dataset was made in.
+            InputError: the anatomy is missing, or is another one than the dataset was made in.
         """
         record = next(record for record in self.manifest["anatomies"] if record["name"] == name)
         folder = (self.folder / record["folder"]).resolve()
@@ -144,7 +144,7 @@ class Dataset:
 def commanded(
     control: Float[np.ndarray, "*n 2"], slip_mm: Float[np.ndarray, "*n"], sample_period_s: float
 ) -> Float[np.ndarray, "*n 2"]:
-    """Return the control that was commanded (mm/s, rad/s), from what the drive made of it and what it slipped by."""
+    """Return the control that was commanded (mm/s, rad/s), from the motion of the drive and its slip."""
     command = control.astype(float)
     command[..., 0] += slip_mm / sample_period_s
     return command.astype(control.dtype).astype(float)

@@ -1,10 +1,10 @@
 """Random navigations of one anatomy that stay inside the vessel that was imaged.
 
 A segmented vessel ends where the scan no longer shows it, not where blood stops: a wire that is pushed against that end
-buckles against a wall that is not there. So the drive looks at the tip before every sample, as an operator does: it
-pushes no farther than shortly before the end of the branch that the tip lies in. From there, and where the wire is
-caught, it pulls where it was to push, until the wire is well back. Simulating the recorded controls without looking
-gives the same navigation again.
+buckles against a wall that does not exist. So before every sample the drive checks the tip, as an operator does: it
+stops pushing shortly before the end of the tip's branch. There, and where the wire is caught, it pulls instead of
+pushing until the wire has come back far enough. Simulating the recorded controls without these checks gives the same
+navigation again.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ PULL_BACK_MM = 15.0
 CAUGHT = 0.5
 """Share of the device's push limit at which a wire counts as caught."""
 _ROUNDING_MM = 1e-2
-"""A wire that is this near to where it had to be pulled back to has been."""
+"""A wire this near to its pull-back target counts as pulled back."""
 
 
 def simulate_navigations(
@@ -56,10 +56,10 @@ def simulate_navigations(
         advance: called after each sample with the number of worlds.
 
     Returns:
-        What happened; the controls that were applied, rounded to float32 as the disk keeps them; and which worlds were
+        The rollout; the controls that were applied, rounded to float32 as they are stored; and which worlds were
         stopped short.
     """
-    watch = _Watch(anatomy.tree, devices)
+    watch = _PushRoom(anatomy.tree, devices)
     simulator = Simulator(anatomy, list(devices), actuation=actuation, config=config)
     started = _begin(simulator, watch, initial, friction)
     applied, stopped = np.empty_like(control), np.zeros(len(control), dtype=bool)
@@ -84,7 +84,7 @@ def simulate_navigations(
     return make_rollout(anatomy, actuation, started, applied, result), applied, stopped
 
 
-class _Watch:
+class _PushRoom:
     """How far each wire may still be pushed.
 
     Attributes:
@@ -107,7 +107,7 @@ class _Watch:
         needed: Float[np.ndarray, "worlds"],
         caught: Bool[np.ndarray, "worlds"],
     ) -> Float[np.ndarray, "worlds"]:
-        """Return the advance (mm) that is left to each wire; 0 where it is `needed` or less, and until it is back."""
+        """Return the advance (mm) that is left to each wire; 0 where it is `needed` or less, or until it is back."""
         ahead = np.minimum(self.deepest_mm - inserted, self.ahead(tip))
         stop = caught | (ahead <= np.maximum(needed, _ROUNDING_MM))
         back = np.maximum(inserted - PULL_BACK_MM, 0.0)
@@ -123,11 +123,11 @@ class _Watch:
 
 def _begin(
     simulator: Simulator,
-    watch: _Watch,
+    watch: _PushRoom,
     initial: Float[np.ndarray, "worlds 2"],
     friction: Float[np.ndarray, "worlds"],
 ) -> Float[np.ndarray, "worlds 2"]:
-    """Push the wires to their first inserted length, or as deep as they come freely, and return Δ and φ there."""
+    """Push the wires to their first inserted length, or as deep as they go freely, and return Δ and φ there."""
     start, again = np.minimum(initial[:, 0], watch.deepest_mm), np.arange(len(initial))
     while True:
         simulator.reset(inserted_length=start, rotation=initial[:, 1], friction=friction, worlds=again.tolist())

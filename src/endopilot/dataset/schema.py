@@ -1,4 +1,4 @@
-"""The columns of a dataset on disk: LeRobot v3, with what a guidewire adds.
+"""The columns of a dataset on disk: LeRobot v3, with the columns of a guidewire.
 
 The layout is that of `LeRobotDataset` v3.0 (https://huggingface.co/docs/lerobot/lerobot-dataset-v3): samples of many
 episodes in one Parquet file, an episode table that says where each lies, and JSON files that describe both.
@@ -26,7 +26,7 @@ MANIFEST_PATH = "meta/manifest.json"
 TASK = "random navigation"
 
 INDEX_COLUMNS = ("index", "episode_index", "frame_index", "task_index")
-"""Integer columns that LeRobot asks for; `timestamp` (s, float32) is the fifth."""
+"""Integer columns that LeRobot requires; `timestamp` (s, float32) is the fifth."""
 
 VELOCITY = ["translation_mm_s", "rotation_rad_s"]
 LOAD = ["drive_force_n", "drive_torque_nmm"]
@@ -42,7 +42,7 @@ _SIGNALS: dict[str, tuple[str, list[str] | None]] = {
     "base_torque_nmm": ("float32", None),
     "drive_force_n": ("float32", None),
     "drive_torque_nmm": ("float32", None),
-    "slip_mm": ("float64", None),  # with all its digits, so that `Dataset.asked` is exact; nearly all are 0
+    "slip_mm": ("float64", None),  # with all its digits, so that `Dataset.command` is exact; nearly all are 0
     "valid": ("bool", None),
 }
 MANOEUVRES = ("insertion", "retraction", "spin", "pause")
@@ -53,8 +53,8 @@ _MOVES_MM_S, _TURNS_RAD_S = 0.1, 0.02
 def signals(actuation: Actuation) -> dict[str, tuple[str, list[str] | None]]:
     """Return the name of each simulated column, its type, and the names of its components if it is a vector.
 
-    `action` is the control that was applied. The velocity that came of a force stands in `velocity`; the load that a
-    velocity took in `drive_force_n` and `drive_torque_nmm`, which are there either way.
+    `action` is the control that was applied. Under force control, `velocity` is the resulting velocity. The load of
+    the drive is always in `drive_force_n` and `drive_torque_nmm`.
     """
     velocity = {"velocity": ("float32", VELOCITY)} if actuation == "force" else {}
     return {"action": ("float32", LOAD if actuation == "force" else VELOCITY), **velocity, **_SIGNALS}
@@ -93,7 +93,7 @@ def paths_of_file(folder: Path, number: int) -> tuple[Path, Path]:
 def info(actuation: Actuation, episodes: int, samples_per_episode: int) -> dict[str, Any]:
     """Return the content of `meta/info.json`.
 
-    LeRobot's `splits` are ranges of episodes, which ours are not: they stand in the episode table, column `split`.
+    LeRobot's `splits` are ranges of episodes, which ours are not: they are in the episode table, column `split`.
     """
     return {
         "codebase_version": LEROBOT_VERSION,

@@ -1,8 +1,8 @@
-"""Which episodes train, which calibrate and which test: fixed by hash, never by chance or by order.
+"""Which episodes train, which calibrate and which test: fixed by hash, not by chance or order.
 
-Two splits are nested. By anatomy, whole patients go to train, calibrate or test, so that nothing of a test patient is
-ever seen. Within the train patients, some navigations are held out as `seen_test`: new controls on known vessels,
-the paper's likely reading of its 80/20 split.
+Two splits are nested. By anatomy, whole patients go to train, calibrate or test, so that no data of a test
+patient are used before. Within the train patients, some navigations are held out as `seen_test`: new controls on
+known vessels, the paper's likely reading of its 80/20 split.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def assign_splits(
         seen_test_share: share of the sequences of a train anatomy that are held out as `seen_test`.
 
     Raises:
-        InputError: too few anatomies for the splits that were asked for, or too few sequences.
+        InputError: too few anatomies for the requested splits, or too few sequences.
     """
     if anatomy_shares is None:
         anatomy_shares = (1.0, 0.0, 0.0) if len(names) == 1 else DEFAULT_ANATOMY_SHARES
@@ -61,13 +61,13 @@ def assign_splits(
 
 def _counts(n: int, shares: tuple[float, float, float]) -> list[int]:
     """Turn shares into counts: one for each positive share, the rest by the largest shortfall (first split first)."""
-    asked = [share > 0 for share in shares]
-    if n < sum(asked):
+    wanted = [share > 0 for share in shares]
+    if n < sum(wanted):
         raise InputError(
-            f"anatomy_shares: {n} anatomies cannot fill {sum(asked)} splits (train, calibrate, test = {shares}); "
-            f"give at least {sum(asked)} anatomies or set a share to 0"
+            f"anatomy_shares: {n} anatomies cannot fill {sum(wanted)} splits (train, calibrate, test = {shares}); "
+            f"give at least {sum(wanted)} anatomies or set a share to 0"
         )
-    counts = [int(is_asked) for is_asked in asked]
+    counts = [int(share) for share in wanted]
     while sum(counts) < n:
         shortfall = [n * share - count for share, count in zip(shares, counts, strict=True)]
         counts[shortfall.index(max(shortfall))] += 1

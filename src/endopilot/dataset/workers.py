@@ -1,4 +1,4 @@
-"""Who simulates the blocks of a dataset: the cores of this machine, or the workers of a Dask cluster."""
+"""Simulate the blocks of a dataset on the cores of this machine or on the workers of a Dask cluster."""
 
 from __future__ import annotations
 
@@ -9,44 +9,44 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from functools import partial
 
 from endopilot.dataset.block import write_block
-from endopilot.dataset.study import Block, Plan, version
+from endopilot.dataset.layout import Block, BlockContext, version
 from endopilot.errors import InputError
 from endopilot.parallel import CORES
 
 Done = Callable[[Block, float], None]
 """Called with each block that has been written and the processor time that it took, s."""
-_PATIENCE_S = 10
-"""Time in which a scheduler must answer, s."""
+_CONNECT_TIMEOUT_S = 10
+"""Time limit for a scheduler to answer, s."""
 
 
-class _Stopped(Exception):
-    """Ends the threads of a run that was interrupted or has failed."""
+class _Interrupted(Exception):
+    """Ends the threads of an interrupted or failed run."""
 
 
-def work_here(plan: Plan, blocks: Sequence[Block], done: Done, advance: Callable[[int], None]) -> None:
+def run_locally(context: BlockContext, blocks: Sequence[Block], done: Done, advance: Callable[[int], None]) -> None:
     """Write blocks with one thread each, as many at a time as there are cores.
 
-    Where there are fewer blocks than cores, the rod core has the others.
+    Where there are fewer blocks than cores, the rod core uses the remaining cores.
 
     Args:
-        plan: what all blocks share.
+        context: what all blocks share.
         blocks: what to write.
         done: called after each block.
         advance: called with the number of samples simulated since the last call.
     """
-    cores = plan.config.simulator.threads or CORES
+    cores = context.config.simulator.threads or CORES
     workers = max(1, min(cores, len(blocks)))
     threads = cores // workers
     stop = threading.Event()
 
-    def go_on(samples: int) -> None:
+    def report(samples: int) -> None:
         if stop.is_set():
-            raise _Stopped
+            raise _Interrupted
         advance(samples)
 
     started = time.process_time()
     with ThreadPoolExecutor(workers) as pool:
-        futures = {pool.submit(write_block, plan, b, threads=threads, advance=go_on): b for b in blocks}
+        futures = {pool.submit(write_block, context, b, threads=threads, advance=report): b for b in blocks}
         try:
             for future in as_completed(futures):
                 future.result()
@@ -59,13 +59,13 @@ def work_here(plan: Plan, blocks: Sequence[Block], done: Done, advance: Callable
             raise
 
 
-def work_on_cluster(plan: Plan, blocks: Sequence[Block], done: Done, scheduler: str) -> None:
-    """Write blocks on the workers of a Dask cluster, which must see the same folders.
+def run_on_cluster(context: BlockContext, blocks: Sequence[Block], done: Done, scheduler: str) -> None:
+    """Write blocks on the workers of a Dask cluster, which must have access to the same folders.
 
-    A worker that dies has its block done by another.
+    If a worker dies, another one does its block.
 
     Args:
-        plan: what all blocks share.
+        context: what all blocks share.
         blocks: what to write.
         done: called after each block.
         scheduler: address, such as tcp://host:8786.
@@ -79,14 +79,14 @@ def work_on_cluster(plan: Plan, blocks: Sequence[Block], done: Done, scheduler: 
     except ImportError as error:
         raise InputError("scheduler: needs Dask; install it with pip install 'endopilot[cluster]'") from error
     try:
-        client = distributed.Client(scheduler, timeout=_PATIENCE_S)
+        client = distributed.Client(scheduler, timeout=_CONNECT_TIMEOUT_S)
     except (OSError, ValueError, TimeoutError) as error:
         raise InputError(
             f"scheduler: {scheduler} cannot be reached; check the address, and that `dask scheduler` runs there"
         ) from error
     with client:
         _check_versions(client, scheduler)
-        futures = {client.submit(partial(_timed, plan), block, pure=False, retries=0): block for block in blocks}
+        futures = {client.submit(partial(_timed, context), block, pure=False, retries=0): block for block in blocks}
         try:
             for future in distributed.as_completed(futures):
                 done(futures[future], future.result())
@@ -111,8 +111,8 @@ def _check_versions(client, scheduler: str) -> None:
             raise InputError(f"scheduler: worker {worker} has {other}, here is {version()}; install the same")
 
 
-def _timed(plan: Plan, block: Block) -> float:
+def _timed(context: BlockContext, block: Block) -> float:
     """Write a block and return the processor time that it took, s."""
     started = time.process_time()
-    write_block(plan, block)
+    write_block(context, block)
     return time.process_time() - started

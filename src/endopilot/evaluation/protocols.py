@@ -65,7 +65,7 @@ def run_protocols(predictor: Predictor, data: Dataset, training: Dataset | None,
     planned = {name: controls[source] for name, source in replayed.items()}
     planned["P4_replanned"] = replanned(predictor, recorded, episodes, predicted["dual"], advance)
     driven = {name: recorded.drivable(control) for name, control in planned.items()}
-    replays = replay(recorded, driven | dict.fromkeys(REPLAYED, data.asked[:, WINDOW:]), advance)
+    replays = replay(recorded, driven | dict.fromkeys(REPLAYED, data.command[:, WINDOW:]), advance)
     return SplitResult(
         sample_period_s=data.sample_period_s,
         anatomies=recorded.names,

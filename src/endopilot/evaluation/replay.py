@@ -100,7 +100,7 @@ class Recorded:
 
     def _whole(self, control: Control) -> Float[np.ndarray, "episodes all_samples 2"]:
         """Return the recorded commands while states are given, followed by `control`."""
-        return np.concatenate([self.data.asked[:, :WINDOW], control], axis=1)
+        return np.concatenate([self.data.command[:, :WINDOW], control], axis=1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -171,7 +171,7 @@ class Episodes:
 
     @property
     def command(self) -> Float[np.ndarray, "episodes samples 2"]:
-        """Control that the drive was commanded (mm/s, rad/s), see `Dataset.asked`."""
+        """Control that the drive was commanded (mm/s, rad/s), see `Dataset.command`."""
         return commanded(self.control, self.slip, SAMPLE_PERIOD_S)
 
     def select(self, chosen: Shaped[np.ndarray, "chosen"]) -> Episodes:

@@ -34,12 +34,12 @@ class Organ:
 
 
 def is_left(tree: VesselTree) -> bool:
-    """Tell whether section names say that this is a left coronary tree: it begins in the left main artery."""
+    """Return whether this is a left coronary tree by its section names: it begins in the left main artery."""
     return tree.section_names[tree.branches[0].section[0]] == "5"
 
 
 def place(tree: VesselTree) -> HeartFit:
-    """Fit the reference heart to the tree; without section labels it is a right one, its crux at 60 % of the way."""
+    """Fit the reference heart to the tree; without section labels it is a right one, its crux at 60 % of the path."""
     if is_left(tree):
         courses = reference_courses().copy()
         # Onto the aorta's surface: the direction of its axis is nearly z there.
@@ -58,7 +58,7 @@ def place(tree: VesselTree) -> HeartFit:
 
 
 def main_paths(tree: VesselTree) -> tuple[Centerline, ...]:
-    """Return the ways from the ostium along the main vessels: of a left tree LAD and LCx, of another the longest."""
+    """Return the paths from the ostium along the main vessels: of a left tree LAD and LCx, of another the longest."""
     if not is_left(tree):
         return (tree.longest_path(),)
     ends = {leaf: tree.section_names[tree.branches[leaf].section[-1]] for leaf in tree.leaves()}
@@ -124,7 +124,7 @@ def organs(
 
 
 def other_coronary(heart: HeartFit, tree: VesselTree) -> tuple[Centerline, ...]:
-    """Return the beginnings of the other coronary artery, by the mean diameters of Dodge 1992.
+    """Return the first part of the other coronary artery, by the mean diameters of Dodge 1992.
 
     Beside a right tree the left main (4.5 mm), LAD (3.7 mm) and LCx (3.4 mm); beside a left tree the right coronary
     artery (4.0 mm) nearly to the acute margin.
@@ -143,7 +143,7 @@ def cardiac_veins(heart: HeartFit, tree: VesselTree) -> tuple[Centerline, ...]:
     line, crux = tree.longest_path(), _crux_abscissa(tree)
     lines = []
     if is_left(tree):
-        # The great cardiac vein climbs beside the anterior descending artery, from 25 to 60 % of its way.
+        # The great cardiac vein climbs beside the anterior descending artery, from 25 to 60 % of its course.
         crux = 0.6 * float(line.abscissa[-1])
     for begin, end, angle, gap, radius in (
         (0.35 * crux, 0.97 * crux, 2.2, 2.3, 1.1),
@@ -169,7 +169,7 @@ def _vein(points: Float[np.ndarray, "n 3"], begin_mm: float, end_mm: float) -> C
 
 
 def _crux_abscissa(tree: VesselTree) -> float:
-    """Return the abscissa where segment 3 ends, or 60 % of the way where there are no such labels, mm."""
+    """Return the abscissa where segment 3 ends, or 60 % of the path where there are no such labels, mm."""
     if "3" in tree.section_names:
         third = tree.section_names.index("3")
         ends = [b.centerline.abscissa[b.section == third].max() for b in tree.branches if np.any(b.section == third)]

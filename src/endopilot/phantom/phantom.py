@@ -49,13 +49,13 @@ class PhantomConfig:
     calcium: NonNegative = 2.0
     """Mean number of calcified plaques."""
     right_heart: Annotated[tuple[NonNegative, NonNegative], Ascending] = (0.35, 0.8)
-    """CT number of the right ventricle's blood as a share of the lumen's: less where saline has washed it out."""
+    """CT number of the right ventricle's blood as a share of the lumen's: less where saline has diluted it."""
     motion_mm: Annotated[float, Within(0, 10)] = 0.0
-    """How far the heart moves while it is scanned, mm: it is smeared along that way, more where it moved last."""
+    """How far the heart moves while it is scanned, mm: it is smeared along its path, most at the ends."""
     margin_mm: Positive = 16.0
     """Width of surroundings beyond the tree on every side, mm."""
     voxels: tuple[_Side, _Side, _Side] | None = None
-    """Voxels along x, y and z about the middle of what the margin asks for; by default as many as that takes."""
+    """Voxels along x, y and z about the middle of the box that the margin gives; as many as fill it by default."""
 
 
 @dataclass(frozen=True, eq=False)

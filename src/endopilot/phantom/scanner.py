@@ -1,4 +1,4 @@
-"""What the scanner does to a phantom: the heart moves under it, noise is added, edges are blurred."""
+"""What the scanner adds to a phantom: motion of the heart, noise and blur."""
 
 from __future__ import annotations
 
@@ -22,26 +22,26 @@ def smear(
     motion_mm: float,
     generator: np.random.Generator,
 ) -> None:
-    """Average the heart over the way that it moves along while it is scanned, in place; the chest stays.
+    """Average the heart over the path of its motion during the scan, in place; the chest stays.
 
-    The heart stands longest where the way ends, so that edges across the way show a ghost. The truth is the middle.
+    The heart rests longest at the ends of the path, so that edges across it show a ghost. The anatomy is the middle.
 
     Args:
         image: HU.
         painter: of this image.
         heart: depth below the pericardium on the painter's coarse grid, mm.
         spacing_mm: voxel size along k, j and i, mm.
-        motion_mm: length of the way, mm; its direction is random.
+        motion_mm: length of the path, mm; its direction is random.
         generator: random stream.
     """
-    way = generator.normal(size=3)
-    way *= motion_mm / (np.linalg.norm(way) * np.array(spacing_mm))
+    path = generator.normal(size=3)
+    path *= motion_mm / (np.linalg.norm(path) * np.array(spacing_mm))
     still = image.copy()
     places, weights = np.linspace(-0.5, 0.5, _PHASES), np.linspace(0.5, 1.5, _PHASES)
     places = places - (weights @ places) / weights.sum()
     image[...] = 0
     for place, weight in zip(places, weights / weights.sum(), strict=True):
-        image += np.float32(weight) * shift(still, place * way, order=1, mode="nearest")
+        image += np.float32(weight) * shift(still, place * path, order=1, mode="nearest")
     for begin in range(0, len(image), SLAB):
         rows = slice(begin, begin + SLAB)
         found = painter.fine(heart, rows)

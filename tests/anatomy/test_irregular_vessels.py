@@ -38,11 +38,11 @@ def test_two_vessels_that_pass_each_other_are_not_joined():
     assert any("alongside" in note for note in anatomy.provenance["notes"])
 
 
-def test_what_lies_beyond_a_long_gap_is_told():
+def test_what_lies_beyond_a_long_gap_is_reported():
     mask = mask_of(lambda p: np.maximum(tube(p, 0, -24, 0), tube(p, 0, 8.0, 20.0)), (4, 4, 28), VOXEL_MM)
     notes = extract_anatomy(mask, name="gap").provenance["notes"]
-    told = next(note for note in notes if "left out" in note)
-    assert "15 mm long" in told and "begins 6.0 mm away" in told and "close the gap" in told
+    remark = next(note for note in notes if "left out" in note)
+    assert "15 mm long" in remark and "begins 6.0 mm away" in remark and "close the gap" in remark
 
 
 def test_a_distal_end_that_is_wider_than_others_is_not_the_inlet():
@@ -52,7 +52,7 @@ def test_a_distal_end_that_is_wider_than_others_is_not_the_inlet():
     assert anatomy.insertion.position[2] > 25
 
 
-def test_an_ostium_in_mid_vessel_looks_away_from_the_inlet():
+def test_an_ostium_in_mid_vessel_points_away_from_the_inlet():
     narrowing = lambda p: tube(p, 0, -30, 30, 1.6 + np.clip(p[..., 2], -30, 30) / 60)  # noqa: E731
     mask = mask_of(narrowing, (5, 5, 36), VOXEL_MM)
     anatomy = extract_anatomy(mask, name="mid", config=AnatomyConfig(ostium_mm=(0.0, 0.0, 5.0)))
@@ -87,7 +87,7 @@ def test_the_radius_at_a_given_ostium_is_the_vessels_and_not_the_distance_to_the
     assert anatomy.tree.branches[0].centerline.radius.min() > 1.2 and anatomy.catheter_radius_mm > 1.2
 
 
-def test_a_vessel_of_one_voxel_is_told_so():
+def test_a_vessel_of_one_voxel_is_refused_with_the_reason():
     mask = mask_of(lambda p: tube(p, 0.125, -9, 9, 0.13), (2, 2, 10), (0.25, 0.25, 0.25))
     with pytest.raises(InputError, match=r"one voxel|nowhere thick"):
         extract_anatomy(mask, name="thin")

@@ -1,0 +1,143 @@
+"""The blocks of navigations that make up a dataset, each simulated and stored by itself: `make_layout`."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Shaped
+
+from endopilot import __version__
+from endopilot.anatomy.io import read_anatomy
+from endopilot.dataset.config import DatasetConfig
+from endopilot.dataset.splits import assign_splits
+from endopilot.errors import InputError
+from endopilot.files import json_text, read_json
+from endopilot.simulation.device import Device
+
+FORMAT_VERSION = 4
+"""Counts changes of the columns or of their meaning."""
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Navigations of one anatomy that share a file: the unit of work, on this machine or on a cluster.
+
+    Attributes:
+        number: of the file.
+        folder: of the anatomy.
+        anatomy: its name.
+        identity: SHA-256 of what the simulation depends on in it.
+        sequences: indices of the navigations among those of the anatomy.
+        first_episode: index of the first one in the dataset.
+        splits: split of each.
+    """
+
+    number: int
+    folder: Path
+    anatomy: str
+    identity: str
+    sequences: range
+    first_episode: int
+    splits: Shaped[np.ndarray, "n"]
+
+
+@dataclass(frozen=True, eq=False)
+class BlockContext:
+    """What all blocks share.
+
+    Attributes:
+        output: folder of the dataset.
+        config: number, length, distribution and split of the navigations.
+        device: the wire.
+        key: marks the files of this dataset; it follows from all settings.
+    """
+
+    output: Path
+    config: DatasetConfig
+    device: Device
+    key: str
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """Which navigations of which anatomies a dataset holds.
+
+    Attributes:
+        context: what all blocks share.
+        folders: of the anatomies.
+        names: their names.
+        identities: their SHA-256s.
+        splits: of every navigation.
+        settings: what a resumed run must share with the run it continues, as plain JSON values.
+    """
+
+    context: BlockContext
+    folders: tuple[Path, ...]
+    names: tuple[str, ...]
+    identities: tuple[str, ...]
+    splits: Shaped[np.ndarray, "anatomies sequences"]
+    settings: dict[str, Any]
+
+    def blocks(self) -> list[Block]:
+        """Return the blocks in the order of their files."""
+        n, size, blocks = self.context.config.sequences, self.context.config.sequences_per_file, []
+        for row, (folder, name, identity) in enumerate(zip(self.folders, self.names, self.identities, strict=True)):
+            for first in range(0, n, size):
+                chosen = range(first, min(first + size, n))
+                splits = self.splits[row, chosen.start : chosen.stop]
+                blocks.append(Block(len(blocks), folder, name, identity, chosen, row * n + first, splits))
+        return blocks
+
+
+def make_layout(folders: Sequence[Path], output: Path, device: Device, config: DatasetConfig) -> Layout:
+    """Read the anatomies' records, and lay out the dataset in blocks.
+
+    Raises:
+        InputError: no anatomy, or a folder that is none; two of one name; too few for the split.
+    """
+    if not folders:
+        raise InputError("anatomies: none given; name at least one folder made by `endopilot anatomy`")
+    names, identities = zip(*(identify(Path(folder)) for folder in folders), strict=True)
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"anatomies: {names.count(name)} are named '{name}'; give each patient a name of its own")
+    splits = assign_splits(
+        names, config.sequences, anatomy_shares=config.anatomy_shares, seen_test_share=config.seen_test_share
+    )
+    described = asdict(config)
+    del described["simulator"]["threads"]  # no bit depends on it
+    settings = {
+        "config": described,
+        "device": asdict(device),
+        "anatomies": dict(zip(names, identities, strict=True)),
+        "version": version(),
+    }
+    settings = json.loads(json_text(settings))  # as JSON gives them back, so that they compare equal
+    key = hashlib.sha256(json_text(settings).encode()).hexdigest()
+    context = BlockContext(Path(output), config, device, key)
+    return Layout(context, tuple(map(Path, folders)), names, identities, splits, settings)
+
+
+def version() -> str:
+    """Return the version that all files of a dataset must have been written by."""
+    return f"endopilot {__version__}, format {FORMAT_VERSION}"
+
+
+def identify(folder: Path) -> tuple[str, str]:
+    """Return an anatomy's name and its identity, from its record; one that does not state it is read whole.
+
+    Raises:
+        InputError: the folder holds no anatomy, or a damaged one.
+    """
+    path = folder / "anatomy.json"
+    record = read_json(path) if path.exists() else {}
+    if isinstance(record, dict) and {"name", "identity"} <= record.keys():
+        return str(record["name"]), str(record["identity"])
+    anatomy = read_anatomy(folder)
+    return anatomy.name, anatomy.identity
