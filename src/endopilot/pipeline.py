@@ -291,7 +291,7 @@ def _learn(run: _Run, anatomies: Sequence[Path]) -> None:
 
     output, config = run.output, run.config
     trains = config.training_seconds > 0
-    tested = len(anatomies) // 3 if trains else len(anatomies) - len(anatomies) // 3  # the others give baselines' means
+    tested = len(anatomies) // 3 if trains else len(anatomies) - len(anatomies) // 3  # one at least is of another split
     shares = (1 - tested / len(anatomies), 0.0, tested / len(anatomies)) if tested else None
     dataset = DatasetConfig(
         sequences=config.sequences,

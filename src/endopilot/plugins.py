@@ -11,7 +11,7 @@ import sys
 import traceback
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import entry_points
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -80,7 +80,7 @@ class Registry:
         file = Path(sys.modules[name.partition(":")[0]].__file__ or "")
         return f"{file.name} sha256:{sha256(file)}" if file.is_file() else name
 
-    def _entry_point(self, name: str) -> EntryPoint | None:
+    def _entry_point(self, name: str) -> Any:  # an EntryPoint, of the standard library or of its backport; or None
         """Return the entry point of a name, or None if the package ships it or no installed package offers it."""
         points = {point.value: point for point in entry_points(group=self.group) if point.name == name}
         owners = [point.dist.name if point.dist else value for value, point in points.items()]

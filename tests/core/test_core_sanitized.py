@@ -23,7 +23,9 @@ def compiler(tmp_path_factory: pytest.TempPathFactory) -> str:
     folder = tmp_path_factory.mktemp("probe")
     (folder / "empty.cpp").write_text("int main() { return 0; }\n")
     program = folder / "empty"
-    built = subprocess.run([found, *SANITIZERS, folder / "empty.cpp", "-o", program], capture_output=True, text=True)
+    built = subprocess.run(
+        [found, *SANITIZERS, folder / "empty.cpp", "-o", program], capture_output=True, encoding="utf-8"
+    )
     if built.returncode or subprocess.run([program], capture_output=True).returncode:
         pytest.skip(f"{found} cannot build programs with address and undefined-behaviour sanitizers here")
     return found
@@ -32,9 +34,9 @@ def compiler(tmp_path_factory: pytest.TempPathFactory) -> str:
 def test_the_core_passes_its_tests_under_sanitizers(compiler: str, tmp_path: Path) -> None:
     program = tmp_path / "test_core"
     command = [compiler, *FLAGS, f"-I{SOURCES}", f"-I{HERE}", HERE / "test_core.cpp", "-o", program]
-    built = subprocess.run(command, capture_output=True, text=True)
+    built = subprocess.run(command, capture_output=True, encoding="utf-8")
     assert built.returncode == 0, built.stderr
-    ran = subprocess.run([program], capture_output=True, text=True)
+    ran = subprocess.run([program], capture_output=True, encoding="utf-8")
     assert ran.returncode == 0, f"{ran.stdout[-4000:]}\n{ran.stderr[-4000:]}"
     assert "all core tests passed" in ran.stdout
 
@@ -49,5 +51,5 @@ def test_the_sanitizers_end_a_faulty_program(compiler: str, tmp_path: Path) -> N
         source.write_text(f"#include <vector>\nint main() {{ {body} }}\n")
         program = tmp_path / "faulty"
         subprocess.run([compiler, *FLAGS, source, "-o", program], check=True, capture_output=True)
-        ran = subprocess.run([program], capture_output=True, text=True)
+        ran = subprocess.run([program], capture_output=True, encoding="utf-8")
         assert ran.returncode != 0 and report in ran.stderr

@@ -151,7 +151,7 @@ def test_methods_and_outputs_that_do_not_fit(few, tmp_path, capsys, monkeypatch)
         slice_.ImagePositionPatient[2] = 10.0 * float(slice_.ImagePositionPatient[2])
         slice_.save_as(file)
     for options, fragment in {
-        ("--method", "magic"): "choose one of aorta, coronary, nnunet, totalsegmentator",
+        ("--method", "magic"): "choose from aorta, coronary, nnunet, totalsegmentator",
         ("--method", "totalsegmentator"): "the program TotalSegmentator is not on the PATH",
         ("--method", "nnunet"): "--options model=FOLDER",
         ("--options", "model=x"): "no setting of method 'coronary'",

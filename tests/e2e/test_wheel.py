@@ -21,7 +21,7 @@ UNREACHABLE = re.compile(
 
 def install(*arguments: str | Path) -> None:
     """Run pip, and skip the test where no package index can be reached."""
-    result = subprocess.run([*map(str, arguments)], capture_output=True, text=True)
+    result = subprocess.run([*map(str, arguments)], capture_output=True, encoding="utf-8")
     if result.returncode and UNREACHABLE.search(result.stdout + result.stderr):
         pytest.skip("no package index can be reached, and the wheel needs one for its build and its libraries")
     assert result.returncode == 0, result.stdout + result.stderr
@@ -52,7 +52,7 @@ def run(clean: Path, *arguments: str | Path) -> subprocess.CompletedProcess[str]
     kept = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
     program, *rest = map(str, arguments)
     return subprocess.run(
-        [str(clean / program), *rest], capture_output=True, text=True, cwd=clean.parent, env=kept, timeout=300
+        [str(clean / program), *rest], capture_output=True, encoding="utf-8", cwd=clean.parent, env=kept, timeout=300
     )
 
 
