@@ -42,7 +42,7 @@ class WireVecEnv(VecEnv):
         self.actions = actions
 
     def step_wait(self):
-        observations, rewards, terminations, truncations, told = self.worlds.step(self.actions)
+        observations, rewards, terminations, truncations, infos = self.worlds.step(self.actions)
         self.returns += rewards
         ended = terminations | truncations
         infos: list[dict] = [{} for _ in ended]
@@ -51,7 +51,7 @@ class WireVecEnv(VecEnv):
                 "terminal_observation": observations[world],
                 "TimeLimit.truncated": bool(truncations[world]),
                 "return": float(self.returns[world]),
-                "success": bool(told["success"][world] and told["safe"][world]),
+                "success": bool(infos["success"][world] and infos["safe"][world]),
             }
         if ended.any():
             self.returns[ended] = 0.0
@@ -97,8 +97,8 @@ def pushing() -> float:
     ended, safe = np.zeros(ENVIRONMENTS, dtype=bool), np.zeros(ENVIRONMENTS, dtype=bool)
     for _ in range(300):
         push = np.where(ended, 0.0, 5.0 / TRANSLATION_MM_S)
-        _, _, terminations, truncations, told = worlds.step(np.column_stack([push, np.zeros(ENVIRONMENTS)]))
-        safe |= ~ended & told["success"] & told["safe"]
+        _, _, terminations, truncations, infos = worlds.step(np.column_stack([push, np.zeros(ENVIRONMENTS)]))
+        safe |= ~ended & infos["success"] & infos["safe"]
         ended |= terminations | truncations
     return float(safe.mean())
 

@@ -1,6 +1,6 @@
 """
-A wire on its way through a vessel
-==================================
+A wire in a vessel
+==================
 
 Sixteen wires start with their tips, bent by 75° over 5 mm, turned to sixteen sides. Which branch a tip enters depends
 on that angle.

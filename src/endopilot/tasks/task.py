@@ -119,7 +119,7 @@ def target_in_section(tree: VesselTree, section: str, depth_mm: float) -> Target
     """Return the place that lies `depth_mm` beyond the begin of a section, in the branch where it begins.
 
     Where several branches begin the section, it is the one that begins nearest to the ostium. If the section goes on in
-    several branches, the target lies where the way goes straight on.
+    several branches, the target lies in the straightest one.
 
     Raises:
         InputError: the tree lacks the section, or the section ends before.
