@@ -150,12 +150,12 @@ def test_a_changed_score_is_named(changed):
         (lambda c: c["tasks"].update(straight="0" * 64), "task 'straight' is not the one of endopilot"),
         (lambda c: c["tasks"].pop("straight"), "tasks and navigations name different tasks"),
         (lambda c: c["navigations"]["straight"].append(_first(c)), "needs the same first 1 to 20 patients"),
-        (lambda c: c.update(format=2), "format = '2'"),
-        (lambda c: c.update(extra=1), "extra = '1'"),
-        (lambda c: c.pop("policy"), "policy: Field required"),
+        (lambda c: c.update(format=2), "format: 2; choose from 1, or give a submission.json"),
+        (lambda c: c.update(extra=1), "extra: no such field; the fields are format"),
+        (lambda c: c.pop("policy"), "policy: missing; add it"),
         (
             lambda c: _first(c)["recording"].pop("control"),
-            r"navigations\.straight\.0\.recording\.control: Field required",
+            r"navigations\.straight\[0\]\.recording\.control: missing; add it",
         ),
     ],
 )

@@ -9,12 +9,10 @@ from __future__ import annotations
 import hashlib
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 from itertools import zip_longest
 from pathlib import Path
-from typing import Annotated, Any, Literal
-
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from typing import Any, Literal
 
 from endopilot import __version__, _core
 from endopilot.control.policies import POLICIES
@@ -23,48 +21,49 @@ from endopilot.files import json_text, manifest, read_json, write_json
 from endopilot.ladder.attempt import Recording, navigation_seed, repeat
 from endopilot.ladder.scores import score
 from endopilot.parallel import each
+from endopilot.settings import CountOrZero, read_settings, settings
 from endopilot.simulation.device import read_device
 from endopilot.tasks.task import Task, find_task, ladder_tasks
 
 SUBMISSION_FILE = "submission.json"
 MOST_PATIENTS = 20
 """Patients of each task."""
-_STRICT = ConfigDict(extra="forbid", frozen=True)
-_Count = Annotated[int, Field(ge=0)]
 
 
-class PackedRecording(BaseModel):
+@settings
+class PackedRecording:
     """A `Recording` as text."""
 
-    model_config = _STRICT
     control: str
     exposed: str
     believed_mm: str | None = None
 
 
-class NavigationEntry(BaseModel):
+@settings
+class NavigationEntry:
     """One navigation: its figures (`endopilot.ladder.attempt.attempt`) and its recording."""
 
-    model_config = _STRICT
     patient: str
-    seed: _Count
+    seed: CountOrZero
     success: bool
     safe: bool
     reason: Literal["reached", "time", "invalid"]
     seconds: float
     path_ratio: float
     peak_force_n: float
-    exposures: _Count
-    events: tuple[_Count, _Count] | None = None
+    exposures: CountOrZero
+    events: tuple[CountOrZero, CountOrZero] | None = None
     sha256: str
     recording: PackedRecording
 
     def figures(self) -> dict[str, Any]:
         """Return what driving the recording again must give."""
-        return self.model_dump(mode="json", exclude={"seed", "recording"} | (set() if self.events else {"events"}))
+        left_out = {"seed", "recording"} if self.events else {"seed", "recording", "events"}
+        return {name: value for name, value in asdict(self).items() if name not in left_out}
 
 
-class Submission(BaseModel):
+@settings
+class Submission:
     """What a policy did on the ladder, and how that can be done again.
 
     Attributes:
@@ -78,7 +77,6 @@ class Submission(BaseModel):
         scores: what `endopilot.ladder.scores.score` makes of them.
     """
 
-    model_config = _STRICT
     format: Literal[1] = 1
     policy: str
     origin: str
@@ -125,7 +123,7 @@ def write_submission(
         results: by the task's name, the results of its navigations (`attempt`) in the order of the task's patients.
         scores: what `score` made of them.
     """
-    fields = NavigationEntry.model_fields
+    known = {field.name for field in fields(NavigationEntry)}
     submission = Submission(
         policy=policy,
         origin=POLICIES.origin(policy),
@@ -133,12 +131,12 @@ def write_submission(
         core=_core.LEVEL,
         tasks={name: task_digest(find_task(name)) for name in results},
         navigations={
-            name: tuple(NavigationEntry(**{key: value for key, value in one.items() if key in fields}) for one in done)
+            name: tuple(NavigationEntry(**{key: value for key, value in one.items() if key in known}) for one in done)
             for name, done in results.items()
         },
         scores=tuple(dict(row) for row in scores),
     )
-    write_json(path, submission.model_dump(mode="json"))
+    write_json(path, submission)
 
 
 def check_submission(path: Path) -> SubmissionCheck:
@@ -150,7 +148,7 @@ def check_submission(path: Path) -> SubmissionCheck:
     Raises:
         InputError: the file is no submission, or its tasks or seeds are not those of this ladder.
     """
-    submission = _read(path)
+    submission = read_settings(path, Submission, remedy="give a submission.json of `endopilot ladder`")
     _refuse_another_ladder(path, submission)
     with tempfile.TemporaryDirectory(prefix="endopilot-") as folder:
         difference = _first_difference(submission, Path(folder))
@@ -161,18 +159,6 @@ def check_submission(path: Path) -> SubmissionCheck:
         difference=difference,
         remarks=_remarks(submission),
     )
-
-
-def _read(path: Path) -> Submission:
-    try:
-        return Submission.model_validate(read_json(path))
-    except ValidationError as error:
-        first = error.errors()[0]
-        field = ".".join(str(part) for part in first["loc"]) or "file"
-        given = "" if first["type"] == "missing" else f" = {str(first['input'])[:60]!r}"
-        raise InputError(
-            f"{path}: {field}{given}: {first['msg']}; give a submission.json of `endopilot ladder`"
-        ) from error
 
 
 def _refuse_another_ladder(path: Path, submission: Submission) -> None:
@@ -205,7 +191,7 @@ def _first_difference(submission: Submission, folder: Path) -> str | None:
         for place, entry in enumerate(done)
     }
     for path, entry in entries.items():
-        write_json(path, entry.recording.model_dump())
+        write_json(path, entry.recording)
     bad = each(f"Checking {submission.policy}", list(entries), _repeat)
     differing = []
     for path, entry in entries.items():
