@@ -79,21 +79,17 @@ def lay_out(device: Device, *, path_mm: float, elements: int, length_mm: float) 
     """
     abscissa = _nodes(path_mm, elements, length_mm)
     length = np.append(np.diff(abscissa), np.diff(abscissa)[-1])
-    middle, tip = abscissa + 0.5 * length, device.tip_bend_length_mm
+    middle = abscissa + 0.5 * length
     # A round section of the device's diameter ties EA and kGA to EI: EA = 16 EI / d², with EI that of the element.
     stretch = 16.0 * device.bend_stiffness(middle) / device.diameter_mm**2
     shear = SHEAR_CORRECTION * stretch / (2 * (1 + POISSON_RATIO))
-    # A joint stands for the stretch between the middles of its elements: the bend that falls there is its own.
-    ends = np.minimum(np.append(0.0, middle), tip)
+    # A joint stands for the stretch between the middles of its elements: the bend that falls there is its own. That ahead
+    # of the first joint is dropped: the first element's direction is that of the wire at its middle.
+    ends = np.minimum(middle, device.tip_bend_length_mm)
     curvature = np.zeros((len(abscissa), 3))
-    if tip > 0:
-        ends[0] = 0.0
-        share = np.diff(ends) / tip
-        span = np.append(middle[0], np.diff(middle))
-        share[1] += share[0]  # nothing bends ahead of the first joint
-        span[0] = 1.0
-        share[0] = 0.0
-        curvature[:, 0] = device.tip_bend_rad * share / span
+    if device.tip_bend_length_mm > 0:
+        bent = device.tip_bend_rad * np.diff(ends) / device.tip_bend_length_mm
+        curvature[1:, 0] = bent / np.diff(middle)
     return RodLayout(
         abscissa_mm=abscissa,
         shear_n=shear,
