@@ -29,8 +29,8 @@ def test_the_polygon_of_a_free_bent_tip_ends_where_the_arc_does(elements: int) -
     tip = rested["tip_position"][0, -1]
     length, curvature = device.tip_bend_length_mm, device.tip_bend_rad / device.tip_bend_length_mm
     across, along = (1 - np.cos(device.tip_bend_rad)) / curvature, np.sin(device.tip_bend_rad) / curvature
-    # Each element has the arc's direction at its middle. As the midpoint rule does, the sum over elements of length h errs
-    # by at most κ²h²/24 of the arc, and by κh²/8 where the bend ends within an element.
+    # Each element has the arc's direction at its middle. As the midpoint rule does, the sum over elements of length h
+    # errs by at most κ²h²/24 of the arc, and by κh²/8 where the bend ends within an element.
     h = float(np.diff(rod.abscissa_mm[rod.abscissa_mm < length + 1.0]).max())
     most = (curvature * h) ** 2 / 24 * length + curvature * h**2 / 8
     assert np.hypot(tip[0], tip[1]) == pytest.approx(across, abs=most)

@@ -83,8 +83,8 @@ def lay_out(device: Device, *, path_mm: float, elements: int, length_mm: float) 
     # A round section of the device's diameter ties EA and kGA to EI: EA = 16 EI / d², with EI that of the element.
     stretch = 16.0 * device.bend_stiffness(middle) / device.diameter_mm**2
     shear = SHEAR_CORRECTION * stretch / (2 * (1 + POISSON_RATIO))
-    # A joint stands for the stretch between the middles of its elements: the bend that falls there is its own. That ahead
-    # of the first joint is dropped: the first element's direction is that of the wire at its middle.
+    # A joint stands for the stretch between the middles of its elements: the bend that falls there is its own. That
+    # ahead of the first joint is dropped: the first element's direction is that of the wire at its middle.
     ends = np.minimum(middle, device.tip_bend_length_mm)
     curvature = np.zeros((len(abscissa), 3))
     if device.tip_bend_length_mm > 0:
