@@ -61,8 +61,9 @@ constexpr int kNodes = 80;
 // The arrays of a wire in a straight lumen of 1.5 mm radius, and each part of an iteration as a sweep over its nodes.
 template <class V>
 struct Sweeps {
+    Rod owned;
     RodModel rod;
-    Lumen& lumen;
+    const Lumen& lumen;
     Vec3<V> x[kNodes + 1];
     Quaternion<V> q[kNodes + 1];
     Distance<V> distance[kNodes];
@@ -71,12 +72,13 @@ struct Sweeps {
     Factor<V> factor[kNodes];
     V one = broadcast<V>(1.0), sink = broadcast<V>(0.0);
 
-    explicit Sweeps(Lumen& l) : lumen(l) {
+    explicit Sweeps(const Lumen& l) : lumen(l) {
         const auto fill = [](double v) { return std::vector<double>(kNodes + 2, v); };
-        rod.nodes = kNodes + 2;
-        rod.length = fill(0.4), rod.shear = fill(1e3), rod.stretch = fill(2.6e3), rod.joint_length = fill(0.4);
-        rod.bend = fill(5), rod.twist = fill(4), rod.radius = fill(0.18);
-        rod.rest.assign(kNodes + 2, {0.1, 0, 0});
+        owned.nodes = kNodes + 2;
+        owned.length = fill(0.4), owned.shear = fill(1e3), owned.stretch = fill(2.6e3), owned.joint_length = fill(0.4);
+        owned.bend = fill(5), owned.twist = fill(4), owned.radius = fill(0.18);
+        owned.rest.assign(kNodes + 2, {0.1, 0, 0});
+        rod = view(owned, InPlace{});
         std::mt19937 random(1);
         std::uniform_real_distribution<double> any(-0.5, 0.5);
         for (int i = 0; i <= kNodes; ++i)
@@ -164,7 +166,8 @@ int main() {
     for (int z = 0, m = 0; z < 160; ++z)
         for (int y = 0; y < 160; ++y)
             for (int x = 0; x < 160; ++x, ++m) map[m] = float(1.5 - 0.3 * std::hypot(x - 80.0, y - 80.0));
-    Lumen lumen(map.data(), size, origin, 0.3, 0.6, 0.5);
+    const LumenMap bricks = make_lumen_map(map.data(), size, origin, 0.3, 0.6, 0.5);
+    const Lumen lumen = view(bricks, InPlace{});
     static Sweeps<Counted> count(lumen);
     static Sweeps<double4> run(lumen);
     const double peak = peak_gflops();

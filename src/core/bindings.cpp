@@ -7,20 +7,22 @@
 #include <memory>
 
 #include "arrays.hpp"
+#include "cpu.hpp"
 #include "levels.hpp"
 #include "projection.hpp"
 #include "simulation.hpp"
 #include "spline.hpp"
 
 using namespace endopilot;
+using Simulations = Simulation<Cpu>;
 
 namespace {
 
 // All arrays have one entry a node; entries without a meaning (the last element, the first joint) are ignored.
-RodModel make_rod(const Array<1>& abscissa, const Array<1>& shear, const Array<1>& stretch, const Array<1>& bend,
+Rod make_rod(const Array<1>& abscissa, const Array<1>& shear, const Array<1>& stretch, const Array<1>& bend,
                   const Array<1>& twist, const Array<2>& rest, const Array<1>& radius, const Array<1>& drag,
                   const Array<1>& spin_drag) {
-    RodModel rod;
+    Rod rod;
     rod.nodes = int(abscissa.size());
     const std::size_t n = abscissa.size();
     require(n >= 4, "a rod needs at least four nodes");
@@ -44,15 +46,15 @@ RodModel make_rod(const Array<1>& abscissa, const Array<1>& shear, const Array<1
     return rod;
 }
 
-Lumen make_lumen(const Image& values, const Array<1>& origin, double spacing, double near, double far) {
+LumenMap make_lumen(const Image& values, const Array<1>& origin, double spacing, double near, double far) {
     require(origin.size() == 3 && spacing > 0, "a lumen needs an origin of three numbers and a positive spacing");
     const int size[3] = {int(values.shape(2)), int(values.shape(1)), int(values.shape(0))};
     require(size[0] > 0 && size[1] > 0 && size[2] > 0, "a lumen needs at least one cell");
     const double o[3] = {origin.data()[0], origin.data()[1], origin.data()[2]};
-    return Lumen(spline_coefficients(values.data(), size).data(), size, o, spacing, near, far);
+    return make_lumen_map(spline_coefficients(values.data(), size).data(), size, o, spacing, near, far);
 }
 
-Loads make_loads(const Array<2>& force, const Array<2>& moment, const Array<2>& spring, const Array<2>& anchor,
+OwnedLoads make_loads(const Array<2>& force, const Array<2>& moment, const Array<2>& spring, const Array<2>& anchor,
                  const Array<1>& hold, const Array<2>& attitude) {
     const std::size_t n = force.shape(0);
     require(moment.shape(0) == n && spring.shape(0) == n && anchor.shape(0) == n && hold.size() == n &&
@@ -61,7 +63,7 @@ Loads make_loads(const Array<2>& force, const Array<2>& moment, const Array<2>& 
     require(force.shape(1) == 3 && moment.shape(1) == 3 && spring.shape(1) == 3 && anchor.shape(1) == 3 &&
                 attitude.shape(1) == 4,
             "loads need three components, attitudes four");
-    Loads loads{.force = vectors(force),
+    OwnedLoads loads{.force = vectors(force),
                 .moment = vectors(moment),
                 .spring = vectors(spring),
                 .anchor = vectors(anchor),
@@ -118,11 +120,11 @@ NB_MODULE(ENDOPILOT_MODULE, module) {
     module.attr("LEVEL") = ENDOPILOT_LEVEL;
     module.attr("LANES") = kLanes;
     module.def("supported_levels", &supported_levels);
-    nb::class_<RodModel>(module, "RodModel")
-        .def_ro("nodes", &RodModel::nodes);
+    nb::class_<Rod>(module, "RodModel")
+        .def_ro("nodes", &Rod::nodes);
     module.def("make_rod", &make_rod, nb::kw_only(), nb::arg("abscissa"), nb::arg("shear"), nb::arg("stretch"),
                nb::arg("bend"), nb::arg("twist"), nb::arg("rest"), nb::arg("radius"), nb::arg("drag"), nb::arg("spin_drag"));
-    nb::class_<Lumen>(module, "Lumen").def_prop_ro("bytes", &Lumen::bytes);
+    nb::class_<LumenMap>(module, "Lumen").def_prop_ro("bytes", &bytes);
     module.def("make_lumen", &make_lumen, nb::kw_only(), nb::arg("values"), nb::arg("origin"), nb::arg("spacing"),
                nb::arg("near"), nb::arg("far"));
     nb::class_<Projector>(module, "Projector")
@@ -130,7 +132,7 @@ NB_MODULE(ENDOPILOT_MODULE, module) {
     module.def("make_projector", &make_projector, nb::kw_only(), nb::arg("point"), nb::arg("tangent"), nb::arg("abscissa"),
                nb::arg("radius"), nb::arg("first"), nb::arg("last"), nb::arg("branch"), nb::arg("rival"), nb::arg("entry"),
                nb::arg("ostium"), nb::arg("axis"), nb::arg("catheter_radius"));
-    nb::class_<Loads>(module, "Loads");
+    nb::class_<OwnedLoads>(module, "Loads");
     module.def("make_loads", &make_loads, nb::kw_only(), nb::arg("force"), nb::arg("moment"), nb::arg("spring"),
                nb::arg("anchor"), nb::arg("hold"), nb::arg("attitude"));
     nb::class_<Options>(module, "Options")
@@ -147,27 +149,27 @@ NB_MODULE(ENDOPILOT_MODULE, module) {
         .def_rw("push_limit", &Options::push_limit)
         .def_rw("introducer_friction", &Options::introducer_friction)
         .def_rw("introducer_drag", &Options::introducer_drag);
-    nb::class_<Simulation>(module, "Simulation")
-        .def(nb::init<RodModel, std::shared_ptr<Lumen>, std::shared_ptr<Loads>, const Array<1>&, const Array<1>&, const Options&, int>(),
+    nb::class_<Simulations>(module, "Simulation")
+        .def(nb::init<Rod, std::shared_ptr<LumenMap>, std::shared_ptr<OwnedLoads>, const Array<1>&, const Array<1>&, const Options&, int>(),
              nb::kw_only(), nb::arg("rod"), nb::arg("lumen").none(), nb::arg("loads").none(), nb::arg("origin"),
              nb::arg("orientation"), nb::arg("options"), nb::arg("worlds"))
-        .def("reset", &Simulation::reset, nb::kw_only(), nb::arg("index"), nb::arg("initial"), nb::arg("friction"), nb::arg("sample_period"))
-        .def("run", &Simulation::run, nb::kw_only(), nb::arg("control"), nb::arg("force_driven"), nb::arg("time_step"),
+        .def("reset", &Simulations::reset, nb::kw_only(), nb::arg("index"), nb::arg("initial"), nb::arg("friction"), nb::arg("sample_period"))
+        .def("run", &Simulations::run, nb::kw_only(), nb::arg("control"), nb::arg("force_driven"), nb::arg("time_step"),
              nb::arg("steps_per_sample"), nb::arg("record_shape"), nb::arg("record_attitude"), nb::arg("threads"),
              nb::arg("lanes"), nb::arg("progress").none())
-        .def("state", &Simulation::state)
-        .def("set_state", &Simulation::set_state, nb::arg("all"))
-        .def("tips", &Simulation::tips)
-        .def("positions", &Simulation::positions)
-        .def("attitudes", &Simulation::attitudes)
-        .def("contacts", &Simulation::contacts)
-        .def_prop_ro("nodes", &Simulation::nodes)
-        .def("inserted_length", [](const Simulation& s) { return s.scalar(World::kInserted); })
-        .def("active", [](const Simulation& s) { return s.scalar(World::kActive); })
-        .def("rotation", [](const Simulation& s) { return s.scalar(World::kRotation); })
-        .def("reason", [](const Simulation& s) { return s.scalar(World::kReason); })
-        .def("base_force", [](const Simulation& s) { return s.scalar(World::kBaseForce); })
-        .def("base_torque", [](const Simulation& s) { return s.scalar(World::kBaseTorque); })
-        .def("drive_force", [](const Simulation& s) { return s.scalar(World::kDriveForce); })
-        .def("drive_torque", [](const Simulation& s) { return s.scalar(World::kDriveTorque); });
+        .def("state", &Simulations::state)
+        .def("set_state", &Simulations::set_state, nb::arg("all"))
+        .def("tips", &Simulations::tips)
+        .def("positions", &Simulations::positions)
+        .def("attitudes", &Simulations::attitudes)
+        .def("contacts", &Simulations::contacts)
+        .def_prop_ro("nodes", &Simulations::nodes)
+        .def("inserted_length", [](Simulations& s) { return s.scalar(World::kInserted); })
+        .def("active", [](Simulations& s) { return s.scalar(World::kActive); })
+        .def("rotation", [](Simulations& s) { return s.scalar(World::kRotation); })
+        .def("reason", [](Simulations& s) { return s.scalar(World::kReason); })
+        .def("base_force", [](Simulations& s) { return s.scalar(World::kBaseForce); })
+        .def("base_torque", [](Simulations& s) { return s.scalar(World::kBaseTorque); })
+        .def("drive_force", [](Simulations& s) { return s.scalar(World::kDriveForce); })
+        .def("drive_torque", [](Simulations& s) { return s.scalar(World::kDriveTorque); });
 }

@@ -1,92 +1,13 @@
-// The lumen: a distance map as a quadratic B-spline, wall contact and friction.
+// Distance to the wall by a quadratic B-spline, wall contact and friction.
 #pragma once
 
-#include <algorithm>
-#include <cmath>
-#include <cstdint>
 #include <cstring>
-#include <limits>
-#include <stdexcept>
-#include <vector>
 
+#include "lumen.hpp"
 #include "rod.hpp"
 #include "solve.hpp"
 
 namespace endopilot {
-
-// B-spline coefficients of the signed distance to the wall (positive inside, mm), kept in bricks of 8³ cells and only
-// where the wall is near. A brick stores one cell more on each side, so that the 3³ stencil never leaves it.
-class Lumen {
-public:
-    static constexpr int kEdge = 8, kStored = kEdge + 2, kVolume = kStored * kStored * kStored;
-
-    // coefficients: nz × ny × nx, x fastest. Cells whose whole stencil is deeper inside than `near` carry no contact;
-    // cells whose whole stencil is farther outside than `far` count as outside the map.
-    Lumen(const float* coefficients, const int (&size)[3], const double (&origin)[3], double spacing, double near,
-          double far)
-        : inverse_spacing_(1.0 / spacing) {
-        for (int a = 0; a < 3; ++a) {
-            origin_[a] = origin[a];
-            bricks_[a] = (size[a] + kEdge - 1) / kEdge;
-            cells_[a] = bricks_[a] * kEdge;
-        }
-        pool_.assign(2 * kVolume, float(kDeep));  // brick 0: deep inside, brick 1: outside
-        std::fill(pool_.begin() + kVolume, pool_.end(), std::numeric_limits<float>::quiet_NaN());
-        index_.resize(std::size_t(bricks_[0]) * bricks_[1] * bricks_[2]);
-        std::vector<float> brick(kVolume);
-        std::size_t at = 0;
-        for (int bz = 0; bz < bricks_[2]; ++bz)
-            for (int by = 0; by < bricks_[1]; ++by)
-                for (int bx = 0; bx < bricks_[0]; ++bx, ++at) {
-                    float lowest = std::numeric_limits<float>::max(), highest = -lowest;
-                    for (int z = 0, m = 0; z < kStored; ++z)
-                        for (int y = 0; y < kStored; ++y)
-                            for (int x = 0; x < kStored; ++x, ++m) {
-                                const int gx = std::clamp(bx * kEdge + x - 1, 0, size[0] - 1);
-                                const int gy = std::clamp(by * kEdge + y - 1, 0, size[1] - 1);
-                                const int gz = std::clamp(bz * kEdge + z - 1, 0, size[2] - 1);
-                                const float c = coefficients[(std::size_t(gz) * size[1] + gy) * size[0] + gx];
-                                brick[m] = c;
-                                lowest = std::min(lowest, c);
-                                highest = std::max(highest, c);
-                            }
-                    if (lowest > near) {
-                        index_[at] = 0;
-                    } else if (highest < -far) {
-                        index_[at] = 1;
-                    } else {
-                        index_[at] = std::int32_t(pool_.size() / kVolume);
-                        pool_.insert(pool_.end(), brick.begin(), brick.end());
-                    }
-                }
-        pool_.push_back(0.0f);  // rows are read four at a time
-    }
-
-    std::size_t bytes() const { return pool_.size() * sizeof(float) + index_.size() * sizeof(std::int32_t); }
-
-    // The first coefficient of the 3³ stencil around the cell with whole-numbered coordinates (x, y, z).
-    ENDOPILOT_DEVICE const float* stencil(double x, double y, double z) const {
-        // written so that a NaN counts as outside
-        const bool inside = x >= 0.0 && x < cells_[0] && y >= 0.0 && y < cells_[1] && z >= 0.0 && z < cells_[2];
-        if (!inside) return &pool_[kVolume];
-        const unsigned i = unsigned(int(x)), j = unsigned(int(y)), k = unsigned(int(z));
-        const std::size_t at = (std::size_t(k / kEdge) * bricks_[1] + j / kEdge) * bricks_[0] + i / kEdge;
-        return &pool_[std::size_t(index_[at]) * kVolume + ((k % kEdge) * kStored + j % kEdge) * kStored + i % kEdge];
-    }
-
-    ENDOPILOT_DEVICE bool deep(const float* stencil) const { return stencil < pool_.data() + kVolume; }
-
-    ENDOPILOT_DEVICE double inverse_spacing() const { return inverse_spacing_; }
-    ENDOPILOT_DEVICE double origin(int axis) const { return origin_[axis]; }
-
-    static constexpr double kDeep = 1e3;
-
-private:
-    double origin_[3], inverse_spacing_, cells_[3];
-    int bricks_[3];
-    std::vector<std::int32_t> index_;
-    std::vector<float> pool_;
-};
 
 template <class V>
 struct Distance {
@@ -138,8 +59,8 @@ template <class V>
     constexpr int W = kWidth<V>;
     // Adding 1.5 · 2^52 rounds to whole numbers: the stencil's middle cell, and the place in it (-1/2..1/2).
     constexpr double kRound = 6755399441055744.0;
-    const double s = lumen.inverse_spacing(), ss = s * s;
-    const Vec3<V> u{s * (x.x - lumen.origin(0)), s * (x.y - lumen.origin(1)), s * (x.z - lumen.origin(2))};
+    const double s = lumen.inverse_spacing, ss = s * s;
+    const Vec3<V> u{s * (x.x - lumen.origin[0]), s * (x.y - lumen.origin[1]), s * (x.z - lumen.origin[2])};
     const Vec3<V> cell{(u.x + kRound) - kRound, (u.y + kRound) - kRound, (u.z + kRound) - kRound};
     const Vec3<V> t = u - cell;
     const float* first[W];

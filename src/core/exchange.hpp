@@ -8,7 +8,8 @@ namespace endopilot {
 constexpr double kOvershoot = 0.02;  // mm that rounded controls may pull the wire behind the ostium
 
 template <class V>
-void Stepper<V>::take(int l, WorkQueue& queue) {
+template <class Queue>
+void Stepper<V>::take(int l, Queue& queue) {
     double length = 0;
     int others = 0;
     for (const Lane& lane : lane_)
@@ -18,7 +19,7 @@ void Stepper<V>::take(int l, WorkQueue& queue) {
         int sample = 0;
         const int world = queue.take(others > 0 ? length / others : -1.0, sample);
         if (world < 0) return;
-        World& w = world_[world];
+        const World w = world_[world];
         if (w[World::kApproach] > 0) sample = -int(w[World::kApproach]);
         if (w.valid() && sample < in_.samples) {
             lane = Lane{};
@@ -36,7 +37,7 @@ void Stepper<V>::take(int l, WorkQueue& queue) {
 template <class V>
 void Stepper<V>::place(int l, int i) {
     const Lane& lane = lane_[l];
-    Node& n = node_[i];
+    Node<V>& n = node_[i];
     put(n.start, l, base_.position(rod_, i, lane.start.advance));
     put(n.start_q, l, base_.attitude(lane.start.rotation));
     put(n.last, l, lane.last.advance * frame(base_.orientation).d3);
@@ -52,7 +53,7 @@ void Stepper<V>::place(int l, int i) {
 template <class V>
 void Stepper<V>::place_base(int l, int i) {
     const Drive& end = lane_[l].end;
-    Node& n = node_[i];
+    Node<V>& n = node_[i];
     put(n.x, l, base_.position(rod_, i, end.advance));
     put(n.q, l, base_.attitude(end.rotation));
     put(n.from, l, take(n.x, l));
@@ -62,7 +63,7 @@ void Stepper<V>::place_base(int l, int i) {
 template <class V>
 void Stepper<V>::load(int l) {
     Lane& lane = lane_[l];
-    const World& w = world_[lane.world];
+    const World w = world_[lane.world];
     lane.inserted = lane.start.advance = lane.end.advance = w[World::kInserted];
     lane.rotation = lane.start.rotation = lane.end.rotation = w[World::kRotation];
     lane.last_duration = w[World::kLastDuration];
@@ -74,12 +75,11 @@ void Stepper<V>::load(int l) {
     read_control(l);
     const double weight = lane.last_duration > 0 ? duration(lane) / lane.last_duration : 0.0;
     lane.last = {weight > 0 ? w[World::kLastAdvance] : 0.0, weight > 0 ? w[World::kLastTurned] : 0.0};
-    const auto vec = [](const double* p) { return Vec3<double>{p[0], p[1], p[2]}; };
     for (int i = 0; i < lane.active; ++i) {
-        const double* p = w.node(i);
-        Node& n = node_[i];
-        const Vec3<double> x = vec(p + World::kX), last = vec(p + World::kLast), turn = vec(p + World::kLastTurn);
-        const Quaternion<double> q{p[World::kQ], vec(p + World::kQ + 1)};
+        const World::Numbers p = w.node(i);
+        Node<V>& n = node_[i];
+        const Vec3<double> x = vec3(p + World::kX), last = vec3(p + World::kLast), turn = vec3(p + World::kLastTurn);
+        const Quaternion<double> q = quaternion(p + World::kQ);
         put(n.start, l, x);
         put(n.start_q, l, q);
         put(n.last, l, last);
@@ -91,8 +91,8 @@ void Stepper<V>::load(int l) {
         put(n.step, l, {0, 0, 0});
         put(n.turn, l, {0, 0, 0});
         set(n.friction.limit, l, p[World::kLimit]);
-        put(n.friction.normal, l, vec(p + World::kNormal));
-        put(n.friction.spin_arm, l, vec(p + World::kSpinArm));
+        put(n.friction.normal, l, vec3(p + World::kNormal));
+        put(n.friction.spin_arm, l, vec3(p + World::kSpinArm));
         set(n.normal_force, l, p[World::kNormalForce]);
     }
     begin(l, weight == 0.0);
@@ -102,7 +102,7 @@ void Stepper<V>::load(int l) {
 template <class V>
 void Stepper<V>::store(int l) {
     const Lane& lane = lane_[l];
-    World& w = world_[lane.world];
+    const World w = world_[lane.world];
     w[World::kInserted] = lane.inserted;
     w[World::kRotation] = lane.rotation;
     w[World::kSpeed] = lane.speed;
@@ -115,13 +115,11 @@ void Stepper<V>::store(int l) {
     w[World::kActive] = lane.active;
     w[World::kSlips] = lane.slips;
     w[World::kPush] = lane.push;
-    const auto write = [](double* to, const Vec3<double>& v) { to[0] = v.x, to[1] = v.y, to[2] = v.z; };
     for (int i = 0; i < lane.active; ++i) {
-        double* p = w.node(i);
-        const Node& n = node_[i];
+        const World::Numbers p = w.node(i);
+        const Node<V>& n = node_[i];
         write(p + World::kX, take(n.start, l));
-        p[World::kQ] = get(n.start_q.w, l);
-        write(p + World::kQ + 1, take(n.start_q.v, l));
+        write(p + World::kQ, take(n.start_q, l));
         write(p + World::kLast, take(n.last, l));
         write(p + World::kLastTurn, take(n.last_turn, l));
         p[World::kLimit] = get(n.friction.limit, l);
@@ -134,7 +132,7 @@ void Stepper<V>::store(int l) {
 template <class V>
 void Stepper<V>::read_control(int l) {
     Lane& lane = lane_[l];
-    const World& w = world_[lane.world];
+    const World w = world_[lane.world];
     if (lane.sample < 0) {  // the approach: pushed in at one speed, then one sample at rest
         const double left = w[World::kDepth] - lane.inserted;
         lane.speed = lane.sample == -1 ? 0.0 : left / ((-lane.sample - 1) * sample_period());
@@ -156,9 +154,10 @@ void Stepper<V>::read_control(int l) {
 }
 
 template <class V>
-void Stepper<V>::end_sample(int l, WorkQueue& queue) {
+template <class Queue>
+void Stepper<V>::end_sample(int l, Queue& queue) {
     Lane& lane = lane_[l];
-    World& w = world_[lane.world];
+    const World w = world_[lane.world];
     if (lane.by_force) {
         lane.inserted = lane.end.advance;
         lane.rotation = lane.end.rotation;
@@ -200,7 +199,7 @@ void Stepper<V>::fail(int l) {
 
 template <class V>
 void Stepper<V>::record(int world, int sample, double iterations, double slip) const {
-    const World& w = world_[world];
+    const World w = world_[world];
     const std::size_t at = std::size_t(world) * in_.samples + sample;
     const int active = int(w[World::kActive]);
     out_.inserted[at] = w[World::kInserted];
@@ -221,24 +220,19 @@ void Stepper<V>::record(int world, int sample, double iterations, double slip) c
     out_.slip[at] = slip;
     out_.valid[at] = w.valid();
     const auto write = [](double* to, const Vec3<double>& v) { to[0] = v.x, to[1] = v.y, to[2] = v.z; };
-    const double* tip = w.node(0);
-    const double* q = tip + World::kQ;
-    std::copy(tip, tip + 3, out_.tip_position + 3 * at);
-    write(out_.tip_direction + 3 * at, frame(Quaternion<double>{q[0], {q[1], q[2], q[3]}}).d3);
+    const World::Numbers tip = w.node(0);
+    write(out_.tip_position + 3 * at, vec3(tip + World::kX));
+    write(out_.tip_direction + 3 * at, frame(quaternion(tip + World::kQ)).d3);
     for (int i = 0; i < rod_.nodes && (out_.shape || out_.attitude); ++i) {
-        const double* p = w.node(i);
-        if (out_.shape) {
-            double* to = out_.shape + 3 * (at * rod_.nodes + i);
-            if (i < active)
-                std::copy(p, p + 3, to);
-            else
-                write(to, base_.position(rod_, i, w[World::kInserted]));
-        }
+        const World::Numbers p = w.node(i);
+        if (out_.shape)
+            write(out_.shape + 3 * (at * rod_.nodes + i),
+                  i < active ? vec3(p + World::kX) : base_.position(rod_, i, w[World::kInserted]));
         if (out_.attitude) {
+            const Quaternion<double> q = i < active ? quaternion(p + World::kQ) : base_.attitude(w[World::kRotation]);
             double* to = out_.attitude + 4 * (at * rod_.nodes + i);
-            const Quaternion<double> turn = base_.attitude(w[World::kRotation]);
-            const double kept[4] = {turn.w, turn.v.x, turn.v.y, turn.v.z};
-            std::copy_n(i < active ? p + World::kQ : kept, 4, to);
+            to[0] = q.w;
+            write(to + 1, q.v);
         }
     }
 }

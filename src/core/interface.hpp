@@ -2,9 +2,11 @@
 #pragma once
 
 #include <algorithm>
+#include <cmath>
 #include <cstdint>
-#include <vector>
+#include <memory>
 
+#include "lumen.hpp"
 #include "rod.hpp"
 
 namespace endopilot {
@@ -31,17 +33,17 @@ struct Base {
     Quaternion<double> orientation;
 
     // Where node i of a wire of some inserted length lies if it follows the drive.
-    Vec3<double> position(const RodModel& rod, int i, double inserted) const {
+    ENDOPILOT_DEVICE Vec3<double> position(const RodModel& rod, int i, double inserted) const {
         return origin + (inserted - rod.abscissa[i]) * frame(orientation).d3;
     }
 
-    Quaternion<double> attitude(double rotation) const {
+    ENDOPILOT_DEVICE Quaternion<double> attitude(double rotation) const {
         return orientation * Quaternion<double>{std::cos(0.5 * rotation), {0, 0, std::sin(0.5 * rotation)}};
     }
 
     // The number of active nodes, which do not follow the drive: the middle of their element is ahead of the point
     // `free_behind` mm behind the origin. One at least, and all but two at most.
-    static int count_active(const RodModel& rod, double inserted, double free_behind) {
+    ENDOPILOT_DEVICE static int count_active(const RodModel& rod, double inserted, double free_behind) {
         int n = 1;
         while (n < rod.nodes - 2 && inserted - middle(rod, n) + free_behind > 0) ++n;
         return n;
@@ -49,26 +51,67 @@ struct Base {
 
     // The share (0 to 1) of the joint between the last active element and the first that follows the drive that lies ahead
     // of that point: the joint is freed gradually, since freeing a whole node at once would jolt the wire.
-    static double share_of_last_joint(const RodModel& rod, double inserted, double free_behind, int active) {
+    ENDOPILOT_DEVICE static double share_of_last_joint(const RodModel& rod, double inserted, double free_behind, int active) {
         const double ahead = middle(rod, active - 1), behind = middle(rod, active);
         return std::clamp((inserted - ahead + free_behind) / (behind - ahead), kLeastShare, 1.0);
     }
 
-    static double middle(const RodModel& rod, int element) { return rod.abscissa[element] + 0.5 * rod.length[element]; }
+    ENDOPILOT_DEVICE static double middle(const RodModel& rod, int element) { return rod.abscissa[element] + 0.5 * rod.length[element]; }
 
 private:
     static constexpr double kLeastShare = 1e-3;  // so that the joint's stiffness stays finite
 };
 
 // Dead loads and springs for verification: arrays of one entry a node, or of an element where they act on rotations.
-struct Loads {
-    std::vector<Vec3<double>> force;           // N
-    std::vector<Vec3<double>> moment;          // in the element's axes, N mm
-    std::vector<Vec3<double>> spring;          // N/mm along the world's axes, towards `anchor`
-    std::vector<Vec3<double>> anchor;          // mm
-    std::vector<double> hold;                  // N mm/rad, towards `attitude`
-    std::vector<Quaternion<double>> attitude;
+template <template <class> class Array>
+struct LoadArrays {
+    Array<Vec3<double>> force{};           // N
+    Array<Vec3<double>> moment{};          // in the element's axes, N mm
+    Array<Vec3<double>> spring{};          // N/mm along the world's axes, towards `anchor`
+    Array<Vec3<double>> anchor{};          // mm
+    Array<double> hold{};                  // N mm/rad, towards `attitude`
+    Array<Quaternion<double>> attitude{};
 };
+
+using OwnedLoads = LoadArrays<Owned>;
+using Loads = LoadArrays<Viewed>;   // no loads if it refers to nothing
+
+// `place` puts a vector where the stepper reads it, and returns its address there.
+template <class Place>
+Loads view(const OwnedLoads& loads, const Place& place) {
+    return {.force = place(loads.force),
+            .moment = place(loads.moment),
+            .spring = place(loads.spring),
+            .anchor = place(loads.anchor),
+            .hold = place(loads.hold),
+            .attitude = place(loads.attitude)};
+}
+
+// What all worlds of a run have in common, as views.
+struct Scene {
+    RodModel rod;
+    Lumen lumen;
+    Loads loads;
+    Base base;
+    Options options;
+};
+
+struct OwnedScene {
+    Rod rod;
+    std::shared_ptr<const LumenMap> lumen;       // may be null
+    std::shared_ptr<const OwnedLoads> loads;     // may be null
+    Base base;
+    Options options;
+};
+
+template <class Place>
+Scene view(const OwnedScene& scene, const Place& place) {
+    return {.rod = view(scene.rod, place),
+            .lumen = scene.lumen ? view(*scene.lumen, place) : Lumen{},
+            .loads = scene.loads ? view(*scene.loads, place) : Loads{},
+            .base = scene.base,
+            .options = scene.options};
+}
 
 // The inputs of one run: samples of equal length, each with one control for each world.
 struct Inputs {

@@ -13,28 +13,46 @@
 // element i in its own axes.
 #pragma once
 
-#include <array>
-#include <vector>
-
-#include "lanes.hpp"
+#include "views.hpp"
 
 namespace endopilot {
 
 // The device as the solver sees it; shared by all worlds. Arrays run from tip to base.
-struct RodModel {
+template <template <class> class Array>
+struct RodArrays {
     int nodes = 0;
-    std::vector<double> abscissa;         // distance of each node from the tip, mm
-    std::vector<double> length;           // element length, mm
-    std::vector<double> shear;            // kGA of an element, N
-    std::vector<double> stretch;          // EA of an element, N
-    std::vector<double> joint_length;     // length that a joint stands for, mm (entry 0 unused)
-    std::vector<double> bend;             // EI of a joint, N mm^2
-    std::vector<double> twist;            // GJ of a joint, N mm^2
-    std::vector<Vec3<double>> rest;       // rest curvature of a joint, rad/mm
-    std::vector<double> radius;           // wire radius at a node, mm
-    std::vector<double> drag;             // drag of a node, N s/mm
-    std::vector<double> spin_drag;        // rotational drag of an element, N mm s/rad
+    Array<double> abscissa{};         // distance of each node from the tip, mm
+    Array<double> length{};           // element length, mm
+    Array<double> shear{};            // kGA of an element, N
+    Array<double> stretch{};          // EA of an element, N
+    Array<double> joint_length{};     // length that a joint stands for, mm (entry 0 unused)
+    Array<double> bend{};             // EI of a joint, N mm^2
+    Array<double> twist{};            // GJ of a joint, N mm^2
+    Array<Vec3<double>> rest{};       // rest curvature of a joint, rad/mm
+    Array<double> radius{};           // wire radius at a node, mm
+    Array<double> drag{};             // drag of a node, N s/mm
+    Array<double> spin_drag{};        // rotational drag of an element, N mm s/rad
 };
+
+using Rod = RodArrays<Owned>;         // owns its arrays
+using RodModel = RodArrays<Viewed>;   // refers to arrays in the memory of whoever steps, a processor or a GPU
+
+// `place` puts a vector where the stepper reads it, and returns its address there.
+template <class Place>
+RodModel view(const Rod& rod, const Place& place) {
+    return {.nodes = rod.nodes,
+            .abscissa = place(rod.abscissa),
+            .length = place(rod.length),
+            .shear = place(rod.shear),
+            .stretch = place(rod.stretch),
+            .joint_length = place(rod.joint_length),
+            .bend = place(rod.bend),
+            .twist = place(rod.twist),
+            .rest = place(rod.rest),
+            .radius = place(rod.radius),
+            .drag = place(rod.drag),
+            .spin_drag = place(rod.spin_drag)};
+}
 
 // One block row of the system: gradient and the block's own, lower triangular, Hessian.
 // Order of the six unknowns: x, y, z, theta1, theta2, theta3.

@@ -7,11 +7,7 @@
 #pragma once
 
 #include <algorithm>
-#include <atomic>
-#include <chrono>
 #include <cmath>
-#include <thread>
-#include <vector>
 
 #include "contact.hpp"
 #include "solve.hpp"
@@ -30,55 +26,47 @@ constexpr double kMaxImbalance = 1e-5;   // N that a damped solution may be out 
 constexpr double kStopStiffness = 100;   // N/mm, of the stops at both ends of the drive's travel
 constexpr double kDriveMotion = 1.2;     // times the drive's own motion that a node may move in a step before it counts as a jump
 
-using TimePoint = std::chrono::steady_clock::time_point;
+// A node of the wires in all lanes.
+template <class V>
+struct Node {
+    Vec3<V> x, from, start, step, last;            // trial, accepted, step start; Newton step; last increment
+    Quaternion<V> q, from_q, start_q;
+    Vec3<V> turn, last_turn;
+    FrictionState<V> friction;
+    WallState<V> wall;
+    V normal_force;                                // of the wall at the end of the last step, N
+};
 
 template <class V>
 class Stepper {
 public:
-    Stepper(const RodModel& rod, const Lumen* lumen, const Loads* loads, const Base& base, const Options& options,
-            std::vector<World>& worlds)
-        : rod_(rod), lumen_(lumen), loads_(loads), base_(base), options_(options), world_(worlds), node_(rod.nodes),
-          factor_(rod.nodes) {}
+    // `node` and `factor` have one entry a node of the rod. The scene must outlive the stepper.
+    ENDOPILOT_DEVICE Stepper(const Scene& scene, const Worlds& worlds, Node<V>* node, Factor<V>* factor)
+        : rod_(scene.rod), lumen_(scene.lumen.pool ? &scene.lumen : nullptr), loads_(scene.loads.force ? &scene.loads : nullptr),
+          base_(scene.base), options_(scene.options), world_(worlds), node_(node), factor_(factor) {}
 
-    // Sets the inputs and outputs of the next runs and frees all lanes.
-    void prepare(const Inputs& in, const Outputs& out) {
+    // Sets the inputs and outputs of the next turns and frees all lanes.
+    ENDOPILOT_DEVICE void prepare(const Inputs& in, const Outputs& out) {
         in_ = in;
         out_ = out;
         for (Lane& lane : lane_) lane.world = -1;
     }
 
-    // Steps worlds of the queue. Returns true when none is left or `stop` is set, and false at the time `until`: call it
-    // again to go on. `done` counts finished samples.
-    bool run(WorkQueue& queue, std::atomic<long>& done, const std::atomic<bool>& stop, TimePoint until) {
-        while (!stop.load(std::memory_order_relaxed)) {
-            bool busy = false;
-            for (int l = 0; l < W; ++l) {
-                if (lane_[l].world < 0) take(l, queue);
-                busy = busy || lane_[l].world >= 0;
-            }
-            if (busy) {
-                done.fetch_add(pass(queue), std::memory_order_relaxed);
-            } else {
-                if (queue.done()) return true;
-                std::this_thread::yield();
-            }
-            if (std::chrono::steady_clock::now() > until) return false;
+    // Gives idle lanes a world of the queue and makes one pass. Returns the number of samples that ended, -1 if no lane has
+    // a world. A queue has `take`, `put_back` and `finish` as WorkQueue has.
+    template <class Queue>
+    ENDOPILOT_DEVICE int turn(Queue& queue) {
+        bool busy = false;
+        for (int l = 0; l < W; ++l) {
+            if (lane_[l].world < 0) take(l, queue);
+            busy = busy || lane_[l].world >= 0;
         }
-        return true;
+        return busy ? pass(queue) : -1;
     }
 
 private:
     static constexpr int W = kWidth<V>;
     enum class Decision { idle, accept, shorten, repeat, converged, restart };
-
-    struct Node {
-        Vec3<V> x, from, start, step, last;            // trial, accepted, step start; Newton step; last increment
-        Quaternion<V> q, from_q, start_q;
-        Vec3<V> turn, last_turn;
-        FrictionState<V> friction;
-        WallState<V> wall;
-        V normal_force;                                // of the wall at the end of the last step, N
-    };
 
     // The drive's end of the wire: advance (mm) and rotation (rad).
     struct Drive {
@@ -121,13 +109,13 @@ private:
     const RodModel& rod_;
     const Lumen* lumen_;
     const Loads* loads_;
-    const Base base_;
-    const Options options_;
+    const Base& base_;
+    const Options& options_;
     Inputs in_{};
     Outputs out_{};
-    std::vector<World>& world_;
-    std::vector<Node> node_;
-    std::vector<Factor<V>> factor_;
+    const Worlds world_;
+    Node<V>* const node_;
+    Factor<V>* const factor_;
     static constexpr int kTogether = 8;  // nodes that each part of the evaluation takes at a time
     Diagonal<V> block_[kTogether + 1];
     Coupling<V> coupling_[kTogether];
@@ -163,13 +151,15 @@ private:
     }
 
     // Between lanes and worlds (exchange.hpp).
-    void take(int l, WorkQueue& queue);
+    template <class Queue>
+    void take(int l, Queue& queue);
     void load(int l);
     void store(int l);
     void read_control(int l);
     void place(int l, int i);
     void place_base(int l, int i);
-    void end_sample(int l, WorkQueue& queue);
+    template <class Queue>
+    void end_sample(int l, Queue& queue);
     void fail(int l);
     void record(int world, int sample, double iterations, double slip) const;
 
@@ -179,8 +169,10 @@ private:
     DriveEnergy introducer(const Drive& moved, int l) const;
     DriveEnergy drive_energy(const Lane& lane, int l) const;
     bool solve_drive(int l);
-    int pass(WorkQueue& queue);
-    int advance(int n, const Decision (&decision)[W], WorkQueue& queue);
+    template <class Queue>
+    int pass(Queue& queue);
+    template <class Queue>
+    int advance(int n, const Decision (&decision)[W], Queue& queue);
 
     // Sweeps over the nodes of all lanes (sweeps.hpp).
     void evaluate(int n);
@@ -190,7 +182,7 @@ private:
     void add_lumen(int first, int count);
     void add_drag(int first, int count);
     void eliminate_nodes(int first, int count);
-    V add_loads(int i, const Node& node, Diagonal<V>& own) const;
+    V add_loads(int i, const Node<V>& node, Diagonal<V>& own) const;
     V solve(int n);
     void update(int n, const Decision (&decision)[W], const V& factor);
     void finish_step(int n, Mask<V> mask, Mask<V> restart, const V& weight);
@@ -233,7 +225,8 @@ void Stepper<V>::begin(int l, bool fresh) {
 
 // One evaluation, decision and update of all lanes. Returns the number of samples that ended.
 template <class V>
-int Stepper<V>::pass(WorkQueue& queue) {
+template <class Queue>
+int Stepper<V>::pass(Queue& queue) {
     const int n = most_active();
     evaluate(n);
     Decision decision[W];
@@ -315,7 +308,8 @@ typename Stepper<V>::Decision Stepper<V>::decide(int l) {
 
 // Ends the steps that converged, restarts those that failed with half the step. Returns the samples that ended.
 template <class V>
-int Stepper<V>::advance(int n, const Decision (&decision)[W], WorkQueue& queue) {
+template <class Queue>
+int Stepper<V>::advance(int n, const Decision (&decision)[W], Queue& queue) {
     Mask<V> finished{}, restarted{};
     V weight{};
     bool any_finished = false, failed[W] = {}, ended[W] = {};
@@ -393,7 +387,7 @@ typename Stepper<V>::DriveEnergy Stepper<V>::drive_energy(const Lane& lane, int 
     const Drive moved{lane.end.advance - lane.start.advance, lane.end.rotation - lane.start.rotation};
     DriveEnergy t = introducer(moved, l);
     const double a = lane.end.advance;
-    const double beyond = std::min(0.0, a) + std::max(0.0, a + options_.free_behind - rod_.abscissa.back());
+    const double beyond = std::min(0.0, a) + std::max(0.0, a + options_.free_behind - rod_.abscissa[rod_.nodes - 1]);
     t.energy += 0.5 * kStopStiffness * beyond * beyond - lane.speed * moved.advance - lane.spin * moved.rotation;
     t.gradient_a += kStopStiffness * beyond - lane.speed;
     t.gradient_r -= lane.spin;

@@ -7,7 +7,7 @@
 namespace endopilot {
 
 template <class V>
-V Stepper<V>::add_loads(int i, const Node& node, Diagonal<V>& own) const {
+V Stepper<V>::add_loads(int i, const Node<V>& node, Diagonal<V>& own) const {
     const Vec3<double>&f = loads_->force[i], &m = loads_->moment[i], &k = loads_->spring[i], &a = loads_->anchor[i];
     const Vec3<V> off{node.x.x - a.x, node.x.y - a.y, node.x.z - a.z};
     own.gradient_x += Vec3<V>{k.x * off.x - f.x, k.y * off.y - f.y, k.z * off.z - f.z};
@@ -60,7 +60,7 @@ void Stepper<V>::add_rod(int first, int count) {
     const Vec3<double> axis = frame(base_.orientation).d3;
     for (int k = 0; k < count; ++k) {
         const int i = first + k;
-        const Node &node = node_[i], &behind = node_[i + 1];
+        const Node<V> &node = node_[i], &behind = node_[i + 1];
         Diagonal<V>&own = block_[k], &next = block_[k + 1];
         const Mask<V> last = active_ == broadcast<V>(i + 1);
         V energy = add_element(rod_, i, geometric_, node.x, behind.x, frame(node.q), own, next, coupling_[k]);
@@ -93,7 +93,7 @@ void Stepper<V>::add_lumen(int first, int count) {
     const V zero{};
     for (int k = 0; k < count; ++k) {
         const int i = first + k;
-        Node& node = node_[i];
+        Node<V>& node = node_[i];
         const Distance<V> d = distance_to_wall(*lumen_, node.x);
         node.wall = {d.value, d.gradient};
         const Mask<V> sticky = (first_ > zero) & (node.friction.limit > zero) & (d.value < rod_.radius[i] + kStickyReach);
@@ -101,7 +101,7 @@ void Stepper<V>::add_lumen(int first, int count) {
         energy_ += select<V>(active_ > broadcast<V>(i), energy, zero);
     }
     for (int k = 0; k < count; ++k) {
-        const Node& node = node_[first + k];
+        const Node<V>& node = node_[first + k];
         const V energy = add_friction(node.friction, eps_, node.x - node.start, relative(node.start_q, node.q), block_[k]);
         energy_ += select<V>(active_ > broadcast<V>(first + k), energy, zero);
     }
@@ -112,7 +112,7 @@ template <class V>
 void Stepper<V>::add_drag(int first, int count) {
     for (int k = 0; k < count; ++k) {
         const int i = first + k;
-        const Node& node = node_[i];
+        const Node<V>& node = node_[i];
         Diagonal<V>& own = block_[k];
         const Mask<V> on = active_ > broadcast<V>(i);
         const Vec3<V> moved = node.x - node.start;
@@ -199,7 +199,7 @@ void Stepper<V>::update(int n, const Decision (&decision)[W], const V& factor) {
         set_mask<V>(repeat, l, decision[l] == Decision::repeat);
     }
     for (int i = 0; i < n; ++i) {
-        Node& node = node_[i];
+        Node<V>& node = node_[i];
         const Mask<V> on = active_ > broadcast<V>(i);
         const V* z = factor_[i].z;
         const Mask<V> take = accept & on, shrink = shorten & on;
@@ -231,7 +231,7 @@ template <class V>
 void Stepper<V>::finish_step(int n, Mask<V> mask, Mask<V> restart, const V& weight) {
     const V zero{}, one = broadcast<V>(1.0);
     for (int i = 0; i < n; ++i) {
-        Node& node = node_[i];
+        Node<V>& node = node_[i];
         const Mask<V> on = mask & (active_ > broadcast<V>(i));
         const Mask<V> back = restart & (active_ > broadcast<V>(i));
         const Quaternion<V> turned_by = relative(node.start_q, node.q);

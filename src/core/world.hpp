@@ -1,17 +1,13 @@
-// Worlds at rest between samples, and the queue that hands them to lanes.
+// Worlds at rest between samples.
 #pragma once
 
-#include <algorithm>
-#include <cmath>
-#include <limits>
-#include <mutex>
-#include <vector>
+#include <cstddef>
 
 #include "interface.hpp"
 
 namespace endopilot {
 
-// All that a world's future depends on, as plain numbers: saved and restored bit by bit. Positions and attitudes are
+// A view of all that a world's future depends on, as plain numbers: saved and restored bit by bit. Positions and attitudes are
 // those at the end of the last step; node quantities are meaningful for the `active` nodes ahead of the base.
 struct World {
     enum Scalar {
@@ -28,77 +24,37 @@ struct World {
         kX = 0, kQ = 3, kLast = 7, kLastTurn = 10, kLimit = 13, kNormal = 14, kSpinArm = 17, kNormalForce = 20, kNodeSize = 21
     };
 
-    std::vector<double> values;
+    // Numbers `stride` apart.
+    struct Numbers {
+        double* first;
+        std::ptrdiff_t stride;
+        ENDOPILOT_DEVICE double& operator[](int k) const { return first[k * stride]; }
+        ENDOPILOT_DEVICE Numbers operator+(int k) const { return {first + k * stride, stride}; }
+    };
 
-    explicit World(int nodes) : values(kScalars + std::size_t(nodes) * kNodeSize) {}
-    double& operator[](Scalar s) { return values[s]; }
-    double operator[](Scalar s) const { return values[s]; }
-    double* node(int i) { return &values[kScalars + std::size_t(i) * kNodeSize]; }
-    const double* node(int i) const { return &values[kScalars + std::size_t(i) * kNodeSize]; }
-    bool valid() const { return values[kReason] == double(kFine); }
+    double* values;
+    std::ptrdiff_t stride;
+
+    ENDOPILOT_DEVICE double& operator[](Scalar s) const { return values[s * stride]; }
+    ENDOPILOT_DEVICE Numbers node(int i) const { return Numbers{values, stride} + (kScalars + i * kNodeSize); }
+    static std::size_t size(int nodes) { return kScalars + std::size_t(nodes) * kNodeSize; }
+    ENDOPILOT_DEVICE bool valid() const { return (*this)[kReason] == double(kFine); }
 };
 
-// A work queue: hands worlds to lanes, one sample at a time. Lanes of a stepper sweep over the nodes of the longest wire
-// among them, so they are given worlds of similar length. A world's result does not depend on the lane that steps it.
-class WorkQueue {
-public:
-    // `order`: the worlds, those of similar length next to each other; `length`: their active nodes. At most `size` of them
-    // are under way at a time.
-    WorkQueue(std::vector<int> order, std::vector<double> length, int size)
-        : order_(std::move(order)), length_(std::move(length)), size_(size) {}
+ENDOPILOT_DEVICE inline Vec3<double> vec3(const World::Numbers& p) { return {p[0], p[1], p[2]}; }
+ENDOPILOT_DEVICE inline Quaternion<double> quaternion(const World::Numbers& p) { return {p[0], vec3(p + 1)}; }
+ENDOPILOT_DEVICE inline void write(const World::Numbers& to, const Vec3<double>& v) { to[0] = v.x, to[1] = v.y, to[2] = v.z; }
+ENDOPILOT_DEVICE inline void write(const World::Numbers& to, const Quaternion<double>& q) { to[0] = q.w, write(to + 1, q.v); }
 
-    // Takes a world whose number of active nodes is near `length` (any, if negative); -1 where none is ready. `sample` is
-    // the one that comes next.
-    int take(double length, int& sample) {
-        const std::lock_guard<std::mutex> lock(mutex_);
-        while (under_way_ < size_ && next_ < order_.size()) {
-            const int world = order_[next_++];
-            ready_.push_back({world, 0, length_[std::size_t(world)]});
-            ++under_way_;
-        }
-        if (ready_.empty()) return -1;
-        int first = std::numeric_limits<int>::max();
-        for (const Ready& r : ready_) first = std::min(first, r.sample);
-        std::size_t best = ready_.size();
-        double least = 0;
-        for (std::size_t i = 0; i < ready_.size(); ++i) {
-            if (ready_[i].sample > first + kLead) continue;  // so that all end at about the same time
-            const double off = length < 0 ? double(ready_[i].sample) : std::abs(ready_[i].length - length);
-            if (best == ready_.size() || off < least) best = i, least = off;
-        }
-        const Ready taken = ready_[best];
-        ready_.erase(ready_.begin() + std::ptrdiff_t(best));
-        sample = taken.sample;
-        return taken.world;
+// All worlds of a run, `between_worlds` and `between_numbers` numbers apart. A processor keeps each world's numbers side by
+// side (the default); a GPU, whose neighbouring threads step neighbouring worlds, keeps side by side the same number of all.
+struct Worlds {
+    double* values;
+    std::ptrdiff_t between_worlds, between_numbers;
+
+    ENDOPILOT_DEVICE World operator[](std::size_t world) const {
+        return {values + std::ptrdiff_t(world) * between_worlds, between_numbers};
     }
-
-    void put_back(int world, int sample, double length) {
-        const std::lock_guard<std::mutex> lock(mutex_);
-        ready_.push_back({world, sample, length});
-    }
-
-    void finish() {
-        const std::lock_guard<std::mutex> lock(mutex_);
-        --under_way_;
-    }
-
-    bool done() {
-        const std::lock_guard<std::mutex> lock(mutex_);
-        return under_way_ == 0 && next_ == order_.size();
-    }
-
-private:
-    static constexpr int kLead = 8;  // samples
-    struct Ready {
-        int world, sample;
-        double length;
-    };
-    std::mutex mutex_;
-    std::vector<int> order_;
-    std::vector<double> length_;
-    std::size_t next_ = 0;
-    int size_, under_way_ = 0;
-    std::vector<Ready> ready_;
 };
 
 }  // namespace endopilot

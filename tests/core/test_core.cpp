@@ -169,8 +169,8 @@ double second_difference(const Energy& energy, const Pose (&poses)[2], int block
     return sum / (8 * h * h);
 }
 
-RodModel two_element_rod() {
-    RodModel rod;
+Rod two_element_rod() {
+    Rod rod;
     rod.nodes = 3;
     rod.abscissa = {0, 0.8, 2.0};
     rod.length = {0.8, 1.2, 1.0};
@@ -187,8 +187,9 @@ RodModel two_element_rod() {
 // The joint's Hessian leaves out the derivatives of g, so it holds to the order of strain: of |v|² where the rest
 // curvature is 0, of |v| times the moment elsewhere. Gradients are exact at any strain.
 void test_elastic_energy(double bent, double rest, double tolerance, double share = 1.0) {
-    RodModel rod = two_element_rod();
-    rod.rest[1] = rest * rod.rest[1];
+    Rod owned = two_element_rod();
+    owned.rest[1] = rest * owned.rest[1];
+    const RodModel rod = view(owned, InPlace{});
     for (int trial = 0; trial < 4; ++trial) {
         const auto start = random_rotation<double>();
         const Vec3<double> bend{uniform(-bent, bent), uniform(-bent, bent), uniform(-bent, bent)};
@@ -218,7 +219,8 @@ void test_elastic_energy(double bent, double rest, double tolerance, double shar
 
 // Without its geometric terms the Hessian is J^T K J: no direction has negative curvature.
 void test_gauss_newton() {
-    const RodModel rod = two_element_rod();
+    const Rod owned = two_element_rod();
+    const RodModel rod = view(owned, InPlace{});
     for (int trial = 0; trial < 50; ++trial) {
         const auto start = random_rotation<double>();
         const Pose distal{{uniform(-1, 1), uniform(-1, 1), uniform(-1, 1)}, random_rotation<double>()};
@@ -238,7 +240,7 @@ void test_gauss_newton() {
 constexpr int kSize[3] = {21, 18, 13};  // no multiples of a brick's edge
 constexpr double kSpacing = 0.5;
 
-Lumen make_lumen(double near) {
+LumenMap make_map(double near) {
     // coefficients of a curved field; quadratic B-splines of them are smooth whatever they are
     std::vector<float> c;
     for (int k = 0; k < kSize[2]; ++k)
@@ -246,12 +248,13 @@ Lumen make_lumen(double near) {
             for (int i = 0; i < kSize[0]; ++i)
                 c.push_back(float(1.5 - 0.3 * std::hypot(0.5 * j - 4.0, 0.5 * k - 3.0) + 0.1 * std::sin(0.9 * i + 0.4 * k)));
     const double origin[3] = {-2.0, -4.0, -3.0};
-    return Lumen(c.data(), kSize, origin, kSpacing, near, 0.5);
+    return make_lumen_map(c.data(), kSize, origin, kSpacing, near, 0.5);
 }
 
 template <class V>
 void test_distance() {
-    const Lumen lumen = make_lumen(1e9);
+    const LumenMap map = make_map(1e9);
+    const Lumen lumen = view(map, InPlace{});
     const double h = 1e-4;
     for (int trial = 0; trial < 100; ++trial) {
         const Vec3<V> x{random_lanes<V>(-1.9, 7.7), random_lanes<V>(-3.9, 4.2), random_lanes<V>(-2.9, 2.7)};
@@ -289,7 +292,8 @@ void test_spline_coefficients() {
     std::uniform_real_distribution<float> any(-1.0f, 1.0f);
     std::vector<float> values(std::size_t(size[0]) * size[1] * size[2]);
     for (float& v : values) v = any(random);
-    const Lumen lumen(spline_coefficients(values.data(), size).data(), size, origin, spacing, 1e9, 1e9);
+    const LumenMap map = make_lumen_map(spline_coefficients(values.data(), size).data(), size, origin, spacing, 1e9, 1e9);
+    const Lumen lumen = view(map, InPlace{});
     for (int z = 1; z + 1 < size[2]; ++z)
         for (int y = 1; y + 1 < size[1]; ++y)
             for (int x = 1; x + 1 < size[0]; ++x) {
@@ -300,7 +304,8 @@ void test_spline_coefficients() {
 }
 
 void test_map_borders() {
-    const Lumen lumen = make_lumen(1e9), sparse = make_lumen(-10.0);
+    const LumenMap map = make_map(1e9), sparse_map = make_map(-10.0);
+    const Lumen lumen = view(map, InPlace{}), sparse = view(sparse_map, InPlace{});
     const double nan = std::numeric_limits<double>::quiet_NaN(), far = 1e300;
     for (const double bad : {nan, far, -far, 1e6, -2.6, std::numeric_limits<double>::infinity()})
         for (int axis = 0; axis < 3; ++axis) {
@@ -314,11 +319,12 @@ void test_map_borders() {
         expect(std::isnan(d) || std::abs(d) < 10, "the distance is finite or NaN");
     }
     expect_near(distance_to_wall<double>(sparse, {1, 0, 0}).value, Lumen::kDeep, 0, "cells without wall count as deep inside");
-    expect(sparse.bytes() < lumen.bytes(), "bricks away from the wall are not kept");
+    expect(bytes(sparse_map) < bytes(map), "bricks away from the wall are not kept");
 }
 
 void test_wall() {
-    const Lumen lumen = make_lumen(1e9);
+    const LumenMap map = make_map(1e9);
+    const Lumen lumen = view(map, InPlace{});
     const double stiffness = 5.0, radius = 0.9;  // touches in part of the map
     int touching = 0, clear = 0;
     for (int trial = 0; trial < 400; ++trial) {

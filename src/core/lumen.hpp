@@ -1,0 +1,102 @@
+// The lumen: the coefficients of a distance map's B-spline, where the wall is near.
+#pragma once
+
+#include <algorithm>
+#include <cstddef>
+#include <cstdint>
+#include <limits>
+
+#include "views.hpp"
+
+namespace endopilot {
+
+// B-spline coefficients of the signed distance to the wall (positive inside, mm), kept in bricks of 8³ cells and only
+// where the wall is near. A brick stores one cell more on each side, so that the 3³ stencil never leaves it.
+template <template <class> class Array>
+struct LumenArrays {
+    double origin[3]{}, inverse_spacing = 0, cells[3]{};
+    int bricks[3]{};
+    Array<std::int32_t> index{};   // the brick of each 8³ cells; 0: deep inside, 1: outside
+    Array<float> pool{};           // the bricks' coefficients
+
+    static constexpr int kEdge = 8, kStored = kEdge + 2, kVolume = kStored * kStored * kStored;
+    static constexpr double kDeep = 1e3;
+
+    // The first coefficient of the 3³ stencil around the cell with whole-numbered coordinates (x, y, z).
+    ENDOPILOT_DEVICE const float* stencil(double x, double y, double z) const {
+        // written so that a NaN counts as outside
+        const bool inside = x >= 0.0 && x < cells[0] && y >= 0.0 && y < cells[1] && z >= 0.0 && z < cells[2];
+        if (!inside) return &pool[kVolume];
+        const unsigned i = unsigned(int(x)), j = unsigned(int(y)), k = unsigned(int(z));
+        const std::size_t at = (std::size_t(k / kEdge) * bricks[1] + j / kEdge) * bricks[0] + i / kEdge;
+        return &pool[std::size_t(index[at]) * kVolume + ((k % kEdge) * kStored + j % kEdge) * kStored + i % kEdge];
+    }
+
+    ENDOPILOT_DEVICE bool deep(const float* stencil) const { return stencil < &pool[kVolume]; }
+};
+
+using LumenMap = LumenArrays<Owned>;
+using Lumen = LumenArrays<Viewed>;   // no lumen if it refers to nothing
+
+// coefficients: nz × ny × nx, x fastest. Cells whose whole stencil is deeper inside than `near` carry no contact;
+// cells whose whole stencil is farther outside than `far` count as outside the map.
+inline LumenMap make_lumen_map(const float* coefficients, const int (&size)[3], const double (&origin)[3], double spacing, double near,
+                               double far) {
+    constexpr int kEdge = Lumen::kEdge, kStored = Lumen::kStored, kVolume = Lumen::kVolume;
+    LumenMap map;
+    map.inverse_spacing = 1.0 / spacing;
+    for (int a = 0; a < 3; ++a) {
+        map.origin[a] = origin[a];
+        map.bricks[a] = (size[a] + kEdge - 1) / kEdge;
+        map.cells[a] = map.bricks[a] * kEdge;
+    }
+    map.pool.assign(2 * kVolume, float(Lumen::kDeep));  // brick 0: deep inside, brick 1: outside
+    std::fill(map.pool.begin() + kVolume, map.pool.end(), std::numeric_limits<float>::quiet_NaN());
+    map.index.resize(std::size_t(map.bricks[0]) * map.bricks[1] * map.bricks[2]);
+    std::vector<float> brick(kVolume);
+    std::size_t at = 0;
+    for (int bz = 0; bz < map.bricks[2]; ++bz)
+        for (int by = 0; by < map.bricks[1]; ++by)
+            for (int bx = 0; bx < map.bricks[0]; ++bx, ++at) {
+                float lowest = std::numeric_limits<float>::max(), highest = -lowest;
+                for (int z = 0, m = 0; z < kStored; ++z)
+                    for (int y = 0; y < kStored; ++y)
+                        for (int x = 0; x < kStored; ++x, ++m) {
+                            const int gx = std::clamp(bx * kEdge + x - 1, 0, size[0] - 1);
+                            const int gy = std::clamp(by * kEdge + y - 1, 0, size[1] - 1);
+                            const int gz = std::clamp(bz * kEdge + z - 1, 0, size[2] - 1);
+                            const float c = coefficients[(std::size_t(gz) * size[1] + gy) * size[0] + gx];
+                            brick[std::size_t(m)] = c;
+                            lowest = std::min(lowest, c);
+                            highest = std::max(highest, c);
+                        }
+                if (lowest > near) {
+                    map.index[at] = 0;
+                } else if (highest < -far) {
+                    map.index[at] = 1;
+                } else {
+                    map.index[at] = std::int32_t(map.pool.size() / kVolume);
+                    map.pool.insert(map.pool.end(), brick.begin(), brick.end());
+                }
+            }
+    map.pool.push_back(0.0f);  // rows are read four at a time
+    return map;
+}
+
+inline std::size_t bytes(const LumenMap& map) {
+    return map.pool.size() * sizeof(float) + map.index.size() * sizeof(std::int32_t);
+}
+
+// `place` puts a vector where the stepper reads it, and returns its address there.
+template <class Place>
+Lumen view(const LumenMap& map, const Place& place) {
+    Lumen lumen{.inverse_spacing = map.inverse_spacing, .index = place(map.index), .pool = place(map.pool)};
+    for (int a = 0; a < 3; ++a) {
+        lumen.origin[a] = map.origin[a];
+        lumen.cells[a] = map.cells[a];
+        lumen.bricks[a] = map.bricks[a];
+    }
+    return lumen;
+}
+
+}  // namespace endopilot
