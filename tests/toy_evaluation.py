@@ -66,6 +66,7 @@ def make_rollout(samples: int = 6) -> Rollout:
         drive_torque=flat,
         slip=flat,
         iterations=flat,
+        node_iterations=flat,
         valid=np.ones((1, samples), dtype=bool),
         reason=np.zeros(1, dtype=int),
         shape=shape,

@@ -28,7 +28,7 @@ void Stepper<V>::take(int l, Queue& queue) {
             load(l);
             return;
         }
-        for (sample = std::max(0, sample); sample < in_.samples; ++sample) record(world, sample, 0.0, 0.0);
+        for (sample = std::max(0, sample); sample < in_.samples; ++sample) record(world, sample, 0.0, 0.0, 0.0);
         queue.finish();
     }
 }
@@ -177,7 +177,8 @@ void Stepper<V>::end_sample(int l, Queue& queue) {
     w[World::kBaseTorque] = get(base_torque_, l);
     w[World::kDriveForce] = lane.by_force ? lane.speed : w[World::kBaseForce] + valve.gradient_a;
     w[World::kDriveTorque] = lane.by_force ? lane.spin : w[World::kBaseTorque] + valve.gradient_r;
-    if (lane.sample >= 0) record(lane.world, lane.sample, double(lane.total_iterations) / lane.steps, lane.slip + lane.refused);
+    if (lane.sample >= 0)
+        record(lane.world, lane.sample, double(lane.total_iterations) / lane.steps, double(lane.node_iterations), lane.slip + lane.refused);
     if (lane.sample + 1 < in_.samples)
         queue.put_back(lane.world, lane.sample + 1, lane.active);
     else
@@ -193,12 +194,13 @@ void Stepper<V>::fail(int l) {
     lane.rotation = lane.start.rotation;
     store(l);
     world_[lane.world][World::kReason] = lane.finite ? kNotConverged : kNotFinite;
-    for (int sample = std::max(0, lane.sample); sample < in_.samples; ++sample) record(lane.world, sample, 0.0, 0.0);
+    for (int sample = std::max(0, lane.sample); sample < in_.samples; ++sample)
+        record(lane.world, sample, 0.0, sample == lane.sample ? double(lane.node_iterations) : 0.0, 0.0);
     lane.world = -1;
 }
 
 template <class V>
-void Stepper<V>::record(int world, int sample, double iterations, double slip) const {
+void Stepper<V>::record(int world, int sample, double iterations, double node_iterations, double slip) const {
     const World w = world_[world];
     const std::size_t at = std::size_t(world) * in_.samples + sample;
     const int active = int(w[World::kActive]);
@@ -217,6 +219,7 @@ void Stepper<V>::record(int world, int sample, double iterations, double slip) c
     out_.drive_force[at] = w[World::kDriveForce];
     out_.drive_torque[at] = w[World::kDriveTorque];
     out_.iterations[at] = iterations;
+    out_.node_iterations[at] = node_iterations;
     out_.slip[at] = slip;
     out_.valid[at] = w.valid();
     const auto write = [](double* to, const Vec3<double>& v) { to[0] = v.x, to[1] = v.y, to[2] = v.z; };

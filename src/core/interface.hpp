@@ -124,14 +124,15 @@ struct Inputs {
 enum Reason : std::uint8_t { kFine = 0, kNotFinite = 1, kNotConverged = 2 };
 
 // Arrays of worlds × samples (× 3, × nodes × 3). `slip` is the commanded advance (mm) that was not made, and
-// `approach_slip` that before the first sample.
+// `approach_slip` that before the first sample. `iterations` are Newton's, a step; `node_iterations` count every evaluation of
+// an active node, those of attempts that were given up too.
 struct Outputs {
     double *inserted, *rotation;                 // mm, rad
     double *tip_position, *tip_direction;        // mm, unit vector
     double *force_max, *force_sum;               // of the wall on a node, N
     double *base_force, *base_torque;            // of the base on the wire, forwards positive, N, N mm
     double *drive_force, *drive_torque;          // of the drive: that of the base and the introducer's resistance, N, N mm
-    double *iterations, *slip;
+    double *iterations, *node_iterations, *slip;
     bool* valid;
     double* approach_slip;    // worlds
     double* shape;            // may be null

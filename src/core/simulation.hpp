@@ -52,7 +52,7 @@ public:
         require(control.shape(0) == worlds && control.shape(2) == 2, "control needs two numbers a world and sample");
         require(steps_per_sample >= 1 && time_step > 0, "time step and steps per sample must be positive");
         OutputArray<double> inserted(n), rotation(n), tip(3 * n), direction(3 * n), force_max(n), force_sum(n), base_force(n),
-            base_torque(n), drive_force(n), drive_torque(n), iterations(n), slip(n), approach_slip(worlds);
+            base_torque(n), drive_force(n), drive_torque(n), iterations(n), node_iterations(n), slip(n), approach_slip(worlds);
         OutputArray<bool> valid(n);
         OutputArray<double> shape(record_shape ? 3 * n * nodes : 0), attitude(record_attitude ? 4 * n * nodes : 0);
         nb::dict result;
@@ -67,6 +67,7 @@ public:
         result["drive_force"] = drive_force.array(worlds, samples);
         result["drive_torque"] = drive_torque.array(worlds, samples);
         result["iterations"] = iterations.array(worlds, samples);
+        result["node_iterations"] = node_iterations.array(worlds, samples);
         result["slip"] = slip.array(worlds, samples);
         result["approach_slip"] = approach_slip.array(worlds);
         result["valid"] = valid.array(worlds, samples);
@@ -91,6 +92,7 @@ public:
                           .drive_force = drive_force.data,
                           .drive_torque = drive_torque.data,
                           .iterations = iterations.data,
+                          .node_iterations = node_iterations.data,
                           .slip = slip.data,
                           .valid = valid.data,
                           .approach_slip = approach_slip.data,

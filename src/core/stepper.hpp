@@ -97,7 +97,7 @@ private:
         int tick = 0, stride = 0;         // time since the start of the sample, and the step, in time_step / kTicks
         int active = 0;                   // nodes that do not follow the drive
         int iterations = 0, rejections = 0, steps = 0;
-        long total_iterations = 0;
+        long total_iterations = 0, node_iterations = 0;   // of the sample; the latter count each active node
         double inserted = 0, rotation = 0, speed = 0, spin = 0;   // at the start of the sample; mm/s, rad/s, or N, N mm
         double slip = 0, refused = 0;                             // mm in this sample: forwards, backwards
         double push = 0;                                          // N, at the end of the last step
@@ -161,7 +161,7 @@ private:
     template <class Queue>
     void end_sample(int l, Queue& queue);
     void fail(int l);
-    void record(int world, int sample, double iterations, double slip) const;
+    void record(int world, int sample, double iterations, double node_iterations, double slip) const;
 
     // The step of one lane (below).
     void begin(int l, bool fresh);
@@ -264,6 +264,7 @@ typename Stepper<V>::Decision Stepper<V>::decide(int l) {
     if (lane.world < 0) return Decision::idle;
     ++lane.iterations;
     ++lane.total_iterations;
+    lane.node_iterations += lane.active;
     const double energy = get(energy_, l) + (lane.by_force ? drive_energy(lane, l).energy : 0.0);
     lane.finite = std::isfinite(energy);
     if (lane.iterations > options_.max_iterations * (lane.stride == 1 && !lane.extrapolated ? kSnapIterations : 1)) return Decision::restart;

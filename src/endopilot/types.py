@@ -269,6 +269,8 @@ class Rollout:
         drive_torque: torque of the drive, N·mm, likewise.
         slip: advance that was commanded and not made in the period, mm; 0 unless the drive slipped.
         iterations: mean Newton iterations a time step over the period.
+        node_iterations: evaluations of active nodes in the period: for each Newton iteration, also those of attempts
+            that were given up, the nodes ahead of the catheter.
         valid: false from the sample in which a world failed to converge or left the finite numbers.
         reason: why a world became invalid: 0 it is valid, 1 it left the finite numbers, 2 it did not converge.
         shape: positions of all nodes from tip to base, LPS mm, if they were recorded.
@@ -291,6 +293,7 @@ class Rollout:
     drive_torque: Float[np.ndarray, "worlds samples"]
     slip: Float[np.ndarray, "worlds samples"]
     iterations: Float[np.ndarray, "worlds samples"]
+    node_iterations: Float[np.ndarray, "worlds samples"]
     valid: Bool[np.ndarray, "worlds samples"]
     reason: Int[np.ndarray, "worlds"]
     shape: Float[np.ndarray, "worlds samples nodes 3"] | None = None

@@ -16,6 +16,7 @@ from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import read_device
 from endopilot.simulation.simulate import simulate
+from endopilot.simulation.simulator import Simulator
 from endopilot.types import Anatomy, Insertion
 
 WORLDS, SAMPLES = 6, 16
@@ -36,7 +37,8 @@ def drive(worlds: int = WORLDS) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndar
 
 
 def same(a, b, rows) -> None:
-    for name in ("tip_position", "tip_direction", "contact_force_sum", "base_force", "base_torque", "iterations"):
+    recorded = ("tip_position", "tip_direction", "contact_force_sum", "base_force", "base_torque", "node_iterations")
+    for name in (*recorded, "iterations"):
         assert np.array_equal(getattr(a, name), getattr(b, name)[rows]), name
 
 
@@ -67,6 +69,21 @@ def test_kinematics_and_forces(anatomy: Anatomy) -> None:
     assert (rollout.contact_force_max <= rollout.contact_force_sum + 1e-12).all()
     assert (rollout.tip.abscissa < rollout.inserted_length + 3).all()
     assert rollout.contact_force_max.max() / 5.0 < 0.05  # penetration, mm
+
+
+def test_node_iterations_count_every_evaluation_of_an_active_node(anatomy: Anatomy) -> None:
+    initial, control = np.array([[20.0, 0.0]]), np.tile([0.0, 1.0], (1, 4, 1))
+    simulator = Simulator(anatomy, DEVICE)
+    simulator.reset(inserted_length=initial[:, 0], rotation=initial[:, 1])
+    active, steps = simulator.active_nodes[0], 5
+    for largest_jump in (1e3, 0.01, 1e-3):  # no step is shortened, some are, many are
+        config = SimulatorConfig(largest_jump=largest_jump, time_step_s=0.1)
+        rollout = simulate(anatomy, DEVICE, control, initial=initial, config=config)
+        evaluations = rollout.node_iterations / active
+        np.testing.assert_array_equal(evaluations, np.round(evaluations))
+        made = evaluations / rollout.iterations  # steps
+        np.testing.assert_allclose(made, np.round(made), rtol=1e-12)
+        assert (made == steps).all() if largest_jump == 1e3 else (made > steps).any()
 
 
 def test_the_wire_moves_on_evenly_while_nodes_are_set_free(anatomy: Anatomy) -> None:
@@ -163,6 +180,7 @@ from bend import vessel
 from endopilot.errors import InputError
 from endopilot.simulation.device import read_device
 from endopilot.simulation.simulate import simulate
+from endopilot.simulation.simulator import Simulator
 anatomy, device, good = vessel(), read_device("workhorse-014"), np.zeros((2, 4, 2))
 for control, others in (
     (np.zeros((2, 4, 3)), {}),

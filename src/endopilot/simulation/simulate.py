@@ -153,6 +153,7 @@ RECORDED = (
     "drive_torque",
     "slip",
     "iterations",
+    "node_iterations",
     "valid",
 )
 
