@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
-from endopilot.extras import extra_named, requirements_of_extras, what_is_missing
+from endopilot.errors import InputError
+from endopilot.extras import extra_named, require_extras, requirements_of_extras, what_is_missing
 
 HIDE = "import sys; sys.modules[{module!r}] = None\n"
 """Makes a process where importing a module fails as if it were not installed."""
@@ -63,3 +65,24 @@ def test_a_name_of_the_package_names_the_extra() -> None:
     assert result.returncode == 1
     last = result.stderr.strip().splitlines()[-1]
     assert last == "ModuleNotFoundError: endopilot.train needs torch; install it with: pip install 'endopilot[learn]'"
+
+
+def test_all_extras_that_are_missing_are_named_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    present = {"learn": False, "env": True, "report": False}
+    monkeypatch.setattr("endopilot.extras.extras_present", lambda: present)
+    require_extras("env")
+    with pytest.raises(InputError, match=r"pip install 'endopilot\[learn,report\]'$"):
+        require_extras("learn", "env", "report")
+
+
+def test_a_run_says_so_before_it_begins(tmp_path: Path) -> None:
+    result = run_without("plotly", f"from endopilot.cli import main; main(['demo', '-o', {str(tmp_path / 'demo')!r}])")
+    assert result.returncode == 2
+    assert result.stderr == "endopilot demo: needs more libraries; install them with: pip install 'endopilot[report]'\n"
+    assert not (tmp_path / "demo").exists()
+
+
+@pytest.mark.parametrize("command", ["demo", "run", "dataset", "dataset-info", "train", "evaluate"])
+def test_help_needs_no_extra(command: str) -> None:
+    result = run_without("pyarrow", f"from endopilot.cli import main; main([{command!r}, '--help'])")
+    assert result.returncode == 0 and result.stdout.startswith(f"usage: endopilot {command} ")

@@ -6,6 +6,8 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from endopilot.errors import InputError
+
 FOR_DEVELOPERS = ("dev", "docs")
 """Extras that no command needs."""
 
@@ -40,6 +42,18 @@ def what_is_missing(error: ModuleNotFoundError) -> str | None:
         if extra not in FOR_DEVELOPERS and _normal(module) in libraries:
             return f"needs {module}; install it with: pip install 'endopilot[{extra}]'"
     return None
+
+
+def require_extras(*extras: str) -> None:
+    """Make sure that the libraries of some extras are installed, before work that needs them only at its end.
+
+    Raises:
+        InputError: some are not; the message names the extras that bring them.
+    """
+    present = extras_present()
+    missing = [extra for extra in extras if not present[extra]]
+    if missing:
+        raise InputError(f"needs more libraries; install them with: pip install 'endopilot[{','.join(missing)}]'")
 
 
 @contextmanager

@@ -23,10 +23,10 @@ from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy, read_sourc
 from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.dataset.config import DatasetConfig
-from endopilot.dataset.generate import generate_dataset
 from endopilot.dataset.loader import load_dataset
 from endopilot.evaluation.anatomy_score import score_anatomy
 from endopilot.evaluation.results import REPORT_FILE
+from endopilot.extras import require_extras
 from endopilot.files import input_hash, manifest, read_json, write_json
 from endopilot.imaging.segment import METHODS, SegmentConfig, segment
 from endopilot.imaging.volume import read_mask, read_volume, write_mask, write_volume
@@ -44,6 +44,8 @@ from endopilot.types import Rollout, Volume
 VOLUME_SUFFIX = ".nii.gz"
 EVALUATED = 48
 """Navigations that are evaluated in each split; each is simulated seven times."""
+_EXTRAS = ("learn", "report")
+"""Extras that the stages need, the last one after minutes of work."""
 _PRETRAINED_DEVICE = "workhorse-014"
 DEMO_ORIGIN = (
     "The patients are synthetic: right coronary arteries drawn from published statistics, and a CT angiogram of each, "
@@ -177,8 +179,10 @@ def run_demo(output: Path, config: DemoConfig) -> dict[str, Any]:
         The report's path and the figures of its summary.
 
     Raises:
-        InputError: the folder belongs to another run, or too few patients could be segmented.
+        InputError: a library of some stage is not installed, the folder belongs to another run, or too few patients
+            could be segmented.
     """
+    require_extras(*_EXTRAS)
     device = read_device(config.device)
     claim(output, "endopilot demo", config=config, device=device, version=__version__)
     run = _Run(
@@ -212,9 +216,10 @@ def run_volume(volume: Path, output: Path, config: RunConfig, *, series: str | N
         As `run_demo` does.
 
     Raises:
-        InputError: the volume cannot be read or segmented, or the folder belongs to another run, such as that of
-            another volume.
+        InputError: a library of some stage is not installed, the volume cannot be read or segmented, or the folder
+            belongs to another run, such as that of another volume.
     """
+    require_extras(*_EXTRAS)
     content, device = read_volume(volume, series=series), read_device(config.device)
     identity = {"volume_sha256": _digest(content), "method": METHODS.origin(config.segmentation.method)}
     claim(output, "endopilot run", **identity, config=config, device=device, version=__version__)
@@ -285,6 +290,7 @@ def _study(run: _Run, volumes: Sequence[Path]) -> dict[str, Any]:
 
 def _learn(run: _Run, anatomies: Sequence[Path]) -> None:
     """Simulate navigations, train networks on them or take those of the package, and evaluate the networks."""
+    from endopilot.dataset.generate import generate_dataset  # an extra brings its libraries
     from endopilot.evaluation.evaluate import EvaluateConfig, evaluate
     from endopilot.models.train import train  # torch takes seconds to import
     from endopilot.report.evaluation_report import report_evaluation

@@ -8,7 +8,6 @@ from tyro.conf import Positional
 
 from endopilot.cli.arguments import OutputFolder, existing, show
 from endopilot.dataset.config import DatasetConfig
-from endopilot.dataset.generate import generate_dataset
 from endopilot.files import read_json
 from endopilot.simulation.device import read_device
 
@@ -36,6 +35,8 @@ def command(
         json: print the figures as JSON.
         config: how many navigations, how long, and how they are split.
     """
+    from endopilot.dataset.generate import generate_dataset  # an extra brings its libraries; --help needs none
+
     generate_dataset(
         [existing(folder) for folder in anatomies], output, read_device(device), config, scheduler=scheduler
     )

@@ -8,7 +8,6 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from endopilot.cli.arguments import existing, show
-from endopilot.dataset.info import describe_dataset, draw_pictures
 
 
 def command(
@@ -25,6 +24,8 @@ def command(
         output: folder of the pictures, one of each distribution; none is drawn if not given.
         json: print the figures as JSON.
     """
+    from endopilot.dataset.info import describe_dataset, draw_pictures  # an extra brings their libraries
+
     description = describe_dataset(existing(dataset))
     pictures = [] if output is None else draw_pictures(description, output)
     show(description.figures | ({"pictures": [str(path) for path in pictures]} if pictures else {}), as_json=json)
