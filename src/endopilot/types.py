@@ -129,6 +129,12 @@ class VesselTree:
     branches: tuple[Branch, ...]
     section_names: tuple[str, ...]
 
+    @property
+    def sections_present(self) -> tuple[str, ...]:
+        """Those of `section_names` that a point of this tree belongs to, in their order."""
+        present = {int(section) for branch in self.branches for section in np.unique(branch.section)}
+        return tuple(self.section_names[section] for section in sorted(present))
+
     def children(self, branch: int) -> tuple[int, ...]:
         """Return the indices of the branches that leave at the end of `branch`."""
         return tuple(i for i, candidate in enumerate(self.branches) if candidate.parent == branch)
@@ -204,6 +210,11 @@ class Anatomy:
     insertion: Insertion
     catheter_radius_mm: float
     provenance: dict[str, Any] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        branches, length = len(self.tree.branches), float(self.tree.longest_path().abscissa[-1])
+        sections = ", ".join(self.tree.sections_present)
+        return f"Anatomy(name={self.name!r}, branches={branches}, longest_path_mm={length:.1f}, sections={sections!r})"
 
     @cached_property
     def identity(self) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from analytic_shapes import forked_tree
@@ -50,3 +52,9 @@ def test_helix_has_its_curvature_and_torsion_and_untwisted_normals():
     turned = np.arccos(np.clip([line.normals[5] @ frenet[5], line.normals[105] @ frenet[105]], -1, 1))
     expected = pitch / square * (line.abscissa[105] - line.abscissa[5])
     assert min(abs(turned[1] - turned[0] - expected), abs(turned[0] - turned[1] - expected)) < 0.02
+
+
+def test_a_tree_names_only_the_sections_that_it_has():
+    tree, _ = make_patient_tree(AtlasConfig(anatomy="rca", count=1, seed=7), 0)
+    root = replace(tree, branches=tree.branches[:1])
+    assert len(tree.sections_present) > 1 and root.sections_present == ("1",)

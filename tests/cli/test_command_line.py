@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from endopilot.cli import COMMANDS, main, module_of
+from endopilot.cli.arguments import show
 
 
 def run(*arguments: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
@@ -112,3 +113,10 @@ def test_a_closed_output_is_no_error() -> None:
         errors = process.stderr.read()
     assert errors == ""
     assert process.returncode == 141
+
+
+def test_what_is_absent_is_shown_as_a_dash(capsys: pytest.CaptureFixture[str]) -> None:
+    show({"remarks": [], "rejected": {}, "difference": None, "count": 0}, as_json=False)
+    assert [line.split() for line in capsys.readouterr().out.splitlines()] == [
+        ["remarks", "-"], ["rejected", "-"], ["difference", "-"], ["count", "0"],
+    ]  # fmt: skip

@@ -67,7 +67,7 @@ def test_one_segment_of_several_is_chosen(tmp_path):
         slices, labels, "BINARY", segments, hd.UID(), 1, hd.UID(), 1, "x", "x", "1", "1", omit_empty_frames=True
     )
     made.save_as(tmp_path / "two.dcm")
-    with pytest.raises(InputError, match=r"2 labels \(1, 2\); choose one with --label") as caught:
+    with pytest.raises(InputError, match=r"2 labels \(1, 2\); choose one: label=N \(--label N\)") as caught:
         read_mask(tmp_path / "two.dcm")
     assert "Doe" not in str(caught.value)
     for label in (1, 2):

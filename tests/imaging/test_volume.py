@@ -172,7 +172,7 @@ def test_one_label_of_several_is_chosen(tmp_path):
     labels = np.zeros((5, 6, 7), np.uint8)
     labels[1:3], labels[3:] = 2, 5
     sitk.WriteImage(_image(labels), tmp_path / "labels.nii.gz")
-    with pytest.raises(InputError, match=r"2 labels \(2, 5\); choose one with --label"):
+    with pytest.raises(InputError, match=r"2 labels \(2, 5\); choose one: label=N \(--label N\)"):
         read_mask(tmp_path / "labels.nii.gz")
     np.testing.assert_array_equal(read_mask(tmp_path / "labels.nii.gz", label=5).volume.voxels, labels == 5)
     with pytest.raises(InputError, match="no voxel has label 3"):

@@ -80,13 +80,13 @@ def _draw_tree(anatomy: Anatomy, figure: Any) -> None:
         colour[:, :3] *= shade[:, None]
         visible = list(corners[order][:, :, [0, 2]])
         axes.add_collection(PolyCollection(visible, facecolors=colour[order], edgecolors="none"))
-        axes.set(aspect="equal", title=title, xlabel="x (left), mm", ylabel="z (head), mm")
+        axes.set(aspect="equal", title=title, xlabel="x (to the patient's left), mm", ylabel="z (to the head), mm")
         axes.autoscale_view()
         if title == "sections":
             handles = [Patch(color=palette(i % palette.N), label=tree.section_names[s]) for i, s in enumerate(present)]
             axes.legend(handles=[*handles, Patch(color="0.75", label="catheter")], fontsize=8, loc="upper right")
         else:
-            figure.colorbar(ScalarMappable(scale, "viridis"), ax=axes, shrink=0.8)
+            figure.colorbar(ScalarMappable(scale, "viridis"), cax=axes.inset_axes((1.03, 0.0, 0.03, 1.0)))
 
 
 def _wall(anatomy: Anatomy) -> tuple[Float[np.ndarray, "n 3"], Any]:

@@ -84,7 +84,7 @@ def describe(anatomy: Anatomy) -> dict[str, object]:
         ),
         "ostium_radius_mm": round(float(path.radius[0]), 2),
         "smallest_radius_mm": round(float(min(b.centerline.radius.min() for b in anatomy.tree.branches)), 2),
-        "sections": list(anatomy.tree.section_names),
+        "sections": list(anatomy.tree.sections_present),
         "ostium_lps_mm": anatomy.insertion.position.round(2).tolist(),
         "insertion_direction": anatomy.insertion.direction.round(3).tolist(),
         "map_spacing_mm": round(anatomy.distance_map.spacing_mm, 3),

@@ -54,7 +54,7 @@ def show_rows(rows: Sequence[Mapping[str, Any]], *, as_json: bool) -> None:
 
 
 def _text(value: Any) -> str:
-    if value is None:
+    if value is None or (isinstance(value, list | tuple | Mapping) and not value):
         return "-"
     if isinstance(value, bool):
         return "yes" if value else "no"

@@ -97,6 +97,11 @@ class Plan:
     processor_seconds: float
 
     @property
+    def seconds(self) -> float:
+        """How long the planned navigation takes, s."""
+        return DECISION_PERIOD_S * len(self.control)
+
+    @property
     def ratio(self) -> Float[np.ndarray, "samples"]:
         """Safety ratio γ/(r − r_w) in the rod core."""
         tip = self.simulated

@@ -76,7 +76,7 @@ def write_plan(plan: Plan, folder: Path, xray: PlannedXray | None = None) -> dic
         "method": plan.config.method,
         "reached": plan.reached,
         "within_force_limit": plan.within_force_limit,
-        "seconds": DECISION_PERIOD_S * len(plan.control),
+        "seconds": plan.seconds,
         "target_mm": round(navigation.target.abscissa, 2),
         "tip_error_mm": round(float(np.abs(tip.abscissa[-1] - navigation.target.abscissa)), 3),
         "model_error_mm": round(float(np.abs(plan.predicted[:, 0] - tip.abscissa).mean()), 3),

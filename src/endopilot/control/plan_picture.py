@@ -104,5 +104,5 @@ def _legend_above(axes: Axes) -> None:
 def _draw_safety(plan: Plan, time_s: np.ndarray, axes: Axes) -> None:
     axes.plot(time_s, plan.ratio, color="tab:purple")
     axes.axhline(plan.config.cost.safe_ratio, color="0.4", linestyle="--", linewidth=1)
-    axes.set_ylim(0, 1.1)
-    axes.set_ylabel("γ/(r − r_w)")
+    axes.set_ylim(0, 1.1 * max(1.0, float(plan.ratio.max())))
+    axes.set_ylabel("safety ratio\nγ/(r − r_w)")

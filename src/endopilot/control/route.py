@@ -139,9 +139,8 @@ def parse_target(anatomy: Anatomy, text: str) -> Target:
     section = names[wanted[0]] if wanted else -1
     length = [_length(branch.centerline, branch.section == section) for branch in tree.branches]
     if not any(length):
-        present = sorted({tree.section_names[i] for branch in tree.branches for i in np.unique(branch.section)})
         raise InputError(
-            f"--target {text}: {anatomy.name} has no such section (it has {', '.join(present)}); "
+            f"--target {text}: {anatomy.name} has no such section (it has {', '.join(tree.sections_present)}); "
             "give one of them, a point X,Y,Z in LPS mm, or a CSV of desired tips"
         )
     branch = int(np.argmax(length))

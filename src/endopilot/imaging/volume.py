@@ -266,7 +266,7 @@ def _inside(values: np.ndarray, label: int | None, path: Path) -> np.ndarray:
     if len(labels) == 0:
         raise InputError(f"{path}: the mask is empty; segment the vessel again or give another file")
     if label is None and len(labels) > 1:
-        raise InputError(f"{path}: the mask holds {len(labels)} labels ({listed}); choose one with --label")
+        raise InputError(f"{path}: the mask holds {len(labels)} labels ({listed}); choose one: label=N (--label N)")
     if label is not None and label not in labels:
         raise InputError(f"{path}: no voxel has label {label}; the file holds {listed}")
     return values == (labels[0] if label is None else label)
