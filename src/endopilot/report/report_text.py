@@ -57,7 +57,7 @@ def opening(metrics: Mapping[str, Any]) -> str:
     parts = [
         f"On {_count(split['episodes'], 'new navigation')} in {patients} {whose}, after 15 s of given states:",
         f"given the drive's motion, the forward network predicts the tip's position along the vessel with a mean error "
-        f"of {_mm(tip['P1'], 'abscissa')} over the next 45 s ({_mm(tip['P1'], 'offset')} across the vessel);",
+        f"of {_mm(tip['P1'], 'abscissa')} over the rest, at most 45 s ({_mm(tip['P1'], 'offset')} across the vessel);",
         f"holding the slack, which needs no learning, errs by {_mm(tip['hold_slack'], 'abscissa')} "
         f"({_mm(tip['hold_slack'], 'offset')}).",
         f"When the inverse network chooses the controls and they are simulated, the tip errs by "
@@ -153,13 +153,13 @@ def mean_errors(metrics: Mapping[str, Any], split: str) -> list[dict[str, str]]:
 
 
 def replay_remark(metrics: Mapping[str, Any], split: str) -> str:
-    """Return how far the recorded navigations repeat when they are simulated again: the floor of P4."""
+    """Return how far the recorded navigations repeat when they are simulated again; P4 cannot err by less."""
     distance = metrics["splits"][split]["tip"].get("true_replay", {}).get("distance_3d", {})
     if distance.get("mae") is None:
         return ""
     return (
         f"Simulated again with the recorded controls, the tips return to where they were recorded within "
-        f"{distance['mae']:.2g} mm on average: the floor under P4."
+        f"{distance['mae']:.2g} mm on average. P4 cannot err by less."
     )
 
 
