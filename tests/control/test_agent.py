@@ -68,7 +68,7 @@ def test_a_course_is_what_the_simulator_does_under_its_controls(side_branch) -> 
     assert side_branch.reached(simulator.project())[0]
 
 
-def test_the_agent_finds_the_way_though_the_wire_is_another_than_believed(side_branch) -> None:
+def test_the_agent_arrives_though_the_wire_is_another_than_believed(side_branch) -> None:
     truth = ModelMismatch(friction_factor=1.2, stiffness_factor=0.8, ostium_mm=0.3)
     record = navigate(side_branch, AgentPolicy(QUICK), seed=2, truth=truth)
     assert record.success and record.safe and record.faults == 0

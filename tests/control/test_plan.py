@@ -79,7 +79,7 @@ def test_a_plan_whose_manifest_lacks_what_was_asked_is_refused(found, vessel, tm
         read_plan(tmp_path / "plan", read_anatomy(vessel), found.navigation.device)
 
 
-def test_a_way_that_does_not_arrive_in_the_rod_core_is_no_plan(vessel, monkeypatch):
+def test_a_path_that_does_not_arrive_in_the_rod_core_is_no_plan(vessel, monkeypatch):
     """The search believes that it arrived; the rod core at its own settings has the tip elsewhere."""
     still = np.zeros((4, 2)), np.full((4, 2), 33.0)
     monkeypatch.setattr(plan_module, "_search", lambda *_: still)

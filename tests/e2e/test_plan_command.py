@@ -98,7 +98,7 @@ def test_desired_tips_that_no_drive_can_keep_up_with(patient, tmp_path, capsys):
         (("--target", "0,0,33", "--force-weight", "-1"), ("force_weight",)),
     ],
 )
-def test_what_cannot_be_planned_is_told_in_one_line(patient, tmp_path, capsys, arguments, parts):
+def test_what_cannot_be_planned_is_refused_in_one_line(patient, tmp_path, capsys, arguments, parts):
     line = refused(capsys, "plan", patient, *arguments, "-o", tmp_path / "plan")
     assert all(part in line for part in parts), line
     assert not (tmp_path / "plan").exists()

@@ -193,7 +193,7 @@ def test_a_world_that_fails_terminates_and_says_so(near, monkeypatch):
     assert not truncations.any() and not infos["success"].any()
 
 
-def test_too_large_a_force_is_told_and_remembered(near):
+def test_too_large_a_force_is_reported_and_remembered(near):
     env = NavigateEnv(navigation=replace(near, force_limit_n=1e-4))
     env.reset(seed=0)
     infos = [env.step(np.array([1.0, 0.0]))[4] for _ in range(15)]
@@ -202,7 +202,7 @@ def test_too_large_a_force_is_told_and_remembered(near):
     assert [info["safe"] for info in infos] == (~np.maximum.accumulate(unsafe)).tolist()
 
 
-def test_a_wrong_branch_lengthens_the_way():
+def test_a_wrong_branch_lengthens_the_route():
     navigation = reference_navigation()
     tree = navigation.anatomy.tree
     env = NavigateEnv(navigation=navigation)
