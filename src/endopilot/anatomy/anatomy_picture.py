@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PolyCollection
-from matplotlib.colors import Normalize
+from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.patches import Patch
 from scipy.ndimage import map_coordinates, zoom
 from skimage.measure import marching_cubes
@@ -28,6 +28,8 @@ SECTIONS = 6
 """Cross-sections that are drawn, evenly along the longest path."""
 
 WINDOW_HU = (-150.0, 650.0)
+_SECTION_COLOURS = ListedColormap(plt.get_cmap("tab10")([0, 1, 2, 3, 4, 5, 6, 8, 9]))
+"""Without grey, which is the catheter's."""
 _LARGEST_GRID = 1_500_000
 _LIGHT = np.array([-0.35, -0.8, 0.5]) / np.linalg.norm([-0.35, -0.8, 0.5])
 
@@ -71,7 +73,7 @@ def _draw_tree(anatomy: Anatomy, figure: Any) -> None:
     shade = 0.45 + 0.55 * np.abs(normal @ _LIGHT)
     order = np.argsort(-corners[:, :, 1].mean(axis=1))  # from the back (large y) to the front
     present = np.unique(section)
-    palette = plt.get_cmap("tab20" if len(present) > 10 else "tab10")
+    palette = _SECTION_COLOURS if len(present) <= _SECTION_COLOURS.N else plt.get_cmap("tab20")
     scale = Normalize(float(radius.min()), float(radius.max()))
     number = np.searchsorted(present, section)
     for axes, title in zip(figure.subplots(1, 2), ("sections", "radius, mm"), strict=True):
