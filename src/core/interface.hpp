@@ -53,7 +53,7 @@ struct Base {
     // of that point: the joint is freed gradually, since freeing a whole node at once would jolt the wire.
     ENDOPILOT_DEVICE static double share_of_last_joint(const RodModel& rod, double inserted, double free_behind, int active) {
         const double ahead = middle(rod, active - 1), behind = middle(rod, active);
-        return std::clamp((inserted - ahead + free_behind) / (behind - ahead), kLeastShare, 1.0);
+        return std::clamp((inserted - ahead + free_behind) / (behind - ahead), double{kLeastShare}, 1.0);
     }
 
     ENDOPILOT_DEVICE static double middle(const RodModel& rod, int element) { return rod.abscissa[element] + 0.5 * rod.length[element]; }

@@ -10,11 +10,14 @@
 #include <immintrin.h>
 #endif
 
-// Functions that also run on a CUDA device, in scalar lanes: one world a thread.
+// Functions that also run on a CUDA device, in scalar lanes: one world a thread. Large ones are called there, not inlined:
+// a kernel of all of them takes every register that there is, and its compilation crashes the compiler of CUDA 13.0.
 #ifdef __CUDACC__
 #define ENDOPILOT_DEVICE __host__ __device__
+#define ENDOPILOT_LARGE __host__ __device__ __noinline__
 #else
 #define ENDOPILOT_DEVICE
+#define ENDOPILOT_LARGE
 #endif
 
 namespace endopilot {

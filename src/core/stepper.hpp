@@ -81,10 +81,10 @@ private:
     // Gradient and Hessian alone, for all lanes.
     struct DriveBlock {
         V gradient_a, gradient_r, aa, ar, rr;
-        friend DriveBlock operator+(const DriveBlock& a, const DriveBlock& b) {
+        ENDOPILOT_DEVICE friend DriveBlock operator+(const DriveBlock& a, const DriveBlock& b) {
             return {a.gradient_a + b.gradient_a, a.gradient_r + b.gradient_r, a.aa + b.aa, a.ar + b.ar, a.rr + b.rr};
         }
-        friend DriveBlock select(Mask<V> mask, const DriveBlock& yes, const DriveBlock& no) {
+        ENDOPILOT_DEVICE friend DriveBlock select(Mask<V> mask, const DriveBlock& yes, const DriveBlock& no) {
             return {endopilot::select<V>(mask, yes.gradient_a, no.gradient_a),
                     endopilot::select<V>(mask, yes.gradient_r, no.gradient_r),
                     endopilot::select<V>(mask, yes.aa, no.aa), endopilot::select<V>(mask, yes.ar, no.ar),
@@ -127,23 +127,23 @@ private:
     DriveBlock drive_{};           // of the wire's energy, all nodes eliminated
     V drive_a_{}, drive_r_{};      // the drive's Newton step
 
-    double duration(const Lane& lane) const { return in_.time_step * lane.stride / kTicks; }
-    double elapsed(int tick) const { return in_.time_step * tick / kTicks; }
-    double sample_period() const { return in_.time_step * in_.steps_per_sample; }
+    ENDOPILOT_DEVICE double duration(const Lane& lane) const { return in_.time_step * lane.stride / kTicks; }
+    ENDOPILOT_DEVICE double elapsed(int tick) const { return in_.time_step * tick / kTicks; }
+    ENDOPILOT_DEVICE double sample_period() const { return in_.time_step * in_.steps_per_sample; }
 
-    static void put(Vec3<V>& to, int l, const Vec3<double>& v) {
+    ENDOPILOT_DEVICE static void put(Vec3<V>& to, int l, const Vec3<double>& v) {
         set(to.x, l, v.x);
         set(to.y, l, v.y);
         set(to.z, l, v.z);
     }
-    static void put(Quaternion<V>& to, int l, const Quaternion<double>& q) {
+    ENDOPILOT_DEVICE static void put(Quaternion<V>& to, int l, const Quaternion<double>& q) {
         set(to.w, l, q.w);
         put(to.v, l, q.v);
     }
-    static Vec3<double> take(const Vec3<V>& v, int l) { return {get(v.x, l), get(v.y, l), get(v.z, l)}; }
-    static Quaternion<double> take(const Quaternion<V>& q, int l) { return {get(q.w, l), take(q.v, l)}; }
+    ENDOPILOT_DEVICE static Vec3<double> take(const Vec3<V>& v, int l) { return {get(v.x, l), get(v.y, l), get(v.z, l)}; }
+    ENDOPILOT_DEVICE static Quaternion<double> take(const Quaternion<V>& q, int l) { return {get(q.w, l), take(q.v, l)}; }
 
-    int most_active() const {
+    ENDOPILOT_DEVICE int most_active() const {
         int n = 0;
         for (const Lane& lane : lane_)
             if (lane.world >= 0) n = std::max(n, lane.active);
@@ -152,40 +152,40 @@ private:
 
     // Between lanes and worlds (exchange.hpp).
     template <class Queue>
-    void take(int l, Queue& queue);
-    void load(int l);
-    void store(int l);
-    void read_control(int l);
-    void place(int l, int i);
-    void place_base(int l, int i);
+    ENDOPILOT_DEVICE void take(int l, Queue& queue);
+    ENDOPILOT_LARGE void load(int l);
+    ENDOPILOT_LARGE void store(int l);
+    ENDOPILOT_DEVICE void read_control(int l);
+    ENDOPILOT_DEVICE void place(int l, int i);
+    ENDOPILOT_DEVICE void place_base(int l, int i);
     template <class Queue>
-    void end_sample(int l, Queue& queue);
-    void fail(int l);
-    void record(int world, int sample, double iterations, double node_iterations, double slip) const;
+    ENDOPILOT_DEVICE void end_sample(int l, Queue& queue);
+    ENDOPILOT_DEVICE void fail(int l);
+    ENDOPILOT_LARGE void record(int world, int sample, double iterations, double node_iterations, double slip) const;
 
     // The step of one lane (below).
-    void begin(int l, bool fresh);
-    Decision decide(int l);
-    DriveEnergy introducer(const Drive& moved, int l) const;
-    DriveEnergy drive_energy(const Lane& lane, int l) const;
-    bool solve_drive(int l);
+    ENDOPILOT_LARGE void begin(int l, bool fresh);
+    ENDOPILOT_LARGE Decision decide(int l);
+    ENDOPILOT_DEVICE DriveEnergy introducer(const Drive& moved, int l) const;
+    ENDOPILOT_DEVICE DriveEnergy drive_energy(const Lane& lane, int l) const;
+    ENDOPILOT_LARGE bool solve_drive(int l);
     template <class Queue>
-    int pass(Queue& queue);
+    ENDOPILOT_DEVICE int pass(Queue& queue);
     template <class Queue>
-    int advance(int n, const Decision (&decision)[W], Queue& queue);
+    ENDOPILOT_DEVICE int advance(int n, const Decision (&decision)[W], Queue& queue);
 
     // Sweeps over the nodes of all lanes (sweeps.hpp).
-    void evaluate(int n);
-    void add_rod(int first, int count);
-    DriveBlock drive_block(const Diagonal<V>& block) const;
-    void clear_drive_entries(Mask<V> mask, Diagonal<V>& block) const;
-    void add_lumen(int first, int count);
-    void add_drag(int first, int count);
-    void eliminate_nodes(int first, int count);
-    V add_loads(int i, const Node<V>& node, Diagonal<V>& own) const;
-    V solve(int n);
-    void update(int n, const Decision (&decision)[W], const V& factor);
-    void finish_step(int n, Mask<V> mask, Mask<V> restart, const V& weight);
+    ENDOPILOT_LARGE void evaluate(int n);
+    ENDOPILOT_LARGE void add_rod(int first, int count);
+    ENDOPILOT_DEVICE DriveBlock drive_block(const Diagonal<V>& block) const;
+    ENDOPILOT_DEVICE void clear_drive_entries(Mask<V> mask, Diagonal<V>& block) const;
+    ENDOPILOT_LARGE void add_lumen(int first, int count);
+    ENDOPILOT_LARGE void add_drag(int first, int count);
+    ENDOPILOT_LARGE void eliminate_nodes(int first, int count);
+    ENDOPILOT_DEVICE V add_loads(int i, const Node<V>& node, Diagonal<V>& own) const;
+    ENDOPILOT_LARGE V solve(int n);
+    ENDOPILOT_LARGE void update(int n, const Decision (&decision)[W], const V& factor);
+    ENDOPILOT_LARGE void finish_step(int n, Mask<V> mask, Mask<V> restart, const V& weight);
 };
 
 // Begins a step of lane.stride ticks from the lane's start state; nodes ahead of the base already hold a trial.
@@ -290,14 +290,14 @@ typename Stepper<V>::Decision Stepper<V>::decide(int l) {
             return Decision::repeat;
         }
         if (damping >= kMaxDamping) return Decision::restart;
-        set(damping_, l, std::max(kFirstDamping, 10 * damping));
+        set(damping_, l, std::max(double{kFirstDamping}, 10 * damping));
         return Decision::repeat;
     }
     lane.energy = energy;
     lane.slope = get(descent_, l);
     // Where the energy is not convex the damped steps are short: lengthen them as long as they succeed.
     const double damping = lane.damping = get(damping_, l);
-    lane.boost = damping > 0 && lane.rejections == 0 ? std::min(2 * lane.boost, kMaxBoost) : 1.0;
+    lane.boost = damping > 0 && lane.rejections == 0 ? std::min(2 * lane.boost, double{kMaxBoost}) : 1.0;
     set(damping_, l, damping > kFirstDamping ? 0.25 * damping : 0.0);
     lane.rejections = 0;
     set(first_, l, 0.0);

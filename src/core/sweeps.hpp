@@ -45,7 +45,7 @@ void Stepper<V>::evaluate(int n) {
     pivot_ = broadcast<V>(1.0);
     block_[0] = Diagonal<V>{};
     for (int first = 0; first < n; first += kTogether) {
-        const int count = std::min(kTogether, n - first);
+        const int count = std::min(int{kTogether}, n - first);
         add_rod(first, count);
         if (lumen_) add_lumen(first, count);
         add_drag(first, count);
