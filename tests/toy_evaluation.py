@@ -60,6 +60,7 @@ def make_rollout(samples: int = 6) -> Rollout:
         tip=TipProjection(depth[None], flat, np.zeros((1, samples), dtype=int), flat + RADIUS_MM),
         contact_force_max=flat,
         contact_force_sum=flat,
+        wall_force=flat,
         base_force=flat,
         base_torque=flat,
         drive_force=flat,

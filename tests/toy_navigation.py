@@ -81,6 +81,7 @@ def toy_simulate(anatomy: Anatomy, device, control, *, initial, config, friction
         ),
         contact_force_max=force,
         contact_force_sum=2 * force,
+        wall_force=force,
         base_force=force.copy(),
         base_torque=0.1 * force,
         drive_force=force + 0.05,

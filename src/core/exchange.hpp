@@ -6,6 +6,7 @@
 namespace endopilot {
 
 constexpr double kOvershoot = 0.02;  // mm that rounded controls may pull the wire behind the ostium
+constexpr double kResultantLength = 2.0;  // mm of wire whose forces of the wall are added up: nodes may share one contact
 
 template <class V>
 template <class Queue>
@@ -206,14 +207,20 @@ void Stepper<V>::record(int world, int sample, double iterations, double node_it
     const int active = int(w[World::kActive]);
     out_.inserted[at] = w[World::kInserted];
     out_.rotation[at] = w[World::kRotation];
-    double largest = 0, sum = 0;
+    double largest = 0, sum = 0, resultant = 0;
     for (int i = 0; i < active; ++i) {
         const double force = w.node(i)[World::kNormalForce];
         largest = std::max(largest, force);
         sum += force;
+        if (force == 0) continue;
+        Vec3<double> all{0, 0, 0};
+        for (int j = i; j < active && rod_.abscissa[j] <= rod_.abscissa[i] + kResultantLength; ++j)
+            all += w.node(j)[World::kNormalForce] * vec3(w.node(j) + World::kNormal);
+        resultant = std::max(resultant, dot(all, all));
     }
     out_.force_max[at] = largest;
     out_.force_sum[at] = sum;
+    out_.wall_force[at] = std::sqrt(resultant);
     out_.base_force[at] = w[World::kBaseForce];
     out_.base_torque[at] = w[World::kBaseTorque];
     out_.drive_force[at] = w[World::kDriveForce];

@@ -130,6 +130,7 @@ struct Outputs {
     double *inserted, *rotation;                 // mm, rad
     double *tip_position, *tip_direction;        // mm, unit vector
     double *force_max, *force_sum;               // of the wall on a node, N
+    double* wall_force;                          // largest resultant on any kResultantLength of the wire, N
     double *base_force, *base_torque;            // of the base on the wire, forwards positive, N, N mm
     double *drive_force, *drive_torque;          // of the drive: that of the base and the introducer's resistance, N, N mm
     double *iterations, *node_iterations, *slip;

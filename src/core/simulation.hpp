@@ -51,8 +51,9 @@ public:
         const std::size_t worlds = count_, samples = control.shape(1), n = worlds * samples, nodes = std::size_t(scene_.rod.nodes);
         require(control.shape(0) == worlds && control.shape(2) == 2, "control needs two numbers a world and sample");
         require(steps_per_sample >= 1 && time_step > 0, "time step and steps per sample must be positive");
-        OutputArray<double> inserted(n), rotation(n), tip(3 * n), direction(3 * n), force_max(n), force_sum(n), base_force(n),
-            base_torque(n), drive_force(n), drive_torque(n), iterations(n), node_iterations(n), slip(n), approach_slip(worlds);
+        OutputArray<double> inserted(n), rotation(n), tip(3 * n), direction(3 * n), force_max(n), force_sum(n), wall_force(n),
+            base_force(n), base_torque(n), drive_force(n), drive_torque(n), iterations(n), node_iterations(n), slip(n),
+            approach_slip(worlds);
         OutputArray<bool> valid(n);
         OutputArray<double> shape(record_shape ? 3 * n * nodes : 0), attitude(record_attitude ? 4 * n * nodes : 0);
         nb::dict result;
@@ -62,6 +63,7 @@ public:
         result["tip_direction"] = direction.array(worlds, samples, 3);
         result["contact_force_max"] = force_max.array(worlds, samples);
         result["contact_force_sum"] = force_sum.array(worlds, samples);
+        result["wall_force"] = wall_force.array(worlds, samples);
         result["base_force"] = base_force.array(worlds, samples);
         result["base_torque"] = base_torque.array(worlds, samples);
         result["drive_force"] = drive_force.array(worlds, samples);
@@ -87,6 +89,7 @@ public:
                           .tip_direction = direction.data,
                           .force_max = force_max.data,
                           .force_sum = force_sum.data,
+                          .wall_force = wall_force.data,
                           .base_force = base_force.data,
                           .base_torque = base_torque.data,
                           .drive_force = drive_force.data,

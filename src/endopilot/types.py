@@ -274,6 +274,8 @@ class Rollout:
         tip: Δtip, γtip, branch and lumen radius at each sample.
         contact_force_max: largest wall force on one node, N.
         contact_force_sum: sum of the wall forces' magnitudes, N.
+        wall_force: largest resultant of the wall's forces on any 2 mm of the wire, N. It does not depend on the number
+            of elements, as the force on a node does: neighbouring nodes share one contact.
         base_force: axial force that the drive must apply to the wire, N, positive when it pushes.
         base_torque: torque that the drive must apply about the wire's axis, N·mm.
         drive_force: axial force of the drive, N: `base_force` and what the introducer's valve takes.
@@ -298,6 +300,7 @@ class Rollout:
     tip: TipProjection
     contact_force_max: Float[np.ndarray, "worlds samples"]
     contact_force_sum: Float[np.ndarray, "worlds samples"]
+    wall_force: Float[np.ndarray, "worlds samples"]
     base_force: Float[np.ndarray, "worlds samples"]
     base_torque: Float[np.ndarray, "worlds samples"]
     drive_force: Float[np.ndarray, "worlds samples"]

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bend import vessel
+from bend import BEND, vessel
 from jaxtyping import Float
 
 from endopilot.errors import InputError
@@ -69,6 +69,33 @@ def test_kinematics_and_forces(anatomy: Anatomy) -> None:
     assert (rollout.contact_force_max <= rollout.contact_force_sum + 1e-12).all()
     assert (rollout.tip.abscissa < rollout.inserted_length + 3).all()
     assert rollout.contact_force_max.max() / 5.0 < 0.05  # penetration, mm
+
+
+@pytest.mark.parametrize("elements", [60, 120])
+def test_the_wall_force_is_the_largest_resultant_on_two_millimetres_of_the_wire(
+    anatomy: Anatomy, elements: int
+) -> None:
+    config = SimulatorConfig(elements=elements)
+    rollout = simulate(
+        anatomy, DEVICE, np.zeros((1, 1, 2)), initial=np.array([[45.0, 1.0]]), config=config, record_shape=True
+    )
+    simulator = Simulator(anatomy, DEVICE, config=config)
+    simulator.reset(inserted_length=[45.0], rotation=[1.0])
+    simulator.step(np.zeros((1, 2)), 0.5)
+    assert rollout.shape is not None
+    at, force = rollout.shape[0, 0], simulator.contacts[0, : rollout.shape.shape[2]]
+    assert force.max() == rollout.contact_force_max[0, 0]
+    # The wall pushes towards the tube's axis: a line, a quarter of a circle around (0, 20, 0) and a line.
+    from_middle = at[:, :2] - [0.0, BEND]
+    turned = np.clip(np.arctan2(from_middle[:, 0], -from_middle[:, 1]), 0.0, np.pi / 2)
+    out = np.column_stack([np.sin(turned), -np.cos(turned), 0 * turned])
+    radial = np.column_stack([(from_middle * out[:, :2]).sum(axis=1) - BEND, at[:, 2]])
+    towards = -(radial[:, :1] * out + radial[:, 1:] * [0.0, 0.0, 1.0]) / np.linalg.norm(radial, axis=1)[:, None]
+    along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(at, axis=0), axis=1)))
+    within = (along >= along[:, None] - 1e-6) & (along <= along[:, None] + 2.0)
+    resultants = np.linalg.norm(within @ (force[:, None] * towards), axis=1)
+    assert rollout.wall_force[0, 0] == pytest.approx(resultants.max(), rel=0.02)
+    assert rollout.wall_force[0, 0] > 1.1 * force.max()  # several nodes share a contact
 
 
 def test_node_iterations_count_every_evaluation_of_an_active_node(anatomy: Anatomy) -> None:
@@ -176,7 +203,7 @@ def test_refuses_arrays_of_wrong_shape(anatomy: Anatomy) -> None:
     script = """
 import numpy as np, sys
 sys.path.insert(0, sys.argv[1])
-from bend import vessel
+from bend import BEND, vessel
 from endopilot.errors import InputError
 from endopilot.simulation.device import read_device
 from endopilot.simulation.simulate import simulate

@@ -147,6 +147,7 @@ RECORDED = (
     "tip_direction",
     "contact_force_max",
     "contact_force_sum",
+    "wall_force",
     "base_force",
     "base_torque",
     "drive_force",
