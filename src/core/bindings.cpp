@@ -147,6 +147,8 @@ NB_MODULE(ENDOPILOT_MODULE, module) {
         .def_rw("free_behind", &Options::free_behind)
         .def_rw("approach_velocity", &Options::approach_velocity)
         .def_rw("push_limit", &Options::push_limit)
+        .def_rw("pull_limit", &Options::pull_limit)
+        .def_rw("torque_limit", &Options::torque_limit)
         .def_rw("introducer_friction", &Options::introducer_friction)
         .def_rw("introducer_drag", &Options::introducer_drag);
     nb::class_<Simulations>(module, "Simulation")

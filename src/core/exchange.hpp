@@ -29,7 +29,7 @@ void Stepper<V>::take(int l, Queue& queue) {
             load(l);
             return;
         }
-        for (sample = std::max(0, sample); sample < in_.samples; ++sample) record(world, sample, 0.0, 0.0, 0.0);
+        for (sample = std::max(0, sample); sample < in_.samples; ++sample) record(world, sample, 0.0, 0.0, {});
         queue.finish();
     }
 }
@@ -70,8 +70,7 @@ void Stepper<V>::load(int l) {
     lane.last_duration = w[World::kLastDuration];
     lane.stride = int(w[World::kStride]);
     lane.active = int(w[World::kActive]);
-    lane.slips = w[World::kSlips] != 0;
-    lane.push = w[World::kPush];
+    lane.slipping = {int(w[World::kSlipping]), int(w[World::kSpinSlipping])};
     set(friction_, l, w[World::kFriction]);
     read_control(l);
     const double weight = lane.last_duration > 0 ? duration(lane) / lane.last_duration : 0.0;
@@ -114,8 +113,8 @@ void Stepper<V>::store(int l) {
     w[World::kLastTurned] = lane.last.rotation;
     w[World::kStride] = lane.stride;
     w[World::kActive] = lane.active;
-    w[World::kSlips] = lane.slips;
-    w[World::kPush] = lane.push;
+    w[World::kSlipping] = lane.slipping.advance;
+    w[World::kSpinSlipping] = lane.slipping.rotation;
     for (int i = 0; i < lane.active; ++i) {
         const World::Numbers p = w.node(i);
         const Node<V>& n = node_[i];
@@ -148,10 +147,8 @@ void Stepper<V>::read_control(int l) {
         lane.refused = lane.inserted + lane.speed * sample_period();  // after a slip there is less wire to pull back
         lane.speed = -lane.inserted / sample_period();
     }
-    const bool slips = !lane.by_force && lane.speed > 0 && lane.push > options_.push_limit;
     const bool same = lane.speed == w[World::kSpeed] && lane.spin == w[World::kSpin] && double(lane.by_force) == w[World::kByForce];
-    if (!same || slips != lane.slips) lane.last_duration = 0;  // do not extrapolate
-    lane.slips = slips;
+    if (!same) lane.last_duration = 0;  // do not extrapolate
 }
 
 template <class V>
@@ -163,13 +160,14 @@ void Stepper<V>::end_sample(int l, Queue& queue) {
         lane.inserted = lane.end.advance;
         lane.rotation = lane.end.rotation;
     } else {
-        lane.inserted += lane.speed * sample_period() - lane.slip;
-        lane.rotation += lane.spin * sample_period();
+        lane.inserted += lane.speed * sample_period() - lane.slip.advance;
+        lane.rotation += lane.spin * sample_period() - lane.slip.rotation;
     }
     if (lane.sample < 0) {
-        out_.approach_slip[lane.world] += lane.slip;
+        out_.approach_slip[2 * lane.world] += lane.slip.advance;
+        out_.approach_slip[2 * lane.world + 1] += lane.slip.rotation;
         w[World::kApproach] = -lane.sample - 1;
-        w[World::kDepth] -= lane.slip;
+        w[World::kDepth] -= lane.slip.advance;
         if (lane.sample == -1) lane.inserted = w[World::kDepth];  // exactly
     }
     store(l);
@@ -179,7 +177,8 @@ void Stepper<V>::end_sample(int l, Queue& queue) {
     w[World::kDriveForce] = lane.by_force ? lane.speed : w[World::kBaseForce] + valve.gradient_a;
     w[World::kDriveTorque] = lane.by_force ? lane.spin : w[World::kBaseTorque] + valve.gradient_r;
     if (lane.sample >= 0)
-        record(lane.world, lane.sample, double(lane.total_iterations) / lane.steps, double(lane.node_iterations), lane.slip + lane.refused);
+        record(lane.world, lane.sample, double(lane.total_iterations) / lane.steps, double(lane.node_iterations),
+               {lane.slip.advance + lane.refused, lane.slip.rotation});
     if (lane.sample + 1 < in_.samples)
         queue.put_back(lane.world, lane.sample + 1, lane.active);
     else
@@ -196,12 +195,12 @@ void Stepper<V>::fail(int l) {
     store(l);
     world_[lane.world][World::kReason] = lane.finite ? kNotConverged : kNotFinite;
     for (int sample = std::max(0, lane.sample); sample < in_.samples; ++sample)
-        record(lane.world, sample, 0.0, sample == lane.sample ? double(lane.node_iterations) : 0.0, 0.0);
+        record(lane.world, sample, 0.0, sample == lane.sample ? double(lane.node_iterations) : 0.0, {});
     lane.world = -1;
 }
 
 template <class V>
-void Stepper<V>::record(int world, int sample, double iterations, double node_iterations, double slip) const {
+void Stepper<V>::record(int world, int sample, double iterations, double node_iterations, const Drive& slip) const {
     const World w = world_[world];
     const std::size_t at = std::size_t(world) * in_.samples + sample;
     const int active = int(w[World::kActive]);
@@ -227,7 +226,8 @@ void Stepper<V>::record(int world, int sample, double iterations, double node_it
     out_.drive_torque[at] = w[World::kDriveTorque];
     out_.iterations[at] = iterations;
     out_.node_iterations[at] = node_iterations;
-    out_.slip[at] = slip;
+    out_.slip[at] = slip.advance;
+    out_.rotation_slip[at] = slip.rotation;
     out_.valid[at] = w.valid();
     const auto write = [](double* to, const Vec3<double>& v) { to[0] = v.x, to[1] = v.y, to[2] = v.z; };
     const World::Numbers tip = w.node(0);

@@ -21,7 +21,8 @@ struct Options {
     int max_iterations;        // of one step; then the step is halved (the shortest may take kSnapIterations times as many)
     double free_behind;        // nodes farther than this behind the ostium follow the drive, mm
     double approach_velocity;  // at which a wire is brought to its first inserted length, mm/s; 0: it is put there, straight
-    double push_limit;         // the drive slips rather than push the wire harder than this, N
+    double push_limit, pull_limit;  // the drive slips rather than push or pull the wire harder than this, N
+    double torque_limit;       // it slips rather than turn the wire harder than this, N mm
     double introducer_friction;  // Coulomb friction of the introducer's valve, N
     double introducer_drag;      // its viscous drag, N s/mm
 };
@@ -123,9 +124,9 @@ struct Inputs {
 
 enum Reason : std::uint8_t { kFine = 0, kNotFinite = 1, kNotConverged = 2 };
 
-// Arrays of worlds × samples (× 3, × nodes × 3). `slip` is the commanded advance (mm) that was not made, and
-// `approach_slip` that before the first sample. `iterations` are Newton's, a step; `node_iterations` count every evaluation of
-// an active node, those of attempts that were given up too.
+// Arrays of worlds × samples (× 3, × nodes × 3). `slip` is the commanded advance (mm) that was not made, `rotation_slip`
+// the commanded rotation (rad), and `approach_slip` (worlds × 2) both before the first sample. `iterations` are Newton's, a
+// step; `node_iterations` count every evaluation of an active node, those of attempts that were given up too.
 struct Outputs {
     double *inserted, *rotation;                 // mm, rad
     double *tip_position, *tip_direction;        // mm, unit vector
@@ -133,9 +134,9 @@ struct Outputs {
     double* wall_force;                          // largest resultant on any kResultantLength of the wire, N
     double *base_force, *base_torque;            // of the base on the wire, forwards positive, N, N mm
     double *drive_force, *drive_torque;          // of the drive: that of the base and the introducer's resistance, N, N mm
-    double *iterations, *node_iterations, *slip;
+    double *iterations, *node_iterations, *slip, *rotation_slip;
     bool* valid;
-    double* approach_slip;    // worlds
+    double* approach_slip;
     double* shape;            // may be null
     double* attitude;         // may be null: worlds × samples × nodes × 4, quaternions w x y z
 };

@@ -53,7 +53,7 @@ public:
         require(steps_per_sample >= 1 && time_step > 0, "time step and steps per sample must be positive");
         OutputArray<double> inserted(n), rotation(n), tip(3 * n), direction(3 * n), force_max(n), force_sum(n), wall_force(n),
             base_force(n), base_torque(n), drive_force(n), drive_torque(n), iterations(n), node_iterations(n), slip(n),
-            approach_slip(worlds);
+            rotation_slip(n), approach_slip(2 * worlds);
         OutputArray<bool> valid(n);
         OutputArray<double> shape(record_shape ? 3 * n * nodes : 0), attitude(record_attitude ? 4 * n * nodes : 0);
         nb::dict result;
@@ -71,7 +71,8 @@ public:
         result["iterations"] = iterations.array(worlds, samples);
         result["node_iterations"] = node_iterations.array(worlds, samples);
         result["slip"] = slip.array(worlds, samples);
-        result["approach_slip"] = approach_slip.array(worlds);
+        result["rotation_slip"] = rotation_slip.array(worlds, samples);
+        result["approach_slip"] = approach_slip.array(worlds, 2);
         result["valid"] = valid.array(worlds, samples);
         nb::object shapes = shape.array(record_shape ? worlds : 0, samples, nodes, 3);
         nb::object attitudes = attitude.array(record_attitude ? worlds : 0, samples, nodes, 4);
@@ -97,6 +98,7 @@ public:
                           .iterations = iterations.data,
                           .node_iterations = node_iterations.data,
                           .slip = slip.data,
+                          .rotation_slip = rotation_slip.data,
                           .valid = valid.data,
                           .approach_slip = approach_slip.data,
                           .shape = record_shape ? shape.data : nullptr,

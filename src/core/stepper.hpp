@@ -24,6 +24,7 @@ constexpr double kMaxDamping = 1e3;
 constexpr double kMaxBoost = 64;
 constexpr double kMaxImbalance = 1e-5;   // N that a damped solution may be out of balance
 constexpr double kStopStiffness = 100;   // N/mm, of the stops at both ends of the drive's travel
+constexpr int kMaxReleases = 8;          // times in a step that the drive may let go of the wire
 constexpr double kDriveMotion = 1.2;     // times the drive's own motion that a node may move in a step before it counts as a jump
 
 // A node of the wires in all lanes.
@@ -73,6 +74,11 @@ private:
         double advance = 0, rotation = 0;
     };
 
+    // Whether the drive slips at its limit: 1 where it would move the wire forwards, -1 backwards, 0 where it grips.
+    struct Slipping {
+        int advance = 0, rotation = 0;
+    };
+
     // An energy, its gradient and its Hessian with respect to the drive's advance a and rotation r.
     struct DriveEnergy {
         double energy, gradient_a, gradient_r, aa, ar, rr;
@@ -99,11 +105,14 @@ private:
         int iterations = 0, rejections = 0, steps = 0;
         long total_iterations = 0, node_iterations = 0;   // of the sample; the latter count each active node
         double inserted = 0, rotation = 0, speed = 0, spin = 0;   // at the start of the sample; mm/s, rad/s, or N, N mm
-        double slip = 0, refused = 0;                             // mm in this sample: forwards, backwards
-        double push = 0;                                          // N, at the end of the last step
-        Drive start, end, from, move, last;   // step start, trial, accepted; Newton step; last increment
+        double refused = 0;                    // mm in this sample that the wire is too short for
+        Drive slip;                            // commanded in this sample and not made
+        Drive start, end, last;                // step start, trial; last increment
+        Drive origin, off, from, move;         // what the unknown `off` = end - origin counts from; trial, accepted; Newton step
+        Slipping slipping;
+        int releases = 0;                      // in this step
         double energy = 0, slope = 0, scale = 1, shorten = 1, boost = 1, damping = 0, last_duration = 0;
-        bool reduced = false, slips = false, first = true, extrapolated = false, finite = true, by_force = false;
+        bool reduced = false, first = true, extrapolated = false, finite = true, by_force = false;
     };
 
     const RodModel& rod_;
@@ -161,7 +170,7 @@ private:
     template <class Queue>
     ENDOPILOT_DEVICE void end_sample(int l, Queue& queue);
     ENDOPILOT_DEVICE void fail(int l);
-    ENDOPILOT_LARGE void record(int world, int sample, double iterations, double node_iterations, double slip) const;
+    ENDOPILOT_LARGE void record(int world, int sample, double iterations, double node_iterations, const Drive& slip) const;
 
     // The step of one lane (below).
     ENDOPILOT_LARGE void begin(int l, bool fresh);
@@ -169,6 +178,7 @@ private:
     ENDOPILOT_DEVICE DriveEnergy introducer(const Drive& moved, int l) const;
     ENDOPILOT_DEVICE DriveEnergy drive_energy(const Lane& lane, int l) const;
     ENDOPILOT_LARGE bool solve_drive(int l);
+    ENDOPILOT_DEVICE bool release(int l);
     template <class Queue>
     ENDOPILOT_DEVICE int pass(Queue& queue);
     template <class Queue>
@@ -177,6 +187,7 @@ private:
     // Sweeps over the nodes of all lanes (sweeps.hpp).
     ENDOPILOT_LARGE void evaluate(int n);
     ENDOPILOT_LARGE void add_rod(int first, int count);
+    ENDOPILOT_DEVICE bool is_base(int i) const;
     ENDOPILOT_DEVICE DriveBlock drive_block(const Diagonal<V>& block) const;
     ENDOPILOT_DEVICE void clear_drive_entries(Mask<V> mask, Diagonal<V>& block) const;
     ENDOPILOT_LARGE void add_lumen(int first, int count);
@@ -193,25 +204,33 @@ template <class V>
 void Stepper<V>::begin(int l, bool fresh) {
     Lane& lane = lane_[l];
     const int before = lane.active;
+    const double weight = fresh ? 0.0 : duration(lane) / lane.last_duration;
+    const Drive ahead{weight * lane.last.advance, weight * lane.last.rotation};
     if (lane.by_force) {
-        const double weight = fresh ? 0.0 : duration(lane) / lane.last_duration;
-        lane.end = {lane.start.advance + weight * lane.last.advance, lane.start.rotation + weight * lane.last.rotation};
+        lane.slipping = {};
+        lane.origin = lane.start;
+        lane.off = ahead;
     } else {
-        lane.start = {lane.inserted - lane.slip + lane.speed * elapsed(lane.tick), lane.rotation + lane.spin * elapsed(lane.tick)};
-        lane.end.advance =
-            lane.slips ? lane.start.advance : lane.inserted - lane.slip + lane.speed * elapsed(lane.tick + lane.stride);
-        lane.end.rotation = lane.rotation + lane.spin * elapsed(lane.tick + lane.stride);
+        const double inserted = lane.inserted - lane.slip.advance, rotation = lane.rotation - lane.slip.rotation;
+        const double began = elapsed(lane.tick), ends = elapsed(lane.tick + lane.stride);
+        lane.start = {inserted + lane.speed * began, rotation + lane.spin * began};
+        lane.origin = {inserted + lane.speed * ends, rotation + lane.spin * ends};
+        const auto behind = [](int side, double off) { return side * off < 0 ? off : 0.0; };
+        lane.off = {behind(lane.slipping.advance, lane.start.advance + ahead.advance - lane.origin.advance),
+                    behind(lane.slipping.rotation, lane.start.rotation + ahead.rotation - lane.origin.rotation)};
     }
-    lane.from = lane.end;
+    lane.from = lane.off;
+    lane.end = {lane.origin.advance + lane.off.advance, lane.origin.rotation + lane.off.rotation};
     lane.active = Base::count_active(rod_, lane.start.advance, options_.free_behind);
     for (int i = std::min(before, lane.active); i <= std::max(before, lane.active); ++i)
         if (i >= before || i >= lane.active) place(l, i);
-    lane.iterations = lane.rejections = 0;
+    lane.iterations = lane.rejections = lane.releases = 0;
     lane.boost = 1;
     lane.first = lane.finite = true;
     lane.extrapolated = !fresh;
-    const double most_x = options_.largest_jump + kDriveMotion * std::abs(lane.end.advance - lane.start.advance);
-    const double most_theta = options_.largest_jump + kDriveMotion * std::abs(lane.end.rotation - lane.start.rotation);
+    const Drive& there = lane.by_force ? lane.end : lane.origin;
+    const double most_x = options_.largest_jump + kDriveMotion * std::abs(there.advance - lane.start.advance);
+    const double most_theta = options_.largest_jump + kDriveMotion * std::abs(there.rotation - lane.start.rotation);
     set(active_, l, lane.active);
     set(share_, l, Base::share_of_last_joint(rod_, lane.start.advance, options_.free_behind, lane.active));
     set(geometric_, l, 0.0);
@@ -250,7 +269,7 @@ int Stepper<V>::pass(Queue& queue) {
         const double tolerance = ends_sample ? options_.sample_tolerance : options_.tolerance;
         const bool at_rest = size <= options_.tolerance && lane.damping * size <= kMaxImbalance;
         if (lane.reduced || lane.damping > 0 ? at_rest : size <= tolerance) {
-            decision[l] = Decision::converged;
+            decision[l] = release(l) ? Decision::repeat : Decision::converged;
             set(factor, l, 1.0);
         }
     }
@@ -265,7 +284,7 @@ typename Stepper<V>::Decision Stepper<V>::decide(int l) {
     ++lane.iterations;
     ++lane.total_iterations;
     lane.node_iterations += lane.active;
-    const double energy = get(energy_, l) + (lane.by_force ? drive_energy(lane, l).energy : 0.0);
+    const double energy = get(energy_, l) + drive_energy(lane, l).energy;
     lane.finite = std::isfinite(energy);
     if (lane.iterations > options_.max_iterations * (lane.stride == 1 && !lane.extrapolated ? kSnapIterations : 1)) return Decision::restart;
     if (!lane.first && lane.stride > 1 && get(jump_, l) > 1.0) {  // a snap: follow it in shorter steps
@@ -323,16 +342,16 @@ int Stepper<V>::advance(int n, const Decision (&decision)[W], Queue& queue) {
             lane.tick += lane.stride;
             ++lane.steps;
             lane.last_duration = took;
-            lane.push = get(base_force_, l);
             lane.last = {lane.end.advance - lane.start.advance, lane.end.rotation - lane.start.rotation};
             lane.start = lane.end;
-            if (lane.slips) lane.slip += lane.speed * took;
+            if (!lane.by_force) {
+                lane.slip = {lane.slip.advance - lane.off.advance, lane.slip.rotation - lane.off.rotation};
+                if (lane.off.advance == 0) lane.slipping.advance = 0;
+                if (lane.off.rotation == 0) lane.slipping.rotation = 0;
+            }
             ended[l] = lane.tick == kTicks * in_.steps_per_sample;
             if (lane.stride < kTicks && lane.tick % (2 * lane.stride) == 0) lane.stride *= 2;
             if (ended[l]) continue;
-            const bool slips = !lane.by_force && lane.speed > 0 && lane.push > options_.push_limit;
-            if (slips != lane.slips) lane.last_duration = 0;  // do not extrapolate
-            lane.slips = slips;
             set(weight, l, lane.last_duration > 0 ? duration(lane) / lane.last_duration : 0.0);
         } else if (decision[l] == Decision::restart) {
             set_mask<V>(restarted, l, true);
@@ -381,11 +400,18 @@ typename Stepper<V>::DriveEnergy Stepper<V>::introducer(const Drive& moved, int 
             .rr = (drag + secant - c * s * s) * r * r};
 }
 
-// Where the wire is driven by force, the drive's advance and rotation are unknowns too: the energy at the trial point of
-// the introducer, of the stops at both ends of the drive's travel, and of the load.
+// Where the drive slips at its limit, or the wire is driven by force, the drive's advance and rotation are unknowns too: the
+// energy at the trial point of what is lost by slipping, or of the introducer, of the stops at both ends of the drive's
+// travel, and of the load.
 template <class V>
 typename Stepper<V>::DriveEnergy Stepper<V>::drive_energy(const Lane& lane, int l) const {
-    const Drive moved{lane.end.advance - lane.start.advance, lane.end.rotation - lane.start.rotation};
+    const Drive& moved = lane.off;
+    if (!lane.by_force) {
+        const auto load = [](int side, double forwards, double backwards) { return side > 0 ? forwards : side < 0 ? -backwards : 0.0; };
+        const double force = load(lane.slipping.advance, options_.push_limit, options_.pull_limit);
+        const double torque = load(lane.slipping.rotation, options_.torque_limit, options_.torque_limit);
+        return {.energy = -force * moved.advance - torque * moved.rotation, .gradient_a = -force, .gradient_r = -torque, .aa = 0, .ar = 0, .rr = 0};
+    }
     DriveEnergy t = introducer(moved, l);
     const double a = lane.end.advance;
     const double beyond = std::min(0.0, a) + std::max(0.0, a + options_.free_behind - rod_.abscissa[rod_.nodes - 1]);
@@ -396,22 +422,49 @@ typename Stepper<V>::DriveEnergy Stepper<V>::drive_energy(const Lane& lane, int 
     return t;
 }
 
-// Newton's step of the drive where it is driven by force. Returns whether the Hessian is positive definite.
+// Newton's step of the drive's unknowns. A drive that slips has them too, but goes no farther than commanded: there it grips
+// again. Returns whether the Hessian is positive definite.
 template <class V>
 bool Stepper<V>::solve_drive(int l) {
     const Lane& lane = lane_[l];
-    if (!lane.by_force) return true;
+    const Slipping& side = lane.slipping;
+    bool holds_a = !lane.by_force && side.advance == 0, holds_r = !lane.by_force && side.rotation == 0;
+    if (holds_a && holds_r) return true;
     const DriveEnergy t = drive_energy(lane, l);
     const double damping = get(damping_, l);
     const double aa = t.aa + get(drive_.aa, l) + damping, ar = t.ar + get(drive_.ar, l), rr = t.rr + get(drive_.rr, l) + damping;
     const double determinant = aa * rr - ar * ar;
-    if (!(aa > 0 && determinant > 0)) return false;
+    if (!((holds_a || aa > 0) && (holds_r || rr > 0) && (holds_a || holds_r || determinant > 0))) return false;
     const double a = t.gradient_a + get(drive_.gradient_a, l), r = t.gradient_r + get(drive_.gradient_r, l);
-    const double step_a = (ar * r - rr * a) / determinant, step_r = (ar * a - aa * r) / determinant;
+    double step_a = 0, step_r = 0;
+    for (int held = -1; held != holds_a + holds_r;) {  // an unknown that would go beyond its bound is held there
+        held = holds_a + holds_r;
+        step_a = holds_a ? -lane.off.advance : holds_r ? (ar * lane.off.rotation - a) / aa : (ar * r - rr * a) / determinant;
+        step_r = holds_r ? -lane.off.rotation : holds_a ? (ar * lane.off.advance - r) / rr : (ar * a - aa * r) / determinant;
+        holds_a = holds_a || side.advance * (lane.off.advance + step_a) > 0;
+        holds_r = holds_r || side.rotation * (lane.off.rotation + step_r) > 0;
+    }
     set(drive_a_, l, step_a);
     set(drive_r_, l, step_r);
     set(descent_, l, get(descent_, l) - a * step_a - r * step_r);
     return true;
+}
+
+// Lets the drive slip where the wire, at rest with the drive where it was commanded, takes more than the drive's limits.
+// Returns whether it does.
+template <class V>
+bool Stepper<V>::release(int l) {
+    Lane& lane = lane_[l];
+    if (lane.by_force || lane.releases == kMaxReleases) return false;
+    const double force = get(drive_.gradient_a, l), torque = get(drive_.gradient_r, l);
+    Slipping side = lane.slipping;
+    if (lane.off.advance == 0 && force > options_.push_limit) side.advance = 1;
+    if (lane.off.advance == 0 && force < -options_.pull_limit) side.advance = -1;
+    if (lane.off.rotation == 0 && std::abs(torque) > options_.torque_limit) side.rotation = torque > 0 ? 1 : -1;
+    const bool released = side.advance != lane.slipping.advance || side.rotation != lane.slipping.rotation;
+    lane.slipping = side;
+    lane.releases += released;
+    return released;
 }
 
 }  // namespace endopilot

@@ -62,16 +62,26 @@ void Stepper<V>::add_rod(int first, int count) {
         const int i = first + k;
         const Node<V> &node = node_[i], &behind = node_[i + 1];
         Diagonal<V>&own = block_[k], &next = block_[k + 1];
+        const bool at_base = is_base(i + 1);
         const Mask<V> last = active_ == broadcast<V>(i + 1);
         V energy = add_element(rod_, i, geometric_, node.x, behind.x, frame(node.q), own, next, coupling_[k]);
-        const V share = select<V>(last, share_, broadcast<V>(1.0));
+        const V share = at_base ? select<V>(last, share_, broadcast<V>(1.0)) : broadcast<V>(1.0);
         energy += add_joint(rod_, i + 1, geometric_, share, node.q, behind.q, own, next, coupling_[k]);
         energy_ += select<V>(active_ > broadcast<V>(i), energy, V{});
-        const Vec3<V>& at_base = next.gradient_x;  // its component along the axis is the force that the base must exert
-        base_force_ = select<V>(last, axis.x * at_base.x + axis.y * at_base.y + axis.z * at_base.z, base_force_);
+        if (!at_base) continue;
+        const Vec3<V>& force = next.gradient_x;  // its component along the axis is the force that the base must exert
+        base_force_ = select<V>(last, axis.x * force.x + axis.y * force.y + axis.z * force.z, base_force_);
         base_torque_ = select<V>(last, next.gradient_theta.z, base_torque_);
-        if (in_.force_driven) drive_ = select(last, drive_block(next), drive_);
+        drive_ = select(last, drive_block(next), drive_);
     }
+}
+
+// Whether a lane's first node that follows the drive is node i.
+template <class V>
+bool Stepper<V>::is_base(int i) const {
+    bool any = false;
+    for (const Lane& lane : lane_) any = any || lane.active == i;
+    return any;
 }
 
 // A block's gradient and Hessian with respect to the drive's advance and rotation, if its node follows the drive.
@@ -153,12 +163,13 @@ void Stepper<V>::eliminate_nodes(int first, int count) {
         const Mask<V> on = active_ > broadcast<V>(i);
         Diagonal<V>& next = block_[k + 1];
         const Mask<V> base_next = active_ == broadcast<V>(i + 1);
-        if (in_.force_driven) clear_drive_entries(base_next, next);
+        const bool at_base = is_base(i + 1);
+        if (at_base) clear_drive_entries(base_next, next);
         const Elimination<V> eliminated = eliminate(block_[k], coupling_[k], factor_[i], next);
         descent_ += select<V>(on, eliminated.descent, zero);
         const Mask<V> sound = eliminated.smallest_pivot > zero;
         pivot_ = select<V>(on, select<V>(sound, pivot_, zero), pivot_);
-        if (in_.force_driven) drive_ = select(base_next, drive_ + drive_block(next), drive_);
+        if (at_base) drive_ = select(base_next, drive_ + drive_block(next), drive_);
     }
 }
 
@@ -213,14 +224,16 @@ void Stepper<V>::update(int n, const Decision (&decision)[W], const V& factor) {
     }
     for (int l = 0; l < W; ++l) {
         Lane& lane = lane_[l];
-        if (!lane.by_force || lane.world < 0) continue;
+        const bool held = !lane.by_force && lane.slipping.advance == 0 && lane.slipping.rotation == 0;
+        if (held || lane.world < 0) continue;
         const double f = get(factor, l);
         const bool takes = decision[l] == Decision::accept || decision[l] == Decision::converged;
-        if (takes || decision[l] == Decision::repeat) lane.from = lane.end;
+        if (takes || decision[l] == Decision::repeat) lane.from = lane.off;
         if (takes) lane.move = {f * get(drive_a_, l), f * get(drive_r_, l)};
         if (decision[l] == Decision::shorten) lane.move = {f * lane.move.advance, f * lane.move.rotation};
         if (!takes && decision[l] != Decision::shorten) continue;
-        lane.end = {lane.from.advance + lane.move.advance, lane.from.rotation + lane.move.rotation};
+        lane.off = {lane.from.advance + lane.move.advance, lane.from.rotation + lane.move.rotation};
+        lane.end = {lane.origin.advance + lane.off.advance, lane.origin.rotation + lane.off.rotation};
         place_base(l, lane.active);
     }
 }

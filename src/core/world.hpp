@@ -14,7 +14,8 @@ struct World {
         kInserted, kRotation,          // mm, rad
         kSpeed, kSpin, kByForce,       // the last control: mm/s and rad/s, or N and N mm
         kLastDuration, kLastAdvance, kLastTurned,  // of the last step, s, mm, rad
-        kFriction, kStride, kActive, kSlips, kPush, kReason,
+        kFriction, kStride, kActive, kReason,
+        kSlipping, kSpinSlipping,      // 1: the drive slips at its limit forwards, -1: backwards, 0: it grips
         kBaseForce, kBaseTorque, kDriveForce, kDriveTorque,  // N, N mm
         kApproach, kDepth,             // samples left of the approach, and the inserted length it ends at, mm
         kScalars

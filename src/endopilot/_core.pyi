@@ -29,6 +29,8 @@ class Options:
     free_behind: float
     approach_velocity: float
     push_limit: float
+    pull_limit: float
+    torque_limit: float
     introducer_friction: float
     introducer_drag: float
 

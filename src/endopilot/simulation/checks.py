@@ -111,8 +111,8 @@ def check_sequences(
     initial: Float[np.ndarray, "worlds 2"],
     friction: Float[np.ndarray, "worlds"],
     actuation: Actuation,
-) -> float:
-    """Check sequences of controls, and return the largest inserted length that they lead to, mm.
+) -> tuple[float, float]:
+    """Check sequences of controls, and return how deep they lead.
 
     Args:
         device: the wire, whose velocity limits hold.
@@ -120,6 +120,10 @@ def check_sequences(
         initial: inserted length (mm) and rotation (rad) before the first period.
         friction: Coulomb friction coefficients.
         actuation: what the controls are.
+
+    Returns:
+        The largest inserted length that is commanded, mm, and the largest that can come of it: a drive that slips
+        leaves in the vessel what it did not pull back, and pushes on from there.
 
     Raises:
         InputError: a number that is not finite or out of its range, a control that is too fast, or one that pulls the
@@ -142,7 +146,7 @@ def check_sequences(
     advance = SAMPLE_PERIOD_S * control[..., 0] if actuation == "velocity" else np.zeros(control.shape[:2])
     inserted = np.cumsum(np.column_stack([initial[:, 0], advance]), axis=1)
     _check(inserted < -_OVERSHOOT_MM, inserted, "inserted length in mm is negative; pull less, or start deeper")
-    return float(inserted.max())
+    return float(inserted.max()), float((initial[:, 0] + np.maximum(advance, 0.0).sum(axis=1)).max())
 
 
 def _check(bad: Bool[np.ndarray, "worlds *rest"], values: Float[np.ndarray, "worlds *rest"], what: str) -> None:

@@ -34,6 +34,8 @@ def run_core(
     approach: bool = True,
     free_behind_mm: float = FREE_BEHIND_MM,
     push_limit_n: float = 2.0,
+    pull_limit_n: float = np.inf,
+    torque_limit_n_mm: float = np.inf,
 ) -> dict[str, np.ndarray]:
     """Run the C++ core on checked input. The simulator and the verification both come through here.
 
@@ -53,6 +55,8 @@ def run_core(
         approach: bring the wire to its first inserted length from the ostium; else it starts there, straight.
         free_behind_mm: nodes farther behind the insertion point follow the drive, mm.
         push_limit_n: force at which the drive slips, N; of the device, where there is one.
+        pull_limit_n: the same where it pulls, N.
+        torque_limit_n_mm: torque at which it slips, N·mm.
 
     Returns:
         The arrays of `Rollout` that need no centerline, and `reason`: 0 fine, 1 not finite, 2 not converged.
@@ -65,6 +69,8 @@ def run_core(
         options=core_options(
             config,
             push_limit_n=push_limit_n,
+            pull_limit_n=pull_limit_n,
+            torque_limit_n_mm=torque_limit_n_mm,
             approach=approach,
             free_behind_mm=free_behind_mm,
         ),
@@ -103,6 +109,8 @@ def core_options(
     config: SimulatorConfig,
     *,
     push_limit_n: float,
+    pull_limit_n: float,
+    torque_limit_n_mm: float,
     free_behind_mm: float,
     approach: bool = True,
 ) -> _core.Options:
@@ -117,6 +125,8 @@ def core_options(
     options.max_iterations = _MAX_ITERATIONS
     options.free_behind = free_behind_mm
     options.push_limit = push_limit_n
+    options.pull_limit = pull_limit_n
+    options.torque_limit = torque_limit_n_mm
     options.approach_velocity = config.approach_velocity_mm_s if approach else 0.0
     options.introducer_friction = config.introducer_friction_n
     options.introducer_drag = config.introducer_drag_n_s_mm

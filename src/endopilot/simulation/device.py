@@ -47,6 +47,8 @@ class Device:
         max_rotation_rad_s: fastest rotation of the drive, rad/s.
         push_limit_n: force at which the drive slips rather than push the wire harder, N; a wire whose tip is caught
             is not folded up in the vessel then.
+        pull_limit_n: force at which it slips rather than pull harder, N.
+        torque_limit_n_mm: torque at which it slips rather than turn the wire harder, in either direction, N·mm.
         sources: where each constant comes from.
     """
 
@@ -62,6 +64,8 @@ class Device:
     max_velocity_mm_s: Positive
     max_rotation_rad_s: Positive
     push_limit_n: Positive
+    pull_limit_n: Positive
+    torque_limit_n_mm: Positive
     sources: dict[str, str]
 
     @model_validator(mode="after")
@@ -164,6 +168,8 @@ class _DeviceFile:
     max_velocity_mm_s: _Sourced[Positive]
     max_rotation_rad_s: _Sourced[Positive]
     push_limit_n: _Sourced[Positive]
+    pull_limit_n: _Sourced[Positive]
+    torque_limit_n_mm: _Sourced[Positive]
     abscissa_mm: _Sourced[tuple[NonNegative, ...]]
     bend_stiffness_n_mm2: _Sourced[tuple[Positive, ...]]
     twist_stiffness_n_mm2: _Sourced[tuple[Positive, ...]]

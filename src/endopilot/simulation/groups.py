@@ -94,7 +94,13 @@ def make_groups(
             lumen=lumens[key],
             loads=None,
             **insertion_arguments(anatomy.insertion),
-            options=core_options(config, push_limit_n=device.push_limit_n, free_behind_mm=FREE_BEHIND_MM),
+            options=core_options(
+                config,
+                push_limit_n=device.push_limit_n,
+                pull_limit_n=device.pull_limit_n,
+                torque_limit_n_mm=device.torque_limit_n_mm,
+                free_behind_mm=FREE_BEHIND_MM,
+            ),
             worlds=len(worlds),
         )
         index, project = np.array(worlds), projectors[anatomy.identity]

@@ -38,9 +38,10 @@ def simulate(
 ) -> Rollout:
     """Drive a device through an anatomy and record it every 0.5 s.
 
-    The drive slips rather than push harder than the device's push limit, and stops when the wire is pulled out:
-    controls, inserted lengths and the initial state of the answer are those that were made. Where force and torque are
-    given, advance and rotation follow, and the answer's controls are the mean velocities that came of them.
+    The drive slips rather than push, pull or turn the wire harder than the device's limits, and stops when the wire is
+    pulled out: controls, inserted lengths, rotations and the initial state of the answer are those that were made. Where
+    force and torque are given, advance and rotation follow, and the answer's controls are the mean velocities that came
+    of them.
 
     Results are the same to the last bit whatever the number of worlds, their order and the number of threads.
 
@@ -74,15 +75,14 @@ def simulate(
         raise InputError(f"friction: shape {friction.shape}; give one number for each of the {worlds} worlds")
     _check_memory(worlds, samples, 0)
     control = np.ascontiguousarray(control, dtype=float)
-    deepest = check_sequences(device, control, initial, friction, actuation)
+    commanded_mm, possible_mm = check_sequences(device, control, initial, friction, actuation)
     check_fits(device, anatomy)
     check_distance_map(anatomy)
     path_mm = float(anatomy.tree.longest_path().abscissa[-1])
+    if actuation == "force":
+        commanded_mm = possible_mm = far_end_mm(anatomy)
     rod = lay_out(
-        device,
-        path_mm=path_mm,
-        elements=config.elements,
-        length_mm=max(path_mm, deepest if actuation == "velocity" else far_end_mm(anatomy)) + FREE_BEHIND_MM,
+        device, path_mm=path_mm, elements=config.elements, length_mm=max(path_mm, possible_mm) + FREE_BEHIND_MM
     )
     _check_memory(worlds, samples, len(rod.abscissa_mm) if record_shape else 0)
     result = run_core(
@@ -96,10 +96,13 @@ def simulate(
         friction=friction,
         record_shape=record_shape,
         push_limit_n=device.push_limit_n,
+        pull_limit_n=device.pull_limit_n,
+        torque_limit_n_mm=device.torque_limit_n_mm,
     )
-    started = initial.copy()
-    started[:, 0] -= result["approach_slip"]
-    rollout = make_rollout(anatomy, actuation, started, control, result)
+    if record_shape:  # of the wire that was needed
+        needed = max(path_mm, commanded_mm, float(result["inserted_length"].max())) + FREE_BEHIND_MM
+        result["shape"] = result["shape"][:, :, : np.searchsorted(rod.abscissa_mm, needed) + 3]
+    rollout = make_rollout(anatomy, actuation, initial - result["approach_slip"], control, result)
     _report_invalid(rollout)
     return rollout
 
@@ -122,8 +125,8 @@ def make_rollout(
     """
     start = started[:, None, :]
     if actuation == "velocity":
-        made = control.copy()
-        made[..., 0] -= result["slip"] / SAMPLE_PERIOD_S
+        slip = np.stack([result["slip"], result["rotation_slip"]], axis=-1)
+        made = control - slip / SAMPLE_PERIOD_S
         proximal = start + np.cumsum(made, axis=1) * SAMPLE_PERIOD_S
     else:
         proximal = np.stack([result["inserted_length"], result["rotation"]], axis=-1)
@@ -153,6 +156,7 @@ RECORDED = (
     "drive_force",
     "drive_torque",
     "slip",
+    "rotation_slip",
     "iterations",
     "node_iterations",
     "valid",

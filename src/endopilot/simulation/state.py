@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from endopilot.errors import InputError
 from endopilot.files import writing
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 """Of `SimulatorState`: raised when its values or its fingerprint come to mean something else."""
 
 
@@ -36,7 +36,8 @@ class Step:
         tip_direction: unit vector along the wire at its tip.
         contact_force_max: largest wall force on one node, N.
         contact_force_sum: sum of the wall forces' magnitudes, N.
-        slip: advance that was asked of the drive and not made, mm.
+        slip: advance that was asked of the drive and not made, mm; negative where it pulled.
+        rotation_slip: rotation that was asked of the drive and not made, rad.
         iterations: mean Newton iterations a time step.
         valid: false for a world that has failed; it stays as it was.
     """
@@ -48,6 +49,7 @@ class Step:
     contact_force_max: Float[np.ndarray, "worlds"]
     contact_force_sum: Float[np.ndarray, "worlds"]
     slip: Float[np.ndarray, "worlds"]
+    rotation_slip: Float[np.ndarray, "worlds"]
     iterations: Float[np.ndarray, "worlds"]
     valid: Bool[np.ndarray, "worlds"]
 

@@ -37,6 +37,7 @@ def rollout_table(rollout: Rollout) -> pd.DataFrame:
         "drive_force_n": rollout.drive_force,
         "drive_torque_nmm": rollout.drive_torque,
         "slip_mm": rollout.slip,
+        "rotation_slip_rad": rollout.rotation_slip,
         "newton_iterations": rollout.iterations,
         "valid": rollout.valid,
     }
