@@ -66,6 +66,7 @@ def make_rollout(samples: int = 6) -> Rollout:
         drive_force=flat,
         drive_torque=flat,
         slip=flat,
+        rotation_slip=flat,
         iterations=flat,
         node_iterations=flat,
         valid=np.ones((1, samples), dtype=bool),

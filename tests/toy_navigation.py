@@ -87,6 +87,7 @@ def toy_simulate(anatomy: Anatomy, device, control, *, initial, config, friction
         drive_force=force + 0.05,
         drive_torque=0.1 * force + 0.01,
         slip=np.zeros((worlds, samples)),
+        rotation_slip=np.zeros((worlds, samples)),
         iterations=np.ones((worlds, samples)),
         node_iterations=np.ones((worlds, samples)),
         valid=np.ones((worlds, samples), dtype=bool),

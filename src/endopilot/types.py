@@ -280,8 +280,8 @@ class Rollout:
         base_torque: torque that the drive must apply about the wire's axis, N·mm.
         drive_force: axial force of the drive, N: `base_force` and what the introducer's valve takes.
         drive_torque: torque of the drive, N·mm, likewise.
-        slip: advance that was commanded and not made in the period, mm; 0 unless the drive slipped, and negative where it
-            pulled or the wire was out already.
+        slip: advance that was commanded and not made in the period, mm; 0 unless the drive slipped, and
+            negative where it pulled or the wire was out already.
         rotation_slip: rotation that was commanded and not made in the period, rad.
         iterations: mean Newton iterations a time step over the period.
         node_iterations: evaluations of active nodes in the period: for each Newton iteration, also those of attempts

@@ -151,8 +151,7 @@ def test_the_drive_slips_at_its_push_limit_and_cannot_pull_back_what_it_did_not_
     rollout = simulate(anatomy, replace(DEVICE, push_limit_n=limit_n), control, initial=initial)
     assert rollout.valid.all()
     assert (rollout.slip[:, 12:20] > 0).all()
-    # One step of 0.02 s at 4 mm/s is 0.08 mm, which adds little to the limit; far beyond lies what is not limited.
-    assert limit_n < rollout.base_force.max() < 1.3 * limit_n
+    assert rollout.base_force.max() == pytest.approx(limit_n, rel=1e-3)  # far beyond lies what is not limited
     free = simulate(anatomy, replace(DEVICE, push_limit_n=5.0), control, initial=initial)
     assert free.base_force.max() > 1.6 * limit_n
     # Δ is the integral of the control that was made, and what was asked is that and the slip.
@@ -168,7 +167,7 @@ def test_the_drive_slips_at_its_push_limit_and_cannot_pull_back_what_it_did_not_
     [
         (lambda c, i: (np.full_like(c, np.nan), i), "finite"),
         (lambda c, i: (c * 100, i), "exceeds"),
-        (lambda c, i: (-c, i), "negative"),
+        (lambda c, i: (c, i - [50, 0]), "negative"),
         (lambda c, i: (c[:0], i[:0]), "at least one"),
         (lambda c, i: (c, i * np.inf), "finite"),
     ],

@@ -20,7 +20,7 @@ from endopilot.errors import InputError
 from endopilot.files import json_text, read_json
 from endopilot.simulation.device import Device
 
-FORMAT_VERSION = 4
+FORMAT_VERSION = 5
 """Counts changes of the columns or of their meaning."""
 
 

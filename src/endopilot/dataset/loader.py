@@ -57,6 +57,7 @@ class Dataset:
         drive_force: axial force of the drive with what the introducer's valve takes, N.
         drive_torque: torque of the drive, likewise, N·mm.
         slip: advance that was commanded and not made over the period, mm; nearly always 0.
+        rotation_slip: rotation likewise, rad.
         valid: false from the sample in which the simulation of that episode failed.
     """
 
@@ -88,6 +89,7 @@ class Dataset:
     drive_force: Float[np.ndarray, "episodes samples"]
     drive_torque: Float[np.ndarray, "episodes samples"]
     slip: Float[np.ndarray, "episodes samples"]
+    rotation_slip: Float[np.ndarray, "episodes samples"]
     valid: Bool[np.ndarray, "episodes samples"]
 
     def __len__(self) -> int:
@@ -101,7 +103,7 @@ class Dataset:
         Simulated again it gives the same navigation to the bit, which `control` does not: a drive that pushes at one
         speed until it slips strains the wire otherwise than one that is slower from the start.
         """
-        return commanded(self.control, self.slip, self.sample_period_s)
+        return commanded(self.control, np.stack([self.slip, self.rotation_slip], axis=-1), self.sample_period_s)
 
     def select(self, episodes: Shaped[np.ndarray, "chosen"]) -> Dataset:
         """Return the chosen episodes, given as a mask or as indices."""
@@ -142,12 +144,10 @@ class Dataset:
 
 
 def commanded(
-    control: Float[np.ndarray, "*n 2"], slip_mm: Float[np.ndarray, "*n"], sample_period_s: float
+    control: Float[np.ndarray, "*n 2"], slip: Float[np.ndarray, "*n 2"], sample_period_s: float
 ) -> Float[np.ndarray, "*n 2"]:
-    """Return the control that was commanded (mm/s, rad/s), from the motion of the drive and its slip."""
-    command = control.astype(float)
-    command[..., 0] += slip_mm / sample_period_s
-    return command.astype(control.dtype).astype(float)
+    """Return the control that was commanded (mm/s, rad/s), from the motion of the drive and its slip (mm, rad)."""
+    return (control + slip / sample_period_s).astype(control.dtype).astype(float)
 
 
 def read_manifest(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -251,5 +251,6 @@ def load_dataset(folder: Path) -> Dataset:
         drive_force=signal["drive_force_n"],
         drive_torque=signal["drive_torque_nmm"],
         slip=signal["slip_mm"],
+        rotation_slip=signal["rotation_slip_rad"],
         valid=signal["valid"],
     )

@@ -56,6 +56,7 @@ def sample_table(rollout: Rollout, applied: np.ndarray, actuation: Actuation, fi
         "drive_force_n": rollout.drive_force,
         "drive_torque_nmm": rollout.drive_torque,
         "slip_mm": rollout.slip,
+        "rotation_slip_rad": rollout.rotation_slip,
         "valid": rollout.valid,
     }
     kinds = dict.fromkeys(INDEX_COLUMNS, ("int64", None)) | {"timestamp": ("float32", None)} | signals(actuation)

@@ -43,6 +43,7 @@ _SIGNALS: dict[str, tuple[str, list[str] | None]] = {
     "drive_force_n": ("float32", None),
     "drive_torque_nmm": ("float32", None),
     "slip_mm": ("float64", None),  # with all its digits, so that `Dataset.command` is exact; nearly all are 0
+    "rotation_slip_rad": ("float64", None),
     "valid": ("bool", None),
 }
 MANOEUVRES = ("insertion", "retraction", "spin", "pause")

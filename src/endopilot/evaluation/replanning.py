@@ -71,7 +71,7 @@ def _driven(
         lost[chosen] = ~ok
         kept, moved = chosen[ok], slice(WINDOW, now + 1)
         made["control"][kept, moved] = rollout.control[ok, moved]
-        made["slip"][kept, moved] = rollout.slip[ok, moved]
+        made["slip"][kept, moved] = np.stack([rollout.slip, rollout.rotation_slip], axis=-1)[ok, moved]
         made["proximal"][kept, moved] = np.stack([rollout.inserted_length, rollout.rotation], axis=-1)[ok, moved]
         made["tip"][kept, now] = np.stack([rollout.tip.abscissa, rollout.tip.offset], axis=-1)[ok, now]
         made["branch"][kept, last + 1 : now] = made["branch"][kept, last, None]  # not observed since

@@ -91,7 +91,7 @@ class Episodes:
         anatomy: name of each episode's anatomy.
         initial: (Δ mm, φ rad) before the first period.
         control: π = (mm/s, rad/s) that the drive made, the mean over each period.
-        slip: advance that the drive was commanded and did not make over the period, mm.
+        slip: advance (mm) and rotation (rad) that the drive was commanded and did not make over the period.
         proximal: x^prox = (Δ mm, φ rad).
         tip: (Δtip, γtip), mm.
         branch: index of the branch that the tip lies in.
@@ -101,7 +101,7 @@ class Episodes:
     anatomy: Shaped[np.ndarray, "episodes"]
     initial: Float[np.ndarray, "episodes 2"]
     control: Float[np.ndarray, "episodes samples 2"]
-    slip: Float[np.ndarray, "episodes samples"]
+    slip: Float[np.ndarray, "episodes samples 2"]
     proximal: Float[np.ndarray, "episodes samples 2"]
     tip: Float[np.ndarray, "episodes samples 2"]
     branch: Int[np.ndarray, "episodes samples"]
@@ -125,7 +125,7 @@ class Episodes:
             anatomy=dataset.anatomy,
             initial=np.stack([dataset.initial_inserted_length, dataset.initial_rotation], axis=-1),
             control=dataset.control,
-            slip=dataset.slip,
+            slip=np.stack([dataset.slip, dataset.rotation_slip], axis=-1),
             proximal=np.stack([dataset.inserted_length, dataset.rotation], axis=-1),
             tip=np.stack([dataset.tip_abscissa, dataset.tip_offset], axis=-1),
             branch=dataset.branch,
@@ -154,7 +154,7 @@ class Episodes:
             anatomy=np.full(count, name),
             initial=np.tile(initial, (count, 1)),
             control=control,
-            slip=np.zeros((count, samples)),
+            slip=np.zeros((count, samples, 2)),
             proximal=initial + SAMPLE_PERIOD_S * np.cumsum(control, axis=1),
             tip=tip,
             branch=np.zeros((count, samples), dtype=np.int64),

@@ -70,6 +70,7 @@ def track(
         error[~step.valid] = np.inf
         best = error.reshape(episodes, each).argmin(axis=1) + each * np.arange(episodes)
         tip[:, k] = np.stack([reached.abscissa[best], reached.offset[best]], axis=-1)
-        control[:, k] = np.stack([command[best, 0] - step.slip[best] / SAMPLE_PERIOD_S, command[best, 1]], axis=-1)
+        slip = np.stack([step.slip, step.rotation_slip], axis=-1)[best]
+        control[:, k] = command[best] - slip / SAMPLE_PERIOD_S
         simulator.copy_worlds(np.repeat(best, each))
     return tip, control

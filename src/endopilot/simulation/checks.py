@@ -14,8 +14,8 @@ from endopilot.simulation.device import Device
 from endopilot.simulation.drive_limits import SPARE_MM
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
-_OVERSHOOT_MM = 1e-2
-"""Rounding of controls may carry the inserted length this far below 0, mm."""
+_ROUNDING_MM = 1e-2
+"""An inserted length may be rounded this far below 0, mm."""
 
 
 def check_distance_map(anatomy: Anatomy) -> None:
@@ -126,8 +126,7 @@ def check_sequences(
         leaves in the vessel what it did not pull back, and pushes on from there.
 
     Raises:
-        InputError: a number that is not finite or out of its range, a control that is too fast, or one that pulls the
-            wire out of the catheter.
+        InputError: a number that is not finite or out of its range, or a control that is too fast.
     """
     if actuation not in ("velocity", "force"):
         raise InputError(f"actuation: {actuation!r}; give 'velocity' or 'force'")
@@ -142,10 +141,10 @@ def check_sequences(
         fast = np.abs(control[..., axis]) > limit * (1 + 1e-6)
         _check(fast, control[..., axis], f"{name} in {unit} exceeds {device.name}'s limit of {limit:g}; slow down")
     _check(~np.isfinite(initial), initial, "initial state is no finite number; correct it")
+    _check(initial[:, 0] < -_ROUNDING_MM, initial[:, 0], "initial inserted length in mm is negative; give 0 or more")
     _check(~(np.isfinite(friction) & (friction >= 0)), friction, "friction must be a finite number of 0 or more")
     advance = SAMPLE_PERIOD_S * control[..., 0] if actuation == "velocity" else np.zeros(control.shape[:2])
     inserted = np.cumsum(np.column_stack([initial[:, 0], advance]), axis=1)
-    _check(inserted < -_OVERSHOOT_MM, inserted, "inserted length in mm is negative; pull less, or start deeper")
     return float(inserted.max()), float((initial[:, 0] + np.maximum(advance, 0.0).sum(axis=1)).max())
 
 

@@ -39,9 +39,9 @@ def simulate(
     """Drive a device through an anatomy and record it every 0.5 s.
 
     The drive slips rather than push, pull or turn the wire harder than the device's limits, and stops when the wire is
-    pulled out: controls, inserted lengths, rotations and the initial state of the answer are those that were made. Where
-    force and torque are given, advance and rotation follow, and the answer's controls are the mean velocities that came
-    of them.
+    pulled out: controls, inserted lengths, rotations and the initial state of the answer are those that were made.
+    Where force and torque are given, advance and rotation follow, and the answer's controls are the mean velocities
+    that came of them.
 
     Results are the same to the last bit whatever the number of worlds, their order and the number of threads.
 
@@ -58,8 +58,8 @@ def simulate(
         friction: Coulomb friction coefficient of each world; the device's own if not given.
 
     Raises:
-        InputError: controls that are not finite, too fast for the device or pull the wire out of the catheter; a
-            device that does not fit; a distance map that is not finite, or negative at the ostium.
+        InputError: controls that are not finite or too fast for the device; a device that does not fit; a distance map
+            that is not finite, or negative at the ostium.
     """
     config = config or SimulatorConfig()
     if control.ndim != 3 or control.shape[2] != 2:

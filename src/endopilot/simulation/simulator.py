@@ -60,8 +60,8 @@ class Simulator:
             device: the wire of all worlds, or one for each.
             worlds: their number, where neither of the above says it.
             actuation: what `step` takes: "velocity" (mm/s, rad/s; the drive makes exactly that motion, except that it
-                slips rather than push, pull or turn harder than the device's limits) or "force" (axial force N and torque N·mm on
-                the wire; advance and rotation follow, against the friction and drag of the introducer).
+                slips rather than push, pull or turn harder than the device's limits) or "force" (axial force N and
+                torque N·mm on the wire; advance and rotation follow, against the friction and drag of the introducer).
             config: settings of the rod core.
             sharing: a simulator that has prepared the same anatomy, whose lumen is then not prepared again.
 

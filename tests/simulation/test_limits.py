@@ -1,0 +1,204 @@
+"""The drive slips at its limits of push, pull and torque: closed forms, bookkeeping, determinism."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from bend import vessel
+
+from endopilot import _core
+from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.core import run_core
+from endopilot.simulation.device import read_device
+from endopilot.simulation.simulate import simulate
+from endopilot.simulation.simulator import Simulator
+from endopilot.simulation.state import SimulatorState
+from endopilot.types import SAMPLE_PERIOD_S, Anatomy
+from endopilot.verification.case import STATIC, X_AXIS, straight_rod
+
+LENGTH_MM, EI, GJ, EA, ELEMENTS = 40.0, 60.0, 46.0, 900.0, 20
+PUSH_N, PULL_N, TORQUE_N_MM = 0.2, 0.3, 1.5
+TURNS_BACK = 30
+"""Sample from which on the base is moved back."""
+HALF_MM = 0.5 * LENGTH_MM / (ELEMENTS - 0.5)
+"""Half an element: forces act at nodes, torques at the middles of elements."""
+START_MM = LENGTH_MM - 0.5 * HALF_MM
+"""Inserted length; the drive holds the rod from the next node on."""
+STIFF = 1e4
+"""Of the springs that hold the tip, N/mm and N mm/rad."""
+DEVICE = replace(read_device("workhorse-014"), friction=0.5)
+WEAK = replace(DEVICE, push_limit_n=0.015, pull_limit_n=0.004, torque_limit_n_mm=0.003)
+"""A drive that slips in every direction in the bent vessel."""
+CONFIG = SimulatorConfig(threads=1, wall_stiffness_n_mm=10.0)
+
+
+def held_at_its_tip(speed: float, spin: float, samples: int = 40) -> dict[str, np.ndarray]:
+    """Return what a straight rod does whose tip is held and whose base is moved (mm/s, rad/s)."""
+    rod = straight_rod(elements=ELEMENTS, length_mm=LENGTH_MM, bend=EI, twist=GJ, stretch=EA)
+    nodes, tip = len(rod.abscissa_mm), np.array([START_MM, 0.0, 0.0])
+    spring, anchor, hold = np.zeros((nodes, 3)), np.zeros((nodes, 3)), np.zeros(nodes)
+    spring[0], anchor[0], hold[0] = STIFF, tip, STIFF
+    loads = _core.make_loads(
+        force=np.zeros((nodes, 3)),
+        moment=np.zeros((nodes, 3)),
+        spring=spring,
+        anchor=anchor,
+        hold=hold,
+        attitude=np.tile([np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0], (nodes, 1)),
+    )
+    control = np.tile([speed, spin], (1, samples, 1))
+    control[:, TURNS_BACK:] *= -1.0
+    result = run_core(
+        rod,
+        None,
+        X_AXIS,
+        config=replace(STATIC, sample_tolerance_mm=1e-10),
+        initial=np.array([[START_MM, 0.0]]),
+        control=control,
+        friction=np.zeros(1),
+        loads=loads,
+        lanes=1,
+        approach=False,
+        free_behind_mm=0.0,
+        push_limit_n=PUSH_N,
+        pull_limit_n=PULL_N,
+        torque_limit_n_mm=TORQUE_N_MM,
+    )
+    assert result["valid"].all()
+    return {name: values[0] for name, values in result.items()} | {"control": control[0]}
+
+
+def clutch(stiffness: float, commanded: np.ndarray, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the load of a spring behind a clutch that slips at `low` and `high`, and the slip, after each sample."""
+    load, loads, slips = 0.0, [], []
+    for moved in commanded:
+        asked = load + stiffness * moved
+        load = min(max(asked, low), high)
+        loads.append(load)
+        slips.append((asked - load) / stiffness)
+    return np.array(loads), np.array(slips)
+
+
+@pytest.mark.parametrize("speed", [1.5e-3, -1.5e-3])
+def test_a_wire_held_at_its_tip_is_pushed_and_pulled_no_harder_than_the_limits(speed: float) -> None:
+    # An axial spring EA/L behind a clutch: F = EA/L (moved - slipped), within [-pull, push]; then back.
+    spring = 1.0 / ((LENGTH_MM - HALF_MM) / EA + 1.0 / STIFF)
+    found = held_at_its_tip(speed, 0.0)
+    load, slip = clutch(spring, SAMPLE_PERIOD_S * found["control"][:, 0], -PULL_N, PUSH_N)
+    assert (slip != 0).sum() > 5 and (slip == 0).sum() > 5
+    np.testing.assert_allclose(found["base_force"], load, atol=1e-6)
+    np.testing.assert_allclose(found["slip"], slip, atol=1e-8)
+    np.testing.assert_array_equal(found["rotation_slip"], 0.0)
+
+
+@pytest.mark.parametrize("spin", [0.2, -0.2])
+def test_a_wire_clamped_at_its_tip_is_turned_no_harder_than_the_limit(spin: float) -> None:
+    # A torsion spring GJ/L behind a clutch: T = GJ θ/L until T = limit; slip = commanded - limit L/GJ. Then back.
+    spring = 1.0 / ((START_MM - HALF_MM) / GJ + 1.0 / STIFF)
+    found = held_at_its_tip(0.0, spin)
+    load, slip = clutch(spring, SAMPLE_PERIOD_S * found["control"][:, 1], -TORQUE_N_MM, TORQUE_N_MM)
+    assert (slip != 0).sum() > 5 and (slip == 0).sum() > 5
+    np.testing.assert_allclose(found["base_torque"], load, atol=1e-6)
+    np.testing.assert_allclose(found["rotation_slip"], slip, atol=1e-6)
+    commanded = SAMPLE_PERIOD_S * spin * TURNS_BACK
+    lost = commanded - np.sign(spin) * TORQUE_N_MM / spring
+    assert found["rotation_slip"][:TURNS_BACK].sum() == pytest.approx(lost, rel=1e-6)
+    np.testing.assert_array_equal(found["slip"], 0.0)
+
+
+@pytest.fixture(scope="module")
+def anatomy() -> Anatomy:
+    return vessel()
+
+
+def navigation(worlds: int = 5, samples: int = 24) -> tuple[np.ndarray, np.ndarray]:
+    random = np.random.default_rng(8)
+    initial = np.column_stack([random.uniform(30, 50, worlds), random.uniform(-3, 3, worlds)])
+    control = np.stack([random.uniform(-3, 5, (worlds, samples)), random.uniform(-4, 4, (worlds, samples))], axis=-1)
+    control[:, 1::2] = control[:, ::2]
+    return initial, control
+
+
+def test_what_slips_in_a_vessel_is_told_and_the_limits_hold(anatomy: Anatomy) -> None:
+    initial, control = navigation()
+    rollout = simulate(anatomy, WEAK, control, initial=initial, config=CONFIG)
+    assert rollout.valid.all()
+    assert (rollout.slip > 1e-3).any() and (rollout.slip < -1e-3).any()
+    assert (rollout.rotation_slip > 1e-3).any() and (rollout.rotation_slip < -1e-3).any()
+    # Newton's method leaves the force within the sample's tolerance of 1 nm times the wire's stiffness of some kN/mm.
+    assert rollout.base_force.max() == pytest.approx(WEAK.push_limit_n, rel=1e-3)
+    assert rollout.base_force.min() == pytest.approx(-WEAK.pull_limit_n, rel=1e-2)
+    assert np.abs(rollout.base_torque).max() == pytest.approx(WEAK.torque_limit_n_mm, rel=1e-2)
+    slip = np.stack([rollout.slip, rollout.rotation_slip], axis=-1)
+    np.testing.assert_allclose(SAMPLE_PERIOD_S * rollout.control + slip, SAMPLE_PERIOD_S * control, atol=1e-12)
+    state = np.stack([rollout.inserted_length, rollout.rotation], axis=-1)
+    start = np.stack([rollout.initial_inserted_length, rollout.initial_rotation], axis=-1)
+    np.testing.assert_allclose(state, start[:, None] + SAMPLE_PERIOD_S * np.cumsum(rollout.control, axis=1), atol=1e-9)
+
+
+def test_what_was_made_is_where_the_wire_is(anatomy: Anatomy) -> None:
+    initial, control = navigation()
+    rollout = simulate(anatomy, WEAK, control, initial=initial, config=CONFIG)
+    simulator = Simulator(anatomy, WEAK, worlds=len(control), config=CONFIG)
+    simulator.reset(inserted_length=initial[:, 0], rotation=initial[:, 1])
+    for sample in np.moveaxis(control, 1, 0):
+        simulator.step(sample, SAMPLE_PERIOD_S)
+    np.testing.assert_allclose(simulator.inserted_length, rollout.inserted_length[:, -1], atol=1e-9)
+    np.testing.assert_allclose(simulator.rotation, rollout.rotation[:, -1], atol=1e-9)
+    np.testing.assert_array_equal(simulator.position[:, 0], rollout.tip_position[:, -1])
+
+
+def test_a_drive_that_slips_gives_the_same_bits_in_any_company_and_from_any_state(anatomy: Anatomy, tmp_path) -> None:
+    initial, control = navigation()
+    names = ("tip_position", "base_force", "base_torque", "slip", "rotation_slip", "iterations", "inserted_length")
+    one = simulate(anatomy, WEAK, control, initial=initial, config=CONFIG)
+    order = np.array([3, 0, 4, 1, 2])
+    shuffled = simulate(anatomy, WEAK, control[order], initial=initial[order], config=replace(CONFIG, threads=2))
+    alone = simulate(anatomy, WEAK, control[[4]], initial=initial[[4]], config=CONFIG)
+    simulator = Simulator(anatomy, WEAK, worlds=len(control), config=CONFIG)
+    simulator.reset(inserted_length=initial[:, 0], rotation=initial[:, 1])
+    for t in range(control.shape[1]):
+        step = simulator.step(control[:, t], SAMPLE_PERIOD_S)
+        for name in ("tip_position", "slip", "rotation_slip"):
+            np.testing.assert_array_equal(getattr(step, name), getattr(one, name)[:, t])
+        simulator.state.save(tmp_path / "state.npz")
+        simulator = Simulator(anatomy, WEAK, worlds=len(control), config=CONFIG)
+        simulator.set_state(SimulatorState.load(tmp_path / "state.npz"))
+    for name in names:
+        np.testing.assert_array_equal(getattr(shuffled, name), getattr(one, name)[order])
+        np.testing.assert_array_equal(getattr(alone, name), getattr(one, name)[[4]])
+
+
+def test_a_wire_that_was_not_pulled_back_is_pushed_on_from_there(anatomy: Anatomy) -> None:
+    # 20 s of pulling at a drive that holds next to nothing, then 10 s of pushing: the wire is deeper than commanded.
+    control = np.zeros((1, 60, 2))
+    control[0, :40, 0], control[0, 40:, 0] = -1.0, 2.0
+    loose = replace(WEAK, pull_limit_n=2e-3, push_limit_n=0.5)
+    rollout = simulate(anatomy, loose, control, initial=np.array([[60.0, 0.0]]), record_shape=True, config=CONFIG)
+    assert rollout.valid.all() and rollout.shape is not None
+    assert rollout.base_force[0, :40] == pytest.approx(-2e-3, abs=1e-6)
+    assert rollout.inserted_length[0, -1] > 70.0  # and 60 mm was commanded
+    behind = anatomy.insertion.position[0] - rollout.shape[0, -1, -1, 0]
+    assert behind > 3.0  # the recorded wire reaches back into the catheter
+
+
+def test_loads_that_are_given_have_no_limit(anatomy: Anatomy) -> None:
+    load = np.zeros((1, 8, 2))
+    load[:, :4], load[:, 4:] = [0.08, 0.02], [-0.08, -0.02]
+    weak, strong = (
+        simulate(
+            anatomy,
+            replace(WEAK, push_limit_n=n, pull_limit_n=n, torque_limit_n_mm=n),
+            load,
+            actuation="force",
+            config=CONFIG,
+        )
+        for n in (5e-3, 1e3)
+    )
+    assert np.ptp(strong.inserted_length) > 5.0
+    for name in ("tip_position", "inserted_length", "rotation", "drive_force", "drive_torque"):
+        np.testing.assert_array_equal(getattr(weak, name), getattr(strong, name))
+    np.testing.assert_array_equal(weak.slip, 0.0)
+    np.testing.assert_array_equal(weak.rotation_slip, 0.0)
