@@ -36,6 +36,7 @@ class Step:
         tip_direction: unit vector along the wire at its tip.
         contact_force_max: largest wall force on one node, N.
         contact_force_sum: sum of the wall forces' magnitudes, N.
+        wall_force: largest resultant of the wall's forces on any 2 mm of the wire, N.
         slip: advance that was asked of the drive and not made, mm; negative where it pulled.
         rotation_slip: rotation that was asked of the drive and not made, rad.
         iterations: mean Newton iterations a time step.
@@ -48,6 +49,7 @@ class Step:
     tip_direction: Float[np.ndarray, "worlds 3"]
     contact_force_max: Float[np.ndarray, "worlds"]
     contact_force_sum: Float[np.ndarray, "worlds"]
+    wall_force: Float[np.ndarray, "worlds"]
     slip: Float[np.ndarray, "worlds"]
     rotation_slip: Float[np.ndarray, "worlds"]
     iterations: Float[np.ndarray, "worlds"]
