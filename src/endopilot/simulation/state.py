@@ -40,6 +40,7 @@ class Step:
         slip: advance that was asked of the drive and not made, mm; negative where it pulled.
         rotation_slip: rotation that was asked of the drive and not made, rad.
         iterations: mean Newton iterations a time step.
+        node_iterations: evaluations of active nodes in the step.
         valid: false for a world that has failed; it stays as it was.
     """
 
@@ -53,6 +54,7 @@ class Step:
     slip: Float[np.ndarray, "worlds"]
     rotation_slip: Float[np.ndarray, "worlds"]
     iterations: Float[np.ndarray, "worlds"]
+    node_iterations: Float[np.ndarray, "worlds"]
     valid: Bool[np.ndarray, "worlds"]
 
 
