@@ -7,14 +7,20 @@
 #include <memory>
 
 #include "arrays.hpp"
-#include "cpu.hpp"
 #include "levels.hpp"
 #include "projection.hpp"
 #include "simulation.hpp"
 #include "spline.hpp"
+#ifdef ENDOPILOT_CUDA
+#include "gpu.hpp"
+using Device = endopilot::Gpu;
+#else
+#include "cpu.hpp"
+using Device = endopilot::Cpu;
+#endif
 
 using namespace endopilot;
-using Simulations = Simulation<Cpu>;
+using Simulations = Simulation<Device>;
 
 namespace {
 
@@ -120,6 +126,9 @@ NB_MODULE(ENDOPILOT_MODULE, module) {
     module.attr("LEVEL") = ENDOPILOT_LEVEL;
     module.attr("LANES") = kLanes;
     module.def("supported_levels", &supported_levels);
+#ifdef ENDOPILOT_CUDA
+    module.def("why_no_gpu", &why_no_gpu);
+#endif
     nb::class_<Rod>(module, "RodModel")
         .def_ro("nodes", &Rod::nodes);
     module.def("make_rod", &make_rod, nb::kw_only(), nb::arg("abscissa"), nb::arg("shear"), nb::arg("stretch"),

@@ -8,6 +8,23 @@ namespace endopilot {
 constexpr double kOvershoot = 0.02;  // mm that rounded controls may pull the wire behind the ostium
 constexpr double kResultantLength = 2.0;  // mm of wire whose forces of the wall are added up: nodes may share one contact
 
+// Puts a world at the ostium, straight, ready to be pushed to the inserted length `depth` (mm) before its first sample.
+inline void start_world(const Scene& scene, const World& w, double depth, double rotation, double friction, double sample_period) {
+    const double speed = scene.options.approach_velocity, inserted = speed > 0 ? 0.0 : depth;
+    for (std::size_t k = 0; k < World::size(scene.rod.nodes); ++k) w.values[std::ptrdiff_t(k) * w.stride] = 0.0;
+    w[World::kInserted] = inserted;
+    w[World::kRotation] = rotation;
+    w[World::kApproach] = speed > 0 ? std::ceil(depth / (speed * sample_period)) + 1 : 0.0;
+    w[World::kDepth] = depth;
+    w[World::kFriction] = friction;
+    w[World::kStride] = kTicks;
+    w[World::kActive] = Base::count_active(scene.rod, inserted, scene.options.free_behind);
+    for (int i = 0; i < int(w[World::kActive]); ++i) {
+        write(w.node(i) + World::kX, scene.base.position(scene.rod, i, inserted));
+        write(w.node(i) + World::kQ, scene.base.attitude(rotation));
+    }
+}
+
 template <class V>
 template <class Queue>
 void Stepper<V>::take(int l, Queue& queue) {

@@ -33,16 +33,8 @@ public:
         require(initial.shape(0) == n && initial.shape(1) == 2 && friction.size() == n, "reset needs one row a world");
         for (std::size_t k = 0; k < n; ++k) {
             require(index.data()[k] >= 0 && std::size_t(index.data()[k]) < count_, "reset names no such world");
-            const World w = world(std::size_t(index.data()[k]));
-            const double depth = initial.data()[2 * k], speed = scene_.options.approach_velocity;
-            std::fill_n(w.values, width(), 0.0);
-            w[World::kInserted] = speed > 0 ? 0.0 : depth;
-            w[World::kRotation] = initial.data()[2 * k + 1];
-            w[World::kApproach] = speed > 0 ? std::ceil(depth / (speed * sample_period)) + 1 : 0.0;
-            w[World::kDepth] = depth;
-            w[World::kFriction] = friction.data()[k];
-            w[World::kStride] = kTicks;
-            lay_straight(w);
+            const double* start = initial.data() + 2 * k;
+            start_world(view_, world(std::size_t(index.data()[k])), start[0], start[1], friction.data()[k], sample_period);
         }
     }
 
@@ -191,17 +183,6 @@ private:
 
     static void copy(const World::Numbers& from, int size, double* to) {
         for (int k = 0; k < size; ++k) to[k] = from[k];
-    }
-
-    void lay_straight(const World& w) {
-        const double inserted = w[World::kInserted];
-        const Quaternion<double> q = scene_.base.attitude(w[World::kRotation]);
-        const int active = Base::count_active(view_.rod, inserted, scene_.options.free_behind);
-        w[World::kActive] = active;
-        for (int i = 0; i < active; ++i) {
-            write(w.node(i) + World::kX, scene_.base.position(view_.rod, i, inserted));
-            write(w.node(i) + World::kQ, q);
-        }
     }
 
     // The worlds in the order of their mean inserted length, so that those under way together are of similar length.

@@ -12,7 +12,7 @@ import pytest
 HERE = Path(__file__).parent
 SOURCES = Path(__file__).parents[2] / "src" / "core"
 SANITIZERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
-FLAGS = ("-std=gnu++20", "-O1", "-g", "-Wall", "-Wextra", "-Wno-psabi", "-march=native", *SANITIZERS)
+FLAGS = (*"-std=gnu++20 -O1 -g -Wall -Wextra -Wno-psabi -march=native -ffp-contract=off".split(), *SANITIZERS)
 
 
 @pytest.fixture(scope="module")
@@ -31,9 +31,11 @@ def compiler(tmp_path_factory: pytest.TempPathFactory) -> str:
     return found
 
 
-def test_the_core_passes_its_tests_under_sanitizers(compiler: str, tmp_path: Path) -> None:
-    program = tmp_path / "test_core"
-    command = [compiler, *FLAGS, f"-I{SOURCES}", f"-I{HERE}", HERE / "test_core.cpp", "-o", program]
+@pytest.mark.parametrize("name", ["test_core", "test_kernel"])
+def test_the_core_passes_its_tests_under_sanitizers(compiler: str, name: str, tmp_path: Path) -> None:
+    program = tmp_path / name
+    folders = [f"-I{folder}" for folder in (SOURCES, HERE, HERE / "cuda_on_cpu")]
+    command = [compiler, *FLAGS, *folders, HERE / f"{name}.cpp", "-o", program]
     built = subprocess.run(command, capture_output=True, encoding="utf-8")
     assert built.returncode == 0, built.stderr
     ran = subprocess.run([program], capture_output=True, encoding="utf-8")

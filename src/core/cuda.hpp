@@ -1,0 +1,33 @@
+// A CUDA GPU that steps worlds, seen from the host and without Python; cuda.cu implements it.
+#pragma once
+
+#include <functional>
+#include <memory>
+#include <string>
+#include <vector>
+
+#include "world.hpp"
+
+namespace endopilot {
+
+// Why no GPU can be used, such as "no CUDA-capable device is detected"; empty if one can.
+std::string why_no_gpu();
+
+class CudaStepper {
+public:
+    // Puts the scene into the GPU's memory. This and `step` throw std::runtime_error with CUDA's own words.
+    explicit CudaStepper(const OwnedScene& scene);
+    ~CudaStepper();
+
+    // Steps all worlds to the end of the inputs; `order` names those of similar length next to each other. Calls `progress`
+    // with the samples that ended since it was last called; if it throws, the worlds stay as they were before.
+    void step(const Worlds& worlds, const Inputs& in, const Outputs& out, const std::vector<int>& order,
+              const std::function<void(long)>& progress);
+
+private:
+    struct Memory;
+    std::unique_ptr<Memory> memory_;
+    Scene scene_;  // in the GPU's memory
+};
+
+}  // namespace endopilot

@@ -1,0 +1,159 @@
+// The GPU's path, run on the processor, against the scalar lanes of a processor's thread: the same numbers to the bit. Built
+// with sanitizers and run by test_core_sanitized.py; `cuda_runtime.h` is that of cuda_on_cpu.
+#include <cmath>
+#include <cstdio>
+#include <cstdlib>
+#include <cstring>
+#include <limits>
+#include <random>
+
+#include "cuda.cu"
+#include "queue.hpp"
+#include "spline.hpp"
+
+using namespace endopilot;
+
+namespace {
+
+int failures = 0;
+
+void expect(bool fine, const char* what) {
+    if (fine) return;
+    std::printf("FAILED: %s\n", what);
+    ++failures;
+}
+
+constexpr double kPeriod = 0.5;  // s
+constexpr int kWorlds = 37, kSamples = 6, kSteps = 10;
+
+// A uniform wire with a bent tip.
+Rod make_rod() {
+    const int nodes = 40;
+    Rod rod{.nodes = nodes};
+    for (int i = 0; i < nodes; ++i) rod.abscissa.push_back(0.9 * i);
+    rod.length.assign(nodes, 0.9), rod.joint_length.assign(nodes, 0.9);
+    rod.shear.assign(nodes, 200.0), rod.stretch.assign(nodes, 500.0);
+    rod.bend.assign(nodes, 4.0), rod.twist.assign(nodes, 3.0);
+    rod.radius.assign(nodes, 0.18), rod.drag.assign(nodes, 1e-3), rod.spin_drag.assign(nodes, 1e-4);
+    for (int i = 0; i < nodes; ++i) rod.rest.push_back({i < 6 ? 0.15 : 0.0, 0, 0});
+    return rod;
+}
+
+// A tube of 1.5 mm radius: straight along x up to the origin, then a quarter of a circle of 18 mm radius towards z.
+LumenMap make_map() {
+    const int size[3] = {73, 14, 62};
+    const double origin[3] = {-8.2, -2.6, -2.6}, spacing = 0.4;
+    std::vector<float> values;
+    for (int k = 0; k < size[2]; ++k)
+        for (int j = 0; j < size[1]; ++j)
+            for (int i = 0; i < size[0]; ++i) {
+                const double x = origin[0] + spacing * i, y = origin[1] + spacing * j, z = origin[2] + spacing * k;
+                const double off = x < 0 ? z : std::hypot(x, z - 18.0) - 18.0;
+                values.push_back(float(1.5 - std::hypot(off, y)));
+            }
+    return make_lumen_map(spline_coefficients(values.data(), size).data(), size, origin, spacing, 0.6, 0.5);
+}
+
+// Dead forces on the tip, and a weak spring.
+OwnedLoads make_loads(std::size_t nodes) {
+    OwnedLoads loads{.force = {}, .moment = {}, .spring = {}, .anchor = {}, .hold = {}, .attitude = {}};
+    loads.force.assign(nodes, {0, 0, 0}), loads.moment.assign(nodes, {0, 0, 0}), loads.spring.assign(nodes, {1e-3, 0, 1e-3});
+    loads.anchor.assign(nodes, {5, 0, 2}), loads.hold.assign(nodes, 0.0), loads.attitude.assign(nodes, {1, {0, 0, 0}});
+    loads.force[0] = {0, 1e-3, 0};
+    return loads;
+}
+
+OwnedScene make_scene(bool with_loads) {
+    const double half = std::sqrt(0.5);
+    return {.rod = make_rod(),
+            .lumen = std::make_shared<LumenMap>(make_map()),
+            .loads = with_loads ? std::make_shared<OwnedLoads>(make_loads(40)) : nullptr,
+            .base = {.origin = {-3.0, 0.0, 0.0}, .orientation = {half, {0, half, 0}}},
+            .options = {.stick_velocity = 0.05, .wall_stiffness = 100.0, .tolerance = 1e-3, .sample_tolerance = 1e-6,
+                        .largest_step = 0.3, .largest_jump = 0.1, .max_iterations = 400, .free_behind = 3.0,
+                        .approach_velocity = 20.0, .push_limit = 0.3, .introducer_friction = 0.05, .introducer_drag = 0.002}};
+}
+
+// Worlds at rest and what is recorded of them.
+struct Run {
+    std::size_t nodes, width;
+    std::vector<double> values;
+    std::vector<std::vector<double>> numbers;
+    std::vector<unsigned char> valid;
+    Outputs out{};
+
+    explicit Run(const Scene& scene) : nodes(std::size_t(scene.rod.nodes)), width(World::size(scene.rod.nodes)) {
+        values.resize(kWorlds * width);
+        std::mt19937 random(3);
+        std::uniform_real_distribution<double> any(0.0, 1.0);
+        for (int w = 0; w < kWorlds; ++w) {
+            const double depth = 4 + 12 * any(random), turn = 6 * any(random), friction = 0.05 + 0.2 * any(random);
+            start_world(scene, worlds()[std::size_t(w)], depth, turn, w == 5 ? std::numeric_limits<double>::quiet_NaN() : friction, kPeriod);
+        }
+        valid.assign(kWorlds * kSamples, 0);
+        out.valid = reinterpret_cast<bool*>(valid.data());
+        double placeholder = 0;
+        out.shape = out.attitude = &placeholder;
+        each_array(out, kSamples, nodes, [this](auto*& array, std::size_t size) {
+            if constexpr (std::is_same_v<decltype(array), double*&>) array = numbers.emplace_back(kWorlds * size).data();
+        });
+    }
+    Worlds worlds() { return {values.data(), std::ptrdiff_t(width), 1}; }
+};
+
+bool same(const std::vector<double>& a, const std::vector<double>& b) {
+    return a.size() == b.size() && std::memcmp(a.data(), b.data(), a.size() * sizeof(double)) == 0;
+}
+
+void test_kernel(bool by_force, bool with_loads) {
+    const OwnedScene owned = make_scene(with_loads);
+    const Scene scene = view(owned, InPlace{});
+    std::mt19937 random(4);
+    std::uniform_real_distribution<double> any(-1.0, 1.0);
+    std::vector<double> control;
+    for (int k = 0; k < kWorlds * kSamples; ++k) {
+        control.push_back(by_force ? 0.1 * any(random) : 2 + 5 * any(random));
+        control.push_back(by_force ? 0.1 * any(random) : 2 * any(random));
+    }
+    const Inputs in{.samples = kSamples, .steps_per_sample = kSteps, .time_step = kPeriod / kSteps, .force_driven = by_force, .control = control.data()};
+
+    Run processor(scene), gpu(scene);
+    std::vector<int> order;
+    for (int w = 0; w < kWorlds; ++w) order.push_back((w * 7) % kWorlds);
+    std::vector<Node<double>> node(processor.nodes);
+    std::vector<Factor<double>> factor(processor.nodes);
+    Stepper<double> stepper(scene, processor.worlds(), node.data(), factor.data());
+    stepper.prepare(in, processor.out);
+    WorkQueue queue(order, std::vector<double>(kWorlds, 0.0), 8);
+    while (stepper.turn(queue) >= 0) {
+    }
+
+    long done = 0;
+    const int before = launches;
+    CudaStepper(owned).step(gpu.worlds(), in, gpu.out, order, [&](long samples) { done += samples; });
+    expect(launches - before >= 2, "a run takes several launches");
+    expect(done == kWorlds * kSamples, "progress counts all samples");
+
+    expect(same(gpu.values, processor.values), "the same worlds");
+    expect(gpu.numbers.size() == processor.numbers.size(), "as many arrays");
+    for (std::size_t a = 0; a < gpu.numbers.size(); ++a) expect(same(gpu.numbers[a], processor.numbers[a]), "the same records");
+    expect(gpu.valid == processor.valid, "the same worlds are valid");
+
+    int touching = 0, invalid = 0;
+    for (int k = 0; k < kWorlds * kSamples; ++k) {
+        touching += processor.out.force_max[k] > 0;
+        invalid += !processor.out.valid[k];
+    }
+    expect(touching > kWorlds, "wires touch the wall");
+    expect(invalid >= kSamples && invalid < kWorlds * kSamples / 2, "a world becomes invalid, most do not");
+}
+
+}  // namespace
+
+int main() {
+    test_kernel(false, false);
+    test_kernel(true, false);
+    test_kernel(false, true);
+    std::printf(failures == 0 ? "all core tests passed\n" : "%d core checks failed\n", failures);
+    return failures == 0 ? EXIT_SUCCESS : EXIT_FAILURE;
+}
