@@ -145,13 +145,14 @@ struct Outputs {
 // Calls f(array, numbers for each world) for every array that is recorded.
 template <class F>
 void each_array(Outputs& out, std::size_t samples, std::size_t nodes, const F& f) {
-    for (double** array : {&out.inserted, &out.rotation, &out.force_max, &out.force_sum, &out.base_force, &out.base_torque,
-                           &out.drive_force, &out.drive_torque, &out.iterations, &out.node_iterations, &out.slip})
+    for (double** array : {&out.inserted, &out.rotation, &out.force_max, &out.force_sum, &out.wall_force, &out.base_force,
+                           &out.base_torque, &out.drive_force, &out.drive_torque, &out.iterations, &out.node_iterations, &out.slip,
+                           &out.rotation_slip})
         f(*array, samples);
     f(out.tip_position, 3 * samples);
     f(out.tip_direction, 3 * samples);
     f(out.valid, samples);
-    f(out.approach_slip, std::size_t(1));
+    f(out.approach_slip, std::size_t(2));
     if (out.shape) f(out.shape, 3 * samples * nodes);
     if (out.attitude) f(out.attitude, 4 * samples * nodes);
 }

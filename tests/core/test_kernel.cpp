@@ -71,7 +71,8 @@ OwnedScene make_scene(bool with_loads) {
             .base = {.origin = {-3.0, 0.0, 0.0}, .orientation = {half, {0, half, 0}}},
             .options = {.stick_velocity = 0.05, .wall_stiffness = 100.0, .tolerance = 1e-3, .sample_tolerance = 1e-6,
                         .largest_step = 0.3, .largest_jump = 0.1, .max_iterations = 400, .free_behind = 3.0,
-                        .approach_velocity = 20.0, .push_limit = 0.3, .introducer_friction = 0.05, .introducer_drag = 0.002}};
+                        .approach_velocity = 20.0, .push_limit = 0.05, .pull_limit = 0.05,
+                        .torque_limit = 0.5, .introducer_friction = 0.05, .introducer_drag = 0.002}};
 }
 
 // Worlds at rest and what is recorded of them.
@@ -139,12 +140,14 @@ void test_kernel(bool by_force, bool with_loads) {
     for (std::size_t a = 0; a < gpu.numbers.size(); ++a) expect(same(gpu.numbers[a], processor.numbers[a]), "the same records");
     expect(gpu.valid == processor.valid, "the same worlds are valid");
 
-    int touching = 0, invalid = 0;
+    int touching = 0, invalid = 0, slipping = 0;
     for (int k = 0; k < kWorlds * kSamples; ++k) {
+        slipping += processor.out.slip[k] > 0;
         touching += processor.out.force_max[k] > 0;
         invalid += !processor.out.valid[k];
     }
     expect(touching > kWorlds, "wires touch the wall");
+    expect(by_force || slipping > 0, "the drive slips at its limit");
     expect(invalid >= kSamples && invalid < kWorlds * kSamples / 2, "a world becomes invalid, most do not");
 }
 
