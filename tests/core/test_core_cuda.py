@@ -21,7 +21,7 @@ def test_the_kernel_compiles_for_a_gpu(tmp_path: Path) -> None:
         pytest.skip("nvcc is older than 12, which knows C++20")
     made = tmp_path / "cuda.o"
     # the options of CMakeLists.txt; a call of host code from the device is an error
-    options = "-std=c++20 -arch=sm_80 --fmad=false --expt-relaxed-constexpr -diag-suppress 549".split()
+    options = ["-std=c++20", "-arch=sm_80", "--fmad=false", "--expt-relaxed-constexpr", "-diag-suppress", "549"]
     options += ["-Werror", "cross-execution-space-call"]
     command = [compiler, *options, "-c", str(CORE / "cuda.cu"), "-o", str(made)]
     run = subprocess.run(command, capture_output=True, text=True, check=False)

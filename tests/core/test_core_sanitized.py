@@ -12,7 +12,8 @@ import pytest
 HERE = Path(__file__).parent
 SOURCES = Path(__file__).parents[2] / "src" / "core"
 SANITIZERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
-FLAGS = (*"-std=gnu++20 -O1 -g -Wall -Wextra -Wno-psabi -march=native -ffp-contract=off".split(), *SANITIZERS)
+WARNINGS = ("-Wall", "-Wextra", "-Wno-psabi")
+FLAGS = ("-std=gnu++20", "-O1", "-g", "-march=native", "-ffp-contract=off", *WARNINGS, *SANITIZERS)
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,7 @@ from pydantic import model_validator
 from endopilot import _core
 from endopilot.parallel import CORES
 from endopilot.settings import CountOrZero, NonNegative, Positive, Within, settings
+from endopilot.simulation.processor import Processor
 from endopilot.types import SAMPLE_PERIOD_S
 
 FREE_BEHIND_MM = 3.0
@@ -47,6 +48,9 @@ class SimulatorConfig:
     """Coulomb friction of the introducer's valve, N; the drive feels it, the wire ahead of the valve does not."""
     introducer_drag_n_s_mm: NonNegative = 0.002
     """Viscous drag of the introducer's valve, N·s/mm."""
+    processor: Processor = "cpu"
+    """Where worlds are stepped: "cpu", or "cuda" on an NVIDIA GPU, one world a thread. The two agree as closely as two
+    systems' cosines; a GPU pays for thousands of worlds at once."""
     threads: CountOrZero = 0
     """Threads; 0 for one a processor core. The results do not depend on it."""
 

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from endopilot import _core
 from endopilot.progress import progress
 from endopilot.simulation.config import FREE_BEHIND_MM, LANES, Actuation, SimulatorConfig, wall_stiffness
+from endopilot.simulation.processor import Processor, core_for, gpu_errors
 from endopilot.simulation.rod import RodLayout
 from endopilot.types import SAMPLE_PERIOD_S, DistanceMap, Insertion
 
@@ -61,28 +62,30 @@ def run_core(
     Returns:
         The arrays of `Rollout` that need no centerline, and `reason`: 0 fine, 1 not finite, 2 not converged.
     """
-    simulation = _core.Simulation(
-        rod=rod.model(),
-        lumen=lumen,
-        loads=loads,
-        **insertion_arguments(insertion),
-        options=core_options(
-            config,
-            push_limit_n=push_limit_n,
-            pull_limit_n=pull_limit_n,
-            torque_limit_n_mm=torque_limit_n_mm,
-            approach=approach,
-            free_behind_mm=free_behind_mm,
-        ),
-        worlds=len(control),
-    )
+    with gpu_errors(config.processor):
+        simulation = core_for(config.processor).Simulation(
+            rod=rod.model(config.processor),
+            lumen=lumen,
+            loads=loads,
+            **insertion_arguments(insertion),
+            options=core_options(
+                config,
+                push_limit_n=push_limit_n,
+                pull_limit_n=pull_limit_n,
+                torque_limit_n_mm=torque_limit_n_mm,
+                approach=approach,
+                free_behind_mm=free_behind_mm,
+            ),
+            worlds=len(control),
+        )
     simulation.reset(
         index=np.arange(len(control)),
         initial=np.ascontiguousarray(initial, dtype=float),
         friction=np.ascontiguousarray(friction, dtype=float),
         sample_period=SAMPLE_PERIOD_S,
     )
-    with progress("Simulating the wire", total=control.shape[0] * control.shape[1]) as advance:
+    total = control.shape[0] * control.shape[1]
+    with gpu_errors(config.processor), progress("Simulating the wire", total=total) as advance:
         result = simulation.run(
             control=np.ascontiguousarray(control, dtype=float),
             force_driven=actuation == "force",
@@ -115,7 +118,7 @@ def core_options(
     approach: bool = True,
 ) -> _core.Options:
     """Return the settings as the core wants them."""
-    options = _core.Options()
+    options = core_for(config.processor).Options()
     options.stick_velocity = config.stick_velocity_mm_s
     options.wall_stiffness = wall_stiffness(config, push_limit_n)
     options.tolerance = config.tolerance_mm
@@ -133,10 +136,10 @@ def core_options(
     return options
 
 
-def make_lumen(distance_map: DistanceMap, radius_mm: float) -> _core.Lumen:
+def make_lumen(distance_map: DistanceMap, radius_mm: float, processor: Processor = "cpu") -> _core.Lumen:
     """Return the wall as the core wants it, a quadratic B-spline through the map, for a wire of some radius."""
     spacing = float(distance_map.spacing_mm)
-    return _core.make_lumen(
+    return core_for(processor).make_lumen(
         values=np.ascontiguousarray(distance_map.values, dtype=np.float32),
         origin=np.asarray(distance_map.origin_mm, dtype=float),
         spacing=spacing,

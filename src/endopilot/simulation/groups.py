@@ -16,6 +16,7 @@ from endopilot.simulation.config import FREE_BEHIND_MM, SimulatorConfig
 from endopilot.simulation.core import core_options, insertion_arguments, make_lumen
 from endopilot.simulation.device import Device, check_fits
 from endopilot.simulation.drive_limits import far_end_mm
+from endopilot.simulation.processor import core_for
 from endopilot.simulation.rod import RodLayout, lay_out
 from endopilot.types import Anatomy
 
@@ -70,7 +71,9 @@ def make_groups(
         InputError: a device that does not fit its anatomy; a distance map that is not finite, or negative at the
             ostium; more worlds than the memory holds.
     """
-    lumens = {(group.anatomy.identity, group.device.tip_radius_mm): group.lumen for group in sharing}
+    core = core_for(config.processor)
+    prepared = [group for group in sharing if isinstance(group.lumen, core.Lumen)]
+    lumens = {(group.anatomy.identity, group.device.tip_radius_mm): group.lumen for group in prepared}
     projectors = {group.anatomy.identity: group.project for group in sharing}
     members: dict[GroupKey, list[int]] = {}
     for world, pair in enumerate(zip(anatomies, devices, strict=True)):
@@ -82,15 +85,15 @@ def make_groups(
         key = (anatomy.identity, device.tip_radius_mm)
         if key not in lumens:
             check_distance_map(anatomy)
-            lumens[key] = make_lumen(anatomy.distance_map, device.tip_radius_mm)
+            lumens[key] = make_lumen(anatomy.distance_map, device.tip_radius_mm, config.processor)
         if anatomy.identity not in projectors:
             projectors[anatomy.identity] = TipProjector(anatomy.tree, anatomy.insertion)
         path_mm = float(anatomy.tree.longest_path().abscissa[-1])
         longest_mm = far_end_mm(anatomy)
         rod = lay_out(device, path_mm=path_mm, elements=config.elements, length_mm=longest_mm + FREE_BEHIND_MM)
         check_memory(8 * len(worlds) * (25 * len(rod.abscissa_mm) + 40), f"worlds: {len(worlds)}", "give fewer")
-        simulation = _core.Simulation(
-            rod=rod.model(),
+        simulation = core.Simulation(
+            rod=rod.model(config.processor),
             lumen=lumens[key],
             loads=None,
             **insertion_arguments(anatomy.insertion),

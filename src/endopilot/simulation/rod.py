@@ -11,6 +11,7 @@ from scipy.optimize import brentq
 
 from endopilot import _core
 from endopilot.simulation.device import Device
+from endopilot.simulation.processor import Processor, core_for
 
 POISSON_RATIO = 0.3
 """Of steel and nitinol; it ties shear to bending stiffness."""
@@ -50,9 +51,9 @@ class RodLayout:
     drag_n_s_mm: Float[np.ndarray, "n"]
     spin_drag_n_mm_s: Float[np.ndarray, "n"]
 
-    def model(self) -> _core.RodModel:
+    def model(self, processor: Processor = "cpu") -> _core.RodModel:
         """Return the rod as the core wants it."""
-        return _core.make_rod(
+        return core_for(processor).make_rod(
             abscissa=self.abscissa_mm,
             shear=self.shear_n,
             stretch=self.stretch_n,

@@ -87,7 +87,7 @@ def simulate(
     _check_memory(worlds, samples, len(rod.abscissa_mm) if record_shape else 0)
     result = run_core(
         rod,
-        make_lumen(anatomy.distance_map, device.tip_radius_mm),
+        make_lumen(anatomy.distance_map, device.tip_radius_mm, config.processor),
         anatomy.insertion,
         config=config,
         initial=initial,

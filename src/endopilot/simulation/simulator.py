@@ -21,6 +21,7 @@ from endopilot.simulation.checks import check_control, check_memory, check_trave
 from endopilot.simulation.config import LANES, Actuation, SimulatorConfig
 from endopilot.simulation.device import Device
 from endopilot.simulation.groups import Group, group_key, make_groups, merge
+from endopilot.simulation.processor import gpu_errors
 from endopilot.simulation.state import SimulatorState, Step, SupportsDLPack
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, TipProjection
 
@@ -82,7 +83,8 @@ class Simulator:
             raise InputError(
                 f"anatomy, device: {len(anatomies)} and {len(devices)}; give at least one, and as many of each"
             )
-        self._groups = make_groups(anatomies, devices, self._config, sharing._groups if sharing else ())
+        with gpu_errors(self._config.processor):
+            self._groups = make_groups(anatomies, devices, self._config, sharing._groups if sharing else ())
         self._device = devices
         fastest = np.array([(device.max_velocity_mm_s, device.max_rotation_rad_s) for device in devices])
         self._largest = np.full_like(fastest, np.finfo(float).max) if self._by_force else fastest * (1 + 1e-6)
@@ -429,17 +431,18 @@ class Simulator:
     def _run(
         self, group: Group, control: np.ndarray, time_step: float, steps: int, *, by_force: bool
     ) -> dict[str, Any]:
-        return group.simulation.run(
-            control=control,
-            force_driven=by_force,
-            time_step=time_step,
-            steps_per_sample=steps,
-            record_shape=False,
-            record_attitude=False,
-            threads=self._config.threads_for(len(group.index), LANES),
-            lanes=LANES,
-            progress=None,
-        )
+        with gpu_errors(self._config.processor):
+            return group.simulation.run(
+                control=control,
+                force_driven=by_force,
+                time_step=time_step,
+                steps_per_sample=steps,
+                record_shape=False,
+                record_attitude=False,
+                threads=self._config.threads_for(len(group.index), LANES),
+                lanes=LANES,
+                progress=None,
+            )
 
     def _per_world(self, name: str, values: Any) -> Float[np.ndarray, "worlds"]:
         array = np.asarray(values, dtype=float)
@@ -470,5 +473,6 @@ class Simulator:
 
 
 def _settings(config: SimulatorConfig) -> tuple[Any, ...]:
-    """Return the settings that results depend on: all but the threads."""
-    return tuple((name, getattr(config, name)) for name in SimulatorConfig.__dataclass_fields__ if name != "threads")
+    """Return the settings that a state belongs to: all but those that say where it is stepped."""
+    names = (name for name in SimulatorConfig.__dataclass_fields__ if name not in ("processor", "threads"))
+    return tuple((name, getattr(config, name)) for name in names)
