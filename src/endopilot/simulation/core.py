@@ -8,7 +8,7 @@ from jaxtyping import Float
 from endopilot import _core
 from endopilot.progress import progress
 from endopilot.simulation.config import FREE_BEHIND_MM, LANES, Actuation, SimulatorConfig, wall_stiffness
-from endopilot.simulation.processor import Processor, core_for, gpu_errors
+from endopilot.simulation.processor import Lumen, Options, Processor, core_for, gpu_errors
 from endopilot.simulation.rod import RodLayout
 from endopilot.types import SAMPLE_PERIOD_S, DistanceMap, Insertion
 
@@ -20,7 +20,7 @@ _MAX_ITERATIONS = 400
 
 def run_core(
     rod: RodLayout,
-    lumen: _core.Lumen | None,
+    lumen: Lumen | None,
     insertion: Insertion,
     *,
     config: SimulatorConfig,
@@ -116,7 +116,7 @@ def core_options(
     torque_limit_n_mm: float,
     free_behind_mm: float,
     approach: bool = True,
-) -> _core.Options:
+) -> Options:
     """Return the settings as the core wants them."""
     options = core_for(config.processor).Options()
     options.stick_velocity = config.stick_velocity_mm_s
@@ -136,7 +136,7 @@ def core_options(
     return options
 
 
-def make_lumen(distance_map: DistanceMap, radius_mm: float, processor: Processor = "cpu") -> _core.Lumen:
+def make_lumen(distance_map: DistanceMap, radius_mm: float, processor: Processor = "cpu") -> Lumen:
     """Return the wall as the core wants it, a quadratic B-spline through the map, for a wire of some radius."""
     spacing = float(distance_map.spacing_mm)
     return core_for(processor).make_lumen(

@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Integer
 
-from endopilot import _core
 from endopilot.anatomy.projection import TipProjector
 from endopilot.simulation.checks import check_distance_map, check_memory
 from endopilot.simulation.config import FREE_BEHIND_MM, SimulatorConfig
 from endopilot.simulation.core import core_options, insertion_arguments, make_lumen
 from endopilot.simulation.device import Device, check_fits
 from endopilot.simulation.drive_limits import far_end_mm
-from endopilot.simulation.processor import core_for
+from endopilot.simulation.processor import Lumen, Simulation, core_for
 from endopilot.simulation.rod import RodLayout, lay_out
 from endopilot.types import Anatomy
 
@@ -43,8 +42,8 @@ class Group:
     anatomy: Anatomy
     device: Device
     rod: RodLayout
-    lumen: _core.Lumen
-    simulation: _core.Simulation
+    lumen: Lumen
+    simulation: Simulation
     index: Integer[np.ndarray, "members"]
     path_mm: float
     longest_mm: float

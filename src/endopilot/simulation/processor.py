@@ -5,10 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from endopilot import _core
 from endopilot.errors import InputError
+
+if TYPE_CHECKING:
+    from endopilot._core import Lumen, Options, RodModel, Simulation
+else:  # each build of the core has classes of its own
+    Lumen = Options = RodModel = Simulation = Any
 
 Processor = Literal["cpu", "cuda"]
 """Where worlds are stepped: the processor's threads, or a CUDA GPU."""

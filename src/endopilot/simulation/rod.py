@@ -9,9 +9,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import brentq
 
-from endopilot import _core
 from endopilot.simulation.device import Device
-from endopilot.simulation.processor import Processor, core_for
+from endopilot.simulation.processor import Processor, RodModel, core_for
 
 POISSON_RATIO = 0.3
 """Of steel and nitinol; it ties shear to bending stiffness."""
@@ -51,7 +50,7 @@ class RodLayout:
     drag_n_s_mm: Float[np.ndarray, "n"]
     spin_drag_n_mm_s: Float[np.ndarray, "n"]
 
-    def model(self, processor: Processor = "cpu") -> _core.RodModel:
+    def model(self, processor: Processor = "cpu") -> RodModel:
         """Return the rod as the core wants it."""
         return core_for(processor).make_rod(
             abscissa=self.abscissa_mm,
