@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
-.PHONY: demo test test-wheel check cta readme docs roofline recipe-laptop recipe-gpu clean
+.PHONY: demo test test-wheel check cta readme docs roofline recipe-laptop recipe-gpu gpu-figures clean
 
 demo: $(INSTALLED)
 	$(BIN)/endopilot demo
@@ -65,16 +65,26 @@ recipe-laptop: $(INSTALLED)
 
 # The paper's full set and both models on one large GPU with some processor cores beside it; never run so far.
 FULL := runs/full
+FULL_PATIENTS := 100
+FULL_SEQUENCES := 1000
+FULL_PROCESSES := gpu
+FULL_TRAINING :=
 recipe-gpu: $(INSTALLED)
-	$(BIN)/endopilot atlas --count 100 --seed 52 -o $(FULL)/patients
-	$(BIN)/endopilot dataset $(FULL)/patients/* -o $(FULL)/dataset --sequences 1000 --seed 52
-	$(BIN)/torchrun --nproc-per-node gpu -m endopilot.cli train $(FULL)/dataset -o $(FULL)/paper \
-	  --precision bfloat16 --batch-size 4096
-	$(BIN)/torchrun --nproc-per-node gpu -m endopilot.cli train $(FULL)/dataset -o $(FULL)/causal --model causal \
-	  --precision bfloat16 --batch-size 512 --epochs 10 --learning-rate 0.002
+	$(BIN)/endopilot atlas --count $(FULL_PATIENTS) --seed 52 -o $(FULL)/patients
+	$(BIN)/endopilot dataset $(FULL)/patients/* -o $(FULL)/dataset --sequences $(FULL_SEQUENCES) --seed 52
+	$(BIN)/torchrun --nproc-per-node $(FULL_PROCESSES) -m endopilot.cli train $(FULL)/dataset -o $(FULL)/paper \
+	  --precision bfloat16 --batch-size 4096 $(FULL_TRAINING)
+	$(BIN)/torchrun --nproc-per-node $(FULL_PROCESSES) -m endopilot.cli train $(FULL)/dataset -o $(FULL)/causal --model causal \
+	  --precision bfloat16 --batch-size 512 --epochs 10 --learning-rate 0.002 $(FULL_TRAINING)
 	for model in paper causal; do \
 	  $(BIN)/endopilot evaluate $(FULL)/$$model -o $(FULL)/evaluation-$$model --sequences 96 || exit; \
 	done
+
+# All that is worth measuring on a GPU, within half an hour: the rod core on it, and a slice of the recipe above.
+gpu-figures: $(INSTALLED)
+	@command -v nvcc >/dev/null && command -v nvidia-smi >/dev/null || { echo "gpu-figures needs a GPU with its driver, and nvcc of the CUDA toolkit" >&2; exit 2; }
+	$(BIN)/python -m pip install -q --no-deps -e . -C cmake.define.ENDOPILOT_CUDA=ON
+	$(BIN)/python docs/figures/gpu.py
 
 # What the rod core's arithmetic could cost on this processor, and what it does cost.
 roofline:
