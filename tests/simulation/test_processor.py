@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
 from types import SimpleNamespace
 from typing import Any
@@ -57,6 +58,19 @@ def test_a_machine_without_gpu_is_refused(monkeypatch: pytest.MonkeyPatch) -> No
         InputError, match=r"processor: 'cuda': no GPU can be used here \(no CUDA-capable device is detected\)"
     ):
         core_for("cuda")
+
+
+def test_the_bench_says_in_one_line_that_there_is_no_gpu() -> None:
+    code = (
+        "import sys\n"
+        "sys.modules['endopilot._core_cuda'] = None\n"
+        "sys.argv = ['endopilot', 'bench', 'simulation', '--device', 'cuda']\n"
+        "from endopilot.cli import main\n"
+        "main()\n"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert ran.returncode == 2 and ran.stdout == ""
+    assert ran.stderr.count("\n") == 1 and "processor: 'cuda': endopilot was built without it" in ran.stderr
 
 
 def test_the_gpu_steps_whole_navigations(monkeypatch: pytest.MonkeyPatch, anatomy: Anatomy) -> None:

@@ -13,6 +13,7 @@ from endopilot.simulation.config import FREE_BEHIND_MM, SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, random_controls
 from endopilot.simulation.core import make_lumen, run_core
 from endopilot.simulation.device import read_device
+from endopilot.simulation.processor import core_for
 from endopilot.simulation.rod import lay_out
 from endopilot.types import SAMPLE_PERIOD_S
 
@@ -47,6 +48,7 @@ def bench_gpu(worlds: tuple[int, ...] = WORLDS, samples: int = SAMPLES) -> list[
     Raises:
         InputError: there is no GPU, or no build of the core for it.
     """
+    core_for("cuda")  # refuses at once where there is none
     anatomy, device = make_patient(AtlasConfig(), 0), read_device(DEVICE)
     longest = float(anatomy.tree.longest_path().abscissa[-1])
     initial, control = random_controls(

@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from endopilot.benchmarks.robustness import RobustnessConfig
 from endopilot.cli.arguments import OutputFolder, existing, show, show_rows
@@ -16,14 +16,21 @@ from endopilot.cli.arguments import OutputFolder, existing, show, show_rows
 EXIT_FAILED = 1
 
 
-def simulation(*, json: bool = False) -> None:
+def simulation(*, device: Literal["cpu", "cuda"] = "cpu", json: bool = False) -> None:
     """Measure the speed of the rod core on its reference scenario, and the tip's error at that speed.
 
     Args:
+        device: measure the processor (cpu), or up to 100 000 wires on a GPU (cuda) and how closely the two agree.
         json: print the figures as JSON.
     """
+    from endopilot.benchmarks.gpu import bench_gpu
     from endopilot.benchmarks.simulation import bench_simulation
 
+    if device == "cuda":
+        rows = bench_gpu()
+        show_rows(rows, as_json=json)
+        _leave(all(row["passed"] is not False for row in rows))
+        return
     show(bench_simulation(), as_json=json)
 
 
