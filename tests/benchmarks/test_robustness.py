@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from endopilot.anatomy.io import write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.benchmarks import robustness
 from endopilot.benchmarks.robustness import MANOEUVRES, RobustnessConfig, measure_robustness, robust_controls
@@ -94,15 +95,17 @@ def test_a_crash_is_counted_and_survived(tmp_path: Path) -> None:
         worker.run(tmp_path / "2.npz", replace(config, seconds=5.0), 0, DEVICE, 1)
     assert "the process died" in read_json(tmp_path / "0.json")["crash"]
     assert "MemoryError" in read_json(tmp_path / "1.json")["crash"]
-    assert read_json(tmp_path / "2.json") == {"invalid": []}
+    assert read_json(tmp_path / "2.json") == {"anatomy": "rca-3-0000", "invalid": []}
 
 
 def test_a_crash_and_an_invalid_world_miss_their_bars(tmp_path: Path) -> None:
     config = replace(small(tmp_path), rollouts=1)
     chunk = robustness.Chunk(
         penetration_mm=np.full((1, 4), 0.2, dtype=np.float32),
-        base_force_n=np.zeros((1, 4), dtype=np.float32),
+        base_force_n=np.array([[0.3, -0.4, -9.0, 9.0]], dtype=np.float32),
         to_end_mm=np.zeros((1, 4), dtype=np.float32),
+        base_torque_n_mm=np.array([[0.1, -0.2, 9.0, 9.0]], dtype=np.float32),
+        wall_force_n=np.array([[0.1, 0.8, 9.0, 9.0]], dtype=np.float32),
         slipped=np.zeros((1, 4), dtype=bool),
         valid=np.array([[True, True, False, False]]),
         non_finite=np.array([2]),
@@ -110,13 +113,32 @@ def test_a_crash_and_an_invalid_world_miss_their_bars(tmp_path: Path) -> None:
     )
     first, second = (tmp_path / f"0000-{name}.npz" for name in list_devices()[:2])
     np.savez(first, **vars(chunk))
-    robustness.write_json(first.with_suffix(".json"), {"invalid": ["did not converge"]})
-    robustness.write_json(second.with_suffix(".json"), {"crash": "patient 0: the process died"})
+    robustness.write_json(first.with_suffix(".json"), {"anatomy": "rca", "invalid": ["did not converge"]})
+    robustness.write_json(second.with_suffix(".json"), {"anatomy": "rca", "crash": "patient 0: the process died"})
     measured = robustness._summarise(config, [read_device(name) for name in list_devices()])
     assert [row["value"] for row in measured["figures"]] == pytest.approx([1.0, 0.2, 2, 1])
     assert not any(row["passed"] for row in measured["figures"])
     assert measured["invalid_worlds"] == ["did not converge"]
     assert measured["crashed"] == ["patient 0: the process died"]
+    # the largest loads of valid samples, and a world that presses the wall with 0.8 N
+    row = measured["by_anatomy"]["rca"]
+    assert [row[f"largest_{name}"] for name in ("push_n", "pull_n", "torque_n_mm")] == [0.3, 0.4, 0.2]
+    assert (row["largest_wall_force_n"], row["wall_force_worlds"], row["invalid"]) == (0.8, 1, 1)
+
+
+def test_anatomies_of_ones_own_are_driven_through(tmp_path: Path, patient) -> None:
+    folders = (tmp_path / "one", tmp_path / "two")
+    for folder in folders:
+        write_anatomy(replace(patient, name=folder.name), folder)
+    measured = measure_robustness(replace(small(tmp_path / "run"), given=folders, rollouts=4, seconds=5.0))
+    assert measured["rollouts"] == 4
+    assert {name: row["rollouts"] for name, row in measured["by_anatomy"].items()} == {"one": 2, "two": 2}
+    assert all(row["largest_push_n"] > 0 for row in measured["by_anatomy"].values())
+    with pytest.raises(InputError, match="no such folder"):
+        measure_robustness(replace(small(tmp_path / "other"), given=(tmp_path / "absent",)))
+    write_anatomy(replace(patient, name="two", catheter_radius_mm=2 * patient.catheter_radius_mm), folders[1])
+    with pytest.raises(InputError, match="was begun with given"):  # another vessel in the same folder
+        measure_robustness(replace(small(tmp_path / "run"), given=folders, rollouts=4, seconds=5.0))
 
 
 @pytest.mark.parametrize("change", [{"rollouts": 0}, {"anatomies": 0}, {"seed": -1}, {"seconds": 1.0}, {"threads": -1}])

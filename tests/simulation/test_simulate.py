@@ -15,7 +15,7 @@ from jaxtyping import Float
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import read_device
-from endopilot.simulation.simulate import simulate
+from endopilot.simulation.simulate import WALL_FORCE_LIMIT_N, WallForceEvent, simulate, wall_force_events
 from endopilot.simulation.simulator import Simulator
 from endopilot.types import Anatomy, Insertion
 
@@ -162,6 +162,19 @@ def test_the_drive_slips_at_its_push_limit_and_cannot_pull_back_what_it_did_not_
     assert rollout.inserted_length[0, -1] == pytest.approx(0.0, abs=1e-9) and (rollout.slip[0, -3:] < 0).all()
 
 
+def test_a_wall_force_that_no_vessel_should_bear_is_told(anatomy: Anatomy) -> None:
+    control = np.zeros((2, 20, 2))
+    control[0, :, 0], control[1, :, 0] = 4.0, -1.0  # against the blind end; out
+    hard = replace(DEVICE, push_limit_n=2.0)
+    with pytest.warns(UserWarning, match=r"^1 of 2 worlds press the wall with more than 0\.7 N; world 0 after"):
+        rollout = simulate(anatomy, hard, control, initial=np.array([[55.0, 0.0], [20.0, 0.0]]))
+    (event,) = wall_force_events(rollout)
+    first = int(np.flatnonzero(rollout.wall_force[0] > WALL_FORCE_LIMIT_N)[0])
+    assert event == WallForceEvent(0, 0.5 * (first + 1), rollout.wall_force[0].max())
+    assert first > 0 and event.force_n > WALL_FORCE_LIMIT_N
+    assert wall_force_events(replace(rollout, valid=np.zeros_like(rollout.valid))) == ()
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -205,7 +218,7 @@ sys.path.insert(0, sys.argv[1])
 from bend import BEND, vessel
 from endopilot.errors import InputError
 from endopilot.simulation.device import read_device
-from endopilot.simulation.simulate import simulate
+from endopilot.simulation.simulate import WALL_FORCE_LIMIT_N, WallForceEvent, simulate, wall_force_events
 from endopilot.simulation.simulator import Simulator
 anatomy, device, good = vessel(), read_device("workhorse-014"), np.zeros((2, 4, 2))
 for control, others in (

@@ -1,6 +1,6 @@
 """Failures of the rod core in many rollouts beyond normal use: `measure_robustness`.
 
-Every device is driven through every synthetic anatomy that it fits, with four kinds of controls in equal shares: random
+Every device is driven through every anatomy that it fits, synthetic ones or some that are given, with four kinds of controls in equal shares: random
 within the vessel, random beyond its end, pushed against its end, and random and then pulled out. A chunk is one anatomy
 and one device. It runs in a separate process, so that a crash is counted and survived, and writes one small file. An
 interrupted run goes on with the missing chunks.
@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from endopilot import __version__, _core
+from endopilot.anatomy.io import read_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.errors import InputError
 from endopilot.files import read_json, sha256, write_json, writing
@@ -35,7 +36,7 @@ from endopilot.simulation.controls import ControlConfig, random_controls
 from endopilot.simulation.device import Device, check_fits, read_device
 from endopilot.simulation.device_files import list_devices
 from endopilot.simulation.drive_limits import within_travel
-from endopilot.simulation.simulate import simulate, why_invalid
+from endopilot.simulation.simulate import WALL_FORCE_LIMIT_N, simulate, why_invalid
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, Rollout
 
 MOST_INVALID_SHARE = 1e-3
@@ -61,7 +62,9 @@ class RobustnessConfig:
     rollouts: Count = 10_000
     """Number of rollouts, spread over the anatomies and the devices that fit; rounded up to whole chunks."""
     anatomies: Count = 100
-    """Number of synthetic anatomies."""
+    """Number of synthetic anatomies, if none are given."""
+    given: tuple[Path, ...] = ()
+    """Folders of anatomies of your own, made by `endopilot anatomy`."""
     seed: Annotated[int, Within(0, 2**63 - 1)] = 0
     """Seed of the anatomies and the controls."""
     seconds: Annotated[float, Within(5, 3600)] = 60.0
@@ -78,7 +81,9 @@ class Chunk:
 
     Attributes:
         penetration_mm: depth of the deepest node in the wall, mm: its contact force over the wall's stiffness.
-        base_force_n: force of the drive, N.
+        base_force_n: force of the drive, N, positive where it pushes.
+        base_torque_n_mm: torque of the drive, N·mm.
+        wall_force_n: largest resultant of the wall's forces on 2 mm of the wire, N.
         to_end_mm: distance of the tip from the end of its branch, mm; negative beyond it.
         slipped: whether the drive slipped in the sample.
         valid: whether the world was valid.
@@ -88,6 +93,8 @@ class Chunk:
 
     penetration_mm: Float[np.ndarray, "rollouts samples"]
     base_force_n: Float[np.ndarray, "rollouts samples"]
+    base_torque_n_mm: Float[np.ndarray, "rollouts samples"]
+    wall_force_n: Float[np.ndarray, "rollouts samples"]
     to_end_mm: Float[np.ndarray, "rollouts samples"]
     slipped: Bool[np.ndarray, "rollouts samples"]
     valid: Bool[np.ndarray, "rollouts samples"]
@@ -99,25 +106,29 @@ def measure_robustness(config: RobustnessConfig) -> dict[str, Any]:
     """Simulate the missing rollouts, and count the failures in all of them.
 
     Returns:
-        `figures`, one row a bar: figure, value, bar, passed; `rollouts` and `simulated_hours`; `by_device` and
-        `by_manoeuvre`, the penetration's 99.9th percentile and maximum (mm) and the invalid worlds of each; `invalid`
-        and `crashed`, one sentence each: reason, anatomy, device, rollout, seconds.
+        `figures`, one row a bar: figure, value, bar, passed; `rollouts` and `simulated_hours`; `by_device`,
+        `by_manoeuvre` and `by_anatomy`, of each the invalid worlds, the penetration's 99.9th percentile and maximum
+        (mm), the drive's largest push, pull (N) and torque (N·mm), the largest wall force (N) and the worlds in which
+        it exceeds its limit; `invalid_worlds` and `crashed`, one sentence each: reason, anatomy, device, rollout,
+        seconds.
 
     Raises:
-        InputError: the folder belongs to another run, such as one of another build of the core, or cannot be written.
+        InputError: the folder belongs to another run, such as one of another build of the core, or cannot be written;
+            a given folder holds no anatomy.
     """
     devices = [read_device(name) for name in list_devices()]
     claim(config.folder, "endopilot bench robustness", **_identity(config, devices))
-    share = -(-config.rollouts // config.anatomies)
-    with progress("Rollouts", total=config.anatomies * len(devices)) as advance, _Worker() as worker:
-        for index in range(config.anatomies):
+    anatomies = len(config.given) or config.anatomies
+    share = -(-config.rollouts // anatomies)
+    with progress("Rollouts", total=anatomies * len(devices)) as advance, _Worker() as worker:
+        for index in range(anatomies):
             for place, device in enumerate(devices):
                 # the remainder of the share falls to other devices in each anatomy
                 count = (share + (place + index) % len(devices)) // len(devices)
                 path = _path(config, index, device)
                 if count > 0 and not _done(path):
                     worker.run(path, config, index, device, count)
-                advance(remark=f"{device.name}, patient {index}")
+                advance(remark=f"{device.name}, anatomy {index}")
     return _summarise(config, devices)
 
 
@@ -171,11 +182,11 @@ def run_chunk(path: Path, config: RobustnessConfig, index: int, device: Device, 
         device: the wire.
         rollouts: number of rollouts.
     """
-    anatomy = _anatomy(config.seed, index)
+    anatomy = _anatomy(config, index)
     try:
         check_fits(device, anatomy)
     except InputError as error:
-        write_json(path.with_suffix(".json"), {"misfit": str(error)})
+        write_json(path.with_suffix(".json"), {"anatomy": anatomy.name, "misfit": str(error)})
         return
     began = time.process_time()
     samples = round(config.seconds / SAMPLE_PERIOD_S)
@@ -193,7 +204,7 @@ def run_chunk(path: Path, config: RobustnessConfig, index: int, device: Device, 
     ]
     with writing(path) as partial:
         np.savez_compressed(partial, **{field.name: getattr(chunk, field.name) for field in fields(chunk)})
-    write_json(path.with_suffix(".json"), {"invalid": invalid})
+    write_json(path.with_suffix(".json"), {"anatomy": anatomy.name, "invalid": invalid})
 
 
 def _describe(anatomy: Anatomy, rollout: Rollout, wall_n_mm: float, seconds: float) -> Chunk:
@@ -204,9 +215,9 @@ def _describe(anatomy: Anatomy, rollout: Rollout, wall_n_mm: float, seconds: flo
             rollout.tip_direction,
             *(
                 getattr(rollout, name)[..., None]
-                for name in ("contact_force_max", "contact_force_sum", "base_force", "base_torque", "slip")
+                for name in ("contact_force_max", "contact_force_sum", "wall_force", "base_force", "base_torque")
             ),
-            *(getattr(rollout, name)[..., None] for name in ("inserted_length", "rotation", "iterations")),
+            *(getattr(rollout, name)[..., None] for name in ("slip", "rotation_slip", "inserted_length", "rotation")),
             *(getattr(rollout.tip, name)[..., None] for name in ("abscissa", "offset", "radius")),
         ],
         axis=-1,
@@ -215,8 +226,10 @@ def _describe(anatomy: Anatomy, rollout: Rollout, wall_n_mm: float, seconds: flo
     return Chunk(
         penetration_mm=(rollout.contact_force_max / wall_n_mm).astype(np.float32),
         base_force_n=rollout.base_force.astype(np.float32),
+        base_torque_n_mm=rollout.base_torque.astype(np.float32),
+        wall_force_n=rollout.wall_force.astype(np.float32),
         to_end_mm=(end[rollout.tip.branch] - rollout.tip.abscissa).astype(np.float32),
-        slipped=rollout.slip != 0,
+        slipped=(rollout.slip != 0) | (rollout.rotation_slip != 0),
         valid=rollout.valid,
         non_finite=bad,
         seconds=seconds,
@@ -224,8 +237,8 @@ def _describe(anatomy: Anatomy, rollout: Rollout, wall_n_mm: float, seconds: flo
 
 
 @lru_cache(maxsize=1)
-def _anatomy(seed: int, index: int) -> Anatomy:
-    return make_patient(AtlasConfig(seed=seed), index)
+def _anatomy(config: RobustnessConfig, index: int) -> Anatomy:
+    return read_anatomy(config.given[index]) if config.given else make_patient(AtlasConfig(seed=config.seed), index)
 
 
 class _Worker:
@@ -257,7 +270,8 @@ class _Worker:
             raise
         except Exception as error:  # a crash is what is being counted
             what = "the process died" if isinstance(error, BrokenProcessPool) else f"{type(error).__name__}: {error}"
-            write_json(path.with_suffix(".json"), {"crash": f"patient {index}, {device.name}: {what}"})
+            name = config.given[index].name if config.given else f"patient {index}"
+            write_json(path.with_suffix(".json"), {"anatomy": name, "crash": f"{name}, {device.name}: {what}"})
             self._pool.shutdown(wait=False)
             self._pool = None
 
@@ -273,7 +287,8 @@ def _done(path: Path) -> bool:
 def _identity(config: RobustnessConfig, devices: list[Device]) -> dict[str, Any]:
     """Return what the results of the chunks follow from."""
     return {
-        "config": {name: value for name, value in asdict(config).items() if name not in ("threads", "folder")},
+        "config": {name: value for name, value in asdict(config).items() if name not in ("threads", "folder", "given")},
+        "given": [read_anatomy(folder).identity for folder in config.given],
         "devices": {device.name: device for device in devices},
         "core_sha256": sha256(Path(_core.__file__)),
         "version": __version__,
@@ -282,6 +297,7 @@ def _identity(config: RobustnessConfig, devices: list[Device]) -> dict[str, Any]
 
 def _summarise(config: RobustnessConfig, devices: list[Device]) -> dict[str, Any]:
     tallies: dict[tuple[str, str], _Tally] = {}
+    groupings = ("by_device", "by_manoeuvre", "by_anatomy")
     invalid, crashed, misfits = [], [], []
     non_finite, seconds = 0, 0.0
     for device, record, chunk in _results(config, devices):
@@ -294,6 +310,7 @@ def _summarise(config: RobustnessConfig, devices: list[Device]) -> dict[str, Any
         seconds += float(chunk.seconds)
         kind = np.arange(len(chunk.valid)) % len(MANOEUVRES)
         groups = [("all", "all", slice(None)), ("by_device", device.name, slice(None))]
+        groups += [("by_anatomy", record["anatomy"], slice(None))]
         groups += [("by_manoeuvre", name, kind == place) for place, name in enumerate(MANOEUVRES)]
         for group, name, rows in groups:
             tally = tallies.setdefault((group, name), _Tally())
@@ -313,8 +330,7 @@ def _summarise(config: RobustnessConfig, devices: list[Device]) -> dict[str, Any
         **everything,
         "simulated_hours": round(worlds * config.seconds / 3600, 2),
         "realtime_factor": round(worlds * config.seconds / seconds, 1) if seconds else None,
-        "by_device": {name: t.row() for (group, name), t in tallies.items() if group == "by_device"},
-        "by_manoeuvre": {name: t.row() for (group, name), t in tallies.items() if group == "by_manoeuvre"},
+        **{of: {name: t.row() for (group, name), t in tallies.items() if group == of} for of in groupings},
         "invalid_worlds": invalid,
         "crashed": crashed,
         "did_not_fit": misfits,
@@ -323,7 +339,7 @@ def _summarise(config: RobustnessConfig, devices: list[Device]) -> dict[str, Any
 
 def _results(config: RobustnessConfig, devices: list[Device]) -> Iterator[tuple[Device, dict[str, Any], Chunk | None]]:
     """Yield the device, the record and the arrays of every chunk on disk."""
-    for index in range(config.anatomies):
+    for index in range(len(config.given) or config.anatomies):
         for device in devices:
             path = _path(config, index, device)
             if not _done(path):
@@ -338,10 +354,11 @@ def _results(config: RobustnessConfig, devices: list[Device]) -> Iterator[tuple[
 
 
 class _Tally:
-    """Penetrations and validity of a group of rollouts."""
+    """Penetrations, forces and validity of a group of rollouts."""
 
     def __init__(self) -> None:
-        self.rollouts = self.invalid = 0
+        self.rollouts = self.invalid = self.pressing = 0
+        self.push = self.pull = self.torque = self.wall = 0.0
         self.penetration: list[np.ndarray] = []
 
     def add(self, chunk: Chunk, rows: Any) -> None:
@@ -349,6 +366,13 @@ class _Tally:
         self.rollouts += len(valid)
         self.invalid += int((~valid.all(axis=1)).sum())
         self.penetration.append(chunk.penetration_mm[rows][valid])
+        force, torque = chunk.base_force_n[rows][valid], chunk.base_torque_n_mm[rows][valid]
+        wall = np.where(valid, chunk.wall_force_n[rows], 0.0)
+        self.push = max(self.push, float(force.max(initial=0.0)))
+        self.pull = max(self.pull, float(-force.min(initial=0.0)))
+        self.torque = max(self.torque, float(np.abs(torque).max(initial=0.0)))
+        self.wall = max(self.wall, float(wall.max(initial=0.0)))
+        self.pressing += int((wall > WALL_FORCE_LIMIT_N).any(axis=1).sum())
 
     def row(self) -> dict[str, Any]:
         depth = np.concatenate(self.penetration) if self.penetration else np.zeros(0)
@@ -361,4 +385,9 @@ class _Tally:
             "penetration_p999_mm": round(float(np.percentile(depth, 99.9)), 4),
             "penetration_max_mm": round(float(depth.max()), 4),
             "share_deeper_than_bar": round(float((depth > MOST_PENETRATION_MM).mean()), 5),
+            "largest_push_n": round(self.push, 3),
+            "largest_pull_n": round(self.pull, 3),
+            "largest_torque_n_mm": round(self.torque, 3),
+            "largest_wall_force_n": round(self.wall, 3),
+            "wall_force_worlds": self.pressing,
         }

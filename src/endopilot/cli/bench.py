@@ -48,6 +48,8 @@ def scaling(*, json: bool = False) -> None:
 def robustness(*, json: bool = False, config: RobustnessConfig = RobustnessConfig()) -> None:
     """Drive every shipped device through many anatomies and beyond their ends, and count failures.
 
+    The anatomies are synthetic, or those given.
+
     Args:
         json: print the figures as JSON.
         config: which rollouts.
@@ -162,7 +164,7 @@ def _leave(passed: bool) -> None:
 
 
 def _show_robustness(measured: dict[str, Any]) -> None:
-    groups = ("by_device", "by_manoeuvre")
+    groups = ("by_device", "by_manoeuvre", "by_anatomy")
     show_rows(measured["figures"], as_json=False)
     show_rows([{"group": name} | row for group in groups for name, row in measured[group].items()], as_json=False)
     rest = {name: value for name, value in measured.items() if name not in ("figures", *groups) and value}

@@ -17,7 +17,7 @@ from endopilot.settings import Count, Seed, Within, settings
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, random_controls, read_controls_csv
 from endopilot.simulation.device import read_device
-from endopilot.simulation.simulate import simulate
+from endopilot.simulation.simulate import simulate, wall_force_events
 from endopilot.simulation.table import write_rollout
 from endopilot.types import SAMPLE_PERIOD_S
 
@@ -87,10 +87,13 @@ def command(
         "worlds": int(valid.shape[0]),
         "samples": int(valid.shape[1]),
         "valid_worlds": int(valid[:, -1].sum()),
-        "slipped_worlds": int((rollout.slip != 0).any(axis=1).sum()),
+        "slipped_worlds": int(((rollout.slip != 0) | (rollout.rotation_slip != 0)).any(axis=1).sum()),
         "deepest_tip_mm": _largest(rollout.tip.abscissa, valid),
         "largest_contact_force_n": _largest(rollout.contact_force_max, valid),
+        "largest_wall_force_n": _largest(rollout.wall_force, valid),
+        "wall_force_worlds": len(wall_force_events(rollout)),
         "largest_base_force_n": _largest(np.abs(rollout.base_force), valid),
+        "largest_base_torque_n_mm": _largest(np.abs(rollout.base_torque), valid),
     }
     if picture is not None:
         from endopilot.report.scene import visible_wire  # plotly is slow to import
