@@ -1,9 +1,9 @@
 """Failures of the rod core in many rollouts beyond normal use: `measure_robustness`.
 
-Every device is driven through every anatomy that it fits, synthetic ones or some that are given, with four kinds of controls in equal shares: random
-within the vessel, random beyond its end, pushed against its end, and random and then pulled out. A chunk is one anatomy
-and one device. It runs in a separate process, so that a crash is counted and survived, and writes one small file. An
-interrupted run goes on with the missing chunks.
+Every device is driven through every anatomy that it fits, synthetic ones or given ones, with four kinds of controls in
+equal shares: random within the vessel, random beyond its end, pushed against its end, and random and then pulled out. A
+chunk is one anatomy and one device. It runs in a separate process, so that a crash is counted and survived, and writes
+one small file. An interrupted run goes on with the missing chunks.
 """
 
 from __future__ import annotations

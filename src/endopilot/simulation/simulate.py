@@ -28,7 +28,8 @@ WALL_FORCE_LIMIT_N = 0.7
 """Force on 2 mm of the wall that no navigation should exert, N. The fibrous cap of an occlusion of up to six weeks is
 punctured at 0.72 ± 0.10 N (rabbit femoral arteries; Thind et al., puncture force of the proximal fibrous cap,
 EuroIntervention). The atrial wall takes more: 1.7 N where it was ablated before and 2.9 N where it was not, under the
-blunt tip of a 7 French catheter (pigs; Shah et al., Europace 2011). For the wall of a coronary or cerebral artery no such figure was found."""
+blunt tip of a 7 French catheter (pigs; Shah et al., Europace 2011). No such figure was found for the wall of a coronary
+or cerebral artery."""
 
 
 @dataclass(frozen=True)
