@@ -109,7 +109,7 @@ struct Sweeps {
     }
     void friction() {
         const FrictionState<V> friction{0.01 * one, {one, 0.0 * one, 0.0 * one}, {0.0 * one, 0.18 * one, 0.0 * one}};
-        for (int i = 0; i < kNodes; ++i) sink += add_friction<V>(friction, 1e-3 * one, x[i] - x[0], q[i], diagonal[i]);
+        for (int i = 0; i < kNodes; ++i) sink += add_friction<V>(friction, 1e-3 * one, one, x[i] - x[0], q[i], diagonal[i]);
     }
     void elimination() {
         Diagonal<V> own = diagonal[0];

@@ -156,9 +156,10 @@ ENDOPILOT_DEVICE inline V add_wall(double stiffness, double radius, const V& geo
 
 // Adds smoothed Coulomb friction of the touching surface, energy limit (sqrt(|s|² + eps²) - eps) with s the tangential
 // displacement of that surface since the start of the step: of the node, and by rotation about the wire's own axis.
-// `moved` is the node's displacement, `p` the element's rotation since the start of the step. Returns the energy.
+// `moved` is the node's displacement, `p` the element's rotation since the start of the step. Where `tangent` is 1 the Hessian is
+// friction's own; where it is 0 friction's secant stands for it, which is nowhere softer. Returns the energy.
 template <class V>
-ENDOPILOT_DEVICE inline V add_friction(const FrictionState<V>& friction, const V& eps, const Vec3<V>& moved,
+ENDOPILOT_DEVICE inline V add_friction(const FrictionState<V>& friction, const V& eps, const V& tangent, const Vec3<V>& moved,
                                        const Quaternion<V>& p, Diagonal<V>& own) {
     const Vec3<V>& n = friction.normal;
     const V twist = 2.0 * p.v.z;
@@ -172,7 +173,7 @@ ENDOPILOT_DEVICE inline V add_friction(const FrictionState<V>& friction, const V
     const V gradient_twist = dot(gradient, friction.spin_arm);
     own.gradient_theta += gradient_twist * turn;
 
-    const V c = secant * a * a;
+    const V c = tangent * secant * a * a;
     own.xx.xx += secant * (1.0 - n.x * n.x) - c * s.x * s.x;
     own.xx.yy += secant * (1.0 - n.y * n.y) - c * s.y * s.y;
     own.xx.zz += secant * (1.0 - n.z * n.z) - c * s.z * s.z;

@@ -17,6 +17,7 @@ namespace endopilot {
 
 constexpr int kTicks = 64;     // a step may be halved down to 1/64
 constexpr int kMaxRejections = 12;
+constexpr int kTurnabout = 10;         // iterations after which friction's tangent and its secant take turns
 constexpr int kSnapIterations = 5;   // times max_iterations that the shortest step may take: a snap takes many at any step
 constexpr double kStickyReach = 0.1;     // mm: in a step's first iteration, a wall that was touched and is this near still holds
 constexpr double kFirstDamping = 1e-3;   // N/mm (rotations: N mm/rad), where the Hessian is indefinite even without geometric terms
@@ -130,7 +131,7 @@ private:
     Coupling<V> coupling_[kTogether];
     Lane lane_[W];
     // For each lane: settings of the step, then results of a sweep.
-    V active_{}, share_{}, geometric_{}, inverse_dt_{}, eps_{}, first_{}, damping_{}, friction_{};
+    V active_{}, share_{}, geometric_{}, inverse_dt_{}, eps_{}, first_{}, damping_{}, friction_{}, tangent_{};
     V jump_scale_x_{}, jump_scale_theta_{};
     V energy_{}, descent_{}, pivot_{}, jump_{}, base_force_{}, base_torque_{};
     DriveBlock drive_{};           // of the wire's energy, all nodes eliminated
@@ -236,6 +237,7 @@ void Stepper<V>::begin(int l, bool fresh) {
     set(geometric_, l, 0.0);
     set(first_, l, 1.0);
     set(damping_, l, 0.0);
+    set(tangent_, l, 1.0);
     set(inverse_dt_, l, 1.0 / duration(lane));
     set(eps_, l, options_.stick_velocity * in_.time_step);
     set(jump_scale_x_, l, 1.0 / (most_x * most_x));
@@ -314,6 +316,8 @@ typename Stepper<V>::Decision Stepper<V>::decide(int l) {
     }
     lane.energy = energy;
     lane.slope = get(descent_, l);
+    // Where friction turns, a step with its tangent overshoots, and one with its secant creeps: they take turns.
+    set(tangent_, l, lane.iterations > kTurnabout && lane.iterations / kTurnabout % 2 == 1 ? 0.0 : 1.0);
     // Where the energy is not convex the damped steps are short: lengthen them as long as they succeed.
     const double damping = lane.damping = get(damping_, l);
     lane.boost = damping > 0 && lane.rejections == 0 ? std::min(2 * lane.boost, double{kMaxBoost}) : 1.0;

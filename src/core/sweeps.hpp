@@ -112,7 +112,7 @@ void Stepper<V>::add_lumen(int first, int count) {
     }
     for (int k = 0; k < count; ++k) {
         const Node<V>& node = node_[first + k];
-        const V energy = add_friction(node.friction, eps_, node.x - node.start, relative(node.start_q, node.q), block_[k]);
+        const V energy = add_friction(node.friction, eps_, tangent_, node.x - node.start, relative(node.start_q, node.q), block_[k]);
         energy_ += select<V>(active_ > broadcast<V>(first + k), energy, zero);
     }
 }

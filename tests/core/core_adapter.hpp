@@ -86,9 +86,9 @@ inline Single wall_energy(const Lumen& lumen, double stiffness, double radius, c
 }
 
 inline Single friction_energy(const FrictionState<double>& friction, double eps, const Vec3<double>& start,
-                              const Quaternion<double>& start_q, const Pose& now) {
+                              const Quaternion<double>& start_q, const Pose& now, double tangent = 1.0) {
     Diagonal<double> own{};
-    const double energy = add_friction<double>(friction, eps, now.x - start, relative(start_q, now.q), own);
+    const double energy = add_friction<double>(friction, eps, tangent, now.x - start, relative(start_q, now.q), own);
     return {energy, gradient_of(own), hessian_of(own)};
 }
 

@@ -372,6 +372,14 @@ void test_friction() {
             for (int b = 0; b < 3; ++b)  // the rows of rotations leave out the second derivative of the turn
                 expect_near(exact.hessian[a][b], (up.gradient[b] - down.gradient[b]) / (2 * h), 1e-5, "Hessian of friction");
         }
+        const Single secant = friction_energy(friction, eps, start, start_q, now, 0.0);
+        expect(secant.energy == exact.energy && secant.gradient == exact.gradient, "the secant changes the Hessian alone");
+        double harder = 0;  // v · (secant - tangent) v, for the step that the slip has made
+        const Vec3<double> made = now.x - start;
+        const double v[6] = {made.x, made.y, made.z, 0, 0, 0};
+        for (int a = 0; a < 6; ++a)
+            for (int b = 0; b < 6; ++b) harder += v[a] * (secant.hessian[a][b] - exact.hessian[a][b]) * v[b];
+        expect(harder > 0, "friction's secant is harder than its tangent");
         const Single still = friction_energy(friction, eps, start, start_q, {start, start_q});
         expect_near(still.energy, 0, 1e-16, "friction at rest holds no energy");
     }
