@@ -12,6 +12,7 @@
 namespace endopilot {
 
 constexpr int kBlock = 32;            // threads: one warp, so that few worlds still spread over all multiprocessors
+constexpr int kMostNodes = 480;      // a thread's local memory has 512 KiB
 constexpr int kSamplesPerLaunch = 4;  // launches are short, so that a run can be interrupted between them
 
 static void check(cudaError_t error) {
@@ -48,8 +49,8 @@ using Kernel = void (*)(Launch);
 static Kernel kernel_for(int nodes) {
     if (nodes <= 128) return step_kernel<128>;
     if (nodes <= 256) return step_kernel<256>;
-    if (nodes <= 512) return step_kernel<512>;
-    throw std::runtime_error("a GPU steps wires of at most 512 nodes, not of " + std::to_string(nodes));
+    if (nodes <= kMostNodes) return step_kernel<kMostNodes>;
+    throw std::runtime_error("a GPU steps wires of at most " + std::to_string(kMostNodes) + " nodes, not of " + std::to_string(nodes));
 }
 
 struct CudaStepper::Memory {
