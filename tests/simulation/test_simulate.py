@@ -77,10 +77,10 @@ def test_the_wall_force_is_the_largest_resultant_on_two_millimetres_of_the_wire(
 ) -> None:
     config = SimulatorConfig(elements=elements)
     rollout = simulate(
-        anatomy, DEVICE, np.zeros((1, 1, 2)), initial=np.array([[45.0, 1.0]]), config=config, record_shape=True
+        anatomy, DEVICE, np.zeros((1, 1, 2)), initial=np.array([[30.0, 2.0]]), config=config, record_shape=True
     )
     simulator = Simulator(anatomy, DEVICE, config=config)
-    simulator.reset(inserted_length=[45.0], rotation=[1.0])
+    simulator.reset(inserted_length=[30.0], rotation=[2.0])
     simulator.step(np.zeros((1, 2)), 0.5)
     assert rollout.shape is not None
     at, force = rollout.shape[0, 0], simulator.contacts[0, : rollout.shape.shape[2]]
@@ -95,7 +95,7 @@ def test_the_wall_force_is_the_largest_resultant_on_two_millimetres_of_the_wire(
     within = (along >= along[:, None] - 1e-6) & (along <= along[:, None] + 2.0)
     resultants = np.linalg.norm(within @ (force[:, None] * towards), axis=1)
     assert rollout.wall_force[0, 0] == pytest.approx(resultants.max(), rel=0.02)
-    assert rollout.wall_force[0, 0] > 1.1 * force.max()  # several nodes share a contact
+    assert rollout.wall_force[0, 0] > 1.5 * force.max()  # two contacts lie 1 to 2 mm apart
 
 
 def test_node_iterations_count_every_evaluation_of_an_active_node(anatomy: Anatomy) -> None:
