@@ -1,6 +1,7 @@
 """Measure the rod core and write the figures into docs/performance.md: `python docs/figures/performance.py`.
 
-Takes some three minutes; nothing else should run meanwhile.
+Takes some ten minutes; nothing else should run meanwhile. First `make core-baseline`: it builds what the speed is
+compared with.
 """
 
 from __future__ import annotations
@@ -9,11 +10,24 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 from endopilot.files import processor_name
+from endopilot.simulation.config import PRESETS
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "performance.md"
+COMPARED = (
+    "realtime_factor_per_core",
+    "speed_over_baseline",
+    "node_iterations_per_second",
+    "true_tip_error_median_mm",
+    "true_tip_error_p95_mm",
+    "true_tip_error_p95_before_fork_mm",
+    "branch_agreement",
+    "wall_force_error_p95_n",
+)
+"""Figures of the presets that stand side by side."""
 
 
 def output(*command: str) -> str:
@@ -21,12 +35,12 @@ def output(*command: str) -> str:
     return subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout
 
 
-def bench(subject: str) -> object:
+def bench(*subject: str) -> Any:
     """Return the figures of `endopilot bench`."""
-    return json.loads(output(sys.executable, "-m", "endopilot.cli", "bench", subject, "--json"))
+    return json.loads(output(sys.executable, "-m", "endopilot.cli", "bench", *subject, "--json"))
 
 
-def table(rows: list[dict[str, object]]) -> str:
+def table(rows: list[dict[str, Any]]) -> str:
     """Return rows as a Markdown table."""
     lines = ["| " + " | ".join(rows[0]) + " |", "|" + "---|" * len(rows[0])]
     lines += ["| " + " | ".join(str(value) for value in row.values()) + " |" for row in rows]
@@ -43,13 +57,23 @@ def fill(name: str, text: str) -> None:
 
 def main() -> None:
     """Run the three measurements."""
-    figures = bench("simulation")
-    assert isinstance(figures, dict)
-    rows = [{"figure": name, "value": value} for name, value in figures.items()]
+    presets = {name: bench("simulation", "--preset", name) for name in PRESETS}
+    figures = presets["default"]
+    errors = figures["intervals"]
+    nested = ("preset", "intervals", "by_anatomy", "reference_own_error", *errors)
+    rows = [{"figure": name, "value": value} for name, value in figures.items() if name not in nested]
     fill("simulation", f"{processor_name()}:\n\n{table(rows)}")
-    scaling = bench("scaling")
-    assert isinstance(scaling, list)
-    fill("scaling", table(scaling))
+    rows = [
+        {"error": name, "all": figures[name], "90 % interval": " to ".join(map(str, interval))}
+        | {anatomy: found[name] for anatomy, found in figures["by_anatomy"].items()}
+        | {"of the reference": figures["reference_own_error"][name]}
+        for name, interval in errors.items()
+    ]
+    fill("errors", table(rows))
+    fill(
+        "presets", table([{"preset": name} | {key: found[key] for key in COMPARED} for name, found in presets.items()])
+    )
+    fill("scaling", table(bench("scaling")))
     fill("roofline", "```\n" + output("make", "-s", "roofline").rstrip() + "\n```")
 
 

@@ -1,79 +1,144 @@
-"""Speed and accuracy of the rod core on one reference scenario, measured together."""
+"""Speed of the rod core and its error against a converged solution, measured together on the same worlds."""
 
 from __future__ import annotations
 
 import os
 import time
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.simulation.config import SimulatorConfig, wall_stiffness
-from endopilot.simulation.controls import ControlConfig, random_controls
+from endopilot.benchmarks.baseline import BASELINE_FOLDER, Baseline
+from endopilot.benchmarks.errors import error_figures, error_intervals
+from endopilot.benchmarks.reference import REFERENCE_FILE, check_reference, read_reference
+from endopilot.benchmarks.scenes import DEVICE, KINDS, SEED, Scene, Solution, make_scenes
+from endopilot.simulation.config import PRESETS, Preset, SimulatorConfig, wall_stiffness
 from endopilot.simulation.device import read_device
-from endopilot.simulation.simulate import simulate
 from endopilot.simulation.simulator import Simulator
 from endopilot.types import SAMPLE_PERIOD_S, Rollout
 
-DEVICE = "workhorse-014"
-WORLDS = 32
-"""Worlds that are timed."""
-COMPARED = 16
-"""Worlds that the tip error is measured on."""
-SAMPLES = 120
-"""60 s."""
+COMPARED = 8
+"""Worlds of each scene that the error in time alone is measured on."""
+REPEATS = 3
+"""Times that the worlds are simulated for the timing; the fastest counts."""
 
 
-def bench_simulation() -> dict[str, Any]:
-    """Measure the rod core: a synthetic right coronary artery, the 0.014-inch workhorse wire, 60 s of random controls.
+def bench_simulation(
+    preset: Preset = "default", *, reference: Path = REFERENCE_FILE, baseline: Path = BASELINE_FOLDER
+) -> dict[str, Any]:
+    """Measure the rod core on the reference's scenes: random navigations of 60 s in three synthetic patients.
+
+    Args:
+        preset: name of the settings.
+        reference: file of the converged solution.
+        baseline: folder of the older build that the speed is compared with.
 
     Returns:
-        `realtime_factor_per_core` (simulated seconds per second of processor time on one thread, including
-        everything that `simulate` does),
-        `tip_error_mean_mm`, `tip_error_p95_mm` and `tip_error_max_mm` against the same scenario at a time step of 1 ms
-        and a Newton tolerance of 1e-8 mm, `threads_speedup` (two threads against one), and beside them the iterations a
-        time step, the share of valid worlds, the largest wall forces and `seconds_for_first_call`: of one world and
-        sample, the first call after the imports.
+        `realtime_factor_per_core` (simulated seconds per second of processor time on one thread, including everything
+        that `simulate` does), `speed_over_baseline` (the same against the older build with its default settings, in
+        turns with it; None where there is no such build), `node_iterations_per_second` (evaluations of nodes a
+        simulated second, all steps and attempts), `threads_speedup` (two threads against one); the errors of
+        `error_figures`, their `intervals` over worlds and the figures `by_anatomy`; `tip_error_*`, the error in time
+        alone: against the same elements at 1 ms and 1e-8 mm; the iterations a time step, the share of valid worlds, the
+        largest wall forces, and `seconds_for_first_call`: of one world and sample, the first call after the imports.
+        `reference_own_error` holds the reference's figures against a finer solution.
+
+    Raises:
+        InputError: the reference is missing or is that of other scenes; the older build does not run.
     """
-    anatomy, device = make_patient(AtlasConfig(), 0), read_device(DEVICE)
-    longest = float(anatomy.tree.longest_path().abscissa[-1])
-    initial, control = random_controls(
-        ControlConfig(), n_sequences=WORLDS, n_samples=SAMPLES, seed=0, max_inserted_length_mm=longest
-    )
-
-    def run(worlds: int, config: SimulatorConfig) -> tuple[Rollout, float, float]:
-        wall, processor = time.perf_counter(), time.process_time()
-        rollout = simulate(anatomy, device, control[:worlds], initial=initial[:worlds], config=config)
-        return rollout, time.perf_counter() - wall, time.process_time() - processor
-
-    one_thread = SimulatorConfig(threads=1)
+    exact = read_reference(reference)
+    scenes = make_scenes(exact.recipe["worlds"], exact.recipe["samples"])
+    check_reference(reference, scenes)
+    config = replace(PRESETS[preset], threads=1)
     started = time.perf_counter()
-    simulate(anatomy, device, np.zeros((1, 1, 2)), config=one_thread)
+    scenes[0].run(config, 1)
     first_call = time.perf_counter() - started
-    rollout, alone, processor = run(WORLDS, one_thread)
-    _, together, _ = run(WORLDS, replace(one_thread, threads=2))
-    exact, _, _ = run(COMPARED, SimulatorConfig(time_step_s=1e-3, tolerance_mm=1e-8))
-    both = exact.valid & rollout.valid[:COMPARED]
-    error = np.linalg.norm(exact.tip_position - rollout.tip_position[:COMPARED], axis=-1)[both]
-    simulated = WORLDS * SAMPLES * SAMPLE_PERIOD_S
+    timed = _time(scenes, config, baseline)
+    found = Solution.of(scenes, timed.rollouts)
+    owner = np.repeat(np.arange(len(scenes)), [len(scene.control) for scene in scenes])
+    simulated = SAMPLE_PERIOD_S * sum(scene.control.shape[0] * scene.control.shape[1] for scene in scenes)
+    force = np.percentile(found.contact_force_max[found.valid], 99.9)
     return {
-        "realtime_factor_per_core": round(simulated / processor, 1),
+        "preset": preset,
+        "realtime_factor_per_core": round(simulated / timed.processor, 1),
+        "speed_over_baseline": None if timed.baseline is None else round(timed.baseline / timed.processor, 3),
+        "node_iterations_per_second": round(sum(r.node_iterations.sum() for r in timed.rollouts) / simulated, 1),
+        "threads_speedup": round(timed.alone / timed.together, 3),
+        **error_figures(found, exact.solution),
+        **_error_in_time(scenes, config, timed.rollouts),
+        "iterations_per_step": round(float(np.mean([r.iterations[r.valid].mean() for r in timed.rollouts])), 3),
+        "valid_worlds": round(float(found.valid[:, -1].mean()), 5),
+        "contact_force_p999_n": round(float(force), 4),
+        "penetration_p999_mm": round(float(force) / wall_stiffness(config, scenes[0].device.push_limit_n), 4),
+        "seconds_for_first_call": round(first_call, 3),
+        "worlds": len(owner),
+        "intervals": error_intervals(found, exact.solution, owner),
+        "by_anatomy": {
+            scene.name: error_figures(found.worlds(rows), exact.solution.worlds(rows))
+            for scene, rows in ((scene, np.flatnonzero(owner == place)) for place, scene in enumerate(scenes))
+        },
+        "reference_own_error": exact.recipe["own_error"],
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class _Timed:
+    """The scenes' rollouts; processor time, and that of the older build, s; wall time on one and two threads, s."""
+
+    rollouts: list[Rollout]
+    processor: float
+    baseline: float | None
+    alone: float
+    together: float
+
+
+def _time(scenes: Sequence[Scene], config: SimulatorConfig, baseline: Path) -> _Timed:
+    work = {
+        "kinds": list(KINDS.values()),
+        "seed": SEED,
+        "device": DEVICE,
+        "worlds": len(scenes[0].control),
+        "samples": scenes[0].control.shape[1],
+    }
+    older = Baseline(baseline, work) if baseline.exists() else None
+    then, alone, together, processor = [], [], [], []
+    rollouts: list[Rollout] = []
+    try:
+        for _ in range(REPEATS):
+            if older is not None:
+                then.append(older.seconds())
+            rollouts, wall, spent = _run(scenes, config)
+            alone.append(wall)
+            processor.append(spent)
+            together.append(_run(scenes, replace(config, threads=2))[1])
+    finally:
+        if older is not None:
+            older.close()
+    return _Timed(rollouts, min(processor), min(then, default=None), min(alone), min(together))
+
+
+def _run(scenes: Sequence[Scene], config: SimulatorConfig) -> tuple[list[Rollout], float, float]:
+    wall, processor = time.perf_counter(), time.process_time()
+    rollouts = [scene.run(config) for scene in scenes]
+    return rollouts, time.perf_counter() - wall, time.process_time() - processor
+
+
+def _error_in_time(scenes: Sequence[Scene], config: SimulatorConfig, rollouts: Sequence[Rollout]) -> dict[str, float]:
+    errors = []
+    for scene, rollout in zip(scenes, rollouts, strict=True):
+        fine = scene.run(replace(config, time_step_s=1e-3, tolerance_mm=1e-8, threads=0), COMPARED)
+        both = fine.valid & rollout.valid[:COMPARED]
+        errors.append(np.linalg.norm(fine.tip_position - rollout.tip_position[:COMPARED], axis=-1)[both])
+    error = np.concatenate(errors)
+    return {
         "tip_error_mean_mm": round(float(error.mean()), 5),
         "tip_error_median_mm": round(float(np.median(error)), 5),
         "tip_error_p95_mm": round(float(np.percentile(error, 95)), 5),
         "tip_error_max_mm": round(float(error.max()), 5),
-        "threads_speedup": round(alone / together, 3),
-        "iterations_per_step": round(float(rollout.iterations[rollout.valid].mean()), 3),
-        "valid_worlds": round(float(rollout.valid[:, -1].mean()), 5),
-        "contact_force_p999_n": round(float(np.percentile(rollout.contact_force_max, 99.9)), 4),
-        "penetration_p999_mm": round(
-            float(np.percentile(rollout.contact_force_max, 99.9)) / wall_stiffness(one_thread, device.push_limit_n), 4
-        ),
-        "seconds_for_first_call": round(first_call, 3),
-        "worlds": WORLDS,
     }
 
 

@@ -12,18 +12,31 @@ from typing import Any, Literal
 
 from endopilot.benchmarks.robustness import RobustnessConfig
 from endopilot.cli.arguments import OutputFolder, existing, show, show_rows
+from endopilot.simulation.config import Preset
 
 EXIT_FAILED = 1
 
 
-def simulation(*, device: Literal["cpu", "cuda"] = "cpu", json: bool = False) -> None:
-    """Measure the speed of the rod core on its reference scenario, and the tip's error at that speed.
+def simulation(
+    *,
+    preset: Preset = "default",
+    device: Literal["cpu", "cuda"] = "cpu",
+    make_reference: bool = False,
+    reference: Path | None = None,
+    json: bool = False,
+) -> None:
+    """Measure the speed of the rod core, and the tip's error at that speed against a converged solution.
 
     Args:
+        preset: settings of the rod core: default, fast or accurate.
         device: measure the processor (cpu), or up to 100 000 wires on a GPU (cuda) and how closely the two agree.
+        make_reference: compute the converged solution anew instead, which takes a quarter of an hour.
+        reference: file of the converged solution; the shipped one if not given.
         json: print the figures as JSON.
     """
     from endopilot.benchmarks.gpu import bench_gpu
+    from endopilot.benchmarks.reference import REFERENCE_FILE
+    from endopilot.benchmarks.reference import make_reference as make
     from endopilot.benchmarks.simulation import bench_simulation
 
     if device == "cuda":
@@ -31,7 +44,17 @@ def simulation(*, device: Literal["cpu", "cuda"] = "cpu", json: bool = False) ->
         show_rows(rows, as_json=json)
         _leave(all(row["passed"] is not False for row in rows))
         return
-    show(bench_simulation(), as_json=json)
+    path = reference or REFERENCE_FILE
+    if make_reference:
+        show(make(path), as_json=json)
+        return
+    measured = bench_simulation(preset, reference=path)
+    if measured["speed_over_baseline"] is None:
+        print("speed_over_baseline is missing: `make core-baseline` builds what it compares with", file=sys.stderr)
+    if json:
+        show(measured, as_json=True)
+    else:
+        _show_simulation(measured)
 
 
 def scaling(*, json: bool = False) -> None:
@@ -161,6 +184,19 @@ SUBJECTS: dict[str, Callable[..., None]] = {
 def _leave(passed: bool) -> None:
     if not passed:
         sys.exit(EXIT_FAILED)
+
+
+def _show_simulation(measured: dict[str, Any]) -> None:
+    groups = ("intervals", "by_anatomy", "reference_own_error")
+    errors = measured["intervals"]
+    show({name: value for name, value in measured.items() if name not in (*groups, *errors)}, as_json=False)
+    rows = [
+        {"error": name, "all": measured[name], "90 % interval": interval}
+        | {anatomy: figures[name] for anatomy, figures in measured["by_anatomy"].items()}
+        | {"reference's own": measured["reference_own_error"][name]}
+        for name, interval in errors.items()
+    ]
+    show_rows(rows, as_json=False)
 
 
 def _show_robustness(measured: dict[str, Any]) -> None:

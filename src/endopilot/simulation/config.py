@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Annotated, Literal
 
 from pydantic import model_validator
@@ -69,6 +71,19 @@ class SimulatorConfig:
     def threads_for(self, worlds: int, lanes: int) -> int:
         """Return how many threads step some worlds, `lanes` of them side by side: no more than have one to step."""
         return min(self.threads or CORES, -(-worlds // lanes))
+
+
+Preset = Literal["default", "fast", "accurate"]
+"""Names of `PRESETS`."""
+PRESETS: Mapping[Preset, SimulatorConfig] = MappingProxyType(
+    {
+        "default": SimulatorConfig(),
+        "fast": SimulatorConfig(elements=50, time_step_s=0.025, tolerance_mm=2e-3, sample_tolerance_mm=1e-4),
+        "accurate": SimulatorConfig(elements=300, time_step_s=0.005),
+    }
+)
+"""Settings by name: the usual ones, those for many rollouts, and those for measurements. `endopilot bench simulation
+--preset NAME` measures speed and error of each."""
 
 
 def wall_stiffness(config: SimulatorConfig, push_limit_n: float) -> float:

@@ -1,0 +1,173 @@
+"""`endopilot bench simulation` on a few short worlds: its figures, its reference, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import endopilot
+from endopilot import cli
+from endopilot.benchmarks.errors import error_figures, error_intervals
+from endopilot.benchmarks.reference import REFERENCE_FILE, check_reference, make_reference, read_reference
+from endopilot.benchmarks.scenes import KINDS, Solution, make_scenes
+from endopilot.benchmarks.simulation import bench_simulation
+from endopilot.errors import InputError
+from endopilot.simulation.config import PRESETS, SimulatorConfig
+
+WORLDS, SAMPLES = 2, 6
+CONVERGED = SimulatorConfig(elements=200, time_step_s=0.005, tolerance_mm=1e-6)
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("reference") / "small.npz"
+    finer = replace(CONVERGED, elements=240)
+    make_reference(path, worlds=WORLDS, samples=SAMPLES, converged=CONVERGED, finer=finer, finer_worlds=1)
+    return path
+
+
+def refused(path: Path) -> str:
+    scenes = make_scenes(WORLDS, SAMPLES)
+    with pytest.raises(InputError) as error:
+        check_reference(path, scenes)
+    return str(error.value)
+
+
+def rewritten(small: Path, to: Path, change: dict[str, Any]) -> Path:
+    with np.load(small) as stored:
+        np.savez(to, **(dict(stored) | change))
+    return to
+
+
+def test_the_figures_of_the_preset_are_those_against_the_reference(small: Path, tmp_path: Path) -> None:
+    measured = bench_simulation("fast", reference=small, baseline=tmp_path / "none")
+    scenes = make_scenes(WORLDS, SAMPLES)
+    rollouts = [scene.run(PRESETS["fast"]) for scene in scenes]
+    exact = [scene.run(CONVERGED) for scene in scenes]
+    tip = np.concatenate(
+        [np.linalg.norm(a.tip_position - b.tip_position, axis=-1) for a, b in zip(rollouts, exact, strict=True)]
+    )
+    assert measured["true_tip_error_median_mm"] == pytest.approx(np.median(tip), abs=2e-5)
+    assert measured["true_tip_error_p95_mm"] == pytest.approx(np.percentile(tip, 95), abs=2e-5)
+    wall = np.concatenate([np.abs(a.wall_force - b.wall_force) for a, b in zip(rollouts, exact, strict=True)])
+    assert measured["wall_force_error_p95_n"] == pytest.approx(np.percentile(wall, 95), abs=2e-5)
+    spent = sum(rollout.node_iterations.sum() for rollout in rollouts)
+    assert measured["node_iterations_per_second"] == pytest.approx(spent / (len(tip) * SAMPLES * 0.5), abs=0.1)
+    # in time alone the error is another, smaller one: the elements are the same
+    assert 0 < measured["tip_error_median_mm"] < measured["true_tip_error_median_mm"]
+    assert measured["speed_over_baseline"] is None and measured["realtime_factor_per_core"] > 0
+    assert measured["worlds"] == len(KINDS) * WORLDS and set(measured["by_anatomy"]) == set(KINDS)
+    assert measured["reference_own_error"]["true_tip_error_median_mm"] > 0
+    for name, (low, high) in measured["intervals"].items():
+        assert (low is None) == (measured[name] is None) and (low is None or low <= high), name
+
+
+def test_the_speed_is_compared_with_another_build_in_a_process_of_its_own(small: Path, tmp_path: Path) -> None:
+    build = tmp_path / "build"
+    shutil.copytree(Path(endopilot.__file__).parent, build / "endopilot", ignore=shutil.ignore_patterns("__pycache__"))
+    for level in ("baseline", "avx2", "avx512"):
+        core = find_spec(f"endopilot._core_{level}")
+        if core is not None and core.origin is not None:
+            shutil.copy(core.origin, build / "endopilot")
+    assert bench_simulation(reference=small, baseline=build)["speed_over_baseline"] > 0
+
+    (build / "endopilot" / "simulation" / "simulate.py").write_text("raise ImportError", encoding="utf-8")
+    with pytest.raises(InputError, match=r"build: does not run; make it anew with `make core-baseline`$"):
+        bench_simulation(reference=small, baseline=build)
+
+
+def test_a_finer_preset_errs_by_less(small: Path) -> None:
+    scenes, exact = make_scenes(WORLDS, SAMPLES), read_reference(small).solution
+    median = {
+        name: error_figures(Solution.of(scenes, [scene.run(PRESETS[name]) for scene in scenes]), exact)
+        for name in ("fast", "accurate")
+    }
+    assert median["accurate"]["true_tip_error_median_mm"] < 0.7 * median["fast"]["true_tip_error_median_mm"]
+
+
+def solution(tip_mm: np.ndarray, **other: Any) -> Solution:
+    zero = np.zeros(tip_mm.shape)
+    position = np.stack([tip_mm, zero, zero], axis=-1)
+    plain = {"branch": zero.astype(int), "valid": zero == 0, "before_fork": zero == 0}
+    forces = dict.fromkeys(("wall_force", "contact_force_max", "base_force", "base_torque"), zero)
+    return Solution(**({"tip_position": position} | plain | forces | other))
+
+
+def test_each_figure_counts_the_samples_that_it_names() -> None:
+    off = np.array([[0.01, 0.02, 0.03, 0.2, 5.0], [0.0, 0.0, 0.0, 0.0, 9.0]])
+    valid = np.array([[True] * 5, [False] * 5])
+    before = np.array([[True, True, False, False, False]] * 2)
+    exact = solution(np.zeros((2, 5)), before_fork=before)
+    branch = np.array([[0, 0, 0, 1, 1]] * 2)
+    figures = error_figures(solution(off, valid=valid, branch=branch, base_force=np.full((2, 5), -0.5)), exact)
+    assert figures["true_tip_error_median_mm"] == 0.03
+    assert figures["true_tip_error_mean_below_1mm_mm"] == pytest.approx((0.01 + 0.02 + 0.03 + 0.2) / 4)
+    assert figures["true_tip_error_share_over_0p1mm"] == pytest.approx(2 / 5)
+    assert figures["true_tip_error_p95_mm"] == pytest.approx(np.percentile(off[0], 95))
+    assert figures["true_tip_error_p95_before_fork_mm"] == pytest.approx(np.percentile([0.01, 0.02], 95))
+    assert figures["branch_agreement"] == pytest.approx(3 / 5)
+    assert figures["base_force_error_p95_n"] == 0.5 and figures["wall_force_error_p95_n"] == 0
+
+
+def test_intervals_are_drawn_over_worlds_not_over_samples() -> None:
+    # 8 worlds that err by their own number throughout: as many samples as one likes tell no more than the worlds
+    off = np.repeat(np.arange(1.0, 9.0)[:, None] / 100, 200, axis=1)
+    low, high = error_intervals(solution(off), solution(0 * off), np.zeros(8, dtype=int))["true_tip_error_median_mm"]
+    assert low <= 0.03 and high >= 0.06
+    # one scene a world leaves nothing to draw
+    fixed = error_intervals(solution(off), solution(0 * off), np.arange(8))["true_tip_error_median_mm"]
+    assert fixed == [0.045, 0.045]
+
+
+def test_a_reference_of_other_scenes_is_refused(small: Path, tmp_path: Path) -> None:
+    check_reference(small, make_scenes(WORLDS, SAMPLES))
+    with np.load(small) as stored:
+        kept = dict(stored)
+    mend = "make it anew with `endopilot bench simulation --make-reference`"
+    for name in ("centerlines_left", "distance_map_cerebral", "initial_states_right", "controls_left"):
+        other = kept[name].copy()
+        other.flat[-1] += 0.01
+        line = refused(rewritten(small, tmp_path / "other.npz", {name: other}))
+        assert line.endswith(f"other.npz: made for other {name.replace('_', ' ')}; {mend}")
+    recipe = json.loads(str(kept["recipe"]))
+    recipe["device"]["friction"] = 0.3
+    line = refused(rewritten(small, tmp_path / "wire.npz", {"recipe": np.array(json.dumps(recipe))}))
+    assert line.endswith(f"wire.npz: made for a workhorse-014 whose friction is 0.3, not 0.1; {mend}")
+
+
+def test_a_file_that_is_no_reference_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    missing = tmp_path / "missing.npz"
+    with pytest.raises(InputError, match=r"missing\.npz: no such file; `endopilot bench simulation --make-ref"):
+        read_reference(missing)
+    strange = tmp_path / "strange.npz"
+    np.savez(strange, tip_position=np.zeros(3))
+    with pytest.raises(InputError, match=r"strange\.npz: no reference \("):
+        read_reference(strange)
+    with pytest.raises(SystemExit) as left:
+        cli.main(["bench", "simulation", "--reference", str(missing)])
+    assert left.value.code == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+def test_the_shipped_reference_is_that_of_the_scenes_of_today() -> None:
+    recipe = read_reference(REFERENCE_FILE).recipe
+    assert recipe["config"]["elements"] >= 400 and recipe["config"]["time_step_s"] <= 1e-3
+    assert recipe["worlds"] * len(KINDS) >= 64
+    check_reference(REFERENCE_FILE, make_scenes(recipe["worlds"], recipe["samples"]))
+    assert recipe["own_error"]["true_tip_error_median_mm"] < 0.005
+
+
+def test_a_reference_made_again_has_the_same_samples(small: Path, tmp_path: Path) -> None:
+    again = tmp_path / "again.npz"
+    make_reference(again, worlds=WORLDS, samples=SAMPLES, converged=CONVERGED, finer=CONVERGED, finer_worlds=1)
+    once, twice = read_reference(small), read_reference(again)
+    assert np.array_equal(once.solution.tip_position, twice.solution.tip_position)
+    assert twice.recipe["own_error"]["true_tip_error_p95_mm"] == 0 < once.recipe["own_error"]["true_tip_error_p95_mm"]
+    assert once.recipe["config"]["elements"] == 200 and once.recipe["finer"]["elements"] == 240
