@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.simulation.config import FREE_BEHIND_MM, SimulatorConfig
+from endopilot.simulation.config import FREE_BEHIND_MM, PRESETS, Preset, SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, random_controls
 from endopilot.simulation.core import make_lumen, run_core
 from endopilot.simulation.device import read_device
@@ -30,12 +30,15 @@ BAR_WORLDS, BAR_FACTOR = 10_000, 100
 """So many wires are to run at so many times real time each."""
 
 
-def bench_gpu(worlds: tuple[int, ...] = WORLDS, samples: int = SAMPLES) -> list[dict[str, Any]]:
-    """Measure the core on a CUDA GPU in the scenario of `bench_simulation`, without the projection of tips.
+def bench_gpu(
+    preset: Preset = "default", worlds: tuple[int, ...] = WORLDS, samples: int = SAMPLES
+) -> list[dict[str, Any]]:
+    """Measure the core on a CUDA GPU on one anatomy of `bench_simulation`, without the projection of tips.
 
     The clock runs from the arrays of controls to the arrays of records, with the copies to the GPU and back.
 
     Args:
+        preset: name of the settings.
         worlds: numbers of worlds.
         samples: of each navigation, 0.5 s long.
 
@@ -55,7 +58,7 @@ def bench_gpu(worlds: tuple[int, ...] = WORLDS, samples: int = SAMPLES) -> list[
         ControlConfig(), n_sequences=min(DRAWN, max(worlds)), n_samples=samples, seed=0, max_inserted_length_mm=longest
     )
     friction = np.random.default_rng(0).uniform(0.8, 1.2, max(worlds)) * device.friction
-    on_gpu = SimulatorConfig(processor="cuda")
+    on_gpu = replace(PRESETS[preset], processor="cuda")
 
     def run(count: int, config: SimulatorConfig) -> dict[str, np.ndarray]:
         chosen = np.arange(count) % len(initial)

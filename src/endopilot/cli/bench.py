@@ -40,7 +40,7 @@ def simulation(
     from endopilot.benchmarks.simulation import bench_simulation
 
     if device == "cuda":
-        rows = bench_gpu()
+        rows = bench_gpu(preset)
         show_rows(rows, as_json=json)
         _leave(all(row["passed"] is not False for row in rows))
         return
