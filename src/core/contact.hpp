@@ -131,6 +131,20 @@ struct FrictionState {
     Vec3<V> spin_arm;   // displacement of the touching surface for a unit rotation about the wire's axis, mm/rad
 };
 
+// A point of the wire that can touch the wall: a node, or the middle of the element behind it. A node of the polygon does not
+// lie on the wire's curve: elements of length l with the direction of their middles put it l²/24 times the curvature vector
+// beside, and the middle of an element -l²/12 times (terms of fourth order left out). The wall is asked at the curve.
+template <class V>
+struct ContactPoint {
+    Vec3<V> offset;              // of the curve from the polygon there, mm; frozen at the start of a step
+    FrictionState<V> friction;
+    WallState<V> wall;
+    V normal_force;              // of the wall at the end of the last step, N
+    Vec3<V> evaluated;           // where the wall was last evaluated,
+    V clearance;                 // and its distance there, mm; NaN: never
+    V gap, last_gap;             // to the wall at the trial and at the accepted point, mm; no more than the reach of contact
+};
+
 // Adds the wall's elastic reaction, energy k/2 (radius - distance)² where positive. Returns the energy. Where `sticky`,
 // gradient and Hessian are those of a wall that can also pull: otherwise a node that has just lost contact would move
 // freely in the next Newton step and hit the wall.
@@ -195,6 +209,27 @@ ENDOPILOT_DEVICE inline V add_friction(const FrictionState<V>& friction, const V
     own.tt.xz += rotary * turn.x * turn.z;
     own.tt.yz += rotary * turn.y * turn.z;
     return friction.limit * (size - eps);
+}
+
+// Shares out what acts at the middle of an element between its two ends; rotations are the element's own.
+template <class V>
+ENDOPILOT_DEVICE inline void add_middle(const Diagonal<V>& middle, Diagonal<V>& own, Diagonal<V>& next, Coupling<V>& coupling) {
+    const V half = broadcast<V>(0.5), quarter = broadcast<V>(0.25);
+    const Vec3<V> gradient = half * middle.gradient_x;
+    own.gradient_x += gradient;
+    next.gradient_x += gradient;
+    own.gradient_theta += middle.gradient_theta;
+    const Sym3<V> xx = quarter * middle.xx;
+    own.xx += xx;
+    next.xx += xx;
+    coupling.xx += xx;
+    own.tt += middle.tt;
+    for (int r = 0; r < 3; ++r)
+        for (int c = 0; c < 3; ++c) {
+            const V tx = half * middle.tx[r][c];
+            own.tx[r][c] += tx;
+            coupling.tx[r][c] += tx;
+        }
 }
 
 }  // namespace endopilot

@@ -1,11 +1,14 @@
 // Between lanes and worlds: a lane takes a world from the queue, steps it for a sample, records it and stores it again.
 #pragma once
 
+#include <limits>
+
 #include "stepper.hpp"
 
 namespace endopilot {
 
 constexpr double kOvershoot = 0.02;  // mm that rounded controls may pull the wire behind the ostium
+constexpr double kNever = std::numeric_limits<double>::quiet_NaN();
 constexpr double kResultantLength = 2.0;  // mm of wire whose forces of the wall are added up: nodes may share one contact
 
 // Puts a world at the ostium, straight, ready to be pushed to the inserted length `depth` (mm) before its first sample.
@@ -60,11 +63,39 @@ void Stepper<V>::place(int l, int i) {
     put(n.start_q, l, base_.attitude(lane.start.rotation));
     put(n.last, l, lane.last.advance * frame(base_.orientation).d3);
     put(n.last_turn, l, {0, 0, lane.last.rotation});
-    set(n.friction.limit, l, 0);
-    put(n.friction.normal, l, {0, 0, 0});
-    put(n.friction.spin_arm, l, {0, 0, 0});
-    set(n.normal_force, l, 0);
+    clear(n.at_node, l);
+    clear(n.at_middle, l);
     place_base(l, i);
+}
+
+// Takes a contact point off the wall.
+template <class V>
+void Stepper<V>::clear(ContactPoint<V>& point, int l) {
+    set(point.friction.limit, l, 0);
+    put(point.friction.normal, l, {0, 0, 0});
+    put(point.friction.spin_arm, l, {0, 0, 0});
+    set(point.normal_force, l, 0);
+    put(point.offset, l, {0, 0, 0});
+    set(point.clearance, l, kNever);
+}
+
+template <class V>
+void Stepper<V>::load(ContactPoint<V>& point, int l, const World::Numbers& from) {
+    set(point.friction.limit, l, from[World::kLimit]);
+    put(point.friction.normal, l, vec3(from + World::kNormal));
+    put(point.friction.spin_arm, l, vec3(from + World::kSpinArm));
+    set(point.normal_force, l, from[World::kNormalForce]);
+    put(point.offset, l, vec3(from + World::kOffset));
+    set(point.clearance, l, kNever);
+}
+
+template <class V>
+void Stepper<V>::store(const ContactPoint<V>& point, int l, const World::Numbers& to) {
+    to[World::kLimit] = get(point.friction.limit, l);
+    write(to + World::kNormal, take(point.friction.normal, l));
+    write(to + World::kSpinArm, take(point.friction.spin_arm, l));
+    to[World::kNormalForce] = get(point.normal_force, l);
+    write(to + World::kOffset, take(point.offset, l));
 }
 
 // Places the trial of a node that follows the drive.
@@ -107,10 +138,8 @@ void Stepper<V>::load(int l) {
         put(n.from_q, l, take(n.q, l));
         put(n.step, l, {0, 0, 0});
         put(n.turn, l, {0, 0, 0});
-        set(n.friction.limit, l, p[World::kLimit]);
-        put(n.friction.normal, l, vec3(p + World::kNormal));
-        put(n.friction.spin_arm, l, vec3(p + World::kSpinArm));
-        set(n.normal_force, l, p[World::kNormalForce]);
+        load(n.at_node, l, p + World::kAtNode);
+        load(n.at_middle, l, p + World::kAtMiddle);
     }
     begin(l, weight == 0.0);
 }
@@ -139,10 +168,8 @@ void Stepper<V>::store(int l) {
         write(p + World::kQ, take(n.start_q, l));
         write(p + World::kLast, take(n.last, l));
         write(p + World::kLastTurn, take(n.last_turn, l));
-        p[World::kLimit] = get(n.friction.limit, l);
-        write(p + World::kNormal, take(n.friction.normal, l));
-        write(p + World::kSpinArm, take(n.friction.spin_arm, l));
-        p[World::kNormalForce] = get(n.normal_force, l);
+        store(n.at_node, l, p + World::kAtNode);
+        store(n.at_middle, l, p + World::kAtMiddle);
     }
 }
 
@@ -224,14 +251,17 @@ void Stepper<V>::record(int world, int sample, double iterations, double node_it
     out_.inserted[at] = w[World::kInserted];
     out_.rotation[at] = w[World::kRotation];
     double largest = 0, sum = 0, resultant = 0;
-    for (int i = 0; i < active; ++i) {
-        const double force = w.node(i)[World::kNormalForce];
+    // Contact points from tip to base: 2 i is node i, 2 i + 1 the middle of the element behind it.
+    const auto point = [&](int p) { return w.node(p / 2) + (p % 2 ? World::kAtMiddle : World::kAtNode); };
+    const auto abscissa = [&](int p) { return p % 2 ? Base::middle(rod_, p / 2) : rod_.abscissa[p / 2]; };
+    for (int p = 0; p < 2 * active; ++p) {
+        const double force = point(p)[World::kNormalForce];
         largest = std::max(largest, force);
         sum += force;
         if (force == 0) continue;
         Vec3<double> all{0, 0, 0};
-        for (int j = i; j < active && rod_.abscissa[j] <= rod_.abscissa[i] + kResultantLength; ++j)
-            all += w.node(j)[World::kNormalForce] * vec3(w.node(j) + World::kNormal);
+        for (int o = p; o < 2 * active && abscissa(o) <= abscissa(p) + kResultantLength; ++o)
+            all += point(o)[World::kNormalForce] * vec3(point(o) + World::kNormal);
         resultant = std::max(resultant, dot(all, all));
     }
     out_.force_max[at] = largest;
@@ -248,13 +278,13 @@ void Stepper<V>::record(int world, int sample, double iterations, double node_it
     out_.valid[at] = w.valid();
     const auto write = [](double* to, const Vec3<double>& v) { to[0] = v.x, to[1] = v.y, to[2] = v.z; };
     const World::Numbers tip = w.node(0);
-    write(out_.tip_position + 3 * at, vec3(tip + World::kX));
+    write(out_.tip_position + 3 * at, w.curve(0));
     write(out_.tip_direction + 3 * at, frame(quaternion(tip + World::kQ)).d3);
     for (int i = 0; i < rod_.nodes && (out_.shape || out_.attitude); ++i) {
         const World::Numbers p = w.node(i);
         if (out_.shape)
             write(out_.shape + 3 * (at * rod_.nodes + i),
-                  i < active ? vec3(p + World::kX) : base_.position(rod_, i, w[World::kInserted]));
+                  i < active ? w.curve(i) : base_.position(rod_, i, w[World::kInserted]));
         if (out_.attitude) {
             const Quaternion<double> q = i < active ? quaternion(p + World::kQ) : base_.attitude(w[World::kRotation]);
             double* to = out_.attitude + 4 * (at * rod_.nodes + i);

@@ -85,6 +85,17 @@ ENDOPILOT_DEVICE inline void set_mask(Mask<V>& mask, int lane, bool value) {
 }
 
 template <class V>
+ENDOPILOT_DEVICE inline bool any(const Mask<V>& mask) {
+    if constexpr (kWidth<V> == 1) {
+        return mask;
+    } else {
+        std::int64_t found = 0;
+        for (int lane = 0; lane < kWidth<V>; ++lane) found |= mask[lane];
+        return found != 0;
+    }
+}
+
+template <class V>
 ENDOPILOT_DEVICE inline V broadcast(double value) {
     return V{} + value;
 }
@@ -97,6 +108,11 @@ ENDOPILOT_DEVICE inline V select(Mask<V> mask, V yes, V no) {
 template <class V>
 ENDOPILOT_DEVICE inline V maximum(V a, V b) {
     return a > b ? a : b;
+}
+
+template <class V>
+ENDOPILOT_DEVICE inline V minimum(V a, V b) {
+    return a < b ? a : b;
 }
 
 template <class V>
@@ -147,6 +163,12 @@ ENDOPILOT_DEVICE inline Vec3<V> select(Mask<V> mask, const Vec3<V>& yes, const V
 template <class V>
 struct Sym3 {
     V xx, yy, zz, xy, xz, yz;
+    ENDOPILOT_DEVICE friend Sym3 operator*(const V& s, const Sym3& m) {
+        return {s * m.xx, s * m.yy, s * m.zz, s * m.xy, s * m.xz, s * m.yz};
+    }
+    ENDOPILOT_DEVICE Sym3& operator+=(const Sym3& m) {
+        return *this = {xx + m.xx, yy + m.yy, zz + m.zz, xy + m.xy, xz + m.xz, yz + m.yz};
+    }
 };
 
 template <class V>

@@ -156,8 +156,19 @@ public:
         });
     }
 
+    // The larger force of the wall at each node and at the middle of the element behind it.
     nb::object contacts() {
-        return per_node(World::kNormalForce, 1, [](const World&, int, double* to) { *to = 0.0; });
+        OutputArray<double> out(count_ * std::size_t(scene_.rod.nodes));
+        double* to = out.data;
+        for (std::size_t k = 0; k < count_; ++k) {
+            const World w = world(k);
+            for (int i = 0; i < scene_.rod.nodes; ++i) {
+                const bool active = i < int(w[World::kActive]);
+                const auto force = [&](int point) { return w.node(i)[point + World::kNormalForce]; };
+                *to++ = active ? std::max(force(World::kAtNode), force(World::kAtMiddle)) : 0.0;
+            }
+        }
+        return out.array(count_, std::size_t(scene_.rod.nodes));
     }
 
     int nodes() const { return scene_.rod.nodes; }

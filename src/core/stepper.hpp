@@ -20,6 +20,9 @@ constexpr int kMaxRejections = 12;
 constexpr int kTurnabout = 10;         // iterations after which friction's tangent and its secant take turns
 constexpr int kSnapIterations = 5;   // times max_iterations that the shortest step may take: a snap takes many at any step
 constexpr double kStickyReach = 0.1;     // mm: in a step's first iteration, a wall that was touched and is this near still holds
+constexpr double kSteepest = 1.5;        // more than any slope of the spline through a distance map
+constexpr double kLeastShare = 1e-4, kMostShare = 0.7;   // of a move that raised the energy, that is tried next
+constexpr double kMostPower = 8;         // of the share, that the energy is taken to grow with beyond its slope
 constexpr double kFirstDamping = 1e-3;   // N/mm (rotations: N mm/rad), where the Hessian is indefinite even without geometric terms
 constexpr double kMaxDamping = 1e3;
 constexpr double kMaxBoost = 64;
@@ -34,9 +37,7 @@ struct Node {
     Vec3<V> x, from, start, step, last;            // trial, accepted, step start; Newton step; last increment
     Quaternion<V> q, from_q, start_q;
     Vec3<V> turn, last_turn;
-    FrictionState<V> friction;
-    WallState<V> wall;
-    V normal_force;                                // of the wall at the end of the last step, N
+    ContactPoint<V> at_node, at_middle;            // the latter on the element behind it
 };
 
 template <class V>
@@ -134,6 +135,10 @@ private:
     V active_{}, share_{}, geometric_{}, inverse_dt_{}, eps_{}, first_{}, damping_{}, friction_{}, tangent_{};
     V jump_scale_x_{}, jump_scale_theta_{};
     V energy_{}, descent_{}, pivot_{}, jump_{}, base_force_{}, base_torque_{};
+    Mask<V> accepted_{};           // the last trial was accepted
+    V hit_{};                      // share of the last move at which it first hits a wall that was free; 1: it hits none
+    V rise_{};                     // slope of the energy along the last move, at its end
+    Vec3<V> eliminated_x_{}, eliminated_theta_{};   // gradient that has been eliminated into block_[0]
     DriveBlock drive_{};           // of the wire's energy, all nodes eliminated
     V drive_a_{}, drive_r_{};      // the drive's Newton step
 
@@ -166,6 +171,9 @@ private:
     ENDOPILOT_LARGE void load(int l);
     ENDOPILOT_LARGE void store(int l);
     ENDOPILOT_DEVICE void read_control(int l);
+    ENDOPILOT_DEVICE static void clear(ContactPoint<V>& point, int l);
+    ENDOPILOT_DEVICE static void load(ContactPoint<V>& point, int l, const World::Numbers& from);
+    ENDOPILOT_DEVICE static void store(const ContactPoint<V>& point, int l, const World::Numbers& to);
     ENDOPILOT_DEVICE void place(int l, int i);
     ENDOPILOT_DEVICE void place_base(int l, int i);
     template <class Queue>
@@ -176,6 +184,7 @@ private:
     // The step of one lane (below).
     ENDOPILOT_LARGE void begin(int l, bool fresh);
     ENDOPILOT_LARGE Decision decide(int l);
+    ENDOPILOT_DEVICE double best_share(double energy, int l) const;
     ENDOPILOT_DEVICE DriveEnergy introducer(const Drive& moved, int l) const;
     ENDOPILOT_DEVICE DriveEnergy drive_energy(const Lane& lane, int l) const;
     ENDOPILOT_LARGE bool solve_drive(int l);
@@ -191,12 +200,19 @@ private:
     ENDOPILOT_DEVICE bool is_base(int i) const;
     ENDOPILOT_DEVICE DriveBlock drive_block(const Diagonal<V>& block) const;
     ENDOPILOT_DEVICE void clear_drive_entries(Mask<V> mask, Diagonal<V>& block) const;
+    ENDOPILOT_DEVICE static bool near_wall(const ContactPoint<V>& point, const Vec3<V>& x, double radius, Mask<V> on);
+    ENDOPILOT_LARGE void add_contact(ContactPoint<V>& point, const Vec3<V>& x, const Vec3<V>& moved, const Quaternion<V>& turned,
+                                     double radius, Mask<V> on, Diagonal<V>& block);
     ENDOPILOT_LARGE void add_lumen(int first, int count);
     ENDOPILOT_LARGE void add_drag(int first, int count);
+    ENDOPILOT_DEVICE void add_rise(int first, int count);
     ENDOPILOT_LARGE void eliminate_nodes(int first, int count);
     ENDOPILOT_DEVICE V add_loads(int i, const Node<V>& node, Diagonal<V>& own) const;
     ENDOPILOT_LARGE V solve(int n);
     ENDOPILOT_LARGE void update(int n, const Decision (&decision)[W], const V& factor);
+    ENDOPILOT_DEVICE void freeze(ContactPoint<V>& point, const Vec3<V>& step, const Vec3<V>& axis, double radius, Mask<V> on,
+                                 const V& weight) const;
+    ENDOPILOT_LARGE void freeze_contacts(int n, Mask<V> mask, const V& weight);
     ENDOPILOT_LARGE void finish_step(int n, Mask<V> mask, Mask<V> restart, const V& weight);
 };
 
@@ -225,6 +241,7 @@ void Stepper<V>::begin(int l, bool fresh) {
     lane.active = Base::count_active(rod_, lane.start.advance, options_.free_behind);
     for (int i = std::min(before, lane.active); i <= std::max(before, lane.active); ++i)
         if (i >= before || i >= lane.active) place(l, i);
+    if (lane.active < before) clear(node_[lane.active - 1].at_middle, l);
     lane.iterations = lane.rejections = lane.releases = 0;
     lane.boost = 1;
     lane.first = lane.finite = true;
@@ -236,6 +253,7 @@ void Stepper<V>::begin(int l, bool fresh) {
     set(share_, l, Base::share_of_last_joint(rod_, lane.start.advance, options_.free_behind, lane.active));
     set(geometric_, l, 0.0);
     set(first_, l, 1.0);
+    set_mask<V>(accepted_, l, false);
     set(damping_, l, 0.0);
     set(tangent_, l, 1.0);
     set(inverse_dt_, l, 1.0 / duration(lane));
@@ -296,10 +314,8 @@ typename Stepper<V>::Decision Stepper<V>::decide(int l) {
     const double slack = 1e-11 * (std::abs(lane.energy) + 1e-3);
     if (!lane.finite || !(lane.first || energy <= lane.energy + slack)) {
         if (lane.first || ++lane.rejections > kMaxRejections) return Decision::restart;
-        // the minimum of the parabola through the accepted energy, its slope and the energy just found
-        const double slope = lane.scale * lane.slope;
-        const double best = lane.finite ? 0.5 * slope / (slope + energy - lane.energy) : 0.0;
-        lane.shorten = std::clamp(best, 0.02, 0.5);
+        lane.shorten = lane.finite ? best_share(energy, l) : kLeastShare;
+        set_mask<V>(accepted_, l, false);
         lane.scale *= lane.shorten;
         return Decision::shorten;
     }
@@ -318,6 +334,7 @@ typename Stepper<V>::Decision Stepper<V>::decide(int l) {
     lane.slope = get(descent_, l);
     // Where friction turns, a step with its tangent overshoots, and one with its secant creeps: they take turns.
     set(tangent_, l, lane.iterations > kTurnabout && lane.iterations / kTurnabout % 2 == 1 ? 0.0 : 1.0);
+    set_mask<V>(accepted_, l, true);
     // Where the energy is not convex the damped steps are short: lengthen them as long as they succeed.
     const double damping = lane.damping = get(damping_, l);
     lane.boost = damping > 0 && lane.rejections == 0 ? std::min(2 * lane.boost, double{kMaxBoost}) : 1.0;
@@ -328,6 +345,21 @@ typename Stepper<V>::Decision Stepper<V>::decide(int l) {
     set(geometric_, l, lane.first ? 1.0 : std::min(1.0, std::max(0.25, 2 * get(geometric_, l))));
     lane.first = false;
     return Decision::accept;
+}
+
+// The share of the last move, which raised the energy, at which the energy is least along it. What raises it are contacts that
+// Newton's step did not foresee. If the wire bends into a wall as it slides along it, the energy is C s^p - slope s at the share
+// s, with p from the slopes at both ends. If it hits a wall head on at a share s0, it is k (s - s0)² / 2 - slope s from there on.
+template <class V>
+double Stepper<V>::best_share(double energy, int l) const {
+    const Lane& lane = lane_[l];
+    const double slope = lane.scale * lane.slope, excess = slope + energy - lane.energy;
+    const bool drive_held = !lane.by_force && lane.slipping.advance == 0 && lane.slipping.rotation == 0;  // else `rise_` lacks its part
+    const double power = drive_held ? std::clamp((get(rise_, l) + slope) / excess, 2.0, kMostPower) : 2.0;
+    const double sliding = std::pow(slope / (power * excess), 1 / (power - 1));
+    const double free = get(hit_, l), rest = 1 - free;
+    const double head_on = rest > 0 ? free + rest * rest * slope / (2 * excess) : 0.0;
+    return std::clamp(std::max(sliding, head_on), kLeastShare, kMostShare);
 }
 
 // Ends the steps that converged, restarts those that failed with half the step. Returns the samples that ended.

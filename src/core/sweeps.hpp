@@ -41,14 +41,16 @@ V Stepper<V>::add_loads(int i, const Node<V>& node, Diagonal<V>& own) const {
 // within a part the nodes do not wait for each other, and what passes between parts stays in the fastest cache.
 template <class V>
 void Stepper<V>::evaluate(int n) {
-    energy_ = descent_ = jump_ = V{};
-    pivot_ = broadcast<V>(1.0);
+    energy_ = descent_ = jump_ = rise_ = V{};
+    eliminated_x_ = eliminated_theta_ = {V{}, V{}, V{}};
+    pivot_ = hit_ = broadcast<V>(1.0);
     block_[0] = Diagonal<V>{};
     for (int first = 0; first < n; first += kTogether) {
         const int count = std::min(int{kTogether}, n - first);
         add_rod(first, count);
         if (lumen_) add_lumen(first, count);
         add_drag(first, count);
+        add_rise(first, count);
         eliminate_nodes(first, count);
         block_[0] = block_[count];
     }
@@ -97,23 +99,55 @@ typename Stepper<V>::DriveBlock Stepper<V>::drive_block(const Diagonal<V>& block
             .rr = block.tt.zz};
 }
 
-// The wall's reaction and friction.
+// Whether any lane's contact point may be within reach of the wall, going by how far it has moved since the wall was evaluated.
+template <class V>
+bool Stepper<V>::near_wall(const ContactPoint<V>& point, const Vec3<V>& x, double radius, Mask<V> on) {
+    const Vec3<V> moved = x - point.evaluated;
+    const V spare = point.clearance - (radius + kStickyReach);
+    const Mask<V> clear = (spare > V{}) & (spare * spare > kSteepest * kSteepest * dot(moved, moved));  // false for NaN
+    return any<V>(on & ~clear);
+}
+
+// The wall's reaction and friction at one contact point of the lanes in `on`: at x, moved by `moved` since the step's start.
+template <class V>
+void Stepper<V>::add_contact(ContactPoint<V>& point, const Vec3<V>& x, const Vec3<V>& moved, const Quaternion<V>& turned, double radius,
+                             Mask<V> on, Diagonal<V>& block) {
+    const V zero{};
+    point.last_gap = select<V>(accepted_, point.gap, point.last_gap);
+    point.gap = broadcast<V>(kStickyReach);
+    if (near_wall(point, x, radius, on)) {
+        Distance<V> d = distance_to_wall(*lumen_, x);
+        point.gap = minimum<V>(d.value - radius, point.gap);
+        const Mask<V> hits = on & (point.last_gap > zero) & (point.gap < zero);
+        hit_ = select<V>(hits, minimum<V>(hit_, point.last_gap / (point.last_gap - point.gap)), hit_);
+        point.evaluated = x;
+        point.clearance = d.value;
+        point.wall = {d.value, d.gradient};
+        d.value = select<V>(on, d.value, broadcast<V>(Lumen::kDeep));
+        const Mask<V> sticky = (first_ > zero) & (point.friction.limit > zero) & (d.value < radius + kStickyReach);
+        energy_ += add_wall<V>(options_.wall_stiffness, radius, geometric_, sticky, d, block);
+    } else {
+        point.wall = {broadcast<V>(Lumen::kDeep), {zero, zero, zero}};
+    }
+    if (any<V>(on & (point.friction.limit > zero)))
+        energy_ += select<V>(on, add_friction(point.friction, eps_, tangent_, moved, turned, block), zero);
+}
+
+// Contact at nodes and at the middles of elements. The middle of the element that joins the base touches nothing.
 template <class V>
 void Stepper<V>::add_lumen(int first, int count) {
-    const V zero{};
+    const V half = broadcast<V>(0.5);
     for (int k = 0; k < count; ++k) {
         const int i = first + k;
         Node<V>& node = node_[i];
-        const Distance<V> d = distance_to_wall(*lumen_, node.x);
-        node.wall = {d.value, d.gradient};
-        const Mask<V> sticky = (first_ > zero) & (node.friction.limit > zero) & (d.value < rod_.radius[i] + kStickyReach);
-        const V energy = add_wall<V>(options_.wall_stiffness, rod_.radius[i], geometric_, sticky, d, block_[k]);
-        energy_ += select<V>(active_ > broadcast<V>(i), energy, zero);
-    }
-    for (int k = 0; k < count; ++k) {
-        const Node<V>& node = node_[first + k];
-        const V energy = add_friction(node.friction, eps_, tangent_, node.x - node.start, relative(node.start_q, node.q), block_[k]);
-        energy_ += select<V>(active_ > broadcast<V>(first + k), energy, zero);
+        const Node<V>& behind = node_[i + 1];
+        const Vec3<V> moved = node.x - node.start;
+        const Quaternion<V> turned = relative(node.start_q, node.q);
+        add_contact(node.at_node, node.x + node.at_node.offset, moved, turned, rod_.radius[i], active_ > broadcast<V>(i), block_[k]);
+        Diagonal<V> middle{};
+        add_contact(node.at_middle, half * (node.x + behind.x) + node.at_middle.offset, half * (moved + (behind.x - behind.start)),
+                    turned, rod_.radius[i], active_ > broadcast<V>(i + 1), middle);
+        add_middle(middle, block_[k], block_[k + 1], coupling_[k]);
     }
 }
 
@@ -145,6 +179,17 @@ void Stepper<V>::add_drag(int first, int count) {
     }
 }
 
+// The slope of the energy along the last move. The first block also holds what was eliminated into it.
+template <class V>
+void Stepper<V>::add_rise(int first, int count) {
+    for (int k = 0; k < count; ++k) {
+        const Node<V>& node = node_[first + k];
+        const Vec3<V> x = k == 0 ? block_[0].gradient_x - eliminated_x_ : block_[k].gradient_x;
+        const Vec3<V> theta = k == 0 ? block_[0].gradient_theta - eliminated_theta_ : block_[k].gradient_theta;
+        rise_ += select<V>(active_ > broadcast<V>(first + k), dot(x, node.step) + dot(theta, node.turn), V{});
+    }
+}
+
 // Clears what `drive_block` reads of the base's block before the nodes ahead are eliminated into it. Its own energy was
 // counted before, and elements behind it are there only for the longer wires of other lanes.
 template <class V>
@@ -158,6 +203,7 @@ void Stepper<V>::clear_drive_entries(Mask<V> mask, Diagonal<V>& block) const {
 template <class V>
 void Stepper<V>::eliminate_nodes(int first, int count) {
     const V zero{};
+    const Vec3<V> last_x = block_[count].gradient_x, last_theta = block_[count].gradient_theta;
     for (int k = 0; k < count; ++k) {
         const int i = first + k;
         const Mask<V> on = active_ > broadcast<V>(i);
@@ -171,6 +217,8 @@ void Stepper<V>::eliminate_nodes(int first, int count) {
         pivot_ = select<V>(on, select<V>(sound, pivot_, zero), pivot_);
         if (at_base) drive_ = select(base_next, drive_ + drive_block(next), drive_);
     }
+    eliminated_x_ = block_[count].gradient_x - last_x;
+    eliminated_theta_ = block_[count].gradient_theta - last_theta;
 }
 
 // Back substitution. Returns the largest displacement (mm) or rotation (rad) of a node; NaN where the solve failed.
@@ -238,11 +286,55 @@ void Stepper<V>::update(int n, const Decision (&decision)[W], const V& factor) {
     }
 }
 
-// For the lanes in `mask`, makes the converged trial the start of the next step, freezes the walls that friction acts
-// on and sets a new trial by extrapolation; for those in `restart`, goes back to the start of the step.
+// Freezes the wall at a contact point that has come to rest after the move `step`: friction in the coming step then has a potential.
+template <class V>
+void Stepper<V>::freeze(ContactPoint<V>& point, const Vec3<V>& step, const Vec3<V>& axis, double radius, Mask<V> on, const V& weight) const {
+    const V zero{}, one = broadcast<V>(1.0);
+    const Vec3<V>& gradient = point.wall.gradient;
+    const V distance = point.wall.distance + dot(gradient, step);
+    const V norm = square_root(dot(gradient, gradient));
+    const Mask<V> touches = (distance < radius) & (norm > 1e-3);
+    const V push = select<V>(touches, options_.wall_stiffness * (radius - distance) * norm, zero);
+    // friction in the coming step acts with the normal force at its middle, extrapolated
+    V ahead = push + select<V>(point.normal_force > zero, 0.5 * weight * (push - point.normal_force), zero);
+    ahead = select<V>(ahead > 2.0 * push, 2.0 * push, ahead);
+    ahead = select<V>(ahead > zero, ahead, zero);
+    point.normal_force = select<V>(on, push, point.normal_force);
+    const V inverse = select<V>(touches, one / norm, zero);
+    const Vec3<V> normal = inverse * gradient;
+    point.friction.limit = select<V>(on, friction_ * ahead, point.friction.limit);
+    point.friction.normal = select(on, normal, point.friction.normal);
+    point.friction.spin_arm = select(on, broadcast<V>(radius) * cross(normal, axis), point.friction.spin_arm);
+}
+
+// Freezes the walls that friction acts on and the curve's offsets from the polygon, for the converged lanes in `mask`.
+template <class V>
+void Stepper<V>::freeze_contacts(int n, Mask<V> mask, const V& weight) {
+    const auto direction = [&](int i) { return broadcast<V>(1.0 / rod_.length[i]) * (node_[i].x - node_[i + 1].x); };
+    Vec3<V> ahead = direction(0), behind = direction(1);   // of the elements ahead of a joint and behind it
+    Vec3<V> bent = broadcast<V>(1.0 / rod_.joint_length[1]) * (ahead - behind);   // curvature vector at the node: at the tip, of the first joint
+    for (int i = 0; i < n; ++i) {
+        Node<V>& node = node_[i];
+        const Mask<V> on = mask & (active_ > broadcast<V>(i)), middle = mask & (active_ > broadcast<V>(i + 1));
+        const Vec3<V> axis = frame(node.q).d3;
+        freeze(node.at_node, node.step, axis, rod_.radius[i], on, weight);
+        freeze(node.at_middle, broadcast<V>(0.5) * (node.step + node_[i + 1].step), axis, rod_.radius[i], middle, weight);
+        const Vec3<V> bent_behind = broadcast<V>(1.0 / rod_.joint_length[i + 1]) * (ahead - behind);
+        const double l = rod_.length[i], around = i > 0 ? rod_.length[i - 1] * l / 24 : l * l / 8;
+        node.at_node.offset = select(on, broadcast<V>(around) * bent, node.at_node.offset);
+        node.at_middle.offset = select(middle, broadcast<V>(-l * l / 24) * (bent + bent_behind), node.at_middle.offset);
+        bent = bent_behind;
+        ahead = behind;
+        behind = direction(std::min(i + 2, rod_.nodes - 2));
+    }
+}
+
+// For the lanes in `mask`, makes the converged trial the start of the next step and sets a new trial by extrapolation; for
+// those in `restart`, goes back to the start of the step.
 template <class V>
 void Stepper<V>::finish_step(int n, Mask<V> mask, Mask<V> restart, const V& weight) {
-    const V zero{}, one = broadcast<V>(1.0);
+    const V zero{};
+    if (lumen_) freeze_contacts(n, mask, weight);
     for (int i = 0; i < n; ++i) {
         Node<V>& node = node_[i];
         const Mask<V> on = mask & (active_ > broadcast<V>(i));
@@ -252,24 +344,6 @@ void Stepper<V>::finish_step(int n, Mask<V> mask, Mask<V> restart, const V& weig
         node.last_turn = select(on, broadcast<V>(2.0) * turned_by.v, node.last_turn);
         node.start = select(on, node.x, node.start);
         node.start_q = select(on, node.q, node.start_q);
-        if (lumen_) {
-            const Vec3<V>& gradient = node.wall.gradient;
-            const V distance = node.wall.distance + dot(gradient, node.step);
-            const V norm = square_root(dot(gradient, gradient));
-            const Mask<V> touches = (distance < rod_.radius[i]) & (norm > 1e-3);
-            const V push = select<V>(touches, options_.wall_stiffness * (rod_.radius[i] - distance) * norm, zero);
-            // friction in the coming step acts with the normal force at its middle, extrapolated
-            V ahead = push + select<V>(node.normal_force > zero, 0.5 * weight * (push - node.normal_force), zero);
-            ahead = select<V>(ahead > 2.0 * push, 2.0 * push, ahead);
-            ahead = select<V>(ahead > zero, ahead, zero);
-            node.normal_force = select<V>(on, push, node.normal_force);
-            const V inverse = select<V>(touches, one / norm, zero);
-            const Vec3<V> normal = inverse * gradient;
-            const Frame<V> axes = frame(node.start_q);
-            node.friction.limit = select<V>(on, friction_ * ahead, node.friction.limit);
-            node.friction.normal = select(on, normal, node.friction.normal);
-            node.friction.spin_arm = select(on, broadcast<V>(rod_.radius[i]) * cross(normal, axes.d3), node.friction.spin_arm);
-        }
         node.x = select(on, node.start + weight * node.last, select(back, node.start, node.x));
         node.q = select(on, rotated(node.start_q, weight * node.last_turn), select(back, node.start_q, node.q));
         node.step = select(on, {zero, zero, zero}, node.step);

@@ -20,10 +20,10 @@ struct World {
         kApproach, kDepth,             // samples left of the approach, and the inserted length it ends at, mm
         kScalars
     };
-    // last increments of position and rotation; friction limit, wall normal, spin arm; normal force, N
-    enum NodeQuantity {
-        kX = 0, kQ = 3, kLast = 7, kLastTurn = 10, kLimit = 13, kNormal = 14, kSpinArm = 17, kNormalForce = 20, kNodeSize = 21
-    };
+    // last increments of position and rotation; the contact points at the node and at the middle of the element behind it
+    enum NodeQuantity { kX = 0, kQ = 3, kLast = 7, kLastTurn = 10, kAtNode = 13, kAtMiddle = 24, kNodeSize = 35 };
+    // of a contact point: friction limit, wall normal, spin arm; normal force, N; offset of the curve from the polygon, mm
+    enum PointQuantity { kLimit = 0, kNormal = 1, kSpinArm = 4, kNormalForce = 7, kOffset = 8 };
 
     // Numbers `stride` apart.
     struct Numbers {
@@ -39,6 +39,8 @@ struct World {
     ENDOPILOT_DEVICE double& operator[](Scalar s) const { return values[s * stride]; }
     ENDOPILOT_DEVICE Numbers node(int i) const { return Numbers{values, stride} + (kScalars + i * kNodeSize); }
     static std::size_t size(int nodes) { return kScalars + std::size_t(nodes) * kNodeSize; }
+    // Where the wire's curve passes node i.
+    ENDOPILOT_DEVICE Vec3<double> curve(int i) const;
     ENDOPILOT_DEVICE bool valid() const { return (*this)[kReason] == double(kFine); }
 };
 
@@ -46,6 +48,10 @@ ENDOPILOT_DEVICE inline Vec3<double> vec3(const World::Numbers& p) { return {p[0
 ENDOPILOT_DEVICE inline Quaternion<double> quaternion(const World::Numbers& p) { return {p[0], vec3(p + 1)}; }
 ENDOPILOT_DEVICE inline void write(const World::Numbers& to, const Vec3<double>& v) { to[0] = v.x, to[1] = v.y, to[2] = v.z; }
 ENDOPILOT_DEVICE inline void write(const World::Numbers& to, const Quaternion<double>& q) { to[0] = q.w, write(to + 1, q.v); }
+
+ENDOPILOT_DEVICE inline Vec3<double> World::curve(int i) const {
+    return vec3(node(i) + kX) + vec3(node(i) + (kAtNode + kOffset));
+}
 
 // All worlds of a run, `between_worlds` and `between_numbers` numbers apart. A processor keeps each world's numbers side by
 // side (the default); a GPU, whose neighbouring threads step neighbouring worlds, keeps side by side the same number of all.

@@ -358,7 +358,7 @@ class Simulator:
 
     @property
     def contacts(self) -> Float[np.ndarray, "worlds nodes"]:
-        """Force of the wall on each node, N.
+        """Force of the wall at each node or at the middle of the element behind it, the larger of the two, N.
 
         Example:
             >>> bool((simulator.contacts >= 0).all())
