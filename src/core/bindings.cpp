@@ -171,6 +171,7 @@ NB_MODULE(ENDOPILOT_MODULE, module) {
         .def("state", &Simulations::state)
         .def("set_state", &Simulations::set_state, nb::arg("all"))
         .def("tips", &Simulations::tips)
+        .def("tip_directions", &Simulations::tip_directions)
         .def("positions", &Simulations::positions)
         .def("attitudes", &Simulations::attitudes)
         .def("contacts", &Simulations::contacts)

@@ -247,18 +247,19 @@ template <class V>
 void Stepper<V>::record(int world, int sample, double iterations, double node_iterations, const Drive& slip) const {
     const World w = world_[world];
     const std::size_t at = std::size_t(world) * in_.samples + sample;
-    const int active = int(w[World::kActive]);
+    const int active = w.active();
     out_.inserted[at] = w[World::kInserted];
     out_.rotation[at] = w[World::kRotation];
     double largest = 0, sum = 0, resultant = 0;
     // Contact points from tip to base: 2 i is node i, 2 i + 1 the middle of the element behind it.
     const auto point = [&](int p) { return w.node(p / 2) + (p % 2 ? World::kAtMiddle : World::kAtNode); };
     const auto abscissa = [&](int p) { return p % 2 ? Base::middle(rod_, p / 2) : rod_.abscissa[p / 2]; };
+    for (int i = 0; i < active; ++i) {
+        largest = std::max(largest, w.force(i));
+        sum += w.force(i);
+    }
     for (int p = 0; p < 2 * active; ++p) {
-        const double force = point(p)[World::kNormalForce];
-        largest = std::max(largest, force);
-        sum += force;
-        if (force == 0) continue;
+        if (point(p)[World::kNormalForce] == 0) continue;
         Vec3<double> all{0, 0, 0};
         for (int o = p; o < 2 * active && abscissa(o) <= abscissa(p) + kResultantLength; ++o)
             all += point(o)[World::kNormalForce] * vec3(point(o) + World::kNormal);
@@ -277,16 +278,12 @@ void Stepper<V>::record(int world, int sample, double iterations, double node_it
     out_.rotation_slip[at] = slip.rotation;
     out_.valid[at] = w.valid();
     const auto write = [](double* to, const Vec3<double>& v) { to[0] = v.x, to[1] = v.y, to[2] = v.z; };
-    const World::Numbers tip = w.node(0);
-    write(out_.tip_position + 3 * at, w.curve(0));
-    write(out_.tip_direction + 3 * at, frame(quaternion(tip + World::kQ)).d3);
+    write(out_.tip_position + 3 * at, position(rod_, base_, w, 0));
+    write(out_.tip_direction + 3 * at, tip_direction(rod_, base_, w));
     for (int i = 0; i < rod_.nodes && (out_.shape || out_.attitude); ++i) {
-        const World::Numbers p = w.node(i);
-        if (out_.shape)
-            write(out_.shape + 3 * (at * rod_.nodes + i),
-                  i < active ? w.curve(i) : base_.position(rod_, i, w[World::kInserted]));
+        if (out_.shape) write(out_.shape + 3 * (at * rod_.nodes + i), position(rod_, base_, w, i));
         if (out_.attitude) {
-            const Quaternion<double> q = i < active ? quaternion(p + World::kQ) : base_.attitude(w[World::kRotation]);
+            const Quaternion<double> q = attitude(base_, w, i);
             double* to = out_.attitude + 4 * (at * rod_.nodes + i);
             to[0] = q.w;
             write(to + 1, q.v);

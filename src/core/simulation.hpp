@@ -117,58 +117,45 @@ public:
         return out.array(count_);
     }
 
-    // Positions of the first nodes.
+    // Where the wires end.
     nb::object tips() {
         OutputArray<double> out(3 * count_);
-        for (std::size_t w = 0; w < count_; ++w) copy(world(w).node(0) + World::kX, 3, out.data + 3 * w);
+        for (std::size_t w = 0; w < count_; ++w) put(position(view_.rod, scene_.base, world(w), 0), out.data + 3 * w);
         return out.array(count_, 3);
     }
 
-    // `size` numbers of each node, from `offset` on; those of nodes that follow the drive from `behind(world, node)`.
-    template <class Behind>
-    nb::object per_node(int offset, int size, const Behind& behind) {
+    nb::object tip_directions() {
+        OutputArray<double> out(3 * count_);
+        for (std::size_t w = 0; w < count_; ++w) put(tip_direction(view_.rod, scene_.base, world(w)), out.data + 3 * w);
+        return out.array(count_, 3);
+    }
+
+    // `size` numbers of each node, which `write(world, node, to)` writes.
+    template <class Write>
+    nb::object per_node(int size, const Write& write) {
         const std::size_t nodes = std::size_t(scene_.rod.nodes);
         OutputArray<double> out(count_ * nodes * std::size_t(size));
         double* to = out.data;
-        for (std::size_t k = 0; k < count_; ++k) {
-            const World w = world(k);
-            for (int i = 0; i < scene_.rod.nodes; ++i, to += size) {
-                if (i < int(w[World::kActive]))
-                    copy(w.node(i) + offset, size, to);
-                else
-                    behind(w, i, to);
-            }
-        }
+        for (std::size_t k = 0; k < count_; ++k)
+            for (int i = 0; i < scene_.rod.nodes; ++i, to += size) write(world(k), i, to);
         return size == 1 ? out.array(count_, nodes) : out.array(count_, nodes, size);
     }
 
     nb::object positions() {
-        return per_node(World::kX, 3, [this](const World& w, int i, double* to) {
-            const Vec3<double> x = scene_.base.position(view_.rod, i, w[World::kInserted]);
-            to[0] = x.x, to[1] = x.y, to[2] = x.z;
-        });
+        return per_node(3, [this](const World& w, int i, double* to) { put(position(view_.rod, scene_.base, w, i), to); });
     }
 
     nb::object attitudes() {
-        return per_node(World::kQ, 4, [this](const World& w, int, double* to) {
-            const Quaternion<double> q = scene_.base.attitude(w[World::kRotation]);
-            to[0] = q.w, to[1] = q.v.x, to[2] = q.v.y, to[3] = q.v.z;
+        return per_node(4, [this](const World& w, int i, double* to) {
+            const Quaternion<double> q = attitude(scene_.base, w, i);
+            to[0] = q.w;
+            put(q.v, to + 1);
         });
     }
 
-    // The larger force of the wall at each node and at the middle of the element behind it.
+    // Forces of the wall at each node and at the middle of the element behind it, added up.
     nb::object contacts() {
-        OutputArray<double> out(count_ * std::size_t(scene_.rod.nodes));
-        double* to = out.data;
-        for (std::size_t k = 0; k < count_; ++k) {
-            const World w = world(k);
-            for (int i = 0; i < scene_.rod.nodes; ++i) {
-                const bool active = i < int(w[World::kActive]);
-                const auto force = [&](int point) { return w.node(i)[point + World::kNormalForce]; };
-                *to++ = active ? std::max(force(World::kAtNode), force(World::kAtMiddle)) : 0.0;
-            }
-        }
-        return out.array(count_, std::size_t(scene_.rod.nodes));
+        return per_node(1, [](const World& w, int i, double* to) { *to = i < w.active() ? w.force(i) : 0.0; });
     }
 
     int nodes() const { return scene_.rod.nodes; }
@@ -192,9 +179,7 @@ private:
     Worlds worlds() { return {values_.data(), std::ptrdiff_t(width()), 1}; }
     World world(std::size_t w) { return worlds()[w]; }
 
-    static void copy(const World::Numbers& from, int size, double* to) {
-        for (int k = 0; k < size; ++k) to[k] = from[k];
-    }
+    static void put(const Vec3<double>& v, double* to) { to[0] = v.x, to[1] = v.y, to[2] = v.z; }
 
     // The worlds in the order of their mean inserted length, so that those under way together are of similar length.
     std::vector<int> by_depth(const Inputs& in) {

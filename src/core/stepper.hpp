@@ -355,11 +355,11 @@ double Stepper<V>::best_share(double energy, int l) const {
     const Lane& lane = lane_[l];
     const double slope = lane.scale * lane.slope, excess = slope + energy - lane.energy;
     const bool drive_held = !lane.by_force && lane.slipping.advance == 0 && lane.slipping.rotation == 0;  // else `rise_` lacks its part
-    const double power = drive_held ? std::clamp((get(rise_, l) + slope) / excess, 2.0, kMostPower) : 2.0;
+    const double power = drive_held ? std::clamp((get(rise_, l) + slope) / excess, 2.0, double{kMostPower}) : 2.0;
     const double sliding = std::pow(slope / (power * excess), 1 / (power - 1));
     const double free = get(hit_, l), rest = 1 - free;
     const double head_on = rest > 0 ? free + rest * rest * slope / (2 * excess) : 0.0;
-    return std::clamp(std::max(sliding, head_on), kLeastShare, kMostShare);
+    return std::clamp(std::max(sliding, head_on), double{kLeastShare}, double{kMostShare});
 }
 
 // Ends the steps that converged, restarts those that failed with half the step. Returns the samples that ended.

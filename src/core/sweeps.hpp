@@ -129,7 +129,7 @@ void Stepper<V>::add_contact(ContactPoint<V>& point, const Vec3<V>& x, const Vec
     } else {
         point.wall = {broadcast<V>(Lumen::kDeep), {zero, zero, zero}};
     }
-    if (any<V>(on & (point.friction.limit > zero)))
+    if (any<V>(on & ~(point.friction.limit <= zero)))  // a NaN goes on
         energy_ += select<V>(on, add_friction(point.friction, eps_, tangent_, moved, turned, block), zero);
 }
 

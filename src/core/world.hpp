@@ -1,6 +1,7 @@
 // Worlds at rest between samples.
 #pragma once
 
+#include <cmath>
 #include <cstddef>
 
 #include "interface.hpp"
@@ -39,8 +40,11 @@ struct World {
     ENDOPILOT_DEVICE double& operator[](Scalar s) const { return values[s * stride]; }
     ENDOPILOT_DEVICE Numbers node(int i) const { return Numbers{values, stride} + (kScalars + i * kNodeSize); }
     static std::size_t size(int nodes) { return kScalars + std::size_t(nodes) * kNodeSize; }
-    // Where the wire's curve passes node i.
-    ENDOPILOT_DEVICE Vec3<double> curve(int i) const;
+    ENDOPILOT_DEVICE int active() const { return int((*this)[kActive]); }
+    // Force of the wall at node i and at the middle of the element behind it, N.
+    ENDOPILOT_DEVICE double force(int i) const {
+        return node(i)[kAtNode + kNormalForce] + node(i)[kAtMiddle + kNormalForce];
+    }
     ENDOPILOT_DEVICE bool valid() const { return (*this)[kReason] == double(kFine); }
 };
 
@@ -49,8 +53,22 @@ ENDOPILOT_DEVICE inline Quaternion<double> quaternion(const World::Numbers& p) {
 ENDOPILOT_DEVICE inline void write(const World::Numbers& to, const Vec3<double>& v) { to[0] = v.x, to[1] = v.y, to[2] = v.z; }
 ENDOPILOT_DEVICE inline void write(const World::Numbers& to, const Quaternion<double>& q) { to[0] = q.w, write(to + 1, q.v); }
 
-ENDOPILOT_DEVICE inline Vec3<double> World::curve(int i) const {
-    return vec3(node(i) + kX) + vec3(node(i) + (kAtNode + kOffset));
+// Where the wire's curve passes node i: beside the polygon's node.
+ENDOPILOT_DEVICE inline Vec3<double> position(const RodModel& rod, const Base& base, const World& w, int i) {
+    if (i >= w.active()) return base.position(rod, i, w[World::kInserted]);
+    return vec3(w.node(i) + World::kX) + vec3(w.node(i) + (World::kAtNode + World::kOffset));
+}
+
+ENDOPILOT_DEVICE inline Quaternion<double> attitude(const Base& base, const World& w, int i) {
+    return i < w.active() ? quaternion(w.node(i) + World::kQ) : base.attitude(w[World::kRotation]);
+}
+
+// The wire's direction at its tip. The first element, of length l, has the direction at its middle; the tip's offset from the
+// polygon is l²/8 times the curvature vector.
+ENDOPILOT_DEVICE inline Vec3<double> tip_direction(const RodModel& rod, const Base& base, const World& w) {
+    Vec3<double> direction = frame(attitude(base, w, 0)).d3;
+    if (w.active() > 0) direction += (4 / rod.length[0]) * vec3(w.node(0) + (World::kAtNode + World::kOffset));
+    return (1 / std::sqrt(dot(direction, direction))) * direction;
 }
 
 // All worlds of a run, `between_worlds` and `between_numbers` numbers apart. A processor keeps each world's numbers side by

@@ -5,7 +5,7 @@
     @settings
     class RodConfig:
         friction: NonNegative = 0.1
-        elements: Annotated[int, Within(10, 2000)] = 100
+        element_mm: Annotated[float, Within(0.02, 5)] = 0.75
 
 A bad value raises `InputError` in one line: the field, its value, and what to give instead. A check of several fields
 is a `pydantic.model_validator(mode="after")` that raises `ValueError("field: value; what to give")`.

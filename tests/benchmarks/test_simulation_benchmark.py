@@ -22,13 +22,13 @@ from endopilot.errors import InputError
 from endopilot.simulation.config import PRESETS, SimulatorConfig
 
 WORLDS, SAMPLES = 2, 6
-CONVERGED = SimulatorConfig(elements=200, time_step_s=0.005, tolerance_mm=1e-6)
+CONVERGED = SimulatorConfig(element_mm=0.35, time_step_s=0.005, tolerance_mm=1e-6)
 
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("reference") / "small.npz"
-    finer = replace(CONVERGED, elements=240)
+    finer = replace(CONVERGED, element_mm=0.3)
     make_reference(path, worlds=WORLDS, samples=SAMPLES, converged=CONVERGED, finer=finer, finer_worlds=1)
     return path
 

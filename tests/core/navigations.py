@@ -18,7 +18,7 @@ from endopilot.types import Insertion
 from endopilot.verification.contact import bent_tube
 
 WORLDS, SAMPLES = 5, 3
-CONFIG = SimulatorConfig(elements=40, threads=1)
+CONFIG = SimulatorConfig(element_mm=1.0, threads=1)
 
 
 @cache
@@ -33,7 +33,7 @@ def navigate(
 ) -> dict[str, np.ndarray]:
     """Return what the core records of random controls in a bent tube, or without a wall and faster."""
     device, random = read_device("workhorse-014"), np.random.default_rng(11)
-    rod = lay_out(device, path_mm=60.0, elements=CONFIG.elements, length_mm=90.0 + FREE_BEHIND_MM)
+    rod = lay_out(device, element_mm=CONFIG.element_mm, length_mm=90.0 + FREE_BEHIND_MM)
     low, high = ((-4, -2), (8, 2)) if actuation == "velocity" else ((-0.08, -0.2), (0.08, 0.2))
     return run_core(
         rod,

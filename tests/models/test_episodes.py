@@ -104,7 +104,7 @@ def test_a_dataset_keeps_its_prepared_patients(dataset, fork, wire, monkeypatch,
         np.testing.assert_array_equal(setup.patient(name).push_tip, one.push_tip)
     assert made == [name]
     replace(setup, identities={name: "of another vessel with this name"}).patient(name)
-    replace(setup, simulator=replace(setup.simulator, elements=60)).patient(name)
+    replace(setup, simulator=replace(setup.simulator, element_mm=1.0)).patient(name)
     assert made == [name] * 3 and len(list((tmp_path / PATIENTS_FOLDER).iterdir())) == 3
 
 

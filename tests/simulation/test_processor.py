@@ -23,8 +23,8 @@ from endopilot.simulation.simulator import Simulator
 from endopilot.types import Anatomy
 
 DEVICE = read_device("workhorse-014")
-GPU = SimulatorConfig(elements=30, processor="cuda")
-CPU = SimulatorConfig(elements=30)
+GPU = SimulatorConfig(element_mm=1.5, processor="cuda")
+CPU = SimulatorConfig(element_mm=1.5)
 
 
 @pytest.fixture(scope="module")

@@ -1,37 +1,62 @@
-"""A device laid out as a rod: where the tip of a free wire comes to lie."""
+"""A device laid out as a rod: where the tip of a free wire comes to lie, and its elements."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import pytest
 
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.core import run_core
+from endopilot.simulation.core import make_lumen, run_core
 from endopilot.simulation.device import read_device
 from endopilot.simulation.rod import lay_out
-from endopilot.types import Insertion
+from endopilot.types import DistanceMap, Insertion
 
 
-@pytest.mark.parametrize("elements", [50, 67, 100, 140, 200])
-def test_the_polygon_of_a_free_bent_tip_ends_where_the_arc_does(elements: int) -> None:
+@pytest.mark.parametrize("element_mm", [0.2, 0.5, 0.75, 1.0, 1.5])
+def test_a_free_bent_tip_lies_where_the_arc_ends(element_mm: float) -> None:
     device, inserted = read_device("workhorse-014"), 6.0
-    rod = lay_out(device, path_mm=120.0, elements=elements, length_mm=130.0)
     rested = run_core(
-        rod,
-        None,
+        lay_out(device, element_mm=element_mm, length_mm=30.0),
+        _wide_lumen(),
         Insertion(np.zeros(3), np.array([0.0, 0.0, 1.0])),
-        config=SimulatorConfig(elements=elements, threads=1),
+        config=SimulatorConfig(threads=1),
         initial=np.array([[inserted, 0.0]]),
         control=np.zeros((1, 4, 2)),
         friction=np.zeros(1),
         approach=False,
     )
-    tip = rested["tip_position"][0, -1]
-    length, curvature = device.tip_bend_length_mm, device.tip_bend_rad / device.tip_bend_length_mm
-    across, along = (1 - np.cos(device.tip_bend_rad)) / curvature, np.sin(device.tip_bend_rad) / curvature
-    # Each element has the arc's direction at its middle. As the midpoint rule does, the sum over elements of length h
-    # errs by at most κ²h²/24 of the arc, and by κh²/8 where the bend ends within an element.
-    h = float(np.diff(rod.abscissa_mm[rod.abscissa_mm < length + 1.0]).max())
-    most = (curvature * h) ** 2 / 24 * length + curvature * h**2 / 8
+    angle, length = device.tip_bend_rad, device.tip_bend_length_mm
+    curvature = angle / length
+    across, along = (1 - np.cos(angle)) / curvature, np.sin(angle) / curvature
+    # The polygon of elements of length h has the arc's direction at their middles. Its nodes lie beside the arc, by κh²/24
+    # along the normal there and by κh²/12 along the normal where the bend ends within an element. The core adds κh²/8 along
+    # the normal at the tip, which leaves κh²/12 times the distance of the two normals, 2 sin(angle/2).
+    tip, direction = rested["tip_position"][0, -1], rested["tip_direction"][0, -1]
+    most = curvature * element_mm**2 / 6 * np.sin(angle / 2) + 1e-5
     assert np.hypot(tip[0], tip[1]) == pytest.approx(across, abs=most)
     assert tip[2] == pytest.approx(inserted - length + along, abs=most)
+    assert np.arccos(direction[2]) == pytest.approx(angle, abs=(curvature * element_mm) ** 3 / 4 + 1e-5)
+
+
+def test_an_element_has_its_middle_where_the_bend_of_the_tip_ends() -> None:
+    device = read_device("workhorse-014")
+    for element_mm in (0.2, 0.5, 0.75, 1.0, 1.5, 4.0):
+        rod = lay_out(device, element_mm=element_mm, length_mm=100.0)
+        length = np.diff(rod.abscissa_mm)
+        middle = rod.abscissa_mm[:-1] + 0.5 * length
+        assert np.abs(middle - device.tip_bend_length_mm).min() < 1e-9
+        assert length[0] <= element_mm and length.max() <= 5 * element_mm
+        assert (np.diff(length) > -1e-12).all()
+        assert rod.abscissa_mm[-3] >= 100.0
+        # the joints ahead of the bend's end carry the bend of their own stretches: all but the first half element's
+        bend = (rod.rest_curvature[1:-1, 0] * np.diff(middle)).sum()
+        share = 1 - 0.5 * length[0] / device.tip_bend_length_mm
+        assert bend == pytest.approx(device.tip_bend_rad * share, rel=1e-9)
+
+
+def _wide_lumen() -> Any:
+    """Return a lumen whose walls are far."""
+    grid = DistanceMap(np.full((20, 20, 40), 20.0, dtype=np.float32), 1.0, np.array([-10.0, -10.0, -10.0]))
+    return make_lumen(grid, 0.18, "cpu")

@@ -63,7 +63,7 @@ def bench_gpu(
     def run(count: int, config: SimulatorConfig) -> dict[str, np.ndarray]:
         chosen = np.arange(count) % len(initial)
         return run_core(
-            lay_out(device, path_mm=longest, elements=config.elements, length_mm=longest + FREE_BEHIND_MM),
+            lay_out(device, element_mm=config.element_mm, length_mm=longest + FREE_BEHIND_MM),
             make_lumen(anatomy.distance_map, device.tip_radius_mm, config.processor),
             anatomy.insertion,
             config=config,

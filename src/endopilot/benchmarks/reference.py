@@ -25,9 +25,9 @@ from endopilot.simulation.device import Device
 
 REFERENCE_FILE = Path(__file__).with_name("reference.npz")
 """The reference that is shipped."""
-CONVERGED = SimulatorConfig(elements=800, time_step_s=1e-3, tolerance_mm=1e-6)
+CONVERGED = SimulatorConfig(element_mm=0.1, time_step_s=1e-3, tolerance_mm=1e-6)
 """Settings of the reference."""
-FINER = SimulatorConfig(elements=1200, time_step_s=5e-4, tolerance_mm=1e-6)
+FINER = SimulatorConfig(element_mm=0.07, time_step_s=5e-4, tolerance_mm=1e-6)
 """Settings that the reference's own error is measured against."""
 FINER_WORLDS = 4
 """Worlds of each patient that the reference's own error is measured on."""

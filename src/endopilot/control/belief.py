@@ -40,15 +40,15 @@ class BeliefConfig:
     """Scale of a good member's error along the wire, mm: X-ray shows the end of a tip badly."""
     across_sd_mm: Positive = 0.3
     """The same across the wire, mm."""
-    elements: Annotated[int, Within(10, 2000)] = 50
-    """Elements of the rod core over the longest path."""
+    element_mm: Annotated[float, Within(0.02, 5)] = 1.25
+    """Length of the rod core's elements at the wire's tip, mm."""
     time_step_s: Positive = 0.025
     """Time step of the rod core, s."""
 
     @property
     def core(self) -> SimulatorConfig:
         """Settings of the rod core."""
-        return SimulatorConfig(elements=self.elements, time_step_s=self.time_step_s, threads=1)
+        return SimulatorConfig(element_mm=self.element_mm, time_step_s=self.time_step_s, threads=1)
 
 
 class Belief:

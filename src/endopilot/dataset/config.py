@@ -14,11 +14,11 @@ from endopilot.types import SAMPLE_PERIOD_S
 
 
 def dataset_simulator() -> SimulatorConfig:
-    """Return the settings that datasets are simulated with: half the elements of the reference and a coarser Newton.
+    """Return the settings that datasets are simulated with: longer elements than the default and a coarser Newton.
 
     What they cost in accuracy stands in docs/dataset.md.
     """
-    return SimulatorConfig(elements=50, tolerance_mm=1e-2, largest_jump=0.3)
+    return SimulatorConfig(element_mm=1.25, tolerance_mm=1e-2, largest_jump=0.3)
 
 
 _Stiffness = Annotated[float, Within(0.05)]

@@ -35,8 +35,8 @@ class SimulatorConfig:
     sample_tolerance_mm: Positive = 1e-6
     """The same for the time step that ends a sample (no more than `tolerance_mm`): its forces are recorded, and the
     wire is stiff axially."""
-    elements: Annotated[int, Within(10, 2000)] = 100
-    """Elements over the longest path of the anatomy; they are shorter near the tip."""
+    element_mm: Annotated[float, Within(0.02, 5)] = 0.75
+    """Length of the wire's elements at its tip, mm; towards the base they grow to five times that."""
     wall_stiffness_n_mm: Positive | None = None
     """Stiffness of the vessel wall at a node, N/mm. If not given, the device's push limit dents it by 0.015 mm."""
     stick_velocity_mm_s: Positive = 0.05
@@ -78,8 +78,10 @@ Preset = Literal["default", "fast", "accurate"]
 PRESETS: Mapping[Preset, SimulatorConfig] = MappingProxyType(
     {
         "default": SimulatorConfig(),
-        "fast": SimulatorConfig(elements=50, time_step_s=0.025, tolerance_mm=2e-3, sample_tolerance_mm=1e-4),
-        "accurate": SimulatorConfig(elements=300, time_step_s=0.005),
+        "fast": SimulatorConfig(
+            element_mm=1.25, time_step_s=0.025, tolerance_mm=2e-3, sample_tolerance_mm=1e-4, largest_jump=1.0
+        ),
+        "accurate": SimulatorConfig(element_mm=0.3),
     }
 )
 """Settings by name: the usual ones, those for many rollouts, and those for measurements. `endopilot bench simulation

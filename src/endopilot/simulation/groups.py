@@ -89,8 +89,8 @@ def make_groups(
             projectors[anatomy.identity] = TipProjector(anatomy.tree, anatomy.insertion)
         path_mm = float(anatomy.tree.longest_path().abscissa[-1])
         longest_mm = far_end_mm(anatomy)
-        rod = lay_out(device, path_mm=path_mm, elements=config.elements, length_mm=longest_mm + FREE_BEHIND_MM)
-        check_memory(8 * len(worlds) * (25 * len(rod.abscissa_mm) + 40), f"worlds: {len(worlds)}", "give fewer")
+        rod = lay_out(device, element_mm=config.element_mm, length_mm=longest_mm + FREE_BEHIND_MM)
+        check_memory(8 * len(worlds) * (40 * len(rod.abscissa_mm) + 40), f"worlds: {len(worlds)}", "give fewer")
         simulation = core.Simulation(
             rod=rod.model(config.processor),
             lumen=lumens[key],

@@ -18,10 +18,10 @@ SHEAR_CORRECTION = 6 * (1 + POISSON_RATIO) / (7 + 6 * POISSON_RATIO)
 """Cowper's shear coefficient of a round section (J. Appl. Mech. 33, 1966)."""
 _DRAG_N_S_MM2 = 5e-6
 """Drag of the surrounding blood on one mm of wire, N·s/mm²; far below friction."""
-_FINEST_MM = 0.75
-"""Element length at the tip, mm, if the elements suffice."""
-_RAMP_MM = 30.0
-"""Length from the tip over which elements grow to their full length, mm."""
+_GROWTH_MM = 40.0
+"""Distance from the tip at which elements are twice as long as there; they grow in proportion to it, mm."""
+_LONGEST = 5.0
+"""Longest elements, as a multiple of those at the tip: the shaft is stiffer and bends less sharply."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,19 +65,19 @@ class RodLayout:
         )
 
 
-def lay_out(device: Device, *, path_mm: float, elements: int, length_mm: float) -> RodLayout:
-    """Lay a device out with `elements` elements over `path_mm`, shorter near the tip.
+def lay_out(device: Device, *, element_mm: float, length_mm: float) -> RodLayout:
+    """Lay a device out as a rod, with shorter elements near the tip.
 
-    The nodes depend on the device, the path and the number of elements alone; a longer `length_mm` only adds nodes at
-    the base. So worlds do not notice what other worlds need.
+    The nodes depend on the device and on `element_mm` alone; a longer `length_mm` only adds nodes at the base. So
+    worlds do not notice what other worlds need.
 
     Args:
         device: the wire.
-        path_mm: length that the elements are spread over, mm.
-        elements: their number.
+        element_mm: length of the elements at the tip, mm. It is taken somewhat shorter, so that the middle of an
+            element lies where the bend of the tip ends: half a joint's bend would act at the wrong place.
         length_mm: length that the rod must have at least, mm; two more elements are added behind it.
     """
-    abscissa = _nodes(path_mm, elements, length_mm)
+    abscissa = _nodes(element_mm, length_mm, device.tip_bend_length_mm)
     length = np.append(np.diff(abscissa), np.diff(abscissa)[-1])
     middle = abscissa + 0.5 * length
     # A round section of the device's diameter ties EA and kGA to EI: EA = 16 EI / d², with EI that of the element.
@@ -103,15 +103,26 @@ def lay_out(device: Device, *, path_mm: float, elements: int, length_mm: float) 
     )
 
 
-def _nodes(path_mm: float, elements: int, length_mm: float) -> Float[np.ndarray, "n"]:
-    finest = min(_FINEST_MM, 0.5 * path_mm / elements)
-    count = np.arange(elements)
+def _nodes(element_mm: float, length_mm: float, bend_mm: float) -> Float[np.ndarray, "n"]:
+    """Return the abscissas of nodes that reach `length_mm` at least, an element's middle lying at `bend_mm`."""
 
-    def lengths(full: float) -> Float[np.ndarray, "elements"]:
-        growth = (full - finest) * finest / _RAMP_MM  # about linear in the abscissa until `full` is reached
-        return np.minimum(finest + growth * count, full)
+    def nodes(first: float, count: int) -> Float[np.ndarray, "n"]:
+        at = np.zeros(count)
+        for i in range(1, count):
+            at[i] = at[i - 1] + min(first * (1 + at[i - 1] / _GROWTH_MM), _LONGEST * element_mm)
+        return at
 
-    full: Any = brentq(lambda full: lengths(full).sum() - path_mm, finest, 1e3 * path_mm)
-    nodes = np.append(0.0, np.cumsum(lengths(full)))
-    extra = max(0, int(np.ceil((length_mm - nodes[-1]) / full))) + 2
-    return np.append(nodes, nodes[-1] + full * (1 + np.arange(extra)))
+    def middle(first: float, element: int) -> float:
+        return float(nodes(first, element + 2)[-2:].mean())
+
+    first = element_mm
+    if bend_mm > 0:
+        element = 1  # a joint at least lies ahead of it
+        while middle(first, element) < bend_mm:
+            element += 1
+        aligned: Any = brentq(lambda first: middle(first, element) - bend_mm, 0.0, max(element_mm, bend_mm))
+        first = aligned
+    count = 4
+    while (abscissa := nodes(first, count))[-3] < length_mm:
+        count *= 2
+    return abscissa[: int(np.searchsorted(abscissa, length_mm)) + 3]

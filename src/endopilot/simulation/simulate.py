@@ -103,9 +103,7 @@ def simulate(
     path_mm = float(anatomy.tree.longest_path().abscissa[-1])
     if actuation == "force":
         commanded_mm = possible_mm = far_end_mm(anatomy)
-    rod = lay_out(
-        device, path_mm=path_mm, elements=config.elements, length_mm=max(path_mm, possible_mm) + FREE_BEHIND_MM
-    )
+    rod = lay_out(device, element_mm=config.element_mm, length_mm=max(path_mm, possible_mm) + FREE_BEHIND_MM)
     _check_memory(worlds, samples, len(rod.abscissa_mm) if record_shape else 0)
     result = run_core(
         rod,

@@ -279,8 +279,8 @@ class Simulator:
         """Settings of the rod core.
 
         Example:
-            >>> simulator.config.elements
-            100
+            >>> simulator.config.element_mm
+            0.75
         """
         return self._config
 
@@ -347,18 +347,17 @@ class Simulator:
 
     @property
     def tip_direction(self) -> Float[np.ndarray, "worlds 3"]:
-        """Unit vectors along the wires at their tips: the third directors of the last elements.
+        """Unit vectors along the wires at their tips.
 
         Example:
             >>> bool(np.allclose(np.linalg.norm(simulator.tip_direction, axis=-1), 1.0))
             True
         """
-        w, x, y, z = self.orientation[:, 0].T
-        return np.column_stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
+        return self._merge([group.simulation.tip_directions() for group in self._groups])
 
     @property
     def contacts(self) -> Float[np.ndarray, "worlds nodes"]:
-        """Force of the wall at each node or at the middle of the element behind it, the larger of the two, N.
+        """Force of the wall at each node and at the middle of the element behind it, added up, N.
 
         Example:
             >>> bool((simulator.contacts >= 0).all())

@@ -19,8 +19,8 @@ from endopilot.simulation.device_files import list_devices
 from endopilot.tasks.navigation import Navigation, Target
 from endopilot.types import Anatomy, VesselTree
 
-CORE = SimulatorConfig(elements=50, time_step_s=1 / 14, sample_tolerance_mm=1e-4)
-"""Settings of the rod core on the ladder and in the environments: half the elements, two time steps a control period,
+CORE = SimulatorConfig(element_mm=1.25, time_step_s=1 / 14, sample_tolerance_mm=1e-4)
+"""Settings of the rod core on the ladder and in the environments: longer elements, two time steps a control period,
 and forces that are exact to a micronewton; docs/environment.md states the accuracy that they keep."""
 _FOLDER = Path(__file__).parent / "ladder"
 

@@ -189,7 +189,7 @@ def stick_slip(*, friction: float = 0.1) -> Pushed:
     speed, samples, start = 0.5, 120, 35.0
     path = np.pi / 2 * CURVE_RADIUS_MM + 60.0
     result = _drive(
-        lay_out(device, path_mm=path, elements=120, length_mm=path + 10),
+        lay_out(device, element_mm=0.4, length_mm=path + 10),
         tube(axis, radius, spacing_mm=0.15),
         np.tile([speed, 0.0], (samples, 1)),
         entry_mm=-5.0,
@@ -216,7 +216,7 @@ def push_against_a_plate(*, friction: float, tip_bend_deg: float) -> Pushed:
     device = replace(read_device("workhorse-014"), tip_bend_rad=float(np.deg2rad(tip_bend_deg)), tip_bend_length_mm=3.0)
     start, speed, samples = PLATE_GAP_MM - 0.3, 0.1, 60
     result = _drive(
-        lay_out(device, path_mm=15.0, elements=60, length_mm=20.0),
+        lay_out(device, element_mm=0.15, length_mm=20.0),
         _chamber(PLATE_GAP_MM + device.tip_radius_mm, 6.0),
         np.tile([speed, 0.0], (samples, 1)),
         entry_mm=0.0,
