@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import model_validator
 
 from endopilot import _core
@@ -89,5 +90,5 @@ PRESETS: Mapping[Preset, SimulatorConfig] = MappingProxyType(
 
 
 def wall_stiffness(config: SimulatorConfig, push_limit_n: float) -> float:
-    """Return the stiffness of the wall at a node, N/mm, for a device of some push limit."""
-    return config.wall_stiffness_n_mm or push_limit_n / _DENT_MM
+    """Return the stiffness of the wall at a node, N/mm, for a device of some push limit; without one, 2 N."""
+    return config.wall_stiffness_n_mm or (push_limit_n if push_limit_n < np.inf else 2.0) / _DENT_MM

@@ -34,7 +34,7 @@ def run_core(
     lanes: int = LANES,
     approach: bool = True,
     free_behind_mm: float = FREE_BEHIND_MM,
-    push_limit_n: float = 2.0,
+    push_limit_n: float = np.inf,
     pull_limit_n: float = np.inf,
     torque_limit_n_mm: float = np.inf,
 ) -> dict[str, np.ndarray]:
@@ -60,7 +60,8 @@ def run_core(
         torque_limit_n_mm: torque at which it slips, N·mm.
 
     Returns:
-        The arrays of `Rollout` that need no centerline, and `reason`: 0 fine, 1 not finite, 2 not converged.
+        The arrays of `Rollout` that need no centerline; `reason`: 0 fine, 1 not finite, 2 not converged; `contacts`: the
+        force of the wall at each node and on the element behind it at the end, N.
     """
     with gpu_errors(config.processor):
         simulation = core_for(config.processor).Simulation(
@@ -97,7 +98,7 @@ def run_core(
             lanes=lanes,
             progress=advance,
         )
-    return {**result, "reason": simulation.reason().astype(int)}
+    return {**result, "reason": simulation.reason().astype(int), "contacts": simulation.contacts()}
 
 
 def insertion_arguments(insertion: Insertion) -> dict[str, np.ndarray]:

@@ -66,8 +66,8 @@ def rod_in_tube(
     samples: int,
     guided: bool,
     lumen: _core.Lumen,
-) -> tuple[Float[np.ndarray, "n 3"], RodLayout, Float[np.ndarray, "n"]]:
-    """Press on the tip of a rod on the bottom of a horizontal tube; return its nodes, the rod and the nodes' weight, N.
+) -> tuple[Float[np.ndarray, "n 3"], RodLayout, Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+    """Press on the tip of a rod in a horizontal tube; return its nodes, the rod, their weight and the wall's force, N.
 
     Args:
         load: dead axial load on the tip in units of LOAD_N.
@@ -99,7 +99,7 @@ def rod_in_tube(
     bottom = Insertion(position=np.array([0.0, 0.0, -CLEARANCE_MM]), direction=np.array([1.0, 0.0, 0.0]))
     config = SimulatorConfig(time_step_s=0.5, tolerance_mm=1e-7, wall_stiffness_n_mm=WALL_N_MM, threads=1)
     result = equilibrium(rod, loading, samples=samples, lumen=lumen, insertion=bottom, config=config)
-    return result["shape"][-1][:elements], rod, weight
+    return result["shape"][-1][:elements], rod, weight, result["contacts"][:elements]
 
 
 def along_tube(elements: int) -> Float[np.ndarray, "n"]:
@@ -125,7 +125,7 @@ def sinusoidal_buckling() -> list[Case]:
     side = share * np.column_stack([pattern, 0 * pattern])
     stiffness = []
     for load in 2 * SINUSOIDAL_SHARES:
-        shape, _, _ = rod_in_tube(load, side, drag=1e-12, samples=3, guided=True, lumen=lumen)
+        shape, *_ = rod_in_tube(load, side, drag=1e-12, samples=3, guided=True, lumen=lumen)
         stiffness.append(share * WEIGHT_N_MM * (pattern**2).sum() / (pattern * shape[:, 1]).sum())
     value = extrapolate_to_zero(np.array(stiffness), 2 * SINUSOIDAL_SHARES)
     line = np.array([1.85, 2.0])
@@ -157,7 +157,7 @@ def helix(load: float, lumen: _core.Lumen) -> tuple[float, float]:
     elements = 300
     phase = WAVE_NUMBER_MM * np.sqrt(load / 2) * along_tube(elements)
     side = 0.1 * np.column_stack([np.sin(phase), -np.cos(phase)])
-    shape, rod, weight = rod_in_tube(load, side, drag=7.5e-6, samples=300, guided=False, lumen=lumen)
+    shape, rod, weight, wall = rod_in_tube(load, side, drag=7.5e-6, samples=300, guided=False, lumen=lumen)
     angle = np.unwrap(np.arctan2(shape[:, 1], -shape[:, 2]))
     first, last = elements // 4, 3 * elements // 4
     turns = int(abs(angle[last] - angle[first]) / (2 * np.pi))
@@ -172,8 +172,7 @@ def helix(load: float, lumen: _core.Lumen) -> tuple[float, float]:
     lifting = weight / size * (shape[:, 2] + CLEARANCE_MM)
     shortening = load * LOAD_N * (1 - np.abs(step[:, 0]) / size)
     energy = bending[first - 1 : last - 1].mean() + lifting[middle].mean() - shortening[middle].mean()
-    depth = np.hypot(shape[middle, 1], shape[middle, 2]) - CLEARANCE_MM
-    force = WALL_N_MM * depth.mean() / size
+    force = wall[middle].mean() / size
     return float(energy / (WEIGHT_N_MM * CLEARANCE_MM)), float(force / WEIGHT_N_MM)
 
 
