@@ -1,4 +1,5 @@
 // Lanes: one arithmetic type that carries one world (double) or several worlds side by side (vectors of doubles).
+// Each has a twin in single precision, Single<V>, for what needs the accuracy of a preconditioner only.
 //
 // All formulas of the core are written once, templated on the lane type V. Operations are element-wise, so what one
 // lane computes never depends on its neighbours; decisions are masks, taken by select().
@@ -6,7 +7,7 @@
 
 #include <cmath>
 #include <cstdint>
-#ifdef __AVX512F__
+#ifdef __AVX__
 #include <immintrin.h>
 #endif
 
@@ -27,6 +28,14 @@ struct LaneTraits;
 template <>
 struct LaneTraits<double> {
     static constexpr int width = 1;
+    using Scalar = double;
+    using Mask = bool;
+    using Single = float;
+};
+template <>
+struct LaneTraits<float> {
+    static constexpr int width = 1;
+    using Scalar = float;
     using Mask = bool;
 };
 
@@ -35,16 +44,36 @@ typedef double double4 __attribute__((vector_size(32)));
 typedef double double8 __attribute__((vector_size(64)));
 typedef std::int64_t mask4 __attribute__((vector_size(32)));
 typedef std::int64_t mask8 __attribute__((vector_size(64)));
+typedef float float4 __attribute__((vector_size(16)));
+typedef float float8 __attribute__((vector_size(32)));
+typedef std::int32_t single_mask4 __attribute__((vector_size(16)));
+typedef std::int32_t single_mask8 __attribute__((vector_size(32)));
 
 template <>
 struct LaneTraits<double4> {
     static constexpr int width = 4;
+    using Scalar = double;
     using Mask = mask4;
+    using Single = float4;
 };
 template <>
 struct LaneTraits<double8> {
     static constexpr int width = 8;
+    using Scalar = double;
     using Mask = mask8;
+    using Single = float8;
+};
+template <>
+struct LaneTraits<float4> {
+    static constexpr int width = 4;
+    using Scalar = float;
+    using Mask = single_mask4;
+};
+template <>
+struct LaneTraits<float8> {
+    static constexpr int width = 8;
+    using Scalar = float;
+    using Mask = single_mask8;
 };
 
 // What suits the processor that this is compiled for.
@@ -59,6 +88,8 @@ template <class V>
 inline constexpr int kWidth = LaneTraits<V>::width;
 template <class V>
 using Mask = typename LaneTraits<V>::Mask;
+template <class V>
+using Single = typename LaneTraits<V>::Single;
 
 template <class V>
 ENDOPILOT_DEVICE inline double get(const V& v, int lane) {
@@ -97,7 +128,46 @@ ENDOPILOT_DEVICE inline bool any(const Mask<V>& mask) {
 
 template <class V>
 ENDOPILOT_DEVICE inline V broadcast(double value) {
-    return V{} + value;
+    return V{} + typename LaneTraits<V>::Scalar(value);
+}
+
+// Rounds to single precision. Compilers make several instructions of __builtin_convertvector where there is one.
+template <class V>
+ENDOPILOT_DEVICE inline Single<V> narrow(const V& v) {
+    if constexpr (kWidth<V> == 1) {
+        return float(v);
+#ifdef __AVX512F__
+    } else if constexpr (kWidth<V> == 8) {
+        return Single<V>(_mm512_maskz_cvtpd_ps(0xff, __m512d(v)));
+#endif
+#ifdef __AVX__
+    } else if constexpr (kWidth<V> == 4) {
+        return Single<V>(_mm256_cvtpd_ps(__m256d(v)));
+#endif
+    } else {
+#ifndef __CUDACC__
+        return __builtin_convertvector(v, Single<V>);
+#endif
+    }
+}
+
+template <class V>
+ENDOPILOT_DEVICE inline V widen(const Single<V>& v) {
+    if constexpr (kWidth<V> == 1) {
+        return double(v);
+#ifdef __AVX512F__
+    } else if constexpr (kWidth<V> == 8) {
+        return V(_mm512_maskz_cvtps_pd(0xff, __m256(v)));
+#endif
+#ifdef __AVX__
+    } else if constexpr (kWidth<V> == 4) {
+        return V(_mm256_cvtps_pd(__m128(v)));
+#endif
+    } else {
+#ifndef __CUDACC__
+        return __builtin_convertvector(v, V);
+#endif
+    }
 }
 
 template <class V>
@@ -159,6 +229,16 @@ ENDOPILOT_DEVICE inline Vec3<V> select(Mask<V> mask, const Vec3<V>& yes, const V
     return {select<V>(mask, yes.x, no.x), select<V>(mask, yes.y, no.y), select<V>(mask, yes.z, no.z)};
 }
 
+template <class V>
+ENDOPILOT_DEVICE inline Vec3<Single<V>> narrow(const Vec3<V>& a) {
+    return {narrow(a.x), narrow(a.y), narrow(a.z)};
+}
+
+template <class V>
+ENDOPILOT_DEVICE inline Vec3<V> widen(const Vec3<Single<V>>& a) {
+    return {widen<V>(a.x), widen<V>(a.y), widen<V>(a.z)};
+}
+
 // Symmetric 3×3 matrix.
 template <class V>
 struct Sym3 {
@@ -166,9 +246,14 @@ struct Sym3 {
     ENDOPILOT_DEVICE friend Sym3 operator*(const V& s, const Sym3& m) {
         return {s * m.xx, s * m.yy, s * m.zz, s * m.xy, s * m.xz, s * m.yz};
     }
-    ENDOPILOT_DEVICE Sym3& operator+=(const Sym3& m) {
-        return *this = {xx + m.xx, yy + m.yy, zz + m.zz, xy + m.xy, xz + m.xz, yz + m.yz};
+    ENDOPILOT_DEVICE friend Sym3 operator+(const Sym3& a, const Sym3& b) {
+        return {a.xx + b.xx, a.yy + b.yy, a.zz + b.zz, a.xy + b.xy, a.xz + b.xz, a.yz + b.yz};
     }
+    ENDOPILOT_DEVICE friend Sym3 operator-(const Sym3& a, const Sym3& b) {
+        return {a.xx - b.xx, a.yy - b.yy, a.zz - b.zz, a.xy - b.xy, a.xz - b.xz, a.yz - b.yz};
+    }
+    ENDOPILOT_DEVICE Sym3& operator+=(const Sym3& m) { return *this = *this + m; }
+    ENDOPILOT_DEVICE Sym3& operator-=(const Sym3& m) { return *this = *this - m; }
 };
 
 template <class V>

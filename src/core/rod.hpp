@@ -11,6 +11,11 @@
 //
 // Unknowns of a block are (x_i, theta_i): the displacement of node i in world axes and the rotation vector of
 // element i in its own axes.
+//
+// Gradients are in double precision: they decide when a step has converged. Hessians are in single precision: they only
+// give the direction. Element i sees nothing but theta_i and u_i = x_i - x_{i+1}, so its Hessian is kept for these.
+// Elimination in (u_i, theta_i) then never takes the difference of two stiff numbers, which a wire that is stiff along its axis
+// and held by next to nothing would not survive in single precision.
 #pragma once
 
 #include "views.hpp"
@@ -54,137 +59,138 @@ RodModel view(const Rod& rod, const Place& place) {
             .spin_drag = place(rod.spin_drag)};
 }
 
-// One block row of the system: gradient and the block's own, lower triangular, Hessian.
+// One block row of the system: gradient, and the lower triangular Hessian of all but element i.
 // Order of the six unknowns: x, y, z, theta1, theta2, theta3.
 template <class V>
 struct Diagonal {
     Vec3<V> gradient_x;       // dE/dx, N: the negative of the force on the node
     Vec3<V> gradient_theta;   // dE/dtheta, N mm: the negative of the moment on the element
-    Sym3<V> xx;
-    V tx[3][3];               // rows theta, columns x
-    Sym3<V> tt;
+    Sym3<Single<V>> xx;
+    Single<V> tx[3][3];       // rows theta, columns x
+    Sym3<Single<V>> tt;
 };
 
-// Coupling of block i (rows) to block i + 1 (columns); its upper right 3×3 part is always zero.
+// What joins block i to block i + 1: the Hessian of element i in u = x_i - x_{i+1} and theta_i, and of joint i + 1 in
+// theta_i (rows) and theta_{i+1} (columns).
 template <class V>
-struct Coupling {
-    Sym3<V> xx;       // d2E / dx_i dx_{i+1}
-    V tx[3][3];       // d2E / dtheta_i dx_{i+1}
-    V tt[3][3];       // d2E / dtheta_i dtheta_{i+1}
+struct Link {
+    Sym3<Single<V>> uu;
+    Single<V> tu[3][3];
+    Single<V> tt[3][3];
 };
 
-// Adds element i to its own block `own`; sets its part of the next block `next` and of the coupling. `geometric` is 1 for
+// Adds element i to its own block `own`; begins the next block `next` and the link with its part. `geometric` is 1 for
 // the full Hessian and 0 for its Gauss-Newton part. Returns the energy.
 template <class V>
-ENDOPILOT_DEVICE inline V add_element(const RodModel& rod, int i, const V& geometric, const Vec3<V>& near_tip, const Vec3<V>& near_base,
-                     const Frame<V>& R, Diagonal<V>& own, Diagonal<V>& next, Coupling<V>& coupling) {
-    const double l = rod.length[i], a = rod.shear[i], c = rod.stretch[i];
-    const Vec3<V> e = broadcast<V>(1.0 / l) * (near_tip - near_base);
-    const Vec3<V> y{dot(R.d1, e), dot(R.d2, e), dot(R.d3, e)};
-    const Vec3<V> n{a * y.x, a * y.y, c * (y.z - 1.0)};
-    const V energy = 0.5 * l * (n.x * y.x + n.y * y.y + n.z * (y.z - 1.0));
+ENDOPILOT_DEVICE inline V add_element(const RodModel& rod, int i, const Single<V>& geometric, const Vec3<V>& near_tip,
+                                      const Vec3<V>& near_base, const Frame<V>& R, Diagonal<V>& own, Diagonal<V>& next, Link<V>& link) {
+    using S = Single<V>;
+    const double length = rod.length[i], shear = rod.shear[i], stretch = rod.stretch[i];
+    const Vec3<V> e = broadcast<V>(1.0 / length) * (near_tip - near_base);
+    const Vec3<V> strain{dot(R.d1, e), dot(R.d2, e), dot(R.d3, e)};
+    const Vec3<V> force{shear * strain.x, shear * strain.y, stretch * (strain.z - 1.0)};
+    const V energy = 0.5 * length * (force.x * strain.x + force.y * strain.y + force.z * (strain.z - 1.0));
 
-    const Vec3<V> gradient = n.x * R.d1 + n.y * R.d2 + n.z * R.d3;
+    const Vec3<V> gradient = force.x * R.d1 + force.y * R.d2 + force.z * R.d3;
     own.gradient_x += gradient;
     next.gradient_x = {-gradient.x, -gradient.y, -gradient.z};
-    own.gradient_theta += broadcast<V>(l) * cross(n, y);
+    own.gradient_theta += broadcast<V>(length) * cross(force, strain);
 
-    const double isotropic = a / l, axial = (c - a) / l;
-    const Vec3<V>& t = R.d3;
-    const Sym3<V> k{isotropic + axial * t.x * t.x, isotropic + axial * t.y * t.y, isotropic + axial * t.z * t.z,
-                    axial * t.x * t.y,             axial * t.x * t.z,             axial * t.y * t.z};
-    own.xx = {own.xx.xx + k.xx, own.xx.yy + k.yy, own.xx.zz + k.zz, own.xx.xy + k.xy, own.xx.xz + k.xz, own.xx.yz + k.yz};
-    next.xx = k;
-    coupling.xx = {-k.xx, -k.yy, -k.zz, -k.xy, -k.xz, -k.yz};
+    const float l = float(length), a = float(shear), c = float(stretch);
+    const Vec3<S> y = narrow(strain), n = narrow(force), d1 = narrow(R.d1), d2 = narrow(R.d2), t = narrow(R.d3);
+    const float isotropic = a / l, axial = (c - a) / l;
+    const Vec3<S> at = broadcast<S>(axial) * t;
+    link.uu = {isotropic + at.x * t.x, isotropic + at.y * t.y, isotropic + at.z * t.z, at.x * t.y, at.x * t.z, at.y * t.z};
+    next.xx = {S{}, S{}, S{}, S{}, S{}, S{}};
 
-    // d2E/dtheta dx = (geometric [n]x - [y]x S) R^T
-    const Vec3<V> p = geometric * n;
-    const V m[3][3] = {{V{}, a * y.z - p.z, p.y - c * y.y}, {p.z - a * y.z, V{}, c * y.x - p.x}, {a * y.y - p.y, p.x - a * y.x, V{}}};
+    // d2E/dtheta du = (geometric [n]x - [y]x S) R^T
+    const Vec3<S> p = geometric * n;
+    const Vec3<S> ay = broadcast<S>(a) * y;
+    const S zx = ay.z - p.z, yz = p.y - c * y.y, xz = c * y.x - p.x, yx = ay.y - p.y, xy = p.x - ay.x;
+    const Vec3<S> row[3] = {zx * d2 + yz * t, xz * t - zx * d1, yx * d1 + xy * d2};
     for (int r = 0; r < 3; ++r) {
-        const Vec3<V> row = m[r][0] * R.d1 + m[r][1] * R.d2 + m[r][2] * R.d3;
-        own.tx[r][0] = own.tx[r][0] + row.x;
-        own.tx[r][1] = own.tx[r][1] + row.y;
-        own.tx[r][2] = own.tx[r][2] + row.z;
-        coupling.tx[r][0] = -row.x;
-        coupling.tx[r][1] = -row.y;
-        coupling.tx[r][2] = -row.z;
-        next.tx[r][0] = next.tx[r][1] = next.tx[r][2] = V{};
+        link.tu[r][0] = row[r].x;
+        link.tu[r][1] = row[r].y;
+        link.tu[r][2] = row[r].z;
+        next.tx[r][0] = next.tx[r][1] = next.tx[r][2] = S{};
     }
 
     // d2E/dtheta2 = l [y]x^T S [y]x + geometric l ((n y^T + y n^T)/2 - n.y)
-    const V along = dot(p, y);
-    own.tt.xx += l * (a * y.z * y.z + c * y.y * y.y + p.x * y.x - along);
-    own.tt.yy += l * (a * y.z * y.z + c * y.x * y.x + p.y * y.y - along);
-    own.tt.zz += l * (a * (y.x * y.x + y.y * y.y) + p.z * y.z - along);
-    own.tt.xy += l * (0.5 * (p.x * y.y + p.y * y.x) - c * y.x * y.y);
-    own.tt.xz += l * (0.5 * (p.x * y.z + p.z * y.x) - a * y.x * y.z);
-    own.tt.yz += l * (0.5 * (p.y * y.z + p.z * y.y) - a * y.y * y.z);
+    const S along = dot(p, y), zz = ay.z * y.z - along;
+    const Vec3<S> cy = broadcast<S>(c) * y;
+    own.tt.xx += l * (zz + cy.y * y.y + p.x * y.x);
+    own.tt.yy += l * (zz + cy.x * y.x + p.y * y.y);
+    own.tt.zz += l * (ay.x * y.x + ay.y * y.y + p.z * y.z - along);
+    own.tt.xy += l * (0.5f * (p.x * y.y + p.y * y.x) - cy.x * y.y);
+    own.tt.xz += l * (0.5f * (p.x * y.z + p.z * y.x) - ay.x * y.z);
+    own.tt.yz += l * (0.5f * (p.y * y.z + p.z * y.y) - ay.y * y.z);
     return energy;
 }
 
 // The same for the joint between element `joint - 1` (block `own`) and element `joint` (block `next`). `share` (0 to 1) is how
-// much of its length is free to bend; the rest is held straight. Returns the energy.
+// much of its length is free to bend, and the rest is held straight; `inverse_share` is 1 / share. Returns the energy.
 template <class V>
-ENDOPILOT_DEVICE inline V add_joint(const RodModel& rod, int joint, const V& geometric, const V& share, const Quaternion<V>& distal,
-                   const Quaternion<V>& proximal, Diagonal<V>& own, Diagonal<V>& next, Coupling<V>& coupling) {
+ENDOPILOT_DEVICE inline V add_joint(const RodModel& rod, int joint, const Single<V>& geometric, const V& share, const V& inverse_share,
+                                    const Quaternion<V>& distal, const Quaternion<V>& proximal, Diagonal<V>& own, Diagonal<V>& next,
+                                    Link<V>& link) {
+    using S = Single<V>;
     const double L = rod.joint_length[joint];
-    const V eb = rod.bend[joint] / share, et = rod.twist[joint] / share;
+    const V bend = rod.bend[joint] * inverse_share, twist = rod.twist[joint] * inverse_share;
     const Vec3<double>& rest = rod.rest[joint];
-    const Quaternion<V> p = relative(proximal, distal);
-    const Vec3<V>& v = p.v;
-    const V& w = p.w;
-    const V u = dot(v, v);
+    const Quaternion<V> turned = relative(proximal, distal);
+    const Vec3<V>& between = turned.v;
+    const V u = dot(between, between);
     // asin(s)/s = 1 + u/6 + 3u²/40 + 5u³/112 + 35u⁴/1152, u = s², and its derivative with respect to u
-    const V g = 1.0 + u * (1.0 / 6 + u * (3.0 / 40 + u * (5.0 / 112 + u * (35.0 / 1152))));
-    const V dg = 1.0 / 6 + u * (3.0 / 20 + u * (15.0 / 112 + u * (35.0 / 288)));
-    const V scale = (2.0 / L) * g;
-    const Vec3<V> bent{scale * v.x - share * rest.x, scale * v.y - share * rest.y, scale * v.z - share * rest.z};
-    const Vec3<V> n{eb * bent.x, eb * bent.y, et * bent.z};
-    const V energy = 0.5 * L * dot(n, bent);
+    const V series = 1.0 + u * (1.0 / 6 + u * (3.0 / 40 + u * (5.0 / 112 + u * (35.0 / 1152))));
+    const V slope = 1.0 / 6 + u * (3.0 / 20 + u * (15.0 / 112 + u * (35.0 / 288)));
+    const V scale = (2.0 / L) * series;
+    const Vec3<V> bent{scale * between.x - share * rest.x, scale * between.y - share * rest.y, scale * between.z - share * rest.z};
+    const Vec3<V> moment{bend * bent.x, bend * bent.y, twist * bent.z};
+    const V energy = 0.5 * L * dot(moment, bent);
 
-    // h = dE/dv; a rotation b of the distal and a of the proximal element give dv = (w (b - a) + v × (b + a)) / 2
-    const Vec3<V> h = (2.0 * g) * n + (4.0 * dg * dot(v, n)) * v;
-    const V half = broadcast<V>(0.5);
-    const Vec3<V> turn = half * cross(h, v), push = (0.5 * w) * h;
+    // dE/dv; a rotation b of the distal and a of the proximal element give dv = (w (b - a) + v × (b + a)) / 2
+    const Vec3<V> gradient = (2.0 * series) * moment + (4.0 * slope * dot(between, moment)) * between;
+    const Vec3<V> turn = broadcast<V>(0.5) * cross(gradient, between), push = (0.5 * turned.w) * gradient;
     own.gradient_theta += push + turn;
     next.gradient_theta = turn - push;
 
     // Gauss-Newton: L K^T B K with K = (g/L) (±w + [v]x)
-    const V sb = (g * g) * (eb / L), st = (g * g) * (et / L);
-    const V ww = w * w, xx = v.x * v.x, yy = v.y * v.y, zz = v.z * v.z;
-    const V curl = geometric * dot(h, v);
-    const V quarter = 0.25 * curl;
+    const S g = narrow(series), w = narrow(turned.w);
+    const Vec3<S> v = narrow(between), h = narrow(gradient);
+    const S gg = g * g * float(1.0 / L), sb = gg * narrow(bend), st = gg * narrow(twist);
+    const S ww = w * w, xx = v.x * v.x, yy = v.y * v.y, zz = v.z * v.z;
+    const S quarter = 0.25f * geometric * dot(h, v);
     // With columns c1 = (±w, vz, -vy), c2 = (-vz, ±w, vx), c3 = (vy, -vx, ±w); only the sign of w differs.
-    const V dxx = sb * (ww + zz) + st * yy - quarter;
-    const V dyy = sb * (ww + zz) + st * xx - quarter;
-    const V dzz = sb * (yy + xx) + st * ww - quarter;
-    const V even_xy = -st * v.x * v.y, even_xz = -sb * v.x * v.z, even_yz = -sb * v.y * v.z;
-    const V odd_xz = (sb - st) * w * v.y, odd_yz = (st - sb) * w * v.x;
+    const S dxx = sb * (ww + zz) + st * yy - quarter;
+    const S dyy = sb * (ww + zz) + st * xx - quarter;
+    const S dzz = sb * (yy + xx) + st * ww - quarter;
+    const S even_xy = -st * v.x * v.y, even_xz = -sb * v.x * v.z, even_yz = -sb * v.y * v.z;
+    const S odd = (sb - st) * w, odd_xz = odd * v.y, odd_yz = odd * v.x;
     own.tt.xx += dxx;
     own.tt.yy += dyy;
     own.tt.zz += dzz;
     own.tt.xy += even_xy;
     own.tt.xz += even_xz + odd_xz;
-    own.tt.yz += even_yz + odd_yz;
-    next.tt = {dxx, dyy, dzz, even_xy, even_xz - odd_xz, even_yz - odd_yz};
+    own.tt.yz += even_yz - odd_yz;
+    next.tt = {dxx, dyy, dzz, even_xy, even_xz - odd_xz, even_yz + odd_yz};
 
     // Rows b (distal), columns a (proximal): Gauss-Newton, then ((h v^T + v h^T) - h.v - w [h]x) / 4
-    const Vec3<V> q = (0.25 * geometric) * h;
-    const Vec3<V> z = w * q;
-    const V swap = (sb + st) * w;
-    coupling.tt[0][0] = sb * (zz - ww) + st * yy + 2.0 * q.x * v.x - quarter;
-    coupling.tt[1][1] = sb * (zz - ww) + st * xx + 2.0 * q.y * v.y - quarter;
-    coupling.tt[2][2] = sb * (xx + yy) - st * ww + 2.0 * q.z * v.z - quarter;
-    const V sym_xy = even_xy + q.x * v.y + q.y * v.x;
-    const V sym_xz = even_xz + q.x * v.z + q.z * v.x;
-    const V sym_yz = even_yz + q.y * v.z + q.z * v.y;
-    const V twice = 2.0 * sb * w * v.z;
-    coupling.tt[0][1] = sym_xy - twice + z.z;
-    coupling.tt[1][0] = sym_xy + twice - z.z;
-    coupling.tt[0][2] = sym_xz + swap * v.y - z.y;
-    coupling.tt[2][0] = sym_xz - swap * v.y + z.y;
-    coupling.tt[1][2] = sym_yz - swap * v.x + z.x;
-    coupling.tt[2][1] = sym_yz + swap * v.x - z.x;
+    const Vec3<S> q = (0.25f * geometric) * h;
+    const Vec3<S> z = w * q;
+    const S swap = (sb + st) * w;
+    link.tt[0][0] = sb * (zz - ww) + st * yy + 2.0f * q.x * v.x - quarter;
+    link.tt[1][1] = sb * (zz - ww) + st * xx + 2.0f * q.y * v.y - quarter;
+    link.tt[2][2] = sb * (xx + yy) - st * ww + 2.0f * q.z * v.z - quarter;
+    const S sym_xy = even_xy + q.x * v.y + q.y * v.x;
+    const S sym_xz = even_xz + q.x * v.z + q.z * v.x;
+    const S sym_yz = even_yz + q.y * v.z + q.z * v.y;
+    const S odd_xy = 2.0f * sb * w * v.z - z.z, swap_xz = swap * v.y - z.y, swap_yz = swap * v.x - z.x;
+    link.tt[0][1] = sym_xy - odd_xy;
+    link.tt[1][0] = sym_xy + odd_xy;
+    link.tt[0][2] = sym_xz + swap_xz;
+    link.tt[2][0] = sym_xz - swap_xz;
+    link.tt[1][2] = sym_yz - swap_yz;
+    link.tt[2][1] = sym_yz + swap_yz;
     return energy;
 }
 

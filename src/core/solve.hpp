@@ -16,50 +16,73 @@ template <int Begin, int End, class F>
     }
 }
 
-// What back substitution needs of one block row. D = L diag(pivot) L^T with a unit lower triangular L; for the coupling
-// C to the next block, w = diag(pivot)^-1 L^-1 C (the upper right 3×3 part of C is zero and so is that of w) and
-// z = -diag(pivot)^-1 L^-1 gradient.
+// What back substitution needs of one block row, with u = x_i - x_{i+1} for x_i. D = L diag(pivot) L^T with a unit lower
+// triangular L; for the coupling C to the next block, w = diag(pivot)^-1 L^-1 C (the upper right 3×3 part of C is zero and so
+// is that of w) and z = -diag(pivot)^-1 L^-1 gradient.
 template <class V>
 struct Factor {
-    V lower[15];     // rows 1 to 5 of L
-    V wx[6][3];
-    V wt[3][3];
-    V z[6];
+    Single<V> lower[15];     // rows 1 to 5 of L
+    Single<V> wx[6][3];
+    Single<V> wt[3][3];
+    Single<V> z[6];
+};
+
+// What the elimination of a block adds to the next: gradient and lower triangular Hessian.
+template <class V>
+struct Carried {
+    Vec3<Single<V>> gradient_x, gradient_theta;
+    Sym3<Single<V>> xx;
+    Single<V> tx[3][3];
+    Sym3<Single<V>> tt;
 };
 
 // A block is positive definite if its smallest pivot is positive; `descent` is its share of gradient · Hessian^-1 gradient.
 template <class V>
 struct Elimination {
-    V smallest_pivot, descent;
+    Single<V> smallest_pivot, descent;
 };
 
-// Factors block `own` and eliminates it from block `next`, row by row: work on the coupling hides the latency of the
-// division by the row's pivot.
+// Factors a block, to which `carried` was carried, row by row: work on the coupling hides the latency of the division by the
+// row's pivot. `carried` becomes what goes to the next block.
+//
+// As x_i = u + x_{i+1}, what holds node i (A, all but the element) and its gradient also appear as coupling of u to x_{i+1} and at the next
+// block: with the element's stiffness k, k - k (A + k)^-1 k becomes A - A (A + k)^-1 A, which keeps a small A.
 template <class V>
-[[gnu::always_inline]] ENDOPILOT_DEVICE inline Elimination<V> eliminate(const Diagonal<V>& own, const Coupling<V>& coupling,
-                                                                         Factor<V>& f, Diagonal<V>& next) {
-    const V d[6][6] = {{own.xx.xx},
-                       {own.xx.xy, own.xx.yy},
-                       {own.xx.xz, own.xx.yz, own.xx.zz},
-                       {own.tx[0][0], own.tx[0][1], own.tx[0][2], own.tt.xx},
-                       {own.tx[1][0], own.tx[1][1], own.tx[1][2], own.tt.xy, own.tt.yy},
-                       {own.tx[2][0], own.tx[2][1], own.tx[2][2], own.tt.xz, own.tt.yz, own.tt.zz}};
-    const V cx[6][3] = {{coupling.xx.xx, coupling.xx.xy, coupling.xx.xz},
-                        {coupling.xx.xy, coupling.xx.yy, coupling.xx.yz},
-                        {coupling.xx.xz, coupling.xx.yz, coupling.xx.zz},
-                        {coupling.tx[0][0], coupling.tx[0][1], coupling.tx[0][2]},
-                        {coupling.tx[1][0], coupling.tx[1][1], coupling.tx[1][2]},
-                        {coupling.tx[2][0], coupling.tx[2][1], coupling.tx[2][2]}};
-    const V g[6] = {own.gradient_x.x,     own.gradient_x.y,     own.gradient_x.z,
-                    own.gradient_theta.x, own.gradient_theta.y, own.gradient_theta.z};
-    V lower[6][6], inverse[6], x[6][3], t[6][3], z[6], smallest = d[0][0];
+[[gnu::always_inline]] ENDOPILOT_DEVICE inline Elimination<V> eliminate(const Diagonal<V>& own, const Link<V>& link, Carried<V>& carried,
+                                                                         Factor<V>& f) {
+    using S = Single<V>;
+    const Sym3<S> xx = own.xx + carried.xx, tt = own.tt + carried.tt, uu = xx + link.uu;
+    const Vec3<S> gx = narrow(own.gradient_x) + carried.gradient_x, gt = narrow(own.gradient_theta) + carried.gradient_theta;
+    S tx[3][3], tu[3][3];
+    unroll<0, 3>([&](auto r_) {
+        constexpr int r = decltype(r_)::value;
+        unroll<0, 3>([&](auto c_) {
+            constexpr int c = decltype(c_)::value;
+            tx[r][c] = own.tx[r][c] + carried.tx[r][c];
+            tu[r][c] = tx[r][c] + link.tu[r][c];
+        });
+    });
+    const S d[6][6] = {{uu.xx},
+                       {uu.xy, uu.yy},
+                       {uu.xz, uu.yz, uu.zz},
+                       {tu[0][0], tu[0][1], tu[0][2], tt.xx},
+                       {tu[1][0], tu[1][1], tu[1][2], tt.xy, tt.yy},
+                       {tu[2][0], tu[2][1], tu[2][2], tt.xz, tt.yz, tt.zz}};
+    const S cx[6][3] = {{xx.xx, xx.xy, xx.xz},
+                        {xx.xy, xx.yy, xx.yz},
+                        {xx.xz, xx.yz, xx.zz},
+                        {tx[0][0], tx[0][1], tx[0][2]},
+                        {tx[1][0], tx[1][1], tx[1][2]},
+                        {tx[2][0], tx[2][1], tx[2][2]}};
+    const S g[6] = {gx.x, gx.y, gx.z, gt.x, gt.y, gt.z};
+    S lower[6][6], inverse[6], x[6][3], t[6][3], z[6], smallest = d[0][0];
     unroll<0, 6>([&](auto r_) {
         constexpr int r = decltype(r_)::value;
-        V scaled[6];  // row r of L diag(pivot)
-        V pivot = d[r][r];
+        S scaled[6];  // row r of L diag(pivot)
+        S pivot = d[r][r];
         unroll<0, r>([&](auto c_) {
             constexpr int c = decltype(c_)::value;
-            V s = d[r][c];
+            S s = d[r][c];
             unroll<0, c>([&](auto k_) {
                 constexpr int k = decltype(k_)::value;
                 s -= scaled[k] * lower[c][k];
@@ -70,17 +93,17 @@ template <class V>
             pivot -= s * lower[r][c];
         });
         smallest = pivot < smallest ? pivot : smallest;
-        inverse[r] = 1.0 / pivot;
+        inverse[r] = 1.0f / pivot;
         unroll<0, 3>([&](auto c_) {
             constexpr int c = decltype(c_)::value;
-            V s = cx[r][c];
+            S s = cx[r][c];
             unroll<0, r>([&](auto k_) {
                 constexpr int k = decltype(k_)::value;
                 s -= lower[r][k] * x[k][c];
             });
             x[r][c] = s;
             if constexpr (r >= 3) {
-                V u = coupling.tt[r - 3][c];
+                S u = link.tt[r - 3][c];
                 unroll<3, r>([&](auto k_) {
                     constexpr int k = decltype(k_)::value;
                     u -= lower[r][k] * t[k][c];
@@ -88,7 +111,7 @@ template <class V>
                 t[r][c] = u;
             }
         });
-        V s = -g[r];
+        S s = -g[r];
         unroll<0, r>([&](auto k_) {
             constexpr int k = decltype(k_)::value;
             s -= lower[r][k] * z[k];
@@ -104,59 +127,49 @@ template <class V>
         });
         f.z[r] = inverse[r] * z[r];
     });
-    const auto xx = [&](auto a_, auto b_) {
+    const auto xwx = [&](auto a_, auto b_) {
         constexpr int a = decltype(a_)::value, b = decltype(b_)::value;
-        V s = x[0][a] * f.wx[0][b];
+        S s = x[0][a] * f.wx[0][b];
         unroll<1, 6>([&](auto k_) {
             constexpr int k = decltype(k_)::value;
             s += x[k][a] * f.wx[k][b];
         });
         return s;
     };
-    const auto tt = [&](int a, int b) { return t[3][a] * f.wt[0][b] + t[4][a] * f.wt[1][b] + t[5][a] * f.wt[2][b]; };
-    const auto xz = [&](auto a_) {
+    const auto twt = [&](int a, int b) { return t[3][a] * f.wt[0][b] + t[4][a] * f.wt[1][b] + t[5][a] * f.wt[2][b]; };
+    const auto zwx = [&](auto a_) {
         constexpr int a = decltype(a_)::value;
-        V s = z[0] * f.wx[0][a];
+        S s = z[0] * f.wx[0][a];
         unroll<1, 6>([&](auto k_) {
             constexpr int k = decltype(k_)::value;
             s += z[k] * f.wx[k][a];
         });
         return s;
     };
-    const auto tz = [&](int a) { return z[3] * f.wt[0][a] + z[4] * f.wt[1][a] + z[5] * f.wt[2][a]; };
+    const auto zwt = [&](int a) { return z[3] * f.wt[0][a] + z[4] * f.wt[1][a] + z[5] * f.wt[2][a]; };
     const std::integral_constant<int, 0> X;
     const std::integral_constant<int, 1> Y;
     const std::integral_constant<int, 2> Z;
-    next.xx.xx -= xx(X, X);
-    next.xx.yy -= xx(Y, Y);
-    next.xx.zz -= xx(Z, Z);
-    next.xx.xy -= xx(X, Y);
-    next.xx.xz -= xx(X, Z);
-    next.xx.yz -= xx(Y, Z);
-    next.tt.xx -= tt(0, 0);
-    next.tt.yy -= tt(1, 1);
-    next.tt.zz -= tt(2, 2);
-    next.tt.xy -= tt(0, 1);
-    next.tt.xz -= tt(0, 2);
-    next.tt.yz -= tt(1, 2);
+    carried.xx = xx - Sym3<S>{xwx(X, X), xwx(Y, Y), xwx(Z, Z), xwx(X, Y), xwx(X, Z), xwx(Y, Z)};
+    carried.tt = {-twt(0, 0), -twt(1, 1), -twt(2, 2), -twt(0, 1), -twt(0, 2), -twt(1, 2)};
     unroll<0, 3>([&](auto r_) {
         constexpr int r = decltype(r_)::value;
         unroll<0, 3>([&](auto c_) {
             constexpr int c = decltype(c_)::value;
-            next.tx[r][c] -= t[3][r] * f.wx[3][c] + t[4][r] * f.wx[4][c] + t[5][r] * f.wx[5][c];
+            carried.tx[r][c] = -(t[3][r] * f.wx[3][c] + t[4][r] * f.wx[4][c] + t[5][r] * f.wx[5][c]);
         });
     });
-    next.gradient_x += Vec3<V>{xz(X), xz(Y), xz(Z)};
-    next.gradient_theta += Vec3<V>{tz(0), tz(1), tz(2)};
-    V descent = z[0] * f.z[0];
+    carried.gradient_x = gx + Vec3<S>{zwx(X), zwx(Y), zwx(Z)};
+    carried.gradient_theta = {zwt(0), zwt(1), zwt(2)};
+    S descent = z[0] * f.z[0];
     for (int r = 1; r < 6; ++r) descent += z[r] * f.z[r];
     return {smallest, descent};
 }
 
 // Solves for this block's unknowns, given those of the next one towards the base.
 template <class V>
-[[gnu::always_inline]] ENDOPILOT_DEVICE inline void substitute(const Factor<V>& f, Vec3<V>& x, Vec3<V>& t) {
-    V s[6];
+[[gnu::always_inline]] ENDOPILOT_DEVICE inline void substitute(const Factor<V>& f, Vec3<Single<V>>& x, Vec3<Single<V>>& t) {
+    Single<V> s[6];
     unroll<0, 6>([&](auto r_) {
         constexpr int r = decltype(r_)::value;
         s[r] = f.z[r] - f.wx[r][0] * x.x - f.wx[r][1] * x.y - f.wx[r][2] * x.z;
@@ -169,7 +182,7 @@ template <class V>
             s[c] -= f.lower[k * (k - 1) / 2 + c] * s[k];
         });
     });
-    x = {s[0], s[1], s[2]};
+    x += Vec3<Single<V>>{s[0], s[1], s[2]};
     t = {s[3], s[4], s[5]};
 }
 

@@ -69,6 +69,7 @@ public:
 
 private:
     static constexpr int W = kWidth<V>;
+    using S = Single<V>;
     enum class Decision { idle, accept, shorten, repeat, converged, restart };
 
     // The drive's end of the wire: advance (mm) and rotation (rad).
@@ -129,16 +130,17 @@ private:
     Factor<V>* const factor_;
     static constexpr int kTogether = 8;  // nodes that each part of the evaluation takes at a time
     Diagonal<V> block_[kTogether + 1];
-    Coupling<V> coupling_[kTogether];
+    Link<V> link_[kTogether];
+    Carried<V> carried_;   // to the node that is eliminated next
     Lane lane_[W];
     // For each lane: settings of the step, then results of a sweep.
-    V active_{}, share_{}, geometric_{}, inverse_dt_{}, eps_{}, first_{}, damping_{}, friction_{}, tangent_{};
+    V active_{}, share_{}, inverse_dt_{}, eps_{}, first_{}, damping_{}, friction_{};
+    S geometric_{}, tangent_{};
     V jump_scale_x_{}, jump_scale_theta_{};
     V energy_{}, descent_{}, pivot_{}, jump_{}, base_force_{}, base_torque_{};
     Mask<V> accepted_{};           // the last trial was accepted
     V hit_{};                      // share of the last move at which it first hits a wall that was free; 1: it hits none
     V rise_{};                     // slope of the energy along the last move, at its end
-    Vec3<V> eliminated_x_{}, eliminated_theta_{};   // gradient that has been eliminated into block_[0]
     DriveBlock drive_{};           // of the wire's energy, all nodes eliminated
     V drive_a_{}, drive_r_{};      // the drive's Newton step
 
@@ -198,16 +200,15 @@ private:
     ENDOPILOT_LARGE void evaluate(int n);
     ENDOPILOT_LARGE void add_rod(int first, int count);
     ENDOPILOT_DEVICE bool is_base(int i) const;
-    ENDOPILOT_DEVICE DriveBlock drive_block(const Diagonal<V>& block) const;
-    ENDOPILOT_DEVICE void clear_drive_entries(Mask<V> mask, Diagonal<V>& block) const;
+    ENDOPILOT_DEVICE DriveBlock drive_block(const Carried<V>& carried) const;
     ENDOPILOT_DEVICE static bool near_wall(const ContactPoint<V>& point, const Vec3<V>& x, double radius, Mask<V> on);
-    ENDOPILOT_LARGE void add_contact(ContactPoint<V>& point, const Vec3<V>& x, const Vec3<V>& moved, const Quaternion<V>& turned,
+    ENDOPILOT_LARGE bool add_contact(ContactPoint<V>& point, const Vec3<V>& x, const Vec3<V>& moved, const Quaternion<V>& turned,
                                      double radius, Mask<V> on, Diagonal<V>& block);
-    ENDOPILOT_LARGE void add_lumen(int first, int count);
-    ENDOPILOT_LARGE void add_drag(int first, int count);
-    ENDOPILOT_DEVICE void add_rise(int first, int count);
+    ENDOPILOT_LARGE void add_surroundings(int first, int count);
+    ENDOPILOT_DEVICE void add_lumen(int k, int i, const Vec3<V>& moved, const Quaternion<V>& turned);
+    ENDOPILOT_DEVICE void add_drag(int i, const Vec3<V>& moved, const Quaternion<V>& turned, Diagonal<V>& own);
     ENDOPILOT_LARGE void eliminate_nodes(int first, int count);
-    ENDOPILOT_DEVICE V add_loads(int i, const Node<V>& node, Diagonal<V>& own) const;
+    ENDOPILOT_DEVICE V add_loads(int i, const Node<V>& node, const Quaternion<V>& turned, Diagonal<V>& own) const;
     ENDOPILOT_LARGE V solve(int n);
     ENDOPILOT_LARGE void update(int n, const Decision (&decision)[W], const V& factor);
     ENDOPILOT_DEVICE void freeze(ContactPoint<V>& point, const Vec3<V>& step, const Vec3<V>& axis, double radius, Mask<V> on,

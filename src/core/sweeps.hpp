@@ -7,33 +7,30 @@
 namespace endopilot {
 
 template <class V>
-V Stepper<V>::add_loads(int i, const Node<V>& node, Diagonal<V>& own) const {
+V Stepper<V>::add_loads(int i, const Node<V>& node, const Quaternion<V>& turned, Diagonal<V>& own) const {
     const Vec3<double>&f = loads_->force[i], &m = loads_->moment[i], &k = loads_->spring[i], &a = loads_->anchor[i];
     const Vec3<V> off{node.x.x - a.x, node.x.y - a.y, node.x.z - a.z};
     own.gradient_x += Vec3<V>{k.x * off.x - f.x, k.y * off.y - f.y, k.z * off.z - f.z};
-    own.xx.xx += k.x;
-    own.xx.yy += k.y;
-    own.xx.zz += k.z;
+    own.xx.xx += float(k.x);
+    own.xx.yy += float(k.y);
+    own.xx.zz += float(k.z);
     V energy = 0.5 * (k.x * off.x * off.x + k.y * off.y * off.y + k.z * off.z * off.z);
     energy -= f.x * node.x.x + f.y * node.x.y + f.z * node.x.z;
     // A moment's potential is its work since the start of the step: exact once the rod has come to rest.
-    const Quaternion<V> p = relative(node.start_q, node.q);
     const Vec3<V> b{broadcast<V>(m.x), broadcast<V>(m.y), broadcast<V>(m.z)};
-    energy -= 2.0 * dot(b, p.v);
-    own.gradient_theta -= p.w * b + cross(b, p.v);
-    const V bent = 0.5 * dot(b, p.v);
+    const V along = dot(b, turned.v);
+    energy -= 2.0 * along;
+    own.gradient_theta -= turned.w * b + cross(b, turned.v);
+    const double h = loads_->hold[i];
+    const S bent = narrow(0.5 * along + h);
     own.tt.xx += bent;
     own.tt.yy += bent;
     own.tt.zz += bent;
-    const double h = loads_->hold[i];
     const Quaternion<double>& c = loads_->attitude[i];
     const Quaternion<V> attitude{broadcast<V>(c.w), {broadcast<V>(c.v.x), broadcast<V>(c.v.y), broadcast<V>(c.v.z)}};
     const Quaternion<V> r = relative(attitude, node.q);
     energy += 2.0 * h * dot(r.v, r.v);
     own.gradient_theta += (2.0 * h * r.w) * r.v;
-    own.tt.xx += h;
-    own.tt.yy += h;
-    own.tt.zz += h;
     return energy;
 }
 
@@ -42,15 +39,13 @@ V Stepper<V>::add_loads(int i, const Node<V>& node, Diagonal<V>& own) const {
 template <class V>
 void Stepper<V>::evaluate(int n) {
     energy_ = descent_ = jump_ = rise_ = V{};
-    eliminated_x_ = eliminated_theta_ = {V{}, V{}, V{}};
     pivot_ = hit_ = broadcast<V>(1.0);
     block_[0] = Diagonal<V>{};
+    carried_ = Carried<V>{};
     for (int first = 0; first < n; first += kTogether) {
         const int count = std::min(int{kTogether}, n - first);
         add_rod(first, count);
-        if (lumen_) add_lumen(first, count);
-        add_drag(first, count);
-        add_rise(first, count);
+        add_surroundings(first, count);
         eliminate_nodes(first, count);
         block_[0] = block_[count];
     }
@@ -66,15 +61,17 @@ void Stepper<V>::add_rod(int first, int count) {
         Diagonal<V>&own = block_[k], &next = block_[k + 1];
         const bool at_base = is_base(i + 1);
         const Mask<V> last = active_ == broadcast<V>(i + 1);
-        V energy = add_element(rod_, i, geometric_, node.x, behind.x, frame(node.q), own, next, coupling_[k]);
-        const V share = at_base ? select<V>(last, share_, broadcast<V>(1.0)) : broadcast<V>(1.0);
-        energy += add_joint(rod_, i + 1, geometric_, share, node.q, behind.q, own, next, coupling_[k]);
+        V energy = add_element(rod_, i, geometric_, node.x, behind.x, frame(node.q), own, next, link_[k]);
+        const V one = broadcast<V>(1.0), share = at_base ? select<V>(last, share_, one) : one;
+        const V inverse_share = at_base ? one / share : one;
+        energy += add_joint(rod_, i + 1, geometric_, share, inverse_share, node.q, behind.q, own, next, link_[k]);
         energy_ += select<V>(active_ > broadcast<V>(i), energy, V{});
         if (!at_base) continue;
         const Vec3<V>& force = next.gradient_x;  // its component along the axis is the force that the base must exert
         base_force_ = select<V>(last, axis.x * force.x + axis.y * force.y + axis.z * force.z, base_force_);
         base_torque_ = select<V>(last, next.gradient_theta.z, base_torque_);
-        drive_ = select(last, drive_block(next), drive_);
+        // the element's stiffness for the drive comes with what is carried to the base
+        drive_ = select(last, {base_force_, base_torque_, V{}, V{}, widen<V>(next.tt.zz)}, drive_);
     }
 }
 
@@ -86,17 +83,17 @@ bool Stepper<V>::is_base(int i) const {
     return any;
 }
 
-// A block's gradient and Hessian with respect to the drive's advance and rotation, if its node follows the drive.
+// The gradient and Hessian with respect to the drive's advance and rotation that the nodes ahead carry to one that follows the drive.
 template <class V>
-typename Stepper<V>::DriveBlock Stepper<V>::drive_block(const Diagonal<V>& block) const {
+typename Stepper<V>::DriveBlock Stepper<V>::drive_block(const Carried<V>& carried) const {
     const Vec3<double> d = frame(base_.orientation).d3;
-    const Vec3<V> axis{broadcast<V>(d.x), broadcast<V>(d.y), broadcast<V>(d.z)};
-    const Vec3<V> across{block.tx[2][0], block.tx[2][1], block.tx[2][2]};
-    return {.gradient_a = dot(axis, block.gradient_x),
-            .gradient_r = block.gradient_theta.z,
-            .aa = dot(axis, block.xx * axis),
-            .ar = dot(axis, across),
-            .rr = block.tt.zz};
+    const Vec3<S> axis{broadcast<S>(d.x), broadcast<S>(d.y), broadcast<S>(d.z)};
+    const Vec3<S> across{carried.tx[2][0], carried.tx[2][1], carried.tx[2][2]};
+    return {.gradient_a = widen<V>(dot(axis, carried.gradient_x)),
+            .gradient_r = widen<V>(carried.gradient_theta.z),
+            .aa = widen<V>(dot(axis, carried.xx * axis)),
+            .ar = widen<V>(dot(axis, across)),
+            .rr = widen<V>(carried.tt.zz)};
 }
 
 // Whether any lane's contact point may be within reach of the wall, going by how far it has moved since the wall was evaluated.
@@ -109,13 +106,15 @@ bool Stepper<V>::near_wall(const ContactPoint<V>& point, const Vec3<V>& x, doubl
 }
 
 // The wall's reaction and friction at one contact point of the lanes in `on`: at x, moved by `moved` since the step's start.
+// Returns whether anything was added to `block`.
 template <class V>
-void Stepper<V>::add_contact(ContactPoint<V>& point, const Vec3<V>& x, const Vec3<V>& moved, const Quaternion<V>& turned, double radius,
+bool Stepper<V>::add_contact(ContactPoint<V>& point, const Vec3<V>& x, const Vec3<V>& moved, const Quaternion<V>& turned, double radius,
                              Mask<V> on, Diagonal<V>& block) {
     const V zero{};
     point.last_gap = select<V>(accepted_, point.gap, point.last_gap);
     point.gap = broadcast<V>(kStickyReach);
-    if (near_wall(point, x, radius, on)) {
+    const bool near = near_wall(point, x, radius, on), rubs = any<V>(on & ~(point.friction.limit <= zero));  // a NaN goes on
+    if (near) {
         Distance<V> d = distance_to_wall(*lumen_, x);
         point.gap = minimum<V>(d.value - radius, point.gap);
         const Mask<V> hits = on & (point.last_gap > zero) & (point.gap < zero);
@@ -129,108 +128,85 @@ void Stepper<V>::add_contact(ContactPoint<V>& point, const Vec3<V>& x, const Vec
     } else {
         point.wall = {broadcast<V>(Lumen::kDeep), {zero, zero, zero}};
     }
-    if (any<V>(on & ~(point.friction.limit <= zero)))  // a NaN goes on
-        energy_ += select<V>(on, add_friction(point.friction, eps_, tangent_, moved, turned, block), zero);
+    if (rubs) energy_ += select<V>(on, add_friction(point.friction, eps_, tangent_, moved, turned, block), zero);
+    return near || rubs;
 }
 
-// Contact at nodes and at the middles of elements. The middle of the element that joins the base touches nothing.
+// What acts on `count` nodes from `first` on from outside; the slope of the energy along the last move.
 template <class V>
-void Stepper<V>::add_lumen(int first, int count) {
-    const V half = broadcast<V>(0.5);
-    for (int k = 0; k < count; ++k) {
-        const int i = first + k;
-        Node<V>& node = node_[i];
-        const Node<V>& behind = node_[i + 1];
-        const Vec3<V> moved = node.x - node.start;
-        const Quaternion<V> turned = relative(node.start_q, node.q);
-        add_contact(node.at_node, node.x + node.at_node.offset, moved, turned, rod_.radius[i], active_ > broadcast<V>(i), block_[k]);
-        Diagonal<V> middle{};
-        add_contact(node.at_middle, half * (node.x + behind.x) + node.at_middle.offset, half * (moved + (behind.x - behind.start)),
-                    turned, rod_.radius[i], active_ > broadcast<V>(i + 1), middle);
-        add_middle(middle, block_[k], block_[k + 1], coupling_[k]);
-    }
-}
-
-// Drag, damping and loads; how far the nodes have moved in the step.
-template <class V>
-void Stepper<V>::add_drag(int first, int count) {
+void Stepper<V>::add_surroundings(int first, int count) {
     for (int k = 0; k < count; ++k) {
         const int i = first + k;
         const Node<V>& node = node_[i];
-        Diagonal<V>& own = block_[k];
-        const Mask<V> on = active_ > broadcast<V>(i);
         const Vec3<V> moved = node.x - node.start;
-        const Quaternion<V> turned_by = relative(node.start_q, node.q);
-        const V moved2 = dot(moved, moved), turned2 = dot(turned_by.v, turned_by.v);
-        jump_ = select<V>(on, maximum<V>(jump_, maximum<V>(jump_scale_x_ * moved2, jump_scale_theta_ * turned2)), jump_);
-        const V drag = rod_.drag[i] * inverse_dt_, spin_drag = rod_.spin_drag[i] * inverse_dt_;
-        V energy = 0.5 * drag * moved2 + 2.0 * spin_drag * turned2;
-        if (loads_) energy += add_loads(i, node, own);
-        energy_ += select<V>(on, energy, V{});
-        const V stiffen = drag + damping_, spin_stiffen = spin_drag + damping_;
-        own.gradient_x += drag * moved;
-        own.gradient_theta += (2.0 * spin_drag * turned_by.w) * turned_by.v;
-        own.xx.xx += stiffen;
-        own.xx.yy += stiffen;
-        own.xx.zz += stiffen;
-        own.tt.xx += spin_stiffen;
-        own.tt.yy += spin_stiffen;
-        own.tt.zz += spin_stiffen;
+        const Quaternion<V> turned = relative(node.start_q, node.q);
+        Diagonal<V>& own = block_[k];
+        if (lumen_) add_lumen(k, i, moved, turned);
+        add_drag(i, moved, turned, own);
+        const V rise = dot(own.gradient_x, node.step) + dot(own.gradient_theta, node.turn);
+        rise_ += select<V>(active_ > broadcast<V>(i), rise, V{});
     }
 }
 
-// The slope of the energy along the last move. The first block also holds what was eliminated into it.
+// Contact at node i, the group's k-th, and at the middle of the element behind it. The middle of the element that joins the base touches nothing.
 template <class V>
-void Stepper<V>::add_rise(int first, int count) {
-    for (int k = 0; k < count; ++k) {
-        const Node<V>& node = node_[first + k];
-        const Vec3<V> x = k == 0 ? block_[0].gradient_x - eliminated_x_ : block_[k].gradient_x;
-        const Vec3<V> theta = k == 0 ? block_[0].gradient_theta - eliminated_theta_ : block_[k].gradient_theta;
-        rise_ += select<V>(active_ > broadcast<V>(first + k), dot(x, node.step) + dot(theta, node.turn), V{});
-    }
+void Stepper<V>::add_lumen(int k, int i, const Vec3<V>& moved, const Quaternion<V>& turned) {
+    const V half = broadcast<V>(0.5);
+    Node<V>& node = node_[i];
+    const Node<V>& behind = node_[i + 1];
+    add_contact(node.at_node, node.x + node.at_node.offset, moved, turned, rod_.radius[i], active_ > broadcast<V>(i), block_[k]);
+    Diagonal<V> middle{};
+    const bool touches = add_contact(node.at_middle, half * (node.x + behind.x) + node.at_middle.offset, half * (moved + (behind.x - behind.start)),
+                                     turned, rod_.radius[i], active_ > broadcast<V>(i + 1), middle);
+    if (touches) add_middle(middle, block_[k], block_[k + 1], link_[k]);
 }
 
-// Clears what `drive_block` reads of the base's block before the nodes ahead are eliminated into it. Its own energy was
-// counted before, and elements behind it are there only for the longer wires of other lanes.
+// Drag, damping and loads of node i; how far it has moved in the step.
 template <class V>
-void Stepper<V>::clear_drive_entries(Mask<V> mask, Diagonal<V>& block) const {
-    const V zero{};
-    for (V* entry : {&block.gradient_x.x, &block.gradient_x.y, &block.gradient_x.z, &block.gradient_theta.z, &block.xx.xx,
-                     &block.xx.yy, &block.xx.zz, &block.xx.xy, &block.xx.xz, &block.xx.yz, &block.tx[2][0], &block.tx[2][1], &block.tx[2][2], &block.tt.zz})
-        *entry = select<V>(mask, zero, *entry);
+void Stepper<V>::add_drag(int i, const Vec3<V>& moved, const Quaternion<V>& turned, Diagonal<V>& own) {
+    const Mask<V> on = active_ > broadcast<V>(i);
+    const V moved2 = dot(moved, moved), turned2 = dot(turned.v, turned.v);
+    jump_ = select<V>(on, maximum<V>(jump_, maximum<V>(jump_scale_x_ * moved2, jump_scale_theta_ * turned2)), jump_);
+    const V drag = rod_.drag[i] * inverse_dt_, spin_drag = rod_.spin_drag[i] * inverse_dt_;
+    V energy = 0.5 * drag * moved2 + 2.0 * spin_drag * turned2;
+    if (loads_) energy += add_loads(i, node_[i], turned, own);
+    energy_ += select<V>(on, energy, V{});
+    own.gradient_x += drag * moved;
+    own.gradient_theta += (2.0 * spin_drag * turned.w) * turned.v;
+    const S stiffen = narrow(drag + damping_), spin_stiffen = narrow(spin_drag + damping_);
+    own.xx.xx += stiffen;
+    own.xx.yy += stiffen;
+    own.xx.zz += stiffen;
+    own.tt.xx += spin_stiffen;
+    own.tt.yy += spin_stiffen;
+    own.tt.zz += spin_stiffen;
 }
 
 template <class V>
 void Stepper<V>::eliminate_nodes(int first, int count) {
     const V zero{};
-    const Vec3<V> last_x = block_[count].gradient_x, last_theta = block_[count].gradient_theta;
     for (int k = 0; k < count; ++k) {
         const int i = first + k;
         const Mask<V> on = active_ > broadcast<V>(i);
-        Diagonal<V>& next = block_[k + 1];
-        const Mask<V> base_next = active_ == broadcast<V>(i + 1);
-        const bool at_base = is_base(i + 1);
-        if (at_base) clear_drive_entries(base_next, next);
-        const Elimination<V> eliminated = eliminate(block_[k], coupling_[k], factor_[i], next);
-        descent_ += select<V>(on, eliminated.descent, zero);
-        const Mask<V> sound = eliminated.smallest_pivot > zero;
+        const Elimination<V> eliminated = eliminate(block_[k], link_[k], carried_, factor_[i]);
+        descent_ += select<V>(on, widen<V>(eliminated.descent), zero);
+        const Mask<V> sound = widen<V>(eliminated.smallest_pivot) > zero;
         pivot_ = select<V>(on, select<V>(sound, pivot_, zero), pivot_);
-        if (at_base) drive_ = select(base_next, drive_ + drive_block(next), drive_);
+        if (is_base(i + 1)) drive_ = select(active_ == broadcast<V>(i + 1), drive_ + drive_block(carried_), drive_);
     }
-    eliminated_x_ = block_[count].gradient_x - last_x;
-    eliminated_theta_ = block_[count].gradient_theta - last_theta;
 }
 
 // Back substitution. Returns the largest displacement (mm) or rotation (rad) of a node; NaN where the solve failed.
 template <class V>
 V Stepper<V>::solve(int n) {
-    const V zero{};
     const Vec3<double> axis = frame(base_.orientation).d3;
-    const Vec3<V> drive_x{axis.x * drive_a_, axis.y * drive_a_, axis.z * drive_a_}, drive_t{zero, zero, drive_r_};
-    Vec3<V> x = drive_x, t = drive_t;
-    V largest = dot(x, x) + dot(t, t);  // rounded as for the nodes of a shorter wire, which follow the drive
+    const Vec3<S> drive_x = narrow(Vec3<V>{axis.x * drive_a_, axis.y * drive_a_, axis.z * drive_a_});
+    const Vec3<S> drive_t{S{}, S{}, narrow(drive_r_)};
+    const S active = narrow(active_);
+    Vec3<S> x = drive_x, t = drive_t;
+    S largest = dot(x, x) + dot(t, t);  // rounded as for the nodes of a shorter wire, which follow the drive
     for (int i = n - 1; i >= 0; --i) {
-        const Mask<V> on = active_ > broadcast<V>(i);
+        const Mask<S> on = active > broadcast<S>(i);
         substitute(factor_[i], x, t);
         x = select(on, x, drive_x);  // the base of a shorter wire follows its drive
         t = select(on, t, drive_t);
@@ -240,11 +216,11 @@ V Stepper<V>::solve(int n) {
         factor_[i].z[3] = t.x;
         factor_[i].z[4] = t.y;
         factor_[i].z[5] = t.z;
-        const V both = dot(x, x) + dot(t, t);
+        const S both = dot(x, x) + dot(t, t);
         largest = largest >= both ? largest : both;  // keeps a NaN of `both`; below, of `largest`
-        largest = select<V>(both == both, largest, both);
+        largest = select<S>(both == both, largest, both);
     }
-    return square_root(largest);
+    return square_root(widen<V>(largest));
 }
 
 // Moves each lane's trial point by its decision: by `factor` times Newton's step where that is accepted, back to
@@ -260,13 +236,14 @@ void Stepper<V>::update(int n, const Decision (&decision)[W], const V& factor) {
     for (int i = 0; i < n; ++i) {
         Node<V>& node = node_[i];
         const Mask<V> on = active_ > broadcast<V>(i);
-        const V* z = factor_[i].z;
+        const S* z = factor_[i].z;
+        const Vec3<V> step = factor * widen<V>(Vec3<S>{z[0], z[1], z[2]}), turn = factor * widen<V>(Vec3<S>{z[3], z[4], z[5]});
         const Mask<V> take = accept & on, shrink = shorten & on;
         const Mask<V> moves = take | shrink, keeps = take | (repeat & on);
         node.from = select(keeps, node.x, node.from);
         node.from_q = select(keeps, node.q, node.from_q);
-        node.step = select(take, {factor * z[0], factor * z[1], factor * z[2]}, select(shrink, factor * node.step, node.step));
-        node.turn = select(take, {factor * z[3], factor * z[4], factor * z[5]}, select(shrink, factor * node.turn, node.turn));
+        node.step = select(take, step, select(shrink, factor * node.step, node.step));
+        node.turn = select(take, turn, select(shrink, factor * node.turn, node.turn));
         node.x = select(moves, node.from + node.step, node.x);
         node.q = select(moves, rotated(node.from_q, node.turn), node.q);
     }

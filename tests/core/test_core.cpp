@@ -126,17 +126,58 @@ void test_solver() {
         }
     }
     bool positive = false;
-    const auto solution = solve_chain<V>(own, coupling, gradient, positive);
+    const auto solution = solve_chain<V>(own, coupling, gradient, positive);  // in single precision
     const std::vector<double> expected = solve_dense(dense, right);
     expect(positive, "a diagonally dominant system has positive pivots");
     for (int l = 0; l < kWidth<V>; ++l)
         for (int i = 0; i < n; ++i)
             for (int r = 0; r < 6; ++r)
-                expect_near(solution[l][i][r], (l + 1) * expected[6 * i + r], 1e-12,
+                expect_near(solution[l][i][r], (l + 1) * expected[6 * i + r], (l + 1) * 1e-6,
                             "solution in lane " + std::to_string(l) + " of " + std::to_string(kWidth<V>));
     own[n / 2][4][4] = -9.0;
     solve_chain<V>(own, coupling, gradient, positive);
     expect(!positive, "an indefinite system is told by its pivots");
+}
+
+// A chain of nodes, stiff in each of its links and held by next to nothing: single precision would not see what holds it beside the
+// links' stiffness. Under a force on each node it moves by force / held as a whole, but for the links' stretch.
+void test_stiff_chain() {
+    const int n = 40;
+    const double stiff = 1e5, held = 1e-4, force = 2e-4;
+    std::vector<Matrix> own(n), coupling(n);
+    std::vector<Vector> gradient(n);
+    for (int i = 0; i < n; ++i)
+        for (int r = 0; r < 6; ++r) {
+            own[i][r][r] = r < 3 ? held + ((i > 0) + (i + 1 < n)) * stiff : 1.0;
+            if (r < 3) coupling[i][r][r] = -stiff;
+            if (r < 3) gradient[i][r] = -force;
+        }
+    bool positive = false;
+    const auto solution = solve_chain<double>(own, coupling, gradient, positive);
+    expect(positive, "a chain held by next to nothing has positive pivots");
+    for (int i = 0; i < n; ++i)
+        for (int r = 0; r < 3; ++r) expect_near(solution[0][i][r], force / held, 1e-5, "motion of a stiff chain");
+}
+
+// The gradient of a force at the middle of two nodes goes half to each, its Hessian in quarters; rotations are the first block's.
+void test_middle() {
+    const auto f = [] { return float(uniform(-1, 1)); };
+    const auto s = [&] { return Sym3<float>{f(), f(), f(), f(), f(), f()}; };
+    const Diagonal<double> middle{{f(), f(), f()}, {f(), f(), f()}, s(), {{f(), f(), f()}, {f(), f(), f()}, {f(), f(), f()}}, s()};
+    const Vector gradient = gradient_of(middle);
+    const Matrix hessian = hessian_of(middle);
+    const Pair pair = middle_of(middle);
+    for (int a = 0; a < 6; ++a) {
+        const double of_a = a < 3 ? 0.5 : 1.0;
+        expect_near(pair.gradient[0][a], of_a * gradient[a], 1e-15, "gradient at the middle, first block");
+        expect_near(pair.gradient[1][a], a < 3 ? 0.5 * gradient[a] : 0.0, 1e-15, "gradient at the middle, second block");
+        for (int b = 0; b < 6; ++b) {
+            const double of_b = b < 3 ? 0.5 : 1.0;
+            expect_near(pair.own[0][a][b], of_a * of_b * hessian[a][b], 1e-6, "Hessian at the middle, first block");
+            expect_near(pair.own[1][a][b], a < 3 && b < 3 ? 0.25 * hessian[a][b] : 0.0, 1e-6, "Hessian at the middle, second block");
+            expect_near(pair.coupling[a][b], b < 3 ? 0.5 * of_a * hessian[a][b] : 0.0, 1e-6, "coupling at the middle");
+        }
+    }
 }
 
 Pose moved(const Pose& pose, int unknown, double by) {
@@ -233,7 +274,7 @@ void test_gauss_newton() {
             for (int c = 0; c < 6; ++c)
                 form += u[0][r] * gauss.own[0][r][c] * u[0][c] + u[1][r] * gauss.own[1][r][c] * u[1][c] +
                         2 * u[0][r] * gauss.coupling[r][c] * u[1][c];
-        expect(form > -1e-12, "Gauss-Newton part is positive semidefinite");
+        expect(form > -1e-4, "Gauss-Newton part is positive semidefinite");
     }
 }
 
@@ -266,7 +307,7 @@ void test_distance() {
         const Distance<V> d = distance_to_wall<V>(lumen, x);
         for (int axis = 0; axis < 3; ++axis) {
             const Distance<V> up = value(axis, h), down = value(axis, -h);
-            const Vec3<V> columns[3] = {{d.hessian.xx, d.hessian.xy, d.hessian.xz}, {d.hessian.xy, d.hessian.yy, d.hessian.yz}, {d.hessian.xz, d.hessian.yz, d.hessian.zz}};
+            const Vec3<Single<V>> columns[3] = {{d.hessian.xx, d.hessian.xy, d.hessian.xz}, {d.hessian.xy, d.hessian.yy, d.hessian.yz}, {d.hessian.xz, d.hessian.yz, d.hessian.zz}};
             for (int l = 0; l < kWidth<V>; ++l) {
                 const Vec3<double> slope = lane_of(d.gradient, l), column = lane_of(columns[axis], l);
                 const double s[3] = {slope.x, slope.y, slope.z};
@@ -276,9 +317,9 @@ void test_distance() {
                 const double place = places[axis] / kSpacing + 0.5;
                 if (std::abs(place - std::round(place)) < 4 * h) continue;
                 const Vec3<double> change = (1 / (2 * h)) * (lane_of(up.gradient, l) - lane_of(down.gradient, l));
-                expect_near(column.x, change.x, 1e-8, "curve of the distance");
-                expect_near(column.y, change.y, 1e-8, "curve of the distance");
-                expect_near(column.z, change.z, 1e-8, "curve of the distance");
+                expect_near(column.x, change.x, 1e-6, "curve of the distance");
+                expect_near(column.y, change.y, 1e-6, "curve of the distance");
+                expect_near(column.z, change.z, 1e-6, "curve of the distance");
             }
         }
     }
@@ -330,7 +371,7 @@ void test_wall() {
     for (int trial = 0; trial < 400; ++trial) {
         const Pose poses[2] = {{{uniform(-1.5, 7), uniform(-3.5, 4), uniform(-2.5, 2.5)}, {1, {0, 0, 0}}}, {}};
         const auto energy = [&](const Vec3<double>& x) { return wall_energy(lumen, stiffness, radius, x).energy; };
-        const Single exact = wall_energy(lumen, stiffness, radius, poses[0].x);
+        const Block exact = wall_energy(lumen, stiffness, radius, poses[0].x);
         const double depth = radius - distance_to_wall<double>(lumen, poses[0].x).value;
         expect_near(exact.energy, depth > 0 ? 0.5 * stiffness * depth * depth : 0.0, 1e-12, "energy of the wall");
         (depth > 0 ? touching : clear)++;
@@ -341,7 +382,7 @@ void test_wall() {
             expect_near(exact.gradient[a], (energy(up) - energy(down)) / (2 * h), 1e-7, "gradient of the wall");
             const double cell = place[a] / kSpacing + 0.5;
             if (std::abs(cell - std::round(cell)) < 1e-3) continue;
-            const Single above = wall_energy(lumen, stiffness, radius, up), below = wall_energy(lumen, stiffness, radius, down);
+            const Block above = wall_energy(lumen, stiffness, radius, up), below = wall_energy(lumen, stiffness, radius, down);
             for (int b = 0; b < 3; ++b)
                 expect_near(exact.hessian[a][b], (above.gradient[b] - below.gradient[b]) / (2 * h), 1e-6, "Hessian of the wall");
         }
@@ -360,19 +401,19 @@ void test_friction() {
         const Vec3<double> start{0.1, -0.2, 0.3};
         const Pose now{start + Vec3<double>{uniform(-.1, .1), uniform(-.1, .1), uniform(-.1, .1)},
                        rotated(start_q, {uniform(-.1, .1), uniform(-.1, .1), uniform(-.3, .3)})};
-        const Single exact = friction_energy(friction, eps, start, start_q, now);
+        const Block exact = friction_energy(friction, eps, start, start_q, now);
         const double force = std::hypot(exact.gradient[0], exact.gradient[1], exact.gradient[2]);
         expect(force <= limit * (1 + 1e-12), "friction is at most its limit");
         expect_near(exact.gradient[0] * n.x + exact.gradient[1] * n.y + exact.gradient[2] * n.z, 0, 1e-14, "friction acts along the wall");
         const double h = 1e-5;
         for (int a = 0; a < 6; ++a) {
-            const Single up = friction_energy(friction, eps, start, start_q, moved(now, a, h));
-            const Single down = friction_energy(friction, eps, start, start_q, moved(now, a, -h));
+            const Block up = friction_energy(friction, eps, start, start_q, moved(now, a, h));
+            const Block down = friction_energy(friction, eps, start, start_q, moved(now, a, -h));
             expect_near(exact.gradient[a], (up.energy - down.energy) / (2 * h), 1e-7, "gradient of friction");
             for (int b = 0; b < 3; ++b)  // the rows of rotations leave out the second derivative of the turn
                 expect_near(exact.hessian[a][b], (up.gradient[b] - down.gradient[b]) / (2 * h), 1e-5, "Hessian of friction");
         }
-        const Single secant = friction_energy(friction, eps, start, start_q, now, 0.0);
+        const Block secant = friction_energy(friction, eps, start, start_q, now, 0.0);
         expect(secant.energy == exact.energy && secant.gradient == exact.gradient, "the secant changes the Hessian alone");
         double harder = 0;  // v · (secant - tangent) v, for the step that the slip has made
         const Vec3<double> made = now.x - start;
@@ -380,7 +421,7 @@ void test_friction() {
         for (int a = 0; a < 6; ++a)
             for (int b = 0; b < 6; ++b) harder += v[a] * (secant.hessian[a][b] - exact.hessian[a][b]) * v[b];
         expect(harder > 0, "friction's secant is harder than its tangent");
-        const Single still = friction_energy(friction, eps, start, start_q, {start, start_q});
+        const Block still = friction_energy(friction, eps, start, start_q, {start, start_q});
         expect_near(still.energy, 0, 1e-16, "friction at rest holds no energy");
     }
 }
@@ -464,6 +505,8 @@ int main() {
     test_wall();
     test_friction();
     test_projection();
+    test_stiff_chain();
+    test_middle();
     std::printf(failures == 0 ? "all core tests passed\n" : "%d core checks failed\n", failures);
     return failures == 0 ? EXIT_SUCCESS : EXIT_FAILURE;
 }
