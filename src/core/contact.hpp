@@ -30,12 +30,21 @@ template <class V>
         c[0] = __builtin_shufflevector(low01, low23, 0, 1, 4, 5);
         c[1] = __builtin_shufflevector(low01, low23, 2, 3, 6, 7);
         c[2] = __builtin_shufflevector(high01, high23, 0, 1, 4, 5);
-    } else if constexpr (kWidth<V> == 8) {
-        const float* const half[2][4] = {{from[0], from[1], from[2], from[3]}, {from[4], from[5], from[6], from[7]}};
-        float4 low[3], high[3];
-        gather<double4>(half[0], offset, low);
-        gather<double4>(half[1], offset, high);
-        for (int i = 0; i < 3; ++i) c[i] = __builtin_shufflevector(low[i], high[i], 0, 1, 2, 3, 4, 5, 6, 7);
+    } else if constexpr (kWidth<V> == 8) {  // the same in both halves of a vector
+        float8 row[4];
+        for (int lane = 0; lane < 4; ++lane) {
+            float4 low, high;
+            std::memcpy(&low, from[lane] + offset, sizeof(float4));
+            std::memcpy(&high, from[lane + 4] + offset, sizeof(float4));
+            row[lane] = __builtin_shufflevector(low, high, 0, 1, 2, 3, 4, 5, 6, 7);
+        }
+        const float8 low01 = __builtin_shufflevector(row[0], row[1], 0, 8, 1, 9, 4, 12, 5, 13);
+        const float8 low23 = __builtin_shufflevector(row[2], row[3], 0, 8, 1, 9, 4, 12, 5, 13);
+        const float8 high01 = __builtin_shufflevector(row[0], row[1], 2, 10, 3, 11, 6, 14, 7, 15);
+        const float8 high23 = __builtin_shufflevector(row[2], row[3], 2, 10, 3, 11, 6, 14, 7, 15);
+        c[0] = __builtin_shufflevector(low01, low23, 0, 1, 8, 9, 4, 5, 12, 13);
+        c[1] = __builtin_shufflevector(low01, low23, 2, 3, 10, 11, 6, 7, 14, 15);
+        c[2] = __builtin_shufflevector(high01, high23, 0, 1, 8, 9, 4, 5, 12, 13);
     } else
 #endif
     {
@@ -78,7 +87,6 @@ template <class V>
     weights(t.y, wy, dy);
     weights(t.z, wz, dz);
 
-    const auto along = [](const auto (&w)[3], const auto (&v)[3]) { return w[0] * v[0] + w[1] * v[1] + w[2] * v[2]; };
     S sy[3], ey[3];   // wy and dy for the Hessian
     for (int j = 0; j < 3; ++j) {
         sy[j] = narrow(wy[j]);
@@ -88,20 +96,26 @@ template <class V>
     S fxx{}, fyy{}, fzz{}, fxy{}, fxz{}, fyz{};
     unroll<0, 3>([&](auto k_) {
         constexpr int k = decltype(k_)::value;
-        V h[3], hx[3];
-        S row[3], slope[3], curve[3];   // of which the Hessian is made: h, hx and hxx
+        V g{}, gx{}, gy{};   // contracted along x and y: the value and its slopes
+        S cxx{}, cxy{}, cyy{};
         unroll<0, 3>([&](auto j_) {
             constexpr int j = decltype(j_)::value;
             S stored[3];
             gather<V>(first, (k * Lumen::kStored + j) * Lumen::kStored, stored);
             const V c[3] = {widen<V>(stored[0]), widen<V>(stored[1]), widen<V>(stored[2])};
-            h[j] = along(wx, c);
-            hx[j] = along(dx, c);
-            row[j] = narrow(h[j]);
-            slope[j] = narrow(hx[j]);
-            curve[j] = (stored[0] + stored[2]) - 2.0f * stored[1];
+            const V h = wx[0] * c[0] + wx[1] * c[1] + wx[2] * c[2];
+            const V hx = dx[0] * c[0] + dx[1] * c[1] + dx[2] * c[2];
+            g += wy[j] * h;
+            gx += wy[j] * hx;
+            gy += dy[j] * h;
+            cxx += sy[j] * ((stored[0] + stored[2]) - 2.0f * stored[1]);
+            cxy += ey[j] * narrow(hx);
+            const S row = narrow(h);
+            if constexpr (j == 1)
+                cyy -= 2.0f * row;
+            else
+                cyy += row;
         });
-        const V g = along(wy, h), gx = along(wy, hx), gy = along(dy, h);
         f += wz[k] * g;
         fz += dz[k] * g;
         fx += wz[k] * gx;
@@ -109,9 +123,9 @@ template <class V>
         const S sz = narrow(wz[k]), ez = narrow(dz[k]), whole = narrow(g);
         fxz += ez * narrow(gx);
         fyz += ez * narrow(gy);
-        fxx += sz * along(sy, curve);
-        fxy += sz * along(ey, slope);
-        fyy += sz * ((row[0] + row[2]) - 2.0f * row[1]);
+        fxx += sz * cxx;
+        fxy += sz * cxy;
+        fyy += sz * cyy;
         if constexpr (k == 1)
             fzz -= 2.0f * whole;
         else

@@ -119,6 +119,14 @@ template <class V>
 ENDOPILOT_DEVICE inline bool any(const Mask<V>& mask) {
     if constexpr (kWidth<V> == 1) {
         return mask;
+#ifdef __AVX512F__
+    } else if constexpr (kWidth<V> == 8) {
+        return _mm512_test_epi64_mask(__m512i(mask), __m512i(mask)) != 0;
+#endif
+#ifdef __AVX__
+    } else if constexpr (kWidth<V> == 4) {
+        return _mm256_movemask_pd(__m256d(mask)) != 0;
+#endif
     } else {
         std::int64_t found = 0;
         for (int lane = 0; lane < kWidth<V>; ++lane) found |= mask[lane];

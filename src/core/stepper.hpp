@@ -131,6 +131,7 @@ private:
     static constexpr int kTogether = 8;  // nodes that each part of the evaluation takes at a time
     Diagonal<V> block_[kTogether + 1];
     Link<V> link_[kTogether];
+    Diagonal<V> middle_{};   // zero but while the middle of an element is evaluated
     Carried<V> carried_;   // to the node that is eliminated next
     Lane lane_[W];
     // For each lane: settings of the step, then results of a sweep.

@@ -118,7 +118,7 @@ bool Stepper<V>::add_contact(ContactPoint<V>& point, const Vec3<V>& x, const Vec
         Distance<V> d = distance_to_wall(*lumen_, x);
         point.gap = minimum<V>(d.value - radius, point.gap);
         const Mask<V> hits = on & (point.last_gap > zero) & (point.gap < zero);
-        hit_ = select<V>(hits, minimum<V>(hit_, point.last_gap / (point.last_gap - point.gap)), hit_);
+        if (any<V>(hits)) hit_ = select<V>(hits, minimum<V>(hit_, point.last_gap / (point.last_gap - point.gap)), hit_);
         point.evaluated = x;
         point.clearance = d.value;
         point.wall = {d.value, d.gradient};
@@ -155,10 +155,11 @@ void Stepper<V>::add_lumen(int k, int i, const Vec3<V>& moved, const Quaternion<
     Node<V>& node = node_[i];
     const Node<V>& behind = node_[i + 1];
     add_contact(node.at_node, node.x + node.at_node.offset, moved, turned, rod_.radius[i], active_ > broadcast<V>(i), block_[k]);
-    Diagonal<V> middle{};
     const bool touches = add_contact(node.at_middle, half * (node.x + behind.x) + node.at_middle.offset, half * (moved + (behind.x - behind.start)),
-                                     turned, rod_.radius[i], active_ > broadcast<V>(i + 1), middle);
-    if (touches) add_middle(middle, block_[k], block_[k + 1], link_[k]);
+                                     turned, rod_.radius[i], active_ > broadcast<V>(i + 1), middle_);
+    if (!touches) return;
+    add_middle(middle_, block_[k], block_[k + 1], link_[k]);
+    middle_ = Diagonal<V>{};
 }
 
 // Drag, damping and loads of node i; how far it has moved in the step.
