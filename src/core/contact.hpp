@@ -67,10 +67,8 @@ template <class V>
     const Vec3<V> t = u - cell;
     const float* first[W];
     bool all_deep = true;
-    for (int lane = 0; lane < W; ++lane) {
-        first[lane] = lumen.stencil(get(cell.x, lane), get(cell.y, lane), get(cell.z, lane));
-        all_deep = all_deep && lumen.deep(first[lane]);
-    }
+    lumen.stencils(cell, first);
+    for (int lane = 0; lane < W; ++lane) all_deep = all_deep && lumen.deep(first[lane]);
     if (all_deep) return {broadcast<V>(Lumen::kDeep), {V{}, V{}, V{}}, {S{}, S{}, S{}, S{}, S{}, S{}}};
 
     const auto weights = [](const V& p, V (&w)[3], V (&d)[3]) {

@@ -22,14 +22,22 @@ struct LumenArrays {
     static constexpr int kEdge = 8, kStored = kEdge + 2, kVolume = kStored * kStored * kStored;
     static constexpr double kDeep = 1e3;
 
-    // The first coefficient of the 3³ stencil around the cell with whole-numbered coordinates (x, y, z).
-    ENDOPILOT_DEVICE const float* stencil(double x, double y, double z) const {
+    // The first coefficient of the 3³ stencils around the cells with whole-numbered coordinates `cell`, for each lane.
+    template <class V>
+    ENDOPILOT_DEVICE void stencils(const Vec3<V>& cell, const float* (&first)[kWidth<V>]) const {
+        constexpr double kRound = 6755399441055744.0;   // 1.5 · 2^52: adding it rounds to whole numbers
+        const V zero{};
         // written so that a NaN counts as outside
-        const bool inside = x >= 0.0 && x < cells[0] && y >= 0.0 && y < cells[1] && z >= 0.0 && z < cells[2];
-        if (!inside) return &pool[kVolume];
-        const unsigned i = unsigned(int(x)), j = unsigned(int(y)), k = unsigned(int(z));
-        const std::size_t at = (std::size_t(k / kEdge) * bricks[1] + j / kEdge) * bricks[0] + i / kEdge;
-        return &pool[std::size_t(index[at]) * kVolume + ((k % kEdge) * kStored + j % kEdge) * kStored + i % kEdge];
+        const Mask<V> inside = (cell.x >= zero) & (cell.x < cells[0]) & (cell.y >= zero) & (cell.y < cells[1]) & (cell.z >= zero) & (cell.z < cells[2]);
+        const auto brick = [](const V& c) { return ((1.0 / kEdge) * c - (0.5 - 0.5 / kEdge) + kRound) - kRound; };
+        const Vec3<V> b{brick(cell.x), brick(cell.y), brick(cell.z)};
+        const Vec3<V> in = cell - broadcast<V>(kEdge) * b;
+        const V at = select<V>(inside, (b.z * double(bricks[1]) + b.y) * double(bricks[0]) + b.x, broadcast<V>(-1));
+        const V from = (in.z * double(kStored) + in.y) * double(kStored) + in.x;
+        for (int lane = 0; lane < kWidth<V>; ++lane) {
+            const int place = int(get(at, lane));
+            first[lane] = place < 0 ? &pool[kVolume] : &pool[std::size_t(index[place]) * kVolume + unsigned(int(get(from, lane)))];
+        }
     }
 
     ENDOPILOT_DEVICE bool deep(const float* stencil) const { return stencil < &pool[kVolume]; }
