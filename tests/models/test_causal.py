@@ -176,7 +176,7 @@ def test_a_later_x_ray_helps(packaged, everyone):
     later = early.copy()
     later[[45, 55]] = True
     without, helped = (
-        np.abs(packaged.predict(everyone, observed).tip - everyone.tip)[:, 56:70, 0].mean()
+        np.abs(packaged.predict(everyone, observed).tip - everyone.tip)[:, 46:70, 0].mean()
         for observed in (early, later)
     )
     assert helped < without

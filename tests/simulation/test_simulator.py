@@ -252,7 +252,8 @@ def test_base_load_balances_contact_friction_and_drag(anatomy: Anatomy) -> None:
     """Σ F = 0 along the catheter and Σ M = 0 about it, for the free part of the wire, in a random navigation.
 
     Forces on node i and on the middle of element i: the wall's N n; friction -µN s/√(s² + ε²), with s the displacement
-    of the touching surface in the step. On node i: drag -c dx/dt. The couple of friction and spin drag acts on element i.
+    of the touching surface in the step. On node i: drag -c dx/dt. The couple of friction and spin drag acts on element
+    i.
     """
     config = SimulatorConfig(tolerance_mm=1e-9)
     simulator = begun(Simulator(anatomy, DEVICE, worlds=5, config=config), 5)

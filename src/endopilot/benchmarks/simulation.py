@@ -146,13 +146,16 @@ def bench_scaling() -> list[dict[str, Any]]:
     """Measure how cost and memory grow with finer elements and with the number of worlds, on one thread.
 
     Returns:
-        Rows of `element_mm`, `worlds`, `seconds` (processor time of the core), `us_per_node_and_iteration` (of the nodes
-        ahead of the catheter) and `kilobytes_per_world` (growth of the process's memory; the map is shared).
+        Rows of `element_mm`, `worlds`, `seconds` (processor time of the core), `us_per_node_and_iteration` (of the
+        nodes ahead of the catheter) and `kilobytes_per_world` (growth of the process's memory; the map is shared).
     """
     anatomy, device = make_patient(AtlasConfig(), 0), read_device(DEVICE)
     depth = 0.6 * float(anatomy.tree.longest_path().abscissa[-1])
     rows = []
-    for element_mm, worlds in (*((size, 64) for size in (1.5, 0.75, 0.375, 0.1875)), *((0.75, n) for n in (1, 10, 100, 1000, 10_000))):
+    for element_mm, worlds in (
+        *((size, 64) for size in (1.5, 0.75, 0.375, 0.1875)),
+        *((0.75, n) for n in (1, 10, 100, 1000, 10_000)),
+    ):
         config = SimulatorConfig(element_mm=element_mm, threads=1)
         before = _resident_kilobytes()
         simulator = Simulator(anatomy, device, worlds=worlds, config=config)

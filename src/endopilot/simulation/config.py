@@ -44,7 +44,7 @@ class SimulatorConfig:
     """Slip velocity under which smoothed Coulomb friction falls off, mm/s; a wire at rest creeps more slowly."""
     approach_velocity_mm_s: Positive = 20.0
     """Velocity at which a wire is brought to its first inserted length before the recording, mm/s."""
-    largest_jump: Positive = 0.1
+    largest_jump: Positive = 0.3
     """Motion of a node in a time step beyond the drive's own, mm (rotations: rad), above which the step is shortened:
     a wire that snaps over is followed in steps of down to 1/64 of `time_step_s`."""
     introducer_friction_n: NonNegative = 0.05
@@ -90,5 +90,5 @@ PRESETS: Mapping[Preset, SimulatorConfig] = MappingProxyType(
 
 
 def wall_stiffness(config: SimulatorConfig, push_limit_n: float) -> float:
-    """Return the stiffness of the wall at a node, N/mm, for a device of some push limit; without one, 2 N."""
+    """Return the stiffness of the wall at a contact, N/mm, for a device of some push limit; without one, 2 N."""
     return config.wall_stiffness_n_mm or (push_limit_n if push_limit_n < np.inf else 2.0) / _DENT_MM

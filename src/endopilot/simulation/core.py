@@ -60,8 +60,8 @@ def run_core(
         torque_limit_n_mm: torque at which it slips, N·mm.
 
     Returns:
-        The arrays of `Rollout` that need no centerline; `reason`: 0 fine, 1 not finite, 2 not converged; `contacts`: the
-        force of the wall at each node and on the element behind it at the end, N.
+        The arrays of `Rollout` that need no centerline; `reason`: 0 fine, 1 not finite, 2 not converged; `contacts`:
+        the force of the wall at each node and on the element behind it at the end, N.
     """
     with gpu_errors(config.processor):
         simulation = core_for(config.processor).Simulation(
