@@ -17,7 +17,7 @@ HIDE = "import sys; sys.modules[{module!r}] = None\n"
 
 def run_without(module: str, code: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-c", HIDE.format(module=module) + code], capture_output=True, text=True, timeout=120
+        [sys.executable, "-c", HIDE.format(module=module) + code], capture_output=True, encoding="utf-8", timeout=120
     )
 
 

@@ -170,4 +170,4 @@ def test_a_reference_made_again_has_the_same_samples(small: Path, tmp_path: Path
     once, twice = read_reference(small), read_reference(again)
     assert np.array_equal(once.solution.tip_position, twice.solution.tip_position)
     assert twice.recipe["own_error"]["true_tip_error_p95_mm"] == 0 < once.recipe["own_error"]["true_tip_error_p95_mm"]
-    assert once.recipe["config"]["elements"] == 200 and once.recipe["finer"]["elements"] == 240
+    assert once.recipe["config"]["element_mm"] == CONVERGED.element_mm and once.recipe["finer"]["element_mm"] == 0.3

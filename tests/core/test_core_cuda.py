@@ -16,7 +16,7 @@ def test_the_kernel_compiles_for_a_gpu(tmp_path: Path) -> None:
     compiler = shutil.which("nvcc")
     if compiler is None:
         pytest.skip("no CUDA compiler (nvcc) here")
-    version = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=True).stdout
+    version = subprocess.run([compiler, "--version"], capture_output=True, encoding="utf-8", check=True).stdout
     if int(version.rsplit("release ", 1)[-1].split(".")[0]) < 12:
         pytest.skip("nvcc is older than 12, which knows C++20")
     made = tmp_path / "cuda.o"
@@ -24,6 +24,6 @@ def test_the_kernel_compiles_for_a_gpu(tmp_path: Path) -> None:
     options = ["-std=c++20", "-arch=sm_80", "--fmad=false", "--expt-relaxed-constexpr", "-diag-suppress", "549"]
     options += ["-Werror", "cross-execution-space-call"]
     command = [compiler, *options, "-c", str(CORE / "cuda.cu"), "-o", str(made)]
-    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    run = subprocess.run(command, capture_output=True, encoding="utf-8", check=False)
     assert run.returncode == 0, run.stdout + run.stderr
     assert b"step_kernel" in made.read_bytes()
