@@ -21,7 +21,8 @@ constexpr int kTurnabout = 10;         // iterations after which friction's tang
 constexpr int kSnapIterations = 5;   // times max_iterations that the shortest step may take: a snap takes many at any step
 constexpr double kStickyReach = 0.1;     // mm: in a step's first iteration, a wall that was touched and is this near still holds
 constexpr double kSteepest = 1.5;        // more than any slope of the spline through a distance map
-constexpr double kLeastShare = 1e-4, kMostShare = 0.7;   // of a move that raised the energy, that is tried next
+constexpr double kBackInside = 0.02;    // of a move that left the map, that is tried next
+constexpr double kLeastOfMove = 1e-4, kMostOfMove = 0.7;   // of a move that raised the energy, that is tried next
 constexpr double kMostPower = 8;         // of the share, that the energy is taken to grow with beyond its slope
 constexpr double kFirstDamping = 1e-3;   // N/mm (rotations: N mm/rad), where the Hessian is indefinite even without geometric terms
 constexpr double kMaxDamping = 1e3;
@@ -316,7 +317,7 @@ typename Stepper<V>::Decision Stepper<V>::decide(int l) {
     const double slack = 1e-11 * (std::abs(lane.energy) + 1e-3);
     if (!lane.finite || !(lane.first || energy <= lane.energy + slack)) {
         if (lane.first || ++lane.rejections > kMaxRejections) return Decision::restart;
-        lane.shorten = lane.finite ? best_share(energy, l) : kLeastShare;
+        lane.shorten = lane.finite ? best_share(energy, l) : kBackInside;
         set_mask<V>(accepted_, l, false);
         lane.scale *= lane.shorten;
         return Decision::shorten;
@@ -361,7 +362,7 @@ double Stepper<V>::best_share(double energy, int l) const {
     const double sliding = std::pow(slope / (power * excess), 1 / (power - 1));
     const double free = get(hit_, l), rest = 1 - free;
     const double head_on = rest > 0 ? free + rest * rest * slope / (2 * excess) : 0.0;
-    return std::clamp(std::max(sliding, head_on), double{kLeastShare}, double{kMostShare});
+    return std::clamp(std::max(sliding, head_on), double{kLeastOfMove}, double{kMostOfMove});
 }
 
 // Ends the steps that converged, restarts those that failed with half the step. Returns the samples that ended.
