@@ -40,7 +40,17 @@ template <>
 struct LaneTraits<Counted> {
     static constexpr int width = 1;
     using Mask = bool;
+    using Single = Counted;
+    using Scalar = double;
 };
+template <>
+inline Counted narrow<Counted>(const Counted& v) {
+    return v;
+}
+template <>
+inline Counted widen<Counted>(const Counted& v) {
+    return v;
+}
 template <>
 inline double get(const Counted& v, int) {
     return v.value;
@@ -68,9 +78,10 @@ struct Sweeps {
     Quaternion<V> q[kNodes + 1];
     Distance<V> distance[kNodes];
     Diagonal<V> diagonal[kNodes + 1];
-    Coupling<V> coupling[kNodes];
+    Link<V> link[kNodes];
     Factor<V> factor[kNodes];
     V one = broadcast<V>(1.0), sink = broadcast<V>(0.0);
+    Single<V> full = narrow(one);
 
     explicit Sweeps(const Lumen& l) : lumen(l) {
         const auto fill = [](double v) { return std::vector<double>(kNodes + 2, v); };
@@ -95,8 +106,8 @@ struct Sweeps {
     void elements() {
         Diagonal<V> own{}, next;
         for (int i = 0; i < kNodes; ++i) {
-            sink += add_element<V>(rod, i, one, x[i], x[i + 1], frame(q[i]), own, next, coupling[i]);
-            sink += add_joint<V>(rod, i + 1, one, one, q[i], q[i + 1], own, next, coupling[i]);
+            sink += add_element<V>(rod, i, full, x[i], x[i + 1], frame(q[i]), own, next, link[i]);
+            sink += add_joint<V>(rod, i + 1, full, one, one, q[i], q[i + 1], own, next, link[i]);
             diagonal[i] = own;
             own = next;
         }
@@ -104,27 +115,21 @@ struct Sweeps {
     void wall() {
         for (int i = 0; i < kNodes; ++i) {
             distance[i] = distance_to_wall<V>(lumen, x[i]);
-            sink += add_wall<V>(5.0, 0.18, one, distance[i].value > 1e6, distance[i], diagonal[i]);
+            sink += add_wall<V>(5.0, 0.18, full, distance[i].value > 1e6, distance[i], diagonal[i]);
         }
     }
     void friction() {
         const FrictionState<V> friction{0.01 * one, {one, 0.0 * one, 0.0 * one}, {0.0 * one, 0.18 * one, 0.0 * one}};
-        for (int i = 0; i < kNodes; ++i) sink += add_friction<V>(friction, 1e-3 * one, one, x[i] - x[0], q[i], diagonal[i]);
+        for (int i = 0; i < kNodes; ++i) sink += add_friction<V>(friction, 1e-3 * one, full, x[i] - x[0], q[i], diagonal[i]);
     }
     void elimination() {
-        Diagonal<V> own = diagonal[0];
-        for (int i = 0; i < kNodes; ++i) {
-            Diagonal<V> next = diagonal[std::min(i + 1, kNodes - 1)];
-            next.xx.xx += 1e4, next.xx.yy += 1e4, next.xx.zz += 1e4;
-            next.tt.xx += 1e4, next.tt.yy += 1e4, next.tt.zz += 1e4;
-            sink += eliminate(own, coupling[i], factor[i], next).descent;
-            own = next;
-        }
+        Carried<V> carried{};
+        for (int i = 0; i < kNodes; ++i) sink += widen<V>(eliminate(diagonal[i], link[i], carried, factor[i]).descent);
     }
     void substitution() {
-        Vec3<V> dx{0.0 * one, 0.0 * one, 0.0 * one}, dt = dx;
+        Vec3<Single<V>> dx{}, dt{};
         for (int i = kNodes - 1; i >= 0; --i) substitute(factor[i], dx, dt);
-        sink += dx.x;
+        sink += widen<V>(dx.x);
     }
 };
 
