@@ -18,7 +18,7 @@ def dataset_simulator() -> SimulatorConfig:
 
     What they cost in accuracy stands in docs/dataset.md.
     """
-    return SimulatorConfig(element_mm=1.25, tolerance_mm=1e-2, largest_jump=0.3)
+    return SimulatorConfig(element_mm=1.25, tolerance_mm=1e-2)
 
 
 _Stiffness = Annotated[float, Within(0.05)]

@@ -21,6 +21,8 @@ LANES = _core.LANES
 """Worlds that one thread steps side by side."""
 _DENT_MM = 0.015
 """Depth to which a node that bears the whole push limit dents the wall, mm, where the stiffness is not given."""
+_HARD_PUSH_N = 2.0
+"""Push that stands for the limit of a drive that has none, N."""
 Actuation = Literal["velocity", "force"]
 """What a control is: translation (mm/s) and rotation (rad/s), or the drive's axial force (N) and torque (N·mm)."""
 
@@ -90,5 +92,5 @@ PRESETS: Mapping[Preset, SimulatorConfig] = MappingProxyType(
 
 
 def wall_stiffness(config: SimulatorConfig, push_limit_n: float) -> float:
-    """Return the stiffness of the wall at a contact, N/mm, for a device of some push limit; without one, 2 N."""
-    return config.wall_stiffness_n_mm or (push_limit_n if push_limit_n < np.inf else 2.0) / _DENT_MM
+    """Return the stiffness of the wall at a contact, N/mm, for a device of some push limit or without one."""
+    return config.wall_stiffness_n_mm or (push_limit_n if push_limit_n < np.inf else _HARD_PUSH_N) / _DENT_MM
