@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from jaxtyping import Float
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
+from scipy.special import ellipe, ellipeinc, ellipk, ellipkinc
 
 from endopilot.simulation.rod import RodLayout
 from endopilot.types import Insertion
@@ -37,39 +36,58 @@ def elastica_tip(alpha: float, elements: int) -> tuple[Float[np.ndarray, "2"], F
     return np.array([shape[0, 1], 1.0 - shape[0, 0]]), shape
 
 
+def elastica_closed_form(alpha: float) -> tuple[float, float, float]:
+    """Return w/L and u/L of a clamped rod's tip under a dead load F = α EI/L², and its curvature at the wall times L.
+
+    With m = (1 + sin θ)/2 of the tip's angle θ and sin ψ = 1/√(2 m), in elliptic integrals of parameter m:
+    √α = K - F(ψ), w/L = 1 - 2 [E - E(ψ)]/√α, 1 - u/L = 2 √m cos ψ/√α and (κ L)² = 2 α sin θ (K. E. Bisshopp and D. C.
+    Drucker, Quart. Appl. Math. 3 (1945) 272-275).
+    """
+
+    def amplitude(m: float) -> float:
+        return float(np.arcsin(1 / np.sqrt(2 * m)))
+
+    def load(m: float) -> float:
+        return float(ellipk(m) - ellipkinc(amplitude(m), m)) ** 2
+
+    m = float(brentq(lambda m: load(m) - alpha, 0.5 + 1e-12, 1 - 1e-15, xtol=1e-15))  # pyright: ignore
+    deflection = 1 - 2 * float(ellipe(m) - ellipeinc(amplitude(m), m)) / np.sqrt(alpha)
+    shortening = 1 - 2 * np.sqrt(m) * np.cos(amplitude(m)) / np.sqrt(alpha)
+    return float(deflection), float(shortening), float(np.sqrt(2 * alpha * (2 * m - 1)))
+
+
 def elastica_curve(alpha: float) -> Float[np.ndarray, "2 n"]:
     """Return x/L and y/L along the elastica θ'' = -α cos θ, θ(0) = 0, θ'(1) = 0, from the wall on."""
 
-    def shoot(curvature: float) -> Any:
-        def slope(_: float, state: Float[np.ndarray, "4"]) -> list[float]:
-            angle, turn = state[:2]
-            return [turn, -alpha * np.cos(angle), np.cos(angle), np.sin(angle)]
+    def slope(_: float, state: Float[np.ndarray, "4"]) -> list[float]:
+        angle, turn = state[:2]
+        return [turn, -alpha * np.cos(angle), np.cos(angle), np.sin(angle)]
 
-        start = [0.0, curvature, 0.0, 0.0]
-        return solve_ivp(slope, (0.0, 1.0), start, rtol=1e-9, atol=1e-10, t_eval=np.linspace(0, 1, 101)).y
-
-    most = np.sqrt(2 * alpha)  # of a rod whose tip has turned by a quarter
-    return shoot(brentq(lambda curvature: shoot(curvature)[1, -1], 0.1 * most, most))[2:]  # pyright: ignore
+    start = [0.0, elastica_closed_form(alpha)[2], 0.0, 0.0]
+    return solve_ivp(slope, (0.0, 1.0), start, rtol=1e-9, atol=1e-10, t_eval=np.linspace(0, 1, 101)).y[2:]
 
 
 def elastica() -> list[Case]:
     """Compare a cantilever under a dead tip load, α = F L²/EI, with Mattiasson's elliptic integrals.
 
-    K. Mattiasson, Int. J. Numer. Meth. Eng. 17 (1981) 145-153.
+    K. Mattiasson, Int. J. Numer. Meth. Eng. 17 (1981) 145-153; loads that he has not: `elastica_closed_form`.
     """
     table = {
         1.0: (0.301721, 0.056433),
         2.0: (0.493457, 0.160642),
+        3.7: elastica_closed_form(3.7)[:2],
         5.0: (0.713792, 0.387628),
         10.0: (0.810609, 0.554996),
+        15.0: elastica_closed_form(15.0)[:2],
+        40.0: elastica_closed_form(40.0)[:2],
     }
     cases = []
     for alpha, reference in table.items():
         tip, shape = elastica_tip(alpha, ELEMENTS)
         line = elastica_curve(alpha)
         exact = Curve("elastica", line[0], line[1], "reference")
-        table_tip = Curve("Mattiasson's tip", np.array([1 - reference[1]]), np.array([reference[0]]), "mark")
-        curves = (exact, Curve("core", *_ahead(shape)), table_tip)
+        closed = Curve("tip by elliptic integrals", np.array([1 - reference[1]]), np.array([reference[0]]), "mark")
+        curves = (exact, Curve("core", *_ahead(shape)), closed)
         picture = Picture("x/L", "y/L", curves, equal=True)
         for name, expected, value in zip(("w/L", "u/L"), reference, tip, strict=True):
             cases.append(compare(f"elastica α={alpha:g} {name}", expected, value, 1e-3, picture))

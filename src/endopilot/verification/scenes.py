@@ -71,7 +71,7 @@ def tube(
     """Return the distance map of a tube around an axis, with round ends.
 
     Args:
-        axis_mm: points on the axis, in the plane z = 0 and close to each other, mm.
+        axis_mm: points on the axis, close to each other, mm.
         radius_mm: inner radius of the tube, at each point if several are given, mm. Where it varies, the map holds the
             radius at the nearest point less the distance to it, a distance to first order in the radius' slope.
         spacing_mm: grid spacing, mm.
@@ -81,9 +81,9 @@ def tube(
     origin = axis_mm.min(axis=0) - margin
     shape = np.ceil((axis_mm.max(axis=0) + margin - origin) / spacing_mm).astype(int) + 1
     x, y, z = (origin[i] + spacing_mm * np.arange(shape[i]) for i in range(3))
-    plane = np.stack(np.meshgrid(x, y, indexing="xy"), axis=-1)
-    away, nearest = KDTree(axis_mm[:, :2]).query(plane)  # the same point is nearest at every height above the plane
-    inside = radius[nearest] - np.hypot(away, z[:, None, None])
+    grid = np.stack(np.meshgrid(z, y, x, indexing="ij")[::-1], axis=-1)
+    away, nearest = KDTree(axis_mm).query(grid, distance_upper_bound=radius.max() - _OUTSIDE_MM)
+    inside = np.append(radius, 0.0)[nearest] - away  # where no point is near, `away` is infinite
     return DistanceMap(values=np.maximum(inside, _OUTSIDE_MM), spacing_mm=spacing_mm, origin_mm=origin)
 
 
