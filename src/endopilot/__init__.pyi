@@ -5,7 +5,7 @@ from .anatomy.io import write_anatomy as write_anatomy
 from .atlas.atlas import AtlasConfig as AtlasConfig
 from .atlas.atlas import make_atlas as make_atlas
 from .control.navigate import NavigateConfig as NavigateConfig
-from .control.navigate import NavigationRecord as NavigationRecord
+from .control.navigate import NavigationLoop as NavigationLoop
 from .control.navigate import navigate as navigate
 from .control.plan import plan as plan
 from .control.plan_config import Plan as Plan
@@ -13,6 +13,7 @@ from .control.plan_config import PlanConfig as PlanConfig
 from .control.policy import Decision as Decision
 from .control.policy import Observation as Observation
 from .control.policy import Policy as Policy
+from .control.record import NavigationRecord as NavigationRecord
 from .dataset.config import DatasetConfig as DatasetConfig
 from .dataset.generate import generate_dataset as generate_dataset
 from .errors import InputError as InputError

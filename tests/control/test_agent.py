@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from endopilot.control import search
 from endopilot.control.agent import AgentConfig, AgentPolicy, OpenLoopPolicy, TwinPolicy
 from endopilot.control.belief import Belief, BeliefConfig
-from endopilot.control.navigate import ModelMismatch, navigate
+from endopilot.control.navigate import ModelMismatch, NavigationLoop, navigate
 from endopilot.control.policy import Decision, Observation, Policy
 from endopilot.control.search import Course, Search
 from endopilot.tasks.navigation import Navigation, Target
@@ -197,3 +197,25 @@ def test_a_search_begins_farther_before_a_wide_junction(side_branch, monkeypatch
         one._approach(search._Log(), 20, 22.5)
         begun.append(float(one.single.project().abscissa[0]))
     assert begun == pytest.approx([16.0, 12.0], abs=1.1)
+
+
+def test_an_agent_tells_what_it_believes_and_goes_on_after_hands(side_branch) -> None:
+    loop = NavigationLoop(side_branch, AgentPolicy(QUICK), seed=2)
+    for _ in range(4):
+        loop.step()
+    for _ in range(6):  # away from its course, turned
+        loop.step(by_hand=Decision(-2.0, 1.5, expose=False))
+    wires, tip = loop.policy.believed_wires(), loop.policy.belief.tip
+    assert wires.shape == (QUICK.belief.members, loop.policy.belief.simulator.nodes, 3)
+    likeliest = int(np.argmax(loop.policy.belief.weight))
+    np.testing.assert_array_equal(wires[0], loop.policy.belief.simulator.position[likeliest])
+    assert loop.believed.abscissa == tip.abscissa[likeliest]
+    while loop.reason is None:
+        loop.step()
+    record = loop.record()
+    assert record.success and record.safe
+    assert record.exposed[10], "the policy goes on with an image"
+    ends = np.abs(record.believed[:-1, 0] - record.tip.abscissa[:-1])
+    assert np.isnan(record.believed[-1]).all() and np.median(ends) < 0.5
+    bands = record.half_width[:-1][~np.isnan(record.half_width[:-1, 0])]
+    assert len(bands) > 5 and (bands > 0).all()

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from endopilot.control.navigate import ModelMismatch, NavigateConfig, navigate
+from endopilot.control.navigate import ModelMismatch, NavigateConfig, NavigationLoop, navigate
 from endopilot.control.policy import Decision, Observation, Policy
-from endopilot.control.robot import RobotConfig
+from endopilot.control.robot import CYCLE_S, RobotConfig
 from endopilot.tasks.navigation import Navigation, Target
 from endopilot.xray.fluoroscope import FluoroscopeConfig
 
@@ -106,3 +106,59 @@ def test_one_view_alone_locates_the_tip_by_the_vessel(straight) -> None:
     shown = [measured for measured in record.measured if measured is not None]
     error = np.array([tip.abscissa for tip in shown]) - record.tip.abscissa[: len(shown)]
     assert np.abs(error).max() < 2.0
+
+
+def test_steps_of_the_loop_are_the_navigation_to_the_bit(straight) -> None:
+    whole = navigate(straight, Forward(3.0, 2, 0.7), seed=5)
+    loop = NavigationLoop(straight, Forward(3.0, 2, 0.7), seed=5)
+    while loop.reason is None:  # in the smallest pieces, and asking for more than is left
+        loop.begin()
+        for _ in range(4):
+            loop.advance(CYCLE_S)
+        assert not loop.between_periods
+        loop.advance(2.0)
+    stepped = loop.record()
+    assert stepped.reason == whole.reason
+    for name in ("tip_position", "contact_force_max", "control", "driven", "exposed"):
+        np.testing.assert_array_equal(getattr(stepped, name), getattr(whole, name), err_msg=name)
+    assert whole.driven.shape == (10 * (len(whole.time_s) - 1), 2)
+    moved = whole.inserted_length[0] + 0.05 * np.cumsum(whole.driven[:, 0])[9::10]
+    np.testing.assert_allclose(moved, whole.inserted_length[1:], atol=1e-6)
+
+
+def test_a_loop_that_is_over_or_within_a_period_takes_no_decision(straight) -> None:
+    loop = NavigationLoop(straight, Forward(3.0))
+    loop.begin()
+    loop.advance(0.2)
+    assert loop.time_s == pytest.approx(0.2)
+    with pytest.raises(ValueError, match="period is not over"):
+        loop.begin()
+    loop.advance(0.3)
+    loop.stop()
+    with pytest.raises(ValueError, match="navigation is over"):
+        loop.step()
+    record = loop.record()
+    assert record.reason == "stopped" and not record.success and record.seconds == 0.5
+
+
+class Watching(Forward):
+    """Counts what it sees while somebody else drives."""
+
+    def watch(self, observation: Observation) -> None:
+        self.watched = [*getattr(self, "watched", []), observation]
+
+
+def test_hands_take_over_and_hand_back(straight) -> None:
+    policy = Watching(4.0)
+    loop = NavigationLoop(straight, policy, config=NavigateConfig(robot=PERFECT))
+    loop.step()
+    for _ in range(3):
+        loop.step(by_hand=Decision(-1.0, 1.0, expose=False))
+    assert len(policy.given) == 1 and len(policy.watched) == 3
+    loop.step()
+    assert policy.given[1].tip is not None, "X-ray is on where the policy goes on"
+    record = loop.record()
+    np.testing.assert_allclose(record.control[:5, 0], [4.0, -1.0, -1.0, -1.0, 4.0])
+    np.testing.assert_allclose(np.diff(record.inserted_length), [2.0, -0.5, -0.5, -0.5, 2.0], atol=1e-6)
+    assert record.exposed.tolist() == [True, False, False, False, True, False]
+    assert record.believed is None and record.half_width is None

@@ -7,7 +7,7 @@ pulled back, with X-ray on, until one agrees with the image, and another path is
 
 from __future__ import annotations
 
-from dataclasses import field
+from dataclasses import field, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from endopilot.control.belief import Belief, BeliefConfig
 from endopilot.control.navigate import ModelMismatch
-from endopilot.control.policy import Decision, Observation
+from endopilot.control.policy import BelievedTip, Decision, Observation
 from endopilot.control.route import Route, check_passable
 from endopilot.control.search import Course, Search, SearchConfig
 from endopilot.progress import Advance
@@ -93,7 +93,7 @@ class _PlanningPolicy:
         )
         self._limits = DriveLimits.of(navigation.device, navigation.anatomy)
         self._course: Course | None = None
-        self._at, self._lost, self._began = 0, False, False
+        self._at, self._lost, self._began, self._led = 0, False, False, False
         self.plans, self._failed = 0, 0
 
     def decide(self, observation: Observation) -> Decision:
@@ -109,6 +109,24 @@ class _PlanningPolicy:
             translation, rotation = self._follow(observation)
         translation, rotation = self._limits.safe(translation, rotation)
         return Decision(translation, rotation, expose=self._lost or self.wants_xray())
+
+    def watch(self, observation: Observation) -> None:
+        """Follow what somebody else does; a new course is searched at the next decision."""
+        if self._began:
+            self.belief.follow(observation.inserted_length, observation.rotation)
+        self._began, self._led, self._course, self._failed = True, True, None, 0
+        if observation.tip is not None:
+            self._update(observation.tip)
+        self.wants_xray()
+
+    def believed(self) -> BelievedTip:
+        """Return where the likeliest wire has its tip."""
+        tip = self.belief.likeliest_tip()
+        return BelievedTip(float(tip.abscissa[0]), float(tip.offset[0]))
+
+    def believed_wires(self) -> Float[np.ndarray, "wires nodes 3"]:
+        """Return the simulated wires, the likeliest first: nodes from the tip on, LPS mm."""
+        return self.belief.simulator.position[np.argsort(-self.belief.weight, kind="stable")]
 
     def _update(self, measured: TipMeasurement) -> None:
         """Weight the simulated wires by a measurement, and note whether all are wrong."""
@@ -228,8 +246,19 @@ class AgentPolicy(_PlanningPolicy):
         """Lay out the simulated wires, and start the adviser."""
         super().start(navigation, seed)
         self._adviser = XrayAdviser(self._calibration, self._advice, navigation.device.tip_radius_mm)
+        self._due = False
+        self._start_adviser()
+
+    def _start_adviser(self) -> None:
         proximal, tip, _, radius = self.adviser_input()
         self._adviser.start(proximal, tip, radius)
+
+    def _update(self, measured: TipMeasurement) -> None:
+        """Weight the wires; an exposure that somebody else made begins the bands anew."""
+        super()._update(measured)
+        if self._led:
+            self._start_adviser()
+            self._led = False
 
     def _parameters(self) -> Float[np.ndarray, "members 3"]:
         return Belief.around(np.array([1.0, 1.0, 0.0]), self.config.belief)
@@ -243,4 +272,15 @@ class AgentPolicy(_PlanningPolicy):
 
     def wants_xray(self) -> bool:
         """Ask the adviser."""
-        return bool(self._adviser.advise(*self.adviser_input())[0])
+        self._due = bool(self._adviser.advise(*self.adviser_input())[0])
+        return self._due
+
+    def believed(self) -> BelievedTip:
+        """Return where the likeliest wire has its tip, the adviser's bands around it, and why it asks for X-ray."""
+        tip, half = super().believed(), self._adviser.half_width
+        if self._lost or len(half) == 0:
+            return replace(tip, asks="no simulated wire explains the last image" if self._lost else "")
+        along, across = half[0].tolist()
+        wide = along >= self._advice.abscissa_mm
+        asks = f"Δtip is known to ±{along:.1f} mm only" if wide else "the tip may be reaching the wall"
+        return replace(tip, half_width=(along, across), asks=asks if self._due else "")

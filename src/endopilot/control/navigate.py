@@ -1,23 +1,26 @@
-"""One navigation in the simulator: a policy decides, a robot moves the wire, an exposure shows the tip where asked."""
+"""One navigation in the simulator: a policy decides, a robot moves the wire, an exposure shows the tip where asked.
+
+`navigate` drives it to its end. `NavigationLoop` is the same, one step at a time.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
 
-from endopilot.anatomy.projection import project_tip
 from endopilot.control.policies import make_policy
-from endopilot.control.policy import Observation, Policy
-from endopilot.control.robot import RobotConfig, SimulatedRobot
+from endopilot.control.policy import BelievedTip, Believer, Decision, Led, Observation, Policy
+from endopilot.control.record import NavigationRecord, Track
+from endopilot.control.robot import CYCLE_S, RobotConfig, SimulatedRobot
 from endopilot.settings import Finite, NonNegative, Positive, settings
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import DECISION_PERIOD_S, SUCCESS_MM, Navigation
-from endopilot.types import TipProjection
-from endopilot.xray.fluoroscope import Fluoroscope, FluoroscopeConfig, TipMeasurement
+from endopilot.xray.fluoroscope import Fluoroscope, FluoroscopeConfig
+
+_CYCLES = round(DECISION_PERIOD_S / CYCLE_S)
 
 
 @settings
@@ -46,47 +49,157 @@ class ModelMismatch:
     """Factor on the robot's latency."""
 
 
-@dataclass(frozen=True, eq=False)
-class NavigationRecord:
-    """A navigation as it truly went: a sample at the start and one after each decision period.
+class NavigationLoop:
+    """One navigation in closed loop, a decision period at a time: policy, robot, wire and X-ray.
+
+    `navigate` is a plain loop over it. A program that shows the navigation starts, pauses and ends it by calling `step`
+    or not. Whoever takes over gives decisions of their own; the policy watches. It goes on when none is given, with
+    X-ray on at its first decision:
+
+        loop = NavigationLoop(navigation, "agent", seed=1)
+        while loop.reason is None:
+            loop.step()                                      # the policy decides
+            loop.step(by_hand=Decision(2.0, 0.5))            # somebody else does
+        record = loop.record()
+
+    Hands that move faster than twice a second call the parts of a step: `begin`, then `advance` in cycles of `CYCLE_S`
+    until the period is over, with `robot.command` between them.
 
     Attributes:
-        time_s: s.
-        inserted_length: Δ, mm.
-        rotation: φ, rad.
-        tip_position: LPS mm.
-        tip: Δtip, γtip, branch and lumen radius.
-        contact_force_max: largest wall force on one node over the period that ends here, N.
-        exposed: whether X-ray was on at this moment.
-        control: what was commanded from this moment on, within the limits, mm/s and rad/s; 0 at the end.
-        measured: what X-ray showed at this moment, or None.
-        success: the tip reached the target in time, at the end of a period.
-        safe: the wall force never exceeded the navigation's limit.
-        seconds: how long it took, s.
-        peak_force_n: largest wall force on one node, N.
-        exposures: their number, of both views together as one.
-        path_mm: length of the tip's path, sample to sample, mm.
-        faults: decisions that were not finite or beyond the drive's limits, and were mended.
-        reason: "reached", "time" or "invalid" (the simulation failed).
+        navigation: what is to be done, as the policy is given it.
+        policy: what decides.
+        simulator: the world as it truly is; its one wire is the real one.
+        robot: what moves it.
+        fluoroscope: the C-arm.
+        observation: what was observed at the last decision; None before the first.
+        believed: what the policy believed then; None for a policy that does not tell.
+        reason: why the navigation is over, as in `NavigationRecord`; None while it goes on.
     """
 
-    time_s: Float[np.ndarray, "samples"]
-    inserted_length: Float[np.ndarray, "samples"]
-    rotation: Float[np.ndarray, "samples"]
-    tip_position: Float[np.ndarray, "samples 3"]
-    tip: TipProjection
-    contact_force_max: Float[np.ndarray, "samples"]
-    exposed: Bool[np.ndarray, "samples"]
-    control: Float[np.ndarray, "samples 2"]
-    measured: tuple[TipMeasurement | None, ...]
-    success: bool
-    safe: bool
-    seconds: float
-    peak_force_n: float
-    exposures: int
-    path_mm: float
-    faults: int
-    reason: str
+    def __init__(
+        self,
+        navigation: Navigation,
+        policy: Policy | str,
+        *,
+        config: NavigateConfig | None = None,
+        seed: int = 0,
+        truth: ModelMismatch | None = None,
+    ) -> None:
+        """Bring the wire to the start; the arguments are those of `navigate`.
+
+        Raises:
+            InputError: there is no such policy, or the wire does not fit the vessel, or starts deeper than it is long.
+        """
+        config, truth = config or NavigateConfig(), truth or ModelMismatch()
+        self.navigation = navigation
+        self.policy = make_policy(policy) if isinstance(policy, str) else policy
+        self.simulator = _start(navigation, truth, config.simulator)
+        self._limits = DriveLimits.of(navigation.device, navigation.anatomy)
+        drive = replace(config.robot, latency_s=config.robot.latency_s * truth.latency_factor)
+        self.robot = SimulatedRobot(self.simulator, self._limits, drive, seed=seed, ostium_mm=truth.ostium_mm)
+        self.fluoroscope = Fluoroscope(navigation.anatomy, navigation.device.tip_radius_mm, config.fluoroscope)
+        self._random = np.random.default_rng([seed, 2])
+        self._track = Track(self.simulator)
+        self._periods = int(np.ceil(navigation.seconds / DECISION_PERIOD_S - 1e-9))
+        self._period, self._cycles_left, self._peak_n, self._expose = 0, 0, 0.0, True
+        self._by_hand = False
+        self.observation: Observation | None = None
+        self.believed: BelievedTip | None = None
+        self.reason: str | None = None
+        self.policy.start(navigation, seed)
+
+    @property
+    def time_s(self) -> float:
+        """Time since the start of the navigation, s."""
+        return DECISION_PERIOD_S * self._period - CYCLE_S * self._cycles_left
+
+    @property
+    def between_periods(self) -> bool:
+        """Whether a decision is due: the last period is over."""
+        return self._cycles_left == 0
+
+    def step(self, by_hand: Decision | None = None) -> Decision:
+        """Decide, and let the robot move for one period; return the decision.
+
+        Args:
+            by_hand: what somebody else decides; the policy does if it is not given.
+        """
+        decision = self.begin(by_hand)
+        self.advance(DECISION_PERIOD_S)
+        return decision
+
+    def begin(self, by_hand: Decision | None = None) -> Decision:
+        """Begin a period: observe, decide and command the robot. `advance` lets it move.
+
+        Args:
+            by_hand: what somebody else decides; the policy does if it is not given.
+
+        Returns:
+            The decision, within the drive's limits.
+
+        Raises:
+            ValueError: the navigation is over, or the last period is not.
+        """
+        if self.reason is not None or not self.between_periods:
+            raise ValueError("the navigation is over" if self.reason else "the period is not over; call advance")
+        state, tip = self.robot.proximal_state(), None
+        handed_back, self._by_hand = self._by_hand and by_hand is None, by_hand is not None
+        if self._expose or handed_back:
+            direction = self.simulator.tip_direction[0]
+            tip = self.fluoroscope.expose(self.simulator.position[0, 0], direction, state.inserted_length, self._random)
+        observation = Observation(self.time_s, state.inserted_length, state.rotation, tip)
+        decision = self._decide(observation, by_hand)
+        asked = (decision.translation, decision.rotation)
+        control, self._expose = self._limits.safe(*asked), bool(decision.expose)
+        self.observation = observation
+        self.believed = self.policy.believed() if isinstance(self.policy, Believer) else None
+        self._track.decided(control, tip, self.believed, fault=control != asked)
+        self.robot.command(*control)
+        self._period, self._cycles_left, self._peak_n = self._period + 1, _CYCLES, 0.0
+        return Decision(*control, expose=self._expose)
+
+    def advance(self, seconds: float) -> float:
+        """Let robot and wire move, no farther than to the end of the period.
+
+        Args:
+            seconds: a multiple of `CYCLE_S`.
+
+        Returns:
+            The largest wall force on a node, N.
+        """
+        cycles, peak_n = min(round(seconds / CYCLE_S), self._cycles_left), 0.0
+        for _ in range(cycles):  # one by one, so that no rounding depends on how a period is cut
+            peak_n = max(peak_n, self.robot.run(CYCLE_S))
+        self._peak_n, self._cycles_left = max(self._peak_n, peak_n), self._cycles_left - cycles
+        if cycles and self._cycles_left == 0:
+            self._end_period()
+        return peak_n
+
+    def stop(self) -> None:
+        """End the navigation where it is."""
+        self.reason = self.reason or "stopped"
+
+    def record(self) -> NavigationRecord:
+        """Return what has happened up to the end of the last whole period."""
+        return self._track.record(self.navigation, self.robot.driven, self.reason or "stopped")
+
+    def _decide(self, observation: Observation, by_hand: Decision | None) -> Decision:
+        if by_hand is None:
+            return self.policy.decide(observation)
+        if isinstance(self.policy, Led):
+            self.policy.watch(observation)
+        else:
+            self.policy.decide(observation)  # what it answers is not done
+        return by_hand
+
+    def _end_period(self) -> None:
+        self._track.moved(self.simulator, self._peak_n)
+        if not self.simulator.valid[0]:
+            self.reason = "invalid"
+        elif _reached(self.navigation, self.simulator):
+            self.reason = "reached"
+        elif self._period == self._periods:
+            self.reason = "time"
 
 
 def navigate(
@@ -113,37 +226,10 @@ def navigate(
     Raises:
         InputError: there is no such policy, or the wire does not fit the vessel, or starts deeper than it is long.
     """
-    config, truth = config or NavigateConfig(), truth or ModelMismatch()
-    policy = make_policy(policy) if isinstance(policy, str) else policy
-    simulator = _start(navigation, truth, config.simulator)
-    limits = DriveLimits.of(navigation.device, navigation.anatomy)
-    drive = replace(config.robot, latency_s=config.robot.latency_s * truth.latency_factor)
-    robot = SimulatedRobot(simulator, limits, drive, seed=seed, ostium_mm=truth.ostium_mm)
-    fluoroscope = Fluoroscope(navigation.anatomy, navigation.device.tip_radius_mm, config.fluoroscope)
-    random = np.random.default_rng([seed, 2])
-    track, periods = _Track(simulator), int(np.ceil(navigation.seconds / DECISION_PERIOD_S - 1e-9))
-    policy.start(navigation, seed)
-    reason, expose, direction = "time", True, simulator.tip_direction[0]
-    for period in range(periods):
-        state, tip = robot.proximal_state(), None
-        if expose:
-            tip = fluoroscope.expose(simulator.position[0, 0], direction, state.inserted_length, random)
-        observation = Observation(period * DECISION_PERIOD_S, state.inserted_length, state.rotation, tip)
-        decision = policy.decide(observation)
-        asked = (decision.translation, decision.rotation)
-        control, expose = limits.safe(*asked), bool(decision.expose)
-        track.decided(control, tip, fault=control != asked)
-        robot.command(*control)
-        peak = robot.run(DECISION_PERIOD_S)
-        track.moved(simulator, peak)
-        direction = simulator.tip_direction[0]
-        if not simulator.valid[0]:
-            reason = "invalid"
-            break
-        if _reached(navigation, simulator):
-            reason = "reached"
-            break
-    return track.record(navigation, reason)
+    loop = NavigationLoop(navigation, policy, config=config, seed=seed, truth=truth)
+    while loop.reason is None:
+        loop.step()
+    return loop.record()
 
 
 def _start(navigation: Navigation, truth: ModelMismatch, config: SimulatorConfig) -> Simulator:
@@ -166,49 +252,3 @@ def _reached(navigation: Navigation, simulator: Simulator) -> bool:
     width = float(line.radius[np.abs(line.abscissa - at) <= SUCCESS_MM + 1.0].max())
     away = np.linalg.norm(simulator.position[0, 0] - navigation.target.position(navigation.anatomy))
     return bool(away <= SUCCESS_MM + 3 * width and navigation.reached(simulator.project())[0])
-
-
-class _Track:
-    """Gathers what happens."""
-
-    def __init__(self, simulator: Simulator) -> None:
-        self._columns: dict[str, list] = {name: [] for name in ("proximal", "position", "force")}
-        self._controls: list[tuple[float, float]] = []
-        self._measured: list[TipMeasurement | None] = []
-        self._faults = 0
-        self.moved(simulator, float(simulator.contacts.max()))
-
-    def decided(self, control: tuple[float, float], tip: TipMeasurement | None, *, fault: bool) -> None:
-        self._controls.append(control)
-        self._measured.append(tip)
-        self._faults += fault
-
-    def moved(self, simulator: Simulator, peak_n: float) -> None:
-        self._columns["proximal"].append([simulator.inserted_length[0], simulator.rotation[0]])
-        self._columns["position"].append(simulator.position[0, 0])
-        self._columns["force"].append(peak_n)
-
-    def record(self, navigation: Navigation, reason: str) -> NavigationRecord:
-        anatomy = navigation.anatomy
-        proximal, position = np.array(self._columns["proximal"]), np.array(self._columns["position"])
-        force = np.array(self._columns["force"])
-        measured = (*self._measured, None)
-        return NavigationRecord(
-            time_s=DECISION_PERIOD_S * np.arange(len(force)),
-            inserted_length=proximal[:, 0],
-            rotation=proximal[:, 1],
-            tip_position=position,
-            tip=project_tip(anatomy.tree, anatomy.insertion, position),
-            contact_force_max=force,
-            exposed=np.array([tip is not None for tip in measured]),
-            control=np.array([*self._controls, (0.0, 0.0)]),
-            measured=measured,
-            success=reason == "reached",
-            safe=bool(force.max() <= navigation.force_limit_n),
-            seconds=DECISION_PERIOD_S * (len(force) - 1),
-            peak_force_n=float(force.max()),
-            exposures=sum(tip is not None for tip in measured),
-            path_mm=float(np.linalg.norm(np.diff(position, axis=0), axis=1).sum()),
-            faults=self._faults,
-            reason=reason,
-        )

@@ -1,9 +1,15 @@
-"""The interface of a policy: `Policy`, what it observes (`Observation`) and what it commands (`Decision`)."""
+"""The interface of a policy: `Policy`, what it observes (`Observation`) and what it commands (`Decision`).
+
+A policy that plans with simulated wires may also tell what it believes (`Believer`) and be led (`Led`).
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float
 
 from endopilot.tasks.navigation import Navigation
 from endopilot.xray.fluoroscope import TipMeasurement
@@ -51,4 +57,43 @@ class Policy(Protocol):
 
     def decide(self, observation: Observation) -> Decision:
         """Return what to do until the next decision, `DECISION_PERIOD_S` later."""
+        ...
+
+
+@dataclass(frozen=True)
+class BelievedTip:
+    """Where a policy believes the tip to be.
+
+    Attributes:
+        abscissa: Δtip, mm.
+        offset: γtip, mm.
+        half_width: of the bands around both in which the tip is expected, mm; NaN without bands.
+        asks: why the policy asks for X-ray at the next decision; empty if it does not.
+    """
+
+    abscissa: float
+    offset: float
+    half_width: tuple[float, float] = (np.nan, np.nan)
+    asks: str = ""
+
+
+@runtime_checkable
+class Believer(Protocol):
+    """A policy that tells what it believes."""
+
+    def believed(self) -> BelievedTip:
+        """Return where the policy believed the tip to be at its last decision."""
+        ...
+
+    def believed_wires(self) -> Float[np.ndarray, "wires nodes 3"]:
+        """Return the wires that it holds possible, the likeliest first: nodes from the tip on, LPS mm."""
+        ...
+
+
+@runtime_checkable
+class Led(Protocol):
+    """A policy that can go on from wherever somebody else has driven the wire to."""
+
+    def watch(self, observation: Observation) -> None:
+        """Take what is observed while somebody else decides."""
         ...

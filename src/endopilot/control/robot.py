@@ -127,6 +127,9 @@ class SimulatedRobot:
 
     The encoders sit on the wire, behind the gears: they measure what backlash and a slipping drive leave of a command.
     They count from the assumed position of the ostium.
+
+    Attributes:
+        driven: velocity of the wire's proximal end that the drive asked for in each cycle so far, mm/s and rad/s.
     """
 
     def __init__(
@@ -152,6 +155,7 @@ class SimulatedRobot:
         self._noise = np.array([config.encoder_sd_mm, config.encoder_sd_rad])
         self._random = np.random.default_rng([seed, 1])
         self._drive = DriveMotion(limits, config, self._encoder())
+        self.driven: list[Float[np.ndarray, "2"]] = []
 
     def command(self, translation: float, rotation: float) -> None:
         """Move on at a velocity, mm/s and rad/s, until the next command. What is not finite stops the wire."""
@@ -173,6 +177,7 @@ class SimulatedRobot:
             inserted = self._simulator.inserted_length
             control[:, 0] = within_travel(control[:, 0], inserted, period, travel_mm=travel_mm)
             step = self._simulator.step(control, period)
+            self.driven.append(control[0])
             self._drive.position = np.array(self._encoder())
             peak = max(peak, float(step.contact_force_max[0]))
         return peak

@@ -14,9 +14,10 @@ from jaxtyping import Bool, Float
 
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.control.agent import AgentPolicy
-from endopilot.control.navigate import ModelMismatch, NavigateConfig, NavigationRecord, navigate
+from endopilot.control.navigate import ModelMismatch, NavigateConfig, navigate
 from endopilot.control.policies import make_policy
 from endopilot.control.policy import Decision, Observation, Policy
+from endopilot.control.record import NavigationRecord
 from endopilot.errors import InputError
 from endopilot.tasks.navigation import Navigation
 from endopilot.tasks.task import CORE, Task
@@ -89,9 +90,9 @@ def attempt(policy: str, navigation: Navigation, *, seed: int, mismatch: ModelMi
         InputError: there is no such policy, or the wire does not fit the vessel.
     """
     driver = make_policy(policy)
-    watched = _Watched(driver) if isinstance(driver, AgentPolicy) else None
-    record = _drive(navigation, watched or driver, seed, mismatch)
-    believed = None if watched is None else np.array(watched.abscissa)
+    record = _drive(navigation, driver, seed, mismatch)
+    told = record.believed if isinstance(driver, AgentPolicy) else None
+    believed = None if told is None else told[:-1, 0]
     recording = Recording(record.control[:-1], record.exposed[:-1], believed)
     return (
         {"seed": seed}
@@ -119,22 +120,6 @@ def repeat(recording: Recording, navigation: Navigation, *, seed: int) -> dict[s
 def _drive(navigation: Navigation, policy: Policy, seed: int, mismatch: ModelMismatch | None) -> NavigationRecord:
     config = NavigateConfig(simulator=replace(CORE, threads=1))
     return navigate(navigation, policy, config=config, seed=seed, truth=mismatch)
-
-
-class _Watched:
-    """The agent, and where it believed the tip to be (Δtip, mm) at each decision."""
-
-    def __init__(self, agent: AgentPolicy) -> None:
-        self._agent = agent
-
-    def start(self, navigation: Navigation, seed: int) -> None:
-        self._agent.start(navigation, seed)
-        self.abscissa: list[float] = []
-
-    def decide(self, observation: Observation) -> Decision:
-        decision = self._agent.decide(observation)
-        self.abscissa.append(float(self._agent.belief.likeliest_tip().abscissa[0]))
-        return decision
 
 
 class _Repeated:

@@ -1,0 +1,135 @@
+"""What happened in a navigation: `NavigationRecord`, and `Track`, which gathers it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from endopilot.anatomy.projection import project_tip
+from endopilot.control.policy import BelievedTip
+from endopilot.simulation.simulator import Simulator
+from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
+from endopilot.types import TipProjection
+from endopilot.xray.fluoroscope import TipMeasurement
+
+
+@dataclass(frozen=True, eq=False)
+class NavigationRecord:
+    """A navigation as it truly went: a sample at the start and one after each decision period.
+
+    Attributes:
+        time_s: s.
+        inserted_length: Δ, mm.
+        rotation: φ, rad.
+        tip_position: LPS mm.
+        tip: Δtip, γtip, branch and lumen radius.
+        contact_force_max: largest wall force on one node over the period that ends here, N.
+        exposed: whether X-ray was on at this moment.
+        control: what was commanded from this moment on, within the limits, mm/s and rad/s; 0 at the end.
+        measured: what X-ray showed at this moment, or None.
+        believed: where the policy believed the tip to be when it decided; NaN at the end, and None for a policy that
+            does not tell: (Δtip, γtip), mm.
+        half_width: of the adviser's bands around it, mm, likewise; NaN where there is none.
+        driven: velocity of the wire's proximal end that the drive asked for in each cycle of `CYCLE_S`, mm/s and rad/s.
+            `endopilot.simulate` makes the same navigation of it, to the bit.
+        success: the tip reached the target in time, at the end of a period.
+        safe: the wall force never exceeded the navigation's limit.
+        seconds: how long it took, s.
+        peak_force_n: largest wall force on one node, N.
+        exposures: their number, of both views together as one.
+        path_mm: length of the tip's path, sample to sample, mm.
+        faults: decisions that were not finite or beyond the drive's limits, and were mended.
+        reason: "reached", "time", "invalid" (the simulation failed) or "stopped" (it was ended before).
+    """
+
+    time_s: Float[np.ndarray, "samples"]
+    inserted_length: Float[np.ndarray, "samples"]
+    rotation: Float[np.ndarray, "samples"]
+    tip_position: Float[np.ndarray, "samples 3"]
+    tip: TipProjection
+    contact_force_max: Float[np.ndarray, "samples"]
+    exposed: Bool[np.ndarray, "samples"]
+    control: Float[np.ndarray, "samples 2"]
+    measured: tuple[TipMeasurement | None, ...]
+    believed: Float[np.ndarray, "samples 2"] | None
+    half_width: Float[np.ndarray, "samples 2"] | None
+    driven: Float[np.ndarray, "cycles 2"]
+    success: bool
+    safe: bool
+    seconds: float
+    peak_force_n: float
+    exposures: int
+    path_mm: float
+    faults: int
+    reason: str
+
+
+class Track:
+    """Gathers what happens in a navigation."""
+
+    def __init__(self, simulator: Simulator) -> None:
+        """Take the start."""
+        self._columns: dict[str, list] = {name: [] for name in ("proximal", "position", "force")}
+        self._controls: list[tuple[float, float]] = []
+        self._measured: list[TipMeasurement | None] = []
+        self._believed: list[BelievedTip | None] = []
+        self._faults = 0
+        self.moved(simulator, float(simulator.contacts.max()))
+
+    def decided(
+        self, control: tuple[float, float], tip: TipMeasurement | None, believed: BelievedTip | None, *, fault: bool
+    ) -> None:
+        """Take what was decided, what X-ray showed then, and what the policy believed."""
+        self._controls.append(control)
+        self._measured.append(tip)
+        self._believed.append(believed)
+        self._faults += fault
+
+    def moved(self, simulator: Simulator, peak_n: float) -> None:
+        """Take where the wire is at the end of a period, and the largest wall force in it, N."""
+        self._columns["proximal"].append([simulator.inserted_length[0], simulator.rotation[0]])
+        self._columns["position"].append(simulator.position[0, 0])
+        self._columns["force"].append(peak_n)
+
+    def record(self, navigation: Navigation, driven: list[np.ndarray], reason: str) -> NavigationRecord:
+        """Return the record of what was gathered up to the end of the last period.
+
+        Args:
+            navigation: what was to be done.
+            driven: velocity of each cycle of the drive, mm/s and rad/s.
+            reason: why it ended.
+        """
+        anatomy = navigation.anatomy
+        proximal, position = np.array(self._columns["proximal"]), np.array(self._columns["position"])
+        force = np.array(self._columns["force"])
+        periods = len(force) - 1  # a decision whose period is not over does not count
+        measured = (*self._measured[:periods], None)
+        believed = [_NOTHING if tip is None else tip for tip in self._believed[:periods]] + [_NOTHING]
+        tells = any(tip is not None for tip in self._believed)
+        return NavigationRecord(
+            time_s=DECISION_PERIOD_S * np.arange(len(force)),
+            inserted_length=proximal[:, 0],
+            rotation=proximal[:, 1],
+            tip_position=position,
+            tip=project_tip(anatomy.tree, anatomy.insertion, position),
+            contact_force_max=force,
+            exposed=np.array([tip is not None for tip in measured]),
+            control=np.array([*self._controls[:periods], (0.0, 0.0)]),
+            measured=measured,
+            believed=np.array([(tip.abscissa, tip.offset) for tip in believed]) if tells else None,
+            half_width=np.array([tip.half_width for tip in believed]) if tells else None,
+            driven=np.array(driven, dtype=float).reshape(-1, 2),
+            success=reason == "reached",
+            safe=bool(force.max() <= navigation.force_limit_n),
+            seconds=DECISION_PERIOD_S * periods,
+            peak_force_n=float(force.max()),
+            exposures=sum(tip is not None for tip in measured),
+            path_mm=float(np.linalg.norm(np.diff(position, axis=0), axis=1).sum()),
+            faults=self._faults,
+            reason=reason,
+        )
+
+
+_NOTHING = BelievedTip(abscissa=np.nan, offset=np.nan)
