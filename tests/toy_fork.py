@@ -10,9 +10,13 @@ from endopilot.types import Anatomy, DistanceMap, Insertion
 SPACING_MM = 0.4
 
 
-def make_fork() -> Anatomy:
-    """Return the vessel: 1 mm in radius along z, a branch of 0.8 mm that leaves after 20 mm, the ostium at 0."""
-    tree = forked_tree(radius=(1.0, 0.8))
+def make_fork(radius: tuple[float, float] = (1.0, 0.8)) -> Anatomy:
+    """Return the vessel: along z, with a branch that leaves after 20 mm, the ostium at 0.
+
+    Args:
+        radius: of the vessel and of the branch, mm.
+    """
+    tree = forked_tree(radius=radius)
     low, high = np.array([-4.0, -4.0, -26.0]), np.array([22.0, 4.0, 44.0])
     axes = [np.arange(a, b, SPACING_MM) for a, b in zip(low, high, strict=True)]
     z, y, x = np.meshgrid(*axes[::-1], indexing="ij")

@@ -19,7 +19,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, dataclass_transform, get_args, get_origin, overload
+from typing import Annotated, Any, TypeVar, cast, dataclass_transform, get_args, get_origin, overload
 
 import numpy as np
 import yaml
@@ -153,7 +153,9 @@ def settings(cls: type[T] | None = None, /, *, eq: bool = True) -> Any:
 
 
 def from_record(cls: type[T], record: Any) -> T:
-    """Return settings from the names and values of all their fields, as `dataclasses.asdict` or a file gives them.
+    """Return settings from the names and values of their fields, as `dataclasses.asdict` or a file gives them.
+
+    All fields must be there but those that are None by default.
 
     Raises:
         InputError: it is no such record; the line names field, value and what to give instead.
@@ -161,9 +163,9 @@ def from_record(cls: type[T], record: Any) -> T:
     if not isinstance(record, Mapping) or not all(isinstance(name, str) for name in record):
         raise InputError(f"holds no mapping of fields; the fields are {', '.join(_fields(cls))}")
     read = cls(**record)
-    for name in _fields(cls):
-        if name not in record:
-            raise InputError(f"{name}: missing; add it")
+    for field in dataclasses.fields(cast(Any, cls)):
+        if field.name not in record and field.default is not None:
+            raise InputError(f"{field.name}: missing; add it")
     return read
 
 

@@ -65,6 +65,7 @@ def command(
     wire = read_device(device)
     if controls is not None and controls.is_dir():
         plan = read_plan(controls, patient, wire)
+        patient, wire = plan.navigation.anatomy, plan.navigation.device
         begin = plan.navigation.start_inserted_mm, plan.navigation.start_rotation
         initial, control = np.array([begin]), plan.control[None]
     elif controls is not None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +17,7 @@ from endopilot.control.plan_config import NETWORK_METHODS, Plan, PlanConfig, Ste
 from endopilot.control.robot import RobotConfig
 from endopilot.control.route import Route, check_passable, parse_target
 from endopilot.control.search import Course, SearchConfig
+from endopilot.control.set_up import TipChoice, choose_tip
 from endopilot.errors import InputError
 from endopilot.extras import extra_named
 from endopilot.models.config import read_run
@@ -79,6 +79,16 @@ def plan(
     )
     route = Route.to(vessel, goal)
     check_passable(route, wire)
+    choice, began = None, _clock()
+    if model is None:
+        choice = choose_tip(navigation, config.tip, catheter_tilt_deg=config.catheter_tilt_deg)
+        navigation = choice.navigation
+        route = Route.to(navigation.anatomy, goal)
+    elif config.tip not in ("auto", "own"):
+        raise InputError(
+            f"tip: {config.tip}; {model} was trained with the wire's own tip: give own, or leave --tip out"
+        )
+    spent = _clock() - began
     if tips is None:
         _check_time(navigation, config)
         desired = tips_along(
@@ -92,13 +102,18 @@ def plan(
     else:
         desired = tips[["abscissa", "offset"]].to_numpy(float)
     find = _method(navigation, config, model, desired, route, follow=tips is not None)
-    began, worked = time.perf_counter(), time.process_time()
+    began = _clock()
     control, predicted = find()
-    spent = time.perf_counter() - began, time.process_time() - worked
-    made = _checked(navigation, config, model, desired, control, predicted, spent)
+    spent += _clock() - began
+    made = _checked(navigation, config, model, choice, desired, control, predicted, spent)
     if config.method == "twin":
         _check_kept(made)
     return made
+
+
+def _clock() -> Float[np.ndarray, "2"]:
+    """Return wall time and processor time, s."""
+    return np.array([time.perf_counter(), time.process_time()])
 
 
 def _method(
@@ -127,7 +142,7 @@ def _wire(model: Path | None, device: Device | str | Path | None, method: str) -
             )
         return asked or read_device("workhorse-014")
     trained = from_record(Device, read_run(model)["device"])
-    if asked is not None and replace(asked, sources={}) != replace(trained, sources={}):
+    if asked is not None and asked.constants != trained.constants:
         raise InputError(
             f"--device {asked.name}: {model} was trained with {trained.name}; leave --device out or train anew"
         )
@@ -221,8 +236,8 @@ def _by_policy(navigation: Navigation, config: PlanConfig) -> tuple[Steps, Steps
 
 
 def _checked(
-    navigation: Navigation, config: PlanConfig, model: Path | None, desired: Float[np.ndarray, "wanted 2"],
-    control: Steps, predicted: Steps, spent: tuple[float, float],
+    navigation: Navigation, config: PlanConfig, model: Path | None, choice: TipChoice | None,
+    desired: Float[np.ndarray, "wanted 2"], control: Steps, predicted: Steps, spent: Float[np.ndarray, "2"],
 ) -> Plan:  # fmt: skip
     """Put the controls within the limits, drive the rod core with them, and return the plan."""
     limits = DriveLimits.of(navigation.device, navigation.anatomy)
@@ -245,8 +260,10 @@ def _checked(
         position=rollout.tip_position[0],
         force=rollout.contact_force_max[0],
         reached=bool(navigation.reached(tip).any()),
-        seconds_to_plan=spent[0],
-        processor_seconds=spent[1],
+        why=choice.why if choice else "",
+        tilt_deg=choice.tilt_deg if choice else 0.0,
+        seconds_to_plan=float(spent[0]),
+        processor_seconds=float(spent[1]),
     )
 
 

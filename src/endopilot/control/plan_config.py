@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.control.cost import Cost
-from endopilot.settings import Count, Finite, NonNegative, Positive, Seed, settings
+from endopilot.control.set_up import TILT_DEG
+from endopilot.settings import Count, Finite, NonNegative, Positive, Seed, Text, Within, settings
 from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.types import TipProjection
@@ -48,6 +49,11 @@ class PlanConfig:
     """Time in which the target is to be reached, s."""
     speed_mm_s: Positive = 10.0
     """Speed of the desired tip along the route, mm/s."""
+    tip: Text = "auto"
+    """Shape of the wire's tip: auto (chosen for the forks of the route), own (the device's), or angle and length such
+    as 75/5, 75 degrees over 5 mm. A trained model goes with its device's own."""
+    catheter_tilt_deg: Annotated[float, Within(0, 45)] = TILT_DEG
+    """How far the guiding catheter may be turned at the ostium where a fork cannot be entered otherwise, degrees."""
     start_inserted_mm: NonNegative = 2.0
     """Inserted length at the start, mm."""
     start_rotation: Finite = 0.0
@@ -78,6 +84,8 @@ class Plan:
         position: of that tip, LPS mm.
         force: largest wall force on one node in the rod core, N.
         reached: whether the target is reached at the end of a period in the rod core.
+        why: why the tip has its shape and the catheter its axis; empty where both are the given ones.
+        tilt_deg: angle by which the catheter was turned from the anatomy's axis, degrees.
         seconds_to_plan: wall time that finding the controls took, s.
         processor_seconds: processor time of it, s.
     """
@@ -93,6 +101,8 @@ class Plan:
     position: Float[np.ndarray, "samples 3"]
     force: Float[np.ndarray, "samples"]
     reached: bool
+    why: str
+    tilt_deg: float
     seconds_to_plan: float
     processor_seconds: float
 

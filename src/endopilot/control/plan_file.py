@@ -24,7 +24,7 @@ The last three are there if the plan holds X-ray.
 from __future__ import annotations
 
 import shutil
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,7 @@ import pandas as pd
 
 from endopilot.control.plan_config import Plan, PlanConfig
 from endopilot.control.plan_xray import PlannedXray
+from endopilot.control.set_up import tip_name, with_axis
 from endopilot.errors import InputError
 from endopilot.files import json_text, manifest, read_json, sha256, writing
 from endopilot.settings import from_record
@@ -74,6 +75,9 @@ def write_plan(plan: Plan, folder: Path, xray: PlannedXray | None = None) -> dic
     )  # fmt: skip
     figures = {
         "method": plan.config.method,
+        "tip": tip_name(navigation.device),
+        "why": plan.why,
+        "catheter_tilt_deg": plan.tilt_deg,
         "reached": plan.reached,
         "within_force_limit": plan.within_force_limit,
         "seconds": plan.seconds,
@@ -103,6 +107,7 @@ def write_plan(plan: Plan, folder: Path, xray: PlannedXray | None = None) -> dic
             inputs={},
             anatomy={"name": navigation.anatomy.name, "identity": navigation.anatomy.identity},
             device=asdict(navigation.device),
+            catheter_axis=navigation.anatomy.insertion.direction.tolist() if plan.tilt_deg else None,
             model=plan.model,
             target=asdict(navigation.target),
             start={"inserted_length_mm": navigation.start_inserted_mm, "rotation_rad": navigation.start_rotation},
@@ -119,6 +124,8 @@ def write_plan(plan: Plan, folder: Path, xray: PlannedXray | None = None) -> dic
 def read_plan(folder: Path, anatomy: Anatomy, device: Device) -> Plan:
     """Read a plan that `write_plan` wrote, for the anatomy and the wire that it was made for.
 
+    The plan's own wire has the tip, and its anatomy the catheter's axis, that were chosen for it.
+
     Raises:
         InputError: a file is missing or damaged, or the plan is for another anatomy or device.
     """
@@ -131,12 +138,15 @@ def read_plan(folder: Path, anatomy: Anatomy, device: Device) -> Plan:
     except InputError as error:
         raise InputError(f"{folder / _RECORD}: config: {error}, or plan anew") from None
     made = record["anatomy"]
+    if record["catheter_axis"] is not None:
+        anatomy = with_axis(anatomy, np.array(record["catheter_axis"]))
     if made.get("identity") != anatomy.identity:
         raise InputError(
             f"{folder}: the plan is for another anatomy ({made['name']}), not for this {anatomy.name}; plan anew"
         )
     planned = from_record(Device, record["device"])
-    if planned.constants != device.constants:
+    tip = {"tip_bend_rad": planned.tip_bend_rad, "tip_bend_length_mm": planned.tip_bend_length_mm}
+    if planned.constants != replace(device, **tip).constants:
         raise InputError(f"{folder}: the plan is for another device ({planned.name}), not for {device.name}; plan anew")
     if not (folder / _TABLE).exists() or sha256(folder / _TABLE) != record["table_sha256"]:
         raise InputError(f"{folder / _TABLE}: is missing or differs from what {_RECORD} records; plan anew")
@@ -149,7 +159,7 @@ def read_plan(folder: Path, anatomy: Anatomy, device: Device) -> Plan:
     return Plan(
         navigation=Navigation(
             anatomy=anatomy,
-            device=device,
+            device=planned,
             target=Target(**record["target"]),
             start_inserted_mm=record["start"]["inserted_length_mm"],
             start_rotation=record["start"]["rotation_rad"],
@@ -171,6 +181,8 @@ def read_plan(folder: Path, anatomy: Anatomy, device: Device) -> Plan:
         position=np.column_stack([column[f"tip_{axis}_mm"] for axis in "xyz"]),
         force=column["contact_force_n"],
         reached=record["reached"],
+        why=record["why"],
+        tilt_deg=record["catheter_tilt_deg"],
         seconds_to_plan=record["seconds_to_plan"],
         processor_seconds=record["processor_seconds"],
     )

@@ -30,6 +30,32 @@ Value = TypeVar("Value")
 
 
 @settings
+class TipShaping:
+    """The bends that a hand can give the tip of a wire.
+
+    Attributes:
+        angle_deg: least and largest angle, degrees.
+        length_mm: least and largest length from the tip over which it is bent, mm.
+    """
+
+    angle_deg: tuple[NonNegative, NonNegative]
+    length_mm: tuple[Positive, Positive]
+
+    @model_validator(mode="after")
+    def _consistent(self) -> TipShaping:
+        for name in ("angle_deg", "length_mm"):
+            low, high = getattr(self, name)
+            if low > high:
+                raise ValueError(f"{name}: [{low:g}, {high:g}]; give the least first")
+        return self
+
+    def allows(self, angle_deg: float, length_mm: float) -> bool:
+        """Return whether a hand can bend the tip by an angle (degrees) over a length (mm)."""
+        (least, largest), (shortest, longest) = self.angle_deg, self.length_mm
+        return least <= angle_deg <= largest and shortest <= length_mm <= longest
+
+
+@settings
 class Device:
     """A guidewire, or another slender device driven at its proximal end.
 
@@ -50,6 +76,7 @@ class Device:
         pull_limit_n: force at which it slips rather than pull harder, N.
         torque_limit_n_mm: torque at which it slips rather than turn the wire harder, in either direction, N·mm.
         sources: where each constant comes from.
+        tip_shaping: the bends that a hand can give its tip; None where the tip keeps the bend that it has.
     """
 
     name: Text
@@ -67,6 +94,7 @@ class Device:
     pull_limit_n: Positive
     torque_limit_n_mm: Positive
     sources: dict[str, str]
+    tip_shaping: TipShaping | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> Device:
@@ -84,7 +112,8 @@ class Device:
     @property
     def constants(self) -> tuple[Any, ...]:
         """All numbers of the device, in the order of its fields: devices with the same constants behave the same."""
-        return tuple(getattr(self, field.name) for field in fields(self) if field.name not in ("name", "sources"))
+        others = ("name", "sources", "tip_shaping")
+        return tuple(getattr(self, field.name) for field in fields(self) if field.name not in others)
 
     @property
     def tip_radius_mm(self) -> float:
@@ -118,6 +147,10 @@ class Device:
             bend_stiffness_n_mm2=tuple(bend.tolist()),
             twist_stiffness_n_mm2=tuple(twist.tolist()),
         )
+
+    def shaped(self, angle_deg: float, length_mm: float) -> Device:
+        """Return the device with its tip bent by an angle (degrees) over a length (mm)."""
+        return replace(self, tip_bend_rad=math.radians(angle_deg), tip_bend_length_mm=float(length_mm))
 
     def summary(self) -> dict[str, Any]:
         """Return what a list of devices shows.
@@ -159,6 +192,13 @@ class _TipBend:
 
 
 @settings
+class _Shaping(TipShaping):
+    """The bends that a hand can give the tip, in a device's file, and where their limits come from."""
+
+    source: Text
+
+
+@settings
 class _DeviceFile:
     """What a device's file holds; `Device` says what each constant means."""
 
@@ -175,6 +215,7 @@ class _DeviceFile:
     twist_stiffness_n_mm2: _Sourced[tuple[Positive, ...]]
     tip_load_n: _Sourced[Positive | None]
     tip_bend: _TipBend
+    tip_shaping: _Shaping | None = None
 
 
 def read_device(name_or_path: str | Path) -> Device:
@@ -186,6 +227,8 @@ def read_device(name_or_path: str | Path) -> Device:
     path, _ = device_yaml(name_or_path)
     content = read_settings(path, _DeviceFile)
     entries = {field.name: getattr(content, field.name) for field in fields(content) if field.name != "name"}
+    entries = {name: entry for name, entry in entries.items() if entry is not None}
+    shaping = content.tip_shaping
     constants = {name: entry.value for name, entry in entries.items() if isinstance(entry, _Sourced)}
     try:
         return Device(
@@ -194,6 +237,7 @@ def read_device(name_or_path: str | Path) -> Device:
             tip_bend_rad=math.radians(content.tip_bend.angle_deg),
             tip_bend_length_mm=content.tip_bend.length_mm,
             sources={name: entry.source for name, entry in entries.items()},
+            tip_shaping=shaping and TipShaping(angle_deg=shaping.angle_deg, length_mm=shaping.length_mm),
         )
     except InputError as error:
         raise InputError(f"{path}: {error}") from None

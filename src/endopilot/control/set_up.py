@@ -1,0 +1,178 @@
+"""What is chosen before a wire goes in, `choose_tip`: the shape of its tip, and the axis of the guiding catheter.
+
+Of the tips that a hand can give the wire, the one of least lateral reach is taken that enters every fork of the route
+with a quarter of all rotations; else the one that enters the hardest fork with most. Where none enters a fork near the
+ostium, the guiding catheter is turned too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from endopilot.anatomy.distance import add_catheter
+from endopilot.anatomy.tree import cross_axes
+from endopilot.control.reach import ROTATIONS, Fork, forks, lateral_reach, rotations_that_enter
+from endopilot.control.route import Route
+from endopilot.errors import InputError
+from endopilot.simulation.device import Device
+from endopilot.tasks.navigation import Navigation
+from endopilot.types import Anatomy, Insertion
+
+SHAPES = ((45.0, 3.0), (60.0, 4.0), (75.0, 5.0), (90.0, 6.5), (90.0, 8.0), (90.0, 10.0))
+"""Tips that are tried, angle in degrees and length in mm: from the usual one to the largest that a hand bends."""
+ENOUGH = ROTATIONS // 4
+"""A tip that enters every fork with this many of the rotations suffices: a quarter of a turn may be missed by a robot's
+backlash and a wire's friction."""
+TILT_DEG = 20.0
+"""A guiding catheter's tip is turned this far at the ostium, at most, degrees."""
+_CATHETER_MM = 20.0
+"""The catheter's axis decides how the wire lies as far as this from the ostium, mm."""
+_AZIMUTHS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class TipChoice:
+    """How a navigation is set up.
+
+    Attributes:
+        navigation: with the wire as it is shaped, in the anatomy with its catheter as it is turned.
+        tilt_deg: angle by which the catheter's axis was turned, degrees.
+        forks: of the route.
+        entering: with how many of `ROTATIONS` rotations the tip enters each.
+        why: why this tip and this axis, in one line.
+    """
+
+    navigation: Navigation
+    tilt_deg: float
+    forks: tuple[Fork, ...]
+    entering: Int[np.ndarray, "forks"]
+    why: str
+
+    @property
+    def refused(self) -> Fork | None:
+        """The first fork that the tip enters with no rotation, or None."""
+        return _refused(self.forks, self.entering)
+
+    @property
+    def tip(self) -> str:
+        """The shape of the tip, such as "75/5": degrees and mm."""
+        return tip_name(self.navigation.device)
+
+
+def choose_tip(navigation: Navigation, tip: str = "auto", *, catheter_tilt_deg: float = TILT_DEG) -> TipChoice:
+    """Choose the shape of the wire's tip for a navigation, and turn the guiding catheter where that alone helps.
+
+    Args:
+        navigation: vessel, wire and target, the wire with its own tip.
+        tip: "auto", "own" for the wire's own tip, or a shape such as "75/5": degrees and mm.
+        catheter_tilt_deg: how far the catheter's axis may be turned, degrees; 0 leaves it as it is.
+
+    Raises:
+        InputError: no such tip, or one that a hand cannot give the wire.
+    """
+    devices = _tips(navigation.device, tip)
+    places = forks(Route.to(navigation.anatomy, navigation.target), navigation.device)
+    counts = rotations_that_enter(navigation, devices)
+    best = _best(counts)
+    made = replace(navigation, device=devices[best])
+    refused = _refused(places, counts[best])
+    if refused is None:
+        return TipChoice(made, 0.0, places, counts[best], _why(made.device, places, counts, best))
+    tilt_deg = 0.0
+    if catheter_tilt_deg > 0 and refused.abscissa <= _CATHETER_MM:
+        turned = [with_axis(navigation.anatomy, axis) for axis in _axes(navigation.anatomy, catheter_tilt_deg)]
+        tried = [(anatomy, rotations_that_enter(replace(navigation, anatomy=anatomy), devices)) for anatomy in turned]
+        anatomy, after = max(tried, key=lambda pair: _merit(pair[1][_best(pair[1])]))
+        if _merit(after[_best(after)]) > _merit(counts[best]):
+            counts, best, tilt_deg = after, _best(after), catheter_tilt_deg
+            made = replace(navigation, anatomy=anatomy, device=devices[best])
+    why = _why(made.device, places, counts, best)
+    if tilt_deg:
+        why += f"; the catheter is turned by {tilt_deg:g} degrees, for before no tip entered {refused}"
+    return TipChoice(made, tilt_deg, places, counts[best], why)
+
+
+def tip_name(device: Device) -> str:
+    """Return the shape of a wire's tip as `--tip` takes it, such as "75/5": degrees and mm."""
+    return f"{np.degrees(device.tip_bend_rad):.4g}/{device.tip_bend_length_mm:.4g}"
+
+
+def _tips(device: Device, tip: str) -> list[Device]:
+    """Return the wire with each tip that may be chosen, its own one first."""
+    shaping = device.tip_shaping
+    if tip == "own" or (tip == "auto" and shaping is None):
+        return [device]
+    if tip == "auto":
+        assert shaping is not None
+        shapes = [device.shaped(*shape) for shape in SHAPES if shaping.allows(*shape)]
+        return [device, *(made for made in shapes if made.constants != device.constants)]
+    try:
+        angle_deg, length_mm = (float(part) for part in tip.split("/"))
+    except ValueError:
+        raise InputError(f"tip: {tip!r}; give auto, own, or angle and length as 75/5 (75 degrees over 5 mm)") from None
+    if shaping is None or not shaping.allows(angle_deg, length_mm):
+        raise InputError(f"tip: {tip} cannot be given to {device.name}; {_limits(device)}")
+    return [device.shaped(angle_deg, length_mm)]
+
+
+def _limits(device: Device) -> str:
+    shaping = device.tip_shaping
+    if shaping is None:
+        return "its tip keeps its shape"
+    (least, largest), (shortest, longest) = shaping.angle_deg, shaping.length_mm
+    return f"a hand bends its tip by {least:g} to {largest:g} degrees over {shortest:g} to {longest:g} mm"
+
+
+def _best(counts: Int[np.ndarray, "devices forks"]) -> int:
+    """Return the device that is taken; their own tip stands first, the others by increasing reach."""
+    enough = (counts >= ENOUGH).all(axis=1)
+    if enough.any():
+        return int(np.argmax(enough))
+    return max(range(len(counts)), key=lambda index: (_merit(counts[index]), -index))
+
+
+def _merit(count: Int[np.ndarray, "forks"]) -> tuple[int, int]:
+    """Return how good a tip is: forks that it enters, and rotations at the hardest of them."""
+    entered = count[count > 0]
+    return len(entered), int(entered.min()) if len(entered) else 0
+
+
+def _axes(anatomy: Anatomy, tilt_deg: float) -> list[Float[np.ndarray, "3"]]:
+    """Return the catheter's axis, turned to all sides."""
+    axis, angle = anatomy.insertion.direction, np.radians(tilt_deg)
+    one, two = (side[0] for side in cross_axes(axis[None]))
+    around = 2 * np.pi * np.arange(_AZIMUTHS) / _AZIMUTHS
+    return [np.cos(angle) * axis + np.sin(angle) * (np.cos(a) * one + np.sin(a) * two) for a in around]
+
+
+def with_axis(anatomy: Anatomy, axis: Float[np.ndarray, "3"]) -> Anatomy:
+    """Return the anatomy with its catheter turned about the ostium; where the catheter lay, the map stays open."""
+    insertion = Insertion(anatomy.insertion.position, axis)
+    opened = add_catheter(anatomy.distance_map, insertion, anatomy.catheter_radius_mm)
+    return replace(anatomy, distance_map=opened, insertion=insertion)
+
+
+def _refused(places: tuple[Fork, ...], count: Int[np.ndarray, "forks"]) -> Fork | None:
+    """Return the first fork that a tip enters with no rotation, or None."""
+    return next((fork for fork, entering in zip(places, count.tolist(), strict=True) if not entering), None)
+
+
+def _why(device: Device, places: tuple[Fork, ...], counts: Int[np.ndarray, "devices forks"], best: int) -> str:
+    """Return why a tip was taken of those that were tried, the wire's own or the only one first."""
+    shape = f"tip {tip_name(device)} (reach {lateral_reach(device.tip_bend_rad, device.tip_bend_length_mm):.1f} mm)"
+    if not places:
+        return f"{shape}: the route has no fork"
+    refused = _refused(places, counts[best])
+    if refused is not None:
+        which = "does not enter" if len(counts) == 1 else f"as none of the {len(counts)} tips tried, does not enter"
+        return f"{shape}, {which} {refused}, {refused.width_mm:.1f} mm wide for the wire"
+    hardest = int(np.argmin(counts[best]))
+    why = f"{shape} enters every fork of the route; the hardest, {places[hardest]}, "
+    why += f"{places[hardest].width_mm:.1f} mm wide for the wire, by {counts[best][hardest]} of {ROTATIONS} rotations"
+    if best:
+        first = int(np.argmin(counts[0]))
+        why += f"; the wire's own tip enters {places[first]} by {counts[0][first]}"
+    return why

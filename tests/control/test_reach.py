@@ -1,0 +1,110 @@
+"""A tip's lateral reach against its closed form; the test of reach at a fork of known width; what is chosen by it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from endopilot.control.reach import ROTATIONS, forks, lateral_reach, rotations_that_enter
+from endopilot.control.route import Route
+from endopilot.control.set_up import choose_tip
+from endopilot.errors import InputError
+from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.core import run_core
+from endopilot.simulation.rod import lay_out
+from endopilot.tasks.navigation import Navigation, Target
+from endopilot.types import Insertion
+from toy_fork import make_fork
+
+RADIUS_MM = 2.6
+"""Of the wide vessel: that of a real left main."""
+
+
+@pytest.fixture(scope="module")
+def wide(wire) -> Navigation:
+    return Navigation(anatomy=make_fork((RADIUS_MM, 2.0)), device=wire, target=Target(branch=2, abscissa=33.0))
+
+
+@pytest.mark.parametrize(
+    ("angle_deg", "length_mm", "reach_mm"), [(45.0, 3.0, 1.119), (75.0, 5.0, 2.831), (90.0, 8.0, 5.093)]
+)
+def test_reach_is_that_of_an_arc(wire, angle_deg, length_mm, reach_mm) -> None:
+    """An arc of angle θ and length L has the radius L/θ, and its end lies L/θ·(1 − cos θ) beside its tangent."""
+    assert lateral_reach(np.radians(angle_deg), length_mm) == pytest.approx(reach_mm, abs=1e-3)
+    assert lateral_reach(-np.radians(angle_deg), length_mm) == pytest.approx(reach_mm, abs=1e-3)
+    shaped, config = wire.shaped(angle_deg, length_mm), SimulatorConfig(element_mm=0.25, threads=1)
+    free = run_core(
+        lay_out(shaped, element_mm=0.25, length_mm=30.0),
+        None,  # no wall: the wire takes its own shape
+        Insertion(np.zeros(3), np.array([0.0, 0.0, 1.0])),
+        config=config,
+        initial=np.array([[20.0, 0.0]]),
+        control=np.zeros((1, 20, 2)),
+        friction=np.zeros(1),
+        approach=False,
+    )
+    assert np.hypot(*free["tip_position"][0, -1, :2]) == pytest.approx(reach_mm, rel=0.02)
+
+
+def test_reach_of_tips_without_and_with_more_than_half_a_turn() -> None:
+    assert lateral_reach(0.0, 0.0) == 0.0 and lateral_reach(1e-6, 5.0) == pytest.approx(0.0, abs=1e-5)
+    assert lateral_reach(np.pi, 3 * np.pi) == pytest.approx(6.0)  # half a circle of radius 3 mm: its diameter
+    assert lateral_reach(1.5 * np.pi, 4.5 * np.pi) == pytest.approx(6.0)  # what lies beyond comes back
+
+
+def test_a_fork_is_as_wide_as_its_lumen_leaves_the_wire(wide, wire) -> None:
+    (fork,) = forks(Route.to(wide.anatomy, wide.target), wire)
+    assert fork.width_mm == pytest.approx(2 * RADIUS_MM - 0.36)
+    assert fork.abscissa == pytest.approx(20.0) and fork.branch == 2
+    assert not forks(Route.to(wide.anatomy, Target(branch=0, abscissa=10.0)), wire)
+
+
+def test_a_wide_fork_refuses_a_short_tip_and_takes_a_long_one(wide, wire) -> None:
+    """4.8 mm are free: 45°/3 mm reaches 1.1 mm of them, 90°/8 mm all."""
+    count = rotations_that_enter(wide, [wire.shaped(45.0, 3.0), wire.shaped(90.0, 8.0)])
+    assert count.shape == (2, 1)
+    assert count[0, 0] == 0 and ROTATIONS / 4 <= count[1, 0] <= ROTATIONS / 2  # the side that looks into the branch
+    straight = rotations_that_enter(replace(wide, target=Target(branch=1, abscissa=33.0)), [wire.shaped(45.0, 3.0)])
+    assert straight[0, 0] == ROTATIONS
+
+
+def test_a_tip_is_chosen_that_enters(wide, wire) -> None:
+    choice = choose_tip(wide)
+    made = choice.navigation
+    assert choice.refused is None and choice.tilt_deg == 0.0 and made.anatomy is wide.anatomy
+    assert lateral_reach(made.device.tip_bend_rad, made.device.tip_bend_length_mm) > 1.2
+    assert choice.tip in choice.why and "own tip enters the fork into section" in choice.why
+    assert rotations_that_enter(made, [made.device])[0, 0] == choice.entering[0] > 0
+    straight = choose_tip(replace(wide, target=Target(branch=1, abscissa=33.0)))
+    assert straight.tip == "45/3" and straight.navigation.device == wire  # its own tip suffices and is kept
+
+
+def test_a_fixed_tip_is_kept_and_the_fork_that_refuses_it_is_named(wide) -> None:
+    choice = choose_tip(wide, "45/3", catheter_tilt_deg=0.0)
+    assert choice.tip == "45/3"
+    assert choice.refused is not None and choice.refused.branch == 2
+    assert f"does not enter {choice.refused}" in choice.why and "at 20.0 mm" in choice.why
+
+
+@pytest.mark.parametrize(
+    ("tip", "message"),
+    [
+        ("120/8", "120/8 cannot be given to workhorse-014; a hand bends its tip by 0 to 90 degrees over 2 to 10 mm"),
+        ("90/12", "90/12 cannot be given to workhorse-014"),
+        ("nan/8", "nan/8 cannot be given"),
+        ("bent", "'bent'; give auto, own, or angle and length as 75/5"),
+        ("75", "'75'; give auto, own"),
+    ],
+)
+def test_a_tip_that_no_hand_can_shape_is_refused(wide, tip, message) -> None:
+    with pytest.raises(InputError, match=message):
+        choose_tip(wide, tip)
+
+
+def test_a_wire_that_keeps_its_shape_is_tried_with_its_own_tip_alone(wide, wire) -> None:
+    fixed = replace(wide, device=replace(wire, tip_shaping=None))
+    assert choose_tip(fixed).tip == "45/3"
+    with pytest.raises(InputError, match="its tip keeps its shape"):
+        choose_tip(fixed, "75/5")
