@@ -64,8 +64,8 @@ def test_a_written_plan_is_read_back_and_drives_the_simulator(found, vessel, tmp
         assert np.allclose(getattr(back, name), getattr(found, name), atol=1e-12), name
     assert np.array_equal(back.simulated.branch, found.simulated.branch)
     assert back.navigation.target == found.navigation.target and back.config == found.config
-    initial, control = read_controls_csv(tmp_path / "plan" / "plan.csv")
-    rollout = simulate(anatomy, device, control, initial=initial, config=SimulatorConfig(threads=1))
+    script = read_controls_csv(tmp_path / "plan" / "plan.csv")
+    rollout = simulate(anatomy, device, script.control, initial=script.initial, config=SimulatorConfig(threads=1))
     assert np.allclose(rollout.tip_position[0], found.position, atol=1e-3)
 
 

@@ -65,9 +65,19 @@ def test_insertion_stays_in_its_range() -> None:
 def test_controls_from_csv(tmp_path: Path) -> None:
     path = tmp_path / "c.csv"
     path.write_text("time_s,translation_mm_s,rotation_rad_s\n0.5,2,0\n1.0,-1,0.5\n")
-    initial, control = read_controls_csv(path)
-    np.testing.assert_array_equal(initial, [[0, 0]])
-    np.testing.assert_array_equal(control, [[[2, 0], [-1, 0.5]]])
+    script = read_controls_csv(path)
+    np.testing.assert_array_equal(script.initial, [[0, 0]])
+    np.testing.assert_array_equal(script.control, [[[2, 0], [-1, 0.5]]])
+    assert script.period_s == 0.5
+
+
+def test_controls_from_csv_may_hold_for_another_time(tmp_path: Path) -> None:
+    path = tmp_path / "c.csv"
+    columns = "time_s,translation_mm_s,rotation_rad_s,inserted_length_mm,rotation_rad\n"
+    path.write_text(columns + "0.05,2,1,5.1,0.25\n0.1,-1,0.5,5.05,0.275\n")
+    script = read_controls_csv(path)
+    assert script.period_s == 0.05
+    np.testing.assert_allclose(script.initial, [[5.0, 0.2]], atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -76,6 +86,8 @@ def test_controls_from_csv(tmp_path: Path) -> None:
         ("time_s,translation_mm_s\n0.5,1\n", "rotation_rad_s is missing"),
         ("time_s,translation_mm_s,rotation_rad_s\n0.5,1,0\n1.0,nan,0\n", "row 3: translation_mm_s"),
         ("time_s,translation_mm_s,rotation_rad_s\n0.5,1,0\n2.0,1,0\n", "row 3: time_s"),
+        ("time_s,translation_mm_s,rotation_rad_s\n0.05,1,0\n0.2,1,0\n", "row 3: time_s = 0.2; .* count 0.05, 0.1"),
+        ("time_s,translation_mm_s,rotation_rad_s\n0,1,0\n0.5,1,0\n", "row 2: time_s = 0; the first row ends"),
         ("time_s,translation_mm_s,rotation_rad_s\n", "no rows"),
         ("", "cannot be read"),
     ],

@@ -66,6 +66,21 @@ def test_steps_are_those_of_simulate_to_the_bit(anatomy: Anatomy) -> None:
     assert np.allclose(simulator.inserted_length, whole.inserted_length[:, -1], atol=1e-12)
 
 
+def test_steps_of_another_length_are_those_of_simulate_to_the_bit(anatomy: Anatomy) -> None:
+    control, period_s = controls(12, 3), 0.06  # no multiple of the time step
+    whole = simulate(anatomy, DEVICE, control.transpose(1, 0, 2).copy(), initial=start(3), period_s=period_s)
+    simulator = begun(Simulator(anatomy, DEVICE, worlds=3), 3)
+    for t in range(12):
+        step = simulator.step(control[t], period_s)
+        for name in ("tip_position", "contact_force_max", "wall_force", "slip"):
+            np.testing.assert_array_equal(getattr(step, name), getattr(whole, name)[:, t], err_msg=name)
+    np.testing.assert_array_equal(simulator.inserted_length, step.inserted_length)
+    np.testing.assert_allclose(whole.inserted_length[:, -1], step.inserted_length, atol=1e-9)
+    assert whole.sample_period_s == period_s
+    with pytest.raises(InputError, match="period_s: 0"):
+        simulate(anatomy, DEVICE, control.transpose(1, 0, 2).copy(), period_s=0.0)
+
+
 def test_every_world_has_its_own_anatomy_and_device(anatomy: Anatomy, wider: Anatomy) -> None:
     anatomies, devices = [anatomy, wider, anatomy, wider], [DEVICE, DEVICE, STIFF, STIFF]
     control = controls(3, 4)

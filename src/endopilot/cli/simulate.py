@@ -47,14 +47,14 @@ def command(
     random: RandomConfig = RandomConfig(),
     config: SimulatorConfig = SimulatorConfig(),
 ) -> None:
-    """Drive a guidewire through an anatomy and record it at 2 Hz.
+    """Drive a guidewire through an anatomy and record it at 2 Hz, or at the end of each control of a file.
 
     Args:
         anatomy: folder made by `endopilot anatomy` or `endopilot atlas`.
         output: .parquet or .csv with a row for each sample, or .npz with all arrays.
         device: name of a device (`endopilot devices`) or a YAML file.
-        controls: CSV of scripted proximal velocities, or folder made by `endopilot plan` for this anatomy and device;
-            random ones by default.
+        controls: CSV of scripted proximal velocities (time_s, translation_mm_s, rotation_rad_s), or folder made by
+            `endopilot plan` for this anatomy and device; random ones by default.
         shape: also record the positions of all nodes, mm (.npz only).
         picture: PNG of the vessel and of the first navigation's wire at its end.
         json: print the figures as JSON.
@@ -63,13 +63,15 @@ def command(
     """
     patient = read_anatomy(existing(anatomy))
     wire = read_device(device)
+    period_s = SAMPLE_PERIOD_S
     if controls is not None and controls.is_dir():
         plan = read_plan(controls, patient, wire)
         patient, wire = plan.navigation.anatomy, plan.navigation.device
         begin = plan.navigation.start_inserted_mm, plan.navigation.start_rotation
         initial, control = np.array([begin]), plan.control[None]
     elif controls is not None:
-        initial, control = read_controls_csv(existing(controls))
+        script = read_controls_csv(existing(controls))
+        initial, control, period_s = script.initial, script.control, script.period_s
     else:
         initial, control = random_controls(
             ControlConfig(),
@@ -78,8 +80,9 @@ def command(
             seed=random.seed,
             max_inserted_length_mm=float(patient.tree.longest_path().abscissa[-1]),
         )
+    record_shape = shape or picture is not None
     rollout = simulate(
-        patient, wire, control, initial=initial, config=config, record_shape=shape or picture is not None
+        patient, wire, control, initial=initial, config=config, record_shape=record_shape, period_s=period_s
     )
     write_rollout(rollout if shape else replace(rollout, shape=None), output)
     valid = rollout.valid

@@ -12,7 +12,7 @@ from endopilot.errors import InputError
 from endopilot.simulation.config import FREE_BEHIND_MM, Actuation
 from endopilot.simulation.device import Device
 from endopilot.simulation.drive_limits import SPARE_MM
-from endopilot.types import SAMPLE_PERIOD_S, Anatomy
+from endopilot.types import Anatomy
 
 _ROUNDING_MM = 1e-2
 """An inserted length may be rounded this far below 0, mm."""
@@ -111,6 +111,7 @@ def check_sequences(
     initial: Float[np.ndarray, "worlds 2"],
     friction: Float[np.ndarray, "worlds"],
     actuation: Actuation,
+    period_s: float,
 ) -> tuple[float, float]:
     """Check sequences of controls, and return how deep they lead.
 
@@ -120,6 +121,7 @@ def check_sequences(
         initial: inserted length (mm) and rotation (rad) before the first period.
         friction: Coulomb friction coefficients.
         actuation: what the controls are.
+        period_s: time that each holds, s.
 
     Returns:
         The largest inserted length that is commanded, mm, and the largest that can come of it: a drive that slips
@@ -143,7 +145,7 @@ def check_sequences(
     _check(~np.isfinite(initial), initial, "initial state is no finite number; correct it")
     _check(initial[:, 0] < -_ROUNDING_MM, initial[:, 0], "initial inserted length in mm is negative; give 0 or more")
     _check(~(np.isfinite(friction) & (friction >= 0)), friction, "friction must be a finite number of 0 or more")
-    advance = SAMPLE_PERIOD_S * control[..., 0] if actuation == "velocity" else np.zeros(control.shape[:2])
+    advance = period_s * control[..., 0] if actuation == "velocity" else np.zeros(control.shape[:2])
     inserted = np.cumsum(np.column_stack([initial[:, 0], advance]), axis=1)
     return float(inserted.max()), float((initial[:, 0] + np.maximum(advance, 0.0).sum(axis=1)).max())
 

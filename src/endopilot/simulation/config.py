@@ -71,6 +71,10 @@ class SimulatorConfig:
         """Time steps in a sample period of 0.5 s."""
         return round(SAMPLE_PERIOD_S / self.time_step_s)
 
+    def steps_of(self, duration_s: float) -> int:
+        """Return into how many time steps, of `time_step_s` at most, some time is cut."""
+        return max(1, int(np.ceil(duration_s / self.time_step_s - 1e-9)))
+
     def threads_for(self, worlds: int, lanes: int) -> int:
         """Return how many threads step some worlds, `lanes` of them side by side: no more than have one to step."""
         return min(self.threads or CORES, -(-worlds // lanes))

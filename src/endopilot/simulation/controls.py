@@ -5,6 +5,7 @@ A control π is the mean velocity (dΔ/dt mm/s, dφ/dt rad/s) over one sample pe
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -145,16 +146,28 @@ def _manoeuvre(config: ControlConfig, generator: np.random.Generator) -> Float[n
     return np.array([translation * config.max_velocity_mm_s, rotation * config.max_rotation_rad_s])
 
 
-def read_controls_csv(path: Path) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n samples 2"]]:
+@dataclass(frozen=True, eq=False)
+class ScriptedControls:
+    """Controls from a file.
+
+    Attributes:
+        initial: (Δ mm, φ rad) of each world before the first period.
+        control: mm/s and rad/s.
+        period_s: time that each control holds, s.
+    """
+
+    initial: Float[np.ndarray, "worlds 2"]
+    control: Float[np.ndarray, "worlds samples 2"]
+    period_s: float
+
+
+def read_controls_csv(path: Path) -> ScriptedControls:
     """Read scripted controls.
 
-    The columns are `time_s` (end of each sample period: 0.5, 1.0, ...), `translation_mm_s` and `rotation_rad_s`;
-    optional are `world` (several navigations in one file), and `inserted_length_mm` with `rotation_rad` (state at the
-    end of each period, from which the initial one follows; 0 if they are not there). So a rollout that was written as
-    CSV can be simulated again.
-
-    Returns:
-        Initial (Δ mm, φ rad), and controls (mm/s, rad/s).
+    The columns are `time_s` (end of each period, all of one length: 0.5, 1.0, ... or 0.05, 0.1, ...),
+    `translation_mm_s` and `rotation_rad_s`; optional are `world` (several navigations in one file), and
+    `inserted_length_mm` with `rotation_rad` (state at the end of each period, from which the initial one follows; 0 if
+    they are not there). So a rollout that was written as CSV can be simulated again.
 
     Raises:
         InputError: not such a table; the line names file, column, row and mend.
@@ -177,20 +190,22 @@ def read_controls_csv(path: Path) -> tuple[Float[np.ndarray, "n 2"], Float[np.nd
             raise InputError(f"{path}: row {row + 2}: {name} = {table[name].iloc[row]} is no finite number; correct it")
         table[name] = numbers
     worlds = [rows for _, rows in table.groupby("world", sort=True)] if "world" in table.columns else [table]
-    samples = len(worlds[0])
+    samples, period_s = len(worlds[0]), float(worlds[0]["time_s"].iloc[0])
+    if period_s <= 0:
+        raise InputError(f"{path}: row 2: time_s = {period_s:g}; the first row ends the first period, as at 0.5")
     for rows in worlds:
         if len(rows) != samples:
             raise InputError(f"{path}: worlds differ in their number of rows; give each {samples}")
-        late = np.flatnonzero(np.abs(rows["time_s"] - SAMPLE_PERIOD_S * (np.arange(samples) + 1)) > 1e-6)
+        late = np.flatnonzero(np.abs(rows["time_s"] - period_s * (np.arange(samples) + 1)) > 1e-6 * samples * period_s)
         if len(late):
             row = int(rows.index[late[0]])
             raise InputError(
-                f"{path}: row {row + 2}: time_s = {table['time_s'].iloc[row]:g}; each world's rows end sample periods "
-                f"and count {SAMPLE_PERIOD_S:g}, {2 * SAMPLE_PERIOD_S:g}, ..."
+                f"{path}: row {row + 2}: time_s = {table['time_s'].iloc[row]:g}; each world's rows end periods of one "
+                f"length and count {period_s:g}, {2 * period_s:g}, ..."
             )
     control = np.stack([rows[list(_COLUMNS[1:])].to_numpy(dtype=float) for rows in worlds])
     initial = np.zeros((len(worlds), 2))
     if len(state) == 2:
         ends = np.stack([rows[state].to_numpy(dtype=float)[0] for rows in worlds])
-        initial = ends - SAMPLE_PERIOD_S * control[:, 0]
-    return initial, control
+        initial = ends - period_s * control[:, 0]
+    return ScriptedControls(initial, control, period_s)

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot import _core
-from endopilot.progress import progress
+from endopilot.progress import Advance, progress
 from endopilot.simulation.config import FREE_BEHIND_MM, LANES, Actuation, SimulatorConfig, wall_stiffness
 from endopilot.simulation.processor import Lumen, Options, Processor, core_for, gpu_errors
 from endopilot.simulation.rod import RodLayout
@@ -27,6 +27,7 @@ def run_core(
     initial: Float[np.ndarray, "worlds 2"],
     control: Float[np.ndarray, "worlds samples 2"],
     friction: Float[np.ndarray, "worlds"],
+    period_s: float = SAMPLE_PERIOD_S,
     actuation: Actuation = "velocity",
     loads: _core.Loads | None = None,
     record_shape: bool = False,
@@ -48,6 +49,8 @@ def run_core(
         initial: inserted length (mm) and rotation (rad) of each world before the first period.
         control: mm/s and rad/s, or N and N·mm.
         friction: Coulomb coefficients.
+        period_s: time that each control holds, and from one recorded sample to the next, s; it is cut into equal time
+            steps of at most `config.time_step_s`, as `Simulator.step` cuts it.
         actuation: what the controls are.
         loads: dead loads and springs.
         record_shape: record node positions, mm.
@@ -86,18 +89,30 @@ def run_core(
         sample_period=SAMPLE_PERIOD_S,
     )
     total = control.shape[0] * control.shape[1]
-    with gpu_errors(config.processor), progress("Simulating the wire", total=total) as advance:
-        result = simulation.run(
+
+    def run(
+        control: Float[np.ndarray, "worlds samples 2"], steps: int, time_step: float, advance: Advance | None
+    ) -> dict:
+        return simulation.run(
             control=np.ascontiguousarray(control, dtype=float),
             force_driven=actuation == "force",
-            time_step=config.time_step_s,
-            steps_per_sample=config.steps_per_sample,
+            time_step=time_step,
+            steps_per_sample=steps,
             record_shape=record_shape,
             record_attitude=record_attitude,
             threads=config.threads_for(len(control), lanes),
             lanes=lanes,
             progress=advance,
         )
+
+    with gpu_errors(config.processor), progress("Simulating the wire", total=total) as advance:
+        if period_s == SAMPLE_PERIOD_S:
+            result = run(control, config.steps_per_sample, config.time_step_s, advance)
+        else:  # the wire is brought to its start in the usual steps
+            begun = run(control[:, :0], config.steps_per_sample, config.time_step_s, None)
+            steps = config.steps_of(period_s)
+            result = run(control, steps, period_s / steps, advance)
+            result["approach_slip"] += begun["approach_slip"]
     return {**result, "reason": simulation.reason().astype(int), "contacts": simulation.contacts()}
 
 

@@ -57,6 +57,7 @@ def simulate(
     config: SimulatorConfig | None = None,
     record_shape: bool = False,
     friction: Float[np.ndarray, "worlds"] | None = None,
+    period_s: float = SAMPLE_PERIOD_S,
 ) -> Rollout:
     """Drive a device through an anatomy and record it every 0.5 s.
 
@@ -78,10 +79,11 @@ def simulate(
         config: settings of the rod core.
         record_shape: record the positions of all nodes too.
         friction: Coulomb friction coefficient of each world; the device's own if not given.
+        period_s: time that each control holds, and from one recorded sample to the next, s.
 
     Raises:
-        InputError: controls that are not finite or too fast for the device; a device that does not fit; a distance map
-            that is not finite, or negative at the ostium.
+        InputError: a period that is not positive; controls that are not finite or too fast for the device; a device
+            that does not fit; a distance map that is not finite, or negative at the ostium.
     """
     config = config or SimulatorConfig()
     if control.ndim != 3 or control.shape[2] != 2:
@@ -97,7 +99,9 @@ def simulate(
         raise InputError(f"friction: shape {friction.shape}; give one number for each of the {worlds} worlds")
     _check_memory(worlds, samples, 0)
     control = np.ascontiguousarray(control, dtype=float)
-    commanded_mm, possible_mm = check_sequences(device, control, initial, friction, actuation)
+    if not 0 < period_s < np.inf:
+        raise InputError(f"period_s: {period_s}; give a positive number of seconds")
+    commanded_mm, possible_mm = check_sequences(device, control, initial, friction, actuation, period_s)
     check_fits(device, anatomy)
     check_distance_map(anatomy)
     path_mm = float(anatomy.tree.longest_path().abscissa[-1])
@@ -114,6 +118,7 @@ def simulate(
         control=control,
         actuation=actuation,
         friction=friction,
+        period_s=period_s,
         record_shape=record_shape,
         push_limit_n=device.push_limit_n,
         pull_limit_n=device.pull_limit_n,
@@ -122,7 +127,8 @@ def simulate(
     if record_shape:  # of the wire that was needed
         needed = max(path_mm, commanded_mm, float(result["inserted_length"].max())) + FREE_BEHIND_MM
         result["shape"] = result["shape"][:, :, : np.searchsorted(rod.abscissa_mm, needed) + 3]
-    rollout = make_rollout(anatomy, actuation, initial - result["approach_slip"], control, result)
+    started = initial - result["approach_slip"]
+    rollout = make_rollout(anatomy, actuation, started, control, result, period_s=period_s)
     _report(rollout)
     return rollout
 
@@ -133,6 +139,8 @@ def make_rollout(
     started: Float[np.ndarray, "worlds 2"],
     control: Float[np.ndarray, "worlds samples 2"],
     result: Mapping[str, np.ndarray],
+    *,
+    period_s: float = SAMPLE_PERIOD_S,
 ) -> Rollout:
     """Return what the core recorded as a rollout.
 
@@ -142,17 +150,18 @@ def make_rollout(
         started: inserted length (mm) and rotation (rad) before the first period.
         control: what was asked of the drive.
         result: arrays as `run_core` returns them.
+        period_s: time of a sample, s.
     """
     start = started[:, None, :]
     if actuation == "velocity":
         slip = np.stack([result["slip"], result["rotation_slip"]], axis=-1)
-        made = control - slip / SAMPLE_PERIOD_S
-        proximal = start + np.cumsum(made, axis=1) * SAMPLE_PERIOD_S
+        made = control - slip / period_s
+        proximal = start + np.cumsum(made, axis=1) * period_s
     else:
         proximal = np.stack([result["inserted_length"], result["rotation"]], axis=-1)
-        made = np.diff(proximal, axis=1, prepend=start) / SAMPLE_PERIOD_S
+        made = np.diff(proximal, axis=1, prepend=start) / period_s
     return Rollout(
-        sample_period_s=SAMPLE_PERIOD_S,
+        sample_period_s=period_s,
         initial_inserted_length=started[:, 0],
         initial_rotation=started[:, 1],
         control=made,
