@@ -260,7 +260,7 @@ def test_invalid_worlds_are_listed_and_never_trained_on(tmp_path):
         ("friction", (0.2, 0.1)),
         ("tip_bend_factor", (1.5, 0.5)),
         ("tip_stiffness_factor", (0.0, 2.0)),
-        ("anatomy_shares", (0.0, 0.5, 0.5)),
+        ("anatomy_shares", (0.0, 0.5, 0.4)),
         ("anatomy_shares", (0.5, 0.1, 0.1)),
         ("seen_test_share", 1.0),
         ("sequences_per_file", 0),

@@ -51,6 +51,11 @@ def test_the_split_is_that_of_the_hash():
     assert trained == set(first)
 
 
+def test_all_may_test():
+    splits = assign_splits(NAMES[:3], 1, anatomy_shares=(0.0, 0.0, 1.0))
+    assert (splits == "test").all()
+
+
 def test_one_patient_is_split_by_sequence():
     splits = assign_splits(["only"], 10)
     assert sorted(splits[0].tolist()) == ["seen_test"] * 2 + ["train"] * 8

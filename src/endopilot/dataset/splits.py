@@ -51,7 +51,7 @@ def assign_splits(
     by_anatomy[order] = np.repeat(np.array(["train", "calibrate", "test"]), counts)
 
     splits = np.repeat(by_anatomy[:, None], n_sequences, axis=1)
-    held_out = _held_out(n_sequences, seen_test_share)
+    held_out = _held_out(n_sequences, seen_test_share) if counts[0] else 0
     for row, name in enumerate(names):
         if by_anatomy[row] == "train":
             ranked = sorted(range(n_sequences), key=lambda i: _digest(f"{name}/{i}"))
