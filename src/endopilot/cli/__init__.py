@@ -31,6 +31,7 @@ COMMANDS = {
     "plan": "anatomy and target -> controls that bring the tip there",
     "advise": "trained run -> calibrated X-ray adviser: exposures against missed events",
     "drive": "a simulated robotic drive that takes commands over TCP, with a watchdog",
+    "cockpit": "a wire in the browser: watched, driven by hand, or left to a policy",
     "ladder": "a policy on twelve tasks in unseen patients -> scores, a page and a submission",
     "verify": "the rod core compared with closed forms and an independent engine",
     "bench": "benchmarks: speed, environments, robustness, anatomy, imaging, labels, dataset, training",

@@ -17,6 +17,7 @@ from jaxtyping import Float
 from endopilot.settings import NonNegative, Positive, settings
 from endopilot.simulation.drive_limits import DriveLimits, within_travel
 from endopilot.simulation.simulator import Simulator
+from endopilot.simulation.state import Step
 
 CYCLE_S = 0.05
 """Period of the drive's own loop, s."""
@@ -130,6 +131,7 @@ class SimulatedRobot:
 
     Attributes:
         driven: velocity of the wire's proximal end that the drive asked for in each cycle so far, mm/s and rad/s.
+        last_step: what the wire did in the drive's last cycle; None before the first.
     """
 
     def __init__(
@@ -156,6 +158,16 @@ class SimulatedRobot:
         self._random = np.random.default_rng([seed, 1])
         self._drive = DriveMotion(limits, config, self._encoder())
         self.driven: list[Float[np.ndarray, "2"]] = []
+        self.last_step: Step | None = None
+
+    @property
+    def velocity(self) -> Float[np.ndarray, "2"]:
+        """The motor's velocity, mm/s and rad/s."""
+        return self._drive.velocity
+
+    def stop(self) -> None:
+        """Brake at once, whatever was commanded before."""
+        self._drive.stop()
 
     def command(self, translation: float, rotation: float) -> None:
         """Move on at a velocity, mm/s and rad/s, until the next command. What is not finite stops the wire."""
@@ -176,7 +188,7 @@ class SimulatedRobot:
             control = moved[None] / period
             inserted = self._simulator.inserted_length
             control[:, 0] = within_travel(control[:, 0], inserted, period, travel_mm=travel_mm)
-            step = self._simulator.step(control, period)
+            self.last_step = step = self._simulator.step(control, period)
             self.driven.append(control[0])
             self._drive.position = np.array(self._encoder())
             peak = max(peak, float(step.contact_force_max[0]))

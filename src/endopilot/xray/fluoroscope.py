@@ -8,7 +8,7 @@ where the numbers come from.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
@@ -18,6 +18,7 @@ from endopilot.anatomy.tree import tangents
 from endopilot.dataset.loader import Dataset
 from endopilot.settings import Finite, Positive, settings
 from endopilot.types import Anatomy, TipProjection
+from endopilot.xray.carm import CArmGeometry, View, view_at
 
 _CATHETER_MM = 20.0
 """Length of the catheter's axis behind the ostium in which a tip may be found, mm."""
@@ -53,41 +54,12 @@ class FluoroscopeConfig:
     """Two views at once; else the first alone."""
     view_angles_deg: tuple[tuple[Finite, Finite], tuple[Finite, Finite]] = ((-30.0, 0.0), (60.0, 0.0))
     """Of each view, LAO (positive) or RAO (negative), and cranial (positive) or caudal (negative), degrees."""
-    source_to_isocenter_mm: Positive = 765.0
-    """Distance of the X-ray source from the isocenter, mm."""
-    source_to_detector_mm: Positive = 1100.0
-    """Distance of the X-ray source from the detector, mm."""
-    pixel_mm: Positive = 0.308
-    """Pixel pitch of the detector in fluoroscopy, mm."""
+    geometry: CArmGeometry = field(default_factory=CArmGeometry)
+    """Distances and pixels."""
     pixel_sd: Positive = 0.5
     """Standard deviation of the tip's place in the image across the wire, pixels."""
     along_sd: Positive = 2.6
     """Standard deviation along the wire, pixels: where a thin tip ends is harder to see than where it runs."""
-
-
-@dataclass(frozen=True, eq=False)
-class _View:
-    """One source and its detector.
-
-    Attributes:
-        source: LPS mm.
-        axes: rows: along the image's columns, along its rows, and from the source to the detector; unit vectors.
-        scale: of a point at distance 1 from the source, pixels.
-    """
-
-    source: Float[np.ndarray, "3"]
-    axes: Float[np.ndarray, "3 3"]
-    scale: float
-
-    def project(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 2"]:
-        """Return the pixels of points, LPS mm."""
-        in_view = (points - self.source) @ self.axes.T
-        return self.scale * in_view[..., :2] / in_view[..., 2:]
-
-    def slope(self, point: Float[np.ndarray, "3"]) -> Float[np.ndarray, "2 3"]:
-        """Return the derivative of the pixel by the point, pixels/mm."""
-        in_view = self.axes @ (point - self.source)
-        return self.scale / in_view[2] * (self.axes[:2] - np.outer(in_view[:2] / in_view[2], self.axes[2]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,21 +72,9 @@ class _Detection:
         whiten: turns an error, pixels, into its parts along and across the wire, in standard deviations.
     """
 
-    view: _View
+    view: View
     pixel: Float[np.ndarray, "2"]
     whiten: Float[np.ndarray, "2 2"]
-
-
-def _view(angles_deg: tuple[float, float], isocenter: Float[np.ndarray, "3"], config: FluoroscopeConfig) -> _View:
-    """Return the view under an LAO and a cranial angle: at 0, 0 the beam goes from the back to the front, along −y."""
-    lao, cranial = np.deg2rad(angles_deg)
-    beam = np.array([np.sin(lao) * np.cos(cranial), -np.cos(lao) * np.cos(cranial), np.sin(cranial)])
-    across = np.array([np.cos(lao), np.sin(lao), 0.0])
-    return _View(
-        source=isocenter - config.source_to_isocenter_mm * beam,
-        axes=np.stack([across, np.cross(beam, across), beam]),
-        scale=config.source_to_detector_mm / config.pixel_mm,
-    )
 
 
 class Fluoroscope:
@@ -136,7 +96,7 @@ class Fluoroscope:
         catheter = insertion.position + behind[:, None] * insertion.direction
         isocenter = np.concatenate(points).mean(axis=0)
         shown = self._config.view_angles_deg[: 2 if self._config.biplane else 1]
-        self._views = [_view(angles, isocenter, self._config) for angles in shown]
+        self._views = [view_at(angles, isocenter, self._config.geometry) for angles in shown]
         radius = [np.full(len(behind), anatomy.catheter_radius_mm), *(line.radius for line in lines)]
         # A wire that lies on the wall, anywhere around, lies clearance/√2 from it along either axis, root mean square.
         self._lateral_sd = [np.maximum(r - wire_radius_mm, 0.1) / np.sqrt(2) for r in radius]
@@ -198,7 +158,7 @@ class Fluoroscope:
 
     def _detect(
         self,
-        view: _View,
+        view: View,
         position: Float[np.ndarray, "3"],
         direction: Float[np.ndarray, "3"],
         random: np.random.Generator,
@@ -215,7 +175,7 @@ class Fluoroscope:
         """Return the most likely place of the tip, LPS mm: the best of the likeliest places in every branch."""
         length_sd = 2.0 + _NEAR_SHARE * max(inserted_length, 0.0)
         prior = [((abscissa - inserted_length) / length_sd) ** 2 for abscissa in self._abscissa]
-        magnified = self._views[0].scale / self._config.source_to_isocenter_mm
+        magnified = self._views[0].scale / self._config.geometry.source_to_isocenter_mm
         first = []
         for points, sd, unlikely in zip(self._points, self._lateral_sd, prior, strict=True):
             squared = sum(((one.view.project(points) - one.pixel) ** 2).sum(axis=1) for one in detections)

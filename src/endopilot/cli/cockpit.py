@@ -1,0 +1,63 @@
+"""`endopilot cockpit`: watch a wire in a browser, drive it by hand, or let a policy drive it."""
+
+from __future__ import annotations
+
+import webbrowser
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional
+
+from endopilot.cli.arguments import existing
+from endopilot.settings import Within, settings
+
+
+@settings
+class ListenConfig:
+    """The page's address."""
+
+    host: str = "127.0.0.1"
+    """Address to listen on; by default only this machine can connect."""
+    port: Annotated[int, Within(0, 65535)] = 0
+    """TCP port; 0 for a free one."""
+
+
+def command(
+    patient: Positional[Path | None] = None,
+    /,
+    *,
+    device: str = "workhorse-014",
+    resume: Path | None = None,
+    ct: Path | None = None,
+    output: Path = Path("runs/cockpit"),
+    browser: bool = True,
+    listen: ListenConfig = ListenConfig(),
+) -> None:
+    """Open a web page on this machine in which a wire is driven by hand or by a policy. No medical device.
+
+    Args:
+        patient: folder made by `endopilot anatomy` or `endopilot atlas`; a synthetic one if nothing is given.
+        device: name of a device (`endopilot devices`) or a YAML file.
+        resume: go on with the session in this file, which a killed server left.
+        ct: CT angiogram of the patient, for the X-ray's background; a phantom's if not given.
+        output: folder of the sessions' recordings.
+        browser: open the page in a browser; --no-browser only prints its address.
+        listen: the page's address.
+    """
+    from endopilot.cockpit.launch import serve
+    from endopilot.cockpit.open import open_session, resume_session
+
+    volume = ct and existing(ct)
+    if resume is not None:
+        opened = resume_session(existing(resume), ct=volume)
+    else:
+        opened = open_session(patient and existing(patient), device=device, ct=volume, output=output)
+
+    def listening(address: str) -> None:
+        print(f"page       {address}", flush=True)
+        if opened.recording is not None:
+            print(f"recording  {opened.recording}", flush=True)
+        if browser:
+            webbrowser.open(address)
+
+    serve(opened.stage, opened.scene, cycle_s=opened.cycle_s, host=listen.host, port=listen.port, listening=listening)

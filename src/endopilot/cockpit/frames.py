@@ -1,0 +1,139 @@
+"""What the server sends: binary messages of a JSON header and raw arrays, one layout for all kinds.
+
+A message is the header's length (uint32), the header (UTF-8 JSON, padded with spaces to a multiple of four bytes), and
+the arrays one after the other, little-endian, each padded to a multiple of four bytes. `header["arrays"]` lists their
+name, type ("f4", "u4" or "u1") and shape.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from typing import Any
+
+import numpy as np
+
+from endopilot.cockpit.world import Snapshot
+from endopilot.report.wall_mesh import wall_mesh
+from endopilot.tasks.navigation import Navigation, Target
+from endopilot.types import Anatomy
+
+_TYPES = {np.dtype("<f4"): "f4", np.dtype("<u4"): "u4", np.dtype("u1"): "u1"}
+WALL_TRIANGLES = 24_000
+"""Triangles of the lumen in the page at most: software rendering must keep up."""
+_POINT_MM = 1.0
+"""Distance between the points of the centerline in the page, mm."""
+
+
+def encode(kind: str, header: dict[str, Any], **arrays: np.ndarray) -> bytes:
+    """Return a message.
+
+    Args:
+        kind: goes into the header as `type`.
+        header: plain values.
+        arrays: float32, uint32 or uint8.
+    """
+    listed = [{"name": name, "type": _TYPES[array.dtype], "shape": array.shape} for name, array in arrays.items()]
+    text = json.dumps(header | {"type": kind, "arrays": listed}, allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    parts = [struct.pack("<I", len(text)), text]
+    for array in arrays.values():
+        data = np.ascontiguousarray(array).tobytes()
+        parts += [data, b"\0" * (-len(data) % 4)]
+    return b"".join(parts)
+
+
+def decode(message: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Return header and arrays of a message that `encode` made."""
+    (length,) = struct.unpack_from("<I", message)
+    header = json.loads(message[4 : 4 + length])
+    arrays, at = {}, 4 + length
+    for entry in header["arrays"]:
+        kind = np.dtype(f"<{entry['type']}")
+        count = int(np.prod(entry["shape"]))
+        arrays[entry["name"]] = np.frombuffer(message, kind, count, at).reshape(entry["shape"])
+        at += count * kind.itemsize + (-count * kind.itemsize) % 4
+    return header, arrays
+
+
+def wire_arrays(snapshot: Snapshot) -> dict[str, np.ndarray]:
+    """Return what the page needs to draw the wire: nodes, LPS mm, and the wall's force at each, N."""
+    return {"nodes": snapshot.nodes.astype("<f4"), "node_force": snapshot.node_force.astype("<f4")}
+
+
+def tip_values(anatomy: Anatomy, snapshot: Snapshot) -> dict[str, Any]:
+    """Return where the tip is and what the wall does to the wire, for the page's figures."""
+    branch = int(snapshot.tip.branch[0])
+    line, labels = anatomy.tree.branches[branch].centerline, anatomy.tree.branches[branch].section
+    nearest = int(np.abs(line.abscissa - snapshot.tip.abscissa[0]).argmin())
+    return {
+        "tip_mm": round(float(snapshot.tip.abscissa[0]), 2),
+        "offset_mm": round(float(snapshot.tip.offset[0]), 3),
+        "section": anatomy.tree.section_names[int(labels[nearest])],
+        "force_n": round(snapshot.force_n, 4),
+        "wall_force_n": round(snapshot.wall_force_n, 4),
+    }
+
+
+def scene(navigation: Navigation, about: dict[str, Any]) -> bytes:
+    """Return what does not move: the lumen, the centerlines with the names of their sections, the wire, the target.
+
+    Args:
+        navigation: vessel, wire and target.
+        about: further entries of the header.
+    """
+    anatomy, device = navigation.anatomy, navigation.device
+    wall = wall_mesh(anatomy.distance_map, max_triangles=WALL_TRIANGLES)
+    lines, points, labels, places = [], [], [], []
+    for branch in anatomy.tree.branches:
+        line = branch.centerline
+        chosen = _every(line.abscissa, _POINT_MM)
+        lines.append(len(chosen))
+        points.append(line.points[chosen])
+        labels.append(branch.section[chosen])
+        places.append(line.abscissa[chosen])
+    names = anatomy.tree.section_names
+    present = sorted({int(label) for part in labels for label in part})
+    header = about | {
+        "name": anatomy.name,
+        "wire": device.name,
+        "diameter_mm": device.diameter_mm,
+        "force_limit_n": navigation.force_limit_n,
+        "push_limit_n": device.push_limit_n,
+        "fastest": [device.max_velocity_mm_s, device.max_rotation_rad_s],
+        "lines": lines,
+        "parents": [branch.parent for branch in anatomy.tree.branches],
+        "sections": [{"label": label, "name": names[label]} for label in present],
+        "ostium": anatomy.insertion.position.round(3).tolist(),
+        "catheter_direction": anatomy.insertion.direction.round(5).tolist(),
+        "catheter_radius_mm": float(anatomy.catheter_radius_mm),
+    }
+    return encode(
+        "scene",
+        header,
+        vertices=wall.vertices.astype("<f4"),
+        triangles=wall.triangles.astype("<u4"),
+        points=np.concatenate(points).astype("<f4"),
+        labels=np.concatenate(labels).astype("<u4"),
+        abscissa=np.concatenate(places).astype("<f4"),
+    )
+
+
+def target_values(anatomy: Anatomy, target: Target | None) -> dict[str, Any] | None:
+    """Return the target for the page: its place, LPS mm, branch, abscissa (mm) and section."""
+    if target is None:
+        return None
+    branch = anatomy.tree.branches[target.branch]
+    nearest = int(np.abs(branch.centerline.abscissa - target.abscissa).argmin())
+    return {
+        "position": target.position(anatomy).round(3).tolist(),
+        "branch": target.branch,
+        "abscissa": round(target.abscissa, 2),
+        "section": anatomy.tree.section_names[int(branch.section[nearest])],
+    }
+
+
+def _every(abscissa: np.ndarray, step: float) -> np.ndarray:
+    """Return indices about `step` apart along a line, its two ends included."""
+    wanted = np.append(np.arange(abscissa[0], abscissa[-1], step), abscissa[-1])
+    return np.unique(np.searchsorted(abscissa, wanted).clip(0, len(abscissa) - 1))

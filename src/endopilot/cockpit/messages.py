@@ -1,0 +1,146 @@
+"""What a page may send: one small JSON object a message, checked against a schema before anything is done."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+LONGEST_MESSAGE = 2048
+"""A longer message closes the connection, bytes."""
+_Speed = Annotated[float, Field(ge=-1e3, le=1e3, allow_inf_nan=False)]
+_Angle = Annotated[float, Field(ge=-180, le=180, allow_inf_nan=False)]
+
+
+class _Message(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Drive(_Message):
+    """Move the wire at a velocity until the next such message, which must come within 200 ms.
+
+    Attributes:
+        translation: mm/s.
+        rotation: rad/s.
+    """
+
+    type: Literal["drive"]
+    translation: _Speed
+    rotation: _Speed
+
+
+class Pedal(_Message):
+    """Press or release the X-ray pedal; while it is pressed, a `drive` or `pedal` must come every 200 ms."""
+
+    type: Literal["pedal"]
+    down: bool
+
+
+class Contrast(_Message):
+    """Inject contrast agent."""
+
+    type: Literal["contrast"]
+
+
+class CArm(_Message):
+    """Turn and set the C-arm; what is not given stays.
+
+    Attributes:
+        angles_deg: LAO (positive) or RAO, and cranial (positive) or caudal, of each plane, degrees.
+        zoom: of the detector's image.
+        biplane: two planes, or the first alone.
+        frames_per_s: pulses of fluoroscopy, 1/s.
+        dose: of a frame at the detector, as a multiple of the usual one.
+        roadmap: lay the contrasted vessel under the live image.
+    """
+
+    type: Literal["c_arm"]
+    angles_deg: tuple[tuple[_Angle, _Angle], tuple[_Angle, _Angle]] | None = None
+    zoom: Annotated[float, Field(ge=0.25, le=4, allow_inf_nan=False)] | None = None
+    biplane: bool | None = None
+    frames_per_s: Literal[4, 7.5, 15, 30] | None = None
+    dose: Annotated[float, Field(ge=0.1, le=10, allow_inf_nan=False)] | None = None
+    roadmap: bool | None = None
+
+
+class Target(_Message):
+    """Set the target: a section by its name, or a place on a branch.
+
+    Attributes:
+        section: name; the target lies in the middle of it.
+        branch: index of a branch.
+        abscissa: distance from the ostium along that branch's path, mm.
+    """
+
+    type: Literal["target"]
+    section: Annotated[str, Field(max_length=80)] | None = None
+    branch: Annotated[int, Field(ge=0, le=10_000)] | None = None
+    abscissa: Annotated[float, Field(ge=0, le=1e5, allow_inf_nan=False)] | None = None
+
+
+class Autopilot(_Message):
+    """Hand the wire to a policy, let it pause, or take over.
+
+    Attributes:
+        action: "start" (or hand back), "pause", "resume" or "stop".
+        policy: name of one of the policies offered.
+    """
+
+    type: Literal["autopilot"]
+    action: Literal["start", "pause", "resume", "stop"]
+    policy: Annotated[str, Field(max_length=80)] | None = None
+
+
+class Game(_Message):
+    """Start the clock of a task."""
+
+    type: Literal["game"]
+    action: Literal["start"]
+
+
+class Replay(_Message):
+    """Play, pause or seek in what is replayed.
+
+    Attributes:
+        playing: whether time passes.
+        at_s: where to go, s.
+    """
+
+    type: Literal["replay"]
+    playing: bool | None = None
+    at_s: Annotated[float, Field(ge=0, le=1e7, allow_inf_nan=False)] | None = None
+
+
+class Wheel(_Message):
+    """Take the wheel if nobody has it, or let it go."""
+
+    type: Literal["wheel"]
+    take: bool
+
+
+class Ping(_Message):
+    """Ask for an answer with the same number, to measure the time that it takes."""
+
+    type: Literal["ping"]
+    number: Annotated[int, Field(ge=0, le=2**31)]
+
+
+Message = Drive | Pedal | Contrast | CArm | Target | Autopilot | Game | Replay | Wheel | Ping
+"""All that a page may send."""
+_READER: TypeAdapter[Message] = TypeAdapter(Annotated[Message, Field(discriminator="type")])
+
+
+def read_message(text: str | bytes) -> Message:
+    """Return the message in a text.
+
+    Raises:
+        ValueError: it is too long, no JSON, or no such message; one line says why.
+    """
+    if len(text) > LONGEST_MESSAGE:
+        raise ValueError(f"message of {len(text)} bytes; the longest is {LONGEST_MESSAGE}")
+    try:
+        return _READER.validate_json(text)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        where = ".".join(str(part) for part in first["loc"]) or "message"
+        raise ValueError(f"{where}: {first['msg']}") from None

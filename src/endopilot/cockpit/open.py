@@ -1,0 +1,156 @@
+"""What a command line asks for, opened: a patient, a task of the ladder, a session to go on with, or a replay."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from endopilot.anatomy.io import read_anatomy, write_anatomy
+from endopilot.cockpit.fluoroscopy import XrayUnit
+from endopilot.cockpit.frames import scene
+from endopilot.cockpit.loop import Stage
+from endopilot.cockpit.recording import SUFFIX, Recorder, Recording, Where, read_recording, replayed
+from endopilot.cockpit.session import Session
+from endopilot.cockpit.world import World
+from endopilot.simulation.device import Device, read_device
+from endopilot.tasks.navigation import Navigation, Target
+from endopilot.tasks.task import reference_navigation
+from endopilot.types import Anatomy, Volume
+from endopilot.xray.image import XrayImager
+
+_START_MM = 5.0
+_DEEP = 0.8
+"""Where the first target lies, as a share of the longest path."""
+
+
+@dataclass(frozen=True, eq=False)
+class Opened:
+    """What the server needs.
+
+    Attributes:
+        stage: what is driven or replayed.
+        scene: makes the message with what does not move.
+        cycle_s: length of a cycle, s.
+        recording: where the session is kept; None for a replay.
+    """
+
+    stage: Stage
+    scene: Callable[[], bytes]
+    cycle_s: float
+    recording: Path | None
+
+
+def open_session(
+    patient: Path | None = None,
+    *,
+    device: str = "workhorse-014",
+    ct: Path | None = None,
+    output: Path = Path("runs/cockpit"),
+) -> Opened:
+    """Open a patient to be driven by hand or by a policy.
+
+    Args:
+        patient: folder of an anatomy; a synthetic one is written into `output` if not given.
+        device: name of a wire or a YAML file.
+        ct: CT angiogram of the patient, for the X-ray's background.
+        output: folder of the recordings.
+
+    Raises:
+        InputError: a file that is missing or bad, or a wire that does not fit.
+    """
+    patient = patient or _synthetic(output)
+    navigation = _start_of(read_anatomy(patient), read_device(device))
+    return _driven(World(navigation), Where(patient=patient), output, ct)
+
+
+def resume_session(path: Path, *, ct: Path | None = None) -> Opened:
+    """Go on with a session that a killed server left: it is driven again up to its last event, and recorded on.
+
+    Raises:
+        InputError: no such session, or one that does not replay to the bit.
+    """
+    recording = read_recording(path)
+    world = _last(recording)
+    _drop_half_line(path)
+    world.stop()
+    opened = _driven(world, recording.where, path.parent, ct, path=path, seed=recording.seed)
+    assert isinstance(opened.stage, Session)
+    opened.stage.restore(recording.events)
+    return opened
+
+
+def _driven(
+    world: World, where: Where, output: Path, ct: Path | None, *, path: Path | None = None, seed: int = 0
+) -> Opened:
+    navigation = world.navigation
+    name = f"{navigation.anatomy.name}-{time.strftime('%Y%m%d-%H%M%S')}"
+    recorder = Recorder(path or _free(output, name), world, where, seed)
+    session = Session(world, xray_unit(navigation.anatomy, navigation.device, read_ct(ct)), recorder)
+    return Opened(session, scene_of(navigation, {}), world.config.cycle_s, recorder.path)
+
+
+def xray_unit(anatomy: Anatomy, device: Device, ct: Volume | None) -> XrayUnit:
+    """Return the X-ray unit around a patient, with a CT of theirs or without."""
+    return XrayUnit(anatomy, lambda volume: XrayImager(anatomy, device, volume), ct)
+
+
+def scene_of(navigation: Navigation, about: dict[str, Any]) -> Callable[[], bytes]:
+    """Return what makes the message of the scene; it is begun at once, and made once."""
+    pool = ThreadPoolExecutor(1)
+    future = pool.submit(scene, navigation, about)
+    pool.shutdown(wait=False)
+    return future.result
+
+
+def read_ct(path: Path | None) -> Volume | None:
+    """Read a CT, HU, if one is given.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    if path is None:
+        return None
+    from endopilot.imaging.volume import read_volume  # slow to import
+
+    return read_volume(path)
+
+
+def _start_of(anatomy: Anatomy, device: Device) -> Navigation:
+    """Return a navigation from the ostium to a first target, far down the longest path."""
+    tree = anatomy.tree
+    leaf = max(tree.leaves(), key=lambda branch: tree.branches[branch].centerline.abscissa[-1])
+    line = tree.branches[leaf].centerline.abscissa
+    target = Target(branch=leaf, abscissa=float(max(_DEEP * line[-1], line[0])))
+    return Navigation(anatomy=anatomy, device=device, target=target, start_inserted_mm=_START_MM)
+
+
+def _last(recording: Recording) -> World:
+    *_, (world, _events) = replayed(recording)
+    return world
+
+
+def _synthetic(output: Path) -> Path:
+    """Return the folder of the synthetic patient; it is written if need be."""
+    folder = output / "synthetic"
+    if not (folder / "anatomy.json").exists():
+        write_anatomy(reference_navigation().anatomy, folder)
+    return folder
+
+
+def _free(output: Path, name: str) -> Path:
+    """Return a file of that name, or with a number, which does not exist."""
+    number, path = 1, output / f"{name}{SUFFIX}"
+    while path.exists():
+        number, path = number + 1, output / f"{name}-{number + 1}{SUFFIX}"
+    return path
+
+
+def _drop_half_line(path: Path) -> None:
+    """Cut off what a killed server left behind its last whole line."""
+    with path.open("rb+") as stream:
+        whole = stream.read().rfind(b"\n") + 1
+        stream.truncate(whole)

@@ -1,0 +1,218 @@
+"""A session on disk: one line an event, written as it happens, so that nothing is lost when the server is killed.
+
+The first line says what the session was held in: vessel, wire, robot, rod core, seed. Each further line is a JSON
+object with the cycle at which it acted: `move` (mm/s, rad/s after the drive's limits), `stop` (and why), `exposure`,
+`contrast`, and every quarter of a second `check`, a hash of the wire. The same commands in the same cycles give the
+same bits, so `replayed` drives a session again and proves each check.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from endopilot import __version__
+from endopilot.anatomy.io import read_anatomy
+from endopilot.cockpit.world import World, WorldConfig
+from endopilot.errors import InputError
+from endopilot.files import json_text
+from endopilot.settings import from_record
+from endopilot.simulation.device import Device
+from endopilot.tasks.navigation import Navigation, Target
+from endopilot.tasks.task import find_task
+
+FORMAT = "endopilot cockpit 1"
+SUFFIX = ".cockpit.jsonl"
+CHECK_S = 0.25
+"""Time from one check to the next, s."""
+
+
+@dataclass(frozen=True)
+class Where:
+    """Where a session takes place.
+
+    Attributes:
+        patient: folder of the anatomy; None for a task.
+        task: name of a task of the ladder; None for a patient.
+        place: of the patient in the task's list.
+    """
+
+    patient: Path | None = None
+    task: str | None = None
+    place: int = 0
+
+
+class Recorder:
+    """Writes a session while it goes on."""
+
+    def __init__(self, path: Path, world: World, where: Where, seed: int) -> None:
+        """Begin a new file, or go on with one that was resumed.
+
+        Raises:
+            InputError: the file cannot be written.
+        """
+        self.path, self._world = path, world
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            new = not path.exists()
+            self._stream = path.open("a", encoding="utf-8")
+        except OSError as error:
+            raise InputError(f"{path}: cannot be written ({error.strerror}); choose another folder") from error
+        if new:
+            self._write(_header(world, where, seed))
+
+    def event(self, **what: Any) -> None:
+        """Write an event of this cycle."""
+        self._write({"at": self._world.cycle} | what)
+
+    def cycle(self) -> None:
+        """Write a check where one is due; call it after each cycle."""
+        if self._world.cycle % round(CHECK_S / self._world.config.cycle_s) == 0:
+            self.event(check=self._world.digest())
+
+    def close(self) -> None:
+        """Write a last check and close the file."""
+        if not self._stream.closed:
+            self.event(check=self._world.digest())
+            self._stream.close()
+
+    def _write(self, line: dict[str, Any]) -> None:
+        self._stream.write(json.dumps(line) + "\n")
+        self._stream.flush()
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """A session that was recorded.
+
+    Attributes:
+        path: of the file.
+        navigation: vessel, wire, target and start.
+        config: robot, rod core and length of a cycle.
+        seed: of the encoders' noise.
+        where: it took place.
+        events: one each, in their order.
+        cycles: how many it lasted.
+    """
+
+    path: Path
+    navigation: Navigation
+    config: WorldConfig
+    seed: int
+    where: Where
+    events: tuple[dict[str, Any], ...]
+    cycles: int
+
+
+def read_recording(path: Path) -> Recording:
+    """Read a session. A last line that a killed server left half-written is ignored.
+
+    Raises:
+        InputError: no such file, no session, or one whose vessel is gone or has changed.
+    """
+    lines = _lines(path)
+    header = lines[0] if lines else {}
+    if header.get("format") != FORMAT:
+        raise InputError(f"{path}: no session of the cockpit; give a file that ends in {SUFFIX}")
+    try:
+        where = Where(
+            patient=None if header["patient"] is None else Path(header["patient"]),
+            task=header["task"],
+            place=header["place"],
+        )
+        navigation = _navigation(path, header, where)
+        events = tuple(lines[1:])
+        cycles = max((int(event["at"]) for event in events), default=0)
+        config = from_record(WorldConfig, header["config"])
+        return Recording(path, navigation, config, int(header["seed"]), where, events, cycles)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: damaged session ({error!r}); choose another") from error
+
+
+def replayed(recording: Recording) -> Iterator[tuple[World, list[dict[str, Any]]]]:
+    """Drive a session again and yield the world before the first cycle and after each, with the events of that cycle.
+
+    Raises:
+        InputError: the wire is not where it was: another version of endopilot, or another processor.
+    """
+    world = World(recording.navigation, recording.config, seed=recording.seed)
+    at: dict[int, list[dict[str, Any]]] = {}
+    for event in recording.events:
+        at.setdefault(int(event["at"]), []).append(event)
+    for cycle in range(recording.cycles + 1):
+        events = at.get(cycle, [])
+        for event in events:
+            if event.get("check", "") not in ("", world.digest()):
+                raise InputError(
+                    f"{recording.path}: at {world.time_s:g} s the wire is not where it was; "
+                    f"replay it with the version and on the kind of processor that recorded it"
+                )
+            if "move" in event:
+                world.robot.command(*event["move"])
+            elif "stop" in event:
+                world.stop()
+        yield world, events
+        if cycle < recording.cycles:
+            world.advance()
+
+
+def _header(world: World, where: Where, seed: int) -> dict[str, Any]:
+    navigation = world.navigation
+    values = {
+        "format": FORMAT,
+        "version": __version__,
+        "patient": None if where.patient is None else str(where.patient.resolve()),
+        "task": where.task,
+        "place": where.place,
+        "identity": navigation.anatomy.identity,
+        "device": asdict(navigation.device),
+        "target": asdict(navigation.target),
+        "start": [navigation.start_inserted_mm, navigation.start_rotation],
+        "seconds": navigation.seconds,
+        "force_limit_n": navigation.force_limit_n,
+        "config": asdict(world.config),
+        "seed": seed,
+    }
+    return json.loads(json_text(values))
+
+
+def _navigation(path: Path, header: dict[str, Any], where: Where) -> Navigation:
+    if where.task is not None:
+        anatomy = find_task(where.task).ladder_navigation(where.place).anatomy
+    elif where.patient is not None:
+        anatomy = read_anatomy(where.patient)
+    else:
+        raise InputError(f"{path}: names no patient and no task; choose another session")
+    if anatomy.identity != header["identity"]:
+        raise InputError(f"{path}: {anatomy.name} is another vessel now; bring the one back that it was recorded in")
+    return Navigation(
+        anatomy=anatomy,
+        device=from_record(Device, header["device"]),
+        target=from_record(Target, header["target"]),
+        start_inserted_mm=header["start"][0],
+        start_rotation=header["start"][1],
+        seconds=header["seconds"],
+        force_limit_n=header["force_limit_n"],
+    )
+
+
+def _lines(path: Path) -> list[dict[str, Any]]:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read ({error}); give a session of the cockpit") from error
+    lines = []
+    for line in text.splitlines(keepends=True):
+        if not line.endswith("\n"):
+            break  # half-written
+        try:
+            content = json.loads(line)
+        except json.JSONDecodeError:
+            break
+        if not isinstance(content, dict):
+            break
+        lines.append(content)
+    return lines

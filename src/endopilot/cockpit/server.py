@@ -1,0 +1,239 @@
+"""The web server: the page and its scripts, and one WebSocket a page. Loopback, a token, one driver, small messages."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import contextlib
+import hashlib
+import hmac
+import re
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from starlette.applications import Starlette
+from starlette.requests import HTTPConnection, Request
+from starlette.responses import HTMLResponse, PlainTextResponse, Response
+from starlette.routing import Mount, Route, WebSocketRoute
+from starlette.staticfiles import StaticFiles
+from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
+
+from endopilot.cockpit.frames import encode
+from endopilot.cockpit.loop import Loop, Stage
+from endopilot.cockpit.messages import Ping, Wheel, read_message
+
+WEB = Path(__file__).parent / "web"
+MOST_PAGES = 8
+"""Pages that may look at once."""
+MOST_PER_SECOND = 200
+"""Messages that a page may send in a second."""
+MOST_FAULTS = 20
+"""Messages of a page that may be refused before its connection is closed."""
+REFUSED, BUSY = 4403, 4429
+"""Why a WebSocket is closed: wrong token or origin; too many pages, messages or faults."""
+
+
+@dataclass(eq=False)
+class _Page:
+    """One connected page: the newest message of each channel that it has not been sent yet."""
+
+    number: int
+    waiting: dict[str, bytes] = field(default_factory=dict)
+    news: asyncio.Event = field(default_factory=asyncio.Event)
+    faults: int = 0
+
+    def put(self, channel: str, message: bytes) -> None:
+        self.waiting[channel] = message  # what a slow page has not taken yet is replaced, never queued
+        self.news.set()
+
+
+class Cockpit:
+    """The application around one stage.
+
+    Attributes:
+        loop: the thread that runs the stage.
+        app: the ASGI application.
+    """
+
+    def __init__(
+        self, stage: Stage, scene: Callable[[], bytes], *, token: str, hosts: tuple[str, ...], cycle_s: float
+    ) -> None:
+        """Lay the routes out.
+
+        Args:
+            stage: what is driven or replayed.
+            scene: makes the message with what does not move.
+            token: that a page's address must hold.
+            hosts: names (with ports) under which the page may be asked for, such as "127.0.0.1:8000".
+            cycle_s: length of a cycle, s.
+        """
+        self._token, self._hosts, self._scene = token, hosts, scene
+        self.loop = Loop(stage, cycle_s, self._publish)
+        self._pages: list[_Page] = []
+        self._driver: _Page | None = None
+        self._counted = 0
+        self._kept: dict[str, bytes] = {}
+        self._async: asyncio.AbstractEventLoop | None = None
+        self._index = (WEB / "index.html").read_text(encoding="utf-8")
+        self.app = Starlette(
+            routes=[
+                Route("/", self._page),
+                Route("/scene", self._scene_route),
+                WebSocketRoute("/socket", self._socket),
+                Mount("/web", StaticFiles(directory=WEB)),
+            ],
+            lifespan=self._lifespan,
+        )
+
+    @asynccontextmanager
+    async def _lifespan(self, app: Starlette) -> AsyncIterator[None]:
+        self._async = asyncio.get_running_loop()
+        self.loop.start()
+        try:
+            yield
+        finally:
+            await asyncio.to_thread(self.loop.stop)
+
+    def _publish(self, channel: str, message: bytes) -> None:
+        """Give a message to all pages; called from the loop's thread."""
+        if self._async is not None and not self._async.is_closed():
+            self._async.call_soon_threadsafe(self._spread, channel, message)
+
+    def _spread(self, channel: str, message: bytes) -> None:
+        if channel.startswith("image") or channel in ("state", "error", "result"):
+            self._kept[channel] = message
+        for page in self._pages:
+            page.put(channel, message)
+
+    def _allowed(self, connection: HTTPConnection, *, need_origin: bool) -> bool:
+        """Return whether host, origin and token are right."""
+        origin = connection.headers.get("origin")
+        if connection.headers.get("host") not in self._hosts:
+            return False  # another name for this machine: DNS rebinding
+        if (need_origin or origin is not None) and (origin is None or urlsplit(origin).netloc not in self._hosts):
+            return False
+        given = connection.query_params.get("token", "").encode()
+        return hmac.compare_digest(given, self._token.encode())
+
+    async def _page(self, request: Request) -> Response:
+        if not self._allowed(request, need_origin=False):
+            return PlainTextResponse("This page needs the address that `endopilot cockpit` printed.", status_code=403)
+        return HTMLResponse(self._index, headers=_headers(self._index))
+
+    async def _scene_route(self, request: Request) -> Response:
+        if not self._allowed(request, need_origin=False):
+            return PlainTextResponse("wrong token", status_code=403)
+        message = await asyncio.to_thread(self._scene)
+        return Response(message, media_type="application/octet-stream", headers={"Cache-Control": "no-store"})
+
+    async def _socket(self, socket: WebSocket) -> None:
+        await socket.accept()
+        if not self._allowed(socket, need_origin=True):
+            await socket.close(REFUSED, "wrong token or origin")
+            return
+        if len(self._pages) >= MOST_PAGES:
+            await socket.close(BUSY, f"{MOST_PAGES} pages look already")
+            return
+        self._counted += 1
+        page = _Page(self._counted)
+        for channel, message in self._kept.items():
+            page.put(channel, message)
+        self._pages.append(page)
+        if self._driver is None:
+            self._driver = page
+        self._tell_roles()
+        self.loop.pause(False)
+        sender = asyncio.create_task(self._send(socket, page))
+        try:
+            await self._receive(socket, page)
+        finally:
+            sender.cancel()
+            self._pages.remove(page)
+            if self._driver is page:
+                self._driver = None
+                self.loop.halt("connection")
+            self._tell_roles()
+            if not self._pages:
+                self.loop.pause(True)
+
+    async def _send(self, socket: WebSocket, page: _Page) -> None:
+        with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+            while True:
+                await page.news.wait()
+                page.news.clear()
+                for channel in list(page.waiting):
+                    await socket.send_bytes(page.waiting.pop(channel))
+
+    async def _receive(self, socket: WebSocket, page: _Page) -> None:
+        clock = asyncio.get_running_loop().time
+        began, count = clock(), 0
+        while socket.client_state == WebSocketState.CONNECTED:
+            incoming = await socket.receive()
+            if incoming["type"] == "websocket.disconnect":
+                return
+            if clock() - began > 1.0:
+                began, count = clock(), 0
+            count += 1
+            if count > MOST_PER_SECOND:
+                await socket.close(BUSY, "too many messages")
+                return
+            text = incoming.get("text") or incoming.get("bytes") or ""
+            refused = self._take(page, text)
+            if refused is not None:
+                page.faults += 1
+                page.put("notice", encode("notice", {"text": refused[:300]}))
+                if page.faults >= MOST_FAULTS:
+                    await socket.close(BUSY, "too many messages were refused")
+                    return
+
+    def _take(self, page: _Page, text: str | bytes) -> str | None:
+        """Do what a message asks for, and return why it is refused, or None."""
+        try:
+            message = read_message(text)
+        except ValueError as error:
+            return str(error)
+        if isinstance(message, Ping):
+            page.put("pong", encode("pong", {"number": message.number}))
+        elif isinstance(message, Wheel):
+            return self._wheel(page, message.take)
+        elif page is self._driver:
+            self.loop.send(message)
+        else:
+            return "this page only watches; take the wheel first"
+        return None
+
+    def _wheel(self, page: _Page, take: bool) -> str | None:
+        if take and self._driver not in (None, page):
+            return "another page drives; it must let the wheel go first"
+        if take:
+            self._driver = page
+        elif page is self._driver:
+            self._driver = None
+            self.loop.halt("wheel")
+        self._tell_roles()
+        return None
+
+    def _tell_roles(self) -> None:
+        for page in self._pages:
+            header = {"drives": page is self._driver, "taken": self._driver is not None, "pages": len(self._pages)}
+            page.put("role", encode("role", header))
+
+
+def _headers(index: str) -> dict[str, str]:
+    """Return headers that let the page load nothing but its own scripts, styles and data."""
+    inline = re.findall(r'<script type="importmap">(.*?)</script>', index, flags=re.DOTALL)
+    hashes = [base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in inline]
+    scripts = " ".join(f"'sha256-{digest}'" for digest in hashes)
+    policy = (
+        f"default-src 'none'; script-src 'self' {scripts}; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
+        "frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
+    )
+    return {
+        "Content-Security-Policy": policy,
+        "X-Content-Type-Options": "nosniff",
+        "Referrer-Policy": "no-referrer",
+        "Cache-Control": "no-store",
+    }

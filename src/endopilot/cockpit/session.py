@@ -1,0 +1,198 @@
+"""A session: what happens in a cycle. Messages come in, the world moves on, X-ray pulses, frames go out.
+
+Everything here runs in one thread, by the world's clock. The only real time in it is the watchdog's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from endopilot.cockpit import messages
+from endopilot.cockpit.fluoroscopy import XrayUnit
+from endopilot.cockpit.frames import encode, target_values, tip_values, wire_arrays
+from endopilot.cockpit.recording import Recorder
+from endopilot.cockpit.world import Snapshot, World
+from endopilot.errors import InputError
+from endopilot.tasks.navigation import Target
+
+SILENCE_S = 0.2
+"""The drive stops after this time without a message from who drives, s."""
+
+
+class Session:
+    """One world driven from a page.
+
+    Attributes:
+        world: the wire in its vessel.
+        xray: C-arm, pedal and contrast.
+        target: where the tip is to go.
+        sight: whether the page may show the wire in space.
+    """
+
+    def __init__(self, world: World, xray: XrayUnit, recorder: Recorder | None = None) -> None:
+        """Take the parts.
+
+        Args:
+            world: the wire in its vessel.
+            xray: C-arm, pedal and contrast.
+            recorder: writes what happens; nothing is kept without one.
+        """
+        self.world, self.xray, self._recorder = world, xray, recorder
+        self.target: Target = world.navigation.target
+        self.sight = True
+        self._command, self._moving, self._heard_s = (0.0, 0.0), False, -np.inf
+        self._stopped = ""
+
+    def handle(self, message: messages.Message, now_s: float) -> None:
+        """Do what the page of who drives asks for.
+
+        Args:
+            message: from that page.
+            now_s: real time, s.
+
+        Raises:
+            InputError: it cannot be done; one line says why.
+        """
+        if isinstance(message, messages.Drive):
+            self._heard_s = now_s
+            self._drive(message.translation, message.rotation)
+        elif isinstance(message, messages.Pedal):
+            self._heard_s = now_s
+            self.xray.pedal = message.down
+        elif isinstance(message, messages.Contrast):
+            self.xray.inject(self.world.time_s)
+            self._record(contrast=True)
+        elif isinstance(message, messages.CArm):
+            changes = message.model_dump(exclude={"type"}, exclude_none=True)
+            self.xray.configure(**changes)
+            self._record(c_arm=changes)
+        elif isinstance(message, messages.Target):
+            self._aim(message)
+        else:
+            raise InputError(f"{message.type}: not here")
+
+    def restore(self, events: Iterable[dict[str, Any]]) -> None:
+        """Take over what the recording of a resumed session says of target and exposures.
+
+        Args:
+            events: of the recording.
+        """
+        for event in events:
+            if "target" in event:
+                self.target = Target(branch=event["target"][0], abscissa=event["target"][1])
+            elif "exposure" in event:
+                self.xray.frames = event["exposure"]
+                self.xray.seconds, self.xray.kerma_ugy = event["seconds"], event["kerma_ugy"]
+        self._record(stop="resumed")
+
+    def halt(self, why: str) -> None:
+        """Brake at once and let the pedal go.
+
+        Args:
+            why: goes into the page and the recording.
+        """
+        self.xray.pedal = False
+        if self._moving:
+            self.world.stop()
+            self._command, self._moving, self._stopped = (0.0, 0.0), False, why
+            self._record(stop=why)
+
+    def cycle(self, now_s: float) -> list[tuple[str, bytes]]:
+        """Let one cycle pass, and return what the pages are to get: a channel's name and a message each.
+
+        Args:
+            now_s: real time, s.
+        """
+        if (self._moving or self.xray.pedal) and now_s - self._heard_s > SILENCE_S:
+            self.halt("silence")
+        self.world.advance()
+        if self._recorder is not None:
+            self._recorder.cycle()
+        snapshot = self.world.snapshot()
+        sent = [(f"image{number}", image) for number, image in enumerate(self._expose(snapshot))]
+        return [*sent, ("state", self.state(snapshot))]
+
+    def state(self, snapshot: Snapshot) -> bytes:
+        """Return the message that shows the world as it is."""
+        arrays = wire_arrays(snapshot) if self.sight else {}
+        return encode("state", self.values(snapshot), **arrays)
+
+    def values(self, snapshot: Snapshot) -> dict[str, Any]:
+        """Return the figures that the page shows."""
+        anatomy = self.world.navigation.anatomy
+        shown = {
+            "mode": "drive",
+            "cycle": snapshot.cycle,
+            "time_s": round(snapshot.time_s, 4),
+            "inserted_mm": round(snapshot.inserted_mm - self.world.config.truth.ostium_mm, 3),
+            "rotation_deg": round(float(np.rad2deg(snapshot.rotation)), 2),
+            "command": self._command,
+            "velocity": snapshot.velocity,
+            "drive_load": snapshot.drive_load,
+            "slip": snapshot.slip,
+            "stopped": self._stopped,
+            "valid": snapshot.valid,
+            "peak_force_n": round(self.world.peak_force_n, 4),
+            "sight": self.sight,
+            "target": target_values(anatomy, self.target),
+            "xray": self.xray.values(snapshot.time_s),
+        }
+        return shown | (tip_values(anatomy, snapshot) if self.sight else {})
+
+    def close(self) -> None:
+        """Stop the wire and close the recording."""
+        self.halt("closed")
+        self.xray.close()
+        if self._recorder is not None:
+            self._recorder.close()
+
+    def _drive(self, translation: float, rotation: float) -> None:
+        command = self.world.limits.safe(translation, rotation)
+        if command != self._command:
+            self._command = self.world.command(*command)
+            self._record(move=command)
+        self._moving = self._command != (0.0, 0.0)
+        if self._moving:
+            self._stopped = ""
+
+    def _aim(self, message: messages.Target) -> None:
+        """Set the target, in the middle of a section or at a place."""
+        tree = self.world.navigation.anatomy.tree
+        if message.section is not None:
+            self.target = middle_of_section(tree, message.section)
+        elif message.branch is not None and message.abscissa is not None:
+            wanted = Target(branch=message.branch, abscissa=message.abscissa)
+            self.target = replace(self.world.navigation, target=wanted).target  # which checks that it is in the tree
+        else:
+            raise InputError("target: give a section, or a branch and an abscissa")
+        self._record(target=[self.target.branch, self.target.abscissa])
+
+    def _expose(self, snapshot: Snapshot) -> list[bytes]:
+        images = self.xray.pulse(snapshot)
+        if images is None:
+            return []
+        xray = self.xray
+        self._record(exposure=xray.frames, seconds=xray.seconds, kerma_ugy=xray.kerma_ugy)
+        return images
+
+    def _record(self, **what: Any) -> None:
+        if self._recorder is not None:
+            self._recorder.event(**what)
+
+
+def middle_of_section(tree: Any, section: str) -> Target:
+    """Return the place half along a section, in the branch that holds most of it.
+
+    Raises:
+        InputError: the tree has no such section.
+    """
+    if section not in tree.sections_present:
+        raise InputError(f"section: {section!r}; this vessel has {', '.join(tree.sections_present)}")
+    label = tree.section_names.index(section)
+    branch = max(range(len(tree.branches)), key=lambda index: int((tree.branches[index].section == label).sum()))
+    inside = tree.branches[branch].centerline.abscissa[tree.branches[branch].section == label]
+    return Target(branch=branch, abscissa=float((inside[0] + inside[-1]) / 2))

@@ -1,0 +1,109 @@
+// The page: connects, hands each message to the view that shows it, and draws one frame after the other.
+import { Connection, fetchScene } from "./connection.js";
+import { Fluoroscopy, list, put } from "./fluoroscopy.js";
+import { Hands } from "./hands.js";
+import { Sound } from "./sound.js";
+import { Space } from "./space.js";
+
+const page = { state: null, role: { drives: false }, space: null, frames: 0, drawn: 0 };
+window.cockpit = page; // for tests and the console
+
+const handlers = {
+  state: (message) => { page.state = message; },
+  image: (message) => page.xray.take(message),
+  role: (message) => showRole(message),
+  notice: (message) => banner(message.text, true),
+  error: (message) => { page.fatal = true; banner(message.text); },
+  pong: (message) => page.pong?.(message.number),
+};
+
+function banner(text, note = false) {
+  const box = document.getElementById("banner");
+  box.hidden = !text;
+  box.textContent = text ?? "";
+  box.classList.toggle("note", note);
+  clearTimeout(page.bannerTimer);
+  if (note) page.bannerTimer = setTimeout(() => banner(null), 6000);
+}
+
+function showRole(role) {
+  page.role = role;
+  const chip = document.getElementById("role");
+  chip.textContent = `${role.drives ? "you drive" : role.taken ? "you watch; another page drives" : "nobody drives"}, ${role.pages} page${role.pages > 1 ? "s" : ""}`;
+  chip.classList.toggle("drives", role.drives);
+  const button = document.getElementById("wheel");
+  button.hidden = role.taken && !role.drives;
+  button.textContent = role.drives ? "Let the wheel go" : "Take the wheel";
+  button.onclick = () => { page.connection.send("wheel", { take: !role.drives }); button.blur(); };
+}
+
+function showForce(state) {
+  const blind = !state.sight;
+  const value = blind ? Math.abs(state.drive_load[0]) : state.force_n;
+  const limit = blind ? page.scene.push_limit_n : page.scene.force_limit_n;
+  const share = value / limit, bar = document.querySelector("#force i");
+  bar.style.width = `${Math.min(100, share * 80)}%`;
+  bar.className = share >= 1 ? "over" : share > 0.6 ? "near" : "";
+  document.querySelector("#force u").style.left = "80%";
+  put("force-label", blind ? "Drive's load" : "Wall force");
+  put("force-text", `${value.toFixed(3)} N`);
+  page.sound.set(share);
+}
+
+function showFigures(state) {
+  const slips = Math.abs(state.slip[0]) > 1e-6 || Math.abs(state.slip[1]) > 1e-6;
+  list("figures", {
+    time: `${state.time_s.toFixed(1)} s`,
+    inserted: `${state.inserted_mm.toFixed(1)} mm`,
+    rotation: `${state.rotation_deg.toFixed(0)}°`,
+    drive: `${state.velocity[0].toFixed(1)} mm/s, ${state.velocity[1].toFixed(1)} rad/s`,
+    tip: state.sight ? `${state.section}, ${state.tip_mm.toFixed(1)} mm` : "hidden",
+    "peak force": state.sight ? `${state.peak_force_n.toFixed(3)} N` : "hidden",
+    state: !state.valid ? "simulation failed" : slips ? "the drive slips" : state.stopped ? `stopped: ${state.stopped}` : "ready",
+  });
+}
+
+function show(state) {
+  page.space.show(state);
+  page.xray.show(state.xray);
+  showForce(state);
+  showFigures(state);
+  document.getElementById("blind").hidden = state.sight;
+}
+
+function frame() {
+  requestAnimationFrame(frame);
+  if (page.state && page.state !== page.shown) {
+    page.shown = page.state;
+    show(page.state);
+  }
+  page.xray.draw();
+  if (!page.shown || page.shown.sight) page.space.draw();
+  page.frames += 1;
+}
+
+function countFrames() {
+  put("frames", `${page.frames - page.drawn} frames/s`);
+  page.drawn = page.frames;
+}
+
+async function start() {
+  try {
+    page.scene = await fetchScene();
+  } catch (error) {
+    banner(`The page cannot be shown: ${error.message}`);
+    return;
+  }
+  put("patient", `${page.scene.name}, ${page.scene.wire}`);
+  put("scale-text", `wall force, 0 to ${page.scene.force_limit_n} N`);
+  page.sound = new Sound(document.getElementById("sound"));
+  page.connection = new Connection(handlers, (why) => { if (!page.fatal) banner(why); });
+  page.xray = new Fluoroscopy(page.connection);
+  page.space = new Space(document.getElementById("scene"), page.scene, (place) => page.connection.send("target", place));
+  page.space.buttons(document.getElementById("cameras"), () => page.xray.angles());
+  page.hands = new Hands(page.connection, () => page.role.drives);
+  setInterval(countFrames, 1000);
+  frame();
+}
+
+start();

@@ -1,0 +1,44 @@
+"""A session in a vessel that forks, and its parts."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+
+
+@pytest.fixture
+def navigation(fork, wire):
+    from endopilot.tasks.navigation import Navigation, Target
+
+    return Navigation(anatomy=fork, device=wire, target=Target(branch=0, abscissa=15.0))
+
+
+@pytest.fixture
+def world(navigation):
+    from endopilot.cockpit.world import World
+
+    return World(navigation)
+
+
+@pytest.fixture
+def xray(fork, wire):
+    from endopilot.cockpit.open import xray_unit
+
+    unit = xray_unit(fork, wire, None)
+    until = time.monotonic() + 20
+    while not unit.ready and time.monotonic() < until:
+        time.sleep(0.01)
+    yield unit
+    unit.close()
+
+
+@pytest.fixture
+def session(world, xray, vessel, tmp_path):
+    from endopilot.cockpit.recording import Recorder, Where
+    from endopilot.cockpit.session import Session
+
+    recorder = Recorder(tmp_path / "a.cockpit.jsonl", world, Where(patient=vessel), 0)
+    made = Session(world, xray, recorder)
+    yield made
+    made.close()

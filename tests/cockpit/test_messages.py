@@ -1,0 +1,86 @@
+"""What pages may send, and what they may not."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from endopilot.cockpit.frames import decode, encode
+from endopilot.cockpit.messages import LONGEST_MESSAGE, CArm, Drive, read_message
+
+
+def test_a_drive_message_is_read():
+    assert read_message('{"type": "drive", "translation": 3, "rotation": -0.5}') == Drive(
+        type="drive", translation=3.0, rotation=-0.5
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [
+        ("", "JSON"),
+        ("[]", "object"),
+        ('{"type": "fly"}', "drive"),
+        ('{"type": "drive", "translation": NaN, "rotation": 0}', "finite"),
+        ('{"type": "drive", "translation": 1e9, "rotation": 0}', "translation"),
+        ('{"type": "drive", "translation": 1}', "rotation"),
+        ('{"type": "drive", "translation": 1, "rotation": 0, "force": 9}', "force"),
+        ('{"type": "c_arm", "frames_per_s": 1000}', "frames_per_s"),
+        ('{"type": "c_arm", "zoom": 0}', "zoom"),
+        (" " * (LONGEST_MESSAGE + 1), "longest"),
+    ],
+)
+def test_other_messages_are_refused_in_one_line(text, word):
+    with pytest.raises(ValueError, match=word) as caught:
+        read_message(text)
+    assert "\n" not in str(caught.value)
+
+
+@given(st.one_of(st.binary(max_size=300), st.text(max_size=300)))
+def test_whatever_comes_is_read_or_refused(text):
+    try:
+        read_message(text)
+    except ValueError as error:
+        assert "\n" not in str(error)
+
+
+_VALUES = st.recursive(
+    st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3),
+    max_leaves=6,
+)
+_TYPES = st.sampled_from(
+    ["drive", "pedal", "contrast", "c_arm", "target", "autopilot", "game", "replay", "wheel", "ping"]
+)
+
+
+@given(
+    _TYPES, st.dictionaries(st.sampled_from(["translation", "down", "zoom", "angles_deg", "at_s"]), _VALUES, max_size=3)
+)
+def test_known_messages_with_strange_values_are_read_or_refused(kind, values):
+    try:
+        message = read_message(json.dumps({"type": kind} | values))
+    except ValueError:
+        return
+    for value in message.model_dump().values():
+        assert not isinstance(value, float) or np.isfinite(value)
+
+
+def test_angles_of_the_c_arm_are_two_pairs():
+    message = read_message('{"type": "c_arm", "angles_deg": [[30, 20], [-60, 0]]}')
+    assert isinstance(message, CArm)
+    assert message.angles_deg == ((30, 20), (-60, 0))
+
+
+@given(st.lists(st.tuples(st.sampled_from(["<f4", "<u4", "u1"]), st.integers(0, 7)), max_size=4))
+def test_a_frame_comes_back_as_it_was(shapes):
+    arrays = {f"a{i}": np.arange(n * 3).reshape(n, 3).astype(kind) for i, (kind, n) in enumerate(shapes)}
+    header, back = decode(encode("state", {"name": "ä"}, **arrays))
+    assert header["type"] == "state" and header["name"] == "ä"
+    assert list(back) == list(arrays)
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(back[name], array)

@@ -1,0 +1,183 @@
+"""The web server: who may look, who drives, and that bad messages harm nobody."""
+
+from __future__ import annotations
+
+import json
+import time
+
+import pytest
+
+pytest.importorskip("starlette", reason="the extra `cockpit` is not installed")
+pytest.importorskip("httpx2", reason="httpx2, which Starlette's test client needs, is not installed")
+
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from starlette.testclient import TestClient
+from starlette.websockets import WebSocketDisconnect
+
+from endopilot.cockpit.frames import decode, encode
+
+HOST, TOKEN = "127.0.0.1:7000", "secret"
+ORIGIN = {"origin": f"http://{HOST}", "host": HOST}
+
+
+class Stage:
+    """Notes what it is asked."""
+
+    def __init__(self):
+        self.heard, self.halted, self.cycles = [], [], 0
+
+    def handle(self, message, now_s):
+        self.heard.append(message)
+
+    def halt(self, why):
+        self.halted.append(why)
+
+    def cycle(self, now_s):
+        self.cycles += 1
+        if self.cycles == 5000:
+            raise RuntimeError("broken")
+        return [("state", encode("state", {"cycle": self.cycles}))]
+
+    def close(self):
+        self.halted.append("closed")
+
+
+@pytest.fixture
+def stage():
+    return Stage()
+
+
+@pytest.fixture
+def client(stage):
+    from endopilot.cockpit.server import Cockpit
+
+    cockpit = Cockpit(stage, lambda: encode("scene", {}), token=TOKEN, hosts=(HOST,), cycle_s=0.005)
+    with TestClient(cockpit.app, base_url=f"http://{HOST}") as made:
+        yield made
+
+
+def socket(client, *, token=TOKEN, headers=ORIGIN):
+    return client.websocket_connect(f"/socket?token={token}", headers=headers)
+
+
+def until(found, *, seconds=5.0):
+    end = time.monotonic() + seconds
+    while not found() and time.monotonic() < end:
+        time.sleep(0.005)
+    assert found()
+
+
+def receive(page, kind):
+    for _ in range(2000):
+        header, _ = decode(page.receive_bytes())
+        if header["type"] == kind:
+            return header
+    raise AssertionError(kind)
+
+
+@pytest.mark.parametrize("path", ["/", "/scene", "/?token=wrong", "/scene?token=wrong"])
+def test_the_page_needs_the_token(client, path):
+    assert client.get(path).status_code == 403
+
+
+def test_the_page_loads_nothing_from_elsewhere(client):
+    answer = client.get(f"/?token={TOKEN}")
+    assert answer.status_code == 200
+    assert "default-src 'none'" in answer.headers["content-security-policy"]
+    assert "Not a medical device" in answer.text
+    assert "://" not in answer.text
+
+
+def test_another_name_of_this_machine_is_refused(client):
+    assert client.get(f"/?token={TOKEN}", headers={"host": "evil.example"}).status_code == 403
+
+
+@pytest.mark.parametrize(
+    ("token", "headers"),
+    [
+        ("wrong", ORIGIN),
+        ("", ORIGIN),
+        (TOKEN, {"host": HOST}),
+        (TOKEN, {"host": HOST, "origin": "http://evil.example"}),
+        (TOKEN, {"host": HOST, "origin": "null"}),
+        (TOKEN, {"host": "evil.example", "origin": f"http://{HOST}"}),
+    ],
+)
+def test_a_socket_needs_token_origin_and_host(client, stage, token, headers):
+    with socket(client, token=token, headers=headers) as page:
+        page.send_text('{"type": "drive", "translation": 1, "rotation": 0}')
+        with pytest.raises(WebSocketDisconnect) as closed:
+            page.receive_bytes()
+    assert closed.value.code == 4403
+    assert not stage.heard
+
+
+def test_the_first_page_drives_and_the_second_watches(client, stage):
+    with socket(client) as first:
+        assert receive(first, "role")["drives"]
+        with socket(client) as second:
+            assert not receive(second, "role")["drives"]
+            assert receive(second, "state")["cycle"] > 0
+            second.send_text('{"type": "drive", "translation": 1, "rotation": 0}')
+            assert "watches" in receive(second, "notice")["text"]
+            second.send_text('{"type": "wheel", "take": true}')
+            assert "another page drives" in receive(second, "notice")["text"]
+            first.send_text('{"type": "drive", "translation": 2, "rotation": 0}')
+            until(lambda: stage.heard)
+            assert [message.translation for message in stage.heard] == [2.0]
+            first.send_text('{"type": "wheel", "take": false}')
+            until(lambda: "wheel" in stage.halted)
+            second.send_text('{"type": "wheel", "take": true}')
+            second.send_text('{"type": "drive", "translation": 3, "rotation": 0}')
+            until(lambda: len(stage.heard) == 2)
+
+
+def test_a_lost_page_stops_the_wire_and_time(client, stage):
+    with socket(client) as page:
+        receive(page, "state")
+    until(lambda: "connection" in stage.halted)
+    time.sleep(0.1)
+    cycles = stage.cycles
+    time.sleep(0.1)
+    assert stage.cycles == cycles
+
+
+def test_too_many_faults_close_the_connection(client, stage):
+    with socket(client) as page:
+        for _ in range(30):
+            page.send_text("nonsense")
+        with pytest.raises(WebSocketDisconnect):
+            for _ in range(2000):
+                page.receive_bytes()
+    assert not stage.heard
+
+
+def test_too_many_messages_close_the_connection(client):
+    with socket(client) as page, pytest.raises(WebSocketDisconnect):
+        for number in range(400):
+            page.send_text(json.dumps({"type": "ping", "number": number}))
+        for _ in range(4000):
+            page.receive_bytes()
+
+
+def test_an_error_of_the_server_is_told_in_the_page(client, stage):
+    stage.cycles = 4990
+    with socket(client) as page:
+        header = receive(page, "error")
+    assert header["fatal"] and "broken" in header["text"]
+    until(lambda: "closed" in stage.halted)
+
+
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(st.one_of(st.text(max_size=100), st.binary(max_size=100)), min_size=1, max_size=15))
+def test_malformed_messages_harm_nobody(client, stage, texts):
+    with socket(client) as page:
+        for text in texts:
+            if isinstance(text, str):
+                page.send_text(text)
+            else:
+                page.send_bytes(text)
+        page.send_text('{"type": "ping", "number": 7}')
+        assert receive(page, "pong")["number"] == 7
+    assert not stage.heard
