@@ -8,12 +8,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.control.navigate import ModelMismatch
+from endopilot.control.navigate import ModelMismatch, start_world
 from endopilot.control.robot import RobotConfig, SimulatedRobot
 from endopilot.settings import Positive, settings
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.drive_limits import DriveLimits
-from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import Navigation
 from endopilot.types import TipProjection
 
@@ -95,15 +94,9 @@ class World:
             InputError: the wire does not fit the vessel, or starts deeper than it is long.
         """
         self.navigation, self.config = navigation, config or WorldConfig()
-        device, truth = navigation.device, self.config.truth
-        wire = device.with_tip(bend_rad=device.tip_bend_rad, stiffness_factor=truth.stiffness_factor)
-        self.simulator = Simulator(navigation.anatomy, wire, config=self.config.simulator)
-        self.simulator.reset(
-            inserted_length=[max(navigation.start_inserted_mm + truth.ostium_mm, 0.0)],
-            rotation=[navigation.start_rotation],
-            friction=[device.friction * truth.friction_factor],
-        )
-        self.limits = DriveLimits.of(device, navigation.anatomy)
+        truth = self.config.truth
+        self.simulator = start_world(navigation, truth, self.config.simulator)
+        self.limits = DriveLimits.of(navigation.device, navigation.anatomy)
         drive = replace(self.config.robot, latency_s=self.config.robot.latency_s * truth.latency_factor)
         self.robot = SimulatedRobot(self.simulator, self.limits, drive, seed=seed, ostium_mm=truth.ostium_mm)
         self.cycle, self.peak_force_n, self._force_n = 0, 0.0, 0.0

@@ -93,7 +93,7 @@ class NavigationLoop:
         config, truth = config or NavigateConfig(), truth or ModelMismatch()
         self.navigation = navigation
         self.policy = make_policy(policy) if isinstance(policy, str) else policy
-        self.simulator = _start(navigation, truth, config.simulator)
+        self.simulator = start_world(navigation, truth, config.simulator)
         self._limits = DriveLimits.of(navigation.device, navigation.anatomy)
         drive = replace(config.robot, latency_s=config.robot.latency_s * truth.latency_factor)
         self.robot = SimulatedRobot(self.simulator, self._limits, drive, seed=seed, ostium_mm=truth.ostium_mm)
@@ -232,8 +232,17 @@ def navigate(
     return loop.record()
 
 
-def _start(navigation: Navigation, truth: ModelMismatch, config: SimulatorConfig) -> Simulator:
-    """Return the world as it truly is, with the wire at the start of the navigation."""
+def start_world(navigation: Navigation, truth: ModelMismatch, config: SimulatorConfig) -> Simulator:
+    """Return the world as it truly is, with the wire at the start of the navigation.
+
+    Args:
+        navigation: as a policy is given it.
+        truth: how reality differs.
+        config: settings of the rod core.
+
+    Raises:
+        InputError: the wire does not fit the vessel, or starts deeper than it is long.
+    """
     device = navigation.device
     wire = device.with_tip(bend_rad=device.tip_bend_rad, stiffness_factor=truth.stiffness_factor)
     simulator = Simulator(navigation.anatomy, wire, config=config)
