@@ -28,8 +28,6 @@ constexpr double kFirstDamping = 1e-3;   // N/mm (rotations: N mm/rad), where th
 constexpr double kMaxDamping = 1e3;
 constexpr double kMaxBoost = 64;
 constexpr double kMaxImbalance = 1e-5;   // N that a damped solution may be out of balance
-constexpr double kStopStiffness = 100;   // N/mm, of the stops at both ends of the drive's travel
-constexpr int kMaxReleases = 8;          // times in a step that the drive may let go of the wire
 constexpr double kDriveMotion = 1.2;     // times the drive's own motion that a node may move in a step before it counts as a jump
 
 // A node of the wires in all lanes.
@@ -189,14 +187,16 @@ private:
     ENDOPILOT_LARGE void begin(int l, bool fresh);
     ENDOPILOT_LARGE Decision decide(int l);
     ENDOPILOT_DEVICE double best_share(double energy, int l) const;
-    ENDOPILOT_DEVICE DriveEnergy introducer(const Drive& moved, int l) const;
-    ENDOPILOT_DEVICE DriveEnergy drive_energy(const Lane& lane, int l) const;
-    ENDOPILOT_LARGE bool solve_drive(int l);
-    ENDOPILOT_DEVICE bool release(int l);
     template <class Queue>
     ENDOPILOT_DEVICE int pass(Queue& queue);
     template <class Queue>
     ENDOPILOT_DEVICE int advance(int n, const Decision (&decision)[W], Queue& queue);
+
+    // The drive of one lane (drive.hpp).
+    ENDOPILOT_DEVICE DriveEnergy introducer(const Drive& moved, int l) const;
+    ENDOPILOT_DEVICE DriveEnergy drive_energy(const Lane& lane, int l) const;
+    ENDOPILOT_LARGE bool solve_drive(int l);
+    ENDOPILOT_DEVICE bool release(int l);
 
     // Sweeps over the nodes of all lanes (sweeps.hpp).
     ENDOPILOT_LARGE void evaluate(int n);
@@ -424,89 +424,8 @@ int Stepper<V>::advance(int n, const Decision (&decision)[W], Queue& queue) {
     return samples;
 }
 
-// The introducer through which the drive moves the wire: smoothed Coulomb friction of its valve and viscous drag, against
-// advance and rotation together; the wire's surface moves by its radius times the rotation.
-template <class V>
-typename Stepper<V>::DriveEnergy Stepper<V>::introducer(const Drive& moved, int l) const {
-    const double r = rod_.radius[lane_[l].active], a = moved.advance, s = r * moved.rotation, eps = get(eps_, l);
-    const double drag = options_.introducer_drag * get(inverse_dt_, l), size = std::sqrt(a * a + s * s + eps * eps);
-    const double secant = options_.introducer_friction / size, c = secant / (size * size);
-    return {.energy = 0.5 * drag * (a * a + s * s) + options_.introducer_friction * (size - eps),
-            .gradient_a = (drag + secant) * a,
-            .gradient_r = (drag + secant) * s * r,
-            .aa = drag + secant - c * a * a,
-            .ar = -c * a * s * r,
-            .rr = (drag + secant - c * s * s) * r * r};
-}
-
-// Where the drive slips at its limit, or the wire is driven by force, the drive's advance and rotation are unknowns too: the
-// energy at the trial point of what is lost by slipping, or of the introducer, of the stops at both ends of the drive's
-// travel, and of the load.
-template <class V>
-typename Stepper<V>::DriveEnergy Stepper<V>::drive_energy(const Lane& lane, int l) const {
-    const Drive& moved = lane.off;
-    if (!lane.by_force) {
-        const auto load = [](int side, double forwards, double backwards) { return side > 0 ? forwards : side < 0 ? -backwards : 0.0; };
-        const double force = load(lane.slipping.advance, options_.push_limit, options_.pull_limit);
-        const double torque = load(lane.slipping.rotation, options_.torque_limit, options_.torque_limit);
-        return {.energy = -force * moved.advance - torque * moved.rotation, .gradient_a = -force, .gradient_r = -torque, .aa = 0, .ar = 0, .rr = 0};
-    }
-    DriveEnergy t = introducer(moved, l);
-    const double a = lane.end.advance;
-    const double beyond = std::min(0.0, a) + std::max(0.0, a + options_.free_behind - rod_.abscissa[rod_.nodes - 1]);
-    t.energy += 0.5 * kStopStiffness * beyond * beyond - lane.speed * moved.advance - lane.spin * moved.rotation;
-    t.gradient_a += kStopStiffness * beyond - lane.speed;
-    t.gradient_r -= lane.spin;
-    t.aa += beyond != 0.0 ? kStopStiffness : 0.0;
-    return t;
-}
-
-// Newton's step of the drive's unknowns. A drive that slips has them too, but goes no farther than commanded: there it grips
-// again. Returns whether the Hessian is positive definite.
-template <class V>
-bool Stepper<V>::solve_drive(int l) {
-    const Lane& lane = lane_[l];
-    const Slipping& side = lane.slipping;
-    bool holds_a = !lane.by_force && side.advance == 0, holds_r = !lane.by_force && side.rotation == 0;
-    if (holds_a && holds_r) return true;
-    const DriveEnergy t = drive_energy(lane, l);
-    const double damping = get(damping_, l);
-    const double aa = t.aa + get(drive_.aa, l) + damping, ar = t.ar + get(drive_.ar, l), rr = t.rr + get(drive_.rr, l) + damping;
-    const double determinant = aa * rr - ar * ar;
-    if (!((holds_a || aa > 0) && (holds_r || rr > 0) && (holds_a || holds_r || determinant > 0))) return false;
-    const double a = t.gradient_a + get(drive_.gradient_a, l), r = t.gradient_r + get(drive_.gradient_r, l);
-    double step_a = 0, step_r = 0;
-    for (int held = -1; held != holds_a + holds_r;) {  // an unknown that would go beyond its bound is held there
-        held = holds_a + holds_r;
-        step_a = holds_a ? -lane.off.advance : holds_r ? (ar * lane.off.rotation - a) / aa : (ar * r - rr * a) / determinant;
-        step_r = holds_r ? -lane.off.rotation : holds_a ? (ar * lane.off.advance - r) / rr : (ar * a - aa * r) / determinant;
-        holds_a = holds_a || side.advance * (lane.off.advance + step_a) > 0;
-        holds_r = holds_r || side.rotation * (lane.off.rotation + step_r) > 0;
-    }
-    set(drive_a_, l, step_a);
-    set(drive_r_, l, step_r);
-    set(descent_, l, get(descent_, l) - a * step_a - r * step_r);
-    return true;
-}
-
-// Lets the drive slip where the wire, at rest with the drive where it was commanded, takes more than the drive's limits.
-// Returns whether it does.
-template <class V>
-bool Stepper<V>::release(int l) {
-    Lane& lane = lane_[l];
-    if (lane.by_force || lane.releases == kMaxReleases) return false;
-    const double force = get(drive_.gradient_a, l), torque = get(drive_.gradient_r, l);
-    Slipping side = lane.slipping;
-    if (lane.off.advance == 0 && force > options_.push_limit) side.advance = 1;
-    if (lane.off.advance == 0 && force < -options_.pull_limit) side.advance = -1;
-    if (lane.off.rotation == 0 && std::abs(torque) > options_.torque_limit) side.rotation = torque > 0 ? 1 : -1;
-    const bool released = side.advance != lane.slipping.advance || side.rotation != lane.slipping.rotation;
-    lane.slipping = side;
-    lane.releases += released;
-    return released;
-}
-
 }  // namespace endopilot
 
+#include "drive.hpp"
 #include "exchange.hpp"
 #include "sweeps.hpp"
