@@ -18,7 +18,8 @@ from pathlib import Path
 import numpy as np
 
 from endopilot.control.agent import AgentConfig, AgentPolicy
-from endopilot.control.navigate import ModelMismatch, NavigateConfig, navigate
+from endopilot.control.mismatch import ModelMismatch
+from endopilot.control.navigate import NavigateConfig, navigate
 from endopilot.errors import InputError
 from endopilot.files import read_json, write_json
 from endopilot.ladder.ladder import identity

@@ -14,7 +14,8 @@ import numpy as np
 
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.control.agent import AgentPolicy, TwinPolicy
-from endopilot.control.navigate import ModelMismatch, navigate
+from endopilot.control.mismatch import ModelMismatch
+from endopilot.control.navigate import navigate
 from endopilot.control.policies import make_policy
 from endopilot.control.policy import Policy
 from endopilot.simulation.device import Device, read_device

@@ -52,7 +52,7 @@ print(f"{int(needed.exposure.sum())} exposures are due in {0.5 * len(route.contr
 
 from endopilot.control.agent import AgentPolicy, OpenLoopPolicy
 from endopilot.control.baseline_policies import RetractRotate
-from endopilot.control.navigate import ModelMismatch
+from endopilot.control.mismatch import ModelMismatch
 
 
 class RecordedAgent(AgentPolicy):

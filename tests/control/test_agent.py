@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from endopilot.control import search
 from endopilot.control.agent import AgentConfig, AgentPolicy, OpenLoopPolicy, TwinPolicy
 from endopilot.control.belief import Belief, BeliefConfig
-from endopilot.control.navigate import ModelMismatch, NavigationLoop, navigate
+from endopilot.control.mismatch import ModelMismatch
+from endopilot.control.navigate import NavigationLoop, navigate
 from endopilot.control.policy import Decision, Observation, Policy
 from endopilot.control.search import Course, Search
 from endopilot.tasks.navigation import Navigation, Target

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from endopilot.control.navigate import ModelMismatch, NavigateConfig, NavigationLoop, navigate
+from endopilot.control.mismatch import ModelMismatch
+from endopilot.control.navigate import NavigateConfig, NavigationLoop, navigate
 from endopilot.control.policy import Decision, Observation, Policy
 from endopilot.control.robot import CYCLE_S, RobotConfig
 from endopilot.tasks.navigation import Navigation, Target

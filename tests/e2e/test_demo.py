@@ -10,7 +10,7 @@ import time
 
 from endopilot import __version__
 from endopilot.files import read_json
-from endopilot.pipeline import DemoConfig
+from endopilot.pipeline.study import DemoConfig
 from endopilot.runs import claim
 from endopilot.simulation.device import read_device
 

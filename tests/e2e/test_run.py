@@ -14,11 +14,11 @@ import numpy as np
 import pydicom
 import pytest
 
-from endopilot import pipeline
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.files import input_hash, read_json
 from endopilot.imaging.volume import write_volume
 from endopilot.phantom.phantom import PhantomConfig, make_phantom
+from endopilot.pipeline import study
 from endopilot.simulation.device_files import device_yaml
 from endopilot.types import Volume
 
@@ -109,7 +109,7 @@ def test_another_device_in_the_same_file_is_refused(case, untouched, capsys):
 
 
 def test_another_version_of_the_package_is_refused(case, untouched, monkeypatch, capsys):
-    monkeypatch.setattr(pipeline, "__version__", "99.0")
+    monkeypatch.setattr(study, "__version__", "99.0")
     assert "was begun with version = 0.1.0, now it is 99.0" in command.refused(capsys, *arguments(case))
 
 

@@ -29,6 +29,7 @@ COMMANDS = {
     "train": "dataset -> forward and inverse networks: the paper's, ours, or the rod core as a twin",
     "evaluate": "trained run -> errors beside the paper's and the baselines'",
     "plan": "anatomy and target -> controls that bring the tip there",
+    "navigate": "anatomy and target -> a wire driven there by a policy, in closed loop, and its page",
     "advise": "trained run -> calibrated X-ray adviser: exposures against missed events",
     "drive": "a simulated robotic drive that takes commands over TCP, with a watchdog",
     "cockpit": "a wire in the browser: watched, driven by hand, or left to a policy",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from endopilot.cli.arguments import OutputFolder, show
-from endopilot.pipeline import DemoConfig, run_demo
+from endopilot.pipeline.study import DemoConfig, run_demo
 
 
 def command(

@@ -7,7 +7,7 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from endopilot.cli.arguments import OutputFolder, existing, show
-from endopilot.pipeline import RunConfig, run_volume
+from endopilot.pipeline.study import RunConfig, run_volume
 
 
 def command(

@@ -13,7 +13,7 @@ from endopilot.models.config import TrainConfig
 
 
 def command(
-    dataset: Positional[Path],
+    dataset: Positional[tuple[Path, ...]],
     /,
     *,
     output: OutputFolder,
@@ -25,14 +25,15 @@ def command(
     An interrupted run goes on where it stopped when the same command is given again.
 
     Args:
-        dataset: folder made by `endopilot dataset`.
+        dataset: folders made by `endopilot dataset`, or the folder `episode` that `endopilot navigate` leaves; several,
+            of one wire and with episodes of one length, are trained on together.
         output: folder of the run.
         json: print the figures as JSON.
         config: model and training.
     """
     from endopilot.models.train import train  # torch takes seconds to import; --help must not wait for it
 
-    train(existing(dataset), output, config)
+    train([existing(folder) for folder in dataset], output, config)
     if os.environ.get("RANK", "0") != "0":  # torchrun runs several processes; one of them prints
         return
     training = read_json(output / "training.json")

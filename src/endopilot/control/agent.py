@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.control.belief import Belief, BeliefConfig
-from endopilot.control.navigate import ModelMismatch
+from endopilot.control.mismatch import ModelMismatch
 from endopilot.control.policy import BelievedTip, Decision, Observation
 from endopilot.control.route import Route, check_passable
 from endopilot.control.search import Course, Search, SearchConfig

@@ -9,11 +9,12 @@ from dataclasses import field, replace
 
 import numpy as np
 
+from endopilot.control.mismatch import ModelMismatch
 from endopilot.control.policies import make_policy
 from endopilot.control.policy import BelievedTip, Believer, Decision, Led, Observation, Policy
 from endopilot.control.record import NavigationRecord, Track
 from endopilot.control.robot import CYCLE_S, RobotConfig, SimulatedRobot
-from endopilot.settings import Finite, NonNegative, Positive, settings
+from endopilot.settings import settings
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.simulation.simulator import Simulator
@@ -33,20 +34,6 @@ class NavigateConfig:
     """The C-arm."""
     simulator: SimulatorConfig = field(default_factory=lambda: SimulatorConfig(threads=1))
     """The rod core."""
-
-
-@settings
-class ModelMismatch:
-    """How reality differs from the navigation that the policy is given."""
-
-    friction_factor: NonNegative = 1.0
-    """Factor on the friction coefficient."""
-    stiffness_factor: Positive = 1.0
-    """Factor on the stiffness of the wire's distal 10 mm."""
-    ostium_mm: Finite = 0.0
-    """The wire is inserted this much deeper than the encoder says, mm: the ostium lies elsewhere along the catheter."""
-    latency_factor: NonNegative = 1.0
-    """Factor on the robot's latency."""
 
 
 class NavigationLoop:

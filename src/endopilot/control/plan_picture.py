@@ -9,20 +9,22 @@ import matplotlib as mpl
 mpl.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
+from jaxtyping import Float
 from matplotlib.axes import Axes
 
 from endopilot.control.plan_config import Plan
 from endopilot.control.plan_xray import PlannedXray
 from endopilot.control.route import Route
 from endopilot.files import writing
-from endopilot.tasks.navigation import DECISION_PERIOD_S
+from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 
 
 def draw_plan(plan: Plan, path: Path, xray: PlannedXray | None = None) -> None:
     """Write a PNG of a plan, with the X-ray that it will need if that is known."""
     figure = plt.figure(figsize=(13, 8), facecolor="white", layout="constrained")
     grid = figure.add_gridspec(4, 2, width_ratios=(1.0, 1.25))
-    _draw_route(plan, figure.add_subplot(grid[:, 0]))
+    title = f"{plan.navigation.anatomy.name}, {plan.navigation.device.name}: {plan.config.method}"
+    draw_route(figure.add_subplot(grid[:, 0]), plan.navigation, plan.position, title)
     time_s = DECISION_PERIOD_S * np.arange(1, len(plan.control) + 1)
     panels = [figure.add_subplot(grid[row, 1]) for row in range(4)]
     _draw_tip(plan, time_s, panels[0])
@@ -34,7 +36,7 @@ def draw_plan(plan: Plan, path: Path, xray: PlannedXray | None = None) -> None:
     edges = np.append(0.0, time_s)
     for axis, color, label in ((0, "tab:blue", "translation, mm/s"), (1, "tab:orange", "rotation, rad/s")):
         panels[3].stairs(plan.control[:, axis], edges, baseline=None, color=color, linewidth=1.5, label=label)
-    _legend_above(panels[3])
+    legend_above(panels[3])
     panels[3].set_ylabel("control")
     panels[3].set_xlabel("time, s")
     if xray is not None:
@@ -48,9 +50,8 @@ def draw_plan(plan: Plan, path: Path, xray: PlannedXray | None = None) -> None:
     plt.close(figure)
 
 
-def _draw_route(plan: Plan, axes: Axes) -> None:
-    """Draw the tree from the front with the route and the tip's path."""
-    navigation = plan.navigation
+def draw_route(axes: Axes, navigation: Navigation, position: Float[np.ndarray, "n 3"], title: str) -> None:
+    """Draw the tree from the front with the route, the target and the path of the tip (LPS mm)."""
     tree, route = navigation.anatomy.tree, Route.to(navigation.anatomy, navigation.target)
     for branch in tree.branches:
         x, _, z = branch.centerline.points.T
@@ -58,15 +59,13 @@ def _draw_route(plan: Plan, axes: Axes) -> None:
     ahead = route.line.abscissa <= navigation.target.abscissa
     x, _, z = route.line.points[ahead].T
     axes.plot(x, z, color="tab:green", linewidth=5, alpha=0.4, label="route")
-    axes.plot(
-        plan.position[:, 0], plan.position[:, 2], ".-", color="tab:blue", linewidth=0.8, markersize=3, label="tip"
-    )
+    axes.plot(position[:, 0], position[:, 2], ".-", color="tab:blue", linewidth=0.8, markersize=3, label="tip")
     goal = navigation.target.position(navigation.anatomy)
     axes.plot(goal[0], goal[2], "*", color="tab:red", markersize=14, label="target")
     axes.set_aspect("equal")
     axes.set_xlabel("x (to the patient's left), mm")
     axes.set_ylabel("z (to the head), mm")
-    axes.set_title(f"{navigation.anatomy.name}, {navigation.device.name}: {plan.config.method}")
+    axes.set_title(title)
     axes.legend(loc="best", fontsize=9)
 
 
@@ -82,7 +81,7 @@ def _draw_tip(plan: Plan, time_s: np.ndarray, axes: Axes) -> None:
     for junction in route.junctions:
         axes.axhline(float(junction), color="0.8", linewidth=0.8, zorder=0)
     axes.set_ylabel("Δtip, mm")
-    _legend_above(axes)
+    legend_above(axes)
 
 
 def _draw_xray(plan: Plan, xray: PlannedXray, time_s: np.ndarray, panels: list[Axes]) -> None:
@@ -93,12 +92,12 @@ def _draw_xray(plan: Plan, xray: PlannedXray, time_s: np.ndarray, panels: list[A
         for moment in time_s[xray.exposure]:
             panel.axvline(moment, color="black", linestyle=":", linewidth=1)
     panels[0].plot([], [], color="black", linestyle=":", linewidth=1, label="X-ray")
-    _legend_above(panels[0])
+    legend_above(panels[0])
 
 
-def _legend_above(axes: Axes) -> None:
+def legend_above(axes: Axes) -> None:
     """Put the legend in a row above a panel, where it covers no curve."""
-    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=5, fontsize=8, frameon=False, borderaxespad=0.1)
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=6, fontsize=8, frameon=False, borderaxespad=0.1)
 
 
 def _draw_safety(plan: Plan, time_s: np.ndarray, axes: Axes) -> None:

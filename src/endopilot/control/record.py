@@ -32,6 +32,7 @@ class NavigationRecord:
         believed: where the policy believed the tip to be when it decided; NaN at the end, and None for a policy that
             does not tell: (Δtip, γtip), mm.
         half_width: of the adviser's bands around it, mm, likewise; NaN where there is none.
+        asks: why the policy asked at this moment for X-ray at the next one; empty where it did not, or does not tell.
         driven: velocity of the wire's proximal end that the drive asked for in each cycle of `CYCLE_S`, mm/s and rad/s.
             `endopilot.simulate` makes the same navigation of it, to the bit.
         success: the tip reached the target in time, at the end of a period.
@@ -55,6 +56,7 @@ class NavigationRecord:
     measured: tuple[TipMeasurement | None, ...]
     believed: Float[np.ndarray, "samples 2"] | None
     half_width: Float[np.ndarray, "samples 2"] | None
+    asks: tuple[str, ...]
     driven: Float[np.ndarray, "cycles 2"]
     success: bool
     safe: bool
@@ -120,6 +122,7 @@ class Track:
             measured=measured,
             believed=np.array([(tip.abscissa, tip.offset) for tip in believed]) if tells else None,
             half_width=np.array([tip.half_width for tip in believed]) if tells else None,
+            asks=tuple(tip.asks for tip in believed),
             driven=np.array(driven, dtype=float).reshape(-1, 2),
             success=reason == "reached",
             safe=bool(force.max() <= navigation.force_limit_n),

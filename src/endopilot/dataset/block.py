@@ -1,4 +1,4 @@
-"""One block of navigations, drawn, simulated and written to two files: `write_block`."""
+"""One block of navigations in two files: `write_block` draws and simulates them, `store_block` writes them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from endopilot.anatomy.io import read_anatomy
 from endopilot.dataset import parquet, schema
@@ -48,6 +48,28 @@ def write_block(
             actuation=config.control,
             advance=advance,
         )
+    store_block(context, block, draw, rollout, applied, stopped)
+
+
+def store_block(
+    context: BlockContext,
+    block: Block,
+    draw: Draw,
+    rollout: Rollout,
+    applied: Float[np.ndarray, "n samples 2"],
+    stopped: Bool[np.ndarray, "n"],
+) -> None:
+    """Write navigations: their episodes, then their samples, which mark both as complete.
+
+    Args:
+        context: what all blocks share.
+        block: which navigations.
+        draw: their friction and tips.
+        rollout: their motion.
+        applied: control of each, where it is a load (N, N·mm).
+        stopped: which were stopped short of an end of the vessel.
+    """
+    config = context.config
     data_path, episodes_path = schema.paths_of_file(context.output, block.number)
     samples = parquet.sample_table(rollout, applied, config.control, block.first_episode, context.key)
     for path, table in (
@@ -81,7 +103,7 @@ def _episodes(
     chunk, file = divmod(block.number, schema.FILES_PER_CHUNK)
     return {
         "episode_index": episode,
-        "tasks": [[schema.TASK]] * n,
+        "tasks": [[context.task]] * n,
         "length": np.full(n, samples),
         "dataset_from_index": episode * samples,
         "dataset_to_index": (episode + 1) * samples,

@@ -82,7 +82,7 @@ def generate_dataset(
             remote = [replace(block, folder=block.folder.resolve()) for block in missing]
             context = replace(layout.context, output=layout.context.output.resolve())
             run_on_cluster(context, remote, done_remotely, scheduler)
-    _finish(layout, blocks)
+    describe(layout, blocks)
 
 
 class _Ledger:
@@ -116,8 +116,8 @@ def _is_finished(layout: Layout, blocks: Sequence[Block]) -> bool:
     return all(file.exists() for file in (*files, *(output / name for name in described)))
 
 
-def _finish(layout: Layout, blocks: Sequence[Block]) -> None:
-    """Write what describes the whole dataset: statistics, task, info, and last the manifest."""
+def describe(layout: Layout, blocks: Sequence[Block]) -> None:
+    """Write what describes a dataset whose blocks are there: statistics, task, info, and last the manifest."""
     import pandas as pd  # slow to import, and only needed here
 
     context = layout.context
@@ -130,7 +130,7 @@ def _finish(layout: Layout, blocks: Sequence[Block]) -> None:
     work = read_work(context.output)
     work["processor_seconds"] += time.process_time() - started
     write_json(context.output / schema.STATS_PATH, stats)
-    tasks = pd.DataFrame({"task_index": [0]}, index=pd.Index([schema.TASK], name="task"))
+    tasks = pd.DataFrame({"task_index": [0]}, index=pd.Index([context.task], name="task"))
     with writing(context.output / schema.TASKS_PATH) as partial:
         tasks.to_parquet(partial)
     samples = context.config.samples

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from jaxtyping import Shaped
 
 from endopilot import __version__
 from endopilot.anatomy.io import read_anatomy
+from endopilot.dataset import schema
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.splits import assign_splits
 from endopilot.errors import InputError
@@ -56,12 +57,14 @@ class BlockContext:
         config: number, length, distribution and split of the navigations.
         device: the wire.
         key: marks the files of this dataset; it follows from all settings.
+        task: what the navigations do, as LeRobot names it.
     """
 
     output: Path
     config: DatasetConfig
     device: Device
     key: str
+    task: str = schema.TASK
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,8 +98,24 @@ class Layout:
         return blocks
 
 
-def make_layout(folders: Sequence[Path], output: Path, device: Device, config: DatasetConfig) -> Layout:
+def make_layout(
+    folders: Sequence[Path],
+    output: Path,
+    device: Device,
+    config: DatasetConfig,
+    *,
+    task: str = schema.TASK,
+    origin: Mapping[str, Any] | None = None,
+) -> Layout:
     """Read the anatomies' records, and lay out the dataset in blocks.
+
+    Args:
+        folders: of the anatomies.
+        output: folder of the dataset.
+        device: the wire.
+        config: number, length, distribution and split of the navigations.
+        task: what they do.
+        origin: what else they follow from, where they were not drawn at random.
 
     Raises:
         InputError: no anatomy, or a folder that is none; two of one name; too few for the split.
@@ -117,10 +136,11 @@ def make_layout(folders: Sequence[Path], output: Path, device: Device, config: D
         "device": asdict(device),
         "anatomies": dict(zip(names, identities, strict=True)),
         "version": version(),
+        **(origin or {}),
     }
     settings = json.loads(json_text(settings))  # as JSON gives them back, so that they compare equal
     key = hashlib.sha256(json_text(settings).encode()).hexdigest()
-    context = BlockContext(Path(output), config, device, key)
+    context = BlockContext(Path(output), config, device, key, task)
     return Layout(context, tuple(map(Path, folders)), names, identities, splits, settings)
 
 

@@ -14,7 +14,8 @@ from jaxtyping import Bool, Float
 
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.control.agent import AgentPolicy
-from endopilot.control.navigate import ModelMismatch, NavigateConfig, navigate
+from endopilot.control.mismatch import ModelMismatch
+from endopilot.control.navigate import NavigateConfig, navigate
 from endopilot.control.policies import make_policy
 from endopilot.control.policy import Decision, Observation, Policy
 from endopilot.control.record import NavigationRecord

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from endopilot.control.navigate import ModelMismatch
+from endopilot.control.mismatch import QUANTITIES, ModelMismatch, drawn_sides, mismatch_by
 from endopilot.control.policies import make_policy
 from endopilot.errors import InputError
 from endopilot.files import read_json, write_json, writing
@@ -21,9 +21,6 @@ from endopilot.tasks.navigation import Navigation
 from endopilot.tasks.task import Task, find_task
 
 MISMATCH_FILE, PICTURE_FILE = "mismatch.json", "mismatch.png"
-QUANTITIES = ("friction", "stiffness", "latency", "ostium")
-"""What differs: friction coefficient, stiffness of the tip, the robot's latency, and the position of the ostium along
-the catheter's axis, the last in units of the lumen's diameter there."""
 CASES = ("matched", *(f"{name}-{side}" for name in QUANTITIES for side in ("less", "more")), "all")
 """No quantity differs; one does; all do, each to a side that is drawn for the patient."""
 
@@ -66,19 +63,13 @@ def measure_mismatch(output: Path, config: LadderConfig, share: float) -> list[d
 
 def mismatch_of(case: str, share: float, navigation: Navigation, task: Task, place: int) -> ModelMismatch:
     """Return how reality differs from the navigation in one case and one patient."""
-    change: dict[str, float] = dict.fromkeys(QUANTITIES, 0.0)
+    if case == "matched":
+        return ModelMismatch()
     if case == "all":
-        sides = np.random.default_rng([task.ladder.seed, task.ladder.numbers[place], 1]).choice([-1.0, 1.0], 4)
-        change = dict(zip(QUANTITIES, (share * sides).tolist(), strict=True))
-    elif case != "matched":
-        name, side = case.split("-")
-        change[name] = share if side == "more" else -share
-    return ModelMismatch(
-        friction_factor=1 + change["friction"],
-        stiffness_factor=1 + change["stiffness"],
-        latency_factor=1 + change["latency"],
-        ostium_mm=change["ostium"] * 2 * float(navigation.anatomy.tree.branches[0].centerline.radius[0]),
-    )
+        random = np.random.default_rng([task.ladder.seed, task.ladder.numbers[place], 1])
+        return mismatch_by(drawn_sides(share, random), navigation.anatomy)
+    name, side = case.split("-")
+    return mismatch_by({name: share if side == "more" else -share}, navigation.anatomy)
 
 
 def _navigate(path: Path, *, policy: str, share: float) -> None:

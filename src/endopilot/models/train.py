@@ -11,6 +11,7 @@ import copy
 import math
 import os
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,8 @@ import torch
 from torch import nn
 
 from endopilot import __version__
-from endopilot.dataset.loader import Dataset, load_dataset
+from endopilot.dataset.join import load_joined
+from endopilot.dataset.loader import Dataset
 from endopilot.errors import InputError
 from endopilot.files import manifest, write_json
 from endopilot.models.causal import CausalNetwork
@@ -54,7 +56,9 @@ _TIMED_STEPS = 12
 _GRADIENT_NORM = 1.0
 
 
-def train(dataset_folder: str | Path, run_folder: str | Path, config: TrainConfig | None = None) -> None:
+def train(
+    dataset: str | Path | Sequence[str | Path], run_folder: str | Path, config: TrainConfig | None = None
+) -> None:
     """Train the forward and the inverse network on the split "train" and write them into a run folder.
 
     The twin has no networks: its run is a folder with settings alone.
@@ -64,7 +68,7 @@ def train(dataset_folder: str | Path, run_folder: str | Path, config: TrainConfi
     same arguments; a finished one returns at once.
 
     Args:
-        dataset_folder: dataset made by `endopilot dataset`.
+        dataset: folder of a dataset made by `endopilot dataset`, or several that are trained on together.
         run_folder: where the result goes.
         config: what is trained, and how long; the paper's networks if not given.
 
@@ -74,11 +78,12 @@ def train(dataset_folder: str | Path, run_folder: str | Path, config: TrainConfi
     """
     config = config or TrainConfig()
     with joined(config.processor) as group:
-        _train(Path(dataset_folder), Path(run_folder), config, group)
+        folders = [dataset] if isinstance(dataset, str | Path) else dataset
+        _train([Path(folder) for folder in folders], Path(run_folder), config, group)
 
 
-def _train(dataset_folder: Path, run_folder: Path, config: TrainConfig, group: ProcessGroup) -> None:
-    dataset = load_dataset(dataset_folder)
+def _train(folders: list[Path], run_folder: Path, config: TrainConfig, group: ProcessGroup) -> None:
+    dataset = load_joined(folders)
     with group.first():  # which writes the settings and prepares the patients, where need be
         if group.writes:
             identity = {"config": config, "dataset": dataset.manifest["key"], "version": __version__}
@@ -99,7 +104,8 @@ def _train(dataset_folder: Path, run_folder: Path, config: TrainConfig, group: P
         config=config,
         seed=config.seed,
         inputs={"dataset": dataset.manifest["key"]},
-        dataset=os.path.relpath(dataset_folder.resolve(), run_folder.resolve()),
+        dataset=os.path.relpath(folders[0].resolve(), run_folder.resolve()),
+        joined=[os.path.relpath(folder.resolve(), run_folder.resolve()) for folder in folders[1:]],
         patients=_patients(dataset, config),
         episodes={"train": len(training.tip), "seen_test": 0 if validation is None else len(validation.tip)},
         rejected={"invalid_episodes": int((~dataset.valid.all(axis=1)).sum())},

@@ -21,7 +21,7 @@ from endopilot.files import read_json, writing
 from endopilot.ladder.ladder import SCORES_FILE
 from endopilot.plotting import BLACK, BLUE, GREEN, ORANGE, STYLE, VERMILLION, png
 from endopilot.report.report import image, template_text
-from endopilot.report.scene import INK, navigation_scene
+from endopilot.report.scene import mark_target, navigation_scene
 from endopilot.simulation.simulate import simulate
 from endopilot.tasks.navigation import Navigation
 from endopilot.tasks.task import CORE, Task, find_task
@@ -95,13 +95,9 @@ def _replay_scene(task: Task, navigation: Navigation, result: dict[str, Any]) ->
     """Return a navigation replayed in space, with its target, what X-ray showed, and what came of it."""
     course = result["course"]
     figure = navigation_scene(navigation.anatomy, _replay(navigation, course))
-    observed = np.array(course["tip_position"])[np.array(course["exposed"])]
-    for points, name, marker in (
-        (navigation.target.position(navigation.anatomy)[None], "Target", {"symbol": "diamond", "size": 6}),
-        (observed, "Tip under X-ray", {"symbol": "circle-open", "size": 7}),
-    ):
-        x, y, z = points.T
-        figure.add_trace(go.Scatter3d(x=x, y=y, z=z, mode="markers", marker=marker | {"color": INK}, name=name))
+    exposed = np.array(course["exposed"])
+    observed, seconds = np.array(course["tip_position"])[exposed], np.array(course["time_s"])[exposed]
+    mark_target(figure, navigation.target.position(navigation.anatomy), observed, seconds)
     figures = f"{result['seconds']:g} s, {result['peak_force_n']:.2f} N, exposures: {result['exposures']}"
     title = f"{task.title}: {navigation.anatomy.name}<br><sup>{_outcome(result)}, {figures}</sup>"
     figure.update_layout(height=None, title={"text": title, "x": 0.02, "y": 0.96, "font": {"size": 18}})

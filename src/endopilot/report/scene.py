@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import plotly.graph_objects as go
 from jaxtyping import Float
@@ -11,7 +13,8 @@ from endopilot.report.wall_mesh import wall_mesh
 from endopilot.types import Anatomy, Rollout
 
 BACKGROUND, INK, FAINT = "#0d1424", "#dfe6f2", "#31405c"
-WALL, WIRE, TIP = "#d98a8a", "#f6f7fb", "#ffd34d"
+WALL, WIRE, TIP, BELIEVED = "#d98a8a", "#f6f7fb", "#ffd34d", "#5fb8ff"
+Wires = Float[np.ndarray, "wires nodes 3"]
 
 SHOWN_BEHIND_MM = 20.0
 """Length of wire that is shown behind the ostium, in the guiding catheter, mm."""
@@ -23,19 +26,50 @@ FRAME_MS = 90
 """Time between two samples when the navigation is played, ms."""
 
 
-def navigation_scene(anatomy: Anatomy, rollout: Rollout | None = None, *, world: int = 0) -> go.Figure:
+def navigation_scene(
+    anatomy: Anatomy,
+    rollout: Rollout | None = None,
+    *,
+    world: int = 0,
+    believed: Sequence[Wires] | None = None,
+) -> go.Figure:
     """Return a plotly figure of the wall, the centerline by section, and one world of a rollout replayed.
 
     Args:
         anatomy: the vessel.
         rollout: navigations with `shape`; without one the vessel is shown alone.
         world: which of its worlds is replayed.
+        believed: wires that a policy holds possible at each sample, nodes from the tip on, LPS mm.
     """
     figure = go.Figure([_wall(anatomy), *_centerlines(anatomy)])
     figure.update_layout(_layout())
     if rollout is not None and rollout.shape is not None:
-        _add_navigation(figure, anatomy, rollout, world)
+        _add_navigation(figure, rollout, world, believed)
     return figure
+
+
+def mark_target(
+    figure: go.Figure,
+    target: Float[np.ndarray, "3"],
+    observed: Float[np.ndarray, "exposures 3"],
+    seconds: Float[np.ndarray, "exposures"],
+) -> None:
+    """Add the target to a scene, and where the tip was when X-ray was on.
+
+    Args:
+        figure: the scene.
+        target: LPS mm.
+        observed: places of the tip, LPS mm.
+        seconds: times of the exposures, s.
+    """
+    for points, name, marker, labels in (
+        (target[None], "Target", {"symbol": "diamond", "size": 6}, ["target"]),
+        (observed, "Tip under X-ray", {"symbol": "circle-open", "size": 7}, [f"X-ray at {t:g} s" for t in seconds]),
+    ):
+        x, y, z = points.T
+        marker = marker | {"color": INK}
+        hover = {"hovertext": labels, "hoverinfo": "text"}
+        figure.add_trace(go.Scatter3d(x=x, y=y, z=z, mode="markers", marker=marker, name=name, **hover))
 
 
 def visible_wire(rollout: Rollout, world: int, sample: int) -> Float[np.ndarray, "nodes 3"]:
@@ -46,10 +80,13 @@ def visible_wire(rollout: Rollout, world: int, sample: int) -> Float[np.ndarray,
     """
     if rollout.shape is None:
         raise ValueError("the rollout holds no wire shapes; simulate with record_shape=True")
-    nodes = rollout.shape[world, sample]
+    return _from_tip(rollout.shape[world, sample], rollout.inserted_length[world, sample] + SHOWN_BEHIND_MM)
+
+
+def _from_tip(nodes: Float[np.ndarray, "nodes 3"], length_mm: float) -> Float[np.ndarray, "shown 3"]:
     nodes = nodes[np.isfinite(nodes).all(axis=1)]
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(nodes, axis=0), axis=1))])
-    return nodes[along <= rollout.inserted_length[world, sample] + SHOWN_BEHIND_MM]
+    return nodes[along <= length_mm]
 
 
 def _wall(anatomy: Anatomy) -> go.Mesh3d:
@@ -102,14 +139,19 @@ def _centerlines(anatomy: Anatomy) -> list[go.Scatter3d]:
     return lines
 
 
-def _add_navigation(figure: go.Figure, anatomy: Anatomy, rollout: Rollout, world: int) -> None:
-    samples = np.flatnonzero(rollout.valid[world])
+def _add_navigation(figure: go.Figure, rollout: Rollout, world: int, believed: Sequence[Wires] | None) -> None:
+    samples = np.flatnonzero(rollout.valid[world]).tolist()
+    if not samples:
+        return
     first = len(list(figure.data))
-    figure.add_traces(_moving(rollout, world, int(samples[0])))
-    figure.frames = [
-        go.Frame(name=str(sample), data=_moving(rollout, world, int(sample)), traces=list(range(first, first + 3)))
-        for sample in samples
-    ]
+
+    def moving(sample: int) -> list[go.Scatter3d]:
+        behind = [] if believed is None else [_possible(believed[sample], rollout.inserted_length[world, sample])]
+        return [*behind, *_moving(rollout, world, sample)]
+
+    figure.add_traces(moving(samples[0]))
+    traces = list(range(first, len(list(figure.data))))
+    figure.frames = [go.Frame(name=str(sample), data=moving(sample), traces=traces) for sample in samples]
     period = rollout.sample_period_s
     animate = {"frame": {"duration": FRAME_MS, "redraw": True}, "transition": {"duration": 0}, "fromcurrent": True}
     stop = {"frame": {"duration": 0, "redraw": True}, "mode": "immediate", "transition": {"duration": 0}}
@@ -178,6 +220,17 @@ def _moving(rollout: Rollout, world: int, sample: int) -> list[go.Scatter3d]:
         trace(trail, mode="lines", line={"color": TIP, "width": 2}, name=f"Tip, last {TRAIL_S:g} s", hoverinfo="skip"),
         trace(tip, mode="markers", marker={"color": TIP, "size": 5}, name="Tip", hovertemplate=hover),
     ]
+
+
+def _possible(wires: Wires, inserted_mm: float) -> go.Scatter3d:
+    """Return the wires that a policy holds possible, as one line with gaps."""
+    gap = np.full((1, 3), np.nan)
+    parts = [part for nodes in wires for part in (_from_tip(nodes, inserted_mm + SHOWN_BEHIND_MM), gap)]
+    x, y, z = np.round(np.concatenate(parts), 2).astype(np.float32).T
+    line = {"color": BELIEVED, "width": 2}
+    return go.Scatter3d(
+        x=x, y=y, z=z, mode="lines", line=line, opacity=0.5, name="Wires held possible", hoverinfo="skip"
+    )
 
 
 def _layout() -> dict:

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from pydantic import model_validator
 
 from endopilot.errors import InputError
+from endopilot.files import writing
 from endopilot.settings import NonNegative, Share, Within, settings
 from endopilot.simulation.drive_limits import within_travel
 from endopilot.types import SAMPLE_PERIOD_S
@@ -173,7 +174,7 @@ def read_controls_csv(path: Path) -> ScriptedControls:
         InputError: not such a table; the line names file, column, row and mend.
     """
     try:
-        table = pd.read_csv(path)
+        table = pd.read_csv(path, float_precision="round_trip")
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read as CSV ({str(error).splitlines()[0]}); check the file") from error
     missing = [name for name in _COLUMNS if name not in table.columns]
@@ -209,3 +210,20 @@ def read_controls_csv(path: Path) -> ScriptedControls:
         ends = np.stack([rows[state].to_numpy(dtype=float)[0] for rows in worlds])
         initial = ends - period_s * control[:, 0]
     return ScriptedControls(initial, control, period_s)
+
+
+def write_controls_csv(
+    path: Path, control: Float[np.ndarray, "samples 2"], proximal: Float[np.ndarray, "samples 2"], period_s: float
+) -> None:
+    """Write controls so that `read_controls_csv` reads them.
+
+    Args:
+        path: where to.
+        control: mm/s and rad/s.
+        proximal: (Δ mm, φ rad) at the end of each.
+        period_s: time that each holds, s.
+    """
+    time_s = period_s * np.arange(1, len(control) + 1)
+    names = [*_COLUMNS, "inserted_length_mm", "rotation_rad"]
+    with writing(path) as partial:
+        pd.DataFrame(np.column_stack([time_s, control, proximal]), columns=names).to_csv(partial, index=False)

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import sys
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -31,8 +30,8 @@ from endopilot.files import input_hash, manifest, read_json, write_json
 from endopilot.imaging.segment import METHODS, SegmentConfig, segment
 from endopilot.imaging.volume import read_mask, read_volume, write_mask, write_volume
 from endopilot.models.config import PRETRAINED, TrainConfig, run_path
-from endopilot.parallel import each
 from endopilot.phantom.phantom import PhantomConfig, make_phantom
+from endopilot.pipeline.stages import Stages
 from endopilot.progress import progress
 from endopilot.runs import claim
 from endopilot.settings import Count, NonNegative, Positive, Seed, Within, settings
@@ -97,45 +96,6 @@ class RunConfig(StudyConfig):
     """How to segment."""
 
 
-class _Stages:
-    """The finished stages of a run, their seconds and the rejected patients, kept in `stages.json`.
-
-    Args:
-        folder: the run's folder, which the run has claimed.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self._path = folder / "stages.json"
-        record = read_json(self._path) if self._path.exists() else {}
-        self.finished: list[str] = record.get("finished", [])
-        self.seconds: dict[str, float] = record.get("seconds", {})
-        self.rejected: dict[str, str] = record.get("rejected", {})
-
-    def do(self, name: str, work: Callable[[], None]) -> None:
-        """Do the work of a stage unless it is finished; time spent before an interruption counts too."""
-        if name in self.finished:
-            return
-        start = time.perf_counter()
-        try:
-            work()
-            self.finished.append(name)
-        finally:
-            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
-            record = {"finished": self.finished, "seconds": self.seconds, "rejected": self.rejected}
-            write_json(self._path, record)
-
-    def do_each(self, name: str, title: str, items: Sequence[Path], work: Callable[[Path], None]) -> None:
-        """Do a stage's work for every item. A bad item is rejected and recorded; a bad only item ends the run."""
-
-        def work_on_all() -> None:
-            bad = each(title, items, work)
-            if len(items) == 1 and bad:
-                raise bad[items[0]]
-            self.rejected.update({item.name: str(error) for item, error in bad.items()})
-
-        self.do(name, work_on_all)
-
-
 @dataclass(frozen=True, kw_only=True)
 class _Run:
     """What the stages share.
@@ -155,7 +115,7 @@ class _Run:
     config: StudyConfig
     segmentation: SegmentConfig
     device: Device
-    stages: _Stages
+    stages: Stages
     origin: str
     command: str
     inputs: Mapping[str, str] = field(default_factory=dict)
@@ -190,7 +150,7 @@ def run_demo(output: Path, config: DemoConfig) -> dict[str, Any]:
         config=config,
         segmentation=SegmentConfig(method="coronary", vessel="rca"),
         device=device,
-        stages=_Stages(output),
+        stages=Stages(output),
         origin=DEMO_ORIGIN,
         command="endopilot demo",
     )
@@ -223,7 +183,7 @@ def run_volume(volume: Path, output: Path, config: RunConfig, *, series: str | N
     content, device = read_volume(volume, series=series), read_device(config.device)
     identity = {"volume_sha256": _digest(content), "method": METHODS.origin(config.segmentation.method)}
     claim(output, "endopilot run", **identity, config=config, device=device, version=__version__)
-    copy, stages = output / "ct" / f"patient{VOLUME_SUFFIX}", _Stages(output)
+    copy, stages = output / "ct" / f"patient{VOLUME_SUFFIX}", Stages(output)
     stages.do("read", lambda: write_volume(content, copy))
     del content  # up to a gigabyte
     run = _Run(

@@ -1,0 +1,273 @@
+"""One wire driven to a named place of one patient's vessel, in closed loop: `navigate_patient`.
+
+The navigation is that of `endopilot.navigate`. Here its vessel is read, its wire is shaped, and reality is made to
+differ from what the policy is given. The whole wire is kept, as it truly was and as the policy believed it to be.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Float
+
+from endopilot.anatomy.io import read_anatomy
+from endopilot.control.agent import TwinPolicy
+from endopilot.control.mismatch import ModelMismatch, drawn_sides, mismatch_by
+from endopilot.control.navigate import NavigateConfig, NavigationLoop
+from endopilot.control.policies import make_policy
+from endopilot.control.policy import Believer, Led, Observation, Policy
+from endopilot.control.record import NavigationRecord
+from endopilot.control.robot import CYCLE_S
+from endopilot.control.route import Route, check_passable, parse_target
+from endopilot.control.set_up import TILT_DEG, TipChoice, choose_tip
+from endopilot.progress import progress
+from endopilot.settings import Finite, NonNegative, Positive, Seed, ShareBelowOne, Text, Within, settings
+from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.device import Device, read_device
+from endopilot.simulation.simulate import simulate
+from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
+from endopilot.types import Anatomy, Rollout, TipProjection
+
+_Factor = Annotated[float, Within(0.2, 5)]
+
+
+@settings
+class NavigatePatientConfig:
+    """Policy, wire, limits, and how reality differs from what the policy is given."""
+
+    policy: Text = "agent"
+    """What decides: agent, twin, open-loop, forward, spin, retract-rotate, or MODULE:OBJECT of your own."""
+    device: Text = "workhorse-014"
+    """Name of a device (`endopilot devices`) or a YAML file."""
+    tip: Text = "auto"
+    """Shape of the wire's tip: auto (chosen for the forks of the route), own (the device's), or angle and length such
+    as 75/5, 75 degrees over 5 mm."""
+    catheter_tilt_deg: Annotated[float, Within(0, 45)] = TILT_DEG
+    """How far the guiding catheter may be turned at the ostium where a fork cannot be entered otherwise, degrees."""
+    seconds: Positive = 60.0
+    """Time in which the target is to be reached, s."""
+    force_limit_n: Positive = 0.5
+    """Largest force of the wall on one node that is safe, N."""
+    start_inserted_mm: NonNegative = 2.0
+    """Inserted length at the start, mm."""
+    start_rotation: Finite = 0.0
+    """Rotation at the start, rad."""
+    seed: Seed = 0
+    """Seed of encoder noise, detection errors, the policy, and of the sides that `mismatch` draws."""
+    mismatch: ShareBelowOne = 0.0
+    """Friction, tip stiffness, latency and ostium differ by this share, each up or down as drawn with the seed; the
+    ostium by this share of the lumen's diameter there. What is given below is not drawn."""
+    true_friction: _Factor | None = None
+    """Factor on the friction coefficient in reality."""
+    true_tip_stiffness: _Factor | None = None
+    """Factor on the stiffness of the wire's distal 10 mm in reality."""
+    true_ostium_mm: Finite | None = None
+    """The wire is this much deeper in reality than the encoder says, mm: the ostium lies elsewhere."""
+    true_latency_s: NonNegative | None = None
+    """Time from a command to the motion in reality, s; 0.05 if not given."""
+
+
+@dataclass(frozen=True, eq=False)
+class SetUp:
+    """A navigation that is ready to begin.
+
+    Attributes:
+        config: what it was made of.
+        anatomy: the patient's vessel as it was given; that of `navigation` may have its catheter turned.
+        navigation: as the policy is given it.
+        choice: of the tip's shape and the catheter's axis.
+        truth: how reality differs from it.
+        snapped_mm: distance from a target that was given as a point to the centerline, mm; None for a section.
+        policy: what decides.
+        simulator: settings of the simulated reality.
+    """
+
+    config: NavigatePatientConfig
+    anatomy: Anatomy
+    navigation: Navigation
+    choice: TipChoice
+    truth: ModelMismatch
+    snapped_mm: float | None
+    policy: Policy
+    simulator: SimulatorConfig
+
+    @property
+    def true_wire(self) -> Device:
+        """The wire as it truly is."""
+        device = self.navigation.device
+        wire = device.with_tip(bend_rad=device.tip_bend_rad, stiffness_factor=self.truth.stiffness_factor)
+        return replace(wire, friction=device.friction * self.truth.friction_factor)
+
+
+@dataclass(frozen=True, eq=False)
+class PatientNavigation:
+    """A navigation in a patient, as it truly went and as the policy believed it to go.
+
+    Attributes:
+        set_up: what it began with.
+        record: what happened, at the start and after each decision period.
+        rollout: the true wire with its shape at the end of each decision period, one world.
+        cycles: the same at the end of each of the drive's cycles, with a wire at rest until the time is over; without
+            shapes.
+        wires: the wires that the policy held possible at the end of each period, the likeliest first: nodes from the
+            tip on, LPS mm; None for a policy that does not tell.
+        plans: how often the policy searched a course; None for one that does not count.
+    """
+
+    set_up: SetUp
+    record: NavigationRecord
+    rollout: Rollout
+    cycles: Rollout
+    wires: tuple[Float[np.ndarray, "wires nodes 3"], ...] | None
+    plans: int | None
+
+    @property
+    def episode(self) -> Rollout:
+        """The true wire at the end of each decision period, at rest from the end of the navigation until its limit."""
+        return sampled(self.cycles)
+
+
+def set_up_navigation(anatomy: Anatomy | str | Path, target: str, config: NavigatePatientConfig | None = None) -> SetUp:
+    """Prepare a navigation in a patient.
+
+    Args:
+        anatomy: the vessel, or its folder.
+        target: a section such as "4" or "LAD", or a point "X,Y,Z" in LPS mm, which is moved to the centerline.
+        config: policy, wire, limits and reality.
+
+    Raises:
+        InputError: no such section, a point outside the vessel, a target behind an occlusion; no such policy, device or
+            tip; a wire that does not fit.
+    """
+    config = config or NavigatePatientConfig()
+    vessel = anatomy if isinstance(anatomy, Anatomy) else read_anatomy(anatomy)
+    device, goal = read_device(config.device), parse_target(vessel, target)
+    check_passable(Route.to(vessel, goal), device)
+    truth = _truth(config, vessel)
+    policy = TwinPolicy(truth) if config.policy == "twin" else make_policy(config.policy)
+    given = Navigation(
+        anatomy=vessel,
+        device=device,
+        target=goal,
+        start_inserted_mm=config.start_inserted_mm,
+        start_rotation=config.start_rotation,
+        seconds=config.seconds,
+        force_limit_n=config.force_limit_n,
+    )
+    choice = choose_tip(given, config.tip, catheter_tilt_deg=config.catheter_tilt_deg)
+    place, parts = goal.position(vessel), target.split(",")
+    return SetUp(
+        config=config,
+        anatomy=vessel,
+        navigation=choice.navigation,
+        choice=choice,
+        truth=truth,
+        snapped_mm=float(np.linalg.norm(place - np.array(parts, dtype=float))) if len(parts) == 3 else None,
+        policy=policy,
+        simulator=SimulatorConfig(threads=1),
+    )
+
+
+def navigate_patient(set_up: SetUp) -> PatientNavigation:
+    """Let the policy drive the wire in the simulated reality, and return what happened."""
+    navigation, policy = set_up.navigation, set_up.policy
+    config = NavigateConfig(simulator=set_up.simulator)
+    loop = NavigationLoop(navigation, policy, config=config, seed=set_up.config.seed, truth=set_up.truth)
+    began = np.array([loop.simulator.inserted_length[0], loop.simulator.rotation[0]])
+    wires: list[Float[np.ndarray, "wires nodes 3"]] = []
+    with progress(f"Navigating, {set_up.config.policy}", total=navigation.seconds) as advance:
+        while loop.reason is None:
+            loop.step()
+            advance(DECISION_PERIOD_S, f"{loop.simulator.inserted_length[0]:.0f} mm inserted")
+            if isinstance(policy, Believer) and loop.time_s > DECISION_PERIOD_S:
+                wires.append(policy.believed_wires())  # at the decision, which ended the period before
+    if isinstance(policy, Led):
+        state = loop.robot.proximal_state()
+        policy.watch(Observation(loop.time_s, state.inserted_length, state.rotation, None))
+    if isinstance(policy, Believer):
+        wires.append(policy.believed_wires())
+    record = loop.record()
+    cycles = _driven_again(set_up, record, began)
+    whole = len(record.time_s) - 1
+    shown = sampled(cycles)
+    return PatientNavigation(
+        set_up=set_up,
+        record=record,
+        rollout=_first(shown, whole),
+        cycles=replace(cycles, shape=None),
+        wires=tuple(wires) if wires else None,
+        plans=getattr(policy, "plans", None),
+    )
+
+
+def _truth(config: NavigatePatientConfig, vessel: Anatomy) -> ModelMismatch:
+    drawn = mismatch_by(drawn_sides(config.mismatch, np.random.default_rng([config.seed, 3])), vessel)
+    latency_s = NavigateConfig().robot.latency_s
+    given = {
+        "friction_factor": config.true_friction,
+        "stiffness_factor": config.true_tip_stiffness,
+        "ostium_mm": config.true_ostium_mm,
+        "latency_factor": None if config.true_latency_s is None else config.true_latency_s / latency_s,
+    }
+    return replace(drawn, **{name: value for name, value in given.items() if value is not None})
+
+
+def _driven_again(set_up: SetUp, record: NavigationRecord, began: Float[np.ndarray, "2"]) -> Rollout:
+    """Return the whole wire, driven again as it was, and then held at rest until the navigation's limit."""
+    periods = int(np.ceil(set_up.navigation.seconds / DECISION_PERIOD_S - 1e-9))
+    per_period = round(DECISION_PERIOD_S / CYCLE_S)
+    control = np.zeros((1, periods * per_period, 2))
+    control[0, : len(record.driven)] = record.driven
+    return simulate(
+        set_up.navigation.anatomy,
+        set_up.true_wire,
+        control,
+        initial=began[None],
+        config=set_up.simulator,
+        record_shape=True,
+        period_s=CYCLE_S,
+    )
+
+
+def sampled(cycles: Rollout) -> Rollout:
+    """Return a rollout of the drive's cycles as it is recorded at the end of each decision period."""
+    step = round(DECISION_PERIOD_S / CYCLE_S)
+
+    def at_end(values: np.ndarray) -> np.ndarray:
+        return values[:, step - 1 :: step]
+
+    def together(values: np.ndarray) -> np.ndarray:
+        return values.reshape(values.shape[0], -1, step, *values.shape[2:])
+
+    names = [f.name for f in fields(Rollout) if f.name not in _WHOLE and f.name not in ("tip", "shape")]
+    shape = None if cycles.shape is None else at_end(cycles.shape)
+    tip = TipProjection(**{f.name: at_end(getattr(cycles.tip, f.name)) for f in fields(TipProjection)})
+    return replace(
+        cycles,
+        **{name: at_end(getattr(cycles, name)) for name in names},
+        sample_period_s=DECISION_PERIOD_S,
+        control=together(cycles.control).mean(axis=2),
+        slip=together(cycles.slip).sum(axis=2),
+        rotation_slip=together(cycles.rotation_slip).sum(axis=2),
+        iterations=together(cycles.iterations).mean(axis=2),
+        node_iterations=together(cycles.node_iterations).sum(axis=2),
+        tip=tip,
+        shape=shape,
+    )
+
+
+_WHOLE = (
+    "sample_period_s", "initial_inserted_length", "initial_rotation", "reason",
+    "control", "slip", "rotation_slip", "iterations", "node_iterations",
+)  # fmt: skip
+"""What a rollout holds once a world, or what is gathered over the cycles of a period."""
+
+
+def _first(rollout: Rollout, samples: int) -> Rollout:
+    names = [f.name for f in fields(Rollout) if f.name not in _WHOLE[:4] and f.name not in ("tip", "shape")]
+    tip = TipProjection(**{f.name: getattr(rollout.tip, f.name)[:, :samples] for f in fields(TipProjection)})
+    shape = None if rollout.shape is None else rollout.shape[:, :samples]
+    return replace(rollout, **{name: getattr(rollout, name)[:, :samples] for name in names}, tip=tip, shape=shape)

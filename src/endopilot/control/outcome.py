@@ -1,0 +1,118 @@
+"""What came of a navigation in a patient, in one line: `tell_outcome`."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from endopilot.anatomy.projection import safety_ratio
+from endopilot.control.navigate_patient import PatientNavigation, SetUp
+from endopilot.control.robot import CYCLE_S
+from endopilot.control.route import Route
+from endopilot.tasks.navigation import DECISION_PERIOD_S, SUCCESS_MM
+from endopilot.types import VesselTree
+
+_TIGHT_RATIO = 0.8
+"""A wire that fills this share of a lumen is held up by its walls."""
+_AT_FORK_MM = 4.0
+"""A tip that came this near to a fork, and the length of its bend, was held up by it, mm."""
+_STILL_S, _STILL_MM = 5.0, 1.0
+"""A tip that comes no farther than this in this time has stopped, s and mm."""
+
+
+def section_at(tree: VesselTree, branch: int, abscissa: float) -> str:
+    """Return the name of the section that a place of the tree lies in.
+
+    Args:
+        tree: centerlines.
+        branch: index of the branch.
+        abscissa: of the place, mm.
+    """
+    line = tree.branches[branch].centerline
+    at = int(np.argmin(np.abs(line.abscissa - abscissa)))
+    return tree.section_names[int(tree.branches[branch].section[at])]
+
+
+def name_target(set_up: SetUp) -> str:
+    """Return the target in words."""
+    navigation = set_up.navigation
+    target = navigation.target
+    section = section_at(navigation.anatomy.tree, target.branch, target.abscissa)
+    place = f"section {section} at {target.abscissa:.1f} mm"
+    if set_up.snapped_mm is None:
+        return place
+    return f"{place}, {set_up.snapped_mm:.1f} mm from the given point"
+
+
+def tell_outcome(found: PatientNavigation) -> str:
+    """Return one line: reached, or why not."""
+    record, navigation = found.record, found.set_up.navigation
+    exposures = f"{record.exposures} exposure{'' if record.exposures == 1 else 's'}"
+    force = f"at most {record.peak_force_n:.3f} N on the wall (limit {navigation.force_limit_n:g} N)"
+    if record.success:
+        unsafe = "" if record.safe else ", but too hard"
+        return f"reached {name_target(found.set_up)} in {record.seconds:g} s{unsafe}: {exposures}, {force}"
+    return f"not reached: {why_not(found)}; {exposures}, {force}"
+
+
+def why_not(found: PatientNavigation) -> str:
+    """Return where a navigation that did not reach its target ended, and what held it up."""
+    record, navigation = found.record, found.set_up.navigation
+    if record.reason == "invalid":
+        return f"the simulation failed after {record.seconds:g} s"
+    route = Route.to(navigation.anatomy, navigation.target)
+    tree, branch, at = navigation.anatomy.tree, int(record.tip.branch[-1]), float(record.tip.abscissa[-1])
+    where = f"after {record.seconds:g} s the tip is in section {section_at(tree, branch, at)} at {at:.1f} mm"
+    departs = tree.departures(navigation.target.branch)[branch]
+    if np.isfinite(departs):
+        where += f", off the route, which it left at the fork at {departs:.1f} mm"
+    else:
+        where += f", {navigation.target.abscissa - at:.1f} mm before the target"
+    return f"{where}: {_held_up(found, route)}"
+
+
+def _held_up(found: PatientNavigation, route: Route) -> str:
+    """Return what is likeliest to have held the wire up."""
+    record, navigation = found.record, found.set_up.navigation
+    device, came = navigation.device, float(route.progress(record.tip).max())
+    refused = found.set_up.choice.refused
+    if refused is not None and abs(came - refused.abscissa) <= _AT_FORK_MM + device.tip_bend_length_mm:
+        return f"no rotation of the tip enters {refused}"
+    narrow = _narrowest(route, came, device.tip_radius_mm)
+    if narrow is not None:
+        at, width = narrow
+        return f"at {at:.1f} mm the lumen is {width:.2f} mm wide, and the wire {device.diameter_mm:g} mm"
+    slipped = int((found.rollout.slip[0] > 0).sum())
+    if slipped:
+        return f"the wire is caught; the drive slipped at its limit of {device.push_limit_n:g} N {slipped} times"
+    progress = route.progress(record.tip)
+    still = min(round(_STILL_S / DECISION_PERIOD_S), len(progress) - 1)
+    if progress[-1] - progress[-1 - still] > _STILL_MM:
+        return "it was still on its course; give more --seconds"
+    if found.plans is not None and found.plans > 1:
+        return f"none of {found.plans} searched courses led on"
+    return "the tip has stopped"
+
+
+def _narrowest(route: Route, came_mm: float, wire_radius_mm: float) -> tuple[float, float] | None:
+    """Return where ahead of the tip a wire fills the lumen, mm, and how wide it is there, mm; None if nowhere."""
+    line = route.line
+    ahead = (line.abscissa >= came_mm - 2 * SUCCESS_MM) & (line.abscissa <= route.target.abscissa)
+    if not ahead.any():
+        return None
+    at = int(np.flatnonzero(ahead)[np.argmin(line.radius[ahead])])
+    if wire_radius_mm < _TIGHT_RATIO * line.radius[at]:
+        return None
+    return float(line.abscissa[at]), 2 * float(line.radius[at])
+
+
+def worst_ratio(found: PatientNavigation) -> float:
+    """Return the largest safety ratio γ/(r − r_w) of the tip."""
+    tip, radius = found.record.tip, found.set_up.navigation.device.tip_radius_mm
+    return float(safety_ratio(tip.offset, tip.radius, radius).max())
+
+
+def slipped_s(found: PatientNavigation) -> float:
+    """Return for how long the drive slipped, s."""
+    cycles = len(found.record.driven)
+    slip = (found.cycles.slip[0, :cycles] != 0) | (found.cycles.rotation_slip[0, :cycles] != 0)
+    return float(slip.sum()) * CYCLE_S

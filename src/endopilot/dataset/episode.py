@@ -1,0 +1,67 @@
+"""One navigation as a dataset of its own, to be read beside others: `write_episode`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from endopilot.dataset.block import store_block
+from endopilot.dataset.config import DatasetConfig
+from endopilot.dataset.draw import Draw
+from endopilot.dataset.generate import describe
+from endopilot.dataset.layout import make_layout
+from endopilot.runs import claim
+from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.device import Device
+from endopilot.types import Rollout
+
+
+def write_episode(
+    rollout: Rollout,
+    anatomy_folder: Path,
+    output: Path,
+    device: Device,
+    *,
+    task: str,
+    friction: float,
+    tip_stiffness_factor: float,
+    simulator: SimulatorConfig,
+    seed: int,
+    origin: Mapping[str, Any],
+) -> None:
+    """Write a navigation that was recorded every 0.5 s as a dataset of one episode, which trains.
+
+    Args:
+        rollout: the navigation, of one world.
+        anatomy_folder: of its vessel.
+        output: folder of the dataset.
+        device: the wire as it was given; friction and stiffness of its tip may have been others.
+        task: what was done, in words.
+        friction: the true friction coefficient.
+        tip_stiffness_factor: the true factor on the stiffness of the distal 10 mm.
+        simulator: settings of the rod core.
+        seed: of the navigation.
+        origin: what else it followed from, such as target and policy.
+
+    Raises:
+        InputError: the output folder holds something else.
+    """
+    config = DatasetConfig(
+        sequences=1,
+        seconds=rollout.valid.shape[1] * rollout.sample_period_s,
+        seed=seed,
+        simulator=simulator,
+        anatomy_shares=(1.0, 0.0, 0.0),
+        seen_test_share=0.0,
+    )
+    layout = make_layout([anatomy_folder], output, device, config, task=task, origin=dict(origin))
+    (block,) = layout.blocks()
+    claim(output, "endopilot navigate", **layout.settings)
+    start = np.column_stack([rollout.initial_inserted_length, rollout.initial_rotation])
+    one = {"friction": friction, "tip_bend_rad": device.tip_bend_rad, "tip_stiffness_factor": tip_stiffness_factor}
+    drawn = Draw(start, rollout.control, **{name: np.array([value]) for name, value in one.items()})
+    store_block(layout.context, block, drawn, rollout, rollout.control, np.array([False]))
+    describe(layout, [block])

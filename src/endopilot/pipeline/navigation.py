@@ -1,0 +1,223 @@
+"""A navigation in one patient, in a folder: page, picture, table, controls, episode, manifest; `navigate_into`."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from endopilot import __version__
+from endopilot.anatomy.io import write_anatomy
+from endopilot.anatomy.projection import safety_ratio
+from endopilot.control.navigate_patient import (
+    NavigatePatientConfig,
+    PatientNavigation,
+    SetUp,
+    navigate_patient,
+    set_up_navigation,
+)
+from endopilot.control.outcome import name_target, section_at, slipped_s, tell_outcome, worst_ratio
+from endopilot.control.policies import POLICIES
+from endopilot.control.set_up import tip_name
+from endopilot.dataset.episode import write_episode
+from endopilot.extras import require_extras
+from endopilot.files import manifest, read_json, write_json, writing
+from endopilot.runs import claim
+from endopilot.simulation.controls import write_controls_csv
+from endopilot.simulation.device import write_device
+
+PAGE_FILE, PICTURE_FILE, TABLE_FILE = "navigation.html", "navigation.png", "navigation.csv"
+CONTROLS_FILE, WIRE_FILE, EPISODE_FOLDER, ANATOMY_FOLDER = "controls.csv", "wire.yaml", "episode", "anatomy"
+MANIFEST_FILE = "manifest.json"
+
+
+def navigate_into(
+    anatomy: str | Path, target: str, output: str | Path, config: NavigatePatientConfig | None = None
+) -> dict[str, Any]:
+    """Drive a wire to a place in a patient's vessel, in closed loop, and write what happened into a folder.
+
+    A folder that was finished with the same arguments is left as it is.
+
+    Args:
+        anatomy: folder made by `endopilot anatomy` or `endopilot atlas`.
+        target: a section such as "4" or "LAD", or a point "X,Y,Z" in LPS mm, which is moved to the centerline.
+        output: folder of the results.
+        config: policy, wire, limits, and how reality differs from what the policy is given.
+
+    Returns:
+        The outcome in one line, and figures.
+
+    Raises:
+        InputError: the navigation cannot be begun (see `set_up_navigation`), a library is missing, or the folder
+            belongs to another run.
+    """
+    require_extras("learn", "report")
+    folder, output, config = Path(anatomy), Path(output), config or NavigatePatientConfig()
+    set_up = set_up_navigation(folder, target, config)
+    claim(
+        output,
+        "endopilot navigate",
+        anatomy=set_up.anatomy.identity,
+        target=target,
+        config=config,
+        device=set_up.navigation.device,
+        policy=POLICIES.origin(config.policy),
+        version=__version__,
+    )
+    if not (output / MANIFEST_FILE).exists():
+        found = navigate_patient(set_up)
+        _write(found, folder, target, output)
+    return read_json(output / MANIFEST_FILE)["figures"]
+
+
+def _write(found: PatientNavigation, folder: Path, target: str, output: Path) -> None:
+    """Write all files, the manifest last."""
+    from endopilot.report.navigation_figure import navigation_picture  # matplotlib and plotly are slow to import
+    from endopilot.report.navigation_page import write_navigation_page
+
+    set_up = found.set_up
+    driven_in = folder
+    if set_up.choice.tilt_deg:  # the catheter was turned: an anatomy of its own
+        driven_in = output / ANATOMY_FOLDER
+        if not driven_in.exists():
+            write_anatomy(set_up.navigation.anatomy, driven_in)
+    with writing(output / TABLE_FILE) as partial:
+        navigation_table(found).to_csv(partial, index=False)
+    cycles = found.cycles
+    count = len(found.record.driven)
+    write_controls_csv(
+        output / CONTROLS_FILE,
+        found.record.driven,
+        np.column_stack([cycles.inserted_length[0, :count], cycles.rotation[0, :count]]),
+        cycles.sample_period_s,
+    )
+    write_device(set_up.true_wire, output / WIRE_FILE)
+    _write_episode(found, driven_in, output / EPISODE_FOLDER)
+    picture = navigation_picture(found)
+    with writing(output / PICTURE_FILE) as partial:
+        partial.write_bytes(picture)
+    record = _manifest(found, target, output)
+    commands = _commands(found, folder, driven_in, target, output)
+    write_navigation_page(output / PAGE_FILE, found, picture=picture, commands=commands, manifest=record)
+    write_json(output / MANIFEST_FILE, record)
+
+
+def navigation_table(found: PatientNavigation) -> pd.DataFrame:
+    """Return a row for the start and for the end of each decision period; docs/navigation.md has the columns."""
+    record, navigation = found.record, found.set_up.navigation
+    tip, count = record.tip, len(record.time_s)
+    tree = navigation.anatomy.tree
+    places = zip(tip.branch.tolist(), tip.abscissa.tolist(), strict=True)
+    measured = [(np.nan, np.nan) if seen is None else (seen.abscissa, seen.offset) for seen in record.measured]
+    nothing = np.full((count, 2), np.nan)
+    believed = nothing if record.believed is None else record.believed
+    band = nothing if record.half_width is None else record.half_width
+    columns: dict[str, Any] = {
+        "time_s": record.time_s,
+        "translation_mm_s": record.control[:, 0],
+        "rotation_rad_s": record.control[:, 1],
+        "inserted_length_mm": record.inserted_length,
+        "rotation_rad": record.rotation,
+        "tip_abscissa_mm": tip.abscissa,
+        "tip_offset_mm": tip.offset,
+        "branch": tip.branch,
+        "section": [section_at(tree, branch, at) for branch, at in places],
+        "lumen_radius_mm": tip.radius,
+        "safety_ratio": safety_ratio(tip.offset, tip.radius, navigation.device.tip_radius_mm),
+        **{f"tip_{axis}_mm": record.tip_position[:, i] for i, axis in enumerate("xyz")},
+        "contact_force_n": record.contact_force_max,
+        "xray": record.exposed.astype(int),
+        "measured_tip_abscissa_mm": np.array(measured)[:, 0],
+        "measured_tip_offset_mm": np.array(measured)[:, 1],
+        "believed_tip_abscissa_mm": believed[:, 0],
+        "believed_tip_offset_mm": believed[:, 1],
+        "band_tip_abscissa_mm": band[:, 0],
+        "band_tip_offset_mm": band[:, 1],
+        "asks_for_xray": list(record.asks),
+    }
+    return pd.DataFrame(columns)
+
+
+def _write_episode(found: PatientNavigation, anatomy_folder: Path, output: Path) -> None:
+    set_up = found.set_up
+    device, truth = set_up.navigation.device, set_up.truth
+    write_episode(
+        found.episode,
+        anatomy_folder,
+        output,
+        device,
+        task=f"navigate to {name_target(set_up)}",
+        friction=device.friction * truth.friction_factor,
+        tip_stiffness_factor=truth.stiffness_factor,
+        simulator=set_up.simulator,
+        seed=set_up.config.seed,
+        origin={
+            "target": asdict(set_up.navigation.target),
+            "navigation": asdict(set_up.config),
+            "truth": asdict(truth),
+        },
+    )
+
+
+def _manifest(found: PatientNavigation, target: str, output: Path) -> dict[str, Any]:
+    set_up, record = found.set_up, found.record
+    navigation = set_up.navigation
+    figures = {
+        "outcome": tell_outcome(found),
+        "reached": record.success,
+        "within_force_limit": record.safe,
+        "reason": record.reason,
+        "policy": set_up.config.policy,
+        "target": name_target(set_up),
+        "snapped_mm": None if set_up.snapped_mm is None else round(set_up.snapped_mm, 2),
+        "tip": tip_name(navigation.device),
+        "why": set_up.choice.why,
+        "catheter_tilt_deg": set_up.choice.tilt_deg,
+        "seconds": record.seconds,
+        "exposures": record.exposures,
+        "peak_force_n": round(record.peak_force_n, 4),
+        "largest_safety_ratio": round(worst_ratio(found), 3),
+        "deepest_tip_mm": round(float(record.tip.abscissa.max()), 2),
+        "end_tip_mm": round(float(record.tip.abscissa[-1]), 2),
+        "target_mm": round(navigation.target.abscissa, 2),
+        "drive_slipped_s": round(slipped_s(found), 2),
+        "courses_searched": found.plans,
+        "page": str(output / PAGE_FILE),
+    }
+    return manifest(
+        config=set_up.config,
+        seed=set_up.config.seed,
+        inputs={},
+        anatomy={"name": set_up.anatomy.name, "identity": set_up.anatomy.identity},
+        device=asdict(navigation.device),
+        catheter_axis=navigation.anatomy.insertion.direction.tolist() if set_up.choice.tilt_deg else None,
+        target={"asked": target, **asdict(navigation.target)},
+        truth=asdict(set_up.truth),
+        simulator=asdict(set_up.simulator),
+        figures=figures,
+    )
+
+
+def _commands(found: PatientNavigation, folder: Path, driven_in: Path, target: str, output: Path) -> Mapping[str, str]:
+    changed = _changed(found.set_up)
+    line = ["endopilot", "navigate", str(folder), f"--target={target}", "-o", str(output), *changed]
+    again = ["endopilot", "simulate", str(driven_in), "--device", str(output / WIRE_FILE)]
+    again += ["--controls", str(output / CONTROLS_FILE), "-o", "again.csv"]
+    beside = ["endopilot", "train", "runs/dataset", str(output / EPISODE_FOLDER), "-o", "runs/training"]
+    return {
+        "The navigation": shlex.join(line),
+        "The same wire from the recorded controls, without the policy": shlex.join(again),
+        "Train on it beside a dataset of the same wire": shlex.join(beside),
+    }
+
+
+def _changed(set_up: SetUp) -> list[str]:
+    """Return the options that are not at their defaults."""
+    default = asdict(NavigatePatientConfig())
+    options = [(name, value) for name, value in asdict(set_up.config).items() if value != default[name]]
+    return [part for name, value in options for part in (f"--{name.replace('_', '-')}", str(value))]

@@ -1,0 +1,131 @@
+"""The page of a navigation in a patient: what came of it, its replay in space, its course in time, how to repeat it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+from plotly.offline import get_plotlyjs
+
+from endopilot.control.navigate_patient import PatientNavigation
+from endopilot.control.outcome import name_target, slipped_s, tell_outcome, worst_ratio
+from endopilot.files import json_text, writing
+from endopilot.report.report import image, template_text
+from endopilot.report.scene import mark_target, navigation_scene
+
+
+def write_navigation_page(
+    path: Path, found: PatientNavigation, *, picture: bytes, commands: Mapping[str, str], manifest: Mapping[str, Any]
+) -> None:
+    """Write the page as one HTML file that needs nothing beside it.
+
+    Args:
+        path: where to.
+        found: the navigation.
+        picture: its course in time, a PNG.
+        commands: what repeats it, by purpose.
+        manifest: how it was made.
+
+    Raises:
+        InputError: the page cannot be written.
+    """
+    environment = Environment(
+        loader=PackageLoader("endopilot.report", "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    name = found.set_up.navigation.anatomy.name
+    outcome = tell_outcome(found)
+    page = environment.get_template("navigation.html.j2").render(
+        css=Markup(template_text("report.css")),
+        title=f"{name}: to {name_target(found.set_up)}",
+        outcome=outcome[0].upper() + outcome[1:] + ".",
+        tiles=_tiles(found),
+        facts=_facts(found),
+        plotly=Markup(get_plotlyjs()),
+        scene=Markup(_scene(found)),
+        believes=found.wires is not None,
+        picture=image(picture, f"Course of the navigation in {name}"),
+        exposures=_exposures(found),
+        commands=commands,
+        manifest=json_text(manifest),
+    )
+    with writing(path) as partial:
+        partial.write_text(page, encoding="utf-8")
+
+
+def _tiles(found: PatientNavigation) -> list[tuple[str, str, str]]:
+    """Return figure, meaning and comparison of each tile."""
+    record, navigation = found.record, found.set_up.navigation
+    minutes = max(record.seconds, 0.5) / 60
+    tiles = [
+        (f"{record.seconds:g} s", "until the target" if record.success else "until it ended",
+         f"of {navigation.seconds:g} s given"),
+        (str(record.exposures), "X-ray exposures", f"{record.exposures / minutes:.1f} a minute"),
+        (f"{record.peak_force_n:.3f} N", "largest force on the wall", f"limit {navigation.force_limit_n:g} N"),
+        (f"{worst_ratio(found):.2f}", "largest safety ratio of the tip", "1 is the wall"),
+    ]  # fmt: skip
+    if record.believed is not None:
+        errors = np.abs(record.believed[:-1, 0] - record.tip.abscissa[:-1])
+        tiles.append(
+            (f"{np.median(errors):.2f} mm", "median error of the believed Δtip", f"at most {errors.max():.2f} mm")
+        )
+    return tiles
+
+
+def _facts(found: PatientNavigation) -> list[tuple[str, str]]:
+    set_up, navigation = found.set_up, found.set_up.navigation
+    truth, device = set_up.truth, navigation.device
+    facts = [
+        ("Policy", set_up.config.policy),
+        ("Wire", f"{device.name}, {device.diameter_mm:g} mm"),
+        ("Tip", set_up.choice.why),
+        ("Friction in reality", f"{device.friction * truth.friction_factor:.3g}, given {device.friction:g}"),
+        ("Tip stiffness in reality", f"{truth.stiffness_factor:g} of the given one"),
+        ("Ostium in reality", f"{truth.ostium_mm:+.2f} mm along the catheter"),
+        ("Latency in reality", f"{truth.latency_factor:g} of the given one"),
+        ("Drive slipped for", f"{slipped_s(found):.2f} s"),
+    ]
+    if found.plans is not None:
+        facts.append(("Courses searched", str(found.plans)))
+    return [*facts, ("Seed", str(set_up.config.seed))]
+
+
+def _scene(found: PatientNavigation) -> str:
+    """Return the replay in space as HTML."""
+    record, navigation = found.record, found.set_up.navigation
+    figure = navigation_scene(navigation.anatomy, found.rollout, believed=found.wires)
+    exposed = record.exposed
+    place = navigation.target.position(navigation.anatomy)
+    mark_target(figure, place, record.tip_position[exposed], record.time_s[exposed])
+    return figure.to_html(
+        full_html=False,
+        include_plotlyjs=False,
+        auto_play=False,
+        div_id="navigation",
+        config={"displaylogo": False, "responsive": True, "modeBarButtonsToRemove": ["toImage"]},
+    )
+
+
+def _exposures(found: PatientNavigation) -> list[dict[str, str]]:
+    """Return a row for each exposure: when, why, what it showed and what had been believed before."""
+    record, rows = found.record, []
+    for sample in np.flatnonzero(record.exposed).tolist():
+        tip = record.measured[sample]
+        assert tip is not None
+        why = "the start" if sample == 0 else record.asks[sample - 1] or "the policy asked"
+        rows.append(
+            {
+                "time": f"{record.time_s[sample]:g}",
+                "why": why[0].upper() + why[1:],
+                "measured": f"{tip.abscissa:.1f}",
+                "true": f"{record.tip.abscissa[sample]:.1f}",
+            }
+        )
+    return rows

@@ -1,0 +1,213 @@
+"""`endopilot navigate` on a small synthetic patient: its folder, what can be done with it, and what is refused."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pandas as pd
+import pytest
+from command import refused, run
+
+from endopilot.anatomy.io import read_anatomy
+from endopilot.cli import main
+from endopilot.control.navigate_patient import NavigatePatientConfig, navigate_patient, set_up_navigation
+from endopilot.dataset.loader import load_dataset
+from endopilot.files import read_json
+from endopilot.pipeline import navigation
+
+SHORT = ("--tip", "own", "--seconds", "20")
+FILES = ["controls.csv", "episode", "manifest.json", "navigation.csv", "navigation.html", "navigation.png", "run.json",
+         "wire.yaml"]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def patient(tmp_path_factory):
+    """Return the folder of a synthetic patient."""
+    folder = tmp_path_factory.mktemp("atlas")
+    with pytest.raises(SystemExit) as leaving:
+        main(["atlas", "-o", str(folder), "--anatomy", "rca", "--count", "1", "--seed", "41"])
+    assert leaving.value.code == 0
+    return folder / "rca-41-0000"
+
+
+@pytest.fixture(scope="module")
+def driven(patient, tmp_path_factory):
+    """Return the folder of a navigation under model mismatch, and its figures."""
+    folder = tmp_path_factory.mktemp("driven") / "navigation"
+    config = NavigatePatientConfig(
+        tip="own",
+        seconds=20.0,
+        seed=3,
+        true_friction=1.2,
+        true_tip_stiffness=0.8,
+        true_ostium_mm=0.4,
+        true_latency_s=0.1,
+    )
+    return folder, navigation.navigate_into(patient, "2", folder, config)
+
+
+def test_the_folder_tells_what_happened(driven, patient):
+    folder, figures = driven
+    assert sorted(path.name for path in folder.iterdir()) == FILES
+    assert figures["reached"] and figures["outcome"].startswith("reached section 2 at ")
+    table, record = pd.read_csv(folder / "navigation.csv"), read_json(folder / "manifest.json")
+    assert table["time_s"].tolist() == (0.5 * np.arange(len(table))).tolist()
+    assert table["xray"].sum() == figures["exposures"] and table["xray"].iloc[0] == 1
+    assert table["contact_force_n"].max() == pytest.approx(figures["peak_force_n"], abs=1e-4)
+    assert abs(table["tip_abscissa_mm"].iloc[-1] - figures["target_mm"]) <= 2.0
+    assert str(table["section"].iloc[-1]) == "2"
+    assert table["measured_tip_abscissa_mm"].notna().tolist() == (table["xray"] == 1).tolist()
+    assert table["band_tip_abscissa_mm"].notna().sum() > len(table) / 2
+    # every exposure but the first was asked for a decision before, with a reason
+    asked = (table["asks_for_xray"].fillna("") != "").to_numpy()
+    np.testing.assert_array_equal(asked[:-1][1:], (table["xray"] == 1).to_numpy()[2:])
+    truth = {"friction_factor": 1.2, "stiffness_factor": 0.8, "ostium_mm": 0.4, "latency_factor": 2.0}
+    assert record["truth"] == truth
+    assert record["anatomy"]["identity"] == read_anatomy(patient).identity
+    # it starts deeper than the encoder says
+    assert table["inserted_length_mm"].iloc[0] == pytest.approx(2.4, abs=1e-6)
+
+
+def test_the_page_needs_nothing_beside_it(driven):
+    folder, figures = driven
+    page = (folder / "navigation.html").read_text(encoding="utf-8")
+    for part in (
+        "Plotly.newPlot",
+        "data:image/png;base64,",
+        "Wires held possible",
+        "Tip under X-ray",
+        "endopilot simulate",
+    ):
+        assert part in page
+    assert figures["outcome"][1:] in page
+    outside = re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
+    assert len(outside) < len(page) / 2 and not re.search(r"""(src|href)=["']?http""", outside)
+
+
+def test_recorded_controls_make_the_same_wire(driven, patient, capsys, tmp_path):
+    folder, _ = driven
+    again = run(
+        *(capsys, "simulate", patient, "--device", folder / "wire.yaml", "--controls", folder / "controls.csv"),
+        *("-o", tmp_path / "again.csv"),
+    )
+    assert again["valid_worlds"] == 1
+    table, wire = pd.read_csv(folder / "navigation.csv"), pd.read_csv(tmp_path / "again.csv")
+    places = [f"tip_{axis}_mm" for axis in "xyz"]
+    np.testing.assert_allclose(wire[places].to_numpy()[9::10], table[places].to_numpy()[1:], atol=1e-9)
+    np.testing.assert_allclose(wire["inserted_length_mm"][9::10], table["inserted_length_mm"][1:], atol=1e-9)
+
+
+def test_the_replayed_wire_is_the_navigations_to_the_bit(patient):
+    found = navigate_patient(set_up_navigation(patient, "2", NavigatePatientConfig(tip="own", seconds=20.0, seed=3)))
+    samples = len(found.record.time_s) - 1
+    np.testing.assert_array_equal(found.rollout.tip_position[0], found.record.tip_position[1:])
+    np.testing.assert_array_equal(found.rollout.shape[0, :, 0], found.record.tip_position[1:])
+    assert found.rollout.tip_position.shape[1] == samples == len(found.wires) < found.episode.valid.shape[1] == 40
+    # the likeliest wire held possible is where the record has it, a decision later
+    shown = np.array([wires[0, 0] for wires in found.wires])
+    errors = np.linalg.norm(shown - found.rollout.tip_position[0], axis=1)
+    assert np.median(errors) < 1.0
+    # then the drive rests
+    np.testing.assert_array_equal(found.episode.control[0, samples + 1 :], 0.0)
+    np.testing.assert_allclose(found.episode.inserted_length[0, :samples], found.record.inserted_length[1:], atol=1e-9)
+
+
+def test_the_episode_trains_beside_simulated_data(driven, patient, capsys, tmp_path):
+    folder, _ = driven
+    episode = load_dataset(folder / "episode")
+    assert len(episode) == 1 and episode.valid.all() and episode.split.tolist() == ["train"]
+    table = pd.read_csv(folder / "navigation.csv")
+    np.testing.assert_allclose(episode.tip_abscissa[0, : len(table) - 1], table["tip_abscissa_mm"][1:], atol=1e-4)
+    assert episode.friction[0] == pytest.approx(0.12) and episode.tip_stiffness_factor[0] == 0.8
+    sizes = ("--sequences", "4", "--seconds", "20")
+    run(capsys, "dataset", patient, "-o", tmp_path / "data", *sizes)
+    alone = run(capsys, "train", tmp_path / "data", "-o", tmp_path / "alone", "--epochs", "1", "--network", "ff")
+    both = run(
+        *(capsys, "train", tmp_path / "data", folder / "episode", "-o", tmp_path / "both"),
+        *("--epochs", "1", "--network", "ff"),
+    )
+    assert np.isfinite(both["training"]["ff"]["curve"][-1]["loss"])
+    counts = [read_json(tmp_path / name / "manifest.json")["episodes"]["train"] for name in ("alone", "both")]
+    assert counts == [3, 4] and alone["training"] != both["training"]
+
+    run(capsys, "dataset", patient, "-o", tmp_path / "long", "--sequences", "4", "--seconds", "30")
+    line = refused(capsys, "train", tmp_path / "long", folder / "episode", "-o", tmp_path / "no")
+    assert "episodes of 20 s, and those of" in line and "--seconds 30" in line
+
+
+def test_a_finished_folder_is_left_alone_and_another_run_is_refused(driven, patient, capsys):
+    folder, figures = driven
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+    same = ("--seed", "3", "--true-friction", "1.2", "--true-tip-stiffness", "0.8", "--true-ostium-mm", "0.4")
+    same += ("--true-latency-s", "0.1")
+    assert run(capsys, "navigate", patient, "--target", "2", "-o", folder, *SHORT, *same) == figures
+    line = refused(capsys, "navigate", patient, "--target", "3", "-o", folder, *SHORT, *same)
+    assert "was begun with target = 2, now it is 3" in line
+    assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
+
+
+def test_an_interrupted_navigation_is_finished_by_the_same_command(patient, capsys, tmp_path, monkeypatch):
+    output = tmp_path / "killed"
+    monkeypatch.setattr(navigation, "_manifest", lambda *_: 1 / 0)  # dies late, after most files
+    with pytest.raises(ZeroDivisionError):
+        navigation.navigate_into(patient, "1", output, NavigatePatientConfig(policy="forward", tip="own", seconds=20.0))
+    monkeypatch.undo()
+    assert not (output / "manifest.json").exists() and not (output / "navigation.html").exists()
+    again = run(capsys, "navigate", patient, "--target", "1", "-o", output, "--policy", "forward", *SHORT)
+    assert sorted(path.name for path in output.iterdir()) == FILES
+    assert again["exposures"] == 1 and "Wires held possible" not in (output / "navigation.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--target", "LADX"), "has no such section (it has 1, 2, 3, 4"),
+        (("--target=900,0,0",), "mm from the nearest centerline"),
+        (("--target", ""), "is empty"),
+        (("--target", "1", "--policy", "none"), "policy: 'none'"),
+        (("--target", "1", "--device", "none"), "device 'none'"),
+        (("--target", "1", "--true-friction", "0"), "true_friction: 0"),
+        (("--target", "1", "--mismatch", "1.5"), "mismatch: 1.5"),
+        (("--target", "1", "--tip", "10000/1"), "cannot be given to workhorse-014"),
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_nothing(patient, capsys, tmp_path, arguments, message):
+    line = refused(capsys, "navigate", patient, "-o", tmp_path / "out", *arguments)
+    assert message in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_point_is_moved_to_the_vessel_and_told(patient, capsys, tmp_path):
+    line = read_anatomy(patient).tree.branches[0].centerline
+    at = len(line.points) // 3
+    point = line.points[at] + 0.7 * line.normals[at]
+    target = ",".join(f"{value:.4f}" for value in point)
+    figures = run(capsys, "navigate", patient, f"--target={target}", "-o", tmp_path / "out", "--policy", "twin", *SHORT)
+    assert figures["snapped_mm"] == pytest.approx(0.7, abs=0.02)
+    assert figures["target_mm"] == pytest.approx(line.abscissa[at], abs=0.5)
+    assert f"{figures['snapped_mm']:.1f} mm from the given point" in figures["outcome"]
+
+
+def test_what_does_not_arrive_says_why(patient, capsys, tmp_path):
+    figures = run(
+        *(capsys, "navigate", patient, "--target", "4", "-o", tmp_path / "out", "--policy", "forward"),
+        *("--tip", "own", "--seconds", "4"),
+    )
+    assert not figures["reached"] and figures["reason"] == "time"
+    assert figures["outcome"].startswith("not reached: after 4 s the tip is in section 1 at ")
+    assert "it was still on its course; give more --seconds" in figures["outcome"]
+
+
+def test_mismatch_is_drawn_with_the_seed(patient):
+    def truth(**changed):
+        return set_up_navigation(patient, "1", NavigatePatientConfig(tip="own", mismatch=0.2, **changed)).truth
+
+    drawn = [truth(seed=seed) for seed in range(6)]
+    assert drawn[0] == truth(seed=0) and len({str(each) for each in drawn}) > 2
+    diameter = 2 * float(read_anatomy(patient).tree.branches[0].centerline.radius[0])
+    for each in drawn:
+        assert {round(abs(each.friction_factor - 1), 9), round(abs(each.latency_factor - 1), 9)} == {0.2}
+        assert abs(each.ostium_mm) == pytest.approx(0.2 * diameter)
+    assert truth(seed=0, true_friction=1.1).friction_factor == 1.1
+    assert truth(seed=0, true_friction=1.1).ostium_mm == drawn[0].ostium_mm
