@@ -8,7 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.control.navigate import ModelMismatch, start_world
+from endopilot.control.mismatch import ModelMismatch
+from endopilot.control.navigate import start_world
 from endopilot.control.robot import RobotConfig, SimulatedRobot
 from endopilot.settings import Positive, settings
 from endopilot.simulation.config import SimulatorConfig
