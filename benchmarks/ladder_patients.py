@@ -145,7 +145,7 @@ def _never(tip: TipProjection) -> np.ndarray:
 
 def choose(task: Task, seed: int, *, search: bool) -> tuple[list[int], int, int]:
     """Return the chosen patients' numbers, how many were eligible and how many were examined."""
-    atlas = AtlasConfig(anatomy=task.anatomy, seed=seed, stenosis_share=task.stenosis_share)
+    atlas = AtlasConfig(anatomy=task.anatomy, seed=seed, stenosis_share=task.stenosis_share, population="textbook")
     eligible = ELIGIBLE.get(task.name, _always)
     chosen: list[int] = []
     count = 0

@@ -27,8 +27,9 @@ SHOWN = {"rca": (0, 2), "lca": (0, 2), "cerebral": (0, 2), "portal": (0, 2), "ar
 
 
 def patients_of(anatomy: str, count: int = 60) -> Patients:
-    """Return the trees of seed 0."""
-    return [make_patient_tree(AtlasConfig(anatomy=anatomy, seed=0), index) for index in range(count)]
+    """Return the textbook's trees of seed 0."""
+    config = AtlasConfig(anatomy=anatomy, seed=0, population="textbook")
+    return [make_patient_tree(config, index) for index in range(count)]
 
 
 def diameters(patients: Patients, section: str) -> list[float]:

@@ -16,7 +16,7 @@ COUNT = 60
 
 @pytest.fixture(scope="module")
 def patients():
-    config = AtlasConfig(seed=11)
+    config = AtlasConfig(seed=11, population="textbook")
     return [make_patient_tree(config, index) for index in range(COUNT)]
 
 
@@ -128,7 +128,9 @@ def test_anatomy_holds_lumen_and_catheter():
     assert 0 < np.median(path.radius - depth) < 0.2
     behind = anatomy.insertion.position - np.outer(np.arange(2.0, 18.0), anatomy.insertion.direction)
     tube = sample(anatomy.distance_map, behind)
-    assert anatomy.catheter_radius_mm - 0.25 < tube.min() and tube.max() < anatomy.catheter_radius_mm + 0.02
+    # Half a grid cell's diagonal across the axis is what linear interpolation rounds off there.
+    rounded = 0.75 * anatomy.distance_map.spacing_mm
+    assert anatomy.catheter_radius_mm - rounded < tube.min() and tube.max() < anatomy.catheter_radius_mm + 0.02
     assert anatomy.insertion.direction @ (path.points[4] - path.points[0]) > 0
     (stenosis,) = anatomy.provenance["stenoses"]
     here = np.interp(stenosis["abscissa_mm"], path.abscissa, path.radius)

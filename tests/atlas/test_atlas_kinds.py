@@ -19,7 +19,11 @@ ROOTS = {"lca": "5", "arch": "descending aorta", "cerebral": "ICA", "portal": "M
 @pytest.fixture(scope="module")
 def atlas():
     return {
-        kind: [make_patient_tree(AtlasConfig(anatomy=kind, seed=11), index) for index in range(COUNT)] for kind in KINDS
+        kind: [
+            make_patient_tree(AtlasConfig(anatomy=kind, seed=11, population="textbook"), index)
+            for index in range(COUNT)
+        ]
+        for kind in KINDS
     }
 
 
@@ -56,7 +60,7 @@ def test_trees_are_connected_and_fork(atlas, kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_patient_depends_on_seed_and_index_alone(atlas, kind):
-    again, truth = make_patient_tree(AtlasConfig(anatomy=kind, seed=11, count=5), 1)
+    again, truth = make_patient_tree(AtlasConfig(anatomy=kind, seed=11, count=5, population="textbook"), 1)
     tree, truth_before = atlas[kind][1]
     assert truth == truth_before
     for one, two in zip(tree.branches, again.branches, strict=True):

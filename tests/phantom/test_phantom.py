@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates, maximum_filter
 
+from endopilot.anatomy.tree import tangents
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.atlas.curves import abscissa, curve_through
 from endopilot.atlas.heart_reference import TO_CRUX, aorta, fit_heart
@@ -64,7 +65,9 @@ def test_lumen_has_its_ct_number_on_the_axis(anatomy, clean):
 
 def test_ostium_opens_into_the_aorta(anatomy, clean):
     steps = np.linspace(-12.0, 4.0, 40)
-    found = at(clean, anatomy.insertion.position + steps[:, None] * anatomy.insertion.direction)
+    # Along the vessel: a catheter that meets it at an angle points at its wall.
+    (ahead, *_) = tangents(anatomy.tree.branches[0].centerline.points)
+    found = at(clean, anatomy.insertion.position + steps[:, None] * ahead)
     assert found.min() > 370
 
 

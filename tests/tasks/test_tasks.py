@@ -38,7 +38,9 @@ def test_a_task_has_twenty_patients_and_others_to_learn_on(path):
 @pytest.mark.parametrize("name", ["straight", "crux", "carotid"])
 def test_the_target_lies_in_its_section(name):
     task = find_task(name)
-    atlas = AtlasConfig(anatomy=task.anatomy, seed=task.ladder.seed, stenosis_share=task.stenosis_share)
+    atlas = AtlasConfig(
+        anatomy=task.anatomy, seed=task.ladder.seed, stenosis_share=task.stenosis_share, population="textbook"
+    )
     tree, _ = make_patient_tree(atlas, task.ladder.numbers[0])
     target = target_in_section(tree, task.section, task.depth_mm)
     branch = tree.branches[target.branch]
@@ -77,7 +79,7 @@ def test_what_is_wrong_in_a_file_is_named(tmp_path, old, new, line):
 
 
 def test_a_target_outside_the_tree_is_refused():
-    tree, _ = make_patient_tree(AtlasConfig(), 0)
+    tree, _ = make_patient_tree(AtlasConfig(population="textbook"), 0)
     with pytest.raises(InputError, match="section: 'LAD'"):
         target_in_section(tree, "LAD", 5.0)
     with pytest.raises(InputError, match="depth_mm: 500"):

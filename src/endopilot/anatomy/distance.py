@@ -8,6 +8,7 @@ smooth union, so that a quadratic B-spline of the values is a good potential for
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -48,27 +49,36 @@ def automatic_spacing(radius: Float[np.ndarray, "n"], extent_mm: Float[np.ndarra
 
 
 def distance_map_from_spheres(
-    tree: VesselTree, *, spacing_mm: float | None = None, band_mm: float = BAND_MM
+    tree: VesselTree,
+    *,
+    beside: Sequence[Sequence[Centerline]] = (),
+    spacing_mm: float | None = None,
+    band_mm: float = BAND_MM,
 ) -> DistanceMap:
     """Return the signed distance to the smooth union of a tree's inscribed spheres.
 
     Args:
         tree: centerlines with radii.
+        beside: for each branch, further lines of spheres that belong to its lumen; none for round sections.
         spacing_mm: grid spacing, mm; chosen by `automatic_spacing` if None.
         band_mm: how far outside the wall distances are kept, mm.
     """
-    points = np.concatenate([branch.centerline.points for branch in tree.branches])
-    radius = np.concatenate([branch.centerline.radius for branch in tree.branches])
+    lumens = [[branch.centerline] for branch in tree.branches]
+    for own, others in zip(lumens, beside, strict=False):
+        own.extend(others)
+    points = np.concatenate([line.points for own in lumens for line in own])
+    radius = np.concatenate([line.radius for own in lumens for line in own])
     margin = radius[:, None] + band_mm
     lower, upper = (points - margin).min(axis=0), (points + margin).max(axis=0)
     spacing = automatic_spacing(radius, upper - lower) if spacing_mm is None else float(spacing_mm)
     shape, origin = _grid(lower, upper, spacing)
     values = np.full(shape, -band_mm, dtype=np.float32)
-    for branch in tree.branches:
-        line = branch.centerline
-        window = _window(line, origin, spacing, shape, band_mm)
+    for own in lumens:
+        line = own[0]
+        window = _window(_joined(own), origin, spacing, shape, band_mm)
         corner = origin + spacing * np.array([window[2].start, window[1].start, window[0].start])
-        field = _tube_field(line, values[window].shape, corner, spacing, band_mm)
+        fields = [_tube_field(part, values[window].shape, corner, spacing, band_mm) for part in own]
+        field = np.maximum.reduce(fields)
         fillet = FILLET * float(line.radius[min(len(line.radius) - 1, 3)])
         values[window] = smooth_union(values[window], field, spacing_mm=spacing, fillet_mm=fillet)
     return DistanceMap(values=values, spacing_mm=spacing, origin_mm=origin)
@@ -218,6 +228,12 @@ def sample(distance_map: DistanceMap, points: Float[np.ndarray, "n 3"], *, order
 
     index = (points - distance_map.origin_mm) / distance_map.spacing_mm
     return map_coordinates(distance_map.values, index[:, ::-1].T, order=order, mode="nearest", output=np.float64)
+
+
+def _joined(lines: Sequence[Centerline]) -> Centerline:
+    """Return all lines' points and radii as one."""
+    parts = [[getattr(line, name) for line in lines] for name in ("points", "radius", "abscissa", "normals")]
+    return Centerline(*(np.concatenate(part) for part in parts))
 
 
 def _grid(lower: Float[np.ndarray, "3"], upper: Float[np.ndarray, "3"], spacing: float) -> Grid:

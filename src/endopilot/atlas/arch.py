@@ -34,6 +34,8 @@ from endopilot.atlas.branching import (
     wiggled,
     with_side_branches,
 )
+from endopilot.atlas.population import Population
+from endopilot.atlas.variation import bent, varied
 from endopilot.types import VesselTree
 
 HEIGHT_MM, WIDTH_MM = {"man": 49.3, "woman": 40.1}, {"man": 83.6, "woman": 73.3}
@@ -69,21 +71,24 @@ LENGTH_MM = {
 }
 
 
-def make_arch(generator: np.random.Generator, stenosis_share: float) -> tuple[VesselTree, dict[str, Any]]:
+def make_arch(
+    generator: np.random.Generator, stenosis_share: float, population: Population
+) -> tuple[VesselTree, dict[str, Any]]:
     """Return one aortic arch and what was drawn for it.
 
     Args:
         generator: random stream of this patient.
         stenosis_share: probability of a stenosis, in a common carotid or the left subclavian artery.
+        population: how patients vary.
     """
     sex = "man" if generator.random() < 0.5 else "woman"
     kind = str(generator.choice(list(TYPE_SHARES), p=np.array(list(TYPE_SHARES.values())) / sum(TYPE_SHARES.values())))
     bovine = bool(generator.random() < BOVINE_SHARE)
-    return until_it_fits(partial(_draw, generator, sex, kind, bovine, stenosis_share), "aortic arch")
+    return until_it_fits(partial(_draw, generator, sex, kind, bovine, stenosis_share, population), "aortic arch")
 
 
 def _draw(
-    generator: np.random.Generator, sex: str, kind: str, bovine: bool, stenosis_share: float
+    generator: np.random.Generator, sex: str, kind: str, bovine: bool, stenosis_share: float, population: Population
 ) -> tuple[VesselTree, dict[str, Any]]:
     size = truncated(generator, 1.0, 0.08, 0.8, 1.2)
     height, width = size * HEIGHT_MM[sex], size * WIDTH_MM[sex]
@@ -100,14 +105,14 @@ def _draw(
     radius = 0.5 * np.interp(along, marks, AORTA_DIAMETER_MM) * uneven(generator, along)
     radius = radius * truncated(generator, 1.0, 0.13, 0.7, 1.3)
     section = np.select([place <= first, place <= last], ARCH_SECTIONS[:2], default=ARCH_SECTIONS[2]).tolist()
-    vessels = [Vessel(points, radius, section)]
-    vessels = with_side_branches(generator, vessels, _plans(generator, vessels[0], origins, wide, bovine))
-    stenoses = []
+    vessels = [Vessel(bent(generator, points, radius, population), radius, section)]
+    plans = varied(generator, _plans(generator, vessels[0], origins, wide, bovine), population)
+    vessels = with_side_branches(generator, vessels, plans, population.carina_mm)
+    narrow = []
     if generator.random() < stenosis_share:
         where = str(generator.choice(["left common carotid", "left subclavian", "right common carotid"]))
         index = [vessel.section[-1] for vessel in vessels].index(where)
-        stenosis, vessels = narrowed(generator, vessels, index, (0.4, 0.8))
-        stenoses.append(stenosis)
+        narrow, vessels = narrowed(generator, vessels, index, (0.4, 0.8), population.tandem_share)
     drawn = {
         "arch_type": kind,
         "bovine": bovine,
@@ -115,7 +120,7 @@ def _draw(
         "arch_height_mm": height,
         "arch_width_mm": width,
         "trunk_drop_mm": drop,
-        "stenoses": stenoses,
+        "stenoses": narrow,
     }
     return build_tree(vessels, ARCH_SECTIONS), drawn
 

@@ -11,10 +11,11 @@ from pydantic import model_validator
 from endopilot.anatomy import distance
 from endopilot.atlas.arch import make_arch
 from endopilot.atlas.cerebral import make_cerebral
-from endopilot.atlas.curves import tangents
 from endopilot.atlas.lca import make_lca
+from endopilot.atlas.population import Population, PopulationName, population_of
 from endopilot.atlas.portal import make_portal
 from endopilot.atlas.rca import make_rca
+from endopilot.atlas.variation import catheter_direction, flattened
 from endopilot.settings import Count, Seed, Share, settings
 from endopilot.types import Anatomy, Insertion, VesselTree
 
@@ -23,7 +24,7 @@ CATHETER_RADIUS_MM = 0.9
 CATHETER_LENGTH_MM = 30.0
 """Length of catheter behind the ostium that the distance map holds, mm."""
 
-_KINDS: dict[str, Callable[[np.random.Generator, float], tuple[VesselTree, dict[str, Any]]]] = {
+_KINDS: dict[str, Callable[[np.random.Generator, float, Population], tuple[VesselTree, dict[str, Any]]]] = {
     "rca": make_rca,
     "lca": make_lca,
     "cerebral": make_cerebral,
@@ -48,6 +49,9 @@ class AtlasConfig:
     """Seed of the atlas: patient i is the same whatever the count."""
     stenosis_share: Share = 0.3
     """Share of the patients that have a stenosis, 0 to 1."""
+    population: PopulationName = "patients"
+    """How patients vary: patients (as measured in real ones: sharp bends, forks of any angle, missing branches, lumens
+    that are not round) or textbook (published mean courses with smooth wiggles)."""
 
     @model_validator(mode="after")
     def _consistent(self) -> AtlasConfig:
@@ -69,20 +73,29 @@ def make_patient(config: AtlasConfig, index: int) -> Anatomy:
     what was drawn: dominance, length, tortuosity, curvature, stenoses.
     """
     tree, drawn = make_patient_tree(config, index)
-    root = tree.branches[0].centerline
-    insertion = Insertion(position=root.points[0], direction=tangents(root.points)[0])
-    lumen = distance.distance_map_from_spheres(tree)
+    population = population_of(config.anatomy, config.population)
+    generator = _stream(config, index, 1)
+    direction, catheter = catheter_direction(generator, tree, population, CATHETER_RADIUS_MM, CATHETER_LENGTH_MM)
+    insertion = Insertion(position=tree.branches[0].centerline.points[0], direction=direction)
+    lumen = distance.distance_map_from_spheres(tree, beside=flattened(generator, tree, population))
+    source = {"source": "atlas", "anatomy": config.anatomy, "population": config.population}
     return Anatomy(
         name=f"{config.anatomy}-{config.seed}-{index:04d}",
         tree=tree,
         distance_map=distance.add_catheter(lumen, insertion, CATHETER_RADIUS_MM, CATHETER_LENGTH_MM),
         insertion=insertion,
         catheter_radius_mm=CATHETER_RADIUS_MM,
-        provenance={"source": "atlas", "anatomy": config.anatomy, "seed": config.seed, "index": index, **drawn},
+        provenance=source | {"seed": config.seed, "index": index} | drawn | catheter,
     )
 
 
 def make_patient_tree(config: AtlasConfig, index: int) -> tuple[VesselTree, dict[str, Any]]:
     """Return the centerline tree of patient `index`, and what was drawn for it, without a distance map."""
-    generator = np.random.Generator(np.random.Philox(key=np.array([config.seed, index], dtype=np.uint64)))
-    return _KINDS[config.anatomy](generator, config.stenosis_share)
+    population = population_of(config.anatomy, config.population)
+    return _KINDS[config.anatomy](_stream(config, index, 0), config.stenosis_share, population)
+
+
+def _stream(config: AtlasConfig, index: int, purpose: int) -> np.random.Generator:
+    """Return a patient's random stream for the tree (0), or for section and catheter (1)."""
+    key = np.array([config.seed, index], dtype=np.uint64)
+    return np.random.Generator(np.random.Philox(key=key, counter=np.array([0, 0, 0, purpose], dtype=np.uint64)))

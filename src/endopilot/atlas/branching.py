@@ -19,6 +19,8 @@ Depth = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n"]]
 
 _CLEARANCE_MM = 0.6
 """Tissue between two lumens that do not belong together, mm: two walls."""
+_BEND_MM = 4.0
+"""Two places of one vessel that lie farther apart along it than this and twice their radii must not touch, mm."""
 
 
 class NoShape(Exception):
@@ -126,10 +128,31 @@ def stenosis(
     return drawn, narrowing
 
 
+def stenoses(
+    generator: np.random.Generator, along: Float[np.ndarray, "n"], shares: tuple[float, float], tandem_share: float
+) -> tuple[list[dict[str, Any]], Float[np.ndarray, "n"]]:
+    """Return a stenosis, with a probability of `tandem_share` a second one 12 to 40 mm from it, and their factor.
+
+    Arguments and factor as for `stenosis`; where the vessel has no room for it, the second one is left out.
+    """
+    drawn, narrowing = stenosis(generator, along, shares)
+    if tandem_share == 0 or generator.random() > tandem_share:
+        return [drawn], narrowing
+    for _ in range(10):
+        second, also = stenosis(generator, along, shares)
+        if 12.0 < abs(second["abscissa_mm"] - drawn["abscissa_mm"]) < 40.0:
+            return [drawn, second], narrowing * also
+    return [drawn], narrowing
+
+
 def narrowed(
-    generator: np.random.Generator, vessels: Sequence[Vessel], index: int, shares: tuple[float, float]
-) -> tuple[dict[str, Any], list[Vessel]]:
-    """Return a stenosis of one vessel (abscissa from the ostium, and section), and the vessels with it.
+    generator: np.random.Generator,
+    vessels: Sequence[Vessel],
+    index: int,
+    shares: tuple[float, float],
+    tandem_share: float = 0.0,
+) -> tuple[list[dict[str, Any]], list[Vessel]]:
+    """Return the stenoses of one vessel (abscissa from the ostium, and section), and the vessels with them.
 
     The mouths of its branches, which lie in its lumen, narrow with it.
     """
@@ -139,8 +162,8 @@ def narrowed(
         parent = vessels[above.parent]
         along = along + shape.abscissa(parent.points)[above.origin]
         above = parent
-    drawn, factor = stenosis(generator, along, shares)
-    section = vessel.section[int(np.searchsorted(along, drawn["abscissa_mm"]))]
+    drawn, factor = stenoses(generator, along, shares, tandem_share)
+    found = [one | {"section": vessel.section[int(np.searchsorted(along, one["abscissa_mm"]))]} for one in drawn]
     changed = []
     for i, other in enumerate(vessels):
         scale = factor if i == index else np.ones(len(other.radius))
@@ -148,7 +171,7 @@ def narrowed(
             inside = np.exp(-((shape.abscissa(other.points) / vessel.radius[other.origin]) ** 2))
             scale = factor[other.origin] * inside + (1 - inside)
         changed.append(replace(other, radius=other.radius * scale))
-    return drawn | {"section": section}, changed
+    return found, changed
 
 
 def wiggled(
@@ -174,18 +197,26 @@ def uneven(generator: np.random.Generator, along: Float[np.ndarray, "n"]) -> Flo
 
 
 def with_side_branches(
-    generator: np.random.Generator, vessels: Sequence[Vessel], plans: Sequence[SidePlan]
+    generator: np.random.Generator, vessels: Sequence[Vessel], plans: Sequence[SidePlan], carina_mm: float
 ) -> list[Vessel]:
     """Return the vessels with the planned branches; one that cuts another lumen is drawn again, twelve times at most.
+
+    Args:
+        generator: random stream.
+        vessels: those that are there.
+        plans: the branches.
+        carina_mm: over this length behind a fork and twice their radii lumens may be in contact, mm.
 
     Raises:
         NoShape: a branch found no place.
     """
     grown = list(vessels)
+    if not plans and lumens_collide(grown, carina_mm):
+        raise NoShape
     for plan in plans:
         for _ in range(12):
             side = _side_branch(generator, grown[plan.parent], plan)
-            if not lumens_collide([*grown, side]):
+            if not lumens_collide([*grown, side], carina_mm):
                 grown.append(side)
                 break
         else:
@@ -265,8 +296,13 @@ def build_tree(vessels: Sequence[Vessel], section_names: tuple[str, ...]) -> Ves
     return VesselTree(tuple(branches), section_names)
 
 
-def lumens_collide(vessels: Sequence[Vessel]) -> bool:
-    """Return whether lumens touch that lie far apart along the tree."""
+def lumens_collide(vessels: Sequence[Vessel], carina_mm: float = _BEND_MM) -> bool:
+    """Return whether lumens touch that lie far apart along the tree.
+
+    Args:
+        vessels: the tree.
+        carina_mm: behind a fork two vessels are far apart from this length and twice their radii on, mm.
+    """
     points = np.concatenate([vessel.points for vessel in vessels])
     radii = np.concatenate([vessel.radius for vessel in vessels])
     place = np.concatenate([shape.abscissa(vessel.points) for vessel in vessels])
@@ -282,7 +318,8 @@ def lumens_collide(vessels: Sequence[Vessel]) -> bool:
         direct = common[pair] == owner[one]
         paths.append((np.where(direct, place[one], entry[pair]), np.where(direct, 0.0, beyond[pair] + place[one])))
     distance = np.abs(paths[0][0] - paths[1][0]) + paths[0][1] + paths[1][1]
-    return bool(np.any(distance > 2.2 * reach + 4.0))
+    same = owner[near[:, 0]] == owner[near[:, 1]]
+    return bool(np.any(distance > 2.2 * reach + np.where(same, _BEND_MM, carina_mm)))
 
 
 def _meetings(vessels: Sequence[Vessel]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

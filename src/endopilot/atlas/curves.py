@@ -68,7 +68,12 @@ def parallel_normals(
 def bend(points: Float[np.ndarray, "n 3"], axis: Float[np.ndarray, "3"], angle_rad: float) -> Float[np.ndarray, "n 3"]:
     """Turn the tangents of a curve about `axis`, in proportion to the length along it, by `angle_rad` at its end."""
     share = (np.arange(len(points) - 1) + 0.5) / (len(points) - 1)
-    steps = Rotation.from_rotvec(angle_rad * share[:, None] * axis).apply(np.diff(points, axis=0))
+    return turned(points, angle_rad * share[:, None] * axis)
+
+
+def turned(points: Float[np.ndarray, "n 3"], rotations: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "n 3"]:
+    """Return the curve from the same start whose steps are turned, each by its rotation vector, rad."""
+    steps = Rotation.from_rotvec(rotations).apply(np.diff(points, axis=0))
     return np.concatenate([points[:1], points[0] + np.cumsum(steps, axis=0)])
 
 

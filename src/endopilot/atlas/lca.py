@@ -10,6 +10,7 @@ Anat 2004;17:6-13: drawn with 3.5 mm.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import Any
@@ -37,6 +38,8 @@ from endopilot.atlas.branching import (
     with_side_branches,
 )
 from endopilot.atlas.heart_reference import HeartFit
+from endopilot.atlas.population import Population
+from endopilot.atlas.variation import bent, drawn_from, ectasia, factor, forks_of, opened_fork, varied
 from endopilot.types import VesselTree
 
 LEFT_MAIN_MM, LEFT_MAIN_SD_MM, LEFT_MAIN_DIAMETER_MM = 13.1, 3.5, 4.5
@@ -124,48 +127,88 @@ _RAMUS = _SideKind(
 
 _ORDERED = (("9", "10"), ("12",))
 """Names of the first branches of the anterior descending artery and of the circumflex, septals aside."""
+_FLARE_MM = 3.0
+"""Over this length before and behind its fork the left main artery widens, mm."""
 _SHARPEST_PER_MM = 0.45
 """Greatest curvature of the main vessels, 1/mm."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Trunk:
-    """A patient's main vessels: course from the ostium and from the fork, indices of fork and crux, the heart's fit."""
+    """A patient's main vessels: courses from the ostium and from the fork, each as far as it could go, the number of
+    points that are there, indices of fork and crux, size and position of the heart.
+    """
 
-    lad: Float[np.ndarray, "n 3"]
-    lcx: Float[np.ndarray, "m 3"]
+    whole_lad: Float[np.ndarray, "n 3"]
+    whole_lcx: Float[np.ndarray, "m 3"]
+    counts: tuple[int, int]
     fork: int
-    crux: int | None
+    crux: int
     size: float
     turn: Rotation
-    heart: HeartFit
+
+    @property
+    def lad(self) -> Float[np.ndarray, "k 3"]:
+        """The left main and anterior descending artery."""
+        return self.whole_lad[: self.counts[0]]
+
+    @property
+    def lcx(self) -> Float[np.ndarray, "k 3"]:
+        """The circumflex artery."""
+        return self.whole_lcx[: self.counts[1]]
+
+    def heart(self) -> HeartFit:
+        """Fit the reference heart to the courses."""
+        return heart_left.fit_left_heart(self.whole_lad, self.whole_lcx[: self.crux + 1], self.whole_lcx[self.crux :])
 
 
-def make_lca(generator: np.random.Generator, stenosis_share: float) -> tuple[VesselTree, dict[str, Any]]:
+def make_lca(
+    generator: np.random.Generator, stenosis_share: float, population: Population
+) -> tuple[VesselTree, dict[str, Any]]:
     """Return one left coronary tree and what was drawn for it.
 
     Args:
         generator: random stream of this patient.
         stenosis_share: probability of a stenosis, in the anterior descending artery or the circumflex.
+        population: how patients vary.
     """
     u = generator.random()
     dominance = "right" if u < _RIGHT_SHARE else "balanced" if u < _RIGHT_SHARE + _BALANCED_SHARE else "left"
-    return until_it_fits(partial(_draw, generator, dominance, stenosis_share), "left coronary artery")
+    # Drawn once, so that shapes that fail do not bias it.
+    main_mm = None if population.left_main_mm is None else drawn_from(generator, population.left_main_mm)
+    draw = partial(_draw, generator, dominance, main_mm, stenosis_share, population)
+    return until_it_fits(draw, "left coronary artery")
 
 
-def _draw(generator: np.random.Generator, dominance: str, stenosis_share: float) -> tuple[VesselTree, dict[str, Any]]:
-    trunk = _trunk(generator, dominance)
+def _draw(
+    generator: np.random.Generator,
+    dominance: str,
+    main_mm: float | None,
+    stenosis_share: float,
+    population: Population,
+) -> tuple[VesselTree, dict[str, Any]]:
+    trunk = _trunk(generator, dominance, main_mm, population)
     calibre = _calibre(generator)
     lad = _lad(generator, trunk, calibre)
-    vessels, stenoses = [lad, _lcx(generator, trunk, lad, dominance, calibre)], []
-    plans = _plan_branches(generator, trunk, vessels, dominance, calibre)
-    vessels = _with_sections(trunk, vessels, plans)
+    flare = factor(generator, population.left_main_flare) - 1
+    if flare:
+        away = (shape.abscissa(trunk.lad) - shape.STEP_MM * trunk.fork) / _FLARE_MM
+        lad = replace(lad, radius=lad.radius * (1 + flare * np.exp(-(away**2))))
+    wide, widening = ectasia(generator, shape.abscissa(trunk.lad), population)
+    lad = replace(lad, radius=lad.radius * widening)
+    vessels, narrow = [lad, _lcx(generator, trunk, lad, dominance, calibre)], []
+    plans = varied(generator, _plan_branches(generator, trunk, vessels, dominance, calibre, population), population)
+    trunk = _bent(generator, trunk, vessels, plans, population)
+    heart = trunk.heart()
+    plans = [plan if plan.section == "septal" else replace(plan, depth=heart.solid_depth) for plan in plans]
+    vessels = [replace(vessels[0], points=trunk.lad), replace(vessels[1], points=trunk.lcx)]
+    vessels = _with_sections(trunk, vessels, plans, dominance)
+    lad = vessels[0]
     if generator.random() < stenosis_share:
         fork = trunk.fork / len(lad.points)
         which, shares = (0, (fork + 0.06, 0.65)) if generator.random() < 0.6 else (1, (0.15, 0.6))
-        stenosis, vessels = narrowed(generator, vessels, which, shares)
-        stenoses.append(stenosis)
-    vessels = with_side_branches(generator, vessels, plans)
+        narrow, vessels = narrowed(generator, vessels, which, shares, population.tandem_share)
+    vessels = with_side_branches(generator, vessels, plans, population.carina_mm)
     tree = build_tree(vessels, LCA_SECTIONS)
     along, bends = shape.abscissa(lad.points), shape.curvature(lad.points)
     drawn = {
@@ -177,7 +220,8 @@ def _draw(generator: np.random.Generator, dominance: str, stenosis_share: float)
         "tortuosity": shape.tortuosity(lad.points),
         "curvature_mean_per_mm": float(bends.mean()),
         "curvature_p90_per_mm": float(np.quantile(bends, 0.9)),
-        "stenoses": stenoses,
+        "stenoses": narrow,
+        "ectasias": wide,
     }
     return tree, drawn
 
@@ -189,11 +233,12 @@ def _templates() -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "m 3"]]:
     return shape.curve_through(heart_left.LAD, 1.0), shape.curve_through(lcx, 1.0)
 
 
-def _trunk(generator: np.random.Generator, dominance: str) -> _Trunk:
+def _trunk(generator: np.random.Generator, dominance: str, main_mm: float | None, population: Population) -> _Trunk:
     """Return the main vessels: the mean courses, sized, turned, moved with the left main's end, and wiggling."""
     size = float(np.exp(_SIZE_SD * np.clip(generator.normal(), -2.5, 2.5)))
     turn = Rotation.from_rotvec(np.deg2rad(generator.normal(0, _TURN_SD_DEG, 3)))
-    main_mm = truncated(generator, LEFT_MAIN_MM, LEFT_MAIN_SD_MM, 5.0, 22.0)
+    if main_mm is None:
+        main_mm = truncated(generator, LEFT_MAIN_MM, LEFT_MAIN_SD_MM, 5.0, 22.0)
     lad, lcx = ((template - template[0]) * size for template in _templates())
     end_of_main = main_mm * heart_left.FORK / np.linalg.norm(heart_left.FORK)
     bow = np.array([[0.0, 0.0, 0.0], 0.5 * end_of_main + main_mm * np.array([0.0, 0.06, 0.08])])
@@ -206,17 +251,39 @@ def _trunk(generator: np.random.Generator, dominance: str) -> _Trunk:
     lcx = wiggled(generator, shape.curve_through(lcx[::stride]), _WIGGLE_MM, quiet_mm=7.0)
     crux = int(np.argmin(np.linalg.norm(lcx - crux_at, axis=1)))
     lad, lcx = turn.apply(lad), turn.apply(lcx + lad[fork])
-    heart = heart_left.fit_left_heart(lad, lcx[: crux + 1], lcx[crux:])
+    if population.left_main_turns_deg is not None:
+        wide = 0.5 * LEFT_MAIN_DIAMETER_MM
+        lad, lcx = opened_fork(generator, lad, lcx, fork, wide, population.left_main_turns_deg)
     if dominance == "left":
         end_mm = shape.STEP_MM * crux + size * truncated(generator, 48.0, 10.0, 28.0, 68.0)
     else:
         end_mm = size * truncated(generator, *_ENDS[dominance])
     # The anterior descending artery ends before, at or beyond the apex.
     last = fork + round((len(lad) - 1 - fork) * generator.uniform(0.74, 1.0))
-    lad, lcx = lad[: last + 1], lcx[: round(end_mm / shape.STEP_MM) + 1]
-    if max(shape.curvature(lad).max(), shape.curvature(lcx).max()) > _SHARPEST_PER_MM:
+    trunk = _Trunk(lad, lcx, (last + 1, round(end_mm / shape.STEP_MM) + 1), fork, crux, size, turn)
+    if max(shape.curvature(trunk.lad).max(), shape.curvature(trunk.lcx).max()) > _SHARPEST_PER_MM:
         raise NoShape
-    return _Trunk(lad, lcx, fork, crux if dominance == "left" else None, size, turn, heart)
+    return trunk
+
+
+def _bent(
+    generator: np.random.Generator,
+    trunk: _Trunk,
+    vessels: Sequence[Vessel],
+    plans: Sequence[SidePlan],
+    population: Population,
+) -> _Trunk:
+    """Return the main vessels with a patient's bends beyond the left main's fork."""
+    if not population.bends_vessels:
+        return trunk
+    beyond = round(2.5 * float(vessels[0].radius[trunk.fork]) / shape.STEP_MM)
+    bent_lines = []
+    for index, (line, first) in enumerate(((trunk.whole_lad, trunk.fork + beyond), (trunk.whole_lcx, beyond))):
+        radius = vessels[index].radius
+        radius = np.concatenate([radius, np.full(max(len(line) - len(radius), 0), radius[-1])])[: len(line)]
+        forks = [fork for fork in forks_of(plans, index) if fork.index > first]
+        bent_lines.append(bent(generator, line, radius, population, forks=forks, first=first))
+    return replace(trunk, whole_lad=bent_lines[0], whole_lcx=bent_lines[1])
 
 
 def _calibre(generator: np.random.Generator) -> float:
@@ -247,15 +314,21 @@ def _lcx(generator: np.random.Generator, trunk: _Trunk, lad: Vessel, dominance: 
 
 
 def _plan_branches(
-    generator: np.random.Generator, trunk: _Trunk, vessels: list[Vessel], dominance: str, calibre: float
+    generator: np.random.Generator,
+    trunk: _Trunk,
+    vessels: list[Vessel],
+    dominance: str,
+    calibre: float,
+    population: Population,
 ) -> list[SidePlan]:
     """Draw which branches there are, where they leave, how long and how wide they are; named in their order."""
     plans: list[SidePlan] = []
+    presence = factor(generator, population.side_share)
     for parent, kinds in enumerate((_LAD_SIDES, _LCX_SIDES)):
         first = trunk.fork if parent == 0 else 0
         taken: list[int] = []
         for name, kind in kinds.items():
-            if generator.random() > kind.share or (name == "14 posterior" and dominance == "right"):
+            if generator.random() > kind.share * presence or (name == "14 posterior" and dominance == "right"):
                 continue
             mean, sd = (trunk.size * value for value in kind.origin_mm)
             origin = first + free_origin(generator, mean, sd, taken)
@@ -290,7 +363,6 @@ def _plan(
         diameter_mm=kind.diameter_mm * (0.6 + 0.4 * calibre) * (1 + 0.1 * float(generator.normal())),
         courses=tuple((begin, tuple(trunk.turn.apply(course))) for begin, course in kind.courses),
         angle_deg=(60.0, 90.0) if septal else (40.0, 70.0),
-        depth=None if septal else trunk.heart.solid_depth,
     )
 
 
@@ -298,15 +370,17 @@ def _origin(plan: SidePlan) -> int:
     return plan.origin
 
 
-def _with_sections(trunk: _Trunk, vessels: list[Vessel], plans: list[SidePlan]) -> list[Vessel]:
-    """Name the points of the two main vessels (SCCT): see `labels`."""
+def _with_sections(trunk: _Trunk, vessels: list[Vessel], plans: list[SidePlan], dominance: str) -> list[Vessel]:
+    """Name the points of the two main vessels (SCCT), without branches by the lengths of `labels_coronary`."""
     lad, lcx = vessels
     place = np.arange(len(lad.points))
     apex = int(np.argmax(np.linalg.norm(lad.points - lad.points[trunk.fork], axis=1)))
-    proximal = min(plan.origin for plan in plans if plan.parent == 0 and plan.origin > trunk.fork)
+    sides = [plan.origin for plan in plans if plan.parent == 0 and plan.origin > trunk.fork]
+    proximal = min(sides, default=trunk.fork + (apex - trunk.fork) // 3)
     ends = [place <= trunk.fork, place <= proximal, place <= (proximal + apex) / 2]
     names = np.select(ends, ["5", "6", "7"], default="8").tolist()
     marginals = [plan.origin for plan in plans if plan.parent == 1]
     place = np.arange(len(lcx.points))
-    ends = [place <= min(marginals), place <= (trunk.crux or len(place))]
+    crux = trunk.crux if dominance == "left" else len(place)
+    ends = [place <= min(marginals, default=len(place) // 2), place <= crux]
     return [replace(lad, section=names), replace(lcx, section=np.select(ends, ["11", "13"], default="15").tolist())]

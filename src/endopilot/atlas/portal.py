@@ -36,6 +36,8 @@ from endopilot.atlas.branching import (
     wiggled,
     with_side_branches,
 )
+from endopilot.atlas.population import Population
+from endopilot.atlas.variation import Fork, bent, varied
 from endopilot.types import VesselTree
 
 MAIN_MM, MAIN_SD_MM = 78.0, 9.0
@@ -64,22 +66,25 @@ _SHARPEST_PER_MM = 0.15
 """Greatest curvature of the widest line, 1/mm: its wall must not fold."""
 
 
-def make_portal(generator: np.random.Generator, stenosis_share: float) -> tuple[VesselTree, dict[str, Any]]:
+def make_portal(
+    generator: np.random.Generator, stenosis_share: float, population: Population
+) -> tuple[VesselTree, dict[str, Any]]:
     """Return one portal vein and what was drawn for it.
 
     Args:
         generator: random stream of this patient.
         stenosis_share: probability of a stenosis, in the main, right or left portal vein.
+        population: how patients vary.
     """
     shares = np.array(list(VARIANT_SHARES.values()))
     variant = str(generator.choice(list(VARIANT_SHARES), p=shares / shares.sum()))
     length = truncated(generator, MAIN_MM, MAIN_SD_MM, 60.0, 96.0)
-    draw = partial(_draw, generator, variant, length, stenosis_share)
+    draw = partial(_draw, generator, variant, length, stenosis_share, population)
     return until_it_fits(draw, "portal vein")
 
 
 def _draw(
-    generator: np.random.Generator, variant: str, main_mm: float, stenosis_share: float
+    generator: np.random.Generator, variant: str, main_mm: float, stenosis_share: float, population: Population
 ) -> tuple[VesselTree, dict[str, Any]]:
     size = truncated(generator, 1.0, 0.1, 0.8, 1.2)
     points, hilum = _main(generator, main_mm, size)
@@ -94,21 +99,23 @@ def _draw(
     calibre = diameter / MAIN_DIAMETER_MM
     radius = 0.5 * calibre * _profile(len(points), left, posterior, anterior)
     radius = radius * uneven(generator, shape.abscissa(points))
+    origins = {"LPV": left, "RPPV": posterior, "S5": anterior}
+    forks = [Fork(origin, _SIDES[name][0][1]) for name, origin in origins.items()]
+    points = bent(generator, points, radius, population, forks=forks)
     place = np.arange(len(points))
     ends = [place <= left, place <= posterior, place <= anterior]
     vessels = [Vessel(points, radius, np.select(ends, ["MPV", "RPV", "RAPV"], default="S8").tolist())]
-    vessels = _grown(generator, vessels, {"LPV": left, "RPPV": posterior, "S5": anterior}, size, calibre)
-    stenoses = []
+    vessels = _grown(generator, vessels, origins, size, calibre, population)
+    narrow = []
     if generator.random() < stenosis_share:
         share = hilum / len(points)
         which, shares = (0, (0.3 * share, 0.8 * share)) if generator.random() < 0.6 else (1, (0.3, 0.5))
-        stenosis, vessels = narrowed(generator, vessels, which, shares)
-        stenoses.append(stenosis)
+        narrow, vessels = narrowed(generator, vessels, which, shares, population.tandem_share)
     drawn = {
         "variant": variant,
         "main_length_mm": float(shape.abscissa(points)[min(left, posterior)]),
         "main_diameter_mm": diameter,
-        "stenoses": stenoses,
+        "stenoses": narrow,
     }
     return build_tree(vessels, PORTAL_SECTIONS), drawn
 
@@ -136,7 +143,12 @@ def _profile(count: int, left: int, posterior: int, anterior: int) -> Float[np.n
 
 
 def _grown(
-    generator: np.random.Generator, vessels: list[Vessel], origins: dict[str, int], size: float, calibre: float
+    generator: np.random.Generator,
+    vessels: list[Vessel],
+    origins: dict[str, int],
+    size: float,
+    calibre: float,
+    population: Population,
 ) -> list[Vessel]:
     """Return the vessels with left and right posterior branch, then their segments' veins, then those of segment 5."""
 
@@ -158,7 +170,7 @@ def _grown(
         plan("RPPV", 0, origins["RPPV"], 62.0, 7.5, 0.5),
         plan("S5", 0, origins["S5"], _LENGTH_MM["S5"], _SEGMENT_DIAMETER_MM, 0.4),
     ]
-    vessels = with_side_branches(generator, vessels, large)
+    vessels = with_side_branches(generator, vessels, varied(generator, large, population), population.carina_mm)
     turn = round(size * transverse / shape.STEP_MM)
     low = round(size * float(generator.uniform(22.0, 28.0)) / shape.STEP_MM)
     places = {
@@ -171,7 +183,7 @@ def _grown(
         plan(name, parent, place, _LENGTH_MM[name], _SEGMENT_DIAMETER_MM, 0.4)
         for name, (parent, place) in places.items()
     ]
-    vessels = with_side_branches(generator, vessels, plans)
+    vessels = with_side_branches(generator, vessels, varied(generator, plans, population), population.carina_mm)
     posterior = vessels[2]
     names = np.where(np.arange(len(posterior.points)) <= low, "RPPV", "S7").tolist()
     vessels[2] = replace(posterior, section=names)

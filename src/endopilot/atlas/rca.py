@@ -8,7 +8,7 @@ the artery and the origins of branches, measured on sixteen manually segmented r
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -26,13 +26,15 @@ from endopilot.atlas.branching import (
     Vessel,
     build_tree,
     free_origin,
-    stenosis,
+    stenoses,
     truncated,
     uneven,
     until_it_fits,
     with_side_branches,
 )
-from endopilot.atlas.heart_reference import BEYOND_CRUX, TO_CRUX, HeartFit, fit_heart
+from endopilot.atlas.heart_reference import BEYOND_CRUX, TO_CRUX, fit_heart
+from endopilot.atlas.population import Population
+from endopilot.atlas.variation import bent, ectasia, factor, forks_of, varied
 from endopilot.types import VesselTree
 
 LENGTH_MM, LENGTH_SD_MM, LENGTH_RANGE_MM = 164.0, 30.0, (112.0, 223.0)
@@ -98,7 +100,9 @@ class _Targets:
     ends_in: str
 
 
-def make_rca(generator: np.random.Generator, stenosis_share: float) -> tuple[VesselTree, dict[str, Any]]:
+def make_rca(
+    generator: np.random.Generator, stenosis_share: float, population: Population
+) -> tuple[VesselTree, dict[str, Any]]:
     """Return one right coronary tree and what was drawn for it.
 
     Targets are kept when a shape fails, so that failures do not bias the statistics.
@@ -106,11 +110,13 @@ def make_rca(generator: np.random.Generator, stenosis_share: float) -> tuple[Ves
     Args:
         generator: random stream of this patient.
         stenosis_share: probability of a stenosis.
+        population: how patients vary.
     """
     for _ in range(10):
         targets = _targets(generator)
+        draw = partial(_draw, generator, targets, stenosis_share, population)
         with suppress(NoShape):
-            return until_it_fits(partial(_draw, generator, targets, stenosis_share), "right coronary artery")
+            return until_it_fits(draw, "right coronary artery")
     raise RuntimeError("no right coronary artery found in 600 draws")
 
 
@@ -133,18 +139,22 @@ def _targets(generator: np.random.Generator) -> _Targets:
 
 
 def _draw(
-    generator: np.random.Generator, targets: _Targets, stenosis_share: float
+    generator: np.random.Generator, targets: _Targets, stenosis_share: float, population: Population
 ) -> tuple[VesselTree, dict[str, Any]]:
     main, crux = _main_vessel(generator, targets)
     healthy, calibre = _main_radius(generator, targets.dominance, main)
-    radius, narrowed = healthy, None
+    radius, narrow = healthy, []
     if generator.random() < stenosis_share:
-        narrowed, narrowing = stenosis(generator, shape.abscissa(main), (0.12, 0.75))
+        narrow, narrowing = stenoses(generator, shape.abscissa(main), (0.12, 0.75), population.tandem_share)
         radius = healthy * narrowing
+    wide, widening = ectasia(generator, shape.abscissa(main), population)
+    radius = radius * widening
+    plans = varied(generator, _plan_branches(generator, healthy, crux, targets, calibre, population), population)
+    main = bent(generator, main, radius, population, forks=forks_of(plans, 0))
     heart = fit_heart(main, 0.5 * crux, targets.ends_in)
-    plans = _plan_branches(generator, heart, healthy, crux, targets, calibre)
+    plans = [replace(plan, depth=heart.solid_depth) for plan in plans]
     vessels = [Vessel(main, radius, _main_sections(main, crux, targets.ends_in))]
-    tree = build_tree(with_side_branches(generator, vessels, plans), RCA_SECTIONS)
+    tree = build_tree(with_side_branches(generator, vessels, plans, population.carina_mm), RCA_SECTIONS)
     bends = shape.curvature(main)
     drawn = {
         "dominance": targets.dominance,
@@ -152,7 +162,8 @@ def _draw(
         "tortuosity": shape.tortuosity(main),
         "curvature_mean_per_mm": float(bends.mean()),
         "curvature_p90_per_mm": float(np.quantile(bends, 0.9)),
-        "stenoses": [] if narrowed is None else [narrowed],
+        "stenoses": narrow,
+        "ectasias": wide,
     }
     return tree, drawn
 
@@ -230,40 +241,32 @@ def _main_sections(main: Float[np.ndarray, "n 3"], crux: int, ends_in: str) -> l
 
 def _plan_branches(
     generator: np.random.Generator,
-    heart: HeartFit,
     radius: Float[np.ndarray, "n"],
     crux: int,
     targets: _Targets,
     calibre: float,
+    population: Population,
 ) -> list[SidePlan]:
     """Draw which branches there are, where they leave, how long and how wide they are."""
     plans: list[SidePlan] = []
     end_mm = (len(radius) - 1) * shape.STEP_MM
+    presence = factor(generator, population.side_share)
     for section, kind in _SIDES.items():
-        if generator.random() > kind.share:
+        if generator.random() > kind.share * presence:
             continue
         origin = free_origin(generator, *kind.origin_mm, [plan.origin for plan in plans])
         length = truncated(generator, *kind.length_mm, 0.5 * kind.length_mm[0], 1.5 * kind.length_mm[0])
         # The main vessel's tip stays the farthest.
         length = min(length, 0.95 * end_mm - origin * shape.STEP_MM)
         diameter = kind.diameter_mm * (0.6 + 0.4 * calibre) * (1 + 0.1 * float(generator.normal()))
-        plans.append(_plan(section, origin, length, diameter, kind.courses, heart))
-    if targets.dominance == "right":
+        plans.append(_plan(section, origin, length, diameter, kind.courses))
+    if targets.dominance == "right" and (presence >= 1 or generator.random() < 0.3 + presence):
         other = "16" if targets.ends_in == "4" else "4"
         length = max((end_mm - crux * shape.STEP_MM) * float(generator.uniform(0.6, 0.92)), 12.0)
         diameter = 2 * float(radius[crux]) * float(generator.uniform(0.68, 0.8))
-        plans.append(_plan(other, crux, length, diameter, _DISTAL_COURSES[other], heart))
+        plans.append(_plan(other, crux, length, diameter, _DISTAL_COURSES[other]))
     return plans
 
 
-def _plan(
-    section: str, origin: int, length_mm: float, diameter_mm: float, courses: Courses, heart: HeartFit
-) -> SidePlan:
-    return SidePlan(
-        section=section,
-        origin=origin,
-        length_mm=length_mm,
-        diameter_mm=diameter_mm,
-        courses=courses,
-        depth=heart.solid_depth,
-    )
+def _plan(section: str, origin: int, length_mm: float, diameter_mm: float, courses: Courses) -> SidePlan:
+    return SidePlan(section=section, origin=origin, length_mm=length_mm, diameter_mm=diameter_mm, courses=courses)

@@ -181,7 +181,7 @@ def _projection_speed() -> dict[str, tuple[float, float | None]]:
     """Return how many points a second are projected, the best of five, and the size of an atlas patient's map."""
     from endopilot.atlas.atlas import AtlasConfig, make_patient
 
-    patient = make_patient(AtlasConfig(seed=0), 0)
+    patient = make_patient(AtlasConfig(seed=0, population="textbook"), 0)
     centre, size = sampled(patient.tree)
     random = np.random.default_rng(0)
     chosen = random.integers(0, len(centre), PROJECTED)

@@ -24,7 +24,7 @@ def main(folder: str, work: dict) -> None:
     assert Path(folder).resolve() in Path(endopilot.__file__).resolve().parents, "another endopilot comes first"
     scenes = []
     for place, kind in enumerate(work["kinds"]):
-        anatomy = make_patient(AtlasConfig(anatomy=kind, seed=work["seed"]), 0)
+        anatomy = make_patient(AtlasConfig(anatomy=kind, seed=work["seed"], population="textbook"), 0)
         initial, control = random_controls(
             ControlConfig(),
             n_sequences=work["worlds"],

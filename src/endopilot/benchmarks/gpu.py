@@ -52,7 +52,7 @@ def bench_gpu(
         InputError: there is no GPU, or no build of the core for it.
     """
     core_for("cuda")  # refuses at once where there is none
-    anatomy, device = make_patient(AtlasConfig(), 0), read_device(DEVICE)
+    anatomy, device = make_patient(AtlasConfig(population="textbook"), 0), read_device(DEVICE)
     longest = float(anatomy.tree.longest_path().abscissa[-1])
     initial, control = random_controls(
         ControlConfig(), n_sequences=min(DRAWN, max(worlds)), n_samples=samples, seed=0, max_inserted_length_mm=longest

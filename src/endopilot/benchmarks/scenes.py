@@ -59,7 +59,7 @@ def make_scenes(worlds: int = WORLDS, samples: int = SAMPLES) -> list[Scene]:
     """
     scenes = []
     for place, (name, kind) in enumerate(KINDS.items()):
-        anatomy = make_patient(AtlasConfig(anatomy=kind, seed=SEED), 0)
+        anatomy = make_patient(AtlasConfig(anatomy=kind, seed=SEED, population="textbook"), 0)
         initial, control = random_controls(
             ControlConfig(),
             n_sequences=worlds,

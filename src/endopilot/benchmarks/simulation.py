@@ -149,7 +149,7 @@ def bench_scaling() -> list[dict[str, Any]]:
         Rows of `element_mm`, `worlds`, `seconds` (processor time of the core), `us_per_node_and_iteration` (of the
         nodes ahead of the catheter) and `kilobytes_per_world` (growth of the process's memory; the map is shared).
     """
-    anatomy, device = make_patient(AtlasConfig(), 0), read_device(DEVICE)
+    anatomy, device = make_patient(AtlasConfig(population="textbook"), 0), read_device(DEVICE)
     depth = 0.6 * float(anatomy.tree.longest_path().abscissa[-1])
     rows = []
     for element_mm, worlds in (

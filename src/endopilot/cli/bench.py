@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
+from endopilot.atlas.atlas import AtlasConfig
 from endopilot.benchmarks.robustness import RobustnessConfig
 from endopilot.cli.arguments import OutputFolder, existing, show, show_rows
 from endopilot.simulation.config import Preset
@@ -140,18 +141,48 @@ def labels(*, count: int = 40, seed: int = 0, json: bool = False) -> None:
     _leave(all(row["passed"] for row in rows))
 
 
-def anatomy(*, centerlines: Path | None = None, json: bool = False) -> None:
-    """Extract lumens whose centerlines are known, and print each error beside its bar.
+def anatomy(
+    *,
+    centerlines: Path | None = None,
+    compare: tuple[Path, ...] = (),
+    atlas: AtlasConfig = AtlasConfig(count=40),
+    json: bool = False,
+) -> None:
+    """Extract lumens whose centerlines are known, and print each error beside its bar; or compare with the atlas.
+
+    With --compare it measures bends, forks, calibre and ostium of given anatomies beside the atlas instead: median and
+    5th to 95th percentile, and the distance of the two distributions in standard deviations (Wasserstein-1).
 
     Args:
         centerlines: folder with VMTK's rca_cl.vtp and lca_cl.vtp of a real patient; left out if not given.
+        compare: anatomies, or folders of anatomies, to compare with the atlas.
+        atlas: the patients to compare with; their kind is that of the given anatomies.
         json: print the figures as JSON.
     """
+    if compare:
+        from endopilot.benchmarks.anatomy_compare import compare_with_atlas
+
+        rows = compare_with_atlas([existing(folder) for folder in compare], atlas)
+        show_rows(rows if json else [_compared(row) for row in rows], as_json=json)
+        return
     from endopilot.benchmarks.anatomy import bench_anatomy
 
     rows = bench_anatomy(None if centerlines is None else existing(centerlines))
     show_rows(rows, as_json=json)
     _leave(all(row["passed"] is not False for row in rows))
+
+
+def _compared(row: dict[str, Any]) -> dict[str, Any]:
+    def spread(name: str) -> str:
+        middle, low, high = (row[key] for key in (name, f"{name}_p5", f"{name}_p95"))
+        return "-" if middle is None else f"{middle:g} [{low:g} to {high:g}], {row[f'{name}_count']}"
+
+    titles = {"given": "given: median [5-95 %], values", "atlas": "atlas: median [5-95 %], values"}
+    return (
+        {"kind": row["kind"], "quantity": row["quantity"]}
+        | {title: spread(name) for name, title in titles.items()}
+        | {"distance": row["distance"]}
+    )
 
 
 def imaging(*, cases: int = 50, seed: int = 0, folder: Path = Path("runs/bench-imaging"), json: bool = False) -> None:

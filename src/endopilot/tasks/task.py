@@ -89,7 +89,9 @@ class Task:
         """Return the anatomy of one of the task's patients, by its place in the list."""
         if not 0 <= place < len(patients.numbers):
             raise InputError(f"patient: {place}; task {self.name} has patients 0 to {len(patients.numbers) - 1}")
-        config = AtlasConfig(anatomy=self.anatomy, seed=patients.seed, stenosis_share=self.stenosis_share)
+        config = AtlasConfig(
+            anatomy=self.anatomy, seed=patients.seed, stenosis_share=self.stenosis_share, population="textbook"
+        )
         return make_patient(config, patients.numbers[place])
 
     def ladder_navigation(self, place: int) -> Navigation:
@@ -186,7 +188,7 @@ def training_navigations(name: str, first: int, count: int) -> list[Navigation]:
 @lru_cache(maxsize=1)
 def reference_navigation() -> Navigation:
     """Return `endopilot/Navigate-v0`'s navigation: into the posterior descending artery of the reference anatomy."""
-    anatomy = make_patient(AtlasConfig(), 0)
+    anatomy = make_patient(AtlasConfig(population="textbook"), 0)
     return Navigation(
         anatomy=anatomy,
         device=read_device("workhorse-014"),

@@ -85,7 +85,7 @@ def navigation_error() -> Float[np.ndarray, "steps"]:
 
     The coronary wire goes through a synthetic right coronary artery for 10 s, pushed, pulled and turned at random.
     """
-    anatomy, device = make_patient(AtlasConfig(), 0), read_device("workhorse-014")
+    anatomy, device = make_patient(AtlasConfig(population="textbook"), 0), read_device("workhorse-014")
     longest = float(anatomy.tree.longest_path().abscissa[-1])
     initial, control = random_controls(
         ControlConfig(),

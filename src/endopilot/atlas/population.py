@@ -1,0 +1,143 @@
+"""How the patients of an atlas differ from each other: the textbook's mean courses, or those and what patients show.
+
+`textbook` patients follow published mean courses with smooth wiggles. `patients` have, on top of these, what was
+measured on 19 patients' coronary CT angiograms (docs/atlas.md) and what is published for the other vessels: sharp bends
+up to the tightest a lumen can make (curvature times radius 1), parents that give way at forks, side branches of any
+angle and calibre, missing branches, lumens that are not round, and catheters that meet the vessel at an angle.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+PopulationName = Literal["patients", "textbook"]
+
+Spread = tuple[float, float, float, float]
+"""Median, SD of the logarithm, smallest and largest value of a log-normal distribution."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Population:
+    """How one kind of vessel tree varies. The defaults add nothing to the textbook's courses, and draw nothing.
+
+    Attributes:
+        waves_deg: range of the amplitude by which the main vessels' direction varies, degrees.
+        waves_mm: shortest and longest wavelength of these variations, mm.
+        bends_per_100_mm: mean number of sharp bends in 100 mm of a main vessel; a patient's own number is drawn from
+            an exponential distribution, so that a few patients have many, up to 2.5 times the mean.
+        bend_deg: range of the angle to which a sharp bend turns the vessel to either side, degrees.
+        bend_tightness: range of curvature times lumen radius in a sharp bend.
+        deflection_deg: angle by which a main vessel gives way where a branch leaves, degrees.
+        side_angle_deg: mean, SD, smallest and largest angle at which side branches leave, degrees; none for the
+            ranges of their kinds.
+        side_calibre: range of the factor on side branches' diameters.
+        side_share: range of a patient's factor on the probability that each side branch is there.
+        carina_mm: beyond a fork, lumens may stay in contact over this length, mm, and twice their radii.
+        flattening: range of what a lumen's section is longer than wide, as a share of its width.
+        ectasia_share: share of patients with a widening of a main vessel.
+        tandem_share: share of the patients with a stenosis that have a second one in the same vessel.
+        catheter_deg: angle between the catheter and the vessel 10 mm beyond the ostium, degrees; none for a catheter
+            that lies along the vessel's first direction.
+        left_main_flare: range of the factor by which the left main artery widens at its fork.
+        left_main_mm: length of the left main artery, mm; none for the textbook's.
+        left_main_turns_deg: angles by which LAD and circumflex turn away from the left main artery, degrees; none for
+            those of the mean courses.
+        trunks_angle_deg: mean, SD, smallest and largest angle between the two trunks of M2, degrees; none for the
+            ranges of their kind.
+    """
+
+    waves_deg: tuple[float, float] = (0.0, 0.0)
+    waves_mm: tuple[float, float] = (9.0, 30.0)
+    bends_per_100_mm: float = 0.0
+    bend_deg: tuple[float, float] = (25.0, 75.0)
+    bend_tightness: tuple[float, float] = (0.35, 1.0)
+    deflection_deg: Spread | None = None
+    side_angle_deg: Spread | None = None
+    side_calibre: tuple[float, float] = (1.0, 1.0)
+    side_share: tuple[float, float] = (1.0, 1.0)
+    carina_mm: float = 4.0
+    flattening: tuple[float, float] = (0.0, 0.0)
+    ectasia_share: float = 0.0
+    tandem_share: float = 0.0
+    catheter_deg: Spread | None = None
+    left_main_flare: tuple[float, float] = (1.0, 1.0)
+    left_main_mm: Spread | None = None
+    left_main_turns_deg: tuple[Spread, Spread] | None = None
+    trunks_angle_deg: Spread | None = None
+
+    @property
+    def bends_vessels(self) -> bool:
+        """Whether main vessels are bent at all beyond the textbook's courses."""
+        return self.waves_deg[1] > 0
+
+
+_TEXTBOOK = Population()
+_PATIENTS = {
+    "rca": Population(
+        waves_deg=(3.0, 9.0),
+        waves_mm=(12.0, 40.0),
+        bends_per_100_mm=1.3,
+        deflection_deg=(14.0, 0.8, 2.0, 60.0),
+        side_angle_deg=(56.0, 0.45, 20.0, 110.0),
+        side_calibre=(0.9, 1.7),
+        side_share=(0.1, 1.15),
+        carina_mm=14.0,
+        flattening=(0.04, 0.22),
+        ectasia_share=0.03,
+        tandem_share=0.25,
+        catheter_deg=(34.0, 0.55, 10.0, 70.0),
+    ),
+    "lca": Population(
+        waves_deg=(1.0, 6.0),
+        waves_mm=(12.0, 40.0),
+        bends_per_100_mm=0.9,
+        deflection_deg=(20.0, 0.65, 4.0, 60.0),
+        side_angle_deg=(55.0, 0.5, 20.0, 110.0),
+        side_calibre=(0.9, 1.4),
+        side_share=(0.05, 0.9),
+        carina_mm=14.0,
+        flattening=(0.04, 0.22),
+        ectasia_share=0.03,
+        tandem_share=0.25,
+        catheter_deg=(28.0, 0.42, 13.0, 53.0),
+        left_main_flare=(1.0, 1.35),
+        left_main_mm=(5.0, 0.95, 1.0, 20.0),
+        left_main_turns_deg=((26.0, 0.7, 5.0, 65.0), (51.0, 0.25, 30.0, 72.0)),
+    ),
+    "cerebral": Population(
+        waves_deg=(2.0, 8.0),
+        bends_per_100_mm=0.25,
+        deflection_deg=(14.0, 0.6, 2.0, 45.0),
+        side_calibre=(0.85, 1.15),
+        side_share=(0.5, 1.1),
+        carina_mm=8.0,
+        flattening=(0.04, 0.3),
+        tandem_share=0.15,
+        catheter_deg=(12.0, 0.5, 3.0, 30.0),
+        trunks_angle_deg=(97.0, 19.0, 55.0, 140.0),
+    ),
+    "arch": Population(
+        waves_deg=(1.0, 5.0),
+        waves_mm=(40.0, 120.0),
+        side_calibre=(0.85, 1.2),
+        carina_mm=8.0,
+        flattening=(0.04, 0.25),
+        ectasia_share=0.02,
+        catheter_deg=(8.0, 0.5, 2.0, 20.0),
+    ),
+    "portal": Population(
+        waves_deg=(2.0, 6.0),
+        waves_mm=(25.0, 70.0),
+        deflection_deg=(12.0, 0.5, 2.0, 35.0),
+        side_calibre=(0.8, 1.25),
+        carina_mm=10.0,
+        flattening=(0.06, 0.4),
+        catheter_deg=(12.0, 0.5, 3.0, 35.0),
+    ),
+}
+
+
+def population_of(anatomy: str, name: PopulationName) -> Population:
+    """Return how a kind of vessel tree varies in a population."""
+    return _PATIENTS[anatomy] if name == "patients" else _TEXTBOOK

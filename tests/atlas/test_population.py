@@ -1,0 +1,229 @@
+"""The atlas' patients against what was measured in real ones (docs/atlas.md), and what bends, forks and sections do."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+
+import numpy as np
+import pytest
+
+from endopilot.anatomy.distance import sample
+from endopilot.atlas import curves as shape
+from endopilot.atlas.atlas import ANATOMIES, AtlasConfig, make_patient, make_patient_tree
+from endopilot.atlas.branching import SidePlan, Vessel, lumens_collide, stenoses, with_side_branches
+from endopilot.atlas.population import Population, population_of
+from endopilot.atlas.variation import TIGHTEST, Fork, bent, catheter_direction, drawn_from, opened_fork
+from endopilot.benchmarks.vessel_shape import vessel_shape
+
+COUNT = 32
+REAL = {
+    "rca": {
+        "curvature p95, 1/mm": (0.17, 0.10, 0.25),
+        "curvature peaks > 0.2 in 100 mm": (0.9, 0.0, 4.3),
+        "largest κ·r": (0.52, 0.31, 1.00),
+        "total turn, °": (739, 373, 1050),
+        "tortuosity in 20 mm, p95": (1.30, 1.14, 1.54),
+        "side-branch angle, °": (52, 22, 97),
+        "parent's deflection at branches, °": (19, 5, 53),
+        "catheter against vessel at 10 mm, °": (34, 11, 71),
+        "branches > 10 mm": (4, 1, 5),
+    },
+    "lca": {
+        "curvature p95, 1/mm": (0.12, 0.09, 0.28),
+        "largest κ·r": (0.39, 0.29, 0.62),
+        "tortuosity in 20 mm, p95": (1.10, 1.05, 1.36),
+        "side-branch angle, °": (44, 20, 84),
+        "parent's deflection at branches, °": (23, 7, 48),
+        "catheter against vessel at 10 mm, °": (28, 13, 53),
+        "branches > 10 mm": (5, 3, 8),
+        "LM→LCx turn, °": (48, 31, 65),
+        "LM→LAD turn, °": (26, 9, 62),
+        "LAD–LCx angle, °": (76, 51, 98),
+        "left main's length, mm": (4.9, 1.0, 15.0),
+    },
+}
+"""Median, 5th and 95th percentile in 14 right and 16 left coronary arteries of 19 patients."""
+
+
+@pytest.fixture(scope="module")
+def measured():
+    found = {}
+    for kind in REAL:
+        values = defaultdict(list)
+        for index in range(COUNT):
+            for name, own in vessel_shape(make_patient(AtlasConfig(anatomy=kind, seed=0), index)).items():
+                values[name] += own
+        found[kind] = values
+    return found
+
+
+@pytest.mark.parametrize(("kind", "quantity"), [(kind, name) for kind, rows in REAL.items() for name in rows])
+def test_patients_resemble_real_ones(measured, kind, quantity):
+    # The median lies within 0.3 of the real 90 % interval from the real median, that interval holds 60 % of the atlas'
+    # values or more, and the atlas' own 90 % interval is 0.4 to 2 times as wide.
+    median, low, high = REAL[kind][quantity]
+    values = np.array(measured[kind][quantity])
+    assert abs(np.median(values) - median) <= 0.3 * (high - low)
+    assert np.mean((values >= low) & (values <= high)) >= 0.6
+    spread = float(np.diff(np.quantile(values, (0.05, 0.95)))[0])
+    assert 0.4 <= spread / (high - low) <= 2.0
+
+
+def test_bends_reach_the_tightest_that_a_lumen_can_make(measured):
+    assert max(measured["rca"]["largest κ·r"]) > 0.8
+    assert min(measured["rca"]["largest κ·r"]) < 0.4
+
+
+def test_sections_are_as_far_from_round_as_real_ones(measured):
+    # Real sections deviate by 0.042 and 0.038, 0.019 of it by voxels.
+    for kind in REAL:
+        assert 0.028 <= np.median(measured[kind]["non-circularity"]) <= 0.048
+
+
+@pytest.mark.parametrize("kind", ANATOMIES)
+def test_lumens_are_valid_and_trees_connected(kind):
+    for index in range(4):
+        tree, drawn = make_patient_tree(AtlasConfig(anatomy=kind, seed=5), index)
+        assert drawn["redrawn"] < 60
+        for branch in tree.branches[1:]:
+            parent = tree.branches[branch.parent].centerline
+            np.testing.assert_allclose(branch.centerline.points[0], parent.points[-1], atol=1e-9)
+            assert branch.centerline.abscissa[0] == parent.abscissa[-1]
+        for branch in tree.branches:
+            steps = np.linalg.norm(np.diff(branch.centerline.points, axis=0), axis=1)
+            assert np.all(np.abs(steps - shape.STEP_MM) < 0.05)
+
+
+@pytest.mark.parametrize("kind", ANATOMIES)
+def test_the_two_populations_differ_and_each_is_the_same_every_time(kind):
+    one, other = (
+        [make_patient(AtlasConfig(anatomy=kind, seed=3, population=name), 1) for _ in range(2)]
+        for name in ("patients", "textbook")
+    )
+    assert one[0].identity == one[1].identity != other[0].identity == other[1].identity
+    assert one[0].provenance["population"] == "patients"
+
+
+def line_and_radius(length_mm=80.0, radius=1.8):
+    along = np.arange(0.0, length_mm + 0.25, shape.STEP_MM)
+    return np.stack([along, np.zeros(len(along)), np.zeros(len(along))], axis=1), np.full(len(along), radius)
+
+
+def test_bends_keep_lengths_and_never_fold_the_wall():
+    points, radius = line_and_radius()
+    population = Population(waves_deg=(4.0, 9.0), bends_per_100_mm=6.0, bend_tightness=(0.5, 1.0))
+    sharpest = []
+    for seed in range(30):
+        moved = bent(np.random.default_rng(seed), points, radius, population, first=20)
+        np.testing.assert_allclose(np.linalg.norm(np.diff(moved, axis=0), axis=1), shape.STEP_MM, atol=1e-9)
+        np.testing.assert_array_equal(moved[:21], points[:21])
+        sharpest.append(float((shape.curvature(moved) * radius)[1:-1].max()))
+    assert max(sharpest) < TIGHTEST and max(sharpest) > 0.7
+
+
+def test_the_textbook_bends_nothing_and_draws_nothing():
+    points, radius = line_and_radius()
+    generator = np.random.default_rng(0)
+    assert bent(generator, points, radius, Population()) is points
+    tree, _ = make_patient_tree(AtlasConfig(population="textbook"), 0)
+    direction, drawn = catheter_direction(generator, tree, population_of("rca", "textbook"), 0.9, 30.0)
+    np.testing.assert_array_equal(direction, shape.tangents(tree.branches[0].centerline.points)[0])
+    assert drawn == {} and generator.random() == np.random.default_rng(0).random()
+
+
+@pytest.mark.parametrize("angle", [15.0, 50.0])
+def test_a_vessel_gives_way_to_the_side_opposite_to_its_branch(angle):
+    points, radius = line_and_radius()
+    population = Population(waves_deg=(1e-6, 1e-6), deflection_deg=(10.0, 0.5, 5.0, 20.0))
+    found = []
+    for seed in range(20):
+        fork = Fork(60, (0.5, 0.8, 0.0), angle)
+        moved = bent(np.random.default_rng(seed), points, radius, population, forks=[fork])
+        behind = moved[65] - moved[60]
+        found.append(behind / np.linalg.norm(behind))
+    mean = np.mean(found, axis=0)
+    assert mean[1] < -0.5 * np.sin(np.deg2rad(angle)) and abs(mean[2]) < 0.5 * abs(mean[1])
+    # Over 2.5 mm most of the turn is made, and far behind the vessel has its direction again.
+    turns = np.rad2deg(np.arccos(np.clip(np.array(found)[:, 0], -1, 1)))
+    assert np.all(turns > 0.5 * angle) and np.all(turns < angle)
+
+
+def test_an_opened_fork_has_the_drawn_angles():
+    points, _ = line_and_radius()
+    other = points[20] + np.stack([np.zeros(60), -0.5 * np.arange(60), np.zeros(60)], axis=1)
+    exact = ((30.0, 1e-6, 29.0, 31.0), (55.0, 1e-6, 54.0, 56.0))
+    own, out = opened_fork(np.random.default_rng(0), points, other, 20, 2.0, exact)
+    np.testing.assert_allclose(out[0], own[20], atol=1e-9)
+    for line, at, angle in ((own, 20, 30.0), (out, 0, 55.0)):
+        chord = line[at + 8] - line[at]
+        arriving = own[20] - own[12]
+        cosine = chord @ arriving / np.linalg.norm(chord) / np.linalg.norm(arriving)
+        assert np.rad2deg(np.arccos(cosine)) == pytest.approx(angle, abs=2.0)
+
+
+def test_draws_follow_their_distribution():
+    generator = np.random.default_rng(0)
+    values = [drawn_from(generator, (20.0, 0.5, 8.0, 60.0)) for _ in range(2000)]
+    assert min(values) >= 8.0 and max(values) <= 60.0
+    assert np.median(values) == pytest.approx(20.0, rel=0.05)
+    # 5 % of a log-normal distribution lie above median · exp(1.645·σ) = 45.5; the cuts take 3 and 1 % off.
+    assert np.mean(np.array(values) > 45.5) == pytest.approx(0.043, abs=0.015)
+
+
+def test_catheters_keep_clear_of_the_vessels_and_meet_them_at_the_drawn_angle():
+    for index in range(6):
+        anatomy = make_patient(AtlasConfig(seed=21), index)
+        path, direction = anatomy.tree.longest_path(), anatomy.insertion.direction
+        at = int(np.searchsorted(path.abscissa, 10.0))
+        there = path.points[at + 1] - path.points[at - 1]
+        angle = np.rad2deg(np.arccos(np.clip(direction @ there / np.linalg.norm(there), -1, 1)))
+        assert angle == pytest.approx(anatomy.provenance["catheter_angle_deg"], abs=0.1)
+        tube = anatomy.insertion.position - np.outer(np.arange(4.0, 29.0), direction)
+        # Where the tube met another lumen, the map would be deeper than the tube is wide.
+        assert sample(anatomy.distance_map, tube).max() < anatomy.catheter_radius_mm + 0.1
+
+
+def test_inscribed_spheres_stay_inscribed_in_sections_that_are_not_round():
+    anatomy = make_patient(AtlasConfig(seed=9, stenosis_share=0.0), 2)
+    path = anatomy.tree.longest_path()
+    depth = sample(anatomy.distance_map, path.points)
+    # Linear interpolation on the grid rounds off the ridge on the axis.
+    assert 0 < np.median(path.radius - depth) < 0.75 * anatomy.distance_map.spacing_mm
+    across = np.cross(path.normals, np.gradient(path.points, axis=0))
+    across = across / np.linalg.norm(across, axis=1, keepdims=True)
+    rings = [
+        sample(
+            anatomy.distance_map, path.points + path.radius[:, None] * (np.cos(t) * path.normals + np.sin(t) * across)
+        )
+        for t in np.linspace(0, np.pi, 12, endpoint=False)
+    ]
+    # On the circle of the inscribed sphere the wall is touched at two opposite places and lies farther out elsewhere.
+    assert np.median(np.min(rings, axis=0)) == pytest.approx(0.0, abs=0.06)
+    assert np.median(np.max(rings, axis=0)) > 0.1
+
+
+def test_tandem_stenoses_lie_apart():
+    along = np.arange(0.0, 150.0, 0.5)
+    both = [stenoses(np.random.default_rng(seed), along, (0.1, 0.8), 1.0) for seed in range(20)]
+    pairs = [drawn for drawn, _ in both if len(drawn) == 2]
+    assert len(pairs) > 15
+    assert all(12 < abs(one["abscissa_mm"] - two["abscissa_mm"]) < 40 for one, two in pairs)
+    drawn, factor = stenoses(np.random.default_rng(0), along, (0.1, 0.8), 0.0)
+    assert len(drawn) == 1 and 0.3 < 1 - factor.min() < 0.66
+
+
+def test_a_narrow_fork_keeps_its_lumens_in_contact_for_longer():
+    points, radius = line_and_radius()
+    angle = np.deg2rad(22.0)
+    side = points[60] + 0.5 * np.arange(60)[:, None] * np.array([np.cos(angle), np.sin(angle), 0.0])
+    vessels = [Vessel(points, radius, ()), Vessel(side, np.full(60, 1.0), (), 0, 60)]
+    assert lumens_collide(vessels) and not lumens_collide(vessels, 14.0)
+    plan = SidePlan(
+        section="RV",
+        origin=60,
+        length_mm=25.0,
+        diameter_mm=2.0,
+        courses=((0.0, (0.2, 1.0, 0.0)),),
+        angle_deg=(20.0, 24.0),
+    )
+    assert len(with_side_branches(np.random.default_rng(0), vessels[:1], [plan], 14.0)) == 2
