@@ -9,7 +9,7 @@ from typing import Annotated
 from tyro.conf import Positional
 
 from endopilot.cli.arguments import existing
-from endopilot.settings import Within, settings
+from endopilot.settings import CountOrZero, Within, settings
 
 
 @settings
@@ -27,6 +27,9 @@ def command(
     /,
     *,
     device: str = "workhorse-014",
+    task: str | None = None,
+    world: CountOrZero = 0,
+    replay: Path | None = None,
     resume: Path | None = None,
     ct: Path | None = None,
     output: Path = Path("runs/cockpit"),
@@ -38,6 +41,9 @@ def command(
     Args:
         patient: folder made by `endopilot anatomy` or `endopilot atlas`; a synthetic one if nothing is given.
         device: name of a device (`endopilot devices`) or a YAML file.
+        task: task of the ladder to drive by hand, with X-ray as the only sight until the end.
+        world: which patient of the task, world of the rollout, or episode of the data set.
+        replay: session, rollout, plan, data set or file of the ladder to look at instead.
         resume: go on with the session in this file, which a killed server left.
         ct: CT angiogram of the patient, for the X-ray's background; a phantom's if not given.
         output: folder of the sessions' recordings.
@@ -45,13 +51,17 @@ def command(
         listen: the page's address.
     """
     from endopilot.cockpit.launch import serve
-    from endopilot.cockpit.open import open_session, resume_session
+    from endopilot.cockpit.open import open_replay, open_session, open_task, resume_session
 
-    volume = ct and existing(ct)
-    if resume is not None:
+    folder, volume = patient and existing(patient), ct and existing(ct)
+    if replay is not None:
+        opened = open_replay(existing(replay), folder, device=device, world=world, task=task, ct=volume)
+    elif task is not None:
+        opened = open_task(task, world, output=output)
+    elif resume is not None:
         opened = resume_session(existing(resume), ct=volume)
     else:
-        opened = open_session(patient and existing(patient), device=device, ct=volume, output=output)
+        opened = open_session(folder, device=device, ct=volume, output=output)
 
     def listening(address: str) -> None:
         print(f"page       {address}", flush=True)

@@ -65,7 +65,7 @@ class XrayUnit:
         frames: exposures so far, of both planes together as one.
         seconds: time of fluoroscopy so far, s.
         kerma_ugy: air kerma at the patient's entrance reference point so far, both planes, µGy.
-        background: what the patient looks like: "CT", "phantom" or "plain".
+        background: what the patient looks like: "CT", "phantom", or "plain" water.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class XrayUnit:
         """
         self.settings = settings or XraySettings()
         self.pedal, self.frames, self.seconds, self.kerma_ugy = False, 0, 0.0, 0.0
-        self.background = "CT" if ct is not None else "phantom" if _is_coronary(anatomy) else "plain"
+        self.background = "plain" if ct is None else "CT"
         self._images: dict[int, bytes] = {}
         self._image_s = self._contrast_s = -np.inf
         self._next_s = 0.0
@@ -96,7 +96,7 @@ class XrayUnit:
         self._failed: BaseException | None = None
         self._imager = make_imager(ct)
         self._prepare()
-        if self.background == "phantom":
+        if ct is None and _is_coronary(anatomy):
             self._pool.submit(self._work, lambda: self._surround(anatomy, make_imager))
 
     def configure(self, **changes: Any) -> None:
@@ -124,9 +124,10 @@ class XrayUnit:
         """Return the images of a pulse if one is due, as messages for the page, else None."""
         if self._failed is not None:
             raise RuntimeError("the X-ray image could not be computed") from self._failed
+        period = 1 / self.settings.frames_per_s
+        self._next_s = min(self._next_s, snapshot.time_s + period)  # a replay may go back in time
         if not (self.pedal and self.ready and snapshot.time_s >= self._next_s - 1e-9):
             return None
-        period = 1 / self.settings.frames_per_s
         behind = snapshot.time_s - self._next_s
         self._next_s = self._next_s + period if behind < period else snapshot.time_s + period
         return self.expose(snapshot, seconds=period)
@@ -194,7 +195,7 @@ class XrayUnit:
         imager = make_imager(make_phantom(anatomy, _PHANTOM, seed=0))
         planes = {key: imager.plane(*key, rays=_COARSE) for key in self.settings.planes}
         with self._lock:
-            self._imager, self._planes, self._fine = imager, planes, set()
+            self._imager, self._planes, self._fine, self.background = imager, planes, set(), "phantom"
         self._prepare()
 
     def _prepare(self) -> None:

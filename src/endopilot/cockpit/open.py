@@ -10,15 +10,20 @@ from pathlib import Path
 from typing import Any
 
 from endopilot.anatomy.io import read_anatomy, write_anatomy
+from endopilot.cockpit.film import FRAME_S, open_film
 from endopilot.cockpit.fluoroscopy import XrayUnit
 from endopilot.cockpit.frames import scene
+from endopilot.cockpit.game import Attempt, GameSession
 from endopilot.cockpit.loop import Stage
 from endopilot.cockpit.recording import SUFFIX, Recorder, Recording, Where, read_recording, replayed
+from endopilot.cockpit.replay import ReplayStage
 from endopilot.cockpit.session import Session
 from endopilot.cockpit.world import World
+from endopilot.control.policies import POLICIES
+from endopilot.ladder.attempt import navigation_seed
 from endopilot.simulation.device import Device, read_device
 from endopilot.tasks.navigation import Navigation, Target
-from endopilot.tasks.task import reference_navigation
+from endopilot.tasks.task import find_task, reference_navigation
 from endopilot.types import Anatomy, Volume
 from endopilot.xray.image import XrayImager
 
@@ -67,6 +72,50 @@ def open_session(
     return _driven(World(navigation), Where(patient=patient), output, ct)
 
 
+def open_task(name: str, place: int = 0, *, output: Path = Path("runs/cockpit")) -> Opened:
+    """Open a task of the ladder, to be driven by hand under X-ray alone.
+
+    Args:
+        name: of the task.
+        place: of the patient in the task's list.
+        output: folder of the recordings.
+
+    Raises:
+        InputError: the ladder has no such task, or the task no such patient.
+    """
+    tried = Attempt(find_task(name), place)
+    world = tried.world()
+    return _driven(world, Where(task=name, place=place), output, None, seed=navigation_seed(tried.task, place))
+
+
+def open_replay(
+    path: Path,
+    patient: Path | None = None,
+    *,
+    device: str = "workhorse-014",
+    world: int = 0,
+    task: str | None = None,
+    ct: Path | None = None,
+) -> Opened:
+    """Open what was recorded, simulated, planned or scored, to be looked at with a time slider.
+
+    Args:
+        path: as for `open_film`.
+        patient: folder of the anatomy, for rollouts and plans.
+        device: wire of a rollout or plan.
+        world: which of a rollout's worlds, a data set's episodes, or a task's patients.
+        task: of the ladder's files.
+        ct: CT angiogram of the patient, for the X-ray's background.
+
+    Raises:
+        InputError: it cannot be read, or lacks its patient or task.
+    """
+    film = open_film(path, patient, device=device, world=world, task=task)
+    navigation = film.navigation
+    stage = ReplayStage(film, xray_unit(navigation.anatomy, navigation.device, read_ct(ct)))
+    return Opened(stage, scene_of(navigation, {}), FRAME_S, None)
+
+
 def resume_session(path: Path, *, ct: Path | None = None) -> Opened:
     """Go on with a session that a killed server left: it is driven again up to its last event, and recorded on.
 
@@ -87,10 +136,15 @@ def _driven(
     world: World, where: Where, output: Path, ct: Path | None, *, path: Path | None = None, seed: int = 0
 ) -> Opened:
     navigation = world.navigation
-    name = f"{navigation.anatomy.name}-{time.strftime('%Y%m%d-%H%M%S')}"
+    name = f"{where.task or navigation.anatomy.name}-{time.strftime('%Y%m%d-%H%M%S')}"
     recorder = Recorder(path or _free(output, name), world, where, seed)
-    session = Session(world, xray_unit(navigation.anatomy, navigation.device, read_ct(ct)), recorder)
-    return Opened(session, scene_of(navigation, {}), world.config.cycle_s, recorder.path)
+    policies = POLICIES.names()
+    xray = xray_unit(navigation.anatomy, navigation.device, read_ct(ct))
+    if where.task is None or path is not None:  # a game that was interrupted goes on as a session without a score
+        session = Session(world, xray, recorder, policies)
+    else:
+        session = GameSession(Attempt(find_task(where.task), where.place), world, xray, recorder, policies)
+    return Opened(session, scene_of(navigation, {"policies": policies}), world.config.cycle_s, recorder.path)
 
 
 def xray_unit(anatomy: Anatomy, device: Device, ct: Volume | None) -> XrayUnit:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from endopilot.cockpit import messages
+from endopilot.cockpit.autopilot import Autopilot, check_policy
 from endopilot.cockpit.fluoroscopy import XrayUnit
 from endopilot.cockpit.frames import encode, target_values, tip_values, wire_arrays
 from endopilot.cockpit.recording import Recorder
@@ -20,7 +21,9 @@ from endopilot.errors import InputError
 from endopilot.tasks.navigation import Target
 
 SILENCE_S = 0.2
-"""The drive stops after this time without a message from who drives, s."""
+"""The drive stops after this time without a message from whose hand drives, s."""
+AUTOPILOT_SILENCE_S = 1.0
+"""The autopilot pauses after this time without a message from the page that started it, s."""
 
 
 class Session:
@@ -29,19 +32,24 @@ class Session:
     Attributes:
         world: the wire in its vessel.
         xray: C-arm, pedal and contrast.
+        autopilot: a policy that may drive.
         target: where the tip is to go.
         sight: whether the page may show the wire in space.
     """
 
-    def __init__(self, world: World, xray: XrayUnit, recorder: Recorder | None = None) -> None:
+    def __init__(
+        self, world: World, xray: XrayUnit, recorder: Recorder | None = None, policies: tuple[str, ...] = ()
+    ) -> None:
         """Take the parts.
 
         Args:
             world: the wire in its vessel.
             xray: C-arm, pedal and contrast.
             recorder: writes what happens; nothing is kept without one.
+            policies: names of those that a page may choose.
         """
-        self.world, self.xray, self._recorder = world, xray, recorder
+        self.world, self.xray, self._recorder, self._policies = world, xray, recorder, policies
+        self.autopilot = Autopilot(world)
         self.target: Target = world.navigation.target
         self.sight = True
         self._command, self._moving, self._heard_s = (0.0, 0.0), False, -np.inf
@@ -72,6 +80,9 @@ class Session:
             self._record(c_arm=changes)
         elif isinstance(message, messages.Target):
             self._aim(message)
+        elif isinstance(message, messages.Autopilot):
+            self._heard_s = now_s
+            self._steer(message)
         else:
             raise InputError(f"{message.type}: not here")
 
@@ -96,6 +107,9 @@ class Session:
             why: goes into the page and the recording.
         """
         self.xray.pedal = False
+        if self.autopilot.drives:
+            self.autopilot.pause(True)
+            self._moving = True
         if self._moving:
             self.world.stop()
             self._command, self._moving, self._stopped = (0.0, 0.0), False, why
@@ -107,13 +121,16 @@ class Session:
         Args:
             now_s: real time, s.
         """
-        if (self._moving or self.xray.pedal) and now_s - self._heard_s > SILENCE_S:
+        limit = AUTOPILOT_SILENCE_S if self.autopilot.drives else SILENCE_S
+        if (self._moving or self.autopilot.drives or self.xray.pedal) and now_s - self._heard_s > limit:
             self.halt("silence")
-        self.world.advance()
-        if self._recorder is not None:
-            self._recorder.cycle()
+        sent = self._think()
+        if not self.autopilot.waits:
+            self.world.advance()
+            if self._recorder is not None:
+                self._recorder.cycle()
         snapshot = self.world.snapshot()
-        sent = [(f"image{number}", image) for number, image in enumerate(self._expose(snapshot))]
+        sent += _images(self._counted(self.xray.pulse(snapshot)))
         return [*sent, ("state", self.state(snapshot))]
 
     def state(self, snapshot: Snapshot) -> bytes:
@@ -140,6 +157,7 @@ class Session:
             "sight": self.sight,
             "target": target_values(anatomy, self.target),
             "xray": self.xray.values(snapshot.time_s),
+            "autopilot": self.autopilot.values(),
         }
         return shown | (tip_values(anatomy, snapshot) if self.sight else {})
 
@@ -147,11 +165,16 @@ class Session:
         """Stop the wire and close the recording."""
         self.halt("closed")
         self.xray.close()
+        self.autopilot.close()
         if self._recorder is not None:
             self._recorder.close()
 
     def _drive(self, translation: float, rotation: float) -> None:
         command = self.world.limits.safe(translation, rotation)
+        if self.autopilot.drives:
+            if command == (0.0, 0.0):
+                return  # the page only says that it is there
+            self._take_over()
         if command != self._command:
             self._command = self.world.command(*command)
             self._record(move=command)
@@ -171,8 +194,44 @@ class Session:
             raise InputError("target: give a section, or a branch and an abscissa")
         self._record(target=[self.target.branch, self.target.abscissa])
 
-    def _expose(self, snapshot: Snapshot) -> list[bytes]:
-        images = self.xray.pulse(snapshot)
+    def _steer(self, message: messages.Autopilot) -> None:
+        """Hand the wheel to a policy or back, or let it pause."""
+        if message.action == "start":
+            self.autopilot.start(check_policy(message.policy, self._policies), self.target)
+            self._stopped = ""
+        elif message.action == "stop":
+            self._take_over()
+        else:
+            self.autopilot.pause(message.action == "pause")
+            if message.action == "pause":
+                self._command = self.world.command(0.0, 0.0)
+                self._record(move=self._command)
+        self._record(autopilot=message.action, policy=message.policy)
+
+    def _take_over(self) -> None:
+        if self.autopilot.drives:
+            self._command = self.world.command(0.0, 0.0)
+            self._record(move=self._command)
+        self.autopilot.stop()
+
+    def _think(self) -> list[tuple[str, bytes]]:
+        """Let the autopilot go on, and return what the pages are to see of it."""
+        if self.autopilot.status == "off" or (self.autopilot.drives and not self.xray.ready):
+            return []
+        snapshot, images = self.world.snapshot(), []
+        before = self.autopilot.values()
+        decision = self.autopilot.think(snapshot, lambda: images.extend(self._counted(self.xray.expose(snapshot))))
+        if decision is not None:
+            self._command = self.world.command(decision.translation, decision.rotation)
+            self._record(move=self._command)
+        sent = _images(images)
+        if self.sight and self.autopilot.values() != before:
+            belief = self.autopilot.belief(snapshot)
+            sent += [] if belief is None else [("belief", belief)]
+        return sent
+
+    def _counted(self, images: list[bytes] | None) -> list[bytes]:
+        """Write an exposure into the recording, if there was one, and return its images."""
         if images is None:
             return []
         xray = self.xray
@@ -182,6 +241,10 @@ class Session:
     def _record(self, **what: Any) -> None:
         if self._recorder is not None:
             self._recorder.event(**what)
+
+
+def _images(images: list[bytes]) -> list[tuple[str, bytes]]:
+    return [(f"image{number}", image) for number, image in enumerate(images)]
 
 
 def middle_of_section(tree: Any, section: str) -> Target:

@@ -14,7 +14,9 @@ from endopilot.control.robot import RobotConfig, SimulatedRobot
 from endopilot.settings import Positive, settings
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.drive_limits import DriveLimits
-from endopilot.tasks.navigation import Navigation
+from endopilot.simulation.simulator import Simulator
+from endopilot.simulation.state import Step
+from endopilot.tasks.navigation import Navigation, Target
 from endopilot.types import TipProjection
 
 SHOWN_BEHIND_MM = 20.0
@@ -80,7 +82,8 @@ class World:
         config: robot, rod core and length of a cycle.
         robot: the drive, whose encoders a policy reads.
         cycle: how many cycles have passed.
-        peak_force_n: largest wall force on one node so far, N.
+        force_n: largest wall force on one node in the last cycle, N.
+        peak_force_n: the same so far, N.
     """
 
     def __init__(self, navigation: Navigation, config: WorldConfig | None = None, *, seed: int = 0) -> None:
@@ -100,12 +103,20 @@ class World:
         self.limits = DriveLimits.of(navigation.device, navigation.anatomy)
         drive = replace(self.config.robot, latency_s=self.config.robot.latency_s * truth.latency_factor)
         self.robot = SimulatedRobot(self.simulator, self.limits, drive, seed=seed, ostium_mm=truth.ostium_mm)
-        self.cycle, self.peak_force_n, self._force_n = 0, 0.0, 0.0
+        self.cycle, self.peak_force_n, self.force_n = 0, 0.0, 0.0
 
     @property
     def time_s(self) -> float:
         """Time since the start, s."""
         return self.cycle * self.config.cycle_s
+
+    def navigation_to(self, target: Target | None) -> Navigation:
+        """Return the navigation with another target, or as it is.
+
+        Raises:
+            InputError: the vessel has no such place.
+        """
+        return self.navigation if target is None else replace(self.navigation, target=target)
 
     def command(self, translation: float, rotation: float) -> tuple[float, float]:
         """Command the drive, mm/s and rad/s, and return what is left of it within the drive's limits."""
@@ -119,32 +130,20 @@ class World:
 
     def advance(self) -> None:
         """Let one cycle pass."""
-        self._force_n = self.robot.run(self.config.cycle_s)
-        self.peak_force_n = max(self.peak_force_n, self._force_n)
+        self.force_n = self.robot.run(self.config.cycle_s)
+        self.peak_force_n = max(self.peak_force_n, self.force_n)
         self.cycle += 1
 
     def snapshot(self) -> Snapshot:
         """Return the world as it is now."""
-        simulator, step = self.simulator, self.robot.last_step
-        nodes, inserted = simulator.position[0], float(simulator.inserted_length[0])
-        along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(nodes, axis=0), axis=1))])
-        shown = along <= inserted + SHOWN_BEHIND_MM
-        velocity, load = self.robot.velocity, simulator.drive_load[0]
-        return Snapshot(
+        velocity, step = self.robot.velocity, self.robot.last_step
+        return take_snapshot(
+            self.simulator,
+            step,
             cycle=self.cycle,
             time_s=self.time_s,
-            nodes=nodes[shown],
-            node_force=simulator.contacts[0][shown],
-            tip_direction=simulator.tip_direction[0],
-            tip=simulator.project(),
-            inserted_mm=inserted,
-            rotation=float(simulator.rotation[0]),
+            force_n=self.force_n,
             velocity=(float(velocity[0]), float(velocity[1])),
-            force_n=self._force_n,
-            wall_force_n=0.0 if step is None else float(step.wall_force[0]),
-            drive_load=(float(load[0]), float(load[1])),
-            slip=(0.0, 0.0) if step is None else (float(step.slip[0]), float(step.rotation_slip[0])),
-            valid=bool(simulator.valid[0]),
         )
 
     def digest(self) -> str:
@@ -152,3 +151,44 @@ class World:
         simulator = self.simulator
         parts = (simulator.position, simulator.inserted_length, simulator.rotation, simulator.contacts)
         return hashlib.sha256(b"".join(part.astype("<f8").tobytes() for part in parts)).hexdigest()[:16]
+
+
+def take_snapshot(
+    simulator: Simulator,
+    step: Step | None,
+    *,
+    cycle: int,
+    time_s: float,
+    force_n: float,
+    velocity: tuple[float, float],
+) -> Snapshot:
+    """Return how the one world of a simulator is now.
+
+    Args:
+        simulator: of one world.
+        step: its last step; None before the first.
+        cycle: how many have passed.
+        time_s: since the start, s.
+        force_n: largest wall force on one node in the cycle, N.
+        velocity: of the drive, mm/s and rad/s.
+    """
+    nodes, inserted = simulator.position[0], float(simulator.inserted_length[0])
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(nodes, axis=0), axis=1))])
+    shown = along <= inserted + SHOWN_BEHIND_MM
+    load = simulator.drive_load[0]
+    return Snapshot(
+        cycle=cycle,
+        time_s=time_s,
+        nodes=nodes[shown],
+        node_force=simulator.contacts[0][shown],
+        tip_direction=simulator.tip_direction[0],
+        tip=simulator.project(),
+        inserted_mm=inserted,
+        rotation=float(simulator.rotation[0]),
+        velocity=velocity,
+        force_n=force_n,
+        wall_force_n=0.0 if step is None else float(step.wall_force[0]),
+        drive_load=(float(load[0]), float(load[1])),
+        slip=(0.0, 0.0) if step is None else (float(step.slip[0]), float(step.rotation_slip[0])),
+        valid=bool(simulator.valid[0]),
+    )

@@ -97,7 +97,7 @@ def attempt(policy: str, navigation: Navigation, *, seed: int, mismatch: ModelMi
     recording = Recording(record.control[:-1], record.exposed[:-1], believed)
     return (
         {"seed": seed}
-        | _figures(navigation, record, recording)
+        | figures(navigation, record, recording)
         | {"course": _course(record), "recording": recording.packed()}
     )
 
@@ -111,11 +111,11 @@ def repeat(recording: Recording, navigation: Navigation, *, seed: int) -> dict[s
     Raises:
         InputError: the recording is longer or shorter than the navigation.
     """
-    record = _drive(navigation, _Repeated(recording), seed, None)
+    record = _drive(navigation, Repeated(recording), seed, None)
     given, needed = len(recording.control), len(record.control) - 1
     if given != needed:
         raise InputError(f"control: holds {given} decisions, and the navigation ends after {needed}")
-    return _figures(navigation, record, recording)
+    return figures(navigation, record, recording)
 
 
 def _drive(navigation: Navigation, policy: Policy, seed: int, mismatch: ModelMismatch | None) -> NavigationRecord:
@@ -123,18 +123,25 @@ def _drive(navigation: Navigation, policy: Policy, seed: int, mismatch: ModelMis
     return navigate(navigation, policy, config=config, seed=seed, truth=mismatch)
 
 
-class _Repeated:
-    """Decides what was recorded."""
+class Repeated:
+    """A policy that decides what was recorded."""
 
     def __init__(self, recording: Recording) -> None:
+        """Take the recording."""
         self._control = recording.control.tolist()
         self._expose_next = [*recording.exposed[1:].tolist(), False]
         self._at = 0
 
     def start(self, navigation: Navigation, seed: int) -> None:
+        """Begin at the first decision."""
         self._at = 0
 
     def decide(self, observation: Observation) -> Decision:
+        """Return the next decision.
+
+        Raises:
+            InputError: there is none.
+        """
         if self._at == len(self._control):
             raise InputError(f"control: holds {self._at} decisions, and the navigation goes on")
         decision = Decision(*self._control[self._at], expose=self._expose_next[self._at])
@@ -142,10 +149,16 @@ class _Repeated:
         return decision
 
 
-def _figures(navigation: Navigation, record: NavigationRecord, recording: Recording) -> dict[str, Any]:
-    """Return what a navigation is scored by, and the hash of all that was recorded of it and of how it went."""
+def figures(navigation: Navigation, record: NavigationRecord, recording: Recording) -> dict[str, Any]:
+    """Return what a navigation is scored by, and the hash of all that was recorded of it and of how it went.
+
+    Args:
+        navigation: what was to be done.
+        record: how it truly went.
+        recording: what was decided.
+    """
     length_mm = navigation.target.abscissa - float(record.tip.abscissa[0])
-    figures = {
+    scored = {
         "success": record.success,
         "safe": record.safe,
         "reason": record.reason,
@@ -156,8 +169,8 @@ def _figures(navigation: Navigation, record: NavigationRecord, recording: Record
     }
     if recording.believed_mm is not None:
         radius = navigation.device.tip_radius_mm
-        figures["events"] = list(_events(record.tip, record.exposed, recording.believed_mm, radius))
-    return figures | {"sha256": _digest(record, recording)}
+        scored["events"] = list(_events(record.tip, record.exposed, recording.believed_mm, radius))
+    return scored | {"sha256": _digest(record, recording)}
 
 
 def _events(

@@ -8,11 +8,12 @@ const KEYS = {
 };
 const DEAD = 0.15;
 
-/** Turns what is held into messages. `state()` returns whether the page drives. */
+/** Turns what is held into messages. `drives()` tells whether the page drives, `policyDrives()` whether its autopilot does. */
 export class Hands {
-  constructor(connection, drives) {
+  constructor(connection, drives, policyDrives) {
     this.connection = connection;
     this.drives = drives;
+    this.policyDrives = policyDrives;
     this.held = new Set();
     this.pedalHeld = new Set();
     this.sent = [0, 0];
@@ -104,7 +105,7 @@ export class Hands {
 
   beat() {
     this.update();
-    if (this.sent[0] || this.sent[1]) this.send(this.sent);
+    if (this.sent[0] || this.sent[1] || this.policyDrives()) this.send(this.sent);
     else if (this.pedalSent) this.connection.send("pedal", { down: true });
   }
 

@@ -1,7 +1,10 @@
 // The page: connects, hands each message to the view that shows it, and draws one frame after the other.
+import { AutopilotBar } from "./autopilot.js";
 import { Connection, fetchScene } from "./connection.js";
 import { Fluoroscopy, list, put } from "./fluoroscopy.js";
+import { GameBar } from "./game.js";
 import { Hands } from "./hands.js";
+import { ReplayBar } from "./replay.js";
 import { Sound } from "./sound.js";
 import { Space } from "./space.js";
 
@@ -11,7 +14,9 @@ window.cockpit = page; // for tests and the console
 const handlers = {
   state: (message) => { page.state = message; },
   image: (message) => page.xray.take(message),
+  belief: (message) => page.space.showBelief(message),
   role: (message) => showRole(message),
+  result: (message) => page.game.scores(message.scores),
   notice: (message) => banner(message.text, true),
   error: (message) => { page.fatal = true; banner(message.text); },
   pong: (message) => page.pong?.(message.number),
@@ -68,6 +73,10 @@ function show(state) {
   page.xray.show(state.xray);
   showForce(state);
   showFigures(state);
+  page.autopilot?.show(state.autopilot, state.target);
+  if (state.replay) page.replay.show(state.replay, state.time_s);
+  if (state.game) page.game.show(state.game);
+  page.space.believed.visible = Boolean(page.autopilot?.shown.checked);
   document.getElementById("blind").hidden = state.sight;
 }
 
@@ -101,7 +110,10 @@ async function start() {
   page.xray = new Fluoroscopy(page.connection);
   page.space = new Space(document.getElementById("scene"), page.scene, (place) => page.connection.send("target", place));
   page.space.buttons(document.getElementById("cameras"), () => page.xray.angles());
-  page.hands = new Hands(page.connection, () => page.role.drives);
+  page.game = new GameBar(page.connection);
+  page.replay = new ReplayBar(page.connection);
+  if (page.scene.policies) page.autopilot = new AutopilotBar(page.connection, page.scene);
+  page.hands = new Hands(page.connection, () => page.role.drives, () => Boolean(page.autopilot?.drives));
   setInterval(countFrames, 1000);
   frame();
 }

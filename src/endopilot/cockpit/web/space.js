@@ -149,26 +149,23 @@ export class Space {
     if (state.nodes) this.wire.set(state.nodes, state.node_force);
     this.target.visible = Boolean(state.target);
     if (state.target) this.target.position.set(...state.target.position);
-    if (state.believed) this.showBelieved(state);
-    else if (this.believed.children.length) this.believed.clear();
   }
 
-  showBelieved(state) {
-    const each = state.believed.length / state.believed_weight.length;
-    while (this.believed.children.length > state.believed_weight.length) this.believed.remove(this.believed.children.at(-1));
-    state.believed_weight.forEach((weight, i) => {
-      let line = this.believed.children[i];
-      if (!line) {
-        line = new THREE.Line(new THREE.BufferGeometry(), new THREE.LineBasicMaterial({ color: "#6fc3ff", transparent: true }));
-        line.frustumCulled = false;
-        line.renderOrder = 4;
-        this.believed.add(line);
-      }
-      const points = state.believed.slice(i * each, (i + 1) * each);
-      line.geometry.dispose();
-      line.geometry = new THREE.BufferGeometry().setAttribute("position", new THREE.BufferAttribute(points, 3));
-      line.material.opacity = 0.15 + 0.85 * Math.min(1, weight * 2);
-    });
+  /** Show the wires that a policy holds possible, the likeliest first, and its band along the centerline. */
+  showBelief(belief) {
+    for (const old of this.believed.children) old.geometry.dispose();
+    this.believed.clear();
+    const each = belief.wires.length / Math.max(belief.wires_shown, 1);
+    const add = (points, color, opacity, kind = THREE.Line) => {
+      const geometry = new THREE.BufferGeometry().setAttribute("position", new THREE.BufferAttribute(points, 3));
+      const paint = { color, transparent: true, opacity, depthTest: false };
+      const line = new kind(geometry, kind === THREE.Points ? new THREE.PointsMaterial({ ...paint, size: 5, sizeAttenuation: false }) : new THREE.LineBasicMaterial(paint));
+      line.frustumCulled = false;
+      line.renderOrder = 4;
+      this.believed.add(line);
+    };
+    for (let i = 0; i < belief.wires_shown; i++) add(belief.wires.slice(i * each, (i + 1) * each), "#6fc3ff", i ? 0.35 : 1);
+    if (belief.band.length) add(belief.band.slice(), "#ffd34d", 0.8, THREE.Points);
   }
 
   draw() {

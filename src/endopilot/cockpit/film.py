@@ -1,0 +1,270 @@
+"""What can be replayed: a session, a rollout, a plan, an episode of a data set, a navigation of the ladder.
+
+Each becomes a `Film`: the wire every 50 ms, driven again by its recorded controls while the page shows its begin.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from endopilot.anatomy.io import read_anatomy
+from endopilot.cockpit.recording import SUFFIX, read_recording, replayed
+from endopilot.cockpit.world import Snapshot, take_snapshot
+from endopilot.control.navigate import NavigateConfig, NavigationLoop
+from endopilot.control.plan_file import read_plan
+from endopilot.dataset.loader import load_dataset
+from endopilot.errors import InputError
+from endopilot.files import read_json
+from endopilot.ladder.attempt import Recording, Repeated, navigation_seed
+from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.controls import read_controls_csv
+from endopilot.simulation.device import read_device
+from endopilot.simulation.simulator import Simulator
+from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target
+from endopilot.tasks.task import CORE, find_task
+
+FRAME_S = 0.05
+"""Time from one frame of a film to the next, s."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """The world at one moment of a film.
+
+    Attributes:
+        snapshot: the world.
+        exposed: whether X-ray was on.
+        peak_n: largest wall force on one node so far, N.
+    """
+
+    snapshot: Snapshot
+    exposed: bool = False
+    peak_n: float = 0.0
+
+
+@dataclass(eq=False)
+class Film:
+    """A navigation that is driven again, frame by frame, in a thread of its own.
+
+    Attributes:
+        navigation: vessel, wire and target.
+        seconds: how long it lasts, s.
+        title: what it is, for the page.
+        frames: those that are there so far.
+        done: whether all are.
+        failure: why it ended early, in a line; empty if it did not.
+    """
+
+    navigation: Navigation
+    seconds: float
+    title: str
+    make: Callable[[], Iterator[Frame]]
+    frames: list[Frame] = field(default_factory=list)
+    done: bool = False
+    failure: str = ""
+
+    def start(self) -> None:
+        """Begin to drive."""
+        threading.Thread(target=self._drive, name="film", daemon=True).start()
+
+    def _drive(self) -> None:
+        try:
+            peak_n = 0.0
+            for frame in self.make():
+                peak_n = max(peak_n, frame.snapshot.force_n)
+                self.frames.append(replace(frame, peak_n=peak_n))
+        except Exception as error:  # told in the page
+            self.failure = " ".join(str(error).split())
+        self.done = True
+
+
+def open_film(
+    path: Path, patient: Path | None = None, *, device: str = "workhorse-014", world: int = 0, task: str | None = None
+) -> Film:
+    """Open what is to be replayed.
+
+    Args:
+        path: a session (.cockpit.jsonl); a rollout or controls (.csv, .parquet); a plan's or a data set's folder; a
+            submission.json, or a navigation's result of the ladder.
+        patient: folder of the anatomy, for rollouts and plans.
+        device: wire of a rollout or plan.
+        world: which of a rollout's worlds, a data set's episodes, or a task's patients.
+        task: of the ladder's files.
+
+    Raises:
+        InputError: it cannot be read, or lacks its patient or task.
+    """
+    if path.name.endswith(SUFFIX):
+        return _session(path)
+    if (path / "plan.csv").exists():
+        plan = read_plan(path, read_anatomy(_given(patient, path)), read_device(device))
+        return _controls(plan.navigation, plan.control, DECISION_PERIOD_S, f"plan {path.name}")
+    if (path / "meta").is_dir():
+        return _episode(path, world)
+    if path.suffix == ".json":
+        return _ladder(path, task, world)
+    if path.suffix in (".csv", ".parquet"):
+        return _rollout(path, read_anatomy(_given(patient, path)), device, world)
+    raise InputError(
+        f"{path}: cannot be replayed; give a session ({SUFFIX}), a rollout (.csv, .parquet), a plan's or data set's "
+        "folder, or a file of the ladder (.json)"
+    )
+
+
+def _session(path: Path) -> Film:
+    recording = read_recording(path)
+    every = max(round(FRAME_S / recording.config.cycle_s), 1)
+    target = next((event["target"] for event in reversed(recording.events) if "target" in event), None)
+    navigation = recording.navigation
+    if target is not None:
+        navigation = replace(navigation, target=Target(branch=target[0], abscissa=target[1]))
+
+    def make() -> Iterator[Frame]:
+        exposed = False
+        for world, events in replayed(recording):
+            exposed |= any("exposure" in event for event in events)
+            if world.cycle % every == 0:
+                yield Frame(world.snapshot(), exposed)
+                exposed = False
+
+    return Film(navigation, recording.cycles * recording.config.cycle_s, f"session {path.name}", make)
+
+
+def _controls(
+    navigation: Navigation,
+    control: Float[np.ndarray, "n 2"],
+    period_s: float,
+    title: str,
+    config: SimulatorConfig | None = None,
+    friction: float | None = None,
+) -> Film:
+    """Return a film of controls, mm/s and rad/s, each held for a period, s."""
+    parts = max(round(period_s / FRAME_S), 1)
+
+    def make() -> Iterator[Frame]:
+        simulator = Simulator(
+            navigation.anatomy, navigation.device, config=replace(config or SimulatorConfig(), threads=1)
+        )
+        simulator.reset(
+            inserted_length=[navigation.start_inserted_mm],
+            rotation=[navigation.start_rotation],
+            friction=[navigation.device.friction if friction is None else friction],
+        )
+        frame = {"cycle": 0, "time_s": 0.0, "force_n": 0.0, "velocity": (0.0, 0.0)}
+        yield Frame(take_snapshot(simulator, None, **frame))
+        for number, (along, turn) in enumerate(control.tolist()):
+            for part in range(parts):
+                step = simulator.step([[along, turn]], period_s / parts)
+                frame = {
+                    "cycle": number * parts + part + 1,
+                    "time_s": (number + (part + 1) / parts) * period_s,
+                    "force_n": float(step.contact_force_max[0]),
+                    "velocity": (along, turn),
+                }
+                yield Frame(take_snapshot(simulator, step, **frame))
+
+    return Film(navigation, len(control) * period_s, title, make)
+
+
+def _rollout(path: Path, anatomy: Any, device: str, world: int) -> Film:
+    """Return a film of a rollout's or script's controls."""
+    if path.suffix == ".parquet":
+        raise InputError(f"{path}: write the rollout as .csv to replay it")
+    script = read_controls_csv(path)
+    worlds = len(script.control)
+    if world >= worlds:
+        raise InputError(f"world: {world}; {path} has worlds 0 to {worlds - 1}")
+    start, turn = script.initial[world].tolist()
+    wire = read_device(device)
+    leaf = max(anatomy.tree.leaves(), key=lambda branch: anatomy.tree.branches[branch].centerline.abscissa[-1])
+    end = float(anatomy.tree.branches[leaf].centerline.abscissa[-1])
+    navigation = Navigation(
+        anatomy=anatomy,
+        device=wire,
+        target=Target(branch=leaf, abscissa=end),
+        start_inserted_mm=start,
+        start_rotation=turn,
+    )
+    return _controls(navigation, script.control[world], script.period_s, f"rollout {path.name}, world {world}")
+
+
+def _episode(folder: Path, number: int) -> Film:
+    """Return a film of an episode of a data set, driven again by what the drive was commanded."""
+    data = load_dataset(folder)
+    if number >= len(data):
+        raise InputError(f"world: {number}; {folder} has episodes 0 to {len(data) - 1}")
+    settings = data.manifest["settings"]
+    anatomy = read_anatomy(data.anatomy_folder(str(data.anatomy[number])))
+    wire = read_device(str(data.device[number])).with_tip(
+        bend_rad=float(data.tip_bend[number]), stiffness_factor=float(data.tip_stiffness_factor[number])
+    )
+    branch = int(data.branch[number, -1])
+    line = anatomy.tree.branches[branch].centerline.abscissa
+    navigation = Navigation(
+        anatomy=anatomy,
+        device=wire,
+        target=Target(branch=branch, abscissa=float(np.clip(data.tip_abscissa[number, -1], line[0], line[-1]))),
+        start_inserted_mm=float(data.initial_inserted_length[number]),
+        start_rotation=float(data.initial_rotation[number]),
+    )
+    config = SimulatorConfig(**(settings["config"]["simulator"] | {"threads": 1}))
+    friction = float(data.friction[number])
+    title = f"episode {number} of {folder.name}"
+    return _controls(navigation, data.command[number], data.sample_period_s, title, config, friction)
+
+
+def _ladder(path: Path, name: str | None, place: int) -> Film:
+    """Return a film of a navigation in a submission, or in a result file of a ladder's folder."""
+    content = read_json(path)
+    if isinstance(content, dict) and "navigations" in content:
+        if name is None or name not in content["navigations"]:
+            raise InputError(f"task: {name!r}; {path} has {', '.join(content['navigations'])}")
+        entries = content["navigations"][name]
+        if place >= len(entries):
+            raise InputError(f"world: {place}; {path} has patients 0 to {len(entries) - 1} of this task")
+        entry = entries[place]
+    elif isinstance(content, dict) and "recording" in content and path.stem.isdecimal():
+        name, place, entry = path.parent.name, int(path.stem), content
+    else:
+        raise InputError(f"{path}: is no file of the ladder; give a submission.json or TASK/NUMBER.json")
+    task = find_task(name)
+    recording = Recording.unpacked(entry["recording"])
+    navigation = task.ladder_navigation(place)
+
+    def make() -> Iterator[Frame]:
+        config = NavigateConfig(simulator=replace(CORE, threads=1))
+        loop = NavigationLoop(navigation, Repeated(recording), config=config, seed=navigation_seed(task, place))
+        yield Frame(_of_loop(loop, 0.0, (0.0, 0.0)))
+        while loop.reason is None:
+            decision = loop.begin()
+            exposed = loop.observation is not None and loop.observation.tip is not None
+            while loop.reason is None and not loop.between_periods:
+                peak = loop.advance(FRAME_S)
+                yield Frame(_of_loop(loop, peak, (decision.translation, decision.rotation)), exposed)
+                exposed = False
+
+    return Film(navigation, len(recording.control) * DECISION_PERIOD_S, f"{task.title}, patient {place}", make)
+
+
+def _of_loop(loop: NavigationLoop, force_n: float, velocity: tuple[float, float]) -> Snapshot:
+    return take_snapshot(
+        loop.simulator,
+        loop.robot.last_step,
+        cycle=round(loop.time_s / FRAME_S),
+        time_s=loop.time_s,
+        force_n=force_n,
+        velocity=velocity,
+    )
+
+
+def _given(patient: Path | None, path: Path) -> Path:
+    if patient is None:
+        raise InputError(f"{path}: give the patient's folder too: endopilot cockpit PATIENT --replay {path}")
+    return patient

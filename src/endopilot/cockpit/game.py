@@ -1,0 +1,189 @@
+"""A task of the ladder, driven by hand with X-ray as the only sight, and scored as policies are.
+
+The clock begins when the page says so. The wire in space, the tip and the wall's force are not sent to the page until
+the end. Then the same code as for policies (`ladder.attempt.figures`) makes the score, and the agent drives the same
+patient in a process of its own, so that both scores stand side by side.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+from concurrent.futures import Future, ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from endopilot.cockpit import messages
+from endopilot.cockpit.fluoroscopy import XrayUnit
+from endopilot.cockpit.frames import encode
+from endopilot.cockpit.recording import Recorder
+from endopilot.cockpit.session import Session
+from endopilot.cockpit.world import Snapshot, World, WorldConfig
+from endopilot.control.record import Track
+from endopilot.errors import InputError
+from endopilot.ladder.attempt import Recording, attempt, figures, navigation_seed
+from endopilot.simulation.simulator import Simulator
+from endopilot.tasks.navigation import DECISION_PERIOD_S
+from endopilot.tasks.task import CORE, Task
+
+RIVAL = "agent"
+"""The policy whose score stands beside a person's."""
+_SHOWN = ("success", "safe", "seconds", "exposures", "peak_force_n", "path_ratio", "reason")
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """Which task in which patient.
+
+    Attributes:
+        task: of the ladder.
+        place: of the patient in the task's list.
+    """
+
+    task: Task
+    place: int
+
+    def world(self) -> World:
+        """Return the world at the task's start, with the ladder's rod core."""
+        config = WorldConfig(simulator=replace(CORE, threads=1))
+        return World(self.task.ladder_navigation(self.place), config, seed=navigation_seed(self.task, self.place))
+
+
+class GameSession(Session):
+    """A session that is a game until its end, and an ordinary one afterwards.
+
+    Attributes:
+        phase: "waits", "on" or "over".
+        result: the figures that the person is scored by, at the end.
+    """
+
+    def __init__(
+        self,
+        tried: Attempt,
+        world: World,
+        xray: XrayUnit,
+        recorder: Recorder | None = None,
+        policies: tuple[str, ...] = (),
+    ) -> None:
+        """Take the parts; the clock stands still.
+
+        Args:
+            tried: which task in which patient.
+            world: at the task's start.
+            xray: C-arm, pedal and contrast.
+            recorder: writes what happens.
+            policies: names of those that a page may choose at the end.
+        """
+        super().__init__(world, xray, recorder, policies)
+        self.sight, self.phase = False, "waits"
+        self.result: dict[str, Any] | None = None
+        self._tried = tried
+        self._track = Track(world.simulator)
+        self._commands: list[tuple[float, float]] = []
+        self._exposed: list[bool] = []
+        self._peak_n, self._counted_before = 0.0, 0
+        self._period = round(DECISION_PERIOD_S / world.config.cycle_s)
+        self._rival: Future[dict[str, Any]] | None = None
+        self._pool: ProcessPoolExecutor | None = None
+
+    def handle(self, message: messages.Message, now_s: float) -> None:
+        """Do what the page asks for; while the game is on, neither targets nor policies."""
+        if isinstance(message, messages.Game):
+            if self.phase == "waits" and not self.xray.ready:
+                raise InputError("game: the C-arm still turns; start in a moment")
+            if self.phase == "waits":
+                self.phase = "on"
+                self._record(game="start")
+            return
+        if self.phase != "over" and isinstance(message, messages.Target | messages.Autopilot):
+            if isinstance(message, messages.Autopilot) and message.action == "stop":
+                return  # the stop key
+            raise InputError(f"{message.type}: not before the end of the task")
+        if self.phase == "waits" and isinstance(message, messages.Drive | messages.Pedal | messages.Contrast):
+            return
+        super().handle(message, now_s)
+
+    def cycle(self, now_s: float) -> list[tuple[str, bytes]]:
+        """Let one cycle pass, unless the game has not begun."""
+        if self.phase == "waits":
+            return [("state", self.state(self.world.snapshot()))]
+        if self.phase == "on" and self.world.cycle % self._period == 0:
+            self._commands.append(self._command)
+        sent = super().cycle(now_s)
+        if self.phase == "on":
+            self._peak_n = max(self._peak_n, self.world.force_n)
+            if self.world.cycle % self._period == 0:
+                sent += self._period_is_over()
+        elif self._rival is not None and self._rival.done():
+            sent.append(self._scores())
+        return sent
+
+    def values(self, snapshot: Snapshot) -> dict[str, Any]:
+        """Return the figures that the page shows; none of what only the simulation knows, while the game is on."""
+        navigation, task = self.world.navigation, self._tried.task
+        shown = super().values(snapshot)
+        if not self.sight:
+            del shown["peak_force_n"]
+        return shown | {
+            "game": {
+                "phase": self.phase,
+                "task": task.name,
+                "title": task.title,
+                "level": task.level,
+                "left_s": round(max(navigation.seconds - snapshot.time_s, 0.0), 1),
+            }
+        }
+
+    def close(self) -> None:
+        """Stop the wire, and the agent."""
+        super().close()
+        if self._pool is not None:
+            self._pool.shutdown(wait=False, cancel_futures=True)
+
+    def _period_is_over(self) -> list[tuple[str, bytes]]:
+        """Take a sample as `navigate` does, and end the game where it would."""
+        self._exposed.append(self.xray.frames > self._counted_before)
+        self._counted_before = self.xray.frames
+        simulator: Simulator = self.world.simulator
+        self._track.decided(self._commands[-1], None, None, fault=False)
+        self._track.moved(simulator, self._peak_n)
+        self._peak_n = 0.0
+        if not simulator.valid[0]:
+            return self._end("invalid")
+        if bool(self.world.navigation.reached(simulator.project())[0]):
+            return self._end("reached")
+        if self.world.time_s >= self.world.navigation.seconds - 1e-9:
+            return self._end("time")
+        return []
+
+    def _end(self, reason: str) -> list[tuple[str, bytes]]:
+        self.halt("the task is over")
+        self.phase, self.sight = "over", True
+        record = self._track.record(self.world.navigation, self.world.robot.driven, reason)
+        record = replace(record, exposures=self.xray.frames)
+        recording = Recording(np.array(self._commands), np.array(self._exposed), None)
+        self.result = figures(self.world.navigation, record, recording)
+        self._record(score={name: self.result[name] for name in _SHOWN})
+        self._pool = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
+        self._rival = self._pool.submit(_rival, self._tried)
+        return [self._scores()]
+
+    def _scores(self) -> tuple[str, bytes]:
+        """Return the message with the person's score, and the agent's once it is known."""
+        rival, failure = None, ""
+        if self._rival is not None and self._rival.done():
+            error = self._rival.exception()
+            rival = None if error else self._rival.result()
+            failure = f"{RIVAL} could not drive: {error}" if error else ""
+            self._rival = None
+        assert self.result is not None
+        scores = {"you": {name: self.result[name] for name in _SHOWN}, RIVAL: rival, "failure": failure}
+        return "result", encode("result", {"scores": scores})
+
+
+def _rival(tried: Attempt) -> dict[str, Any]:
+    """Let the agent drive the same task in the same patient."""
+    navigation = tried.task.ladder_navigation(tried.place)
+    scored = attempt(RIVAL, navigation, seed=navigation_seed(tried.task, tried.place))
+    return {name: scored[name] for name in _SHOWN}
