@@ -13,11 +13,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from endopilot.cockpit.frames import encode
 from endopilot.cockpit.world import Snapshot
 from endopilot.phantom.phantom import PhantomConfig, make_phantom
 from endopilot.types import Anatomy, Volume
+from endopilot.xray.carm import view_at
 from endopilot.xray.image import Plane, XrayImager
 
 CONTRAST_S = 2.0
@@ -185,6 +187,16 @@ class XrayUnit:
             "dose": settings.dose,
             "roadmap": settings.roadmap,
         }
+
+    def pixels(self, point: Float[np.ndarray, "3"]) -> list[list[float]]:
+        """Return where a point of the patient, LPS mm, lies in the image of each plane: column and row."""
+        found = []
+        for angles, factor in self.settings.planes:
+            view = view_at(angles, self._imager.isocenter, self._imager.config.geometry)
+            right, up = factor * view.project(point)
+            middle = (self._imager.config.pixels - 1) / 2
+            found.append([round(middle + float(right), 1), round(middle - float(up), 1)])
+        return found
 
     def close(self) -> None:
         """Stop computing."""

@@ -97,6 +97,7 @@ class ReplayStage:
             "sight": True,
             "target": target_values(anatomy, film.navigation.target),
             "xray": self._xray.values(snapshot.time_s),
+            "target_px": self._xray.pixels(film.navigation.target.position(anatomy)),
             "replay": {
                 "title": film.title,
                 "seconds": round(film.seconds, 3),

@@ -157,6 +157,7 @@ class Session:
             "sight": self.sight,
             "target": target_values(anatomy, self.target),
             "xray": self.xray.values(snapshot.time_s),
+            "target_px": self.xray.pixels(self.target.position(anatomy)),
             "autopilot": self.autopilot.values(),
         }
         return shown | (tip_values(anatomy, snapshot) if self.sight else {})

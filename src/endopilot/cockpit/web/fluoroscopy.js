@@ -64,8 +64,14 @@ export class Fluoroscopy {
     this.biplane.checked = this.last.biplane;
   }
 
-  /** Show what the X-ray unit says of itself. */
-  show(xray) {
+  /** Show what the X-ray unit says of itself, and where the target lies in its images. */
+  show(xray, target) {
+    target.forEach(([column, row], plane) => {
+      const mark = document.getElementById(`mark${plane}`);
+      mark.style.left = `${(column / 512) * 100}%`;
+      mark.style.top = `${(row / 512) * 100}%`;
+      mark.hidden = column < 0 || row < 0 || column > 512 || row > 512;
+    });
     const changed = JSON.stringify([xray.angles_deg, xray.zoom, xray.biplane, xray.frames_per_s, xray.dose, xray.roadmap]);
     this.last = xray;
     if (changed !== this.filled) {

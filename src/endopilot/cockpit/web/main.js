@@ -70,7 +70,7 @@ function showFigures(state) {
 
 function show(state) {
   page.space.show(state);
-  page.xray.show(state.xray);
+  page.xray.show(state.xray, state.target_px);
   showForce(state);
   showFigures(state);
   page.autopilot?.show(state.autopilot, state.target);

@@ -1,0 +1,104 @@
+"""A task driven by hand: what is hidden, when it ends, and that its score is that of the ladder's own code."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+
+from endopilot.cockpit import game
+from endopilot.cockpit.frames import decode
+from endopilot.cockpit.game import Attempt, GameSession
+from endopilot.cockpit.messages import Autopilot, Drive, Game, Pedal, Target
+from endopilot.cockpit.world import World
+from endopilot.errors import InputError
+from endopilot.tasks.task import find_task
+
+HIDDEN = {"tip_mm", "offset_mm", "section", "force_n", "wall_force_n", "peak_force_n"}
+
+
+class Rival:
+    """In place of the process in which the agent drives."""
+
+    def __init__(self, *arguments, **more):
+        pass
+
+    def submit(self, function, tried):
+        from concurrent.futures import Future
+
+        future = Future()
+        future.set_result({"success": True})
+        return future
+
+    def shutdown(self, **arguments):
+        pass
+
+
+@pytest.fixture
+def played(navigation, xray):
+    world = World(replace(navigation, seconds=6.0, force_limit_n=0.3))
+    with patch.object(game, "ProcessPoolExecutor", Rival):
+        made = GameSession(Attempt(find_task("straight"), 0), world, xray)
+        yield made
+        made.close()
+
+
+def play(session, message, seconds):
+    last = {}
+    for number in range(round(seconds / session.world.config.cycle_s)):
+        now = number * session.world.config.cycle_s
+        if message is not None and number % 4 == 0:
+            session.handle(message, now)
+        last |= {channel: decode(sent) for channel, sent in session.cycle(now)}
+    return last
+
+
+def test_nothing_moves_before_the_clock_starts(played):
+    last = play(played, Drive(type="drive", translation=10.0, rotation=0.0), 0.5)
+    assert played.world.cycle == 0 and last["state"][0]["game"]["phase"] == "waits"
+
+
+def test_only_x_ray_shows_the_wire(played):
+    played.handle(Game(type="game", action="start"), 0.0)
+    last = play(played, Pedal(type="pedal", down=True), 0.5)
+    header, arrays = last["state"]
+    assert not HIDDEN & set(header) and not arrays
+    assert last["image0"][1]["grey"].shape == (512, 512)
+    for message in (
+        Target(type="target", branch=0, abscissa=1.0),
+        Autopilot(type="autopilot", action="start", policy="twin"),
+    ):
+        with pytest.raises(InputError, match="not before the end"):
+            played.handle(message, 0.0)
+
+
+def test_it_is_scored_by_the_ladders_code(played):
+    played.handle(Game(type="game", action="start"), 0.0)
+    play(played, Pedal(type="pedal", down=True), 0.4)
+    played.handle(Pedal(type="pedal", down=False), 0.0)
+    last = play(played, Drive(type="drive", translation=5.0, rotation=1.0), 3.0)
+    assert played.phase == "over"
+    you = last["result"][0]["scores"]["you"]
+    assert you["success"] and you["reason"] == "reached"
+    assert you["seconds"] % 0.5 == 0 and 1.5 <= you["seconds"] <= 4.0
+    assert you["exposures"] == played.xray.frames > 0
+    assert set(last["state"][0]) >= HIDDEN and len(last["state"][1]["nodes"]) > 10
+    assert last["result"][0]["scores"]["agent"] == {"success": True}
+
+
+def test_the_time_ends_it(played):
+    played.handle(Game(type="game", action="start"), 0.0)
+    last = play(played, None, 6.1)
+    you = last["result"][0]["scores"]["you"]
+    assert (you["success"], you["reason"], you["seconds"], you["exposures"]) == (False, "time", 6.0, 0)
+
+
+def test_a_task_has_the_ladders_world():
+    tried = Attempt(find_task("straight"), 1)
+    world = tried.world()
+    ladder = tried.task.ladder_navigation(1)
+    assert world.navigation.anatomy.identity == ladder.anatomy.identity
+    assert world.config.simulator.element_mm == 1.25
+    assert np.isclose(world.snapshot().rotation, ladder.start_rotation)
