@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from analytic_shapes import mask_of
+from toy_coronaries import artery, mask_of_arteries
 
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.anatomy.parent_vessel import piece_on_side
 from endopilot.anatomy.surface import Surface, surface_from_mask
+from endopilot.errors import InputError
 
 HALF_MM = (22.0, 12.0, 34.0)
 
@@ -30,13 +34,18 @@ def artery_from_aorta(points):
     return np.maximum.reduce([upright(points, 0.0, -32.0), aorta, bulge])
 
 
-@pytest.mark.parametrize(("vessel", "side"), [("rca", -10.0), ("lca", 10.0), ("generic", 10.0)])
-def test_of_two_arteries_the_patients_side_decides(vessel, side):
+def test_of_two_vessels_the_larger_is_taken_and_the_other_named():
     mask = mask_of(two_arteries, HALF_MM, (0.6, 0.6, 0.6))
     for source in (mask, surface_from_mask(mask.volume)):
-        anatomy = extract_anatomy(source, name="both", config=AnatomyConfig(vessel=vessel))
-        assert abs(anatomy.insertion.position[0] - side) < 1.0
+        anatomy = extract_anatomy(source, name="both")
+        assert abs(anatomy.insertion.position[0] - 10.0) < 1.0
         assert any("other large pieces" in note for note in anatomy.provenance["notes"])
+
+
+@pytest.mark.parametrize("vessel", ["rca", "lca"])
+def test_straight_tubes_are_not_answered_as_coronary_arteries(vessel):
+    with pytest.raises(InputError, match="--ostium-mm"):
+        extract_anatomy(mask_of(two_arteries, HALF_MM, (0.6, 0.6, 0.6)), config=AnatomyConfig(vessel=vessel))
 
 
 def test_small_pieces_do_not_count_as_the_other_artery():
@@ -62,9 +71,13 @@ def test_surface_exported_twice_is_read_once():
 
 
 def test_aneurysm_low_in_the_tree_is_not_taken_for_the_aorta():
-    def with_aneurysm(points):
-        return np.maximum(upright(points, 0.0, -24.0), 5.0 - np.linalg.norm(points - [0.0, 0.0, -24.0], axis=-1))
-
-    mask = mask_of(with_aneurysm, HALF_MM, (0.6, 0.6, 0.6))
+    lumen = artery("rca")
+    index = np.indices(lumen.values.shape)[::-1].reshape(3, -1).T
+    place = (lumen.origin_mm + lumen.spacing_mm * index).reshape(*lumen.values.shape, 3)
+    low = place[lumen.values > 1.0]
+    sac = 5.0 - np.linalg.norm(place - low[low[:, 2].argmin()], axis=-1)
+    mask = mask_of_arteries(replace(lumen, values=np.maximum(lumen.values, sac)))
     anatomy = extract_anatomy(mask, name="sac", config=AnatomyConfig(vessel="rca"))
-    assert anatomy.provenance["ostium_rule"] == "widest open end"
+    assert anatomy.provenance["ostium_rule"] == "shape of the coronary arteries"
+    assert np.linalg.norm(anatomy.insertion.position) < 3.0
+    assert anatomy.tree.longest_path().radius.max() > 3.5

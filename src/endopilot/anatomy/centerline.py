@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
 from endopilot.anatomy.distance import sample
-from endopilot.anatomy.line_ends import before_cap, from_ostium, to_cut, without_inlets
+from endopilot.anatomy.line_ends import before_cap, from_ostium, from_tip, to_cut, without_inlets
 from endopilot.anatomy.lumen_graph import LumenGraph
 from endopilot.anatomy.surface import Surface
 from endopilot.anatomy.tree import Line, cross_axes, resampled, smoothed, tangents
@@ -68,7 +68,7 @@ def refined_lines(
         if index == 0:
             drawn, width = (side[::-1] for side in to_cut(distance_map, points[::-1], radius[::-1], step_mm))
             begun = None if ostium is None else from_ostium(distance_map, drawn, width, points, radius, ostium, step_mm)
-            points, radius = begun or (drawn, width)
+            points, radius = begun or from_tip(drawn, width, points, radius, graph.points[nodes], step_mm)
         else:
             home[nodes[1:]] = len(lines)
             place = _meeting_point(points, lines[parent])

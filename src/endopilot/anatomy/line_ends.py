@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 
 from endopilot.anatomy.distance import sample
 from endopilot.anatomy.lumen_graph import LumenGraph
-from endopilot.anatomy.tree import Line, cross_axes, smoothed
+from endopilot.anatomy.tree import Line, cross_axes, resampled, smoothed
 from endopilot.types import DistanceMap, Insertion
 
 _RING = 12
@@ -26,6 +26,9 @@ _AHEAD = 0.87
 
 _SIGHT = np.linspace(0.0, 1.0, 50)
 """Shares of a line of sight at which the lumen is looked at."""
+
+_LED_ELSEWHERE = 2.0
+"""A line drawn out to its cut ends within this many radii of the tip that it was traced from."""
 
 _LONGEST_BRIDGE = 4.0
 """A known ostium is joined to a line that begins at most this many radii away."""
@@ -134,6 +137,39 @@ def from_ostium(
     free = int(np.argmax(np.append(gone > 1.25 * clearance + step_mm, True)))
     clearance[:free] = np.append(clearance, radius[first])[free]
     return smoothed(np.concatenate([bridge, points[first:]]), 3.0), np.concatenate([clearance, radius[first:]])
+
+
+def from_tip(
+    drawn: Float[np.ndarray, "n 3"],
+    width: Float[np.ndarray, "n"],
+    points: Float[np.ndarray, "m 3"],
+    radius: Float[np.ndarray, "m"],
+    traced: Float[np.ndarray, "t 3"],
+    step_mm: float,
+) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k"]]:
+    """Return the first line so that it begins at the tip that it was traced from, if drawing it out led elsewhere.
+
+    Where a short left main meets its branches, a line that is cut back from the cap is cut back round the bend.
+
+    Args:
+        drawn: the line as it was drawn out to the cut.
+        width: its radii, mm.
+        points: the line before that, cut back from the cap.
+        radius: its radii, mm.
+        traced: the nodes of its path, the tip first.
+        step_mm: distance between points, mm.
+    """
+    if np.linalg.norm(drawn[0] - traced[0]) < _LED_ELSEWHERE * width[0]:
+        return drawn, width
+    first = int(np.linalg.norm(traced - points[0], axis=1).argmin())
+    # The tip lies in the rim of the cap, not on the axis: begin where a sphere of half the width touches it.
+    gone = np.linalg.norm(traced[:first] - traced[0], axis=1)
+    stub = traced[:first][gone > 0.5 * radius[0]]
+    if len(stub) < 2:
+        return drawn, width
+    line = resampled(smoothed(np.concatenate([stub, points]), radius[0] / step_mm), step_mm)
+    added = len(line) - len(points)
+    return line, np.concatenate([np.full(max(added, 0), radius[0]), radius[max(-added, 0) :]])
 
 
 def without_inlets(distance_map: DistanceMap, lines: list[Line], ostium: Insertion) -> list[Line]:

@@ -79,8 +79,17 @@ def lumen_graph(
     return LumenGraph(kept, clearance[reached], parent, _length_to_root(kept, parent), spacing_mm)
 
 
-def trace_branches(graph: LumenGraph, *, minimum_length_mm: float) -> list[Int[np.ndarray, "_"]]:
-    """Return the tree as paths of nodes: the first from the root, each other one from a node of an earlier path."""
+def trace_branches(
+    graph: LumenGraph, *, minimum_length_mm: float, coverage: float = COVERAGE, slenderness: float = SLENDERNESS
+) -> list[Int[np.ndarray, "_"]]:
+    """Return the tree as paths of nodes: the first from the root, each other one from a node of an earlier path.
+
+    Args:
+        graph: the lumen with its paths to the root.
+        minimum_length_mm: a branch reaches at least this far out of its parent, mm.
+        coverage: a path covers what lies within this many inscribed radii (and two grid steps) of it.
+        slenderness: a branch reaches at least this many times its own radius out of its parent.
+    """
     surroundings = KDTree(graph.points)
     covered = np.zeros(len(graph.points), dtype=bool)
     on_tree = np.zeros(len(graph.points), dtype=bool)
@@ -93,12 +102,12 @@ def trace_branches(graph: LumenGraph, *, minimum_length_mm: float) -> list[Int[n
         while not on_tree[path[-1]] and graph.predecessor[path[-1]] >= 0:
             path.append(int(graph.predecessor[path[-1]]))
         nodes = np.array(path[::-1])
-        if len(paths) == 0 or _is_branch(graph, nodes, minimum_length_mm):
+        if len(paths) == 0 or _is_branch(graph, nodes, minimum_length_mm, slenderness):
             on_tree[nodes] = True
             paths.append(nodes)
         else:
             nodes = nodes[-1:]
-        reach = COVERAGE * graph.clearance[nodes] + 2 * graph.spacing_mm
+        reach = coverage * graph.clearance[nodes] + 2 * graph.spacing_mm
         for found in surroundings.query_ball_point(graph.points[nodes], reach):
             covered[found] = True
     return paths
@@ -115,7 +124,7 @@ def _length_to_root(points: Float[np.ndarray, "n 3"], predecessor: Int[np.ndarra
         length, jump = length + length[jump], further
 
 
-def _is_branch(graph: LumenGraph, nodes: Int[np.ndarray, "_"], minimum_length_mm: float) -> bool:
+def _is_branch(graph: LumenGraph, nodes: Int[np.ndarray, "_"], minimum_length_mm: float, slenderness: float) -> bool:
     """Tell a side branch from a bump: it must reach far enough out of the inscribed sphere that it leaves."""
     points = graph.points[nodes]
     parent_radius = graph.clearance[nodes[0]]
@@ -124,4 +133,4 @@ def _is_branch(graph: LumenGraph, nodes: Int[np.ndarray, "_"], minimum_length_mm
         return False
     length = graph.length[nodes[-1]] - graph.length[nodes[beyond[0]]]
     own_radius = float(np.median(graph.clearance[nodes[beyond]]))
-    return bool(length >= max(minimum_length_mm, SLENDERNESS * own_radius, 0.5 * parent_radius))
+    return bool(length >= max(minimum_length_mm, slenderness * own_radius, 0.5 * parent_radius))

@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
@@ -33,6 +33,10 @@ _ONWARDS = 0.5
 
 SMALLEST_PIECE = 12
 """A piece of fewer voxels is noise."""
+
+
+MOST_PIECES = 12
+"""At most this many pieces of a mask are looked at as coronary arteries or parts of them."""
 
 
 def connected_mask(
@@ -88,6 +92,25 @@ def connected_mask(
     return replace(cropped, voxels=closed), remarks
 
 
+def joined_mask(mask: Volume) -> Volume:
+    """Return a mask in which each of the largest pieces is joined to what carries it on; specks are left out."""
+    from scipy.ndimage import label as components
+
+    voxels = np.asarray(mask.voxels, dtype=bool)
+    labels, _ = components(voxels, structure=np.ones((3, 3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
+    sizes = np.bincount(labels.ravel())
+    sizes[0] = 0
+    pieces = [int(piece) for piece in np.argsort(-sizes)[:MOST_PIECES] if sizes[piece] >= SMALLEST_PIECE]
+    result = np.zeros_like(voxels)
+    for piece in pieces:
+        own = labels == piece
+        if result[own].any():
+            continue
+        others = [other for other in pieces if other != piece and not result[labels == other].any()]
+        result |= _bridged(own, labels, others)[0]
+    return replace(mask, voxels=result)
+
+
 def closed_surface(
     surface: Surface, given: Insertion | None, label: str, vessel: Vessel = "generic"
 ) -> tuple[Surface, list[str]]:
@@ -136,6 +159,17 @@ def closed_surface(
     if result.volume < 0:
         result = Surface(result.vertices, result.faces[:, ::-1])
     return result, remarks
+
+
+def region_places(surface: Surface) -> list[Float[np.ndarray, "3"]]:
+    """Return a point on each of the largest connected parts of a surface, LPS mm."""
+    import pyvista
+
+    faces = np.insert(surface.faces, 0, 3, axis=1).ravel()
+    regions: Any = pyvista.PolyData(surface.vertices, faces).clean().triangulate().connectivity(extraction_mode="all")
+    ids = np.asarray(regions.point_data["RegionId"])
+    sizes = np.bincount(ids)
+    return [np.asarray(regions.points[ids == i][0], float) for i in np.argsort(-sizes)[:MOST_PIECES] if sizes[i] >= 100]
 
 
 def _refuse_blocks_and_noise(voxels: Bool[np.ndarray, "nz ny nx"], label: str) -> None:
@@ -194,7 +228,7 @@ def _bridged(
     if not pieces:
         return result, 0, 0
     result, joined, beside = result.copy(), 0, 0
-    clearance = np.asarray(distance_transform_edt(np.isin(labels, [0], invert=True)))
+    clearance: np.ndarray | None = None  # where nothing is joined it is not needed
     members = {piece: np.argwhere(labels == piece) for piece in pieces}
     changed = True
     while changed:
@@ -211,6 +245,8 @@ def _bridged(
             if not (_carries_on(here, start, end) or _carries_on(own, end, start)):
                 beside += 1
                 continue
+            if clearance is None:
+                clearance = np.asarray(distance_transform_edt(labels > 0))
             width = min(_widest(clearance, start), _widest(clearance, end))
             _draw_tube(result, start, end, width)
             result |= labels == piece

@@ -75,7 +75,7 @@ def command(
 def describe(anatomy: Anatomy) -> dict[str, object]:
     """Return the figures of an anatomy: extent, calibre, ostium, and what was repaired."""
     path, found = anatomy.tree.longest_path(), anatomy.provenance
-    notes = {name: found[name] for name in ("ostium_rule", "notes") if found.get(name)}
+    notes = {name: found[name] for name in ("ostium_rule", "ostium_confidence", "notes") if found.get(name)}
     return {
         "branches": len(anatomy.tree.branches),
         "longest_path_mm": round(float(path.abscissa[-1]), 1),

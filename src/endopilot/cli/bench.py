@@ -10,6 +10,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
+from tyro.conf import Positional
+
 from endopilot.atlas.atlas import AtlasConfig
 from endopilot.benchmarks.robustness import RobustnessConfig
 from endopilot.cli.arguments import OutputFolder, existing, show, show_rows
@@ -185,6 +187,26 @@ def _compared(row: dict[str, Any]) -> dict[str, Any]:
     )
 
 
+def ostia(folder: Positional[Path], /, *, json: bool = False) -> None:
+    """Find the coronary ostia of real patients' masks without an aorta, and compare with where they are known to be.
+
+    Args:
+        folder: masks named after patients, every label a coronary lumen, and ostia.json: for each patient and vessel
+            (rca, lca) `near_aorta_mm`, LPS mm.
+        json: print the figures as JSON.
+    """
+    from endopilot.benchmarks.ostia import bench_ostia, judged
+
+    rows = bench_ostia(existing(folder))
+    figures = judged(rows)
+    if json:
+        show({"arteries": rows, "figures": figures}, as_json=True)
+    else:
+        show_rows(rows, as_json=False)
+        show_rows(figures, as_json=False)
+    _leave(all(figure["passed"] for figure in figures))
+
+
 def imaging(*, cases: int = 50, seed: int = 0, folder: Path = Path("runs/bench-imaging"), json: bool = False) -> None:
     """Segment synthetic CT angiograms from the volume alone, and compare with the truth.
 
@@ -207,7 +229,7 @@ def imaging(*, cases: int = 50, seed: int = 0, folder: Path = Path("runs/bench-i
 
 SUBJECTS: dict[str, Callable[..., None]] = {
     function.__name__: function
-    for function in (simulation, scaling, robustness, env, dataset, training, labels, anatomy, imaging)
+    for function in (simulation, scaling, robustness, env, dataset, training, labels, anatomy, ostia, imaging)
 }
 """The subjects that can be measured."""
 

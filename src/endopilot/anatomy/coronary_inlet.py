@@ -1,0 +1,161 @@
+"""The ostium of the right or left coronary artery in a mask or surface without an aorta: found, or asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from endopilot.anatomy import parent_vessel, repair
+from endopilot.anatomy.coronary_ends import OpenEnd, open_ends, skeleton_of
+from endopilot.anatomy.coronary_ostia import OstiumCandidate, Side, rank_ostia
+from endopilot.anatomy.distance import distance_map_from_surface
+from endopilot.anatomy.surface import Surface, surface_from_mask
+from endopilot.errors import InputError
+from endopilot.types import DistanceMap, Insertion, LumenMask, Volume
+
+CERTAIN = 0.7
+"""An ostium less probable than this is asked for."""
+
+SHORTEST_MM = 15.0
+"""A lumen whose branches together are shorter than this is no artery but a crumb."""
+
+SHORT_MM = 60.0
+"""A coronary artery whose longest path is shorter than this is cut off, or a vestige."""
+
+GRID_MM = 0.5
+"""Grid spacing at which the arteries are compared, mm."""
+
+_NAMES = {"rca": "right coronary artery", "lca": "left coronary artery"}
+_NAMED, _WORTH_NAMING = 4, 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class CoronaryInlet:
+    """Where a coronary artery begins.
+
+    Attributes:
+        position: tip of the open end, LPS mm.
+        confidence: probability that the artery begins there, 0 to 1.
+        runner_up: the next best place, if any.
+    """
+
+    position: Float[np.ndarray, "3"]
+    confidence: float
+    runner_up: OstiumCandidate | None
+
+    def record(self) -> dict[str, object]:
+        """Return what `anatomy.json` keeps: `ostium_confidence`, and where else the artery may begin."""
+        other = self.runner_up
+        return {
+            "ostium_confidence": round(self.confidence, 4),
+            "ostium_runner_up": other
+            and {"position_mm": other.position.round(2).tolist(), "probability": round(other.probability, 4)},
+        }
+
+
+def coronary_inlet(content: LumenMask | Surface, side: Side, label: str) -> CoronaryInlet | None:
+    """Return where an artery begins, or None where the lumen holds a piece of the aorta, which shows it.
+
+    Args:
+        content: both coronary arteries, or one, with whatever specks.
+        side: which artery is asked for.
+        label: name of the source, for messages.
+
+    Raises:
+        InputError: the artery is not there, or it is not certain where it begins; the candidates are named.
+    """
+    pieces: list[list[OpenEnd]] = []
+    if isinstance(content, LumenMask) and _holds_aorta(content.volume):
+        return None
+    for lumen in _lumens(content, label):
+        inside = lumen.values > 0
+        for points, clearance in _parts(lumen, inside):
+            if clearance.max() > parent_vessel.AORTA_RADIUS_MM:
+                return None
+            skeleton = skeleton_of(points, clearance, lumen.spacing_mm)
+            if skeleton.length_mm >= SHORTEST_MM:
+                pieces.append(open_ends(skeleton))
+    if not pieces:
+        raise InputError(f"{label}: holds no vessel of {SHORTEST_MM:g} mm or more; check the label and the unit")
+    ranked, absent = rank_ostia(pieces, side)
+    best = ranked[0]
+    if best.probability < CERTAIN:
+        raise InputError(f"{label}: {_doubt(ranked, absent, side)}")
+    return CoronaryInlet(best.position, best.probability, ranked[1] if len(ranked) > 1 else None)
+
+
+def _doubt(ranked: list[OstiumCandidate], absent: float, side: Side) -> str:
+    first = " ".join(f"{value:.1f}" for value in ranked[0].position)
+    if absent > ranked[0].probability:
+        other = "lca" if side == "rca" else "rca"
+        return (
+            f"holds no {_NAMES[side]}: what is in it looks like the {_NAMES[other].split()[0]} one; "
+            f"take --vessel {other}, or say where it begins, perhaps --ostium-mm {first}"
+        )
+    named = [candidate for candidate in ranked[:_NAMED] if candidate.probability > _WORTH_NAMING] or ranked[:1]
+    places = ", ".join(f"{_text(candidate.position)} {candidate.probability:.0%}" for candidate in named)
+    return (
+        f"it is not certain where the {_NAMES[side]} begins: {places} (LPS mm, probability); look, and give the right "
+        f"one, such as --ostium-mm {first}; surfaces in RAS axes need --coordinates ras"
+    )
+
+
+def _text(position: Float[np.ndarray, "3"]) -> str:
+    return "(" + ", ".join(f"{value:.1f}" for value in position) + ")"
+
+
+def _lumens(content: LumenMask | Surface, label: str) -> Iterator[DistanceMap]:
+    if isinstance(content, LumenMask):
+        mask = _coarse(content.volume)
+        if mask.voxels.any():
+            wall = surface_from_mask(repair.joined_mask(mask))
+            yield distance_map_from_surface(wall, spacing_mm=GRID_MM, band_mm=2 * GRID_MM)
+        return
+    for place in repair.region_places(content):
+        wall, _ = repair.closed_surface(content, Insertion(place, np.zeros(3)), label)
+        yield distance_map_from_surface(wall, spacing_mm=GRID_MM, band_mm=2 * GRID_MM)
+
+
+def _parts(lumen: DistanceMap, inside: np.ndarray) -> Iterator[tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]]:
+    from scipy.ndimage import find_objects
+    from scipy.ndimage import label as components
+
+    labels, _ = components(inside, structure=np.ones((3, 3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
+    for number, box in enumerate(find_objects(labels), start=1):
+        own = labels[box] == number
+        corner = np.array([part.start for part in box])
+        index = np.argwhere(own) + corner
+        if len(index) > 100:
+            yield lumen.origin_mm + lumen.spacing_mm * index[:, ::-1], lumen.values[tuple(index.T)].astype(float)
+
+
+def _holds_aorta(mask: Volume) -> bool:
+    """Return whether a mask is somewhere too thick for a coronary artery, at a fraction of its wall's cost."""
+    from scipy.ndimage import distance_transform_edt
+
+    coarse = _coarse(mask)
+    depth = np.asarray(distance_transform_edt(coarse.voxels, sampling=coarse.spacing_mm[::-1]))
+    return bool(depth.max(initial=0.0) > parent_vessel.AORTA_RADIUS_MM)
+
+
+def _coarse(mask: Volume) -> Volume:
+    """Return a mask cropped to what is in it, of voxels no finer than the ostia are looked for at."""
+    filled = np.nonzero(mask.voxels)
+    if len(filled[0]) == 0:
+        return mask
+    corner = np.array([index.min() for index in filled])
+    voxels = mask.voxels[tuple(slice(low, index.max() + 1) for low, index in zip(corner, filled, strict=True))]
+    factor = np.maximum(np.floor(GRID_MM / mask.spacing_mm + 0.2).astype(int), 1)
+    origin = mask.index_to_world(corner[::-1].astype(float))
+    cropped = replace(mask, voxels=np.asarray(voxels, dtype=bool), origin_mm=origin)
+    if (factor == 1).all():
+        return cropped
+    from skimage.measure import block_reduce
+
+    block = tuple(int(size) for size in factor[::-1])
+    shares = block_reduce(cropped.voxels.astype(np.float32), block, np.mean)  # pyright: ignore[reportArgumentType]
+    origin = cropped.index_to_world((factor - 1) / 2.0)
+    return replace(mask, voxels=shares >= 0.5, spacing_mm=mask.spacing_mm * factor, origin_mm=origin)
