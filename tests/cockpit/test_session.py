@@ -42,6 +42,10 @@ def test_silence_stops_the_wire(session):
     (header, _), _ = run(session, 0.3, start=SILENCE_S + 0.02)
     assert moving[0] == 5.0
     assert header["stopped"] == "silence" and header["velocity"] == [0.0, 0.0]
+    drive = Drive(type="drive", translation=5.0, rotation=0.0)
+    assert run(session, 0.3, message=drive, start=0.6)[0][0]["velocity"] == [0.0, 0.0]  # until the hands let go
+    session.handle(Drive(type="drive", translation=0.0, rotation=0.0), 0.9)
+    assert run(session, 0.3, message=drive, start=0.9)[0][0]["velocity"] == [5.0, 0.0]
 
 
 def test_the_pedal_counts_and_silence_lets_it_go(session):

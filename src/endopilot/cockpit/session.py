@@ -53,7 +53,7 @@ class Session:
         self.target: Target = world.navigation.target
         self.sight = True
         self._command, self._moving, self._heard_s = (0.0, 0.0), False, -np.inf
-        self._stopped = ""
+        self._stopped, self._locked = "", False
 
     def handle(self, message: messages.Message, now_s: float) -> None:
         """Do what the page of who drives asks for.
@@ -124,6 +124,7 @@ class Session:
         limit = AUTOPILOT_SILENCE_S if self.autopilot.drives else SILENCE_S
         if (self._moving or self.autopilot.drives or self.xray.pedal) and now_s - self._heard_s > limit:
             self.halt("silence")
+            self._locked = True
         sent = self._think()
         if not self.autopilot.waits:
             self.world.advance()
@@ -172,6 +173,9 @@ class Session:
 
     def _drive(self, translation: float, rotation: float) -> None:
         command = self.world.limits.safe(translation, rotation)
+        if self._locked and command != (0.0, 0.0):
+            return  # after silence the hands must let go before the wire moves again
+        self._locked = False
         if self.autopilot.drives:
             if command == (0.0, 0.0):
                 return  # the page only says that it is there

@@ -1,0 +1,91 @@
+"""A server in a process of its own, and a browser, for tests."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+
+FLAGS = (
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--no-first-run",
+)
+
+
+def browser_path():
+    """Return the program of an installed browser, or None."""
+    names = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+    return next((found for found in map(shutil.which, names) if found), None)
+
+
+class Server:
+    """`endopilot cockpit` in a process of its own."""
+
+    def __init__(self, *arguments):
+        command = [sys.executable, "-m", "endopilot.cli", "cockpit", "--no-browser", *map(str, arguments)]
+        self.process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"}
+        )
+        lines = []
+        while not lines or (lines[-1].startswith("page") and "--replay" not in arguments):
+            line = self.process.stdout.readline()
+            assert line, "the server ended before it listened"
+            lines.append(line)
+        text = "".join(lines)
+        self.address = re.search(r"page +(\S+)", text)[1]
+        recording = re.search(r"recording +(\S+)", text)
+        self.recording = recording and recording[1]
+        self.origin = self.address.partition("/?")[0]
+
+    def kill(self):
+        """Kill it as a crash does."""
+        self.process.send_signal(signal.SIGKILL)
+        self.process.wait()
+
+    def stop(self):
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGINT)
+            try:
+                self.process.wait(timeout=15)
+            except subprocess.TimeoutExpired:
+                self.kill()
+
+
+@contextmanager
+def serving(*arguments):
+    server = Server(*arguments)
+    try:
+        yield server
+    finally:
+        server.stop()
+
+
+def value(page, script):
+    """Return the value of an expression in the page."""
+    return page.evaluate(f"() => {script}")
+
+
+def until(page, script, seconds=40.0):
+    """Wait for an expression in the page to be true."""
+    end = time.monotonic() + seconds
+    while not value(page, f"Boolean({script})"):
+        assert time.monotonic() < end, f"{script} is not so; the page says: {page.inner_text('#banner')!r}"
+        time.sleep(0.05)
+
+
+def opened(context, server):
+    """Open the page and wait until it shows the wire's state and the C-arm stands still."""
+    page = context.new_page()
+    page.goto(server.address)
+    until(page, "window.cockpit?.shown?.xray.ready")
+    return page

@@ -1,0 +1,195 @@
+"""The page in a real browser."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from browser import FLAGS, browser_path, opened, serving, until, value
+
+from endopilot.cockpit.recording import read_recording, replayed
+
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+pytest.importorskip("starlette", reason="the extra `cockpit` is not installed")
+pytest.importorskip("websockets", reason="the extra `cockpit` is not installed")
+
+pytestmark = pytest.mark.skipif(browser_path() is None, reason="no Chromium or Chrome is installed")
+IMAGE = "Array.from(document.getElementById('plane0').getContext('2d').getImageData(0, 0, 100, 100).data).join()"
+
+
+@pytest.fixture(scope="module")
+def chromium():
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=browser_path(), args=list(FLAGS))
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def context(chromium):
+    made = chromium.new_context(viewport={"width": 1280, "height": 800})
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def server(vessel, tmp_path):
+    with serving(vessel, "--output", tmp_path) as made:
+        yield made
+
+
+def test_keys_move_the_wire_and_the_pedal_counts(context, server):
+    requests, errors = [], []
+    context.on("request", lambda request: requests.append(request.url))
+    page = opened(context, server)
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    assert "Not a medical device" in page.inner_text("header")
+    began = value(page, "cockpit.shown.inserted_mm")
+    page.keyboard.down("KeyW")
+    until(page, f"cockpit.shown.inserted_mm > {began + 3}")
+    page.keyboard.up("KeyW")
+    until(page, "cockpit.shown.velocity[0] === 0")
+    held = value(page, "cockpit.shown.inserted_mm")
+    page.keyboard.down("ArrowLeft")
+    until(page, "cockpit.shown.rotation_deg < -20")
+    page.keyboard.up("ArrowLeft")
+    assert value(page, "cockpit.shown.xray.frames") == 0
+    page.keyboard.down("KeyX")
+    until(page, "cockpit.shown.xray.frames >= 3")
+    assert "live" in page.inner_text("#caption0")
+    page.keyboard.up("KeyX")
+    until(page, "!cockpit.shown.xray.on")
+    frames, image = value(page, "cockpit.shown.xray.frames"), value(page, IMAGE)
+    page.keyboard.down("KeyS")
+    until(page, f"cockpit.shown.inserted_mm < {held - 2}")
+    page.keyboard.up("KeyS")
+    assert value(page, "cockpit.shown.xray.frames") == frames
+    assert value(page, IMAGE) == image  # the last image is held while X-ray is off
+    assert "last image" in page.inner_text("#caption0")
+    assert requests and all(url.startswith((server.origin, "data:")) for url in requests)
+    assert not errors
+
+
+def test_a_closed_page_stops_the_wire(context, server):
+    page = opened(context, server)
+    watcher = opened(context, server)
+    page.bring_to_front()
+    page.evaluate("() => { cockpit.hands.release = () => {}; }")  # or the page would let the keys go before it closes
+    page.keyboard.down("KeyW")
+    until(watcher, "cockpit.state.velocity[0] > 0")
+    page.close()
+    until(watcher, "cockpit.state.velocity[0] === 0")
+    assert value(watcher, "cockpit.state.stopped") in ("connection", "silence")
+
+
+def test_a_page_that_hangs_stops_the_wire(context, server):
+    page = opened(context, server)
+    watcher = opened(context, server)
+    page.bring_to_front()
+    page.keyboard.down("KeyW")
+    until(watcher, "cockpit.state.velocity[0] > 0")
+    page.evaluate("() => { const end = Date.now() + 1500; while (Date.now() < end); }")
+    until(watcher, "cockpit.state.velocity[0] === 0 && cockpit.state.stopped === 'silence'")
+
+
+def test_two_pages_watch_and_one_drives(context, server):
+    first, second = opened(context, server), opened(context, server)
+    until(second, "cockpit.role.taken && !cockpit.role.drives")
+    first.bring_to_front()
+    began = value(second, "cockpit.state.inserted_mm")
+    second.evaluate("() => cockpit.connection.send('drive', {translation: 5, rotation: 0})")
+    until(second, "document.getElementById('banner').textContent.includes('watches')")
+    assert value(second, "cockpit.state.inserted_mm") == pytest.approx(began, abs=0.01)
+    first.click("#wheel")
+    until(second, "!document.getElementById('wheel').hidden && !cockpit.role.taken")
+    second.bring_to_front()
+    second.click("#wheel")
+    until(second, "cockpit.role.drives")
+    second.keyboard.down("KeyW")
+    until(first, f"cockpit.state.inserted_mm > {began + 2}")
+    second.keyboard.up("KeyW")
+
+
+def test_a_wrong_token_shows_nothing(context, server):
+    page = context.new_page()
+    answer = page.goto(server.origin + "/?token=wrong")
+    assert answer.status == 403
+    assert "needs the address" in page.inner_text("body")
+    page.goto(server.origin + "/web/connection.js")
+    closed = page.evaluate(
+        f"""() => new Promise((done) => {{
+            const socket = new WebSocket("{server.origin.replace("http", "ws")}/socket?token=wrong");
+            socket.onclose = (event) => done(event.code);
+        }})"""
+    )
+    assert closed == 4403
+
+
+def test_a_policy_drives_and_a_hand_takes_over(context, server):
+    page = opened(context, server)
+    page.select_option("#autopilot-policy", "forward")
+    page.click("#autopilot-start")
+    until(page, "cockpit.shown.autopilot.status === 'drives' && cockpit.shown.velocity[0] > 0")
+    page.keyboard.down("KeyS")
+    until(page, "cockpit.shown.autopilot.status === 'off' && cockpit.shown.velocity[0] < 0")
+    page.keyboard.up("KeyS")
+    page.click("#autopilot-start")
+    until(page, "cockpit.shown.autopilot.status === 'reached'", seconds=60)
+    target, tip = value(page, "cockpit.shown.target.abscissa"), value(page, "cockpit.shown.tip_mm")
+    assert abs(tip - target) < 3.0
+    assert "reached" in page.inner_text("#autopilot-text")
+
+
+def test_a_killed_server_goes_on_and_a_replay_shows_what_was(context, server):
+    page = opened(context, server)
+    page.keyboard.down("KeyW")
+    until(page, "cockpit.shown.inserted_mm > 9")
+    page.keyboard.down("KeyD")
+    until(page, "cockpit.shown.inserted_mm > 13")
+    for key in ("KeyW", "KeyD"):
+        page.keyboard.up(key)
+    until(page, "cockpit.shown.velocity.every((v) => v === 0)")
+    time.sleep(1.0)
+    cycle, nodes = value(page, "[cockpit.state.cycle, Array.from(cockpit.state.nodes)]")
+    server.kill()
+    until(page, "!document.getElementById('banner').hidden")
+    with serving("--resume", server.recording) as again:
+        resumed = opened(context, again)
+        assert value(resumed, "cockpit.shown.inserted_mm") == pytest.approx(13.5, abs=3.0)
+        resumed.keyboard.down("KeyS")
+        until(resumed, "cockpit.shown.inserted_mm < 11")
+        resumed.keyboard.up("KeyS")
+    recording = read_recording(Path(server.recording))
+    then = next((world.snapshot().nodes for world, _ in replayed(recording) if world.cycle == cycle), None)
+    np.testing.assert_array_equal(np.array(nodes, dtype="<f4"), then.astype("<f4").ravel())
+    with serving("--replay", server.recording) as shown:
+        film = opened(context, shown)
+        until(film, f"cockpit.state.replay.ready_s * 80 > {cycle}")
+        film.evaluate(f"() => cockpit.connection.send('replay', {{at_s: {cycle // 4 / 20}, playing: false}})")
+        until(film, f"cockpit.state.time_s === {cycle // 4 / 20} && !cockpit.state.replay.playing")
+        at = next(world.snapshot().nodes for world, _ in replayed(recording) if world.cycle == cycle // 4 * 4)
+        seen = np.array(value(film, "Array.from(cockpit.state.nodes)"), dtype="<f4")
+        np.testing.assert_array_equal(seen, at.astype("<f4").ravel())
+        assert film.locator("#slider").is_visible()
+
+
+def test_a_task_is_driven_by_x_ray_alone(context, tmp_path):
+    with serving("--task", "straight", "--output", tmp_path) as server:
+        page = opened(context, server)
+        assert page.locator("#blind").is_visible()
+        page.click("#game-start")
+        until(page, "cockpit.shown.game.phase === 'on'")
+        page.keyboard.down("KeyX")
+        until(page, "cockpit.shown.xray.frames >= 2")
+        page.keyboard.up("KeyX")
+        assert value(
+            page, "[cockpit.state.nodes, cockpit.state.tip_mm, cockpit.state.force_n].every((v) => v === undefined)"
+        )
+        page.keyboard.down("Shift")
+        page.keyboard.down("KeyW")
+        until(page, "cockpit.shown.game.phase === 'over'", seconds=100)
+        until(page, "document.querySelector('#scores')?.innerText.includes('you')")
+        assert page.locator("#blind").is_hidden()
+        assert value(page, "cockpit.state.nodes.length") > 10
