@@ -12,10 +12,11 @@ from hypothesis import strategies as st
 from endopilot.control import search
 from endopilot.control.agent import AgentConfig, AgentPolicy, OpenLoopPolicy, TwinPolicy
 from endopilot.control.belief import Belief, BeliefConfig
+from endopilot.control.course import Course
 from endopilot.control.mismatch import ModelMismatch
 from endopilot.control.navigate import NavigationLoop, navigate
 from endopilot.control.policy import Decision, Observation, Policy
-from endopilot.control.search import Course, Search
+from endopilot.control.search import Search
 from endopilot.tasks.navigation import Navigation, Target
 from endopilot.xray.adviser import AdviserConfig
 from endopilot.xray.bands import Calibration
@@ -178,7 +179,7 @@ def test_whatever_the_model_returns_commands_are_finite_and_within_limits(starte
 
 @pytest.mark.timeout(60)
 def test_a_search_ends_though_pushing_seems_to_arrive_and_the_target_is_not_reached(side_branch, monkeypatch) -> None:
-    monkeypatch.setattr(Search, "_push_on", lambda *_: True)
+    monkeypatch.setattr(Search, "_push_on", lambda *_: None)
     policy = TwinPolicy(config=QUICK)
     policy.start(side_branch, 0)
     course = policy.find_course(5.0)
@@ -195,7 +196,7 @@ def test_a_search_begins_farther_before_a_wide_junction(side_branch, monkeypatch
         one = policy._search
         one.single.copy_worlds(np.zeros(1, dtype=int), of=policy.belief.simulator)
         one._weight = np.ones(1)
-        one._approach(search._Log(), 20, 22.5)
+        one._approach(search.Log(), 20, 22.5, np.inf)
         begun.append(float(one.single.project().abscissa[0]))
     assert begun == pytest.approx([16.0, 12.0], abs=1.1)
 

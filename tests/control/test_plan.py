@@ -83,7 +83,7 @@ def test_a_path_that_does_not_arrive_in_the_rod_core_is_no_plan(vessel, monkeypa
     """The search believes that it arrived; the rod core at its own settings has the tip elsewhere."""
     still = np.zeros((4, 2)), np.full((4, 2), 33.0)
     monkeypatch.setattr(plan_module, "_search", lambda *_: still)
-    with pytest.raises(InputError, match=r"target: not reached in 30 s .* ends at \d\.\d of 33\.0 mm"):
+    with pytest.raises(InputError, match=r"target: not reached on the path .* ends at \d\.\d of 33\.0 mm"):
         plan(vessel, "0,0,33", PlanConfig(seconds=30.0))
 
 

@@ -63,11 +63,12 @@ def test_a_fork_is_as_wide_as_its_lumen_leaves_the_wire(wide, wire) -> None:
 
 def test_a_wide_fork_refuses_a_short_tip_and_takes_a_long_one(wide, wire) -> None:
     """4.8 mm are free: 45°/3 mm reaches 1.1 mm of them, 90°/8 mm all."""
-    count = rotations_that_enter(wide, [wire.shaped(45.0, 3.0), wire.shaped(90.0, 8.0)])
-    assert count.shape == (2, 1)
-    assert count[0, 0] == 0 and ROTATIONS / 4 <= count[1, 0] <= ROTATIONS / 2  # the side that looks into the branch
-    straight = rotations_that_enter(replace(wide, target=Target(branch=1, abscissa=33.0)), [wire.shaped(45.0, 3.0)])
-    assert straight[0, 0] == ROTATIONS
+    refused = rotations_that_enter(wide, wire.shaped(45.0, 3.0))
+    assert refused.tolist() == [0]
+    (entering,) = rotations_that_enter(wide, wire.shaped(90.0, 8.0)).tolist()
+    assert ROTATIONS / 4 <= entering <= ROTATIONS / 2  # the side that looks into the branch
+    straight = replace(wide, target=Target(branch=1, abscissa=33.0))
+    assert rotations_that_enter(straight, wire.shaped(45.0, 3.0)).tolist() == [ROTATIONS]
 
 
 def test_a_tip_is_chosen_that_enters(wide, wire) -> None:
@@ -76,7 +77,7 @@ def test_a_tip_is_chosen_that_enters(wide, wire) -> None:
     assert choice.refused is None and choice.tilt_deg == 0.0 and made.anatomy is wide.anatomy
     assert lateral_reach(made.device.tip_bend_rad, made.device.tip_bend_length_mm) > 1.2
     assert choice.tip in choice.why and "own tip enters the fork into section" in choice.why
-    assert rotations_that_enter(made, [made.device])[0, 0] == choice.entering[0] > 0
+    assert rotations_that_enter(made, made.device)[0] == choice.entering[0] > 0
     straight = choose_tip(replace(wide, target=Target(branch=1, abscissa=33.0)))
     assert straight.tip == "45/3" and straight.navigation.device == wire  # its own tip suffices and is kept
 

@@ -14,10 +14,11 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.control.belief import Belief, BeliefConfig
+from endopilot.control.course import Course
 from endopilot.control.mismatch import ModelMismatch
 from endopilot.control.policy import BelievedTip, Decision, Observation
 from endopilot.control.route import Route, check_passable
-from endopilot.control.search import Course, Search, SearchConfig
+from endopilot.control.search import Search, SearchConfig
 from endopilot.progress import Advance
 from endopilot.settings import Count, Positive, settings
 from endopilot.simulation.drive_limits import DriveLimits
@@ -166,6 +167,11 @@ class _PlanningPolicy:
         return TipProjection(
             abscissa=course.abscissa[at], offset=course.offset[at], branch=course.branch[at], radius=course.radius[at]
         )
+
+    @property
+    def halt(self) -> str:
+        """Where and why the last search ended before the target, in words; empty if it arrived."""
+        return self._search.halt
 
     def find_course(self, seconds: float, advance: Advance | None = None) -> Course:
         """Search a path from where the likeliest wires are.

@@ -11,12 +11,13 @@ from jaxtyping import Float
 
 from endopilot.anatomy.io import read_anatomy
 from endopilot.control.agent import AgentConfig, TwinPolicy
+from endopilot.control.course import Course
 from endopilot.control.desired import last_place, read_tips, tips_along
 from endopilot.control.navigate import NavigateConfig, navigate
 from endopilot.control.plan_config import NETWORK_METHODS, Plan, PlanConfig, Steps
 from endopilot.control.robot import RobotConfig
 from endopilot.control.route import Route, check_passable, parse_target
-from endopilot.control.search import Course, SearchConfig
+from endopilot.control.search import SearchConfig
 from endopilot.control.set_up import TipChoice, choose_tip
 from endopilot.errors import InputError
 from endopilot.extras import extra_named
@@ -167,22 +168,17 @@ def _search(navigation: Navigation, config: PlanConfig) -> tuple[Steps, Steps]:
     with progress("plan: searching in the rod core", total=navigation.target.abscissa) as advance:
         course = policy.find_course(navigation.seconds, advance)
     if course.reached < 0.5:
-        raise InputError(_no_path(navigation, course))
+        raise InputError(_no_path(navigation, course, policy.halt))
     return course.control, np.column_stack([course.abscissa[:, 0], course.offset[:, 0]])
 
 
-def _no_path(navigation: Navigation, course: Course) -> str:
-    """Return how far a search came, and which limit it met, as one line."""
-    if course.force.max() > navigation.force_limit_n:
-        mend = f"pressing with {course.force.max():.3g} N; give a larger force_limit_n or a softer wire"
-    elif DECISION_PERIOD_S * (len(course.control) + 2) > navigation.seconds:  # a round of the search is 2 periods
-        mend = "when the time was over; give more seconds"
-    else:
-        mend = "and no further; give a wire of larger tip bend"
+def _no_path(navigation: Navigation, course: Course, halt: str) -> str:
+    """Return how far a search came, and what it met there, as one line."""
+    came = float(course.abscissa[-1, 0]) if len(course.abscissa) else navigation.start_inserted_mm
     return (
         f"target: no path found to branch {navigation.target.branch} of {navigation.anatomy.name} in "
         f"{navigation.seconds:g} s under {navigation.force_limit_n:g} N with {navigation.device.name}; the tip came to "
-        f"{course.abscissa[-1, 0]:.0f} of {navigation.target.abscissa:.0f} mm, {mend}"
+        f"{came:.0f} of {navigation.target.abscissa:.0f} mm; {halt}"
     )
 
 
@@ -200,11 +196,14 @@ def _check_kept(made: Plan) -> None:
             f"with {made.force.max():.3g} N; give a larger force_limit_n, another seed or a softer wire"
         )
     if not made.reached:
-        far = float(made.simulated.abscissa[-1])
+        tip = made.simulated
+        far, branch = float(tip.abscissa[-1]), int(tip.branch[-1])
+        where = f"at {far:.1f} of {navigation.target.abscissa:.1f} mm"
+        if branch != navigation.target.branch:
+            where += f", in branch {branch}"
         raise InputError(
-            f"target: not reached in {navigation.seconds:g} s on the path found to {goal}: in the rod core the "
-            f"tip ends at {far:.1f} of {navigation.target.abscissa:.1f} mm; give another seed, more seconds or a wire "
-            "of larger tip bend"
+            f"target: not reached on the path found to {goal}: in the rod core the tip ends {where}; give another seed "
+            "or another tip"
         )
 
 

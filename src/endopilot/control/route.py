@@ -17,6 +17,8 @@ BEYOND_MM = 1.5
 """A waypoint lies this far beyond the wall of the parent, on the centerline of the branch that leaves it, mm."""
 ENTERED_MM = 1.0
 """A tip this far beyond a waypoint has entered the branch, mm."""
+NEAR_MM = 1.5
+"""A tip this near to the target, in its branch, has arrived, mm: half a millimetre before it counts as reached."""
 OUTSIDE_MM = 2.0
 """A point this far outside the lumen is no target, mm."""
 
@@ -78,7 +80,7 @@ class Route:
         """Return which tips have entered the branch of a waypoint, or reached the target if it is the last."""
         on_route = self.off_route(tip) == 0
         if waypoint >= self.target.abscissa:
-            return on_route & (tip.branch == self.target.branch) & (np.abs(tip.abscissa - waypoint) <= ENTERED_MM)
+            return on_route & (tip.branch == self.target.branch) & (np.abs(tip.abscissa - waypoint) <= NEAR_MM)
         return on_route & (tip.abscissa >= min(waypoint + ENTERED_MM, self.target.abscissa))
 
     def next_waypoint(self, progress: float) -> float:

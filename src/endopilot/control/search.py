@@ -10,14 +10,17 @@ copied over the others, until one of them has entered the wanted branch.
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.control.cost import Cost
+from endopilot.control.course import SLIP_SHARE, STALL_PERIODS, Controls, Course, Log
+from endopilot.control.halt import Halt, describe_halt
 from endopilot.control.route import Route
+from endopilot.control.sweep import middle, sweep
 from endopilot.progress import Advance
 from endopilot.settings import Count, OpenShare, Positive, settings
 from endopilot.simulation.device import Device
@@ -26,16 +29,14 @@ from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.types import TipProjection
 
-Controls = Float[np.ndarray, "periods 2"]
 _BACK_MM_S = 2.0
 """Speed at which a wire that has gone past its target is pulled back, mm/s."""
 _SHORT_MM = 1.0
 """A path leaves this much of the travel unused, mm: encoders err."""
-_STALL_PERIODS = 4
-"""A tip that has come forward by less than `_STALL_SHARE` of the wire's advance in this many periods has stopped."""
-_STALL_SHARE = 0.25
 _LEFT_BEHIND = 0.2
 """Each further attempt accepts a path that this much more of the wires, by weight, do not follow."""
+_LEAST_SHARE = 0.5
+"""No attempt accepts a path that fewer of the wires follow, by weight."""
 _LOOKOUT_MM, _LOOKOUT_RADII = 12.0, 3.0
 """A waypoint that is searched for lies no farther ahead than this, mm, or lumen radii where that is more: beyond, a
 chord says little."""
@@ -67,37 +68,12 @@ class SearchConfig:
     """What the candidates are compared by."""
 
 
-@dataclass(frozen=True, eq=False)
-class Course:
-    """Controls, and what the wires that they were found with do under them.
+class Search:
+    """Searches paths for a navigation, from any state of its wires.
 
     Attributes:
-        control: (mm/s, rad/s) of each decision period.
-        abscissa: Δtip at the end of each period, a column a wire, mm.
-        offset: γtip, mm.
-        branch: index of the branch of the tip.
-        radius: lumen radius at the tip, mm.
-        position: of the tips, LPS mm.
-        force: largest wall force on a node, N.
-        inserted: Δ, mm, of the first wire.
-        rotation: φ, rad, of the first wire.
-        reached: whether they end at the target, by weight: 1 if all do.
+        halt: where and why the last search ended before the target, in words; empty if it arrived.
     """
-
-    control: Controls
-    abscissa: Float[np.ndarray, "periods wires"]
-    offset: Float[np.ndarray, "periods wires"]
-    branch: Int[np.ndarray, "periods wires"]
-    radius: Float[np.ndarray, "periods wires"]
-    position: Float[np.ndarray, "periods wires 3"]
-    force: Float[np.ndarray, "periods wires"]
-    inserted: Float[np.ndarray, "periods"]
-    rotation: Float[np.ndarray, "periods"]
-    reached: float
-
-
-class Search:
-    """Searches paths for a navigation, from any state of its wires."""
 
     def __init__(
         self,
@@ -149,67 +125,126 @@ class Search:
         """
         self.single.copy_worlds(source, of=start)
         self._weight, same = weight, np.arange(len(weight))
-        log, reported = _Log(), 0.0
+        log, reported, self.halt = Log(), 0.0, ""
         periods = max(1, int(seconds / DECISION_PERIOD_S))
         while log.periods < periods:
-            here = float(self.route.progress(self.single.project()) @ weight)
+            here = float(self.route.progress(self.single.project()) @ self._weight)
             if advance is not None:
                 advance(max(here - reported, 0.0))
                 reported = max(here, reported)
             waypoint, before = self.route.next_waypoint(here), log.periods
             self._kept.copy_worlds(same, of=self.single)
-            if self._push_on(log, periods, waypoint):
+            halt = self._push_on(log, periods, waypoint)
+            if halt is None:
                 if self._reached() > 0.5:
                     break
                 if log.periods == before:  # past the waypoint and not at the target: some wire lies beyond it
                     self._drive(log, np.array([-_BACK_MM_S, 0.0]))
                 continue
-            self.single.copy_worlds(same, of=self._kept)
-            log.cut(before)
-            self._approach(log, periods, waypoint)
-            if not self._search_candidates(log, periods) or log.periods == before:
-                break
+            hard = self._farthest(log, before, here)
+            for near in (True, False):
+                self._go_back(log, before)
+                if near:
+                    self._approach(log, periods, waypoint, hard)
+                if self._sweep(log, periods, waypoint):
+                    break
+            else:
+                self._go_back(log, before)
+                self._approach(log, periods, waypoint, hard)
+                if not self._search_candidates(log, periods) or log.periods == before:
+                    self.halt = describe_halt(halt, hard, self.route, self.navigation)
+                    break
+        else:
+            self.halt = describe_halt("late", 0.0, self.route, self.navigation)
         return log.course(len(weight), self._reached())
+
+    def _go_back(self, log: Log, periods: int) -> None:
+        """Put the wires back to where they were kept, and forget what they have done since."""
+        self.single.copy_worlds(np.arange(self.single.worlds), of=self._kept)
+        log.cut(periods)
+
+    def _farthest(self, log: Log, begun: int, here: float) -> float:
+        """Return how far along the route the wires have come since a period, in the mean, mm."""
+        tips = [TipProjection(abscissa=row[1], offset=row[2], branch=row[3], radius=row[4]) for row in log.rows[begun:]]
+        return max([here, *(float(self.route.progress(tip) @ self._weight) for tip in tips)])
+
+    def _sweep(self, log: Log, periods: int, waypoint: float) -> bool:
+        """Turn the wires to all sides and push them on; follow the middle of the rotations that pass the waypoint.
+
+        Where none passes within the share of the force limit that costs nothing, one that stays under the limit does.
+        """
+        wires, limit = self.single.worlds, self.navigation.force_limit_n
+        self._many.copy_worlds(np.repeat(np.arange(wires), self.config.candidates), of=self.single)
+        made = sweep(
+            self._many,
+            self.route,
+            waypoint,
+            weight=self._weight,
+            travel=self._limits,
+            force_limit_n=limit,
+            speed_mm_s=self.config.speed_mm_s,
+            periods=periods - log.periods,
+        )
+        for share in (self.config.cost.forbidden_share, 0.5 * (1 + self.config.cost.forbidden_share)):
+            within = made.within(share * limit)
+            if within.any():
+                self._follow(log, made.controls(middle(within)))
+                return True
+        return False
 
     def _reached(self) -> float:
         return float(self.navigation.reached(self.single.project()) @ self._weight)
 
-    def _push_on(self, log: _Log, periods: int, waypoint: float) -> bool:
-        """Push straight on past a waypoint; False if a wire leaves the route, stops or presses too hard."""
+    def _push_on(self, log: Log, periods: int, waypoint: float) -> Halt | None:
+        """Push straight on past a waypoint; return why not, or None if all wires passed it."""
         begun = log.periods
         while log.periods < periods:
             tip = self.single.project()
             if self._all(self.route.passed(tip, waypoint)):
-                return True
+                return None
             if not self._all(self.route.off_route(tip) == 0):
-                return False
+                return "off"
             left = waypoint - float(self.route.progress(tip) @ self._weight)
             last = waypoint >= self.route.target.abscissa
             speed = np.clip(left / DECISION_PERIOD_S, 1.0, self.config.speed_mm_s) if last else self.config.speed_mm_s
+            before = self.single.inserted_length
             self._drive(log, np.array([speed, 0.0]))
-            if self._pressed(log) or (log.periods - begun >= _STALL_PERIODS and log.stalled(self._weight > 0)):
-                return False
-        return self._all(self.route.passed(self.single.project(), waypoint))
+            advance = (self.single.inserted_length - before)[self._weight > 0].min()
+            if advance < SLIP_SHARE * log.control[0] * DECISION_PERIOD_S:
+                return "slipped"
+            if self._pressed(log):
+                return "pressed"
+            if log.periods - begun >= STALL_PERIODS and log.stalled(self._weight > 0):
+                return "stalled"
+        return None if self._all(self.route.passed(self.single.project(), waypoint)) else "late"
 
-    def _approach(self, log: _Log, periods: int, waypoint: float) -> None:
-        """Push on, or pull back, to where a search for a waypoint begins."""
+    def _approach(self, log: Log, periods: int, waypoint: float, hard: float) -> None:
+        """Push on, or pull back, to where a search for a waypoint begins.
+
+        Args:
+            log: what is done is added to it.
+            periods: its length at most.
+            waypoint: that is searched for, mm.
+            hard: abscissa that a straight push came to, mm; a bend that turns a wire back may lie before the junction.
+        """
         before = self.route.junctions[self.route.junctions < waypoint]
         last = waypoint >= self.route.target.abscissa
         begin = waypoint - _LOOKOUT_MM
         if len(before) and not last:
             radius = float(self.route.radius(before[-1:])[0])
             begin = float(before[-1]) - max(self.config.lead_mm, _LEAD_RADII * radius)
+        begin = min(begin, hard - self.config.lead_mm)
         for _ in range(periods - log.periods):
             tip = self.single.project()
             here, on_route = self.route.progress(tip) @ self._weight, self._all(self.route.off_route(tip) == 0)
             if not on_route and self.single.inserted_length.min() > 1.0:
                 self._drive(log, np.array([-self.config.speed_mm_s, 0.0]))
-            elif here < begin - 1.0 and not (log.periods >= _STALL_PERIODS and log.stalled(self._weight > 0)):
+            elif here < begin - 1.0 and not (log.periods >= STALL_PERIODS and log.stalled(self._weight > 0)):
                 self._drive(log, np.array([min(self.config.speed_mm_s, (begin - here) / DECISION_PERIOD_S), 0.0]))
             else:
                 return
 
-    def _drive(self, log: _Log, control: Float[np.ndarray, "2"]) -> None:
+    def _drive(self, log: Log, control: Float[np.ndarray, "2"]) -> None:
         made = self._possible(control[None], self.single)[0]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -224,7 +259,7 @@ class Search:
             control = self._limits.clip(control, length, DECISION_PERIOD_S)
         return control
 
-    def _pressed(self, log: _Log) -> bool:
+    def _pressed(self, log: Log) -> bool:
         limit = self.config.cost.forbidden_share * self.navigation.force_limit_n
         return not self._all((log.force[-1] <= limit) & self.single.valid)
 
@@ -232,7 +267,7 @@ class Search:
         """Return whether something holds for all wires that have not been left behind."""
         return bool(holds[self._weight > 0].all())
 
-    def _search_candidates(self, log: _Log, periods: int) -> bool:
+    def _search_candidates(self, log: Log, periods: int) -> bool:
         """Search with the whole population for a path past the next waypoint; append the best to the log.
 
         Every attempt begins from the same state, so that a plan holds no motion of a failed one.
@@ -271,7 +306,7 @@ class Search:
             spent += self._run_round(drawn, before, waypoint)
             history = np.concatenate([history, np.repeat(drawn[None], self.config.round_periods, axis=0)])
             score, share = self._judge(waypoint, spent)
-            won = share >= 1 - _LEFT_BEHIND * attempt - 1e-9
+            won = share >= max(1 - _LEFT_BEHIND * attempt, _LEAST_SHARE) - 1e-9
             if won.any():
                 return 0.0, history[:, np.argmin(np.where(won, score, np.inf))], True
             if number == 0:
@@ -348,44 +383,6 @@ class Search:
         others = self._random.choice(best, len(score) - len(best))
         return np.concatenate([best, others])
 
-    def _follow(self, log: _Log, controls: Controls) -> None:
+    def _follow(self, log: Log, controls: Controls) -> None:
         for control in controls:
             self._drive(log, control)
-
-
-class _Log:
-    """What the wires have done so far, a row a period."""
-
-    def __init__(self) -> None:
-        self.rows: list[tuple] = []
-
-    def add(self, control: np.ndarray, tip: TipProjection, *rest: np.ndarray) -> None:
-        self.rows.append((control, tip.abscissa, tip.offset, tip.branch, tip.radius, *rest))
-
-    def cut(self, periods: int) -> None:
-        del self.rows[periods:]
-
-    @property
-    def periods(self) -> int:
-        return len(self.rows)
-
-    @property
-    def force(self) -> list[np.ndarray]:
-        return [row[6] for row in self.rows]
-
-    def stalled(self, counted: Bool[np.ndarray, "wires"]) -> bool:
-        """Return whether a tip that counts has stayed behind in the last periods while the wires went forward."""
-        last = self.rows[-_STALL_PERIODS:]
-        advance = sum(float(row[0][0]) for row in last) * DECISION_PERIOD_S
-        gain = float(np.min((last[-1][1] - last[0][1])[counted]))
-        return len(last) == _STALL_PERIODS and advance > 2.0 and gain < _STALL_SHARE * advance
-
-    def course(self, wires: int, reached: float) -> Course:
-        shapes = ((2,), *[(wires,)] * 4, (wires, 3), *[(wires,)] * 3)
-        empty = [np.zeros((0, *shape), dtype=int if k == 3 else float) for k, shape in enumerate(shapes)]
-        columns = [np.array(column) for column in zip(*self.rows, strict=True)] or empty
-        control, abscissa, offset, branch, radius, position, force, inserted, rotation = columns
-        return Course(
-            control=control, abscissa=abscissa, offset=offset, branch=branch, radius=radius, position=position,
-            force=force, inserted=inserted[:, 0], rotation=rotation[:, 0], reached=reached,
-        )  # fmt: skip

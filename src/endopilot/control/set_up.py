@@ -31,6 +31,7 @@ TILT_DEG = 20.0
 _CATHETER_MM = 20.0
 """The catheter's axis decides how the wire lies as far as this from the ostium, mm."""
 _AZIMUTHS = 8
+Count = Int[np.ndarray, "forks"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +49,7 @@ class TipChoice:
     navigation: Navigation
     tilt_deg: float
     forks: tuple[Fork, ...]
-    entering: Int[np.ndarray, "forks"]
+    entering: Count
     why: str
 
     @property
@@ -74,24 +75,22 @@ def choose_tip(navigation: Navigation, tip: str = "auto", *, catheter_tilt_deg: 
         InputError: no such tip, or one that a hand cannot give the wire.
     """
     devices = _tips(navigation.device, tip)
-    places = forks(Route.to(navigation.anatomy, navigation.target), navigation.device)
-    counts = rotations_that_enter(navigation, devices)
-    best = _best(counts)
-    made = replace(navigation, device=devices[best])
-    refused = _refused(places, counts[best])
-    if refused is None:
-        return TipChoice(made, 0.0, places, counts[best], _why(made.device, places, counts, best))
-    tilt_deg = 0.0
-    if catheter_tilt_deg > 0 and refused.abscissa <= _CATHETER_MM:
-        turned = [with_axis(navigation.anatomy, axis) for axis in _axes(navigation.anatomy, catheter_tilt_deg)]
-        tried = [(anatomy, rotations_that_enter(replace(navigation, anatomy=anatomy), devices)) for anatomy in turned]
-        anatomy, after = max(tried, key=lambda pair: _merit(pair[1][_best(pair[1])]))
-        if _merit(after[_best(after)]) > _merit(counts[best]):
-            counts, best, tilt_deg = after, _best(after), catheter_tilt_deg
-            made = replace(navigation, anatomy=anatomy, device=devices[best])
+    route = Route.to(navigation.anatomy, navigation.target)
+    places = forks(route, navigation.device)
+    best, counts = _choose(navigation, devices)
+    made, tilt_deg, refused = replace(navigation, device=devices[best]), 0.0, _refused(places, counts[best])
+    if refused is not None and catheter_tilt_deg > 0 and _near_catheter(route, counts[best]):
+        for axis in _axes(route, catheter_tilt_deg):
+            turned = replace(navigation, anatomy=with_axis(navigation.anatomy, axis))
+            other, after = _choose(turned, devices)
+            if _merit(after[other]) > _merit(counts[best]):
+                best, counts, tilt_deg = other, after, catheter_tilt_deg
+                made = replace(turned, device=devices[best])
+            if _suffices(counts[best]):
+                break
     why = _why(made.device, places, counts, best)
     if tilt_deg:
-        why += f"; the catheter is turned by {tilt_deg:g} degrees, for before no tip entered {refused}"
+        why += f"; the catheter is turned by {tilt_deg:g} degrees, for with its given axis no tip enters {refused}"
     return TipChoice(made, tilt_deg, places, counts[best], why)
 
 
@@ -126,26 +125,39 @@ def _limits(device: Device) -> str:
     return f"a hand bends its tip by {least:g} to {largest:g} degrees over {shortest:g} to {longest:g} mm"
 
 
-def _best(counts: Int[np.ndarray, "devices forks"]) -> int:
-    """Return the device that is taken; their own tip stands first, the others by increasing reach."""
-    enough = (counts >= ENOUGH).all(axis=1)
-    if enough.any():
-        return int(np.argmax(enough))
-    return max(range(len(counts)), key=lambda index: (_merit(counts[index]), -index))
+def _choose(navigation: Navigation, devices: list[Device]) -> tuple[int, dict[int, Count]]:
+    """Return the first wire that suffices, else the best one, and the counts of those that were tried."""
+    counts: dict[int, Count] = {}
+    for index, device in enumerate(devices):
+        counts[index] = rotations_that_enter(navigation, device)
+        if _suffices(counts[index]):
+            return index, counts
+    return max(counts, key=lambda index: (_merit(counts[index]), -index)), counts
 
 
-def _merit(count: Int[np.ndarray, "forks"]) -> tuple[int, int]:
-    """Return how good a tip is: forks that it enters, and rotations at the hardest of them."""
-    entered = count[count > 0]
-    return len(entered), int(entered.min()) if len(entered) else 0
+def _suffices(count: Count) -> bool:
+    return bool((count >= ENOUGH).all())
 
 
-def _axes(anatomy: Anatomy, tilt_deg: float) -> list[Float[np.ndarray, "3"]]:
-    """Return the catheter's axis, turned to all sides."""
-    axis, angle = anatomy.insertion.direction, np.radians(tilt_deg)
+def _merit(count: Count) -> tuple[int, int]:
+    """Return how good a tip is: places that it passes, and rotations at the hardest of them."""
+    passed = count[count > 0]
+    return len(passed), int(passed.min()) if len(passed) else 0
+
+
+def _near_catheter(route: Route, count: Count) -> bool:
+    """Return whether turning the catheter may help: whether the fork that refuses lies near it."""
+    return bool(route.junctions[int(np.argmin(count > 0))] <= _CATHETER_MM)
+
+
+def _axes(route: Route, tilt_deg: float) -> list[Float[np.ndarray, "3"]]:
+    """Return the catheter's axis, turned to all sides, that nearest to the route's direction first."""
+    axis, angle = route.anatomy.insertion.direction, np.radians(tilt_deg)
     one, two = (side[0] for side in cross_axes(axis[None]))
     around = 2 * np.pi * np.arange(_AZIMUTHS) / _AZIMUTHS
-    return [np.cos(angle) * axis + np.sin(angle) * (np.cos(a) * one + np.sin(a) * two) for a in around]
+    turned = [np.cos(angle) * axis + np.sin(angle) * (np.cos(a) * one + np.sin(a) * two) for a in around]
+    onwards = route.position(_CATHETER_MM) - route.position(0.0)
+    return sorted(turned, key=lambda axis: -float(axis @ onwards))
 
 
 def with_axis(anatomy: Anatomy, axis: Float[np.ndarray, "3"]) -> Anatomy:
@@ -155,23 +167,23 @@ def with_axis(anatomy: Anatomy, axis: Float[np.ndarray, "3"]) -> Anatomy:
     return replace(anatomy, distance_map=opened, insertion=insertion)
 
 
-def _refused(places: tuple[Fork, ...], count: Int[np.ndarray, "forks"]) -> Fork | None:
+def _refused(places: tuple[Fork, ...], count: Count) -> Fork | None:
     """Return the first fork that a tip enters with no rotation, or None."""
     return next((fork for fork, entering in zip(places, count.tolist(), strict=True) if not entering), None)
 
 
-def _why(device: Device, places: tuple[Fork, ...], counts: Int[np.ndarray, "devices forks"], best: int) -> str:
+def _why(device: Device, places: tuple[Fork, ...], counts: dict[int, Count], best: int) -> str:
     """Return why a tip was taken of those that were tried, the wire's own or the only one first."""
     shape = f"tip {tip_name(device)} (reach {lateral_reach(device.tip_bend_rad, device.tip_bend_length_mm):.1f} mm)"
     if not places:
         return f"{shape}: the route has no fork"
     refused = _refused(places, counts[best])
     if refused is not None:
-        which = "does not enter" if len(counts) == 1 else f"as none of the {len(counts)} tips tried, does not enter"
-        return f"{shape}, {which} {refused}, {refused.width_mm:.1f} mm wide for the wire"
+        which = "does not enter" if len(counts) == 1 else f"as the other {len(counts) - 1} tried, does not enter"
+        return f"{shape}, {which} {refused}, where a wire has {refused.width_mm:.1f} mm"
     hardest = int(np.argmin(counts[best]))
     why = f"{shape} enters every fork of the route; the hardest, {places[hardest]}, "
-    why += f"{places[hardest].width_mm:.1f} mm wide for the wire, by {counts[best][hardest]} of {ROTATIONS} rotations"
+    why += f"where a wire has {places[hardest].width_mm:.1f} mm, by {counts[best][hardest]} of {ROTATIONS} rotations"
     if best:
         first = int(np.argmin(counts[0]))
         why += f"; the wire's own tip enters {places[first]} by {counts[0][first]}"

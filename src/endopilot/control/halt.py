@@ -1,0 +1,44 @@
+"""Why a search ended before the target, in words."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from endopilot.control.reach import forks
+from endopilot.control.route import BEYOND_MM, Route
+from endopilot.control.set_up import tip_name
+from endopilot.tasks.navigation import Navigation
+
+Halt = Literal["off", "stalled", "slipped", "pressed", "late"]
+"""A wire leaves the route, does not come forward though it is pushed, cannot be pushed without the drive's slipping,
+presses on the wall too hard, or the time is over."""
+
+
+def describe_halt(halt: Halt, at_mm: float, route: Route, navigation: Navigation) -> str:
+    """Return where and why no path goes on, and what may help, as a part of a sentence.
+
+    Args:
+        halt: what a straight push met.
+        at_mm: how far along the route it came, mm.
+        route: to the target.
+        navigation: with the wire and the limits.
+    """
+    device = navigation.device
+    if halt == "late":
+        return f"the {navigation.seconds:g} s are over; give more seconds"
+    radius = {fork: 0.5 * (fork.width_mm + device.diameter_mm) for fork in forks(route, device)}
+    near = [fork for fork, r in radius.items() if abs(at_mm - fork.abscissa) <= r + BEYOND_MM + 1.0]
+    where = f"at {near[0]}" if near else f"at {at_mm:.0f} mm, where no branch leaves,"
+    if halt == "pressed":
+        limit = f"{where} it presses with more than the limit of {navigation.force_limit_n:g} N"
+        return f"{limit}; give a larger force_limit_n or a softer wire"
+    if halt == "slipped":
+        return (
+            f"{where} the drive slips, which pushes {device.name} with no more than {device.push_limit_n:g} N; "
+            "give a wire of less friction or a drive of a larger push_limit_n"
+        )
+    if near:
+        tip = f"{where}, which its tip of {tip_name(device)} does not enter"
+        return f"{tip}; give another tip (--tip), or let the catheter be turned (--catheter-tilt-deg)"
+    folds = f"{where} the wire is pushed and its tip does not come forward: it folds in a bend"
+    return f"{folds}; give another tip (--tip) or a stiffer wire"
