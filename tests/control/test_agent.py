@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -13,9 +14,11 @@ from endopilot.control import search
 from endopilot.control.agent import AgentConfig, AgentPolicy, OpenLoopPolicy, TwinPolicy
 from endopilot.control.belief import Belief, BeliefConfig
 from endopilot.control.course import Course
+from endopilot.control.halt import describe_halt
 from endopilot.control.mismatch import ModelMismatch
 from endopilot.control.navigate import NavigationLoop, navigate
 from endopilot.control.policy import Decision, Observation, Policy
+from endopilot.control.route import Route
 from endopilot.control.search import Search
 from endopilot.tasks.navigation import Navigation, Target
 from endopilot.xray.adviser import AdviserConfig
@@ -221,3 +224,37 @@ def test_an_agent_tells_what_it_believes_and_goes_on_after_hands(side_branch) ->
     assert np.isnan(record.believed[-1]).all() and np.median(ends) < 0.5
     bands = record.half_width[:-1][~np.isnan(record.half_width[:-1, 0])]
     assert len(bands) > 5 and (bands > 0).all()
+
+
+def test_no_attempt_wins_without_a_wire_that_arrives(side_branch) -> None:
+    """However many attempts were made, a path that no wire follows into the branch is none."""
+    policy = TwinPolicy(config=QUICK)
+    straight = replace(side_branch.device, tip_bend_rad=0.0, tip_bend_length_mm=0.0)
+    policy.start(replace(side_branch, device=straight), 0)
+    one = policy._search
+    one.single.copy_worlds(np.zeros(1, dtype=int), of=policy.belief.simulator)
+    one._weight = np.ones(1)
+    for attempt in (0, 5, 9):
+        _, _, won = one._attempt(22.5, 2, attempt)
+        assert not won
+
+
+def test_an_agent_gives_up_early_and_names_the_fork(side_branch) -> None:
+    straight = replace(side_branch.device, tip_bend_rad=0.0, tip_bend_length_mm=0.0)
+    config = replace(QUICK, search=replace(QUICK.search, attempts=1, rounds=2), tries=2)
+    record = navigate(replace(side_branch, device=straight), AgentPolicy(config), seed=2)
+    assert record.reason == "gave up" and not record.success
+    assert record.seconds < 0.5 * side_branch.seconds
+    assert "at the fork into section vessel (branch 2) at 20.0 mm" in record.gives_up
+    assert "tip of 0/0 does not enter" in record.gives_up and "--tip" in record.gives_up
+
+
+def test_advice_names_a_tip_at_forks_alone(side_branch) -> None:
+    """A wire that meets its limits where no branch leaves does not need a larger bend."""
+    route = Route.to(side_branch.anatomy, side_branch.target)
+    for halt, words in (("slipped", "drive slips.*0.5 N"), ("pressed", "0.5 N on the wall"), ("stalled", "folds")):
+        said = describe_halt(halt, 9.0, route, side_branch)
+        assert "at 9 mm, where no branch leaves" in said and re.search(words, said)
+        assert "does not enter" not in said
+    assert "40 s are over" in describe_halt("late", 9.0, route, side_branch)
+    assert "does not enter" in describe_halt("off", 20.5, route, side_branch)

@@ -47,8 +47,8 @@ class AgentConfig:
     """The simulated wires."""
     off_course_mm: Positive = 2.5
     """Another path is searched when the likeliest tip is this far along the centerline from where it should be, mm."""
-    tries: Count = 8
-    """Failed searches, one after another, after which the wire is left where it is."""
+    tries: Count = 3
+    """Failed searches, one after another and each from where the last has led, after which the agent gives up."""
     lost_along_mm: Positive = 4.0
     """A measured tip this far along the wire from all simulated ones is explained by none, mm."""
     lost_across_mm: Positive = 1.5
@@ -109,7 +109,8 @@ class _PlanningPolicy:
         else:
             translation, rotation = self._follow(observation)
         translation, rotation = self._limits.safe(translation, rotation)
-        return Decision(translation, rotation, expose=self._lost or self.wants_xray())
+        gives_up = self.halt if self._failed >= self.config.tries and self._course is None and not self._lost else ""
+        return Decision(translation, rotation, expose=self._lost or self.wants_xray(), gives_up=gives_up)
 
     def watch(self, observation: Observation) -> None:
         """Follow what somebody else does; a new course is searched at the next decision."""

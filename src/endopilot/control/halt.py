@@ -13,6 +13,9 @@ Halt = Literal["off", "stalled", "slipped", "pressed", "late"]
 """A wire leaves the route, does not come forward though it is pushed, cannot be pushed without the drive's slipping,
 presses on the wall too hard, or the time is over."""
 
+SPARE_SHARE = 0.85
+"""Share of the force limit that a path is followed under: what is uncertain takes the rest."""
+
 
 def describe_halt(halt: Halt, at_mm: float, route: Route, navigation: Navigation) -> str:
     """Return where and why no path goes on, and what may help, as a part of a sentence.
@@ -30,8 +33,10 @@ def describe_halt(halt: Halt, at_mm: float, route: Route, navigation: Navigation
     near = [fork for fork, r in radius.items() if abs(at_mm - fork.abscissa) <= r + BEYOND_MM + 1.0]
     where = f"at {near[0]}" if near else f"at {at_mm:.0f} mm, where no branch leaves,"
     if halt == "pressed":
-        limit = f"{where} it presses with more than the limit of {navigation.force_limit_n:g} N"
-        return f"{limit}; give a larger force_limit_n or a softer wire"
+        limit = (
+            f"{where} it cannot go on with less than {SPARE_SHARE:.0%} of the limit of {navigation.force_limit_n:g} N"
+        )
+        return f"{limit} on the wall; give a larger force_limit_n or a softer wire"
     if halt == "slipped":
         return (
             f"{where} the drive slips, which pushes {device.name} with no more than {device.push_limit_n:g} N; "

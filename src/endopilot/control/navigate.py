@@ -61,6 +61,8 @@ class NavigationLoop:
         observation: what was observed at the last decision; None before the first.
         believed: what the policy believed then; None for a policy that does not tell.
         reason: why the navigation is over, as in `NavigationRecord`; None while it goes on.
+        gives_up: where and why the policy gave up at the last decision, in words; empty if it goes on. Somebody else
+            may go on then.
     """
 
     def __init__(
@@ -93,6 +95,7 @@ class NavigationLoop:
         self.observation: Observation | None = None
         self.believed: BelievedTip | None = None
         self.reason: str | None = None
+        self.gives_up = ""
         self.policy.start(navigation, seed)
 
     @property
@@ -138,12 +141,12 @@ class NavigationLoop:
         decision = self._decide(observation, by_hand)
         asked = (decision.translation, decision.rotation)
         control, self._expose = self._limits.safe(*asked), bool(decision.expose)
-        self.observation = observation
+        self.observation, self.gives_up = observation, decision.gives_up
         self.believed = self.policy.believed() if isinstance(self.policy, Believer) else None
         self._track.decided(control, tip, self.believed, fault=control != asked)
         self.robot.command(*control)
         self._period, self._cycles_left, self._peak_n = self._period + 1, _CYCLES, 0.0
-        return Decision(*control, expose=self._expose)
+        return Decision(*control, expose=self._expose, gives_up=self.gives_up)
 
     def advance(self, seconds: float) -> float:
         """Let robot and wire move, no farther than to the end of the period.
@@ -164,11 +167,11 @@ class NavigationLoop:
 
     def stop(self) -> None:
         """End the navigation where it is."""
-        self.reason = self.reason or "stopped"
+        self.reason = self.reason or ("gave up" if self.gives_up else "stopped")
 
     def record(self) -> NavigationRecord:
         """Return what has happened up to the end of the last whole period."""
-        return self._track.record(self.navigation, self.robot.driven, self.reason or "stopped")
+        return self._track.record(self.navigation, self.robot.driven, self.reason or "stopped", self.gives_up)
 
     def _decide(self, observation: Observation, by_hand: Decision | None) -> Decision:
         if by_hand is None:
@@ -201,7 +204,7 @@ def navigate(
 
     Every `DECISION_PERIOD_S` the policy is given the encoders' readings and, where its last decision asked for it, what
     X-ray shows; at the first decision X-ray is always on. It ends when the target is reached at the end of a period,
-    when the time is over, or when the simulation fails.
+    when the time is over, when the policy gives up, or when the simulation fails.
 
     Args:
         navigation: as the policy is given it.
@@ -216,6 +219,8 @@ def navigate(
     loop = NavigationLoop(navigation, policy, config=config, seed=seed, truth=truth)
     while loop.reason is None:
         loop.step()
+        if loop.gives_up:
+            loop.stop()
     return loop.record()
 
 

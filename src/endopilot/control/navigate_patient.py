@@ -181,6 +181,8 @@ def navigate_patient(set_up: SetUp) -> PatientNavigation:
     with progress(f"Navigating, {set_up.config.policy}", total=navigation.seconds) as advance:
         while loop.reason is None:
             loop.step()
+            if loop.gives_up:
+                loop.stop()
             advance(DECISION_PERIOD_S, f"{loop.simulator.inserted_length[0]:.0f} mm inserted")
             if isinstance(policy, Believer) and loop.time_s > DECISION_PERIOD_S:
                 wires.append(policy.believed_wires())  # at the decision, which ended the period before

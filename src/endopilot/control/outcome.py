@@ -67,6 +67,8 @@ def why_not(found: PatientNavigation) -> str:
         where += f", off the route, which it left at the fork at {departs:.1f} mm"
     else:
         where += f", {navigation.target.abscissa - at:.1f} mm before the target"
+    if record.gives_up:
+        return f"{where}; the policy gave up: {record.gives_up}"
     return f"{where}: {_held_up(found, route)}"
 
 

@@ -40,11 +40,13 @@ class Decision:
         translation: of the wire's proximal end, mm/s.
         rotation: of the wire's proximal end, rad/s.
         expose: whether X-ray is to be on at the next decision.
+        gives_up: where and why the policy ends the navigation with this decision, in words; empty if it goes on.
     """
 
     translation: float
     rotation: float
     expose: bool = False
+    gives_up: str = ""
 
 
 @runtime_checkable

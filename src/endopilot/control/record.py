@@ -42,7 +42,9 @@ class NavigationRecord:
         exposures: their number, of both views together as one.
         path_mm: length of the tip's path, sample to sample, mm.
         faults: decisions that were not finite or beyond the drive's limits, and were mended.
-        reason: "reached", "time", "invalid" (the simulation failed) or "stopped" (it was ended before).
+        reason: "reached", "time", "invalid" (the simulation failed), "gave up" (the policy did) or "stopped" (somebody
+            ended it before).
+        gives_up: where and why the policy gave up, in words; empty if it did not.
     """
 
     time_s: Float[np.ndarray, "samples"]
@@ -66,6 +68,7 @@ class NavigationRecord:
     path_mm: float
     faults: int
     reason: str
+    gives_up: str
 
 
 class Track:
@@ -95,13 +98,14 @@ class Track:
         self._columns["position"].append(simulator.position[0, 0])
         self._columns["force"].append(peak_n)
 
-    def record(self, navigation: Navigation, driven: list[np.ndarray], reason: str) -> NavigationRecord:
+    def record(self, navigation: Navigation, driven: list[np.ndarray], reason: str, gives_up: str) -> NavigationRecord:
         """Return the record of what was gathered up to the end of the last period.
 
         Args:
             navigation: what was to be done.
             driven: velocity of each cycle of the drive, mm/s and rad/s.
             reason: why it ended.
+            gives_up: where and why the policy gave up, in words.
         """
         anatomy = navigation.anatomy
         proximal, position = np.array(self._columns["proximal"]), np.array(self._columns["position"])
@@ -132,6 +136,7 @@ class Track:
             path_mm=float(np.linalg.norm(np.diff(position, axis=0), axis=1).sum()),
             faults=self._faults,
             reason=reason,
+            gives_up=gives_up,
         )
 
 

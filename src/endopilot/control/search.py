@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.control.cost import Cost
 from endopilot.control.course import SLIP_SHARE, STALL_PERIODS, Controls, Course, Log
-from endopilot.control.halt import Halt, describe_halt
+from endopilot.control.halt import SPARE_SHARE, Halt, describe_halt
 from endopilot.control.route import Route
 from endopilot.control.sweep import middle, sweep
 from endopilot.progress import Advance
@@ -104,6 +104,7 @@ class Search:
         limits = DriveLimits.of(wires[0], anatomy)
         self._limits = replace(limits, travel_mm=(limits.travel_mm[0], limits.travel_mm[1] - _SHORT_MM))
         self._wire_radius = wires[0].tip_radius_mm
+        self.halt = ""
 
     def find(
         self,
@@ -185,7 +186,7 @@ class Search:
             speed_mm_s=self.config.speed_mm_s,
             periods=periods - log.periods,
         )
-        for share in (self.config.cost.forbidden_share, 0.5 * (1 + self.config.cost.forbidden_share)):
+        for share in (self.config.cost.forbidden_share, SPARE_SHARE):
             within = made.within(share * limit)
             if within.any():
                 self._follow(log, made.controls(middle(within)))

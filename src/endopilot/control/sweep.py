@@ -115,7 +115,9 @@ def sweep(
             going &= ~_stalled(made, progress, counted)
         if not going.any():
             break
-    return Sweep(np.array(made), took, passed, force, np.max([weight @ row for row in progress], axis=0))
+    return Sweep(
+        np.array(made).reshape(-1, count, 2), took, passed, force, np.max([weight @ row for row in progress], axis=0)
+    )
 
 
 def middle(passed: Bool[np.ndarray, "rotations"]) -> int:

@@ -37,23 +37,26 @@ class Recording:
         control: velocities of each decision within the drive's limits, mm/s and rad/s.
         exposed: whether X-ray was on at each decision.
         believed_mm: where the agent believed the tip to be (Δtip) at each decision, mm; None for other policies.
+        gave_up: whether the policy ended the navigation with its last decision.
     """
 
     control: Float[np.ndarray, "decisions 2"]
     exposed: Bool[np.ndarray, "decisions"]
     believed_mm: Float[np.ndarray, "decisions"] | None
+    gave_up: bool = False
 
-    def packed(self) -> dict[str, str | None]:
+    def packed(self) -> dict[str, Any]:
         """Return the recording as text: little-endian arrays, compressed by zlib, in base64."""
         believed = self.believed_mm
         return {
             "control": _pack(self.control, "<f8"),
             "exposed": _pack(self.exposed, "|u1"),
             "believed_mm": None if believed is None else _pack(believed, "<f8"),
+            "gave_up": self.gave_up,
         }
 
     @staticmethod
-    def unpacked(text: dict[str, str | None]) -> Recording:
+    def unpacked(text: dict[str, Any]) -> Recording:
         """Return the recording that `packed` made a text of.
 
         Raises:
@@ -70,7 +73,7 @@ class Recording:
                 raise InputError(f"{name}: {size:g} decisions, exposed: {count}; each must have one value a decision")
         if not exposed[0]:
             raise InputError("exposed: X-ray is off at the first decision, where it is always on")
-        return Recording(control.reshape(-1, 2), exposed, believed)
+        return Recording(control.reshape(-1, 2), exposed, believed, bool(text.get("gave_up", False)))
 
 
 def navigation_seed(task: Task, place: int) -> int:
@@ -94,7 +97,7 @@ def attempt(policy: str, navigation: Navigation, *, seed: int, mismatch: ModelMi
     record = _drive(navigation, driver, seed, mismatch)
     told = record.believed if isinstance(driver, AgentPolicy) else None
     believed = None if told is None else told[:-1, 0]
-    recording = Recording(record.control[:-1], record.exposed[:-1], believed)
+    recording = Recording(record.control[:-1], record.exposed[:-1], believed, record.reason == "gave up")
     return (
         {"seed": seed}
         | figures(navigation, record, recording)
@@ -130,6 +133,7 @@ class Repeated:
         """Take the recording."""
         self._control = recording.control.tolist()
         self._expose_next = [*recording.exposed[1:].tolist(), False]
+        self._gave_up = recording.gave_up
         self._at = 0
 
     def start(self, navigation: Navigation, seed: int) -> None:
@@ -144,9 +148,10 @@ class Repeated:
         """
         if self._at == len(self._control):
             raise InputError(f"control: holds {self._at} decisions, and the navigation goes on")
-        decision = Decision(*self._control[self._at], expose=self._expose_next[self._at])
+        control, expose = self._control[self._at], self._expose_next[self._at]
         self._at += 1
-        return decision
+        last = self._gave_up and self._at == len(self._control)
+        return Decision(*control, expose=expose, gives_up="as recorded" if last else "")
 
 
 def figures(navigation: Navigation, record: NavigationRecord, recording: Recording) -> dict[str, Any]:

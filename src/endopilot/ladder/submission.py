@@ -37,6 +37,7 @@ class PackedRecording:
     control: str
     exposed: str
     believed_mm: str | None = None
+    gave_up: bool = False
 
 
 @settings
@@ -47,7 +48,7 @@ class NavigationEntry:
     seed: CountOrZero
     success: bool
     safe: bool
-    reason: Literal["reached", "time", "invalid"]
+    reason: Literal["reached", "time", "invalid", "gave up"]
     seconds: float
     path_ratio: float
     peak_force_n: float
