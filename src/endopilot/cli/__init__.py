@@ -18,7 +18,7 @@ from endopilot.extras import what_is_missing
 
 COMMANDS = {
     "demo": "six synthetic patients -> everything from the CT angiogram to the report",
-    "run": "one CT angiogram -> everything up to the report",
+    "run": "one CT angiogram -> everything up to the report, and a wire driven to a target",
     "segment": "CT angiogram -> mask of the vessel lumen",
     "anatomy": "mask, mesh or centerline -> centerline tree, section labels, distance map",
     "atlas": "synthetic patients",

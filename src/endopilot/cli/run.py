@@ -1,4 +1,4 @@
-"""`endopilot run`: one CT angiogram -> everything up to the report."""
+"""`endopilot run`: one CT angiogram -> everything up to the report, and a wire driven to a target."""
 
 from __future__ import annotations
 
@@ -15,19 +15,25 @@ def command(
     /,
     *,
     output: OutputFolder,
+    target: str | None = None,
     series: str | None = None,
     json: bool = False,
     config: RunConfig = RunConfig(),
 ) -> None:
     """Run every stage on one patient, from the CT angiogram to the report.
 
+    With --target the agent drives the wire to a place of the vessel, as `endopilot navigate` does with its defaults;
+    the page of that navigation is in the folder `navigation`. The networks of the package are evaluated in this
+    patient; --training-seconds trains networks on it instead.
+
     An interrupted run goes on where it stopped when the same command is given again.
 
     Args:
         volume: DICOM folder or file, NIfTI, NRRD or MHA, in HU.
         output: folder of all results; the report is report.html.
+        target: section label such as 4 or LAD, or point X,Y,Z in LPS mm, to which the agent drives the wire.
         series: number or instance UID of the series, where a DICOM folder holds several.
         json: print the figures as JSON.
         config: segmentation, device and size of the study.
     """
-    show(run_volume(existing(volume), output, config, series=series), as_json=json)
+    show(run_volume(existing(volume), output, config, series=series, target=target), as_json=json)

@@ -1,12 +1,14 @@
 """All stages in a row: a CT angiogram goes in, a report comes out.
 
-`run_demo` makes its own patients first; `run_volume` takes one volume of yours. Both record the finished stages, so
-that an interrupted run goes on where it stopped, and both end with report.html, metrics.json and manifest.json.
+`run_demo` makes its own patients first; `run_volume` takes one volume of yours, and drives a wire to a target in it if
+one is given. Both record the finished stages, so that an interrupted run goes on where it stopped, and both end with
+report.html, metrics.json and manifest.json.
 """
 
 from __future__ import annotations
 
 import hashlib
+import re
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -21,6 +23,7 @@ from endopilot import __version__
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy, read_source
 from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
+from endopilot.control.navigate_patient import NavigatePatientConfig
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.loader import load_dataset
 from endopilot.evaluation.anatomy_score import score_anatomy
@@ -31,6 +34,7 @@ from endopilot.imaging.segment import METHODS, SegmentConfig, segment
 from endopilot.imaging.volume import read_mask, read_volume, write_mask, write_volume
 from endopilot.models.config import PRETRAINED, TrainConfig, run_path
 from endopilot.phantom.phantom import PhantomConfig, make_phantom
+from endopilot.pipeline.navigation import navigate_into
 from endopilot.pipeline.stages import Stages
 from endopilot.progress import progress
 from endopilot.runs import claim
@@ -63,8 +67,8 @@ class StudyConfig:
     """Random navigations simulated in each patient."""
     seconds: Positive = 60.0
     """Length of a navigation, s."""
-    training_seconds: Positive = 100.0
-    """Training time of each of the paper's two networks, s."""
+    training_seconds: NonNegative = 0.0
+    """Training time of each of the paper's two networks, s; 0 takes the trained networks that come with the package."""
     seed: Seed = 1
     """Seed of everything random."""
 
@@ -75,8 +79,6 @@ class DemoConfig(StudyConfig):
 
     patients: Annotated[int, Within(3)] = 6
     """Number of patients, at least 3."""
-    training_seconds: NonNegative = 0.0
-    """Training time of each of the paper's two networks, s; 0 takes the trained networks that come with the package."""
 
     @model_validator(mode="after")
     def _consistent(self) -> DemoConfig:
@@ -125,6 +127,12 @@ class _Run:
         """The run whose networks are evaluated: this study's, or that of the package."""
         return self.output / "training" if self.config.training_seconds > 0 else Path(PRETRAINED)
 
+    @property
+    def evaluates(self) -> bool:
+        """Whether there are networks for the wire: those of the package know one wire alone."""
+        packaged = read_device(_PRETRAINED_DEVICE)
+        return self.config.training_seconds > 0 or self.device.constants == packaged.constants
+
 
 def run_demo(output: Path, config: DemoConfig) -> dict[str, Any]:
     """Run all stages on synthetic patients and write `output`/report.html.
@@ -160,24 +168,30 @@ def run_demo(output: Path, config: DemoConfig) -> dict[str, Any]:
     scan = partial(_make_volume, output=output, seed=config.seed, truths=truths)
     run.stages.do_each("atlas", "Synthetic patients", truths, draw)
     run.stages.do_each("phantom", "Synthetic CT angiograms", truths, scan)
-    return _study(run, [output / "ct" / f"{folder.name}{VOLUME_SUFFIX}" for folder in truths])
+    return _study(run, _anatomies(run, [output / "ct" / f"{folder.name}{VOLUME_SUFFIX}" for folder in truths]))
 
 
-def run_volume(volume: Path, output: Path, config: RunConfig, *, series: str | None = None) -> dict[str, Any]:
+def run_volume(
+    volume: Path, output: Path, config: RunConfig, *, series: str | None = None, target: str | None = None
+) -> dict[str, Any]:
     """Run all stages on one CT angiogram and write `output`/report.html.
+
+    With a target, the agent drives the wire there, and its page is in `output`/navigation. Another target may be given
+    to the same folder later.
 
     Args:
         volume: DICOM folder or file, NIfTI, NRRD or MHA, in HU.
         output: folder of everything the run makes.
         config: segmentation, device and size of the study.
         series: number or instance UID of the series, where a DICOM folder holds several.
+        target: a section such as "4" or "LAD", or a point "X,Y,Z" in LPS mm, that the agent drives the wire to.
 
     Returns:
-        As `run_demo` does.
+        As `run_demo` does; with a target, the figures of the navigation first.
 
     Raises:
-        InputError: a library of some stage is not installed, the volume cannot be read or segmented, or the folder
-            belongs to another run, such as that of another volume.
+        InputError: a library of some stage is not installed, the volume cannot be read or segmented, the vessel has no
+            such target, or the folder belongs to another run, such as that of another volume.
     """
     require_extras(*_EXTRAS)
     content, device = read_volume(volume, series=series), read_device(config.device)
@@ -196,7 +210,14 @@ def run_volume(volume: Path, output: Path, config: RunConfig, *, series: str | N
         command=f"endopilot run {volume} -o {output}" + (f" --series {series}" if series else ""),
         inputs=input_hash(volume),
     )
-    return _study(run, [copy])
+    anatomies = _anatomies(run, [copy])
+    if target is None:
+        return _study(run, anatomies)
+    folder = output / "navigation" / re.sub(r"[^\w.,+-]", "_", target)
+    settings = NavigatePatientConfig(device=config.device, seed=config.seed)
+    navigation = navigate_into(anatomies[0], target, folder, settings)
+    found = _study(run, anatomies)
+    return {"outcome": navigation["outcome"], "page": navigation["page"], **found}
 
 
 def _digest(volume: Volume) -> str:
@@ -233,8 +254,8 @@ def _make_anatomy(volume: Path, *, output: Path, config: AnatomyConfig) -> None:
         write_anatomy(extract_anatomy(read_source(mask), name=name, config=config), folder)
 
 
-def _study(run: _Run, volumes: Sequence[Path]) -> dict[str, Any]:
-    """Run the stages that synthetic and real patients share, from the volumes to the report."""
+def _anatomies(run: _Run, volumes: Sequence[Path]) -> list[Path]:
+    """Segment volumes, extract their anatomies, and return the folders of those where both succeeded."""
     output, stages, segmentation = run.output, run.stages, run.segmentation
     scheme = segmentation.vessel if segmentation.method == "coronary" else "generic"
     make_mask = partial(_make_mask, output=output, config=segmentation)
@@ -242,9 +263,14 @@ def _study(run: _Run, volumes: Sequence[Path]) -> dict[str, Any]:
     stages.do_each("segmentation", "Segmentation", volumes, make_mask)
     stages.do_each("anatomy", "Centerlines and distance maps", volumes, make_anatomy)
     names = [volume.name.removesuffix(VOLUME_SUFFIX) for volume in volumes]
-    names = [name for name in names if (output / "anatomies" / name).exists()]
-    _learn(run, [output / "anatomies" / name for name in names])
-    stages.do("report", lambda: _report(run, names))
+    return [output / "anatomies" / name for name in names if (output / "anatomies" / name).exists()]
+
+
+def _study(run: _Run, anatomies: Sequence[Path]) -> dict[str, Any]:
+    """Run the stages that follow the anatomies, up to the report."""
+    if run.evaluates:
+        _learn(run, anatomies)
+    run.stages.do("report", lambda: _report(run, [folder.name for folder in anatomies]))
     return _finish(run)
 
 
@@ -284,7 +310,7 @@ def _report(run: _Run, names: Sequence[str]) -> None:
     from endopilot.report.report import PatientContent, ReportContent, write_report  # matplotlib and plotly
 
     output = run.output
-    anatomy, replay = _replay(output, run.device)
+    anatomy, replay = _replay(output, run.device) if run.evaluates else (None, None)
     scores = _scores(output, names)
     patients = tuple(
         PatientContent(
@@ -301,8 +327,8 @@ def _report(run: _Run, names: Sequence[str]) -> None:
         origin=run.origin,
         command=run.command,
         patients=patients,
-        evaluation=output / "evaluation",
-        run=run_path(run.trained),
+        evaluation=output / "evaluation" if run.evaluates else None,
+        run=run_path(run.trained) if run.evaluates else None,
         replay=replay,
         replay_anatomy=anatomy,
         stage_seconds=run.stages.seconds,
@@ -346,7 +372,7 @@ def _replay(output: Path, device: Device) -> tuple[Path, Rollout]:
 def _finish(run: _Run) -> dict[str, Any]:
     """Write metrics.json and manifest.json unless they are there, and return what the command prints."""
     output, stages = run.output, run.stages
-    metrics = read_json(output / "evaluation" / "metrics.json")
+    metrics = read_json(output / "evaluation" / "metrics.json") if run.evaluates else {"findings": []}
     wall_seconds = sum(stages.seconds.values())
     if not (output / "manifest.json").exists():
         write_json(output / "metrics.json", {**metrics, "anatomy_scores": read_json(output / "scores.json")})
