@@ -12,7 +12,7 @@ from analytic_shapes import BEND_MM, forked_tree, mask_of, torus_distance, tree_
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from endopilot.anatomy.distance import distance_map_from_spheres, sample
+from endopilot.anatomy.distance import CATHETER_RADIUS_MM, distance_map_from_spheres, sample
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy, read_source
 from endopilot.anatomy.line_ends import to_cut
 from endopilot.anatomy.sources import Polylines
@@ -157,6 +157,37 @@ def test_surface_with_holes_and_inverted_normals(fork_mask, tmp_path):
     assert len(anatomy.tree.leaves()) == 2 and is_sound(anatomy)
     assert any("capped" in note for note in anatomy.provenance["notes"])
     assert len(anatomy.provenance["source"]["sha256"]) == 64
+
+
+@pytest.mark.parametrize(("factor", "scale"), [(0.1, "10"), (0.001, "1000"), (1000.0, "0.001")])
+def test_coronary_centerlines_and_walls_in_another_unit_are_told_with_the_scale(factor, scale):
+    along = np.linspace(0.0, 1.0, 400)[:, None]
+    line = 70.0 * np.hstack([np.cos(3 * along), np.sin(3 * along), 0.3 * along])
+    lines = Polylines((factor * line,), (np.full(400, factor * 1.5),))
+    config = AnatomyConfig(vessel="rca")
+    with pytest.raises(InputError, match=f"--scale {scale}$"):
+        extract_anatomy(lines, name="tree", config=config)
+    tube = Surface(factor * line, np.arange(399)[:, None] + np.array([0, 1, 0]))
+    with pytest.raises(InputError, match=f"--scale {scale}$"):
+        extract_anatomy(tube, name="wall", config=config)
+    assert extract_anatomy(lines, name="tree", config=replace(config, scale=float(scale))).tree.branches
+
+
+def test_radii_in_another_unit_than_the_positions_are_told():
+    line = np.outer(np.linspace(0.0, 90.0, 4000), [0.0, 0.6, 0.8])
+    with pytest.raises(InputError, match=r"mean radius of 0\.05 mm.*positions and radii"):
+        extract_anatomy(Polylines((line,), (np.full(4000, 0.05),)), name="tree", config=AnatomyConfig(vessel="lca"))
+
+
+def test_the_guiding_catheter_is_one_of_6_french_or_as_wide_as_a_narrower_ostium(fork_mask):
+    anatomy = extract_anatomy(fork_mask, name="fork")
+    assert anatomy.catheter_radius_mm == CATHETER_RADIUS_MM == 0.9
+    behind = anatomy.insertion.position - 8.0 * anatomy.insertion.direction
+    assert abs(float(sample(anatomy.distance_map, behind[None])[0]) - 0.9) < 0.1
+    # a tube of 0.9 mm in an ostium of 2 mm leans until 3 mm of it span the gap
+    assert abs(anatomy.provenance["catheter_tilt_deg"] - np.degrees(np.arctan(1.1 / 3.0))) < 3.0
+    narrow = Polylines((np.outer(np.linspace(0.0, 60.0, 200), [0.0, 0.6, 0.8]),), (np.full(200, 0.5),))
+    assert abs(extract_anatomy(narrow, name="narrow").catheter_radius_mm - 0.5) < 1e-6
 
 
 def test_units_and_axes_of_surfaces(fork_mask, tmp_path):

@@ -84,7 +84,7 @@ def test_the_radius_at_a_given_ostium_is_the_vessels_and_not_the_distance_to_the
     mask = mask_of(lambda p: np.minimum(crescent(p, 1.1), p[..., 2] + 20.0), (13, 4, 34), VOXEL_MM)
     ostium = Insertion(np.array([0.0, 0.0, -20.0]), np.array([0.0, 0.0, 1.0]))
     anatomy = extract_anatomy(replace(mask, ostium=ostium), name="wide")
-    assert anatomy.tree.branches[0].centerline.radius.min() > 1.2 and anatomy.catheter_radius_mm > 1.2
+    assert anatomy.tree.branches[0].centerline.radius.min() > 1.2 and anatomy.catheter_radius_mm == 0.9
 
 
 def test_a_vessel_of_one_voxel_is_refused_with_the_reason():

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial import KDTree
@@ -82,6 +84,18 @@ def test_the_left_tree_is_another_one(heart):
 def test_seeds_choose_the_vessel(heart, right_tree):
     by_seed = segment(heart[0], SegmentConfig(vessel="lca", seeds=(tuple(_axis()[20]), tuple(_branch()[-4]))))
     assert dice(by_seed.volume.voxels, right_tree.volume.voxels) > 0.9
+
+
+def test_a_volume_cut_off_at_zero_is_segmented_with_seeds_and_one_that_lost_its_rescale_is_not(heart):
+    cut = replace(heart[0], voxels=np.maximum(heart[0].voxels, 0))
+    with pytest.raises(InputError, match="give seeds if it was cut off at 0"):
+        segment(cut, SegmentConfig())
+    seeds = (tuple(_axis()[0]), tuple(_axis()[-6]))
+    whole, found = (segment(volume, SegmentConfig(seeds=seeds)).volume.voxels for volume in (heart[0], cut))
+    assert 2 * (whole & found).sum() / (whole.sum() + found.sum()) > 0.9
+    lost = replace(heart[0], voxels=heart[0].voxels + 1024 - min(int(heart[0].voxels.min()), 0))
+    with pytest.raises(InputError, match="as at the seeds: the rescale is lost"):
+        segment(lost, SegmentConfig(seeds=seeds))
 
 
 def test_a_seed_serves_where_the_aorta_is_not_in_the_volume(heart, right_tree):

@@ -13,6 +13,7 @@ from endopilot.anatomy.coronary_ends import OpenEnd, open_ends, skeleton_of
 from endopilot.anatomy.coronary_ostia import OstiumCandidate, Side, rank_ostia
 from endopilot.anatomy.distance import distance_map_from_surface
 from endopilot.anatomy.surface import Surface, surface_from_mask
+from endopilot.anatomy.units import check_unit
 from endopilot.errors import InputError
 from endopilot.types import DistanceMap, Insertion, LumenMask, Volume
 
@@ -111,6 +112,8 @@ def _lumens(content: LumenMask | Surface, label: str) -> Iterator[DistanceMap]:
     if isinstance(content, LumenMask):
         mask = _coarse(content.volume)
         if mask.voxels.any():
+            corners = mask.index_to_world(np.array([np.zeros(3), np.array(mask.voxels.shape[::-1]) - 1.0]))
+            check_unit(corners, None, "rca", label)
             wall = surface_from_mask(repair.joined_mask(mask))
             yield distance_map_from_surface(wall, spacing_mm=GRID_MM, band_mm=2 * GRID_MM)
         return

@@ -26,6 +26,15 @@ MAXIMUM_GRID_POINTS = 20_000_000
 FILLET = 0.5
 """Strength of the fillet where a branch leaves its parent, in radii of the branch."""
 
+CATHETER_RADIUS_MM = 0.9
+"""Inner radius of a 6 French guiding catheter, mm: 0.071 inch across (Medtronic Launcher, instructions for use)."""
+
+CATHETER_LENGTH_MM = 20.0
+"""Length of catheter behind the ostium that a distance map holds, mm."""
+
+ENGAGED_MM = 3.0
+"""A guiding catheter's tip lies this deep in the ostium, mm."""
+
 _NEAR_WALL = (2, 5)
 """This many grid steps outside and inside the wall are computed exactly, the rest on every second grid point."""
 
@@ -151,7 +160,7 @@ def distance_map_from_mask(mask: Volume, *, spacing_mm: float | None = None, ban
 
 
 def add_catheter(
-    distance_map: DistanceMap, insertion: Insertion, radius_mm: float, length_mm: float = 20.0
+    distance_map: DistanceMap, insertion: Insertion, radius_mm: float, length_mm: float = CATHETER_LENGTH_MM
 ) -> DistanceMap:
     """Return the map joined with a straight guiding catheter that ends at the ostium.
 
@@ -187,6 +196,16 @@ def add_catheter(
         grown.values[window], field, spacing_mm=spacing, fillet_mm=FILLET * float(radius_mm)
     )
     return grown
+
+
+def catheter_tilt_deg(ostium_radius_mm: float, catheter_radius_mm: float) -> float:
+    """Return how far a catheter may lean off the vessel's axis before its engaged tip meets the wall, degrees.
+
+    Args:
+        ostium_radius_mm: the lumen's radius at the ostium, mm.
+        catheter_radius_mm: the catheter's inner radius, mm.
+    """
+    return math.degrees(math.atan2(max(ostium_radius_mm - catheter_radius_mm, 0.0), ENGAGED_MM))
 
 
 def smooth_union(

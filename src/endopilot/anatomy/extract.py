@@ -14,9 +14,11 @@ from endopilot.anatomy import polylines, repair
 from endopilot.anatomy.centerline import refined_lines
 from endopilot.anatomy.coronary_inlet import SHORT_MM, CoronaryInlet, coronary_inlet
 from endopilot.anatomy.distance import (
+    CATHETER_RADIUS_MM,
     MAXIMUM_GRID_POINTS,
     add_catheter,
     automatic_spacing,
+    catheter_tilt_deg,
     distance_map_from_spheres,
     distance_map_from_surface,
 )
@@ -26,6 +28,7 @@ from endopilot.anatomy.lumen_graph import lumen_graph, trace_branches
 from endopilot.anatomy.sources import AnatomySource, Polylines, read_source, transformed
 from endopilot.anatomy.surface import Surface, surface_from_mask
 from endopilot.anatomy.tree import tree_from_lines
+from endopilot.anatomy.units import SMALLEST_RADIUS_MM, check_unit
 from endopilot.errors import InputError
 from endopilot.progress import progress
 from endopilot.settings import Finite, Positive, settings
@@ -33,11 +36,11 @@ from endopilot.types import Anatomy, DistanceMap, Insertion, LumenMask, VesselTr
 
 __all__ = ["AnatomyConfig", "extract_anatomy", "read_source"]
 
-SMALLEST_MEAN_RADIUS_MM, LARGEST_MEAN_RADIUS_MM = 0.25, 40.0
-"""Vessels that a guidewire enters have mean radii between these; others suggest a wrong unit."""
-
 CORONARY_RADIUS_MM = 1.6
 """Mean radius of a coronary tree at most: what counts for the grid where a lumen holds a piece of the aorta too."""
+
+_RESOLVED_STEPS = 1.25
+"""A catheter's radius in steps of the distance map, at least: wide vessels have coarse maps."""
 
 SHORTEST_IN_DIAMETERS = 1.5
 """A lumen whose longest path is shorter than this many of its own mean diameters is no vessel."""
@@ -53,7 +56,8 @@ class AnatomyConfig:
     """Where the device enters, LPS mm, within some 5 mm; by default the mask's own ostium, or else where the vessel
     looks as if it began."""
     catheter_radius_mm: Positive | None = None
-    """Inner radius of the guiding catheter, mm; by default the lumen's radius at the ostium."""
+    """Inner radius of the guiding catheter, mm; by default 0.9 (6 French), the ostium's where that is narrower, and
+    more where the map is too coarse for it."""
     spacing_mm: Positive | None = None
     """Grid spacing of the distance map, mm; by default 0.45 times the narrow vessels' radius, from 0.3 to 1.5 mm."""
     minimum_branch_length_mm: Positive = 4.0
@@ -95,6 +99,7 @@ def extract_anatomy(
     source_name = wrapped.file or name
     with progress(f"anatomy {name}", 4) as advance:
         if isinstance(content, (Polylines, VesselTree)):
+            _check_lines(content, config, source_name)
             tree, rule = polylines.tree_from_polylines(content, given, source_name)
             inlet: CoronaryInlet | None = None
             advance(2)
@@ -109,7 +114,9 @@ def extract_anatomy(
         tree = label_tree(tree, config.vessel)
         notes += _short(tree, config.vessel)
         insertion = _insertion(tree, given)
-        radius = config.catheter_radius_mm or float(np.median(tree.branches[0].centerline.radius[:3]))
+        ostium_radius = float(np.median(tree.branches[0].centerline.radius[:3]))
+        resolved = max(CATHETER_RADIUS_MM, _RESOLVED_STEPS * distance_map.spacing_mm)
+        radius = config.catheter_radius_mm or min(resolved, ostium_radius)
         distance_map = add_catheter(distance_map, insertion, radius)
         advance()
     provenance = {
@@ -118,10 +125,16 @@ def extract_anatomy(
         "config": asdict(config),
         "ostium_rule": rule,
         **(inlet.record() if inlet is not None else {}),
+        "catheter_tilt_deg": round(catheter_tilt_deg(ostium_radius, radius), 1),
         "dominance": dominance(tree),
         "notes": notes,
     }
     return Anatomy(name, tree, distance_map, insertion, radius, provenance)
+
+
+def _check_lines(lines: Polylines | VesselTree, config: AnatomyConfig, label: str) -> None:
+    if isinstance(lines, Polylines):
+        check_unit(np.concatenate(lines.points), float(np.median(np.concatenate(lines.radius))), config.vessel, label)
 
 
 def _wall(
@@ -129,6 +142,8 @@ def _wall(
 ) -> tuple[Surface, float, CoronaryInlet | None, list[str]]:
     """Return the closed wall of the wanted vessel, the voxels' shortest edge (mm), its inlet if found, and repairs."""
     inlet = None
+    if isinstance(content, Surface):
+        check_unit(content.vertices, None, config.vessel, label)
     if given is None and config.vessel != "generic":
         inlet = coronary_inlet(content, config.vessel, label)
         given = None if inlet is None else Insertion(inlet.position, np.zeros(3))
@@ -176,16 +191,12 @@ def _tree(
 ) -> tuple[VesselTree, str]:
     """Return the centerline tree inside a closed wall, and the rule by which its root was chosen."""
     mean_radius = 2.0 * surface.volume / surface.area
-    if mean_radius < min(SMALLEST_MEAN_RADIUS_MM, finest_mm):
+    if mean_radius < min(SMALLEST_RADIUS_MM, finest_mm):
         raise InputError(
             f"{label}: the lumen is about one voxel thick (mean radius {mean_radius:.2g} mm, voxels of "
             f"{finest_mm:.2g} mm), too thin to follow; segment on a finer grid"
         )
-    if not SMALLEST_MEAN_RADIUS_MM <= mean_radius <= LARGEST_MEAN_RADIUS_MM:
-        raise InputError(
-            f"{label}: the lumen's mean radius is {mean_radius:.3g} mm, which no vessel has; "
-            "if the file is in m or cm, use --scale 1000 or --scale 10"
-        )
+    check_unit(surface.vertices, mean_radius, config.vessel, label)
     if config.vessel != "generic":  # a piece of the aorta in the lumen must not set the scale
         mean_radius = min(mean_radius, CORONARY_RADIUS_MM)
     extent = np.ptp(surface.vertices, axis=0)

@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import model_validator
 
 from endopilot.anatomy import distance
+from endopilot.anatomy.distance import CATHETER_RADIUS_MM
 from endopilot.atlas.arch import make_arch
 from endopilot.atlas.cerebral import make_cerebral
 from endopilot.atlas.lca import make_lca
@@ -19,8 +20,6 @@ from endopilot.atlas.variation import catheter_direction, flattened
 from endopilot.settings import Count, Seed, Share, settings
 from endopilot.types import Anatomy, Insertion, VesselTree
 
-CATHETER_RADIUS_MM = 0.9
-"""Inner radius of a 6 French guiding catheter (0.071 inch), mm."""
 CATHETER_LENGTH_MM = 30.0
 """Length of catheter behind the ostium that the distance map holds, mm."""
 

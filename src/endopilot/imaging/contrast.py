@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float
 from scipy import ndimage
@@ -22,17 +24,35 @@ _LEAST_POOL_ML = 4.0
 """Less than the inside of any heart chamber; homogeneous bone of the thorax comes in smaller pieces."""
 
 
-def refuse_other_units(volume: Volume) -> None:
+def refuse_other_units(volume: Volume, seeds: Sequence[Sequence[float]] = ()) -> None:
     """Refuse a volume that cannot be in HU.
 
+    A CT that was cut off at 0, or stripped of all but the brain, holds nothing below 0 either. Seeds tell it from one
+    whose rescale is lost: at them it has the HU of blood with contrast.
+
+    Args:
+        volume: CT in HU.
+        seeds: places in the vessel, LPS mm.
+
     Raises:
-        InputError: nothing is below 0, where fat, lung and air are.
+        InputError: nothing is below 0, where fat, lung and air are, and no blood at seeds shows that it is CT.
     """
     low, high = float(volume.voxels.min()), float(volume.voxels.max())
-    if low >= 0:
+    if low < 0:
+        return
+    if not seeds:
         raise InputError(
             f"the volume's values go from {low:g} to {high:g}, but fat, lung and air are below 0 HU: this is no CT, or "
-            "its rescale is lost; export it in HU"
+            "its rescale is lost; export it in HU, or give seeds if it was cut off at 0"
+        )
+    places = np.rint(volume.world_to_index(np.array(seeds, dtype=float))).astype(int)[:, ::-1]
+    around = [volume.voxels[tuple(slice(max(i - 1, 0), i + 2) for i in place)] for place in places]
+    blood = float(np.median([np.median(box) for box in around]))
+    if not LEAST_BLOOD_HU <= blood <= _BRIGHTEST_HU:
+        raise InputError(
+            f"the volume's values go from {low:g} to {high:g}, but fat, lung and air are below 0 HU, and blood with "
+            f"contrast has {LEAST_BLOOD_HU:g} to {_BRIGHTEST_HU:g} HU, not {blood:g} as at the seeds: the rescale is "
+            "lost, or the seeds lie beside the vessel"
         )
 
 

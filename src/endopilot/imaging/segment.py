@@ -104,8 +104,8 @@ def segment(volume: Volume | str | Path, config: SegmentConfig = SegmentConfig()
     """
     if not isinstance(volume, Volume):
         volume = read_volume(volume)
-    refuse_other_units(volume)
     _refuse_seeds_outside(volume, config)
+    refuse_other_units(volume, config.seeds)
     method = _method(config.method)
     if not config.seeds and method.blood_pools:
         refuse_without_contrast(volume)
