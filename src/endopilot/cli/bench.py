@@ -227,9 +227,29 @@ def imaging(*, cases: int = 50, seed: int = 0, folder: Path = Path("runs/bench-i
     _leave(all(measured[name]["met"] for name in BARS))
 
 
+def cockpit(*, json: bool = False) -> None:
+    """Measure the cockpit in a headless browser without a GPU: time in reserve, latency, frames per second, start.
+
+    Args:
+        json: print the figures as JSON.
+    """
+    from endopilot.benchmarks.cockpit import BARS, bench_cockpit
+
+    measured = bench_cockpit()
+    if json:
+        show(measured, as_json=True)
+    else:
+        rows = [
+            {"figure": name, "value": measured[name], "bar": measured["bars"][name], "passed": measured["passed"][name]}
+            for name in BARS
+        ]
+        show_rows(rows, as_json=False)
+    _leave(all(measured["passed"].values()))
+
+
 SUBJECTS: dict[str, Callable[..., None]] = {
     function.__name__: function
-    for function in (simulation, scaling, robustness, env, dataset, training, labels, anatomy, ostia, imaging)
+    for function in (simulation, scaling, robustness, env, dataset, training, labels, anatomy, ostia, imaging, cockpit)
 }
 """The subjects that can be measured."""
 

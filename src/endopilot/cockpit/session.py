@@ -156,6 +156,7 @@ class Session:
             "valid": snapshot.valid,
             "peak_force_n": round(self.world.peak_force_n, 4),
             "sight": self.sight,
+            "reserve": round(self.world.reserve, 1),
             "target": target_values(anatomy, self.target),
             "xray": self.xray.values(snapshot.time_s),
             "target_px": self.xray.pixels(self.target.position(anatomy)),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import time
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -104,11 +105,17 @@ class World:
         drive = replace(self.config.robot, latency_s=self.config.robot.latency_s * truth.latency_factor)
         self.robot = SimulatedRobot(self.simulator, self.limits, drive, seed=seed, ostium_mm=truth.ostium_mm)
         self.cycle, self.peak_force_n, self.force_n = 0, 0.0, 0.0
+        self._taken_s = self.config.cycle_s / 10
 
     @property
     def time_s(self) -> float:
         """Time since the start, s."""
         return self.cycle * self.config.cycle_s
+
+    @property
+    def reserve(self) -> float:
+        """Simulated time over the time that simulating it takes, lately."""
+        return self.config.cycle_s / self._taken_s
 
     def navigation_to(self, target: Target | None) -> Navigation:
         """Return the navigation with another target, or as it is.
@@ -130,7 +137,9 @@ class World:
 
     def advance(self) -> None:
         """Let one cycle pass."""
+        began = time.perf_counter()
         self.force_n = self.robot.run(self.config.cycle_s)
+        self._taken_s += 0.02 * (time.perf_counter() - began - self._taken_s)
         self.peak_force_n = max(self.peak_force_n, self.force_n)
         self.cycle += 1
 
