@@ -13,7 +13,7 @@ from contextlib import contextmanager
 
 FLAGS = (
     "--no-sandbox",
-    "--use-angle=swiftshader",
+    "--disable-gpu",
     "--enable-unsafe-swiftshader",
     "--disable-background-networking",
     "--disable-component-update",
@@ -80,6 +80,27 @@ def until(page, script, seconds=40.0):
     end = time.monotonic() + seconds
     while not value(page, f"Boolean({script})"):
         assert time.monotonic() < end, f"{script} is not so; the page says: {page.inner_text('#banner')!r}"
+        time.sleep(0.05)
+
+
+def hold(page, key, script, *, watcher=None, seconds=60.0):
+    """Hold a key until an expression is true; where a busy machine lets the page fall silent, press it again.
+
+    Args:
+        page: that drives.
+        key: which stays pressed.
+        script: the expression.
+        watcher: the page that it is true in; the same one if not given.
+        seconds: to wait at most.
+    """
+    end = time.monotonic() + seconds
+    page.keyboard.down(key)
+    while not value(watcher or page, f"Boolean({script})"):
+        assert time.monotonic() < end, f"{script} is not so; the page says: {page.inner_text('#figures')!r}"
+        if value(page, "cockpit.state.stopped === 'silence'"):
+            page.keyboard.up(key)
+            time.sleep(0.1)
+            page.keyboard.down(key)
         time.sleep(0.05)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import FLAGS, browser_path, opened, serving, until, value
+from browser import FLAGS, browser_path, hold, opened, serving, until, value
 
 from endopilot.cockpit.recording import read_recording, replayed
 
@@ -47,23 +47,19 @@ def test_keys_move_the_wire_and_the_pedal_counts(context, server):
     page.on("pageerror", lambda error: errors.append(str(error)))
     assert "Not a medical device" in page.inner_text("header")
     began = value(page, "cockpit.shown.inserted_mm")
-    page.keyboard.down("KeyW")
-    until(page, f"cockpit.shown.inserted_mm > {began + 3}")
+    hold(page, "KeyW", f"cockpit.shown.inserted_mm > {began + 3}")
     page.keyboard.up("KeyW")
     until(page, "cockpit.shown.velocity[0] === 0")
     held = value(page, "cockpit.shown.inserted_mm")
-    page.keyboard.down("ArrowLeft")
-    until(page, "cockpit.shown.rotation_deg < -20")
+    hold(page, "ArrowLeft", "cockpit.shown.rotation_deg < -20")
     page.keyboard.up("ArrowLeft")
     assert value(page, "cockpit.shown.xray.frames") == 0
-    page.keyboard.down("KeyX")
-    until(page, "cockpit.shown.xray.frames >= 3")
+    hold(page, "KeyX", "cockpit.shown.xray.frames >= 3")
     assert "live" in page.inner_text("#caption0")
     page.keyboard.up("KeyX")
     until(page, "!cockpit.shown.xray.on")
     frames, image = value(page, "cockpit.shown.xray.frames"), value(page, IMAGE)
-    page.keyboard.down("KeyS")
-    until(page, f"cockpit.shown.inserted_mm < {held - 2}")
+    hold(page, "KeyS", f"cockpit.shown.inserted_mm < {held - 2}")
     page.keyboard.up("KeyS")
     assert value(page, "cockpit.shown.xray.frames") == frames
     assert value(page, IMAGE) == image  # the last image is held while X-ray is off
@@ -77,8 +73,7 @@ def test_a_closed_page_stops_the_wire(context, server):
     watcher = opened(context, server)
     page.bring_to_front()
     page.evaluate("() => { cockpit.hands.release = () => {}; }")  # or the page would let the keys go before it closes
-    page.keyboard.down("KeyW")
-    until(watcher, "cockpit.state.velocity[0] > 0")
+    hold(page, "KeyW", "cockpit.state.velocity[0] > 0", watcher=watcher)
     page.close()
     until(watcher, "cockpit.state.velocity[0] === 0")
     assert value(watcher, "cockpit.state.stopped") in ("connection", "silence")
@@ -89,8 +84,7 @@ def test_a_page_that_hangs_stops_the_wire(context, server):
     watcher = opened(context, server)
     page.bring_to_front()
     page.evaluate("() => { cockpit.hands.release = () => {}; }")
-    page.keyboard.down("KeyW")
-    until(watcher, "cockpit.state.velocity[0] > 0")
+    hold(page, "KeyW", "cockpit.state.velocity[0] > 0", watcher=watcher)
     page.evaluate("() => { const end = Date.now() + 1500; while (Date.now() < end); }")
     until(watcher, "cockpit.state.velocity[0] === 0 && cockpit.state.stopped === 'silence'")
 
@@ -108,8 +102,7 @@ def test_two_pages_watch_and_one_drives(context, server):
     second.bring_to_front()
     second.click("#wheel")
     until(second, "cockpit.role.drives")
-    second.keyboard.down("KeyW")
-    until(first, f"cockpit.state.inserted_mm > {began + 2}")
+    hold(second, "KeyW", f"cockpit.state.inserted_mm > {began + 2}", watcher=first)
     second.keyboard.up("KeyW")
 
 
@@ -133,8 +126,7 @@ def test_a_policy_drives_and_a_hand_takes_over(context, server):
     page.select_option("#autopilot-policy", "forward")
     page.click("#autopilot-start")
     until(page, "cockpit.shown.autopilot.status === 'drives' && cockpit.shown.velocity[0] > 0")
-    page.keyboard.down("KeyS")
-    until(page, "cockpit.shown.autopilot.status === 'off' && cockpit.shown.velocity[0] < 0")
+    hold(page, "KeyS", "cockpit.shown.autopilot.status === 'off' && cockpit.shown.velocity[0] < 0")
     page.keyboard.up("KeyS")
     page.click("#autopilot-start")
     until(page, "cockpit.shown.autopilot.status === 'reached'", seconds=60)
@@ -145,12 +137,10 @@ def test_a_policy_drives_and_a_hand_takes_over(context, server):
 
 def test_a_killed_server_goes_on_and_a_replay_shows_what_was(context, server):
     page = opened(context, server)
-    page.keyboard.down("KeyW")
-    until(page, "cockpit.shown.inserted_mm > 9")
-    page.keyboard.down("KeyD")
-    until(page, "cockpit.shown.inserted_mm > 13")
-    for key in ("KeyW", "KeyD"):
-        page.keyboard.up(key)
+    hold(page, "KeyW", "cockpit.shown.inserted_mm > 12")
+    page.keyboard.up("KeyW")
+    hold(page, "KeyD", "cockpit.shown.rotation_deg > 40")
+    page.keyboard.up("KeyD")
     until(page, "cockpit.shown.velocity.every((v) => v === 0)")
     time.sleep(1.0)
     cycle, nodes = value(page, "[cockpit.state.cycle, Array.from(cockpit.state.nodes)]")
@@ -158,9 +148,8 @@ def test_a_killed_server_goes_on_and_a_replay_shows_what_was(context, server):
     until(page, "!document.getElementById('banner').hidden")
     with serving("--resume", server.recording) as again:
         resumed = opened(context, again)
-        assert value(resumed, "cockpit.shown.inserted_mm") == pytest.approx(13.5, abs=3.0)
-        resumed.keyboard.down("KeyS")
-        until(resumed, "cockpit.shown.inserted_mm < 11")
+        assert value(resumed, "cockpit.shown.inserted_mm") == pytest.approx(13, abs=3.0)
+        hold(resumed, "KeyS", "cockpit.shown.inserted_mm < 11")
         resumed.keyboard.up("KeyS")
     recording = read_recording(Path(server.recording))
     then = next((world.snapshot().nodes for world, _ in replayed(recording) if world.cycle == cycle), None)
@@ -182,15 +171,13 @@ def test_a_task_is_driven_by_x_ray_alone(context, tmp_path):
         assert page.locator("#blind").is_visible()
         page.click("#game-start")
         until(page, "cockpit.shown.game.phase === 'on'")
-        page.keyboard.down("KeyX")
-        until(page, "cockpit.shown.xray.frames >= 2")
+        hold(page, "KeyX", "cockpit.shown.xray.frames >= 2")
         page.keyboard.up("KeyX")
         assert value(
             page, "[cockpit.state.nodes, cockpit.state.tip_mm, cockpit.state.force_n].every((v) => v === undefined)"
         )
         page.keyboard.down("Shift")
-        page.keyboard.down("KeyW")
-        until(page, "cockpit.shown.game.phase === 'over'", seconds=100)
+        hold(page, "KeyW", "cockpit.shown.game.phase === 'over'", seconds=100)
         until(page, "document.querySelector('#scores')?.innerText.includes('you')")
         assert page.locator("#blind").is_hidden()
         assert value(page, "cockpit.state.nodes.length") > 10

@@ -6,6 +6,7 @@ then finely. Until then there is no X-ray.
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -17,7 +18,6 @@ from jaxtyping import Float
 
 from endopilot.cockpit.frames import encode
 from endopilot.cockpit.world import Snapshot
-from endopilot.phantom.phantom import PhantomConfig, make_phantom
 from endopilot.types import Anatomy, Volume
 from endopilot.xray.carm import view_at
 from endopilot.xray.image import Plane, XrayImager
@@ -26,10 +26,8 @@ CONTRAST_S = 2.0
 """How long an injection fills the vessel, s; then the blood washes it out."""
 _FILL_S, _WASH_S, _GONE = 0.2, 0.4, 0.02
 _COARSE, _FINE = 96, 256
-_PHANTOM = PhantomConfig(
-    in_plane_mm=1.5, slice_mm=1.5, margin_mm=50.0, lumen_hu=(45.0, 45.0), noise_hu=(0.0, 0.0), calcium=0.0
-)
-"""The chest around a coronary artery without a CT; without contrast, as it is between two injections."""
+_NICE = 10
+"""Of the thread that computes views: the wire goes first."""
 
 
 @dataclass(frozen=True)
@@ -98,8 +96,8 @@ class XrayUnit:
         self._failed: BaseException | None = None
         self._imager = make_imager(ct)
         self._prepare()
-        if ct is None and _is_coronary(anatomy):
-            self._pool.submit(self._work, lambda: self._surround(anatomy, make_imager))
+        self._later = ct is None and _is_coronary(anatomy)
+        self._surroundings = lambda: self._surround(anatomy, make_imager)
 
     def configure(self, **changes: Any) -> None:
         """Turn or set the C-arm; `changes` are fields of `XraySettings`."""
@@ -126,6 +124,9 @@ class XrayUnit:
         """Return the images of a pulse if one is due, as messages for the page, else None."""
         if self._failed is not None:
             raise RuntimeError("the X-ray image could not be computed") from self._failed
+        if self._later:  # with the first cycle, so that the page is there before
+            self._later = False
+            self._pool.submit(self._work, self._surroundings)
         period = 1 / self.settings.frames_per_s
         self._next_s = min(self._next_s, snapshot.time_s + period)  # a replay may go back in time
         if not (self.pedal and self.ready and snapshot.time_s >= self._next_s - 1e-9):
@@ -204,7 +205,13 @@ class XrayUnit:
 
     def _surround(self, anatomy: Anatomy, make_imager: Callable[[Volume | None], XrayImager]) -> None:
         """Put the phantom around the vessel, and compute the views again."""
-        imager = make_imager(make_phantom(anatomy, _PHANTOM, seed=0))
+        from endopilot.phantom.phantom import PhantomConfig, make_phantom  # slow to import, and not always needed
+
+        # Without contrast, as the chest is between two injections.
+        config = PhantomConfig(
+            in_plane_mm=1.5, slice_mm=1.5, margin_mm=50.0, lumen_hu=(45.0, 45.0), noise_hu=(0.0, 0.0), calcium=0.0
+        )
+        imager = make_imager(make_phantom(anatomy, config, seed=0))
         planes = {key: imager.plane(*key, rays=_COARSE) for key in self.settings.planes}
         with self._lock:
             self._imager, self._planes, self._fine, self.background = imager, planes, set(), "phantom"
@@ -227,6 +234,8 @@ class XrayUnit:
                 self._fine.add(key)
 
     def _work(self, task: Callable[[], None]) -> None:
+        if hasattr(os, "setpriority"):
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
         try:
             task()
         except Exception as error:  # told in the page by the next pulse, not lost in a thread

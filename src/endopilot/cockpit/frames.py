@@ -14,12 +14,11 @@ from typing import Any
 import numpy as np
 
 from endopilot.cockpit.world import Snapshot
-from endopilot.report.wall_mesh import wall_mesh
 from endopilot.tasks.navigation import Navigation, Target
 from endopilot.types import Anatomy
 
 _TYPES = {np.dtype("<f4"): "f4", np.dtype("<u4"): "u4", np.dtype("u1"): "u1"}
-WALL_TRIANGLES = 24_000
+WALL_TRIANGLES = 14_000
 """Triangles of the lumen in the page at most: software rendering must keep up."""
 _POINT_MM = 1.0
 """Distance between the points of the centerline in the page, mm."""
@@ -82,6 +81,8 @@ def scene(navigation: Navigation, about: dict[str, Any]) -> bytes:
         navigation: vessel, wire and target.
         about: further entries of the header.
     """
+    from endopilot.report.wall_mesh import wall_mesh  # slow to import, and needed in the thread that makes the scene
+
     anatomy, device = navigation.anatomy, navigation.device
     wall = wall_mesh(anatomy.distance_map, max_triangles=WALL_TRIANGLES)
     lines, points, labels, places = [], [], [], []

@@ -44,10 +44,15 @@ class Attempt:
     task: Task
     place: int
 
+    @property
+    def seed(self) -> int:
+        """Of the navigation, the same for policies."""
+        return navigation_seed(self.task, self.place)
+
     def world(self) -> World:
         """Return the world at the task's start, with the ladder's rod core."""
         config = WorldConfig(simulator=replace(CORE, threads=1))
-        return World(self.task.ladder_navigation(self.place), config, seed=navigation_seed(self.task, self.place))
+        return World(self.task.ladder_navigation(self.place), config, seed=self.seed)
 
 
 class GameSession(Session):
@@ -185,5 +190,5 @@ class GameSession(Session):
 def _rival(tried: Attempt) -> dict[str, Any]:
     """Let the agent drive the same task in the same patient."""
     navigation = tried.task.ladder_navigation(tried.place)
-    scored = attempt(RIVAL, navigation, seed=navigation_seed(tried.task, tried.place))
+    scored = attempt(RIVAL, navigation, seed=tried.seed)
     return {name: scored[name] for name in _SHOWN}

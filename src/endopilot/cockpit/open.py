@@ -6,24 +6,20 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from endopilot.anatomy.io import read_anatomy, write_anatomy
-from endopilot.cockpit.film import FRAME_S, open_film
 from endopilot.cockpit.fluoroscopy import XrayUnit
 from endopilot.cockpit.frames import scene
-from endopilot.cockpit.game import Attempt, GameSession
 from endopilot.cockpit.loop import Stage
 from endopilot.cockpit.recording import SUFFIX, Recorder, Recording, Where, read_recording, replayed
-from endopilot.cockpit.replay import ReplayStage
 from endopilot.cockpit.session import Session
 from endopilot.cockpit.world import World
 from endopilot.control.policies import POLICIES
-from endopilot.ladder.attempt import navigation_seed
 from endopilot.simulation.device import Device, read_device
 from endopilot.tasks.navigation import Navigation, Target
-from endopilot.tasks.task import find_task, reference_navigation
 from endopilot.types import Anatomy, Volume
 from endopilot.xray.image import XrayImager
 
@@ -83,9 +79,18 @@ def open_task(name: str, place: int = 0, *, output: Path = Path("runs/cockpit"))
     Raises:
         InputError: the ladder has no such task, or the task no such patient.
     """
+    from endopilot.cockpit.game import Attempt, GameSession  # slow to import, and needed for tasks alone
+    from endopilot.tasks.task import find_task
+
     tried = Attempt(find_task(name), place)
-    world = tried.world()
-    return _driven(world, Where(task=name, place=place), output, None, seed=navigation_seed(tried.task, place))
+    return _driven(
+        tried.world(),
+        Where(task=name, place=place),
+        output,
+        None,
+        seed=tried.seed,
+        make=partial(GameSession, tried),
+    )
 
 
 def open_replay(
@@ -110,6 +115,9 @@ def open_replay(
     Raises:
         InputError: it cannot be read, or lacks its patient or task.
     """
+    from endopilot.cockpit.film import FRAME_S, open_film  # slow to import, and needed for replays alone
+    from endopilot.cockpit.replay import ReplayStage
+
     film = open_film(path, patient, device=device, world=world, task=task)
     navigation = film.navigation
     stage = ReplayStage(film, xray_unit(navigation.anatomy, navigation.device, read_ct(ct)))
@@ -126,6 +134,7 @@ def resume_session(path: Path, *, ct: Path | None = None) -> Opened:
     world = _last(recording)
     _drop_half_line(path)
     world.stop()
+    # A game that was interrupted goes on as a session without a score.
     opened = _driven(world, recording.where, path.parent, ct, path=path, seed=recording.seed)
     assert isinstance(opened.stage, Session)
     opened.stage.restore(recording.events)
@@ -133,17 +142,20 @@ def resume_session(path: Path, *, ct: Path | None = None) -> Opened:
 
 
 def _driven(
-    world: World, where: Where, output: Path, ct: Path | None, *, path: Path | None = None, seed: int = 0
+    world: World,
+    where: Where,
+    output: Path,
+    ct: Path | None,
+    *,
+    path: Path | None = None,
+    seed: int = 0,
+    make: Callable[..., Session] = Session,
 ) -> Opened:
     navigation = world.navigation
     name = f"{where.task or navigation.anatomy.name}-{time.strftime('%Y%m%d-%H%M%S')}"
     recorder = Recorder(path or _free(output, name), world, where, seed)
     policies = POLICIES.names()
-    xray = xray_unit(navigation.anatomy, navigation.device, read_ct(ct))
-    if where.task is None or path is not None:  # a game that was interrupted goes on as a session without a score
-        session = Session(world, xray, recorder, policies)
-    else:
-        session = GameSession(Attempt(find_task(where.task), where.place), world, xray, recorder, policies)
+    session = make(world, xray_unit(navigation.anatomy, navigation.device, read_ct(ct)), recorder, policies)
     return Opened(session, scene_of(navigation, {"policies": policies}), world.config.cycle_s, recorder.path)
 
 
@@ -191,6 +203,8 @@ def _synthetic(output: Path) -> Path:
     """Return the folder of the synthetic patient; it is written if need be."""
     folder = output / "synthetic"
     if not (folder / "anatomy.json").exists():
+        from endopilot.tasks.task import reference_navigation
+
         write_anatomy(reference_navigation().anatomy, folder)
     return folder
 

@@ -22,7 +22,6 @@ from endopilot.files import json_text
 from endopilot.settings import from_record
 from endopilot.simulation.device import Device
 from endopilot.tasks.navigation import Navigation, Target
-from endopilot.tasks.task import find_task
 
 FORMAT = "endopilot cockpit 1"
 SUFFIX = ".cockpit.jsonl"
@@ -181,6 +180,8 @@ def _header(world: World, where: Where, seed: int) -> dict[str, Any]:
 
 def _navigation(path: Path, header: dict[str, Any], where: Where) -> Navigation:
     if where.task is not None:
+        from endopilot.tasks.task import find_task  # slow to import, and needed for tasks alone
+
         anatomy = find_task(where.task).ladder_navigation(where.place).anatomy
     elif where.patient is not None:
         anatomy = read_anatomy(where.patient)

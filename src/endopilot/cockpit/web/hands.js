@@ -106,7 +106,7 @@ export class Hands {
   beat() {
     this.update();
     if (this.sent[0] || this.sent[1] || this.policyDrives()) this.send(this.sent);
-    else if (this.pedalSent) this.connection.send("pedal", { down: true });
+    if (this.pedalSent && this.drives()) this.connection.send("pedal", { down: true });
   }
 
   send([translation, rotation]) {

@@ -8,7 +8,8 @@ import { ReplayBar } from "./replay.js";
 import { Sound } from "./sound.js";
 import { Space } from "./space.js";
 
-const page = { state: null, role: { drives: false }, space: null, frames: 0, drawn: 0 };
+const page = { state: null, role: { drives: false }, space: null, frames: 0, drawn: 0, written: 0 };
+const TEXT_MS = 90; // between two updates of the page's text
 window.cockpit = page; // for tests and the console
 
 const handlers = {
@@ -68,27 +69,30 @@ function showFigures(state) {
   });
 }
 
-function show(state) {
-  page.space.show(state);
+function showText(state) {
   page.xray.show(state.xray, state.target_px);
   showForce(state);
   showFigures(state);
   page.autopilot?.show(state.autopilot, state.target);
   if (state.replay) page.replay.show(state.replay, state.time_s);
   if (state.game) page.game.show(state.game);
-  page.space.believed.visible = Boolean(page.autopilot?.shown.checked);
+  page.space.believe(Boolean(page.autopilot?.shown.checked));
   document.getElementById("blind").hidden = state.sight;
 }
 
-function frame() {
+function frame(now) {
   requestAnimationFrame(frame);
-  if (page.state && page.state !== page.shown) {
+  const fresh = page.state && page.state !== page.shown;
+  if (fresh) {
     page.shown = page.state;
-    show(page.state);
+    page.space.show(page.state);
+  }
+  if (page.shown && now - page.written > TEXT_MS) {
+    page.written = now;
+    showText(page.shown);
   }
   page.xray.draw();
-  if (!page.shown || page.shown.sight) page.space.draw();
-  page.frames += 1;
+  if (page.shown?.sight !== false) page.frames += page.space.draw();
 }
 
 function countFrames() {
@@ -115,7 +119,7 @@ async function start() {
   if (page.scene.policies) page.autopilot = new AutopilotBar(page.connection, page.scene);
   page.hands = new Hands(page.connection, () => page.role.drives, () => Boolean(page.autopilot?.drives));
   setInterval(countFrames, 1000);
-  frame();
+  requestAnimationFrame(frame);
 }
 
 start();

@@ -22,6 +22,7 @@ const LUMEN_FRAGMENT = `
   }`;
 const PRESETS = { AP: [0, 0], "RAO 30": [-30, 0], "LAO 45": [45, 0], "LAO 45 CRAN 25": [45, 25], "RAO 30 CAUD 20": [-30, -20], lateral: [90, 0] };
 const FIELD_DEG = 26;
+const STILL_MM = 0.003;
 // The colours of sections in all pictures of endopilot; the two darkest are lighter here, on a dark ground.
 const COLORS = ["#0f86d6", "#e69f00", "#12b886", "#e2703a", "#56b4e9", "#cc79a7", "#f0e442", "#a27fc6", "#b08a56", "#44aa99", "#c85a8e", "#9aa3b5"];
 const sectionColor = (label) => COLORS[label % COLORS.length];
@@ -40,6 +41,8 @@ export class Space {
     this.camera.up.set(0, 0, 1);
     this.controls = new OrbitControls(this.camera, canvas);
     this.controls.enableDamping = false;
+    this.controls.addEventListener("change", () => { this.changed = true; });
+    this.changed = true;
     this.wire = new Wire(scene.diameter_mm, scene.force_limit_n);
     this.scene.add(this.wire.mesh);
     this.addLumen(scene);
@@ -145,14 +148,36 @@ export class Space {
 
   /** Show the state's wire, target and believed wires. */
   show(state) {
-    this.wire.mesh.visible = Boolean(state.nodes);
-    if (state.nodes) this.wire.set(state.nodes, state.node_force);
-    this.target.visible = Boolean(state.target);
-    if (state.target) this.target.position.set(...state.target.position);
+    if (state.nodes && this.moved(state.nodes)) {
+      this.wire.set(state.nodes, state.node_force);
+      this.changed = true;
+    }
+    const target = state.target?.position.join();
+    if (target !== this.targetAt) {
+      this.targetAt = target;
+      this.target.visible = Boolean(target);
+      if (target) this.target.position.set(...state.target.position);
+      this.changed = true;
+    }
+  }
+
+  /** Whether the wire has moved visibly since it was drawn. */
+  moved(nodes) {
+    const before = this.drawnNodes;
+    const still = before?.length === nodes.length && nodes.every((value, i) => Math.abs(value - before[i]) < STILL_MM);
+    if (!still) this.drawnNodes = nodes;
+    return !still;
+  }
+
+  /** Show or hide what a policy believes. */
+  believe(shown) {
+    if (this.believed.visible !== shown) this.changed = true;
+    this.believed.visible = shown;
   }
 
   /** Show the wires that a policy holds possible, the likeliest first, and its band along the centerline. */
   showBelief(belief) {
+    this.changed = true;
     for (const old of this.believed.children) old.geometry.dispose();
     this.believed.clear();
     const each = belief.wires.length / Math.max(belief.wires_shown, 1);
@@ -168,6 +193,7 @@ export class Space {
     if (belief.band.length) add(belief.band.slice(), "#ffd34d", 0.8, THREE.Points);
   }
 
+  /** Draw what has changed, and return whether there was anything to draw. */
   draw() {
     const { clientWidth: width, clientHeight: height } = this.canvas;
     if (this.width !== width || this.height !== height) {
@@ -175,9 +201,13 @@ export class Space {
       this.renderer.setSize(width, height, false);
       this.camera.aspect = width / Math.max(height, 1);
       this.camera.updateProjectionMatrix();
+      this.changed = true;
     }
+    if (!this.changed) return false;
+    this.changed = false;
     this.target.quaternion.copy(this.camera.quaternion);
     this.renderer.render(this.scene, this.camera);
+    return true;
   }
 
   choose(event) {
