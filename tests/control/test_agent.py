@@ -258,3 +258,24 @@ def test_advice_names_a_tip_at_forks_alone(side_branch) -> None:
         assert "does not enter" not in said
     assert "40 s are over" in describe_halt("late", 9.0, route, side_branch)
     assert "does not enter" in describe_halt("off", 20.5, route, side_branch)
+
+
+def test_a_search_takes_no_path_that_presses_harder_than_the_limit(side_branch) -> None:
+    """Under a limit below what the branch takes there is no path, and no part of one that breaks the limit."""
+    policy = TwinPolicy(config=QUICK)
+    policy.start(side_branch, 0)
+    needed = float(policy.find_course(20.0).force.max())
+    tight = replace(side_branch, force_limit_n=0.25 * needed)
+    policy.start(tight, 0)
+    course = policy.find_course(20.0)
+    assert course.reached == 0.0 and course.force.max(initial=0.0) <= tight.force_limit_n
+    assert "on the wall; give a larger force_limit_n" in policy.halt
+
+
+def test_a_course_may_begin_with_a_turn(side_branch) -> None:
+    policy = TwinPolicy(config=QUICK)
+    policy.start(side_branch, 0)
+    source, weight = policy.belief.likeliest()
+    course = policy._search.find(policy.belief.simulator, source, weight, seconds=20.0, turn=np.pi)
+    assert course.rotation[1] - side_branch.start_rotation == pytest.approx(np.pi)
+    assert (course.control[:2, 0] == 0.0).all() and course.reached == 1.0

@@ -13,13 +13,15 @@ from tyro.conf import Positional
 from endopilot.anatomy.io import read_anatomy
 from endopilot.cli.arguments import OutputFile, existing, show
 from endopilot.control.plan_file import read_plan
+from endopilot.dataset.navigations import simulate_navigations
+from endopilot.progress import progress
 from endopilot.settings import Count, Seed, Within, settings
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, random_controls, read_controls_csv
-from endopilot.simulation.device import read_device
+from endopilot.simulation.device import Device, read_device
 from endopilot.simulation.simulate import simulate, wall_force_events
 from endopilot.simulation.table import write_rollout
-from endopilot.types import SAMPLE_PERIOD_S
+from endopilot.types import SAMPLE_PERIOD_S, Anatomy, Rollout
 
 
 @settings
@@ -32,6 +34,9 @@ class RandomConfig:
     """Length of a navigation, s."""
     seed: Seed = 0
     """Seed of the random controls."""
+    stop_short: bool = True
+    """Stop a tip 5 mm before the end of its branch, where the image ends and not the vessel, and pull a caught wire
+    back, as `endopilot dataset` does. Given controls are made as they are."""
 
 
 def command(
@@ -80,10 +85,14 @@ def command(
             seed=random.seed,
             max_inserted_length_mm=float(patient.tree.longest_path().abscissa[-1]),
         )
-    record_shape = shape or picture is not None
-    rollout = simulate(
-        patient, wire, control, initial=initial, config=config, record_shape=record_shape, period_s=period_s
-    )
+    stopped, record_shape = None, shape or picture is not None
+    if controls is None and random.stop_short:
+        rollout, control, stopped = _stopped_short(patient, wire, initial, control, config)
+        initial = np.column_stack([rollout.initial_inserted_length, rollout.initial_rotation])
+    if stopped is None or record_shape:  # the controls that were made give the same navigations again
+        rollout = simulate(
+            patient, wire, control, initial=initial, config=config, record_shape=record_shape, period_s=period_s
+        )
     write_rollout(rollout if shape else replace(rollout, shape=None), output)
     valid = rollout.valid
     figures = {
@@ -91,6 +100,7 @@ def command(
         "worlds": int(valid.shape[0]),
         "samples": int(valid.shape[1]),
         "valid_worlds": int(valid[:, -1].sum()),
+        **({} if stopped is None else {"worlds_stopped_short": int(stopped.sum())}),
         "slipped_worlds": int(((rollout.slip != 0) | (rollout.rotation_slip != 0)).any(axis=1).sum()),
         "deepest_tip_mm": _largest(rollout.tip.abscissa, valid),
         "largest_contact_force_n": _largest(rollout.contact_force_max, valid),
@@ -109,6 +119,16 @@ def command(
         else:
             print(missing, file=sys.stderr)
     show(figures, as_json=json)
+
+
+def _stopped_short(
+    patient: Anatomy, wire: Device, initial: np.ndarray, control: np.ndarray, config: SimulatorConfig
+) -> tuple[Rollout, np.ndarray, np.ndarray]:
+    """Return random navigations that stop short of the ends, their controls, and which of them were stopped."""
+    worlds, samples = control.shape[:2]
+    friction = np.full(worlds, wire.friction)
+    with progress("Simulating the wire", total=worlds * samples) as advance:
+        return simulate_navigations(patient, [wire] * worlds, initial, control, friction, config, advance=advance)
 
 
 def _largest(values: np.ndarray, valid: np.ndarray) -> float | None:

@@ -55,8 +55,18 @@ class AgentConfig:
     """The same across the wire, mm."""
 
 
+_TURNS = (0.0, np.pi)
+"""Angles by which the wire may be turned before it goes in, rad."""
+_GENTLE_SHARE = 0.9
+"""Share of the force limit that a first course stays under for no other to be searched."""
+
+
 class _PlanningPolicy:
-    """What both policies share."""
+    """What both policies share.
+
+    Attributes:
+        halt: where and why the last search ended before the target, in words; empty if it arrived.
+    """
 
     def __init__(self, config: AgentConfig | None = None) -> None:
         """Take the settings.
@@ -95,7 +105,7 @@ class _PlanningPolicy:
         self._limits = DriveLimits.of(navigation.device, navigation.anatomy)
         self._course: Course | None = None
         self._at, self._lost, self._began, self._led = 0, False, False, False
-        self.plans, self._failed = 0, 0
+        self.plans, self._failed, self.halt = 0, 0, ""
 
     def decide(self, observation: Observation) -> Decision:
         """Follow the course, search another one, or pull back, as the module describes."""
@@ -169,13 +179,11 @@ class _PlanningPolicy:
             abscissa=course.abscissa[at], offset=course.offset[at], branch=course.branch[at], radius=course.radius[at]
         )
 
-    @property
-    def halt(self) -> str:
-        """Where and why the last search ended before the target, in words; empty if it arrived."""
-        return self._search.halt
-
     def find_course(self, seconds: float, advance: Advance | None = None) -> Course:
         """Search a path from where the likeliest wires are.
+
+        In a tortuous vessel forces depend on the side that the bent tip looks to as the wire goes in. So where the
+        first course presses hard, or none is found though no fork refuses, others are searched with the wire turned.
 
         Args:
             seconds: time that is left, s.
@@ -183,7 +191,18 @@ class _PlanningPolicy:
         """
         source, weight = self.belief.likeliest()
         self._ostium = float(self.belief.parameters[source[0], 2])
-        return self._search.find(self.belief.simulator, source, weight, seconds=seconds, advance=advance)
+        gentle_n = _GENTLE_SHARE * self.navigation.force_limit_n
+        best: Course | None = None
+        for turn in _TURNS if self.plans <= 1 else _TURNS[:1]:
+            course = self._search.find(
+                self.belief.simulator, source, weight, seconds=seconds, turn=turn, advance=advance
+            )
+            if best is None or _merit(course) > _merit(best):
+                best, self.halt = course, self._search.halt
+            if (course.reached > 0.5 and course.force.max() <= gentle_n) or self._search.at_fork:
+                break
+        assert best is not None
+        return best
 
     def _plan(self, observation: Observation) -> None:
         seconds = self.navigation.seconds - observation.time_s
@@ -193,6 +212,14 @@ class _PlanningPolicy:
         self._at, self.plans = 0, self.plans + 1
         self._course = self.find_course(seconds) if seconds >= DECISION_PERIOD_S else None
         self._failed = self._failed + 1 if self._course is not None and self._course.reached < 0.5 else 0
+
+
+def _merit(course: Course) -> tuple[bool, float]:
+    """Return how good a course is: whether it arrives, and how gently, or how far it comes."""
+    arrives = course.reached > 0.5
+    if arrives or not len(course.force):
+        return arrives, -float(course.force.max(initial=0.0)) if arrives else 0.0
+    return False, float(course.abscissa[-1].mean())
 
 
 class TwinPolicy(_PlanningPolicy):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from endopilot.control.reach import forks
+from endopilot.control.reach import Fork, forks
 from endopilot.control.route import BEYOND_MM, Route
 from endopilot.control.set_up import tip_name
 from endopilot.tasks.navigation import Navigation
@@ -15,6 +15,16 @@ presses on the wall too hard, or the time is over."""
 
 SPARE_SHARE = 0.85
 """Share of the force limit that a path is followed under: what is uncertain takes the rest."""
+
+
+def near_fork(at_mm: float, route: Route, navigation: Navigation) -> Fork | None:
+    """Return the fork of the route that a tip which came to an abscissa (mm) is at, or None."""
+    device = navigation.device
+    for fork in forks(route, device):
+        radius = 0.5 * (fork.width_mm + device.diameter_mm)
+        if abs(at_mm - fork.abscissa) <= radius + BEYOND_MM + 1.0:
+            return fork
+    return None
 
 
 def describe_halt(halt: Halt, at_mm: float, route: Route, navigation: Navigation) -> str:
@@ -29,9 +39,8 @@ def describe_halt(halt: Halt, at_mm: float, route: Route, navigation: Navigation
     device = navigation.device
     if halt == "late":
         return f"the {navigation.seconds:g} s are over; give more seconds"
-    radius = {fork: 0.5 * (fork.width_mm + device.diameter_mm) for fork in forks(route, device)}
-    near = [fork for fork, r in radius.items() if abs(at_mm - fork.abscissa) <= r + BEYOND_MM + 1.0]
-    where = f"at {near[0]}" if near else f"at {at_mm:.0f} mm, where no branch leaves,"
+    near = near_fork(at_mm, route, navigation)
+    where = f"at {near}" if near else f"at {at_mm:.0f} mm, where no branch leaves,"
     if halt == "pressed":
         limit = (
             f"{where} it cannot go on with less than {SPARE_SHARE:.0%} of the limit of {navigation.force_limit_n:g} N"

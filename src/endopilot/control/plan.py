@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from endopilot.anatomy.io import read_anatomy
 from endopilot.control.agent import AgentConfig, TwinPolicy
+from endopilot.control.belief import BeliefConfig
 from endopilot.control.course import Course
 from endopilot.control.desired import last_place, read_tips, tips_along
 from endopilot.control.navigate import NavigateConfig, navigate
@@ -36,6 +37,8 @@ _IDEAL = RobotConfig(
     encoder_sd_mm=0.0, encoder_sd_rad=0.0,
 )  # fmt: skip
 """A drive that makes every commanded motion exactly."""
+_TRIALS = 3
+"""Searches at most: a path that does not hold in the rod core at its own settings is searched again there."""
 
 
 def plan(
@@ -102,11 +105,16 @@ def plan(
         )
     else:
         desired = tips[["abscissa", "offset"]].to_numpy(float)
-    find = _method(navigation, config, model, desired, route, follow=tips is not None)
-    began = _clock()
-    control, predicted = find()
-    spent += _clock() - began
-    made = _checked(navigation, config, model, choice, desired, control, predicted, spent)
+    made, trials = None, _TRIALS if config.method == "twin" and tips is None else 1
+    for trial in range(trials):
+        find = _method(navigation, config, model, desired, route, follow=tips is not None, trial=trial)
+        began = _clock()
+        control, predicted = find()
+        spent += _clock() - began
+        made = _checked(navigation, config, model, choice, desired, control, predicted, spent)
+        if made.reached and made.within_force_limit:
+            break
+    assert made is not None
     if config.method == "twin":
         _check_kept(made)
     return made
@@ -119,7 +127,7 @@ def _clock() -> Float[np.ndarray, "2"]:
 
 def _method(
     navigation: Navigation, config: PlanConfig, model: Path | None, desired: Steps, route: Route, *,
-    follow: bool,
+    follow: bool, trial: int,
 ) -> Callable[[], tuple[Steps, Steps]]:  # fmt: skip
     """Return a function that finds controls and predicts their tips; loading a model is done before it is called."""
     if config.method in NETWORK_METHODS:
@@ -130,7 +138,7 @@ def _method(
         return network_planner(navigation, model, desired, route, config)
     if config.method != "twin":
         return lambda: _by_policy(navigation, config)
-    return lambda: _track(navigation, desired) if follow else _search(navigation, config)
+    return lambda: _track(navigation, desired) if follow else _search(navigation, config, trial)
 
 
 def _wire(model: Path | None, device: Device | str | Path | None, method: str) -> Device:
@@ -161,10 +169,13 @@ def _check_time(navigation: Navigation, config: PlanConfig) -> None:
         )
 
 
-def _search(navigation: Navigation, config: PlanConfig) -> tuple[Steps, Steps]:
-    """Search a path in the rod core."""
-    policy = TwinPolicy(config=AgentConfig(search=SearchConfig(speed_mm_s=config.speed_mm_s, cost=config.cost)))
-    policy.start(navigation, config.seed)
+def _search(navigation: Navigation, config: PlanConfig, trial: int) -> tuple[Steps, Steps]:
+    """Search a path in the rod core: with the settings of a belief, then with those that a plan is checked with."""
+    own = SimulatorConfig()
+    belief = BeliefConfig(element_mm=own.element_mm, time_step_s=own.time_step_s) if trial else BeliefConfig()
+    search = SearchConfig(speed_mm_s=config.speed_mm_s, cost=config.cost)
+    policy = TwinPolicy(config=AgentConfig(search=search, belief=belief))
+    policy.start(navigation, config.seed + trial)
     with progress("plan: searching in the rod core", total=navigation.target.abscissa) as advance:
         course = policy.find_course(navigation.seconds, advance)
     if course.reached < 0.5:

@@ -18,9 +18,9 @@ from jaxtyping import Bool, Float, Int
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.control.cost import Cost
 from endopilot.control.course import SLIP_SHARE, STALL_PERIODS, Controls, Course, Log
-from endopilot.control.halt import SPARE_SHARE, Halt, describe_halt
+from endopilot.control.halt import SPARE_SHARE, Halt, describe_halt, near_fork
 from endopilot.control.route import Route
-from endopilot.control.sweep import middle, sweep
+from endopilot.control.sweep import TURN_PERIODS, middle, sweep
 from endopilot.progress import Advance
 from endopilot.settings import Count, OpenShare, Positive, settings
 from endopilot.simulation.device import Device
@@ -73,6 +73,7 @@ class Search:
 
     Attributes:
         halt: where and why the last search ended before the target, in words; empty if it arrived.
+        at_fork: whether that was at a fork which the tip does not enter.
     """
 
     def __init__(
@@ -104,7 +105,7 @@ class Search:
         limits = DriveLimits.of(wires[0], anatomy)
         self._limits = replace(limits, travel_mm=(limits.travel_mm[0], limits.travel_mm[1] - _SHORT_MM))
         self._wire_radius = wires[0].tip_radius_mm
-        self.halt = ""
+        self.halt, self.at_fork = "", False
 
     def find(
         self,
@@ -113,6 +114,7 @@ class Search:
         weight: Float[np.ndarray, "wires"],
         *,
         seconds: float,
+        turn: float = 0.0,
         advance: Advance | None = None,
     ) -> Course:
         """Find a path from a state of the wires to the target.
@@ -122,12 +124,15 @@ class Search:
             source: which of its worlds each wire is.
             weight: how much each wire counts; their sum is 1.
             seconds: time that is left, s.
+            turn: angle by which the wire is turned before all else, rad.
             advance: called with every millimetre along the route.
         """
         self.single.copy_worlds(source, of=start)
         self._weight, same = weight, np.arange(len(weight))
-        log, reported, self.halt = Log(), 0.0, ""
+        log, reported, self.halt, self.at_fork = Log(), 0.0, "", False
         periods = max(1, int(seconds / DECISION_PERIOD_S))
+        for _ in range(min(TURN_PERIODS, periods) if turn else 0):
+            self._drive(log, np.array([0.0, turn / (TURN_PERIODS * DECISION_PERIOD_S)]))
         while log.periods < periods:
             here = float(self.route.progress(self.single.project()) @ self._weight)
             if advance is not None:
@@ -154,10 +159,22 @@ class Search:
                 self._approach(log, periods, waypoint, hard)
                 if not self._search_candidates(log, periods) or log.periods == before:
                     self.halt = describe_halt(halt, hard, self.route, self.navigation)
+                    self.at_fork = (
+                        halt in ("off", "stalled") and near_fork(hard, self.route, self.navigation) is not None
+                    )
                     break
         else:
             self.halt = describe_halt("late", 0.0, self.route, self.navigation)
-        return log.course(len(weight), self._reached())
+        reached = self._reached()
+        if reached <= 0.5:
+            self._cut_hard(log)
+        return log.course(len(weight), reached)
+
+    def _cut_hard(self, log: Log) -> None:
+        """Forget what a path that does not arrive does from where a wire presses too hard."""
+        hard = [bool((force[self._weight > 0] > self.navigation.force_limit_n).any()) for force in log.force]
+        if any(hard):
+            log.cut(hard.index(True))
 
     def _go_back(self, log: Log, periods: int) -> None:
         """Put the wires back to where they were kept, and forget what they have done since."""
@@ -300,6 +317,7 @@ class Search:
         count, wires = self.config.candidates, self.single.worlds
         self._many.copy_worlds(np.repeat(np.arange(wires), count), of=self.single)
         history, spent = np.zeros((0, count, 2)), np.zeros(count)
+        self._peak = np.zeros(wires * count)
         nearest, best = np.inf, np.zeros((0, 2))
         for number in range(rounds):
             before = history[-1] if number else np.zeros((count, 2))
@@ -315,7 +333,9 @@ class Search:
             if score.min() < nearest:
                 nearest, best = float(score.min()), history[:, np.argmin(score)]
             chosen = self._select(score)
-            self._many.copy_worlds((np.arange(wires)[:, None] * count + chosen).ravel())
+            source = (np.arange(wires)[:, None] * count + chosen).ravel()
+            self._many.copy_worlds(source)
+            self._peak = self._peak[source]
             history, spent = history[:, chosen], spent[chosen]
         return nearest, best, False
 
@@ -356,6 +376,7 @@ class Search:
                 warnings.simplefilter("ignore")
                 step = self._many.step(np.tile(control, (wires, 1)), DECISION_PERIOD_S)
             tip = self._many.project()
+            self._peak = np.maximum(self._peak, step.contact_force_max)
             running = cost.running(
                 error=self._distance(step.tip_position, waypoint),
                 ratio=safety_ratio(tip.offset, tip.radius, self._wire_radius),
@@ -374,7 +395,8 @@ class Search:
         """Return each candidate's cost so far and to go, and the share of its wires that have passed the waypoint."""
         tip, wires = self._many.project(), self.single.worlds
         to_go = self._distance(self._many.position[:, 0], waypoint) + 0.5 * self.route.off_route(tip)
-        passed = (self.route.passed(tip, waypoint) & self._many.valid).reshape(wires, -1)
+        sound = self._many.valid & (self._peak <= self.navigation.force_limit_n)
+        passed = (self.route.passed(tip, waypoint) & sound).reshape(wires, -1)
         score = self._weight @ to_go.reshape(wires, -1) + spent
         return score, self._weight @ passed
 

@@ -14,7 +14,7 @@ from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import DECISION_PERIOD_S
 
-_TURN_PERIODS = 2
+TURN_PERIODS = 2
 """Decision periods in which the wire is turned, half a turn at most."""
 _OFF_MM = 4.0
 """A tip that is this far in a wrong branch does not come back, mm: in a wide fork it may seem to leave the route."""
@@ -86,8 +86,8 @@ def sweep(
     progress = [_progress(simulator, route, wires)]
     for period in range(periods):
         control = np.zeros((count, 2))
-        if period < _TURN_PERIODS:
-            control[:, 1] = side / (_TURN_PERIODS * DECISION_PERIOD_S)
+        if period < TURN_PERIODS:
+            control[:, 1] = side / (TURN_PERIODS * DECISION_PERIOD_S)
         else:
             left = (waypoint - weight @ progress[-1]) / DECISION_PERIOD_S
             control[:, 0] = np.where(going, np.clip(left, 1.0, speed_mm_s) if last else speed_mm_s, 0.0)
@@ -105,13 +105,13 @@ def sweep(
         pressed = step.contact_force_max.reshape(shape)
         force = np.where(going, np.maximum(force, pressed[counted].max(axis=0)), force)
         progress.append(_progress(simulator, route, wires))
-        if period >= _TURN_PERIODS:
+        if period >= TURN_PERIODS:
             off = route.off_route(tip).reshape(shape)
             there = (off == 0) & route.passed(tip, waypoint).reshape(shape)
             sound = step.valid.reshape(shape) & (pressed <= force_limit_n) & (off <= _OFF_MM) & ~slipped
             passed |= going & (sound & there)[counted].all(axis=0)
             going &= sound[counted].all(axis=0) & ~passed & (weight @ progress[-1] < waypoint + _BEYOND_MM)
-        if period >= _TURN_PERIODS + STALL_PERIODS - 1:
+        if period >= TURN_PERIODS + STALL_PERIODS - 1:
             going &= ~_stalled(made, progress, counted)
         if not going.any():
             break

@@ -1,0 +1,24 @@
+"""`endopilot simulate` with random controls: where it stops."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from endopilot.cli import main
+
+
+@pytest.mark.parametrize(("option", "deepest_mm"), [((), 35.0), (("--no-stop-short",), 39.0)])
+def test_random_navigations_stop_short_of_ends_unless_asked_otherwise(vessel, tmp_path, capsys, option, deepest_mm):
+    """The vessel ends at 40 mm, its branch too; a tip stops 5 mm before."""
+    options = ("--sequences", "3", "--seconds", "20", "--seed", "1", "--json")
+    with pytest.raises(SystemExit) as leaving:
+        main(["simulate", str(vessel), "-o", str(tmp_path / "run.csv"), *option, *options])
+    assert leaving.value.code == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert figures["valid_worlds"] == 3
+    if not option:
+        assert figures["worlds_stopped_short"] > 0 and figures["deepest_tip_mm"] <= deepest_mm + 0.5
+    else:
+        assert "worlds_stopped_short" not in figures and figures["deepest_tip_mm"] >= deepest_mm
