@@ -40,8 +40,9 @@ cta: $(INSTALLED)
 	$(BIN)/endopilot segment $$volume --method aorta --seeds 2 -143 543 2 -184 657 -o $(CTA)/mask.nii.gz \
 	  --reference $$(dirname $$volume)/seg_aorta.nii.gz --picture $(CTA)/mask.png --json > $(CTA)/segment.json
 	$(BIN)/endopilot anatomy $(CTA)/mask.nii.gz --vessel generic -o $(CTA)/anatomy
-	$(BIN)/endopilot simulate $(CTA)/anatomy --device j-035 --controls docs/examples/up-the-aorta.csv \
-	  -o $(CTA)/rollout.csv --picture $(CTA)/wire.png --json > $(CTA)/simulate.json
+	$(BIN)/endopilot navigate $(CTA)/anatomy --target G6.1 --device j-035 --force-limit-n 0.7 -o $(CTA)/navigation
+	$(BIN)/endopilot simulate $(CTA)/anatomy --device $(CTA)/navigation/wire.yaml \
+	  --controls $(CTA)/navigation/controls.csv -o $(CTA)/rollout.csv --picture $(CTA)/wire.png --json > $(CTA)/simulate.json
 
 readme: $(INSTALLED)
 	$(BIN)/python docs/readme.py

@@ -105,17 +105,19 @@ def _demo_table(metrics: dict, record: dict) -> str:
 
 def _cta(run: Path) -> str:
     """Return agreement and navigation in the real CT angiogram."""
-    mask, wire = read_json(run / "segment.json"), read_json(run / "simulate.json")
+    mask, wire = read_json(run / "segment.json"), read_json(run / "navigation" / "manifest.json")["figures"]
     return (
         f"Dice {mask['dice']:.2f} against the aorta of a segmentation network (not a human reader): "
         f"{100 * mask['share_inside_reference']:.0f} % of our lumen lies inside theirs, {mask['cut_off_ml']:.0f} ml of "
         "theirs are outside ours (mostly false lumen without contrast), "
-        f"{mask['beyond_ml']:.0f} ml of ours are outside theirs (stumps of arch branches). The 0.035″ J wire advances "
-        f"{wire['deepest_tip_mm']:.0f} mm up the descending aorta. There a neck of the dissected lumen stops it: it "
-        "folds back, and the drive slips at its limit of 2 N "
-        f"({wire['largest_base_force_n']:.1f} N in the step in which it slipped).\n\n"
+        f"{mask['beyond_ml']:.0f} ml of ours are outside theirs (stumps of arch branches). The entry "
+        "lies in the false lumen. The agent takes the 0.035″ J wire through a tear into the true lumen, and over the "
+        "arch, where our lumen shows no membrane, into the ascending aorta: "
+        f"{wire['deepest_tip_mm']:.0f} mm in {wire['seconds']:g} s, with "
+        f"{wire['exposures']} X-ray exposures and at most {wire['peak_force_n']:.2f} N on the wall "
+        "([navigation](docs/navigation.md#a-dissected-aorta)).\n\n"
         "![The CT in three slices, our lumen in green, the network's aorta in red](docs/images/cta-mask.png)\n\n"
-        "![The J wire in the extracted lumen of the aorta](docs/images/cta-wire.png)"
+        "![The J wire in the true lumen, over the arch](docs/images/cta-wire.png)"
     )
 
 

@@ -7,6 +7,11 @@ from .atlas.atlas import make_atlas as make_atlas
 from .control.navigate import NavigateConfig as NavigateConfig
 from .control.navigate import NavigationLoop as NavigationLoop
 from .control.navigate import navigate as navigate
+from .control.navigate_patient import NavigatePatientConfig as NavigatePatientConfig
+from .control.navigate_patient import PatientNavigation as PatientNavigation
+from .control.navigate_patient import SetUp as SetUp
+from .control.navigate_patient import navigate_patient as navigate_patient
+from .control.navigate_patient import set_up_navigation as set_up_navigation
 from .control.plan import plan as plan
 from .control.plan_config import Plan as Plan
 from .control.plan_config import PlanConfig as PlanConfig
@@ -25,6 +30,7 @@ from .imaging.volume import read_volume as read_volume
 from .models.config import TrainConfig as TrainConfig
 from .models.rollout import load_model as load_model
 from .models.train import train as train
+from .pipeline.navigation import navigate_into as navigate_into
 from .simulation.config import SimulatorConfig as SimulatorConfig
 from .simulation.device import Device as Device
 from .simulation.device import read_device as read_device

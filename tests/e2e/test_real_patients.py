@@ -8,11 +8,13 @@ import numpy as np
 import pandas as pd
 import pytest
 from command import run
+from scipy.ndimage import binary_dilation
+
+from endopilot.imaging.volume import read_volume
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 CORONARIES = DATA / "coronary_centerlines"
 CTA = DATA / "cta_thorax"
-CONTROLS = Path(__file__).parents[2] / "docs" / "examples" / "up-the-aorta.csv"
 
 
 @pytest.mark.skipif(not CORONARIES.exists(), reason="the real coronary centerlines are not here")
@@ -37,7 +39,7 @@ def test_real_coronary_centerlines_are_simulated_and_learnt_on(tmp_path, capsys)
 
 
 @pytest.mark.skipif(not CTA.exists(), reason="the real CT angiogram is not here")
-def test_a_j_wire_goes_up_the_aorta_of_a_real_cta(tmp_path, capsys):
+def test_the_agent_drives_a_j_wire_over_the_arch_of_a_real_cta(tmp_path, capsys):
     mask, seeds = tmp_path / "mask.nii.gz", ("2", "-143", "543", "2", "-184", "657")
     agreement = run(
         *(capsys, "segment", CTA / "cta_thorax_1p5mm.nii.gz", "--method", "aorta", "--seeds", *seeds, "-o", mask),
@@ -47,14 +49,24 @@ def test_a_j_wire_goes_up_the_aorta_of_a_real_cta(tmp_path, capsys):
     assert agreement["share_inside_reference"] > 0.9
     assert (tmp_path / "mask.png").stat().st_size > 100_000
     run(capsys, "anatomy", mask, "-o", tmp_path / "aorta", "--vessel", "generic")
-    wire = run(
-        *(capsys, "simulate", tmp_path / "aorta", "-o", tmp_path / "wire.csv"),
-        *("--device", "j-035", "--controls", CONTROLS),
+    driven = run(
+        *(capsys, "navigate", tmp_path / "aorta", "--target", "G6.1", "--device", "j-035"),
+        *("--force-limit-n", "0.7", "-o", tmp_path / "navigation"),
     )
-    # a neck of the dissected lumen stops the wire, it folds back, and the drive slips at its 2 N
-    assert wire["valid_worlds"] == 1 and wire["slipped_worlds"] == 1
-    table = pd.read_csv(tmp_path / "wire.csv")
-    assert np.isfinite(table.select_dtypes("number")).all(axis=None)
-    assert table["tip_z_mm"].max() > table["tip_z_mm"].iloc[0] + 40
-    assert table["inserted_length_mm"].max() > 80
-    assert 2.0 < table["base_force_n"].max() < 3.0
+    assert driven["reached"] and driven["within_force_limit"] and driven["drive_slipped_s"] == 0
+    table = pd.read_csv(tmp_path / "navigation" / "navigation.csv")
+    assert table["tip_z_mm"].max() > 740  # the top of the arch, 200 mm above the place where the wire enters
+    assert table["tip_z_mm"].iloc[-1] < 720 and table["tip_y_mm"].iloc[-1] < table["tip_y_mm"].iloc[0] - 30
+    # it enters in the false lumen, and takes the true one, as a network sees them, where the two are apart
+    place = table[["tip_x_mm", "tip_y_mm", "tip_z_mm"]].to_numpy()
+    inside = [share_inside(CTA / f"seg_aorta_{name}_lumen.nii.gz", place) for name in ("false", "true")]
+    depth = table["tip_abscissa_mm"].to_numpy()
+    assert inside[0][depth < 15].all() and inside[1][(depth > 25) & (depth < 165)].all()
+
+
+def share_inside(mask: Path, place: np.ndarray) -> np.ndarray:
+    """Return which places, LPS mm, lie in a mask or within a voxel of it."""
+    volume = read_volume(mask)
+    grown = binary_dilation(volume.voxels > 0)
+    i, j, k = np.round(volume.world_to_index(place)).astype(int).T
+    return grown[k, j, i]

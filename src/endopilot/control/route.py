@@ -129,9 +129,7 @@ def parse_target(anatomy: Anatomy, text: str) -> Target:
         InputError: nothing is named, no such section, a point that is not three numbers, or one outside the lumen.
     """
     if not text.strip():
-        raise InputError(
-            "--target: is empty; give a section such as 4, a point X,Y,Z in LPS mm, or a CSV of desired tips"
-        )
+        raise InputError("--target: is empty; give a section such as 4, or a point X,Y,Z in LPS mm")
     parts = text.split(",")
     if len(parts) == 3:
         return _nearest(anatomy, text, parts)
@@ -143,7 +141,7 @@ def parse_target(anatomy: Anatomy, text: str) -> Target:
     if not any(length):
         raise InputError(
             f"--target {text}: {anatomy.name} has no such section (it has {', '.join(tree.sections_present)}); "
-            "give one of them, a point X,Y,Z in LPS mm, or a CSV of desired tips"
+            "give one of them, or a point X,Y,Z in LPS mm"
         )
     branch = int(np.argmax(length))
     own = tree.branches[branch].centerline.abscissa[tree.branches[branch].section == section]

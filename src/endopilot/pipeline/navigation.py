@@ -24,7 +24,6 @@ from endopilot.control.navigate_patient import (
 from endopilot.control.outcome import name_target, section_at, slipped_s, tell_outcome, worst_ratio
 from endopilot.control.policies import POLICIES
 from endopilot.control.set_up import tip_name
-from endopilot.dataset.episode import write_episode
 from endopilot.extras import require_extras
 from endopilot.files import manifest, read_json, write_json, writing
 from endopilot.runs import claim
@@ -144,6 +143,8 @@ def navigation_table(found: PatientNavigation) -> pd.DataFrame:
 
 
 def _write_episode(found: PatientNavigation, anatomy_folder: Path, output: Path) -> None:
+    from endopilot.dataset.episode import write_episode  # an extra brings its libraries
+
     set_up = found.set_up
     device, truth = set_up.navigation.device, set_up.truth
     write_episode(

@@ -15,6 +15,9 @@ from endopilot.control.route import Route
 from endopilot.plotting import BLACK, BLUE, GREY, ORANGE, PURPLE, STYLE, VERMILLION, png
 from endopilot.xray.adviser import AdviserConfig
 
+_LABEL_SHARE = 0.06
+"""Labels of forks are this share of the axis apart, at least."""
+
 
 def navigation_picture(found: PatientNavigation) -> bytes:
     """Draw a navigation as a PNG."""
@@ -67,9 +70,13 @@ def _draw_tip(axes: Axes, found: PatientNavigation) -> None:
     seen = [(t, tip.abscissa) for t, tip in zip(time_s, record.measured, strict=True) if tip is not None]
     axes.plot(*np.array(seen).T, "o", mfc="none", color=BLACK, markersize=5, label="measured by X-ray")
     route, tree = Route.to(navigation.anatomy, navigation.target), navigation.anatomy.tree
+    span, last = float(np.ptp(np.append(record.tip.abscissa, navigation.target.abscissa))), -np.inf
     for junction in route.junctions:
         axes.axhline(float(junction), color="0.75", linewidth=0.8, zorder=0)
         section = section_at(tree, int(route.branch(np.array([junction + 1e-3]))[0]), float(junction) + 1.0)
+        if junction - last < _LABEL_SHARE * span:
+            continue  # its label would cover the one below
+        last = junction
         axes.annotate(f"fork into {section}", (1.0, junction), xycoords=("axes fraction", "data"), fontsize=7.5,
                       ha="right", va="bottom", color="0.45")  # fmt: skip
     axes.axhline(navigation.target.abscissa, color=VERMILLION, linestyle=":", linewidth=1.2, label="target")

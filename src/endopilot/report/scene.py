@@ -22,6 +22,9 @@ SHOWN_BEHIND_MM = 20.0
 TRAIL_S = 20.0
 """How long the path of the tip stays in the picture, s."""
 
+_VIEWED = 1.3
+"""Length, in units of the cube root of its box's volume, that the camera sees of a vessel from its usual place."""
+
 FRAME_MS = 90
 """Time between two samples when the navigation is played, ms."""
 
@@ -41,8 +44,9 @@ def navigation_scene(
         world: which of its worlds is replayed.
         believed: wires that a policy holds possible at each sample, nodes from the tip on, LPS mm.
     """
-    figure = go.Figure([_wall(anatomy), *_centerlines(anatomy)])
-    figure.update_layout(_layout())
+    wall = _wall(anatomy)
+    figure = go.Figure([wall, *_centerlines(anatomy)])
+    figure.update_layout(_layout(np.ptp([wall.x, wall.y, wall.z], axis=1)))
     if rollout is not None and rollout.shape is not None:
         _add_navigation(figure, rollout, world, believed)
     return figure
@@ -233,7 +237,11 @@ def _possible(wires: Wires, inserted_mm: float) -> go.Scatter3d:
     )
 
 
-def _layout() -> dict:
+def _layout(size_mm: Float[np.ndarray, "3"]) -> dict:
+    """Return axes, camera and colours for a vessel of some size along x, y and z, mm."""
+    # plotly's box keeps its volume, so that of a tall vessel is longer than the usual view is high
+    farther = max(1.0, float(size_mm.max() / size_mm.prod() ** (1 / 3)) / _VIEWED)
+    eye = {name: farther * at for name, at in zip("xyz", (0.4, -2.0, 0.5), strict=True)}
     axis = {
         "backgroundcolor": BACKGROUND,
         "gridcolor": FAINT,
@@ -250,7 +258,7 @@ def _layout() -> dict:
         "scene": {
             "aspectmode": "data",
             **axes,
-            "camera": {"eye": {"x": 0.4, "y": -2.0, "z": 0.5}, "center": {"x": 0, "y": 0, "z": -0.12}},
+            "camera": {"eye": eye, "center": {"x": 0, "y": 0, "z": -0.12}},
         },
         "paper_bgcolor": BACKGROUND,
         "font": {"color": INK, "family": "system-ui, sans-serif"},
