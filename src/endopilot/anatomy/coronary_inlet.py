@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.anatomy import parent_vessel, repair
-from endopilot.anatomy.coronary_ends import OpenEnd, open_ends, skeleton_of
+from endopilot.anatomy.coronary_crux import Crux, find_crux
+from endopilot.anatomy.coronary_ends import OpenEnd, Skeleton, open_ends, skeleton_of
 from endopilot.anatomy.coronary_ostia import OstiumCandidate, Side, rank_ostia
 from endopilot.anatomy.distance import distance_map_from_surface
 from endopilot.anatomy.surface import Surface, surface_from_mask
@@ -41,11 +42,13 @@ class CoronaryInlet:
         position: tip of the open end, LPS mm.
         confidence: probability that the artery begins there, 0 to 1.
         runner_up: the next best place, if any.
+        crux: where the arteries meet the crux of the heart, if both are in the lumen and their ostia certain.
     """
 
     position: Float[np.ndarray, "3"]
     confidence: float
     runner_up: OstiumCandidate | None
+    crux: Crux | None = None
 
     def record(self) -> dict[str, object]:
         """Return what `anatomy.json` keeps: `ostium_confidence`, and where else the artery may begin."""
@@ -69,6 +72,7 @@ def coronary_inlet(content: LumenMask | Surface, side: Side, label: str) -> Coro
         InputError: the artery is not there, or it is not certain where it begins; the candidates are named.
     """
     pieces: list[list[OpenEnd]] = []
+    skeletons: list[Skeleton] = []
     if isinstance(content, LumenMask) and _holds_aorta(content.volume):
         return None
     for lumen in _lumens(content, label):
@@ -79,13 +83,19 @@ def coronary_inlet(content: LumenMask | Surface, side: Side, label: str) -> Coro
             skeleton = skeleton_of(points, clearance, lumen.spacing_mm)
             if skeleton.length_mm >= SHORTEST_MM:
                 pieces.append(open_ends(skeleton))
+                skeletons.append(skeleton)
     if not pieces:
         raise InputError(f"{label}: holds no vessel of {SHORTEST_MM:g} mm or more; check the label and the unit")
     ranked, absent = rank_ostia(pieces, side)
     best = ranked[0]
     if best.probability < CERTAIN:
         raise InputError(f"{label}: {_doubt(ranked, absent, side)}")
-    return CoronaryInlet(best.position, best.probability, ranked[1] if len(ranked) > 1 else None)
+    other = rank_ostia(pieces, "lca" if side == "rca" else "rca")[0][0]
+    crux = None
+    if other.probability >= CERTAIN and other.piece != best.piece:
+        right, left = (best, other) if side == "rca" else (other, best)
+        crux = find_crux(right.position, skeletons[right.piece].points, skeletons[left.piece].points)
+    return CoronaryInlet(best.position, best.probability, ranked[1] if len(ranked) > 1 else None, crux)
 
 
 def _doubt(ranked: list[OstiumCandidate], absent: float, side: Side) -> str:

@@ -111,7 +111,8 @@ def extract_anatomy(
             advance()
             distance_map = _final_map(surface, tree, config)
         advance()
-        tree = label_tree(tree, config.vessel)
+        crux = None if inlet is None else inlet.crux
+        tree = label_tree(tree, config.vessel, crux=crux)
         notes += _short(tree, config.vessel)
         insertion = _insertion(tree, given)
         ostium_radius = float(np.median(tree.branches[0].centerline.radius[:3]))
@@ -126,7 +127,7 @@ def extract_anatomy(
         "ostium_rule": rule,
         **(inlet.record() if inlet is not None else {}),
         "catheter_tilt_deg": round(catheter_tilt_deg(ostium_radius, radius), 1),
-        "dominance": dominance(tree),
+        "dominance": dominance(tree) if crux is None else crux.dominance,
         "notes": notes,
     }
     return Anatomy(name, tree, distance_map, insertion, radius, provenance)

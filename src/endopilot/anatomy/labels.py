@@ -12,6 +12,7 @@ from typing import Literal
 
 import numpy as np
 
+from endopilot.anatomy.coronary_crux import Crux
 from endopilot.anatomy.labels_coronary import label_lca, label_rca
 from endopilot.anatomy.labels_tree import (
     ARCH_SECTIONS,
@@ -41,7 +42,9 @@ _RULES: dict[str, tuple[tuple[str, ...], Callable[[Labeller], None]]] = {
 }
 
 
-def label_tree(tree: VesselTree, scheme: Scheme, *, naming: Mapping[str, str] | None = None) -> VesselTree:
+def label_tree(
+    tree: VesselTree, scheme: Scheme, *, naming: Mapping[str, str] | None = None, crux: Crux | None = None
+) -> VesselTree:
     """Return the tree with every point's section.
 
     Args:
@@ -49,6 +52,8 @@ def label_tree(tree: VesselTree, scheme: Scheme, *, naming: Mapping[str, str] | 
         scheme: "rca" and "lca" name AHA/SCCT segments, "arch", "cerebral" and "portal" the vessels of these anatomies
             (`labels_tree` lists all names); "generic" names branches "G0", "G1.1", "G1.2", …: generation (bifurcations
             from the root), then order, widest first.
+        crux: where the crux of the heart lies and which artery reaches it, if both are known; otherwise the tree's own
+            shape decides.
         naming: other names for some sections, such as {"G0": "superficial femoral artery"}.
 
     Raises:
@@ -59,7 +64,7 @@ def label_tree(tree: VesselTree, scheme: Scheme, *, naming: Mapping[str, str] | 
     else:
         names, rules = _RULES[scheme]
         sections = [np.zeros(len(branch.centerline.points), dtype=np.int64) for branch in tree.branches]
-        rules(Labeller(tree, names, sections))
+        rules(Labeller(tree, names, sections, crux))
         named = zip(tree.branches, sections, strict=True)
         labelled = VesselTree(tuple(Branch(branch.centerline, branch.parent, own) for branch, own in named), names)
     unknown = sorted(set(naming or ()) - set(labelled.section_names))

@@ -5,10 +5,20 @@ from __future__ import annotations
 import numpy as np
 
 from endopilot.anatomy.labels_tree import Labeller
+from endopilot.types import Centerline
 
 ACUTE_MARGIN = 0.64
 """The acute margin lies at this share of the path from the ostium to the crux (Dodge et al., Circulation
 1988;78:1167-80, R2 distal); segment 1 ends halfway to it."""
+
+USUAL_CRUX_MM = 140.0
+"""Path from the right ostium to the crux; 122 to 170 mm in six real patients."""
+
+CRUX_FORK_MM = 25.0
+"""The fork at the crux lies within this much of the path from where the path passes the crux, mm."""
+
+BEYOND_CRUX_MM, FORWARDS_MM = 15.0, 8.0
+"""A vessel that goes on for the first beyond the crux and turns forwards by the second is a posterior descending."""
 
 MAJOR_MM = 6.0
 """A branch with at least this much length behind it counts as a named end vessel, mm."""
@@ -29,20 +39,55 @@ def label_rca(labeller: Labeller) -> None:
     tree = labeller.tree
     leaf = max(tree.leaves(), key=lambda index: tree.branches[index].centerline.abscissa[-1])
     route = tree.route(leaf)
-    crux = _crux(labeller, route)
-    if crux is None:
+    passed = None if labeller.crux is None else labeller.crux.abscissa(tree.path(leaf))
+    crux = _crux(labeller, route) if labeller.crux is None else _crux_near(labeller, route, passed)
+    beyond = "4"
+    if crux is not None:
+        end, trunk = float(tree.branches[crux].centerline.abscissa[-1]), tree.route(crux)
+    elif labeller.crux is None:
         end, trunk = _unforked_crux(labeller, route), route
     else:
-        end = float(tree.branches[crux].centerline.abscissa[-1])
-        trunk = tree.route(crux)
+        end, trunk = _end_of_distal(tree.path(leaf), passed), route
+        beyond = "4" if _turns_forwards(tree.path(leaf), end) else "16"
     margin = ACUTE_MARGIN * end
-    labeller.along(trunk, [("1", margin / 2), ("2", margin), ("3", end), ("4", np.inf)])
+    labeller.along(trunk, [("1", margin / 2), ("2", margin), ("3", end), (beyond, np.inf)])
     if crux is not None:
         ends = sorted(tree.children(crux), key=lambda child: _towards_apex(labeller, child))
         for child in ends[:-1]:
             labeller.fill(child, "16")
         labeller.fill(ends[-1], "4")
     _label_right_sides(labeller, trunk, crux, end)
+
+
+def _crux_near(labeller: Labeller, route: tuple[int, ...], passed: float | None) -> int | None:
+    """Return the branch of a route that forks first near where the route passes the known crux, or None."""
+    if passed is None:
+        return None
+    ends = {index: float(labeller.tree.branches[index].centerline.abscissa[-1]) for index in route}
+    forks = [
+        index
+        for index in route
+        if abs(ends[index] - passed) < CRUX_FORK_MM
+        and sum(labeller.length_behind(child) >= MAJOR_MM for child in labeller.tree.children(index)) >= 2
+    ]
+    return min(forks, key=lambda index: ends[index], default=None)
+
+
+def _end_of_distal(line: Centerline, passed: float | None) -> float:
+    """Return where segment 3 ends, mm, in an artery that does not fork where it passes the known crux.
+
+    One that ends before the crux is a part of the usual way there: a vestige of 35 mm is all segment 1.
+    """
+    whole = float(line.abscissa[-1])
+    if passed is None:
+        return max(whole, USUAL_CRUX_MM)
+    return passed if whole - passed > BEYOND_CRUX_MM else whole
+
+
+def _turns_forwards(line: Centerline, crux_mm: float) -> bool:
+    """Return whether a line runs forwards beyond the crux, as the posterior descending artery does."""
+    behind = line.points[line.abscissa >= crux_mm, 1]
+    return len(behind) > 0 and float(behind.max() - behind[-1]) > FORWARDS_MM
 
 
 def _crux(labeller: Labeller, route: tuple[int, ...]) -> int | None:
@@ -78,7 +123,8 @@ def _unforked_crux(labeller: Labeller, route: tuple[int, ...]) -> float:
     turn = int(later[line.points[later, 1].argmax()])
     forwards = line.points[turn, 1] - line.points[-1, 1]
     beyond = line.abscissa[-1] - line.abscissa[turn]
-    return float(line.abscissa[turn]) if beyond > 15.0 and forwards > 8.0 else float(line.abscissa[-1])
+    goes_on = beyond > BEYOND_CRUX_MM and forwards > FORWARDS_MM
+    return float(line.abscissa[turn]) if goes_on else float(line.abscissa[-1])
 
 
 def _towards_apex(labeller: Labeller, branch: int) -> float:
@@ -163,11 +209,18 @@ def _label_lad(labeller: Labeller, branch: int, end: float) -> None:
 def _label_lcx(labeller: Labeller, branch: int, end: float) -> None:
     tree = labeller.tree
     # The circumflex keeps to the groove, round the back; the marginals leave it to the left.
-    leaf = max(labeller.ends(branch), key=lambda index: (tree.path(index).points @ GROOVE).max())
+    supplies = labeller.crux is not None and labeller.crux.dominance != "right"
+    if supplies:
+        leaf = min(labeller.ends(branch), key=lambda index: _from_crux(labeller, index))
+    else:
+        leaf = max(labeller.ends(branch), key=lambda index: (tree.path(index).points @ GROOVE).max())
     route = labeller.onwards(branch, leaf)
+    crux_mm = _left_crux(labeller, route)
     marginals = []
     for side in labeller.sides(route):
-        if labeller.origin(side) - end < _RAMUS_MM and labeller.length_behind(side) > 2.5 * MAJOR_MM:
+        if supplies and labeller.origin(side) > crux_mm - CRUX_FORK_MM and _towards_apex(labeller, side) > 0:
+            labeller.fill(side, "15")
+        elif labeller.origin(side) - end < _RAMUS_MM and labeller.length_behind(side) > 2.5 * MAJOR_MM:
             labeller.fill(side, "16")
         else:
             marginals.append(side)
@@ -175,13 +228,22 @@ def _label_lcx(labeller: Labeller, branch: int, end: float) -> None:
         labeller.fill(side, "12" if order == 0 else "14")
     tip = float(tree.branches[route[-1]].centerline.abscissa[-1])
     proximal = labeller.origin(marginals[0]) if marginals else end + 0.5 * (tip - end)
-    labeller.along(route, [("11", proximal), ("13", _left_crux(labeller, route)), ("15", np.inf)])
+    labeller.along(route, [("11", proximal), ("13", crux_mm), ("15", np.inf)])
 
 
 def _left_crux(labeller: Labeller, route: tuple[int, ...]) -> float:
     """Return where the circumflex becomes the left posterior descending, mm; infinity where it does not."""
     line = labeller.tree.path(route[-1])
+    if labeller.crux is not None:
+        passed = labeller.crux.abscissa(line)
+        return np.inf if passed is None or labeller.crux.dominance == "right" else passed
     turn = int((line.points @ GROOVE).argmax())
     beyond = line.abscissa[-1] - line.abscissa[turn]
     forwards = line.points[turn, 1] - line.points[-1, 1]
-    return float(line.abscissa[turn]) if beyond > 15.0 and forwards > 8.0 else np.inf
+    return float(line.abscissa[turn]) if beyond > BEYOND_CRUX_MM and forwards > FORWARDS_MM else np.inf
+
+
+def _from_crux(labeller: Labeller, leaf: int) -> float:
+    """Return how near the path to an end comes to the known crux, mm."""
+    assert labeller.crux is not None
+    return float(np.linalg.norm(labeller.tree.path(leaf).points - labeller.crux.position, axis=1).min())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from endopilot.anatomy.coronary_crux import Crux
 from endopilot.types import VesselTree
 
 RCA_SECTIONS = ("1", "2", "3", "4", "16", "conus", "SA", "RV", "AM")
@@ -37,8 +38,10 @@ PORTAL_SECTIONS = ("MPV", "RPV", "LPV", "RAPV", "RPPV", "S2", "S3", "S4", "S5", 
 class Labeller:
     """A tree with the queries that the schemes need."""
 
-    def __init__(self, tree: VesselTree, names: tuple[str, ...], sections: list[np.ndarray]) -> None:
-        self.tree, self.names, self.sections = tree, names, sections
+    def __init__(
+        self, tree: VesselTree, names: tuple[str, ...], sections: list[np.ndarray], crux: Crux | None = None
+    ) -> None:
+        self.tree, self.names, self.sections, self.crux = tree, names, sections, crux
 
     def fill(self, branch: int, name: str) -> None:
         """Name a branch and everything behind it."""
