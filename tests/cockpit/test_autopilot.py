@@ -13,7 +13,13 @@ from endopilot.cockpit.session import AUTOPILOT_SILENCE_S, Session
 from endopilot.control.policy import BelievedTip, Decision
 from endopilot.errors import InputError
 
-POLICIES = ("forward", "test_autopilot:Scripted", "test_autopilot:Broken", "test_autopilot:Slow")
+POLICIES = (
+    "forward",
+    "test_autopilot:Scripted",
+    "test_autopilot:Broken",
+    "test_autopilot:Slow",
+    "test_autopilot:Hopeless",
+)
 
 
 class Scripted:
@@ -44,6 +50,11 @@ class Scripted:
 class Broken(Scripted):
     def decide(self, observation):
         raise ValueError("no idea")
+
+
+class Hopeless(Scripted):
+    def decide(self, observation):
+        return Decision(1.0, 0.0, gives_up="at the first fork")
 
 
 class Slow(Scripted):
@@ -119,6 +130,13 @@ def test_a_policy_that_fails_stops_the_wire(session):
     start(session, "test_autopilot:Broken")
     drive(session, until=lambda: session.autopilot.status == "failed")
     assert "no idea" in session.autopilot.failure
+    assert session.values(session.world.snapshot())["command"] == (0.0, 0.0)
+
+
+def test_a_policy_that_gives_up_says_why(session):
+    start(session, "test_autopilot:Hopeless")
+    drive(session, until=lambda: session.autopilot.status == "gave up")
+    assert "at the first fork" in session.autopilot.values()["failure"]
     assert session.values(session.world.snapshot())["command"] == (0.0, 0.0)
 
 

@@ -9,6 +9,7 @@ from typing import Annotated
 from tyro.conf import Positional
 
 from endopilot.cli.arguments import existing
+from endopilot.errors import InputError
 from endopilot.settings import CountOrZero, Within, settings
 
 
@@ -30,6 +31,7 @@ def command(
     task: str | None = None,
     world: CountOrZero = 0,
     replay: Path | None = None,
+    episode: Path | None = None,
     resume: Path | None = None,
     ct: Path | None = None,
     output: Path = Path("runs/cockpit"),
@@ -44,12 +46,17 @@ def command(
         task: task of the ladder to drive by hand, with X-ray as the only sight until the end.
         world: which patient of the task, world of the rollout, or episode of the data set.
         replay: session, rollout, plan, data set or file of the ladder to look at instead.
+        episode: with --replay SESSION: write the session into this folder as a data set of one episode to train on, and
+            leave.
         resume: go on with the session in this file, which a killed server left.
         ct: CT angiogram of the patient, for the X-ray's background; a phantom's if not given.
         output: folder of the sessions' recordings.
         browser: open the page in a browser; --no-browser only prints its address.
         listen: the page's address.
     """
+    if episode is not None:
+        _write_episode(replay, episode)
+        return
     from endopilot.cockpit.launch import serve
     from endopilot.cockpit.open import open_replay, open_session, open_task, resume_session
 
@@ -71,3 +78,12 @@ def command(
             webbrowser.open(address)
 
     serve(opened.stage, opened.scene, cycle_s=opened.cycle_s, host=listen.host, port=listen.port, listening=listening)
+
+
+def _write_episode(session: Path | None, output: Path) -> None:
+    from endopilot.cockpit.episode import write_session_episode
+
+    if session is None:
+        raise InputError("episode: names no session; give --replay SESSION too")
+    write_session_episode(existing(session), output)
+    print(f"episode    {output}")

@@ -31,10 +31,10 @@ class Autopilot:
     """A policy that drives, watches or waits.
 
     Attributes:
-        status: "off", "thinking", "drives", "paused", "watches", "reached" or "failed".
+        status: "off", "thinking", "drives", "paused", "watches", "reached", "gave up" or "failed".
         policy_name: of the policy, once there is one.
         asks: why it asks for X-ray at its next decision; empty if it does not.
-        failure: what went wrong, in a line.
+        failure: what went wrong or why the policy gave up, in a line.
     """
 
     def __init__(self, world: World) -> None:
@@ -182,6 +182,9 @@ class Autopilot:
             self._believed = self._policy.believed()
         if decision is None or self.status != "thinking":
             return None  # taken over or paused meanwhile
+        if decision.gives_up:
+            self.status, self.failure, self.asks = "gave up", f"{self.policy_name} gives up: {decision.gives_up}", ""
+            return Decision(0.0, 0.0)
         self.status, self._expose = "drives", bool(decision.expose)
         told = "" if self._believed is None else self._believed.asks
         self.asks = (told or "the policy asks for it") if decision.expose else ""

@@ -165,7 +165,7 @@ class GameSession(Session):
     def _end(self, reason: str) -> list[tuple[str, bytes]]:
         self.halt("the task is over")
         self.phase, self.sight = "over", True
-        record = self._track.record(self.world.navigation, self.world.robot.driven, reason)
+        record = self._track.record(self.world.navigation, self.world.robot.driven, reason, gives_up="")
         record = replace(record, exposures=self.xray.frames)
         recording = Recording(np.array(self._commands), np.array(self._exposed), None)
         self.result = figures(self.world.navigation, record, recording)

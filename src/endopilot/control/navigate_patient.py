@@ -235,8 +235,8 @@ def _driven_again(set_up: SetUp, record: NavigationRecord, began: Float[np.ndarr
 
 
 def sampled(cycles: Rollout) -> Rollout:
-    """Return a rollout of the drive's cycles as it is recorded at the end of each decision period."""
-    step = round(DECISION_PERIOD_S / CYCLE_S)
+    """Return a rollout of a drive's cycles, which divide a decision period, as it is recorded at each period's end."""
+    step = round(DECISION_PERIOD_S / cycles.sample_period_s)
 
     def at_end(values: np.ndarray) -> np.ndarray:
         return values[:, step - 1 :: step]

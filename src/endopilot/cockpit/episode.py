@@ -1,0 +1,68 @@
+"""A session as an episode of a data set: what a person did, beside simulated navigations, to learn from."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from endopilot.anatomy.io import write_anatomy
+from endopilot.cockpit.recording import read_recording, replayed
+from endopilot.control.navigate_patient import sampled
+from endopilot.dataset.episode import write_episode
+from endopilot.errors import InputError
+from endopilot.simulation.simulate import simulate
+from endopilot.tasks.navigation import DECISION_PERIOD_S
+
+
+def write_session_episode(session: Path, output: Path) -> None:
+    """Write a recorded session as a data set of one episode, which `endopilot train` reads beside others.
+
+    The session is driven again and sampled every 0.5 s; what is left after the last whole sample is dropped. The vessel
+    of a task is written beside the episode, into `OUTPUT-anatomy`.
+
+    Args:
+        session: a recording of the cockpit.
+        output: folder of the data set.
+
+    Raises:
+        InputError: no such session, one shorter than a sample, or an output folder that holds something else.
+    """
+    recording = read_recording(session)
+    per_sample = round(DECISION_PERIOD_S / recording.config.cycle_s)
+    samples = recording.cycles // per_sample
+    if samples == 0:
+        raise InputError(f"{session}: lasts less than {DECISION_PERIOD_S:g} s; drive for longer")
+    targets = [event["target"] for event in recording.events if "target" in event]
+    navigation, truth = recording.navigation, recording.config.truth
+    *_, (world, _events) = replayed(recording)
+    device = navigation.device
+    wire = device.with_tip(bend_rad=device.tip_bend_rad, stiffness_factor=truth.stiffness_factor)
+    start = [max(navigation.start_inserted_mm + truth.ostium_mm, 0.0), navigation.start_rotation]
+    friction = device.friction * truth.friction_factor
+    cycles = simulate(
+        navigation.anatomy,
+        replace(wire, friction=friction),
+        np.array(world.robot.driven)[None, : samples * per_sample],
+        initial=np.array([start]),
+        config=recording.config.simulator,
+        period_s=recording.config.cycle_s,
+    )
+    folder = recording.where.patient
+    if folder is None:
+        folder = output.with_name(f"{output.name}-anatomy")
+        write_anatomy(navigation.anatomy, folder)
+    target = targets[-1] if targets else [navigation.target.branch, navigation.target.abscissa]
+    write_episode(
+        sampled(cycles),
+        folder,
+        output,
+        device,
+        task="navigation by hand",
+        friction=friction,
+        tip_stiffness_factor=truth.stiffness_factor,
+        simulator=recording.config.simulator,
+        seed=recording.seed,
+        origin={"session": session.name, "target_branch": int(target[0]), "target_mm": float(target[1])},
+    )
