@@ -1,9 +1,9 @@
-"""Choose the patients of the ladder's tasks: `python benchmarks/ladder_patients.py [TASK ...] [--write]`.
+"""Choose the patients of the ladder's tasks: `python benchmarks/ladder_patients.py [TASK ...] [--version N] [--write]`.
 
-The ladder gets the first twenty patients of a task's atlas that are eligible by the task's `chosen_for`. From level 5
-on, a search must also reach the target with a wall force below the task's limit. The search knows the full state of
-the wire. It stops before each fork and tries twelve directions of the tip; a policy has neither advantage. The training
-patients are the first twenty eligible ones of another atlas, without the search.
+The ladder gets the first twenty patients of a task's atlas that are eligible by the task's `chosen_for`. In version 2,
+and from level 5 on in version 1, a search must also reach the target with a wall force below the task's limit. The
+search knows the full state of the wire. It stops before each fork and tries twelve directions of the tip; a policy has
+neither advantage. The training patients are the first twenty eligible ones of another atlas, without the search.
 
 With `--write` the numbers go into the tasks' files.
 """
@@ -11,19 +11,19 @@ With `--write` the numbers go into the tasks' files.
 from __future__ import annotations
 
 import re
-import sys
+from argparse import ArgumentParser, RawDescriptionHelpFormatter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from endopilot.atlas.atlas import AtlasConfig, make_patient_tree
+from endopilot.atlas.atlas import make_patient_tree
 from endopilot.errors import InputError
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import Navigation, Target
-from endopilot.tasks.task import CORE, Task, ladder_tasks, target_in_section, turn_rad
+from endopilot.tasks.task import CORE, NEWEST, Task, ladder_tasks, target_in_section, turn_rad
 from endopilot.types import TipProjection, VesselTree
 
 WANTED = 20
@@ -57,6 +57,10 @@ ELIGIBLE: dict[str, Callable[[VesselTree, dict[str, Any], Target], bool]] = {
     "crux": _turns("4", 35),
     "diagonal": _turns("10", 40),
     "circumflex": _turns("11", 60),
+    "circumflex in version 2": _turns("11", 50),
+    "portal in version 2": _turns("RPPV", 55),
+    "crux in version 2": _turns("4", 50),
+    "diagonal in version 2": _turns("10", 50),
     "marginal": _turns("12", 40),
     "anterior-cerebral": _turns("A1", 70),
     "carotid": _turns("left common carotid", 90),
@@ -145,8 +149,8 @@ def _never(tip: TipProjection) -> np.ndarray:
 
 def choose(task: Task, seed: int, *, search: bool) -> tuple[list[int], int, int]:
     """Return the chosen patients' numbers, how many were eligible and how many were examined."""
-    atlas = AtlasConfig(anatomy=task.anatomy, seed=seed, stenosis_share=task.stenosis_share, population="textbook")
-    eligible = ELIGIBLE.get(task.name, _always)
+    atlas = task.atlas(seed)
+    eligible = ELIGIBLE.get(f"{task.name} in version {task.version}", ELIGIBLE.get(task.name, _always))
     chosen: list[int] = []
     count = 0
     for number in range(MOST_EXAMINED):
@@ -158,7 +162,7 @@ def choose(task: Task, seed: int, *, search: bool) -> tuple[list[int], int, int]
         if not eligible(tree, truth, target):
             continue
         count += 1
-        patients = task.ladder.model_copy(update={"seed": seed, "numbers": (number,)})
+        patients = replace(task.ladder, seed=seed, numbers=(number,))
         if not search or _Search(task.navigation(task.patient(patients, 0))).reachable():
             chosen.append(number)
             if len(chosen) == WANTED:
@@ -168,18 +172,25 @@ def choose(task: Task, seed: int, *, search: bool) -> tuple[list[int], int, int]
 
 def main() -> None:
     """Choose, print, and write if asked to."""
-    names = [argument for argument in sys.argv[1:] if argument != "--write"]
-    for task in ladder_tasks():
-        if names and task.name not in names:
+    parser = ArgumentParser(description=__doc__, formatter_class=RawDescriptionHelpFormatter)
+    parser.add_argument("tasks", nargs="*", metavar="TASK", help="all if none is given")
+    parser.add_argument("--version", type=int, choices=(1, 2), default=NEWEST, help="of the ladder")
+    parser.add_argument("--write", action="store_true", help="write the numbers into the tasks' files")
+    given = parser.parse_args()
+    for task in ladder_tasks(given.version):
+        if given.tasks and task.name not in given.tasks:
             continue
-        path = Path(__file__).parents[1] / "src" / "endopilot" / "tasks" / "ladder" / f"{task.name}.yaml"
+        path = (
+            Path(__file__).parents[1] / "src" / "endopilot" / "tasks" / f"ladder_{task.version}" / f"{task.name}.yaml"
+        )
         text = path.read_text(encoding="utf-8")
-        for role, patients, search in (("ladder", task.ladder, task.level >= 5), ("training", task.training, False)):
-            chosen, eligible, examined = choose(task, patients.seed, search=search)
+        search = task.version == 2 or task.level >= 5
+        for role, patients, searched in (("ladder", task.ladder, search), ("training", task.training, False)):
+            chosen, eligible, examined = choose(task, patients.seed, search=searched)
             print(f"{task.name}, {role}: {WANTED} of {eligible} eligible patients, of {examined}: {chosen}", flush=True)
             pattern = rf"({role}:\n  seed: \d+\n  numbers: )\[[^\]]*\]"
             text = re.sub(pattern, lambda found, chosen=chosen: found[1] + str(chosen), text)
-        if "--write" in sys.argv:
+        if given.write:
             path.write_text(text, encoding="utf-8")
 
 

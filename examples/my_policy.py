@@ -50,7 +50,7 @@ class TurnBack:
 
 def main() -> None:
     # The second diagonal branch in the first of the ladder's patients, which pushing alone does not reach.
-    navigation = find_task("diagonal").ladder_navigation(0)
+    navigation = find_task("diagonal", 1).ladder_navigation(0)
     policy = make_policy("my_policy:TurnBack")  # as `endopilot ladder --policy` finds it
     record = navigate(navigation, policy, seed=1)
     pushed = navigate(navigation, make_policy("forward"), seed=1)

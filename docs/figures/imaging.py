@@ -35,7 +35,7 @@ def main() -> None:
     print(
         f"of what is cut off {low:.2f} is below 130 HU; most of it lies between z {heights[0]:.0f} and {heights[1]:.0f}"
     )
-    patient = make_patient(AtlasConfig(seed=1003), 0)
+    patient = make_patient(AtlasConfig(seed=1003, population="textbook"), 0)
     phantom = make_phantom(patient, PhantomConfig(), 1003)
     draw_overlay(phantom, segment(phantom, SegmentConfig()), IMAGES / "imaging-coronary.png")
 

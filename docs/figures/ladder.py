@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 
 from endopilot.ladder.mismatch import title_of
-from endopilot.tasks.task import ladder_tasks
+from endopilot.tasks.task import NEWEST, ladder_tasks
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "ladder.md"
@@ -45,6 +45,8 @@ def scores(folder: Path) -> list[str]:
     columns = _kept()
     for path in sorted(folder.glob("*/ladder.json")):
         content = json.loads(path.read_text(encoding="utf-8"))
+        if content["ladder"] != NEWEST:
+            continue
         table = {row["task"]: row for row in content["scores"]}
         column = {name: f"{100 * row['safe_success']:.0f} ({100 * row['success']:.0f})" for name, row in table.items()}
         if (over := table.get("all twelve") or table.get("upper eight")) is not None:
@@ -63,6 +65,8 @@ def _kept() -> dict[str, dict[str, str]]:
     """Return the columns that stand in the page."""
     text = PAGE.read_text(encoding="utf-8").split("<!-- scores:begin -->")[1].split("<!-- scores:end -->")[0]
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.strip().splitlines()]
+    if not rows:
+        return {}
     head, body = rows[0][1:], rows[2:]
     return {policy: {row[0]: row[1 + place] for row in body} for place, policy in enumerate(head)}
 

@@ -14,7 +14,7 @@ import numpy as np
 import endopilot
 from endopilot.xray.fluoroscope import Fluoroscope, FluoroscopeConfig
 
-anatomy = next(endopilot.make_atlas(endopilot.AtlasConfig(anatomy="rca", seed=0)))
+anatomy = next(endopilot.make_atlas(endopilot.AtlasConfig(anatomy="rca", seed=0, population="textbook")))
 device = endopilot.read_device("workhorse-014")
 push = np.tile([5.0, 0.0], (1, 16, 1))
 rollout = endopilot.simulate(anatomy, device, push)

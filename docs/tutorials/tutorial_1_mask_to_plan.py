@@ -24,7 +24,7 @@ import endopilot
 from endopilot.phantom.phantom import PhantomConfig, make_phantom
 
 folder = Path(tempfile.mkdtemp())
-patient = next(endopilot.make_atlas(endopilot.AtlasConfig(anatomy="rca", seed=0)))
+patient = next(endopilot.make_atlas(endopilot.AtlasConfig(anatomy="rca", seed=0, population="textbook")))
 ct = make_phantom(patient, PhantomConfig(), seed=0)
 print(f"{patient.name}: {ct.voxels.shape[::-1]} voxels of {ct.spacing_mm} mm")
 

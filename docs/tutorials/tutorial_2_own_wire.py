@@ -76,7 +76,7 @@ plt.show()
 # rotation in rad/s, one row every 0.5 s. Twelve worlds start with the tip bend turned to a side each, then push on at
 # 5 mm/s for 12 s. All worlds run side by side, and no result depends on another world.
 
-anatomy = next(endopilot.make_atlas(endopilot.AtlasConfig(anatomy="lca", seed=41)))
+anatomy = next(endopilot.make_atlas(endopilot.AtlasConfig(anatomy="lca", seed=41, population="textbook")))
 worlds, samples = 12, 24
 control = np.tile([5.0, 0.0], (worlds, samples, 1))
 start = np.column_stack([np.full(worlds, 2.0), np.linspace(0, 2 * np.pi, worlds, endpoint=False)])

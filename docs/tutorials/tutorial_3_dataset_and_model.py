@@ -22,7 +22,7 @@ import endopilot
 
 folder = Path(tempfile.mkdtemp())
 patients = []
-for anatomy in endopilot.make_atlas(endopilot.AtlasConfig(anatomy="rca", count=10, seed=7)):
+for anatomy in endopilot.make_atlas(endopilot.AtlasConfig(anatomy="rca", count=10, seed=7, population="textbook")):
     patients.append(folder / anatomy.name)
     endopilot.write_anatomy(anatomy, patients[-1])
 

@@ -41,7 +41,7 @@ print(inspect.getsource(TurnBack))
 from endopilot.control.baseline_policies import Forward
 from endopilot.tasks.task import find_task
 
-navigation = find_task("diagonal").ladder_navigation(0)
+navigation = find_task("diagonal", 1).ladder_navigation(0)
 records = {
     policy.__class__.__name__: endopilot.navigate(navigation, policy, seed=1) for policy in (Forward(), TurnBack())
 }
@@ -80,7 +80,7 @@ from endopilot.ladder.ladder import LadderConfig, climb
 folder = Path(tempfile.mkdtemp())
 safe_success = {}
 for policy in ("forward", "my_policy:TurnBack"):
-    config = LadderConfig(policy=policy, tasks=("diagonal",), patients=4)
+    config = LadderConfig(policy=policy, tasks=("diagonal",), patients=4, version=1)
     row = climb(folder / policy.replace(":", "-"), config)[0]
     safe_success[policy] = row["safe_success"]
     print(f"{policy}: safe success {100 * row['safe_success']:.0f} %, {row['exposures']:.1f} exposures on average")

@@ -22,7 +22,7 @@ import numpy as np
 
 import endopilot
 
-anatomy = next(endopilot.make_atlas(endopilot.AtlasConfig(anatomy="rca", seed=0)))
+anatomy = next(endopilot.make_atlas(endopilot.AtlasConfig(anatomy="rca", seed=0, population="textbook")))
 
 # %%
 # Before the navigation

@@ -75,10 +75,12 @@ def test_a_plan_is_shown(found, vessel, tmp_path):
     np.testing.assert_allclose(film.frames[-1].snapshot.nodes[0], found.position[-1], atol=0.05)
 
 
-def test_a_navigation_of_the_ladder_is_the_same_to_the_bit(tmp_path):
-    task = find_task("straight")
+@pytest.mark.parametrize("version", [1, 2])
+def test_a_navigation_of_the_ladder_is_the_same_to_the_bit(tmp_path, version):
+    task = find_task("straight", version)
     result = attempt("forward", task.ladder_navigation(0), seed=navigation_seed(task, 0))
-    write_json(tmp_path / "straight" / "00.json", result)
+    of_version = {} if version == 1 else {"ladder": version}  # as files were before there was a version 2
+    write_json(tmp_path / "straight" / "00.json", of_version | result)
     film = driven(open_film(tmp_path / "straight" / "00.json"))
     tips = np.array([frame.snapshot.nodes[0] for frame in film.frames[::10]])
     np.testing.assert_array_equal(tips.round(3), np.array(result["course"]["tip_position"]))

@@ -71,9 +71,16 @@ def test_a_folder_of_another_policy_or_of_something_else_is_refused(climbed, tmp
 def test_a_folder_of_another_task_is_refused(climbed, monkeypatch):
     folder, _ = climbed
     changed = tuple(replace(task, seconds=1.0) for task in ladder_tasks())
-    monkeypatch.setattr(ladder, "ladder_tasks", lambda: changed)
+    monkeypatch.setattr(ladder, "ladder_tasks", lambda version: changed)
     with pytest.raises(InputError, match=r"was begun with tasks\.straight = "):
         climb(folder, LadderConfig(policy="forward", tasks=("straight",), patients=1))
+
+
+def test_a_folder_of_another_version_of_the_ladder_is_refused(climbed):
+    folder, _ = climbed
+    assert json.loads((folder / "ladder.json").read_text(encoding="utf-8"))["ladder"] == 2
+    with pytest.raises(InputError, match=r"was begun with tasks\.straight = "):
+        climb(folder, LadderConfig(policy="forward", tasks=("straight",), patients=1, version=1))
 
 
 def test_another_wire_of_the_same_name_or_another_version_is_refused(climbed, monkeypatch):

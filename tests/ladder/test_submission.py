@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +13,12 @@ import pytest
 
 from endopilot.cli import main
 from endopilot.errors import InputError
+from endopilot.files import json_text
 from endopilot.ladder import submission
 from endopilot.ladder.attempt import Recording, attempt, repeat
 from endopilot.ladder.ladder import LadderConfig, climb
 from endopilot.ladder.submission import check_submission
+from endopilot.simulation.device import read_device
 from endopilot.tasks.task import find_task
 
 _POLICY = """
@@ -98,6 +101,27 @@ def test_a_submission_is_confirmed_in_other_processes(written, tmp_path):
     assert found.difference is None and found.navigations == 2 and found.remarks == ()
     assert found.policy == "forward" and found.origin.startswith("endopilot ")
     assert {row["task"] for row in written["scores"]} == {"straight", "descending"}
+
+
+def test_a_file_of_version_1_is_driven_again_in_the_textbook_s_patients(tmp_path, monkeypatch):
+    monkeypatch.setattr(submission, "each", here)
+    climb(tmp_path, LadderConfig(policy="forward", tasks=("straight",), patients=1, version=1))
+    path = tmp_path / "submission.json"
+    content = json.loads(path.read_text(encoding="utf-8"))
+    del content["ladder"]  # as files were before there was a version 2
+    path.write_text(json.dumps(content), encoding="utf-8")
+    assert check_submission(path).difference is None
+    path.write_text(json.dumps(content | {"ladder": 2}), encoding="utf-8")
+    with pytest.raises(InputError, match="task 'straight' is not the one of endopilot"):
+        check_submission(path)
+
+
+def test_a_version_1_task_has_the_hash_of_its_file_before_there_were_versions():
+    task = find_task("crux", 1)
+    before = {name: value for name, value in asdict(task).items() if name != "version"}
+    content = json_text(before) + json_text(read_device(task.device))
+    assert submission.task_digest(task) == hashlib.sha256(content.encode()).hexdigest()
+    assert submission.task_digest(task) != submission.task_digest(replace(task, version=2))
 
 
 @pytest.mark.parametrize(

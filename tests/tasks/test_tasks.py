@@ -15,33 +15,34 @@ from endopilot.settings import read_settings
 from endopilot.tasks import task
 from endopilot.tasks.task import Task, find_task, ladder_tasks, target_in_section
 
-FILES = sorted((Path(task.__file__).parent / "ladder").glob("*.yaml"))
+FOLDER = Path(task.__file__).parent
+FILES = sorted(FOLDER.glob("ladder_[12]/*.yaml"))
 
 
 def test_there_are_twelve_tasks_one_a_level_each_with_its_environment():
-    assert [task.level for task in ladder_tasks()] == list(range(1, 13))
-    assert [path.stem for path in FILES] == sorted(task.name for task in ladder_tasks())
-    assert {name.lower() for name in endopilot.env.TASKS} == {task.name for task in ladder_tasks()}
+    for version in (1, 2):
+        assert [task.level for task in ladder_tasks(version)] == list(range(1, 13))
+        own = [path for path in FILES if path.parent.name == f"ladder_{version}"]
+        assert [path.stem for path in own] == sorted(task.name for task in ladder_tasks(version))
+        assert {task.version for task in ladder_tasks(version)} == {version}
+        assert {name.lower() for name in endopilot.env.TASKS} == {task.name for task in ladder_tasks(version)}
     for name in endopilot.env.TASKS:
         assert f"endopilot/{name}-v0" in gymnasium.registry
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", FILES, ids=lambda path: f"{path.parent.name}/{path.stem}")
 def test_a_task_has_twenty_patients_and_others_to_learn_on(path):
     task = read_settings(path, Task)
     assert len(set(task.ladder.numbers)) == len(set(task.training.numbers)) == 20
     assert task.ladder.seed != task.training.seed
-    seeds = [other.ladder.seed for other in ladder_tasks()]
-    assert len(set(seeds)) == 12 and task.training.seed not in seeds
+    seeds = [other.ladder.seed for version in (1, 2) for other in ladder_tasks(version)]
+    assert len(set(seeds)) == 24 and task.training.seed not in seeds
 
 
 @pytest.mark.parametrize("name", ["straight", "crux", "carotid"])
 def test_the_target_lies_in_its_section(name):
     task = find_task(name)
-    atlas = AtlasConfig(
-        anatomy=task.anatomy, seed=task.ladder.seed, stenosis_share=task.stenosis_share, population="textbook"
-    )
-    tree, _ = make_patient_tree(atlas, task.ladder.numbers[0])
+    tree, _ = make_patient_tree(task.atlas(task.ladder.seed), task.ladder.numbers[0])
     target = target_in_section(tree, task.section, task.depth_mm)
     branch = tree.branches[target.branch]
     at = int(np.searchsorted(branch.centerline.abscissa, target.abscissa))
@@ -69,7 +70,7 @@ def test_a_ladder_navigation_is_the_same_every_time():
     ],
 )
 def test_what_is_wrong_in_a_file_is_named(tmp_path, old, new, line):
-    text = (Path(task.__file__).parent / "ladder" / "crux.yaml").read_text(encoding="utf-8")
+    text = (FOLDER / "ladder_1" / "crux.yaml").read_text(encoding="utf-8")
     assert old in text
     path = tmp_path / "task.yaml"
     path.write_text(text.replace(old, new), encoding="utf-8")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,10 +13,12 @@ from endopilot.anatomy import distance
 from endopilot.anatomy.distance import CATHETER_RADIUS_MM
 from endopilot.atlas.arch import make_arch
 from endopilot.atlas.cerebral import make_cerebral
+from endopilot.atlas.curves import tangents
 from endopilot.atlas.lca import make_lca
 from endopilot.atlas.population import Population, PopulationName, population_of
 from endopilot.atlas.portal import make_portal
 from endopilot.atlas.rca import make_rca
+from endopilot.atlas.through_ct import seen_through_ct, visible
 from endopilot.atlas.variation import catheter_direction, flattened
 from endopilot.settings import Count, Seed, Share, settings
 from endopilot.types import Anatomy, Insertion, VesselTree
@@ -52,6 +55,10 @@ class AtlasConfig:
     """How patients vary: patients (as measured in real ones: sharp bends, forks of any angle, missing branches, lumens
     that are not round) or textbook (published mean courses with smooth wiggles)."""
 
+    seen_through_ct: bool = False
+    """Rasterise each patient at a coronary CT's resolution and make the anatomy of that mask, as of a real one: rough
+    walls, wide narrow lumens, no branches thinner than the voxels. Takes some 5 s a patient."""
+
     @model_validator(mode="after")
     def _consistent(self) -> AtlasConfig:
         if self.anatomy not in _KINDS:
@@ -74,17 +81,24 @@ def make_patient(config: AtlasConfig, index: int) -> Anatomy:
     tree, drawn = make_patient_tree(config, index)
     population = population_of(config.anatomy, config.population)
     generator = _stream(config, index, 1)
+    name, source = f"{config.anatomy}-{config.seed}-{index:04d}", {"source": "atlas", "anatomy": config.anatomy}
+    source |= {"population": config.population, "seed": config.seed, "index": index}
     direction, catheter = catheter_direction(generator, tree, population, CATHETER_RADIUS_MM, CATHETER_LENGTH_MM)
-    insertion = Insertion(position=tree.branches[0].centerline.points[0], direction=direction)
+    if config.seen_through_ct:
+        tree = visible(generator, tree)
     lumen = distance.distance_map_from_spheres(tree, beside=flattened(generator, tree, population))
-    source = {"source": "atlas", "anatomy": config.anatomy, "population": config.population}
+    if config.seen_through_ct:
+        first = tangents(tree.branches[0].centerline.points)[0]
+        found, scan = seen_through_ct(generator, config.anatomy, tree, lumen, first, name, CATHETER_RADIUS_MM)
+        return replace(found, provenance=source | drawn | {"seen_through_ct": scan})
+    insertion = Insertion(position=tree.branches[0].centerline.points[0], direction=direction)
     return Anatomy(
-        name=f"{config.anatomy}-{config.seed}-{index:04d}",
+        name=name,
         tree=tree,
         distance_map=distance.add_catheter(lumen, insertion, CATHETER_RADIUS_MM, CATHETER_LENGTH_MM),
         insertion=insertion,
         catheter_radius_mm=CATHETER_RADIUS_MM,
-        provenance=source | {"seed": config.seed, "index": index} | drawn | catheter,
+        provenance=source | drawn | catheter,
     )
 
 

@@ -234,7 +234,7 @@ def _ladder(path: Path, name: str | None, place: int) -> Film:
         name, place, entry = path.parent.name, int(path.stem), content
     else:
         raise InputError(f"{path}: is no file of the ladder; give a submission.json or TASK/NUMBER.json")
-    task = find_task(name)
+    task = find_task(name, content.get("ladder") or 1)
     recording = Recording.unpacked(entry["recording"])
     navigation = task.ladder_navigation(place)
 

@@ -16,7 +16,7 @@ from endopilot.ladder.scores import score
 from endopilot.ladder.submission import MOST_PATIENTS, SUBMISSION_FILE, task_digest, write_submission
 from endopilot.runs import claim, make_missing
 from endopilot.settings import Within, settings
-from endopilot.tasks.task import Task, find_task, ladder_tasks
+from endopilot.tasks.task import NEWEST, LadderVersion, Task, find_task, ladder_tasks
 
 SCORES_FILE = "ladder.json"
 
@@ -33,17 +33,20 @@ class LadderConfig:
     patients: Annotated[int, Within(1, MOST_PATIENTS)] = MOST_PATIENTS
     """Patients of each task, the first of its list: 1 to 20."""
 
+    version: LadderVersion = NEWEST
+    """Version of the ladder: 2 in patients that resemble real ones, 1 in the textbook patients of before."""
+
     @model_validator(mode="after")
     def _consistent(self) -> LadderConfig:
         POLICIES.check(self.policy)
         for name in self.tasks:
-            find_task(name)
+            find_task(name, self.version)
         return self
 
     @property
     def chosen(self) -> list[Task]:
         """The tasks named, or all."""
-        return [task for task in ladder_tasks() if not self.tasks or task.name in self.tasks]
+        return [task for task in ladder_tasks(self.version) if not self.tasks or task.name in self.tasks]
 
 
 def climb(output: Path, config: LadderConfig) -> list[dict[str, Any]]:
@@ -64,25 +67,26 @@ def climb(output: Path, config: LadderConfig) -> list[dict[str, Any]]:
     """
     make_policy(config.policy)
     tasks = config.chosen
-    claim(output, "endopilot ladder", **identity(config.policy))
+    claim(output, "endopilot ladder", **identity(config.policy, config.version))
     paths = [output / task.name / f"{place:02d}.json" for task in tasks for place in range(config.patients)]
-    make_missing(f"Ladder, {config.policy}", paths, partial(_navigate, policy=config.policy))
+    make_missing(f"Ladder, {config.policy}", paths, partial(_navigate, policy=config.policy, version=config.version))
     results = {task.name: [read_json(path) for path in paths if path.parent.name == task.name] for task in tasks}
     rows = score(tasks, results)
-    write_json(output / SCORES_FILE, {"policy": config.policy, "patients": config.patients, "scores": rows})
-    write_submission(output / SUBMISSION_FILE, config.policy, results, rows)
+    content = {"policy": config.policy, "ladder": config.version, "patients": config.patients, "scores": rows}
+    write_json(output / SCORES_FILE, content)
+    write_submission(output / SUBMISSION_FILE, config.policy, config.version, results, rows)
     return rows
 
 
-def identity(policy: str) -> dict[str, Any]:
+def identity(policy: str, version: LadderVersion) -> dict[str, Any]:
     """Return what a policy's results follow from: its source, every task with its device, and the package's version."""
-    tasks = {task.name: task_digest(task) for task in ladder_tasks()}
+    tasks = {task.name: task_digest(task) for task in ladder_tasks(version)}
     return {"policy": policy, "origin": POLICIES.origin(policy), "tasks": tasks, "version": __version__}
 
 
-def _navigate(path: Path, *, policy: str) -> None:
+def _navigate(path: Path, *, policy: str, version: LadderVersion) -> None:
     """Do one navigation and write what came of it."""
-    task, place = find_task(path.parent.name), int(path.stem)
+    task, place = find_task(path.parent.name, version), int(path.stem)
     navigation = task.ladder_navigation(place)
     result = attempt(policy, navigation, seed=navigation_seed(task, place))
-    write_json(path, {"task": task.name, "patient": navigation.anatomy.name} | result)
+    write_json(path, {"task": task.name, "ladder": version, "patient": navigation.anatomy.name} | result)

@@ -18,7 +18,7 @@ from endopilot.ladder.ladder import LadderConfig, identity
 from endopilot.ladder.scores import score_navigations
 from endopilot.runs import claim, make_missing
 from endopilot.tasks.navigation import Navigation
-from endopilot.tasks.task import Task, find_task
+from endopilot.tasks.task import LadderVersion, Task, find_task
 
 MISMATCH_FILE, PICTURE_FILE = "mismatch.json", "mismatch.png"
 CASES = ("matched", *(f"{name}-{side}" for name in QUANTITIES for side in ("less", "more")), "all")
@@ -46,17 +46,23 @@ def measure_mismatch(output: Path, config: LadderConfig, share: float) -> list[d
         raise InputError(f"mismatch: {share} is not in (0, 1); give e.g. 0.2")
     make_policy(config.policy)
     tasks = config.chosen
-    claim(output, "endopilot ladder --mismatch", **identity(config.policy), mismatch=share)
+    claim(output, "endopilot ladder --mismatch", **identity(config.policy, config.version), mismatch=share)
     paths = {
         case: [output / case / task.name / f"{place:02d}.json" for task in tasks for place in range(config.patients)]
         for case in CASES
     }
     every = [path for of_case in paths.values() for path in of_case]
-    make_missing(f"Model mismatch, {config.policy}", every, partial(_navigate, policy=config.policy, share=share))
+    navigate = partial(_navigate, policy=config.policy, version=config.version, share=share)
+    make_missing(f"Model mismatch, {config.policy}", every, navigate)
     rows = [{"case": case} | _scores([read_json(path) for path in paths[case]]) for case in CASES]
     with writing(output / PICTURE_FILE) as partly:
         partly.write_bytes(_picture(rows, config.policy, share))
-    content = {"policy": config.policy, "mismatch": share, "tasks": [task.name for task in tasks]}
+    content = {
+        "policy": config.policy,
+        "ladder": config.version,
+        "mismatch": share,
+        "tasks": [task.name for task in tasks],
+    }
     write_json(output / MISMATCH_FILE, content | {"patients": config.patients, "cases": rows})
     return rows
 
@@ -72,8 +78,8 @@ def mismatch_of(case: str, share: float, navigation: Navigation, task: Task, pla
     return mismatch_by({name: share if side == "more" else -share}, navigation.anatomy)
 
 
-def _navigate(path: Path, *, policy: str, share: float) -> None:
-    case, task, place = path.parents[1].name, find_task(path.parent.name), int(path.stem)
+def _navigate(path: Path, *, policy: str, version: LadderVersion, share: float) -> None:
+    case, task, place = path.parents[1].name, find_task(path.parent.name, version), int(path.stem)
     navigation = task.ladder_navigation(place)
     mismatch = mismatch_of(case, share, navigation, task, place)
     result = attempt(policy, navigation, seed=navigation_seed(task, place), mismatch=mismatch)

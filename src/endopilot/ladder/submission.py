@@ -10,6 +10,7 @@ import hashlib
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
+from functools import partial
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any, Literal
@@ -23,7 +24,7 @@ from endopilot.ladder.scores import score
 from endopilot.parallel import each
 from endopilot.settings import CountOrZero, read_settings, settings
 from endopilot.simulation.device import read_device
-from endopilot.tasks.task import Task, find_task, ladder_tasks
+from endopilot.tasks.task import LadderVersion, Task, find_task, ladder_tasks
 
 SUBMISSION_FILE = "submission.json"
 MOST_PATIENTS = 20
@@ -69,6 +70,7 @@ class Submission:
 
     Attributes:
         format: version of this form.
+        ladder: version of the ladder; a file without it is one of version 1.
         policy: name of the policy.
         origin: package and version that it comes from, or its file and the SHA-256 of that.
         versions: of endopilot, Python and libraries.
@@ -79,6 +81,7 @@ class Submission:
     """
 
     format: Literal[1] = 1
+    ladder: LadderVersion | None = None
     policy: str
     origin: str
     versions: dict[str, str | None]
@@ -86,6 +89,11 @@ class Submission:
     tasks: dict[str, str]
     navigations: dict[str, tuple[NavigationEntry, ...]]
     scores: tuple[dict[str, Any], ...]
+
+    @property
+    def version(self) -> LadderVersion:
+        """Version of the ladder."""
+        return self.ladder or 1
 
 
 @dataclass(frozen=True)
@@ -109,28 +117,36 @@ class SubmissionCheck:
 
 def task_digest(task: Task) -> str:
     """Return the SHA-256 of what a task's navigations follow from: its definition and its device."""
-    content = json_text(task) + json_text(read_device(task.device))
+    # Version 1's tasks had no such field: their hashes stay.
+    definition = {name: value for name, value in asdict(task).items() if (name, value) != ("version", 1)}
+    content = json_text(definition) + json_text(read_device(task.device))
     return hashlib.sha256(content.encode()).hexdigest()
 
 
 def write_submission(
-    path: Path, policy: str, results: Mapping[str, Sequence[Mapping[str, Any]]], scores: Sequence[Mapping[str, Any]]
+    path: Path,
+    policy: str,
+    version: LadderVersion,
+    results: Mapping[str, Sequence[Mapping[str, Any]]],
+    scores: Sequence[Mapping[str, Any]],
 ) -> None:
     """Write the submission file of a policy.
 
     Args:
         path: the file.
         policy: name of the policy.
+        version: of the ladder.
         results: by the task's name, the results of its navigations (`attempt`) in the order of the task's patients.
         scores: what `score` made of them.
     """
     known = {field.name for field in fields(NavigationEntry)}
     submission = Submission(
+        ladder=version,
         policy=policy,
         origin=POLICIES.origin(policy),
         versions=manifest(config=None)["versions"],
         core=_core.LEVEL,
-        tasks={name: task_digest(find_task(name)) for name in results},
+        tasks={name: task_digest(find_task(name, version)) for name in results},
         navigations={
             name: tuple(NavigationEntry(**{key: value for key, value in one.items() if key in known}) for one in done)
             for name, done in results.items()
@@ -171,7 +187,7 @@ def _refuse_another_ladder(path: Path, submission: Submission) -> None:
         raise InputError(f"{path}: navigations: {counts}; each task needs the same first 1 to {MOST_PATIENTS} patients")
     for name, entries in submission.navigations.items():
         try:
-            task = find_task(name)
+            task = find_task(name, submission.version)
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
         if submission.tasks[name] != task_digest(task):
@@ -188,12 +204,14 @@ def _first_difference(submission: Submission, folder: Path) -> str | None:
     """Return where the file first differs from its recordings driven again, in words."""
     entries = {
         folder / name / f"{place:02d}.json": entry
-        for name, done in sorted(submission.navigations.items(), key=lambda item: find_task(item[0]).level)
+        for name, done in sorted(
+            submission.navigations.items(), key=lambda item: find_task(item[0], submission.version).level
+        )
         for place, entry in enumerate(done)
     }
     for path, entry in entries.items():
         write_json(path, entry.recording)
-    bad = each(f"Checking {submission.policy}", list(entries), _repeat)
+    bad = each(f"Checking {submission.policy}", list(entries), partial(_repeat, version=submission.version))
     differing = []
     for path, entry in entries.items():
         remark = str(bad[path]) if path in bad else _difference(entry.figures(), read_json(path))
@@ -205,7 +223,7 @@ def _first_difference(submission: Submission, folder: Path) -> str | None:
         name: [read_json(folder / name / f"{place:02d}.json") for place in range(len(done))]
         for name, done in submission.navigations.items()
     }
-    rows = score([task for task in ladder_tasks() if task.name in results], results)
+    rows = score([task for task in ladder_tasks(submission.version) if task.name in results], results)
     for given, again in zip_longest(submission.scores, rows, fillvalue={}):
         remark = _difference(given, again)
         if remark is not None:
@@ -213,9 +231,9 @@ def _first_difference(submission: Submission, folder: Path) -> str | None:
     return None
 
 
-def _repeat(path: Path) -> None:
+def _repeat(path: Path, *, version: LadderVersion) -> None:
     """Drive the recording in a file again, and put the figures in its place."""
-    task, place = find_task(path.parent.name), int(path.stem)
+    task, place = find_task(path.parent.name, version), int(path.stem)
     navigation = task.ladder_navigation(place)
     figures = repeat(Recording.unpacked(read_json(path)), navigation, seed=navigation_seed(task, place))
     write_json(path, {"patient": navigation.anatomy.name} | figures)

@@ -46,7 +46,7 @@ def write_page(output: Path) -> Path:
         InputError: the folder holds no scores.
     """
     content = read_json(output / SCORES_FILE)
-    tasks = [find_task(row["task"]) for row in content["scores"] if row["level"] is not None]
+    tasks = [find_task(row["task"], content["ladder"]) for row in content["scores"] if row["level"] is not None]
     plotly = output / "plotly.min.js"
     if not plotly.exists():
         with writing(plotly) as partial:

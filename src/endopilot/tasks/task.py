@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal, get_args
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -22,7 +22,10 @@ from endopilot.types import Anatomy, VesselTree
 CORE = SimulatorConfig(element_mm=1.25, time_step_s=1 / 14, sample_tolerance_mm=1e-4)
 """Settings of the rod core on the ladder and in the environments: longer elements, two time steps a control period,
 and forces that are exact to a micronewton; docs/environment.md states the accuracy that they keep."""
-_FOLDER = Path(__file__).parent / "ladder"
+LadderVersion = Literal[1, 2]
+NEWEST: LadderVersion = 2
+"""The ladder's versions: 1 in textbook patients of the atlas, 2 in patients that resemble real ones."""
+_FOLDERS = {version: Path(__file__).parent / f"ladder_{version}" for version in get_args(LadderVersion)}
 
 
 @settings
@@ -59,6 +62,7 @@ class Task:
         chosen_for: what makes the patients of the atlas eligible; the first eligible ones are taken.
         ladder: the patients that the ladder is scored on.
         training: patients to learn on.
+        version: of the ladder that the task belongs to; it says which population the patients come from.
     """
 
     name: str
@@ -77,6 +81,7 @@ class Task:
     chosen_for: str
     ladder: Patients
     training: Patients
+    version: LadderVersion
 
     @model_validator(mode="after")
     def _consistent(self) -> Task:
@@ -89,10 +94,16 @@ class Task:
         """Return the anatomy of one of the task's patients, by its place in the list."""
         if not 0 <= place < len(patients.numbers):
             raise InputError(f"patient: {place}; task {self.name} has patients 0 to {len(patients.numbers) - 1}")
-        config = AtlasConfig(
-            anatomy=self.anatomy, seed=patients.seed, stenosis_share=self.stenosis_share, population="textbook"
+        return make_patient(self.atlas(patients.seed), patients.numbers[place])
+
+    def atlas(self, seed: int) -> AtlasConfig:
+        """Return the atlas of a seed that the task's patients come from."""
+        return AtlasConfig(
+            anatomy=self.anatomy,
+            seed=seed,
+            stenosis_share=self.stenosis_share,
+            population="textbook" if self.version == 1 else "patients",
         )
-        return make_patient(config, patients.numbers[place])
 
     def ladder_navigation(self, place: int) -> Navigation:
         """Return the task in one of the patients that the ladder is scored on, with its own first rotation."""
@@ -156,32 +167,34 @@ def turn_rad(tree: VesselTree, branch: int) -> float:
     return float(np.arccos(np.clip(into @ onto / (np.linalg.norm(into) * np.linalg.norm(onto)), -1.0, 1.0)))
 
 
-@lru_cache(maxsize=1)
-def ladder_tasks() -> tuple[Task, ...]:
-    """Return the ladder's tasks, the lowest first."""
-    tasks = (read_settings(path, Task) for path in _FOLDER.glob("*.yaml"))
+@cache
+def ladder_tasks(version: LadderVersion = NEWEST) -> tuple[Task, ...]:
+    """Return the tasks of a version of the ladder, the lowest first."""
+    tasks = (read_settings(path, Task) for path in _FOLDERS[version].glob("*.yaml"))
     return tuple(sorted(tasks, key=lambda task: task.level))
 
 
-def find_task(name: str) -> Task:
-    """Return a task of the ladder by its name.
+def find_task(name: str, version: LadderVersion = NEWEST) -> Task:
+    """Return a task of a version of the ladder by its name.
 
     Raises:
         InputError: the ladder has no such task.
     """
-    for task in ladder_tasks():
+    for task in ladder_tasks(version):
         if task.name == name:
             return task
-    raise InputError(f"task: {name!r}; choose from {', '.join(task.name for task in ladder_tasks())}")
+    raise InputError(f"task: {name!r}; choose from {', '.join(task.name for task in ladder_tasks(version))}")
 
 
 def training_navigations(name: str, first: int, count: int) -> list[Navigation]:
-    """Return a task in `count` of its training patients, from number `first` on.
+    """Return a task of the ladder's version 1 in `count` of its training patients, from number `first` on.
+
+    The learning environments `endopilot/NAME-v0` are made of these and stay as they are.
 
     Raises:
         InputError: the ladder has no such task, or the task fewer patients.
     """
-    task = find_task(name)
+    task = find_task(name, 1)
     return [task.navigation(task.patient(task.training, first + place)) for place in range(count)]
 
 
