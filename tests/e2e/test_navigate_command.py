@@ -59,9 +59,9 @@ def test_the_folder_tells_what_happened(driven, patient):
     assert str(table["section"].iloc[-1]) == "2"
     assert table["measured_tip_abscissa_mm"].notna().tolist() == (table["xray"] == 1).tolist()
     assert table["band_tip_abscissa_mm"].notna().sum() > len(table) / 2
-    # every exposure but the first was asked for a decision before, with a reason
+    # every exposure but the first was asked for a decision before, with a reason; the last decision's comes too late
     asked = (table["asks_for_xray"].fillna("") != "").to_numpy()
-    np.testing.assert_array_equal(asked[:-1][1:], (table["xray"] == 1).to_numpy()[2:])
+    np.testing.assert_array_equal(asked[1:-2], (table["xray"] == 1).to_numpy()[2:-1])
     truth = {"friction_factor": 1.2, "stiffness_factor": 0.8, "ostium_mm": 0.4, "latency_factor": 2.0}
     assert record["truth"] == truth
     assert record["anatomy"]["identity"] == read_anatomy(patient).identity
@@ -189,14 +189,19 @@ def test_a_point_is_moved_to_the_vessel_and_told(patient, capsys, tmp_path):
     assert f"{figures['snapped_mm']:.1f} mm from the given point" in figures["outcome"]
 
 
-def test_what_does_not_arrive_says_why(patient, capsys, tmp_path):
-    figures = run(
-        *(capsys, "navigate", patient, "--target", "4", "-o", tmp_path / "out", "--policy", "forward"),
-        *("--tip", "own", "--seconds", "4"),
-    )
-    assert not figures["reached"] and figures["reason"] == "time"
-    assert figures["outcome"].startswith("not reached: after 4 s the tip is in section 1 at ")
-    assert "it was still on its course; give more --seconds" in figures["outcome"]
+def test_what_does_not_arrive_says_why(vessel, fork, capsys, tmp_path):
+    def outcome(name: str, target: str, seconds: str) -> str:
+        line = ("navigate", vessel, f"--target={target}", "-o", tmp_path / name, "--policy", "forward", "--tip", "own")
+        figures = run(capsys, *line, "--seconds", seconds)
+        assert not figures["reached"] and figures["reason"] == "time"
+        return figures["outcome"]
+
+    early = outcome("early", "0,0,36", "3")
+    assert early.startswith("not reached: after 3 s the tip is in section vessel at ")
+    assert "it was still on its course; give more --seconds" in early
+    side = fork.tree.branches[2].centerline.points[-4]
+    missed = outcome("missed", ",".join(f"{value:.3f}" for value in side), "8")
+    assert "off the route, which it left at the fork at 20.0 mm" in missed and "give more" not in missed
 
 
 def test_mismatch_is_drawn_with_the_seed(patient):

@@ -86,6 +86,8 @@ def _held_up(found: PatientNavigation, route: Route) -> str:
     slipped = int((found.rollout.slip[0] > 0).sum())
     if slipped:
         return f"the wire is caught; the drive slipped at its limit of {device.push_limit_n:g} N {slipped} times"
+    if route.off_route(record.tip)[-1] > 0:
+        return "it took another branch"
     progress = route.progress(record.tip)
     still = min(round(_STILL_S / DECISION_PERIOD_S), len(progress) - 1)
     if progress[-1] - progress[-1 - still] > _STILL_MM:
