@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from endopilot.anatomy.io import write_anatomy
+from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.generate import generate_dataset
@@ -21,10 +21,12 @@ from endopilot.models.causal import CausalNetwork, CausalPredictor
 from endopilot.models.config import CausalConfig, TrainConfig
 from endopilot.models.episodes import Episodes
 from endopilot.models.open_loop import Predictor, ProbabilisticPredictor
+from endopilot.models.patient import STEP_MM, prepare
 from endopilot.models.play import N_FEATURES, mirrored
 from endopilot.models.rollout import load_model
 from endopilot.models.sequences import N_INPUTS, Sequences, prepare_vessels, unfold
 from endopilot.models.train import train
+from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import read_device
 from endopilot.simulation.drive_limits import DriveLimits
 
@@ -286,3 +288,12 @@ def test_bad_input_is_named(brief, tmp_path):
         CausalConfig(width=0)
     with pytest.raises(InputError, match="no such run; give a folder made by `endopilot train`, or 'pretrained'"):
         load_model(tmp_path / "nothing")
+
+
+def test_a_wire_that_the_vessel_holds_ends_where_it_is(folder):
+    anatomy = read_anatomy(next(folder.parent.glob("rca-*")))
+    weak = replace(read_device("workhorse-014"), pull_limit_n=1e-9)  # friction holds it
+    patient = prepare(anatomy, weak, SimulatorConfig(element_mm=1.25, tolerance_mm=1e-2))
+    slack = np.arange(patient.pull_tip.shape[1]) * STEP_MM - patient.pull_tip
+    assert (patient.deepest > 20.0).all()
+    assert (np.ptp(slack[:, :5], axis=1) < 1e-9).any()  # nothing is known of lengths that it is not pulled back to

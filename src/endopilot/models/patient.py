@@ -35,6 +35,9 @@ SPEED_MM_S = 10.0
 STEP_MM = 1.0
 """Inserted lengths that the envelopes are kept at are this far apart."""
 _PERIOD_S = 0.25
+_PATIENCE = 8
+"""Periods without motion after which a wire that is pulled counts as held by the vessel."""
+_STILL_MM = 1e-3
 _FORMAT_VERSION = 1
 
 
@@ -75,6 +78,8 @@ class Patient:
 def prepare(anatomy: Anatomy, device: Device, config: SimulatorConfig) -> Patient:
     """Push nominal wires into a vessel until each nears the end of a branch or is caught, and pull them out.
 
+    A wire that the vessel holds against the drive's pull limit stays where it is.
+
     Raises:
         InputError: no wire could be simulated to the end.
     """
@@ -84,17 +89,19 @@ def prepare(anatomy: Anatomy, device: Device, config: SimulatorConfig) -> Patien
     ends = _ends(anatomy.tree)
     deepest = float(ends[np.isfinite(ends)].max()) - STOP_SHORT_MM
     pushing, rows = np.ones(WIRES, dtype=bool), []
+    idle, before = np.zeros(WIRES, dtype=int), np.zeros(WIRES)
     while True:
         tip, inserted = simulator.project(), simulator.inserted_length
+        idle, before = np.where(~pushing & (inserted > before - _STILL_MM), idle + 1, 0), inserted.copy()
         rows.append((inserted.copy(), tip.abscissa, tip.offset, tip.branch, pushing))
         room = np.minimum(deepest - inserted, ends[tip.branch] - STOP_SHORT_MM - tip.abscissa)
         caught = simulator.base_load[:, 0] > CAUGHT * device.push_limit_n
         pushing = pushing & (room > 1e-2) & ~caught & simulator.valid
-        if (~pushing & ((inserted <= 1e-6) | ~simulator.valid)).all():
+        out = ~pushing & ((inserted <= 1e-6) | (idle >= _PATIENCE) | ~simulator.valid)
+        if out.all():
             break
-        speed = np.where(
-            pushing, np.clip(room / _PERIOD_S, 0.2, SPEED_MM_S), -np.minimum(SPEED_MM_S, inserted / _PERIOD_S)
-        )
+        pulled = np.where(out, 0.0, -np.minimum(SPEED_MM_S, inserted / _PERIOD_S))
+        speed = np.where(pushing, np.clip(room / _PERIOD_S, 0.2, SPEED_MM_S), pulled)
         simulator.step(np.column_stack([speed, np.zeros(WIRES)]), _PERIOD_S)
     if not simulator.valid.all():
         raise InputError(
