@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+
 from endopilot.dataset.loader import load_dataset
 from endopilot.models.episodes import Episodes
 from endopilot.simulation.config import PRESETS, SimulatorConfig
