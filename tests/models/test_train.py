@@ -201,7 +201,7 @@ def test_samples_that_are_not_finite_are_named(toy_dataset, tmp_path, monkeypatc
     poisoned = replace(data, tip_abscissa=data.tip_abscissa.copy())
     episode = int(np.flatnonzero(data.split == "train")[5])
     poisoned.tip_abscissa[episode, 60] = np.nan
-    monkeypatch.setattr("endopilot.models.train.load_dataset", lambda folder: poisoned)
+    monkeypatch.setattr("endopilot.models.train.load_joined", lambda folders: poisoned)
     where = f"tip_abscissa of {data.anatomy[episode]}, sequence {data.sequence[episode]}, is not finite"
     with pytest.raises(InputError, match=where):
         train(toy_dataset, tmp_path / "run", TrainConfig(**SHORT))
