@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from endopilot.anatomy.coronary_crux import CRUX_FROM_OSTIUM_MM, Crux, find_crux
+from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.anatomy.labels import label_tree
+from endopilot.anatomy.sources import Polylines
 from endopilot.anatomy.tree import Line, tree_from_lines
 
 OSTIUM = np.array([5.0, -7.0, 3.0])
@@ -68,10 +70,19 @@ def test_what_lies_beyond_the_crux_is_named_by_where_it_goes(beyond, last):
     assert abs(line.abscissa[names == last].min() - crux_mm) < 2.0
 
 
-def test_a_vestige_of_35_mm_is_the_first_segment_alone():
-    vestige = right_artery()[:36]
-    assert label_tree(tree_of_line(vestige), "rca", crux=Crux(CRUX, "left")).sections_present == ("1",)
-    assert "3" in label_tree(tree_of_line(vestige), "rca").sections_present  # what its shape alone would say
+@pytest.mark.parametrize(("length", "sections"), [(36, ("1",)), (70, ("1", "2"))])
+def test_an_artery_that_ends_before_the_crux_has_the_segments_of_its_length(length, sections):
+    piece = right_artery()[:length]
+    assert label_tree(tree_of_line(piece), "rca", crux=Crux(CRUX, "left")).sections_present == sections
+
+
+def test_an_artery_of_35_mm_is_its_first_segment_and_leaves_dominance_open():
+    stump = right_artery()[:36]
+    lines = Polylines((stump,), (np.full(36, 1.5),))
+    anatomy = extract_anatomy(lines, name="stump", config=AnatomyConfig(vessel="rca"))
+    assert anatomy.tree.sections_present == ("1",)
+    assert anatomy.provenance["dominance"] is None
+    assert any("only 35 mm long" in note for note in anatomy.provenance["notes"])
 
 
 def left_tree():

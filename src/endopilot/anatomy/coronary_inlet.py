@@ -24,9 +24,6 @@ CERTAIN = 0.7
 SHORTEST_MM = 15.0
 """A lumen whose branches together are shorter than this is no artery but a crumb."""
 
-SHORT_MM = 60.0
-"""A coronary artery whose longest path is shorter than this is cut off, or a vestige."""
-
 GRID_MM = 0.5
 """Grid spacing at which the arteries are compared, mm."""
 

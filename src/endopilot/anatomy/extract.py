@@ -12,7 +12,7 @@ import numpy as np
 from endopilot import __version__
 from endopilot.anatomy import polylines, repair
 from endopilot.anatomy.centerline import refined_lines
-from endopilot.anatomy.coronary_inlet import SHORT_MM, CoronaryInlet, coronary_inlet
+from endopilot.anatomy.coronary_inlet import CoronaryInlet, coronary_inlet
 from endopilot.anatomy.distance import (
     CATHETER_RADIUS_MM,
     MAXIMUM_GRID_POINTS,
@@ -24,6 +24,7 @@ from endopilot.anatomy.distance import (
 )
 from endopilot.anatomy.inlet import beyond_parent, component, entrance, grid_points, in_front, widest_open_end
 from endopilot.anatomy.labels import dominance, label_tree
+from endopilot.anatomy.labels_coronary import SHORT_MM
 from endopilot.anatomy.lumen_graph import lumen_graph, trace_branches
 from endopilot.anatomy.sources import AnatomySource, Polylines, read_source, transformed
 from endopilot.anatomy.surface import Surface, surface_from_mask
@@ -113,7 +114,8 @@ def extract_anatomy(
         advance()
         crux = None if inlet is None else inlet.crux
         tree = label_tree(tree, config.vessel, crux=crux)
-        notes += _short(tree, config.vessel)
+        short = _short(tree, config.vessel)
+        notes += short
         insertion = _insertion(tree, given)
         ostium_radius = float(np.median(tree.branches[0].centerline.radius[:3]))
         resolved = max(CATHETER_RADIUS_MM, _RESOLVED_STEPS * distance_map.spacing_mm)
@@ -127,7 +129,7 @@ def extract_anatomy(
         "ostium_rule": rule,
         **(inlet.record() if inlet is not None else {}),
         "catheter_tilt_deg": round(catheter_tilt_deg(ostium_radius, radius), 1),
-        "dominance": dominance(tree) if crux is None else crux.dominance,
+        "dominance": crux.dominance if crux is not None else None if short else dominance(tree),
         "notes": notes,
     }
     return Anatomy(name, tree, distance_map, insertion, radius, provenance)

@@ -14,6 +14,9 @@ ACUTE_MARGIN = 0.64
 USUAL_CRUX_MM = 140.0
 """Path from the right ostium to the crux; 122 to 170 mm in six real patients."""
 
+SHORT_MM = 60.0
+"""A coronary artery whose longest path is shorter than this is cut off, occluded, or a vestige."""
+
 CRUX_FORK_MM = 25.0
 """The fork at the crux lies within this much of the path from where the path passes the crux, mm."""
 
@@ -119,6 +122,8 @@ def _unforked_crux(labeller: Labeller, route: tuple[int, ...]) -> float:
     descending artery; otherwise it ends as segment 3.
     """
     line = labeller.tree.path(route[-1])
+    if line.abscissa[-1] < SHORT_MM:
+        return USUAL_CRUX_MM
     later = np.flatnonzero(line.abscissa > 0.5 * line.abscissa[-1])
     turn = int(later[line.points[later, 1].argmax()])
     forwards = line.points[turn, 1] - line.points[-1, 1]
