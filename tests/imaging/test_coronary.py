@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ from shapes import BLOOD_HU, FAT_HU, dice, empty_grid, inside_tube, positions, s
 from endopilot.errors import InputError
 from endopilot.imaging.segment import SegmentConfig, segment
 from endopilot.types import Volume
+
+CTA = Path(__file__).parents[3] / "shared" / "data" / "cta_thorax" / "cta_thorax_1p5mm.nii.gz"
 
 AORTA_RADIUS_MM, ARC_MM = 13.0, 18.0
 
@@ -113,6 +116,19 @@ def test_a_volume_without_contrast_is_refused(heart):
     plain = Volume(np.minimum(volume.voxels, 60), volume.spacing_mm, volume.origin_mm, volume.direction)
     with pytest.raises(InputError, match="no contrast: homogeneous soft tissue peaks at 65 HU"):
         segment(plain, SegmentConfig())
+
+
+@pytest.mark.parametrize("seeds", [(), ((0.0, 0.0, 0.0),)])
+def test_voxels_too_coarse_for_coronary_arteries_are_refused_with_their_size(heart, seeds):
+    thick = Volume(heart[0].voxels[::3], heart[0].spacing_mm * [1.0, 1.0, 3.0], heart[0].origin_mm, heart[0].direction)
+    with pytest.raises(InputError, match=r"too coarse for coronary arteries \(1.8 mm; 1.25 mm at most\)"):
+        segment(thick, SegmentConfig(seeds=seeds))
+
+
+@pytest.mark.skipif(not CTA.exists(), reason="the real CT angiogram is not here")
+def test_a_thoracic_ct_of_1_5_mm_is_told_to_be_too_coarse():
+    with pytest.raises(InputError, match=r"too coarse for coronary arteries \(1.5 mm"):
+        segment(CTA, SegmentConfig())
 
 
 def test_a_volume_without_aorta_is_refused():

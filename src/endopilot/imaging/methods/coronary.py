@@ -57,6 +57,9 @@ _LEAST_TREE_MM3 = 250.0
 """A smaller connected vessel is no coronary tree: 50 mm of 2.5 mm width hold as much."""
 _WALL_HU = 50.0
 """The aortic wall."""
+COARSEST_MM = 1.25
+"""Longest edge of voxels in which a coronary artery of 2 mm still shows."""
+
 _MOUTH_MM = 4.0
 """Length of the artery's beginning where the aorta's blood hides its radius, mm."""
 _WIDEST_MM = 3.0
@@ -103,8 +106,15 @@ def segment_lumen(volume: Volume, config: SegmentConfig) -> LumenMask:
     distal ends that must be reached.
 
     Raises:
-        InputError: there is no contrast, no aorta, no such vessel at its wall, or no vessel at a seed.
+        InputError: the voxels are too coarse, there is no contrast, no aorta, no such vessel at its wall, or no vessel
+            at a seed.
     """
+    coarsest = float(volume.spacing_mm.max())
+    if coarsest > COARSEST_MM:
+        raise InputError(
+            f"the CT is too coarse for coronary arteries ({coarsest:.3g} mm; {COARSEST_MM:g} mm at most), which are "
+            "2 to 4 mm wide: give a reconstruction with thinner slices, or segment the aorta with --method aorta"
+        )
     with progress("Segmenting the coronary tree", 5) as advance:
         grid = resample(volume, _GRID_MM)
         roots = _find_roots(grid, config)
