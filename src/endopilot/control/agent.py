@@ -7,6 +7,7 @@ pulled back, with X-ray on, until one agrees with the image, and another path is
 
 from __future__ import annotations
 
+import time
 from dataclasses import field, replace
 from pathlib import Path
 
@@ -65,6 +66,8 @@ class _PlanningPolicy:
     """What both policies share.
 
     Attributes:
+        plans: how often a course was searched.
+        planning_s: processor time that the searches took, s.
         halt: where and why the last search ended before the target, in words; empty if it arrived.
     """
 
@@ -105,7 +108,7 @@ class _PlanningPolicy:
         self._limits = DriveLimits.of(navigation.device, navigation.anatomy)
         self._course: Course | None = None
         self._at, self._lost, self._began, self._led = 0, False, False, False
-        self.plans, self._failed, self.halt = 0, 0, ""
+        self.plans, self.planning_s, self._failed, self.halt = 0, 0.0, 0, ""
 
     def decide(self, observation: Observation) -> Decision:
         """Follow the course, search another one, or pull back, as the module describes."""
@@ -209,8 +212,9 @@ class _PlanningPolicy:
         if self._failed >= self.config.tries:
             self._course = None
             return
-        self._at, self.plans = 0, self.plans + 1
+        self._at, self.plans, worked = 0, self.plans + 1, time.process_time()
         self._course = self.find_course(seconds) if seconds >= DECISION_PERIOD_S else None
+        self.planning_s += time.process_time() - worked
         self._failed = self._failed + 1 if self._course is not None and self._course.reached < 0.5 else 0
 
 

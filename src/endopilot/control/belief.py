@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from scipy.stats import qmc
 
 from endopilot.settings import Count, NonNegative, Positive, ShareBelowOne, Within, settings
-from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.config import PRESETS, SimulatorConfig
 from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
@@ -47,8 +47,15 @@ class BeliefConfig:
 
     @property
     def core(self) -> SimulatorConfig:
-        """Settings of the rod core."""
-        return SimulatorConfig(element_mm=self.element_mm, time_step_s=self.time_step_s, threads=1)
+        """Settings of the rod core: Newton's method ends as early as for many rollouts; snaps are followed closely."""
+        fast = PRESETS["fast"]
+        return SimulatorConfig(
+            element_mm=self.element_mm,
+            time_step_s=self.time_step_s,
+            tolerance_mm=fast.tolerance_mm,
+            sample_tolerance_mm=fast.sample_tolerance_mm,
+            threads=1,
+        )
 
 
 class Belief:

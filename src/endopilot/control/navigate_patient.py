@@ -115,6 +115,7 @@ class PatientNavigation:
         wires: the wires that the policy held possible at the end of each period, the likeliest first: nodes from the
             tip on, LPS mm; None for a policy that does not tell.
         plans: how often the policy searched a course; None for one that does not count.
+        planning_s: processor time that its searches took, s; None likewise.
     """
 
     set_up: SetUp
@@ -123,6 +124,7 @@ class PatientNavigation:
     cycles: Rollout
     wires: tuple[Float[np.ndarray, "wires nodes 3"], ...] | None
     plans: int | None
+    planning_s: float | None
 
     @property
     def episode(self) -> Rollout:
@@ -202,6 +204,7 @@ def navigate_patient(set_up: SetUp) -> PatientNavigation:
         cycles=replace(cycles, shape=None),
         wires=tuple(wires) if wires else None,
         plans=getattr(policy, "plans", None),
+        planning_s=getattr(policy, "planning_s", None),
     )
 
 

@@ -188,6 +188,7 @@ def _manifest(found: PatientNavigation, target: str, output: Path) -> dict[str, 
         "target_mm": round(navigation.target.abscissa, 2),
         "drive_slipped_s": round(slipped_s(found), 2),
         "courses_searched": found.plans,
+        "planning_processor_s": None if found.planning_s is None else round(found.planning_s, 2),
         "page": str(output / PAGE_FILE),
     }
     return manifest(
