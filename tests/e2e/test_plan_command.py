@@ -94,7 +94,7 @@ def test_desired_tips_that_no_drive_can_keep_up_with(patient, tmp_path, capsys):
         (("--target", "0,0,33", "--seconds", "2"), ("seconds: 2", "31 mm", "speed_mm_s")),
         (("--target", "0,0,33", "--method", "inverse"), ("--model",)),
         (("--target", "0,0,33", "--force-limit-n", "nan"), ("force_limit_n",)),
-        (("--target", "0,0,33", "--force-limit-n", "1e-6"), ("force_limit_n: 1e-06 N", "workhorse-014", "larger")),
+        (("--target", "0,0,33", "--force-limit-n", "1e-6"), ("under 1e-06 N", "workhorse-014", "larger force_limit_n")),
         (("--target", "0,0,33", "--force-weight", "-1"), ("force_weight",)),
     ],
 )
@@ -124,8 +124,13 @@ def test_a_branch_that_the_wire_does_not_get_into(patient, tmp_path, capsys):
     (tmp_path / "straight.yaml").write_text(text)
     out = 20.0 * np.array([np.sin(np.pi / 3), 0.0, np.cos(np.pi / 3)]) * 0.8 + [0.0, 0.0, 20.0]
     target = ",".join(f"{x:.2f}" for x in out)
-    line = refused(
-        capsys, "plan", patient, "--target", target, "-o", tmp_path / "plan", "--device", tmp_path / "straight.yaml"
-    )
-    assert "no path found to branch 2" in line and "tip bend" in line
+    plan = ("plan", patient, "--target", target, "-o", tmp_path / "plan", "--device", tmp_path / "straight.yaml")
+    line = refused(capsys, *plan, "--tip", "own")
+    assert "no path found to branch 2" in line
+    assert "at the fork into section vessel (branch 2) at 20.0 mm, which its tip of 0/3 does not enter" in line
+    assert "--tip" in line and "--catheter-tilt-deg" in line
     assert not (tmp_path / "plan").exists()
+    shaped = run(capsys, *plan)  # a hand bends it
+    assert shaped["reached"] and shaped["tip"] != "0/3"
+    assert "the wire's own tip enters the fork into section vessel (branch 2) at 20.0 mm by 0" in shaped["why"]
+    assert run(capsys, "simulate", patient, "--controls", tmp_path / "plan", "-o", tmp_path / "again.csv", *plan[-2:])
