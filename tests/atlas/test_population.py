@@ -15,7 +15,7 @@ from endopilot.atlas.atlas import ANATOMIES, AtlasConfig, make_patient, make_pat
 from endopilot.atlas.branching import SidePlan, Vessel, lumens_collide, stenoses, with_side_branches
 from endopilot.atlas.population import Population, population_of
 from endopilot.atlas.through_ct import rasterised, visible
-from endopilot.atlas.variation import TIGHTEST, Fork, bent, catheter_direction, drawn_from, opened_fork
+from endopilot.atlas.variation import TIGHTEST, Fork, bent, catheter_direction, drawn_from, ectasia, opened_fork
 from endopilot.benchmarks.vessel_shape import vessel_shape
 
 COUNT = 32
@@ -291,3 +291,25 @@ def test_a_patient_seen_through_a_ct_is_the_same_patient_with_wide_ends(tmp_path
     away = np.min(np.linalg.norm(seen.tree.longest_path().points[:, None] - axis[None, ::5], axis=2), axis=1)
     assert np.quantile(away, 0.9) < 0.7
     assert seen.identity == make_patient(replace(config, seen_through_ct=True), 0).identity != exact.identity
+
+
+def test_an_ectasia_widens_a_vessel_where_it_is_recorded():
+    along = np.arange(0.0, 150.0, 0.5)
+    for seed in range(5):
+        (drawn,), widening = ectasia(np.random.default_rng(seed), along, Population(ectasia_share=1.0))
+        assert widening.max() == pytest.approx(1 + drawn["diameter_increase"], rel=0.02)
+        assert along[widening.argmax()] == pytest.approx(drawn["abscissa_mm"], abs=0.5)
+        beyond = np.abs(along - drawn["abscissa_mm"]) > drawn["length_mm"]
+        assert np.all(widening[beyond] < 1.001) and 1.4 <= widening.max() <= 2.0
+    found, widening = ectasia(np.random.default_rng(0), along, Population())
+    assert found == [] and np.all(widening == 1)
+
+
+def test_left_mains_widen_at_their_fork():
+    widened = []
+    for index in range(16):
+        first = make_patient_tree(AtlasConfig(anatomy="lca", seed=4), index)[0].branches[0].centerline
+        if first.abscissa[-1] > 8.0:
+            widened.append(first.radius[-1] / np.interp(first.abscissa[-1] - 7.0, first.abscissa, first.radius))
+    # The textbook's left mains keep their calibre within 5 %; the flare is drawn from 0 to 35 %.
+    assert len(widened) >= 3 and 1.05 < np.mean(widened) < 1.35

@@ -163,7 +163,8 @@ def _waves(
     """Return the angles of a patient's waves towards the two normals, rad."""
     low, high = population.waves_deg
     amplitude = np.deg2rad(np.exp(generator.uniform(np.log(low), np.log(high))))
-    wavelength = np.exp(generator.uniform(*np.log(population.waves_mm), 8))
+    shortest, longest = population.waves_mm
+    wavelength = np.exp(generator.uniform(np.log(shortest), np.log(longest), 8))
     phase = generator.uniform(0, 2 * np.pi, (8, 2))
     weight = generator.normal(size=(8, 2)) * np.sqrt(wavelength / wavelength.max())[:, None]
     weight = weight / np.sqrt((weight**2).sum(axis=0) / 2)

@@ -50,7 +50,6 @@ def vessel_shape(anatomy: Anatomy) -> dict[str, list[float]]:
     bends, twists, radius, whole = curvature_and_torsion(path)
     peaks = find_peaks(bends, height=SHARP_PER_MM, distance=round(BENDS_APART_MM / STEP_MM))[0]
     forks = list(_forks(tree))
-    left = len(forks) > 0 and _left_main_fork(tree, forks)
     return {
         "curvature p95, 1/mm": [float(np.quantile(bends, 0.95))],
         "curvature peaks > 0.2 in 100 mm": [100.0 * len(peaks) / (STEP_MM * len(bends))],
@@ -64,7 +63,7 @@ def vessel_shape(anatomy: Anatomy) -> dict[str, list[float]]:
         "non-circularity": non_circularity(anatomy, path),
         "catheter against vessel at 10 mm, °": _catheter_angle(anatomy, path),
         "branches > 10 mm": [float(len(_long_ends(tree)))],
-        **({} if left is False else left),
+        **_left_main_fork(tree),
     }
 
 
@@ -191,7 +190,8 @@ def non_circularity(anatomy: Anatomy, path: Centerline) -> list[float]:
     depth = sample(lumen, points.reshape(-1, 3)).reshape(points.shape[:3])
     outside = depth < 0
     last = np.argmax(outside, axis=2)
-    whole = outside.any(axis=2).all(axis=1) & (last > 0).all(axis=1)
+    closed = np.asarray(outside.any(axis=2)) & (last > 0)
+    whole = np.asarray(closed.all(axis=1))
     i, j = np.indices(last.shape)
     inner, outer = depth[i, j, np.maximum(last - 1, 0)], depth[i, j, last]
     share = np.maximum(last - 1, 0) + inner / np.maximum(inner - outer, 1e-9)
@@ -208,8 +208,8 @@ def _catheter_angle(anatomy: Anatomy, path: Centerline) -> list[float]:
     return [angle_between(anatomy.insertion.direction, along)]
 
 
-def _left_main_fork(tree: VesselTree, forks: list[_Fork]) -> dict[str, list[float]] | bool:
-    """Return the shape of the left main's fork into LAD and LCx, or False where the tree names none."""
+def _left_main_fork(tree: VesselTree) -> dict[str, list[float]]:
+    """Return the shape of the left main's fork into LAD and LCx; nothing where the tree names none."""
     names = tree.section_names
     first = {
         name: next((i for i, b in enumerate(tree.branches) if len(b.section) > 1 and names[b.section[1]] == name), None)
@@ -217,10 +217,10 @@ def _left_main_fork(tree: VesselTree, forks: list[_Fork]) -> dict[str, list[floa
     }
     lad, lcx = first["6"], first["11"]
     if lad is None or lcx is None or tree.branches[lad].parent != tree.branches[lcx].parent:
-        return False
+        return {}
     main = tree.branches[lad].parent
     if main < 0:
-        return False
+        return {}
     path = tree.path(main)
     reach = FORK_RADII * float(path.radius[-1])
     return {

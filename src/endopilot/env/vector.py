@@ -143,7 +143,7 @@ class NavigateVectorEnv(VectorEnv):
     ## Arguments
 
     `endopilot/Navigate-v0`: 15 mm into the posterior descending artery of the reference right coronary artery (patient
-    0 of the atlas with seed 0). The other environments are the tasks of the ladder, such as `endopilot/Crux-v0`, in
+    0 of the textbook atlas with seed 0). The others are the tasks of the ladder's version 1, as `endopilot/Crux-v0`, in
     patients of their own, which are not those that the ladder is scored on; world i has patient (`patient` + i) modulo
     `patients`. Or give `navigations` of your own.
 
