@@ -7,22 +7,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import FLAGS, browser_path, hold, opened, serving, until, value
+from browser import hold, opened, serving, until, value
 
+from endopilot.benchmarks.cockpit import BROWSER_FLAGS, find_browser
 from endopilot.cockpit.recording import read_recording, replayed
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 pytest.importorskip("starlette", reason="the extra `cockpit` is not installed")
 pytest.importorskip("websockets", reason="the extra `cockpit` is not installed")
 
-pytestmark = pytest.mark.skipif(browser_path() is None, reason="no Chromium or Chrome is installed")
+pytestmark = pytest.mark.skipif(find_browser() is None, reason="no Chromium or Chrome is installed")
 IMAGE = "Array.from(document.getElementById('plane0').getContext('2d').getImageData(0, 0, 100, 100).data).join()"
 
 
 @pytest.fixture(scope="module")
 def chromium():
     with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=browser_path(), args=list(FLAGS))
+        browser = driver.chromium.launch(executable_path=find_browser(), args=list(BROWSER_FLAGS))
         yield browser
         browser.close()
 

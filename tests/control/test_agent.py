@@ -279,3 +279,15 @@ def test_a_course_may_begin_with_a_turn(side_branch) -> None:
     course = policy._search.find(policy.belief.simulator, source, weight, seconds=20.0, turn=np.pi)
     assert course.rotation[1] - side_branch.start_rotation == pytest.approx(np.pi)
     assert (course.control[:2, 0] == 0.0).all() and course.reached == 1.0
+
+
+def test_a_path_that_does_not_arrive_ends_before_it_presses_too_hard(side_branch) -> None:
+    policy = TwinPolicy(config=QUICK)
+    policy.start(side_branch, 0)
+    one, log, tip = policy._search, search.Log(), policy.belief.tip
+    one._weight = np.ones(1)
+    for share in (0.5, 1.0, 1.5, 0.5):
+        force = np.array([share * side_branch.force_limit_n])
+        log.add(np.zeros(2), tip, np.zeros((1, 3)), force, np.ones(1), np.zeros(1))
+    one._cut_hard(log)
+    assert log.periods == 2

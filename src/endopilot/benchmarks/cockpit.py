@@ -30,7 +30,7 @@ BARS = {
 }
 """Bar of each figure, and on which side of it the figure must lie."""
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-_FLAGS = (
+BROWSER_FLAGS = (
     "--no-sandbox",
     "--disable-gpu",
     "--enable-unsafe-swiftshader",
@@ -39,6 +39,7 @@ _FLAGS = (
     "--disable-sync",
     "--no-first-run",
 )
+"""A headless browser that draws in software and asks nobody anything."""
 _SECONDS = 6.0
 _PRESSES = 40
 _MOST_S = 60.0
@@ -74,7 +75,7 @@ def bench_cockpit() -> dict[str, Any]:
     Raises:
         InputError: there is no browser, or playwright is not installed.
     """
-    browser_path = next((found for found in map(shutil.which, _BROWSERS) if found), None)
+    browser_path = find_browser()
     if browser_path is None:
         raise InputError("browser: none found; install Chromium or Chrome")
     try:
@@ -85,14 +86,14 @@ def bench_cockpit() -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as driver:
         patient = Path(folder) / "patient"
         write_anatomy(reference_navigation().anatomy, patient)
-        browser = driver.chromium.launch(executable_path=browser_path, args=list(_FLAGS))
+        browser = driver.chromium.launch(executable_path=browser_path, args=list(BROWSER_FLAGS))
         page = browser.new_page(viewport={"width": 1280, "height": 800})
         began = time.perf_counter()
-        with _server(patient, Path(folder) / "recordings") as address:
+        with serving(patient, Path(folder) / "recordings") as address:
             page.goto(address)
-            _until(page, "window.cockpit?.shown && cockpit.frames > 0")
+            wait_for(page, "window.cockpit?.shown && cockpit.frames > 0")
             figures["ready_seconds"] = time.perf_counter() - began
-            _until(page, "cockpit.shown.xray.background === 'phantom' && cockpit.shown.xray.ready")
+            wait_for(page, "cockpit.shown.xray.background === 'phantom' && cockpit.shown.xray.ready")
             figures |= _views(page)
             figures |= _latency(page)
         browser.close()
@@ -101,6 +102,11 @@ def bench_cockpit() -> dict[str, Any]:
         name: rounded[name] >= bar if side == ">=" else rounded[name] <= bar for name, (bar, side) in BARS.items()
     }
     return rounded | {"bars": {name: f"{side} {bar:g}" for name, (bar, side) in BARS.items()}, "passed": passed}
+
+
+def find_browser() -> str | None:
+    """Return the program of an installed browser, or None."""
+    return next((found for found in map(shutil.which, _BROWSERS) if found), None)
 
 
 def _views(page: Any) -> dict[str, float]:
@@ -143,8 +149,13 @@ def _latency(page: Any) -> dict[str, float]:
 
 
 @contextmanager
-def _server(patient: Path, output: Path) -> Iterator[str]:
-    """Run `endopilot cockpit` in a process of its own and yield the page's address."""
+def serving(patient: Path, output: Path) -> Iterator[str]:
+    """Run `endopilot cockpit` in a process of its own and yield the page's address.
+
+    Args:
+        patient: folder of the anatomy.
+        output: folder of the recordings.
+    """
     command = [sys.executable, "-m", "endopilot.cli", "cockpit", str(patient), "--no-browser", "--output", str(output)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
@@ -158,7 +169,12 @@ def _server(patient: Path, output: Path) -> Iterator[str]:
         process.wait(timeout=20)
 
 
-def _until(page: Any, script: str) -> None:
+def wait_for(page: Any, script: str) -> None:
+    """Wait for an expression in the page to be true.
+
+    Raises:
+        RuntimeError: it is not after a minute.
+    """
     end = time.perf_counter() + _MOST_S
     while not page.evaluate(f"() => Boolean({script})"):
         if time.perf_counter() > end:

@@ -91,8 +91,8 @@ def open_film(
     """Open what is to be replayed.
 
     Args:
-        path: a session (.cockpit.jsonl); a rollout or controls (.csv, .parquet); a plan's or a data set's folder; a
-            submission.json, or a navigation's result of the ladder.
+        path: a session (.cockpit.jsonl); a rollout or controls (.csv); a folder of a plan, of `endopilot navigate` or
+            of a data set; a submission.json, or a navigation's result of the ladder.
         patient: folder of the anatomy, for rollouts and plans.
         device: wire of a rollout or plan.
         world: which of a rollout's worlds, a data set's episodes, or a task's patients.
@@ -106,15 +106,17 @@ def open_film(
     if (path / "plan.csv").exists():
         plan = read_plan(path, read_anatomy(_given(patient, path)), read_device(device))
         return _controls(plan.navigation, plan.control, DECISION_PERIOD_S, f"plan {path.name}")
+    if (path / "navigation.csv").exists():
+        return _rollout(path / "controls.csv", read_anatomy(_given(patient, path)), str(path / "wire.yaml"), 0)
     if (path / "meta").is_dir():
         return _episode(path, world)
     if path.suffix == ".json":
         return _ladder(path, task, world)
-    if path.suffix in (".csv", ".parquet"):
+    if path.suffix == ".csv":
         return _rollout(path, read_anatomy(_given(patient, path)), device, world)
     raise InputError(
-        f"{path}: cannot be replayed; give a session ({SUFFIX}), a rollout (.csv, .parquet), a plan's or data set's "
-        "folder, or a file of the ladder (.json)"
+        f"{path}: cannot be replayed; give a session ({SUFFIX}), a rollout (.csv), a folder of a plan, a navigation "
+        "or a data set, or a file of the ladder (.json)"
     )
 
 
@@ -175,8 +177,6 @@ def _controls(
 
 def _rollout(path: Path, anatomy: Any, device: str, world: int) -> Film:
     """Return a film of a rollout's or script's controls."""
-    if path.suffix == ".parquet":
-        raise InputError(f"{path}: write the rollout as .csv to replay it")
     script = read_controls_csv(path)
     worlds = len(script.control)
     if world >= worlds:

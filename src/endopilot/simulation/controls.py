@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import pandas as pd
 from jaxtyping import Float
 from pydantic import model_validator
 
@@ -173,6 +172,8 @@ def read_controls_csv(path: Path) -> ScriptedControls:
     Raises:
         InputError: not such a table; the line names file, column, row and mend.
     """
+    import pandas as pd  # slow to import, and needed for files alone
+
     try:
         table = pd.read_csv(path, float_precision="round_trip")
     except (OSError, ValueError) as error:
@@ -223,6 +224,8 @@ def write_controls_csv(
         proximal: (Δ mm, φ rad) at the end of each.
         period_s: time that each holds, s.
     """
+    import pandas as pd
+
     time_s = period_s * np.arange(1, len(control) + 1)
     names = [*_COLUMNS, "inserted_length_mm", "rotation_rad"]
     with writing(path) as partial:

@@ -89,7 +89,7 @@ export class Fluoroscopy {
     });
     document.getElementById("pedal").classList.toggle("live", xray.on);
     const kerma = xray.kerma_ugy < 1000 ? `${xray.kerma_ugy.toFixed(0)} µGy` : `${(xray.kerma_ugy / 1000).toFixed(2)} mGy`;
-    list("counts", { exposures: xray.frames, fluoroscopy: `${xray.seconds.toFixed(1)} s`, "air kerma (estimate)": kerma, background: xray.background });
+    list("counts", { exposures: xray.frames, fluoroscopy: `${xray.seconds.toFixed(1)} s`, "air kerma, est.": kerma, background: xray.background });
   }
 }
 

@@ -8,7 +8,7 @@ import { ReplayBar } from "./replay.js";
 import { Sound } from "./sound.js";
 import { Space } from "./space.js";
 
-const page = { state: null, role: { drives: false }, space: null, frames: 0, drawn: 0, written: 0 };
+const page = { state: null, role: { drives: false }, space: null, frames: 0, ticks: 0, counted: 0, written: 0 };
 const TEXT_MS = 90; // between two updates of the page's text
 window.cockpit = page; // for tests and the console
 
@@ -82,6 +82,7 @@ function showText(state) {
 
 function frame(now) {
   requestAnimationFrame(frame);
+  page.ticks += 1;
   const fresh = page.state && page.state !== page.shown;
   if (fresh) {
     page.shown = page.state;
@@ -96,8 +97,8 @@ function frame(now) {
 }
 
 function countFrames() {
-  put("frames", `${page.frames - page.drawn} frames/s`);
-  page.drawn = page.frames;
+  put("frames", `${page.ticks - page.counted} frames/s`);
+  page.counted = page.ticks;
 }
 
 async function start() {

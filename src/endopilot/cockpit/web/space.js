@@ -121,7 +121,7 @@ export class Space {
   look(lao, cranial) {
     const a = (lao * Math.PI) / 180, b = (cranial * Math.PI) / 180;
     const beam = new THREE.Vector3(Math.sin(a) * Math.cos(b), -Math.cos(a) * Math.cos(b), Math.sin(b));
-    const distance = (0.95 * this.size) / Math.sin((FIELD_DEG / 2) * (Math.PI / 180));
+    const distance = (1.03 * this.size) / Math.sin((FIELD_DEG / 2) * (Math.PI / 180));
     this.controls.target.copy(this.centre);
     this.camera.position.copy(this.centre).addScaledVector(beam, distance);
     this.camera.near = distance / 50;
