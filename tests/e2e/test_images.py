@@ -15,7 +15,7 @@ from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.imaging.volume import read_mask, read_volume, write_mask, write_volume
 from endopilot.types import Insertion, LumenMask, Volume
 
-_COARSE = ("--in-plane-mm", "1.0", "--slice-mm", "1.5", "--margin-mm", "8")
+_COARSE = ("--in-plane-mm", "1.0", "--slice-mm", "1.2", "--margin-mm", "8")
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +101,7 @@ def test_bad_series(few, tmp_path, capsys):
     tilted = copy("tilted")
     for k, file in enumerate(sorted(tilted.iterdir())):
         slice_ = pydicom.dcmread(file)
-        slice_.ImagePositionPatient[1] = float(slice_.ImagePositionPatient[1]) + k / 4
+        slice_.ImagePositionPatient[1] = float(slice_.ImagePositionPatient[1]) + k / 5
         slice_.save_as(file)
     for volume, fragments in {
         truncated: ("truncated", slices[3].name),
