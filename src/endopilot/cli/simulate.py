@@ -85,11 +85,11 @@ def command(
             seed=random.seed,
             max_inserted_length_mm=float(patient.tree.longest_path().abscissa[-1]),
         )
-    stopped, record_shape = None, shape or picture is not None
+    rollout, stopped, record_shape = None, None, shape or picture is not None
     if controls is None and random.stop_short:
         rollout, control, stopped = _stopped_short(patient, wire, initial, control, config)
         initial = np.column_stack([rollout.initial_inserted_length, rollout.initial_rotation])
-    if stopped is None or record_shape:  # the controls that were made give the same navigations again
+    if rollout is None or record_shape:  # the controls that were made give the same navigations again
         rollout = simulate(
             patient, wire, control, initial=initial, config=config, record_shape=record_shape, period_s=period_s
         )
