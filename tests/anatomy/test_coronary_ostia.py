@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from analytic_shapes import mask_of
-from toy_coronaries import PLACE_MM, artery, mask_of_arteries, without
 
 from endopilot.anatomy.coronary_ends import open_ends, skeleton_of
 from endopilot.anatomy.coronary_inlet import _coarse, coronary_inlet
@@ -23,6 +22,7 @@ from endopilot.benchmarks.analytic_lumens import tree_of
 from endopilot.errors import InputError
 from endopilot.imaging.volume import read_volume
 from endopilot.types import Insertion, LumenMask, Volume
+from toy_coronaries import PLACE_MM, artery, mask_of_arteries, without
 
 REAL = Path(__file__).parents[3] / "shared" / "data" / "real_coronaries"
 

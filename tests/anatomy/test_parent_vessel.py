@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from analytic_shapes import mask_of
-from toy_coronaries import artery, mask_of_arteries
 
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.anatomy.parent_vessel import piece_on_side
 from endopilot.anatomy.surface import Surface, surface_from_mask
 from endopilot.errors import InputError
+from toy_coronaries import artery, mask_of_arteries
 
 HALF_MM = (22.0, 12.0, 34.0)
 

@@ -46,7 +46,7 @@ def navigation_scene(
     """
     wall = _wall(anatomy)
     figure = go.Figure([wall, *_centerlines(anatomy)])
-    figure.update_layout(_layout(np.ptp([wall.x, wall.y, wall.z], axis=1)))
+    figure.update_layout(_layout(np.ptp([np.asarray(axis) for axis in (wall.x, wall.y, wall.z)], axis=1)))
     if rollout is not None and rollout.shape is not None:
         _add_navigation(figure, rollout, world, believed)
     return figure
