@@ -66,6 +66,14 @@ def until(page, script, seconds=40.0):
         time.sleep(0.05)
 
 
+def says(page, element, text, seconds=10.0):
+    """Wait for an element's text, which is written a few times a second, to contain a text."""
+    end = time.monotonic() + seconds
+    while text not in page.inner_text(element):
+        assert time.monotonic() < end, f"{element} says {page.inner_text(element)!r}, not {text!r}"
+        time.sleep(0.05)
+
+
 def hold(page, key, script, *, watcher=None, seconds=60.0):
     """Hold a key until an expression is true; where a busy machine lets the page fall silent, press it again.
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import hold, opened, serving, until, value
+from browser import hold, opened, says, serving, until, value
 
 from endopilot.benchmarks.cockpit import BROWSER_FLAGS, find_browser
 from endopilot.cockpit.recording import read_recording, replayed
@@ -56,7 +56,7 @@ def test_keys_move_the_wire_and_the_pedal_counts(context, server):
     page.keyboard.up("ArrowLeft")
     assert value(page, "cockpit.shown.xray.frames") == 0
     hold(page, "KeyX", "cockpit.shown.xray.frames >= 3")
-    assert "live" in page.inner_text("#caption0")
+    says(page, "#caption0", "live")
     page.keyboard.up("KeyX")
     until(page, "!cockpit.shown.xray.on")
     frames, image = value(page, "cockpit.shown.xray.frames"), value(page, IMAGE)
@@ -64,7 +64,7 @@ def test_keys_move_the_wire_and_the_pedal_counts(context, server):
     page.keyboard.up("KeyS")
     assert value(page, "cockpit.shown.xray.frames") == frames
     assert value(page, IMAGE) == image  # the last image is held while X-ray is off
-    assert "last image" in page.inner_text("#caption0")
+    says(page, "#caption0", "last image")
     assert requests and all(url.startswith((server.origin, "data:")) for url in requests)
     assert not errors
 
@@ -133,7 +133,7 @@ def test_a_policy_drives_and_a_hand_takes_over(context, server):
     until(page, "cockpit.shown.autopilot.status === 'reached'", seconds=60)
     target, tip = value(page, "cockpit.shown.target.abscissa"), value(page, "cockpit.shown.tip_mm")
     assert abs(tip - target) < 3.0
-    assert "reached" in page.inner_text("#autopilot-text")
+    says(page, "#autopilot-text", "reached")
 
 
 def test_a_killed_server_goes_on_and_a_replay_shows_what_was(context, server):
@@ -163,13 +163,13 @@ def test_a_killed_server_goes_on_and_a_replay_shows_what_was(context, server):
         at = next(world.snapshot().nodes for world, _ in replayed(recording) if world.cycle == cycle // 4 * 4)
         seen = np.array(value(film, "Array.from(cockpit.state.nodes)"), dtype="<f4")
         np.testing.assert_array_equal(seen, at.astype("<f4").ravel())
-        assert film.locator("#slider").is_visible()
+        film.wait_for_selector("#slider", state="visible")
 
 
 def test_a_task_is_driven_by_x_ray_alone(context, tmp_path):
     with serving("--task", "straight", "--output", tmp_path) as server:
         page = opened(context, server)
-        assert page.locator("#blind").is_visible()
+        page.wait_for_selector("#blind", state="visible")
         page.click("#game-start")
         until(page, "cockpit.shown.game.phase === 'on'")
         hold(page, "KeyX", "cockpit.shown.xray.frames >= 2")
@@ -180,5 +180,5 @@ def test_a_task_is_driven_by_x_ray_alone(context, tmp_path):
         page.keyboard.down("Shift")
         hold(page, "KeyW", "cockpit.shown.game.phase === 'over'", seconds=100)
         until(page, "document.querySelector('#scores')?.innerText.includes('you')")
-        assert page.locator("#blind").is_hidden()
+        page.wait_for_selector("#blind", state="hidden")
         assert value(page, "cockpit.state.nodes.length") > 10
