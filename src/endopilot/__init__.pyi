@@ -42,5 +42,9 @@ from .types import Anatomy as Anatomy
 from .types import LumenMask as LumenMask
 from .types import Rollout as Rollout
 from .types import Volume as Volume
+from .xray.image import ImageConfig as ImageConfig
+from .xray.image import XrayImager as XrayImager
+from .xray.take_image import TakeImageConfig as TakeImageConfig
+from .xray.take_image import take_image as take_image
 
 __version__: str

@@ -6,9 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
+from scipy.special import erf
 
-from endopilot.types import Volume
-from endopilot.xray.image import _COIL_MM, _STEEL_MM, PHOTONS_MM2_UGY, WATER_MM, ImageConfig, XrayImager
+from endopilot.types import Insertion, Volume
+from endopilot.xray.absorbers import COIL_MM, STEEL_MM, WATER_MM, catheter_line, in_catheter
+from endopilot.xray.carm import Pose
+from endopilot.xray.image import PHOTONS_MM2_UGY, ImageConfig, XrayImager
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +32,7 @@ def test_a_wire_takes_away_what_its_metal_does(imager):
     nodes = imager.isocenter + np.linspace(-20, 20, 9)[:, None] * np.array([0.6, 0.0, 0.8])
     wire = imager.wire(plane, nodes)
     radius = imager.device.tip_radius_mm
-    metal = np.pi * radius**2 * (30.0 * _COIL_MM + 10.0 * _STEEL_MM)
+    metal = np.pi * radius**2 * (30.0 * COIL_MM + 10.0 * STEEL_MM)
     assert wire.sum() * side**2 == pytest.approx(metal, rel=2e-3)
 
 
@@ -56,7 +60,7 @@ def test_the_wire_lies_where_the_view_projects_it(imager):
     wire = imager.wire(plane, nodes)
     rows, columns = np.indices(wire.shape)
     found = np.array([(columns * wire).sum(), (rows * wire).sum()]) / wire.sum()
-    right, up = 1.5 * plane.view.project(nodes.mean(axis=0))
+    right, up = plane.view.project(nodes.mean(axis=0))
     middle = (imager.config.pixels - 1) / 2
     np.testing.assert_allclose(found, [middle + right, middle - up], atol=0.1)
 
@@ -75,19 +79,27 @@ def test_a_slab_of_water_takes_away_what_water_does(fork, wire):
 
 
 def test_quantum_noise_is_that_of_the_counted_photons(imager):
-    """The standard deviation of ln(signal) is 1/√N with N = dose × photons × efficiency × pixel area."""
-    plane = replace(imager.plane((0.0, 0.0)), background=np.full((512, 512), WATER_MM * 200, dtype=np.float32))
-    config = imager.config
-    for dose in (1.0, 4.0):
-        frame = imager.frame(plane, imager.isocenter + np.array([[500.0, 0, 0], [501.0, 0, 0]]), dose=dose, seed=1)
-        photons = PHOTONS_MM2_UGY * config.efficiency * config.detector_ugy * dose * config.geometry.pixel_mm**2
-        sd = frame[:100].astype(float).std() * config.window / 127.5
-        assert sd == pytest.approx(1 / np.sqrt(photons), rel=0.03)
+    """Behind even water, the standard deviation of ln(signal) is 1/√N with N = dose × photons × efficiency × area.
+
+    The scintillator's blur g lowers it by the root of Σg².
+    """
+    level = np.full((512, 512), WATER_MM * 200, dtype=np.float32)
+    even = replace(imager.plane((0.0, 0.0)), background=level, scatter=0 * level, reference=-float(level[0, 0]))
+    for scintillator_mm in (0.0, 0.16):
+        config = ImageConfig(scintillator_mm=scintillator_mm)
+        impulse = np.zeros((15, 15))
+        impulse[7, 7] = 1.0
+        kernel = gaussian_filter(impulse, scintillator_mm / config.geometry.pixel_mm)
+        blurred = XrayImager(imager.anatomy, imager.device, config=config)
+        for dose in (1.0, 4.0):
+            signal = blurred.signal(even, np.zeros((0, 3)), dose=dose, seed=1)
+            photons = PHOTONS_MM2_UGY * config.efficiency * config.detector_ugy * dose * config.geometry.pixel_mm**2
+            assert signal.std() == pytest.approx(np.sqrt((kernel**2).sum() / photons), rel=0.01)
 
 
 def test_a_frame_follows_from_its_seed(imager):
     plane, nodes = imager.plane((0.0, 0.0)), imager.isocenter + np.linspace(0, 20, 5)[:, None] * np.array([0, 0, 1.0])
-    first, again, other = (imager.frame(plane, nodes, seed=seed) for seed in (3, 3, 4))
+    first, again, other = (imager.signal(plane, nodes, seed=seed) for seed in (3, 3, 4))
     np.testing.assert_array_equal(first, again)
     assert (first != other).mean() > 0.9
 
@@ -96,3 +108,76 @@ def test_more_dose_is_more_air_kerma(imager):
     plane = imager.plane((0.0, 0.0))
     assert imager.air_kerma_ugy(plane, 2.0) == pytest.approx(2 * imager.air_kerma_ugy(plane, 1.0))
     assert 0.1 < imager.air_kerma_ugy(plane, 1.0) < 100  # µGy a frame: fluoroscopy of a chest
+
+
+def test_scatter_spreads_a_share_of_the_light(imager):
+    """Far from the image's edges an even beam is scattered into itself: scatter = share × primary."""
+    plane = imager.plane((0.0, 0.0))
+    primary = np.exp(-WATER_MM * 200)
+    middle = plane.scatter[250:262, 250:262].mean()
+    # erf: the beam ends at ±256 pixels of 0.308 mm, which is 2.63 standard deviations of 30 mm
+    assert middle == pytest.approx(imager.config.scatter * primary * erf(256 * 0.308 / 30 / np.sqrt(2)) ** 2, rel=0.02)
+    assert plane.scatter[0, 0] == pytest.approx(0.25 * imager.config.scatter * primary, rel=0.1)
+
+
+def test_motion_blurs_a_wire_along_its_path(imager):
+    """Across its axis a wire that moves by d while it is exposed has a profile whose variance grows by d²/12."""
+    plane = imager.plane((0.0, 0.0))
+    nodes = imager.isocenter + np.linspace(-5, 5, 9)[:, None] * np.array([0.0, 0.0, 1.0])
+    speed = np.tile([250.0, 0.0, 0.0], (9, 1))  # 2 mm in a pulse of 8 ms
+    still, moving = imager._moving_wire(plane, nodes, None), imager._moving_wire(plane, nodes, speed)
+    columns = np.arange(512)
+
+    def middle_and_variance(image):
+        profile = image.sum(axis=0)
+        middle = (profile * columns).sum() / profile.sum()
+        return middle, (profile * (columns - middle) ** 2).sum() / profile.sum()
+
+    path = 2.0 * magnification(imager) / imager.config.geometry.pixel_mm
+    (at, narrow), (at_moving, wide) = middle_and_variance(still), middle_and_variance(moving)
+    assert wide - narrow == pytest.approx(path**2 / 12, rel=0.05)
+    assert at - at_moving == pytest.approx(path / 2, rel=0.02)  # the pulse ends with the wire at its nodes
+    assert moving.sum() == pytest.approx(still.sum(), rel=1e-3)
+
+
+def test_subtraction_leaves_the_contrast_alone(imager):
+    """The logarithm of an image less that of its mask is the contrast's attenuation, wherever scatter is absent."""
+    plane = imager.plane((0.0, 0.0))
+    plane = replace(plane, scatter=0 * plane.scatter)
+    none = np.zeros((0, 3))
+    dose = 1e6  # hardly any noise
+    lit, mask = imager.signal(plane, none, contrast=0.5, dose=dose), imager.signal(plane, none, dose=dose, seed=1)
+    np.testing.assert_allclose(lit - mask, -0.5 * imager.config.iodine_mm * plane.vessel_mm, atol=1e-3)
+    grey = imager.grey(lit, mask=mask)
+    assert len(np.unique(grey[plane.vessel_mm == 0])) <= 2
+
+
+def test_a_pose_moves_the_patient_in_the_image(imager):
+    """A translation across the beam moves everything by as many pixels; the isocenter is the middle of a rotation."""
+    still = imager.plane((0.0, 0.0))
+    moved = imager.plane((0.0, 0.0), pose=Pose(np.array([0.0, 0.2, 0.0]), np.array([4.0, 0.0, -3.0])))
+    per_mm = magnification(imager) / imager.config.geometry.pixel_mm
+    change = moved.pixel(imager.isocenter) - still.pixel(imager.isocenter)
+    np.testing.assert_allclose(change, [3.0 * per_mm, 4.0 * per_mm], atol=1e-6)  # down by 3 mm, right by 4 mm
+    place = imager.isocenter + np.array([0.0, 0.0, 10.0])
+    pose = Pose(np.array([0.0, 0.2, 0.0]), np.array([4.0, 0.0, -3.0]))
+    np.testing.assert_allclose(moved.pixel(place), still.pixel(pose.move(place, imager.isocenter)), atol=1e-6)
+
+
+def test_a_coronary_catheter_bends_up_behind_its_straight_end(fork):
+    """A wire behind the ostium is laid along the bend, as far from the axis as before; elsewhere all stays."""
+    nodes = np.array([[0.1, 0.0, 5.0], [0.1, 0.2, -3.0], [0.0, 0.1, -90.0]])
+    np.testing.assert_allclose(in_catheter(fork, nodes), nodes, atol=1e-9)  # no coronary: straight
+    level = Insertion(np.zeros(3), np.array([1.0, 0.0, 0.0]))
+    tree = replace(fork.tree, section_names=("1", *fork.tree.section_names[1:]))
+    coronary = replace(fork, tree=tree, insertion=level)
+    distance, places, heading = catheter_line(coronary)
+    np.testing.assert_allclose(places[:11], -distance[:11, None] * level.direction, atol=1e-9)
+    np.testing.assert_allclose(heading[-1], [0.0, 0.0, 1.0], atol=1e-9)
+    np.testing.assert_allclose(places[-1, 0], -10.0 - 25.0, atol=0.1)  # 10 mm straight, then a quarter of a circle
+    steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    np.testing.assert_allclose(steps, 1.0, rtol=1e-3)
+    wire = np.array([[3.0, 0.1, 0.0], [-3.0, 0.1, 0.0], [-80.0, 0.3, 0.0]])
+    laid = in_catheter(coronary, wire)
+    np.testing.assert_allclose(laid[:2], wire[:2], atol=1e-9)
+    np.testing.assert_allclose(laid[2] - places[80], [0.0, 0.3, 0.0], atol=1e-9)

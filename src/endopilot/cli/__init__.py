@@ -30,6 +30,7 @@ COMMANDS = {
     "evaluate": "trained run -> errors beside the paper's and the baselines'",
     "plan": "anatomy and target -> controls that bring the tip there",
     "navigate": "anatomy and target -> a wire driven there by a policy, in closed loop, and its page",
+    "xray": "anatomy -> X-ray image of a wire in it: fluoroscopy, contrast, DSA or roadmap",
     "advise": "trained run -> calibrated X-ray adviser: exposures against missed events",
     "drive": "a simulated robotic drive that takes commands over TCP, with a watchdog",
     "cockpit": "a wire in the browser: watched, driven by hand, or left to a policy",

@@ -19,6 +19,7 @@ from jaxtyping import Float
 from endopilot.cockpit.frames import encode
 from endopilot.cockpit.world import Snapshot
 from endopilot.types import Anatomy, Volume
+from endopilot.xray.absorbers import is_coronary, surroundings
 from endopilot.xray.carm import view_at
 from endopilot.xray.image import Plane, XrayImager
 
@@ -96,7 +97,7 @@ class XrayUnit:
         self._failed: BaseException | None = None
         self._imager = make_imager(ct)
         self._prepare()
-        self._later = ct is None and _is_coronary(anatomy)
+        self._later = ct is None and is_coronary(anatomy)
         self._surroundings = lambda: self._surround(anatomy, make_imager)
 
     def configure(self, **changes: Any) -> None:
@@ -151,14 +152,10 @@ class XrayUnit:
             self.kerma_ugy += self._imager.air_kerma_ugy(plane, self.settings.dose)
             if share >= 0.9:
                 self._roadmap[key] = plane.vessel_mm
-            image = self._imager.frame(
-                plane,
-                snapshot.nodes,
-                contrast=share,
-                dose=self.settings.dose,
-                seed=2 * self.frames + number,
-                roadmap=self._roadmap.get(key) if self.settings.roadmap and share == 0 else None,
-            )
+            seed = 2 * self.frames + number
+            signal = self._imager.signal(plane, snapshot.nodes, contrast=share, dose=self.settings.dose, seed=seed)
+            roadmap = self._roadmap.get(key) if self.settings.roadmap and share == 0 else None
+            image = self._imager.grey(signal, roadmap=roadmap)
             header = {"plane": number, "angles_deg": key[0], "frame": self.frames, "time_s": round(snapshot.time_s, 4)}
             messages.append(encode("image", header, grey=image))
             self._images[number] = messages[-1]
@@ -205,13 +202,7 @@ class XrayUnit:
 
     def _surround(self, anatomy: Anatomy, make_imager: Callable[[Volume | None], XrayImager]) -> None:
         """Put the phantom around the vessel, and compute the views again."""
-        from endopilot.phantom.phantom import PhantomConfig, make_phantom  # slow to import, and not always needed
-
-        # Without contrast, as the chest is between two injections.
-        config = PhantomConfig(
-            in_plane_mm=1.5, slice_mm=1.5, margin_mm=50.0, lumen_hu=(45.0, 45.0), noise_hu=(0.0, 0.0), calcium=0.0
-        )
-        imager = make_imager(make_phantom(anatomy, config, seed=0))
+        imager = make_imager(surroundings(anatomy))
         planes = {key: imager.plane(*key, rays=_COARSE) for key in self.settings.planes}
         with self._lock:
             self._imager, self._planes, self._fine, self.background = imager, planes, set(), "phantom"
@@ -240,8 +231,3 @@ class XrayUnit:
             task()
         except Exception as error:  # told in the page by the next pulse, not lost in a thread
             self._failed = error
-
-
-def _is_coronary(anatomy: Anatomy) -> bool:
-    """Return whether the vessel is a coronary artery by its section names: the phantom knows only these."""
-    return anatomy.tree.section_names[int(anatomy.tree.branches[0].section[0])] in ("1", "5")

@@ -1,11 +1,12 @@
-"""A C-arm's geometry: where its source stands, and where points of the patient lie in the image."""
+"""A C-arm's geometry: where its source stands, how the patient lies, and where their points are in the image."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from endopilot.settings import Positive, settings
 
@@ -20,6 +21,40 @@ class CArmGeometry:
     """Distance of the X-ray source from the detector, mm."""
     pixel_mm: Positive = 0.308
     """Pixel pitch of the detector in fluoroscopy, mm."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """How a patient lies in the C-arm's frame, compared with where the CT has them.
+
+    Attributes:
+        rotation_rad: rotation vector about the isocenter, LPS axes, rad.
+        translation_mm: after the rotation, LPS mm.
+    """
+
+    rotation_rad: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
+    translation_mm: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
+
+    @classmethod
+    def of_vector(cls, values: Float[np.ndarray, "6"]) -> Pose:
+        """Return the pose of three angles, rad, and three lengths, mm."""
+        return cls(np.asarray(values[:3], dtype=float), np.asarray(values[3:], dtype=float))
+
+    @property
+    def vector(self) -> Float[np.ndarray, "6"]:
+        """Rotation vector, rad, and translation, mm."""
+        return np.concatenate([self.rotation_rad, self.translation_mm])
+
+    @classmethod
+    def draw(cls, random: np.random.Generator, translation_mm: float = 5.0, rotation_deg: float = 3.0) -> Pose:
+        """Draw a pose: each length and each angle evenly up to these bounds on either side, mm and degrees."""
+        angles, lengths = random.uniform(-1, 1, 3), random.uniform(-1, 1, 3)
+        return cls(np.deg2rad(rotation_deg) * angles, translation_mm * lengths)
+
+    def move(self, points: Float[np.ndarray, "*n 3"], isocenter: Float[np.ndarray, "3"]) -> Float[np.ndarray, "*n 3"]:
+        """Return where points of the CT, LPS mm, lie in the C-arm's frame."""
+        matrix = Rotation.from_rotvec(self.rotation_rad).as_matrix()
+        return (points - isocenter) @ matrix.T + isocenter + self.translation_mm
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,10 +76,21 @@ class View:
         in_view = (points - self.source) @ self.axes.T
         return self.scale * in_view[..., :2] / in_view[..., 2:]
 
+    def magnified(self, factor: float) -> View:
+        """Return the view with an image that is magnified by a factor."""
+        return replace(self, scale=self.scale * factor)
+
     def slope(self, point: Float[np.ndarray, "3"]) -> Float[np.ndarray, "2 3"]:
         """Return the derivative of the pixel by the point, pixels/mm."""
         in_view = self.axes @ (point - self.source)
         return self.scale / in_view[2] * (self.axes[:2] - np.outer(in_view[:2] / in_view[2], self.axes[2]))
+
+
+def view_of(view: View, pose: Pose, isocenter: Float[np.ndarray, "3"]) -> View:
+    """Return a view, given in the C-arm's frame, in the CT's frame of a patient who lies in a pose."""
+    matrix = Rotation.from_rotvec(pose.rotation_rad).as_matrix()
+    source = (view.source - isocenter - pose.translation_mm) @ matrix + isocenter
+    return replace(view, source=source, axes=view.axes @ matrix)
 
 
 def view_at(angles_deg: tuple[float, float], isocenter: Float[np.ndarray, "3"], geometry: CArmGeometry) -> View:

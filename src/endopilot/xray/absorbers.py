@@ -1,0 +1,160 @@
+"""What takes away X-rays: the patient, the lumen with its contrast, the guiding catheter and the wire.
+
+Each but the patient is a cloud of small volumes, which `projector.splat` turns into line integrals.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from endopilot.phantom.chest import is_left
+from endopilot.phantom.phantom import PhantomConfig, make_phantom
+from endopilot.types import Anatomy, Volume
+
+WATER_MM = 0.0206
+"""Attenuation of water at 60 keV, the mean energy of fluoroscopy's beam, 1/mm (NIST XCOM)."""
+STEEL_MM, COIL_MM = 0.95, 3.0
+"""Attenuation of a wire's steel shaft, and of the tungsten or platinum coil over its tip, partly filled, 1/mm."""
+CATHETER_MM, _CATHETER_WALL_MM = 0.23, 0.25
+"""Attenuation of a catheter's wall with its barium and its steel braid, 1/mm, and its thickness, mm."""
+_STRAIGHT_MM, _BEND_MM, _SHOWN_MM = 10.0, 25.0, 180.0
+"""Length of the catheter behind the ostium that is straight, radius of its bend into the aorta, and the length that is
+shown, mm."""
+_BLOOD_HU = 40.0
+_STEP_MM, _RING, _RINGS, _SPOKES = 0.15, 48, 4, 16
+_SURROUNDINGS = PhantomConfig(  # without contrast, as the chest is between two injections
+    in_plane_mm=1.5, slice_mm=1.5, margin_mm=60.0, lumen_hu=(45.0, 45.0), noise_hu=(0.0, 0.0), calcium=0.0
+)
+
+Places = Float[np.ndarray, "n 3"]
+
+
+def is_coronary(anatomy: Anatomy) -> bool:
+    """Return whether the vessel is a coronary artery by its section names: the phantom knows only these."""
+    return is_left(anatomy.tree) or anatomy.tree.section_names[int(anatomy.tree.branches[0].section[0])] == "1"
+
+
+def surroundings(anatomy: Anatomy) -> Volume | None:
+    """Return the CT of a synthetic chest around a coronary artery, HU; None for any other vessel."""
+    return make_phantom(anatomy, _SURROUNDINGS, seed=0) if is_coronary(anatomy) else None
+
+
+def without_contrast(ct: Volume, anatomy: Anatomy) -> Volume:
+    """Return a CT, HU, with the blood of the vessel as it is without contrast."""
+    voxels = ct.voxels.astype(np.float32)
+    points, _ = lumen_points(anatomy)
+    index = np.rint(ct.world_to_index(points)).astype(int)[:, ::-1]
+    index = index[((index >= 0) & (index < voxels.shape)).all(axis=1)]
+    at = tuple(index.T)
+    voxels[at] = np.minimum(voxels[at], _BLOOD_HU)
+    return Volume(voxels, ct.spacing_mm, ct.origin_mm, ct.direction)
+
+
+def lumen_points(anatomy: Anatomy) -> tuple[Places, Float[np.ndarray, "n"]]:
+    """Return the lumen as small volumes: their places, LPS mm, and sizes, mm³; those on the wall count in part.
+
+    What lies behind the ostium is the catheter, which the distance map holds too; it is left out.
+    """
+    lumen, start = anatomy.distance_map, anatomy.insertion
+    share = np.clip(np.asarray(lumen.values) / lumen.spacing_mm + 0.5, 0, 1)
+    index = np.argwhere(share > 0)
+    points, size = lumen.origin_mm + index[:, ::-1] * lumen.spacing_mm, share[tuple(index.T)] * lumen.spacing_mm**3
+    behind = (points - start.position) @ start.direction
+    aside = np.linalg.norm(points - start.position - behind[:, None] * start.direction, axis=1)
+    vessel = (behind >= 0) | (aside > anatomy.catheter_radius_mm + lumen.spacing_mm)
+    return points[vessel], size[vessel]
+
+
+def catheter_line(anatomy: Anatomy) -> tuple[Float[np.ndarray, "n"], Places, Places]:
+    """Return the axis of the guiding catheter from the ostium backwards.
+
+    It is straight, and that of a coronary artery bends up into the ascending aorta behind its first 10 mm.
+
+    Returns:
+        Distance behind the ostium, mm; places, LPS mm; unit vectors backwards.
+    """
+    start = anatomy.insertion
+    distance, back = np.arange(0.0, _SHOWN_MM, 1.0), -np.asarray(start.direction, dtype=float)
+    heading = np.tile(back, (len(distance), 1))
+    if is_coronary(anatomy):
+        up = np.array([0.0, 0.0, 1.0])
+        angle = np.arccos(np.clip(back @ up, -1, 1))
+        turned = np.clip((distance - _STRAIGHT_MM) / _BEND_MM, 0, angle)[:, None]
+        if 1e-6 < angle < np.pi - 1e-6:
+            heading = (np.sin(angle - turned) * back + np.sin(turned) * up) / np.sin(angle)
+    middle = 0.5 * (heading[1:] + heading[:-1])
+    places = start.position + np.concatenate([np.zeros((1, 3)), np.cumsum(middle, axis=0)])
+    return distance, places, heading
+
+
+def in_catheter(anatomy: Anatomy, nodes: Places) -> Places:
+    """Return the nodes of a wire, LPS mm, with those behind the ostium laid along the guiding catheter's bend.
+
+    The rod core's catheter is straight; nothing that it computes depends on what lies behind.
+    """
+    start = anatomy.insertion
+    behind = -((nodes - start.position) @ start.direction)
+    inside = behind > 0
+    distance, places, _ = catheter_line(anatomy)
+    aside = nodes[inside] - start.position + behind[inside, None] * start.direction
+    laid = np.stack([np.interp(behind[inside], distance, axis) for axis in places.T], axis=-1)
+    past = np.maximum(behind[inside] - distance[-1], 0.0)[:, None]
+    moved = nodes.astype(float).copy()
+    moved[inside] = laid + aside + past * (places[-1] - places[-2])
+    return moved
+
+
+def catheter_lumen_points(anatomy: Anatomy) -> tuple[Places, Float[np.ndarray, "n"]]:
+    """Return the inside of the guiding catheter, through which contrast is injected, as `lumen_points` does."""
+    distance, places, heading = catheter_line(anatomy)
+    at = np.arange(_STEP_MM / 2, distance[-1], _STEP_MM)
+    middle = np.stack([np.interp(at, distance, axis) for axis in places.T], axis=-1)
+    first, second = _across(np.stack([np.interp(at, distance, part) for part in heading.T], axis=-1))
+    turn = np.linspace(0, 2 * np.pi, _SPOKES, endpoint=False)
+    shares = (np.arange(_RINGS) + 0.5) / _RINGS
+    radius = anatomy.catheter_radius_mm * shares
+    side = np.stack([np.outer(radius, np.cos(turn)).ravel(), np.outer(radius, np.sin(turn)).ravel()], axis=-1)
+    ring = side[:, 0, None, None] * first + side[:, 1, None, None] * second
+    area = np.repeat(2 * np.pi * radius * anatomy.catheter_radius_mm / _RINGS / _SPOKES, _SPOKES)
+    size = np.broadcast_to((area * _STEP_MM)[:, None], ring.shape[:2])
+    return (middle + ring).reshape(-1, 3), size.ravel()
+
+
+def catheter_points(anatomy: Anatomy) -> tuple[Places, float]:
+    """Return the wall of the guiding catheter as small volumes: their places, LPS mm, and the size of each, mm³."""
+    distance, places, heading = catheter_line(anatomy)
+    radius = anatomy.catheter_radius_mm + _CATHETER_WALL_MM / 2
+    at = np.arange(_STEP_MM / 2, distance[-1], _STEP_MM)
+    middle = np.stack([np.interp(at, distance, axis) for axis in places.T], axis=-1)
+    first, second = _across(np.stack([np.interp(at, distance, part) for part in heading.T], axis=-1))
+    turn = np.linspace(0, 2 * np.pi, _RING, endpoint=False)[:, None, None]
+    ring = radius * (np.cos(turn) * first + np.sin(turn) * second)
+    size = 2 * np.pi * radius * _CATHETER_WALL_MM * _STEP_MM / _RING
+    return (middle + ring).reshape(-1, 3), size
+
+
+def _across(axis: Places) -> tuple[Places, Places]:
+    """Return two unit vectors across each axis, and across each other."""
+    axis = axis / np.linalg.norm(axis, axis=1, keepdims=True)
+    first = np.cross(axis, np.eye(3)[int(np.abs(axis).max(axis=0).argmin())])
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return first, np.cross(axis, first)
+
+
+def wire_points(
+    nodes: Places, radius_mm: float, opaque_tip_mm: float, step_mm: float = 0.1
+) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m"]]:
+    """Return a wire as small volumes: their places, LPS mm, and sizes times their attenuation, mm².
+
+    Args:
+        nodes: from the tip on, LPS mm.
+        radius_mm: of the wire.
+        opaque_tip_mm: length of the radiopaque coil.
+        step_mm: distance of the places.
+    """
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(nodes, axis=0), axis=1))])
+    at = np.arange(step_mm / 2, along[-1], step_mm)
+    points = np.stack([np.interp(at, along, axis) for axis in nodes.T], axis=-1)
+    per_mm = np.where(at <= opaque_tip_mm, COIL_MM, STEEL_MM)
+    return points, per_mm * np.pi * radius_mm**2 * step_mm

@@ -1,0 +1,131 @@
+"""One X-ray image of a wire that was pushed into a vessel: `take_image`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import SimpleITK as sitk
+from jaxtyping import Float, UInt8
+
+from endopilot.errors import InputError
+from endopilot.files import writing
+from endopilot.settings import Finite, NonNegative, Positive, Seed, Share, Text, Within, settings
+from endopilot.simulation.device import Device, read_device
+from endopilot.simulation.simulate import simulate
+from endopilot.types import Anatomy, Volume
+from endopilot.xray.absorbers import surroundings
+from endopilot.xray.image import ImageConfig, XrayImager
+
+_REST = np.zeros((1, 1, 2))
+_MASK_SEED = 2**32
+"""The image without contrast has noise of its own."""
+
+
+@settings
+class TakeImageConfig:
+    """What is shown, from where, at which dose."""
+
+    show: Literal["fluoroscopy", "contrast", "dsa", "roadmap"] = "fluoroscopy"
+    """fluoroscopy; contrast (the vessel filled); dsa (that less the image before the injection); roadmap (fluoroscopy
+    over the vessel of an injection before, in white)."""
+    view_deg: tuple[Finite, Finite] = (-30.0, 0.0)
+    """LAO (positive) or RAO, and cranial (positive) or caudal, degrees."""
+    zoom: Annotated[float, Within(0.25, 8)] = 1.0
+    """Magnification of the image."""
+    dose: Positive = 1.0
+    """Multiple of the usual dose of a frame."""
+    contrast: Share = 1.0
+    """Share of the full contrast in the vessel, where it is shown."""
+    device: Text = "workhorse-014"
+    """Name of a device (`endopilot devices`) or a YAML file."""
+    inserted_mm: NonNegative = 60.0
+    """Length of wire that is pushed in before, mm; 0 shows the vessel without a wire."""
+    rotation_rad: Finite = 0.0
+    """Rotation of the wire as it goes in, rad."""
+    speed_mm_s: Finite = 0.0
+    """Speed of the wire along its axis while it is exposed, mm/s: it is blurred."""
+    seed: Seed = 0
+    """Seed of the quantum noise."""
+    image: ImageConfig = field(default_factory=ImageConfig)
+    """Detector and beam."""
+
+
+@dataclass(frozen=True, eq=False)
+class XrayImage:
+    """An image, and what it cost.
+
+    Attributes:
+        grey: values from 0 (black) to 255.
+        tip_pixel: row and column of the wire's true tip; None without a wire.
+        air_kerma_ugy: at the patient's entrance reference point, µGy, for all its frames.
+        frames: exposures that it took: two with a mask or a roadmap.
+        mm_per_pixel: at the isocenter.
+    """
+
+    grey: UInt8[np.ndarray, "rows columns"]
+    tip_pixel: Float[np.ndarray, "2"] | None
+    air_kerma_ugy: float
+    frames: int
+    mm_per_pixel: float
+
+    def write(self, path: Path) -> None:
+        """Write the image as PNG.
+
+        Raises:
+            InputError: the suffix is not .png, or the file cannot be written.
+        """
+        if path.suffix != ".png":
+            raise InputError(f"{path}: an image is written as PNG; give a name that ends in .png")
+        with writing(path) as partial:
+            sitk.WriteImage(sitk.GetImageFromArray(self.grey), str(partial), useCompression=True)
+
+
+def take_image(anatomy: Anatomy, config: TakeImageConfig | None = None, ct: Volume | None = None) -> XrayImage:
+    """Push a wire into a vessel, and take an X-ray image of it.
+
+    Args:
+        anatomy: the vessel.
+        config: what is shown, from where, at which dose.
+        ct: of the patient, HU; of a synthetic chest around a coronary artery, else 200 mm of water if not given.
+
+    Raises:
+        InputError: no such device, or it does not fit the vessel.
+    """
+    config = config or TakeImageConfig()
+    device = read_device(config.device)
+    nodes = _pushed(anatomy, device, config.inserted_mm, config.rotation_rad)
+    imager = XrayImager(anatomy, device, surroundings(anatomy) if ct is None else ct, config.image)
+    plane = imager.plane(config.view_deg, config.zoom)
+    forwards = -np.gradient(nodes, axis=0) if len(nodes) else nodes
+    if len(nodes):
+        forwards /= np.linalg.norm(forwards, axis=1, keepdims=True)
+    share = config.contrast if config.show in ("contrast", "dsa") else 0.0
+    signal = imager.signal(
+        plane, nodes, contrast=share, dose=config.dose, seed=config.seed, velocity=config.speed_mm_s * forwards
+    )
+    mask = None
+    if config.show == "dsa":
+        mask = imager.signal(plane, nodes[:0], dose=config.dose, seed=config.seed + _MASK_SEED)
+    grey = imager.grey(signal, mask=mask, roadmap=plane.vessel_mm if config.show == "roadmap" else None)
+    frames = 2 if config.show in ("dsa", "roadmap") else 1
+    geometry = config.image.geometry
+    return XrayImage(
+        grey=grey,
+        tip_pixel=plane.pixel(nodes[0]) if len(nodes) else None,
+        air_kerma_ugy=frames * imager.air_kerma_ugy(plane, config.dose),
+        frames=frames,
+        mm_per_pixel=geometry.source_to_isocenter_mm / plane.view.scale,
+    )
+
+
+def _pushed(anatomy: Anatomy, device: Device, inserted_mm: float, rotation_rad: float) -> Float[np.ndarray, "n 3"]:
+    """Return the nodes of a wire that was pushed in, from its tip on, LPS mm; none at 0 mm."""
+    if inserted_mm == 0:
+        return np.zeros((0, 3))
+    initial = np.array([[inserted_mm, rotation_rad]])
+    rollout = simulate(anatomy, device, _REST, initial=initial, record_shape=True)
+    assert rollout.shape is not None
+    return rollout.shape[0, -1]

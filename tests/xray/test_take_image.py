@@ -1,0 +1,62 @@
+"""`take_image` and `endopilot xray`: what is shown, and what it cost."""
+
+from __future__ import annotations
+
+import json
+
+import matplotlib.image
+import numpy as np
+import pytest
+
+from endopilot.anatomy.io import write_anatomy
+from endopilot.cli import main
+from endopilot.errors import InputError
+from endopilot.xray.take_image import TakeImageConfig, take_image
+
+
+def shown(fork, **changes):
+    return take_image(fork, TakeImageConfig(view_deg=(0.0, 0.0), inserted_mm=12.0, **changes))
+
+
+def darker(image, row: int, column: int) -> float:
+    """Return by how much a small square is darker than the image."""
+    square = image.grey[row - 1 : row + 2, column - 1 : column + 2]
+    return float(np.median(image.grey)) - float(square.mean())
+
+
+def test_fluoroscopy_shows_the_wire_to_its_tip(fork):
+    """The straight wire lies along z: above its tip there is no wire, 5 mm below it there is."""
+    image = shown(fork, dose=10.0)
+    row, column = np.rint(image.tip_pixel).astype(int)
+    below = row + round(5.0 / image.mm_per_pixel)
+    darkest = max(darker(image, below, column + side) for side in range(-4, 5))
+    assert darkest > 30 > 10 > darker(image, row - 10, column)
+    assert (image.frames, image.air_kerma_ugy > 0) == (1, True)
+
+
+def test_dsa_and_roadmap_show_the_vessel_and_take_two_frames(fork):
+    plain, dsa, roadmap = (shown(fork, show=kind, dose=4.0) for kind in ("fluoroscopy", "dsa", "roadmap"))
+    row, column = np.rint(plain.tip_pixel).astype(int)
+    place = row - round(10.0 / plain.mm_per_pixel), column  # in the vessel, ahead of the wire
+    assert darker(dsa, *place) > 10
+    assert darker(roadmap, *place) < darker(plain, *place) - 10
+    assert (dsa.frames, roadmap.frames) == (2, 2)
+    assert dsa.air_kerma_ugy == pytest.approx(2 * plain.air_kerma_ugy)
+
+
+def test_the_command_writes_the_image(fork, tmp_path, capsys):
+    write_anatomy(fork, tmp_path / "fork")
+    path = tmp_path / "image.png"
+    with pytest.raises(SystemExit) as left:
+        main(["xray", str(tmp_path / "fork"), "-o", str(path), "--view-deg", "0", "0", "--inserted-mm", "12", "--json"])
+    assert left.value.code == 0
+    figures = json.loads(capsys.readouterr().out)
+    image = shown(fork)
+    np.testing.assert_allclose(figures["tip_row_column"], image.tip_pixel, atol=0.02)
+    grey = np.rint(255 * matplotlib.image.imread(path))
+    np.testing.assert_array_equal(grey, image.grey)
+
+
+def test_refuses_what_is_no_png(fork, tmp_path):
+    with pytest.raises(InputError, match=r"image.jpg: an image is written as PNG"):
+        shown(fork).write(tmp_path / "image.jpg")
