@@ -51,6 +51,7 @@ def test_keys_move_the_wire_and_the_pedal_counts(context, server):
     hold(page, "KeyW", f"cockpit.shown.inserted_mm > {began + 3}")
     page.keyboard.up("KeyW")
     until(page, "cockpit.shown.velocity[0] === 0")
+    until(page, "cockpit.space.canvas.width === cockpit.space.canvas.clientWidth")  # a view at rest is sharp
     held = value(page, "cockpit.shown.inserted_mm")
     hold(page, "ArrowLeft", "cockpit.shown.rotation_deg < -20")
     page.keyboard.up("ArrowLeft")

@@ -12,8 +12,11 @@ from endopilot.cli import main
 from endopilot.dataset.loader import load_dataset
 from endopilot.errors import InputError
 from endopilot.evaluation.evaluate import EvaluateConfig, evaluate
+from endopilot.evaluation.protocols import count_steps, run_protocols
 from endopilot.evaluation.results import read_results
 from endopilot.files import read_json, write_json
+from endopilot.models.config import WINDOW
+from endopilot.models.open_loop import OpenLoop, begin_after
 from endopilot.report.evaluation_report import report_evaluation
 from endopilot.simulation.drive_limits import SPARE_MM
 from toy_navigation import LENGTH_MM, make_toy_dataset, toy_simulate
@@ -55,6 +58,34 @@ def test_an_untrained_forward_network_is_the_baseline_it_corrects(evaluated):
     assert evaluated[1]["splits"]["test"]["tip"]["P1"]["abscissa"]["all"]["skill"]["hold_slack"] == pytest.approx(
         0.0, abs=1e-3
     )
+
+
+class Parroting:
+    """Predicts that the tip is where it is; a patient at a time."""
+
+    def __init__(self):
+        self.patients = []
+
+    def rollout_forward(self, episodes, observed=None):
+        self.patients.append(set(episodes.anatomy.tolist()))
+        later = slice(WINDOW if observed is None else begin_after(observed), None)
+        return OpenLoop(episodes.tip[:, later], episodes.proximal[:, later], episodes.control[:, later])
+
+    rollout_inverse = rollout_dual = rollout_forward
+
+
+def test_patients_are_predicted_one_after_the_other_with_the_error_so_far(toy_dataset):
+    data = load_dataset(toy_dataset)
+    data = data.select(np.random.default_rng(0).permutation(len(data)))
+    remarks, predictor = [], Parroting()
+    with patch("endopilot.evaluation.replay.simulate", toy_simulate):
+        result = run_protocols(predictor, data, None, lambda amount=1, remark="": remarks.append(remark))
+    np.testing.assert_array_equal(result.tips["P1"].abscissa, result.true.abscissa)
+    assert len(remarks) == count_steps(data)
+    patients = len(set(data.anatomy.tolist()))
+    assert patients > 1 and all(len(names) == 1 for names in predictor.patients[: 3 * patients])
+    assert remarks[0] == "forward; P1: Δtip errs by 0.000 mm in 1 patient"
+    assert remarks[patients - 1].endswith(f"in {patients} patients")
 
 
 def test_an_untrained_inverse_network_drives_as_the_tip_is_to_move(evaluated):

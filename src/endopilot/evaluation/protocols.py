@@ -15,14 +15,17 @@ from endopilot.evaluation.replay import Control, Recorded, Samples, replay
 from endopilot.evaluation.results import REPLAYED, SplitResult, TipSeries
 from endopilot.models.config import WINDOW
 from endopilot.models.episodes import Episodes
-from endopilot.models.open_loop import Predictor
+from endopilot.models.open_loop import OpenLoop, Predictor
 from endopilot.progress import Advance
 from endopilot.types import VesselTree
+
+PROTOCOLS = ("forward", "inverse", "dual")
+"""What a predictor does with the episodes of each patient."""
 
 
 def count_steps(data: Dataset) -> int:
     """Return how often `run_protocols` calls its `advance`."""
-    return 3 + len(exposures(data)) + len(np.unique(data.anatomy))
+    return len(exposures(data)) + (1 + len(PROTOCOLS)) * len(np.unique(data.anatomy))
 
 
 def run_protocols(predictor: Predictor, data: Dataset, training: Dataset | None, advance: Advance) -> SplitResult:
@@ -38,13 +41,11 @@ def run_protocols(predictor: Predictor, data: Dataset, training: Dataset | None,
         data: the episodes of one split.
         training: the episodes that the run was trained on, over which the baselines that are means are taken; these
             are left out if there are none.
-        advance: called after each protocol, each new plan and each anatomy's simulation.
+        advance: called after each protocol in each anatomy, with P1's error so far, each new plan and each anatomy's
+            simulation.
     """
     recorded, episodes = Recorded.of(data), Episodes.of_dataset(data)
-    predicted = {}
-    for protocol in ("forward", "inverse", "dual"):
-        predicted[protocol] = getattr(predictor, f"rollout_{protocol}")(episodes)
-        advance(1, protocol)
+    predicted = _predicted(predictor, episodes, recorded.anatomy_of, advance)
     controls: dict[str, Control] = {
         "P2": predicted["inverse"].control,
         "P3": predicted["dual"].control,
@@ -81,6 +82,32 @@ def run_protocols(predictor: Predictor, data: Dataset, training: Dataset | None,
         tip_distance={name: r.distance for name, r in replays.items()},
         events=tip_events(*(signal[:, WINDOW - 1 :] for signal in _moving(data))),
     )
+
+
+def _predicted(
+    predictor: Predictor, episodes: Episodes, anatomy_of: Int[np.ndarray, "episodes"], advance: Advance
+) -> dict[str, OpenLoop]:
+    """Return what a predictor makes of the episodes by each protocol.
+
+    One anatomy comes after the other, so that a slow model shows its first errors early.
+    """
+    order = np.argsort(anatomy_of, kind="stable")
+    parts = [
+        episodes.select(chosen) for chosen in np.split(order, np.unique(anatomy_of[order], return_index=True)[1][1:])
+    ]
+    found, errors = {}, []
+    for protocol in PROTOCOLS:
+        rollouts = []
+        for part in parts:
+            rollouts.append(getattr(predictor, f"rollout_{protocol}")(part))
+            if protocol == "forward":
+                errors.append(np.abs(rollouts[-1].tip[..., 0] - part.tip[:, WINDOW:, 0]).mean())
+            patients = "patient" if len(errors) == 1 else "patients"
+            advance(1, f"{protocol}; P1: Δtip errs by {np.nanmean(errors):.3f} mm in {len(errors)} {patients}")
+        back = np.argsort(order)
+        signals = ([getattr(rollout, name) for rollout in rollouts] for name in ("tip", "proximal", "control"))
+        found[protocol] = OpenLoop(*(np.concatenate(signal)[back] for signal in signals))
+    return found
 
 
 def _moving(data: Dataset) -> tuple[np.ndarray, ...]:

@@ -93,7 +93,7 @@ function frame(now) {
     showText(page.shown);
   }
   page.xray.draw();
-  if (page.shown?.sight !== false) page.frames += page.space.draw();
+  if (page.shown?.sight !== false) page.frames += page.space.draw(now);
 }
 
 function countFrames() {

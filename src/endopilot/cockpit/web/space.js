@@ -23,6 +23,7 @@ const LUMEN_FRAGMENT = `
 const PRESETS = { AP: [0, 0], "RAO 30": [-30, 0], "LAO 45": [45, 0], "LAO 45 CRAN 25": [45, 25], "RAO 30 CAUD 20": [-30, -20], lateral: [90, 0] };
 const FIELD_DEG = 26;
 const STILL_MM = 0.003;
+const COARSE = 0.7, SHARP_AFTER_MS = 200; // resolution of a moving view that is drawn in software; a view at rest is sharp
 // The colours of sections in all pictures of endopilot; the two darkest are lighter here, on a dark ground.
 const COLORS = ["#0f86d6", "#e69f00", "#12b886", "#e2703a", "#56b4e9", "#cc79a7", "#f0e442", "#a27fc6", "#b08a56", "#44aa99", "#c85a8e", "#9aa3b5"];
 const sectionColor = (label) => COLORS[label % COLORS.length];
@@ -32,8 +33,10 @@ export class Space {
   constructor(canvas, scene, pick) {
     this.canvas = canvas;
     this.pick = pick;
-    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: !isSoftware(), powerPreference: "high-performance" });
-    this.renderer.setPixelRatio(isSoftware() ? 1 : Math.min(devicePixelRatio, 2));
+    this.software = isSoftware();
+    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: !this.software, powerPreference: "high-performance" });
+    this.renderer.setPixelRatio(this.software ? 1 : Math.min(devicePixelRatio, 2));
+    this.changedAt = -Infinity;
     this.renderer.setClearColor("#0d1424");
     this.scene = new THREE.Scene();
     this.scene.add(new THREE.HemisphereLight("#ffffff", "#566079", 2.6));
@@ -194,7 +197,7 @@ export class Space {
   }
 
   /** Draw what has changed, and return whether there was anything to draw. */
-  draw() {
+  draw(now) {
     const { clientWidth: width, clientHeight: height } = this.canvas;
     if (this.width !== width || this.height !== height) {
       [this.width, this.height] = [width, height];
@@ -203,11 +206,21 @@ export class Space {
       this.camera.updateProjectionMatrix();
       this.changed = true;
     }
+    if (this.software) this.sharpen(now);
     if (!this.changed) return false;
     this.changed = false;
     this.target.quaternion.copy(this.camera.quaternion);
     this.renderer.render(this.scene, this.camera);
     return true;
+  }
+
+  /** Draw a view that changes in fewer pixels, and once more in all of them when it is at rest. */
+  sharpen(now) {
+    if (this.changed) this.changedAt = now;
+    const ratio = now - this.changedAt < SHARP_AFTER_MS ? COARSE : 1;
+    if (ratio === this.renderer.getPixelRatio()) return;
+    this.renderer.setPixelRatio(ratio);
+    this.changed = true;
   }
 
   choose(event) {
