@@ -143,7 +143,8 @@ def test_motion_blurs_a_wire_along_its_path(imager):
 def test_subtraction_leaves_the_contrast_alone(imager):
     """The logarithm of an image less that of its mask is the contrast's attenuation, wherever scatter is absent."""
     plane = imager.plane((0.0, 0.0))
-    plane = replace(plane, scatter=0 * plane.scatter)
+    uneven = np.linspace(0, 2, 512, dtype=np.float32)
+    plane = replace(plane, scatter=0 * plane.scatter, background=plane.background + uneven)
     none = np.zeros((0, 3))
     dose = 1e6  # hardly any noise
     lit, mask = imager.signal(plane, none, contrast=0.5, dose=dose), imager.signal(plane, none, dose=dose, seed=1)

@@ -36,7 +36,7 @@ COMMANDS = {
     "cockpit": "a wire in the browser: watched, driven by hand, or left to a policy",
     "ladder": "a policy on twelve tasks in unseen patients -> scores, a page and a submission",
     "verify": "the rod core compared with closed forms and an independent engine",
-    "bench": "benchmarks: speed, environments, robustness, anatomy, imaging, labels, dataset, training, cockpit",
+    "bench": "benchmarks: speed, environments, robustness, anatomy, imaging, labels, dataset, training, cockpit, X-ray",
     "devices": "the known guidewires and their properties",
     "sample": "download a real CT angiogram to try",
     "info": "versions and machine",

@@ -14,6 +14,7 @@ from tyro.conf import Positional
 
 from endopilot.atlas.atlas import AtlasConfig
 from endopilot.benchmarks.robustness import RobustnessConfig
+from endopilot.benchmarks.xray import XrayBenchConfig
 from endopilot.cli.arguments import OutputFolder, existing, show, show_rows
 from endopilot.simulation.config import Preset
 
@@ -247,9 +248,52 @@ def cockpit(*, json: bool = False) -> None:
     _leave(all(measured["passed"].values()))
 
 
+def xray(*, json: bool = False, config: XrayBenchConfig = XrayBenchConfig()) -> None:
+    """Measure how fast X-ray images are made, and how well tips and poses are found in them, in new patients.
+
+    Args:
+        json: print the figures as JSON.
+        config: patients and images.
+    """
+    from endopilot.benchmarks.xray import BARS, bench_xray
+
+    measured = bench_xray(config)
+    if json:
+        show(measured, as_json=True)
+    else:
+        rows = [
+            {"figure": name, "value": measured[name], "bar": measured["bars"][name], "passed": measured["passed"][name]}
+            for name in BARS
+        ]
+        show_rows(rows, as_json=False)
+        two = {name: value for name, value in measured.items() if name in measured["one_view"]}
+        show_rows(
+            [
+                {"group": name} | row
+                for name, row in ({"two views": two, "one view": measured["one_view"]} | measured["by"]).items()
+            ],
+            as_json=False,
+        )
+        show({"false_alarms_share": measured["false_alarms_share"]}, as_json=False)
+    _leave(all(measured["passed"].values()))
+
+
 SUBJECTS: dict[str, Callable[..., None]] = {
     function.__name__: function
-    for function in (simulation, scaling, robustness, env, dataset, training, labels, anatomy, ostia, imaging, cockpit)
+    for function in (
+        simulation,
+        scaling,
+        robustness,
+        env,
+        dataset,
+        training,
+        labels,
+        anatomy,
+        ostia,
+        imaging,
+        cockpit,
+        xray,
+    )
 }
 """The subjects that can be measured."""
 

@@ -1,0 +1,157 @@
+"""The tip of a wire found in X-ray images: `TipDetector`.
+
+Ridges say how likely each pixel is on a wire (`ridge`), a hidden Markov model follows the wire through the vessel as
+registration has it (`tracker`), and its end is fitted to the pixels there (`wire_end`). Contrast in the vessel is
+estimated and taken away first: a filled branch is a dark line too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float32
+from scipy.ndimage import gaussian_filter
+
+from endopilot.settings import Finite, NonNegative, OpenShare, Share, settings
+from endopilot.simulation.device import Device
+from endopilot.types import Anatomy
+from endopilot.xray.absorbers import catheter_lumen_points, lumen_points
+from endopilot.xray.carm import View
+from endopilot.xray.corridor import CATHETER_MM, make_corridor
+from endopilot.xray.projector import splat
+from endopilot.xray.ridge import RidgeEvidence
+from endopilot.xray.tracker import TipEstimate, track
+from endopilot.xray.wire_end import fit_end
+
+Signal = Float32[np.ndarray, "rows columns"]
+_HIGH_PASS_PX = 12.0
+_LEAST_CONTRAST = 0.01
+"""Contrast below this, 1/mm, is none."""
+_AHEAD_SHARE, _AHEAD_MM = 1.3, 8.0
+"""A tip lies no deeper than this many times the inserted length, and this much more."""
+_END_SECTIONS = 6
+"""Cross-sections of the wire's end that give its first direction."""
+_DOUBT = 1.5
+"""The followed wire's errors are this many times as large as the model says: found on synthetic patients."""
+_LOOSE_MM = 0.4
+"""Standard deviation that the followed wire's end is taken to have at least, mm: it cuts the corner of a bent tip."""
+_BLUR_PX = 0.6
+"""Standard deviation of the detector's blur, pixels."""
+_SEEN_SHARE = 0.35
+"""An end that is foreshortened to less than this share of its length shows no direction, and is not fitted."""
+_BELIEVABLE = 3.0
+"""An end farther than this many standard deviations from the followed wire's is another line's."""
+
+
+@settings
+class DetectorConfig:
+    """How far an image is trusted."""
+
+    slack_mm: NonNegative = 0.3
+    """How far outside the lumen the wire's axis may seem to lie, because registration is not perfect, mm."""
+    hidden: OpenShare = 0.02
+    """Share of the wire that is not seen, whatever the evidence against it."""
+    alike: OpenShare = 0.05
+    """Share of the places off the wire that look like one, whatever the evidence."""
+    independent: Share = 0.35
+    """Weight of a cross-section's evidence: neighbouring pixels share their noise."""
+    least_log_odds: Finite = 25.0
+    """There is a wire where the images are likelier with one by this logarithm."""
+
+
+class TipDetector:
+    """Finds the tip of one wire in one vessel."""
+
+    def __init__(
+        self,
+        anatomy: Anatomy,
+        device: Device,
+        config: DetectorConfig | None = None,
+        evidence: RidgeEvidence | None = None,
+    ) -> None:
+        """Take the vessel and the wire.
+
+        Args:
+            anatomy: the vessel.
+            device: the wire.
+            config: how far an image is trusted.
+            evidence: for a wire in a pixel; the package's if not given.
+        """
+        self._anatomy, self._radius_mm = anatomy, device.tip_radius_mm
+        self.config, self._evidence = config or DetectorConfig(), evidence or RidgeEvidence.read()
+        behind, size = catheter_lumen_points(anatomy)
+        near = np.linalg.norm(behind - anatomy.insertion.position, axis=1) <= 1.25 * CATHETER_MM
+        points, volume = lumen_points(anatomy)
+        self._filled = np.concatenate([points, behind[near]]), np.concatenate([volume, size[near]])
+
+    def find(
+        self, views: Sequence[View], signals: Sequence[Signal], photons: Sequence[float], inserted_length: float
+    ) -> TipEstimate | None:
+        """Find the tip in the images of one exposure.
+
+        Args:
+            views: of the images, in the CT's frame (`Registration.views`).
+            signals: from `XrayImager.signal`.
+            photons: that a pixel of usual brightness counts, in each image.
+            inserted_length: Δ by the robot's encoder, mm.
+
+        Returns:
+            The tip; None where there is no wire.
+        """
+        found = self.estimate(views, signals, photons, inserted_length)
+        return found if found.log_odds >= self.config.least_log_odds else None
+
+    def estimate(
+        self, views: Sequence[View], signals: Sequence[Signal], photons: Sequence[float], inserted_length: float
+    ) -> TipEstimate:
+        """Return where the tip is if there is a wire, and how likely that is; the arguments are those of `find`."""
+        plain = [self.without_contrast(view, signal) for view, signal in zip(views, signals, strict=True)]
+        evidence = [self._saturated(self._evidence(one, count)) for one, count in zip(plain, photons, strict=True)]
+        deepest = _AHEAD_SHARE * max(inserted_length, 0.0) + _AHEAD_MM
+        corridor = make_corridor(self._anatomy, self._radius_mm, self.config.slack_mm, deepest)
+        return _refined(track(corridor, views, evidence, inserted_length), views, plain, self._radius_mm)
+
+    def _saturated(self, log_ratio: Signal) -> Signal:
+        """Return evidence that no single pixel can overrule all others with."""
+        likelier = np.exp(np.clip(log_ratio, -30, 30))
+        config = self.config
+        bounded = np.log((likelier + config.hidden) / (1 + config.alike * likelier))
+        return np.asarray(config.independent * bounded, dtype=np.float32)
+
+    def without_contrast(self, view: View, signal: Signal) -> Signal:
+        """Return an image without the contrast in the vessel, whose strength is estimated from the image."""
+        width_mm = 0.5 * self._anatomy.distance_map.spacing_mm
+        path_mm = splat(view, len(signal), *self._filled, width_mm=width_mm, blur_px=_BLUR_PX)
+        edges = path_mm - gaussian_filter(path_mm, _HIGH_PASS_PX)
+        filled = path_mm > 0.3
+        if filled.sum() < 10:
+            return signal
+        dark = gaussian_filter(signal, _HIGH_PASS_PX) - signal
+        strength = float(dark[filled] @ edges[filled] / (edges[filled] @ edges[filled]))
+        return signal + np.float32(strength) * path_mm if strength > _LEAST_CONTRAST else signal
+
+
+def _refined(found: TipEstimate, views: Sequence[View], signals: Sequence[Signal], radius_mm: float) -> TipEstimate:
+    """Return the estimate after each image's fit of the wire's end: a Kalman update of position and covariance."""
+    position = found.position
+    covariance = _DOUBT**2 * found.covariance + _LOOSE_MM**2 * np.eye(3)
+    before = found.wire[-1 - min(_END_SECTIONS, len(found.wire) - 1)]
+    length, fitted = float(np.linalg.norm(found.position - before)), False
+    for view, signal in zip(views, signals, strict=True):
+        guess, slope = view.project(position), view.slope(position)
+        forwards, per_mm = guess - view.project(before), float(np.linalg.norm(slope, 2))
+        if float(np.linalg.norm(forwards)) < _SEEN_SHARE * per_mm * length:
+            continue
+        end = fit_end(signal, guess, forwards, float(np.hypot(0.5 * radius_mm * per_mm, _BLUR_PX)))
+        if end is None:
+            continue
+        expected = slope @ covariance @ slope.T + end.covariance
+        error = end.place - guess
+        if error @ np.linalg.solve(expected, error) > _BELIEVABLE**2:
+            continue
+        gain = covariance @ slope.T @ np.linalg.inv(expected)
+        position = position + gain @ error
+        covariance, fitted = (np.eye(3) - gain @ slope) @ covariance, True
+    return replace(found, position=position, covariance=covariance) if fitted else found

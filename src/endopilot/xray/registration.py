@@ -1,0 +1,192 @@
+"""Registration: how the patient lies in the C-arm's frame, from one or two images of the contrasted vessel.
+
+What contrast adds to an image, the logarithm of the image before it less that with it, is the attenuation of the
+iodine times the path through the lumen. The lumen of the CT is laid onto the detector in a pose, and the pose is moved
+until both agree, first blurred, then finely. Where they do not agree in the end, registration has failed, and says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Float32
+from scipy.ndimage import gaussian_filter
+from scipy.optimize import least_squares
+from skimage.transform import downscale_local_mean
+
+from endopilot.types import Anatomy
+from endopilot.xray.absorbers import catheter_lumen_points, lumen_points
+from endopilot.xray.carm import Pose, View, view_of
+from endopilot.xray.image import ImageConfig, isocenter_of
+from endopilot.xray.projector import splat
+
+_PRIOR = np.concatenate([np.full(3, np.deg2rad(2.0)), np.full(3, 3.5)])
+"""Standard deviations of a pose before any image: rad, mm. Poses of up to 3° and 5 mm lie within."""
+_FAR = 3.0
+"""A pose this many of these standard deviations from where the patient was laid is not believed."""
+_LEVELS = ((8, 3.0), (8, 1.5), (4, 1.5), (2, 1.0))
+"""Pixels that are averaged along a side, and the blur of what is left, in averaged pixels: the first sees 5 mm."""
+_POINTS = 30000
+_STEP_SHARE = 0.01
+"""The derivative is taken over this share of a standard deviation either way, times the averaged pixels."""
+_DARKEST = 0.05
+"""Share of the light below which none is taken to be unscattered."""
+_AGREES = 0.8
+"""Least correlation of image and projected vessel. Without contrast it is near 0."""
+_MISFIT = 0.1
+"""Residuals are scaled by this share of the full contrast; beyond it they count less."""
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """A pose, and whether to believe it.
+
+    Attributes:
+        pose: of the patient.
+        correlation: of the contrast in the images and of the vessel projected in this pose.
+        failure: why it is not to be believed, in words; empty if it is.
+    """
+
+    pose: Pose
+    correlation: float
+    failure: str
+
+    def views(self, views: Sequence[View], isocenter: Float[np.ndarray, "3"]) -> list[View]:
+        """Return views that were given in the C-arm's frame in the CT's frame."""
+        return [view_of(view, self.pose, isocenter) for view in views]
+
+
+def register(
+    anatomy: Anatomy,
+    views: Sequence[View],
+    contrasted: Sequence[Float32[np.ndarray, "rows columns"]],
+    before: Sequence[Float32[np.ndarray, "rows columns"]],
+    config: ImageConfig | None = None,
+) -> Registration:
+    """Find the pose in which the patient lies.
+
+    Args:
+        anatomy: the vessel of the CT.
+        views: of the images, in the C-arm's frame.
+        contrasted: an image of the filled vessel for each view, from `XrayImager.signal`.
+        before: the image before the injection, likewise.
+        config: detector and beam.
+    """
+    config, isocenter = config or ImageConfig(), isocenter_of(anatomy)
+    points, size = _sampled(anatomy)
+    found, correlation = np.zeros(6), 0.0
+    for averaged, blur in _LEVELS:
+        observed = [
+            gaussian_filter(_added(lit, mask, averaged, config), blur)
+            for lit, mask in zip(contrasted, before, strict=True)
+        ]
+        level = _Level(points, size, views, observed, averaged, blur, config, isocenter)
+        slope: Any = level.slope  # the annotation of scipy knows names of schemes alone
+        found = least_squares(
+            level.residuals,
+            found,
+            slope,
+            bounds=(-_FAR * _PRIOR, _FAR * _PRIOR),
+            x_scale=_PRIOR,
+            loss="soft_l1",
+            max_nfev=10,
+            xtol=1e-4,
+            ftol=1e-4,
+        ).x
+        correlation = level.correlation(found)
+    far = float(np.abs(found / _PRIOR).max()) + 1e-2
+    failure = ""
+    if correlation < _AGREES:
+        failure = f"the image and the vessel agree by {correlation:.2f} only; inject contrast, or choose another view"
+    elif far > _FAR:
+        failure = "the vessel fits the image only far from where the patient was laid; check the views' angles"
+    return Registration(Pose.of_vector(found), correlation, failure)
+
+
+@dataclass(frozen=True, eq=False)
+class _Level:
+    """The comparison at one resolution; the arguments are those of `register` and `_LEVELS`."""
+
+    points: Float[np.ndarray, "n 3"]
+    size: Float[np.ndarray, "n"]
+    views: Sequence[View]
+    observed: Sequence[np.ndarray]
+    averaged: int
+    blur: float
+    config: ImageConfig
+    isocenter: Float[np.ndarray, "3"]
+
+    def expected(self, pose: Float[np.ndarray, "6"]) -> list[np.ndarray]:
+        """Return what contrast would add to each image in a pose."""
+        images = []
+        for view in self.views:
+            coarse = view_of(view, Pose.of_vector(pose), self.isocenter).magnified(1 / self.averaged)
+            pixels = self.config.pixels // self.averaged
+            images.append(self.config.iodine_mm * splat(coarse, pixels, self.points, self.size, blur_px=self.blur))
+        return images
+
+    def residuals(self, pose: Float[np.ndarray, "6"]) -> Float[np.ndarray, "n"]:
+        """Return all differences, in units of the usual misfit, and those of the pose from the prior."""
+        full = _MISFIT * self.config.iodine_mm * 3.0  # a vessel of 3 mm
+        pairs = zip(self.expected(pose), self.observed, strict=True)
+        difference = [((ours - theirs) / full).ravel() for ours, theirs in pairs]
+        return np.concatenate([*difference, pose / _PRIOR])
+
+    def slope(self, pose: Float[np.ndarray, "6"]) -> Float[np.ndarray, "n 6"]:
+        """Return the derivative of the residuals by the pose."""
+        steps = _STEP_SHARE * self.averaged * np.diag(_PRIOR)
+        columns = [(self.residuals(pose + step) - self.residuals(pose - step)) / (2 * step.sum()) for step in steps]
+        return np.stack(columns, axis=-1)
+
+    def correlation(self, pose: Float[np.ndarray, "6"]) -> float:
+        """Return the correlation of what was expected and observed around the vessel."""
+        ours, theirs = (
+            np.concatenate([image.ravel() for image in images]) for images in (self.expected(pose), self.observed)
+        )
+        near = ours > 0.02 * ours.max()
+        wide = near | (gaussian_filter(near.astype(np.float32), 2.0) > 0)
+        return float(np.corrcoef(ours[wide], theirs[wide])[0, 1]) if wide.sum() > 2 else 0.0
+
+
+def _added(
+    lit: Float32[np.ndarray, "rows columns"],
+    mask: Float32[np.ndarray, "rows columns"],
+    averaged: int,
+    config: ImageConfig,
+) -> Float32[np.ndarray, "r c"]:
+    """Return the attenuation that contrast added, pixels averaged; scatter is estimated as the mask, spread out."""
+    light, before = (downscale_local_mean(np.exp(image), (averaged, averaged)) for image in (lit, mask))
+    reach = config.scatter_mm / config.geometry.pixel_mm / averaged
+    scatter = config.scatter / (1 + config.scatter) * gaussian_filter(before, reach, mode="constant")
+    least = _DARKEST * before
+    return np.log(np.maximum(before - scatter, least) / np.maximum(light - scatter, least)).astype(np.float32)
+
+
+def _sampled(anatomy: Anatomy) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]:
+    """Return a sample of the lumen, and of the catheter's straight end, which contrast fills too."""
+    points, size = lumen_points(anatomy)
+    behind, size_behind = catheter_lumen_points(anatomy)
+    near = np.linalg.norm(behind - anatomy.insertion.position, axis=1) < 10.0
+    random = np.random.default_rng(0)
+    chosen = random.permutation(len(points))[:_POINTS]
+    inside = np.flatnonzero(near)
+    inside = inside[random.permutation(len(inside))[: _POINTS // 20]]
+    return (
+        np.concatenate([points[chosen], behind[inside]]),
+        np.concatenate(
+            [
+                size[chosen] * size.sum() / size[chosen].sum(),
+                size_behind[inside] * size_behind[near].sum() / size_behind[inside].sum(),
+            ]
+        ),
+    )
+
+
+def vessel_error_mm(anatomy: Anatomy, true: Pose, found: Pose) -> float:
+    """Return how far a vessel in one pose lies from itself in another: the mean over its centerlines, mm."""
+    points = np.concatenate([branch.centerline.points for branch in anatomy.tree.branches])
+    isocenter = isocenter_of(anatomy)
+    return float(np.linalg.norm(true.move(points, isocenter) - found.move(points, isocenter), axis=1).mean())

@@ -1,0 +1,42 @@
+"""How the figures of X-ray detection are counted."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from endopilot.benchmarks.xray import BARS, _Exposure, _figures
+
+
+def exposure(**changes) -> _Exposure:
+    usual = {"views": 2, "dose": 1.0, "contrast": 0.0, "angle": "RAO 30", "wire": True, "found": True}
+    errors = {"along_px": 1.0, "across_px": 0.2, "along_mm": 0.3, "space_mm": 0.4, "deviations": 1.0}
+    return _Exposure(**(usual | errors | changes))
+
+
+def test_a_tip_found_elsewhere_is_missed_and_one_found_without_a_wire_is_a_false_alarm():
+    rows = [
+        exposure(),
+        exposure(along_px=3.0),
+        exposure(along_px=8.0, across_px=7.0, deviations=9.0),
+        exposure(found=False, along_px=np.nan),
+        exposure(dose=4.0, along_px=99.0),
+        exposure(views=1, along_px=5.0),
+        exposure(wire=False),
+        exposure(wire=False, found=False),
+    ]
+    registrations = [{"two_views_mm": value, "one_view_mm": [1.0, 3.0]} for value in (0.2, 0.9)]
+    figures = _figures(rows, registrations, [20.0, 30.0, 10.0])
+    assert figures["missed_share"] == 0.5 and figures["images"] == 4
+    assert figures["tip_along_median_px"] == 3.0
+    assert figures["inside_own_95_share"] == pytest.approx(2 / 3)
+    assert figures["one_view"]["tip_along_median_px"] == 5.0
+    assert figures["by"]["dose 4, contrast 0"]["missed_share"] == 1.0
+    assert figures["false_alarms_share"] == 0.5
+    assert figures["registration_error_mm"] == pytest.approx(0.55)
+    assert figures["passed"] == {
+        name: name
+        not in ("tip_along_median_px", "missed_share", "registration_error_mm", "registration_error_one_view_mm")
+        for name in BARS
+    }
+    assert figures["images_per_second"] == 20.0

@@ -1,0 +1,137 @@
+"""Tips found in images: against lines of known end, and wires of known tip in a forked vessel."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.special import ndtr
+
+from endopilot.xray.corridor import CELL_MM, STEP_MM, make_corridor
+from endopilot.xray.detector import DetectorConfig, TipDetector
+from endopilot.xray.image import XrayImager
+from endopilot.xray.tracker import track
+from endopilot.xray.wire_end import fit_end
+
+ANGLES = ((-30.0, 0.0), (60.0, 0.0))
+TIP = {0: 14.0, 1: 32.0, 2: 32.0}
+"""Abscissa of a tip in each branch, mm."""
+
+
+@pytest.fixture(scope="module")
+def imager(fork, wire):
+    return XrayImager(fork, wire)
+
+
+@pytest.fixture(scope="module")
+def planes(imager):
+    return [imager.plane(angles) for angles in ANGLES]
+
+
+def wire_to(fork, branch: int) -> np.ndarray:
+    """Return the nodes of a wire on the wall of a branch and of those before it, from its tip to the catheter."""
+    line = fork.tree.path(branch)
+    at = np.arange(TIP[branch], -30.0, -0.5)
+    inside = np.stack([np.interp(np.maximum(at, 0.0), line.abscissa, axis) for axis in line.points.T], axis=-1)
+    return inside + np.minimum(at, 0.0)[:, None] * fork.insertion.direction + np.array([0.0, 0.4, 0.0])
+
+
+def exposed(imager, planes, nodes, **how):
+    return [imager.signal(plane, nodes, seed=index, **how) for index, plane in enumerate(planes)]
+
+
+def found_in(imager, planes, signals, length: float, shown=(0, 1), dose: float = 1.0):
+    detector = TipDetector(imager.anatomy, imager.device)
+    views, photons = [planes[i].view for i in shown], [imager.photons(planes[i], dose) for i in shown]
+    return detector.find(views, [signals[i] for i in shown], photons, length)
+
+
+@pytest.mark.parametrize("branch", TIP)
+def test_two_views_find_the_tip_in_space(imager, planes, fork, branch):
+    nodes = wire_to(fork, branch)
+    found = found_in(imager, planes, exposed(imager, planes, nodes), TIP[branch])
+    error = found.position - nodes[0]
+    assert np.linalg.norm(error) < 0.4
+    assert error @ np.linalg.solve(found.covariance, error) < 16.0  # 4 standard deviations
+    assert np.sqrt(np.trace(found.covariance)) < 0.5
+    start = fork.insertion.position - 8.0 * fork.insertion.direction
+    assert np.linalg.norm(found.wire[0] - start) < 1.0 and np.linalg.norm(found.wire[-1] - nodes[0]) < 1.0
+
+
+def test_one_view_leaves_the_depth_to_the_vessel(imager, planes, fork):
+    nodes = wire_to(fork, 2)
+    found = found_in(imager, planes, exposed(imager, planes, nodes), TIP[2], shown=(0,))
+    error = planes[0].view.project(found.position) - planes[0].view.project(nodes[0])
+    assert np.linalg.norm(error) < 1.5  # pixels
+    beam = planes[0].view.axes[2]
+    assert np.sqrt(beam @ found.covariance @ beam) > 0.3  # mm: as wide as the lumen
+    assert np.linalg.norm(found.position - nodes[0]) < 1.2
+
+
+@pytest.mark.parametrize("contrast", [0.0, 0.7])
+def test_without_a_wire_none_is_found(imager, planes, fork, contrast):
+    """A branch filled with contrast is a dark line too."""
+    signals = exposed(imager, planes, np.zeros((0, 3)), contrast=contrast)
+    for shown in ((0,), (1,), (0, 1)):
+        assert found_in(imager, planes, signals, TIP[2], shown) is None
+    lit = exposed(imager, planes, wire_to(fork, 2), contrast=contrast)
+    assert found_in(imager, planes, lit, TIP[2]) is not None
+
+
+def test_less_dose_is_less_sure(imager, planes, fork):
+    nodes = wire_to(fork, 1)
+    usual, dim = (
+        found_in(imager, planes, exposed(imager, planes, nodes, dose=dose), TIP[1], dose=dose) for dose in (1.0, 0.1)
+    )
+    assert usual.log_odds > 2 * dim.log_odds > 0
+    assert np.trace(usual.covariance) < np.trace(dim.covariance)
+
+
+def test_the_end_of_a_line_is_found_to_a_part_of_a_pixel():
+    """exp(−a²/2w²)·Φ(b/w), a aside and b behind the end, on an uneven background with noise."""
+    side = np.arange(65) - 32.0
+    right, up = np.meshgrid(side, -side)
+    end, angle, width = np.array([3.3, -2.6]), np.deg2rad(35.0), 0.9
+    behind = -(np.cos(angle) * (right - end[0]) + np.sin(angle) * (up - end[1]))
+    aside = -np.sin(angle) * (right - end[0]) + np.cos(angle) * (up - end[1])
+    noise = np.random.default_rng(0).standard_normal(right.shape)
+    background = 0.3 + 0.01 * right - 0.02 * up + 0.05 * noise
+    image = (background - 0.6 * np.exp(-0.5 * (aside / width) ** 2) * ndtr(behind / width)).astype(np.float32)
+    found = fit_end(image, end + np.array([1.5, -1.0]), np.array([1.0, 0.0]), width)
+    np.testing.assert_allclose(found.place, end, atol=0.3)
+    assert np.all(np.diag(found.covariance) < 0.45**2)
+    assert fit_end(background.astype(np.float32), end, np.array([1.0, 0.0]), width) is None  # no line
+    assert fit_end(image, np.array([29.0, 0.0]), np.array([1.0, 0.0]), width) is None  # the image ends
+
+
+def test_the_corridor_is_the_vessel(fork):
+    corridor = make_corridor(fork, 0.18, 0.0, 25.0)
+    assert [one.branch for one in corridor.passages] == [-1, 0, 1, 2]
+    for one in corridor.passages[1:]:
+        line = fork.tree.branches[one.branch].centerline
+        np.testing.assert_allclose(one.room, np.interp(one.abscissa, line.abscissa, line.radius) - 0.18, atol=1e-6)
+        end = corridor.passages[one.parent].middle[-1]
+        assert np.linalg.norm(one.middle[0] - end) <= 1.5 * STEP_MM
+        assert one.abscissa[-1] <= 25.0
+        places = corridor.places(one)[corridor.open(one)]
+        radius = np.interp(one.abscissa, line.abscissa, line.radius)
+        away = np.linalg.norm(places[:, None] - one.middle[None], axis=2).min(axis=1)
+        assert away.max() <= radius.max() - 0.18 + CELL_MM
+
+
+def test_evidence_and_encoder_both_count(fork, planes):
+    """Without evidence the odds are even, and the tip is where the encoder says, less sure by its 2 mm and a tenth."""
+    corridor = make_corridor(fork, 0.18, 0.3, 30.0)
+    flat = np.zeros((512, 512), dtype=np.float32)
+    found = track(corridor, [planes[0].view], [flat], 12.0)
+    assert found.log_odds == pytest.approx(0.0, abs=1e-4)
+    assert found.position[2] == pytest.approx(12.0, abs=0.3)
+    assert found.covariance[2, 2] == pytest.approx(2.3**2, rel=0.25)  # within 4 mm of the mode, of 3.2²
+    uphill = np.full((512, 512), -0.1, dtype=np.float32)
+    assert track(corridor, [planes[0].view], [uphill], 12.0).log_odds < -2.0
+
+
+def test_a_detector_needs_sensible_shares():
+    from endopilot.errors import InputError
+
+    with pytest.raises(InputError, match="hidden: 0"):
+        DetectorConfig(hidden=0.0)

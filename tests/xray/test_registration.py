@@ -1,0 +1,66 @@
+"""Registration: a known pose found again, and failures that are told."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from endopilot.xray.carm import Pose, view_at
+from endopilot.xray.image import XrayImager
+from endopilot.xray.registration import register, vessel_error_mm
+
+ANGLES = ((-30.0, 0.0), (60.0, 0.0))
+POSE = Pose(np.deg2rad([2.0, -2.5, 1.5]), np.array([4.0, -3.0, 3.5]))
+NONE = np.zeros((0, 3))
+
+
+@pytest.fixture(scope="module")
+def exposures(fork, wire):
+    """Return the views as the C-arm has them, images with contrast, images before and a second time before."""
+    imager = XrayImager(fork, wire)
+    planes = [imager.plane(angles, pose=POSE) for angles in ANGLES]
+    views = [view_at(angles, imager.isocenter, imager.config.geometry) for angles in ANGLES]
+    lit, before, again = (
+        [imager.signal(plane, NONE, contrast=share, seed=seed + index) for index, plane in enumerate(planes)]
+        for share, seed in ((1.0, 0), (0.0, 10), (0.0, 20))
+    )
+    return views, lit, before, again
+
+
+def test_two_views_find_the_pose(fork, exposures):
+    views, lit, before, _ = exposures
+    assert vessel_error_mm(fork, POSE, Pose()) > 5.0
+    found = register(fork, views, lit, before)
+    assert found.failure == "" and found.correlation > 0.9
+    assert vessel_error_mm(fork, POSE, found.pose) < 0.5
+
+
+def test_one_view_finds_what_it_sees(fork, exposures):
+    """Across the beam the vessel lies where it is; along the beam one view knows little."""
+    views, lit, before, _ = exposures
+    found = register(fork, views[:1], lit[:1], before[:1])
+    points = np.concatenate([branch.centerline.points for branch in fork.tree.branches])
+    isocenter = points.mean(axis=0)
+    pixels = [views[0].project(pose.move(points, isocenter)) for pose in (POSE, found.pose)]
+    assert found.failure == ""
+    assert np.linalg.norm(pixels[0] - pixels[1], axis=1).mean() < 2.0
+
+
+def test_an_image_without_contrast_is_told(fork, exposures):
+    views, _, before, again = exposures
+    assert "inject contrast" in register(fork, views, again, before).failure
+
+
+def test_a_view_that_is_not_the_given_one_is_told(fork, exposures):
+    views, lit, before, _ = exposures
+    assert register(fork, views[::-1], lit, before).failure
+
+
+def test_the_vessels_error_is_that_of_its_points(fork):
+    """Turned about the isocenter by a small angle, a point moves by the angle times its distance from the axis."""
+    points = np.concatenate([branch.centerline.points for branch in fork.tree.branches])
+    around = np.linalg.norm((points - points.mean(axis=0))[:, :2], axis=1)
+    turned = Pose(np.array([0.0, 0.0, 0.01]), np.zeros(3))
+    assert vessel_error_mm(fork, Pose(), turned) == pytest.approx(0.01 * around.mean(), rel=1e-3)
+    moved = Pose(np.zeros(3), np.array([0.0, 3.0, 4.0]))
+    assert vessel_error_mm(fork, Pose(), moved) == pytest.approx(5.0)
