@@ -106,6 +106,15 @@ def test_measurements_weigh_the_member_that_they_are_of(side_branch) -> None:
     assert 4 in best and share.sum() == pytest.approx(1.0) and best[share.argmax()] == 4
 
 
+def test_an_unsure_measurement_weighs_little(side_branch) -> None:
+    """The scales of the weights are no smaller than the standard deviations that the detector states."""
+    config = BeliefConfig(members=6, time_step_s=0.05, ostium_spread_mm=2.0)
+    sure, unsure = (Belief(side_branch, Belief.around(np.array([1.0, 1.0, 0.0]), config), config) for _ in range(2))
+    sure.weigh(replace(measured(sure, 4), sd_mm=(0.01, 0.01)))
+    unsure.weigh(replace(measured(unsure, 4), sd_mm=(50.0, 50.0)))
+    assert np.ptp(sure.weight) > 0.1 > 0.01 > np.ptp(unsure.weight)
+
+
 def test_a_tip_that_no_wire_explains_is_pulled_back_under_xray(side_branch) -> None:
     policy = AgentPolicy(QUICK)
     policy.start(side_branch, 0)

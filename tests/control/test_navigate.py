@@ -163,3 +163,26 @@ def test_hands_take_over_and_hand_back(straight) -> None:
     np.testing.assert_allclose(np.diff(record.inserted_length), [2.0, -0.5, -0.5, -0.5, 2.0], atol=1e-6)
     assert record.exposed.tolist() == [True, False, False, False, True, False]
     assert record.believed is None and record.half_width is None
+
+
+def test_images_show_the_tip(straight) -> None:
+    """In a patient who lies in a pose of their own: as far along as the tip is, and how sure that is."""
+    record = navigate(straight, Forward(8.0, expose_every=4), config=NavigateConfig(xray="images"), seed=2)
+    assert record.reason == "reached" and record.exposures >= 2
+    for sample in np.flatnonzero(record.exposed):
+        shown = record.measured[sample]
+        assert shown is not None and min(shown.sd_mm) > 0
+        assert abs(shown.abscissa - record.tip.abscissa[sample]) < 1.5
+
+
+def test_an_image_without_a_wire_is_taken_again_and_counts(straight, monkeypatch) -> None:
+    loop = NavigationLoop(straight, Forward(4.0))
+    blind = iter([True, True, False])
+    measure = loop._measure
+    monkeypatch.setattr(loop, "_measure", lambda length: None if next(blind) else measure(length))
+    for _ in range(5):
+        loop.step()
+    record = loop.record()
+    assert record.exposed.tolist() == [True, True, True, False, False, False]
+    assert record.exposures == 3
+    assert [tip is not None for tip in record.measured] == [False, False, True, False, False, False]

@@ -136,9 +136,11 @@ class Belief:
         """Update the likelihoods by a measurement.
 
         The density is a Cauchy density. Its tails are heavy: a tip that snapped a moment too early says little about
-        friction.
+        friction. Its scales are no smaller than the measurement's own standard deviations.
         """
-        scaled = self.errors(measured) / np.array([self._config.along_sd_mm, self._config.across_sd_mm])
+        scaled = self.errors(measured) / np.maximum(
+            [self._config.along_sd_mm, self._config.across_sd_mm], measured.sd_mm
+        )
         self._score = self._score - np.log1p((scaled**2).sum(axis=1))
 
     def likeliest(self) -> tuple[Int[np.ndarray, "levels"], Float[np.ndarray, "levels"]]:

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import field, replace
+from typing import Literal
 
 import numpy as np
 
@@ -19,9 +20,11 @@ from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import DECISION_PERIOD_S, SUCCESS_MM, Navigation
-from endopilot.xray.fluoroscope import Fluoroscope, FluoroscopeConfig
+from endopilot.xray.fluoroscope import Fluoroscope, FluoroscopeConfig, TipMeasurement
+from endopilot.xray.image_fluoroscope import ImageFluoroscope
 
 _CYCLES = round(DECISION_PERIOD_S / CYCLE_S)
+XrayKind = Literal["assumed", "images"]
 
 
 @settings
@@ -32,6 +35,9 @@ class NavigateConfig:
     """The drive."""
     fluoroscope: FluoroscopeConfig = field(default_factory=FluoroscopeConfig)
     """The C-arm."""
+    xray: XrayKind = "assumed"
+    """What an exposure is: assumed (the tip, with the C-arm's errors of detection) or images (the tip is found in X-ray
+    images of a patient whose pose is registered by one injection of contrast)."""
     simulator: SimulatorConfig = field(default_factory=lambda: SimulatorConfig(threads=1))
     """The rod core."""
 
@@ -77,7 +83,8 @@ class NavigationLoop:
         """Bring the wire to the start; the arguments are those of `navigate`.
 
         Raises:
-            InputError: there is no such policy, or the wire does not fit the vessel, or starts deeper than it is long.
+            InputError: there is no such policy, or the wire does not fit the vessel, or starts deeper than it is long,
+                or the vessel is not recognised in X-ray images.
         """
         config, truth = config or NavigateConfig(), truth or ModelMismatch()
         self.navigation = navigation
@@ -86,7 +93,12 @@ class NavigationLoop:
         self._limits = DriveLimits.of(navigation.device, navigation.anatomy)
         drive = replace(config.robot, latency_s=config.robot.latency_s * truth.latency_factor)
         self.robot = SimulatedRobot(self.simulator, self._limits, drive, seed=seed, ostium_mm=truth.ostium_mm)
-        self.fluoroscope = Fluoroscope(navigation.anatomy, navigation.device.tip_radius_mm, config.fluoroscope)
+        anatomy, device = navigation.anatomy, navigation.device
+        self.fluoroscope = (
+            ImageFluoroscope(anatomy, device, config.fluoroscope, seed)
+            if config.xray == "images"
+            else Fluoroscope(anatomy, device.tip_radius_mm, config.fluoroscope)
+        )
         self._random = np.random.default_rng([seed, 2])
         self._track = Track(self.simulator)
         self._periods = int(np.ceil(navigation.seconds / DECISION_PERIOD_S - 1e-9))
@@ -134,16 +146,17 @@ class NavigationLoop:
             raise ValueError("the navigation is over" if self.reason else "the period is not over; call advance")
         state, tip = self.robot.proximal_state(), None
         handed_back, self._by_hand = self._by_hand and by_hand is None, by_hand is not None
-        if self._expose or handed_back:
-            direction = self.simulator.tip_direction[0]
-            tip = self.fluoroscope.expose(self.simulator.position[0, 0], direction, state.inserted_length, self._random)
+        exposed = self._expose or handed_back
+        if exposed:
+            tip = self._measure(state.inserted_length)
         observation = Observation(self.time_s, state.inserted_length, state.rotation, tip)
         decision = self._decide(observation, by_hand)
         asked = (decision.translation, decision.rotation)
-        control, self._expose = self._limits.safe(*asked), bool(decision.expose)
+        # An image in which no wire was found is taken again.
+        control, self._expose = self._limits.safe(*asked), bool(decision.expose) or (exposed and tip is None)
         self.observation, self.gives_up = observation, decision.gives_up
         self.believed = self.policy.believed() if isinstance(self.policy, Believer) else None
-        self._track.decided(control, tip, self.believed, fault=control != asked)
+        self._track.decided(control, tip, self.believed, exposed=exposed, fault=control != asked)
         self.robot.command(*control)
         self._period, self._cycles_left, self._peak_n = self._period + 1, _CYCLES, 0.0
         return Decision(*control, expose=self._expose, gives_up=self.gives_up)
@@ -172,6 +185,12 @@ class NavigationLoop:
     def record(self) -> NavigationRecord:
         """Return what has happened up to the end of the last whole period."""
         return self._track.record(self.navigation, self.robot.driven, self.reason or "stopped", self.gives_up)
+
+    def _measure(self, inserted_length: float) -> TipMeasurement | None:
+        nodes = self.simulator.position[0]
+        if isinstance(self.fluoroscope, ImageFluoroscope):
+            return self.fluoroscope.expose(nodes, inserted_length, self._random)
+        return self.fluoroscope.expose(nodes[0], self.simulator.tip_direction[0], inserted_length, self._random)
 
     def _decide(self, observation: Observation, by_hand: Decision | None) -> Decision:
         if by_hand is None:

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from endopilot.anatomy.io import read_anatomy
 from endopilot.control.agent import TwinPolicy
 from endopilot.control.mismatch import ModelMismatch, drawn_sides, mismatch_by
-from endopilot.control.navigate import NavigateConfig, NavigationLoop
+from endopilot.control.navigate import NavigateConfig, NavigationLoop, XrayKind
 from endopilot.control.policies import make_policy
 from endopilot.control.policy import Believer, Led, Observation, Policy
 from endopilot.control.record import NavigationRecord
@@ -55,6 +55,9 @@ class NavigatePatientConfig:
     """Inserted length at the start, mm."""
     start_rotation: Finite = 0.0
     """Rotation at the start, rad."""
+    xray: XrayKind = "assumed"
+    """What an exposure is: assumed (the tip, with the C-arm's errors of detection) or images (the tip is found in X-ray
+    images of a patient whose pose is registered by one injection of contrast)."""
     seed: Seed = 0
     """Seed of encoder noise, detection errors, the policy, and of the sides that `mismatch` draws."""
     mismatch: ShareBelowOne = 0.0
@@ -176,7 +179,7 @@ def set_up_navigation(anatomy: Anatomy | str | Path, target: str, config: Naviga
 def navigate_patient(set_up: SetUp) -> PatientNavigation:
     """Let the policy drive the wire in the simulated reality, and return what happened."""
     navigation, policy = set_up.navigation, set_up.policy
-    config = NavigateConfig(simulator=set_up.simulator)
+    config = NavigateConfig(simulator=set_up.simulator, xray=set_up.config.xray)
     loop = NavigationLoop(navigation, policy, config=config, seed=set_up.config.seed, truth=set_up.truth)
     began = np.array([loop.simulator.inserted_length[0], loop.simulator.rotation[0]])
     wires: list[Float[np.ndarray, "wires nodes 3"]] = []

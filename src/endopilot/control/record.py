@@ -28,7 +28,7 @@ class NavigationRecord:
         contact_force_max: largest wall force on one node over the period that ends here, N.
         exposed: whether X-ray was on at this moment.
         control: what was commanded from this moment on, within the limits, mm/s and rad/s; 0 at the end.
-        measured: what X-ray showed at this moment, or None.
+        measured: what X-ray showed at this moment; None where it was off, or no wire was found in the images.
         believed: where the policy believed the tip to be when it decided; NaN at the end, and None for a policy that
             does not tell: (Δtip, γtip), mm.
         half_width: of the adviser's bands around it, mm, likewise; NaN where there is none.
@@ -79,15 +79,23 @@ class Track:
         self._columns: dict[str, list] = {name: [] for name in ("proximal", "position", "force")}
         self._controls: list[tuple[float, float]] = []
         self._measured: list[TipMeasurement | None] = []
+        self._exposed: list[bool] = []
         self._believed: list[BelievedTip | None] = []
         self._faults = 0
         self.moved(simulator, float(simulator.contacts.max()))
 
     def decided(
-        self, control: tuple[float, float], tip: TipMeasurement | None, believed: BelievedTip | None, *, fault: bool
+        self,
+        control: tuple[float, float],
+        tip: TipMeasurement | None,
+        believed: BelievedTip | None,
+        *,
+        exposed: bool,
+        fault: bool,
     ) -> None:
-        """Take what was decided, what X-ray showed then, and what the policy believed."""
+        """Take what was decided, whether X-ray was on and what it showed then, and what the policy believed."""
         self._controls.append(control)
+        self._exposed.append(exposed)
         self._measured.append(tip)
         self._believed.append(believed)
         self._faults += fault
@@ -121,7 +129,7 @@ class Track:
             tip_position=position,
             tip=project_tip(anatomy.tree, anatomy.insertion, position),
             contact_force_max=force,
-            exposed=np.array([tip is not None for tip in measured]),
+            exposed=np.array([*self._exposed[:periods], False]),
             control=np.array([*self._controls[:periods], (0.0, 0.0)]),
             measured=measured,
             believed=np.array([(tip.abscissa, tip.offset) for tip in believed]) if tells else None,
@@ -132,7 +140,7 @@ class Track:
             safe=bool(force.max() <= navigation.force_limit_n),
             seconds=DECISION_PERIOD_S * periods,
             peak_force_n=float(force.max()),
-            exposures=sum(tip is not None for tip in measured),
+            exposures=sum(self._exposed[:periods]),
             path_mm=float(np.linalg.norm(np.diff(position, axis=0), axis=1).sum()),
             faults=self._faults,
             reason=reason,

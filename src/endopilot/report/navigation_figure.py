@@ -68,7 +68,7 @@ def _draw_tip(axes: Axes, found: PatientNavigation) -> None:
     if off.any():
         axes.plot(time_s[off], record.tip.abscissa[off], "x", color=VERMILLION, label="in a wrong branch")
     seen = [(t, tip.abscissa) for t, tip in zip(time_s, record.measured, strict=True) if tip is not None]
-    axes.plot(*np.array(seen).T, "o", mfc="none", color=BLACK, markersize=5, label="measured by X-ray")
+    axes.plot(*np.array(seen).reshape(-1, 2).T, "o", mfc="none", color=BLACK, markersize=5, label="measured by X-ray")
     route, tree = Route.to(navigation.anatomy, navigation.target), navigation.anatomy.tree
     span, last = float(np.ptp(np.append(record.tip.abscissa, navigation.target.abscissa))), -np.inf
     for junction in route.junctions:

@@ -118,13 +118,12 @@ def _exposures(found: PatientNavigation) -> list[dict[str, str]]:
     record, rows = found.record, []
     for sample in np.flatnonzero(record.exposed).tolist():
         tip = record.measured[sample]
-        assert tip is not None
         why = "the start" if sample == 0 else record.asks[sample - 1] or "the policy asked"
         rows.append(
             {
                 "time": f"{record.time_s[sample]:g}",
                 "why": why[0].upper() + why[1:],
-                "measured": f"{tip.abscissa:.1f}",
+                "measured": "no wire found" if tip is None else f"{tip.abscissa:.1f}",
                 "true": f"{record.tip.abscissa[sample]:.1f}",
             }
         )

@@ -38,12 +38,15 @@ class TipMeasurement:
         abscissa: Δtip of that position on the vessel's tree, mm.
         offset: γtip, mm.
         branch: index of the branch that it is observed in.
+        sd_mm: standard deviations of the position along and across the wire as the detector states them, mm; 0 where it
+            states none.
     """
 
     position: Float[np.ndarray, "3"]
     abscissa: float
     offset: float
     branch: int
+    sd_mm: tuple[float, float] = (0.0, 0.0)
 
 
 @settings

@@ -1,0 +1,93 @@
+"""A C-arm whose exposures are images: the tip is found in them, in a patient whose pose is not known beforehand.
+
+It stands for `Fluoroscope`, which assumes the errors of detection. One injection of contrast registers the patient;
+then every exposure makes an image of each view, and the detector finds the tip, or says that it finds none.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from endopilot.anatomy.projection import project_tip
+from endopilot.errors import InputError
+from endopilot.simulation.device import Device
+from endopilot.types import Anatomy
+from endopilot.xray.absorbers import surroundings
+from endopilot.xray.carm import Pose, view_at
+from endopilot.xray.detector import TipDetector
+from endopilot.xray.fluoroscope import FluoroscopeConfig, TipMeasurement
+from endopilot.xray.image import ImageConfig, Plane, XrayImager
+from endopilot.xray.registration import Registration, register
+
+_NO_WIRE = np.zeros((0, 3))
+
+
+class ImageFluoroscope:
+    """A C-arm around one patient, whose vessel is known from the CT and whose pose is not.
+
+    Attributes:
+        pose: in which the patient truly lies; nothing that is measured knows it.
+        registration: the pose as one injection of contrast shows it.
+    """
+
+    def __init__(
+        self, anatomy: Anatomy, device: Device, config: FluoroscopeConfig | None = None, seed: int = 0
+    ) -> None:
+        """Lay the patient on the table, inject contrast and register.
+
+        Args:
+            anatomy: the vessel; a coronary artery lies in a synthetic chest, any other in water.
+            device: the wire.
+            config: geometry and views; its errors of detection are not used.
+            seed: of the pose, up to 5 mm and 3° along and about each axis, and of these images' noise.
+
+        Raises:
+            InputError: the vessel is not recognised in the images.
+        """
+        config = config or FluoroscopeConfig()
+        random = np.random.default_rng([seed, 0x706F7365])
+        angles = config.view_angles_deg[: 2 if config.biplane else 1]
+        self.pose, self._anatomy = Pose.draw(random), anatomy
+        self._imager = XrayImager(anatomy, device, surroundings(anatomy), ImageConfig(geometry=config.geometry))
+        self._planes = [self._imager.plane(angle, pose=self.pose) for angle in angles]
+        views = [view_at(angle, self._imager.isocenter, config.geometry) for angle in angles]
+        lit, before = ([self._signal(plane, _NO_WIRE, random, share) for plane in self._planes] for share in (1.0, 0.0))
+        self.registration: Registration = register(anatomy, views, lit, before, self._imager.config)
+        if self.registration.failure:
+            raise InputError(f"X-ray images: {anatomy.name} cannot be registered: {self.registration.failure}")
+        self._views = self.registration.views(views, self._imager.isocenter)
+        self._detector = TipDetector(anatomy, device)
+
+    def expose(
+        self, nodes: Float[np.ndarray, "n 3"], inserted_length: float, random: np.random.Generator
+    ) -> TipMeasurement | None:
+        """Take one exposure of every view and say where the tip is; None where no wire is found.
+
+        Args:
+            nodes: of the wire as it truly is, from its tip on, LPS mm.
+            inserted_length: Δ by the robot's encoder, mm.
+            random: where the noise is drawn from.
+        """
+        signals = [self._signal(plane, nodes, random) for plane in self._planes]
+        photons = [self._imager.photons(plane) for plane in self._planes]
+        found = self._detector.find(self._views, signals, photons, inserted_length)
+        if found is None:
+            return None
+        tip = project_tip(self._anatomy.tree, self._anatomy.insertion, found.position[None])
+        along = found.wire[-1] - found.wire[max(-5, -len(found.wire))]
+        along = along / max(float(np.linalg.norm(along)), 1e-9)
+        variance = float(along @ found.covariance @ along)
+        across = max(float(np.trace(found.covariance)) - variance, 0.0) / 2
+        return TipMeasurement(
+            position=found.position,
+            abscissa=float(tip.abscissa[0]),
+            offset=float(tip.offset[0]),
+            branch=int(tip.branch[0]),
+            sd_mm=(float(np.sqrt(variance)), float(np.sqrt(across))),
+        )
+
+    def _signal(
+        self, plane: Plane, nodes: Float[np.ndarray, "n 3"], random: np.random.Generator, contrast: float = 0.0
+    ) -> Float32[np.ndarray, "rows columns"]:
+        return self._imager.signal(plane, nodes, contrast=contrast, seed=int(random.integers(2**31)))

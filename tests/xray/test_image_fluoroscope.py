@@ -1,0 +1,45 @@
+"""A C-arm that makes images: in a patient who lies otherwise than in the CT, it finds the tip, or says it does not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from endopilot.errors import InputError
+from endopilot.xray import image_fluoroscope
+from endopilot.xray.image_fluoroscope import ImageFluoroscope
+from endopilot.xray.registration import vessel_error_mm
+
+
+@pytest.fixture(scope="module")
+def arm(fork, wire):
+    return ImageFluoroscope(fork, wire, seed=3)
+
+
+def test_the_patient_is_registered_by_contrast(arm, fork):
+    assert np.linalg.norm(arm.pose.translation_mm) > 1.0
+    assert vessel_error_mm(fork, arm.pose, arm.registration.pose) < 0.5
+
+
+def test_an_exposure_measures_the_tip_with_its_uncertainty(arm):
+    at = np.arange(15.0, -30.0, -0.5)
+    nodes = np.stack([0.4 + 0 * at, 0 * at, at], axis=-1)
+    shown = arm.expose(nodes, 15.3, np.random.default_rng(0))
+    assert shown is not None and shown.branch == 0
+    assert np.linalg.norm(shown.position - nodes[0]) < 0.8
+    assert shown.abscissa == pytest.approx(15.0, abs=0.6)
+    assert all(0.02 < sd < 1.0 for sd in shown.sd_mm)
+    again = arm.expose(nodes, 15.3, np.random.default_rng(0))
+    np.testing.assert_array_equal(shown.position, again.position)
+
+
+def test_an_image_without_a_wire_measures_nothing(arm):
+    assert arm.expose(np.zeros((0, 3)), 15.0, np.random.default_rng(1)) is None
+
+
+def test_a_vessel_that_is_not_recognised_is_told(fork, wire, monkeypatch):
+    monkeypatch.setattr(
+        image_fluoroscope.Pose, "draw", lambda random: image_fluoroscope.Pose(np.zeros(3), np.full(3, 40.0))
+    )
+    with pytest.raises(InputError, match=r"fork cannot be registered"):
+        ImageFluoroscope(fork, wire)
