@@ -79,6 +79,33 @@ OwnedLoads make_loads(const Array<2>& force, const Array<2>& moment, const Array
     return loads;
 }
 
+// A row a tube, the innermost first, of at most three; profiles are integrals from the tip at distances `spacing` apart.
+OwnedTubes make_tubes(double spacing, double shear_share, const Array<2>& bend, const Array<2>& twist, const Array<2>& stretch,
+                      const Array<2>& rest, const Array<1>& radius, const Array<1>& bore_friction, const Array<1>& push_limit,
+                      const Array<1>& pull_limit, const Array<1>& torque_limit) {
+    const std::size_t n = radius.size(), points = bend.shape(1);
+    require(n >= 2 && n <= 3, "give two or three tubes");
+    require(spacing > 0 && points >= 2, "profiles of tubes need two points at least");
+    for (const Array<2>* profile : {&bend, &twist, &stretch, &rest})
+        require(profile->shape(0) == n && profile->shape(1) == points, "every profile needs a row a tube");
+    for (const Array<1>* numbers : {&bore_friction, &push_limit, &pull_limit, &torque_limit})
+        require(numbers->size() == n, "every array of tubes needs one entry a tube");
+    const auto flat = [](const Array<2>& a) { return std::vector<double>(a.data(), a.data() + a.size()); };
+    return {.tubes = int(n),
+            .points = int(points),
+            .spacing = spacing,
+            .shear_share = shear_share,
+            .bend = flat(bend),
+            .twist = flat(twist),
+            .stretch = flat(stretch),
+            .rest = flat(rest),
+            .radius = values(radius),
+            .bore_friction = values(bore_friction),
+            .push_limit = values(push_limit),
+            .pull_limit = values(pull_limit),
+            .torque_limit = values(torque_limit)};
+}
+
 // All arrays but those of the catheter have a row a vertex; `rival` and `entry` a column a branch.
 Projector make_projector(const Array<2>& point, const Array<2>& tangent, const Array<1>& abscissa, const Array<1>& radius,
                          const Indices<1>& first, const Indices<1>& last, const Indices<1>& branch, const Array<2>& rival,
@@ -144,6 +171,10 @@ NB_MODULE(ENDOPILOT_MODULE, module) {
     nb::class_<OwnedLoads>(module, "Loads");
     module.def("make_loads", &make_loads, nb::kw_only(), nb::arg("force"), nb::arg("moment"), nb::arg("spring"),
                nb::arg("anchor"), nb::arg("hold"), nb::arg("attitude"));
+    nb::class_<OwnedTubes>(module, "Tubes");
+    module.def("make_tubes", &make_tubes, nb::kw_only(), nb::arg("spacing"), nb::arg("shear_share"), nb::arg("bend"),
+               nb::arg("twist"), nb::arg("stretch"), nb::arg("rest"), nb::arg("radius"), nb::arg("bore_friction"),
+               nb::arg("push_limit"), nb::arg("pull_limit"), nb::arg("torque_limit"));
     nb::class_<Options>(module, "Options")
         .def(nb::init<>())
         .def_rw("stick_velocity", &Options::stick_velocity)
@@ -161,9 +192,10 @@ NB_MODULE(ENDOPILOT_MODULE, module) {
         .def_rw("introducer_friction", &Options::introducer_friction)
         .def_rw("introducer_drag", &Options::introducer_drag);
     nb::class_<Simulations>(module, "Simulation")
-        .def(nb::init<Rod, std::shared_ptr<LumenMap>, std::shared_ptr<OwnedLoads>, const Array<1>&, const Array<1>&, const Options&, int>(),
+        .def(nb::init<Rod, std::shared_ptr<LumenMap>, std::shared_ptr<OwnedLoads>, const Array<1>&, const Array<1>&, const Options&,
+                      std::shared_ptr<OwnedTubes>, int>(),
              nb::kw_only(), nb::arg("rod"), nb::arg("lumen").none(), nb::arg("loads").none(), nb::arg("origin"),
-             nb::arg("orientation"), nb::arg("options"), nb::arg("worlds"))
+             nb::arg("orientation"), nb::arg("options"), nb::arg("tubes").none() = nb::none(), nb::arg("worlds"))
         .def("reset", &Simulations::reset, nb::kw_only(), nb::arg("index"), nb::arg("initial"), nb::arg("friction"), nb::arg("sample_period"))
         .def("run", &Simulations::run, nb::kw_only(), nb::arg("control"), nb::arg("force_driven"), nb::arg("time_step"),
              nb::arg("steps_per_sample"), nb::arg("record_shape"), nb::arg("record_attitude"), nb::arg("threads"),
@@ -175,6 +207,7 @@ NB_MODULE(ENDOPILOT_MODULE, module) {
         .def("positions", &Simulations::positions)
         .def("attitudes", &Simulations::attitudes)
         .def("contacts", &Simulations::contacts)
+        .def("tubes", &Simulations::tubes)
         .def_prop_ro("nodes", &Simulations::nodes)
         .def("inserted_length", [](Simulations& s) { return s.scalar(World::kInserted); })
         .def("active", [](Simulations& s) { return s.scalar(World::kActive); })

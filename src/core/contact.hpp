@@ -162,12 +162,21 @@ struct ContactPoint {
     V gap, last_gap;             // to the wall at the trial and at the accepted point, mm; no more than the reach of contact
 };
 
+// How the further tubes touch the wall at a contact point: the share of it that each covers, how far each has twisted against the
+// reference frame since the step's start, and the rotation that their sliding along the mesh brings (tubes.hpp).
+template <class V, int T>
+struct Touching {
+    V weight[T], twisted[T], spin;
+};
+template <class V>
+struct Touching<V, 0> {};
+
 // Adds the wall's elastic reaction, energy k/2 (radius - distance)² where positive. Returns the energy. Where `sticky`,
 // gradient and Hessian are those of a wall that can also pull: otherwise a node that has just lost contact would move
 // freely in the next Newton step and hit the wall.
-template <class V>
-ENDOPILOT_DEVICE inline V add_wall(double stiffness, double radius, const Single<V>& geometric, Mask<V> sticky, const Distance<V>& d,
-                                   Diagonal<V>& own) {
+template <class V, int T, class Radius>
+ENDOPILOT_DEVICE inline V add_wall(double stiffness, const Radius& radius, const Single<V>& geometric, Mask<V> sticky,
+                                   const Distance<V>& d, Diagonal<V, T>& own) {
     using S = Single<V>;
     const Mask<V> clear = d.value >= radius;  // false for NaN, so that NaN reaches the energy
     const V gap = radius - d.value;
@@ -191,17 +200,23 @@ ENDOPILOT_DEVICE inline V add_wall(double stiffness, double radius, const Single
 // displacement of that surface since the start of the step: of the node, and by rotation about the wire's own axis.
 // `moved` is the node's displacement, `p` the element's rotation since the start of the step. Where `tangent` is 1 the Hessian is
 // friction's own; where it is 0 friction's secant stands for it, which is nowhere softer. Returns the energy.
-template <class V>
+template <class V, int T>
 ENDOPILOT_DEVICE inline V add_friction(const FrictionState<V>& friction, const V& eps, const Single<V>& tangent,
-                                       const Vec3<V>& moved, const Quaternion<V>& p, Diagonal<V>& own) {
+                                       const Vec3<V>& moved, const Quaternion<V>& p, const Touching<V, T>& touching, Diagonal<V, T>& own) {
     using S = Single<V>;
-    const V twist = 2.0 * p.v.z;
+    V twist = 2.0 * p.v.z;
+    if constexpr (T > 0) {
+        twist += touching.spin;
+        for (int k = 0; k < T; ++k) twist += touching.weight[k] * touching.twisted[k];
+    }
     const Vec3<V> slip = moved - dot(moved, friction.normal) * friction.normal + twist * friction.spin_arm;
     const V size = square_root(dot(slip, slip) + eps * eps);
     const V inverse = 1.0 / size;
     const V stiffness = friction.limit * inverse;  // N/mm; the force of friction on the wire is -stiffness times slip
     const Vec3<V> gradient = stiffness * slip;
-    const Vec3<V> turn{-p.v.y, p.v.x, p.w};  // d twist / d theta
+    Vec3<V> turn{-p.v.y, p.v.x, p.w};  // d twist / d theta
+    if constexpr (T > 0)
+        for (int k = 0; k < T; ++k) turn.z -= touching.weight[k];   // a tube's twist is its turn less theta_3
     own.gradient_x += gradient;
     const V gradient_twist = dot(gradient, friction.spin_arm);
     own.gradient_theta += gradient_twist * turn;
@@ -230,13 +245,24 @@ ENDOPILOT_DEVICE inline V add_friction(const FrictionState<V>& friction, const V
     own.tt.xy += rb.x * b.y;
     own.tt.xz += rb.x * b.z;
     own.tt.yz += rb.y * b.z;
+    if constexpr (T > 0) {
+        for (int k = 0; k < T; ++k) {
+            own.twists.gradient[k] += gradient_twist * touching.weight[k];
+            const S w = narrow(touching.weight[k]);
+            own.twists.px[k][0] += w * mixed.x;
+            own.twists.px[k][1] += w * mixed.y;
+            own.twists.px[k][2] += w * mixed.z;
+            for (int r = 0; r < 3; ++r) own.twists.pt[k][r] += w * (rotary * t[r]);
+            for (int c = 0; c <= k; ++c) own.twists.pp[k][c] += w * (rotary * narrow(touching.weight[c]));
+        }
+    }
     return friction.limit * (size - eps);
 }
 
 // Shares out what acts at the middle of an element, x_{i+1} + u/2, between its two ends; rotations are the element's own.
 // Elimination counts what holds node i for u, for its coupling to x_{i+1} and for x_{i+1} alike; here these are a quarter, a half and the whole.
-template <class V>
-ENDOPILOT_DEVICE inline void add_middle(const Diagonal<V>& middle, Diagonal<V>& own, Diagonal<V>& next, Link<V>& link) {
+template <class V, int T>
+ENDOPILOT_DEVICE inline void add_middle(const Diagonal<V, T>& middle, Diagonal<V, T>& own, Diagonal<V, T>& next, Link<V, T>& link) {
     using S = Single<V>;
     const Vec3<V> gradient = broadcast<V>(0.5) * middle.gradient_x;
     own.gradient_x += gradient;
@@ -252,6 +278,17 @@ ENDOPILOT_DEVICE inline void add_middle(const Diagonal<V>& middle, Diagonal<V>& 
             own.tx[r][c] += middle.tx[r][c];
             link.tu[r][c] -= 0.5f * middle.tx[r][c];
         }
+    if constexpr (T > 0) {
+        for (int k = 0; k < T; ++k) {
+            own.twists.gradient[k] += middle.twists.gradient[k];
+            for (int c = 0; c < 3; ++c) {
+                own.twists.px[k][c] += middle.twists.px[k][c];
+                link.twists.pu[k][c] -= 0.5f * middle.twists.px[k][c];
+                own.twists.pt[k][c] += middle.twists.pt[k][c];
+            }
+            for (int c = 0; c <= k; ++c) own.twists.pp[k][c] += middle.twists.pp[k][c];
+        }
+    }
 }
 
 }  // namespace endopilot

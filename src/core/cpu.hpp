@@ -53,7 +53,7 @@ void run_threads(int threads, const nb::object& progress, const std::atomic<long
 }
 
 // A stepper with its nodes.
-template <class V>
+template <class V, int T>
 class ThreadStepper {
 public:
     ThreadStepper(const Scene& scene, const Worlds& worlds)
@@ -78,9 +78,9 @@ public:
     }
 
 private:
-    std::vector<Node<V>> node_;
-    std::vector<Factor<V>> factor_;
-    Stepper<V> stepper_;
+    std::vector<Node<V, T>> node_;
+    std::vector<Factor<V, T>> factor_;
+    Stepper<V, T> stepper_;
 };
 
 class Cpu {
@@ -90,27 +90,40 @@ public:
     // Steps worlds, `lanes` of them side by side on each thread; `order` names those of similar length next to each other.
     void step(const Worlds& worlds, const Inputs& in, const Outputs& out, std::vector<int> order, int threads, int lanes,
               const nb::object& progress) {
-        if (lanes == 1)
-            step<double>(worlds, in, out, std::move(order), std::max(1, threads), progress);
-        else if (lanes == 4)
-            step<double4>(worlds, in, out, std::move(order), std::max(1, threads), progress);
-        else if (lanes == 8)
-            step<double8>(worlds, in, out, std::move(order), std::max(1, threads), progress);
+        if (scene_.tubes.tubes == 0)
+            step<0>(worlds, in, out, std::move(order), threads, lanes, progress);
+        else if (scene_.tubes.tubes == 2)
+            step<1>(worlds, in, out, std::move(order), threads, lanes, progress);
         else
-            throw std::invalid_argument("lanes: " + std::to_string(lanes) + "; give 1, 4 or 8");
+            step<2>(worlds, in, out, std::move(order), threads, lanes, progress);
     }
 
 private:
     const Scene scene_;
-    template <class V>
-    using Steppers = std::vector<std::unique_ptr<ThreadStepper<V>>>;  // one a thread, kept from call to call
-    std::tuple<Steppers<double>, Steppers<double4>, Steppers<double8>> steppers_;
+    template <class V, int T>
+    using Steppers = std::vector<std::unique_ptr<ThreadStepper<V, T>>>;  // one a thread, kept from call to call
+    template <int T>
+    using OfTubes = std::tuple<Steppers<double, T>, Steppers<double4, T>, Steppers<double8, T>>;
+    std::tuple<OfTubes<0>, OfTubes<1>, OfTubes<2>> steppers_;
     static constexpr int kUnderWay = 64;  // worlds under way for each thread: enough to find some of similar length
 
-    template <class V>
+    template <int T>
+    void step(const Worlds& worlds, const Inputs& in, const Outputs& out, std::vector<int> order, int threads, int lanes,
+              const nb::object& progress) {
+        if (lanes == 1)
+            step<double, T>(worlds, in, out, std::move(order), std::max(1, threads), progress);
+        else if (lanes == 4)
+            step<double4, T>(worlds, in, out, std::move(order), std::max(1, threads), progress);
+        else if (lanes == 8)
+            step<double8, T>(worlds, in, out, std::move(order), std::max(1, threads), progress);
+        else
+            throw std::invalid_argument("lanes: " + std::to_string(lanes) + "; give 1, 4 or 8");
+    }
+
+    template <class V, int T>
     void step(const Worlds& worlds, const Inputs& in, const Outputs& out, std::vector<int> order, int threads, const nb::object& progress) {
-        Steppers<V>& steppers = std::get<Steppers<V>>(steppers_);
-        while (int(steppers.size()) < threads) steppers.push_back(std::make_unique<ThreadStepper<V>>(scene_, worlds));
+        Steppers<V, T>& steppers = std::get<Steppers<V, T>>(std::get<T>(steppers_));
+        while (int(steppers.size()) < threads) steppers.push_back(std::make_unique<ThreadStepper<V, T>>(scene_, worlds));
         for (const auto& stepper : steppers) stepper->prepare(in, out);
         std::vector<double> length;
         for (std::size_t w = 0; w < order.size(); ++w) length.push_back(worlds[w][World::kActive]);

@@ -9,10 +9,10 @@ constexpr double kStopStiffness = 100;  // N/mm, of the stops at both ends of th
 constexpr int kMaxReleases = 8;         // times in a step that the drive may let go of the wire
 
 // The introducer through which the drive moves the wire: smoothed Coulomb friction of its valve and viscous drag, against
-// advance and rotation together; the wire's surface moves by its radius times the rotation.
-template <class V>
-typename Stepper<V>::DriveEnergy Stepper<V>::introducer(const Drive& moved, int l) const {
-    const double r = rod_.radius[lane_[l].active], a = moved.advance, s = r * moved.rotation, eps = get(eps_, l);
+// advance and rotation together; the wire's surface moves by its radius r times the rotation.
+template <class V, int T>
+typename Stepper<V, T>::DriveEnergy Stepper<V, T>::introducer(const Drive& moved, double r, int l) const {
+    const double a = moved.advance, s = r * moved.rotation, eps = get(eps_, l);
     const double drag = options_.introducer_drag * get(inverse_dt_, l), size = std::sqrt(a * a + s * s + eps * eps);
     const double secant = options_.introducer_friction / size, c = secant / (size * size);
     return {.energy = 0.5 * drag * (a * a + s * s) + options_.introducer_friction * (size - eps),
@@ -26,8 +26,9 @@ typename Stepper<V>::DriveEnergy Stepper<V>::introducer(const Drive& moved, int 
 // Where the drive slips at its limit, or the wire is driven by force, the drive's advance and rotation are unknowns too: the
 // energy at the trial point of what is lost by slipping, or of the introducer, of the stops at both ends of the drive's
 // travel, and of the load.
-template <class V>
-typename Stepper<V>::DriveEnergy Stepper<V>::drive_energy(const Lane& lane, int l) const {
+template <class V, int T>
+typename Stepper<V, T>::DriveEnergy Stepper<V, T>::drive_energy(const Lane& lane, int l) const {
+    if constexpr (T > 0) return tube_drive_energy(lane);
     const Drive& moved = lane.off;
     if (!lane.by_force) {
         const auto load = [](int side, double forwards, double backwards) { return side > 0 ? forwards : side < 0 ? -backwards : 0.0; };
@@ -35,7 +36,7 @@ typename Stepper<V>::DriveEnergy Stepper<V>::drive_energy(const Lane& lane, int 
         const double torque = load(lane.slipping.rotation, options_.torque_limit, options_.torque_limit);
         return {.energy = -force * moved.advance - torque * moved.rotation, .gradient_a = -force, .gradient_r = -torque, .aa = 0, .ar = 0, .rr = 0};
     }
-    DriveEnergy t = introducer(moved, l);
+    DriveEnergy t = introducer(moved, rod_.radius[lane.active], l);
     const double a = lane.end.advance;
     const double beyond = std::min(0.0, a) + std::max(0.0, a + options_.free_behind - rod_.abscissa[rod_.nodes - 1]);
     t.energy += 0.5 * kStopStiffness * beyond * beyond - lane.speed * moved.advance - lane.spin * moved.rotation;
@@ -47,8 +48,9 @@ typename Stepper<V>::DriveEnergy Stepper<V>::drive_energy(const Lane& lane, int 
 
 // Newton's step of the drive's unknowns. A drive that slips has them too, but goes no farther than commanded: there it grips
 // again. Returns whether the Hessian is positive definite.
-template <class V>
-bool Stepper<V>::solve_drive(int l) {
+template <class V, int T>
+bool Stepper<V, T>::solve_drive(int l) {
+    if constexpr (T > 0) return solve_tube_drives(l);
     const Lane& lane = lane_[l];
     const Slipping& side = lane.slipping;
     bool holds_a = !lane.by_force && side.advance == 0, holds_r = !lane.by_force && side.rotation == 0;
@@ -75,8 +77,9 @@ bool Stepper<V>::solve_drive(int l) {
 
 // Lets the drive slip where the wire, at rest with the drive where it was commanded, takes more than the drive's limits.
 // Returns whether it does.
-template <class V>
-bool Stepper<V>::release(int l) {
+template <class V, int T>
+bool Stepper<V, T>::release(int l) {
+    if constexpr (T > 0) return release_tubes(l);
     Lane& lane = lane_[l];
     if (lane.by_force || lane.releases == kMaxReleases) return false;
     const double force = get(drive_.gradient_a, l), torque = get(drive_.gradient_r, l);

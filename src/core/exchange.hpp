@@ -28,9 +28,29 @@ inline void start_world(const Scene& scene, const World& w, double depth, double
     }
 }
 
-template <class V>
+// The same for tubes: `initial` and `friction` hold advance and rotation, and the coefficient, of each. The foremost is approached at
+// the approach velocity, the others arrive with it.
+inline void start_tubes(const Scene& scene, const World& w, const double* initial, const double* friction, double sample_period) {
+    const int tubes = scene.tubes.tubes, nodes = scene.rod.nodes;
+    double depth = 0;
+    for (int k = 0; k < tubes; ++k) depth = std::max(depth, initial[2 * k]);
+    start_world(scene, w, depth, initial[1], friction[0], sample_period);
+    for (std::size_t k = World::size(nodes); k < World::size(nodes, tubes - 1); ++k) w.values[std::ptrdiff_t(k) * w.stride] = 0.0;
+    for (int k = 0; k < tubes; ++k) {
+        const World::Numbers tube = w.tube(nodes, k);
+        tube[World::kTubeInserted] = scene.options.approach_velocity > 0 ? 0.0 : initial[2 * k];
+        tube[World::kTubeDepth] = initial[2 * k];
+        tube[World::kTubeRotation] = initial[2 * k + 1];
+        tube[World::kTubeFriction] = friction[k];
+        tube[World::kTubePace] = 1.0;
+    }
+    for (int i = 0; i < w.active(); ++i)
+        for (int k = 1; k < tubes; ++k) w.twists(nodes, tubes - 1, i)[k - 1] = initial[2 * k + 1] - initial[1];
+}
+
+template <class V, int T>
 template <class Queue>
-void Stepper<V>::take(int l, Queue& queue) {
+void Stepper<V, T>::take(int l, Queue& queue) {
     double length = 0;
     int others = 0;
     for (const Lane& lane : lane_)
@@ -55,22 +75,32 @@ void Stepper<V>::take(int l, Queue& queue) {
 }
 
 // Places node i of a lane on the catheter's axis as it was at the step's start (start) and is at its end (trial).
-template <class V>
-void Stepper<V>::place(int l, int i) {
+template <class V, int T>
+void Stepper<V, T>::place(int l, int i) {
     const Lane& lane = lane_[l];
-    Node<V>& n = node_[i];
+    Node<V, T>& n = node_[i];
     put(n.start, l, base_.position(rod_, i, lane.start.advance));
     put(n.start_q, l, base_.attitude(lane.start.rotation));
     put(n.last, l, lane.last.advance * frame(base_.orientation).d3);
     put(n.last_turn, l, {0, 0, lane.last.rotation});
     clear(n.at_node, l);
     clear(n.at_middle, l);
+    if constexpr (T > 0) {
+        const auto& tube = lane.tubes.tube;
+        for (int k = 0; k <= T; ++k) set(n.tubes.rate[k], l, 0);
+        for (int k = 0; k < T; ++k) {
+            set(n.tubes.start[k], l, tube[k + 1].turned - lane.start.rotation);
+            set(n.tubes.last[k], l, tube[k + 1].last_rotation - lane.last.rotation);
+            set(n.tubes.step[k], l, 0);
+            set(n.tubes.limit[k], l, 0);
+        }
+    }
     place_base(l, i);
 }
 
 // Takes a contact point off the wall.
-template <class V>
-void Stepper<V>::clear(ContactPoint<V>& point, int l) {
+template <class V, int T>
+void Stepper<V, T>::clear(ContactPoint<V>& point, int l) {
     set(point.friction.limit, l, 0);
     put(point.friction.normal, l, {0, 0, 0});
     put(point.friction.spin_arm, l, {0, 0, 0});
@@ -79,8 +109,8 @@ void Stepper<V>::clear(ContactPoint<V>& point, int l) {
     set(point.clearance, l, kNever);
 }
 
-template <class V>
-void Stepper<V>::load(ContactPoint<V>& point, int l, const World::Numbers& from) {
+template <class V, int T>
+void Stepper<V, T>::load(ContactPoint<V>& point, int l, const World::Numbers& from) {
     set(point.friction.limit, l, from[World::kLimit]);
     put(point.friction.normal, l, vec3(from + World::kNormal));
     put(point.friction.spin_arm, l, vec3(from + World::kSpinArm));
@@ -89,8 +119,8 @@ void Stepper<V>::load(ContactPoint<V>& point, int l, const World::Numbers& from)
     set(point.clearance, l, kNever);
 }
 
-template <class V>
-void Stepper<V>::store(const ContactPoint<V>& point, int l, const World::Numbers& to) {
+template <class V, int T>
+void Stepper<V, T>::store(const ContactPoint<V>& point, int l, const World::Numbers& to) {
     to[World::kLimit] = get(point.friction.limit, l);
     write(to + World::kNormal, take(point.friction.normal, l));
     write(to + World::kSpinArm, take(point.friction.spin_arm, l));
@@ -99,18 +129,24 @@ void Stepper<V>::store(const ContactPoint<V>& point, int l, const World::Numbers
 }
 
 // Places the trial of a node that follows the drive.
-template <class V>
-void Stepper<V>::place_base(int l, int i) {
+template <class V, int T>
+void Stepper<V, T>::place_base(int l, int i) {
     const Drive& end = lane_[l].end;
-    Node<V>& n = node_[i];
+    Node<V, T>& n = node_[i];
     put(n.x, l, base_.position(rod_, i, end.advance));
     put(n.q, l, base_.attitude(end.rotation));
     put(n.from, l, take(n.x, l));
     put(n.from_q, l, take(n.q, l));
+    if constexpr (T > 0) {
+        for (int k = 0; k < T; ++k) {
+            set(n.tubes.twist[k], l, lane_[l].tubes.tube[k + 1].end_rotation - end.rotation);
+            set(n.tubes.from[k], l, get(n.tubes.twist[k], l));
+        }
+    }
 }
 
-template <class V>
-void Stepper<V>::load(int l) {
+template <class V, int T>
+void Stepper<V, T>::load(int l) {
     Lane& lane = lane_[l];
     const World w = world_[lane.world];
     lane.inserted = lane.start.advance = lane.end.advance = w[World::kInserted];
@@ -120,12 +156,16 @@ void Stepper<V>::load(int l) {
     lane.active = int(w[World::kActive]);
     lane.slipping = {int(w[World::kSlipping]), int(w[World::kSpinSlipping])};
     set(friction_, l, w[World::kFriction]);
+    if constexpr (T > 0) load_tubes(l);
     read_control(l);
     const double weight = lane.last_duration > 0 ? duration(lane) / lane.last_duration : 0.0;
     lane.last = {weight > 0 ? w[World::kLastAdvance] : 0.0, weight > 0 ? w[World::kLastTurned] : 0.0};
+    if constexpr (T > 0)
+        if (!(weight > 0))
+            for (Tube& tube : lane.tubes.tube) tube.last_rotation = 0;
     for (int i = 0; i < lane.active; ++i) {
         const World::Numbers p = w.node(i);
-        Node<V>& n = node_[i];
+        Node<V, T>& n = node_[i];
         const Vec3<double> x = vec3(p + World::kX), last = vec3(p + World::kLast), turn = vec3(p + World::kLastTurn);
         const Quaternion<double> q = quaternion(p + World::kQ);
         put(n.start, l, x);
@@ -140,13 +180,25 @@ void Stepper<V>::load(int l) {
         put(n.turn, l, {0, 0, 0});
         load(n.at_node, l, p + World::kAtNode);
         load(n.at_middle, l, p + World::kAtMiddle);
+        if constexpr (T > 0) {
+            const World::Numbers t = w.twists(rod_.nodes, T, i);
+            for (int k = 0; k < T; ++k) {
+                set(n.tubes.start[k], l, t[k]);
+                set(n.tubes.last[k], l, t[T + k]);
+                set(n.tubes.twist[k], l, t[k] + weight * t[T + k]);
+                set(n.tubes.from[k], l, get(n.tubes.twist[k], l));
+                set(n.tubes.step[k], l, 0);
+                set(n.tubes.limit[k], l, t[2 * T + k]);
+            }
+            for (int k = 0; k <= T; ++k) set(n.tubes.rate[k], l, t[3 * T + k]);
+        }
     }
     begin(l, weight == 0.0);
 }
 
 // Keeps the lane's world as it was at the end of the last step that converged.
-template <class V>
-void Stepper<V>::store(int l) {
+template <class V, int T>
+void Stepper<V, T>::store(int l) {
     const Lane& lane = lane_[l];
     const World w = world_[lane.world];
     w[World::kInserted] = lane.inserted;
@@ -163,18 +215,29 @@ void Stepper<V>::store(int l) {
     w[World::kSpinSlipping] = lane.slipping.rotation;
     for (int i = 0; i < lane.active; ++i) {
         const World::Numbers p = w.node(i);
-        const Node<V>& n = node_[i];
+        const Node<V, T>& n = node_[i];
         write(p + World::kX, take(n.start, l));
         write(p + World::kQ, take(n.start_q, l));
         write(p + World::kLast, take(n.last, l));
         write(p + World::kLastTurn, take(n.last_turn, l));
         store(n.at_node, l, p + World::kAtNode);
         store(n.at_middle, l, p + World::kAtMiddle);
+        if constexpr (T > 0) {
+            const World::Numbers t = w.twists(rod_.nodes, T, i);
+            for (int k = 0; k < T; ++k) {
+                t[k] = get(n.tubes.start[k], l);
+                t[T + k] = get(n.tubes.last[k], l);
+                t[2 * T + k] = get(n.tubes.limit[k], l);
+            }
+            for (int k = 0; k <= T; ++k) t[3 * T + k] = get(n.tubes.rate[k], l);
+        }
     }
+    if constexpr (T > 0) store_tubes(l);
 }
 
-template <class V>
-void Stepper<V>::read_control(int l) {
+template <class V, int T>
+void Stepper<V, T>::read_control(int l) {
+    if constexpr (T > 0) return read_tube_controls(l);
     Lane& lane = lane_[l];
     const World w = world_[lane.world];
     if (lane.sample < 0) {  // the approach: pushed in at one speed, then one sample at rest
@@ -195,19 +258,21 @@ void Stepper<V>::read_control(int l) {
     if (!same) lane.last_duration = 0;  // do not extrapolate
 }
 
-template <class V>
+template <class V, int T>
 template <class Queue>
-void Stepper<V>::end_sample(int l, Queue& queue) {
+void Stepper<V, T>::end_sample(int l, Queue& queue) {
     Lane& lane = lane_[l];
     const World w = world_[lane.world];
-    if (lane.by_force) {
+    if constexpr (T > 0) {
+        end_tubes(l);
+    } else if (lane.by_force) {
         lane.inserted = lane.end.advance;
         lane.rotation = lane.end.rotation;
     } else {
         lane.inserted += lane.speed * sample_period() - lane.slip.advance;
         lane.rotation += lane.spin * sample_period() - lane.slip.rotation;
     }
-    if (lane.sample < 0) {
+    if (lane.sample < 0 && T == 0) {
         out_.approach_slip[2 * lane.world] += lane.slip.advance;
         out_.approach_slip[2 * lane.world + 1] += lane.slip.rotation;
         w[World::kApproach] = -lane.sample - 1;
@@ -215,11 +280,13 @@ void Stepper<V>::end_sample(int l, Queue& queue) {
         if (lane.sample == -1) lane.inserted = w[World::kDepth];  // exactly
     }
     store(l);
-    const DriveEnergy valve = introducer(lane.last, l);
-    w[World::kBaseForce] = get(base_force_, l);
-    w[World::kBaseTorque] = get(base_torque_, l);
-    w[World::kDriveForce] = lane.by_force ? lane.speed : w[World::kBaseForce] + valve.gradient_a;
-    w[World::kDriveTorque] = lane.by_force ? lane.spin : w[World::kBaseTorque] + valve.gradient_r;
+    if constexpr (T == 0) {
+        const DriveEnergy valve = introducer(lane.last, rod_.radius[lane.active], l);
+        w[World::kBaseForce] = get(base_force_, l);
+        w[World::kBaseTorque] = get(base_torque_, l);
+        w[World::kDriveForce] = lane.by_force ? lane.speed : w[World::kBaseForce] + valve.gradient_a;
+        w[World::kDriveTorque] = lane.by_force ? lane.spin : w[World::kBaseTorque] + valve.gradient_r;
+    }
     if (lane.sample >= 0)
         record(lane.world, lane.sample, double(lane.total_iterations) / lane.steps, double(lane.node_iterations),
                {lane.slip.advance + lane.refused, lane.slip.rotation});
@@ -231,11 +298,13 @@ void Stepper<V>::end_sample(int l, Queue& queue) {
 }
 
 // Marks the lane's world invalid from this sample on and frees the lane; its pose stays as last converged.
-template <class V>
-void Stepper<V>::fail(int l) {
+template <class V, int T>
+void Stepper<V, T>::fail(int l) {
     Lane& lane = lane_[l];
     lane.inserted = lane.start.advance;
     lane.rotation = lane.start.rotation;
+    if constexpr (T > 0)
+        for (Tube& tube : lane.tubes.tube) tube.inserted = tube.advanced, tube.rotation = tube.turned;
     store(l);
     world_[lane.world][World::kReason] = lane.finite ? kNotConverged : kNotFinite;
     for (int sample = std::max(0, lane.sample); sample < in_.samples; ++sample)
@@ -243,8 +312,8 @@ void Stepper<V>::fail(int l) {
     lane.world = -1;
 }
 
-template <class V>
-void Stepper<V>::record(int world, int sample, double iterations, double node_iterations, const Drive& slip) const {
+template <class V, int T>
+void Stepper<V, T>::record(int world, int sample, double iterations, double node_iterations, const Drive& slip) const {
     const World w = world_[world];
     const std::size_t at = std::size_t(world) * in_.samples + sample;
     const int active = w.active();
@@ -277,6 +346,7 @@ void Stepper<V>::record(int world, int sample, double iterations, double node_it
     out_.slip[at] = slip.advance;
     out_.rotation_slip[at] = slip.rotation;
     out_.valid[at] = w.valid();
+    if constexpr (T > 0) record_tubes(world, sample);
     const auto write = [](double* to, const Vec3<double>& v) { to[0] = v.x, to[1] = v.y, to[2] = v.z; };
     write(out_.tip_position + 3 * at, position(rod_, base_, w, 0));
     write(out_.tip_direction + 3 * at, tip_direction(rod_, base_, w));

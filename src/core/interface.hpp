@@ -9,6 +9,7 @@
 
 #include "lumen.hpp"
 #include "rod.hpp"
+#include "tubes.hpp"
 
 namespace endopilot {
 
@@ -96,6 +97,7 @@ struct Scene {
     Loads loads;
     Base base;
     Options options;
+    Tubes tubes{};
 };
 
 struct OwnedScene {
@@ -104,6 +106,7 @@ struct OwnedScene {
     std::shared_ptr<const OwnedLoads> loads;     // may be null
     Base base;
     Options options;
+    std::shared_ptr<const OwnedTubes> tubes{};   // null for a wire alone; else the rod is the mesh that they share
 };
 
 template <class Place>
@@ -112,7 +115,8 @@ Scene view(const OwnedScene& scene, const Place& place) {
             .lumen = scene.lumen ? view(*scene.lumen, place) : Lumen{},
             .loads = scene.loads ? view(*scene.loads, place) : Loads{},
             .base = scene.base,
-            .options = scene.options};
+            .options = scene.options,
+            .tubes = scene.tubes ? view(*scene.tubes, place) : Tubes{}};
 }
 
 // The inputs of one run: samples of equal length, each with one control for each world.
@@ -120,7 +124,7 @@ struct Inputs {
     int samples, steps_per_sample;
     double time_step;         // s
     bool force_driven;        // controls are an axial force and a torque on the wire, not velocities
-    const double* control;    // worlds × samples × 2: mm/s and rad/s, or N and N mm
+    const double* control;    // worlds × samples × 2 (of each tube): mm/s and rad/s, or N and N mm
 };
 
 enum Reason : std::uint8_t { kFine = 0, kNotFinite = 1, kNotConverged = 2 };
@@ -140,7 +144,12 @@ struct Outputs {
     double* approach_slip;
     double* shape;            // may be null
     double* attitude;         // may be null: worlds × samples × nodes × 4, quaternions w x y z
+    double* tubes = nullptr;  // may be null: worlds × samples × tubes × kTubeOutputs
 };
+
+// Numbers recorded of each tube: advance (mm) and rotation (rad), force (N) and torque (N mm) of the base on it, of its drive, advance and
+// rotation that were asked and not made, where its tip is, mm, and its twist against tube 0 there, rad.
+constexpr int kTubeOutputs = 12;
 
 // Calls f(array, numbers for each world) for every array that is recorded.
 template <class F>

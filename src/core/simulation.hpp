@@ -19,8 +19,8 @@ template <class Device>
 class Simulation {
 public:
     Simulation(Rod rod, std::shared_ptr<LumenMap> lumen, std::shared_ptr<OwnedLoads> loads, const Array<1>& origin,
-               const Array<1>& orientation, const Options& options, int worlds)
-        : scene_(make_scene(std::move(rod), std::move(lumen), std::move(loads), origin, orientation, options)), count_(std::size_t(worlds)) {
+               const Array<1>& orientation, const Options& options, std::shared_ptr<OwnedTubes> tubes, int worlds)
+        : scene_(make_scene(std::move(rod), std::move(lumen), std::move(loads), origin, orientation, options, std::move(tubes))), count_(std::size_t(worlds)) {
         require(worlds >= 1, "a simulation needs at least one world");
         values_.assign(count_ * width(), 0.0);
     }
@@ -30,22 +30,30 @@ public:
     // Puts worlds at the ostium, ready to be pushed to their first inserted length by the next run.
     void reset(const Indices<1>& index, const Array<2>& initial, const Array<1>& friction, double sample_period) {
         const std::size_t n = index.size();
-        require(initial.shape(0) == n && initial.shape(1) == 2 && friction.size() == n, "reset needs one row a world");
+        const std::size_t drives = std::size_t(this->drives());
+        require(initial.shape(0) == n && initial.shape(1) == 2 * drives && friction.size() == n * drives, "reset needs one row a world");
         for (std::size_t k = 0; k < n; ++k) {
             require(index.data()[k] >= 0 && std::size_t(index.data()[k]) < count_, "reset names no such world");
-            const double* start = initial.data() + 2 * k;
-            start_world(view_, world(std::size_t(index.data()[k])), start[0], start[1], friction.data()[k], sample_period);
+            const double* start = initial.data() + 2 * k * drives;
+            const World w = world(std::size_t(index.data()[k]));
+            if (drives == 1)
+                start_world(view_, w, start[0], start[1], friction.data()[k], sample_period);
+            else
+                start_tubes(view_, w, start, friction.data() + k * drives, sample_period);
         }
     }
 
     nb::dict run(const Array<3>& control, bool force_driven, double time_step, int steps_per_sample, bool record_shape,
                  bool record_attitude, int threads, int lanes, const nb::object& progress) {
         const std::size_t worlds = count_, samples = control.shape(1), n = worlds * samples, nodes = std::size_t(scene_.rod.nodes);
-        require(control.shape(0) == worlds && control.shape(2) == 2, "control needs two numbers a world and sample");
+        const std::size_t drives = std::size_t(this->drives());
+        require(control.shape(0) == worlds && control.shape(2) == 2 * drives, "control needs two numbers a world, sample and drive");
+        require(drives == 1 || !force_driven, "tubes are not driven by force");
         require(steps_per_sample >= 1 && time_step > 0, "time step and steps per sample must be positive");
         OutputArray<double> inserted(n), rotation(n), tip(3 * n), direction(3 * n), force_max(n), force_sum(n), wall_force(n),
             base_force(n), base_torque(n), drive_force(n), drive_torque(n), iterations(n), node_iterations(n), slip(n),
             rotation_slip(n), approach_slip(2 * worlds);
+        OutputArray<double> tubes(drives > 1 ? n * drives * kTubeOutputs : 0);
         OutputArray<bool> valid(n);
         OutputArray<double> shape(record_shape ? 3 * n * nodes : 0), attitude(record_attitude ? 4 * n * nodes : 0);
         nb::dict result;
@@ -68,6 +76,8 @@ public:
         result["valid"] = valid.array(worlds, samples);
         nb::object shapes = shape.array(record_shape ? worlds : 0, samples, nodes, 3);
         nb::object attitudes = attitude.array(record_attitude ? worlds : 0, samples, nodes, 4);
+        nb::object of_tubes = tubes.array(drives > 1 ? worlds : 0, samples, drives, kTubeOutputs);
+        if (drives > 1) result["tubes"] = of_tubes;
         if (record_shape) result["shape"] = shapes;
         if (record_attitude) result["attitude"] = attitudes;
 
@@ -94,7 +104,8 @@ public:
                           .valid = valid.data,
                           .approach_slip = approach_slip.data,
                           .shape = record_shape ? shape.data : nullptr,
-                          .attitude = record_attitude ? attitude.data : nullptr};
+                          .attitude = record_attitude ? attitude.data : nullptr,
+                          .tubes = drives > 1 ? tubes.data : nullptr};
         device_.step(this->worlds(), in, out, by_depth(in), threads, lanes, progress);
         return result;
     }
@@ -158,6 +169,16 @@ public:
         return per_node(1, [](const World& w, int i, double* to) { *to = i < w.active() ? w.force(i) : 0.0; });
     }
 
+    // The numbers of each tube, as World has them: worlds × tubes × TubeQuantity.
+    nb::object tubes() {
+        const std::size_t drives = std::size_t(this->drives());
+        require(drives > 1, "a wire alone has no tubes");
+        OutputArray<double> out(count_ * drives * World::kTubeSize);
+        for (std::size_t w = 0; w < count_; ++w)
+            for (std::size_t k = 0; k < drives * World::kTubeSize; ++k) out.data[w * drives * World::kTubeSize + k] = world(w).tube(nodes(), 0)[int(k)];
+        return out.array(count_, drives, World::kTubeSize);
+    }
+
     int nodes() const { return scene_.rod.nodes; }
 
 private:
@@ -167,15 +188,17 @@ private:
     std::vector<double> values_;  // of all worlds, one after the other
     Device device_{scene_};
 
+    int drives() const { return scene_.tubes ? scene_.tubes->tubes : 1; }
+
     static OwnedScene make_scene(Rod rod, std::shared_ptr<LumenMap> lumen, std::shared_ptr<OwnedLoads> loads, const Array<1>& origin,
-                                 const Array<1>& orientation, const Options& options) {
+                                 const Array<1>& orientation, const Options& options, std::shared_ptr<OwnedTubes> tubes) {
         require(origin.size() == 3 && orientation.size() == 4, "the base needs a position and a quaternion");
         require(!loads || int(loads->force.size()) == rod.nodes, "loads need one entry a node of the rod");
         const Base base{.origin = vec3(origin.data()), .orientation = quaternion(orientation.data())};
-        return {std::move(rod), std::move(lumen), std::move(loads), base, options};
+        return {std::move(rod), std::move(lumen), std::move(loads), base, options, std::move(tubes)};
     }
 
-    std::size_t width() const { return World::size(scene_.rod.nodes); }
+    std::size_t width() const { return World::size(scene_.rod.nodes, drives() - 1); }
     Worlds worlds() { return {values_.data(), std::ptrdiff_t(width()), 1}; }
     World world(std::size_t w) { return worlds()[w]; }
 
@@ -188,7 +211,7 @@ private:
             const World start = world(w);
             double inserted = start[World::kApproach] > 0 ? start[World::kDepth] : start[World::kInserted], sum = inserted;
             for (int s = 0; s < in.samples && !in.force_driven; ++s) {
-                inserted += in.control[2 * (w * std::size_t(in.samples) + std::size_t(s))] * in.time_step * in.steps_per_sample;
+                inserted += in.control[2 * std::size_t(drives()) * (w * std::size_t(in.samples) + std::size_t(s))] * in.time_step * in.steps_per_sample;
                 sum += inserted;
             }
             depth.push_back(sum);

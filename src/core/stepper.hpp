@@ -11,6 +11,7 @@
 
 #include "contact.hpp"
 #include "solve.hpp"
+#include "tubes.hpp"
 #include "world.hpp"
 
 namespace endopilot {
@@ -30,21 +31,83 @@ constexpr double kMaxBoost = 64;
 constexpr double kMaxImbalance = 1e-5;   // N that a damped solution may be out of balance
 constexpr double kDriveMotion = 1.2;     // times the drive's own motion that a node may move in a step before it counts as a jump
 
-// A node of the wires in all lanes.
+// How tubes touch the wall at a contact point: radius (mm) and friction coefficient there, the share of it that each further tube
+// covers; how far what touches slides along the mesh in the step, mm, and the rotation that this brings.
+template <class V, int T>
+struct TubeContact {
+    V radius, friction, weight[T], spin;
+    Vec3<V> slide;
+};
+
+// What a node has of T further tubes. Twists are rad: trial, accepted, step start; Newton step of the turn; last increment.
+template <class V, int T>
+struct TubeNode {
+    V twist[T], from[T], start[T], step[T], last[T];
+    V rate[T + 1];             // twist of each tube's frame a mm towards the tip, at the step's start, rad/mm
+    V limit[T];                // of friction between tube k and tube k + 1, N
+    V inside[T + 1], outside[T + 1];   // share of the node's stretch that any of the first k tubes, and any other, covers
+    V shear, stretch;          // kGA and EA of the element behind, N
+    TubeJoint<V, T> joint;     // between the elements ahead and behind
+    TubeContact<V, T> at_node, at_middle;
+};
 template <class V>
+struct TubeNode<V, 0> {};
+
+// A tube of a lane: its drive, as far as it is not the lane's own.
+struct Tube {
+    double inserted, rotation, speed, spin, depth;    // at the start of the sample; mm/s, rad/s; where the approach ends
+    double refused;                                   // mm in this sample that the tube is too short for
+    double advanced, turned, asked_advance, asked_rotation;   // step start; commanded for its end
+    double end_advance, end_rotation, last_rotation;          // trial, last increment
+    double slipped, rotation_slipped;                 // commanded in this sample and not made
+    double off, from, move;                           // of the rotation, what the unknown counts from the commanded; Newton step
+    int slipping;                                     // of the rotation
+    double pace, grip;                                // share of its motion that the drive makes; of friction along the tube around
+    double force, torque;                             // on the tube at its drive, N, N mm
+};
+
+template <int T>
+struct TubeLane {
+    Tube tube[T + 1];
+    int lead;            // the tube whose tip is foremost: the mesh follows it
+    double others;       // force of the drives of the others at the end of the last step, N
+};
+template <>
+struct TubeLane<0> {};
+
+// For each lane: how far a tube slides along the mesh in the step, mm; friction coefficients; friction between tubes as a share of
+// its most; torques of the further tubes' drives, N mm, and their Newton steps; tension of the first k tubes at the base, N.
+template <class V, int T>
+struct TubeLanes {
+    V slide[T + 1], friction[T + 1], grip[T], torque[T], turn[T], bundle[T];
+};
+template <class V>
+struct TubeLanes<V, 0> {};
+
+template <class V, int T>
+struct TwistDrive {
+    V gradient[T], ap[T], rp[T], pp[T][T];
+};
+template <class V>
+struct TwistDrive<V, 0> {};
+
+// A node of the wires in all lanes.
+template <class V, int T = 0>
 struct Node {
     Vec3<V> x, from, start, step, last;            // trial, accepted, step start; Newton step; last increment
     Quaternion<V> q, from_q, start_q;
     Vec3<V> turn, last_turn;
     ContactPoint<V> at_node, at_middle;            // the latter on the element behind it
+    [[no_unique_address]] TubeNode<V, T> tubes;
 };
 
-template <class V>
+// T: tubes around the innermost device; 0 for a wire alone.
+template <class V, int T = 0>
 class Stepper {
 public:
     // `node` and `factor` have one entry a node of the rod. The scene must outlive the stepper.
-    ENDOPILOT_DEVICE Stepper(const Scene& scene, const Worlds& worlds, Node<V>* node, Factor<V>* factor)
-        : rod_(scene.rod), lumen_(scene.lumen.pool ? &scene.lumen : nullptr), loads_(scene.loads.force ? &scene.loads : nullptr),
+    ENDOPILOT_DEVICE Stepper(const Scene& scene, const Worlds& worlds, Node<V, T>* node, Factor<V, T>* factor)
+        : rod_(scene.rod), lumen_(scene.lumen.pool ? &scene.lumen : nullptr), loads_(scene.loads.force ? &scene.loads : nullptr), tubes_(scene.tubes),
           base_(scene.base), options_(scene.options), world_(worlds), node_(node), factor_(factor) {}
 
     // Sets the inputs and outputs of the next turns and frees all lanes.
@@ -89,14 +152,29 @@ private:
     // Gradient and Hessian alone, for all lanes.
     struct DriveBlock {
         V gradient_a, gradient_r, aa, ar, rr;
+        [[no_unique_address]] TwistDrive<V, T> twists{};
         ENDOPILOT_DEVICE friend DriveBlock operator+(const DriveBlock& a, const DriveBlock& b) {
-            return {a.gradient_a + b.gradient_a, a.gradient_r + b.gradient_r, a.aa + b.aa, a.ar + b.ar, a.rr + b.rr};
+            DriveBlock sum{a.gradient_a + b.gradient_a, a.gradient_r + b.gradient_r, a.aa + b.aa, a.ar + b.ar, a.rr + b.rr};
+            if constexpr (T > 0) merge(sum, [&](auto of) { return of(a) + of(b); });
+            return sum;
         }
         ENDOPILOT_DEVICE friend DriveBlock select(Mask<V> mask, const DriveBlock& yes, const DriveBlock& no) {
-            return {endopilot::select<V>(mask, yes.gradient_a, no.gradient_a),
-                    endopilot::select<V>(mask, yes.gradient_r, no.gradient_r),
-                    endopilot::select<V>(mask, yes.aa, no.aa), endopilot::select<V>(mask, yes.ar, no.ar),
-                    endopilot::select<V>(mask, yes.rr, no.rr)};
+            DriveBlock chosen{endopilot::select<V>(mask, yes.gradient_a, no.gradient_a),
+                              endopilot::select<V>(mask, yes.gradient_r, no.gradient_r),
+                              endopilot::select<V>(mask, yes.aa, no.aa), endopilot::select<V>(mask, yes.ar, no.ar),
+                              endopilot::select<V>(mask, yes.rr, no.rr)};
+            if constexpr (T > 0) merge(chosen, [&](auto of) { return endopilot::select<V>(mask, of(yes), of(no)); });
+            return chosen;
+        }
+        // Sets all that belongs to twists to `number(of)`, where of(block) is that number of a block.
+        template <class Number>
+        ENDOPILOT_DEVICE static void merge(DriveBlock& to, const Number& number) {
+            for (int k = 0; k < T; ++k) {
+                to.twists.gradient[k] = number([k](const DriveBlock& d) { return d.twists.gradient[k]; });
+                to.twists.ap[k] = number([k](const DriveBlock& d) { return d.twists.ap[k]; });
+                to.twists.rp[k] = number([k](const DriveBlock& d) { return d.twists.rp[k]; });
+                for (int c = 0; c <= k; ++c) to.twists.pp[k][c] = number([k, c](const DriveBlock& d) { return d.twists.pp[k][c]; });
+            }
         }
     };
 
@@ -115,23 +193,25 @@ private:
         int releases = 0;                      // in this step
         double energy = 0, slope = 0, scale = 1, shorten = 1, boost = 1, damping = 0, last_duration = 0;
         bool reduced = false, first = true, extrapolated = false, finite = true, by_force = false;
+        [[no_unique_address]] TubeLane<T> tubes{};   // with tubes, the advance above is that of the foremost, the rotation tube 0's
     };
 
     const RodModel& rod_;
     const Lumen* lumen_;
     const Loads* loads_;
+    const Tubes& tubes_;
     const Base& base_;
     const Options& options_;
     Inputs in_{};
     Outputs out_{};
     const Worlds world_;
-    Node<V>* const node_;
-    Factor<V>* const factor_;
+    Node<V, T>* const node_;
+    Factor<V, T>* const factor_;
     static constexpr int kTogether = 8;  // nodes that each part of the evaluation takes at a time
-    Diagonal<V> block_[kTogether + 1];
-    Link<V> link_[kTogether];
-    Diagonal<V> middle_{};   // zero but while the middle of an element is evaluated
-    Carried<V> carried_;   // to the node that is eliminated next
+    Diagonal<V, T> block_[kTogether + 1];
+    Link<V, T> link_[kTogether];
+    Diagonal<V, T> middle_{};   // zero but while the middle of an element is evaluated
+    Carried<V, T> carried_;   // to the node that is eliminated next
     Lane lane_[W];
     // For each lane: settings of the step, then results of a sweep.
     V active_{}, share_{}, inverse_dt_{}, eps_{}, first_{}, damping_{}, friction_{};
@@ -143,6 +223,7 @@ private:
     V rise_{};                     // slope of the energy along the last move, at its end
     DriveBlock drive_{};           // of the wire's energy, all nodes eliminated
     V drive_a_{}, drive_r_{};      // the drive's Newton step
+    [[no_unique_address]] TubeLanes<V, T> of_tubes_{};
 
     ENDOPILOT_DEVICE double duration(const Lane& lane) const { return in_.time_step * lane.stride / kTicks; }
     ENDOPILOT_DEVICE double elapsed(int tick) const { return in_.time_step * tick / kTicks; }
@@ -183,6 +264,26 @@ private:
     ENDOPILOT_DEVICE void fail(int l);
     ENDOPILOT_LARGE void record(int world, int sample, double iterations, double node_iterations, const Drive& slip) const;
 
+    // Tubes (coaxial.hpp); where T is 0 none of it is used.
+    void aim_tubes(int l, double weight);
+    void prepare_tubes(int l);
+    TubeContact<double, T> tube_contact(int l, const double (&cover)[T + 1], const double (&rate)[T + 1], const Vec3<double>& axis) const;
+    void turn_tubes(int l, bool keeps, bool takes, bool shortens, double factor);
+    void settle_tubes(int l);
+    void pace_tubes(int l);
+    bool tubes_slip(const Lane& lane) const;
+    DriveEnergy tube_drive_energy(const Lane& lane) const;
+    bool solve_tube_drives(int l);
+    bool release_tubes(int l);
+    void freeze_tubes(int n, Mask<V> mask);
+    void load_tubes(int l);
+    void store_tubes(int l);
+    void read_tube_controls(int l);
+    void end_tubes(int l);
+    void record_tubes(int world, int sample) const;
+    V add_interfaces(const Node<V, T>& node, Diagonal<V, T>& own) const;
+    V bundle_moment(int k, int joint, Vec3<V>& moment) const;
+
     // The step of one lane (below).
     ENDOPILOT_LARGE void begin(int l, bool fresh);
     ENDOPILOT_LARGE Decision decide(int l);
@@ -193,7 +294,7 @@ private:
     ENDOPILOT_DEVICE int advance(int n, const Decision (&decision)[W], Queue& queue);
 
     // The drive of one lane (drive.hpp).
-    ENDOPILOT_DEVICE DriveEnergy introducer(const Drive& moved, int l) const;
+    ENDOPILOT_DEVICE DriveEnergy introducer(const Drive& moved, double r, int l) const;
     ENDOPILOT_DEVICE DriveEnergy drive_energy(const Lane& lane, int l) const;
     ENDOPILOT_LARGE bool solve_drive(int l);
     ENDOPILOT_DEVICE bool release(int l);
@@ -202,31 +303,36 @@ private:
     ENDOPILOT_LARGE void evaluate(int n);
     ENDOPILOT_LARGE void add_rod(int first, int count);
     ENDOPILOT_DEVICE bool is_base(int i) const;
-    ENDOPILOT_DEVICE DriveBlock drive_block(const Carried<V>& carried) const;
-    ENDOPILOT_DEVICE static bool near_wall(const ContactPoint<V>& point, const Vec3<V>& x, double radius, Mask<V> on);
+    ENDOPILOT_DEVICE DriveBlock drive_block(const Carried<V, T>& carried) const;
+    template <class Radius>
+    ENDOPILOT_DEVICE static bool near_wall(const ContactPoint<V>& point, const Vec3<V>& x, const Radius& radius, Mask<V> on);
+    template <class Radius>
     ENDOPILOT_LARGE bool add_contact(ContactPoint<V>& point, const Vec3<V>& x, const Vec3<V>& moved, const Quaternion<V>& turned,
-                                     double radius, Mask<V> on, Diagonal<V>& block);
+                                     const Radius& radius, const Touching<V, T>& touching, Mask<V> on, Diagonal<V, T>& block);
     ENDOPILOT_LARGE void add_surroundings(int first, int count);
     ENDOPILOT_DEVICE void add_lumen(int k, int i, const Vec3<V>& moved, const Quaternion<V>& turned);
-    ENDOPILOT_DEVICE void add_drag(int i, const Vec3<V>& moved, const Quaternion<V>& turned, Diagonal<V>& own);
+    ENDOPILOT_DEVICE void add_drag(int i, const Vec3<V>& moved, const Quaternion<V>& turned, Diagonal<V, T>& own);
     ENDOPILOT_LARGE void eliminate_nodes(int first, int count);
-    ENDOPILOT_DEVICE V add_loads(int i, const Node<V>& node, const Quaternion<V>& turned, Diagonal<V>& own) const;
+    ENDOPILOT_DEVICE V add_loads(int i, const Node<V, T>& node, const Quaternion<V>& turned, Diagonal<V, T>& own) const;
     ENDOPILOT_LARGE V solve(int n);
     ENDOPILOT_LARGE void update(int n, const Decision (&decision)[W], const V& factor);
-    ENDOPILOT_DEVICE void freeze(ContactPoint<V>& point, const Vec3<V>& step, const Vec3<V>& axis, double radius, Mask<V> on,
-                                 const V& weight) const;
+    template <class Radius>
+    ENDOPILOT_DEVICE void freeze(ContactPoint<V>& point, const Vec3<V>& step, const Vec3<V>& axis, const Radius& radius,
+                                 const V& friction, Mask<V> on, const V& weight) const;
     ENDOPILOT_LARGE void freeze_contacts(int n, Mask<V> mask, const V& weight);
     ENDOPILOT_LARGE void finish_step(int n, Mask<V> mask, Mask<V> restart, const V& weight);
 };
 
 // Begins a step of lane.stride ticks from the lane's start state; nodes ahead of the base already hold a trial.
-template <class V>
-void Stepper<V>::begin(int l, bool fresh) {
+template <class V, int T>
+void Stepper<V, T>::begin(int l, bool fresh) {
     Lane& lane = lane_[l];
     const int before = lane.active;
     const double weight = fresh ? 0.0 : duration(lane) / lane.last_duration;
     const Drive ahead{weight * lane.last.advance, weight * lane.last.rotation};
-    if (lane.by_force) {
+    if constexpr (T > 0) {
+        aim_tubes(l, weight);
+    } else if (lane.by_force) {
         lane.slipping = {};
         lane.origin = lane.start;
         lane.off = ahead;
@@ -245,13 +351,17 @@ void Stepper<V>::begin(int l, bool fresh) {
     for (int i = std::min(before, lane.active); i <= std::max(before, lane.active); ++i)
         if (i >= before || i >= lane.active) place(l, i);
     if (lane.active < before) clear(node_[lane.active - 1].at_middle, l);
+    if constexpr (T > 0) prepare_tubes(l);
     lane.iterations = lane.rejections = lane.releases = 0;
     lane.boost = 1;
     lane.first = lane.finite = true;
     lane.extrapolated = !fresh;
     const Drive& there = lane.by_force ? lane.end : lane.origin;
     const double most_x = options_.largest_jump + kDriveMotion * std::abs(there.advance - lane.start.advance);
-    const double most_theta = options_.largest_jump + kDriveMotion * std::abs(there.rotation - lane.start.rotation);
+    double turns = std::abs(there.rotation - lane.start.rotation);
+    if constexpr (T > 0)
+        for (int k = 1; k <= T; ++k) turns += std::abs(lane.tubes.tube[k].asked_rotation - lane.tubes.tube[k].turned);
+    const double most_theta = options_.largest_jump + kDriveMotion * turns;
     set(active_, l, lane.active);
     set(share_, l, Base::share_of_last_joint(rod_, lane.start.advance, options_.free_behind, lane.active));
     set(geometric_, l, 0.0);
@@ -266,13 +376,15 @@ void Stepper<V>::begin(int l, bool fresh) {
 }
 
 // One evaluation, decision and update of all lanes. Returns the number of samples that ended.
-template <class V>
+template <class V, int T>
 template <class Queue>
-int Stepper<V>::pass(Queue& queue) {
+int Stepper<V, T>::pass(Queue& queue) {
     const int n = most_active();
     evaluate(n);
     Decision decision[W];
     drive_a_ = drive_r_ = V{};
+    if constexpr (T > 0)
+        for (V& turn : of_tubes_.turn) turn = V{};
     for (int l = 0; l < W; ++l) decision[l] = decide(l);
     const V largest = solve(n);
     V factor{};
@@ -300,8 +412,8 @@ int Stepper<V>::pass(Queue& queue) {
     return advance(n, decision, queue);
 }
 
-template <class V>
-typename Stepper<V>::Decision Stepper<V>::decide(int l) {
+template <class V, int T>
+typename Stepper<V, T>::Decision Stepper<V, T>::decide(int l) {
     Lane& lane = lane_[l];
     if (lane.world < 0) return Decision::idle;
     ++lane.iterations;
@@ -353,11 +465,12 @@ typename Stepper<V>::Decision Stepper<V>::decide(int l) {
 // The share of the last move, which raised the energy, at which the energy is least along it. What raises it are contacts that
 // Newton's step did not foresee. If the wire bends into a wall as it slides along it, the energy is C s^p - slope s at the share
 // s, with p from the slopes at both ends. If it hits a wall head on at a share s0, it is k (s - s0)² / 2 - slope s from there on.
-template <class V>
-double Stepper<V>::best_share(double energy, int l) const {
+template <class V, int T>
+double Stepper<V, T>::best_share(double energy, int l) const {
     const Lane& lane = lane_[l];
     const double slope = lane.scale * lane.slope, excess = slope + energy - lane.energy;
-    const bool drive_held = !lane.by_force && lane.slipping.advance == 0 && lane.slipping.rotation == 0;  // else `rise_` lacks its part
+    bool drive_held = !lane.by_force && lane.slipping.advance == 0 && lane.slipping.rotation == 0;  // else `rise_` lacks its part
+    if constexpr (T > 0) drive_held = !tubes_slip(lane);
     const double power = drive_held ? std::clamp((get(rise_, l) + slope) / excess, 2.0, double{kMostPower}) : 2.0;
     const double sliding = std::pow(slope / (power * excess), 1 / (power - 1));
     const double free = get(hit_, l), rest = 1 - free;
@@ -366,9 +479,9 @@ double Stepper<V>::best_share(double energy, int l) const {
 }
 
 // Ends the steps that converged, restarts those that failed with half the step. Returns the samples that ended.
-template <class V>
+template <class V, int T>
 template <class Queue>
-int Stepper<V>::advance(int n, const Decision (&decision)[W], Queue& queue) {
+int Stepper<V, T>::advance(int n, const Decision (&decision)[W], Queue& queue) {
     Mask<V> finished{}, restarted{};
     V weight{};
     bool any_finished = false, failed[W] = {}, ended[W] = {};
@@ -382,6 +495,7 @@ int Stepper<V>::advance(int n, const Decision (&decision)[W], Queue& queue) {
             ++lane.steps;
             lane.last_duration = took;
             lane.last = {lane.end.advance - lane.start.advance, lane.end.rotation - lane.start.rotation};
+            if constexpr (T > 0) settle_tubes(l);
             lane.start = lane.end;
             if (!lane.by_force) {
                 lane.slip = {lane.slip.advance - lane.off.advance, lane.slip.rotation - lane.off.rotation};
@@ -408,6 +522,8 @@ int Stepper<V>::advance(int n, const Decision (&decision)[W], Queue& queue) {
     int samples = 0;
     for (int l = 0; l < W; ++l) {
         Lane& lane = lane_[l];
+        if constexpr (T > 0)
+            if (decision[l] == Decision::converged) pace_tubes(l);
         if (failed[l]) {
             samples += std::max(0, in_.samples - std::max(0, lane.sample));
             fail(l);
@@ -428,4 +544,5 @@ int Stepper<V>::advance(int n, const Decision (&decision)[W], Queue& queue) {
 
 #include "drive.hpp"
 #include "exchange.hpp"
+#include "coaxial.hpp"
 #include "sweeps.hpp"

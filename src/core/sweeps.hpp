@@ -6,8 +6,8 @@
 
 namespace endopilot {
 
-template <class V>
-V Stepper<V>::add_loads(int i, const Node<V>& node, const Quaternion<V>& turned, Diagonal<V>& own) const {
+template <class V, int T>
+V Stepper<V, T>::add_loads(int i, const Node<V, T>& node, const Quaternion<V>& turned, Diagonal<V, T>& own) const {
     const Vec3<double>&f = loads_->force[i], &m = loads_->moment[i], &k = loads_->spring[i], &a = loads_->anchor[i];
     const Vec3<V> off{node.x.x - a.x, node.x.y - a.y, node.x.z - a.z};
     own.gradient_x += Vec3<V>{k.x * off.x - f.x, k.y * off.y - f.y, k.z * off.z - f.z};
@@ -36,12 +36,12 @@ V Stepper<V>::add_loads(int i, const Node<V>& node, const Quaternion<V>& turned,
 
 // Energy, gradient and Hessian at the trial point, eliminated from tip to base. A few nodes at a time, part by part:
 // within a part the nodes do not wait for each other, and what passes between parts stays in the fastest cache.
-template <class V>
-void Stepper<V>::evaluate(int n) {
+template <class V, int T>
+void Stepper<V, T>::evaluate(int n) {
     energy_ = descent_ = jump_ = rise_ = V{};
     pivot_ = hit_ = broadcast<V>(1.0);
-    block_[0] = Diagonal<V>{};
-    carried_ = Carried<V>{};
+    block_[0] = Diagonal<V, T>{};
+    carried_ = Carried<V, T>{};
     for (int first = 0; first < n; first += kTogether) {
         const int count = std::min(int{kTogether}, n - first);
         add_rod(first, count);
@@ -52,53 +52,80 @@ void Stepper<V>::evaluate(int n) {
 }
 
 // Elements and joints of `count` nodes from `first` on; the force and torque that the base exerts on the wire.
-template <class V>
-void Stepper<V>::add_rod(int first, int count) {
+template <class V, int T>
+void Stepper<V, T>::add_rod(int first, int count) {
     const Vec3<double> axis = frame(base_.orientation).d3;
     for (int k = 0; k < count; ++k) {
         const int i = first + k;
-        const Node<V> &node = node_[i], &behind = node_[i + 1];
-        Diagonal<V>&own = block_[k], &next = block_[k + 1];
+        const Node<V, T> &node = node_[i], &behind = node_[i + 1];
+        Diagonal<V, T>&own = block_[k], &next = block_[k + 1];
         const bool at_base = is_base(i + 1);
         const Mask<V> last = active_ == broadcast<V>(i + 1);
-        V energy = add_element(rod_, i, geometric_, node.x, behind.x, frame(node.q), own, next, link_[k]);
+        const double length = rod_.length[i];
+        V energy;
+        if constexpr (T == 0)
+            energy = add_element(length, rod_.shear[i], rod_.stretch[i], geometric_, node.x, behind.x, frame(node.q), own, next, link_[k]);
+        else
+            energy = add_element(length, node.tubes.shear, node.tubes.stretch, geometric_, node.x, behind.x, frame(node.q), own, next, link_[k]);
         const V one = broadcast<V>(1.0), share = at_base ? select<V>(last, share_, one) : one;
         const V inverse_share = at_base ? one / share : one;
-        energy += add_joint(rod_, i + 1, geometric_, share, inverse_share, node.q, behind.q, own, next, link_[k]);
+        if constexpr (T == 0)
+            energy += add_joint(rod_, i + 1, geometric_, share, inverse_share, node.q, behind.q, own, next, link_[k]);
+        else
+            energy += add_tube_joint(rod_.joint_length[i + 1], behind.tubes.joint, geometric_, share, inverse_share, node.q, behind.q,
+                                     node.tubes.twist, behind.tubes.twist, own, next, link_[k]);
         energy_ += select<V>(active_ > broadcast<V>(i), energy, V{});
         if (!at_base) continue;
         const Vec3<V>& force = next.gradient_x;  // its component along the axis is the force that the base must exert
         base_force_ = select<V>(last, axis.x * force.x + axis.y * force.y + axis.z * force.z, base_force_);
         base_torque_ = select<V>(last, next.gradient_theta.z, base_torque_);
         // the element's stiffness for the drive comes with what is carried to the base
-        drive_ = select(last, {base_force_, base_torque_, V{}, V{}, widen<V>(next.tt.zz)}, drive_);
+        DriveBlock at_drive{base_force_, base_torque_, V{}, V{}, widen<V>(next.tt.zz)};
+        if constexpr (T > 0) {
+            for (int p = 0; p < T; ++p) {
+                at_drive.twists.gradient[p] = next.twists.gradient[p];
+                of_tubes_.torque[p] = select<V>(last, next.twists.gradient[p], of_tubes_.torque[p]);
+                at_drive.twists.ap[p] = V{};
+                at_drive.twists.rp[p] = widen<V>(next.twists.pt[p][2]);
+                for (int c = 0; c <= p; ++c) at_drive.twists.pp[p][c] = widen<V>(next.twists.pp[p][c]);
+            }
+        }
+        drive_ = select(last, at_drive, drive_);
     }
 }
 
 // Whether a lane's first node that follows the drive is node i.
-template <class V>
-bool Stepper<V>::is_base(int i) const {
+template <class V, int T>
+bool Stepper<V, T>::is_base(int i) const {
     bool any = false;
     for (const Lane& lane : lane_) any = any || lane.active == i;
     return any;
 }
 
 // The gradient and Hessian with respect to the drive's advance and rotation that the nodes ahead carry to one that follows the drive.
-template <class V>
-typename Stepper<V>::DriveBlock Stepper<V>::drive_block(const Carried<V>& carried) const {
+template <class V, int T>
+typename Stepper<V, T>::DriveBlock Stepper<V, T>::drive_block(const Carried<V, T>& carried) const {
     const Vec3<double> d = frame(base_.orientation).d3;
     const Vec3<S> axis{broadcast<S>(d.x), broadcast<S>(d.y), broadcast<S>(d.z)};
     const Vec3<S> across{carried.tx[2][0], carried.tx[2][1], carried.tx[2][2]};
-    return {.gradient_a = widen<V>(dot(axis, carried.gradient_x)),
-            .gradient_r = widen<V>(carried.gradient_theta.z),
-            .aa = widen<V>(dot(axis, carried.xx * axis)),
-            .ar = widen<V>(dot(axis, across)),
-            .rr = widen<V>(carried.tt.zz)};
+    DriveBlock block{widen<V>(dot(axis, carried.gradient_x)), widen<V>(carried.gradient_theta.z),
+                     widen<V>(dot(axis, carried.xx * axis)), widen<V>(dot(axis, across)), widen<V>(carried.tt.zz)};
+    if constexpr (T > 0) {
+        for (int k = 0; k < T; ++k) {
+            block.twists.gradient[k] = widen<V>(carried.twists.gradient[k]);
+            const S(&px)[3] = carried.twists.px[k];
+            block.twists.ap[k] = widen<V>(axis.x * px[0] + axis.y * px[1] + axis.z * px[2]);
+            block.twists.rp[k] = widen<V>(carried.twists.pt[k][2]);
+            for (int c = 0; c <= k; ++c) block.twists.pp[k][c] = widen<V>(carried.twists.pp[k][c]);
+        }
+    }
+    return block;
 }
 
 // Whether any lane's contact point may be within reach of the wall, going by how far it has moved since the wall was evaluated.
-template <class V>
-bool Stepper<V>::near_wall(const ContactPoint<V>& point, const Vec3<V>& x, double radius, Mask<V> on) {
+template <class V, int T>
+template <class Radius>
+bool Stepper<V, T>::near_wall(const ContactPoint<V>& point, const Vec3<V>& x, const Radius& radius, Mask<V> on) {
     const Vec3<V> moved = x - point.evaluated;
     const V spare = point.clearance - (radius + kStickyReach);
     const Mask<V> clear = (spare > V{}) & (spare * spare > kSteepest * kSteepest * dot(moved, moved));  // false for NaN
@@ -107,9 +134,10 @@ bool Stepper<V>::near_wall(const ContactPoint<V>& point, const Vec3<V>& x, doubl
 
 // The wall's reaction and friction at one contact point of the lanes in `on`: at x, moved by `moved` since the step's start.
 // Returns whether anything was added to `block`.
-template <class V>
-bool Stepper<V>::add_contact(ContactPoint<V>& point, const Vec3<V>& x, const Vec3<V>& moved, const Quaternion<V>& turned, double radius,
-                             Mask<V> on, Diagonal<V>& block) {
+template <class V, int T>
+template <class Radius>
+bool Stepper<V, T>::add_contact(ContactPoint<V>& point, const Vec3<V>& x, const Vec3<V>& moved, const Quaternion<V>& turned,
+                                const Radius& radius, const Touching<V, T>& touching, Mask<V> on, Diagonal<V, T>& block) {
     const V zero{};
     point.last_gap = select<V>(accepted_, point.gap, point.last_gap);
     point.gap = broadcast<V>(kStickyReach);
@@ -124,53 +152,83 @@ bool Stepper<V>::add_contact(ContactPoint<V>& point, const Vec3<V>& x, const Vec
         point.wall = {d.value, d.gradient};
         d.value = select<V>(on, d.value, broadcast<V>(Lumen::kDeep));
         const Mask<V> sticky = (first_ > zero) & (point.friction.limit > zero) & (d.value < radius + kStickyReach);
-        energy_ += add_wall<V>(options_.wall_stiffness, radius, geometric_, sticky, d, block);
+        energy_ += add_wall<V, T, Radius>(options_.wall_stiffness, radius, geometric_, sticky, d, block);
     } else {
         point.wall = {broadcast<V>(Lumen::kDeep), {zero, zero, zero}};
     }
-    if (rubs) energy_ += select<V>(on, add_friction(point.friction, eps_, tangent_, moved, turned, block), zero);
+    if (rubs) energy_ += select<V>(on, add_friction(point.friction, eps_, tangent_, moved, turned, touching, block), zero);
     return near || rubs;
 }
 
 // What acts on `count` nodes from `first` on from outside; the slope of the energy along the last move.
-template <class V>
-void Stepper<V>::add_surroundings(int first, int count) {
+template <class V, int T>
+void Stepper<V, T>::add_surroundings(int first, int count) {
     for (int k = 0; k < count; ++k) {
         const int i = first + k;
-        const Node<V>& node = node_[i];
+        const Node<V, T>& node = node_[i];
         const Vec3<V> moved = node.x - node.start;
         const Quaternion<V> turned = relative(node.start_q, node.q);
-        Diagonal<V>& own = block_[k];
+        Diagonal<V, T>& own = block_[k];
         if (lumen_) add_lumen(k, i, moved, turned);
         add_drag(i, moved, turned, own);
-        const V rise = dot(own.gradient_x, node.step) + dot(own.gradient_theta, node.turn);
+        V rise = dot(own.gradient_x, node.step) + dot(own.gradient_theta, node.turn);
+        if constexpr (T > 0)
+            for (int p = 0; p < T; ++p) rise += own.twists.gradient[p] * node.tubes.step[p];
         rise_ += select<V>(active_ > broadcast<V>(i), rise, V{});
     }
 }
 
 // Contact at node i, the group's k-th, and at the middle of the element behind it. The middle of the element that joins the base touches nothing.
-template <class V>
-void Stepper<V>::add_lumen(int k, int i, const Vec3<V>& moved, const Quaternion<V>& turned) {
+template <class V, int T>
+void Stepper<V, T>::add_lumen(int k, int i, const Vec3<V>& moved, const Quaternion<V>& turned) {
     const V half = broadcast<V>(0.5);
-    Node<V>& node = node_[i];
-    const Node<V>& behind = node_[i + 1];
-    add_contact(node.at_node, node.x + node.at_node.offset, moved, turned, rod_.radius[i], active_ > broadcast<V>(i), block_[k]);
-    const bool touches = add_contact(node.at_middle, half * (node.x + behind.x) + node.at_middle.offset, half * (moved + (behind.x - behind.start)),
-                                     turned, rod_.radius[i], active_ > broadcast<V>(i + 1), middle_);
+    Node<V, T>& node = node_[i];
+    const Node<V, T>& behind = node_[i + 1];
+    const Mask<V> on = active_ > broadcast<V>(i), middle_on = active_ > broadcast<V>(i + 1);
+    const Vec3<V> middle = half * (node.x + behind.x) + node.at_middle.offset, middle_moved = half * (moved + (behind.x - behind.start));
+    bool touches;
+    if constexpr (T == 0) {
+        add_contact(node.at_node, node.x + node.at_node.offset, moved, turned, rod_.radius[i], {}, on, block_[k]);
+        touches = add_contact(node.at_middle, middle, middle_moved, turned, rod_.radius[i], {}, middle_on, middle_);
+    } else {
+        const auto touching = [&](const TubeContact<V, T>& contact) {
+            Touching<V, T> t{.weight = {}, .twisted = {}, .spin = contact.spin};
+            for (int p = 0; p < T; ++p) {
+                t.weight[p] = contact.weight[p];
+                t.twisted[p] = node.tubes.twist[p] - node.tubes.start[p];
+            }
+            return t;
+        };
+        const TubeContact<V, T>&here = node.tubes.at_node, &there = node.tubes.at_middle;
+        add_contact(node.at_node, node.x + node.at_node.offset, moved + here.slide, turned, here.radius, touching(here), on, block_[k]);
+        touches = add_contact(node.at_middle, middle, middle_moved + there.slide, turned, there.radius, touching(there), middle_on, middle_);
+    }
     if (!touches) return;
     add_middle(middle_, block_[k], block_[k + 1], link_[k]);
-    middle_ = Diagonal<V>{};
+    middle_ = Diagonal<V, T>{};
 }
 
 // Drag, damping and loads of node i; how far it has moved in the step.
-template <class V>
-void Stepper<V>::add_drag(int i, const Vec3<V>& moved, const Quaternion<V>& turned, Diagonal<V>& own) {
+template <class V, int T>
+void Stepper<V, T>::add_drag(int i, const Vec3<V>& moved, const Quaternion<V>& turned, Diagonal<V, T>& own) {
     const Mask<V> on = active_ > broadcast<V>(i);
     const V moved2 = dot(moved, moved), turned2 = dot(turned.v, turned.v);
     jump_ = select<V>(on, maximum<V>(jump_, maximum<V>(jump_scale_x_ * moved2, jump_scale_theta_ * turned2)), jump_);
     const V drag = rod_.drag[i] * inverse_dt_, spin_drag = rod_.spin_drag[i] * inverse_dt_;
     V energy = 0.5 * drag * moved2 + 2.0 * spin_drag * turned2;
     if (loads_) energy += add_loads(i, node_[i], turned, own);
+    if constexpr (T > 0) {
+        const TubeNode<V, T>& tubes = node_[i].tubes;
+        energy += add_interfaces(node_[i], own);
+        for (int k = 0; k < T; ++k) {
+            const V turn = tubes.twist[k] - tubes.start[k] + 2.0 * turned.v.z, turn2 = turn * turn, torque = spin_drag * turn;
+            jump_ = select<V>(on, maximum<V>(jump_, 0.25 * jump_scale_theta_ * turn2), jump_);
+            energy += 0.5 * torque * turn;
+            own.twists.gradient[k] += torque;
+            own.gradient_theta += torque * Vec3<V>{-turned.v.y, turned.v.x, turned.w - 1.0};
+            own.twists.pp[k][k] += narrow(spin_drag + damping_);
+        }
+    }
     energy_ += select<V>(on, energy, V{});
     own.gradient_x += drag * moved;
     own.gradient_theta += (2.0 * spin_drag * turned.w) * turned.v;
@@ -183,8 +241,8 @@ void Stepper<V>::add_drag(int i, const Vec3<V>& moved, const Quaternion<V>& turn
     own.tt.zz += spin_stiffen;
 }
 
-template <class V>
-void Stepper<V>::eliminate_nodes(int first, int count) {
+template <class V, int T>
+void Stepper<V, T>::eliminate_nodes(int first, int count) {
     const V zero{};
     for (int k = 0; k < count; ++k) {
         const int i = first + k;
@@ -198,17 +256,20 @@ void Stepper<V>::eliminate_nodes(int first, int count) {
 }
 
 // Back substitution. Returns the largest displacement (mm) or rotation (rad) of a node; NaN where the solve failed.
-template <class V>
-V Stepper<V>::solve(int n) {
+template <class V, int T>
+V Stepper<V, T>::solve(int n) {
     const Vec3<double> axis = frame(base_.orientation).d3;
     const Vec3<S> drive_x = narrow(Vec3<V>{axis.x * drive_a_, axis.y * drive_a_, axis.z * drive_a_});
     const Vec3<S> drive_t{S{}, S{}, narrow(drive_r_)};
     const S active = narrow(active_);
     Vec3<S> x = drive_x, t = drive_t;
     S largest = dot(x, x) + dot(t, t);  // rounded as for the nodes of a shorter wire, which follow the drive
+    S twist[T + 1]{}, drive_twist[T + 1]{};   // one more than there are: none is no array
+    if constexpr (T > 0)
+        for (int k = 0; k < T; ++k) twist[k] = drive_twist[k] = narrow(of_tubes_.turn[k]);
     for (int i = n - 1; i >= 0; --i) {
         const Mask<S> on = active > broadcast<S>(i);
-        substitute(factor_[i], x, t);
+        substitute(factor_[i], x, t, twist);
         x = select(on, x, drive_x);  // the base of a shorter wire follows its drive
         t = select(on, t, drive_t);
         factor_[i].z[0] = x.x;
@@ -217,7 +278,14 @@ V Stepper<V>::solve(int n) {
         factor_[i].z[3] = t.x;
         factor_[i].z[4] = t.y;
         factor_[i].z[5] = t.z;
-        const S both = dot(x, x) + dot(t, t);
+        S both = dot(x, x) + dot(t, t);
+        if constexpr (T > 0) {
+            for (int k = 0; k < T; ++k) {
+                twist[k] = select<S>(on, twist[k], drive_twist[k]);
+                factor_[i].z[6 + k] = twist[k];
+                both += twist[k] * twist[k];
+            }
+        }
         largest = largest >= both ? largest : both;  // keeps a NaN of `both`; below, of `largest`
         largest = select<S>(both == both, largest, both);
     }
@@ -226,8 +294,8 @@ V Stepper<V>::solve(int n) {
 
 // Moves each lane's trial point by its decision: by `factor` times Newton's step where that is accepted, back to
 // `factor` times its last move where that is shortened.
-template <class V>
-void Stepper<V>::update(int n, const Decision (&decision)[W], const V& factor) {
+template <class V, int T>
+void Stepper<V, T>::update(int n, const Decision (&decision)[W], const V& factor) {
     Mask<V> accept{}, shorten{}, repeat{};
     for (int l = 0; l < W; ++l) {
         set_mask<V>(accept, l, decision[l] == Decision::accept || decision[l] == Decision::converged);
@@ -235,7 +303,7 @@ void Stepper<V>::update(int n, const Decision (&decision)[W], const V& factor) {
         set_mask<V>(repeat, l, decision[l] == Decision::repeat);
     }
     for (int i = 0; i < n; ++i) {
-        Node<V>& node = node_[i];
+        Node<V, T>& node = node_[i];
         const Mask<V> on = active_ > broadcast<V>(i);
         const S* z = factor_[i].z;
         const Vec3<V> step = factor * widen<V>(Vec3<S>{z[0], z[1], z[2]}), turn = factor * widen<V>(Vec3<S>{z[3], z[4], z[5]});
@@ -247,16 +315,27 @@ void Stepper<V>::update(int n, const Decision (&decision)[W], const V& factor) {
         node.turn = select(take, turn, select(shrink, factor * node.turn, node.turn));
         node.x = select(moves, node.from + node.step, node.x);
         node.q = select(moves, rotated(node.from_q, node.turn), node.q);
+        if constexpr (T > 0) {
+            TubeNode<V, T>& tubes = node.tubes;
+            for (int k = 0; k < T; ++k) {
+                const V turned = factor * widen<V>(z[6 + k]);
+                tubes.from[k] = select<V>(keeps, tubes.twist[k], tubes.from[k]);
+                tubes.step[k] = select<V>(take, turned, select<V>(shrink, factor * tubes.step[k], tubes.step[k]));
+                tubes.twist[k] = select<V>(moves, tubes.from[k] + (tubes.step[k] - node.turn.z), tubes.twist[k]);
+            }
+        }
     }
     for (int l = 0; l < W; ++l) {
         Lane& lane = lane_[l];
-        const bool held = !lane.by_force && lane.slipping.advance == 0 && lane.slipping.rotation == 0;
+        bool held = !lane.by_force && lane.slipping.advance == 0 && lane.slipping.rotation == 0;
+        if constexpr (T > 0) held = !tubes_slip(lane);
         if (held || lane.world < 0) continue;
         const double f = get(factor, l);
         const bool takes = decision[l] == Decision::accept || decision[l] == Decision::converged;
         if (takes || decision[l] == Decision::repeat) lane.from = lane.off;
         if (takes) lane.move = {f * get(drive_a_, l), f * get(drive_r_, l)};
         if (decision[l] == Decision::shorten) lane.move = {f * lane.move.advance, f * lane.move.rotation};
+        if constexpr (T > 0) turn_tubes(l, takes || decision[l] == Decision::repeat, takes, decision[l] == Decision::shorten, f);
         if (!takes && decision[l] != Decision::shorten) continue;
         lane.off = {lane.from.advance + lane.move.advance, lane.from.rotation + lane.move.rotation};
         lane.end = {lane.origin.advance + lane.off.advance, lane.origin.rotation + lane.off.rotation};
@@ -265,8 +344,10 @@ void Stepper<V>::update(int n, const Decision (&decision)[W], const V& factor) {
 }
 
 // Freezes the wall at a contact point that has come to rest after the move `step`: friction in the coming step then has a potential.
-template <class V>
-void Stepper<V>::freeze(ContactPoint<V>& point, const Vec3<V>& step, const Vec3<V>& axis, double radius, Mask<V> on, const V& weight) const {
+template <class V, int T>
+template <class Radius>
+void Stepper<V, T>::freeze(ContactPoint<V>& point, const Vec3<V>& step, const Vec3<V>& axis, const Radius& radius, const V& friction,
+                           Mask<V> on, const V& weight) const {
     const V zero{}, one = broadcast<V>(1.0);
     const Vec3<V>& gradient = point.wall.gradient;
     const V distance = point.wall.distance + dot(gradient, step);
@@ -280,23 +361,30 @@ void Stepper<V>::freeze(ContactPoint<V>& point, const Vec3<V>& step, const Vec3<
     point.normal_force = select<V>(on, push, point.normal_force);
     const V inverse = select<V>(touches, one / norm, zero);
     const Vec3<V> normal = inverse * gradient;
-    point.friction.limit = select<V>(on, friction_ * ahead, point.friction.limit);
+    point.friction.limit = select<V>(on, friction * ahead, point.friction.limit);
     point.friction.normal = select(on, normal, point.friction.normal);
-    point.friction.spin_arm = select(on, broadcast<V>(radius) * cross(normal, axis), point.friction.spin_arm);
+    point.friction.spin_arm = select(on, (V{} + radius) * cross(normal, axis), point.friction.spin_arm);
 }
 
 // Freezes the walls that friction acts on and the curve's offsets from the polygon, for the converged lanes in `mask`.
-template <class V>
-void Stepper<V>::freeze_contacts(int n, Mask<V> mask, const V& weight) {
+template <class V, int T>
+void Stepper<V, T>::freeze_contacts(int n, Mask<V> mask, const V& weight) {
     const auto direction = [&](int i) { return broadcast<V>(1.0 / rod_.length[i]) * (node_[i].x - node_[i + 1].x); };
     Vec3<V> ahead = direction(0), behind = direction(1);   // of the elements ahead of a joint and behind it
     Vec3<V> bent = broadcast<V>(1.0 / rod_.joint_length[1]) * (ahead - behind);   // curvature vector at the node: at the tip, of the first joint
     for (int i = 0; i < n; ++i) {
-        Node<V>& node = node_[i];
+        Node<V, T>& node = node_[i];
         const Mask<V> on = mask & (active_ > broadcast<V>(i)), middle = mask & (active_ > broadcast<V>(i + 1));
         const Vec3<V> axis = frame(node.q).d3;
-        freeze(node.at_node, node.step, axis, rod_.radius[i], on, weight);
-        freeze(node.at_middle, broadcast<V>(0.5) * (node.step + node_[i + 1].step), axis, rod_.radius[i], middle, weight);
+        const Vec3<V> middle_step = broadcast<V>(0.5) * (node.step + node_[i + 1].step);
+        if constexpr (T == 0) {
+            freeze(node.at_node, node.step, axis, rod_.radius[i], friction_, on, weight);
+            freeze(node.at_middle, middle_step, axis, rod_.radius[i], friction_, middle, weight);
+        } else {
+            const TubeContact<V, T>&here = node.tubes.at_node, &there = node.tubes.at_middle;
+            freeze(node.at_node, node.step, axis, here.radius, here.friction, on, weight);
+            freeze(node.at_middle, middle_step, axis, there.radius, there.friction, middle, weight);
+        }
         const Vec3<V> bent_behind = broadcast<V>(1.0 / rod_.joint_length[i + 1]) * (ahead - behind);
         const double l = rod_.length[i], around = i > 0 ? rod_.length[i - 1] * l / 24 : l * l / 8;
         node.at_node.offset = select(on, broadcast<V>(around) * bent, node.at_node.offset);
@@ -309,12 +397,13 @@ void Stepper<V>::freeze_contacts(int n, Mask<V> mask, const V& weight) {
 
 // For the lanes in `mask`, makes the converged trial the start of the next step and sets a new trial by extrapolation; for
 // those in `restart`, goes back to the start of the step.
-template <class V>
-void Stepper<V>::finish_step(int n, Mask<V> mask, Mask<V> restart, const V& weight) {
+template <class V, int T>
+void Stepper<V, T>::finish_step(int n, Mask<V> mask, Mask<V> restart, const V& weight) {
     const V zero{};
     if (lumen_) freeze_contacts(n, mask, weight);
+    if constexpr (T > 0) freeze_tubes(n, mask);
     for (int i = 0; i < n; ++i) {
-        Node<V>& node = node_[i];
+        Node<V, T>& node = node_[i];
         const Mask<V> on = mask & (active_ > broadcast<V>(i));
         const Mask<V> back = restart & (active_ > broadcast<V>(i));
         const Quaternion<V> turned_by = relative(node.start_q, node.q);
@@ -326,6 +415,15 @@ void Stepper<V>::finish_step(int n, Mask<V> mask, Mask<V> restart, const V& weig
         node.q = select(on, rotated(node.start_q, weight * node.last_turn), select(back, node.start_q, node.q));
         node.step = select(on, {zero, zero, zero}, node.step);
         node.turn = select(on, {zero, zero, zero}, node.turn);
+        if constexpr (T > 0) {
+            TubeNode<V, T>& tubes = node.tubes;
+            for (int k = 0; k < T; ++k) {
+                tubes.last[k] = select<V>(on, tubes.twist[k] - tubes.start[k], tubes.last[k]);
+                tubes.start[k] = select<V>(on, tubes.twist[k], tubes.start[k]);
+                tubes.twist[k] = select<V>(on, tubes.start[k] + weight * tubes.last[k], select<V>(back, tubes.start[k], tubes.twist[k]));
+                tubes.step[k] = select<V>(on, zero, tubes.step[k]);
+            }
+        }
     }
 }
 

@@ -26,6 +26,16 @@ struct World {
     // of a contact point: friction limit, wall normal, spin arm; normal force, N; offset of the curve from the polygon, mm
     enum PointQuantity { kLimit = 0, kNormal = 1, kSpinArm = 4, kNormalForce = 7, kOffset = 8 };
 
+    // of each tube, innermost first, where there are several: as the scalars of a wire above; kInserted is then the foremost's
+    enum TubeQuantity {
+        kTubeInserted, kTubeRotation, kTubeSpeed, kTubeSpin, kTubeLastTurned, kTubeFriction, kTubeSlipping,
+        kTubeBaseForce, kTubeBaseTorque, kTubeDriveForce, kTubeDriveTorque, kTubeDepth,
+        kTubePace, kTubeGrip,          // share of its motion that a drive at its limit makes; of friction along the tube around it
+        kTubeLeads,                    // 1: its tip is the foremost
+        kTubeSlip, kTubeRotationSlip,  // asked in the last sample and not made, mm, rad
+        kTubeSize
+    };
+
     // Numbers `stride` apart.
     struct Numbers {
         double* first;
@@ -39,7 +49,17 @@ struct World {
 
     ENDOPILOT_DEVICE double& operator[](Scalar s) const { return values[s * stride]; }
     ENDOPILOT_DEVICE Numbers node(int i) const { return Numbers{values, stride} + (kScalars + i * kNodeSize); }
-    static std::size_t size(int nodes) { return kScalars + std::size_t(nodes) * kNodeSize; }
+    // `further`: tubes around the innermost. After the nodes come all tubes, then the twists of each node.
+    static std::size_t size(int nodes, int further = 0) {
+        const std::size_t tubes = further ? std::size_t(further + 1) * kTubeSize + std::size_t(nodes) * twist_size(further) : 0;
+        return kScalars + std::size_t(nodes) * kNodeSize + tubes;
+    }
+    ENDOPILOT_DEVICE Numbers tube(int nodes, int k) const { return node(nodes) + k * kTubeSize; }
+    // Of node i: twists, their last increments, limits of friction between tubes, and all tubes' rates of twist.
+    ENDOPILOT_DEVICE Numbers twists(int nodes, int further, int i) const {
+        return tube(nodes, further + 1) + i * int(twist_size(further));
+    }
+    static constexpr std::size_t twist_size(int further) { return 4 * std::size_t(further) + 1; }
     ENDOPILOT_DEVICE int active() const { return int((*this)[kActive]); }
     // Force of the wall at node i and at the middle of the element behind it, N.
     ENDOPILOT_DEVICE double force(int i) const {

@@ -255,6 +255,35 @@ class TipProjection:
 
 
 @dataclass(frozen=True, eq=False)
+class CatheterMotion:
+    """The recorded motion of the catheters around a wire, from the inside out; the fields are those of `Rollout`.
+
+    Attributes:
+        control: dΔ/dt (mm/s) and dφ/dt (rad/s) of each drive.
+        inserted_length: Δ, mm.
+        rotation: φ, rad.
+        tip_position: where each catheter ends, LPS mm.
+        base_force: axial force that each drive must apply, N, positive when it pushes.
+        base_torque: torque, N·mm.
+        drive_force: `base_force` and what the valve that the catheter passes takes, N.
+        drive_torque: torque, N·mm, likewise.
+        slip: advance that was commanded and not made, mm.
+        rotation_slip: rotation that was commanded and not made, rad.
+    """
+
+    control: Float[np.ndarray, "worlds samples catheters 2"]
+    inserted_length: Float[np.ndarray, "worlds samples catheters"]
+    rotation: Float[np.ndarray, "worlds samples catheters"]
+    tip_position: Float[np.ndarray, "worlds samples catheters 3"]
+    base_force: Float[np.ndarray, "worlds samples catheters"]
+    base_torque: Float[np.ndarray, "worlds samples catheters"]
+    drive_force: Float[np.ndarray, "worlds samples catheters"]
+    drive_torque: Float[np.ndarray, "worlds samples catheters"]
+    slip: Float[np.ndarray, "worlds samples catheters"]
+    rotation_slip: Float[np.ndarray, "worlds samples catheters"]
+
+
+@dataclass(frozen=True, eq=False)
 class Rollout:
     """The recorded motion of simulated worlds, one sample every `sample_period_s`.
 
@@ -288,7 +317,9 @@ class Rollout:
             that were given up, the nodes ahead of the catheter.
         valid: false from the sample in which a world failed to converge or left the finite numbers.
         reason: why a world became invalid: 0 it is valid, 1 it left the finite numbers, 2 it did not converge.
-        shape: positions of all nodes from tip to base, LPS mm, if they were recorded.
+        shape: positions of all nodes from the foremost tip to the base, LPS mm, if they were recorded.
+        catheters: the motion of the catheters; None for a wire alone. With catheters, the fields above are those of the
+            wire, but for the direction of the tip and the wall's forces, which are those of all.
     """
 
     sample_period_s: float
@@ -314,6 +345,7 @@ class Rollout:
     valid: Bool[np.ndarray, "worlds samples"]
     reason: Int[np.ndarray, "worlds"]
     shape: Float[np.ndarray, "worlds samples nodes 3"] | None = None
+    catheters: CatheterMotion | None = None
 
 
 def _add(digest: hashlib._Hash, values: np.ndarray, kind: type[np.generic]) -> None:

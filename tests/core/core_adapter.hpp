@@ -78,7 +78,7 @@ inline Pair pair_of(double energy, const Diagonal<double>& own, const Diagonal<d
 inline Pair elastic_energy(const RodModel& rod, const Pose& distal, const Pose& proximal, double geometric = 1.0, double share = 1.0) {
     Diagonal<double> own{}, next{};
     Link<double> link{};
-    double energy = add_element<double>(rod, 0, float(geometric), distal.x, proximal.x, frame(distal.q), own, next, link);
+    double energy = add_element(rod.length[0], rod.shear[0], rod.stretch[0], float(geometric), distal.x, proximal.x, frame(distal.q), own, next, link);
     energy += add_joint<double>(rod, 1, float(geometric), share, 1 / share, distal.q, proximal.q, own, next, link);
     return pair_of(energy, own, next, link);
 }
@@ -100,7 +100,7 @@ inline Pair middle_of(const Diagonal<double>& middle) {
 inline Block friction_energy(const FrictionState<double>& friction, double eps, const Vec3<double>& start,
                               const Quaternion<double>& start_q, const Pose& now, double tangent = 1.0) {
     Diagonal<double> own{};
-    const double energy = add_friction<double>(friction, eps, float(tangent), now.x - start, relative(start_q, now.q), own);
+    const double energy = add_friction<double>(friction, eps, float(tangent), now.x - start, relative(start_q, now.q), {}, own);
     return {energy, gradient_of(own), hessian_of(own)};
 }
 

@@ -163,7 +163,7 @@ void test_stiff_chain() {
 void test_middle() {
     const auto f = [] { return float(uniform(-1, 1)); };
     const auto s = [&] { return Sym3<float>{f(), f(), f(), f(), f(), f()}; };
-    const Diagonal<double> middle{{f(), f(), f()}, {f(), f(), f()}, s(), {{f(), f(), f()}, {f(), f(), f()}, {f(), f(), f()}}, s()};
+    const Diagonal<double> middle{{f(), f(), f()}, {f(), f(), f()}, s(), {{f(), f(), f()}, {f(), f(), f()}, {f(), f(), f()}}, s(), {}};
     const Vector gradient = gradient_of(middle);
     const Matrix hessian = hessian_of(middle);
     const Pair pair = middle_of(middle);

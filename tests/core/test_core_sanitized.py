@@ -32,7 +32,7 @@ def compiler(tmp_path_factory: pytest.TempPathFactory) -> str:
     return found
 
 
-@pytest.mark.parametrize("name", ["test_core", "test_kernel"])
+@pytest.mark.parametrize("name", ["test_core", "test_kernel", "test_tubes"])
 def test_the_core_passes_its_tests_under_sanitizers(compiler: str, name: str, tmp_path: Path) -> None:
     program = tmp_path / name
     folders = [f"-I{folder}" for folder in (SOURCES, HERE, HERE / "cuda_on_cpu")]

@@ -1,4 +1,4 @@
-"""`endopilot simulate`: anatomy and proximal controls -> motion of the wire and its contact forces."""
+"""`endopilot simulate`: anatomy and proximal controls -> motion of wire and catheters, and their contact forces."""
 
 from __future__ import annotations
 
@@ -14,8 +14,10 @@ from endopilot.anatomy.io import read_anatomy
 from endopilot.cli.arguments import OutputFile, existing, show
 from endopilot.control.plan_file import read_plan
 from endopilot.dataset.navigations import simulate_navigations
+from endopilot.errors import InputError
 from endopilot.progress import progress
 from endopilot.settings import Count, Seed, Within, settings
+from endopilot.simulation.catheter import read_catheter
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, random_controls, read_controls_csv
 from endopilot.simulation.device import Device, read_device
@@ -45,6 +47,7 @@ def command(
     *,
     output: OutputFile,
     device: str = "workhorse-014",
+    catheter: tuple[str, ...] = (),
     controls: Path | None = None,
     shape: bool = False,
     picture: Path | None = None,
@@ -58,8 +61,11 @@ def command(
         anatomy: folder made by `endopilot anatomy` or `endopilot atlas`.
         output: .parquet or .csv with a row for each sample, or .npz with all arrays.
         device: name of a device (`endopilot devices`) or a YAML file.
-        controls: CSV of scripted proximal velocities (time_s, translation_mm_s, rotation_rad_s), or folder made by
-            `endopilot plan` for this anatomy and device; random ones by default.
+        catheter: up to two catheters around it, from the inside out: names (`microcatheter-1.7f`, `microcatheter-2.4f`,
+            `straight-5f`, `multipurpose-5f`, `vertebral-5f`, `jr4-5f`, `jl4-5f`, `simmons-2-5f`) or YAML files.
+        controls: CSV of scripted proximal velocities (time_s, translation_mm_s, rotation_rad_s, those of catheters as
+            catheter_1_translation_mm_s, ...), or folder made by `endopilot plan` for this anatomy and device; random
+            ones by default.
         shape: also record the positions of all nodes, mm (.npz only).
         picture: PNG of the vessel and of the first navigation's wire at its end.
         json: print the figures as JSON.
@@ -67,31 +73,34 @@ def command(
         config: settings of the rod core.
     """
     patient = read_anatomy(existing(anatomy))
-    wire = read_device(device)
+    wire, catheters = read_device(device), tuple(read_catheter(name) for name in catheter)
     period_s = SAMPLE_PERIOD_S
     if controls is not None and controls.is_dir():
+        if catheters:
+            raise InputError(f"--controls {controls}: a plan drives a wire alone; leave --catheter out")
         plan = read_plan(controls, patient, wire)
         patient, wire = plan.navigation.anatomy, plan.navigation.device
         begin = plan.navigation.start_inserted_mm, plan.navigation.start_rotation
         initial, control = np.array([begin]), plan.control[None]
     elif controls is not None:
-        script = read_controls_csv(existing(controls))
+        script = read_controls_csv(existing(controls), catheters=len(catheters))
         initial, control, period_s = script.initial, script.control, script.period_s
     else:
-        initial, control = random_controls(
-            ControlConfig(),
-            n_sequences=random.sequences,
-            n_samples=round(random.seconds / SAMPLE_PERIOD_S),
-            seed=random.seed,
-            max_inserted_length_mm=float(patient.tree.longest_path().abscissa[-1]),
-        )
+        initial, control = _random(random, patient, drives=1 + len(catheters))
     rollout, stopped, record_shape = None, None, shape or picture is not None
-    if controls is None and random.stop_short:
+    if controls is None and random.stop_short and not catheters:
         rollout, control, stopped = _stopped_short(patient, wire, initial, control, config)
         initial = np.column_stack([rollout.initial_inserted_length, rollout.initial_rotation])
     if rollout is None or record_shape:  # the controls that were made give the same navigations again
         rollout = simulate(
-            patient, wire, control, initial=initial, config=config, record_shape=record_shape, period_s=period_s
+            patient,
+            wire,
+            control,
+            catheters=catheters,
+            initial=initial,
+            config=config,
+            record_shape=record_shape,
+            period_s=period_s,
         )
     write_rollout(rollout if shape else replace(rollout, shape=None), output)
     valid = rollout.valid
@@ -109,6 +118,9 @@ def command(
         "largest_base_force_n": _largest(np.abs(rollout.base_force), valid),
         "largest_base_torque_n_mm": _largest(np.abs(rollout.base_torque), valid),
     }
+    if rollout.catheters is not None:
+        figures["largest_catheter_force_n"] = _largest(np.abs(rollout.catheters.base_force).max(axis=-1), valid)
+        figures["largest_catheter_torque_n_mm"] = _largest(np.abs(rollout.catheters.base_torque).max(axis=-1), valid)
     if picture is not None:
         from endopilot.report.scene import visible_wire  # plotly is slow to import
         from endopilot.report.still import render_still
@@ -119,6 +131,22 @@ def command(
         else:
             print(missing, file=sys.stderr)
     show(figures, as_json=json)
+
+
+def _random(config: RandomConfig, patient: Anatomy, *, drives: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return random starts and controls of a wire, and of catheters that are driven independently of it."""
+    drawn = [
+        random_controls(
+            ControlConfig(),
+            n_sequences=config.sequences,
+            n_samples=round(config.seconds / SAMPLE_PERIOD_S),
+            seed=config.seed,
+            max_inserted_length_mm=float(patient.tree.longest_path().abscissa[-1]),
+            first=drive * 2**32,
+        )
+        for drive in range(drives)
+    ]
+    return np.concatenate([start for start, _ in drawn], axis=-1), np.concatenate([part for _, part in drawn], axis=-1)
 
 
 def _stopped_short(

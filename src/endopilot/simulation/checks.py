@@ -12,6 +12,7 @@ from endopilot.errors import InputError
 from endopilot.simulation.config import FREE_BEHIND_MM, Actuation
 from endopilot.simulation.device import Device
 from endopilot.simulation.drive_limits import SPARE_MM
+from endopilot.simulation.tubes import Stack
 from endopilot.types import Anatomy
 
 _ROUNDING_MM = 1e-2
@@ -59,14 +60,14 @@ def check_memory(needed: int, what: str, mend: str) -> None:
 
 
 def check_control(
-    control: Float[np.ndarray, "..."], largest: Float[np.ndarray, "worlds 2"], devices: Sequence[Device]
+    control: Float[np.ndarray, "..."], largest: Float[np.ndarray, "worlds numbers"], stacks: Sequence[Stack]
 ) -> None:
     """Check the controls of one step.
 
     Args:
         control: a row a world.
         largest: magnitude that no control may exceed, likewise.
-        devices: of the worlds.
+        stacks: wire and catheters of the worlds.
 
     Raises:
         InputError: an array of another shape, or a control that is not finite or too large.
@@ -79,9 +80,10 @@ def check_control(
     world = int(np.argmin(allowed.all(axis=1)))
     if not np.isfinite(control[world]).all():
         raise InputError(f"control: world {world}: {control[world]} is not finite; correct it")
-    device = devices[world]
+    which = int(np.argmin(allowed[world])) // 2
+    device, asked = stacks[world].devices[which], control[world, 2 * which : 2 * which + 2]
     raise InputError(
-        f"control: world {world}: {control[world, 0]:g} mm/s, {control[world, 1]:g} rad/s exceed "
+        f"control: world {world}: {asked[0]:g} mm/s, {asked[1]:g} rad/s exceed "
         f"{device.max_velocity_mm_s:g} mm/s, {device.max_rotation_rad_s:g} rad/s, the limits of "
         f"{device.name}; slow down"
     )

@@ -151,23 +151,28 @@ class ScriptedControls:
     """Controls from a file.
 
     Attributes:
-        initial: (Δ mm, φ rad) of each world before the first period.
-        control: mm/s and rad/s.
+        initial: (Δ mm, φ rad) of each world before the first period, of the wire and of each catheter.
+        control: mm/s and rad/s, likewise.
         period_s: time that each control holds, s.
     """
 
-    initial: Float[np.ndarray, "worlds 2"]
-    control: Float[np.ndarray, "worlds samples 2"]
+    initial: Float[np.ndarray, "worlds numbers"]
+    control: Float[np.ndarray, "worlds samples numbers"]
     period_s: float
 
 
-def read_controls_csv(path: Path) -> ScriptedControls:
+def read_controls_csv(path: Path, *, catheters: int = 0) -> ScriptedControls:
     """Read scripted controls.
 
     The columns are `time_s` (end of each period, all of one length: 0.5, 1.0, ... or 0.05, 0.1, ...),
     `translation_mm_s` and `rotation_rad_s`; optional are `world` (several navigations in one file), and
     `inserted_length_mm` with `rotation_rad` (state at the end of each period, from which the initial one follows; 0 if
-    they are not there). So a rollout that was written as CSV can be simulated again.
+    they are not there). So a rollout that was written as CSV can be simulated again. Columns of catheters begin with
+    `catheter_1_` and `catheter_2_`.
+
+    Args:
+        path: the file.
+        catheters: how many catheters it drives; each adds two numbers to the controls and the initial state.
 
     Raises:
         InputError: not such a table; the line names file, column, row and mend.
@@ -178,13 +183,17 @@ def read_controls_csv(path: Path) -> ScriptedControls:
         table = pd.read_csv(path, float_precision="round_trip")
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read as CSV ({str(error).splitlines()[0]}); check the file") from error
-    missing = [name for name in _COLUMNS if name not in table.columns]
+    prefixes = ["", *(f"catheter_{k + 1}_" for k in range(catheters))]
+    driven = [prefix + name for prefix in prefixes for name in _COLUMNS[1:]]
+    wanted = [_COLUMNS[0], *driven]
+    missing = [name for name in wanted if name not in table.columns]
     if missing:
-        raise InputError(f"{path}: column {missing[0]} is missing; the columns are {', '.join(_COLUMNS)}")
+        raise InputError(f"{path}: column {missing[0]} is missing; the columns are {', '.join(wanted)}")
     if len(table) == 0:
         raise InputError(f"{path}: has no rows; give one for each {SAMPLE_PERIOD_S} s")
-    state = [name for name in ("inserted_length_mm", "rotation_rad") if name in table.columns]
-    for name in (*_COLUMNS, *state):
+    places = [prefix + name for prefix in prefixes for name in ("inserted_length_mm", "rotation_rad")]
+    state = [name for name in places if name in table.columns]
+    for name in (*wanted, *state):
         numbers = np.asarray(pd.to_numeric(table[name], errors="coerce"), dtype=float)
         bad = np.flatnonzero(~np.isfinite(numbers))
         if len(bad):
@@ -205,9 +214,9 @@ def read_controls_csv(path: Path) -> ScriptedControls:
                 f"{path}: row {row + 2}: time_s = {table['time_s'].iloc[row]:g}; each world's rows end periods of one "
                 f"length and count {period_s:g}, {2 * period_s:g}, ..."
             )
-    control = np.stack([rows[list(_COLUMNS[1:])].to_numpy(dtype=float) for rows in worlds])
-    initial = np.zeros((len(worlds), 2))
-    if len(state) == 2:
+    control = np.stack([rows[driven].to_numpy(dtype=float) for rows in worlds])
+    initial = np.zeros((len(worlds), len(driven)))
+    if len(state) == len(driven):
         ends = np.stack([rows[state].to_numpy(dtype=float)[0] for rows in worlds])
         initial = ends - period_s * control[:, 0]
     return ScriptedControls(initial, control, period_s)

@@ -10,6 +10,7 @@ from endopilot.progress import Advance, progress
 from endopilot.simulation.config import FREE_BEHIND_MM, LANES, Actuation, SimulatorConfig, wall_stiffness
 from endopilot.simulation.processor import Lumen, Options, Processor, core_for, gpu_errors
 from endopilot.simulation.rod import RodLayout
+from endopilot.simulation.tubes import TubeLayout
 from endopilot.types import SAMPLE_PERIOD_S, DistanceMap, Insertion
 
 _LARGEST_NEWTON_STEP = 0.3
@@ -24,9 +25,9 @@ def run_core(
     insertion: Insertion,
     *,
     config: SimulatorConfig,
-    initial: Float[np.ndarray, "worlds 2"],
-    control: Float[np.ndarray, "worlds samples 2"],
-    friction: Float[np.ndarray, "worlds"],
+    initial: Float[np.ndarray, "worlds numbers"],
+    control: Float[np.ndarray, "worlds samples numbers"],
+    friction: Float[np.ndarray, "worlds *tubes"],
     period_s: float = SAMPLE_PERIOD_S,
     actuation: Actuation = "velocity",
     loads: _core.Loads | None = None,
@@ -38,17 +39,18 @@ def run_core(
     push_limit_n: float = np.inf,
     pull_limit_n: float = np.inf,
     torque_limit_n_mm: float = np.inf,
+    tubes: TubeLayout | None = None,
 ) -> dict[str, np.ndarray]:
     """Run the C++ core on checked input. The simulator and the verification both come through here.
 
     Args:
-        rod: nodes and stiffnesses.
+        rod: nodes and stiffnesses; with tubes, the nodes alone count, and the drag.
         lumen: the wall, or None for a rod in the open.
         insertion: the point and the direction along which the base slides.
         config: settings.
-        initial: inserted length (mm) and rotation (rad) of each world before the first period.
-        control: mm/s and rad/s, or N and N·mm.
-        friction: Coulomb coefficients.
+        initial: inserted length (mm) and rotation (rad) of each world before the first period; of each of its tubes.
+        control: mm/s and rad/s, or N and N·mm; of each tube.
+        friction: Coulomb coefficients; with tubes, a column for each.
         period_s: time that each control holds, and from one recorded sample to the next, s; it is cut into equal time
             steps of at most `config.time_step_s`, as `Simulator.step` cuts it.
         actuation: what the controls are.
@@ -61,10 +63,14 @@ def run_core(
         push_limit_n: force at which the drive slips, N; of the device, where there is one.
         pull_limit_n: the same where it pulls, N.
         torque_limit_n_mm: torque at which it slips, N·mm.
+        tubes: telescoping tubes, which have limits of their own.
 
     Returns:
         The arrays of `Rollout` that need no centerline; `reason`: 0 fine, 1 not finite, 2 not converged; `contacts`:
-        the force of the wall at each node and on the element behind it at the end, N.
+        the force of the wall at each node and on the element behind it at the end, N. With tubes, the wire's arrays are
+        those of the innermost, the tip's direction is that of the foremost, and `tubes` (worlds samples tubes 12) holds
+        of each its inserted length (mm) and rotation (rad), force (N) and torque (N·mm) at the base and of the drive,
+        slip (mm, rad), where its tip is (mm), and by how much it is twisted there against the innermost (rad).
     """
     with gpu_errors(config.processor):
         simulation = core_for(config.processor).Simulation(
@@ -80,18 +86,19 @@ def run_core(
                 approach=approach,
                 free_behind_mm=free_behind_mm,
             ),
+            tubes=None if tubes is None else tubes.model(config.processor),
             worlds=len(control),
         )
     simulation.reset(
         index=np.arange(len(control)),
         initial=np.ascontiguousarray(initial, dtype=float),
-        friction=np.ascontiguousarray(friction, dtype=float),
+        friction=np.ascontiguousarray(friction, dtype=float).reshape(-1),
         sample_period=SAMPLE_PERIOD_S,
     )
     total = control.shape[0] * control.shape[1]
 
     def run(
-        control: Float[np.ndarray, "worlds samples 2"], steps: int, time_step: float, advance: Advance | None
+        control: Float[np.ndarray, "worlds samples numbers"], steps: int, time_step: float, advance: Advance | None
     ) -> dict:
         return simulation.run(
             control=np.ascontiguousarray(control, dtype=float),
@@ -113,6 +120,8 @@ def run_core(
             steps = config.steps_of(period_s)
             result = run(control, steps, period_s / steps, advance)
             result["approach_slip"] += begun["approach_slip"]
+    if tubes is not None:
+        result["tip_position"] = np.ascontiguousarray(result["tubes"][:, :, 0, 8:11])
     return {**result, "reason": simulation.reason().astype(int), "contacts": simulation.contacts()}
 
 

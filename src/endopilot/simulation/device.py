@@ -177,7 +177,7 @@ class Device:
 
 
 @settings
-class _Sourced(Generic[Value]):
+class Sourced(Generic[Value]):
     """A constant in a device's file, and where it comes from."""
 
     value: Value
@@ -205,17 +205,17 @@ class _DeviceFile:
     """What a device's file holds; `Device` says what each constant means."""
 
     name: Text
-    diameter_mm: _Sourced[Positive]
-    friction: _Sourced[NonNegative]
-    max_velocity_mm_s: _Sourced[Positive]
-    max_rotation_rad_s: _Sourced[Positive]
-    push_limit_n: _Sourced[Positive]
-    pull_limit_n: _Sourced[Positive]
-    torque_limit_n_mm: _Sourced[Positive]
-    abscissa_mm: _Sourced[tuple[NonNegative, ...]]
-    bend_stiffness_n_mm2: _Sourced[tuple[Positive, ...]]
-    twist_stiffness_n_mm2: _Sourced[tuple[Positive, ...]]
-    tip_load_n: _Sourced[Positive | None]
+    diameter_mm: Sourced[Positive]
+    friction: Sourced[NonNegative]
+    max_velocity_mm_s: Sourced[Positive]
+    max_rotation_rad_s: Sourced[Positive]
+    push_limit_n: Sourced[Positive]
+    pull_limit_n: Sourced[Positive]
+    torque_limit_n_mm: Sourced[Positive]
+    abscissa_mm: Sourced[tuple[NonNegative, ...]]
+    bend_stiffness_n_mm2: Sourced[tuple[Positive, ...]]
+    twist_stiffness_n_mm2: Sourced[tuple[Positive, ...]]
+    tip_load_n: Sourced[Positive | None]
     tip_bend: _TipBend
     tip_shaping: _Shaping | None = None
 
@@ -231,7 +231,7 @@ def read_device(name_or_path: str | Path) -> Device:
     entries = {field.name: getattr(content, field.name) for field in fields(content) if field.name != "name"}
     entries = {name: entry for name, entry in entries.items() if entry is not None}
     shaping = content.tip_shaping
-    constants = {name: entry.value for name, entry in entries.items() if isinstance(entry, _Sourced)}
+    constants = {name: entry.value for name, entry in entries.items() if isinstance(entry, Sourced)}
     try:
         return Device(
             name=content.name,

@@ -1,4 +1,4 @@
-"""Worlds in groups: those with an equal anatomy and an equal device are stepped by one simulation of the core."""
+"""Worlds in groups: those with an equal anatomy and equal devices are stepped by one simulation of the core."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from endopilot.anatomy.projection import TipProjector
 from endopilot.simulation.checks import check_distance_map, check_memory
 from endopilot.simulation.config import FREE_BEHIND_MM, SimulatorConfig
 from endopilot.simulation.core import core_options, insertion_arguments, make_lumen
-from endopilot.simulation.device import Device, check_fits
 from endopilot.simulation.drive_limits import far_end_mm
 from endopilot.simulation.processor import Lumen, Simulation, core_for
 from endopilot.simulation.rod import RodLayout, lay_out
+from endopilot.simulation.tubes import Stack
 from endopilot.types import Anatomy
 
 GroupKey = tuple[str, tuple[Any, ...]]
-"""Identity of an anatomy, and constants of a device."""
+"""Identity of an anatomy, and constants of its devices."""
 
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """The worlds with an equal anatomy and an equal device.
+    """The worlds with an equal anatomy and equal devices.
 
     Attributes:
         anatomy: the vessel, as the first of them has it.
-        device: the wire, as the first of them has it.
+        stack: the wire and its catheters, as the first of them has it.
         rod: its nodes and stiffnesses.
         lumen: the wall, as the core has it.
         simulation: the worlds, as the core has them.
@@ -40,7 +40,7 @@ class Group:
     """
 
     anatomy: Anatomy
-    device: Device
+    stack: Stack
     rod: RodLayout
     lumen: Lumen
     simulation: Simulation
@@ -50,46 +50,47 @@ class Group:
     project: TipProjector
 
 
-def group_key(anatomy: Anatomy, device: Device) -> GroupKey:
+def group_key(anatomy: Anatomy, stack: Stack) -> GroupKey:
     """Return what worlds have in common that are stepped together."""
-    return anatomy.identity, device.constants
+    return anatomy.identity, stack.constants
 
 
 def make_groups(
-    anatomies: Sequence[Anatomy], devices: Sequence[Device], config: SimulatorConfig, sharing: Sequence[Group]
+    anatomies: Sequence[Anatomy], stacks: Sequence[Stack], config: SimulatorConfig, sharing: Sequence[Group]
 ) -> list[Group]:
     """Return the groups of worlds, with their wires laid out and at the ostium.
 
     Args:
         anatomies: of each world.
-        devices: of each world.
+        stacks: wire and catheters of each world.
         config: settings of the rod core.
         sharing: groups whose lumens and projections are taken rather than prepared again.
 
     Raises:
-        InputError: a device that does not fit its anatomy; a distance map that is not finite, or negative at the
-            ostium; more worlds than the memory holds.
+        InputError: a device that does not fit its anatomy or the catheter around it; a distance map that is not finite,
+            or negative at the ostium; more worlds than the memory holds.
     """
     core = core_for(config.processor)
     prepared = [group for group in sharing if isinstance(group.lumen, core.Lumen)]
-    lumens = {(group.anatomy.identity, group.device.tip_radius_mm): group.lumen for group in prepared}
+    lumens = {(group.anatomy.identity, group.stack.outer_radius_mm): group.lumen for group in prepared}
     projectors = {group.anatomy.identity: group.project for group in sharing}
     members: dict[GroupKey, list[int]] = {}
-    for world, pair in enumerate(zip(anatomies, devices, strict=True)):
+    for world, pair in enumerate(zip(anatomies, stacks, strict=True)):
         members.setdefault(group_key(*pair), []).append(world)
     groups = []
     for worlds in members.values():
-        anatomy, device = anatomies[worlds[0]], devices[worlds[0]]
-        check_fits(device, anatomy)
-        key = (anatomy.identity, device.tip_radius_mm)
+        anatomy, stack = anatomies[worlds[0]], stacks[worlds[0]]
+        stack.check(anatomy)
+        key = (anatomy.identity, stack.outer_radius_mm)
         if key not in lumens:
             check_distance_map(anatomy)
-            lumens[key] = make_lumen(anatomy.distance_map, device.tip_radius_mm, config.processor)
+            lumens[key] = make_lumen(anatomy.distance_map, stack.outer_radius_mm, config.processor)
         if anatomy.identity not in projectors:
             projectors[anatomy.identity] = TipProjector(anatomy.tree, anatomy.insertion)
         path_mm = float(anatomy.tree.longest_path().abscissa[-1])
         longest_mm = far_end_mm(anatomy)
-        rod = lay_out(device, element_mm=config.element_mm, length_mm=longest_mm + FREE_BEHIND_MM)
+        rod = lay_out(stack.wire, element_mm=config.element_mm, length_mm=longest_mm + FREE_BEHIND_MM)
+        tubes = stack.lay_out(length_mm=longest_mm + FREE_BEHIND_MM)
         check_memory(8 * len(worlds) * (40 * len(rod.abscissa_mm) + 40), f"worlds: {len(worlds)}", "give fewer")
         simulation = core.Simulation(
             rod=rod.model(config.processor),
@@ -98,15 +99,16 @@ def make_groups(
             **insertion_arguments(anatomy.insertion),
             options=core_options(
                 config,
-                push_limit_n=device.push_limit_n,
-                pull_limit_n=device.pull_limit_n,
-                torque_limit_n_mm=device.torque_limit_n_mm,
+                push_limit_n=stack.push_limit_n,
+                pull_limit_n=stack.wire.pull_limit_n,
+                torque_limit_n_mm=stack.wire.torque_limit_n_mm,
                 free_behind_mm=FREE_BEHIND_MM,
             ),
+            tubes=None if tubes is None else tubes.model(config.processor),
             worlds=len(worlds),
         )
         index, project = np.array(worlds), projectors[anatomy.identity]
-        groups.append(Group(anatomy, device, rod, lumens[key], simulation, index, path_mm, longest_mm, project))
+        groups.append(Group(anatomy, stack, rod, lumens[key], simulation, index, path_mm, longest_mm, project))
     return groups
 
 

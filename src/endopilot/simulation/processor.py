@@ -11,9 +11,9 @@ from endopilot import _core
 from endopilot.errors import InputError
 
 if TYPE_CHECKING:
-    from endopilot._core import Lumen, Options, RodModel, Simulation
+    from endopilot._core import Lumen, Options, RodModel, Simulation, Tubes
 else:  # each build of the core has classes of its own
-    Lumen = Options = RodModel = Simulation = Any
+    Lumen = Options = RodModel = Simulation = Tubes = Any
 
 Processor = Literal["cpu", "cuda"]
 """Where worlds are stepped: the processor's threads, or a CUDA GPU."""

@@ -6,21 +6,24 @@ C++ core in `src/core`; this module checks its input, lays out the rod and retur
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from endopilot.anatomy.projection import project_tip
 from endopilot.errors import InputError
+from endopilot.simulation.catheter import Catheter
 from endopilot.simulation.checks import check_distance_map, check_memory, check_sequences
 from endopilot.simulation.config import FREE_BEHIND_MM, Actuation, SimulatorConfig
 from endopilot.simulation.core import make_lumen, run_core
-from endopilot.simulation.device import Device, check_fits
+from endopilot.simulation.device import Device
 from endopilot.simulation.drive_limits import far_end_mm
 from endopilot.simulation.rod import lay_out
-from endopilot.types import SAMPLE_PERIOD_S, Anatomy, Rollout
+from endopilot.simulation.tubes import Stack
+from endopilot.types import SAMPLE_PERIOD_S, Anatomy, CatheterMotion, Rollout
 
 _REASONS = {1: "left the finite numbers", 2: "did not converge"}
 """Meaning of `Rollout.reason` for an invalid world."""
@@ -50,10 +53,11 @@ class WallForceEvent:
 def simulate(
     anatomy: Anatomy,
     device: Device,
-    control: Float[np.ndarray, "worlds samples 2"],
+    control: Float[np.ndarray, "worlds samples numbers"],
     *,
+    catheters: Sequence[Catheter] = (),
     actuation: Actuation = "velocity",
-    initial: Float[np.ndarray, "worlds 2"] | None = None,
+    initial: Float[np.ndarray, "worlds numbers"] | None = None,
     config: SimulatorConfig | None = None,
     record_shape: bool = False,
     friction: Float[np.ndarray, "worlds"] | None = None,
@@ -72,28 +76,32 @@ def simulate(
         anatomy: the vessel.
         device: the wire.
         control: proximal velocities (mm/s, rad/s), or force and torque (N, N·mm) of the drive, constant over each
-            sample period.
-        actuation: which of the two: "velocity" or "force".
-        initial: inserted length (mm) and rotation (rad) before the first period; zeros if not given. The wire is
-            pushed there from the ostium at `config.approach_velocity_mm_s`, then rests for one period.
+            sample period; two numbers for the wire, and two for each catheter.
+        catheters: catheters around the wire, from the inside out.
+        actuation: which of the two: "velocity" or "force"; catheters are driven by velocity.
+        initial: inserted length (mm) and rotation (rad) before the first period, of the wire and of each catheter;
+            zeros if not given. The wire is pushed there from the ostium at `config.approach_velocity_mm_s`, then rests
+            for one period; catheters are pushed along with it.
         config: settings of the rod core.
         record_shape: record the positions of all nodes too.
-        friction: Coulomb friction coefficient of each world; the device's own if not given.
+        friction: Coulomb friction coefficient of the wire of each world; the device's own if not given.
         period_s: time that each control holds, and from one recorded sample to the next, s.
 
     Raises:
         InputError: a period that is not positive; controls that are not finite or too fast for the device; a device
-            that does not fit; a distance map that is not finite, or negative at the ostium.
+            that does not fit the vessel or the catheter around it; a distance map that is not finite, or negative at
+            the ostium.
     """
-    config = config or SimulatorConfig()
-    if control.ndim != 3 or control.shape[2] != 2:
-        raise InputError(f"control: shape {control.shape}; give (worlds, samples, 2), in mm/s and rad/s")
+    config, stack = config or SimulatorConfig(), Stack(device, tuple(catheters))
+    numbers = 2 * len(stack.devices)
+    if control.ndim != 3 or control.shape[2] != numbers:
+        raise InputError(f"control: shape {control.shape}; give (worlds, samples, {numbers}), in mm/s and rad/s")
     worlds, samples = control.shape[:2]
-    initial = np.zeros((worlds, 2)) if initial is None else np.asarray(initial, dtype=float)
+    initial = np.zeros((worlds, numbers)) if initial is None else np.asarray(initial, dtype=float)
     friction = np.full(worlds, device.friction) if friction is None else np.asarray(friction, dtype=float)
-    if initial.shape != (worlds, 2):
+    if initial.shape != (worlds, numbers):
         raise InputError(
-            f"initial: shape {initial.shape}; give ({worlds}, 2), inserted length in mm and rotation in rad"
+            f"initial: shape {initial.shape}; give ({worlds}, {numbers}), inserted length in mm and rotation in rad"
         )
     if friction.shape != (worlds,):
         raise InputError(f"friction: shape {friction.shape}; give one number for each of the {worlds} worlds")
@@ -101,36 +109,81 @@ def simulate(
     control = np.ascontiguousarray(control, dtype=float)
     if not 0 < period_s < np.inf:
         raise InputError(f"period_s: {period_s}; give a positive number of seconds")
-    commanded_mm, possible_mm = check_sequences(device, control, initial, friction, actuation, period_s)
-    check_fits(device, anatomy)
+    commanded_mm, possible_mm = _check_drives(stack, control, initial, friction, actuation, period_s)
+    stack.check(anatomy)
     check_distance_map(anatomy)
     path_mm = float(anatomy.tree.longest_path().abscissa[-1])
     if actuation == "force":
         commanded_mm = possible_mm = far_end_mm(anatomy)
-    rod = lay_out(device, element_mm=config.element_mm, length_mm=max(path_mm, possible_mm) + FREE_BEHIND_MM)
+    length_mm = max(path_mm, possible_mm) + FREE_BEHIND_MM
+    rod = lay_out(device, element_mm=config.element_mm, length_mm=length_mm)
     _check_memory(worlds, samples, len(rod.abscissa_mm) if record_shape else 0)
     result = run_core(
         rod,
-        make_lumen(anatomy.distance_map, device.tip_radius_mm, config.processor),
+        make_lumen(anatomy.distance_map, stack.outer_radius_mm, config.processor),
         anatomy.insertion,
         config=config,
         initial=initial,
         control=control,
         actuation=actuation,
-        friction=friction,
+        friction=np.column_stack([friction, *(np.full(worlds, each.friction) for each in stack.devices[1:])]),
         period_s=period_s,
         record_shape=record_shape,
-        push_limit_n=device.push_limit_n,
+        push_limit_n=stack.push_limit_n,
         pull_limit_n=device.pull_limit_n,
         torque_limit_n_mm=device.torque_limit_n_mm,
+        tubes=stack.lay_out(length_mm=length_mm),
     )
     if record_shape:  # of the wire that was needed
         needed = max(path_mm, commanded_mm, float(result["inserted_length"].max())) + FREE_BEHIND_MM
         result["shape"] = result["shape"][:, :, : np.searchsorted(rod.abscissa_mm, needed) + 3]
-    started = initial - result["approach_slip"]
-    rollout = make_rollout(anatomy, actuation, started, control, result, period_s=period_s)
+    started = initial[:, :2] - result["approach_slip"]
+    rollout = make_rollout(anatomy, actuation, started, control[..., :2], result, period_s=period_s)
+    if catheters:
+        rollout = replace(rollout, catheters=_catheter_motion(control, result["tubes"], period_s))
     _report(rollout)
     return rollout
+
+
+def _check_drives(
+    stack: Stack,
+    control: Float[np.ndarray, "worlds samples numbers"],
+    initial: Float[np.ndarray, "worlds numbers"],
+    friction: Float[np.ndarray, "worlds"],
+    actuation: Actuation,
+    period_s: float,
+) -> tuple[float, float]:
+    """Check the controls of all devices; return the largest inserted lengths as `check_sequences` does."""
+    if stack.catheters and actuation == "force":
+        raise InputError("actuation: 'force' with catheters; give 'velocity'")
+    lengths = [
+        check_sequences(
+            device, control[..., 2 * k : 2 * k + 2], initial[:, 2 * k : 2 * k + 2], friction, actuation, period_s
+        )
+        for k, device in enumerate(stack.devices)
+    ]
+    return max(commanded for commanded, _ in lengths), max(possible for _, possible in lengths)
+
+
+def _catheter_motion(
+    control: Float[np.ndarray, "worlds samples numbers"],
+    tubes: Float[np.ndarray, "worlds samples tubes 12"],
+    period_s: float,
+) -> CatheterMotion:
+    asked = control[..., 2:].reshape(*control.shape[:2], -1, 2)
+    numbers = np.moveaxis(tubes[:, :, 1:], -1, 0)
+    return CatheterMotion(
+        control=asked - np.stack([numbers[6], numbers[7]], axis=-1) / period_s,
+        inserted_length=numbers[0],
+        rotation=numbers[1],
+        tip_position=tubes[:, :, 1:, 8:11],
+        base_force=numbers[2],
+        base_torque=numbers[3],
+        drive_force=numbers[4],
+        drive_torque=numbers[5],
+        slip=numbers[6],
+        rotation_slip=numbers[7],
+    )
 
 
 def make_rollout(
@@ -160,6 +213,7 @@ def make_rollout(
     else:
         proximal = np.stack([result["inserted_length"], result["rotation"]], axis=-1)
         made = np.diff(proximal, axis=1, prepend=start) / period_s
+    recorded: dict[str, Any] = {name: result[name] for name in RECORDED}
     return Rollout(
         sample_period_s=period_s,
         initial_inserted_length=started[:, 0],
@@ -170,7 +224,7 @@ def make_rollout(
         tip=project_tip(anatomy.tree, anatomy.insertion, result["tip_position"]),
         reason=result["reason"],
         shape=result.get("shape"),
-        **{name: result[name] for name in RECORDED},
+        **recorded,
     )
 
 

@@ -17,12 +17,14 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from endopilot.errors import InputError
+from endopilot.simulation.catheter import Catheter
 from endopilot.simulation.checks import check_control, check_memory, check_travel
 from endopilot.simulation.config import LANES, Actuation, SimulatorConfig
 from endopilot.simulation.device import Device
 from endopilot.simulation.groups import Group, group_key, make_groups, merge
 from endopilot.simulation.processor import gpu_errors
 from endopilot.simulation.state import SimulatorState, Step, SupportsDLPack
+from endopilot.simulation.tubes import Stack
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, TipProjection
 
 _DEEPEST_START = 0.8
@@ -49,6 +51,7 @@ class Simulator:
         anatomy: Anatomy | Sequence[Anatomy],
         device: Device | Sequence[Device],
         *,
+        catheters: Sequence[Catheter] = (),
         worlds: int = 1,
         actuation: Actuation = "velocity",
         config: SimulatorConfig | None = None,
@@ -59,6 +62,7 @@ class Simulator:
         Args:
             anatomy: the vessel of all worlds, or one for each.
             device: the wire of all worlds, or one for each.
+            catheters: catheters around the wire, from the inside out, of all worlds; they are driven by velocity.
             worlds: their number, where neither of the above says it.
             actuation: what `step` takes: "velocity" (mm/s, rad/s; the drive makes exactly that motion, except that it
                 slips rather than push, pull or turn harder than the device's limits) or "force" (axial force N and
@@ -67,12 +71,14 @@ class Simulator:
             sharing: a simulator that has prepared the same anatomy, whose lumen is then not prepared again.
 
         Raises:
-            InputError: a device that does not fit its anatomy; a distance map that is not finite, or negative at the
-                ostium; lists of different lengths; more worlds than the memory holds.
+            InputError: a device that does not fit its anatomy or the catheter around it; a distance map that is not
+                finite, or negative at the ostium; lists of different lengths; more worlds than the memory holds.
         """
         if actuation not in ("velocity", "force"):
             raise InputError(f"actuation: {actuation!r}; give 'velocity' or 'force'")
         self._config = config or SimulatorConfig()
+        if catheters and actuation == "force":
+            raise InputError("actuation: 'force' with catheters; give 'velocity'")
         self._by_force = actuation == "force"
         check_memory(worlds * _LEAST_BYTES, f"worlds: {worlds}", "give fewer")
         anatomies = [anatomy] * worlds if isinstance(anatomy, Anatomy) else list(anatomy)
@@ -83,10 +89,13 @@ class Simulator:
             raise InputError(
                 f"anatomy, device: {len(anatomies)} and {len(devices)}; give at least one, and as many of each"
             )
+        self._stacks = [Stack(wire, tuple(catheters)) for wire in devices]
         with gpu_errors(self._config.processor):
-            self._groups = make_groups(anatomies, devices, self._config, sharing._groups if sharing else ())
+            self._groups = make_groups(anatomies, self._stacks, self._config, sharing._groups if sharing else ())
         self._device = devices
-        fastest = np.array([(device.max_velocity_mm_s, device.max_rotation_rad_s) for device in devices])
+        fastest = np.array(
+            [[(each.max_velocity_mm_s, each.max_rotation_rad_s) for each in stack.devices] for stack in self._stacks]
+        ).reshape(len(devices), -1)
         self._largest = np.full_like(fastest, np.finfo(float).max) if self._by_force else fastest * (1 + 1e-6)
         self._longest = self._merge([np.full(len(group.index), group.longest_mm) for group in self._groups])
         self.reset(inserted_length=np.zeros(len(devices)), rotation=np.zeros(len(devices)))
@@ -98,6 +107,8 @@ class Simulator:
         inserted_length: ArrayLike | None = None,
         rotation: ArrayLike | None = None,
         friction: ArrayLike | None = None,
+        catheter_inserted_length: ArrayLike | None = None,
+        catheter_rotation: ArrayLike | None = None,
         worlds: Sequence[int] | None = None,
     ) -> None:
         """Put worlds back to the ostium and push them to their first inserted length.
@@ -110,7 +121,9 @@ class Simulator:
             seed: of the random start.
             inserted_length: mm, a number for every world.
             rotation: rad, likewise.
-            friction: Coulomb friction coefficient, likewise.
+            friction: Coulomb friction coefficient of the wire, likewise.
+            catheter_inserted_length: mm, of each world and catheter; 0 if not given.
+            catheter_rotation: rad, likewise.
             worlds: the worlds to reset; all if not given. The arrays still hold a number for every world.
 
         Raises:
@@ -132,25 +145,35 @@ class Simulator:
         turn = turn if rotation is None else self._per_world("rotation", rotation)
         own = np.array([device.friction for device in self._device])
         coefficient = own if friction is None else self._per_world("friction", friction)
+        each = (self.worlds, len(self._stacks[0].catheters))
+        inner, inner_turn = (
+            np.zeros(each) if given is None else self._of_worlds(name, given, each)
+            for name, given in (
+                ("catheter_inserted_length", catheter_inserted_length),
+                ("catheter_rotation", catheter_rotation),
+            )
+        )
         if (coefficient < 0).any():
             raise InputError(f"friction: world {int(np.argmin(coefficient))}: {coefficient.min():g}; give 0 or more")
         for group in self._groups:
-            bad = (start[group.index] < 0) | (start[group.index] > group.longest_mm)
-            if bad.any():
-                world = int(group.index[np.argmax(bad)])
-                raise InputError(
-                    f"inserted_length: world {world}: {start[world]:g} mm; give 0 to {group.longest_mm:.1f} mm"
-                )
+            for name, given in [("inserted_length", start), *(("catheter_inserted_length", at) for at in inner.T)]:
+                bad = (given[group.index] < 0) | (given[group.index] > group.longest_mm)
+                if bad.any():
+                    world = int(group.index[np.argmax(bad)])
+                    raise InputError(f"{name}: world {world}: {given[world]:g} mm; give 0 to {group.longest_mm:.1f} mm")
+        initial = np.stack([np.column_stack([start, inner]), np.column_stack([turn, inner_turn])], axis=-1)
         for group in self._groups:
             mine = np.isin(group.index, chosen)
             index = group.index[mine]
             group.simulation.reset(
                 index=np.flatnonzero(mine),
-                initial=np.column_stack([start, turn])[index],
-                friction=np.ascontiguousarray(coefficient[index]),
+                initial=initial[index].reshape(len(index), -1),
+                friction=np.array(
+                    [[coefficient[world], *(each.friction for each in group.stack.devices[1:])] for world in index]
+                ).reshape(-1),
                 sample_period=SAMPLE_PERIOD_S,
             )
-            no_control = np.zeros((len(group.index), 0, 2))
+            no_control = np.zeros((len(group.index), 0, 2 * len(group.stack.devices)))
             self._run(group, no_control, self._config.time_step_s, self._config.steps_per_sample, by_force=False)
 
     def step(self, control: ArrayLike | SupportsDLPack, duration: float) -> Step:
@@ -158,7 +181,8 @@ class Simulator:
 
         Args:
             control: a row a world, of translation (mm/s) and rotation (rad/s), or of axial force (N) and torque
-                (N·mm); numpy, or anything that speaks DLPack, such as a torch tensor on the CPU.
+                (N·mm), of the wire, then of each catheter; numpy, or anything that speaks DLPack, such as a torch
+                tensor on the CPU.
             duration: s; it is cut into equal time steps of at most `config.time_step_s`.
 
         Returns:
@@ -180,14 +204,19 @@ class Simulator:
         array = np.ascontiguousarray(array, dtype=float)
         if not (math.isfinite(duration) and duration > 0):
             raise InputError(f"duration: {duration}; give a positive number of seconds")
-        check_control(array, self._largest, self._device)
+        check_control(array, self._largest, self._stacks)
         if not self._by_force:
-            check_travel(self.inserted_length + array[:, 0] * duration, self._longest)
+            ends = [self.inserted_length, *self.catheter_inserted_length.T]
+            for k, inserted in enumerate(ends):
+                check_travel(inserted + array[:, 2 * k] * duration, self._longest)
         steps = max(1, int(np.ceil(duration / self._config.time_step_s - 1e-9)))
         results = [
             self._run(group, array[group.index][:, None], duration / steps, steps, by_force=self._by_force)
             for group in self._groups
         ]
+        if self._stacks[0].catheters:
+            for result in results:
+                result["tip_position"] = np.ascontiguousarray(result["tubes"][:, :, 0, 8:11])
         return Step(
             **{name: self._merge([result[name][:, 0] for result in results]) for name in Step.__dataclass_fields__}
         )
@@ -257,11 +286,11 @@ class Simulator:
             raise InputError(f"source: {source}; give the number of a world for each of the {self.worlds} worlds")
         if (self._by_force, _settings(self._config)) != (of._by_force, _settings(of._config)):
             raise InputError("of: a simulator with other settings; make both with the same actuation and config")
-        originals = {group_key(group.anatomy, group.device): group for group in of._groups}
+        originals = {group_key(group.anatomy, group.stack): group for group in of._groups}
         states = []
         for group in self._groups:
             wanted = chosen[group.index]
-            original = originals.get(group_key(group.anatomy, group.device))
+            original = originals.get(group_key(group.anatomy, group.stack))
             strange = ~np.isin(wanted, original.index if original else [])
             if original is None or strange.any():
                 world = int(group.index[np.argmax(strange)])
@@ -312,7 +341,37 @@ class Simulator:
             >>> simulator.inserted_length.shape
             (4,)
         """
-        return self._gather("inserted_length")
+        return self._of_tubes(0)[:, 0] if self._stacks[0].catheters else self._gather("inserted_length")
+
+    @property
+    def catheter_inserted_length(self) -> Float[np.ndarray, "worlds catheters"]:
+        """Inserted lengths of the catheters, mm.
+
+        Example:
+            >>> simulator.catheter_inserted_length.shape  # a wire alone
+            (4, 0)
+        """
+        return self._of_tubes(0)[:, 1:]
+
+    @property
+    def catheter_rotation(self) -> Float[np.ndarray, "worlds catheters"]:
+        """Rotations of the catheters' drives, rad.
+
+        Example:
+            >>> simulator.catheter_rotation.shape
+            (4, 0)
+        """
+        return self._of_tubes(1)[:, 1:]
+
+    @property
+    def catheter_drive_load(self) -> Float[np.ndarray, "worlds catheters 2"]:
+        """Force (N) and torque (N·mm) of the catheters' drives.
+
+        Example:
+            >>> simulator.catheter_drive_load.shape
+            (4, 0, 2)
+        """
+        return np.stack([self._of_tubes(9)[:, 1:], self._of_tubes(10)[:, 1:]], axis=-1)
 
     @property
     def rotation(self) -> Float[np.ndarray, "worlds"]:
@@ -444,12 +503,23 @@ class Simulator:
             )
 
     def _per_world(self, name: str, values: Any) -> Float[np.ndarray, "worlds"]:
+        return self._of_worlds(name, values, (self.worlds,))
+
+    def _of_worlds(self, name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
         array = np.asarray(values, dtype=float)
-        if array.shape != (self.worlds,):
-            raise InputError(f"{name}: shape {array.shape}; give one number for each of the {self.worlds} worlds")
+        if array.shape != shape:
+            each = "one number" if len(shape) == 1 else f"{shape[1]} numbers"
+            raise InputError(f"{name}: shape {array.shape}; give {each} for each of the {self.worlds} worlds")
         if not np.isfinite(array).all():
-            raise InputError(f"{name}: world {int(np.argmin(np.isfinite(array)))}: not a finite number; correct it")
+            world = int(np.argwhere(~np.isfinite(array))[0][0])
+            raise InputError(f"{name}: world {world}: not a finite number; correct it")
         return array
+
+    def _of_tubes(self, number: int) -> Float[np.ndarray, "worlds tubes"]:
+        """Return one of the core's numbers of the wire and its catheters."""
+        if not self._stacks[0].catheters:
+            return np.zeros((self.worlds, 1))
+        return self._merge([group.simulation.tubes()[:, :, number] for group in self._groups])
 
     def _merge(self, parts: Sequence[np.ndarray]) -> np.ndarray:
         return merge(self._groups, parts)
@@ -467,7 +537,7 @@ class Simulator:
     @cached_property
     def _fingerprint(self) -> str:
         """Hash of all that a state belongs to."""
-        groups = [(group.index.tolist(), group_key(group.anatomy, group.device)) for group in self._groups]
+        groups = [(group.index.tolist(), group_key(group.anatomy, group.stack)) for group in self._groups]
         return hashlib.sha256(repr((self._by_force, _settings(self._config), groups)).encode()).hexdigest()
 
 

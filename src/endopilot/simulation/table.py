@@ -40,8 +40,33 @@ def rollout_table(rollout: Rollout) -> pd.DataFrame:
         "rotation_slip_rad": rollout.rotation_slip,
         "newton_iterations": rollout.iterations,
         "valid": rollout.valid,
+        **_catheter_columns(rollout),
     }
     return pd.DataFrame({name: np.asarray(values).reshape(-1) for name, values in columns.items()})
+
+
+def _catheter_columns(rollout: Rollout) -> dict[str, np.ndarray]:
+    """Return the columns of each catheter, the innermost first: `catheter_1_...`; none for a wire alone."""
+    motion = rollout.catheters
+    if motion is None:
+        return {}
+    columns = {}
+    for k in range(motion.rotation.shape[-1]):
+        one = {
+            "translation_mm_s": motion.control[:, :, k, 0],
+            "rotation_rad_s": motion.control[:, :, k, 1],
+            "inserted_length_mm": motion.inserted_length[:, :, k],
+            "rotation_rad": motion.rotation[:, :, k],
+            **{f"tip_{axis}_mm": motion.tip_position[:, :, k, i] for i, axis in enumerate("xyz")},
+            "base_force_n": motion.base_force[:, :, k],
+            "base_torque_nmm": motion.base_torque[:, :, k],
+            "drive_force_n": motion.drive_force[:, :, k],
+            "drive_torque_nmm": motion.drive_torque[:, :, k],
+            "slip_mm": motion.slip[:, :, k],
+            "rotation_slip_rad": motion.rotation_slip[:, :, k],
+        }
+        columns |= {f"catheter_{k + 1}_{name}": values for name, values in one.items()}
+    return columns
 
 
 def write_rollout(rollout: Rollout, path: Path) -> None:

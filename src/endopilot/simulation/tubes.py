@@ -1,0 +1,144 @@
+"""Telescoping devices on one shared centreline, as the core wants them: a wire, and the catheters around it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from endopilot.simulation.catheter import Catheter, check_nested
+from endopilot.simulation.device import Device, check_fits
+from endopilot.simulation.processor import Processor, Tubes, core_for
+from endopilot.simulation.rod import POISSON_RATIO, SHEAR_CORRECTION
+from endopilot.types import Anatomy
+
+_SPACING_MM = 0.25
+"""Distance between the points of a profile, mm."""
+
+
+@dataclass(frozen=True, eq=False)
+class TubeLayout:
+    """Two or three telescoping tubes; row k of each array belongs to tube k, the innermost first.
+
+    A profile has a value for each of the equal stretches that follow each other from the tube's tip; the last value
+    goes on beyond them.
+
+    Attributes:
+        spacing_mm: length of a stretch, mm.
+        bend_n_mm2: EI, N·mm².
+        twist_n_mm2: GJ, N·mm².
+        stretch_n: EA, N.
+        rest_curvature: curvature of the unloaded tube about its first director, 1/mm.
+        radius_mm: outer radius, mm.
+        bore_friction: Coulomb coefficient between a tube and the next one in it; that of the innermost is not used.
+        push_limit_n: force at which its drive slips, N.
+        pull_limit_n: the same where it pulls, N.
+        torque_limit_n_mm: torque at which its drive slips, N·mm.
+        shear_share: κGA / EA of all tubes.
+    """
+
+    spacing_mm: float
+    bend_n_mm2: Float[np.ndarray, "tubes stretches"]
+    twist_n_mm2: Float[np.ndarray, "tubes stretches"]
+    stretch_n: Float[np.ndarray, "tubes stretches"]
+    rest_curvature: Float[np.ndarray, "tubes stretches"]
+    radius_mm: Float[np.ndarray, "tubes"]
+    bore_friction: Float[np.ndarray, "tubes"]
+    push_limit_n: Float[np.ndarray, "tubes"]
+    pull_limit_n: Float[np.ndarray, "tubes"]
+    torque_limit_n_mm: Float[np.ndarray, "tubes"]
+    shear_share: float = SHEAR_CORRECTION / (2 * (1 + POISSON_RATIO))
+
+    def model(self, processor: Processor = "cpu") -> Tubes:
+        """Return the tubes as the core wants them."""
+
+        def integral(profile: Float[np.ndarray, "tubes stretches"]) -> Float[np.ndarray, "tubes points"]:
+            return np.concatenate([np.zeros((len(profile), 1)), self.spacing_mm * np.cumsum(profile, axis=1)], axis=1)
+
+        return core_for(processor).make_tubes(
+            spacing=self.spacing_mm,
+            shear_share=self.shear_share,
+            bend=integral(self.bend_n_mm2),
+            twist=integral(self.twist_n_mm2),
+            stretch=integral(self.stretch_n),
+            rest=integral(self.rest_curvature),
+            radius=self.radius_mm,
+            bore_friction=self.bore_friction,
+            push_limit=self.push_limit_n,
+            pull_limit=self.pull_limit_n,
+            torque_limit=self.torque_limit_n_mm,
+        )
+
+
+@dataclass(frozen=True)
+class Stack:
+    """A wire, and the catheters around it from the inside out; none for a wire alone."""
+
+    wire: Device
+    catheters: tuple[Catheter, ...] = ()
+
+    @property
+    def devices(self) -> tuple[Device, ...]:
+        """The wire, and what each catheter has in common with one."""
+        return (self.wire, *(catheter.device for catheter in self.catheters))
+
+    @property
+    def outer_radius_mm(self) -> float:
+        """Radius of the widest device, mm."""
+        return max(device.tip_radius_mm for device in self.devices)
+
+    @property
+    def push_limit_n(self) -> float:
+        """Largest push limit of the devices, N."""
+        return max(device.push_limit_n for device in self.devices)
+
+    @property
+    def constants(self) -> tuple[Any, ...]:
+        """All numbers of the devices: stacks with the same constants behave the same."""
+        bores = tuple((each.inner_diameter_mm, each.bore_friction, each.shape) for each in self.catheters)
+        return self.wire.constants + tuple(each.device.constants for each in self.catheters) + bores
+
+    def check(self, anatomy: Anatomy) -> None:
+        """Check that the devices fit into each other, and into an anatomy.
+
+        Raises:
+            InputError: one does not.
+        """
+        check_nested(self.wire, self.catheters)
+        for device in self.devices:
+            check_fits(device, anatomy)
+
+    def lay_out(self, *, length_mm: float) -> TubeLayout | None:
+        """Return the tubes that the core takes; None for a wire alone.
+
+        Args:
+            length_mm: length that the profiles must cover.
+        """
+        return _lay_out(self.wire, self.catheters, length_mm) if self.catheters else None
+
+
+def _lay_out(wire: Device, catheters: Sequence[Catheter], length_mm: float) -> TubeLayout:
+    devices = [wire, *(catheter.device for catheter in catheters)]
+    stretches = int(np.ceil(length_mm / _SPACING_MM)) + 2
+    edges = _SPACING_MM * np.arange(stretches + 1)
+    middle = edges[:-1] + 0.5 * _SPACING_MM
+    bend = np.array([device.bend_stiffness(middle) for device in devices])
+    bores = np.array([0.0, *(catheter.inner_diameter_mm for catheter in catheters)])
+    widths = np.array([device.diameter_mm for device in devices])
+    tip = wire.tip_bend_rad * np.minimum(edges / max(wire.tip_bend_length_mm, 1e-9), 1.0)
+    turned = np.array([tip, *(catheter.turned(edges) for catheter in catheters)])
+    return TubeLayout(
+        spacing_mm=_SPACING_MM,
+        bend_n_mm2=bend,
+        twist_n_mm2=np.array([device.twist_stiffness(middle) for device in devices]),
+        stretch_n=16 * bend / (widths**2 + bores**2)[:, None],  # of a ring of these diameters, EA / EI
+        rest_curvature=np.diff(turned, axis=1) / _SPACING_MM,
+        radius_mm=widths / 2,
+        bore_friction=np.array([0.0, *(catheter.bore_friction for catheter in catheters)]),
+        push_limit_n=np.array([device.push_limit_n for device in devices]),
+        pull_limit_n=np.array([device.pull_limit_n for device in devices]),
+        torque_limit_n_mm=np.array([device.torque_limit_n_mm for device in devices]),
+    )

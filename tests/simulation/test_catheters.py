@@ -1,0 +1,182 @@
+"""Wires with catheters around them: files, fit, drives, and the same bits however worlds are stepped."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import endopilot
+from endopilot.errors import InputError
+from endopilot.simulation.catheter import Catheter, list_catheters, read_catheter
+from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.controls import read_controls_csv
+from endopilot.simulation.device import read_device
+from endopilot.simulation.table import write_rollout
+from endopilot.types import Anatomy
+
+SHIPPED = Path(endopilot.__file__).parent / "simulation/catheters"
+
+
+@pytest.fixture(scope="module")
+def vessel() -> Anatomy:
+    return next(iter(endopilot.make_atlas(endopilot.AtlasConfig())))
+
+
+@pytest.fixture(scope="module")
+def catheter() -> Catheter:
+    return read_catheter("microcatheter-1.7f")
+
+
+def random_drives(worlds: int, samples: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    draw = np.random.default_rng(seed)
+    start = np.column_stack([draw.uniform(0, 40, worlds), draw.uniform(-3, 3, worlds)])
+    start = np.column_stack([start, draw.uniform(0, 40, worlds), draw.uniform(-3, 3, worlds)])
+    control = draw.uniform(-1, 1, (worlds, samples, 4)) * [15.0, 3.0, 15.0, 3.0]
+    return start, control
+
+
+@pytest.mark.parametrize("name", list_catheters())
+def test_shipped_catheters_are_whole(name: str) -> None:
+    catheter = read_catheter(name)
+    assert catheter.name == name
+    assert 0 < catheter.inner_diameter_mm < catheter.device.diameter_mm
+    assert all(len(source) > 7 for source in catheter.device.sources.values())
+    assert catheter.turned(np.array([0.0, 1e3]))[1] == pytest.approx(sum(angle for _, angle in catheter.shape))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("value: 0.42", "value: 0.6", "inner_diameter_mm: 0.6; give less than the outer diameter, 0.57 mm"),
+        ("bore_friction:", "bore_fiction:", "bore_fiction: no such field; did you mean bore_friction?"),
+        ("arcs: []", "arcs: [[0, 30]]", "shape.arcs[0][0]: 0; give a positive number"),
+        ("arcs: []", "arcs: [[5, 900]]", "shape.arcs[0][1]: 900; give a number from -720 to 720"),
+    ],
+)
+def test_a_bad_file_is_refused(tmp_path: Path, old: str, new: str, message: str) -> None:
+    text = (SHIPPED / "microcatheter-1.7f.yaml").read_text(encoding="utf-8")
+    assert old in text
+    path = tmp_path / "catheter.yaml"
+    path.write_text(text.replace(old, new, 1), encoding="utf-8")
+    with pytest.raises(InputError) as error:
+        read_catheter(path)
+    assert str(error.value).startswith(f"{path}: {message}")
+    assert "\n" not in str(error.value)
+
+
+def test_what_is_too_wide_is_refused(vessel: Anatomy, catheter: Catheter) -> None:
+    control = np.zeros((1, 1, 4))
+    with pytest.raises(
+        InputError, match=r"diameter_mm = 0\.89 is too wide for the bore of catheter microcatheter-1\.7f"
+    ):
+        endopilot.simulate(vessel, read_device("j-035"), control, catheters=[catheter])
+    wide = replace(catheter, device=replace(catheter.device, diameter_mm=9.0))
+    with pytest.raises(InputError, match="wider than the"):
+        endopilot.simulate(vessel, read_device("workhorse-014"), control, catheters=[wide])
+    with pytest.raises(InputError, match="catheter 'none'"):
+        read_catheter("none")
+    with pytest.raises(InputError, match="'force' with catheters"):
+        endopilot.simulate(vessel, read_device("workhorse-014"), control, catheters=[catheter], actuation="force")
+
+
+def test_worlds_do_not_notice_each_other(vessel: Anatomy, catheter: Catheter) -> None:
+    wire = read_device("workhorse-014")
+    start, control = random_drives(9, 6, 5)
+    together = endopilot.simulate(vessel, wire, control, catheters=[catheter], initial=start)
+    assert together.catheters is not None and together.valid.all()
+    crossed = together.inserted_length > together.catheters.inserted_length[..., 0]
+    assert crossed.any() and not crossed.all()  # wire and catheter overtake each other
+    few = endopilot.simulate(
+        vessel, wire, control[3:5], catheters=[catheter], initial=start[3:5], config=SimulatorConfig(threads=1)
+    )
+    assert few.catheters is not None
+    for all_worlds, two in (
+        (together.tip_position, few.tip_position),
+        (together.base_force, few.base_force),
+        (together.catheters.base_force, few.catheters.base_force),
+        (together.catheters.tip_position, few.catheters.tip_position),
+    ):
+        assert np.array_equal(all_worlds[3:5], two)
+
+
+def test_step_by_step_and_from_a_saved_state_the_bits_are_the_same(
+    vessel: Anatomy, catheter: Catheter, tmp_path: Path
+) -> None:
+    wire = read_device("workhorse-014")
+    start, control = random_drives(3, 5, 6)
+    whole = endopilot.simulate(vessel, wire, control, catheters=[catheter], initial=start)
+    assert whole.catheters is not None
+    simulator = endopilot.Simulator(vessel, wire, catheters=[catheter], worlds=3)
+    simulator.reset(
+        inserted_length=start[:, 0],
+        rotation=start[:, 1],
+        catheter_inserted_length=start[:, 2:3],
+        catheter_rotation=start[:, 3:],
+    )
+    for sample in range(3):
+        simulator.step(control[:, sample], 0.5)
+    simulator.state.save(tmp_path / "state.npz")
+    again = endopilot.Simulator(vessel, wire, catheters=[catheter], worlds=3)
+    again.set_state(type(simulator.state).load(tmp_path / "state.npz"))
+    for sample in range(3, 5):
+        step = again.step(control[:, sample], 0.5)
+    assert np.array_equal(step.tip_position, whole.tip_position[:, -1])
+    assert np.array_equal(again.catheter_inserted_length, whole.catheters.inserted_length[:, -1])
+    assert np.array_equal(again.catheter_drive_load[:, 0, 0], whole.catheters.drive_force[:, -1, 0])
+    alone = endopilot.Simulator(vessel, wire, worlds=3)
+    with pytest.raises(InputError, match="other anatomies, devices or settings"):
+        alone.set_state(simulator.state)
+    too_fast = np.array([[1.0, 0.0, 1e3, 0.0]] * 3)
+    with pytest.raises(InputError, match=r"the limits of microcatheter-1\.7f"):
+        again.step(too_fast, 0.1)
+
+
+def test_a_withdrawn_wire_leaves_the_catheter_where_it_is(vessel: Anatomy, catheter: Catheter) -> None:
+    # and the foremost tip is then the catheter's
+    start = np.array([[40.0, 0.0, 30.0, 0.0]])
+    control = np.zeros((1, 10, 4))
+    control[0, :8, 0] = -10.0
+    rollout = endopilot.simulate(vessel, read_device("workhorse-014"), control, catheters=[catheter], initial=start)
+    motion = rollout.catheters
+    assert rollout.valid.all() and motion is not None
+    assert rollout.inserted_length[0, -1] == pytest.approx(0.0, abs=1e-9)
+    assert motion.inserted_length[0, :, 0] == pytest.approx(np.full(10, 30.0))
+    moved = np.linalg.norm(motion.tip_position[0, -1, 0] - motion.tip_position[0, 0, 0])
+    assert moved < 1.5  # it leans on the wall as its own stiffness has it
+
+
+def test_drives_keep_their_limits(vessel: Anatomy, catheter: Catheter) -> None:
+    weak = replace(
+        catheter, device=replace(catheter.device, push_limit_n=0.02, pull_limit_n=0.02, torque_limit_n_mm=2e-4)
+    )
+    start = np.array([[60.0, 0.0, 20.0, 0.0]])
+    control = np.zeros((1, 16, 4))
+    control[0, :, 2], control[0, :, 3] = 8.0, 2.0
+    wire = read_device("workhorse-014")
+    free = endopilot.simulate(vessel, wire, control, catheters=[catheter], initial=start)
+    held = endopilot.simulate(vessel, wire, control, catheters=[weak], initial=start)
+    assert free.catheters is not None and held.catheters is not None
+    assert free.catheters.base_force.max() > 0.03 and np.abs(free.catheters.base_torque).max() > 3e-4
+    assert np.abs(free.catheters.slip).max() == 0
+    assert held.catheters.base_force.max() < 0.025  # a drive behind the lead is slowed down after it met its limit
+    assert np.abs(held.catheters.base_torque).max() <= 2e-4 * (1 + 1e-3)
+    made = start[0, 2] + 8.0 * 8.0 - held.catheters.slip[0, :, 0].sum()
+    assert held.catheters.inserted_length[0, -1, 0] == pytest.approx(made) and held.catheters.slip.sum() > 1.0
+
+
+def test_a_rollout_written_as_csv_is_simulated_again(vessel: Anatomy, catheter: Catheter, tmp_path: Path) -> None:
+    start, control = random_drives(2, 4, 8)
+    wire = read_device("workhorse-014")
+    first = endopilot.simulate(vessel, wire, control, catheters=[catheter], initial=start)
+    write_rollout(first, tmp_path / "rollout.csv")
+    script = read_controls_csv(tmp_path / "rollout.csv", catheters=1)
+    second = endopilot.simulate(
+        vessel, wire, script.control, catheters=[catheter], initial=script.initial, period_s=script.period_s
+    )
+    assert second.catheters is not None and first.catheters is not None
+    assert second.catheters.tip_position == pytest.approx(first.catheters.tip_position, abs=1e-3)
+    with pytest.raises(InputError, match="column catheter_2_translation_mm_s is missing"):
+        read_controls_csv(tmp_path / "rollout.csv", catheters=2)
