@@ -1,14 +1,18 @@
-"""Runs `endopilot bench imaging` and writes what it measured into docs/imaging.md; give the number of cases, or 50."""
+"""Runs `endopilot bench imaging` and writes what it measured into docs/imaging.md.
+
+Give the number of clean cases, or 50, and that of each difficulty, or 10.
+"""
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
 from endopilot.benchmarks.imaging import BARS, ImagingBenchConfig, bench_imaging
+from endopilot.benchmarks.imaging_cases import DIFFICULTIES
 
 PAGE = Path(__file__).parents[1] / "imaging.md"
-BEGIN, END = "<!-- bench:begin -->", "<!-- bench:end -->"
 TITLES = {
     "dice": "Dice",
     "cldice": "clDice",
@@ -21,7 +25,7 @@ TITLES = {
 
 
 def main() -> None:
-    """Measure, and replace the table between the page's marks."""
+    """Measure, and replace the tables between the page's marks."""
     cases = int(sys.argv[1]) if len(sys.argv) > 1 else ImagingBenchConfig.cases
     found = bench_imaging(ImagingBenchConfig(cases=cases))
     lines = [
@@ -40,9 +44,30 @@ def main() -> None:
         )
     reasons = "; ".join(f"case {case}: {why}" for case, why in found["failed"].items()) or "none"
     lines += ["", f"Cases without a result: {reasons}."]
-    head, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
-    page = "\n".join([f"{head}{BEGIN}", *lines, END]) + rest.split(END)[1]
-    PAGE.write_text(page, encoding="utf-8")
+    _replace("bench", lines)
+    _replace("difficulties", _difficulties(int(sys.argv[2]) if len(sys.argv) > 2 else 10))
+
+
+def _difficulties(cases: int) -> list[str]:
+    """Measure the same patients with each difficulty, and return the table."""
+    lines = [
+        f"`endopilot bench imaging --cases {cases} --seed 0 --difficulty NAME`, means of the cases with a result:",
+        "",
+        "| difficulty | Dice | clDice | overlap OV | ostium error, mm | wrong or none | told | silent |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    for name in DIFFICULTIES:
+        found: dict[str, Any] = bench_imaging(ImagingBenchConfig(cases=cases, difficulty=name))
+        means = [_number(found[figure]["mean_found"]) for figure in ("dice", "cldice", "overlap", "ostium_error_mm")]
+        lines.append(f"| {' | '.join([name, *means])} | {found['wrong']} | {found['told']} | {found['silent']} |")
+    return lines
+
+
+def _replace(mark: str, lines: list[str]) -> None:
+    """Put the lines between the page's marks of that name, and print them."""
+    begin, end = f"<!-- {mark}:begin -->", f"<!-- {mark}:end -->"
+    head, rest = PAGE.read_text(encoding="utf-8").split(begin)
+    PAGE.write_text("\n".join([f"{head}{begin}", *lines, end]) + rest.split(end)[1], encoding="utf-8")
     print("\n".join(lines))
 
 

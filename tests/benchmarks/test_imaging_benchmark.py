@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -11,7 +11,8 @@ import pytest
 from endopilot import runs
 from endopilot.atlas.atlas import make_patient
 from endopilot.benchmarks import imaging as imaging_bench
-from endopilot.benchmarks.imaging import BARS, ImagingBenchConfig, bench_imaging, draw_case
+from endopilot.benchmarks.imaging import BARS, ImagingBenchConfig, bench_imaging
+from endopilot.benchmarks.imaging_cases import DIFFICULTIES, draw_case
 from endopilot.errors import InputError
 from endopilot.imaging.overlap import mask_like
 from endopilot.runs import claim
@@ -26,9 +27,22 @@ GOOD = {
     "ostium_error_mm": 0.4,
     "false_length_mm": 0.0,
 }
+DISTURBANCES = {
+    "slices": ["slice_mm"],
+    "motion": ["motion_mm"],
+    "steps": ["step_mm", "slab_mm"],
+    "grain": ["grain_mm"],
+    "blooming": ["blooming_mm"],
+    "stents": ["stents"],
+    "leads": ["leads"],
+    "veins": ["veins"],
+    "appendage": ["appendage_mm"],
+    "graft": ["graft"],
+}
 
 
-def write(folder, rows) -> None:
+def write(base, rows) -> None:
+    folder = base / "clean"
     claim(folder, "endopilot bench imaging", **imaging_bench._identity(7))
     for index, row in enumerate(rows):
         whole = {"case": index, "failed": None, "seconds": 2, "processor_seconds": 3}
@@ -43,7 +57,8 @@ def figures(folder, rows):
 def test_means_spreads_and_bars(tmp_path):
     found = figures(tmp_path, [GOOD, GOOD | {"dice": 0.83, "ostium_error_mm": 1.2}])
     assert found["dice"] == {
-        "mean": 0.88, "sd": 0.0707, "worst": 0.83, "worst_found": 0.83, "bar": 0.85, "counts": "mean", "met": True
+        "mean": 0.88, "sd": 0.0707, "worst": 0.83, "mean_found": 0.88, "worst_found": 0.83,
+        "bar": 0.85, "counts": "mean", "met": True
     }  # fmt: skip
     assert found["ostium_error_mm"]["worst"] == 1.2 and not found["ostium_error_mm"]["met"]
     assert all(found[name]["met"] for name in BARS if name != "ostium_error_mm")
@@ -54,6 +69,7 @@ def test_a_failed_case_counts_against_every_figure(tmp_path):
     found = figures(tmp_path, [GOOD] * 9 + [{"failed": "no aorta"}])
     assert found["failed"] == {"9": "no aorta"}
     assert found["dice"]["worst"] == 0.0 and found["dice"]["worst_found"] == 0.93
+    assert found["dice"]["mean_found"] == pytest.approx(0.93)
     assert found["dice"]["mean"] == pytest.approx(0.837)
     assert not any(found[name]["met"] for name in BARS if name.endswith("_mm"))
 
@@ -88,6 +104,21 @@ def test_a_case_depends_on_seed_and_index_alone():
     assert draw_case(3, 5)[1] != draw_case(3, 6)[1] != draw_case(4, 6)[1]
 
 
+def test_a_difficulty_changes_the_scan_and_nothing_else():
+    patients, clean = draw_case(3, 5)
+    for difficulty in DIFFICULTIES[1:]:
+        others, scan = draw_case(3, 5, difficulty)
+        assert others == patients and scan != clean
+        changed = {name for name, value in asdict(scan).items() if value != asdict(clean)[name]}
+        assert changed <= {"calcium", *DISTURBANCES[difficulty]}, difficulty
+    assert set(DISTURBANCES) == set(DIFFICULTIES[1:])
+
+
+def test_wrong_results_are_counted_and_those_that_were_refused(tmp_path):
+    found = figures(tmp_path, [GOOD, GOOD | {"overlap": 0.79}, GOOD | {"ostium_error_mm": 5.1}, {"failed": "no aorta"}])
+    assert (found["wrong"], found["told"], found["silent"]) == (3, 1, 2)
+
+
 def test_one_case_from_the_volume_to_its_scores(tmp_path, monkeypatch):
     patients, scan = draw_case(1000, 0)
     coarse = replace(scan, in_plane_mm=0.9, slice_mm=0.9)
@@ -97,13 +128,13 @@ def test_one_case_from_the_volume_to_its_scores(tmp_path, monkeypatch):
         inside = mask_like(LumenMask(as_volume(truth.distance_map)), volume)
         return LumenMask(replace(volume, voxels=inside), truth.insertion)
 
-    monkeypatch.setattr(imaging_bench, "draw_case", lambda seed, index: (patients, coarse))
+    monkeypatch.setattr(imaging_bench, "draw_case", lambda seed, index, difficulty: (patients, coarse))
     monkeypatch.setattr(imaging_bench, "segment", whole_lumen)
     monkeypatch.setattr(imaging_bench, "extract_anatomy", lambda mask, name, config: truth)
     found = bench_imaging(ImagingBenchConfig(cases=1, seed=1000, folder=tmp_path))
     assert found["failed"] == {}
     assert found["dice"]["mean"] > 0.9 and found["overlap"]["mean"] == 1.0
-    row = json.loads((tmp_path / "0000.json").read_text())
+    row = json.loads((tmp_path / "clean" / "0000.json").read_text())
     assert row["scan"]["in_plane_mm"] == 0.9 and row["manifest"]["seed"] == 1000
 
 

@@ -211,8 +211,12 @@ def right_atrium(x: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
 
 def left_atrium(x: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
     """Depth in the left atrium and its appendage, which lies beside the left main artery."""
-    body = ellipsoid(x, (24, 41, -9), (27, 17, 22), (1.0, 0.1, 0.1))
-    return np.maximum(body, ellipsoid(x, (47, 17, 7), (15, 7, 8), (0.3, -0.8, 0.2)))
+    return np.maximum(ellipsoid(x, (24, 41, -9), (27, 17, 22), (1.0, 0.1, 0.1)), left_appendage(x))
+
+
+def left_appendage(x: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
+    """Depth in the left atrial appendage."""
+    return ellipsoid(x, (47, 17, 7), (15, 7, 8), (0.3, -0.8, 0.2))
 
 
 def aorta(x: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:

@@ -18,17 +18,18 @@ import endopilot.imaging
 import endopilot.phantom
 from endopilot import __version__
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
-from endopilot.atlas.atlas import AtlasConfig, make_patient
+from endopilot.atlas.atlas import make_patient
+from endopilot.benchmarks.imaging_cases import Difficulty, draw_case
 from endopilot.errors import InputError
 from endopilot.evaluation.anatomy_score import score_anatomy
 from endopilot.files import manifest, read_json, write_json
 from endopilot.imaging.segment import SegmentConfig, segment
-from endopilot.phantom.phantom import PhantomConfig, make_phantom
+from endopilot.phantom.phantom import make_phantom
 from endopilot.runs import claim, make_missing
 from endopilot.settings import Count, Within, settings
 
-VESSELS = ("rca", "lca")
-"""Coronary trees of the cases, in turn."""
+LEAST_OVERLAP, LARGEST_OSTIUM_ERROR_MM = 0.8, 5.0
+"""A result is wrong where its centerline overlap is smaller, or its ostium error larger."""
 
 
 @dataclass(frozen=True)
@@ -55,14 +56,16 @@ BARS = {
 
 @settings
 class ImagingBenchConfig:
-    """Number and seed of the cases, and the folder of their results."""
+    """Number, seed and difficulty of the cases, and the folder of their results."""
 
     cases: Count = 50
     """Number of synthetic CT angiograms."""
     seed: Annotated[int, Within(0, 2**63 - 1)] = 0
     """Seed of patients, scanners and noise: case i is the same however many there are."""
+    difficulty: Difficulty = "clean"
+    """What the scans have in common; `draw_case` says how much of it. Patients, scanners and noise stay the same."""
     folder: Path = Path("runs/bench-imaging")
-    """Folder of the cases' results; an interrupted run goes on where it stopped."""
+    """Folder of the results, with a folder for each difficulty; an interrupted run goes on where it stopped."""
 
 
 def bench_imaging(config: ImagingBenchConfig) -> dict[str, Any]:
@@ -71,45 +74,40 @@ def bench_imaging(config: ImagingBenchConfig) -> dict[str, Any]:
     Centerlines and radii are those that `extract_anatomy` finds in the mask; its tree begins at the mask's ostium.
 
     Returns:
-        For each of `BARS` its `mean`, `sd`, `worst` of all cases and `worst_found` of those with a result, `bar`,
-        `counts` (mean or worst) and whether it is `met`; `seconds`
+        For each of `BARS` its `mean`, `sd`, `worst` of all cases, `mean_found` and `worst_found` of those with a
+        result, `bar`, `counts` (mean or worst) and whether it is `met`; `seconds`
         and `processor_seconds` of the segmentation a case; `cases`, and `failed`: cases without any result, each with
-        the reason. A failed case counts 0 in the shares, and no bar in mm is met then.
+        the reason. A failed case counts 0 in the shares, and no bar in mm is met then. `wrong` counts results that
+        are wrong or absent, `told` those of them that were refused, `silent` the others.
 
     Raises:
         InputError: the folder belongs to another run, such as one of another seed or by other source code.
     """
-    claim(config.folder, "endopilot bench imaging", **_identity(config.seed))
-    paths = [config.folder / f"{index:04d}.json" for index in range(config.cases)]
-    make_missing("Synthetic CT angiograms", paths, partial(_measure, seed=config.seed))
+    folder = config.folder / config.difficulty
+    claim(folder, "endopilot bench imaging", **_identity(config.seed))
+    paths = [folder / f"{index:04d}.json" for index in range(config.cases)]
+    make_missing("Synthetic CT angiograms", paths, partial(_measure, seed=config.seed, difficulty=config.difficulty))
     rows = [read_json(path) for path in paths]
     failed = {str(row["case"]): row["failed"] for row in rows if row["failed"]}
     figures: dict[str, Any] = {name: _figure(name, rows) for name in BARS}
     for name in ("seconds", "processor_seconds"):
         values = np.array([row[name] for row in rows])
         figures[name] = {"mean": round(float(values.mean()), 2), "worst": round(float(values.max()), 2)}
-    return figures | {"cases": len(rows), "failed": failed}
+    wrong = [row for row in rows if is_wrong(row)]
+    told = sum(1 for row in wrong if row["failed"])
+    counts = {"wrong": len(wrong), "told": told, "silent": len(wrong) - told}
+    return figures | {"cases": len(rows)} | counts | {"failed": failed}
 
 
-def draw_case(seed: int, index: int) -> tuple[AtlasConfig, PhantomConfig]:
-    """Return the patient and the scan of a case: voxels, calcium, background and all that the phantom draws."""
-    key = np.array([seed, index], dtype=np.uint64)
-    generator = np.random.Generator(np.random.Philox(key=key, counter=1))
-    patients = AtlasConfig(anatomy=VESSELS[index % len(VESSELS)], seed=seed, stenosis_share=0.5)
-    right_heart = float(generator.uniform(0.2, 0.95))
-    scan = PhantomConfig(
-        in_plane_mm=float(generator.uniform(0.32, 0.45)),
-        slice_mm=float(generator.uniform(0.4, 0.7)),
-        calcium=float(generator.uniform(0.0, 6.0)),
-        right_heart=(right_heart, right_heart),
-    )
-    return patients, scan
+def is_wrong(row: dict[str, Any]) -> bool:
+    """Return whether a case has no result or a wrong one."""
+    return bool(row["failed"] or row["overlap"] < LEAST_OVERLAP or row["ostium_error_mm"] > LARGEST_OSTIUM_ERROR_MM)
 
 
-def _measure(path: Path, *, seed: int) -> None:
+def _measure(path: Path, *, seed: int, difficulty: Difficulty) -> None:
     """Make, segment and score one case, and write its row."""
     index = int(path.stem)
-    patients, scan = draw_case(seed, index)
+    patients, scan = draw_case(seed, index, difficulty)
     truth = make_patient(patients, index)
     volume = make_phantom(truth, scan, seed * 1_000_003 + index)
     vessel = "lca" if patients.anatomy == "lca" else "rca"
@@ -144,6 +142,7 @@ def _figure(name: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
         "mean": _rounded(mean),
         "sd": _rounded(float(counted.std(ddof=1)) if len(counted) > 1 else 0.0),
         "worst": _rounded(worst),
+        "mean_found": _rounded(float(found.mean()) if len(found) else np.nan),
         "worst_found": _rounded(float((found.min() if bar.at_least else found.max()) if len(found) else np.nan)),
         "bar": bar.limit,
         "counts": "worst" if bar.worst else "mean",

@@ -13,6 +13,7 @@ from typing import Any, Literal
 from tyro.conf import Positional
 
 from endopilot.atlas.atlas import AtlasConfig
+from endopilot.benchmarks.imaging_cases import Difficulty
 from endopilot.benchmarks.robustness import RobustnessConfig
 from endopilot.benchmarks.xray import XrayBenchConfig
 from endopilot.cli.arguments import OutputFolder, existing, show, show_rows
@@ -208,18 +209,28 @@ def ostia(folder: Positional[Path], /, *, json: bool = False) -> None:
     _leave(all(figure["passed"] for figure in figures))
 
 
-def imaging(*, cases: int = 50, seed: int = 0, folder: Path = Path("runs/bench-imaging"), json: bool = False) -> None:
+def imaging(
+    *,
+    cases: int = 50,
+    seed: int = 0,
+    difficulty: Difficulty = "clean",
+    folder: Path = Path("runs/bench-imaging"),
+    json: bool = False,
+) -> None:
     """Segment synthetic CT angiograms from the volume alone, and compare with the truth.
 
     Args:
         cases: number of CT angiograms.
         seed: seed of the patients and their scans.
-        folder: folder of the cases' results; an interrupted run goes on where it stopped.
+        difficulty: clean, or what disturbs the same scans: slices (thick ones), motion, steps (between heart beats),
+            grain (of iterative reconstruction), blooming (of calcium), stents, leads (of a pacemaker), veins,
+            appendage (of the left atrium), graft (a bypass).
+        folder: folder of the results, one for each difficulty; an interrupted run goes on where it stopped.
         json: print the figures as JSON.
     """
     from endopilot.benchmarks.imaging import BARS, ImagingBenchConfig, bench_imaging
 
-    measured = bench_imaging(ImagingBenchConfig(cases=cases, seed=seed, folder=folder))
+    measured = bench_imaging(ImagingBenchConfig(cases=cases, seed=seed, difficulty=difficulty, folder=folder))
     if json:
         show(measured, as_json=True)
     else:

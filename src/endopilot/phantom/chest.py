@@ -75,6 +75,7 @@ def organs(
     grid: Float32[np.ndarray, "nz ny nx 3"],
     around_vessels: Float[np.ndarray, "nz ny nx"],
     generator: np.random.Generator,
+    appendage_mm: float = 0.0,
 ) -> tuple[Organ, ...]:
     """Return the organs in painting order, from the chest wall to the blood pools.
 
@@ -83,6 +84,7 @@ def organs(
         grid: the patient's positions of the coarse grid, mm.
         around_vessels: signed distance to the surface of the fat that the coronaries need, mm.
         generator: random stream of the surfaces' unevenness.
+        appendage_mm: the left atrial appendage is wider by this, mm, and touches the coronary walls; 0: it does not.
     """
     x = heart.to_reference(grid.reshape(-1, 3)).reshape(grid.shape).astype(np.float32)
     spacing_mm = float(grid[0, 0, 1, 0] - grid[0, 0, 0, 0])
@@ -98,7 +100,8 @@ def organs(
     aorta, pulmonary = reference.aorta(x), reference.pulmonary_artery(x)
     cava, lower_cava = tube(x, _UPPER_CAVA, (8, 8.5, 9)), tube(x, _LOWER_CAVA, (10, 11, 11))
     veins = np.max([tube(x, line, (6, 5, 3)) for line in _PULMONARY_VEINS], axis=0)
-    epicardium = np.max([lv_wall, rv_wall, ra + 2, la + 2], axis=0)
+    appendage = reference.left_appendage(x) + appendage_mm + 0.5 * wavy if appendage_mm > 0 else la
+    epicardium = np.max([lv_wall, rv_wall, ra + 2, np.maximum(la, appendage) + 2], axis=0)
     large_vessels = np.max([aorta, pulmonary, cava, lower_cava], axis=0)
     pericardium = _close(np.max([epicardium + 2.5, large_vessels + 3, around_vessels], axis=0), 26.0, spacing_mm)
     bone = _bone(x)
@@ -117,6 +120,7 @@ def organs(
         Organ("vena cava", cava, 2.2),
         Organ("right ventricle", np.maximum(np.minimum(rv, -1.0 - lv_wall), pulmonary), 2.2),
         Organ("left atrium", np.maximum(la, veins), 2.2),
+        *([Organ("left atrium", np.minimum(appendage, -1.3 - large_vessels), 0.8)] if appendage_mm > 0 else []),
         Organ("left ventricle", lv, 2.2),
         Organ("aorta", aorta),
     )
@@ -138,8 +142,11 @@ def other_coronary(heart: HeartFit, tree: VesselTree) -> tuple[Centerline, ...]:
     return tuple(lines)
 
 
-def cardiac_veins(heart: HeartFit, tree: VesselTree) -> tuple[Centerline, ...]:
-    """Return the small cardiac vein beside segments 2 and 3, a vein beside the distal artery, the coronary sinus."""
+def cardiac_veins(heart: HeartFit, tree: VesselTree, *, touching: bool = False) -> tuple[Centerline, ...]:
+    """Return the small cardiac vein beside segments 2 and 3, a vein beside the distal artery, the coronary sinus.
+
+    Where they touch the artery, only its wall lies between.
+    """
     line, crux = tree.longest_path(), _crux_abscissa(tree)
     lines = []
     if is_left(tree):
@@ -155,11 +162,20 @@ def cardiac_veins(heart: HeartFit, tree: VesselTree) -> tuple[Centerline, ...]:
         points, tangent = line.points[inside], shape.tangents(line.points[inside])
         side = np.cross(tangent, line.normals[inside])
         across = np.cos(angle) * line.normals[inside] + np.sin(angle) * side
-        points = points + (line.radius[inside] + radius + gap)[:, None] * across
+        points = points + (line.radius[inside] + radius + (_TOUCHING_MM if touching else gap))[:, None] * across
         lines.append(_vein(points, radius, radius))
     sinus = heart.from_reference(shape.curve_through(np.array(_CORONARY_SINUS, dtype=float)))
     lines.append(_vein(sinus, 4.2, 2.2))
     return tuple(lines)
+
+
+def bypass_graft(heart: HeartFit, tree: VesselTree) -> Centerline:
+    """Return a saphenous vein graft of 4 mm from the ascending aorta: to the middle of the LAD or to the distal RCA."""
+    line = main_paths(tree)[0]
+    anastomosis = 0.5 * float(line.abscissa[-1]) if is_left(tree) else 0.85 * _crux_abscissa(tree)
+    target = line.points[int(np.searchsorted(line.abscissa, anastomosis))]
+    course = heart.from_reference(np.array(_LEFT_GRAFT if is_left(tree) else _RIGHT_GRAFT, dtype=float))
+    return _vein(shape.curve_through(np.concatenate([course, target[None]])), 2.1, 1.5)
 
 
 def _vein(points: Float[np.ndarray, "n 3"], begin_mm: float, end_mm: float) -> Centerline:
@@ -187,6 +203,11 @@ _PULMONARY_VEINS = [
     [(44, 46, -2), (62, 54, 4), (90, 50, 14)],
     [(44, 46, -16), (60, 58, -24), (88, 64, -36)],
 ]
+_TOUCHING_MM = 0.7
+"""Gap between the lumens of an artery and a vein that touches it, mm."""
+_LEFT_GRAFT = [(9, -9, 22), (9, -20, 27), (16, -36, 21), (28, -44, 10), (44, -48, -6)]
+_RIGHT_GRAFT = [(2, -8, 20), (-6, -19, 20), (-26, -22, 6), (-38, -20, -14), (-41, -14, -36)]
+"""From within the aorta's front wall over the pulmonary trunk, and beside the right atrium."""
 _CORONARY_SINUS = [(-6, 20, -47), (4, 29, -48), (18, 36, -44), (33, 37, -38), (48, 27, -28)]
 _RIGHT_CORONARY = ((reference.TO_CRUX[:7].tolist(), 2.0, 1.8),)
 _LEFT_CORONARY = (

@@ -16,9 +16,10 @@ from scipy.spatial import KDTree
 
 from endopilot.atlas.heart_reference import HeartFit
 from endopilot.phantom import chest
+from endopilot.phantom.metal import add_metal, leads, stents
 from endopilot.phantom.painter import COARSE_MM, SLAB, Grid, Painter, smooth_min, window
-from endopilot.phantom.scanner import scan, smear
-from endopilot.settings import Ascending, NonNegative, Positive, Within, settings
+from endopilot.phantom.scanner import misregister, scan, smear
+from endopilot.settings import Ascending, NonNegative, Positive, Share, Within, settings
 from endopilot.types import Anatomy, Centerline, Volume
 
 _REACH_MM = 5.0
@@ -52,6 +53,24 @@ class PhantomConfig:
     """CT number of the right ventricle's blood as a share of the lumen's: less where saline has diluted it."""
     motion_mm: Annotated[float, Within(0, 10)] = 0.0
     """How far the heart moves while it is scanned, mm: it is smeared along its path, most at the ends."""
+    step_mm: Annotated[float, Within(0, 10)] = 0.0
+    """How far the heart jumps from one heart beat's slab of slices to the next, mm: step artefacts."""
+    slab_mm: Positive = 30.0
+    """Height of the slabs, mm."""
+    grain_mm: NonNegative = 0.0
+    """Additional width of the noise's grain at equal SD, mm: iterative reconstruction."""
+    blooming_mm: NonNegative = 0.0
+    """Calcium looks this much wider on every side, mm, over the lumen too."""
+    stents: Annotated[int, Within(0, 4)] = 0
+    """Number of stents in the tree's main vessels."""
+    leads: Annotated[int, Within(0, 2)] = 0
+    """Number of pacemaker leads in the right heart, with their streaks."""
+    veins: Share = 0.0
+    """CT number of the cardiac veins as a share of the lumen's; they touch the artery's wall. 0: dim and 2 mm off."""
+    appendage_mm: NonNegative = 0.0
+    """The left atrial appendage is wider by this on every side, mm, and then touches the arteries' walls."""
+    graft: bool = False
+    """A bypass graft runs from the ascending aorta to the artery: to the LAD of a left tree."""
     margin_mm: Positive = 16.0
     """Width of surroundings beyond the tree on every side, mm."""
     voxels: tuple[_Side, _Side, _Side] | None = None
@@ -80,25 +99,38 @@ def make_phantom(anatomy: Anatomy, config: PhantomConfig, seed: int) -> Volume:
     """
     generator = np.random.Generator(np.random.Philox(key=np.array([seed, 0x7068616E], dtype=np.uint64)))
     heart = chest.place(anatomy.tree)
-    grid = _field_of_view(anatomy, config)
+    # A stream of its own, so that the rest of the scan is the same with and without what disturbs it.
+    disturbance = np.random.Generator(np.random.Philox(key=np.array([seed, 0x68617264], dtype=np.uint64)))
+    graft = [chest.bypass_graft(heart, anatomy.tree)] if config.graft else []
+    grid = _field_of_view(anatomy, config, graft)
     lumen_hu, noise_hu, psf_mm = (
         generator.uniform(*span) for span in (config.lumen_hu, config.noise_hu, config.psf_mm)
     )
     tissue = _tissue_hu(generator, lumen_hu, config.right_heart)
     coronaries = [branch.centerline for branch in anatomy.tree.branches]
     coronaries += chest.other_coronary(heart, anatomy.tree)
+    coronaries += graft
     lumen = _small_vessels(grid, coronaries)
-    veins = _small_vessels(grid, chest.cardiac_veins(heart, anatomy.tree))
-    coarse, organs = _organs(grid, heart, coronaries, generator)
+    veins = _small_vessels(grid, chest.cardiac_veins(heart, anatomy.tree, touching=config.veins > 0))
+    if config.veins > 0:
+        tissue["vein"] = config.veins * lumen_hu
+    coarse, organs = _organs(grid, heart, coronaries, generator, config.appendage_mm)
     painter = Painter(grid, coarse, in_plane_mm=config.in_plane_mm, slice_mm=config.slice_mm)
     image = _render(grid, painter, organs, lumen, veins, tissue)
     for plaque in _plaques(grid, anatomy, generator, config.calcium):
-        painter.paint(image[plaque.box], np.minimum(plaque.depth, -lumen[plaque.box]), tissue[plaque.tissue])
+        bloom = np.float32(config.blooming_mm if plaque.tissue == "calcium" else 0.0)
+        depth = np.minimum(plaque.depth, -lumen[plaque.box]) + bloom
+        painter.paint(image[plaque.box], depth, tissue[plaque.tissue])
+    metal = leads(heart, config.leads) + stents(chest.main_paths(anatomy.tree), config.stents, disturbance)
+    if metal:
+        add_metal(image, grid, metal, disturbance)
     spacing = config.slice_mm, config.in_plane_mm, config.in_plane_mm
+    pericardium = next(organ.depth for organ in organs if organ.name == "fat")
     if config.motion_mm > 0:
-        pericardium = next(organ.depth for organ in organs if organ.name == "fat")
         smear(image, painter, pericardium, spacing, config.motion_mm, generator)
-    scan(image, spacing, psf_mm, noise_hu, generator)
+    if config.step_mm > 0:
+        misregister(image, painter, pericardium, spacing, config.step_mm, config.slab_mm, disturbance)
+    scan(image, spacing, psf_mm, noise_hu, config.grain_mm, generator)
     return Volume(
         voxels=np.clip(np.rint(image), -1024, 3071).astype(np.int16),
         spacing_mm=np.array([config.in_plane_mm, config.in_plane_mm, config.slice_mm]),
@@ -107,9 +139,10 @@ def make_phantom(anatomy: Anatomy, config: PhantomConfig, seed: int) -> Volume:
     )
 
 
-def _field_of_view(anatomy: Anatomy, config: PhantomConfig) -> Grid:
-    """Return a grid around the tree with the margin; the aorta beside the ostium, and above it by twice the margin."""
-    points = np.concatenate([branch.centerline.points for branch in anatomy.tree.branches])
+def _field_of_view(anatomy: Anatomy, config: PhantomConfig, grafts: Sequence[Centerline] = ()) -> Grid:
+    """Return a grid around the tree and its grafts; the aorta beside the ostium, and above it by twice the margin."""
+    lines = [*(branch.centerline for branch in anatomy.tree.branches), *grafts]
+    points = np.concatenate([line.points for line in lines])
     low, high = points.min(axis=0) - config.margin_mm, points.max(axis=0) + config.margin_mm
     high[2] = max(high[2], anatomy.insertion.position[2] + 2 * config.margin_mm)
     across = np.array([44.0, 36.0])
@@ -225,7 +258,11 @@ def _plaque(
 
 
 def _organs(
-    grid: Grid, heart: HeartFit, coronaries: Sequence[Centerline], generator: np.random.Generator
+    grid: Grid,
+    heart: HeartFit,
+    coronaries: Sequence[Centerline],
+    generator: np.random.Generator,
+    appendage_mm: float,
 ) -> tuple[Grid, tuple[chest.Organ, ...]]:
     """Return the coarse grid and the organs on it; fat wraps the coronaries too."""
     axes = (np.arange(axis[0] - COARSE_MM, axis[-1] + 2 * COARSE_MM, COARSE_MM) for axis in (grid.x, grid.y, grid.z))
@@ -234,7 +271,7 @@ def _organs(
     positions = np.stack([x, y, z], axis=-1).astype(np.float32)
     vessels = KDTree(np.concatenate([line.points[::2] for line in coronaries]))
     distance, _ = vessels.query(positions, distance_upper_bound=2 * _FAT_MM)
-    return coarse, chest.organs(heart, positions, _FAT_MM - np.minimum(distance, 2 * _FAT_MM), generator)
+    return coarse, chest.organs(heart, positions, _FAT_MM - np.minimum(distance, 2 * _FAT_MM), generator, appendage_mm)
 
 
 def _render(

@@ -1,6 +1,8 @@
-"""What the scanner adds to a phantom: motion of the heart, noise and blur."""
+"""What the scanner adds to a phantom: motion of the heart, steps between heart beats, noise and blur."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -42,6 +44,43 @@ def smear(
     image[...] = 0
     for place, weight in zip(places, weights / weights.sum(), strict=True):
         image += np.float32(weight) * shift(still, place * path, order=1, mode="nearest")
+    _hold_chest(image, still, painter, heart)
+
+
+def misregister(
+    image: Float32[np.ndarray, "nz ny nx"],
+    painter: Painter,
+    heart: Float[np.ndarray, "mz my mx"],
+    spacing_mm: tuple[float, float, float],
+    step_mm: float,
+    slab_mm: float,
+    generator: np.random.Generator,
+) -> None:
+    """Displace the heart from one slab of slices to the next, in place, as heart beats that differ do; the chest stays.
+
+    The heart lies in turn half a step to either side of its mean place, along one random direction.
+
+    Args:
+        image: HU.
+        painter: of this image.
+        heart: depth below the pericardium on the painter's coarse grid, mm.
+        spacing_mm: voxel size along k, j and i, mm.
+        step_mm: distance between the heart's places in neighbouring slabs, mm.
+        slab_mm: height of the slabs, mm; the first one's is random.
+        generator: random stream.
+    """
+    path = generator.normal(size=3)
+    path *= 0.5 * step_mm / (np.linalg.norm(path) * np.array(spacing_mm))
+    still = image.copy()
+    slab = np.floor((np.arange(len(image)) * spacing_mm[0] + generator.uniform(0, slab_mm)) / slab_mm).astype(int)
+    for parity, sign in ((0, 1.0), (1, -1.0)):
+        rows = slab % 2 == parity
+        image[rows] = shift(still, sign * path, order=1, mode="nearest")[rows]
+    _hold_chest(image, still, painter, heart)
+
+
+def _hold_chest(image: np.ndarray, still: np.ndarray, painter: Painter, heart: np.ndarray) -> None:
+    """Put back what does not move with the heart: the change fades out towards the pericardium."""
     for begin in range(0, len(image), SLAB):
         rows = slice(begin, begin + SLAB)
         found = painter.fine(heart, rows)
@@ -57,24 +96,40 @@ def scan(
     spacing_mm: tuple[float, float, float],
     psf_mm: float,
     noise_hu: float,
+    grain_mm: float,
     generator: np.random.Generator,
 ) -> None:
     """Add noise and blur, in place: the reconstruction kernel shapes the image and the noise's grain alike.
+
+    Iterative reconstruction leaves a coarser grain: it takes the noise's fine part away and the edges' not.
 
     Args:
         image: HU.
         spacing_mm: voxel size along k, j and i, mm.
         psf_mm: width of the point-spread function at half its height, mm.
         noise_hu: standard deviation of the noise in the result, HU.
+        grain_mm: additional width of the noise's grain at half its height, mm.
         generator: random stream.
     """
-    sigma_mm = psf_mm / np.sqrt(8 * np.log(2))
-    sigmas = [sigma_mm / step for step in spacing_mm]
-    impulse = np.zeros(33)
-    impulse[16] = 1.0
-    gain = np.prod([np.linalg.norm(gaussian_filter1d(impulse, sigma, truncate=3.0)) for sigma in sigmas])
-    for begin in range(0, len(image), SLAB):
-        slab = image[begin : begin + SLAB]
-        slab += generator.standard_normal(slab.shape, dtype=np.float32) * np.float32(noise_hu / gain)
+    sigmas = [psf_mm / np.sqrt(8 * np.log(2)) / step for step in spacing_mm]
+    if grain_mm == 0:
+        gain = _gain(sigmas)
+        for begin in range(0, len(image), SLAB):
+            slab = image[begin : begin + SLAB]
+            slab += generator.standard_normal(slab.shape, dtype=np.float32) * np.float32(noise_hu / gain)
     for axis, sigma in enumerate(sigmas):
         gaussian_filter1d(image, sigma, axis=axis, truncate=3.0, output=image)
+    if grain_mm > 0:
+        noise = generator.standard_normal(image.shape, dtype=np.float32)
+        wider = [np.hypot(psf_mm, grain_mm) / np.sqrt(8 * np.log(2)) / step for step in spacing_mm]
+        for axis, sigma in enumerate(wider):
+            gaussian_filter1d(noise, sigma, axis=axis, truncate=3.0, output=noise)
+        noise *= np.float32(noise_hu / _gain(wider))
+        image += noise
+
+
+def _gain(sigmas: Sequence[float]) -> float:
+    """Return by which factor the blur lessens the standard deviation of white noise."""
+    impulse = np.zeros(33)
+    impulse[16] = 1.0
+    return float(np.prod([np.linalg.norm(gaussian_filter1d(impulse, sigma, truncate=3.0)) for sigma in sigmas]))
