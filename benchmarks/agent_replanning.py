@@ -27,8 +27,8 @@ MISMATCH = 0.2
 class AlwaysReplanning(AgentPolicy):
     """The agent, but it drops its course at every exposure."""
 
-    def _look(self, measured: TipMeasurement) -> None:
-        super()._look(measured)
+    def _update(self, measured: TipMeasurement) -> None:
+        super()._update(measured)
         self._course = None
 
 

@@ -13,10 +13,11 @@ from hypothesis import strategies as st
 from endopilot.control import search
 from endopilot.control.agent import AgentConfig, AgentPolicy, OpenLoopPolicy, TwinPolicy
 from endopilot.control.belief import Belief, BeliefConfig
-from endopilot.control.course import Course
+from endopilot.control.course import Course, Log
 from endopilot.control.halt import describe_halt
 from endopilot.control.mismatch import ModelMismatch
 from endopilot.control.navigate import NavigationLoop, navigate
+from endopilot.control.period import drive_period
 from endopilot.control.policy import Decision, Observation, Policy
 from endopilot.control.route import Route
 from endopilot.control.search import Search
@@ -68,8 +69,9 @@ def test_a_course_is_what_the_simulator_does_under_its_controls(side_branch) -> 
     assert np.allclose(course.inserted, moved, atol=1e-9)
     simulator = Belief(side_branch, np.array([[1.0, 1.0, 0.0]]), QUICK.belief).simulator
     for k in range(len(course.control)):
-        step = simulator.step(course.control[k : k + 1], 0.5)
-        assert np.array_equal(step.tip_position[0], course.position[k, 0])
+        looks = [simulator.step(course.control[k : k + 1], 0.1) for _ in range(5)]
+        assert np.array_equal(looks[-1].tip_position[0], course.position[k, 0])
+        assert course.force[k, 0] == max(look.contact_force_max[0] for look in looks)
     assert side_branch.reached(simulator.project())[0]
 
 
@@ -279,6 +281,34 @@ def test_a_search_takes_no_path_that_presses_harder_than_the_limit(side_branch) 
     course = policy.find_course(20.0)
     assert course.reached == 0.0 and course.force.max(initial=0.0) <= tight.force_limit_n
     assert "on the wall; give a larger force_limit_n" in policy.halt
+
+
+def test_a_force_that_a_snap_ends_within_a_period_counts(side_branch) -> None:
+    """Where the tip slips, the wall bears more before than at the end of the period."""
+    policy = TwinPolicy(config=QUICK)
+    policy.start(side_branch, 0)
+    simulator, ends = policy.belief.simulator, []
+    for _ in range(10):
+        peak = drive_period(simulator, np.array([[8.0, 0.0]])).contact_force_max[0]
+        ends.append((peak, simulator.contacts.max()))
+    peaks, last = np.array(ends).T
+    assert (peaks >= last).all() and (peaks > 2 * last).any()
+
+
+def test_a_wire_that_should_have_arrived_goes_by_the_image(side_branch) -> None:
+    """No simulated wire says why the target is not reached: X-ray shows how far it is off."""
+    policy = AgentPolicy(QUICK)
+    policy.start(side_branch, 0)
+    shown, here = measured(policy.belief, 0), float(policy.belief.tip.abscissa[0])
+    for off_mm, translation in ((0.4, 0.8), (-0.4, -0.8), (1.9, 2.0)):  # at most 2 mm/s
+        navigation = replace(side_branch, target=Target(branch=0, abscissa=here + off_mm))
+        policy.start(navigation, 0)
+        policy._search.find = lambda *_, **__: Log().course(3, 1.0)
+        blind = policy.decide(Observation(0.0, 2.0, 0.0, None))
+        assert blind.expose and blind.translation == 0.0
+        assert policy.believed().asks == "the tip should be at the target"
+        seen = policy.decide(Observation(0.5, 2.0, 0.0, shown))
+        assert seen.expose and seen.translation == pytest.approx(translation) and seen.rotation == 0.0
 
 
 def test_a_course_may_begin_with_a_turn(side_branch) -> None:

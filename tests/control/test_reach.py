@@ -9,7 +9,7 @@ import pytest
 
 from endopilot.control.reach import ROTATIONS, forks, lateral_reach, rotations_that_enter
 from endopilot.control.route import Route
-from endopilot.control.set_up import choose_tip
+from endopilot.control.set_up import choose_tip, with_axis
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.core import run_core
@@ -87,6 +87,19 @@ def test_a_fixed_tip_is_kept_and_the_fork_that_refuses_it_is_named(wide) -> None
     assert choice.tip == "45/3"
     assert choice.refused is not None and choice.refused.branch == 2
     assert f"does not enter {choice.refused}" in choice.why and "at 20.0 mm" in choice.why
+
+
+@pytest.mark.parametrize(("off_deg", "turned_deg"), [(80.0, 30.0), (30.0, 0.0)])
+def test_a_catheter_is_turned_towards_a_route_that_leaves_its_axis_steeply(wide, off_deg, turned_deg) -> None:
+    along, off = Target(branch=1, abscissa=33.0), np.radians(off_deg)
+    axis = np.array([np.sin(off), 0.0, np.cos(off)])
+    steep = replace(wide, anatomy=with_axis(wide.anatomy, axis), target=along)
+    choice = choose_tip(steep)
+    onwards = choice.navigation.anatomy.insertion.direction[2]  # the vessel goes along z
+    assert choice.tilt_deg == turned_deg
+    assert np.degrees(np.arccos(onwards)) == pytest.approx(off_deg - turned_deg, abs=1.0)
+    assert ("the route leaves its axis by 80 degrees" in choice.why) == (turned_deg > 0)
+    assert choose_tip(steep, catheter_tilt_deg=0.0).navigation.anatomy is steep.anatomy
 
 
 @pytest.mark.parametrize(

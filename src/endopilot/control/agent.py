@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from endopilot.control.belief import Belief, BeliefConfig
 from endopilot.control.course import Course
+from endopilot.control.halt import SPARE_SHARE
 from endopilot.control.mismatch import ModelMismatch
 from endopilot.control.policy import BelievedTip, Decision, Observation
 from endopilot.control.route import Route, check_passable
@@ -58,8 +59,8 @@ class AgentConfig:
 
 _TURNS = (0.0, np.pi)
 """Angles by which the wire may be turned before it goes in, rad."""
-_GENTLE_SHARE = 0.9
-"""Share of the force limit that a first course stays under for no other to be searched."""
+_CREEP_MM_S = 2.0
+"""Fastest translation of a wire that should have arrived, and that X-ray shows beside its target, mm/s."""
 
 
 class _PlanningPolicy:
@@ -107,7 +108,7 @@ class _PlanningPolicy:
         )
         self._limits = DriveLimits.of(navigation.device, navigation.anatomy)
         self._course: Course | None = None
-        self._at, self._lost, self._began, self._led = 0, False, False, False
+        self._at, self._lost, self._began, self._led, self._arrived = 0, False, False, False, False
         self.plans, self.planning_s, self._failed, self.halt = 0, 0.0, 0, ""
 
     def decide(self, observation: Observation) -> Decision:
@@ -156,6 +157,10 @@ class _PlanningPolicy:
         """Return the velocities that lead to the next place of the course."""
         if self._course is None or self._at >= len(self._course.control) or self._off_course():
             self._plan(observation)
+        self._arrived = self._course is not None and self._course.reached > 0.5 and not len(self._course.control)
+        if self._arrived and observation.tip is not None:  # no wire says what is wrong; the image does
+            left = (self.navigation.target.abscissa - observation.tip.abscissa) / DECISION_PERIOD_S
+            return float(np.clip(left, -_CREEP_MM_S, _CREEP_MM_S)), 0.0
         if self._course is None or self._at >= len(self._course.control):
             return 0.0, 0.0
         wanted = self._course.inserted[self._at] - self._ostium, self._course.rotation[self._at]
@@ -194,7 +199,7 @@ class _PlanningPolicy:
         """
         source, weight = self.belief.likeliest()
         self._ostium = float(self.belief.parameters[source[0], 2])
-        gentle_n = _GENTLE_SHARE * self.navigation.force_limit_n
+        gentle_n = SPARE_SHARE * self.navigation.force_limit_n
         best: Course | None = None
         for turn in _TURNS if self.plans <= 1 else _TURNS[:1]:
             course = self._search.find(
@@ -202,7 +207,7 @@ class _PlanningPolicy:
             )
             if best is None or _merit(course) > _merit(best):
                 best, self.halt = course, self._search.halt
-            if (course.reached > 0.5 and course.force.max() <= gentle_n) or self._search.at_fork:
+            if (course.reached > 0.5 and course.force.max(initial=0.0) <= gentle_n) or self._search.at_fork:
                 break
         assert best is not None
         return best
@@ -309,8 +314,8 @@ class AgentPolicy(_PlanningPolicy):
         return proximal, np.array([[tip.abscissa[0], tip.offset[0]]]), self.belief.tip_spread()[None], tip.radius
 
     def wants_xray(self) -> bool:
-        """Ask the adviser."""
-        self._due = bool(self._adviser.advise(*self.adviser_input())[0])
+        """Ask the adviser; a wire that should have arrived is looked at."""
+        self._due = bool(self._adviser.advise(*self.adviser_input())[0]) or self._arrived
         return self._due
 
     def believed(self) -> BelievedTip:
@@ -321,4 +326,5 @@ class AgentPolicy(_PlanningPolicy):
         along, across = half[0].tolist()
         wide = along >= self._advice.abscissa_mm
         asks = f"Δtip is known to ±{along:.1f} mm only" if wide else "the tip may be reaching the wall"
+        asks = "the tip should be at the target" if self._arrived else asks
         return replace(tip, half_width=(along, across), asks=asks if self._due else "")

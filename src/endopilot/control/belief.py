@@ -40,9 +40,9 @@ class BeliefConfig:
     """Scale of a good member's error along the wire, mm: X-ray shows the end of a tip badly."""
     across_sd_mm: Positive = 0.3
     """The same across the wire, mm."""
-    element_mm: Annotated[float, Within(0.02, 5)] = 1.25
-    """Length of the rod core's elements at the wire's tip, mm."""
-    time_step_s: Positive = 0.025
+    element_mm: Annotated[float, Within(0.02, 5)] = 0.75
+    """Length of the rod core's elements at the wire's tip, mm: longer ones catch in hairpin bends."""
+    time_step_s: Positive = 0.05
     """Time step of the rod core, s."""
 
     @property

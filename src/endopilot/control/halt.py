@@ -13,7 +13,7 @@ Halt = Literal["off", "stalled", "slipped", "pressed", "late"]
 """A wire leaves the route, does not come forward though it is pushed, cannot be pushed without the drive's slipping,
 presses on the wall too hard, or the time is over."""
 
-SPARE_SHARE = 0.85
+SPARE_SHARE = 0.9
 """Share of the force limit that a path is followed under: what is uncertain takes the rest."""
 
 

@@ -9,8 +9,8 @@ copied over the others, until one of them has entered the wanted branch.
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import field, replace
+from itertools import product
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -19,8 +19,9 @@ from endopilot.anatomy.projection import safety_ratio
 from endopilot.control.cost import Cost
 from endopilot.control.course import SLIP_SHARE, STALL_PERIODS, Controls, Course, Log
 from endopilot.control.halt import SPARE_SHARE, Halt, describe_halt, near_fork
+from endopilot.control.period import drive_period
 from endopilot.control.route import Route
-from endopilot.control.sweep import TURN_PERIODS, middle, sweep
+from endopilot.control.sweep import TURN_PERIODS, Sweep, middle, sweep
 from endopilot.progress import Advance
 from endopilot.settings import Count, OpenShare, Positive, settings
 from endopilot.simulation.device import Device
@@ -148,21 +149,14 @@ class Search:
                     self._drive(log, np.array([-_BACK_MM_S, 0.0]))
                 continue
             hard = self._farthest(log, before, here)
-            for near in (True, False):
-                self._go_back(log, before)
-                if near:
-                    self._approach(log, periods, waypoint, hard)
-                if self._sweep(log, periods, waypoint):
-                    break
-            else:
-                self._go_back(log, before)
-                self._approach(log, periods, waypoint, hard)
-                if not self._search_candidates(log, periods) or log.periods == before:
-                    self.halt = describe_halt(halt, hard, self.route, self.navigation)
-                    self.at_fork = (
-                        halt in ("off", "stalled") and near_fork(hard, self.route, self.navigation) is not None
-                    )
-                    break
+            if self._sweep(log, periods, before, waypoint, hard):
+                continue
+            self._go_back(log, before)
+            self._approach(log, periods, waypoint, hard)
+            if not self._search_candidates(log, periods) or log.periods == before:
+                self.halt = describe_halt(halt, hard, self.route, self.navigation)
+                self.at_fork = halt in ("off", "stalled") and near_fork(hard, self.route, self.navigation) is not None
+                break
         else:
             self.halt = describe_halt("late", 0.0, self.route, self.navigation)
         reached = self._reached()
@@ -186,27 +180,43 @@ class Search:
         tips = [TipProjection(abscissa=row[1], offset=row[2], branch=row[3], radius=row[4]) for row in log.rows[begun:]]
         return max([here, *(float(self.route.progress(tip) @ self._weight) for tip in tips)])
 
-    def _sweep(self, log: Log, periods: int, waypoint: float) -> bool:
+    def _sweep(self, log: Log, periods: int, before: int, waypoint: float, hard: float) -> bool:
         """Turn the wires to all sides and push them on; follow the middle of the rotations that pass the waypoint.
 
-        Where none passes within the share of the force limit that costs nothing, one that stays under the limit does.
+        That is tried before the place that a straight push came to, and from where the wires were kept: in a tortuous
+        vessel the side that a tip looks to decides early. What stays within the share of the force limit that costs
+        nothing is taken first, then what leaves something for the uncertain.
+
+        Args:
+            log: what is done is added to it; nothing remains of it where no rotation passes.
+            periods: its length at most.
+            before: its length when the wires were kept.
+            waypoint: that is to be passed, mm.
+            hard: abscissa that a straight push came to, mm.
         """
         wires, limit = self.single.worlds, self.navigation.force_limit_n
-        self._many.copy_worlds(np.repeat(np.arange(wires), self.config.candidates), of=self.single)
-        made = sweep(
-            self._many,
-            self.route,
-            waypoint,
-            weight=self._weight,
-            travel=self._limits,
-            force_limit_n=limit,
-            speed_mm_s=self.config.speed_mm_s,
-            periods=periods - log.periods,
-        )
-        for share in (self.config.cost.forbidden_share, SPARE_SHARE):
-            within = made.within(share * limit)
+        made: dict[bool, Sweep] = {}
+        for share, near in product((self.config.cost.forbidden_share, SPARE_SHARE), (True, False)):
+            if near in made and not made[near].within(share * limit).any():
+                continue
+            self._go_back(log, before)
+            if near:
+                self._approach(log, periods, waypoint, hard)
+            if near not in made:
+                self._many.copy_worlds(np.repeat(np.arange(wires), self.config.candidates), of=self.single)
+                made[near] = sweep(
+                    self._many,
+                    self.route,
+                    waypoint,
+                    weight=self._weight,
+                    travel=self._limits,
+                    force_limit_n=limit,
+                    speed_mm_s=self.config.speed_mm_s,
+                    periods=periods - log.periods,
+                )
+            within = made[near].within(share * limit)
             if within.any():
-                self._follow(log, made.controls(middle(within)))
+                self._follow(log, made[near].controls(middle(within)))
                 return True
         return False
 
@@ -264,9 +274,7 @@ class Search:
 
     def _drive(self, log: Log, control: Float[np.ndarray, "2"]) -> None:
         made = self._possible(control[None], self.single)[0]
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            step = self.single.step(np.tile(made, (self.single.worlds, 1)), DECISION_PERIOD_S)
+        step = drive_period(self.single, np.tile(made, (self.single.worlds, 1)))
         tip = self.single.project()
         log.add(made, tip, step.tip_position, step.contact_force_max, step.inserted_length, step.rotation)
 
@@ -372,9 +380,7 @@ class Search:
         cost, wires = self.config.cost, self.single.worlds
         spent = cost.roughness(before, control, self._limits.fastest)
         for _ in range(self.config.round_periods):
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                step = self._many.step(np.tile(control, (wires, 1)), DECISION_PERIOD_S)
+            step = drive_period(self._many, np.tile(control, (wires, 1)))
             tip = self._many.project()
             self._peak = np.maximum(self._peak, step.contact_force_max)
             running = cost.running(
@@ -395,7 +401,7 @@ class Search:
         """Return each candidate's cost so far and to go, and the share of its wires that have passed the waypoint."""
         tip, wires = self._many.project(), self.single.worlds
         to_go = self._distance(self._many.position[:, 0], waypoint) + 0.5 * self.route.off_route(tip)
-        sound = self._many.valid & (self._peak <= self.navigation.force_limit_n)
+        sound = self._many.valid & (self._peak <= SPARE_SHARE * self.navigation.force_limit_n)
         passed = (self.route.passed(tip, waypoint) & sound).reshape(wires, -1)
         score = self._weight @ to_go.reshape(wires, -1) + spent
         return score, self._weight @ passed

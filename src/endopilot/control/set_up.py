@@ -1,8 +1,8 @@
 """What is chosen before a wire goes in, `choose_tip`: the shape of its tip, and the axis of the guiding catheter.
 
 Of the tips that a hand can give the wire, the one of least lateral reach is taken that enters every fork of the route
-with a quarter of all rotations; else the one that enters the hardest fork with most. Where none enters a fork near the
-ostium, the guiding catheter is turned too.
+with a quarter of all rotations; else the one that enters the hardest fork with most. The guiding catheter is turned too
+where none enters a fork near the ostium, and where the route leaves its axis steeply.
 """
 
 from __future__ import annotations
@@ -26,8 +26,11 @@ SHAPES = ((45.0, 3.0), (60.0, 4.0), (75.0, 5.0), (90.0, 6.5), (90.0, 8.0), (90.0
 ENOUGH = ROTATIONS // 4
 """A tip that enters every fork with this many of the rotations suffices: a quarter of a turn may be missed by a robot's
 backlash and a wire's friction."""
-TILT_DEG = 20.0
+TILT_DEG = 30.0
 """A guiding catheter's tip is turned this far at the ostium, at most, degrees."""
+_COAXIAL_MM, _COAXIAL_DEG = 10.0, 45.0
+"""A catheter is turned towards a route whose first millimetres leave its axis by more than this, mm and degrees: round
+such a bend a stiff shaft presses on the wall long before it has pushed its tip to a distant target."""
 _CATHETER_MM = 20.0
 """The catheter's axis decides how the wire lies as far as this from the ostium, mm."""
 _AZIMUTHS = 8
@@ -74,23 +77,29 @@ def choose_tip(navigation: Navigation, tip: str = "auto", *, catheter_tilt_deg: 
     Raises:
         InputError: no such tip, or one that a hand cannot give the wire.
     """
-    devices = _tips(navigation.device, tip)
+    devices, given = _tips(navigation.device, tip), navigation
     route = Route.to(navigation.anatomy, navigation.target)
-    places = forks(route, navigation.device)
+    places, steep_deg = forks(route, navigation.device), _off_axis_deg(route)
+    tilt_deg, turned_for = 0.0, ""
+    if steep_deg > _COAXIAL_DEG and catheter_tilt_deg > 0:
+        tilt_deg = min(catheter_tilt_deg, steep_deg)
+        navigation = replace(given, anatomy=with_axis(given.anatomy, _towards(route, tilt_deg)))
+        turned_for = f"the route leaves its axis by {steep_deg:.0f} degrees"
     best, counts = _choose(navigation, devices)
-    made, tilt_deg, refused = replace(navigation, device=devices[best]), 0.0, _refused(places, counts[best])
+    made, refused = replace(navigation, device=devices[best]), _refused(places, counts[best])
     if refused is not None and catheter_tilt_deg > 0 and _near_catheter(route, counts[best]):
         for axis in _axes(route, catheter_tilt_deg):
-            turned = replace(navigation, anatomy=with_axis(navigation.anatomy, axis))
+            turned = replace(given, anatomy=with_axis(given.anatomy, axis))
             other, after = _choose(turned, devices)
             if _merit(after[other]) > _merit(counts[best]):
                 best, counts, tilt_deg = other, after, catheter_tilt_deg
                 made = replace(turned, device=devices[best])
+                turned_for = f"with its given axis no tip enters {refused}"
             if _suffices(counts[best]):
                 break
     why = _why(made.device, places, counts, best)
     if tilt_deg:
-        why += f"; the catheter is turned by {tilt_deg:g} degrees, for with its given axis no tip enters {refused}"
+        why += f"; the catheter is turned by {tilt_deg:.3g} degrees, for {turned_for}"
     return TipChoice(made, tilt_deg, places, counts[best], why)
 
 
@@ -148,6 +157,20 @@ def _merit(count: Count) -> tuple[int, int]:
 def _near_catheter(route: Route, count: Count) -> bool:
     """Return whether turning the catheter may help: whether the fork that refuses lies near it."""
     return bool(route.junctions[int(np.argmin(count > 0))] <= _CATHETER_MM)
+
+
+def _off_axis_deg(route: Route) -> float:
+    """Return how far a route's first millimetres leave the catheter's axis, degrees."""
+    onwards = route.position(_COAXIAL_MM) - route.position(0.0)
+    cosine = onwards @ route.anatomy.insertion.direction / np.linalg.norm(onwards)
+    return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+
+
+def _towards(route: Route, tilt_deg: float) -> Float[np.ndarray, "3"]:
+    """Return the catheter's axis, turned by an angle (degrees) towards the route's first millimetres."""
+    axis, onwards = route.anatomy.insertion.direction, route.position(_COAXIAL_MM) - route.position(0.0)
+    side = onwards - (onwards @ axis) * axis
+    return np.cos(np.radians(tilt_deg)) * axis + np.sin(np.radians(tilt_deg)) * side / np.linalg.norm(side)
 
 
 def _axes(route: Route, tilt_deg: float) -> list[Float[np.ndarray, "3"]]:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from endopilot.control.course import SLIP_SHARE, STALL_PERIODS, STALL_SHARE, Controls
+from endopilot.control.period import drive_period
 from endopilot.control.route import Route
 from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.simulation.simulator import Simulator
@@ -94,9 +94,7 @@ def sweep(
         inserted = simulator.inserted_length.reshape(wires, count)
         for length in (inserted.min(axis=0), inserted.max(axis=0)):
             control = travel.clip(control, length, DECISION_PERIOD_S)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # a wire that fails does not pass
-            step = simulator.step(np.tile(control, (wires, 1)), DECISION_PERIOD_S)
+        step = drive_period(simulator, np.tile(control, (wires, 1)))
         made.append(control)
         took[going] = period + 1
         tip, shape = simulator.project(), (wires, count)
