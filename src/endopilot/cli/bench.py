@@ -25,6 +25,7 @@ EXIT_FAILED = 1
 def simulation(
     *,
     preset: Preset = "default",
+    catheter: str | None = None,
     device: Literal["cpu", "cuda"] = "cpu",
     make_reference: bool = False,
     reference: Path | None = None,
@@ -34,16 +35,24 @@ def simulation(
 
     Args:
         preset: settings of the rod core: default, fast or accurate.
+        catheter: measure the wire in this catheter (a name or a YAML file), beside the wire alone.
         device: measure the processor (cpu), or up to 100 000 wires on a GPU (cuda) and how closely the two agree.
         make_reference: compute the converged solution anew instead, which takes a quarter of an hour.
         reference: file of the converged solution; the shipped one if not given.
         json: print the figures as JSON.
     """
+    from endopilot.benchmarks.coaxial import bench_coaxial
     from endopilot.benchmarks.gpu import bench_gpu
     from endopilot.benchmarks.reference import REFERENCE_FILE
     from endopilot.benchmarks.reference import make_reference as make
     from endopilot.benchmarks.simulation import bench_simulation
+    from endopilot.simulation.catheter import read_catheter
 
+    if catheter is not None:
+        coaxial = bench_coaxial(read_catheter(catheter), preset)
+        show(coaxial, as_json=json)
+        _leave(coaxial["passed"])
+        return
     if device == "cuda":
         rows = bench_gpu(preset)
         show_rows(rows, as_json=json)
