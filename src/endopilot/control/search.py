@@ -326,13 +326,15 @@ class Search:
         self._many.copy_worlds(np.repeat(np.arange(wires), count), of=self.single)
         history, spent = np.zeros((0, count, 2)), np.zeros(count)
         self._peak = np.zeros(wires * count)
+        spare = SPARE_SHARE if 2 * attempt < self.config.attempts else 1.0  # the last attempts leave nothing to spare
+        most_n = spare * self.navigation.force_limit_n
         nearest, best = np.inf, np.zeros((0, 2))
         for number in range(rounds):
             before = history[-1] if number else np.zeros((count, 2))
             drawn = self._possible(self._draw(before, number, attempt), self._many)
             spent += self._run_round(drawn, before, waypoint)
             history = np.concatenate([history, np.repeat(drawn[None], self.config.round_periods, axis=0)])
-            score, share = self._judge(waypoint, spent)
+            score, share = self._judge(waypoint, spent, most_n)
             won = share >= max(1 - _LEFT_BEHIND * attempt, _LEAST_SHARE) - 1e-9
             if won.any():
                 return 0.0, history[:, np.argmin(np.where(won, score, np.inf))], True
@@ -396,12 +398,12 @@ class Search:
         return np.linalg.norm(position - self.route.position(waypoint), axis=-1)
 
     def _judge(
-        self, waypoint: float, spent: Float[np.ndarray, "candidates"]
+        self, waypoint: float, spent: Float[np.ndarray, "candidates"], force_n: float
     ) -> tuple[Float[np.ndarray, "candidates"], Float[np.ndarray, "candidates"]]:
-        """Return each candidate's cost so far and to go, and the share of its wires that have passed the waypoint."""
+        """Return each candidate's cost so far and to go, and the share of its wires that passed within a force."""
         tip, wires = self._many.project(), self.single.worlds
         to_go = self._distance(self._many.position[:, 0], waypoint) + 0.5 * self.route.off_route(tip)
-        sound = self._many.valid & (self._peak <= SPARE_SHARE * self.navigation.force_limit_n)
+        sound = self._many.valid & (self._peak <= force_n)
         passed = (self.route.passed(tip, waypoint) & sound).reshape(wires, -1)
         score = self._weight @ to_go.reshape(wires, -1) + spent
         return score, self._weight @ passed
