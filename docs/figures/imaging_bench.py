@@ -53,13 +53,14 @@ def _difficulties(cases: int) -> list[str]:
     lines = [
         f"`endopilot bench imaging --cases {cases} --seed 0 --difficulty NAME`, means of the cases with a result:",
         "",
-        "| difficulty | Dice | clDice | overlap OV | ostium error, mm | wrong or none | told | silent |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- |",
+        "| difficulty | Dice | clDice | overlap OV | ostium error, mm | wrong or none | told | silent | false alarms |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     for name in DIFFICULTIES:
         found: dict[str, Any] = bench_imaging(ImagingBenchConfig(cases=cases, difficulty=name))
         means = [_number(found[figure]["mean_found"]) for figure in ("dice", "cldice", "overlap", "ostium_error_mm")]
-        lines.append(f"| {' | '.join([name, *means])} | {found['wrong']} | {found['told']} | {found['silent']} |")
+        counts = [str(found[count]) for count in ("wrong", "told", "silent", "false_alarms")]
+        lines.append(f"| {' | '.join([name, *means, *counts])} |")
     return lines
 
 

@@ -76,11 +76,13 @@ class LumenMask:
         volume: boolean voxels, true inside the lumen.
         ostium: where the device enters, if the segmentation found it or the user gave it.
         method: name of the segmentation method, or where the mask came from.
+        warnings: what the segmentation doubts, a sentence each.
     """
 
     volume: Volume
     ostium: Insertion | None = None
     method: str = "given"
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -45,7 +45,7 @@ def write(base, rows) -> None:
     folder = base / "clean"
     claim(folder, "endopilot bench imaging", **imaging_bench._identity(7))
     for index, row in enumerate(rows):
-        whole = {"case": index, "failed": None, "seconds": 2, "processor_seconds": 3}
+        whole = {"case": index, "failed": None, "warnings": [], "seconds": 2, "processor_seconds": 3}
         (folder / f"{index:04d}.json").write_text(json.dumps(whole | row))
 
 
@@ -114,9 +114,11 @@ def test_a_difficulty_changes_the_scan_and_nothing_else():
     assert set(DISTURBANCES) == set(DIFFICULTIES[1:])
 
 
-def test_wrong_results_are_counted_and_those_that_were_refused(tmp_path):
-    found = figures(tmp_path, [GOOD, GOOD | {"overlap": 0.79}, GOOD | {"ostium_error_mm": 5.1}, {"failed": "no aorta"}])
-    assert (found["wrong"], found["told"], found["silent"]) == (3, 1, 2)
+def test_wrong_results_are_counted_and_those_that_are_told(tmp_path):
+    few, far, unsure = {"overlap": 0.79}, {"ostium_error_mm": 5.1}, {"warnings": ["a vessel ends"]}
+    rows = [GOOD, GOOD | few, GOOD | far, GOOD | far | unsure, GOOD | unsure, {"failed": "no aorta"}]
+    found = figures(tmp_path, rows)
+    assert [found[name] for name in ("wrong", "told", "silent", "false_alarms")] == [4, 2, 2, 1]
 
 
 def test_one_case_from_the_volume_to_its_scores(tmp_path, monkeypatch):
@@ -126,7 +128,7 @@ def test_one_case_from_the_volume_to_its_scores(tmp_path, monkeypatch):
 
     def whole_lumen(volume, config):
         inside = mask_like(LumenMask(as_volume(truth.distance_map)), volume)
-        return LumenMask(replace(volume, voxels=inside), truth.insertion)
+        return LumenMask(replace(volume, voxels=inside), truth.insertion, warnings=("a vessel ends",))
 
     monkeypatch.setattr(imaging_bench, "draw_case", lambda seed, index, difficulty: (patients, coarse))
     monkeypatch.setattr(imaging_bench, "segment", whole_lumen)
@@ -135,6 +137,7 @@ def test_one_case_from_the_volume_to_its_scores(tmp_path, monkeypatch):
     assert found["failed"] == {}
     assert found["dice"]["mean"] > 0.9 and found["overlap"]["mean"] == 1.0
     row = json.loads((tmp_path / "clean" / "0000.json").read_text())
+    assert row["warnings"] == ["a vessel ends"] and found["false_alarms"] == 1
     assert row["scan"]["in_plane_mm"] == 0.9 and row["manifest"]["seed"] == 1000
 
 

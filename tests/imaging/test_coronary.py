@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,8 +9,10 @@ import pytest
 from scipy.spatial import KDTree
 from shapes import BLOOD_HU, FAT_HU, dice, empty_grid, inside_tube, positions, scan
 
+from endopilot.cli import segment as segment_command
 from endopilot.errors import InputError
 from endopilot.imaging.segment import SegmentConfig, segment
+from endopilot.imaging.volume import write_volume
 from endopilot.types import Volume
 
 CTA = Path(__file__).parents[3] / "shared" / "data" / "cta_thorax" / "cta_thorax_1p5mm.nii.gz"
@@ -170,19 +173,50 @@ def test_a_stump_is_no_coronary_tree(heart):
         segment(changed(heart[0], positions(heart[0])[..., 0] > 36.0, FAT_HU), SegmentConfig(vessel="lca"))
 
 
-def test_a_pulmonary_trunk_as_bright_as_the_aorta_is_not_taken_for_it():
-    # It is wider than the aorta, and the artery passes by in front of it, 2 mm from its blood.
+@pytest.fixture(scope="module")
+def two_trunks():
+    """Return an aorta with an artery, and a pulmonary trunk: as bright, wider, and the artery passes 2 mm in front."""
     grid = empty_grid((90, 130, 108), (0.6, 0.6, 0.6), (-20.0, -50.0, -36.0))
     x = positions(grid)
     aorta, trunk = (
         np.hypot(x[..., 0] - middle[0], x[..., 1] - middle[1]) - radius
         for middle, radius in (((7.8, 10.4), AORTA_RADIUS_MM), ((22.0, -26.0), 16.0))
     )
-    corners = np.array([[0, 0, 0], [-7, -10, -2], [-5, -26, -6], [2, -38, -12], [9.3, -41.2, -20], [22, -46, -34]])
-    axis = np.stack([np.interp(np.linspace(0, 5, 300), np.arange(6), column) for column in corners.T], axis=1)
-    artery = inside_tube(grid, axis, 1.6)
+    corners = [[0, 0, 0], [-7, -10, -2], [-5, -26, -6], [2, -38, -12], [9.3, -41.2, -20], [22, -46, -34]]
     hu = np.where(np.minimum(aorta, trunk) < 1.2, 50.0, FAT_HU)
-    hu[(aorta < 0) | (trunk < 0) | artery] = BLOOD_HU
+    hu[(aorta < 0) | (trunk < 0) | _through(grid, corners)] = BLOOD_HU
+    return grid, hu
+
+
+def _through(grid, corners):
+    """Return where voxels lie in an artery through the corners."""
+    places = np.linspace(0, len(corners) - 1, 300)
+    axis = [np.interp(places, np.arange(len(corners)), column) for column in np.array(corners, dtype=float).T]
+    return inside_tube(grid, np.stack(axis, axis=1), 1.6)
+
+
+RIVAL = "two vessels may be the ascending aorta"
+
+
+def test_a_pulmonary_trunk_as_bright_as_the_aorta_is_not_taken_for_it(two_trunks):
+    grid, hu = two_trunks
     found = segment(scan(grid, hu, blur_mm=0.4, noise_hu=20.0), SegmentConfig(vessel="rca"))
     assert found.ostium is not None
     assert np.linalg.norm(found.ostium.position) < 1.5
+    assert not any(RIVAL in told for told in found.warnings)
+
+
+def test_a_second_trunk_that_an_artery_opens_into_is_told(two_trunks):
+    grid, hu = two_trunks
+    both = np.where(_through(grid, [[12.5, -37, 8], [4, -45, 9], [-12, -40, 10], [-17, -15, 10]]), BLOOD_HU, hu)
+    found = segment(scan(grid, both, blur_mm=0.4, noise_hu=20.0), SegmentConfig(vessel="rca"))
+    assert sum(RIVAL in told for told in found.warnings) == 1
+
+
+def test_warnings_stand_beside_the_mask_and_on_the_command_line(heart, right_tree, tmp_path, capsys, monkeypatch):
+    assert any("ends" in told and "main vessels are longer" in told for told in right_tree.warnings)
+    write_volume(heart[0], tmp_path / "ct.nrrd")
+    monkeypatch.setattr(segment_command, "segment", lambda volume, config: right_tree)
+    segment_command.command(tmp_path / "ct.nrrd", output=tmp_path / "mask.nrrd")
+    assert right_tree.warnings[0] in capsys.readouterr().out
+    assert json.loads((tmp_path / "mask.json").read_text())["warnings"] == list(right_tree.warnings)

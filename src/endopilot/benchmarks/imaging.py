@@ -78,7 +78,8 @@ def bench_imaging(config: ImagingBenchConfig) -> dict[str, Any]:
         result, `bar`, `counts` (mean or worst) and whether it is `met`; `seconds`
         and `processor_seconds` of the segmentation a case; `cases`, and `failed`: cases without any result, each with
         the reason. A failed case counts 0 in the shares, and no bar in mm is met then. `wrong` counts results that
-        are wrong or absent, `told` those of them that were refused, `silent` the others.
+        are wrong or absent, `told` those of them that were refused or come with warnings, `silent` the others;
+        `false_alarms` counts right results with warnings.
 
     Raises:
         InputError: the folder belongs to another run, such as one of another seed or by other source code.
@@ -94,8 +95,9 @@ def bench_imaging(config: ImagingBenchConfig) -> dict[str, Any]:
         values = np.array([row[name] for row in rows])
         figures[name] = {"mean": round(float(values.mean()), 2), "worst": round(float(values.max()), 2)}
     wrong = [row for row in rows if is_wrong(row)]
-    told = sum(1 for row in wrong if row["failed"])
-    counts = {"wrong": len(wrong), "told": told, "silent": len(wrong) - told}
+    told = sum(1 for row in wrong if row["failed"] or row["warnings"])
+    alarms = sum(1 for row in rows if not is_wrong(row) and row["warnings"])
+    counts = {"wrong": len(wrong), "told": told, "silent": len(wrong) - told, "false_alarms": alarms}
     return figures | {"cases": len(rows)} | counts | {"failed": failed}
 
 
@@ -111,7 +113,7 @@ def _measure(path: Path, *, seed: int, difficulty: Difficulty) -> None:
     truth = make_patient(patients, index)
     volume = make_phantom(truth, scan, seed * 1_000_003 + index)
     vessel = "lca" if patients.anatomy == "lca" else "rca"
-    row: dict[str, Any] = {"case": index, "failed": None}
+    row: dict[str, Any] = {"case": index, "failed": None, "warnings": []}
     wall, processor = time.perf_counter(), time.process_time()
     mask = None
     try:
@@ -120,6 +122,7 @@ def _measure(path: Path, *, seed: int, difficulty: Difficulty) -> None:
         row["failed"] = str(error)
     row |= {"seconds": time.perf_counter() - wall, "processor_seconds": time.process_time() - processor}
     if mask is not None:
+        row["warnings"] = list(mask.warnings)
         try:
             extracted = extract_anatomy(mask, name=truth.name, config=AnatomyConfig(vessel=vessel))
             row |= asdict(score_anatomy(mask, extracted, truth))

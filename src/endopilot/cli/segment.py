@@ -28,7 +28,7 @@ def command(
 ) -> None:
     """Segment the lumen of a vessel tree in a CT angiogram.
 
-    A JSON file beside the mask holds the ostium, the method and the manifest.
+    A JSON file beside the mask holds the ostium, the method, the manifest, and warnings of what is doubtful.
 
     Args:
         volume: DICOM folder or file, NIfTI, NRRD or MHA, in HU.
@@ -50,6 +50,7 @@ def command(
     volume_ml = float(mask.volume.voxels.sum() * mask.volume.spacing_mm.prod() / 1000)
     ostium = mask.ostium.position.round(2).tolist() if mask.ostium is not None else None
     figures = {"mask": str(output), "method": mask.method, "lumen_ml": round(volume_ml, 3), "ostium_lps_mm": ostium}
+    figures["warnings"] = list(mask.warnings)
     if agreement is not None:
         figures |= {name: round(value, 4) for name, value in asdict(agreement).items()}
     if picture is not None:

@@ -148,7 +148,7 @@ def read_mask(path: str | Path, *, label: int | None = None) -> LumenMask:
 
 
 def write_mask(mask: LumenMask, path: str | Path, *, manifest: Mapping[str, Any]) -> None:
-    """Write a mask, and beside it `<stem>.json` with its ostium, its method and the manifest of the run.
+    """Write a mask, and beside it `<stem>.json` with its ostium, method and warnings and the manifest of the run.
 
     Args:
         mask: the mask.
@@ -170,6 +170,7 @@ def write_mask(mask: LumenMask, path: str | Path, *, manifest: Mapping[str, Any]
         {
             "ostium": ostium and {"position_mm": ostium.position, "direction": ostium.direction},
             "method": mask.method,
+            "warnings": list(mask.warnings),
             "manifest": dict(manifest),
         },
     )

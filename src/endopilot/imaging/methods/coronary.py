@@ -21,7 +21,9 @@ from scipy.spatial import KDTree
 from endopilot.errors import InputError
 from endopilot.imaging.aortic_root import AorticRoot, find_aortic_roots
 from endopilot.imaging.contour import lumen_at_half_height
+from endopilot.imaging.coronary_doubts import FoundTree, coronary_doubts
 from endopilot.imaging.grid import LEAST_BLOOD_HU, connected_components, distance_to_outside, interpolate_like, resample
+from endopilot.imaging.openings import TO_WALL_MM, box_around, openings, opens_into
 from endopilot.imaging.ostium import find_ostium
 from endopilot.imaging.segment import SegmentConfig
 from endopilot.imaging.vessel_tracking import track_tree
@@ -47,14 +49,12 @@ _SCALES_MM = (0.6, 0.9, 1.3, 1.9)
 """Scales of the vesselness: they answer most to radii of 0.8 to 2.7 mm."""
 _GAP_MM = 1.0
 """Voxels between vessels this close together are bridged, if they are bright."""
-_TO_WALL_MM = 3.5
-"""Vesselness fades where the artery opens into the aorta: the tree starts within this distance of the wall."""
 _SEED_MM = 5.0
 """A seed belongs to the vessel within this distance."""
-_OPENING_MM = 5.0
-"""Blood that joins a tree to the aorta is looked for this far around the tree's voxel nearest the wall."""
 _LEAST_TREE_MM3 = 250.0
 """A smaller connected vessel is no coronary tree: 50 mm of 2.5 mm width hold as much."""
+_RIVAL_SHARE = 0.85
+"""What is dimmer than this share of the aorta's blood is no second candidate for it."""
 _WALL_HU = 50.0
 """The aortic wall."""
 COARSEST_MM = 1.25
@@ -132,9 +132,27 @@ def segment_lumen(volume: Volume, config: SegmentConfig) -> LumenMask:
         advance()
         blood = scan.hu > scan.blood_hu
         ostium, paths[0] = find_ostium(paths[0], blood, aorta, scan.grid)
-        mask = _refine(volume, scan, paths, ostium)
+        radius = _rough_radius(paths, scan)
+        mask = _refine(volume, scan, paths, radius, ostium)
+        found = FoundTree(
+            volume=volume,
+            grid=grid,
+            hu=scan.hu,
+            lumen_hu=scan.lumen_hu,
+            blood_hu=scan.blood_hu,
+            vessels=scan.vessels,
+            aorta=aorta,
+            tree=tree,
+            ostium=ostium.position,
+            paths=paths,
+            radius=radius,
+        )
+        warnings = coronary_doubts(found, config.vessel)
+        if not config.seeds:
+            warnings = (*_rival_aortas(scan, aorta, roots, config.vessel, tree, start), *warnings)
         advance()
-    return LumenMask(Volume(mask, volume.spacing_mm, volume.origin_mm, volume.direction), ostium)
+    found_mask = Volume(mask, volume.spacing_mm, volume.origin_mm, volume.direction)
+    return LumenMask(found_mask, ostium, warnings=warnings)
 
 
 def _find_roots(grid: Volume, config: SegmentConfig) -> list[AorticRoot]:
@@ -150,7 +168,7 @@ def _find_roots(grid: Volume, config: SegmentConfig) -> list[AorticRoot]:
 def _hu_at(volume: Volume, seed: tuple[float, float, float]) -> float:
     """Return the brightest smoothed HU within 2 mm of a seed."""
     index = volume.world_to_index(np.array(seed, dtype=float))[::-1]
-    box = _box(index[None], 2.0 / volume.spacing_mm[::-1], volume.voxels.shape)
+    box = box_around(index[None], 2.0 / volume.spacing_mm[::-1], volume.voxels.shape)
     found = float(np.max(ndimage.gaussian_filter(volume.voxels[box].astype(np.float32), 0.7)))
     if found < LEAST_BLOOD_HU:
         raise InputError(
@@ -193,7 +211,9 @@ def _thick(body: Volume, level_hu: float, grid: Volume) -> Bool[np.ndarray, "nz 
 def _aorta(scan: _Scan, root: AorticRoot) -> Bool[np.ndarray, "nz ny nx"]:
     """Return the pool voxels around the aorta's axis."""
     reach = 1.15 * root.radius + 1.0
-    box = _box(scan.grid.world_to_index(root.centres)[:, ::-1], np.full(3, reach.max() / _GRID_MM), scan.pools.shape)
+    box = box_around(
+        scan.grid.world_to_index(root.centres)[:, ::-1], np.full(3, reach.max() / _GRID_MM), scan.pools.shape
+    )
     voxels = np.argwhere(scan.pools[box]) + [part.start for part in box]
     points = scan.grid.index_to_world(voxels[:, ::-1].astype(float))
     distance, disc = KDTree(root.centres).query(points)
@@ -222,7 +242,7 @@ def _unseeded_tree(grid: Volume, roots: list[AorticRoot], vessel: str) -> _Tree:
         found = _tree_at_aorta(scan, root, aorta, vessel)
         if found is None:
             continue
-        if _opens_into(scan, aorta, *found):
+        if opens_into(scan.hu, scan.blood_hu, aorta, *found, _GRID_MM):
             return scan, aorta, *found
         passing = passing or (scan, aorta, *found)
     if passing is not None:  # a narrow ostium may be too dim to look open
@@ -233,12 +253,27 @@ def _unseeded_tree(grid: Volume, roots: list[AorticRoot], vessel: str) -> _Tree:
     )
 
 
-def _opens_into(scan: _Scan, aorta: np.ndarray, tree: np.ndarray, start: np.ndarray) -> bool:
-    """Return whether blood joins a tree to the aorta around the tree's voxel nearest to it."""
-    box = _box(start[None], np.full(3, _OPENING_MM / _GRID_MM), tree.shape)
-    blood = scan.hu[box] > scan.blood_hu
-    label = connected_components(blood)
-    return bool(np.intersect1d(label[tree[box] & blood], label[aorta[box] & blood]).size)
+def _rival_aortas(
+    scan: _Scan, aorta: np.ndarray, roots: list[AorticRoot], vessel: str, tree: np.ndarray, start: np.ndarray
+) -> list[str]:
+    """Tell what else may be the ascending aorta, since such an artery opens into it too, or into none visibly."""
+    told = []
+    if not opens_into(scan.hu, scan.blood_hu, aorta, tree, start, _GRID_MM):
+        told.append("the artery does not visibly open into the aorta: the ostium may be elsewhere; give a seed at it")
+    label = connected_components(scan.vessels, corners=True)
+    sizes = np.bincount(label.ravel()) * _GRID_MM**3
+    for root in roots:
+        other = _aorta(scan, root)
+        if (other & aorta).any() or root.blood_hu < _RIVAL_SHARE * scan.lumen_hu:
+            continue
+        found = openings(scan.hu, scan.blood_hu, other, label, _GRID_MM)
+        if any(sizes[o.vessel] >= _LEAST_TREE_MM3 and _on_side(scan, root, o.voxel, vessel) for o in found):
+            x, y, z = root.centres[len(root.centres) // 2]
+            told.append(
+                f"two vessels may be the ascending aorta; the one not taken passes ({x:.0f}, {y:.0f}, {z:.0f}) mm, and "
+                "an artery opens into it too; if it is the aorta, give a seed at the ostium there"
+            )
+    return told
 
 
 def _tree_at_seed(
@@ -248,9 +283,9 @@ def _tree_at_seed(
     at = _vessel_near(scan, scan.vessels, seed)
     label = connected_components(scan.vessels, corners=True)
     tree = label == label[tuple(at)]
-    box = _box(at[None], np.full(3, 2 * _SEED_MM / _GRID_MM), tree.shape)
+    box = box_around(at[None], np.full(3, 2 * _SEED_MM / _GRID_MM), tree.shape)
     gap = distance_to_outside(~aorta[box], _GRID_MM)
-    voxels = np.argwhere(tree[box] & (gap <= _TO_WALL_MM)) if aorta[box].any() else np.zeros((0, 3), dtype=int)
+    voxels = np.argwhere(tree[box] & (gap <= TO_WALL_MM)) if aorta[box].any() else np.zeros((0, 3), dtype=int)
     if len(voxels):
         at = voxels[gap[tuple(voxels.T)].argmin()] + [part.start for part in box]
     return tree, at
@@ -261,24 +296,28 @@ def _tree_at_aorta(
 ) -> tuple[Bool[np.ndarray, "nz ny nx"], Int[np.ndarray, "3"]] | None:
     """Return the connected vessel that belongs to the ostium wanted, and its voxel nearest the aortic wall, if any."""
     label = connected_components(scan.vessels, corners=True)
-    box = _box(np.argwhere(aorta), np.full(3, _TO_WALL_MM / _GRID_MM + 1), aorta.shape)
+    box = box_around(np.argwhere(aorta), np.full(3, TO_WALL_MM / _GRID_MM + 1), aorta.shape)
     gap = distance_to_outside(~aorta[box], _GRID_MM)
-    touching = np.argwhere((gap <= _TO_WALL_MM) & (label[box] > 0))
+    touching = np.argwhere((gap <= TO_WALL_MM) & (label[box] > 0))
     sizes = np.bincount(label.ravel())
     best, start = 0, None
     for name in np.unique(label[box][tuple(touching.T)]):
         voxels = touching[label[box][tuple(touching.T)] == name]
         nearest = voxels[gap[tuple(voxels.T)].argmin()] + [part.start for part in box]
-        point = scan.grid.index_to_world(nearest[::-1].astype(float))
-        disc = int(np.abs(root.centres[:, 2] - point[2]).argmin())
-        outward = point[:2] - root.centres[disc, :2]
-        if point[2] < root.centres[0, 2]:  # what comes to a chamber below is no ostium
-            continue
-        if outward @ np.array(_SIDE[vessel]) > 0 and sizes[name] > sizes[best] * (best > 0):
+        if _on_side(scan, root, nearest, vessel) and sizes[name] > sizes[best] * (best > 0):
             best, start = int(name), nearest
     if start is None or sizes[best] * _GRID_MM**3 < _LEAST_TREE_MM3:
         return None
     return label == best, start
+
+
+def _on_side(scan: _Scan, root: AorticRoot, voxel: np.ndarray, vessel: str) -> bool:
+    """Return whether a voxel at the aorta's wall is where the wanted artery's ostium may be."""
+    point = scan.grid.index_to_world(voxel[::-1].astype(float))
+    disc = int(np.abs(root.centres[:, 2] - point[2]).argmin())
+    if point[2] < root.centres[0, 2]:  # what comes to a chamber below is no ostium
+        return False
+    return bool((point[:2] - root.centres[disc, :2]) @ np.array(_SIDE[vessel]) > 0)
 
 
 def _vessel_near(scan: _Scan, vessels: np.ndarray, seed: tuple[float, float, float]) -> Int[np.ndarray, "3"]:
@@ -295,11 +334,12 @@ def _vessel_near(scan: _Scan, vessels: np.ndarray, seed: tuple[float, float, flo
     return voxels[nearest]
 
 
-def _refine(volume: Volume, scan: _Scan, lines: list[np.ndarray], ostium: Insertion) -> Bool[np.ndarray, "nz ny nx"]:
+def _refine(
+    volume: Volume, scan: _Scan, lines: list[np.ndarray], radius: list[np.ndarray], ostium: Insertion
+) -> Bool[np.ndarray, "nz ny nx"]:
     """Return the lumen around the paths on the volume's own grid, cut at the ostium."""
     points = np.concatenate(lines)
-    radius = _rough_radius(lines, scan)
-    box = _box(volume.world_to_index(points)[:, ::-1], _MARGIN_MM / volume.spacing_mm[::-1], volume.voxels.shape)
+    box = box_around(volume.world_to_index(points)[:, ::-1], _MARGIN_MM / volume.spacing_mm[::-1], volume.voxels.shape)
     corner = np.array([part.start for part in box])
     crop = Volume(
         volume.voxels[box], volume.spacing_mm, volume.index_to_world(corner[::-1].astype(float)), volume.direction
@@ -307,7 +347,7 @@ def _refine(volume: Volume, scan: _Scan, lines: list[np.ndarray], ostium: Insert
     pools = Volume(scan.pools.astype(np.float32), scan.grid.spacing_mm, scan.grid.origin_mm, scan.grid.direction)
     excluded = interpolate_like(pools, crop, outside=0.0) > 0.5
     _cut(excluded, crop, ostium)
-    lumen = lumen_at_half_height(crop, points, radius, scan.lumen_hu, excluded)
+    lumen = lumen_at_half_height(crop, points, np.concatenate(radius), scan.lumen_hu, excluded)
     mask = np.zeros(volume.voxels.shape, dtype=bool)
     if lumen.any():
         label = connected_components(lumen)
@@ -318,24 +358,17 @@ def _refine(volume: Volume, scan: _Scan, lines: list[np.ndarray], ostium: Insert
 def _cut(excluded: np.ndarray, crop: Volume, ostium: Insertion) -> None:
     """Around the ostium, let the plane across the vessel exclude what lies behind it, and nothing else."""
     centre = crop.world_to_index(ostium.position)[::-1]
-    box = _box(centre[None], _OSTIUM_REACH_MM / crop.spacing_mm[::-1], excluded.shape)
+    box = box_around(centre[None], _OSTIUM_REACH_MM / crop.spacing_mm[::-1], excluded.shape)
     k, j, i = np.meshgrid(*(np.arange(part.start, part.stop) for part in box), indexing="ij")
     offset = crop.index_to_world(np.stack([i, j, k], axis=-1).astype(float)) - ostium.position
     near = np.linalg.norm(offset, axis=-1) < _OSTIUM_REACH_MM
     excluded[box] = np.where(near, offset @ ostium.direction < 0, excluded[box])
 
 
-def _box(index: np.ndarray, margin: np.ndarray, shape: tuple[int, ...]) -> tuple[slice, ...]:
-    """Return the slices (k, j, i) around some voxel indices with a margin, clipped to the volume."""
-    low = np.maximum(np.floor(index.min(axis=0) - margin).astype(int), 0)
-    high = np.minimum(np.ceil(index.max(axis=0) + margin).astype(int) + 1, shape)
-    return tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
-
-
-def _rough_radius(lines: list[np.ndarray], scan: _Scan) -> Float[np.ndarray, "n"]:
+def _rough_radius(lines: list[np.ndarray], scan: _Scan) -> list[Float[np.ndarray, "_"]]:
     """Return the lumen radius along each path, mm, from the distance to voxels below half height."""
     index = np.round(scan.grid.world_to_index(np.concatenate(lines))).astype(int)[:, ::-1]
-    box = _box(index, np.full(3, 4.0 / _GRID_MM), scan.hu.shape)
+    box = box_around(index, np.full(3, 4.0 / _GRID_MM), scan.hu.shape)
     blood = scan.hu[box] > scan.blood_hu
     depth = np.asarray(ndimage.maximum_filter(distance_to_outside(blood, _GRID_MM), 3)) - _GRID_MM / 2
     pieces = []
@@ -348,4 +381,4 @@ def _rough_radius(lines: list[np.ndarray], scan: _Scan) -> Float[np.ndarray, "n"
             # At its mouth the artery has no wall of its own: take what it has a little farther on.
             radius[along <= _MOUTH_MM] = np.median(radius[beyond])
         pieces.append(ndimage.median_filter(radius, 9, mode="nearest"))
-    return np.concatenate(pieces)
+    return pieces
