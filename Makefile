@@ -50,18 +50,18 @@ readme: $(INSTALLED)
 # docs/learning.md's figures: two cores and an evening. What is there already is not made again.
 LEARNING := runs/causal
 recipe-laptop: $(INSTALLED)
-	$(BIN)/endopilot atlas --count 160 --seed 51 -o $(LEARNING)/patients
-	$(BIN)/endopilot dataset $(LEARNING)/patients/* -o $(LEARNING)/dataset --sequences 12 --seed 51 \
-	  --anatomy-shares 0.725 0.125 0.15 --seen-test-share 0.1
-	for seed in 0 1 2; do \
-	  $(BIN)/endopilot train $(LEARNING)/dataset -o $(LEARNING)/seed-$$seed --model causal --epochs 10 \
-	    --learning-rate 0.002 --seed $$seed || exit; \
-	done
-	$(BIN)/endopilot train $(LEARNING)/dataset -o $(LEARNING)/paper --batch-size 64 \
-	  --windows-per-epoch 20000
-	$(BIN)/endopilot evaluate $(LEARNING)/seed-0 -o $(LEARNING)/evaluation --sequences 48 \
-	  --other-seeds $(LEARNING)/seed-1 $(LEARNING)/seed-2
-	$(BIN)/endopilot evaluate $(LEARNING)/paper -o $(LEARNING)/evaluation-paper --sequences 48
+	$(BIN)/endopilot atlas --count 100 --seed 51 -o $(LEARNING)/patients
+	$(BIN)/endopilot atlas --anatomy lca --count 100 --seed 51 -o $(LEARNING)/patients
+	$(BIN)/endopilot dataset $(LEARNING)/patients/* -o $(LEARNING)/dataset --sequences 8 --seed 51 \
+	  --friction 0.08 0.12 --tip-stiffness-factor 0.8 1.2 --anatomy-shares 0.725 0.125 0.15 --seen-test-share 0.125
+	$(BIN)/endopilot dataset $(LEARNING)/patients/* -o $(LEARNING)/fixed --sequences 2 --seed 52 \
+	  --anatomy-shares 0.725 0.125 0.15 --seen-test-share 0.5
+	$(BIN)/endopilot atlas --count 20 --seed 151 -o $(LEARNING)/new-patients
+	$(BIN)/endopilot atlas --anatomy lca --count 20 --seed 151 -o $(LEARNING)/new-patients
+	$(BIN)/endopilot dataset $(LEARNING)/new-patients/* -o $(LEARNING)/new --sequences 6 --seed 4 --anatomy-shares 0 0 1
+	$(BIN)/endopilot train $(LEARNING)/dataset $(LEARNING)/fixed -o $(LEARNING)/seed-0 --model causal --epochs 10 \
+	  --learning-rate 0.002
+	$(BIN)/endopilot evaluate $(LEARNING)/seed-0 -o $(LEARNING)/evaluation --sequences 24
 	$(BIN)/endopilot advise $(LEARNING)/seed-0 $(LEARNING)/dataset -o $(LEARNING)/advice
 
 # The paper's full set and both models on one large GPU with some processor cores beside it; never run so far.

@@ -1,7 +1,7 @@
 """Put a trained run into the package as `pretrained`, with the model card that its figures make.
 
 `python docs/figures/pretrained.py FOLDER`: FOLDER holds `dataset`, the run `seed-0`, its `evaluation` and its `advice`,
-as `make recipe-laptop` leaves them.
+as `make recipe-laptop` leaves them. The commands of the card are that recipe's.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import shutil
 import sys
 from pathlib import Path
+from textwrap import dedent
 from typing import Any
 
 from endopilot.files import read_json
@@ -17,15 +18,15 @@ PACKAGED = Path(__file__).parents[2] / "src" / "endopilot" / "models" / "pretrai
 FILES = ("ff.safetensors", "if.safetensors", "manifest.json", "training.json", "xray.json")
 CARD = """# Model card: `pretrained`
 
-A forward and an inverse causal network (`endopilot.models.causal`) for the device {device} in right coronary arteries.
+A forward and an inverse causal network (`endopilot.models.causal`) for the device {device} in coronary arteries.
 
 | | |
 | --- | --- |
-| patients | {patients} synthetic right coronary arteries, `endopilot atlas` seed {atlas_seed} |
+| patients | {patients} synthetic coronary arteries, half of them left ones, `endopilot atlas` seed {atlas_seed} |
 | split | {train} train, {calibrate} calibrate, {test} test |
-| navigations | {sequences} of {seconds:g} s a patient, dataset seed {dataset_seed} |
+| navigations | {sequences} of {seconds:g} s a patient, and {more} with the wire as given; dataset seed {dataset_seed} |
 | trained on | {episodes} of them; {held} of the same patients are held out |
-| friction | {friction:g}, not varied |
+| wires | friction {friction[0]:g} to {friction[1]:g}, stiffness of the tip ×{stiffness[0]:g} to ×{stiffness[1]:g} |
 | training | seed {seed}, {epochs} epochs, learning rate {rate:g}, {steps} sequences a step |
 | time | {hours:.2f} hours by the clock on one thread of {processor}, shared with other work |
 | parameters | {parameters} |
@@ -53,12 +54,19 @@ X-ray advice by `xray.json`, calibrated on {calibrated} patients: on {advised} o
 hold throughout {coverage:.0f} % of the intervals of 45 s; {missed:.1f} % of the events are missed with {exposures:.1f}
 exposures a minute, of 40 that are possible (docs/xray.md explains why a network asks so often).
 
-**Meant for** research with this device or one much like it, in right coronary arteries of the atlas's kind. It gets
-each patient's vessel from simulations of the device (`models/patient.py`). It was trained on one device and one
-friction coefficient. Wires that snag or prolapse are rare and badly predicted: the mean errors are
-several times the medians.
+**Meant for** research with this device or one much like it, in coronary arteries. It gets each patient's vessel from
+simulations of the device (`models/patient.py`), and simulates three wires under the controls that it predicts for
+(`models/simulated_wires.py`). Where a wire snags, prolapses or may enter another branch, the errors are large and rare:
+the means are several times the medians. The probability of a jump says where.
 **No medical device.**
 """
+
+
+def recipe() -> str:
+    """Return the commands of `make recipe-laptop`."""
+    text = (PACKAGED.parents[3] / "Makefile").read_text(encoding="utf-8")
+    lines = text.split("recipe-laptop: $(INSTALLED)\n")[1].split("\n\n")[0]
+    return dedent(lines.expandtabs(4)).replace("$(BIN)/", "").replace("$(LEARNING)", "runs/causal")
 
 
 def card(folder: Path) -> str:
@@ -68,7 +76,6 @@ def card(folder: Path) -> str:
     advice = read_json(folder / "advice" / "advice.json")
     config, made = run["config"], data["config"]
     names = [record["name"] for record in data["anatomies"]]
-    shares = made["anatomy_shares"]
     counts = {split: data["splits"].get(split, 0) for split in ("train", "seen_test", "calibrate", "test")}
     per = made["sequences"]
     atlas_seed = names[0].split("-")[1]
@@ -82,11 +89,13 @@ def card(folder: Path) -> str:
         calibrate=counts["calibrate"] // per,
         test=counts["test"] // per,
         sequences=per,
+        more=read_json(folder / "fixed" / "meta/manifest.json")["config"]["sequences"],
         seconds=made["seconds"],
         dataset_seed=made["seed"],
         episodes=run["episodes"]["train"],
         held=run["episodes"]["seen_test"],
-        friction=run["device"]["friction"],
+        friction=made["friction"],
+        stiffness=made["tip_stiffness_factor"],
         seed=config["seed"],
         epochs=config["epochs"],
         rate=rate,
@@ -95,19 +104,7 @@ def card(folder: Path) -> str:
         processor=run["machine"]["processor"],
         parameters=" and ".join(str(network["parameters"]) for network in run["networks"].values()),
         version=run["versions"]["endopilot"],
-        commands="\n".join(
-            (
-                f"endopilot atlas --count {len(names)} --seed {atlas_seed} -o runs/causal/patients",
-                f"endopilot dataset runs/causal/patients/* -o runs/causal/dataset --sequences {per} \\",
-                f"  --seed {made['seed']} --anatomy-shares {' '.join(f'{share:g}' for share in shares)} "
-                f"--seen-test-share {made['seen_test_share']:g}",
-                "endopilot train runs/causal/dataset -o runs/causal/seed-0 --model causal "
-                f"--epochs {config['epochs']} --learning-rate {rate:g}",
-                "endopilot evaluate runs/causal/seed-0 -o runs/causal/evaluation --sequences 48",
-                "endopilot advise runs/causal/seed-0 runs/causal/dataset -o runs/causal/advice",
-                "python docs/figures/pretrained.py runs/causal",
-            )
-        ),
+        commands=recipe() + "\npython docs/figures/pretrained.py runs/causal",
         evaluated=metrics["episodes"],
         n_test=len(metrics["anatomies"]),
         ours=_cells(tip["P1"]),

@@ -49,7 +49,7 @@ class Unsure(Lagging):
         last = np.maximum.accumulate(np.where(each, np.arange(each.shape[1]), 0), axis=1)
         spread = 0.3 * (np.arange(each.shape[1]) - last)
         tip = np.stack([0.8 * episodes.proximal[..., 0], np.full(each.shape, 0.1)], axis=-1)
-        return Prediction(tip=tip, spread=np.stack([spread, 0.0 * spread], axis=-1))
+        return Prediction(tip=tip, spread=np.stack([spread, 0.0 * spread], axis=-1), jump=0.0 * spread)
 
 
 @pytest.fixture
@@ -111,7 +111,7 @@ class Branched(Lagging):
     def predict(self, episodes: Episodes, observed: np.ndarray) -> Prediction:
         self.branches.append(episodes.branch[np.broadcast_to(observed, episodes.branch.shape)][WINDOW:].tolist())
         tip = np.stack([0.8 * episodes.proximal[..., 0], np.full(episodes.branch.shape, 0.1)], axis=-1)
-        return Prediction(tip=tip, spread=np.zeros_like(tip))
+        return Prediction(tip=tip, spread=np.zeros_like(tip), jump=0.0 * tip[..., 0])
 
 
 def test_a_network_observes_the_tip_in_the_branch_that_the_route_takes(by_network):

@@ -17,14 +17,15 @@ from endopilot.dataset.loader import Dataset, load_dataset
 from endopilot.errors import InputError
 from endopilot.evaluation.prediction_baselines import follow_slack, hold_slack, mean_control
 from endopilot.files import read_json, sha256
-from endopilot.models.causal import CausalNetwork, CausalPredictor
+from endopilot.models.causal import CausalPredictor, ForwardNetwork, InverseNetwork, Mixture
 from endopilot.models.config import CausalConfig, TrainConfig
 from endopilot.models.episodes import Episodes
-from endopilot.models.open_loop import Predictor, ProbabilisticPredictor
+from endopilot.models.open_loop import JUMP_MM, Predictor, ProbabilisticPredictor, jumps
 from endopilot.models.patient import STEP_MM, prepare
 from endopilot.models.play import N_FEATURES, mirrored
 from endopilot.models.rollout import load_model
 from endopilot.models.sequences import N_INPUTS, Sequences, prepare_vessels, unfold
+from endopilot.models.simulated_wires import FRICTION_FACTORS, SimulatedWires, read_or_simulate, simulated_tips
 from endopilot.models.train import train
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import read_device
@@ -32,6 +33,7 @@ from endopilot.simulation.drive_limits import DriveLimits
 
 GIVEN = 30
 SMALL = CausalConfig(width=8)
+WIRES = SimulatedWires()  # of all tests, which simulates none twice
 SHORT = TrainConfig(model="causal", network="ff", epochs=2, batch_size=4, causal=SMALL)
 
 
@@ -75,10 +77,11 @@ def packaged():
 
 def untrained() -> CausalPredictor:
     torch.manual_seed(1)
-    networks = CausalNetwork(SMALL).eval(), CausalNetwork(SMALL).eval()
+    networks = ForwardNetwork(SMALL).eval(), InverseNetwork(SMALL).eval()
     for network in networks:
         torch.nn.init.normal_(network.output.weight, std=0.5)
-    return CausalPredictor(*networks, limits=DriveLimits(max_velocity_mm_s=40.0, max_rotation_rad_s=12.6))
+    limits = DriveLimits(max_velocity_mm_s=40.0, max_rotation_rad_s=12.6)
+    return CausalPredictor(*networks, limits=limits, wires=WIRES)
 
 
 def given(episodes) -> np.ndarray:
@@ -135,7 +138,8 @@ def test_the_loop_of_both_leads_the_predicted_tip_along(packaged, everyone):
 
 @pytest.mark.parametrize("k", [30, 43])
 def test_a_later_control_changes_no_earlier_prediction(brief, k):
-    other = changed(brief, proximal=(k + 1, lambda proximal: proximal + np.array([3.0, 1.0])))
+    faster = (k + 1, lambda control: control + np.array([5.0, 1.0]))
+    other = changed(brief, proximal=(k + 1, lambda proximal: proximal + np.array([3.0, 1.0])), control=faster)
     before, after = (untrained().predict(episodes, given(brief)) for episodes in (brief, other))
     np.testing.assert_array_equal(before.tip[:, : k + 1], after.tip[:, : k + 1])
     np.testing.assert_array_equal(before.spread[:, : k + 1], after.spread[:, : k + 1])
@@ -230,7 +234,7 @@ def test_mirrored_vessels_behave_alike(brief):
     assert mirrored().shape == (N_FEATURES,)
     vessels = prepare_vessels(brief)
     forms = Sequences.of(brief, vessels, ("ff",), 0)
-    inputs, change = forms.window("ff", torch.tensor([[0, 0], [0, 2]]))
+    inputs, _, change = forms.window("ff", torch.tensor([[0, 0], [0, 2]]))
     np.testing.assert_array_equal(change[0], change[1])
     assert (inputs[0] != inputs[1]).any()
     # a vessel in the mirror, with the wire turned the other way, gives the mirrored features
@@ -257,6 +261,63 @@ def test_mirrored_vessels_behave_alike(brief):
     )
     theirs = unfold("forward", twin, patient, turned, observed).inputs
     np.testing.assert_allclose(ours, theirs, atol=2e-3)
+
+
+def test_a_simulated_wire_of_the_true_friction_retraces_the_navigation_and_is_simulated_once(brief, tmp_path):
+    wires = SimulatedWires()
+    tips = wires.tips(brief)
+    own = np.abs(tips[:, :, FRICTION_FACTORS.index(1.0)] - brief.tip).mean(axis=(0, 1))
+    assert (own < 0.5 * np.abs(tips[:, :, 0] - brief.tip).mean(axis=(0, 1))).all() and own.max() < 0.1  # mm
+    some = np.array([len(brief) - 1, 0])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("endopilot.models.simulated_wires.simulated_tips", None)
+        np.testing.assert_array_equal(wires.tips(brief.select(some)), tips[some])
+    np.testing.assert_array_equal(read_or_simulate(tmp_path, brief), tips)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("endopilot.models.simulated_wires.simulated_tips", lambda episodes: np.full((1, 1, 3, 2), 7.0))
+        np.testing.assert_array_equal(read_or_simulate(tmp_path, brief), tips)
+        assert (read_or_simulate(tmp_path, brief.select(some)) == 7.0).all()  # other episodes are other wires
+
+
+def test_a_wire_whose_simulation_fails_is_where_the_guess_is(brief):
+    vessels, patient = prepare_vessels(brief), np.unique(brief.anatomy, return_inverse=True)[1]
+    observed = np.broadcast_to(given(brief), brief.branch.shape)
+    tips = simulated_tips(brief)
+    whole = unfold("forward", vessels, patient, brief, observed, tips)
+    tips[2, 40:, 1] = np.nan
+    found = unfold("forward", vessels, patient, brief, observed, tips)
+    assert np.isfinite(found.inputs).all() and (found.others[2, 40:, 1] == 0).all()
+    np.testing.assert_array_equal(found.inputs[2, :40], whole.inputs[2, :40])
+    np.testing.assert_array_equal(np.delete(found.inputs, 2, axis=0), np.delete(whole.inputs, 2, axis=0))
+
+
+def test_the_median_of_a_mixture_has_half_of_it_below():
+    generator = torch.Generator().manual_seed(0)
+    weight = torch.log_softmax(torch.randn(3, 5, 4, generator=generator), dim=-1)
+    location = 3 * torch.randn(3, 5, 4, 2, generator=generator)
+    scale = 0.1 + torch.rand(3, 5, 4, 2, generator=generator)
+    mixture = Mixture(weight, location, scale, torch.zeros(3, 5))
+    median = mixture.median()
+    away = (median[..., None, :] - location) / scale
+    # P(x < m) = ½ exp(−|m − μ|/b) below a component's median, 1 − that above it
+    below = torch.where(away < 0, 0.5 * torch.exp(-away.abs()), 1 - 0.5 * torch.exp(-away.abs()))
+    np.testing.assert_allclose((weight.exp()[..., None] * below).sum(dim=-2), 0.5, atol=1e-5)
+    # variance of a Laplace distribution: 2 b²
+    alone = Mixture(torch.zeros(1, 1, 1), torch.ones(1, 1, 1, 2), 0.5 * torch.ones(1, 1, 1, 2), torch.zeros(1, 1))
+    np.testing.assert_allclose(alone.deviation(alone.median()), np.sqrt(0.5), rtol=1e-5)
+
+
+def test_a_jump_is_a_motion_that_the_drive_did_not_make():
+    inserted = np.array([[10.0, 12.0, 20.0, 20.0]])
+    slack = np.array([[1.0, 1.0 + 0.9 * JUMP_MM, 1.0, 1.0 + 1.1 * JUMP_MM]])
+    assert jumps(inserted - slack, inserted).tolist() == [[False, False, False, True]]
+
+
+def test_the_packaged_forward_network_says_where_a_tip_may_jump(packaged, everyone):
+    probability = packaged.predict(everyone, given(everyone)).jump
+    jumping = jumps(everyone.tip[..., 0].astype(float), everyone.proximal[..., 0].astype(float))
+    assert probability.min() >= 0 and probability.max() <= 1 and jumping.any()
+    assert probability[jumping].mean() > 10 * probability[~jumping].mean()
 
 
 def test_a_seed_repeats_to_the_bit_and_an_interrupted_run_goes_on(folder, tmp_path):

@@ -61,6 +61,8 @@ def test_another_motion_of_the_drive_changes_the_last_samples_alone(dataset):
     other = episodes.driven(moved, 2 * moved)
     np.testing.assert_array_equal(other.proximal[:, :-7], episodes.proximal[:, :-7])
     assert (other.proximal[:, -7:] == 3.0).all() and (other.control[:, -7:] == 6.0).all()
+    np.testing.assert_array_equal(other.command[:, :-7], episodes.command[:, :-7])
+    assert (other.command[:, -7:] == 6.0).all()  # nothing of how the drive slipped in the recorded motion
     np.testing.assert_array_equal(other.tip, episodes.tip)
 
 

@@ -114,7 +114,7 @@ class Unsure(HoldSlack):
         length = episodes.proximal[..., 0]
         abscissa = length - (length - episodes.tip[..., 0])[row, last]
         tip = np.stack([abscissa, episodes.tip[row, last, 1]], axis=-1).astype(float)
-        return Prediction(tip, np.repeat(0.1 * (here - last)[..., None], 2, axis=-1))
+        return Prediction(tip, np.repeat(0.1 * (here - last)[..., None], 2, axis=-1), np.zeros(tip.shape[:2]))
 
 
 def test_a_probabilistic_model_keeps_its_own_spread(split) -> None:

@@ -1,20 +1,24 @@
-"""The causal networks: from the vessel and the whole past they correct the prediction of the play operator.
+"""The causal networks: from the vessel, the whole past and simulated wires they predict the tip.
 
-FF predicts (Δtip, γtip) from the drive's motion, IF the drive's motion from the desired tip. Both are one network with
-the roles exchanged (`play`). Its inputs at every sample are the vessel around the tip, the push–pull envelopes, the
-play operator between them, and what was observed a sample ago; a recurrent layer carries the past. Its outputs are the
-change against the play operator's guess and an estimate of its own error:
+FF predicts (Δtip, γtip) from the drive's motion, IF the drive's motion from the desired tip. Inputs at every sample are
+the vessel around the tip, the push–pull envelopes, the play operator between them (`play`), and what was observed a
+sample ago; FF also gets wires of different friction that are simulated under the same controls (`simulated_wires`). A
+recurrent layer carries the past:
 
-    inputs -> two dense layers -> GRU -> two dense layers -> median and scale b of a Laplace distribution
+    inputs -> two dense layers -> GRU -> two dense layers -> for each guess: weight, location and scale b
 
-The loss is the negative logarithm of that distribution's density plus the absolute error in units of its mean over the
-training data, so that rare snaps, which the density forgives, count as well. Nothing feeds back: the network is run
-once over all controls, and the output at a sample depends on nothing that comes after it.
+Each guess, of the play operator and of every simulated wire, is one component of a mixture of Laplace distributions.
+Where the wires part, at a snap or at a branching point, the mixture has several modes: the tip may be at either. FF
+also gives the probability that the tip jumps in the sample.
+
+The loss is the negative logarithm of the mixture's density plus the expected absolute error in units of its mean over
+the training data, so that rare snaps, which the density forgives, count as well, and the cross entropy of the jumps.
+Nothing feeds back: the network is run once over all controls, and the output at a sample depends on nothing that comes
+after it.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from weakref import WeakKeyDictionary
 
@@ -29,74 +33,161 @@ from endopilot.models.config import WINDOW, CausalConfig
 from endopilot.models.episodes import Episodes, Setup
 from endopilot.models.open_loop import EachObserved, Observed, OpenLoop, Prediction, Steps2, begin_after, given_states
 from endopilot.models.play import Direction, Vessels
-from endopilot.models.sequences import N_INPUTS, prepare_vessels, unfold
+from endopilot.models.sequences import N_INPUTS, N_WIRE_INPUTS, prepare_vessels, unfold
+from endopilot.models.simulated_wires import FRICTION_FACTORS, SimulatedWires
 from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.types import SAMPLE_PERIOD_S
 
 _GIVEN_WEIGHT = 0.3
 """Weight of the loss over the first 30 samples, where the tip was observed a sample ago."""
-_LEAST_SCALE = 0.05
-"""Smallest scale of the distribution, in units of the mean absolute change."""
+_LEAST_SCALE = 0.02
+"""Smallest scale of a component, in units of the mean absolute change."""
+_RARE = -5.0
+"""Logit of the probability of a jump in an untrained network: jumps are rare."""
+_BISECTIONS = 40
 _FARTHEST = 6.0
 """Inputs are clipped to this many standard deviations, so that an unusual vessel cannot lead the network far astray."""
-_REFINEMENTS = 6
+_REFINEMENTS = 2
 """Times that P3 corrects the controls by the tip that FF predicts from them."""
 
 
 class CausalNetwork(nn.Module):
-    """The network; FF and IF are two of the same kind.
+    """What FF and IF have in common.
 
     Buffers `input_mean`, `input_scale` and `output_scale` are part of the checkpoint; `fit_scales` sets them.
+
+    Attributes:
+        n_inputs: inputs at a sample.
+        n_guesses: components of the mixture.
     """
+
+    n_inputs: int
+    n_guesses: int
 
     def __init__(self, config: CausalConfig):
         super().__init__()
         width = config.width
         self.embedding = nn.Sequential(
-            nn.Linear(N_INPUTS, width), nn.GELU(), nn.Dropout(config.drop_share), nn.Linear(width, width)
+            nn.Linear(self.n_inputs, width), nn.GELU(), nn.Dropout(config.drop_share), nn.Linear(width, width)
         )
         self.memory = nn.GRU(width, width, config.layers, batch_first=True)
         self.head = nn.Sequential(
             nn.LayerNorm(2 * width), nn.Linear(2 * width, width), nn.GELU(), nn.Dropout(config.drop_share)
         )
-        self.output = nn.Linear(width, 4)
-        nn.init.zeros_(self.output.weight)  # an untrained network is the play operator
+        self.output = nn.Linear(width, 5 * self.n_guesses + 1)
+        nn.init.zeros_(self.output.weight)  # an untrained network believes all guesses alike
         nn.init.zeros_(self.output.bias)
-        self.register_buffer("input_mean", torch.zeros(N_INPUTS))
-        self.register_buffer("input_scale", torch.ones(N_INPUTS))
+        self.register_buffer("input_mean", torch.zeros(self.n_inputs))
+        self.register_buffer("input_scale", torch.ones(self.n_inputs))
         self.register_buffer("output_scale", torch.ones(2))
 
     input_mean: Tensor
     input_scale: Tensor
     output_scale: Tensor
 
-    def forward(self, inputs: Float[Tensor, "b samples inputs"]) -> Float[Tensor, "b samples 4"]:
-        """Return the medians of both changes, and the scales b of their Laplace distributions."""
+    def forward(
+        self, inputs: Float[Tensor, "b samples inputs"], others: Float[Tensor, "b samples wires 2"]
+    ) -> Float[Tensor, "b samples outputs"]:
+        """Return the mixture, as `Mixture.of` takes it: log weights, locations and scales of both changes, and jumps.
+
+        Args:
+            inputs: of every sample.
+            others: by how much the guesses after the first differ from it.
+        """
         scaled = ((inputs - self.input_mean) / self.input_scale).clamp(-_FARTHEST, _FARTHEST)
         tokens = self.embedding(scaled)
         carried, _ = self.memory(tokens)
         out = self.output(self.head(torch.cat([carried, tokens], dim=-1)))
-        scale = F.softplus(out[..., 2:]) + _LEAST_SCALE
-        return torch.cat([out[..., :2] * self.output_scale, scale * self.output_scale], dim=-1)
+        n, each = self.n_guesses, (*out.shape[:-1], self.n_guesses, 2)
+        centers = torch.cat([torch.zeros_like(out[..., None, :2]), others], dim=-2)
+        location = centers + out[..., n : 3 * n].view(each) * self.output_scale
+        scale = (F.softplus(out[..., 3 * n : 5 * n].view(each)) + _LEAST_SCALE) * self.output_scale
+        weight = torch.log_softmax(out[..., :n], dim=-1)
+        return torch.cat([weight, location.flatten(-2), scale.flatten(-2), out[..., -1:] + _RARE], dim=-1)
 
-    def fit_scales(self, inputs: Float[Tensor, "b samples inputs"], change: Float[Tensor, "b samples 2"]) -> None:
+    def fit_scales(
+        self,
+        inputs: Float[Tensor, "b samples inputs"],
+        others: Float[Tensor, "b samples wires 2"],
+        change: Float[Tensor, "b samples 3"],
+    ) -> None:
         """Set the scales from training data."""
         flat = inputs.flatten(0, 1)
         self.input_mean.copy_(flat.mean(dim=0))
         self.input_scale.copy_(flat.std(dim=0).clamp(min=1e-3))
-        self.output_scale.copy_(change[:, WINDOW:].abs().mean(dim=(0, 1)).clamp(min=1e-6))
+        self.output_scale.copy_(change[:, WINDOW:, :2].abs().mean(dim=(0, 1)).clamp(min=1e-6))
 
-    def loss(self, output: Float[Tensor, "b samples 4"], change: Float[Tensor, "b samples 2"]) -> Float[Tensor, ""]:
-        """Return −log density of the Laplace distribution, plus the absolute error, in units of the mean change."""
-        error = (output[..., :2] - change).abs()
-        scale = output[..., 2:]
-        each = error / scale + (scale / self.output_scale).log() + error / self.output_scale
-        weight = torch.ones(change.shape[1], 1, device=change.device)
+    def loss(
+        self, output: Float[Tensor, "b samples outputs"], change: Float[Tensor, "b samples 3"]
+    ) -> Float[Tensor, ""]:
+        """Return −log density of the mixture, plus the expected absolute error, plus the cross entropy of the jumps."""
+        found = Mixture.of(output, self.n_guesses)
+        error = (found.location - change[..., None, :2]).abs()
+        density = (-error / found.scale - (found.scale / self.output_scale).log()).sum(dim=-1)
+        likely = -torch.logsumexp(found.log_weight + density, dim=-1)
+        absolute = (found.log_weight.exp() * (error / self.output_scale).sum(dim=-1)).sum(dim=-1)
+        jump = F.binary_cross_entropy_with_logits(found.jump, change[..., 2], reduction="none")
+        weight = torch.ones(change.shape[1], device=change.device)
         weight[:WINDOW] = _GIVEN_WEIGHT
-        return (weight * each).mean()
+        return (weight * (0.5 * (likely + absolute) + jump)).mean()
 
 
-CAUSAL_NETWORKS: dict[str, type[CausalNetwork]] = {"ff": CausalNetwork, "if": CausalNetwork}
+class ForwardNetwork(CausalNetwork):
+    """FF: guesses of the play operator and of the simulated wires."""
+
+    n_inputs = N_INPUTS + N_WIRE_INPUTS
+    n_guesses = 1 + len(FRICTION_FACTORS)
+
+
+class InverseNetwork(CausalNetwork):
+    """IF: the play operator's guess alone."""
+
+    n_inputs = N_INPUTS
+    n_guesses = 1
+
+
+CAUSAL_NETWORKS: dict[str, type[CausalNetwork]] = {"ff": ForwardNetwork, "if": InverseNetwork}
+
+
+@dataclass(frozen=True, eq=False)
+class Mixture:
+    """A mixture of Laplace distributions of two independent quantities, and the probability of a jump.
+
+    Attributes:
+        log_weight: logarithm of each component's weight.
+        location: median of each component.
+        scale: its scale b.
+        jump: logit of the probability that the tip jumps in the sample.
+    """
+
+    log_weight: Float[Tensor, "b samples n"]
+    location: Float[Tensor, "b samples n 2"]
+    scale: Float[Tensor, "b samples n 2"]
+    jump: Float[Tensor, "b samples"]
+
+    @staticmethod
+    def of(output: Float[Tensor, "b samples outputs"], n: int) -> Mixture:
+        """Return the mixture of n components that a network's output says."""
+        each = (*output.shape[:-1], n, 2)
+        location, scale = (output[..., first * n : (first + 2) * n].view(each) for first in (1, 3))
+        return Mixture(output[..., :n], location, scale, output[..., -1])
+
+    def median(self) -> Float[Tensor, "b samples 2"]:
+        """Return the median of both quantities, which lies between the components' medians, by bisection."""
+        weight = self.log_weight.exp()[..., None]
+        low, high = self.location.amin(dim=-2), self.location.amax(dim=-2)
+        for _ in range(_BISECTIONS):
+            middle = 0.5 * (low + high)
+            away = (middle[..., None, :] - self.location) / self.scale
+            tail = 0.5 * torch.exp(-away.abs())
+            below = (weight * torch.where(away < 0, tail, 1 - tail)).sum(dim=-2) < 0.5
+            low, high = torch.where(below, middle, low), torch.where(below, high, middle)
+        return 0.5 * (low + high)
+
+    def deviation(self, center: Float[Tensor, "b samples 2"]) -> Float[Tensor, "b samples 2"]:
+        """Return the root mean square distance from a center."""
+        away = self.location - center[..., None, :]
+        return (self.log_weight.exp()[..., None] * (2 * self.scale**2 + away**2)).sum(dim=-2).sqrt()
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +199,7 @@ class CausalPredictor:
         inverse: IF, if it was trained.
         limits: of the drive.
         prepared: names and tables of the patients of each setup that it has predicted in.
+        wires: simulated so far.
     """
 
     forward: CausalNetwork | None
@@ -116,6 +208,7 @@ class CausalPredictor:
     prepared: WeakKeyDictionary[Setup, tuple[tuple[str, ...], Vessels]] = field(
         default_factory=WeakKeyDictionary, repr=False
     )
+    wires: SimulatedWires = field(default_factory=SimulatedWires, repr=False)
 
     def predict(self, episodes: Episodes, observed: Observed | EachObserved) -> Prediction:
         """Predict the tips of episodes from their controls and from the observed tips.
@@ -126,10 +219,11 @@ class CausalPredictor:
         """
         network = _needed(self.forward, "forward")
         given = np.broadcast_to(observed, episodes.branch.shape)
-        guess, output = self._run(network, "forward", episodes, given)
-        tip = np.where(given[..., None], episodes.tip.astype(float), guess + output[..., :2])
-        spread = np.where(given[..., None], 0.0, math.sqrt(2.0) * output[..., 2:])
-        return Prediction(tip, spread)
+        guess, found = self._run(network, "forward", episodes, given)
+        median = found.median()
+        tip = np.where(given[..., None], episodes.tip.astype(float), guess + median.double().numpy())
+        spread = np.where(given[..., None], 0.0, found.deviation(median).double().numpy())
+        return Prediction(tip, spread, found.jump.sigmoid().double().numpy())
 
     def rollout_forward(self, episodes: Episodes) -> OpenLoop:
         """P1: predict the tip under the true controls."""
@@ -168,8 +262,8 @@ class CausalPredictor:
         """Return IF's inserted length (mm) and turn (rad) of every sample from `begin` on."""
         network = _needed(self.inverse, "inverse")
         given = np.broadcast_to(np.arange(episodes.samples) < begin, episodes.branch.shape)
-        guess, output = self._run(network, "inverse", episodes, given)
-        wanted = (guess + output[..., :2])[:, begin:]
+        guess, found = self._run(network, "inverse", episodes, given)
+        wanted = (guess + found.location[..., 0, :].double().numpy())[:, begin:]
         return wanted[..., 0], wanted[..., 1]
 
     @torch.inference_mode()
@@ -179,11 +273,13 @@ class CausalPredictor:
         direction: Direction,
         episodes: Episodes,
         observed: Bool[np.ndarray, "episodes samples"],
-    ) -> tuple[Float[np.ndarray, "episodes samples 2"], Float[np.ndarray, "episodes samples 4"]]:
-        """Return the play operator's guess and the network's output for episodes."""
+    ) -> tuple[Float[np.ndarray, "episodes samples 2"], Mixture]:
+        """Return the play operator's guess for episodes, and the distribution of the change against it."""
         vessels, patient = self._vessels(episodes)
-        unfolded = unfold(direction, vessels, patient, episodes, observed)
-        return unfolded.guess, network(torch.as_tensor(unfolded.inputs)).double().numpy()
+        wires = self.wires.tips(episodes) if direction == "forward" else None
+        unfolded = unfold(direction, vessels, patient, episodes, observed, wires)
+        inputs, others = (torch.as_tensor(part, dtype=torch.float32) for part in (unfolded.inputs, unfolded.others))
+        return unfolded.guess, Mixture.of(network(inputs, others), network.n_guesses)
 
     def _vessels(self, episodes: Episodes) -> tuple[Vessels, Int[np.ndarray, "episodes"]]:
         """Return the tables of the episodes' patients, perhaps of others too, and which row each episode has."""

@@ -190,9 +190,10 @@ class Episodes:
     def driven(
         self, proximal: Float[np.ndarray, "episodes later 2"], control: Float[np.ndarray, "episodes later 2"]
     ) -> Episodes:
-        """Return the episodes with another motion of the drive in their last samples."""
+        """Return the episodes with another motion of the drive in their last samples, made as it is commanded."""
 
         def then(before: np.ndarray, later: np.ndarray) -> np.ndarray:
             return np.concatenate([before[:, : -later.shape[1]], later.astype(before.dtype)], axis=1)
 
-        return replace(self, control=then(self.control, control), proximal=then(self.proximal, proximal))
+        slip = then(self.slip, np.zeros_like(control))
+        return replace(self, control=then(self.control, control), slip=slip, proximal=then(self.proximal, proximal))

@@ -21,6 +21,8 @@ Observed = Bool[np.ndarray, "samples"]
 EachObserved = Bool[np.ndarray, "episodes samples"]
 """The same for each episode."""
 Steps2 = Float[np.ndarray, "episodes steps 2"]
+JUMP_MM = 3.0
+"""A tip jumps where it moves by this much more or less in a sample than the drive, mm: a snap, or a branch lost."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,10 +47,12 @@ class Prediction:
     Attributes:
         tip: (Δtip, γtip), mm.
         spread: one standard deviation of its error as the model estimates it, mm.
+        jump: probability that the tip jumps in the sample: see `jumps`.
     """
 
     tip: Float[np.ndarray, "episodes samples 2"]
     spread: Float[np.ndarray, "episodes samples 2"]
+    jump: Float[np.ndarray, "episodes samples"]
 
 
 @runtime_checkable
@@ -97,3 +101,11 @@ def given_states(episodes: Episodes) -> Observed:
 def begin_after(observed: Observed) -> int:
     """Return the first sample that is to be predicted: the one after the last observed one."""
     return int(np.flatnonzero(observed)[-1]) + 1
+
+
+def jumps(
+    tip_mm: Float[np.ndarray, "episodes samples"], inserted_mm: Float[np.ndarray, "episodes samples"]
+) -> Bool[np.ndarray, "episodes samples"]:
+    """Return the samples in which a tip at abscissas Δtip jumps: it moves otherwise than the drive by `JUMP_MM`."""
+    slack = inserted_mm - tip_mm
+    return np.abs(np.diff(slack, axis=1, prepend=slack[:, :1])) > JUMP_MM

@@ -13,11 +13,17 @@ from torch import Tensor
 from endopilot.models import play
 from endopilot.models.config import WINDOW
 from endopilot.models.episodes import Episodes
+from endopilot.models.open_loop import jumps
 from endopilot.models.play import PARTIAL_PLAYS, Direction, Vessels
+from endopilot.models.simulated_wires import FRICTION_FACTORS, WireTips, read_or_simulate
 from endopilot.progress import progress
 
 N_INPUTS = play.N_FEATURES + 4
 """Inputs of a network at a sample: the features, and four numbers of what was observed."""
+N_WIRE_INPUTS = 6 * len(FRICTION_FACTORS) + 1
+"""Further inputs of the forward network: six for each simulated wire, and the time since the tip was observed."""
+_FARTHEST_MM = 5.0
+"""Differences between simulated wires and tips are cut off here, mm: beyond, a wire is lost."""
 _OBSERVED_SHARE = 0.05
 """In training, share of the later samples at which the tip is observed too, in one of two copies of each sequence."""
 
@@ -29,14 +35,18 @@ class Unfolded:
     Attributes:
         inputs: of the network.
         guess: forward: (Δtip, γtip) of play and envelopes, mm; inverse: Δ by the play (mm) and a turn of 0 (rad).
+        others: forward: by how much the simulated wires differ from that guess, mm; inverse: none.
         branch: branch that the play operator puts the tip in.
         truth: forward: (Δtip, γtip), mm; inverse: Δ (mm) and the turn over the sample (rad).
+        jump: whether the tip jumps in the sample.
     """
 
     inputs: Float[np.ndarray, "episodes samples inputs"]
     guess: Float[np.ndarray, "episodes samples 2"]
+    others: Float[np.ndarray, "episodes samples wires 2"]
     branch: Int[np.ndarray, "episodes samples"]
     truth: Float[np.ndarray, "episodes samples 2"]
+    jump: Bool[np.ndarray, "episodes samples"]
 
 
 def prepare_vessels(episodes: Episodes) -> Vessels:
@@ -60,11 +70,20 @@ def unfold(
     patient: Int[np.ndarray, "episodes"],
     episodes: Episodes,
     observed: Bool[np.ndarray, "episodes samples"],
+    wires: WireTips | None = None,
 ) -> Unfolded:
     """Apply the play operator along episodes, and correct it after every sample at which the state was observed.
 
     Sample t depends on nothing later: forward, on the motion up to t and the tips observed before it; inverse, on the
     desired tips up to t and the motion before it, where observed.
+
+    Args:
+        direction: forward or inverse.
+        vessels: tables of the patients.
+        patient: row of the tables, for each episode.
+        episodes: the navigations.
+        observed: samples at which the tip was observed.
+        wires: forward: tips of the simulated wires, as `simulated_wires` gives them.
     """
     (tip, offset), (inserted, rotation) = (
         np.moveaxis(signal.astype(float), -1, 0) for signal in (episodes.tip, episodes.proximal)
@@ -105,7 +124,44 @@ def unfold(
             turn, angle = np.where(now, rotation[:, t] - angle, 0.0), np.where(now, rotation[:, t], angle)
     turned = np.diff(rotation, axis=1, prepend=initial_angle[:, None])
     truth = np.stack([tip, offset] if forward else [inserted, turned], axis=-1)
-    return Unfolded(inputs, guess, branches, truth)
+    others = np.zeros((*tip.shape, 0, 2))
+    if wires is not None:
+        others, columns = _beside(wires, guess, inserted, episodes.tip.astype(float), observed)
+        inputs = np.concatenate([inputs, columns], axis=-1, dtype=np.float32)
+    return Unfolded(inputs, guess, others, branches, truth, jumps(tip, inserted))
+
+
+def _beside(
+    wires: WireTips,
+    guess: Float[np.ndarray, "episodes samples 2"],
+    inserted: Float[np.ndarray, "episodes samples"],
+    tip: Float[np.ndarray, "episodes samples 2"],
+    observed: Bool[np.ndarray, "episodes samples"],
+) -> tuple[Float[np.ndarray, "episodes samples wires 2"], Float[np.ndarray, "episodes samples inputs"]]:
+    """Return by how much the simulated wires differ from a guess, mm, and what a network is given of them.
+
+    For each wire: that difference, cut off; by how much the tip differed from it when it was last observed; the
+    logarithm of its mean error so far; and how much more than the drive it moves in the sample. A wire whose simulation
+    failed is where the guess is.
+    """
+    others = np.where(np.isfinite(wires), wires - guess[:, :, None], 0.0)
+    at = guess[:, :, None] + others
+    seen, missed = observed[:, :, None], np.where(observed[:, :, None, None], tip[:, :, None] - at, 0.0)
+    missed = np.clip(missed, -_FARTHEST_MM, _FARTHEST_MM)
+    index = np.where(observed, np.arange(observed.shape[1]), -1)
+    before = np.pad(np.maximum.accumulate(index, axis=1), ((0, 0), (1, 0)), constant_values=-1)[:, :-1]
+    last = np.take_along_axis(missed, np.maximum(before, 0)[:, :, None, None], axis=1) * (before >= 0)[:, :, None, None]
+    count = np.pad(np.cumsum(seen, axis=1), ((0, 0), (1, 0), (0, 0)))[:, :-1]
+    total = np.pad(np.cumsum(np.abs(missed[..., 0]), axis=1), ((0, 0), (1, 0), (0, 0)))[:, :-1]
+    slack = inserted[:, :, None] - at[..., 0]
+    columns = [
+        *np.moveaxis(np.clip(others, -_FARTHEST_MM, _FARTHEST_MM), -1, 0),
+        *np.moveaxis(last, -1, 0),
+        np.log(total / np.maximum(count, 1) + 0.01),
+        np.clip(np.diff(slack, axis=1, prepend=slack[:, :1]), -_FARTHEST_MM, _FARTHEST_MM),
+    ]
+    since = np.log1p(np.arange(observed.shape[1]) - before)
+    return others, np.concatenate([*columns, since[:, :, None]], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,12 +171,14 @@ class Sequences:
     Attributes:
         tip: (Δtip, γtip), mm; for counting.
         inputs: of the networks, by network: (sequences, 2 forms, samples, inputs).
-        change: truth minus guess, by network.
+        others: by how much other guesses differ from the play operator's, by network.
+        change: truth minus the play operator's guess, and 1 where the tip jumps, by network.
     """
 
     tip: Float[Tensor, "episodes samples 2"]
     inputs: dict[str, Float[Tensor, "episodes forms samples inputs"]]
-    change: dict[str, Float[Tensor, "episodes forms samples 2"]]
+    others: dict[str, Float[Tensor, "episodes forms samples wires 2"]]
+    change: dict[str, Float[Tensor, "episodes forms samples 3"]]
 
     @staticmethod
     def of(episodes: Episodes, vessels: Vessels, networks: Sequence[str], seed: int) -> Sequences:
@@ -138,26 +196,33 @@ class Sequences:
         generator = np.random.default_rng([seed, shape[0]])
         first = generator.integers(1, 2 * WINDOW, shape[0])
         some = (np.arange(shape[1]) < first[:, None]) | (generator.random(shape) < _OBSERVED_SHARE)
-        inputs, change = {}, {}
+        inputs, others, change = {}, {}, {}
         for network in networks:
             direction: Direction = "forward" if network == "ff" else "inverse"
-            forms = [unfold(direction, vessels, patient, episodes, observed) for observed in (given, some)]
-            inputs[network] = torch.stack([torch.as_tensor(form.inputs) for form in forms], dim=1)
-            rest = [torch.as_tensor(form.truth - form.guess, dtype=torch.float32) for form in forms]
-            change[network] = torch.stack(rest, dim=1)
-        return Sequences(torch.as_tensor(episodes.tip, dtype=torch.float32), inputs, change)
+            wires = read_or_simulate(episodes.setup.patients_folder, episodes) if network == "ff" else None
+            forms = [unfold(direction, vessels, patient, episodes, observed, wires) for observed in (given, some)]
+            rest = [np.concatenate([form.truth - form.guess, form.jump[..., None]], axis=-1) for form in forms]
+            for kept, parts in (
+                (inputs, [form.inputs for form in forms]),
+                (others, [form.others for form in forms]),
+                (change, rest),
+            ):
+                kept[network] = torch.as_tensor(np.stack(parts, axis=1), dtype=torch.float32)
+        return Sequences(torch.as_tensor(episodes.tip, dtype=torch.float32), inputs, others, change)
 
     def targets(self) -> Int[Tensor, "forms 2"]:
         """Return (sequence, form) of every form of every sequence."""
         return torch.cartesian_prod(torch.arange(len(self.tip)), torch.arange(4))
 
-    def window(self, network: str, target: Int[Tensor, "b 2"]) -> tuple[Tensor, Tensor]:
-        """Return the network's inputs of some forms, and by how much the truth differs from the guess."""
+    def window(self, network: str, target: Int[Tensor, "b 2"]) -> tuple[Tensor, Tensor, Tensor]:
+        """Return a network's inputs of some forms, the other guesses, and the truth's difference from the first."""
         sequence, form = target[:, 0], target[:, 1]
-        inputs, change = self.inputs[network][sequence, form % 2], self.change[network][sequence, form % 2]
+        inputs, others, change = (kept[network][sequence, form % 2] for kept in (self.inputs, self.others, self.change))
         mirrored = (form >= 2)[:, None, None]  # and the others by 1: one product is cheaper than a choice of two
-        sign = torch.as_tensor(np.append(play.mirrored(), np.ones(N_INPUTS - play.N_FEATURES)), dtype=torch.float32)
-        turned = torch.tensor([1.0, 1.0 if network == "ff" else -1.0])
-        inputs *= torch.where(mirrored, sign, 1.0)  # of the copies that indexing made
+        sign = np.append(play.mirrored(), np.ones(inputs.shape[-1] - play.N_FEATURES))
+        turned = torch.tensor([1.0, 1.0 if network == "ff" else -1.0, 1.0])
+        inputs *= torch.where(
+            mirrored, torch.as_tensor(sign, dtype=torch.float32), 1.0
+        )  # of the copies that indexing made
         change *= torch.where(mirrored, turned, 1.0)
-        return inputs, change
+        return inputs, others, change

@@ -19,7 +19,7 @@ from scipy.stats import qmc
 
 from endopilot.models.config import WINDOW, TwinConfig
 from endopilot.models.episodes import Episodes
-from endopilot.models.open_loop import Observed, OpenLoop, Prediction, begin_after, given_states
+from endopilot.models.open_loop import Observed, OpenLoop, Prediction, begin_after, given_states, jumps
 from endopilot.models.tip_tracking import track
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import Device
@@ -79,7 +79,7 @@ class TwinPredictor:
             observed: samples at which the tip was observed.
         """
         tip, spread = np.full(episodes.tip.shape, np.nan), np.full(episodes.tip.shape, np.nan)
-        parameters = np.full((len(episodes), 3), np.nan)
+        parameters, jump = np.full((len(episodes), 3), np.nan), np.zeros(episodes.branch.shape)
         for anatomy, chosen in _by_anatomy(episodes):
             data = episodes.select(chosen)
             members, paths = self._narrowed_ensemble(anatomy, data, observed)
@@ -88,8 +88,12 @@ class TwinPredictor:
             each = np.broadcast_to(observed, data.branch.shape)
             beyond = _unexplained(tip[chosen], data.tip.astype(float), each, self.config)
             spread[chosen] = np.hypot(own, beyond)
+            inserted = np.broadcast_to(data.proximal[..., 0], paths.shape[:-1])
+            jump[chosen] = np.einsum(
+                "me,mes->es", weight, [jumps(*each) for each in zip(paths[..., 0], inserted, strict=True)]
+            )
             parameters[chosen] = members[weight.argmax(axis=0), np.arange(len(data))]
-        return TwinPrediction(tip, spread, parameters)
+        return TwinPrediction(tip, spread, jump, parameters)
 
     def ensemble(self, episodes: Episodes, observed: Observed) -> Float[np.ndarray, "members episodes samples 2"]:
         """Return the tips, mm, of every wire that is likely after the observed ones; NaN from where a simulation fails.
