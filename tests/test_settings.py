@@ -76,7 +76,7 @@ def package_classes() -> list[type]:
             continue
         names = vars(importlib.import_module(module.name)).values()
         found |= {kind for kind in names if isinstance(kind, type) and kind.__module__ == module.name}
-    return sorted(found, key=lambda kind: kind.__qualname__)
+    return sorted(found, key=lambda kind: (kind.__qualname__, kind.__module__))  # the same in every process
 
 
 def is_settings(kind: type) -> bool:
