@@ -99,7 +99,8 @@ template <class V, int T>
     // the coupling of theta and twists to those of the next block
     const auto coupling = [&](auto r_, auto c_) {
         constexpr int r = decltype(r_)::value, c = decltype(c_)::value;
-        if constexpr (r < 3 && c < 3) return link.tt[r][c];
+        if constexpr (T == 0) return link.tt[r][c];
+        else if constexpr (r < 3 && c < 3) return link.tt[r][c];
         else if constexpr (r < 3) return link.twists.tp[r][c - 3];
         else if constexpr (c < 3) return link.twists.pt[r - 3][c];
         else return link.twists.pp[r - 3][c - 3];

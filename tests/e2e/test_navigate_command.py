@@ -156,7 +156,8 @@ def test_an_interrupted_navigation_is_finished_by_the_same_command(patient, caps
     assert not (output / "manifest.json").exists() and not (output / "navigation.html").exists()
     again = run(capsys, "navigate", patient, "--target", "1", "-o", output, "--policy", "forward", *SHORT)
     assert sorted(path.name for path in output.iterdir()) == FILES
-    assert again["exposures"] == 1 and "Wires held possible" not in (output / "navigation.html").read_text()
+    page = (output / "navigation.html").read_text(encoding="utf-8")
+    assert again["exposures"] == 1 and "Wires held possible" not in page
 
 
 @pytest.mark.parametrize(

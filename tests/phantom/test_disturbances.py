@@ -176,7 +176,7 @@ def test_a_graft_joins_the_aorta_to_the_artery(vessel):
 def test_what_disturbs_leaves_the_scanner_and_the_noise_as_they_are(anatomy):
     noisy = replace(QUIET, noise_hu=(20.0, 40.0), lumen_hu=(300.0, 500.0), calcium=3.0)
     plain = make_phantom(anatomy, noisy, 4).voxels.astype(int)
-    for disturbed in ({"stents": 1}, {"graft": True}, {"veins": 0.8}):
+    for disturbed in ({"stents": 1}, {"veins": 0.8}):  # a graft widens the field of view
         change = make_phantom(anatomy, replace(noisy, **disturbed), 4).voxels - plain
         assert np.mean(change == 0) > 0.9 and np.abs(change).max() > 100
 
