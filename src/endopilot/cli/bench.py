@@ -14,6 +14,7 @@ from tyro.conf import Positional
 
 from endopilot.atlas.atlas import AtlasConfig
 from endopilot.benchmarks.imaging_cases import Difficulty
+from endopilot.benchmarks.published import PublishedConfig
 from endopilot.benchmarks.robustness import RobustnessConfig
 from endopilot.benchmarks.xray import XrayBenchConfig
 from endopilot.cli.arguments import OutputFolder, existing, show, show_rows
@@ -99,6 +100,18 @@ def robustness(*, json: bool = False, config: RobustnessConfig = RobustnessConfi
     else:
         _show_robustness(measured)
     _leave(all(row["passed"] for row in measured["figures"]))
+
+
+def published(*, json: bool = False, config: PublishedConfig = PublishedConfig()) -> None:
+    """Simulate published bench tests of wires and catheters, and show our figures beside theirs.
+
+    Args:
+        json: print the figures as JSON.
+        config: how often what the articles do not state is drawn.
+    """
+    from endopilot.benchmarks.published import bench_published
+
+    show_rows(bench_published(config), as_json=json)
 
 
 def env(*, json: bool = False) -> None:
@@ -304,6 +317,7 @@ SUBJECTS: dict[str, Callable[..., None]] = {
         simulation,
         scaling,
         robustness,
+        published,
         env,
         dataset,
         training,
