@@ -566,11 +566,8 @@ void Stepper<V, T>::record_tubes(int world, int sample) const {
         to[5] = from[World::kTubeDriveTorque];
         to[6] = from[World::kTubeSlip];
         to[7] = from[World::kTubeRotationSlip];
-        const double behind = w[World::kInserted] - from[World::kTubeInserted];
-        int i = 0;
-        while (i < rod_.nodes - 2 && rod_.abscissa[i + 1] < behind) ++i;
-        const double f = (behind - rod_.abscissa[i]) / rod_.length[i];
-        const Vec3<double> ahead = position(rod_, base_, w, i), tip = ahead + f * (position(rod_, base_, w, i + 1) - ahead);
+        const Vec3<double> tip = tube_tip(rod_, base_, w, k);
+        const int i = tube_end(rod_, w, k).element;
         to[8] = tip.x, to[9] = tip.y, to[10] = tip.z;
         to[11] = 0;
         if (k > 0) to[11] = i < w.active() ? w.twists(rod_.nodes, T, i)[k - 1] : to[1] - w[World::kRotation];

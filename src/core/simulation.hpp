@@ -128,16 +128,20 @@ public:
         return out.array(count_);
     }
 
-    // Where the wires end.
-    nb::object tips() {
+    // Where one of the devices ends, the wire (0) or a catheter around it.
+    nb::object tips(int device) {
+        require(device >= 0 && device < drives(), "there is no such device");
         OutputArray<double> out(3 * count_);
-        for (std::size_t w = 0; w < count_; ++w) put(position(view_.rod, scene_.base, world(w), 0), out.data + 3 * w);
+        for (std::size_t w = 0; w < count_; ++w)
+            put(drives() == 1 ? position(view_.rod, scene_.base, world(w), 0) : tube_tip(view_.rod, scene_.base, world(w), device), out.data + 3 * w);
         return out.array(count_, 3);
     }
 
-    nb::object tip_directions() {
+    nb::object tip_directions(int device) {
+        require(device >= 0 && device < drives(), "there is no such device");
         OutputArray<double> out(3 * count_);
-        for (std::size_t w = 0; w < count_; ++w) put(tip_direction(view_.rod, scene_.base, world(w)), out.data + 3 * w);
+        for (std::size_t w = 0; w < count_; ++w)
+            put(drives() == 1 ? tip_direction(view_.rod, scene_.base, world(w)) : tube_direction(view_.rod, scene_.base, world(w), device), out.data + 3 * w);
         return out.array(count_, 3);
     }
 

@@ -83,12 +83,36 @@ ENDOPILOT_DEVICE inline Quaternion<double> attitude(const Base& base, const Worl
     return i < w.active() ? quaternion(w.node(i) + World::kQ) : base.attitude(w[World::kRotation]);
 }
 
+// Where tube k ends: in element `element`, at `share` of its length from its distal node.
+struct TubeEnd {
+    int element;
+    double share;
+};
+ENDOPILOT_DEVICE inline TubeEnd tube_end(const RodModel& rod, const World& w, int k) {
+    const double behind = w[World::kInserted] - w.tube(rod.nodes, k)[World::kTubeInserted];
+    int i = 0;
+    while (i < rod.nodes - 2 && rod.abscissa[i + 1] < behind) ++i;
+    return {i, (behind - rod.abscissa[i]) / rod.length[i]};
+}
+
+ENDOPILOT_DEVICE inline Vec3<double> tube_tip(const RodModel& rod, const Base& base, const World& w, int k) {
+    const TubeEnd end = tube_end(rod, w, k);
+    const Vec3<double> ahead = position(rod, base, w, end.element);
+    return ahead + end.share * (position(rod, base, w, end.element + 1) - ahead);
+}
+
 // The wire's direction at its tip. The first element, of length l, has the direction at its middle; the tip's offset from the
 // polygon is l²/8 times the curvature vector.
 ENDOPILOT_DEVICE inline Vec3<double> tip_direction(const RodModel& rod, const Base& base, const World& w) {
     Vec3<double> direction = frame(attitude(base, w, 0)).d3;
     if (w.active() > 0) direction += (4 / rod.length[0]) * vec3(w.node(0) + (World::kAtNode + World::kOffset));
     return (1 / std::sqrt(dot(direction, direction))) * direction;
+}
+
+// Tube k's direction where it ends: behind the foremost tip, that of the element there.
+ENDOPILOT_DEVICE inline Vec3<double> tube_direction(const RodModel& rod, const Base& base, const World& w, int k) {
+    const TubeEnd end = tube_end(rod, w, k);
+    return end.element == 0 && end.share <= 0 ? tip_direction(rod, base, w) : frame(attitude(base, w, end.element)).d3;
 }
 
 // All worlds of a run, `between_worlds` and `between_numbers` numbers apart. A processor keeps each world's numbers side by

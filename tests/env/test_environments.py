@@ -26,7 +26,7 @@ from endopilot.env.vector import (
 from endopilot.errors import InputError
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import Navigation, Target
-from endopilot.tasks.task import reference_navigation
+from endopilot.tasks.task import in_catheter, reference_navigation
 
 WORLDS, STEPS = 3, 12
 
@@ -39,8 +39,15 @@ def near() -> Navigation:
     return replace(reference_navigation(), target=Target(branch=branch, abscissa=25.0), seconds=3.0)
 
 
-def _actions(steps: int = STEPS, worlds: int = WORLDS, seed: int = 0) -> np.ndarray:
-    return np.random.default_rng(seed).uniform(-0.5, 1.0, (steps, worlds, 2)).astype(np.float32)
+@pytest.fixture(scope="module", params=["wire", "catheter"])
+def either(near, request) -> Navigation:
+    """Return that navigation of a wire alone, and of a microcatheter over the wire."""
+    return near if request.param == "wire" else in_catheter([near], "microcatheter-1.7f")[0]
+
+
+def _actions(navigation: Navigation, steps: int = STEPS, worlds: int = WORLDS, seed: int = 0) -> np.ndarray:
+    shape = (steps, worlds, 2 * len(navigation.devices))
+    return np.random.default_rng(seed).uniform(-0.5, 1.0, shape).astype(np.float32)
 
 
 def _rollout(env: NavigateVectorEnv, actions: np.ndarray) -> list[np.ndarray]:
@@ -53,10 +60,11 @@ def _same(one: list[np.ndarray], other: list[np.ndarray]) -> bool:
     return all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
 
 
-def test_the_registered_environment_passes_gymnasiums_check():
+@pytest.mark.parametrize("name", ["Navigate", "NavigateCoaxial"])
+def test_the_registered_environments_pass_gymnasiums_check(name):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        check_env(gymnasium.make("endopilot/Navigate-v0").unwrapped)
+        check_env(gymnasium.make(f"endopilot/{name}-v0").unwrapped)
 
 
 def test_a_process_that_imported_nothing_makes_environments_by_name():
@@ -81,23 +89,23 @@ def test_a_vector_environment_is_made_by_its_name(near):
     assert {f"_{name}" for name in infos if not name.startswith("_")} == {n for n in infos if n.startswith("_")}
 
 
-def test_the_same_seed_and_actions_give_the_same_bits(near):
-    first = NavigateVectorEnv(WORLDS, navigations=near)
-    second = NavigateVectorEnv(WORLDS, navigations=near)
+def test_the_same_seed_and_actions_give_the_same_bits(either):
+    first = NavigateVectorEnv(WORLDS, navigations=either)
+    second = NavigateVectorEnv(WORLDS, navigations=either)
     start, again = first.reset(seed=4)[0], second.reset(seed=4)[0]
     assert np.array_equal(start, again)
     assert not np.array_equal(start[0], start[1]), "worlds begin with rotations of their own"
-    assert _same(_rollout(first, _actions()), _rollout(second, _actions()))
+    assert _same(_rollout(first, _actions(either)), _rollout(second, _actions(either)))
     assert not np.array_equal(start, first.reset(seed=5)[0])
 
 
-def test_a_single_environment_is_one_world_of_the_vector_environment(near):
-    actions = _actions(steps=30)
-    many = NavigateVectorEnv(WORLDS, navigations=near, autoreset_mode=AutoresetMode.DISABLED)
+def test_a_single_environment_is_one_world_of_the_vector_environment(either):
+    actions = _actions(either, steps=30)
+    many = NavigateVectorEnv(WORLDS, navigations=either, autoreset_mode=AutoresetMode.DISABLED)
     begun = many.reset(seed=7)[0]
     steps = _rollout(many, actions)
     for world in (0, 2):
-        one = NavigateEnv(navigation=near)
+        one = NavigateEnv(navigation=either)
         assert np.array_equal(one.reset(seed=7 + world)[0], begun[world])
         for step, action in enumerate(actions[:, world]):
             observation, reward, terminated, truncated, _ = one.step(action)
@@ -105,12 +113,12 @@ def test_a_single_environment_is_one_world_of_the_vector_environment(near):
             assert (reward, terminated, truncated) == tuple(values[step, world] for values in steps[1:])
 
 
-def test_an_environment_goes_on_with_the_same_bits_from_a_state_and_from_a_pickle(near):
-    env = NavigateVectorEnv(WORLDS, navigations=near)
+def test_an_environment_goes_on_with_the_same_bits_from_a_state_and_from_a_pickle(either):
+    env = NavigateVectorEnv(WORLDS, navigations=either)
     env.reset(seed=1)
-    _rollout(env, _actions(steps=5))
+    _rollout(env, _actions(either, steps=5))
     kept, stored = env.state, pickle.dumps(env)
-    actions = _actions(steps=40, seed=2)  # past the time limit, so that new rotations are drawn too
+    actions = _actions(either, steps=40, seed=2)  # past the time limit, so that new rotations are drawn too
     went = _rollout(env, actions)
     assert went[3].any()
     env.set_state(pickle.loads(pickle.dumps(kept)))
@@ -118,19 +126,20 @@ def test_an_environment_goes_on_with_the_same_bits_from_a_state_and_from_a_pickl
     assert _same(_rollout(pickle.loads(stored), actions), went)
 
 
-def test_a_single_environment_can_be_pickled_and_restored(near):
-    env = NavigateEnv(navigation=near)
+def test_a_single_environment_can_be_pickled_and_restored(either):
+    env = NavigateEnv(navigation=either)
     env.reset(seed=3)
-    env.step(np.array([1.0, 0.2]))
+    first, second = np.tile([[1.0, 0.2], [0.5, 1.0]], len(either.devices))
+    env.step(first)
     kept = env.state
     copy = pickle.loads(pickle.dumps(env))
-    went = env.step(np.array([0.5, 1.0]))
+    went = env.step(second)
     start = env.reset()[0]
-    again = copy.step(np.array([0.5, 1.0]))
+    again = copy.step(second)
     assert np.array_equal(went[0], again[0]) and went[1:4] == again[1:4] and went[4] == again[4]
     assert np.array_equal(copy.reset()[0], start)
     env.set_state(kept)
-    assert np.array_equal(env.step(np.array([0.5, 1.0]))[0], went[0])
+    assert np.array_equal(env.step(second)[0], went[0])
     assert np.array_equal(env.reset()[0], start)
 
 
@@ -153,6 +162,53 @@ def test_reward_is_what_the_table_says_and_success_terminates(near):
         assert not truncated
         before = info["distance_mm"]
     assert info["success"] and info["valid"] and info["safe"] and info["distance_mm"] <= 2.0
+
+
+def test_wire_and_catheter_are_driven_and_observed_each_by_itself(near):
+    navigation = in_catheter([near], "microcatheter-1.7f")[0]
+    env = NavigateEnv(navigation=navigation)
+    start, _ = env.reset(seed=0)
+    assert start.shape == (39,) and env.action_space.shape == (4,)
+    assert start[31] == 0.0 and start[0] == pytest.approx(near.start_inserted_mm / 100)
+    action = np.array([0.0, 0.0, 0.5, 0.25])
+    seen, _, _, _, info = [env.step(action) for _ in range(8)][-1]
+    advance, turn = 8 * CONTROL_PERIOD_S * 6.0, 8 * CONTROL_PERIOD_S * 0.25 * 3.14
+    assert info["inserted_length"] == pytest.approx(near.start_inserted_mm, abs=1e-6)
+    assert info["catheter_1_inserted_length"] == pytest.approx(advance, abs=1e-6)
+    assert info["catheter_1_rotation"] == pytest.approx(turn, abs=1e-6)
+    # the catheter is the foremost now: each tip is told by itself
+    assert info["catheter_1_tip_abscissa"] == pytest.approx(advance, abs=0.5)
+    assert info["tip_abscissa"] == pytest.approx(near.start_inserted_mm, abs=0.5)
+    told = [info[f"catheter_1_{name}"] for name in ("inserted_length", "tip_abscissa")]
+    assert seen[[31, 34]] == pytest.approx(np.array(told) / 100, abs=1e-6)
+    assert seen[32:34] == pytest.approx([np.cos(turn), np.sin(turn)], abs=1e-6)
+    assert seen[36] == pytest.approx(info["distance_mm"] / 100, abs=1e-6) and seen[37] == 1.0
+    assert seen[5] == pytest.approx((25.0 - info["tip_abscissa"]) / 100, abs=1e-6)
+
+
+def test_the_catheter_arrives_over_its_wire_and_both_tips_are_rewarded(near):
+    navigation = replace(in_catheter([near], "microcatheter-1.7f")[0], seconds=10.0)
+    env = NavigateEnv(navigation=navigation)
+
+    def left(info: dict) -> float:
+        return info["distance_mm"] + abs(25.0 - info["tip_abscissa"])
+
+    _, info = env.reset(seed=0)
+    ended = False
+    while not ended:
+        action = [1.0, 0.0, 0.0, 0.0] if info["tip_abscissa"] < 25.0 else [0.0, 0.0, 1.0, 0.0]
+        before, wire_was_there = left(info), info["tip_abscissa"] >= 25.0
+        _, reward, ended, truncated, info = env.step(np.array(action))
+        expected = PROGRESS_REWARD * (before - left(info)) + STEP_REWARD + SUCCESS_REWARD * info["success"]
+        assert reward == pytest.approx(expected, abs=1e-6)
+        assert not truncated and (wire_was_there or not ended)  # the wire is there first, its catheter is not
+    assert info["success"] and abs(info["catheter_1_tip_abscissa"] - 25.0) <= 2.0
+    # a catheter that arrives with its wire drawn back into it does not count
+    env.reset(seed=0)
+    for _ in range(20):
+        _, _, ended, _, info = env.step(np.array([0.0, 0.0, 1.0, 0.0]))
+        assert not info["success"]
+    assert info["catheter_1_tip_abscissa"] > 27.0 and info["tip_abscissa"] < 10.0
 
 
 def test_the_time_limit_truncates_and_the_next_step_begins_anew(near):
@@ -241,6 +297,15 @@ def test_bad_arguments_are_one_clear_line(near):
         NavigateVectorEnv(0, navigations=near)
     with pytest.raises(InputError, match="task: 'moon'"):
         NavigateVectorEnv(1, task="moon")
+    with pytest.raises(InputError, match="catheter 'hose'"):
+        NavigateVectorEnv(1, catheter="hose")
+    with pytest.raises(InputError, match=r"catheter: microcatheter-1\.7f; give it to the navigations"):
+        NavigateVectorEnv(1, navigations=near, catheter="microcatheter-1.7f")
+    coaxial = in_catheter([near], "microcatheter-1.7f")[0]
+    with pytest.raises(InputError, match="navigations: differ in catheters"):
+        NavigateVectorEnv(2, navigations=[near, coaxial])
+    with pytest.raises(InputError, match="arrives: catheter; there is none"):
+        replace(coaxial, catheters=())
     slow = replace(near, device=replace(near.device, max_velocity_mm_s=1.0))
     with pytest.raises(InputError, match="max_velocity_mm_s"):
         NavigateVectorEnv(1, navigations=slow)

@@ -124,6 +124,16 @@ def test_step_by_step_and_from_a_saved_state_the_bits_are_the_same(
     again.step(control[:, 3], 0.5)
     step = again.step(control[:, 4], 0.5)
     assert np.array_equal(step.tip_position, whole.tip_position[:, -1])
+    assert np.array_equal(again.tips(), whole.tip_position[:, -1])
+    assert np.array_equal(again.tips(1), whole.catheters.tip_position[:, -1, 0])
+    assert np.array_equal(again.project().abscissa, whole.tip.abscissa[:, -1])
+    ahead = again.inserted_length > again.catheter_inserted_length[:, 0]
+    assert np.array_equal((again.tips() == again.position[:, 0]).all(axis=1), ahead) and 0 < ahead.sum() < 3
+    assert again.project(1).abscissa == pytest.approx(again.catheter_inserted_length[:, 0], abs=12.0)
+    assert np.linalg.norm(again.tip_direction, axis=1) == pytest.approx(np.ones(3))
+    assert np.array_equal(step.tip_direction, again.tip_direction)
+    with pytest.raises(InputError, match="device: 2; give 0 for the wire, to 1"):
+        again.tips(2)
     assert np.array_equal(again.catheter_inserted_length, whole.catheters.inserted_length[:, -1])
     assert np.array_equal(again.catheter_drive_load[:, 0, 0], whole.catheters.drive_force[:, -1, 0])
     alone = endopilot.Simulator(vessel, wire, worlds=3)

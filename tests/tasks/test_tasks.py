@@ -60,7 +60,7 @@ def test_a_ladder_navigation_is_the_same_every_time():
 @pytest.mark.parametrize(
     ("old", "new", "line"),
     [
-        ("level: 6", "level: 13", "level: 13; give a whole number from 1 to 12"),
+        ("level: 6", "level: 17", "level: 17; give a whole number from 1 to 16"),
         ("seconds: 90", "seconds: -1", "seconds: -1; give a positive number"),
         ("force_limit_n: 0.2", "force_limit_n: .nan", "force_limit_n: nan; give a positive number"),
         ("anatomy: rca", "anatomy: knee", "anatomy: 'knee'; choose from"),

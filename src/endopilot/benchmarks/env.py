@@ -22,6 +22,8 @@ SECONDS = 60.0
 """Length of the navigations that are timed, s: an episode."""
 SINGLES = 4
 """Episodes of a single environment that are timed."""
+CATHETER = "microcatheter-1.7f"
+"""Around the wire of the coaxial environments, whose drive is moved like the wire's and independently of it."""
 COMPARED, COMPARED_SECONDS = 8, 30.0
 """Navigations that the error is measured on, and their length, s."""
 
@@ -36,16 +38,21 @@ def bench_env() -> dict[str, Any]:
     Returns:
         `steps_per_second_256` and `steps_per_second_1`, of 256 environments together and of one, over a minute's
         navigations, on all cores and with all overhead; the same with the prefix `random_actions_` for actions drawn
-        independently, and with `processor_` for steps a second of processor time; the median, the mean, the 95th
-        percentile and the maximum of the tip's distance from that of a core with the settings of the reference
+        independently, with `coaxial_` for a wire in a catheter, and with `processor_` for steps a second of processor
+        time; the median, the mean, the 95th percentile and the maximum of the tip's distance from that of a core with
+        the settings of the reference
         (`reference.CONVERGED`), mm, with the environments' settings and with the simulator's default ones; and the
         share of worlds that stayed valid.
     """
     figures: dict[str, Any] = {}
     valid = []
-    for prefix, independent in (("", False), ("random_actions_", True)):
+    for prefix, catheter, independent in (
+        ("", None, False),
+        ("random_actions_", None, True),
+        ("coaxial_", CATHETER, False),
+    ):
         for count, episodes in ((MANY, 1), (1, SINGLES)):
-            wall, processor, kept = _timed(count, episodes, independent=independent)
+            wall, processor, kept = _timed(count, episodes, catheter=catheter, independent=independent)
             steps = count * episodes * round(SECONDS / CONTROL_PERIOD_S)
             figures[f"{prefix}steps_per_second_{count}"] = round(steps / wall, 1)
             figures[f"{prefix}processor_steps_per_second_{count}"] = round(steps / processor, 1)
@@ -60,14 +67,15 @@ def bench_env() -> dict[str, Any]:
     return figures | {"valid_worlds": round(float(np.mean(valid)), 5), "processor": processor_name()}
 
 
-def _timed(count: int, episodes: int, *, independent: bool) -> tuple[float, float, float]:
+def _timed(count: int, episodes: int, *, catheter: str | None, independent: bool) -> tuple[float, float, float]:
     """Return wall and processor seconds of some episodes, and the share of valid worlds at their end."""
-    env = NavigateVectorEnv(count)
-    steps = round(SECONDS / CONTROL_PERIOD_S)
+    env = NavigateVectorEnv(count, catheter=catheter)
+    steps, numbers = round(SECONDS / CONTROL_PERIOD_S), 2 * len(env.navigations[0].devices)
     if independent:
-        actions = np.random.default_rng(0).uniform(-1.0, 1.0, (episodes, steps, count, 2))
+        actions = np.random.default_rng(0).uniform(-1.0, 1.0, (episodes, steps, count, numbers))
     else:
-        actions = _navigations(count * episodes, SECONDS).reshape(episodes, count, steps, 2).swapaxes(1, 2)
+        drives = [_navigations(count * episodes, SECONDS, first=k * 2**32) for k in range(numbers // 2)]
+        actions = np.concatenate(drives, axis=-1).reshape(episodes, count, steps, numbers).swapaxes(1, 2)
     wall = processor = 0.0
     valid = np.ones(count, dtype=bool)
     for episode in range(episodes):
@@ -79,12 +87,12 @@ def _timed(count: int, episodes: int, *, independent: bool) -> tuple[float, floa
     return wall, processor, float(valid.mean())
 
 
-def _navigations(count: int, seconds: float) -> Float[np.ndarray, "count steps 2"]:
-    """Return random navigations as actions."""
+def _navigations(count: int, seconds: float, *, first: int) -> Float[np.ndarray, "count steps 2"]:
+    """Return random navigations as actions of one drive, from number `first` on."""
     longest = float(reference_navigation().anatomy.tree.longest_path().abscissa[-1])
     samples = int(np.ceil(seconds / SAMPLE_PERIOD_S))
     _, control = random_controls(
-        ControlConfig(), n_sequences=count, n_samples=samples, seed=0, max_inserted_length_mm=longest
+        ControlConfig(), n_sequences=count, n_samples=samples, seed=0, max_inserted_length_mm=longest, first=first
     )
     at = (np.arange(round(seconds / CONTROL_PERIOD_S)) * CONTROL_PERIOD_S / SAMPLE_PERIOD_S).astype(int)
     return control[:, at] / (TRANSLATION_MM_S, ROTATION_RAD_S)

@@ -14,8 +14,13 @@ from endopilot.simulation.state import Step
 from endopilot.types import TipProjection
 
 _BOUND = 10.0
-SPACE = Box(-_BOUND, _BOUND, (31,), np.float32)
-"""Of one world's observation; what lies beyond is cut off."""
+_OF_WIRE, _OF_CATHETER = 31, 8
+"""Numbers of an observation: of the wire and its route, and of each catheter."""
+
+
+def space(catheters: int) -> Box:
+    """Return the space of one world's observation, of a wire with some catheters; what lies beyond is cut off."""
+    return Box(-_BOUND, _BOUND, (_OF_WIRE + _OF_CATHETER * catheters,), np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,46 +28,48 @@ class Measured:
     """The worlds at one moment; row i belongs to world i.
 
     Attributes:
-        tip: the tips' projections to the centerline.
-        position: of the tips, LPS mm.
+        tips: projections to the centerline of the wires' tips, then of each catheter's.
+        position: of the wires' tips, LPS mm.
         direction: unit vectors along the wires at their tips.
         contact_force: largest force of the wall on one node, N.
-        inserted_length: Δ, mm.
-        rotation: φ, rad.
+        inserted_length: Δ of the wires, then of each catheter, mm.
+        rotation: φ, rad, likewise.
         valid: false for a world that has failed.
     """
 
-    tip: TipProjection
+    tips: tuple[TipProjection, ...]
     position: Float[np.ndarray, "worlds 3"]
     direction: Float[np.ndarray, "worlds 3"]
     contact_force: Float[np.ndarray, "worlds"]
-    inserted_length: Float[np.ndarray, "worlds"]
-    rotation: Float[np.ndarray, "worlds"]
+    inserted_length: tuple[Float[np.ndarray, "worlds"], ...]
+    rotation: tuple[Float[np.ndarray, "worlds"], ...]
     valid: Bool[np.ndarray, "worlds"]
 
     @classmethod
     def after(cls, step: Step, simulator: Simulator) -> Measured:
         """Return the worlds at the end of a step."""
+        inserted, turned = simulator.catheter_inserted_length.T, simulator.catheter_rotation.T
         return cls(
-            tip=simulator.project(),
+            tips=tuple(simulator.project(device) for device in range(1 + len(inserted))),
             position=step.tip_position,
             direction=step.tip_direction,
             contact_force=step.contact_force_max,
-            inserted_length=step.inserted_length,
-            rotation=step.rotation,
+            inserted_length=(step.inserted_length, *inserted),
+            rotation=(step.rotation, *turned),
             valid=step.valid,
         )
 
     @classmethod
     def current(cls, simulator: Simulator) -> Measured:
         """Return the worlds as they are now."""
+        inserted, turned = simulator.catheter_inserted_length.T, simulator.catheter_rotation.T
         return cls(
-            tip=simulator.project(),
-            position=simulator.position[:, 0],
+            tips=tuple(simulator.project(device) for device in range(1 + len(inserted))),
+            position=simulator.tips(),
             direction=simulator.tip_direction,
             contact_force=simulator.contacts.max(axis=1),
-            inserted_length=simulator.inserted_length,
-            rotation=simulator.rotation,
+            inserted_length=(simulator.inserted_length, *inserted),
+            rotation=(simulator.rotation, *turned),
             valid=simulator.valid,
         )
 
@@ -70,30 +77,31 @@ class Measured:
 def observe(
     now: Measured,
     routes: RouteTables,
-    distance_mm: Float[np.ndarray, "worlds"],
+    distances_mm: tuple[Float[np.ndarray, "worlds"], ...],
     force_limit_n: Float[np.ndarray, "worlds"],
     time_share: Float[np.ndarray, "worlds"],
 ) -> Float[np.ndarray, "worlds features"]:
-    """Return the observations, as the table at `NavigateVectorEnv` has them.
+    """Return the observations, as the tables at `NavigateVectorEnv` have them.
 
     Args:
         now: the worlds.
         routes: the paths to their targets.
-        distance_mm: path length that is left.
+        distances_mm: path length to the target of the wires' tips, then of each catheter's.
         force_limit_n: their force limits.
         time_share: share of the time limit that is used up.
     """
-    place, tip = routes.place(now.tip), now.tip
+    tip, inserted, turned = now.tips[0], now.inserted_length[0], now.rotation[0]
+    place = routes.place(tip)
     outside = np.empty((len(time_share), 3, 2))
     outside[:, :, 0] = now.direction
     outside[:, :, 1] = (now.position - place.point) / place.radius[:, None]
     inside = place.frame @ outside
-    out = np.empty((len(time_share), *SPACE.shape))
-    out[:, 0] = now.inserted_length / 100.0
-    out[:, 1], out[:, 2] = np.cos(now.rotation), np.sin(now.rotation)
+    out = np.empty((len(time_share), _OF_WIRE + _OF_CATHETER * (len(now.tips) - 1)))
+    out[:, 0] = inserted / 100.0
+    out[:, 1], out[:, 2] = np.cos(turned), np.sin(turned)
     out[:, 3] = tip.abscissa / 100.0
     out[:, 4] = tip.offset / tip.radius
-    out[:, 5] = distance_mm / 100.0
+    out[:, 5] = distances_mm[0] / 100.0
     out[:, 6] = place.on_route
     out[:, 7] = now.contact_force / force_limit_n
     out[:, 8] = time_share
@@ -101,5 +109,15 @@ def observe(
     out[:, 12:14] = inside[:, 1:, 1]
     out[:, 14:26] = place.ahead
     out[:, 26:30] = place.radius_ahead / 2.0
-    out[:, 30] = (now.inserted_length - tip.abscissa) / 10.0
+    out[:, 30] = (inserted - tip.abscissa) / 10.0
+    for device in range(1, len(now.tips)):
+        begin = _OF_WIRE + _OF_CATHETER * (device - 1)
+        tip, inserted, turned = now.tips[device], now.inserted_length[device], now.rotation[device]
+        out[:, begin] = inserted / 100.0
+        out[:, begin + 1], out[:, begin + 2] = np.cos(turned), np.sin(turned)
+        out[:, begin + 3] = tip.abscissa / 100.0
+        out[:, begin + 4] = tip.offset / tip.radius
+        out[:, begin + 5] = distances_mm[device] / 100.0
+        out[:, begin + 6] = routes.on_route(tip)
+        out[:, begin + 7] = (inserted - tip.abscissa) / 10.0
     return np.minimum(np.maximum(out, -_BOUND, out=out), _BOUND, out=out).astype(np.float32)

@@ -77,6 +77,10 @@ class RouteTables:
         fork = np.minimum(leave, tip.abscissa)
         return (tip.abscissa - fork) + np.abs(self.target - fork)
 
+    def on_route(self, tip: TipProjection) -> Bool[np.ndarray, "worlds"]:
+        """Return which tips lie in a branch of the route."""
+        return np.isinf(self.leave[self.route, tip.branch])
+
     def place(self, tip: TipProjection) -> Place:
         """Return the place of each world's route that is nearest to its tip along the tree."""
         leave = self.leave[self.route, tip.branch]

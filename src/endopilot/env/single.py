@@ -34,6 +34,7 @@ class NavigateEnv(gymnasium.Env):
         navigation: Navigation | None = None,
         task: str | None = None,
         patient: int = 0,
+        catheter: str | None = None,
         config: SimulatorConfig = CORE,
     ) -> None:
         """Lay the wire out; `reset` starts the first episode.
@@ -42,12 +43,14 @@ class NavigateEnv(gymnasium.Env):
             navigation: what is to be done.
             task: in its place, the name of a task of the ladder.
             patient: which of its training patients.
+            catheter: name of a catheter around the wire, or a YAML file; its tip is to arrive then.
             config: settings of the rod core.
         """
         self._worlds = NavigateVectorEnv(
             navigations=navigation,
             task=task,
             patient=patient,
+            catheter=catheter,
             autoreset_mode=AutoresetMode.DISABLED,
             config=config,
         )

@@ -15,8 +15,7 @@ from gymnasium.vector.utils import batch_space
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
-from endopilot.env import observation
-from endopilot.env.observation import Measured, observe
+from endopilot.env.observation import Measured, observe, space
 from endopilot.env.route_tables import RouteTables
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
@@ -24,13 +23,12 @@ from endopilot.simulation.drive_limits import far_end_mm, within_travel
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import SimulatorState
 from endopilot.tasks.navigation import Navigation, reached
-from endopilot.tasks.task import CORE, reference_navigation, training_navigations
+from endopilot.tasks.task import CORE, in_catheter, reference_navigation, training_navigations
 
 CONTROL_PERIOD_S = 2 / 15
 """Time between two actions, s: fluoroscopy's usual 7.5 frames a second."""
 TRANSLATION_MM_S, ROTATION_RAD_S = 12.0, 3.14
 """Velocities of an action of 1: the fastest of the random navigations of `ControlConfig`, and half a turn a second."""
-_FASTEST = np.array([TRANSLATION_MM_S, ROTATION_RAD_S])
 PROGRESS_REWARD, STEP_REWARD, FORCE_REWARD, SUCCESS_REWARD = 0.1, -0.01, -0.1, 5.0
 """A mm nearer to the target, every step, every step with too large a force, and the target."""
 
@@ -42,6 +40,8 @@ _MASKS = tuple(
     )
 )
 """Names of the masks in the info of a vector environment."""
+_OF_CATHETER = ("inserted_length", "rotation", "tip_abscissa", "tip_offset", "tip_branch")
+"""What the info tells of each catheter."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,7 @@ class NavigationState:
     Attributes:
         simulator: the worlds.
         steps: steps of each world since its reset.
-        distance: path length from each tip to its target at the last step, mm.
+        distance: path length from each tip that counts to its target at the last step, mm, a row a device.
         safe: worlds whose force has not been too large since their reset.
         ended: worlds whose episode has ended, which the next step resets.
         generators: state of each world's random generator.
@@ -84,7 +84,10 @@ class NavigateVectorEnv(VectorEnv):
     | 0 | translation of the proximal end, positive inwards | 12 mm/s |
     | 1 | rotation of the proximal end about its axis | 3.14 rad/s |
 
-    No wire is driven farther than 20 mm beyond the vessel's longest path, nor pulled out of the catheter.
+    No wire is driven farther than 20 mm beyond the vessel's longest path, nor pulled out of the guiding catheter.
+
+    With a catheter around the wire it is `Box(-1, 1, (4,), float32)`: 2 and 3 are the same of the catheter's proximal
+    end, and so on for a second one. Each is driven by itself.
 
     ## Observation space
 
@@ -108,6 +111,18 @@ class NavigateVectorEnv(VectorEnv):
     | 26 to 29 | lumen radius at these places | 2 mm |
     | 30 | slack Δ − Δtip | 10 mm |
 
+    With a catheter it is `Box(-10, 10, (39,), float32)`, with eight more for each:
+
+    | index | observation | unit of 1 |
+    |---|---|---|
+    | 31 | inserted length of the catheter | 100 mm |
+    | 32, 33 | cosine and sine of its rotation | |
+    | 34 | abscissa of its tip | 100 mm |
+    | 35 | offset of its tip from the centerline | the lumen's radius |
+    | 36 | path length from its tip to the target | 100 mm |
+    | 37 | 1 where its tip is on the route, 0 in a wrong branch | |
+    | 38 | its slack | 10 mm |
+
     ## Reward
 
     The sum of
@@ -119,15 +134,19 @@ class NavigateVectorEnv(VectorEnv):
     | every step that ends with a force of the wall beyond the navigation's limit | −0.1 |
     | the target | 5 |
 
+    Where the catheter's tip is to go to the target, every mm counts that the wire's tip or the catheter's comes nearer.
+
     ## Start
 
-    Inserted length as the navigation says; the rotation is drawn evenly over a full turn. World i of a vector
+    Inserted lengths as the navigation says; the wire's rotation is drawn evenly over a full turn, a catheter's is 0.
+    World i of a vector
     environment that is reset with seed s draws what a single environment that is reset with seed s + i draws.
 
     ## End of an episode
 
     - *Termination:* the tip has reached the target (in its branch, within 2 mm along the centerline), or the world has
-      become invalid (the rod core failed; it then stays as it was).
+      become invalid (the rod core failed; it then stays as it was). Where the catheter's tip is to go there, the wire's
+      may not lie more than 2 mm behind it.
     - *Truncation:* the navigation's time is over.
 
     A vector environment resets an ended world at the next step (`AutoresetMode.NEXT_STEP`: that step's action is
@@ -137,15 +156,19 @@ class NavigateVectorEnv(VectorEnv):
 
     Arrays with an entry a world, each with its mask `_name`: `contact_force_max` (N, the largest force of the wall on
     one node at the end of the step), `valid`, `success`, `safe` (no force beyond the limit so far), `distance_mm` (path
-    length to the target), `inserted_length` (mm), `rotation` (rad), `tip_abscissa` (mm), `tip_offset` (mm),
-    `tip_branch`, `time_s`. In a single environment they are numbers.
+    length to the target from the tip that is to arrive), `inserted_length` (mm), `rotation` (rad), `tip_abscissa` (mm),
+    `tip_offset` (mm), `tip_branch`, `time_s`; and for each catheter `catheter_1_inserted_length`,
+    `catheter_1_rotation`, `catheter_1_tip_abscissa`, `catheter_1_tip_offset`, `catheter_1_tip_branch`. In a single
+    environment they are numbers.
 
     ## Arguments
 
     `endopilot/Navigate-v0`: 15 mm into the posterior descending artery of the reference right coronary artery (patient
-    0 of the textbook atlas with seed 0). The others are the tasks of the ladder's version 1, as `endopilot/Crux-v0`, in
-    patients of their own, which are not those that the ladder is scored on; world i has patient (`patient` + i) modulo
-    `patients`. Or give `navigations` of your own.
+    0 of the textbook atlas with seed 0). `endopilot/NavigateCoaxial-v0`: the same place, to which the tip of a
+    microcatheter (`microcatheter-1.7f`) is to be brought over the wire. The others are the tasks of the ladder's
+    version 1, as `endopilot/Crux-v0`, in patients of their own, which are not those that the ladder is scored on; world
+    i has patient (`patient` + i) modulo `patients`. With `catheter` a task is to be done by the tip of that catheter.
+    Or give `navigations` of your own.
 
     ## Version history
 
@@ -160,6 +183,7 @@ class NavigateVectorEnv(VectorEnv):
         task: str | None = None,
         patient: int = 0,
         patients: int = 1,
+        catheter: str | None = None,
         autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
         config: SimulatorConfig = CORE,
     ) -> None:
@@ -171,23 +195,31 @@ class NavigateVectorEnv(VectorEnv):
             task: in place of them, the name of a task of the ladder.
             patient: the first of its training patients.
             patients: number of its training patients that the worlds have.
+            catheter: name of a catheter around the wire, or a YAML file; its tip is to arrive then.
             autoreset_mode: whether an ended world is reset at the next step.
             config: settings of the rod core.
 
         Raises:
-            InputError: no world, no such task, or a wire that is slower than an action of 1 or does not fit.
+            InputError: no world, no such task or catheter, a catheter for navigations of one's own; a device that is
+                slower than an action of 1 or does not fit; navigations with different catheters.
         """
         if num_envs < 1:
             raise InputError(f"num_envs: {num_envs}; give at least 1")
         if autoreset_mode not in (AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED):
             raise InputError(f"autoreset_mode: {autoreset_mode}; give AutoresetMode.NEXT_STEP or DISABLED")
         if navigations is None:
-            navigations = training_navigations(task, patient, patients) if task else reference_navigation()
+            navigations = training_navigations(task, patient, patients) if task else [reference_navigation()]
+            navigations = in_catheter(navigations, catheter) if catheter else navigations
+        elif catheter:
+            raise InputError(f"catheter: {catheter}; give it to the navigations")
         given = [navigations] if isinstance(navigations, Navigation) else list(navigations)
         self._prepare([given[world % len(given)] for world in range(num_envs)], autoreset_mode, config)
 
     def _prepare(self, navigations: list[Navigation], autoreset_mode: AutoresetMode, config: SimulatorConfig) -> None:
-        for device in (navigation.device for navigation in navigations):
+        first = navigations[0]
+        if any((other.catheters, other.arrives) != (first.catheters, first.arrives) for other in navigations):
+            raise InputError("navigations: differ in catheters, or in which tip is to arrive; give all the same")
+        for device in (device for navigation in navigations for device in navigation.devices):
             if device.max_velocity_mm_s < TRANSLATION_MM_S or device.max_rotation_rad_s < ROTATION_RAD_S:
                 raise InputError(
                     f"device {device.name}: max_velocity_mm_s = {device.max_velocity_mm_s:g}, max_rotation_rad_s = "
@@ -198,13 +230,16 @@ class NavigateVectorEnv(VectorEnv):
         self.navigations, self._config = tuple(navigations), config
         self.metadata = {"autoreset_mode": autoreset_mode, "render_modes": []}
         self.num_envs = count
-        self.single_action_space = Box(-1.0, 1.0, (2,), np.float32)
-        self.single_observation_space = observation.SPACE
+        self._drives, self._counted = len(first.devices), 1 + first.arriving
+        self._fastest = np.tile([TRANSLATION_MM_S, ROTATION_RAD_S], self._drives)
+        self.single_action_space = Box(-1.0, 1.0, (2 * self._drives,), np.float32)
+        self.single_observation_space = space(len(first.catheters))
         self.action_space = batch_space(self.single_action_space, count)
         self.observation_space = batch_space(self.single_observation_space, count)
         self._simulator = Simulator(
             [navigation.anatomy for navigation in navigations],
             [navigation.device for navigation in navigations],
+            catheters=first.catheters,
             config=config,
         )
         self._routes = RouteTables.of(navigations)
@@ -212,13 +247,14 @@ class NavigateVectorEnv(VectorEnv):
         targets = [navigation.target for navigation in navigations]
         self._target_branch = np.array([target.branch for target in targets])
         self._target_abscissa = np.array([target.abscissa for target in targets])
-        self._start, self._seconds, self._force_limit = (
+        self._start, start_catheter, self._seconds, self._force_limit = (
             np.array([getattr(navigation, name) for navigation in navigations])
-            for name in ("start_inserted_mm", "seconds", "force_limit_n")
+            for name in ("start_inserted_mm", "start_catheter_mm", "seconds", "force_limit_n")
         )
+        self._start_catheters = np.tile(start_catheter[:, None], len(first.catheters))
         self._everyone = np.ones(count, dtype=bool)
         self._generators = [seeding.np_random()[0] for _ in range(count)]
-        self._steps, self._distance = np.zeros(count, dtype=np.int64), np.zeros(count)
+        self._steps, self._distance = np.zeros(count, dtype=np.int64), np.zeros((self._counted, count))
         self._safe, self._ended = np.ones(count, dtype=bool), np.zeros(count, dtype=bool)
 
     def reset(
@@ -242,7 +278,8 @@ class NavigateVectorEnv(VectorEnv):
                 self._generators[world] = seeding.np_random(seeds[world])[0]
         self._begin(mask)
         now = Measured.current(self._simulator)
-        return self._observe(now), self._infos(now, self._distance)
+        distances = self._distances(now)
+        return self._observe(now, distances), self._infos(now)
 
     def step(
         self, actions: ArrayLike
@@ -265,14 +302,15 @@ class NavigateVectorEnv(VectorEnv):
             InputError: actions of another shape, or not finite; no world is moved then.
         """
         control = np.array(actions, dtype=float)
-        if control.shape != (self.num_envs, 2) or not np.isfinite(control).all():
-            raise InputError(f"actions: shape {control.shape}; give finite numbers of shape ({self.num_envs}, 2)")
+        if control.shape != self.action_space.shape or not np.isfinite(control).all():
+            raise InputError(f"actions: shape {control.shape}; give finite numbers of shape {self.action_space.shape}")
         fresh = self._ended & (self.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP)
-        control = np.minimum(np.maximum(control, -1.0), 1.0) * _FASTEST
+        control = np.minimum(np.maximum(control, -1.0), 1.0) * self._fastest
         control[fresh] = 0.0
-        travel_mm = (-np.inf, self._far_ends)  # at the ostium the simulator stops the drive by itself
-        inserted = self._simulator.inserted_length
-        control[:, 0] = within_travel(control[:, 0], inserted, CONTROL_PERIOD_S, travel_mm=travel_mm)
+        travel_mm = (-np.inf, self._far_ends)  # at the ostium the simulator stops the drives by itself
+        simulator = self._simulator
+        for k, inserted in enumerate((simulator.inserted_length, *simulator.catheter_inserted_length.T)):
+            control[:, 2 * k] = within_travel(control[:, 2 * k], inserted, CONTROL_PERIOD_S, travel_mm=travel_mm)
         step = self._simulator.step(control, CONTROL_PERIOD_S)
         now = Measured.after(step, self._simulator)
         if fresh.any():
@@ -284,22 +322,29 @@ class NavigateVectorEnv(VectorEnv):
         """Score what the worlds did in a step, of which those of `fresh` have only begun."""
         going, before = ~fresh, self._distance
         self._steps += going
-        self._distance = self._routes.distance(now.tip)
+        distances = self._distances(now)
+        self._distance = np.array(distances[: self._counted])
         unsafe = ~(now.contact_force <= self._force_limit) & going
         self._safe &= ~unsafe
-        infos = self._infos(now, self._distance)
+        infos = self._infos(now)
         success = infos["success"] & going
-        rewards = (
-            PROGRESS_REWARD * (before - self._distance) + STEP_REWARD + FORCE_REWARD * unsafe + SUCCESS_REWARD * success
-        )
+        nearer = (before - self._distance).sum(axis=0)
+        rewards = PROGRESS_REWARD * nearer + STEP_REWARD + FORCE_REWARD * unsafe + SUCCESS_REWARD * success
         terminations = (success | ~now.valid) & going
         truncations = (infos["time_s"] > self._seconds - 1e-9) & ~terminations & going
         self._ended = terminations | truncations
-        return self._observe(now), np.where(fresh, 0.0, rewards), terminations, truncations, infos
+        observations = self._observe(now, distances)
+        return observations, np.where(fresh, 0.0, rewards), terminations, truncations, infos
 
-    def _observe(self, now: Measured) -> Float[np.ndarray, "worlds features"]:
+    def _observe(
+        self, now: Measured, distances: tuple[Float[np.ndarray, "worlds"], ...]
+    ) -> Float[np.ndarray, "worlds features"]:
         time_share = self._steps * CONTROL_PERIOD_S / self._seconds
-        return observe(now, self._routes, self._distance, self._force_limit, time_share)
+        return observe(now, self._routes, distances, self._force_limit, time_share)
+
+    def _distances(self, now: Measured) -> tuple[Float[np.ndarray, "worlds"], ...]:
+        """Return the path length from each device's tips to the targets, mm."""
+        return tuple(self._routes.distance(tip) for tip in now.tips)
 
     def draw_from(self, *generators: np.random.Generator) -> None:
         """Let each world draw its starts from a generator that the caller holds."""
@@ -310,25 +355,38 @@ class NavigateVectorEnv(VectorEnv):
         turn = np.zeros(self.num_envs)
         worlds = np.flatnonzero(mask)
         turn[worlds] = [self._generators[world].uniform(0.0, 2 * np.pi) for world in worlds]
-        self._simulator.reset(inserted_length=self._start, rotation=turn, worlds=worlds.tolist())
+        self._simulator.reset(
+            inserted_length=self._start,
+            rotation=turn,
+            catheter_inserted_length=self._start_catheters,
+            worlds=worlds.tolist(),
+        )
         self._steps[mask], self._safe[mask], self._ended[mask] = 0, True, False
-        self._distance = np.where(mask, self._routes.distance(self._simulator.project()), self._distance)
+        begun = [self._routes.distance(self._simulator.project(device)) for device in range(self._counted)]
+        self._distance = np.where(mask, np.array(begun), self._distance)
 
-    def _infos(self, now: Measured, distance: Float[np.ndarray, "worlds"]) -> dict[str, Any]:
+    def _infos(self, now: Measured) -> dict[str, Any]:
+        wire = now.tips[0]
         infos: dict[str, Any] = {  # the names of `_MASKS`
             "contact_force_max": now.contact_force,
             "valid": now.valid,
-            "success": reached(now.tip, self._target_branch, self._target_abscissa),
+            "success": reached(now.tips[: self._counted], self._target_branch, self._target_abscissa),
             "safe": self._safe.copy(),
-            "distance_mm": distance,
-            "inserted_length": now.inserted_length,
-            "rotation": now.rotation,
-            "tip_abscissa": now.tip.abscissa,
-            "tip_offset": now.tip.offset,
-            "tip_branch": now.tip.branch,
+            "distance_mm": self._distance[-1],
+            "inserted_length": now.inserted_length[0],
+            "rotation": now.rotation[0],
+            "tip_abscissa": wire.abscissa,
+            "tip_offset": wire.offset,
+            "tip_branch": wire.branch,
             "time_s": self._steps * CONTROL_PERIOD_S,
         }
-        return infos | dict.fromkeys(_MASKS, self._everyone)
+        infos |= dict.fromkeys(_MASKS, self._everyone)
+        for k in range(1, self._drives):
+            tip = now.tips[k]
+            values = (now.inserted_length[k], now.rotation[k], tip.abscissa, tip.offset, tip.branch)
+            for name, value in zip(_OF_CATHETER, values, strict=True):
+                infos[f"catheter_{k}_{name}"], infos[f"_catheter_{k}_{name}"] = value, self._everyone
+        return infos
 
     @property
     def state(self) -> NavigationState:

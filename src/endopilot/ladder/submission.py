@@ -23,6 +23,7 @@ from endopilot.ladder.attempt import Recording, navigation_seed, repeat
 from endopilot.ladder.scores import score
 from endopilot.parallel import each
 from endopilot.settings import CountOrZero, read_settings, settings
+from endopilot.simulation.catheter import read_catheter
 from endopilot.simulation.device import read_device
 from endopilot.tasks.task import LadderVersion, Task, find_task, ladder_tasks
 
@@ -116,10 +117,13 @@ class SubmissionCheck:
 
 
 def task_digest(task: Task) -> str:
-    """Return the SHA-256 of what a task's navigations follow from: its definition and its device."""
-    # Version 1's tasks had no such field: their hashes stay.
-    definition = {name: value for name, value in asdict(task).items() if (name, value) != ("version", 1)}
+    """Return the SHA-256 of what a task's navigations follow from: its definition and its devices."""
+    # Older tasks had no such fields: their hashes stay.
+    definition = {
+        name: value for name, value in asdict(task).items() if (name, value) != ("version", 1) and value is not None
+    }
     content = json_text(definition) + json_text(read_device(task.device))
+    content += json_text(read_catheter(task.catheter)) if task.catheter else ""
     return hashlib.sha256(content.encode()).hexdigest()
 
 
@@ -235,7 +239,8 @@ def _repeat(path: Path, *, version: LadderVersion) -> None:
     """Drive the recording in a file again, and put the figures in its place."""
     task, place = find_task(path.parent.name, version), int(path.stem)
     navigation = task.ladder_navigation(place)
-    figures = repeat(Recording.unpacked(read_json(path)), navigation, seed=navigation_seed(task, place))
+    recording = Recording.unpacked(read_json(path), len(navigation.devices))
+    figures = repeat(recording, navigation, seed=navigation_seed(task, place))
     write_json(path, {"patient": navigation.anatomy.name} | figures)
 
 

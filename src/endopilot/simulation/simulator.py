@@ -214,24 +214,43 @@ class Simulator:
             self._run(group, array[group.index][:, None], duration / steps, steps, by_force=self._by_force)
             for group in self._groups
         ]
-        if self._stacks[0].catheters:
-            for result in results:
+        if self._stacks[0].catheters:  # the core records the foremost tip
+            for group, result in zip(self._groups, results, strict=True):
                 result["tip_position"] = np.ascontiguousarray(result["tubes"][:, :, 0, 8:11])
+                result["tip_direction"] = group.simulation.tip_directions()[:, None]
         return Step(
             **{name: self._merge([result[name][:, 0] for result in results]) for name in Step.__dataclass_fields__}
         )
 
-    def project(self) -> TipProjection:
-        """Project the tips to the centerline: Δtip (mm), γtip (mm), branch and lumen radius (mm), a row a world.
+    def project(self, device: int = 0) -> TipProjection:
+        """Project tips to the centerline: Δtip (mm), γtip (mm), branch and lumen radius (mm), a row a world.
+
+        Args:
+            device: whose tips, those of the wires (0) or of a catheter (1, 2), from the inside out.
+
+        Raises:
+            InputError: there is no such device.
 
         Example:
             >>> tip = simulator.project()
             >>> bool((tip.offset < tip.radius).all())
             True
         """
-        tips = [group.project(group.simulation.tips()) for group in self._groups]
+        tips = [group.project(points) for group, points in zip(self._groups, self._tips(device), strict=True)]
         names = TipProjection.__dataclass_fields__
         return TipProjection(**{name: self._merge([getattr(tip, name) for tip in tips]) for name in names})
+
+    def tips(self, device: int = 0) -> Float[np.ndarray, "worlds 3"]:
+        """Return where tips are, LPS mm, those of the wires (0) or of a catheter (1, 2), from the inside out.
+
+        Raises:
+            InputError: there is no such device.
+
+        Example:
+            >>> np.array_equal(simulator.tips(), simulator.position[:, 0])  # wires alone
+            True
+        """
+        return self._merge(self._tips(device))
 
     @property
     def state(self) -> SimulatorState:
@@ -388,6 +407,8 @@ class Simulator:
     def position(self) -> Float[np.ndarray, "worlds nodes 3"]:
         """Positions of the nodes from the tip to the base, LPS mm; NaN beyond the nodes of a shorter wire.
 
+        With catheters the first node is the foremost tip.
+
         Example:
             >>> simulator.position.shape == (4, simulator.nodes, 3)
             True
@@ -476,6 +497,13 @@ class Simulator:
             array([0, 0, 0, 0])
         """
         return self._gather("reason").astype(int)
+
+    def _tips(self, device: int) -> list[Float[np.ndarray, "members 3"]]:
+        """Return where tips are, an array a group."""
+        count = len(self._stacks[0].devices)
+        if not 0 <= device < count:
+            raise InputError(f"device: {device}; give 0 for the wire" + (f", to {count - 1}" if count > 1 else ""))
+        return [group.simulation.tips(device) for group in self._groups]
 
     def _random_start(self, seed: int | None) -> tuple[np.ndarray, np.ndarray]:
         if seed is None:

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Literal
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from pydantic import InstanceOf, model_validator
 
+from endopilot.errors import InputError
 from endopilot.settings import CountOrZero, Finite, NonNegative, Positive, settings
+from endopilot.simulation.catheter import Catheter, check_nested
 from endopilot.simulation.device import Device
 from endopilot.types import Anatomy, TipProjection
 
@@ -14,6 +19,9 @@ DECISION_PERIOD_S = 0.5
 """Time between two decisions, s: the paper's sample period, at which its models speak."""
 SUCCESS_MM = 2.0
 """A target counts as reached when the tip lies in its branch, this near to it along the centerline, mm."""
+Arrives = Literal["wire", "catheter"]
+"""Whose tip is to reach the target: the wire's, or that of the catheter next to it."""
+_ARRIVING: dict[Arrives, int] = {"wire": 0, "catheter": 1}
 
 
 @settings
@@ -36,14 +44,18 @@ class Target:
 
 @settings(eq=False)
 class Navigation:
-    """One wire that is to be brought to one target.
+    """One wire, alone or with catheters around it, that is to be brought to one target.
 
     Attributes:
         anatomy: the vessel.
         device: the wire.
-        target: where its tip is to go.
+        catheters: around it, from the inside out.
+        arrives: whose tip is to go to the target: "wire", or "catheter", the one next to the wire. The wire's tip may
+            then not be pulled back into the catheter.
+        target: where the tip is to go.
         start_inserted_mm: inserted length Δ at the start, mm.
         start_rotation: rotation φ at the start, rad.
+        start_catheter_mm: inserted length of the catheters at the start, mm; their rotations are 0.
         seconds: time in which the target is to be reached, s.
         force_limit_n: largest force of the wall on one node that is safe, N.
     """
@@ -51,8 +63,11 @@ class Navigation:
     anatomy: InstanceOf[Anatomy]
     device: Device
     target: Target
+    catheters: tuple[Catheter, ...] = ()
+    arrives: Arrives = "wire"
     start_inserted_mm: NonNegative = 2.0
     start_rotation: Finite = 0.0
+    start_catheter_mm: NonNegative = 0.0
     seconds: Positive = 60.0
     force_limit_n: Positive = 0.5
 
@@ -69,21 +84,58 @@ class Navigation:
                 f"target.abscissa: {self.target.abscissa:g} mm; branch {self.target.branch} of {self.anatomy.name} "
                 f"runs from {line[0]:.1f} to {line[-1]:.1f} mm"
             )
+        if len(self.catheters) < self.arriving:
+            raise ValueError("arrives: catheter; there is none; give catheters, or arrives: wire")
+        check_nested(self.device, self.catheters)
         return self
 
-    def reached(self, tip: TipProjection) -> Bool[np.ndarray, "..."]:
-        """Return which tips have reached the target: in its branch, within `SUCCESS_MM` of it along the centerline."""
-        return reached(tip, self.target.branch, self.target.abscissa)
+    @property
+    def devices(self) -> tuple[Device, ...]:
+        """The wire, and what each catheter has in common with one."""
+        return (self.device, *(catheter.device for catheter in self.catheters))
+
+    @property
+    def arriving(self) -> int:
+        """Place among `devices` of the one whose tip is to go to the target."""
+        return _ARRIVING[self.arrives]
+
+    def reached(self, *tips: TipProjection) -> Bool[np.ndarray, "..."]:
+        """Return which worlds have reached the target, see `reached`.
+
+        Args:
+            tips: of the wires; where a catheter is to arrive, of the catheters too.
+        """
+        return reached(tips[: self.arriving + 1], self.target.branch, self.target.abscissa)
 
 
 def reached(
-    tip: TipProjection, branch: int | Int[np.ndarray, "..."], abscissa: float | Float[np.ndarray, "..."]
+    tips: Sequence[TipProjection], branch: int | Int[np.ndarray, "..."], abscissa: float | Float[np.ndarray, "..."]
 ) -> Bool[np.ndarray, "..."]:
-    """Return which tips have reached targets: in their branch, within `SUCCESS_MM` of them along the centerline.
+    """Return which worlds have reached their targets.
+
+    The tip that is to arrive lies in the target's branch, within `SUCCESS_MM` of it along the centerline, and the
+    wire's tip lies no more than that behind it.
 
     Args:
-        tip: the tips.
+        tips: of the wires, and if a catheter's are to arrive, those last.
         branch: of the target of all, or of each.
         abscissa: of the target of all, or of each, mm.
     """
-    return (np.abs(tip.abscissa - abscissa) <= SUCCESS_MM) & (tip.branch == branch)
+    wire, arriving = tips[0], tips[-1]
+    there = (np.abs(arriving.abscissa - abscissa) <= SUCCESS_MM) & (arriving.branch == branch)
+    return there & (wire.abscissa >= arriving.abscissa - SUCCESS_MM)
+
+
+def check_wire_alone(navigation: Navigation, what: str) -> None:
+    """Check that a navigation has no catheter, for what takes a wire alone.
+
+    Args:
+        navigation: what is to be done.
+        what: what takes a wire alone, as the line begins.
+
+    Raises:
+        InputError: it has one.
+    """
+    if navigation.catheters:
+        names = ", ".join(catheter.name for catheter in navigation.catheters)
+        raise InputError(f"{what} takes a wire alone, and there is {names} around it; leave the catheter out")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache, lru_cache
 from pathlib import Path
@@ -13,18 +14,20 @@ from pydantic import Field, model_validator
 from endopilot.atlas.atlas import ANATOMIES, AtlasConfig, make_patient
 from endopilot.errors import InputError
 from endopilot.settings import CountOrZero, NonNegative, Positive, Seed, Share, Within, read_settings, settings
+from endopilot.simulation.catheter import list_catheters, read_catheter
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import read_device
 from endopilot.simulation.device_files import list_devices
-from endopilot.tasks.navigation import Navigation, Target
+from endopilot.tasks.navigation import Arrives, Navigation, Target
 from endopilot.types import Anatomy, VesselTree
 
 CORE = SimulatorConfig(element_mm=1.25, time_step_s=1 / 14, sample_tolerance_mm=1e-4)
 """Settings of the rod core on the ladder and in the environments: longer elements, two time steps a control period,
 and forces that are exact to a micronewton; docs/environment.md states the accuracy that they keep."""
-LadderVersion = Literal[1, 2]
+LadderVersion = Literal[1, 2, "coaxial"]
 NEWEST: LadderVersion = 2
-"""The ladder's versions: 1 in textbook patients of the atlas, 2 in patients that resemble real ones."""
+"""The ladder's versions: 1 in textbook patients of the atlas, 2 in patients that resemble real ones, coaxial for four
+tasks of wire and catheter in patients of the latter kind."""
 _FOLDERS = {version: Path(__file__).parent / f"ladder_{version}" for version in get_args(LadderVersion)}
 
 
@@ -47,7 +50,7 @@ class Task:
 
     Attributes:
         name: short name.
-        level: place on the ladder, 1 to 12.
+        level: place on the ladder, 1 to 12, or 13 to 16 of those with a catheter.
         title: what is to be done, in a few words.
         anatomy: kind of vessel tree of the atlas.
         device: shipped device.
@@ -63,10 +66,13 @@ class Task:
         ladder: the patients that the ladder is scored on.
         training: patients to learn on.
         version: of the ladder that the task belongs to; it says which population the patients come from.
+        catheter: shipped catheter around the wire, if any.
+        arrives: whose tip is to go to the target, "wire" or "catheter"; the wire's if not given.
+        start_catheter_mm: inserted length of the catheter at the start, mm; 0 if not given.
     """
 
     name: str
-    level: Annotated[int, Within(1, 12)]
+    level: Annotated[int, Within(1, 16)]
     title: str
     anatomy: str
     device: str
@@ -82,12 +88,16 @@ class Task:
     ladder: Patients
     training: Patients
     version: LadderVersion
+    catheter: str | None = None
+    arrives: Arrives | None = None
+    start_catheter_mm: NonNegative | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> Task:
-        for name, known in (("anatomy", ANATOMIES), ("device", list_devices())):
+        known_catheters = (*list_catheters(), None)
+        for name, known in (("anatomy", ANATOMIES), ("device", list_devices()), ("catheter", known_catheters)):
             if getattr(self, name) not in known:
-                raise ValueError(f"{name}: {getattr(self, name)!r}; choose from {', '.join(known)}")
+                raise ValueError(f"{name}: {getattr(self, name)!r}; choose from {', '.join(filter(None, known))}")
         return self
 
     def patient(self, patients: Patients, place: int) -> Anatomy:
@@ -125,6 +135,9 @@ class Task:
             start_rotation=start_rotation,
             seconds=self.seconds,
             force_limit_n=self.force_limit_n,
+            catheters=(read_catheter(self.catheter),) if self.catheter else (),
+            arrives=self.arrives or "wire",
+            start_catheter_mm=self.start_catheter_mm or 0.0,
         )
 
 
@@ -196,6 +209,20 @@ def training_navigations(name: str, first: int, count: int) -> list[Navigation]:
     """
     task = find_task(name, 1)
     return [task.navigation(task.patient(task.training, first + place)) for place in range(count)]
+
+
+def in_catheter(navigations: Sequence[Navigation], name: str) -> list[Navigation]:
+    """Return navigations to the same targets, with a catheter around each wire, whose tip is to arrive.
+
+    Args:
+        navigations: of wires alone.
+        name: of the catheter, or its YAML file.
+
+    Raises:
+        InputError: there is no such catheter, or a wire does not fit into it.
+    """
+    catheter = read_catheter(name)
+    return [replace(navigation, catheters=(catheter,), arrives="catheter") for navigation in navigations]
 
 
 @lru_cache(maxsize=1)
