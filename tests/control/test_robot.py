@@ -84,7 +84,7 @@ def test_motion_is_lost_where_it_reverses() -> None:
 def test_the_encoders_read_the_wire_with_noise(fork, wire) -> None:
     simulator = Simulator(fork, wire, config=SimulatorConfig(element_mm=1.5, threads=1))
     simulator.reset(inserted_length=[10.0], rotation=[0.3])
-    robot = SimulatedRobot(simulator, DriveLimits.of(wire, fork), RobotConfig(encoder_sd_mm=0.05), seed=3)
+    robot = SimulatedRobot(simulator, [DriveLimits.of(wire, fork)], RobotConfig(encoder_sd_mm=0.05), seed=3)
     assert isinstance(robot, Robot)
     robot.command(8.0, 0.0)
     robot.run(10 * CYCLE_S)

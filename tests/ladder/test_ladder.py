@@ -115,7 +115,7 @@ def test_the_page_shows_the_scores_and_links_the_replay(climbed):
     replay = (folder / "replay-straight.html").read_text(encoding="utf-8")
     assert "Guidewire" in replay and 'src="plotly.min.js"' in replay
     assert all(word in replay for word in ("Target", "Tip under X-ray", "safe success", "exposures: 1"))
-    assert "1 of the ladder's twelve tasks, in 1 synthetic patient of each" in text
+    assert "1 of the ladder's 12 tasks, in 1 synthetic patient of each" in text
     assert "the tip's path in 1 patient" in unescape(text) and "1 patients" not in text
     assert (folder / "plotly.min.js").stat().st_size > 1e6
 

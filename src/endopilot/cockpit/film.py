@@ -27,7 +27,7 @@ from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import read_controls_csv
 from endopilot.simulation.device import read_device
 from endopilot.simulation.simulator import Simulator
-from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target
+from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target, check_wire_alone
 from endopilot.tasks.task import CORE, find_task
 
 FRAME_S = 0.05
@@ -235,8 +235,9 @@ def _ladder(path: Path, name: str | None, place: int) -> Film:
     else:
         raise InputError(f"{path}: is no file of the ladder; give a submission.json or TASK/NUMBER.json")
     task = find_task(name, content.get("ladder") or 1)
-    recording = Recording.unpacked(entry["recording"])
     navigation = task.ladder_navigation(place)
+    check_wire_alone(navigation, f"{path}: the replay")
+    recording = Recording.unpacked(entry["recording"])
 
     def make() -> Iterator[Frame]:
         config = NavigateConfig(simulator=replace(CORE, threads=1))

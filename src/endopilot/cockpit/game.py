@@ -151,7 +151,7 @@ class GameSession(Session):
         self._exposed.append(self.xray.frames > self._counted_before)
         self._counted_before = self.xray.frames
         simulator: Simulator = self.world.simulator
-        self._track.decided(self._commands[-1], None, None, exposed=self._exposed[-1], fault=False)
+        self._track.decided((self._commands[-1],), None, None, exposed=self._exposed[-1], fault=False)
         self._track.moved(simulator, self._peak_n)
         self._peak_n = 0.0
         if not simulator.valid[0]:

@@ -17,7 +17,7 @@ from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import Step
-from endopilot.tasks.navigation import Navigation, Target
+from endopilot.tasks.navigation import Navigation, Target, check_wire_alone
 from endopilot.types import TipProjection
 
 SHOWN_BEHIND_MM = 20.0
@@ -96,14 +96,15 @@ class World:
             seed: of the encoders' noise.
 
         Raises:
-            InputError: the wire does not fit the vessel, or starts deeper than it is long.
+            InputError: the wire does not fit the vessel, or starts deeper than it is long; a navigation with catheters.
         """
+        check_wire_alone(navigation, "cockpit: it")
         self.navigation, self.config = navigation, config or WorldConfig()
         truth = self.config.truth
         self.simulator = start_world(navigation, truth, self.config.simulator)
         self.limits = DriveLimits.of(navigation.device, navigation.anatomy)
         drive = replace(self.config.robot, latency_s=self.config.robot.latency_s * truth.latency_factor)
-        self.robot = SimulatedRobot(self.simulator, self.limits, drive, seed=seed, ostium_mm=truth.ostium_mm)
+        self.robot = SimulatedRobot(self.simulator, (self.limits,), drive, seed=seed, ostium_mm=truth.ostium_mm)
         self.cycle, self.peak_force_n, self.force_n = 0, 0.0, 0.0
         self._taken_s = self.config.cycle_s / 10
 

@@ -24,7 +24,7 @@ from endopilot.control.search import Search, SearchConfig
 from endopilot.progress import Advance
 from endopilot.settings import Count, Positive, settings
 from endopilot.simulation.drive_limits import DriveLimits
-from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
+from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, check_wire_alone
 from endopilot.types import TipProjection
 from endopilot.xray.adviser import AdviserConfig, XrayAdviser
 from endopilot.xray.bands import Calibration
@@ -92,8 +92,9 @@ class _PlanningPolicy:
         """Lay out the simulated wires, around the navigation's device and ostium.
 
         Raises:
-            InputError: the lumen is narrower than the wire on the route.
+            InputError: the lumen is narrower than the wire on the route, or there are catheters.
         """
+        check_wire_alone(navigation, "policy: it")
         self.navigation = navigation
         self.route = Route.to(navigation.anatomy, navigation.target)
         check_passable(self.route, navigation.device)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from endopilot.settings import Finite, NonNegative, Positive, settings
+from endopilot.simulation.catheter import Catheter
 from endopilot.types import Anatomy
 
 QUANTITIES = ("friction", "stiffness", "latency", "ostium")
@@ -26,6 +28,13 @@ class ModelMismatch:
     """The wire is inserted this much deeper than the encoder says, mm: the ostium lies elsewhere along the catheter."""
     latency_factor: NonNegative = 1.0
     """Factor on the robot's latency."""
+
+    def catheters(self, given: Sequence[Catheter]) -> tuple[Catheter, ...]:
+        """Return catheters as they are in reality: their friction on the wall differs as the wire's does."""
+        return tuple(
+            replace(each, device=replace(each.device, friction=each.device.friction * self.friction_factor))
+            for each in given
+        )
 
 
 def drawn_sides(share: float, random: np.random.Generator) -> dict[str, float]:

@@ -19,7 +19,7 @@ from endopilot.settings import settings
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.simulation.simulator import Simulator
-from endopilot.tasks.navigation import DECISION_PERIOD_S, SUCCESS_MM, Navigation
+from endopilot.tasks.navigation import DECISION_PERIOD_S, SUCCESS_MM, Navigation, check_wire_alone
 from endopilot.xray.fluoroscope import Fluoroscope, FluoroscopeConfig, TipMeasurement
 from endopilot.xray.image_fluoroscope import ImageFluoroscope
 
@@ -62,7 +62,7 @@ class NavigationLoop:
         navigation: what is to be done, as the policy is given it.
         policy: what decides.
         simulator: the world as it truly is; its one wire is the real one.
-        robot: what moves it.
+        robot: what moves it, and its catheters.
         fluoroscope: the C-arm.
         observation: what was observed at the last decision; None before the first.
         believed: what the policy believed then; None for a policy that does not tell.
@@ -90,10 +90,12 @@ class NavigationLoop:
         self.navigation = navigation
         self.policy = make_policy(policy) if isinstance(policy, str) else policy
         self.simulator = start_world(navigation, truth, config.simulator)
-        self._limits = DriveLimits.of(navigation.device, navigation.anatomy)
+        self._limits = tuple(DriveLimits.of(device, navigation.anatomy) for device in navigation.devices)
         drive = replace(config.robot, latency_s=config.robot.latency_s * truth.latency_factor)
         self.robot = SimulatedRobot(self.simulator, self._limits, drive, seed=seed, ostium_mm=truth.ostium_mm)
         anatomy, device = navigation.anatomy, navigation.device
+        if config.xray == "images":
+            check_wire_alone(navigation, "xray: images: the detector")
         self.fluoroscope = (
             ImageFluoroscope(anatomy, device, config.fluoroscope, seed)
             if config.xray == "images"
@@ -137,7 +139,7 @@ class NavigationLoop:
             by_hand: what somebody else decides; the policy does if it is not given.
 
         Returns:
-            The decision, within the drive's limits.
+            The decision, within the drives' limits.
 
         Raises:
             ValueError: the navigation is over, or the last period is not.
@@ -149,17 +151,19 @@ class NavigationLoop:
         exposed = self._expose or handed_back
         if exposed:
             tip = self._measure(state.inserted_length)
-        observation = Observation(self.time_s, state.inserted_length, state.rotation, tip)
+        observation = Observation(self.time_s, state.inserted_length, state.rotation, tip, state.catheters)
         decision = self._decide(observation, by_hand)
-        asked = (decision.translation, decision.rotation)
+        asked = decision.velocities(len(self._limits))
+        control = tuple(limits.safe(*pair) for limits, pair in zip(self._limits, asked, strict=False))
         # An image in which no wire was found is taken again.
-        control, self._expose = self._limits.safe(*asked), bool(decision.expose) or (exposed and tip is None)
+        self._expose = bool(decision.expose) or (exposed and tip is None)
         self.observation, self.gives_up = observation, decision.gives_up
         self.believed = self.policy.believed() if isinstance(self.policy, Believer) else None
         self._track.decided(control, tip, self.believed, exposed=exposed, fault=control != asked)
-        self.robot.command(*control)
+        wire, *catheters = control
+        self.robot.command(*wire, *catheters)
         self._period, self._cycles_left, self._peak_n = self._period + 1, _CYCLES, 0.0
-        return Decision(*control, expose=self._expose, gives_up=self.gives_up)
+        return Decision(*wire, expose=self._expose, gives_up=self.gives_up, catheters=tuple(catheters))
 
     def advance(self, seconds: float) -> float:
         """Let robot and wire move, no farther than to the end of the period.
@@ -187,10 +191,11 @@ class NavigationLoop:
         return self._track.record(self.navigation, self.robot.driven, self.reason or "stopped", self.gives_up)
 
     def _measure(self, inserted_length: float) -> TipMeasurement | None:
-        nodes = self.simulator.position[0]
         if isinstance(self.fluoroscope, ImageFluoroscope):
+            nodes = self.simulator.position[0]
             return self.fluoroscope.expose(nodes, inserted_length, self._random)
-        return self.fluoroscope.expose(nodes[0], self.simulator.tip_direction[0], inserted_length, self._random)
+        tip = self.simulator.tips()[0]
+        return self.fluoroscope.expose(tip, self.simulator.tip_direction[0], inserted_length, self._random)
 
     def _decide(self, observation: Observation, by_hand: Decision | None) -> Decision:
         if by_hand is None:
@@ -244,7 +249,7 @@ def navigate(
 
 
 def start_world(navigation: Navigation, truth: ModelMismatch, config: SimulatorConfig) -> Simulator:
-    """Return the world as it truly is, with the wire at the start of the navigation.
+    """Return the world as it truly is, with the wire and its catheters at the start of the navigation.
 
     Args:
         navigation: as a policy is given it.
@@ -256,11 +261,13 @@ def start_world(navigation: Navigation, truth: ModelMismatch, config: SimulatorC
     """
     device = navigation.device
     wire = device.with_tip(bend_rad=device.tip_bend_rad, stiffness_factor=truth.stiffness_factor)
-    simulator = Simulator(navigation.anatomy, wire, config=config)
+    catheters = truth.catheters(navigation.catheters)
+    simulator = Simulator(navigation.anatomy, wire, catheters=catheters, config=config)
     simulator.reset(
         inserted_length=[max(navigation.start_inserted_mm + truth.ostium_mm, 0.0)],
         rotation=[navigation.start_rotation],
         friction=[device.friction * truth.friction_factor],
+        catheter_inserted_length=np.full((1, len(catheters)), max(navigation.start_catheter_mm + truth.ostium_mm, 0.0)),
     )
     return simulator
 
@@ -270,5 +277,8 @@ def _reached(navigation: Navigation, simulator: Simulator) -> bool:
     line = navigation.anatomy.tree.branches[navigation.target.branch].centerline
     at = navigation.target.abscissa
     width = float(line.radius[np.abs(line.abscissa - at) <= SUCCESS_MM + 1.0].max())
-    away = np.linalg.norm(simulator.position[0, 0] - navigation.target.position(navigation.anatomy))
-    return bool(away <= SUCCESS_MM + 3 * width and navigation.reached(simulator.project())[0])
+    arriving = navigation.arriving
+    away = np.linalg.norm(simulator.tips(arriving)[0] - navigation.target.position(navigation.anatomy))
+    if away > SUCCESS_MM + 3 * width:
+        return False
+    return bool(navigation.reached(*(simulator.project(device) for device in range(arriving + 1)))[0])

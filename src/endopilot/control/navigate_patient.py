@@ -25,10 +25,11 @@ from endopilot.control.route import Route, check_passable, parse_target
 from endopilot.control.set_up import TILT_DEG, TipChoice, choose_tip
 from endopilot.progress import progress
 from endopilot.settings import Finite, NonNegative, Positive, Seed, ShareBelowOne, Text, Within, settings
+from endopilot.simulation.catheter import Catheter, read_catheter
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import Device, read_device
 from endopilot.simulation.simulate import simulate
-from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
+from endopilot.tasks.navigation import DECISION_PERIOD_S, Arrives, Navigation
 from endopilot.types import Anatomy, Rollout, TipProjection
 
 _Factor = Annotated[float, Within(0.2, 5)]
@@ -39,9 +40,14 @@ class NavigatePatientConfig:
     """Policy, wire, limits, and how reality differs from what the policy is given."""
 
     policy: Text = "agent"
-    """What decides: agent, twin, open-loop, forward, spin, retract-rotate, or MODULE:OBJECT of your own."""
+    """What decides: agent, twin, open-loop, forward, spin, retract-rotate, with a catheter in-turn or catheter-alone,
+    or MODULE:OBJECT of your own."""
     device: Text = "workhorse-014"
     """Name of a device (`endopilot devices`) or a YAML file."""
+    catheter: tuple[Text, ...] = ()
+    """Up to two catheters around it, from the inside out: names such as microcatheter-1.7f, or YAML files."""
+    arrives: Arrives = "wire"
+    """Whose tip is to go to the target: wire, or catheter, the one next to the wire."""
     tip: Text = "auto"
     """Shape of the wire's tip: auto (chosen for the forks of the route), own (the device's), or angle and length such
     as 75/5, 75 degrees over 5 mm."""
@@ -104,6 +110,11 @@ class SetUp:
         wire = device.with_tip(bend_rad=device.tip_bend_rad, stiffness_factor=self.truth.stiffness_factor)
         return replace(wire, friction=device.friction * self.truth.friction_factor)
 
+    @property
+    def true_catheters(self) -> tuple[Catheter, ...]:
+        """The catheters as they truly are."""
+        return self.truth.catheters(self.navigation.catheters)
+
 
 @dataclass(frozen=True, eq=False)
 class PatientNavigation:
@@ -144,24 +155,27 @@ def set_up_navigation(anatomy: Anatomy | str | Path, target: str, config: Naviga
         config: policy, wire, limits and reality.
 
     Raises:
-        InputError: no such section, a point outside the vessel, a target behind an occlusion; no such policy, device or
-            tip; a wire that does not fit.
+        InputError: no such section, a point outside the vessel, a target behind an occlusion; no such policy, device,
+            catheter or tip; devices that do not fit.
     """
     config = config or NavigatePatientConfig()
     vessel = anatomy if isinstance(anatomy, Anatomy) else read_anatomy(anatomy)
     device, goal = read_device(config.device), parse_target(vessel, target)
-    check_passable(Route.to(vessel, goal), device)
+    catheters = tuple(read_catheter(name) for name in config.catheter)
     truth = _truth(config, vessel)
     policy = TwinPolicy(truth) if config.policy == "twin" else make_policy(config.policy)
     given = Navigation(
         anatomy=vessel,
         device=device,
         target=goal,
+        catheters=catheters,
+        arrives=config.arrives,
         start_inserted_mm=config.start_inserted_mm,
         start_rotation=config.start_rotation,
         seconds=config.seconds,
         force_limit_n=config.force_limit_n,
     )
+    check_passable(Route.to(vessel, goal), given.devices[given.arriving])
     choice = choose_tip(given, config.tip, catheter_tilt_deg=config.catheter_tilt_deg)
     place, parts = goal.position(vessel), target.split(",")
     return SetUp(
@@ -181,7 +195,7 @@ def navigate_patient(set_up: SetUp) -> PatientNavigation:
     navigation, policy = set_up.navigation, set_up.policy
     config = NavigateConfig(simulator=set_up.simulator, xray=set_up.config.xray)
     loop = NavigationLoop(navigation, policy, config=config, seed=set_up.config.seed, truth=set_up.truth)
-    began = np.array([loop.simulator.inserted_length[0], loop.simulator.rotation[0]])
+    began = loop.robot.proximal.ravel()
     wires: list[Float[np.ndarray, "wires nodes 3"]] = []
     with progress(f"Navigating, {set_up.config.policy}", total=navigation.seconds) as advance:
         while loop.reason is None:
@@ -193,7 +207,7 @@ def navigate_patient(set_up: SetUp) -> PatientNavigation:
                 wires.append(policy.believed_wires())  # at the decision, which ended the period before
     if isinstance(policy, Led):
         state = loop.robot.proximal_state()
-        policy.watch(Observation(loop.time_s, state.inserted_length, state.rotation, None))
+        policy.watch(Observation(loop.time_s, state.inserted_length, state.rotation, None, state.catheters))
     if isinstance(policy, Believer):
         wires.append(policy.believed_wires())
     record = loop.record()
@@ -223,16 +237,17 @@ def _truth(config: NavigatePatientConfig, vessel: Anatomy) -> ModelMismatch:
     return replace(drawn, **{name: value for name, value in given.items() if value is not None})
 
 
-def _driven_again(set_up: SetUp, record: NavigationRecord, began: Float[np.ndarray, "2"]) -> Rollout:
-    """Return the whole wire, driven again as it was, and then held at rest until the navigation's limit."""
+def _driven_again(set_up: SetUp, record: NavigationRecord, began: Float[np.ndarray, "numbers"]) -> Rollout:
+    """Return wire and catheters, driven again as they were, and then held at rest until the navigation's limit."""
     periods = int(np.ceil(set_up.navigation.seconds / DECISION_PERIOD_S - 1e-9))
     per_period = round(DECISION_PERIOD_S / CYCLE_S)
-    control = np.zeros((1, periods * per_period, 2))
+    control = np.zeros((1, periods * per_period, len(began)))
     control[0, : len(record.driven)] = record.driven
     return simulate(
         set_up.navigation.anatomy,
         set_up.true_wire,
         control,
+        catheters=set_up.true_catheters,
         initial=began[None],
         config=set_up.simulator,
         record_shape=True,
@@ -241,7 +256,10 @@ def _driven_again(set_up: SetUp, record: NavigationRecord, began: Float[np.ndarr
 
 
 def sampled(cycles: Rollout) -> Rollout:
-    """Return a rollout of a drive's cycles, which divide a decision period, as it is recorded at each period's end."""
+    """Return a rollout of a drive's cycles, which divide a decision period, as it is recorded at each period's end.
+
+    It tells nothing of catheters.
+    """
     step = round(DECISION_PERIOD_S / cycles.sample_period_s)
 
     def at_end(values: np.ndarray) -> np.ndarray:
@@ -255,6 +273,7 @@ def sampled(cycles: Rollout) -> Rollout:
     tip = TipProjection(**{f.name: at_end(getattr(cycles.tip, f.name)) for f in fields(TipProjection)})
     return replace(
         cycles,
+        catheters=None,
         **{name: at_end(getattr(cycles, name)) for name in names},
         sample_period_s=DECISION_PERIOD_S,
         control=together(cycles.control).mean(axis=2),

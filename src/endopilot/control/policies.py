@@ -14,6 +14,8 @@ POLICIES = Registry(
         "forward": "endopilot.control.baseline_policies:Forward",
         "spin": "endopilot.control.baseline_policies:Spin",
         "retract-rotate": "endopilot.control.baseline_policies:RetractRotate",
+        "catheter-alone": "endopilot.control.coaxial_policies:CatheterAlone",
+        "in-turn": "endopilot.control.coaxial_policies:InTurn",
         "twin": "endopilot.control.agent:TwinPolicy",
         "agent": "endopilot.control.agent:AgentPolicy",
         "open-loop": "endopilot.control.agent:OpenLoopPolicy",

@@ -14,6 +14,9 @@ from jaxtyping import Float
 from endopilot.tasks.navigation import Navigation
 from endopilot.xray.fluoroscope import TipMeasurement
 
+Proximals = tuple[tuple[float, float], ...]
+"""Of each of some devices' proximal ends a length and an angle, or their rates."""
+
 
 @dataclass(frozen=True, eq=False)
 class Observation:
@@ -24,12 +27,14 @@ class Observation:
         inserted_length: Δ by the robot's encoder, mm.
         rotation: φ by the robot's encoder, rad.
         tip: what X-ray shows now, or None where it is off.
+        catheters: inserted length (mm) and rotation (rad) of each catheter by its encoders, from the inside out.
     """
 
     time_s: float
     inserted_length: float
     rotation: float
     tip: TipMeasurement | None
+    catheters: Proximals = ()
 
 
 @dataclass(frozen=True)
@@ -41,12 +46,24 @@ class Decision:
         rotation: of the wire's proximal end, rad/s.
         expose: whether X-ray is to be on at the next decision.
         gives_up: where and why the policy ends the navigation with this decision, in words; empty if it goes on.
+        catheters: translation (mm/s) and rotation (rad/s) of each catheter's proximal end, from the inside out; those
+            that are not given stand still.
     """
 
     translation: float
     rotation: float
     expose: bool = False
     gives_up: str = ""
+    catheters: Proximals = ()
+
+    def velocities(self, devices: int) -> Proximals:
+        """Return translation (mm/s) and rotation (rad/s) of the wire, then of each catheter.
+
+        Args:
+            devices: number of wire and catheters.
+        """
+        given = ((self.translation, self.rotation), *self.catheters)
+        return (*given, *[(0.0, 0.0)] * (devices - len(given)))
 
 
 @runtime_checkable

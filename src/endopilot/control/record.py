@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from endopilot.anatomy.projection import project_tip
-from endopilot.control.policy import BelievedTip
+from endopilot.control.policy import BelievedTip, Proximals
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.types import TipProjection
@@ -27,14 +27,17 @@ class NavigationRecord:
         tip: Δtip, γtip, branch and lumen radius.
         contact_force_max: largest wall force on one node over the period that ends here, N.
         exposed: whether X-ray was on at this moment.
-        control: what was commanded from this moment on, within the limits, mm/s and rad/s; 0 at the end.
+        catheter_inserted_length: of each catheter, mm.
+        catheter_rotation: of each catheter, rad.
+        control: what was commanded from this moment on, within the limits, mm/s and rad/s of the wire, then of each
+            catheter; 0 at the end.
         measured: what X-ray showed at this moment; None where it was off, or no wire was found in the images.
         believed: where the policy believed the tip to be when it decided; NaN at the end, and None for a policy that
             does not tell: (Δtip, γtip), mm.
         half_width: of the adviser's bands around it, mm, likewise; NaN where there is none.
         asks: why the policy asked at this moment for X-ray at the next one; empty where it did not, or does not tell.
-        driven: velocity of the wire's proximal end that the drive asked for in each cycle of `CYCLE_S`, mm/s and rad/s.
-            `endopilot.simulate` makes the same navigation of it, to the bit.
+        driven: velocity of each device's proximal end that its drive asked for in each cycle of `CYCLE_S`, mm/s and
+            rad/s of the wire, then of each catheter. `endopilot.simulate` makes the same navigation of it, to the bit.
         success: the tip reached the target in time, at the end of a period.
         safe: the wall force never exceeded the navigation's limit.
         seconds: how long it took, s.
@@ -54,12 +57,14 @@ class NavigationRecord:
     tip: TipProjection
     contact_force_max: Float[np.ndarray, "samples"]
     exposed: Bool[np.ndarray, "samples"]
-    control: Float[np.ndarray, "samples 2"]
+    catheter_inserted_length: Float[np.ndarray, "samples catheters"]
+    catheter_rotation: Float[np.ndarray, "samples catheters"]
+    control: Float[np.ndarray, "samples numbers"]
     measured: tuple[TipMeasurement | None, ...]
     believed: Float[np.ndarray, "samples 2"] | None
     half_width: Float[np.ndarray, "samples 2"] | None
     asks: tuple[str, ...]
-    driven: Float[np.ndarray, "cycles 2"]
+    driven: Float[np.ndarray, "cycles numbers"]
     success: bool
     safe: bool
     seconds: float
@@ -76,8 +81,8 @@ class Track:
 
     def __init__(self, simulator: Simulator) -> None:
         """Take the start."""
-        self._columns: dict[str, list] = {name: [] for name in ("proximal", "position", "force")}
-        self._controls: list[tuple[float, float]] = []
+        self._columns: dict[str, list] = {name: [] for name in ("inserted", "turned", "position", "force")}
+        self._controls: list[Proximals] = []
         self._measured: list[TipMeasurement | None] = []
         self._exposed: list[bool] = []
         self._believed: list[BelievedTip | None] = []
@@ -86,7 +91,7 @@ class Track:
 
     def decided(
         self,
-        control: tuple[float, float],
+        control: Proximals,
         tip: TipMeasurement | None,
         believed: BelievedTip | None,
         *,
@@ -102,8 +107,9 @@ class Track:
 
     def moved(self, simulator: Simulator, peak_n: float) -> None:
         """Take where the wire is at the end of a period, and the largest wall force in it, N."""
-        self._columns["proximal"].append([simulator.inserted_length[0], simulator.rotation[0]])
-        self._columns["position"].append(simulator.position[0, 0])
+        self._columns["inserted"].append(np.append(simulator.inserted_length, simulator.catheter_inserted_length))
+        self._columns["turned"].append(np.append(simulator.rotation, simulator.catheter_rotation))
+        self._columns["position"].append(simulator.tips()[0])
         self._columns["force"].append(peak_n)
 
     def record(self, navigation: Navigation, driven: list[np.ndarray], reason: str, gives_up: str) -> NavigationRecord:
@@ -116,26 +122,30 @@ class Track:
             gives_up: where and why the policy gave up, in words.
         """
         anatomy = navigation.anatomy
-        proximal, position = np.array(self._columns["proximal"]), np.array(self._columns["position"])
-        force = np.array(self._columns["force"])
+        inserted, turned, position, force = (
+            np.array(self._columns[name]) for name in ("inserted", "turned", "position", "force")
+        )
+        numbers = 2 * inserted.shape[1]
         periods = len(force) - 1  # a decision whose period is not over does not count
         measured = (*self._measured[:periods], None)
         believed = [_NOTHING if tip is None else tip for tip in self._believed[:periods]] + [_NOTHING]
         tells = any(tip is not None for tip in self._believed)
         return NavigationRecord(
             time_s=DECISION_PERIOD_S * np.arange(len(force)),
-            inserted_length=proximal[:, 0],
-            rotation=proximal[:, 1],
+            inserted_length=inserted[:, 0],
+            rotation=turned[:, 0],
             tip_position=position,
             tip=project_tip(anatomy.tree, anatomy.insertion, position),
             contact_force_max=force,
             exposed=np.array([*self._exposed[:periods], False]),
-            control=np.array([*self._controls[:periods], (0.0, 0.0)]),
+            catheter_inserted_length=inserted[:, 1:],
+            catheter_rotation=turned[:, 1:],
+            control=np.array([*map(np.ravel, self._controls[:periods]), np.zeros(numbers)]),
             measured=measured,
             believed=np.array([(tip.abscissa, tip.offset) for tip in believed]) if tells else None,
             half_width=np.array([tip.half_width for tip in believed]) if tells else None,
             asks=tuple(tip.asks for tip in believed),
-            driven=np.array(driven, dtype=float).reshape(-1, 2),
+            driven=np.array(driven, dtype=float).reshape(-1, numbers),
             success=reason == "reached",
             safe=bool(force.max() <= navigation.force_limit_n),
             seconds=DECISION_PERIOD_S * periods,

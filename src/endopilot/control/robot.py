@@ -8,6 +8,7 @@ it, the drive process (`endopilot drive`) a clock.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -31,11 +32,13 @@ class ProximalState:
         time_s: by the robot's clock, s.
         inserted_length: Δ, mm.
         rotation: φ, rad, unwrapped.
+        catheters: the same two of each catheter around the wire, from the inside out.
     """
 
     time_s: float
     inserted_length: float
     rotation: float
+    catheters: tuple[tuple[float, float], ...] = ()
 
 
 @runtime_checkable
@@ -124,75 +127,99 @@ class DriveMotion:
 
 
 class SimulatedRobot:
-    """A robot whose wire is the one world of a simulator.
+    """A robot whose wire, and catheters if it has any, are the one world of a simulator. Each device has its own drive.
 
-    The encoders sit on the wire, behind the gears: they measure what backlash and a slipping drive leave of a command.
-    They count from the assumed position of the ostium.
+    The encoders sit on the devices, behind the gears: they measure what backlash and a slipping drive leave of a
+    command. They count from the assumed position of the ostium.
 
     Attributes:
-        driven: velocity of the wire's proximal end that the drive asked for in each cycle so far, mm/s and rad/s.
+        driven: velocity of each device's proximal end that its drive asked for in each cycle so far, mm/s and rad/s of
+            the wire, then of each catheter.
         last_step: what the wire did in the drive's last cycle; None before the first.
     """
 
     def __init__(
         self,
         simulator: Simulator,
-        limits: DriveLimits,
+        limits: Sequence[DriveLimits],
         config: RobotConfig | None = None,
         *,
         seed: int = 0,
         ostium_mm: float = 0.0,
     ) -> None:
-        """Grasp the wire where it is.
+        """Grasp the devices where they are.
 
         Args:
             simulator: of one world, driven by velocity.
-            limits: of the drive.
+            limits: of the drive of the wire, then of each catheter's.
             config: latency, backlash, accelerations and encoder noise.
             seed: of the encoder noise.
-            ostium_mm: the true inserted length is this much more than the encoder's, mm.
+            ostium_mm: the true inserted lengths are this much more than the encoders', mm.
         """
-        self._simulator, self._limits, self._ostium_mm = simulator, limits, ostium_mm
+        self._simulator, self._ostium_mm = simulator, ostium_mm
         config = config or RobotConfig()
         self._noise = np.array([config.encoder_sd_mm, config.encoder_sd_rad])
         self._random = np.random.default_rng([seed, 1])
-        self._drive = DriveMotion(limits, config, self._encoder())
-        self.driven: list[Float[np.ndarray, "2"]] = []
+        self._drives = [
+            DriveMotion(limit, config, (at, turned))
+            for limit, (at, turned) in zip(limits, self._encoders().tolist(), strict=True)
+        ]
+        # at the ostium the simulator stops the drives by itself
+        self._travel_mm = [(-np.inf, limit.travel_mm[1]) for limit in limits]
+        self.driven: list[Float[np.ndarray, "numbers"]] = []
         self.last_step: Step | None = None
 
     @property
-    def velocity(self) -> Float[np.ndarray, "2"]:
-        """The motor's velocity, mm/s and rad/s."""
-        return self._drive.velocity
+    def velocity(self) -> Float[np.ndarray, "numbers"]:
+        """The motors' velocities, mm/s and rad/s of the wire's, then of each catheter's."""
+        return np.concatenate([drive.velocity for drive in self._drives])
 
     def stop(self) -> None:
         """Brake at once, whatever was commanded before."""
-        self._drive.stop()
+        for drive in self._drives:
+            drive.stop()
 
-    def command(self, translation: float, rotation: float) -> None:
-        """Move on at a velocity, mm/s and rad/s, until the next command. What is not finite stops the wire."""
-        self._drive.command(translation, rotation)
+    def command(self, translation: float, rotation: float, *catheters: tuple[float, float]) -> None:
+        """Move on at a velocity, mm/s and rad/s, until the next command. What is not finite stops a device.
+
+        Args:
+            translation: of the wire.
+            rotation: of the wire.
+            catheters: both of each catheter; one that is not given stops.
+        """
+        orders = [(translation, rotation), *catheters, *[(0.0, 0.0)] * len(self._drives)]
+        for drive, order in zip(self._drives, orders, strict=False):
+            drive.command(*order)
 
     def proximal_state(self) -> ProximalState:
         """Return the readings of the encoders; every reading has a noise of its own."""
-        inserted, rotation = np.array(self._encoder()) + self._noise * self._random.standard_normal(2)
-        return ProximalState(self._drive.time_s, float(inserted), float(rotation))
+        places = self._encoders()
+        wire, *catheters = (places + self._noise * self._random.standard_normal(places.shape)).tolist()
+        return ProximalState(self._drives[0].time_s, *wire, catheters=tuple((at, turn) for at, turn in catheters))
 
     def run(self, duration: float) -> float:
-        """Let the robot and its wire run for some time, s, and return the largest wall force on a node, N."""
+        """Let the robot and its devices run for some time, s, and return the largest wall force on a node, N."""
         cycles = max(1, round(duration / CYCLE_S))
         period, peak = duration / cycles, 0.0
-        travel_mm = (-np.inf, self._limits.travel_mm[1])  # at the ostium the simulator stops the drive by itself
         for _ in range(cycles):
-            moved = self._drive.advance(period)
-            control = moved[None] / period
-            inserted = self._simulator.inserted_length
-            control[:, 0] = within_travel(control[:, 0], inserted, period, travel_mm=travel_mm)
-            self.last_step = step = self._simulator.step(control, period)
-            self.driven.append(control[0])
-            self._drive.position = np.array(self._encoder())
+            control = np.concatenate([drive.advance(period) for drive in self._drives]) / period
+            inserted = self.proximal[:, 0]
+            for k, travel_mm in enumerate(self._travel_mm):
+                control[2 * k] = within_travel(control[2 * k], inserted[k], period, travel_mm=travel_mm)
+            self.last_step = step = self._simulator.step(control[None], period)
+            self.driven.append(control)
+            for drive, place in zip(self._drives, self._encoders(), strict=True):
+                drive.position = place
             peak = max(peak, float(step.contact_force_max[0]))
         return peak
 
-    def _encoder(self) -> tuple[float, float]:
-        return float(self._simulator.inserted_length[0]) - self._ostium_mm, float(self._simulator.rotation[0])
+    @property
+    def proximal(self) -> Float[np.ndarray, "devices 2"]:
+        """Inserted length, mm, and rotation, rad, of each device as they truly are."""
+        simulator = self._simulator
+        inserted = np.append(simulator.inserted_length, simulator.catheter_inserted_length)
+        return np.column_stack([inserted, np.append(simulator.rotation, simulator.catheter_rotation)])
+
+    def _encoders(self) -> Float[np.ndarray, "devices 2"]:
+        """Return what the encoders read without noise: they count from where the ostium is assumed."""
+        return self.proximal - [self._ostium_mm, 0.0]

@@ -34,13 +34,14 @@ class Recording:
     """What was decided during a navigation, in full precision: it is enough to drive the navigation again.
 
     Attributes:
-        control: velocities of each decision within the drive's limits, mm/s and rad/s.
+        control: velocities of each decision within the drives' limits, mm/s and rad/s of the wire, then of each
+            catheter.
         exposed: whether X-ray was on at each decision.
         believed_mm: where the agent believed the tip to be (Δtip) at each decision, mm; None for other policies.
         gave_up: whether the policy ended the navigation with its last decision.
     """
 
-    control: Float[np.ndarray, "decisions 2"]
+    control: Float[np.ndarray, "decisions numbers"]
     exposed: Bool[np.ndarray, "decisions"]
     believed_mm: Float[np.ndarray, "decisions"] | None
     gave_up: bool = False
@@ -56,8 +57,12 @@ class Recording:
         }
 
     @staticmethod
-    def unpacked(text: dict[str, Any]) -> Recording:
+    def unpacked(text: dict[str, Any], devices: int = 1) -> Recording:
         """Return the recording that `packed` made a text of.
+
+        Args:
+            text: the arrays.
+            devices: number of wire and catheters.
 
         Raises:
             InputError: an array cannot be read, is not finite, or has another length than the others.
@@ -66,14 +71,14 @@ class Recording:
         believed = None if text["believed_mm"] is None else _unpack(text, "believed_mm", "<f8")
         count = len(exposed)
         for name, size in (
-            ("control", len(control) / 2),
+            ("control", len(control) / (2 * devices)),
             ("believed_mm", count if believed is None else len(believed)),
         ):
             if size != count or count == 0:
                 raise InputError(f"{name}: {size:g} decisions, exposed: {count}; each must have one value a decision")
         if not exposed[0]:
             raise InputError("exposed: X-ray is off at the first decision, where it is always on")
-        return Recording(control.reshape(-1, 2), exposed, believed, bool(text.get("gave_up", False)))
+        return Recording(control.reshape(count, -1), exposed, believed, bool(text.get("gave_up", False)))
 
 
 def navigation_seed(task: Task, place: int) -> int:
@@ -131,7 +136,7 @@ class Repeated:
 
     def __init__(self, recording: Recording) -> None:
         """Take the recording."""
-        self._control = recording.control.tolist()
+        self._control = [list(zip(row[::2], row[1::2], strict=True)) for row in recording.control.tolist()]
         self._expose_next = [*recording.exposed[1:].tolist(), False]
         self._gave_up = recording.gave_up
         self._at = 0
@@ -148,10 +153,11 @@ class Repeated:
         """
         if self._at == len(self._control):
             raise InputError(f"control: holds {self._at} decisions, and the navigation goes on")
-        control, expose = self._control[self._at], self._expose_next[self._at]
+        (wire, *catheters), expose = self._control[self._at], self._expose_next[self._at]
         self._at += 1
         last = self._gave_up and self._at == len(self._control)
-        return Decision(*control, expose=expose, gives_up="as recorded" if last else "")
+        gives_up = "as recorded" if last else ""
+        return Decision(*wire, expose=expose, gives_up=gives_up, catheters=tuple(catheters))
 
 
 def figures(navigation: Navigation, record: NavigationRecord, recording: Recording) -> dict[str, Any]:
@@ -196,6 +202,7 @@ def _digest(record: NavigationRecord, recording: Recording) -> str:
     """Return the SHA-256 of the decisions and of the wire's course under them, to the bit."""
     digest = hashlib.sha256(f"{len(record.time_s)}".encode())
     course = (record.inserted_length, record.rotation, record.tip_position, record.contact_force_max)
+    course += (record.catheter_inserted_length, record.catheter_rotation)
     for array in (recording.control, recording.exposed, recording.believed_mm, record.exposed, *course):
         if array is not None:
             digest.update(array.astype(array.dtype.newbyteorder("<")).tobytes())
@@ -208,6 +215,8 @@ def _course(record: NavigationRecord) -> dict[str, list]:
         "time_s": record.time_s.tolist(),
         "inserted_length": record.inserted_length.round(4).tolist(),
         "rotation": record.rotation.round(4).tolist(),
+        "catheter_inserted_length": record.catheter_inserted_length.round(4).tolist(),
+        "catheter_rotation": record.catheter_rotation.round(4).tolist(),
         "tip_position": record.tip_position.round(3).tolist(),
         "contact_force_max": record.contact_force_max.round(5).tolist(),
         "exposed": record.exposed.tolist(),

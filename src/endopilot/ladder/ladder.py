@@ -26,15 +26,16 @@ class LadderConfig:
     """What climbs the ladder, and how much of it."""
 
     policy: str = "forward"
-    """forward, spin, retract-rotate, twin, agent or open-loop, the name of a policy of an installed package, or
-    MODULE:OBJECT of a policy of your own."""
+    """forward, spin, retract-rotate, twin, agent, open-loop, catheter-alone or in-turn, the name of a policy of an
+    installed package, or MODULE:OBJECT of a policy of your own."""
     tasks: tuple[str, ...] = ()
     """Names of the tasks; all if none is given."""
     patients: Annotated[int, Within(1, MOST_PATIENTS)] = MOST_PATIENTS
     """Patients of each task, the first of its list: 1 to 20."""
 
     version: LadderVersion = NEWEST
-    """Version of the ladder: 2 in patients that resemble real ones, 1 in the textbook patients of before."""
+    """Version of the ladder: 2 in patients that resemble real ones, 1 in the textbook patients of before, or coaxial,
+    four tasks of wire and catheter in patients as of version 2."""
 
     @model_validator(mode="after")
     def _consistent(self) -> LadderConfig:

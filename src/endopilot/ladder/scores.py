@@ -11,10 +11,14 @@ from endopilot.tasks.task import Task
 
 UPPER = range(5, 13)
 """Levels of the upper eight tasks, which pushing alone must not solve."""
+COAXIAL = range(13, 17)
+"""Levels of the tasks of wire and catheter, which a wire alone must not solve."""
 
 
 def score(tasks: Sequence[Task], results: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:
-    """Return the scores of tasks, and over the lower four, the upper eight and all, where all of these were done.
+    """Return the scores of tasks, and over the lower four, the upper eight, all twelve and the coaxial four.
+
+    Several tasks are scored together where all of them were done.
 
     Each row has `level`; `task`; `safe_success`, the share of navigations that reached the target with a wall force
     that never exceeded the task's limit; `success`, the share that reached it; of those that did, the medians of
@@ -24,7 +28,8 @@ def score(tasks: Sequence[Task], results: Mapping[str, Sequence[Mapping[str, Any
     """
     rows = [{"level": task.level, "task": task.name} | score_navigations(results[task.name]) for task in tasks]
     levels = {task.level: task.name for task in tasks}
-    for title, wanted in (("lower four", range(1, 5)), ("upper eight", UPPER), ("all twelve", range(1, 13))):
+    groups = {"lower four": range(1, 5), "upper eight": UPPER, "all twelve": range(1, 13), "coaxial four": COAXIAL}
+    for title, wanted in groups.items():
         if all(level in levels for level in wanted):
             together = [result for level in wanted for result in results[levels[level]]]
             rows.append({"level": None, "task": title} | score_navigations(together))

@@ -27,12 +27,13 @@ from endopilot.control.set_up import tip_name
 from endopilot.extras import require_extras
 from endopilot.files import manifest, read_json, write_json, writing
 from endopilot.runs import claim
+from endopilot.simulation.catheter import write_catheter
 from endopilot.simulation.controls import write_controls_csv
 from endopilot.simulation.device import write_device
 
 PAGE_FILE, PICTURE_FILE, TABLE_FILE = "navigation.html", "navigation.png", "navigation.csv"
 CONTROLS_FILE, WIRE_FILE, EPISODE_FOLDER, ANATOMY_FOLDER = "controls.csv", "wire.yaml", "episode", "anatomy"
-MANIFEST_FILE = "manifest.json"
+CATHETER_FILE, MANIFEST_FILE = "catheter-{}.yaml", "manifest.json"
 
 
 def navigate_into(
@@ -65,6 +66,7 @@ def navigate_into(
         target=target,
         config=config,
         device=set_up.navigation.device,
+        catheters=set_up.navigation.catheters,
         policy=POLICIES.origin(config.policy),
         version=__version__,
     )
@@ -89,14 +91,20 @@ def _write(found: PatientNavigation, folder: Path, target: str, output: Path) ->
         navigation_table(found).to_csv(partial, index=False)
     cycles = found.cycles
     count = len(found.record.driven)
+    motions = [(cycles.inserted_length[0], cycles.rotation[0])]
+    if cycles.catheters is not None:
+        motions += zip(cycles.catheters.inserted_length[0].T, cycles.catheters.rotation[0].T, strict=True)
     write_controls_csv(
         output / CONTROLS_FILE,
         found.record.driven,
-        np.column_stack([cycles.inserted_length[0, :count], cycles.rotation[0, :count]]),
+        np.column_stack([column[:count] for motion in motions for column in motion]),
         cycles.sample_period_s,
     )
     write_device(set_up.true_wire, output / WIRE_FILE)
-    _write_episode(found, driven_in, output / EPISODE_FOLDER)
+    for path, catheter in zip(_catheter_files(set_up, output), set_up.true_catheters, strict=True):
+        write_catheter(catheter, path)
+    if not set_up.true_catheters:  # datasets hold wires alone
+        _write_episode(found, driven_in, output / EPISODE_FOLDER)
     picture = navigation_picture(found)
     with writing(output / PICTURE_FILE) as partial:
         partial.write_bytes(picture)
@@ -139,6 +147,13 @@ def navigation_table(found: PatientNavigation) -> pd.DataFrame:
         "band_tip_offset_mm": band[:, 1],
         "asks_for_xray": list(record.asks),
     }
+    for k in range(len(navigation.catheters)):
+        columns |= {
+            f"catheter_{k + 1}_translation_mm_s": record.control[:, 2 * k + 2],
+            f"catheter_{k + 1}_rotation_rad_s": record.control[:, 2 * k + 3],
+            f"catheter_{k + 1}_inserted_length_mm": record.catheter_inserted_length[:, k],
+            f"catheter_{k + 1}_rotation_rad": record.catheter_rotation[:, k],
+        }
     return pd.DataFrame(columns)
 
 
@@ -197,6 +212,7 @@ def _manifest(found: PatientNavigation, target: str, output: Path) -> dict[str, 
         inputs={},
         anatomy={"name": set_up.anatomy.name, "identity": set_up.anatomy.identity},
         device=asdict(navigation.device),
+        catheters=[asdict(catheter) for catheter in navigation.catheters],
         catheter_axis=navigation.anatomy.insertion.direction.tolist() if set_up.choice.tilt_deg else None,
         target={"asked": target, **asdict(navigation.target)},
         truth=asdict(set_up.truth),
@@ -209,17 +225,28 @@ def _commands(found: PatientNavigation, folder: Path, driven_in: Path, target: s
     changed = _changed(found.set_up)
     line = ["endopilot", "navigate", str(folder), f"--target={target}", "-o", str(output), *changed]
     again = ["endopilot", "simulate", str(driven_in), "--device", str(output / WIRE_FILE)]
+    files = _catheter_files(found.set_up, output)
+    again += ["--catheter", *map(str, files)] if files else []
     again += ["--controls", str(output / CONTROLS_FILE), "-o", "again.csv"]
     beside = ["endopilot", "train", "runs/dataset", str(output / EPISODE_FOLDER), "-o", "runs/training"]
     return {
         "The navigation": shlex.join(line),
         "The same wire from the recorded controls, without the policy": shlex.join(again),
-        "Train on it beside a dataset of the same wire": shlex.join(beside),
+        **({} if files else {"Train on it beside a dataset of the same wire": shlex.join(beside)}),
     }
+
+
+def _catheter_files(set_up: SetUp, output: Path) -> list[Path]:
+    """Return where the catheters, as they truly were, are written."""
+    return [output / CATHETER_FILE.format(k + 1) for k in range(len(set_up.navigation.catheters))]
 
 
 def _changed(set_up: SetUp) -> list[str]:
     """Return the options that are not at their defaults."""
     default = asdict(NavigatePatientConfig())
     options = [(name, value) for name, value in asdict(set_up.config).items() if value != default[name]]
-    return [part for name, value in options for part in (f"--{name.replace('_', '-')}", str(value))]
+    return [
+        part
+        for name, value in options
+        for part in (f"--{name.replace('_', '-')}", *map(str, value if isinstance(value, tuple) else (value,)))
+    ]

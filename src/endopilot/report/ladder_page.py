@@ -24,7 +24,7 @@ from endopilot.report.report import image, template_text
 from endopilot.report.scene import mark_target, navigation_scene
 from endopilot.simulation.simulate import simulate
 from endopilot.tasks.navigation import Navigation
-from endopilot.tasks.task import CORE, Task, find_task
+from endopilot.tasks.task import CORE, Task, find_task, ladder_tasks
 from endopilot.types import SAMPLE_PERIOD_S, Rollout
 
 PAGE_FILE = "index.html"
@@ -60,6 +60,7 @@ def write_page(output: Path) -> Path:
         lstrip_blocks=True,
     ).get_template("ladder.html.j2")
     page = template.render(
+        of=len(ladder_tasks(content["ladder"])),
         css=Markup(template_text("report.css")),
         policy=content["policy"],
         patients=content["patients"],
@@ -113,11 +114,17 @@ def _outcome(result: dict[str, Any]) -> str:
 
 def _replay(navigation: Navigation, course: dict[str, Any]) -> Rollout:
     """Return the whole wire over a navigation, by driving its proximal end along the same course again."""
-    proximal = np.column_stack([course["inserted_length"], course["rotation"]])
+    numbers = [course["inserted_length"], course["rotation"]]
+    for inserted, turned in zip(
+        np.array(course["catheter_inserted_length"]).T, np.array(course["catheter_rotation"]).T, strict=True
+    ):
+        numbers += [inserted, turned]
+    proximal = np.column_stack(numbers)
     return simulate(
         navigation.anatomy,
         navigation.device,
         (np.diff(proximal, axis=0) / SAMPLE_PERIOD_S)[None],
+        catheters=navigation.catheters,
         initial=proximal[:1],
         config=replace(CORE, threads=1),
         record_shape=True,

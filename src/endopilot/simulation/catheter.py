@@ -11,13 +11,15 @@ import math
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
+import yaml
 from jaxtyping import Float
 from pydantic import model_validator
 
 from endopilot.errors import InputError
+from endopilot.files import writing
 from endopilot.settings import NonNegative, Positive, Text, Within, read_settings, settings
 from endopilot.simulation.device import Device, Sourced
 
@@ -127,6 +129,28 @@ def read_catheter(name_or_path: str | Path) -> Catheter:
         )
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
+
+
+def write_catheter(catheter: Catheter, path: Path) -> None:
+    """Write a catheter as a file that `read_catheter` reads, with the same constants.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+
+    def sourced(owner: Device | Catheter, name: str) -> dict[str, Any]:
+        value = getattr(owner, name)
+        return {"value": list(value) if isinstance(value, tuple) else value, "source": catheter.device.sources[name]}
+
+    content: dict[str, Any] = {"name": catheter.name}
+    for field in fields(_CatheterFile):
+        if field.name not in ("name", "shape"):
+            owner = catheter if hasattr(catheter, field.name) else catheter.device
+            content[field.name] = sourced(owner, field.name)
+    arcs = [[length, round(math.degrees(angle), 10)] for length, angle in catheter.shape]
+    content["shape"] = {"arcs": arcs, "source": catheter.device.sources["shape"]}
+    with writing(path) as partial:
+        partial.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")
 
 
 def check_nested(wire: Device, catheters: Sequence[Catheter]) -> None:

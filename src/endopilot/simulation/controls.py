@@ -223,19 +223,24 @@ def read_controls_csv(path: Path, *, catheters: int = 0) -> ScriptedControls:
 
 
 def write_controls_csv(
-    path: Path, control: Float[np.ndarray, "samples 2"], proximal: Float[np.ndarray, "samples 2"], period_s: float
+    path: Path,
+    control: Float[np.ndarray, "samples numbers"],
+    proximal: Float[np.ndarray, "samples numbers"],
+    period_s: float,
 ) -> None:
     """Write controls so that `read_controls_csv` reads them.
 
     Args:
         path: where to.
-        control: mm/s and rad/s.
-        proximal: (Δ mm, φ rad) at the end of each.
+        control: mm/s and rad/s of the wire, then of each catheter.
+        proximal: (Δ mm, φ rad) at the end of each, likewise.
         period_s: time that each holds, s.
     """
     import pandas as pd
 
     time_s = period_s * np.arange(1, len(control) + 1)
-    names = [*_COLUMNS, "inserted_length_mm", "rotation_rad"]
+    prefixes = ["", *(f"catheter_{k + 1}_" for k in range(control.shape[1] // 2 - 1))]
+    names = [_COLUMNS[0], *(prefix + name for prefix in prefixes for name in _COLUMNS[1:])]
+    names += [prefix + name for prefix in prefixes for name in ("inserted_length_mm", "rotation_rad")]
     with writing(path) as partial:
         pd.DataFrame(np.column_stack([time_s, control, proximal]), columns=names).to_csv(partial, index=False)
