@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -15,6 +16,7 @@ from endopilot.control.navigate_patient import NavigatePatientConfig, navigate_p
 from endopilot.dataset.loader import load_dataset
 from endopilot.files import read_json
 from endopilot.pipeline import navigation
+from endopilot.simulation.catheter import read_catheter
 
 SHORT = ("--tip", "own", "--seconds", "20")
 FILES = ["controls.csv", "episode", "manifest.json", "navigation.csv", "navigation.html", "navigation.png", "run.json",
@@ -96,6 +98,36 @@ def test_recorded_controls_make_the_same_wire(driven, patient, capsys, tmp_path)
     places = [f"tip_{axis}_mm" for axis in "xyz"]
     np.testing.assert_allclose(wire[places].to_numpy()[9::10], table[places].to_numpy()[1:], atol=1e-9)
     np.testing.assert_allclose(wire["inserted_length_mm"][9::10], table["inserted_length_mm"][1:], atol=1e-9)
+
+
+def test_a_catheter_follows_its_wire_and_both_are_written(patient, capsys, tmp_path):
+    folder = tmp_path / "coaxial"
+    command = ("navigate", patient, "--target", "1", "--policy", "in-turn", "--arrives", "catheter", *SHORT)
+    figures = run(capsys, *command, "--true-friction", "1.1", "--catheter", "microcatheter-1.7f", "-o", folder)
+    assert figures["reached"]
+    files = sorted({*FILES, "catheter-1.yaml"} - {"episode"})  # a dataset holds wires alone
+    assert sorted(path.name for path in folder.iterdir()) == files
+    given, true = read_catheter("microcatheter-1.7f"), read_catheter(folder / "catheter-1.yaml")
+    assert true.device.friction == 1.1 * given.device.friction
+    assert true == replace(given, device=replace(given.device, friction=true.device.friction))
+    table = pd.read_csv(folder / "navigation.csv")
+    assert table["catheter_1_inserted_length_mm"].iloc[-1] > 0.8 * figures["target_mm"]
+    again = run(
+        *(capsys, "simulate", patient, "--device", folder / "wire.yaml", "--catheter", folder / "catheter-1.yaml"),
+        *("--controls", folder / "controls.csv", "-o", tmp_path / "again.csv"),
+    )
+    assert again["valid_worlds"] == 1
+    motion = pd.read_csv(tmp_path / "again.csv")
+    for name in ("tip_z_mm", "inserted_length_mm", "catheter_1_inserted_length_mm"):
+        count = len(table) - 1
+        np.testing.assert_allclose(motion[name][9::10][:count], table[name][1:], atol=1e-4, err_msg=name)
+    assert "--catheter microcatheter-1.7f" in (folder / "navigation.html").read_text(encoding="utf-8")
+    line = refused(
+        capsys, "navigate", patient, "--target", "1", "--catheter", "microcatheter-1.7f", "-o", tmp_path / "n"
+    )
+    assert "policy: it takes a wire alone, and there is microcatheter-1.7f around it; leave the catheter out" in line
+    line = refused(capsys, *command, "-o", tmp_path / "n")
+    assert "arrives: catheter; there is none" in line
 
 
 def test_the_replayed_wire_is_the_navigations_to_the_bit(patient):
