@@ -70,6 +70,24 @@ def test_keys_move_the_wire_and_the_pedal_counts(context, server):
     assert not errors
 
 
+def test_a_gamepad_drives_turns_and_exposes(context, server):
+    context.add_init_script(
+        """const buttons = Array.from({length: 16}, () => ({pressed: false}));
+        window.pad = {connected: true, axes: [0, 0, 0, 0], buttons};
+        navigator.getGamepads = () => [null, window.pad];"""
+    )
+    page = opened(context, server)
+    began = value(page, "cockpit.shown.inserted_mm")
+    page.evaluate("() => { pad.axes[1] = -0.5; pad.axes[2] = 1; pad.buttons[7].pressed = true; }")
+    until(page, f"cockpit.shown.inserted_mm > {began + 2}")
+    until(page, "Math.abs(cockpit.shown.rotation_deg) > 10 && cockpit.shown.xray.frames >= 2")
+    half = value(page, "cockpit.shown.command[0]")
+    page.evaluate("() => { pad.axes[1] = -1; pad.buttons[5].pressed = true; }")
+    until(page, f"cockpit.shown.command[0] > {2 * half - 1e-6}")
+    page.evaluate("() => { pad.axes[1] = 0.05; pad.axes[2] = 0; pad.buttons[7].pressed = false; }")  # a worn stick
+    until(page, "cockpit.shown.velocity[0] === 0 && cockpit.shown.velocity[1] === 0 && !cockpit.shown.xray.on")
+
+
 def test_a_closed_page_stops_the_wire(context, server):
     page = opened(context, server)
     watcher = opened(context, server)

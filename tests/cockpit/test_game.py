@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from unittest.mock import patch
 
@@ -12,6 +13,9 @@ from endopilot.cockpit import game
 from endopilot.cockpit.frames import decode
 from endopilot.cockpit.game import Attempt, GameSession
 from endopilot.cockpit.messages import Autopilot, Drive, Game, Pedal, Target
+from endopilot.cockpit.open import resume_session
+from endopilot.cockpit.recording import Recorder, Where
+from endopilot.cockpit.session import Session
 from endopilot.cockpit.world import World
 from endopilot.errors import InputError
 from endopilot.tasks.task import find_task
@@ -102,3 +106,31 @@ def test_a_task_has_the_ladders_world():
     assert world.navigation.anatomy.identity == ladder.anatomy.identity
     assert world.config.simulator.element_mm == 1.25
     assert np.isclose(world.snapshot().rotation, ladder.start_rotation)
+
+
+def test_a_killed_game_goes_on_and_is_scored_as_if_it_had_not_been(tmp_path, xray):
+    """Half the drive, the server killed, and the other half: the same figures as in one go."""
+    tried = Attempt(find_task("straight"), 0)
+    scores = {}
+    with patch.object(game, "ProcessPoolExecutor", Rival):
+        for name, parts in (("one", (16.0,)), ("two", (1.3, 14.7))):
+            world = tried.world()
+            path = tmp_path / f"{name}.cockpit.jsonl"
+            played = GameSession(tried, world, xray, Recorder(path, world, Where(task="straight"), tried.seed))
+            xray.frames = 0
+            played.handle(Game(type="game", action="start"), 0.0)
+            for seconds in parts:
+                if played.world.cycle:
+                    played = resume_session(path).stage
+                    until = time.monotonic() + 20
+                    while not played.xray.ready and time.monotonic() < until:
+                        time.sleep(0.01)
+                    assert played.phase == "waits" and not played.sight
+                    played.handle(Game(type="game", action="start"), 0.0)
+                play(played, Drive(type="drive", translation=15.0, rotation=0.5), seconds)
+            assert played.phase == "over"
+            scores[name] = played.result
+            played.close()
+    for figure in ("success", "safe", "reason", "seconds", "peak_force_n", "path_ratio"):
+        assert scores["two"][figure] == pytest.approx(scores["one"][figure], abs=0.02), figure
+    assert resume_session(path).stage.__class__ is Session  # what is over is not played again

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import signal
 import subprocess
@@ -15,7 +16,7 @@ from endopilot.runs import claim
 from endopilot.simulation.device import read_device
 
 SIZE = ("--patients", "3", "--sequences", "6", "--seconds", "25")
-STAGES = ["atlas", "phantom", "segmentation", "anatomy", "dataset", "evaluation", "report"]
+STAGES = ["atlas", "phantom", "segmentation", "anatomy", "navigation", "dataset", "evaluation", "report"]
 
 
 def test_killed_and_started_again_it_ends_with_a_report(tmp_path):
@@ -49,6 +50,8 @@ def test_killed_and_started_again_it_ends_with_a_report(tmp_path):
     for series in ("P1", "P3", "P4", "hold_slack"):
         assert unseen["tip"][series]["abscissa"]["all"]["count"] > 0
     assert min(score["dice"] for score in metrics["anatomy_scores"].values()) > 0.85
+    assert 'href="navigation/navigation.html"' in report and (folder / "navigation" / "navigation.html").exists()
+    assert read_json(folder / "navigation" / "manifest.json")["figures"]["outcome"] in html.unescape(report)
     partial = [path for path in folder.rglob("*") if path.name.startswith(".part")]
     assert partial == []
 

@@ -8,6 +8,7 @@ patient in a process of its own, so that both scores stand side by side.
 from __future__ import annotations
 
 import multiprocessing
+from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
@@ -117,9 +118,7 @@ class GameSession(Session):
             self._commands.append(self._command)
         sent = super().cycle(now_s)
         if self.phase == "on":
-            self._peak_n = max(self._peak_n, self.world.force_n)
-            if self.world.cycle % self._period == 0:
-                sent += self._period_is_over()
+            sent += self._cycle_is_over()
         elif self._rival is not None and self._rival.done():
             sent.append(self._scores())
         return sent
@@ -145,6 +144,31 @@ class GameSession(Session):
         super().close()
         if self._pool is not None:
             self._pool.shutdown(wait=False, cancel_futures=True)
+
+    def restore(self, history: Iterable[tuple[World, Sequence[dict[str, Any]]]]) -> None:
+        """Live through what was played again, and wait for the page to start the clock."""
+        super().restore(history)
+        if self.phase == "on":
+            self.phase = "waits"
+
+    def _relive(self, events: Sequence[dict[str, Any]]) -> None:
+        """Count a cycle that has passed as `cycle` did; the events after it set the next command."""
+        if self.phase == "on" and (self.world.cycle - 1) % self._period == 0:
+            self._commands.append(self._command)
+        super()._relive(events)
+        if self.phase == "on":
+            self._cycle_is_over()
+        for event in events:
+            if "game" in event:
+                self.phase = "on"
+            elif "move" in event:
+                self._command = tuple(event["move"])
+            elif "stop" in event:
+                self._command = (0.0, 0.0)
+
+    def _cycle_is_over(self) -> list[tuple[str, bytes]]:
+        self._peak_n = max(self._peak_n, self.world.force_n)
+        return self._period_is_over() if self.world.cycle % self._period == 0 else []
 
     def _period_is_over(self) -> list[tuple[str, bytes]]:
         """Take a sample as `navigate` does, and end the game where it would."""

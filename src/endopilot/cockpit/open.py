@@ -7,6 +7,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.cockpit.fluoroscopy import XrayUnit
 from endopilot.cockpit.frames import scene
 from endopilot.cockpit.loop import Stage
-from endopilot.cockpit.recording import SUFFIX, Recorder, Recording, Where, read_recording, replayed
+from endopilot.cockpit.recording import SUFFIX, Recorder, Where, read_recording, replayed
 from endopilot.cockpit.session import Session
 from endopilot.cockpit.world import World
 from endopilot.control.policies import POLICIES
@@ -127,18 +128,30 @@ def open_replay(
 def resume_session(path: Path, *, ct: Path | None = None) -> Opened:
     """Go on with a session that a killed server left: it is driven again up to its last event, and recorded on.
 
+    A task that was not over goes on, and is scored: its clock waits for the page's start.
+
     Raises:
         InputError: no such session, or one that does not replay to the bit.
     """
     recording = read_recording(path)
-    world = _last(recording)
+    history = replayed(recording)
+    first = next(history)
     _drop_half_line(path)
-    world.stop()
-    # A game that was interrupted goes on as a session without a score.
-    opened = _driven(world, recording.where, path.parent, ct, path=path, seed=recording.seed)
+    where, make = recording.where, Session
+    if where.task is not None and not any("score" in event for event in recording.events):
+        make = _game(where.task, where.place)
+    opened = _driven(first[0], where, path.parent, ct, path=path, seed=recording.seed, make=make)
     assert isinstance(opened.stage, Session)
-    opened.stage.restore(recording.events)
+    opened.stage.restore(chain([first], history))
     return opened
+
+
+def _game(task: str, place: int) -> Callable[..., Session]:
+    """Return what makes the session of a task."""
+    from endopilot.cockpit.game import Attempt, GameSession  # slow to import, and needed for tasks alone
+    from endopilot.tasks.task import find_task
+
+    return partial(GameSession, Attempt(find_task(task), place))
 
 
 def _driven(
@@ -192,11 +205,6 @@ def _start_of(anatomy: Anatomy, device: Device) -> Navigation:
     line = tree.branches[leaf].centerline.abscissa
     target = Target(branch=leaf, abscissa=float(max(_DEEP * line[-1], line[0])))
     return Navigation(anatomy=anatomy, device=device, target=target, start_inserted_mm=_START_MM)
-
-
-def _last(recording: Recording) -> World:
-    *_, (world, _events) = replayed(recording)
-    return world
 
 
 def _synthetic(output: Path) -> Path:

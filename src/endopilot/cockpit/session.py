@@ -5,7 +5,7 @@ Everything here runs in one thread, by the world's clock. The only real time in 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -86,19 +86,25 @@ class Session:
         else:
             raise InputError(f"{message.type}: not here")
 
-    def restore(self, events: Iterable[dict[str, Any]]) -> None:
-        """Take over what the recording of a resumed session says of target and exposures.
+    def restore(self, history: Iterable[tuple[World, Sequence[dict[str, Any]]]]) -> None:
+        """Live through a recorded session again: take over what it says of target and exposures, and stop.
 
         Args:
-            events: of the recording.
+            history: the session's world after each cycle, and the events of that cycle (`recording.replayed`).
         """
+        for _, events in history:
+            self._relive(events)
+        self.world.stop()
+        self._record(stop="resumed")
+
+    def _relive(self, events: Sequence[dict[str, Any]]) -> None:
+        """Take over the events of a cycle that has passed."""
         for event in events:
             if "target" in event:
                 self.target = Target(branch=event["target"][0], abscissa=event["target"][1])
             elif "exposure" in event:
                 self.xray.frames = event["exposure"]
                 self.xray.seconds, self.xray.kerma_ugy = event["seconds"], event["kerma_ugy"]
-        self._record(stop="resumed")
 
     def halt(self, why: str) -> None:
         """Brake at once and let the pedal go.

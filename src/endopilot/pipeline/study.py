@@ -111,6 +111,7 @@ class _Run:
         origin: where the patients come from, for the report.
         command: what was typed, for the report.
         inputs: SHA-256 of the input files, by name.
+        navigation: folder of the agent's navigation; None where no target was given.
     """
 
     output: Path
@@ -121,6 +122,7 @@ class _Run:
     origin: str
     command: str
     inputs: Mapping[str, str] = field(default_factory=dict)
+    navigation: Path | None = None
 
     @property
     def trained(self) -> Path:
@@ -161,6 +163,7 @@ def run_demo(output: Path, config: DemoConfig) -> dict[str, Any]:
         stages=Stages(output),
         origin=DEMO_ORIGIN,
         command="endopilot demo",
+        navigation=output / "navigation",
     )
     # of the other population the segmentation loses some arteries
     atlas = AtlasConfig(anatomy="rca", population="textbook", count=config.patients, seed=config.seed)
@@ -169,7 +172,9 @@ def run_demo(output: Path, config: DemoConfig) -> dict[str, Any]:
     scan = partial(_make_volume, output=output, seed=config.seed, truths=truths)
     run.stages.do_each("atlas", "Synthetic patients", truths, draw)
     run.stages.do_each("phantom", "Synthetic CT angiograms", truths, scan)
-    return _study(run, _anatomies(run, [output / "ct" / f"{folder.name}{VOLUME_SUFFIX}" for folder in truths]))
+    anatomies = _anatomies(run, [output / "ct" / f"{folder.name}{VOLUME_SUFFIX}" for folder in truths])
+    run.stages.do("navigation", lambda: _drive(run, anatomies[0]))
+    return _study(run, anatomies)
 
 
 def run_volume(
@@ -199,6 +204,7 @@ def run_volume(
     identity = {"volume_sha256": _digest(content), "method": METHODS.origin(config.segmentation.method)}
     claim(output, "endopilot run", **identity, config=config, device=device, version=__version__)
     copy, stages = output / "ct" / f"patient{VOLUME_SUFFIX}", Stages(output)
+    folder = None if target is None else output / "navigation" / re.sub(r"[^\w.,+-]", "_", target)
     stages.do("read", lambda: write_volume(content, copy))
     del content  # up to a gigabyte
     run = _Run(
@@ -210,11 +216,11 @@ def run_volume(
         origin=RUN_ORIGIN,
         command=f"endopilot run {volume} -o {output}" + (f" --series {series}" if series else ""),
         inputs=input_hash(volume),
+        navigation=folder,
     )
     anatomies = _anatomies(run, [copy])
-    if target is None:
+    if target is None or folder is None:
         return _study(run, anatomies)
-    folder = output / "navigation" / re.sub(r"[^\w.,+-]", "_", target)
     settings = NavigatePatientConfig(device=config.device, seed=config.seed)
     navigation = navigate_into(anatomies[0], target, folder, settings)
     found = _study(run, anatomies)
@@ -265,6 +271,16 @@ def _anatomies(run: _Run, volumes: Sequence[Path]) -> list[Path]:
     stages.do_each("anatomy", "Centerlines and distance maps", volumes, make_anatomy)
     names = [volume.name.removesuffix(VOLUME_SUFFIX) for volume in volumes]
     return [output / "anatomies" / name for name in names if (output / "anatomies" / name).exists()]
+
+
+def _drive(run: _Run, anatomy: Path) -> None:
+    """Let the agent drive to the distal end of the longest path."""
+    assert run.navigation is not None
+    tree = read_anatomy(anatomy).tree
+    longest = max(tree.leaves(), key=lambda leaf: tree.branches[leaf].centerline.abscissa[-1])
+    target = tree.section_names[tree.branches[longest].section[-1]]
+    settings = NavigatePatientConfig(device=run.config.device, seed=run.config.seed)
+    navigate_into(anatomy, target, run.navigation, settings)
 
 
 def _study(run: _Run, anatomies: Sequence[Path]) -> dict[str, Any]:
@@ -332,6 +348,7 @@ def _report(run: _Run, names: Sequence[str]) -> None:
         run=run_path(run.trained) if run.evaluates else None,
         replay=replay,
         replay_anatomy=anatomy,
+        navigation=run.navigation,
         stage_seconds=run.stages.seconds,
         manifest=manifest(config=run.config, seed=run.config.seed, inputs=run.inputs, rejected=run.stages.rejected),
     )

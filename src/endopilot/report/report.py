@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import html
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -61,6 +62,7 @@ class ReportContent:
         run: folder made by `endopilot train`.
         replay: navigations with `shape`, the first of which is shown in space.
         replay_anatomy: folder of the anatomy that they are in.
+        navigation: folder made by `endopilot navigate`, beside or below the report; its page is linked.
         stage_seconds: seconds that each stage took, in the order of the stages.
         manifest: how everything was made (`files.manifest`).
     """
@@ -73,6 +75,7 @@ class ReportContent:
     run: Path | None = None
     replay: Rollout | None = None
     replay_anatomy: Path | None = None
+    navigation: Path | None = None
     stage_seconds: Mapping[str, float] = field(default_factory=dict)
     manifest: Mapping[str, Any] = field(default_factory=dict)
 
@@ -95,6 +98,7 @@ def write_report(output_html: Path, content: ReportContent) -> list[str]:
         "metrics": metrics,
         "text": report_text,
         "patients": [_patient(patient) for patient in content.patients],
+        "driven": _driven(content.navigation, output_html.parent),
         "scene": _scene(content, output_html.with_name(STILL_FILE), remarks),
         "figures": {name: _stored_figure(content.evaluation, name) for name in report_text.EVALUATION_FIGURES},
         "training": _training(content.run),
@@ -134,6 +138,20 @@ def _patient(patient: PatientContent) -> dict[str, Any]:
         "picture": image(png(figure), f"{patient.name}: CT with the segmented lumen, and the centerline"),
         "facts": report_text.anatomy_facts(anatomy),
         "scores": dict(patient.scores),
+    }
+
+
+def _driven(navigation: Path | None, beside: Path) -> dict[str, Any] | None:
+    """Return what the agent did: one line, the picture, and where its page is, seen from the report."""
+    if navigation is None:
+        return None
+    figures = read_json(navigation / "manifest.json")["figures"]
+    picture = (navigation / "navigation.png").read_bytes()
+    page = navigation / "navigation.html"
+    return {
+        "outcome": figures["outcome"],
+        "picture": image(picture, "The navigation: the vessel with the tip's path, and its figures over time"),
+        "href": Path(os.path.relpath(page, beside)).as_posix(),
     }
 
 

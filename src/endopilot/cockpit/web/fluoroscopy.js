@@ -1,5 +1,6 @@
 // The X-ray view: grey images into canvases, the C-arm's controls, and what is counted.
 
+const MOST_WAITING = 2; // images that wait for a frame
 const CONTROLS = ["roadmap", "biplane", "which", "lao", "cran", "zoom", "rate", "dose"];
 
 /** The images of one or two planes, and the bar below them. */
@@ -10,7 +11,7 @@ export class Fluoroscopy {
     this.pixels = this.pens.map((pen) => pen.createImageData(512, 512));
     this.words = this.pixels.map((pixels) => new Uint32Array(pixels.data.buffer));
     this.grey = new Uint32Array(256).map((_, value) => 0xff000000 | (value << 16) | (value << 8) | value);
-    this.waiting = [null, null];
+    this.waiting = [[], []];
     this.images = 0;
     for (const id of CONTROLS) {
       this[id] = document.getElementById(id);
@@ -18,18 +19,20 @@ export class Fluoroscopy {
     }
   }
 
-  /** Keep an image until the next frame is drawn. */
+  /** Keep an image until the next frame is drawn; of two that come between two frames both are shown, one after the other. */
   take(message) {
-    this.waiting[message.plane] = message;
+    const waiting = this.waiting[message.plane];
+    waiting.push(message);
+    if (waiting.length > MOST_WAITING) waiting.shift();
   }
 
   draw() {
-    this.waiting.forEach((message, plane) => {
+    this.waiting.forEach((waiting, plane) => {
+      const message = waiting.shift();
       if (!message) return;
       const words = this.words[plane], grey = message.grey;
       for (let i = 0; i < grey.length; i++) words[i] = this.grey[grey[i]];
       this.pens[plane].putImageData(this.pixels[plane], 0, 0);
-      this.waiting[plane] = null;
       this.images += plane === 0 ? 1 : 0;
     });
   }

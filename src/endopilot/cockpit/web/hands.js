@@ -8,10 +8,11 @@ const KEYS = {
 };
 const DEAD = 0.15;
 
-/** Turns what is held into messages. `drives()` tells whether the page drives, `policyDrives()` whether its autopilot does. */
+/** Turns what is held into messages. `drives()` tells whether the page drives, `policyDrives()` whether its autopilot does; `wake()` is called as a motion begins. */
 export class Hands {
-  constructor(connection, drives, policyDrives) {
+  constructor(connection, drives, policyDrives, wake) {
     this.connection = connection;
+    this.wake = wake;
     this.drives = drives;
     this.policyDrives = policyDrives;
     this.held = new Set();
@@ -110,6 +111,7 @@ export class Hands {
   }
 
   send([translation, rotation]) {
+    if (!this.sent[0] && !this.sent[1]) this.wake();
     this.sent = [translation, rotation];
     if (this.drives()) this.connection.send("drive", { translation, rotation });
   }

@@ -118,7 +118,7 @@ async function start() {
   page.game = new GameBar(page.connection);
   page.replay = new ReplayBar(page.connection);
   if (page.scene.policies) page.autopilot = new AutopilotBar(page.connection, page.scene);
-  page.hands = new Hands(page.connection, () => page.role.drives, () => Boolean(page.autopilot?.drives));
+  page.hands = new Hands(page.connection, () => page.role.drives, () => Boolean(page.autopilot?.drives), () => page.space.wake());
   setInterval(countFrames, 1000);
   requestAnimationFrame(frame);
 }

@@ -23,7 +23,8 @@ const LUMEN_FRAGMENT = `
 const PRESETS = { AP: [0, 0], "RAO 30": [-30, 0], "LAO 45": [45, 0], "LAO 45 CRAN 25": [45, 25], "RAO 30 CAUD 20": [-30, -20], lateral: [90, 0] };
 const FIELD_DEG = 26;
 const STILL_MM = 0.003;
-const COARSE = 0.7, SHARP_AFTER_MS = 200; // resolution of a moving view that is drawn in software; a view at rest is sharp
+const COARSE = 0.6; // resolution of a moving view that is drawn in software; a view at rest is sharp
+const SHARP_AFTER_MS = 600; // longer than hands rest between two presses: drawing all pixels would delay the second
 // The colours of sections in all pictures of endopilot; the two darkest are lighter here, on a dark ground.
 const COLORS = ["#0f86d6", "#e69f00", "#12b886", "#e2703a", "#56b4e9", "#cc79a7", "#f0e442", "#a27fc6", "#b08a56", "#44aa99", "#c85a8e", "#9aa3b5"];
 const sectionColor = (label) => COLORS[label % COLORS.length];
@@ -212,6 +213,11 @@ export class Space {
     this.target.quaternion.copy(this.camera.quaternion);
     this.renderer.render(this.scene, this.camera);
     return true;
+  }
+
+  /** Expect a motion: what is allotted for a moving view is allotted before it, not in the frame that shows it. */
+  wake() {
+    if (this.software) this.changed = true;
   }
 
   /** Draw a view that changes in fewer pixels, and once more in all of them when it is at rest. */
