@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32
 from scipy.ndimage import zoom
-from scipy.signal import fftconvolve
 
 from endopilot.atlas import curves as shape
 from endopilot.atlas.heart_reference import HeartFit
@@ -176,6 +175,8 @@ def _back_projected(
     error: Float[np.ndarray, "views bins"], angles: Float[np.ndarray, "views"], grid: Grid, middle: np.ndarray
 ) -> Float32[np.ndarray, "ny nx"]:
     """Return the filtered back-projection of a sinogram (Ram-Lak filter) on the image's pixels, HU."""
+    from scipy.signal import fftconvolve  # slow to import
+
     bins = error.shape[1]
     offset = np.arange(-bins, bins + 1)
     ramp = np.where(offset % 2, -1 / (np.pi * np.where(offset == 0, 1, offset)) ** 2, 0.0)
