@@ -21,7 +21,6 @@ from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import DECISION_PERIOD_S, SUCCESS_MM, Navigation, check_wire_alone
 from endopilot.xray.fluoroscope import Fluoroscope, FluoroscopeConfig, TipMeasurement
-from endopilot.xray.image_fluoroscope import ImageFluoroscope
 
 _CYCLES = round(DECISION_PERIOD_S / CYCLE_S)
 XrayKind = Literal["assumed", "images"]
@@ -95,12 +94,12 @@ class NavigationLoop:
         self.robot = SimulatedRobot(self.simulator, self._limits, drive, seed=seed, ostium_mm=truth.ostium_mm)
         anatomy, device = navigation.anatomy, navigation.device
         if config.xray == "images":
+            from endopilot.xray.image_fluoroscope import ImageFluoroscope  # slow to import
+
             check_wire_alone(navigation, "xray: images: the detector")
-        self.fluoroscope = (
-            ImageFluoroscope(anatomy, device, config.fluoroscope, seed)
-            if config.xray == "images"
-            else Fluoroscope(anatomy, device.tip_radius_mm, config.fluoroscope)
-        )
+            self.fluoroscope = ImageFluoroscope(anatomy, device, config.fluoroscope, seed)
+        else:
+            self.fluoroscope = Fluoroscope(anatomy, device.tip_radius_mm, config.fluoroscope)
         self._random = np.random.default_rng([seed, 2])
         self._track = Track(self.simulator)
         self._periods = int(np.ceil(navigation.seconds / DECISION_PERIOD_S - 1e-9))
@@ -191,11 +190,10 @@ class NavigationLoop:
         return self._track.record(self.navigation, self.robot.driven, self.reason or "stopped", self.gives_up)
 
     def _measure(self, inserted_length: float) -> TipMeasurement | None:
-        if isinstance(self.fluoroscope, ImageFluoroscope):
-            nodes = self.simulator.position[0]
-            return self.fluoroscope.expose(nodes, inserted_length, self._random)
-        tip = self.simulator.tips()[0]
-        return self.fluoroscope.expose(tip, self.simulator.tip_direction[0], inserted_length, self._random)
+        if isinstance(self.fluoroscope, Fluoroscope):
+            tip, heading = self.simulator.tips()[0], self.simulator.tip_direction[0]
+            return self.fluoroscope.expose(tip, heading, inserted_length, self._random)
+        return self.fluoroscope.expose(self.simulator.position[0], inserted_length, self._random)
 
     def _decide(self, observation: Observation, by_hand: Decision | None) -> Decision:
         if by_hand is None:
