@@ -95,6 +95,7 @@ class Session:
         for _, events in history:
             self._relive(events)
         self.world.stop()
+        self._command = (0.0, 0.0)
         self._record(stop="resumed")
 
     def _relive(self, events: Sequence[dict[str, Any]]) -> None:
