@@ -10,7 +10,11 @@
 namespace endopilot {
 
 constexpr double kGripLength = 0.02;   // mm of sliding that turn friction along two tubes from one direction to the other by half
-constexpr double kSlower = 0.5, kFaster = 1.25, kLeastPace = 1.0 / 64;   // of the share of its motion that a drive at its limit makes
+constexpr double kFaster = 1.25, kLeastPace = 1.0 / 64;   // of the share of its motion that a drive makes after it was at its limit
+constexpr double kYield = 20, kMostYield = 40;   // mm/s by which a drive at twice its limit gives way faster with each step, and at most
+constexpr double kLeap = 0.05;         // share of its limit by which a drive's force may pass it in a step that can be shortened
+constexpr double kNear = 0.4;          // share of its limit below which no force passes it in one step
+constexpr int kLeastStride = kTicks / 8;   // no shorter steps than these for the sake of a limit
 
 // Where the tubes are at the step's start and are to be at its end.
 template <class V, int T>
@@ -42,8 +46,10 @@ void Stepper<V, T>::aim_tubes(int l, double weight) {
     const double end = lane.origin.advance + lane.off.advance;
     for (int k = 0; k <= T; ++k) {
         Tube& tube = lane.tubes.tube[k];
-        if (k == lead) tube.pace = 1;
-        const double made = tube.pace < 1 ? tube.advanced + tube.pace * (tube.asked_advance - tube.advanced) : tube.asked_advance;
+        if (k == lead) tube.pace = 1, tube.yield = 0;
+        double made = tube.asked_advance;
+        if (tube.pace < 1 || tube.yield != 0)
+            made = std::max(0.0, tube.advanced + tube.pace * (tube.asked_advance - tube.advanced) + tube.yield * duration(lane));
         tube.end_advance = k == lead ? end : std::min(made, end);
         set(of_tubes_.slide[k], l, (tube.end_advance - tube.advanced) - (end - foremost));
         if (k > 0) set(of_tubes_.grip[k - 1], l, lane.tubes.tube[k - 1].grip);
@@ -195,8 +201,10 @@ V Stepper<V, T>::bundle_moment(int k, int joint, Vec3<V>& moment) const {
 //
 // The inner tubes of an interface carry the force n_i = T_i t_i + Q_i through element i, Q from the slope of their moment. At each node
 // the outer tubes hold them with the force n_i - n_(i-1). Its part across the wire makes friction; that along it is friction.
+//
+// Where `kept` is false only the tension of each bundle at the base is found, and the nodes stay as they were.
 template <class V, int T>
-void Stepper<V, T>::freeze_tubes(int n, Mask<V> mask) {
+void Stepper<V, T>::freeze_tubes(int n, Mask<V> mask, bool kept) {
     const V zero{}, half = broadcast<V>(0.5);
     for (int k = 1; k <= T; ++k) {
         const double friction = tubes_.bore_friction[k], radius = tubes_.radius[k - 1];
@@ -245,12 +253,14 @@ void Stepper<V, T>::freeze_tubes(int n, Mask<V> mask) {
                 tension = select<V>(both > zero, marched, alone);
             }
             of_tubes_.bundle[k - 1] = select<V>(mask & (active_ == broadcast<V>(i + 1)), tension, of_tubes_.bundle[k - 1]);
-            node.tubes.limit[k - 1] = select<V>(on, limit, node.tubes.limit[k - 1]);
-            const V between = (1.0 / rod_.joint_length[i + 1]) * (node.tubes.twist[k - 1] - node_[i + 1].tubes.twist[k - 1]);
-            const V turn = rate + between, before = i > 0 ? rate_ahead : turn;
-            if (k == 1) node.tubes.rate[0] = select<V>(on, rate, node.tubes.rate[0]);
-            node.tubes.rate[k] = select<V>(on, half * (turn + before), node.tubes.rate[k]);
-            rate_ahead = turn;
+            if (kept) {
+                node.tubes.limit[k - 1] = select<V>(on, limit, node.tubes.limit[k - 1]);
+                const V between = (1.0 / rod_.joint_length[i + 1]) * (node.tubes.twist[k - 1] - node_[i + 1].tubes.twist[k - 1]);
+                const V turn = rate + between, before = i > 0 ? rate_ahead : turn;
+                if (k == 1) node.tubes.rate[0] = select<V>(on, rate, node.tubes.rate[0]);
+                node.tubes.rate[k] = select<V>(on, half * (turn + before), node.tubes.rate[k]);
+                rate_ahead = turn;
+            }
             moment = moment_behind;
             tangent = t;
             shear = q;
@@ -281,24 +291,82 @@ void Stepper<V, T>::settle_tubes(int l) {
     }
 }
 
-// The force and torque of each drive after a step. A drive that does not lead and is beyond its limit makes less of its motion from now on.
+// The axial force of each drive, after freeze_tubes.
+template <class V, int T>
+void Stepper<V, T>::tell_forces(int l, double (&force)[T + 1]) const {
+    double pushed = 0;
+    for (int k = 0; k <= T; ++k) {
+        force[k] = (k < T ? -get(of_tubes_.bundle[k], l) : get(base_force_, l)) - pushed;
+        pushed += force[k];
+    }
+}
+
+// By how much a force of drive k is beyond its limit, as a share of that: positive where it pushes, negative where it pulls.
+template <class V, int T>
+double Stepper<V, T>::beyond_limit(int k, double force) const {
+    if (force > tubes_.push_limit[k]) return force / tubes_.push_limit[k] - 1;
+    return force < -tubes_.pull_limit[k] ? force / tubes_.pull_limit[k] + 1 : 0.0;
+}
+
+// Friction between tubes turns within some 0.04 mm, and the drives' forces with it: a step in which one leaps beyond its limit
+// is made again in shorter ones, in which the drive can give way.
+template <class V, int T>
+void Stepper<V, T>::refuse_leaps(int n, Decision (&decision)[W]) {
+    bool any_near = false, near[W] = {};
+    for (int l = 0; l < W; ++l) {
+        const Lane& lane = lane_[l];
+        if (decision[l] != Decision::converged || lane.stride <= kLeastStride) continue;
+        for (int k = 0; k <= T; ++k) {
+            const double most = kNear * std::min(tubes_.push_limit[k], tubes_.pull_limit[k]);
+            near[l] = near[l] || std::abs(get(base_force_, l)) > most || std::abs(lane.tubes.tube[k].force) > most;
+        }
+        any_near = any_near || near[l];
+    }
+    if (!any_near) return;
+    Lane before[W];
+    const TubeLanes<V, T> of_tubes = of_tubes_;
+    Mask<V> tried{};
+    for (int l = 0; l < W; ++l) {
+        if (!near[l]) continue;
+        set_mask<V>(tried, l, true);
+        before[l] = lane_[l];
+        settle_tubes(l);
+    }
+    freeze_tubes(n, tried, false);
+    double force[T + 1];
+    for (int l = 0; l < W; ++l) {
+        if (!near[l]) continue;
+        Lane& lane = lane_[l];
+        lane = before[l];
+        tell_forces(l, force);
+        for (int k = 0; k <= T; ++k) {
+            const double beyond = std::abs(beyond_limit(k, force[k])), was = std::abs(beyond_limit(k, lane.tubes.tube[k].force));
+            if (!(beyond > kLeap && beyond > was)) continue;
+            decision[l] = Decision::restart;
+            lane.extrapolated = false;
+        }
+    }
+    of_tubes_ = of_tubes;
+}
+
+// The force and torque of each drive after a step. A drive that does not lead and is beyond its limit stops and gives way; within it,
+// it takes its motion up again by and by.
 template <class V, int T>
 void Stepper<V, T>::pace_tubes(int l) {
     Lane& lane = lane_[l];
-    double pushed = 0;
+    double force[T + 1], pushed = 0;
+    tell_forces(l, force);
     for (int k = 0; k <= T; ++k) {
         Tube& tube = lane.tubes.tube[k];
-        tube.force = (k < T ? -get(of_tubes_.bundle[k], l) : get(base_force_, l)) - pushed;
+        tube.force = force[k];
         pushed += tube.force;
         tube.torque = k > 0 ? get(of_tubes_.torque[k - 1], l) : get(base_torque_, l);
+        const double beyond = beyond_limit(k, tube.force);
+        tube.pace = beyond * tube.speed > 0 ? 0.0 : std::min(1.0, kFaster * tube.pace + kLeastPace);
+        tube.yield = beyond == 0 ? 0.5 * tube.yield : std::clamp(tube.yield - kYield * beyond, double{-kMostYield}, double{kMostYield});
+        if (std::abs(tube.yield) < options_.stick_velocity) tube.yield = 0;
     }
     lane.tubes.others = pushed - lane.tubes.tube[lane.tubes.lead].force;
-    for (int k = 0; k <= T; ++k) {
-        Tube& tube = lane.tubes.tube[k];
-        const bool strained = (tube.speed > 0 && tube.force > tubes_.push_limit[k]) || (tube.speed < 0 && tube.force < -tubes_.pull_limit[k]);
-        tube.pace = strained ? kSlower * tube.pace : std::min(1.0, kFaster * tube.pace + kLeastPace);
-        if (tube.pace < kLeastPace) tube.pace = 0;
-    }
 }
 
 template <class V, int T>
@@ -453,6 +521,7 @@ void Stepper<V, T>::load_tubes(int l) {
         tube.slipping = int(from[World::kTubeSlipping]);
         tube.depth = from[World::kTubeDepth];
         tube.pace = from[World::kTubePace];
+        tube.yield = from[World::kTubeYield];
         tube.grip = from[World::kTubeGrip];
         tube.force = from[World::kTubeBaseForce];
         tube.torque = from[World::kTubeBaseTorque];
@@ -478,6 +547,7 @@ void Stepper<V, T>::store_tubes(int l) {
         to[World::kTubeSlipping] = tube.slipping;
         to[World::kTubeDepth] = tube.depth;
         to[World::kTubePace] = tube.pace;
+        to[World::kTubeYield] = tube.yield;
         to[World::kTubeGrip] = tube.grip;
         to[World::kTubeLeads] = k == lane.tubes.lead;
         to[World::kTubeBaseForce] = tube.force;

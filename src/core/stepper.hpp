@@ -62,7 +62,7 @@ struct Tube {
     double slipped, rotation_slipped;                 // commanded in this sample and not made
     double off, from, move;                           // of the rotation, what the unknown counts from the commanded; Newton step
     int slipping;                                     // of the rotation
-    double pace, grip;                                // share of its motion that the drive makes; of friction along the tube around
+    double pace, yield, grip;   // share of its motion that the drive makes, and mm/s that it gives way; of friction along the tube around
     double force, torque;                             // on the tube at its drive, N, N mm
 };
 
@@ -275,7 +275,10 @@ private:
     DriveEnergy tube_drive_energy(const Lane& lane) const;
     bool solve_tube_drives(int l);
     bool release_tubes(int l);
-    void freeze_tubes(int n, Mask<V> mask);
+    void freeze_tubes(int n, Mask<V> mask, bool kept);
+    void tell_forces(int l, double (&force)[T + 1]) const;
+    double beyond_limit(int k, double force) const;
+    void refuse_leaps(int n, Decision (&decision)[W]);
     void load_tubes(int l);
     void store_tubes(int l);
     void read_tube_controls(int l);
@@ -409,6 +412,7 @@ int Stepper<V, T>::pass(Queue& queue) {
         }
     }
     update(n, decision, factor);
+    if constexpr (T > 0) refuse_leaps(n, decision);
     return advance(n, decision, queue);
 }
 

@@ -30,7 +30,8 @@ struct World {
     enum TubeQuantity {
         kTubeInserted, kTubeRotation, kTubeSpeed, kTubeSpin, kTubeLastTurned, kTubeFriction, kTubeSlipping,
         kTubeBaseForce, kTubeBaseTorque, kTubeDriveForce, kTubeDriveTorque, kTubeDepth,
-        kTubePace, kTubeGrip,          // share of its motion that a drive at its limit makes; of friction along the tube around it
+        kTubePace, kTubeGrip,          // share of its motion that a drive makes after its limit; of friction along the tube around it
+        kTubeYield,                    // mm/s that a drive beyond its limit gives way
         kTubeLeads,                    // 1: its tip is the foremost
         kTubeSlip, kTubeRotationSlip,  // asked in the last sample and not made, mm, rad
         kTubeSize

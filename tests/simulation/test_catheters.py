@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import bend
 import numpy as np
 import pytest
 
@@ -175,6 +176,32 @@ def test_drives_keep_their_limits(vessel: Anatomy, catheter: Catheter) -> None:
     assert np.abs(held.catheters.base_torque).max() <= 2e-4 * (1 + 1e-3)
     made = start[0, 2] + 8.0 * 8.0 - held.catheters.slip[0, :, 0].sum()
     assert held.catheters.inserted_length[0, -1, 0] == pytest.approx(made) and held.catheters.slip.sum() > 1.0
+
+
+def test_neither_drive_passes_its_limit_where_both_meet_an_obstacle() -> None:
+    # Rough devices in a bend with a blind end, pushed together, in turn and against each other. Friction
+    # between them turns within 0.04 mm and moves load from one drive to the other.
+    limit = {"push_limit_n": 0.3, "pull_limit_n": 0.3}
+    wire = replace(read_device("workhorse-014"), friction=0.3, **limit)
+    catheter = read_catheter("microcatheter-1.7f")
+    catheter = replace(catheter, bore_friction=0.3, device=replace(catheter.device, friction=0.3, **limit))
+    control = np.zeros((4, 43, 4))
+    phases = (
+        ((20, 6, 6), (8, 0, 0), (12, -8, -8)),
+        ((14, 6, 0), (14, 0, 6), (8, 0, -8), (7, -8, 8)),
+        ((6, 0, 0), (20, 0, 10), (12, 10, 0), (5, -10, 10)),
+        ((10, 8, 0), (12, -6, 12), (12, 12, -6), (9, -10, -10)),
+    )
+    for world, made in enumerate(phases):
+        speeds = np.concatenate([np.tile([a, b], (count, 1)) for count, a, b in made])
+        control[world, : len(speeds), ::2] = speeds
+    start = np.tile([40.0, 0.0, 20.0, 0.0], (4, 1))
+    rollout = endopilot.simulate(bend.vessel(), wire, control, catheters=[catheter], initial=start)
+    motion = rollout.catheters
+    assert rollout.valid.all() and motion is not None
+    assert (np.abs(rollout.slip).sum(axis=1) > 5).any() and (np.abs(motion.slip).sum(axis=1) > 5).any()
+    for force in (rollout.base_force, motion.base_force[..., 0]):
+        assert 0.9 * 0.3 < np.abs(force).max() < 1.1 * 0.3
 
 
 def test_a_rollout_written_as_csv_is_simulated_again(vessel: Anatomy, catheter: Catheter, tmp_path: Path) -> None:
