@@ -5,6 +5,9 @@ and from level 5 on in version 1, a search must also reach the target with a wal
 search knows the full state of the wire. It stops before each fork and tries twelve directions of the tip; a policy has
 neither advantage. The training patients are the first twenty eligible ones of another atlas, without the search.
 
+Of the coaxial tasks' atlases the first twenty eligible patients are taken in which the wire alone, pushed straight on,
+arrives from at most two of eight rotations; no search shows that both together can arrive.
+
 With `--write` the numbers go into the tasks' files.
 """
 
@@ -23,7 +26,7 @@ from endopilot.atlas.atlas import make_patient_tree
 from endopilot.errors import InputError
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import Navigation, Target
-from endopilot.tasks.task import CORE, NEWEST, Task, ladder_tasks, target_in_section, turn_rad
+from endopilot.tasks.task import CORE, NEWEST, LadderVersion, Task, ladder_tasks, target_in_section, turn_rad
 from endopilot.types import TipProjection, VesselTree
 
 WANTED = 20
@@ -65,6 +68,8 @@ ELIGIBLE: dict[str, Callable[[VesselTree, dict[str, Any], Target], bool]] = {
     "marginal": _turns("12", 40),
     "anterior-cerebral": _turns("A1", 70),
     "carotid": _turns("left common carotid", 90),
+    "follow": _turns("4", 40),
+    "steep-carotid": _turns("left common carotid", 90),
 }
 
 
@@ -148,6 +153,22 @@ def _never(tip: TipProjection) -> np.ndarray:
     return np.zeros(tip.abscissa.shape, dtype=bool)
 
 
+def wire_alone_fails(navigation: Navigation) -> bool:
+    """Return whether the wire, pushed straight on without its catheter, arrives from at most two of eight rotations."""
+    navigation = replace(navigation, catheters=(), arrives="wire", start_catheter_mm=0.0)
+    count = 8
+    simulator = Simulator(navigation.anatomy, navigation.device, worlds=count, config=CORE)
+    turn = 2 * np.pi * np.arange(count) / count
+    simulator.reset(inserted_length=np.full(count, navigation.start_inserted_mm), rotation=turn)
+    longest = float(navigation.anatomy.tree.longest_path().abscissa[-1]) + 19.0
+    deepest, arrived = min(navigation.target.abscissa + 20.0, longest), np.zeros(count, dtype=bool)
+    for _ in range(round(deepest / (PUSH_MM_S * PERIOD_S))):
+        speed = np.clip((deepest - simulator.inserted_length) / PERIOD_S, 0.0, PUSH_MM_S)
+        simulator.step(np.column_stack([speed, np.zeros(count)]), PERIOD_S)
+        arrived |= navigation.reached(simulator.project())
+    return int(arrived.sum()) <= 2
+
+
 def choose(task: Task, seed: int, *, search: bool) -> tuple[list[int], int, int]:
     """Return the chosen patients' numbers, how many were eligible and how many were examined."""
     atlas = task.atlas(seed)
@@ -164,7 +185,9 @@ def choose(task: Task, seed: int, *, search: bool) -> tuple[list[int], int, int]
             continue
         count += 1
         patients = replace(task.ladder, seed=seed, numbers=(number,))
-        if not search or _Search(task.navigation(task.patient(patients, 0))).reachable():
+        navigation = task.navigation(task.patient(patients, 0)) if search else None
+        hard = wire_alone_fails if task.catheter else lambda given: _Search(given).reachable()
+        if navigation is None or hard(navigation):
             chosen.append(number)
             if len(chosen) == WANTED:
                 return chosen, count, number + 1
@@ -175,17 +198,18 @@ def main() -> None:
     """Choose, print, and write if asked to."""
     parser = ArgumentParser(description=__doc__, formatter_class=RawDescriptionHelpFormatter)
     parser.add_argument("tasks", nargs="*", metavar="TASK", help="all if none is given")
-    parser.add_argument("--version", type=int, choices=(1, 2), default=NEWEST, help="of the ladder")
+    parser.add_argument("--version", choices=("1", "2", "coaxial"), default=str(NEWEST), help="of the ladder")
     parser.add_argument("--write", action="store_true", help="write the numbers into the tasks' files")
     given = parser.parse_args()
-    for task in ladder_tasks(given.version):
+    version: LadderVersion = "coaxial" if given.version == "coaxial" else 1 if given.version == "1" else 2
+    for task in ladder_tasks(version):
         if given.tasks and task.name not in given.tasks:
             continue
         path = (
             Path(__file__).parents[1] / "src" / "endopilot" / "tasks" / f"ladder_{task.version}" / f"{task.name}.yaml"
         )
         text = path.read_text(encoding="utf-8")
-        search = task.version == 2 or task.level >= 5
+        search = task.version != 1 or task.level >= 5
         for role, patients, searched in (("ladder", task.ladder, search), ("training", task.training, False)):
             chosen, eligible, examined = choose(task, patients.seed, search=searched)
             print(f"{task.name}, {role}: {WANTED} of {eligible} eligible patients, of {examined}: {chosen}", flush=True)

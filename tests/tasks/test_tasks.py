@@ -11,12 +11,14 @@ import pytest
 import endopilot.env
 from endopilot.atlas.atlas import AtlasConfig, make_patient_tree
 from endopilot.errors import InputError
+from endopilot.ladder.scores import COAXIAL
 from endopilot.settings import read_settings
 from endopilot.tasks import task
 from endopilot.tasks.task import Task, find_task, ladder_tasks, target_in_section
 
 FOLDER = Path(task.__file__).parent
-FILES = sorted(FOLDER.glob("ladder_[12]/*.yaml"))
+FILES = sorted(FOLDER.glob("ladder_*/*.yaml"))
+VERSIONS = (1, 2, "coaxial")
 
 
 def test_there_are_twelve_tasks_one_a_level_each_with_its_environment():
@@ -35,8 +37,19 @@ def test_a_task_has_twenty_patients_and_others_to_learn_on(path):
     task = read_settings(path, Task)
     assert len(set(task.ladder.numbers)) == len(set(task.training.numbers)) == 20
     assert task.ladder.seed != task.training.seed
-    seeds = [other.ladder.seed for version in (1, 2) for other in ladder_tasks(version)]
-    assert len(set(seeds)) == 24 and task.training.seed not in seeds
+    seeds = [other.ladder.seed for version in VERSIONS for other in ladder_tasks(version)]
+    assert len(set(seeds)) == len(seeds) == len(FILES) and task.training.seed not in seeds
+
+
+def test_coaxial_tasks_are_done_by_the_tip_of_a_catheter():
+    tasks = ladder_tasks("coaxial")
+    assert [each.level for each in tasks] == list(COAXIAL)
+    for each in tasks:
+        tree, _ = make_patient_tree(each.atlas(each.ladder.seed), each.ladder.numbers[0])
+        target = target_in_section(tree, each.section, each.depth_mm)
+        assert each.start_catheter_mm < each.start_inserted_mm < target.abscissa
+    navigation = find_task("follow", "coaxial").ladder_navigation(0)
+    assert navigation.arrives == "catheter" and [c.name for c in navigation.catheters] == ["microcatheter-1.7f"]
 
 
 @pytest.mark.parametrize("name", ["straight", "crux", "carotid"])
@@ -60,7 +73,7 @@ def test_a_ladder_navigation_is_the_same_every_time():
 @pytest.mark.parametrize(
     ("old", "new", "line"),
     [
-        ("level: 6", "level: 17", "level: 17; give a whole number from 1 to 16"),
+        ("level: 6", "level: 15", "level: 15; give a whole number from 1 to 14"),
         ("seconds: 90", "seconds: -1", "seconds: -1; give a positive number"),
         ("force_limit_n: 0.2", "force_limit_n: .nan", "force_limit_n: nan; give a positive number"),
         ("anatomy: rca", "anatomy: knee", "anatomy: 'knee'; choose from"),

@@ -17,12 +17,12 @@ _LOOKS = 5
 of a second."""
 
 
-def drive_period(simulator: Simulator, control: Float[np.ndarray, "worlds 2"]) -> Step:
+def drive_period(simulator: Simulator, control: Float[np.ndarray, "worlds numbers"]) -> Step:
     """Drive all worlds for a decision period; a world that fails stays where it was.
 
     Args:
         simulator: of the wires.
-        control: mm/s and rad/s of each.
+        control: mm/s and rad/s of each wire, then of its catheters.
 
     Returns:
         The worlds at the end of the period, but with the largest `contact_force_max` within it.
