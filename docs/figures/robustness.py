@@ -1,6 +1,7 @@
 """Write the figures of `endopilot bench robustness --json > FILE` into docs/simulation.md.
 
-`python docs/figures/robustness.py FILE`. The run itself takes half an hour on two quiet cores.
+`python docs/figures/robustness.py FILE`, or `... FILE catheters` for a run with `--catheters`. Each run takes half
+an hour on two quiet cores.
 """
 
 from __future__ import annotations
@@ -10,7 +11,6 @@ import sys
 from pathlib import Path
 
 PAGE = Path(__file__).parents[1] / "simulation.md"
-BEGIN, END = "<!-- robustness:begin -->", "<!-- robustness:end -->"
 
 
 def text(measured: dict) -> str:
@@ -33,12 +33,13 @@ def text(measured: dict) -> str:
     return "\n".join([*lines, "", "Invalid worlds:", "", *(f"- {line}" for line in failed or ["none"])])
 
 
-def main(file: str) -> None:
-    """Replace what stands between the page's marks."""
+def main(file: str, kind: str = "robustness") -> None:
+    """Replace what stands between the page's marks of one kind."""
+    begin, end = f"<!-- {kind}:begin -->", f"<!-- {kind}:end -->"
     page = PAGE.read_text(encoding="utf-8")
     figures = text(json.loads(Path(file).read_text(encoding="utf-8")))
-    PAGE.write_text(f"{page.split(BEGIN)[0]}{BEGIN}\n{figures}\n{END}{page.split(END)[1]}", encoding="utf-8")
+    PAGE.write_text(f"{page.split(begin)[0]}{begin}\n{figures}\n{end}{page.split(end)[1]}", encoding="utf-8")
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    main(*sys.argv[1:])

@@ -12,13 +12,16 @@ import pytest
 from endopilot.anatomy.io import write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.benchmarks import robustness
-from endopilot.benchmarks.robustness import MANOEUVRES, RobustnessConfig, measure_robustness, robust_controls
+from endopilot.benchmarks.manoeuvres import MANOEUVRES, paired_controls, robust_controls, stacks_of
+from endopilot.benchmarks.robustness import RobustnessConfig, measure_robustness
 from endopilot.errors import InputError
 from endopilot.files import read_json
+from endopilot.simulation.catheter import read_catheter
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import Device, read_device
 from endopilot.simulation.device_files import list_devices
 from endopilot.simulation.simulate import simulate
+from endopilot.simulation.tubes import Stack
 
 DEVICE = read_device("workhorse-014")
 
@@ -68,6 +71,37 @@ def test_the_manoeuvres_push_beyond_the_end_and_pull_fully_out(patient) -> None:
     assert np.ptp(control[..., 1], axis=1).min() > 1  # all turn too
 
 
+def test_wire_and_catheter_have_manoeuvres_of_their_own_and_go_in_again(patient) -> None:
+    stack = Stack(DEVICE, (read_catheter("microcatheter-2.4f"),))
+    initial, control = paired_controls(patient, stack, rollouts=16, samples=120, seed=0)
+    assert initial.shape == (16, 4) and control.shape == (16, 120, 4)
+    inserted = initial[:, None, ::2] + 0.5 * np.cumsum(control[..., ::2], axis=1)
+    assert inserted.min() > -1e-9
+    out = (inserted[:, 101] < 1e-9) & (inserted[:, -1] > 10)  # pulled out, and in again
+    np.testing.assert_array_equal(out.sum(axis=0), [8, 8])
+    assert (out.all(axis=1)).any() and (out[:, 0] != out[:, 1]).any()
+    ahead = inserted[..., 0] > inserted[..., 1]
+    assert (ahead.any(axis=1) & ~ahead.all(axis=1)).sum() > 8  # their ends cross
+
+
+def test_pairs_are_random_and_fit_into_each_other() -> None:
+    drawn = [stacks_of(index, seed=1, catheters=True) for index in range(6)]
+    names = [[tuple(device.name for device in stack.devices) for stack in stacks] for stacks in drawn]
+    assert all(len(set(pairs)) == 5 for pairs in names) and len({tuple(pairs) for pairs in names}) == 6
+    for stack in (stack for stacks in drawn for stack in stacks):
+        assert stack.wire.diameter_mm < stack.catheters[0].inner_diameter_mm
+    again = stacks_of(3, seed=1, catheters=True)
+    assert [stack.devices for stack in again] == [stack.devices for stack in drawn[3]]
+
+
+def test_pairs_are_driven_and_told_by_name(tmp_path: Path) -> None:
+    config = replace(small(tmp_path / "run"), rollouts=5, seconds=5.0, catheters=True)
+    measured = measure_robustness(config)
+    assert measured["rollouts"] + len(measured["did_not_fit"]) == 5 and measured["invalid"] == 0
+    pairs = {" in ".join(device.name for device in stack.devices) for stack in stacks_of(0, seed=3, catheters=True)}
+    assert set(measured["by_device"]) <= pairs and measured["largest_push_n"] > 0
+
+
 def test_non_finite_numbers_in_valid_worlds_are_counted(patient) -> None:
     initial, control = robust_controls(patient, DEVICE, rollouts=2, samples=2, seed=0)
     rollout = simulate(patient, DEVICE, control, initial=initial, config=SimulatorConfig(threads=1))
@@ -90,9 +124,9 @@ class Fatal(Device):
 def test_a_crash_is_counted_and_survived(tmp_path: Path) -> None:
     config = small(tmp_path)
     with robustness._Worker() as worker:
-        worker.run(tmp_path / "0.npz", config, 0, Fatal(**vars(DEVICE)), 1)
-        worker.run(tmp_path / "1.npz", config, 0, DEVICE, 10**12)  # more than any memory holds
-        worker.run(tmp_path / "2.npz", replace(config, seconds=5.0), 0, DEVICE, 1)
+        worker.run(tmp_path / "0.npz", config, 0, Stack(Fatal(**vars(DEVICE))), 1)
+        worker.run(tmp_path / "1.npz", config, 0, Stack(DEVICE), 10**12)  # more than any memory holds
+        worker.run(tmp_path / "2.npz", replace(config, seconds=5.0), 0, Stack(DEVICE), 1)
     assert "the process died" in read_json(tmp_path / "0.json")["crash"]
     assert "MemoryError" in read_json(tmp_path / "1.json")["crash"]
     assert read_json(tmp_path / "2.json") == {"anatomy": "rca-3-0000", "invalid": []}
@@ -115,7 +149,7 @@ def test_a_crash_and_an_invalid_world_miss_their_bars(tmp_path: Path) -> None:
     np.savez(first, **vars(chunk))
     robustness.write_json(first.with_suffix(".json"), {"anatomy": "rca", "invalid": ["did not converge"]})
     robustness.write_json(second.with_suffix(".json"), {"anatomy": "rca", "crash": "patient 0: the process died"})
-    measured = robustness._summarise(config, [read_device(name) for name in list_devices()])
+    measured = robustness._summarise(config)
     assert [row["value"] for row in measured["figures"]] == pytest.approx([1.0, 0.2, 2, 1])
     assert not any(row["passed"] for row in measured["figures"])
     assert measured["invalid_worlds"] == ["did not converge"]

@@ -2,8 +2,9 @@
 
 Every device is driven through every anatomy that it fits, synthetic ones or given ones, with four kinds of controls in
 equal shares: random within the vessel, random beyond its end, pushed against its end, and random and then pulled out. A
-chunk is one anatomy and one device. It runs in a separate process, so that a crash is counted and survived, and writes
-one small file. An interrupted run goes on with the missing chunks.
+chunk is one anatomy and one device, or a pair of a wire and a catheter around it, each with a drive of its own. It runs
+in a separate process, so that a crash is counted and survived, and writes one small file. An interrupted run goes on
+with the missing chunks.
 """
 
 from __future__ import annotations
@@ -25,34 +26,25 @@ from jaxtyping import Bool, Float, Int
 from endopilot import __version__, _core
 from endopilot.anatomy.io import read_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
+from endopilot.benchmarks.manoeuvres import MANOEUVRES, name_of, paired_controls, stacks_of
 from endopilot.errors import InputError
 from endopilot.files import read_json, sha256, write_json, writing
 from endopilot.parallel import follow_the_parent
 from endopilot.progress import progress
 from endopilot.runs import claim
 from endopilot.settings import Count, CountOrZero, Within, settings
+from endopilot.simulation.catheter import list_catheters, read_catheter
 from endopilot.simulation.config import SimulatorConfig, wall_stiffness
-from endopilot.simulation.controls import ControlConfig, random_controls
-from endopilot.simulation.device import Device, check_fits, read_device
+from endopilot.simulation.device import read_device
 from endopilot.simulation.device_files import list_devices
-from endopilot.simulation.drive_limits import within_travel
 from endopilot.simulation.simulate import WALL_FORCE_LIMIT_N, simulate, why_invalid
+from endopilot.simulation.tubes import Stack
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, Rollout
 
 MOST_INVALID_SHARE = 1e-3
 """Bar: share of the worlds that may be invalid."""
 MOST_PENETRATION_MM = 0.05
 """Bar: 99.9th percentile of the penetration over all valid samples, mm."""
-MANOEUVRES = ("within", "beyond", "against the end", "pulled out")
-"""Rollout i of a chunk is of kind i modulo 4."""
-BEYOND = 1.3
-"""The last three kinds insert up to this multiple of the longest path."""
-_PUSH_MM_S = 8.0
-"""Speed of the push against the vessel's end, mm/s."""
-_PULL_MM_S = 20.0
-"""Speed at which a wire is pulled out, mm/s; below every device's limit."""
-_PULL_AT = 0.6
-"""Share of the rollout after which it is pulled out."""
 
 
 @settings
@@ -65,6 +57,8 @@ class RobustnessConfig:
     """Number of synthetic anatomies, if none are given."""
     given: tuple[Path, ...] = ()
     """Folders of anatomies of your own, made by `endopilot anatomy`."""
+    catheters: bool = False
+    """Put a catheter around each wire: five random pairs of shipped ones for each anatomy."""
     seed: Annotated[int, Within(0, 2**63 - 1)] = 0
     """Seed of the anatomies and the controls."""
     seconds: Annotated[float, Within(5, 3600)] = 60.0
@@ -116,89 +110,49 @@ def measure_robustness(config: RobustnessConfig) -> dict[str, Any]:
         InputError: the folder belongs to another run, such as one of another build of the core, or cannot be written;
             a given folder holds no anatomy.
     """
-    devices = [read_device(name) for name in list_devices()]
-    claim(config.folder, "endopilot bench robustness", **_identity(config, devices))
+    claim(config.folder, "endopilot bench robustness", **_identity(config))
     anatomies = len(config.given) or config.anatomies
     share = -(-config.rollouts // anatomies)
-    with progress("Rollouts", total=anatomies * len(devices)) as advance, _Worker() as worker:
+    with progress("Rollouts", total=anatomies * len(_stacks(config, 0))) as advance, _Worker() as worker:
         for index in range(anatomies):
-            for place, device in enumerate(devices):
+            stacks = _stacks(config, index)
+            for place, stack in enumerate(stacks):
                 # the remainder of the share falls to other devices in each anatomy
-                count = (share + (place + index) % len(devices)) // len(devices)
-                path = _path(config, index, device)
+                count = (share + (place + index) % len(stacks)) // len(stacks)
+                path = _path(config, index, stack)
                 if count > 0 and not _done(path):
-                    worker.run(path, config, index, device, count)
-                advance(remark=f"{device.name}, anatomy {index}")
-    return _summarise(config, devices)
+                    worker.run(path, config, index, stack, count)
+                advance(remark=f"{name_of(stack)}, anatomy {index}")
+    return _summarise(config)
 
 
-def robust_controls(
-    anatomy: Anatomy, device: Device, *, rollouts: int, samples: int, seed: int
-) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n samples 2"]]:
-    """Return initial states and controls of the four manoeuvres in turn; see `MANOEUVRES`.
-
-    Args:
-        anatomy: the vessel.
-        device: the wire, whose limits are kept.
-        rollouts: their number.
-        samples: sample periods of each.
-        seed: key of the random streams.
-    """
-    longest = float(anatomy.tree.longest_path().abscissa[-1])
-    config = ControlConfig(
-        max_velocity_mm_s=min(12.0, device.max_velocity_mm_s), max_rotation_rad_s=min(3.0, device.max_rotation_rad_s)
-    )
-    drawn = [
-        random_controls(config, n_sequences=rollouts, n_samples=samples, seed=seed, max_inserted_length_mm=length)
-        for length in (longest, BEYOND * longest)
-    ]
-    kind = np.arange(rollouts) % len(MANOEUVRES)
-    initial, control = (np.where(_rows(kind == 0, near), near, far) for near, far in zip(*drawn, strict=True))
-    turn = control[..., 1].copy()
-    pull = round(_PULL_AT * samples)
-    for rollout in np.flatnonzero(kind >= 2):
-        if kind[rollout] == 2:
-            control[rollout, :pull, 0] = _PUSH_MM_S
-        control[rollout, pull:, 0] = -_PULL_MM_S
-        inserted = initial[rollout, 0]
-        for sample in control[rollout]:
-            sample[0] = within_travel(sample[0], inserted, SAMPLE_PERIOD_S, travel_mm=(0.0, BEYOND * longest))
-            inserted += SAMPLE_PERIOD_S * sample[0]
-    control[..., 1] = turn
-    return initial, control
-
-
-def _rows(chosen: np.ndarray, like: np.ndarray) -> np.ndarray:
-    return chosen.reshape(-1, *[1] * (like.ndim - 1))
-
-
-def run_chunk(path: Path, config: RobustnessConfig, index: int, device: Device, rollouts: int) -> None:
-    """Simulate the rollouts of one anatomy and one device, and write the results to `path` and beside it.
+def run_chunk(path: Path, config: RobustnessConfig, index: int, stack: Stack, rollouts: int) -> None:
+    """Simulate the rollouts of one anatomy and one device or pair, and write the results to `path` and beside it.
 
     Args:
         path: file of the chunk, `.npz`; a `.json` of the same name lists the invalid worlds.
         config: length, seed and threads.
         index: number of the anatomy.
-        device: the wire.
+        stack: the wire, and the catheter around it if there is one.
         rollouts: number of rollouts.
     """
     anatomy = _anatomy(config, index)
     try:
-        check_fits(device, anatomy)
+        stack.check(anatomy)
     except InputError as error:
         write_json(path.with_suffix(".json"), {"anatomy": anatomy.name, "misfit": str(error)})
         return
     began = time.process_time()
     samples = round(config.seconds / SAMPLE_PERIOD_S)
     seed = int(np.random.SeedSequence([config.seed, index]).generate_state(1, np.uint64)[0])
-    initial, control = robust_controls(anatomy, device, rollouts=rollouts, samples=samples, seed=seed)
+    initial, control = paired_controls(anatomy, stack, rollouts=rollouts, samples=samples, seed=seed)
     simulator = SimulatorConfig(threads=config.threads)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # invalid worlds are listed below, each with its reason
-        rollout = simulate(anatomy, device, control, initial=initial, config=simulator)
-    chunk = _describe(anatomy, rollout, wall_stiffness(simulator, device.push_limit_n), time.process_time() - began)
+        rollout = simulate(anatomy, stack.wire, control, catheters=stack.catheters, initial=initial, config=simulator)
+    chunk = _describe(anatomy, rollout, wall_stiffness(simulator, stack.push_limit_n), time.process_time() - began)
     invalid = [
-        f"{anatomy.name}, {device.name}, rollout {world} ({MANOEUVRES[world % len(MANOEUVRES)]}): "
+        f"{anatomy.name}, {name_of(stack)}, rollout {world} ({MANOEUVRES[world % len(MANOEUVRES)]}): "
         + why_invalid(rollout, world)
         for world in np.flatnonzero(rollout.reason).tolist()
     ]
@@ -222,18 +176,32 @@ def _describe(anatomy: Anatomy, rollout: Rollout, wall_n_mm: float, seconds: flo
         ],
         axis=-1,
     )
+    force, torque = rollout.base_force[..., None], rollout.base_torque[..., None]
+    slipped = (rollout.slip != 0) | (rollout.rotation_slip != 0)
+    if (catheters := rollout.catheters) is not None:
+        force = np.concatenate([force, catheters.base_force], axis=-1)
+        torque = np.concatenate([torque, catheters.base_torque], axis=-1)
+        slipped |= (catheters.slip != 0).any(axis=-1) | (catheters.rotation_slip != 0).any(axis=-1)
+        others = (catheters.base_force, catheters.base_torque, catheters.inserted_length, catheters.rotation)
+        numbers = np.concatenate([numbers, *others, *np.moveaxis(catheters.tip_position, 2, 0)], axis=-1)
     bad = (~np.isfinite(numbers) & rollout.valid[..., None]).sum(axis=(1, 2))
     return Chunk(
         penetration_mm=(rollout.contact_force_max / wall_n_mm).astype(np.float32),
-        base_force_n=rollout.base_force.astype(np.float32),
-        base_torque_n_mm=rollout.base_torque.astype(np.float32),
+        base_force_n=_largest(force).astype(np.float32),
+        base_torque_n_mm=_largest(torque).astype(np.float32),
         wall_force_n=rollout.wall_force.astype(np.float32),
         to_end_mm=(end[rollout.tip.branch] - rollout.tip.abscissa).astype(np.float32),
-        slipped=(rollout.slip != 0) | (rollout.rotation_slip != 0),
+        slipped=slipped,
         valid=rollout.valid,
         non_finite=bad,
         seconds=seconds,
     )
+
+
+def _largest(loads: Float[np.ndarray, "rollouts samples drives"]) -> Float[np.ndarray, "rollouts samples"]:
+    """Return the load of the drive that bears most."""
+    most = np.abs(np.nan_to_num(loads)).argmax(axis=-1)
+    return np.take_along_axis(loads, most[..., None], axis=-1)[..., 0]
 
 
 @lru_cache(maxsize=1)
@@ -255,7 +223,7 @@ class _Worker:
             for process in running:
                 process.terminate()
 
-    def run(self, path: Path, config: RobustnessConfig, index: int, device: Device, rollouts: int) -> None:
+    def run(self, path: Path, config: RobustnessConfig, index: int, stack: Stack, rollouts: int) -> None:
         """Simulate a chunk; if that raises or ends the process, record the chunk as crashed.
 
         Raises:
@@ -265,42 +233,49 @@ class _Worker:
             context = multiprocessing.get_context("spawn")
             self._pool = ProcessPoolExecutor(1, mp_context=context, initializer=follow_the_parent)
         try:
-            self._pool.submit(run_chunk, path, config, index, device, rollouts).result()
+            self._pool.submit(run_chunk, path, config, index, stack, rollouts).result()
         except InputError:
             raise
         except Exception as error:  # a crash is what is being counted
             what = "the process died" if isinstance(error, BrokenProcessPool) else f"{type(error).__name__}: {error}"
             name = config.given[index].name if config.given else f"patient {index}"
-            write_json(path.with_suffix(".json"), {"anatomy": name, "crash": f"{name}, {device.name}: {what}"})
+            write_json(path.with_suffix(".json"), {"anatomy": name, "crash": f"{name}, {name_of(stack)}: {what}"})
             self._pool.shutdown(wait=False)
             self._pool = None
 
 
-def _path(config: RobustnessConfig, index: int, device: Device) -> Path:
-    return Path(config.folder) / f"{index:04d}-{device.name}.npz"
+def _stacks(config: RobustnessConfig, index: int) -> list[Stack]:
+    return stacks_of(index, seed=config.seed, catheters=config.catheters)
+
+
+def _path(config: RobustnessConfig, index: int, stack: Stack) -> Path:
+    return Path(config.folder) / f"{index:04d}-{'-'.join(device.name for device in stack.devices)}.npz"
 
 
 def _done(path: Path) -> bool:
     return path.with_suffix(".json").exists()  # written last
 
 
-def _identity(config: RobustnessConfig, devices: list[Device]) -> dict[str, Any]:
+def _identity(config: RobustnessConfig) -> dict[str, Any]:
     """Return what the results of the chunks follow from."""
+    devices = [read_device(name) for name in list_devices()]
+    catheters = [read_catheter(name) for name in list_catheters() if config.catheters]
     return {
         "config": {name: value for name, value in asdict(config).items() if name not in ("threads", "folder", "given")},
         "given": [read_anatomy(folder).identity for folder in config.given],
         "devices": {device.name: device for device in devices},
+        "catheters": {catheter.name: catheter for catheter in catheters},
         "core_sha256": sha256(Path(_core.__file__)),
         "version": __version__,
     }
 
 
-def _summarise(config: RobustnessConfig, devices: list[Device]) -> dict[str, Any]:
+def _summarise(config: RobustnessConfig) -> dict[str, Any]:
     tallies: dict[tuple[str, str], _Tally] = {}
     groupings = ("by_device", "by_manoeuvre", "by_anatomy")
     invalid, crashed, misfits = [], [], []
     non_finite, seconds = 0, 0.0
-    for device, record, chunk in _results(config, devices):
+    for stack, record, chunk in _results(config):
         invalid.extend(record.get("invalid", []))
         crashed.extend([record["crash"]] if "crash" in record else [])
         misfits.extend([record["misfit"]] if "misfit" in record else [])
@@ -309,7 +284,7 @@ def _summarise(config: RobustnessConfig, devices: list[Device]) -> dict[str, Any
         non_finite += int(chunk.non_finite.sum())
         seconds += float(chunk.seconds)
         kind = np.arange(len(chunk.valid)) % len(MANOEUVRES)
-        groups = [("all", "all", slice(None)), ("by_device", device.name, slice(None))]
+        groups = [("all", "all", slice(None)), ("by_device", name_of(stack), slice(None))]
         groups += [("by_anatomy", record["anatomy"], slice(None))]
         groups += [("by_manoeuvre", name, kind == place) for place, name in enumerate(MANOEUVRES)]
         for group, name, rows in groups:
@@ -337,11 +312,11 @@ def _summarise(config: RobustnessConfig, devices: list[Device]) -> dict[str, Any
     }
 
 
-def _results(config: RobustnessConfig, devices: list[Device]) -> Iterator[tuple[Device, dict[str, Any], Chunk | None]]:
-    """Yield the device, the record and the arrays of every chunk on disk."""
+def _results(config: RobustnessConfig) -> Iterator[tuple[Stack, dict[str, Any], Chunk | None]]:
+    """Yield the devices, the record and the arrays of every chunk on disk."""
     for index in range(len(config.given) or config.anatomies):
-        for device in devices:
-            path = _path(config, index, device)
+        for stack in _stacks(config, index):
+            path = _path(config, index, stack)
             if not _done(path):
                 continue
             chunk = None
@@ -350,7 +325,7 @@ def _results(config: RobustnessConfig, devices: list[Device]) -> Iterator[tuple[
                     chunk = Chunk(
                         **{name: arrays[name] if arrays[name].ndim else arrays[name].item() for name in arrays.files}
                     )
-            yield device, read_json(path.with_suffix(".json")), chunk
+            yield stack, read_json(path.with_suffix(".json")), chunk
 
 
 class _Tally:
