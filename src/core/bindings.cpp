@@ -106,6 +106,44 @@ OwnedTubes make_tubes(double spacing, double shear_share, const Array<2>& bend, 
             .torque_limit = values(torque_limit)};
 }
 
+// `coefficients`: cycles × knots × numbers.
+OwnedMotion make_motion(const Array<1>& ostium, const Array<1>& period, const Array<3>& coefficients) {
+    const std::size_t cycles = period.size();
+    require(ostium.size() == 3, "a motion needs an ostium of three numbers");
+    require(cycles >= 1 && cycles <= OwnedMotion::kMostCycles, "a motion has one or two cycles");
+    require(coefficients.shape(0) == cycles && coefficients.shape(1) >= 4 && coefficients.shape(2) == OwnedMotion::kNumbers,
+            "every cycle of a motion needs four knots of twelve numbers at least");
+    OwnedMotion motion{.cycles = int(cycles),
+                       .knots = int(coefficients.shape(1)),
+                       .ostium = vec3(ostium.data()),
+                       .coefficients = std::vector<double>(coefficients.data(), coefficients.data() + coefficients.size())};
+    for (std::size_t c = 0; c < cycles; ++c) motion.period[c] = period.data()[c];
+    for (double period : values(period)) require(period > 0, "a cycle of a motion lasts longer than nothing");
+    return motion;
+}
+
+// The maps of points of the vessel to the laboratory, a row of three by four numbers a time, and the rotations in them.
+nb::tuple placements(const OwnedMotion& motion, const Array<1>& times) {
+    const std::size_t n = times.size();
+    OutputArray<double> maps(12 * n), rotations(4 * n);
+    const nb::tuple result = nb::make_tuple(maps.array(n, 3, 4), rotations.array(n, 4));
+    for (std::size_t k = 0; k < n; ++k) {
+        const Placement vessel = placement(motion, times.data()[k]);
+        const Vec3<double> at = vessel.to_laboratory({0, 0, 0});
+        const Vec3<double> column[4] = {vessel.to_laboratory({1, 0, 0}) - at, vessel.to_laboratory({0, 1, 0}) - at,
+                                        vessel.to_laboratory({0, 0, 1}) - at, at};
+        for (std::size_t c = 0; c < 4; ++c) {
+            maps.data[12 * k + c] = column[c].x;
+            maps.data[12 * k + 4 + c] = column[c].y;
+            maps.data[12 * k + 8 + c] = column[c].z;
+        }
+        const Quaternion<double>& q = vessel.rotation;
+        const double numbers[4] = {q.w, q.v.x, q.v.y, q.v.z};
+        std::copy_n(numbers, 4, rotations.data + 4 * k);
+    }
+    return result;
+}
+
 // All arrays but those of the catheter have a row a vertex; `rival` and `entry` a column a branch.
 Projector make_projector(const Array<2>& point, const Array<2>& tangent, const Array<1>& abscissa, const Array<1>& radius,
                          const Indices<1>& first, const Indices<1>& last, const Indices<1>& branch, const Array<2>& rival,
@@ -175,6 +213,8 @@ NB_MODULE(ENDOPILOT_MODULE, module) {
     module.def("make_tubes", &make_tubes, nb::kw_only(), nb::arg("spacing"), nb::arg("shear_share"), nb::arg("bend"),
                nb::arg("twist"), nb::arg("stretch"), nb::arg("rest"), nb::arg("radius"), nb::arg("bore_friction"),
                nb::arg("push_limit"), nb::arg("pull_limit"), nb::arg("torque_limit"));
+    nb::class_<OwnedMotion>(module, "Motion").def("placements", &placements, nb::arg("times"));
+    module.def("make_motion", &make_motion, nb::kw_only(), nb::arg("ostium"), nb::arg("period"), nb::arg("coefficients"));
     nb::class_<Options>(module, "Options")
         .def(nb::init<>())
         .def_rw("stick_velocity", &Options::stick_velocity)
@@ -193,9 +233,9 @@ NB_MODULE(ENDOPILOT_MODULE, module) {
         .def_rw("introducer_drag", &Options::introducer_drag);
     nb::class_<Simulations>(module, "Simulation")
         .def(nb::init<Rod, std::shared_ptr<LumenMap>, std::shared_ptr<OwnedLoads>, const Array<1>&, const Array<1>&, const Options&,
-                      std::shared_ptr<OwnedTubes>, int>(),
+                      std::shared_ptr<OwnedTubes>, std::shared_ptr<OwnedMotion>, int>(),
              nb::kw_only(), nb::arg("rod"), nb::arg("lumen").none(), nb::arg("loads").none(), nb::arg("origin"),
-             nb::arg("orientation"), nb::arg("options"), nb::arg("tubes").none() = nb::none(), nb::arg("worlds"))
+             nb::arg("orientation"), nb::arg("options"), nb::arg("tubes").none() = nb::none(), nb::arg("motion").none() = nb::none(), nb::arg("worlds"))
         .def("reset", &Simulations::reset, nb::kw_only(), nb::arg("index"), nb::arg("initial"), nb::arg("friction"), nb::arg("sample_period"))
         .def("run", &Simulations::run, nb::kw_only(), nb::arg("control"), nb::arg("force_driven"), nb::arg("time_step"),
              nb::arg("steps_per_sample"), nb::arg("record_shape"), nb::arg("record_attitude"), nb::arg("threads"),
@@ -210,6 +250,7 @@ NB_MODULE(ENDOPILOT_MODULE, module) {
         .def("tubes", &Simulations::tubes)
         .def_prop_ro("nodes", &Simulations::nodes)
         .def("inserted_length", [](Simulations& s) { return s.scalar(World::kInserted); })
+        .def("time", [](Simulations& s) { return s.scalar(World::kTime); })
         .def("active", [](Simulations& s) { return s.scalar(World::kActive); })
         .def("rotation", [](Simulations& s) { return s.scalar(World::kRotation); })
         .def("reason", [](Simulations& s) { return s.scalar(World::kReason); })

@@ -624,6 +624,7 @@ template <class V, int T>
 void Stepper<V, T>::record_tubes(int world, int sample) const {
     const World w = world_[world];
     const std::size_t at = std::size_t(world) * in_.samples + sample;
+    const Pose pose(rod_, base_, motion_, w);
     out_.inserted[at] = w.tube(rod_.nodes, 0)[World::kTubeInserted];
     for (int k = 0; k <= T; ++k) {
         const World::Numbers from = w.tube(rod_.nodes, k);
@@ -636,7 +637,7 @@ void Stepper<V, T>::record_tubes(int world, int sample) const {
         to[5] = from[World::kTubeDriveTorque];
         to[6] = from[World::kTubeSlip];
         to[7] = from[World::kTubeRotationSlip];
-        const Vec3<double> tip = tube_tip(rod_, base_, w, k);
+        const Vec3<double> tip = pose.tube_tip(k);
         const int i = tube_end(rod_, w, k).element;
         to[8] = tip.x, to[9] = tip.y, to[10] = tip.z;
         to[11] = 0;

@@ -157,7 +157,7 @@ struct ContactPoint {
     FrictionState<V> friction;
     WallState<V> wall;
     V normal_force;              // of the wall at the end of the last step, N
-    Vec3<V> evaluated;           // where the wall was last evaluated,
+    Vec3<V> evaluated;           // where in the distance map the wall was last evaluated,
     V clearance;                 // and its distance there, mm; NaN: never
     V gap, last_gap;             // to the wall at the trial and at the accepted point, mm; no more than the reach of contact
 };

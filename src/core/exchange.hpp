@@ -22,9 +22,10 @@ inline void start_world(const Scene& scene, const World& w, double depth, double
     w[World::kFriction] = friction;
     w[World::kStride] = kTicks;
     w[World::kActive] = Base::count_active(scene.rod, inserted, scene.options.free_behind);
+    const Base base = scene.motion.cycles > 0 ? scene.base.moved(placement(scene.motion, w[World::kTime])) : scene.base;
     for (int i = 0; i < int(w[World::kActive]); ++i) {
-        write(w.node(i) + World::kX, scene.base.position(scene.rod, i, inserted));
-        write(w.node(i) + World::kQ, scene.base.attitude(rotation));
+        write(w.node(i) + World::kX, base.position(scene.rod, i, inserted));
+        write(w.node(i) + World::kQ, base.attitude(rotation));
     }
 }
 
@@ -79,9 +80,9 @@ template <class V, int T>
 void Stepper<V, T>::place(int l, int i) {
     const Lane& lane = lane_[l];
     Node<V, T>& n = node_[i];
-    put(n.start, l, base_.position(rod_, i, lane.start.advance));
-    put(n.start_q, l, base_.attitude(lane.start.rotation));
-    put(n.last, l, lane.last.advance * frame(base_.orientation).d3);
+    put(n.start, l, lane.base.position(rod_, i, lane.start.advance));
+    put(n.start_q, l, lane.base.attitude(lane.start.rotation));
+    put(n.last, l, lane.last.advance * frame(lane.base.orientation).d3);
     put(n.last_turn, l, {0, 0, lane.last.rotation});
     clear(n.at_node, l);
     clear(n.at_middle, l);
@@ -96,6 +97,43 @@ void Stepper<V, T>::place(int l, int i) {
         }
     }
     place_base(l, i);
+}
+
+// Carries the start of the coming step with the vessel to where that is at the step's end: what a step moves is then its motion
+// relative to the wall, and so is what friction and drag resist.
+template <class V, int T>
+void Stepper<V, T>::carry(int l) {
+    Lane& lane = lane_[l];
+    const bool waits = lane.sample < 0;
+    const double begins = waits ? lane.time : lane.time + elapsed(lane.tick), ends = waits ? lane.time : lane.time + elapsed(lane.tick + lane.stride);
+    const Carriage carriage(placement(motion_, lane.carried), placement(motion_, ends));
+    const Placement& vessel = carriage.to;
+    lane.carried = ends;
+    lane.strain = strain(placement(motion_, begins), vessel);
+    lane.base = base_.moved(vessel);
+    put(axis_, l, frame(lane.base.orientation).d3);
+    const Frame<double> r = frame(vessel.rotation);
+    const Vec3<double> x{r.d1.x, r.d2.x, r.d3.x}, y{r.d1.y, r.d2.y, r.d3.y}, z{r.d1.z, r.d2.z, r.d3.z};   // columns of its transpose
+    const Vec3<double> a = vessel.shrink * x, b = vessel.shrink * y, c = vessel.shrink * z;
+    put(wall_.row[0], l, {a.x, b.x, c.x});
+    put(wall_.row[1], l, {a.y, b.y, c.y});
+    put(wall_.row[2], l, {a.z, b.z, c.z});
+    put(wall_.at, l, vessel.to_vessel({0, 0, 0}));
+    const auto turn_point = [&](ContactPoint<V>& point) {
+        put(point.offset, l, carriage.direction(take(point.offset, l)));
+        put(point.friction.normal, l, carriage.direction(take(point.friction.normal, l)));
+        put(point.friction.spin_arm, l, carriage.direction(take(point.friction.spin_arm, l)));
+    };
+    for (int i = 0; i < lane.active; ++i) {
+        Node<V, T>& n = node_[i];
+        const Vec3<double> start = take(n.start, l), carried = carriage.point(start);
+        put(n.x, l, carried + carriage.direction(take(n.x, l) - start));
+        put(n.start, l, carried);
+        put(n.q, l, carriage.attitude(take(n.q, l)));
+        put(n.start_q, l, carriage.attitude(take(n.start_q, l)));
+        turn_point(n.at_node);
+        turn_point(n.at_middle);
+    }
 }
 
 // Takes a contact point off the wall.
@@ -132,9 +170,10 @@ void Stepper<V, T>::store(const ContactPoint<V>& point, int l, const World::Numb
 template <class V, int T>
 void Stepper<V, T>::place_base(int l, int i) {
     const Drive& end = lane_[l].end;
+    const Base& base = lane_[l].base;
     Node<V, T>& n = node_[i];
-    put(n.x, l, base_.position(rod_, i, end.advance));
-    put(n.q, l, base_.attitude(end.rotation));
+    put(n.x, l, base.position(rod_, i, end.advance));
+    put(n.q, l, base.attitude(end.rotation));
     put(n.from, l, take(n.x, l));
     put(n.from_q, l, take(n.q, l));
     if constexpr (T > 0) {
@@ -154,6 +193,9 @@ void Stepper<V, T>::load(int l) {
     lane.last_duration = w[World::kLastDuration];
     lane.stride = int(w[World::kStride]);
     lane.active = int(w[World::kActive]);
+    lane.time = lane.carried = w[World::kTime];
+    lane.base = base_;
+    put(axis_, l, frame(base_.orientation).d3);
     lane.slipping = {int(w[World::kSlipping]), int(w[World::kSpinSlipping])};
     set(friction_, l, w[World::kFriction]);
     if constexpr (T > 0) load_tubes(l);
@@ -211,6 +253,7 @@ void Stepper<V, T>::store(int l) {
     w[World::kLastTurned] = lane.last.rotation;
     w[World::kStride] = lane.stride;
     w[World::kActive] = lane.active;
+    w[World::kTime] = motion_.cycles > 0 || lane.sample < 0 ? lane.carried : lane.time + elapsed(lane.tick);
     w[World::kSlipping] = lane.slipping.advance;
     w[World::kSpinSlipping] = lane.slipping.rotation;
     for (int i = 0; i < lane.active; ++i) {
@@ -348,12 +391,13 @@ void Stepper<V, T>::record(int world, int sample, double iterations, double node
     out_.valid[at] = w.valid();
     if constexpr (T > 0) record_tubes(world, sample);
     const auto write = [](double* to, const Vec3<double>& v) { to[0] = v.x, to[1] = v.y, to[2] = v.z; };
-    write(out_.tip_position + 3 * at, position(rod_, base_, w, 0));
-    write(out_.tip_direction + 3 * at, tip_direction(rod_, base_, w));
+    const Pose pose(rod_, base_, motion_, w);
+    write(out_.tip_position + 3 * at, pose.position(0));
+    write(out_.tip_direction + 3 * at, pose.tip_direction());
     for (int i = 0; i < rod_.nodes && (out_.shape || out_.attitude); ++i) {
-        if (out_.shape) write(out_.shape + 3 * (at * rod_.nodes + i), position(rod_, base_, w, i));
+        if (out_.shape) write(out_.shape + 3 * (at * rod_.nodes + i), pose.position(i));
         if (out_.attitude) {
-            const Quaternion<double> q = attitude(base_, w, i);
+            const Quaternion<double> q = pose.attitude(i);
             double* to = out_.attitude + 4 * (at * rod_.nodes + i);
             to[0] = q.w;
             write(to + 1, q.v);

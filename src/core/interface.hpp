@@ -8,6 +8,7 @@
 #include <memory>
 
 #include "lumen.hpp"
+#include "motion.hpp"
 #include "rod.hpp"
 #include "tubes.hpp"
 
@@ -34,6 +35,11 @@ struct Options {
 struct Base {
     Vec3<double> origin;
     Quaternion<double> orientation;
+
+    // The catheter once the vessel has moved there.
+    ENDOPILOT_DEVICE Base moved(const Placement& vessel) const {
+        return {vessel.to_laboratory(origin), vessel.rotation * orientation};
+    }
 
     // Where node i of a wire of some inserted length lies if it follows the drive.
     ENDOPILOT_DEVICE Vec3<double> position(const RodModel& rod, int i, double inserted) const {
@@ -98,6 +104,7 @@ struct Scene {
     Base base;
     Options options;
     Tubes tubes{};
+    Motion motion{};
 };
 
 struct OwnedScene {
@@ -107,6 +114,7 @@ struct OwnedScene {
     Base base;
     Options options;
     std::shared_ptr<const OwnedTubes> tubes{};   // null for a wire alone; else the rod is the mesh that they share
+    std::shared_ptr<const OwnedMotion> motion{};  // null for a vessel that lies still
 };
 
 template <class Place>
@@ -116,7 +124,8 @@ Scene view(const OwnedScene& scene, const Place& place) {
             .loads = scene.loads ? view(*scene.loads, place) : Loads{},
             .base = scene.base,
             .options = scene.options,
-            .tubes = scene.tubes ? view(*scene.tubes, place) : Tubes{}};
+            .tubes = scene.tubes ? view(*scene.tubes, place) : Tubes{},
+            .motion = scene.motion ? view(*scene.motion, place) : Motion{}};
 }
 
 // The inputs of one run: samples of equal length, each with one control for each world.

@@ -19,8 +19,9 @@ template <class Device>
 class Simulation {
 public:
     Simulation(Rod rod, std::shared_ptr<LumenMap> lumen, std::shared_ptr<OwnedLoads> loads, const Array<1>& origin,
-               const Array<1>& orientation, const Options& options, std::shared_ptr<OwnedTubes> tubes, int worlds)
-        : scene_(make_scene(std::move(rod), std::move(lumen), std::move(loads), origin, orientation, options, std::move(tubes))), count_(std::size_t(worlds)) {
+               const Array<1>& orientation, const Options& options, std::shared_ptr<OwnedTubes> tubes, std::shared_ptr<OwnedMotion> motion, int worlds)
+        : scene_(make_scene(std::move(rod), std::move(lumen), std::move(loads), origin, orientation, options, std::move(tubes), std::move(motion))),
+          count_(std::size_t(worlds)) {
         require(worlds >= 1, "a simulation needs at least one world");
         values_.assign(count_ * width(), 0.0);
     }
@@ -132,37 +133,43 @@ public:
     nb::object tips(int device) {
         require(device >= 0 && device < drives(), "there is no such device");
         OutputArray<double> out(3 * count_);
-        for (std::size_t w = 0; w < count_; ++w)
-            put(drives() == 1 ? position(view_.rod, scene_.base, world(w), 0) : tube_tip(view_.rod, scene_.base, world(w), device), out.data + 3 * w);
+        for (std::size_t w = 0; w < count_; ++w) {
+            const Pose pose(view_, world(w));
+            put(drives() == 1 ? pose.position(0) : pose.tube_tip(device), out.data + 3 * w);
+        }
         return out.array(count_, 3);
     }
 
     nb::object tip_directions(int device) {
         require(device >= 0 && device < drives(), "there is no such device");
         OutputArray<double> out(3 * count_);
-        for (std::size_t w = 0; w < count_; ++w)
-            put(drives() == 1 ? tip_direction(view_.rod, scene_.base, world(w)) : tube_direction(view_.rod, scene_.base, world(w), device), out.data + 3 * w);
+        for (std::size_t w = 0; w < count_; ++w) {
+            const Pose pose(view_, world(w));
+            put(drives() == 1 ? pose.tip_direction() : pose.tube_direction(device), out.data + 3 * w);
+        }
         return out.array(count_, 3);
     }
 
-    // `size` numbers of each node, which `write(world, node, to)` writes.
+    // `size` numbers of each node, which `write(world, its pose, node, to)` writes.
     template <class Write>
     nb::object per_node(int size, const Write& write) {
         const std::size_t nodes = std::size_t(scene_.rod.nodes);
         OutputArray<double> out(count_ * nodes * std::size_t(size));
         double* to = out.data;
-        for (std::size_t k = 0; k < count_; ++k)
-            for (int i = 0; i < scene_.rod.nodes; ++i, to += size) write(world(k), i, to);
+        for (std::size_t k = 0; k < count_; ++k) {
+            const Pose pose(view_, world(k));
+            for (int i = 0; i < scene_.rod.nodes; ++i, to += size) write(world(k), pose, i, to);
+        }
         return size == 1 ? out.array(count_, nodes) : out.array(count_, nodes, size);
     }
 
     nb::object positions() {
-        return per_node(3, [this](const World& w, int i, double* to) { put(position(view_.rod, scene_.base, w, i), to); });
+        return per_node(3, [](const World&, const Pose& pose, int i, double* to) { put(pose.position(i), to); });
     }
 
     nb::object attitudes() {
-        return per_node(4, [this](const World& w, int i, double* to) {
-            const Quaternion<double> q = attitude(scene_.base, w, i);
+        return per_node(4, [](const World&, const Pose& pose, int i, double* to) {
+            const Quaternion<double> q = pose.attitude(i);
             to[0] = q.w;
             put(q.v, to + 1);
         });
@@ -170,7 +177,7 @@ public:
 
     // Forces of the wall at each node and at the middle of the element behind it, added up.
     nb::object contacts() {
-        return per_node(1, [](const World& w, int i, double* to) { *to = i < w.active() ? w.force(i) : 0.0; });
+        return per_node(1, [](const World& w, const Pose&, int i, double* to) { *to = i < w.active() ? w.force(i) : 0.0; });
     }
 
     // The numbers of each tube, as World has them: worlds × tubes × TubeQuantity.
@@ -195,11 +202,12 @@ private:
     int drives() const { return scene_.tubes ? scene_.tubes->tubes : 1; }
 
     static OwnedScene make_scene(Rod rod, std::shared_ptr<LumenMap> lumen, std::shared_ptr<OwnedLoads> loads, const Array<1>& origin,
-                                 const Array<1>& orientation, const Options& options, std::shared_ptr<OwnedTubes> tubes) {
+                                 const Array<1>& orientation, const Options& options, std::shared_ptr<OwnedTubes> tubes,
+                                 std::shared_ptr<OwnedMotion> motion) {
         require(origin.size() == 3 && orientation.size() == 4, "the base needs a position and a quaternion");
         require(!loads || int(loads->force.size()) == rod.nodes, "loads need one entry a node of the rod");
         const Base base{.origin = vec3(origin.data()), .orientation = quaternion(orientation.data())};
-        return {std::move(rod), std::move(lumen), std::move(loads), base, options, std::move(tubes)};
+        return {std::move(rod), std::move(lumen), std::move(loads), base, options, std::move(tubes), std::move(motion)};
     }
 
     std::size_t width() const { return World::size(scene_.rod.nodes, drives() - 1); }

@@ -108,7 +108,7 @@ public:
     // `node` and `factor` have one entry a node of the rod. The scene must outlive the stepper.
     ENDOPILOT_DEVICE Stepper(const Scene& scene, const Worlds& worlds, Node<V, T>* node, Factor<V, T>* factor)
         : rod_(scene.rod), lumen_(scene.lumen.pool ? &scene.lumen : nullptr), loads_(scene.loads.force ? &scene.loads : nullptr), tubes_(scene.tubes),
-          base_(scene.base), options_(scene.options), world_(worlds), node_(node), factor_(factor) {}
+          base_(scene.base), options_(scene.options), motion_(scene.motion), world_(worlds), node_(node), factor_(factor) {}
 
     // Sets the inputs and outputs of the next turns and frees all lanes.
     ENDOPILOT_DEVICE void prepare(const Inputs& in, const Outputs& out) {
@@ -183,6 +183,9 @@ private:
         int tick = 0, stride = 0;         // time since the start of the sample, and the step, in time_step / kTicks
         int active = 0;                   // nodes that do not follow the drive
         int iterations = 0, rejections = 0, steps = 0;
+        double time = 0, carried = 0;     // at the start of the sample; to which the step's start is carried with the vessel, s
+        double strain = 0;                // by which the vessel stretches in the step
+        Base base{};                      // at the step's end
         long total_iterations = 0, node_iterations = 0;   // of the sample; the latter count each active node
         double inserted = 0, rotation = 0, speed = 0, spin = 0;   // at the start of the sample; mm/s, rad/s, or N, N mm
         double refused = 0;                    // mm in this sample that the wire is too short for
@@ -202,6 +205,7 @@ private:
     const Tubes& tubes_;
     const Base& base_;
     const Options& options_;
+    const Motion& motion_;
     Inputs in_{};
     Outputs out_{};
     const Worlds world_;
@@ -216,6 +220,8 @@ private:
     // For each lane: settings of the step, then results of a sweep.
     V active_{}, share_{}, inverse_dt_{}, eps_{}, first_{}, damping_{}, friction_{};
     S geometric_{}, tangent_{};
+    Vec3<V> axis_{};               // of the guiding catheter
+    WallPlace<V> wall_{};          // where the vessel is, if it moves
     V jump_scale_x_{}, jump_scale_theta_{};
     V energy_{}, descent_{}, pivot_{}, jump_{}, base_force_{}, base_torque_{};
     Mask<V> accepted_{};           // the last trial was accepted
@@ -259,6 +265,7 @@ private:
     ENDOPILOT_DEVICE static void store(const ContactPoint<V>& point, int l, const World::Numbers& to);
     ENDOPILOT_DEVICE void place(int l, int i);
     ENDOPILOT_DEVICE void place_base(int l, int i);
+    ENDOPILOT_LARGE void carry(int l);
     template <class Queue>
     ENDOPILOT_DEVICE void end_sample(int l, Queue& queue);
     ENDOPILOT_DEVICE void fail(int l);
@@ -331,6 +338,7 @@ template <class V, int T>
 void Stepper<V, T>::begin(int l, bool fresh) {
     Lane& lane = lane_[l];
     const int before = lane.active;
+    if (motion_.cycles > 0) carry(l);
     const double weight = fresh ? 0.0 : duration(lane) / lane.last_duration;
     const Drive ahead{weight * lane.last.advance, weight * lane.last.rotation};
     if constexpr (T > 0) {
@@ -360,7 +368,9 @@ void Stepper<V, T>::begin(int l, bool fresh) {
     lane.first = lane.finite = true;
     lane.extrapolated = !fresh;
     const Drive& there = lane.by_force ? lane.end : lane.origin;
-    const double most_x = options_.largest_jump + kDriveMotion * std::abs(there.advance - lane.start.advance);
+    double slides = std::abs(there.advance - lane.start.advance);
+    if (motion_.cycles > 0) slides += lane.strain * std::max(0.0, lane.start.advance);   // a vessel that stretches slides along the wire
+    const double most_x = options_.largest_jump + kDriveMotion * slides;
     double turns = std::abs(there.rotation - lane.start.rotation);
     if constexpr (T > 0)
         for (int k = 1; k <= T; ++k) turns += std::abs(lane.tubes.tube[k].asked_rotation - lane.tubes.tube[k].turned);

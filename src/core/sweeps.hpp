@@ -54,7 +54,7 @@ void Stepper<V, T>::evaluate(int n) {
 // Elements and joints of `count` nodes from `first` on; the force and torque that the base exerts on the wire.
 template <class V, int T>
 void Stepper<V, T>::add_rod(int first, int count) {
-    const Vec3<double> axis = frame(base_.orientation).d3;
+    const Vec3<V>& axis = axis_;
     for (int k = 0; k < count; ++k) {
         const int i = first + k;
         const Node<V, T> &node = node_[i], &behind = node_[i + 1];
@@ -105,8 +105,7 @@ bool Stepper<V, T>::is_base(int i) const {
 // The gradient and Hessian with respect to the drive's advance and rotation that the nodes ahead carry to one that follows the drive.
 template <class V, int T>
 typename Stepper<V, T>::DriveBlock Stepper<V, T>::drive_block(const Carried<V, T>& carried) const {
-    const Vec3<double> d = frame(base_.orientation).d3;
-    const Vec3<S> axis{broadcast<S>(d.x), broadcast<S>(d.y), broadcast<S>(d.z)};
+    const Vec3<S> axis = narrow(axis_);
     const Vec3<S> across{carried.tx[2][0], carried.tx[2][1], carried.tx[2][2]};
     DriveBlock block{widen<V>(dot(axis, carried.gradient_x)), widen<V>(carried.gradient_theta.z),
                      widen<V>(dot(axis, carried.xx * axis)), widen<V>(dot(axis, across)), widen<V>(carried.tt.zz)};
@@ -141,13 +140,15 @@ bool Stepper<V, T>::add_contact(ContactPoint<V>& point, const Vec3<V>& x, const 
     const V zero{};
     point.last_gap = select<V>(accepted_, point.gap, point.last_gap);
     point.gap = broadcast<V>(kStickyReach);
-    const bool near = near_wall(point, x, radius, on), rubs = any<V>(on & ~(point.friction.limit <= zero));  // a NaN goes on
+    const Vec3<V> at = motion_.cycles > 0 ? wall_.to_vessel(x) : x;   // where the distance map is asked
+    const bool near = near_wall(point, at, radius, on), rubs = any<V>(on & ~(point.friction.limit <= zero));  // a NaN goes on
     if (near) {
-        Distance<V> d = distance_to_wall(*lumen_, x);
+        Distance<V> d = distance_to_wall(*lumen_, at);
+        if (motion_.cycles > 0) wall_.to_laboratory(d.gradient, d.hessian);
         point.gap = minimum<V>(d.value - radius, point.gap);
         const Mask<V> hits = on & (point.last_gap > zero) & (point.gap < zero);
         if (any<V>(hits)) hit_ = select<V>(hits, minimum<V>(hit_, point.last_gap / (point.last_gap - point.gap)), hit_);
-        point.evaluated = x;
+        point.evaluated = at;
         point.clearance = d.value;
         point.wall = {d.value, d.gradient};
         d.value = select<V>(on, d.value, broadcast<V>(Lumen::kDeep));
@@ -258,8 +259,7 @@ void Stepper<V, T>::eliminate_nodes(int first, int count) {
 // Back substitution. Returns the largest displacement (mm) or rotation (rad) of a node; NaN where the solve failed.
 template <class V, int T>
 V Stepper<V, T>::solve(int n) {
-    const Vec3<double> axis = frame(base_.orientation).d3;
-    const Vec3<S> drive_x = narrow(Vec3<V>{axis.x * drive_a_, axis.y * drive_a_, axis.z * drive_a_});
+    const Vec3<S> drive_x = narrow(drive_a_ * axis_);
     const Vec3<S> drive_t{S{}, S{}, narrow(drive_r_)};
     const S active = narrow(active_);
     Vec3<S> x = drive_x, t = drive_t;

@@ -19,6 +19,7 @@ struct World {
         kSlipping, kSpinSlipping,      // 1: the drive slips at its limit forwards, -1: backwards, 0: it grips
         kBaseForce, kBaseTorque, kDriveForce, kDriveTorque,  // N, N mm
         kApproach, kDepth,             // samples left of the approach, and the inserted length it ends at, mm
+        kTime,                         // since the reset, s; the vessel stands still in the approach
         kScalars
     };
     // last increments of position and rotation; the contact points at the node and at the middle of the element behind it
@@ -74,16 +75,6 @@ ENDOPILOT_DEVICE inline Quaternion<double> quaternion(const World::Numbers& p) {
 ENDOPILOT_DEVICE inline void write(const World::Numbers& to, const Vec3<double>& v) { to[0] = v.x, to[1] = v.y, to[2] = v.z; }
 ENDOPILOT_DEVICE inline void write(const World::Numbers& to, const Quaternion<double>& q) { to[0] = q.w, write(to + 1, q.v); }
 
-// Where the wire's curve passes node i: beside the polygon's node.
-ENDOPILOT_DEVICE inline Vec3<double> position(const RodModel& rod, const Base& base, const World& w, int i) {
-    if (i >= w.active()) return base.position(rod, i, w[World::kInserted]);
-    return vec3(w.node(i) + World::kX) + vec3(w.node(i) + (World::kAtNode + World::kOffset));
-}
-
-ENDOPILOT_DEVICE inline Quaternion<double> attitude(const Base& base, const World& w, int i) {
-    return i < w.active() ? quaternion(w.node(i) + World::kQ) : base.attitude(w[World::kRotation]);
-}
-
 // Where tube k ends: in element `element`, at `share` of its length from its distal node.
 struct TubeEnd {
     int element;
@@ -96,25 +87,68 @@ ENDOPILOT_DEVICE inline TubeEnd tube_end(const RodModel& rod, const World& w, in
     return {i, (behind - rod.abscissa[i]) / rod.length[i]};
 }
 
-ENDOPILOT_DEVICE inline Vec3<double> tube_tip(const RodModel& rod, const Base& base, const World& w, int k) {
-    const TubeEnd end = tube_end(rod, w, k);
-    const Vec3<double> ahead = position(rod, base, w, end.element);
-    return ahead + end.share * (position(rod, base, w, end.element + 1) - ahead);
-}
+// A world's wire as it is reported: in the vessel as CT shows it, wherever the vessel has moved.
+class Pose {
+public:
+    ENDOPILOT_DEVICE Pose(const Scene& scene, const World& world) : Pose(scene.rod, scene.base, scene.motion, world) {}
+    ENDOPILOT_DEVICE Pose(const RodModel& rod, const Base& base, const Motion& motion, const World& world)
+        : rod_(rod), world_(world), moves_(motion.cycles > 0), base_(base) {
+        if (!moves_) return;
+        vessel_ = placement(motion, world[World::kTime]);
+        base_ = base.moved(vessel_);
+    }
 
-// The wire's direction at its tip. The first element, of length l, has the direction at its middle; the tip's offset from the
-// polygon is l²/8 times the curvature vector.
-ENDOPILOT_DEVICE inline Vec3<double> tip_direction(const RodModel& rod, const Base& base, const World& w) {
-    Vec3<double> direction = frame(attitude(base, w, 0)).d3;
-    if (w.active() > 0) direction += (4 / rod.length[0]) * vec3(w.node(0) + (World::kAtNode + World::kOffset));
-    return (1 / std::sqrt(dot(direction, direction))) * direction;
-}
+    // Where the wire's curve passes node i: beside the polygon's node.
+    ENDOPILOT_DEVICE Vec3<double> position(int i) const {
+        const Vec3<double> x = i >= world_.active() ? base_.position(rod_, i, world_[World::kInserted])
+                                                    : vec3(world_.node(i) + World::kX) + vec3(world_.node(i) + (World::kAtNode + World::kOffset));
+        return moves_ ? vessel_.to_vessel(x) : x;
+    }
 
-// Tube k's direction where it ends: behind the foremost tip, that of the element there.
-ENDOPILOT_DEVICE inline Vec3<double> tube_direction(const RodModel& rod, const Base& base, const World& w, int k) {
-    const TubeEnd end = tube_end(rod, w, k);
-    return end.element == 0 && end.share <= 0 ? tip_direction(rod, base, w) : frame(attitude(base, w, end.element)).d3;
-}
+    // The element's attitude in the vessel, which turns with the vessel's rotation.
+    ENDOPILOT_DEVICE Quaternion<double> attitude(int i) const {
+        const Quaternion<double> q = in_laboratory(i);
+        return moves_ ? relative(vessel_.rotation, q) : q;
+    }
+
+    // The wire's direction at its tip. The first element, of length l, has the direction at its middle; the tip's offset from the
+    // polygon is l²/8 times the curvature vector.
+    ENDOPILOT_DEVICE Vec3<double> tip_direction() const {
+        Vec3<double> direction = frame(in_laboratory(0)).d3;
+        if (world_.active() > 0) direction += (4 / rod_.length[0]) * vec3(world_.node(0) + (World::kAtNode + World::kOffset));
+        return unit_in_vessel(direction);
+    }
+
+    ENDOPILOT_DEVICE Vec3<double> tube_tip(int k) const {
+        const TubeEnd end = tube_end(rod_, world_, k);
+        const Vec3<double> ahead = position(end.element);
+        return ahead + end.share * (position(end.element + 1) - ahead);
+    }
+
+    // Tube k's direction where it ends: behind the foremost tip, that of the element there.
+    ENDOPILOT_DEVICE Vec3<double> tube_direction(int k) const {
+        const TubeEnd end = tube_end(rod_, world_, k);
+        if (end.element == 0 && end.share <= 0) return tip_direction();
+        const Vec3<double> direction = frame(in_laboratory(end.element)).d3;
+        return moves_ ? unit_in_vessel(direction) : direction;
+    }
+
+private:
+    const RodModel& rod_;
+    const World world_;
+    const bool moves_;
+    Base base_;
+    Placement vessel_{};
+
+    ENDOPILOT_DEVICE Vec3<double> unit_in_vessel(Vec3<double> direction) const {
+        if (moves_) direction = vessel_.shrink * turn_back(vessel_.rotation, direction);
+        return (1 / std::sqrt(dot(direction, direction))) * direction;
+    }
+
+    ENDOPILOT_DEVICE Quaternion<double> in_laboratory(int i) const {
+        return i < world_.active() ? quaternion(world_.node(i) + World::kQ) : base_.attitude(world_[World::kRotation]);
+    }
+};
 
 // All worlds of a run, `between_worlds` and `between_numbers` numbers apart. A processor keeps each world's numbers side by
 // side (the default); a GPU, whose neighbouring threads step neighbouring worlds, keeps side by side the same number of all.

@@ -322,6 +322,8 @@ class Rollout:
         shape: positions of all nodes from the foremost tip to the base, LPS mm, if they were recorded.
         catheters: the motion of the catheters; None for a wire alone. With catheters, the fields above are those of the
             wire, but for the direction of the tip and the wall's forces, which are those of all.
+        vessel_to_laboratory: where the vessel lies at each sample, if it moves: affine maps of its points, as CT shows
+            them, to the laboratory, LPS mm. Positions and directions above are those in the vessel as CT shows it.
     """
 
     sample_period_s: float
@@ -348,6 +350,7 @@ class Rollout:
     reason: Int[np.ndarray, "worlds"]
     shape: Float[np.ndarray, "worlds samples nodes 3"] | None = None
     catheters: CatheterMotion | None = None
+    vessel_to_laboratory: Float[np.ndarray, "samples 3 4"] | None = None
 
 
 def _add(digest: hashlib._Hash, values: np.ndarray, kind: type[np.generic]) -> None:

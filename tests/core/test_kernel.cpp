@@ -62,7 +62,17 @@ OwnedLoads make_loads(std::size_t nodes) {
     return loads;
 }
 
-OwnedScene make_scene(bool with_loads) {
+// Shifts, turns and shrinks by a few per cent and back in 0.8 s.
+OwnedMotion make_motion() {
+    OwnedMotion motion{.cycles = 1, .knots = 8, .ostium = {-3.0, 0.0, 0.0}, .coefficients = {}};
+    motion.period[0] = 0.8;
+    const double most[OwnedMotion::kNumbers] = {3, -2, 1, 0.1, 0.05, -0.1, -0.05, -0.03, -0.04, 0.01, 0, 0.02};
+    for (int k = 0; k < motion.knots; ++k)
+        for (double number : most) motion.coefficients.push_back(number * (1 - std::cos(2 * std::acos(-1.0) * k / motion.knots)) / 2);
+    return motion;
+}
+
+OwnedScene make_scene(bool with_loads, bool moving = false) {
     const double half = std::sqrt(0.5);
     return {.rod = make_rod(40),
             .lumen = std::make_shared<LumenMap>(make_map()),
@@ -71,7 +81,8 @@ OwnedScene make_scene(bool with_loads) {
             .options = {.stick_velocity = 0.05, .wall_stiffness = 100.0, .tolerance = 1e-3, .sample_tolerance = 1e-6,
                         .largest_step = 0.3, .largest_jump = 0.1, .max_iterations = 400, .free_behind = 3.0,
                         .approach_velocity = 20.0, .push_limit = 0.05, .pull_limit = 0.05,
-                        .torque_limit = 0.5, .introducer_friction = 0.05, .introducer_drag = 0.002}};
+                        .torque_limit = 0.5, .introducer_friction = 0.05, .introducer_drag = 0.002},
+            .motion = moving ? std::make_shared<OwnedMotion>(make_motion()) : nullptr};
 }
 
 // Worlds at rest and what is recorded of them.
@@ -105,8 +116,8 @@ bool same(const std::vector<double>& a, const std::vector<double>& b) {
     return a.size() == b.size() && std::memcmp(a.data(), b.data(), a.size() * sizeof(double)) == 0;
 }
 
-void test_kernel(bool by_force, bool with_loads) {
-    const OwnedScene owned = make_scene(with_loads);
+void test_kernel(bool by_force, bool with_loads, bool moving = false) {
+    const OwnedScene owned = make_scene(with_loads, moving);
     const Scene scene = view(owned, InPlace{});
     std::mt19937 random(4);
     std::uniform_real_distribution<double> any(-1.0, 1.0);
@@ -171,6 +182,7 @@ int main() {
     test_kernel(false, false);
     test_kernel(true, false);
     test_kernel(false, true);
+    test_kernel(false, false, true);
     test_longest_wire();
     std::printf(failures == 0 ? "all core tests passed\n" : "%d core checks failed\n", failures);
     return failures == 0 ? EXIT_SUCCESS : EXIT_FAILURE;

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from endopilot.cli import verify as command
-from endopilot.verification import contact, engine, free_rod, order, stability, tube, tubes, verify
+from endopilot.verification import contact, engine, free_rod, motion, order, stability, tube, tubes, verify
 from endopilot.verification.case import Case, compare
 
 KEYS = ["case", "reference", "value", "error", "bar", "passed"]
@@ -18,7 +18,7 @@ KEYS = ["case", "reference", "value", "error", "bar", "passed"]
 def cases(monkeypatch: pytest.MonkeyPatch) -> list[Case]:
     """The cases that verify runs, in place of all."""
     found = free_rod.timoshenko()
-    for module in (contact, engine, order, stability, tube, tubes):
+    for module in (contact, engine, motion, order, stability, tube, tubes):
         monkeypatch.setattr(module, "CASES", ())
     monkeypatch.setattr(free_rod, "CASES", (lambda: found,))
     return found

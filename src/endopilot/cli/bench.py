@@ -18,7 +18,9 @@ from endopilot.benchmarks.published import PublishedConfig
 from endopilot.benchmarks.robustness import RobustnessConfig
 from endopilot.benchmarks.xray import XrayBenchConfig
 from endopilot.cli.arguments import OutputFolder, existing, show, show_rows
+from endopilot.errors import InputError
 from endopilot.simulation.config import Preset
+from endopilot.simulation.motion import MotionName, motion_named
 
 EXIT_FAILED = 1
 
@@ -27,6 +29,7 @@ def simulation(
     *,
     preset: Preset = "default",
     catheter: str | None = None,
+    motion: MotionName = "still",
     device: Literal["cpu", "cuda"] = "cpu",
     make_reference: bool = False,
     reference: Path | None = None,
@@ -37,6 +40,7 @@ def simulation(
     Args:
         preset: settings of the rod core: default, fast or accurate.
         catheter: measure the wire in this catheter (a name or a YAML file), beside the wire alone.
+        motion: measure the wire in patients that move (breathing, heartbeat or both), beside the same at rest.
         device: measure the processor (cpu), or up to 100 000 wires on a GPU (cuda) and how closely the two agree.
         make_reference: compute the converged solution anew instead, which takes a quarter of an hour.
         reference: file of the converged solution; the shipped one if not given.
@@ -44,15 +48,24 @@ def simulation(
     """
     from endopilot.benchmarks.coaxial import bench_coaxial
     from endopilot.benchmarks.gpu import bench_gpu
+    from endopilot.benchmarks.motion import bench_motion
     from endopilot.benchmarks.reference import REFERENCE_FILE
     from endopilot.benchmarks.reference import make_reference as make
     from endopilot.benchmarks.simulation import bench_simulation
     from endopilot.simulation.catheter import read_catheter
 
+    moves = motion_named(motion)
+    if catheter is not None and moves is not None:
+        raise InputError("motion: with a catheter; measure one of the two")
     if catheter is not None:
         coaxial = bench_coaxial(read_catheter(catheter), preset)
         show(coaxial, as_json=json)
         _leave(coaxial["passed"])
+        return
+    if moves is not None:
+        moving = bench_motion(moves, preset)
+        show({"motion": motion, **moving}, as_json=json)
+        _leave(moving["passed"])
         return
     if device == "cuda":
         rows = bench_gpu(preset)

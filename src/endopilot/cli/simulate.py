@@ -21,6 +21,7 @@ from endopilot.simulation.catheter import read_catheter
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, random_controls, read_controls_csv
 from endopilot.simulation.device import Device, read_device
+from endopilot.simulation.motion import Motion, MotionName, motion_named
 from endopilot.simulation.simulate import simulate, wall_force_events
 from endopilot.simulation.table import write_rollout
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, Rollout
@@ -49,6 +50,8 @@ def command(
     device: str = "workhorse-014",
     catheter: tuple[str, ...] = (),
     controls: Path | None = None,
+    motion: MotionName = "still",
+    motion_seed: Seed | None = None,
     shape: bool = False,
     picture: Path | None = None,
     json: bool = False,
@@ -66,6 +69,8 @@ def command(
         controls: CSV of scripted proximal velocities (time_s, translation_mm_s, rotation_rad_s, those of catheters as
             catheter_1_translation_mm_s, ...), or folder made by `endopilot plan` for this anatomy and device; random
             ones by default.
+        motion: how heart and breath move the vessel and the guiding catheter: still, breathing, heartbeat or both.
+        motion_seed: draws the patient's amplitudes from the published distributions; their means by default.
         shape: also record the positions of all nodes, mm (.npz only).
         picture: PNG of the vessel and of the first navigation's wire at its end.
         json: print the figures as JSON.
@@ -74,7 +79,7 @@ def command(
     """
     patient = read_anatomy(existing(anatomy))
     wire, catheters = read_device(device), tuple(read_catheter(name) for name in catheter)
-    period_s = SAMPLE_PERIOD_S
+    moves, period_s = motion_named(motion, motion_seed), SAMPLE_PERIOD_S
     if controls is not None and controls.is_dir():
         if catheters:
             raise InputError(f"--controls {controls}: a plan drives a wire alone; leave --catheter out")
@@ -89,9 +94,10 @@ def command(
         initial, control = _random(random, patient, drives=1 + len(catheters))
     rollout, stopped, record_shape = None, None, shape or picture is not None
     if controls is None and random.stop_short and not catheters:
-        rollout, control, stopped = _stopped_short(patient, wire, initial, control, config)
+        rollout, control, stopped = _stopped_short(patient, wire, initial, control, moves, config)
         initial = np.column_stack([rollout.initial_inserted_length, rollout.initial_rotation])
-    if rollout is None or record_shape:  # the controls that were made give the same navigations again
+    # The controls that were made give the same navigations again.
+    if rollout is None or record_shape or moves is not None:
         rollout = simulate(
             patient,
             wire,
@@ -101,6 +107,7 @@ def command(
             config=config,
             record_shape=record_shape,
             period_s=period_s,
+            motion=moves,
         )
     write_rollout(rollout if shape else replace(rollout, shape=None), output)
     valid = rollout.valid
@@ -150,13 +157,20 @@ def _random(config: RandomConfig, patient: Anatomy, *, drives: int) -> tuple[np.
 
 
 def _stopped_short(
-    patient: Anatomy, wire: Device, initial: np.ndarray, control: np.ndarray, config: SimulatorConfig
+    patient: Anatomy,
+    wire: Device,
+    initial: np.ndarray,
+    control: np.ndarray,
+    motion: Motion | None,
+    config: SimulatorConfig,
 ) -> tuple[Rollout, np.ndarray, np.ndarray]:
     """Return random navigations that stop short of the ends, their controls, and which of them were stopped."""
     worlds, samples = control.shape[:2]
     friction = np.full(worlds, wire.friction)
     with progress("Simulating the wire", total=worlds * samples) as advance:
-        return simulate_navigations(patient, [wire] * worlds, initial, control, friction, config, advance=advance)
+        return simulate_navigations(
+            patient, [wire] * worlds, initial, control, friction, config, motion=motion, advance=advance
+        )
 
 
 def _largest(values: np.ndarray, valid: np.ndarray) -> float | None:

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float
 from endopilot.simulation.config import Actuation, SimulatorConfig
 from endopilot.simulation.device import Device
 from endopilot.simulation.drive_limits import within_travel
+from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulate import RECORDED, make_rollout
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import Step
@@ -41,6 +42,7 @@ def simulate_navigations(
     config: SimulatorConfig,
     *,
     actuation: Actuation = "velocity",
+    motion: Motion | None = None,
     advance: Callable[[int], None] = lambda samples: None,
 ) -> tuple[Rollout, Float[np.ndarray, "worlds samples 2"], Bool[np.ndarray, "worlds"]]:
     """Simulate navigations, stopped short of the ends of the vessel.
@@ -53,6 +55,7 @@ def simulate_navigations(
         friction: friction coefficient of each world.
         config: settings of the rod core.
         actuation: what the controls are.
+        motion: how the vessel moves with time; it lies still if not given.
         advance: called after each sample with the number of worlds.
 
     Returns:
@@ -60,7 +63,7 @@ def simulate_navigations(
         stopped short.
     """
     watch = _PushRoom(anatomy.tree, devices)
-    simulator = Simulator(anatomy, list(devices), actuation=actuation, config=config)
+    simulator = Simulator(anatomy, list(devices), actuation=actuation, motion=motion, config=config)
     started = _begin(simulator, watch, initial, friction)
     applied, stopped = np.empty_like(control), np.zeros(len(control), dtype=bool)
     result: dict[str, np.ndarray] = {}

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from endopilot import _core
 from endopilot.progress import Advance, progress
 from endopilot.simulation.config import FREE_BEHIND_MM, LANES, Actuation, SimulatorConfig, wall_stiffness
-from endopilot.simulation.processor import Lumen, Options, Processor, core_for, gpu_errors
+from endopilot.simulation.processor import CoreMotion, Lumen, Options, Processor, core_for, gpu_errors
 from endopilot.simulation.rod import RodLayout
 from endopilot.simulation.tubes import TubeLayout
 from endopilot.types import SAMPLE_PERIOD_S, DistanceMap, Insertion
@@ -40,6 +40,7 @@ def run_core(
     pull_limit_n: float = np.inf,
     torque_limit_n_mm: float = np.inf,
     tubes: TubeLayout | None = None,
+    motion: CoreMotion | None = None,
 ) -> dict[str, np.ndarray]:
     """Run the C++ core on checked input. The simulator and the verification both come through here.
 
@@ -64,6 +65,7 @@ def run_core(
         pull_limit_n: the same where it pulls, N.
         torque_limit_n_mm: torque at which it slips, N·mm.
         tubes: telescoping tubes, which have limits of their own.
+        motion: of the vessel and the insertion; positions and directions are returned in the vessel as it was at first.
 
     Returns:
         The arrays of `Rollout` that need no centerline; `reason`: 0 fine, 1 not finite, 2 not converged; `contacts`:
@@ -87,6 +89,7 @@ def run_core(
                 free_behind_mm=free_behind_mm,
             ),
             tubes=None if tubes is None else tubes.model(config.processor),
+            motion=motion,
             worlds=len(control),
         )
     simulation.reset(

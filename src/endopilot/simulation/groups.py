@@ -14,7 +14,8 @@ from endopilot.simulation.checks import check_distance_map, check_memory
 from endopilot.simulation.config import FREE_BEHIND_MM, SimulatorConfig
 from endopilot.simulation.core import core_options, insertion_arguments, make_lumen
 from endopilot.simulation.drive_limits import far_end_mm
-from endopilot.simulation.processor import Lumen, Simulation, core_for
+from endopilot.simulation.motion import Motion
+from endopilot.simulation.processor import CoreMotion, Lumen, Simulation, core_for
 from endopilot.simulation.rod import RodLayout, lay_out
 from endopilot.simulation.tubes import Stack
 from endopilot.types import Anatomy
@@ -32,6 +33,7 @@ class Group:
         stack: the wire and its catheters, as the first of them has it.
         rod: its nodes and stiffnesses.
         lumen: the wall, as the core has it.
+        motion: of the vessel, as the core has it; None if it lies still.
         simulation: the worlds, as the core has them.
         index: their numbers, ascending.
         path_mm: length of the vessel's longest path.
@@ -43,6 +45,7 @@ class Group:
     stack: Stack
     rod: RodLayout
     lumen: Lumen
+    motion: CoreMotion | None
     simulation: Simulation
     index: Integer[np.ndarray, "members"]
     path_mm: float
@@ -56,13 +59,18 @@ def group_key(anatomy: Anatomy, stack: Stack) -> GroupKey:
 
 
 def make_groups(
-    anatomies: Sequence[Anatomy], stacks: Sequence[Stack], config: SimulatorConfig, sharing: Sequence[Group]
+    anatomies: Sequence[Anatomy],
+    stacks: Sequence[Stack],
+    motion: Motion | None,
+    config: SimulatorConfig,
+    sharing: Sequence[Group],
 ) -> list[Group]:
     """Return the groups of worlds, with their wires laid out and at the ostium.
 
     Args:
         anatomies: of each world.
         stacks: wire and catheters of each world.
+        motion: of every vessel about its ostium; None if they lie still.
         config: settings of the rod core.
         sharing: groups whose lumens and projections are taken rather than prepared again.
 
@@ -92,6 +100,7 @@ def make_groups(
         rod = lay_out(stack.wire, element_mm=config.element_mm, length_mm=longest_mm + FREE_BEHIND_MM)
         tubes = stack.lay_out(length_mm=longest_mm + FREE_BEHIND_MM)
         check_memory(8 * len(worlds) * (40 * len(rod.abscissa_mm) + 40), f"worlds: {len(worlds)}", "give fewer")
+        moving = None if motion is None else motion.core(np.asarray(anatomy.insertion.position), config.processor)
         simulation = core.Simulation(
             rod=rod.model(config.processor),
             lumen=lumens[key],
@@ -105,10 +114,11 @@ def make_groups(
                 free_behind_mm=FREE_BEHIND_MM,
             ),
             tubes=None if tubes is None else tubes.model(config.processor),
+            motion=moving,
             worlds=len(worlds),
         )
         index, project = np.array(worlds), projectors[anatomy.identity]
-        groups.append(Group(anatomy, stack, rod, lumens[key], simulation, index, path_mm, longest_mm, project))
+        groups.append(Group(anatomy, stack, rod, lumens[key], moving, simulation, index, path_mm, longest_mm, project))
     return groups
 
 

@@ -12,8 +12,9 @@ from endopilot.errors import InputError
 
 if TYPE_CHECKING:
     from endopilot._core import Lumen, Options, RodModel, Simulation, Tubes
+    from endopilot._core import Motion as CoreMotion
 else:  # each build of the core has classes of its own
-    Lumen = Options = RodModel = Simulation = Tubes = Any
+    CoreMotion = Lumen = Options = RodModel = Simulation = Tubes = Any
 
 Processor = Literal["cpu", "cuda"]
 """Where worlds are stepped: the processor's threads, or a CUDA GPU."""

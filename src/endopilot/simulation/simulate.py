@@ -21,6 +21,7 @@ from endopilot.simulation.config import FREE_BEHIND_MM, Actuation, SimulatorConf
 from endopilot.simulation.core import make_lumen, run_core
 from endopilot.simulation.device import Device
 from endopilot.simulation.drive_limits import far_end_mm
+from endopilot.simulation.motion import Motion
 from endopilot.simulation.rod import lay_out
 from endopilot.simulation.tubes import Stack
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, CatheterMotion, Rollout
@@ -62,6 +63,7 @@ def simulate(
     record_shape: bool = False,
     friction: Float[np.ndarray, "worlds"] | None = None,
     period_s: float = SAMPLE_PERIOD_S,
+    motion: Motion | None = None,
 ) -> Rollout:
     """Drive a device through an anatomy and record it every 0.5 s.
 
@@ -86,6 +88,7 @@ def simulate(
         record_shape: record the positions of all nodes too.
         friction: Coulomb friction coefficient of the wire of each world; the device's own if not given.
         period_s: time that each control holds, and from one recorded sample to the next, s.
+        motion: how the vessel moves with time; it lies still if not given.
 
     Raises:
         InputError: a period that is not positive; controls that are not finite or too fast for the device; a device
@@ -118,6 +121,7 @@ def simulate(
     length_mm = max(path_mm, possible_mm) + FREE_BEHIND_MM
     rod = lay_out(device, element_mm=config.element_mm, length_mm=length_mm)
     _check_memory(worlds, samples, len(rod.abscissa_mm) if record_shape else 0)
+    moving = None if motion is None else motion.core(np.asarray(anatomy.insertion.position), config.processor)
     result = run_core(
         rod,
         make_lumen(anatomy.distance_map, stack.outer_radius_mm, config.processor),
@@ -133,12 +137,15 @@ def simulate(
         pull_limit_n=device.pull_limit_n,
         torque_limit_n_mm=device.torque_limit_n_mm,
         tubes=stack.lay_out(length_mm=length_mm),
+        motion=moving,
     )
     if record_shape:  # of the wire that was needed
         needed = max(path_mm, commanded_mm, float(result["inserted_length"].max())) + FREE_BEHIND_MM
         result["shape"] = result["shape"][:, :, : np.searchsorted(rod.abscissa_mm, needed) + 3]
     started = initial[:, :2] - result["approach_slip"]
     rollout = make_rollout(anatomy, actuation, started, control[..., :2], result, period_s=period_s)
+    if moving is not None:
+        rollout = replace(rollout, vessel_to_laboratory=moving.placements(period_s * np.arange(1, samples + 1))[0])
     if catheters:
         rollout = replace(rollout, catheters=_catheter_motion(control, result["tubes"], period_s))
     _report(rollout)

@@ -22,6 +22,7 @@ from endopilot.simulation.checks import check_control, check_memory, check_trave
 from endopilot.simulation.config import LANES, Actuation, SimulatorConfig
 from endopilot.simulation.device import Device
 from endopilot.simulation.groups import Group, group_key, make_groups, merge
+from endopilot.simulation.motion import Motion
 from endopilot.simulation.processor import gpu_errors
 from endopilot.simulation.state import SimulatorState, Step, SupportsDLPack
 from endopilot.simulation.tubes import Stack
@@ -54,6 +55,7 @@ class Simulator:
         catheters: Sequence[Catheter] = (),
         worlds: int = 1,
         actuation: Actuation = "velocity",
+        motion: Motion | None = None,
         config: SimulatorConfig | None = None,
         sharing: Simulator | None = None,
     ) -> None:
@@ -67,6 +69,8 @@ class Simulator:
             actuation: what `step` takes: "velocity" (mm/s, rad/s; the drive makes exactly that motion, except that it
                 slips rather than push, pull or turn harder than the device's limits) or "force" (axial force N and
                 torque N·mm on the wire; advance and rotation follow, against the friction and drag of the introducer).
+            motion: how every vessel moves with time; it lies still if not given. Positions and directions are those in
+                the vessel as CT shows it; `vessel_to_laboratory` says where that lies.
             config: settings of the rod core.
             sharing: a simulator that has prepared the same anatomy, whose lumen is then not prepared again.
 
@@ -79,7 +83,7 @@ class Simulator:
         self._config = config or SimulatorConfig()
         if catheters and actuation == "force":
             raise InputError("actuation: 'force' with catheters; give 'velocity'")
-        self._by_force = actuation == "force"
+        self._by_force, self._motion = actuation == "force", motion
         check_memory(worlds * _LEAST_BYTES, f"worlds: {worlds}", "give fewer")
         anatomies = [anatomy] * worlds if isinstance(anatomy, Anatomy) else list(anatomy)
         devices = [device] * len(anatomies) if isinstance(device, Device) else list(device)
@@ -91,7 +95,9 @@ class Simulator:
             )
         self._stacks = [Stack(wire, tuple(catheters)) for wire in devices]
         with gpu_errors(self._config.processor):
-            self._groups = make_groups(anatomies, self._stacks, self._config, sharing._groups if sharing else ())
+            self._groups = make_groups(
+                anatomies, self._stacks, motion, self._config, sharing._groups if sharing else ()
+            )
         self._device = devices
         fastest = np.array(
             [[(each.max_velocity_mm_s, each.max_rotation_rad_s) for each in stack.devices] for stack in self._stacks]
@@ -303,8 +309,8 @@ class Simulator:
         chosen = np.asarray(source)
         if chosen.shape != (self.worlds,) or not np.issubdtype(chosen.dtype, np.integer):
             raise InputError(f"source: {source}; give the number of a world for each of the {self.worlds} worlds")
-        if (self._by_force, _settings(self._config)) != (of._by_force, _settings(of._config)):
-            raise InputError("of: a simulator with other settings; make both with the same actuation and config")
+        if self._setup != of._setup:
+            raise InputError("of: a simulator with other settings; make both with equal actuation, motion and config")
         originals = {group_key(group.anatomy, group.stack): group for group in of._groups}
         states = []
         for group in self._groups:
@@ -402,6 +408,36 @@ class Simulator:
             array([0. , 0.5, 1. , 1.5])
         """
         return self._gather("rotation")
+
+    @property
+    def time(self) -> Float[np.ndarray, "worlds"]:
+        """Time since each world was put to its first inserted length, s; it is what the vessel moves with.
+
+        Example:
+            >>> simulator.reset(seed=0)
+            >>> _ = simulator.step(np.zeros((4, 2)), duration=0.25)
+            >>> simulator.time
+            array([0.25, 0.25, 0.25, 0.25])
+        """
+        return self._gather("time")
+
+    @property
+    def vessel_to_laboratory(self) -> Float[np.ndarray, "worlds 3 4"]:
+        """Where each vessel lies now: affine maps of its points, as CT shows them, to the laboratory, LPS mm.
+
+        Example:
+            >>> bool((simulator.vessel_to_laboratory[:, :, :3] == np.eye(3)).all())  # a vessel that lies still
+            True
+        """
+        still = np.eye(3, 4)
+        return self._merge(
+            [
+                np.tile(still, (len(group.index), 1, 1))
+                if group.motion is None
+                else group.motion.placements(group.simulation.time())[0]
+                for group in self._groups
+            ]
+        )
 
     @property
     def position(self) -> Float[np.ndarray, "worlds nodes 3"]:
@@ -566,10 +602,10 @@ class Simulator:
     def _fingerprint(self) -> str:
         """Hash of all that a state belongs to."""
         groups = [(group.index.tolist(), group_key(group.anatomy, group.stack)) for group in self._groups]
-        return hashlib.sha256(repr((self._by_force, _settings(self._config), groups)).encode()).hexdigest()
+        return hashlib.sha256(repr((self._setup, groups)).encode()).hexdigest()
 
-
-def _settings(config: SimulatorConfig) -> tuple[Any, ...]:
-    """Return the settings that a state belongs to: all but those that say where it is stepped."""
-    names = (name for name in SimulatorConfig.__dataclass_fields__ if name not in ("processor", "threads"))
-    return tuple((name, getattr(config, name)) for name in names)
+    @property
+    def _setup(self) -> tuple[Any, ...]:
+        """What a state belongs to besides anatomies and devices: settings, but not where it is stepped."""
+        names = (name for name in SimulatorConfig.__dataclass_fields__ if name not in ("processor", "threads"))
+        return self._by_force, self._motion, tuple((name, getattr(self._config, name)) for name in names)

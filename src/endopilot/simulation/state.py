@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from endopilot.errors import InputError
 from endopilot.files import writing
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 """Of `SimulatorState`: raised when its values or its fingerprint come to mean something else."""
 
 
@@ -32,7 +32,7 @@ class Step:
     Attributes:
         inserted_length: Δ at the end of the step, mm.
         rotation: φ at its end, rad.
-        tip_position: LPS mm.
+        tip_position: LPS mm, in the vessel as CT shows it, wherever it has moved.
         tip_direction: unit vector along the wire at its tip.
         contact_force_max: largest wall force on one node, N.
         contact_force_sum: sum of the wall forces' magnitudes, N.

@@ -10,6 +10,7 @@ import pandas as pd
 from endopilot.errors import InputError
 from endopilot.extras import extra_named
 from endopilot.files import writing
+from endopilot.simulation.motion import place
 from endopilot.types import Rollout
 
 
@@ -41,8 +42,18 @@ def rollout_table(rollout: Rollout) -> pd.DataFrame:
         "newton_iterations": rollout.iterations,
         "valid": rollout.valid,
         **_catheter_columns(rollout),
+        **_laboratory_columns(rollout),
     }
     return pd.DataFrame({name: np.asarray(values).reshape(-1) for name, values in columns.items()})
+
+
+def _laboratory_columns(rollout: Rollout) -> dict[str, np.ndarray]:
+    """Return where the tip is in the laboratory; nothing for a vessel that lies still, whose tip is there already."""
+    if rollout.vessel_to_laboratory is None:
+        return {}
+    maps = np.broadcast_to(rollout.vessel_to_laboratory, (*rollout.valid.shape, 3, 4))
+    tip = place(maps, rollout.tip_position)
+    return {f"tip_laboratory_{axis}_mm": tip[..., i] for i, axis in enumerate("xyz")}
 
 
 def _catheter_columns(rollout: Rollout) -> dict[str, np.ndarray]:

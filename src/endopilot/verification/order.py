@@ -35,7 +35,7 @@ def order_in_element_length() -> list[Case]:
     tip = np.array([elastica_tip(10.0, int(n))[0][0] for n in ELEMENTS])
     change = np.abs(np.diff(tip))
     return [
-        _order(
+        order_case(
             "order in element length, elastica",
             2.0,
             1 / ELEMENTS[:-1],
@@ -69,7 +69,7 @@ def order_in_time_step() -> list[Case]:
     """Measure the order of the error of a dragged tip as the time step shrinks: implicit Euler is of first order."""
     error = np.array([abs(relaxation_error(step)) for step in RELAXATION_STEPS_S])
     return [
-        _order(
+        order_case(
             "order in time step, relaxation",
             1.0,
             RELAXATION_STEPS_S,
@@ -114,10 +114,10 @@ def order_in_navigation() -> list[Case]:
     error = navigation_error()
     steps = NAVIGATION_STEPS_S - NAVIGATION_FINEST_S
     names = (f"time step − {NAVIGATION_FINEST_S:g} s, s", "mean distance of the tips, mm")
-    return [_order("order in time step, navigation", 1.0, steps, error, names, NAVIGATION_BAR)]
+    return [order_case("order in time step, navigation", 1.0, steps, error, names, NAVIGATION_BAR)]
 
 
-def _order(
+def order_case(
     case: str,
     expected: float,
     size: Float[np.ndarray, "n"],
@@ -125,6 +125,16 @@ def _order(
     names: tuple[str, str],
     bar: float,
 ) -> Case:
+    """Return the comparison of the slope of errors over sizes, both on logarithmic scales, with the expected order.
+
+    Args:
+        case: what is compared.
+        expected: the order.
+        size: element lengths or time steps.
+        error: at each of them.
+        names: what size and error are, with units.
+        bar: largest relative error of the order.
+    """
     value = float(np.polyfit(np.log(size), np.log(error), 1)[0])
     ideal = error[-1] * (size / size[-1]) ** expected
     picture = Picture(

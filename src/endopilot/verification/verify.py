@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from endopilot.progress import progress
-from endopilot.verification import contact, engine, free_rod, order, stability, tube, tubes
+from endopilot.verification import contact, engine, free_rod, motion, order, stability, tube, tubes
 from endopilot.verification.case import Case
 from endopilot.verification.plots import draw
 
@@ -24,7 +24,7 @@ def run_verification(plots: Path | None = None) -> list[dict[str, Any]]:
     Returns:
         One row a comparison: case, reference, value, error, bar, passed (None if it was skipped).
     """
-    modules = (free_rod, stability, contact, tube, tubes, engine, order)
+    modules = (free_rod, stability, contact, tube, tubes, motion, engine, order)
     groups: list[Callable[[], list[Case]]] = [group for module in modules for group in module.CASES]
     cases: list[Case] = []
     with progress("Verifying the rod core", total=len(groups)) as advance:

@@ -1,0 +1,197 @@
+"""Vessels that move: published amplitudes and rests, the same bits however worlds are stepped, and what is told."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from bend import vessel
+
+from endopilot.anatomy.io import write_anatomy
+from endopilot.atlas.heart_reference import LEFT_VENTRICLE_AXIS, TO_CRUX
+from endopilot.cli import simulate as command
+from endopilot.errors import InputError
+from endopilot.simulation.catheter import read_catheter
+from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.device import read_device
+from endopilot.simulation.motion import Motion, draw_motion, motion_named, place
+from endopilot.simulation.simulate import simulate
+from endopilot.simulation.simulator import Simulator
+from endopilot.simulation.state import SimulatorState
+from endopilot.types import Anatomy
+
+DEVICE = read_device("workhorse-014")
+OSTIUM = np.array([10.0, -20.0, 30.0])
+MOTION = Motion()
+BEATS = Motion(breathing_caudal_mm=0.0, breathing_anterior_mm=0.0, breathing_dorsal_deg=0.0, breathing_dextral_deg=0.0)
+
+
+@pytest.fixture(scope="module")
+def anatomy() -> Anatomy:
+    return vessel()
+
+
+def maps(motion: Motion, times: np.ndarray) -> np.ndarray:
+    return motion.core(OSTIUM).placements(times)[0]
+
+
+def drives(worlds: int, samples: int) -> tuple[np.ndarray, np.ndarray]:
+    random = np.random.default_rng(4)
+    initial = np.column_stack([random.uniform(5, 30, worlds), random.uniform(-3, 3, worlds)])
+    return initial, random.uniform((-2, -3), (6, 3), (worlds, samples, 2))
+
+
+def test_a_breath_shifts_and_turns_by_the_given_amounts() -> None:
+    motion = motion_named("breathing")
+    assert motion is not None
+    (map_,), ((w, *_),) = motion.core(OSTIUM).placements(np.array([2.0]))  # inspired
+    np.testing.assert_allclose(place(map_, OSTIUM) - OSTIUM, [0, -1.3, -4.9], atol=1e-3)  # forwards and to the feet
+    np.testing.assert_allclose(map_[:, :3] @ map_[:, :3].T, np.eye(3), atol=1e-12)  # rigid
+    assert np.degrees(2 * np.arccos(w)) == pytest.approx(np.hypot(1.5, 1.2), rel=1e-3)
+    head = map_[:, :3] @ [0, 0, 1.0]
+    assert head[1] == pytest.approx(np.sin(np.radians(1.5)), rel=0.01)  # the head's end goes backwards,
+    assert head[0] == pytest.approx(np.sin(np.radians(1.2)), rel=0.01)  # and the feet's end to the right
+
+
+def test_a_heartbeat_contracts_towards_a_resting_apex() -> None:
+    times = BEATS.heart_period_s * np.linspace(0, 1, 500)
+    found = maps(BEATS, times)
+    axis = np.array(LEFT_VENTRICLE_AXIS) / np.linalg.norm(LEFT_VENTRICLE_AXIS)
+    ostium, apex = place(found, OSTIUM), place(found, OSTIUM + 94 * axis)
+    assert np.ptp(ostium @ axis) == pytest.approx(11.6, rel=0.01)
+    assert np.ptp(apex, axis=0).max() < 0.01
+    assert np.ptp(np.linalg.det(found[:, :, :3]) / (1 - np.ptp(ostium @ axis) / 94)) > 0.05
+    across = np.sqrt(np.linalg.det(found[:, :, :3]) / np.linalg.norm(found[:, :, :3] @ axis, axis=-1))
+    assert across.min() / across.max() == pytest.approx(np.sqrt(1 - 0.082), abs=0.003)
+
+
+def test_every_motion_begins_where_ct_shows_the_vessel_and_is_periodic() -> None:
+    for motion in (MOTION, draw_motion(3), replace(BEATS, heart_period_s=1.0)):
+        np.testing.assert_allclose(maps(motion, np.zeros(1))[0], np.eye(3, 4), atol=1e-9)
+    times = np.linspace(0, BEATS.heart_period_s, 7)
+    np.testing.assert_allclose(maps(BEATS, times), maps(BEATS, times + 3 * BEATS.heart_period_s), atol=1e-9)
+
+
+def test_the_right_coronary_artery_rests_as_long_as_published() -> None:
+    # Proximal to middle segments move by less than 1 mm in 76 ± 34 ms at end-systole and 65 ± 42 ms in mid-diastole
+    # (Shechter, Resar and McVeigh, Med Phys 2005).
+    step, period = 4e-3, BEATS.heart_period_s
+    times = step * np.arange(round(period / step))
+    points = place(maps(BEATS, times)[:, None], OSTIUM + TO_CRUX[:7])
+    apart = np.tile(np.linalg.norm(points[:, None] - points[None], axis=-1).mean(axis=-1), (2, 2))
+
+    def rest(first: float, last: float) -> float:
+        """Longest time in a part of the heartbeat, counted from mid-diastole, in which the artery stays within 1 mm."""
+        longest = 0.0
+        for begin in range(int(first * period / step), int(last * period / step)):
+            end = begin
+            while apart[begin : end + 2, begin : end + 2].max() < 1:
+                end += 1
+            longest = max(longest, step * (end - begin))
+        return longest
+
+    assert rest(0.5, 0.75) == pytest.approx(0.076, abs=0.034)  # end-systole is 0.66 of a period after mid-diastole
+    assert rest(0.85, 1.05) == pytest.approx(0.065, abs=0.042)
+    assert 8 < apart.max() < 25
+
+
+def test_drawn_patients_differ_and_stay_in_the_published_ranges() -> None:
+    drawn = [draw_motion(seed) for seed in range(200)]
+    assert draw_motion(7) == draw_motion(7) != draw_motion(8)
+    caudal = np.array([motion.breathing_caudal_mm for motion in drawn])
+    assert caudal.min() >= 2.4 and caudal.max() <= 8.0
+    assert caudal.mean() == pytest.approx(4.9, abs=0.4) and caudal.std() == pytest.approx(1.4, abs=0.4)
+    assert motion_named("still") is None and motion_named("still", 3) is None
+    assert motion_named("both", 7) == draw_motion(7)
+    heartbeat = motion_named("heartbeat", 7)
+    assert heartbeat is not None and heartbeat.annulus_mm == draw_motion(7).annulus_mm
+    with pytest.raises(InputError, match=r"annulus_mm: -1\.0; give a number of 0 or more"):
+        Motion(annulus_mm=-1.0)
+
+
+def test_a_motion_of_nothing_leaves_the_wire_where_a_still_vessel_does(anatomy: Anatomy) -> None:
+    initial, control = drives(3, 6)
+    nothing = replace(BEATS, annulus_mm=0.0, heart_volume_share=0.0, heart_rotation_deg=0.0)
+    config = SimulatorConfig(tolerance_mm=1e-6)
+    still = simulate(anatomy, DEVICE, control, initial=initial, config=config)
+    moving = simulate(anatomy, DEVICE, control, initial=initial, config=config, motion=nothing)
+    np.testing.assert_allclose(moving.tip_position, still.tip_position, atol=1e-4)
+    np.testing.assert_allclose(moving.wall_force, still.wall_force, atol=1e-4)
+
+
+def test_a_breath_does_not_move_the_wire_in_its_vessel(anatomy: Anatomy) -> None:
+    # A rigid motion of vessel and catheter: a wire without mass does not feel it.
+    initial, control = drives(3, 6)
+    config = SimulatorConfig(tolerance_mm=1e-7)
+    still = simulate(anatomy, DEVICE, control, initial=initial, config=config)
+    breathing = replace(motion_named("breathing") or MOTION, breathing_period_s=2.0, breathing_dorsal_deg=25.0)
+    moving = simulate(anatomy, DEVICE, control, initial=initial, config=config, motion=breathing)
+    np.testing.assert_allclose(moving.tip_position, still.tip_position, atol=1e-4)
+    np.testing.assert_allclose(moving.tip_direction, still.tip_direction, atol=1e-4)
+    np.testing.assert_allclose(moving.base_force, still.base_force, atol=1e-4)
+    assert moving.vessel_to_laboratory is not None
+    tip = place(np.broadcast_to(moving.vessel_to_laboratory, (3, 6, 3, 4)), moving.tip_position)
+    assert np.linalg.norm(tip - moving.tip_position, axis=-1).max() > 4
+
+
+def test_a_contracting_vessel_loads_the_wire(anatomy: Anatomy) -> None:
+    initial, control = drives(3, 6)
+    still = simulate(anatomy, DEVICE, control, initial=initial)
+    moving = simulate(anatomy, DEVICE, control, initial=initial, motion=BEATS)
+    assert moving.valid.all()
+    assert np.abs(moving.tip.abscissa - still.tip.abscissa).max() > 0.5
+
+
+def test_steps_are_those_of_simulate_to_the_bit_and_a_state_keeps_the_phase(anatomy: Anatomy, tmp_path: Path) -> None:
+    initial, control = drives(3, 4)
+    whole = simulate(anatomy, DEVICE, control, initial=initial, motion=MOTION)
+    simulator = Simulator(anatomy, DEVICE, worlds=3, motion=MOTION)
+    simulator.reset(inserted_length=initial[:, 0], rotation=initial[:, 1])
+    np.testing.assert_array_equal(simulator.time, 0)
+    for t in range(2):
+        simulator.step(control[:, t], 0.5)
+    simulator.state.save(tmp_path / "state.npz")
+    again = Simulator(anatomy, DEVICE, worlds=3, motion=MOTION)
+    again.set_state(SimulatorState.load(tmp_path / "state.npz"))
+    np.testing.assert_array_equal(again.time, 1.0)
+    for t in (2, 3):
+        np.testing.assert_array_equal(again.step(control[:, t], 0.5).tip_position, whole.tip_position[:, t])
+    assert whole.vessel_to_laboratory is not None
+    np.testing.assert_array_equal(again.vessel_to_laboratory[1], whole.vessel_to_laboratory[-1])
+    np.testing.assert_array_equal(again.position[:, 0], whole.tip_position[:, -1])
+    alone = simulate(anatomy, DEVICE, control[1:2], initial=initial[1:2], motion=MOTION)
+    np.testing.assert_array_equal(alone.tip_position[0], whole.tip_position[1])
+    with pytest.raises(InputError, match="other anatomies, devices or settings"):
+        Simulator(anatomy, DEVICE, worlds=3).set_state(again.state)
+    with pytest.raises(InputError, match="equal actuation, motion and config"):
+        Simulator(anatomy, DEVICE, worlds=3).copy_worlds([0, 1, 2], of=again)
+
+
+def test_wires_in_catheters_move_with_the_vessel_too(anatomy: Anatomy) -> None:
+    initial, control = drives(2, 4)
+    both, start = np.concatenate([control, 0.5 * control], axis=-1), np.concatenate([initial, 0.5 * initial], axis=-1)
+    catheters, config = [read_catheter("microcatheter-1.7f")], SimulatorConfig(tolerance_mm=1e-7)
+    still = simulate(anatomy, DEVICE, both, catheters=catheters, initial=start, config=config)
+    breathing = motion_named("breathing")
+    moving = simulate(anatomy, DEVICE, both, catheters=catheters, initial=start, config=config, motion=breathing)
+    assert moving.catheters is not None and still.catheters is not None
+    np.testing.assert_allclose(moving.tip_position, still.tip_position, atol=2e-3)
+    np.testing.assert_allclose(moving.catheters.tip_position, still.catheters.tip_position, atol=2e-3)
+
+
+def test_the_command_tells_tips_in_the_vessel_and_in_the_laboratory(anatomy: Anatomy, tmp_path: Path) -> None:
+    write_anatomy(anatomy, tmp_path / "bend")
+    random = command.RandomConfig(sequences=2, seconds=2.0)
+    command.command(tmp_path / "bend", output=tmp_path / "still.csv", random=random)
+    command.command(tmp_path / "bend", output=tmp_path / "both.csv", motion="both", motion_seed=5, random=random)
+    still, moving = (pd.read_csv(tmp_path / name) for name in ("still.csv", "both.csv"))
+    told = [f"tip_laboratory_{axis}_mm" for axis in "xyz"]
+    assert set(moving.columns) - set(still.columns) == set(told)
+    found = place(
+        draw_motion(5).core(np.asarray(anatomy.insertion.position)).placements(moving["time_s"].to_numpy())[0],
+        moving[[f"tip_{axis}_mm" for axis in "xyz"]].to_numpy(),
+    )
+    np.testing.assert_allclose(moving[told], found, atol=1e-6)
