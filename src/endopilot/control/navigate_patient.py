@@ -268,7 +268,7 @@ def sampled(cycles: Rollout) -> Rollout:
     def together(values: np.ndarray) -> np.ndarray:
         return values.reshape(values.shape[0], -1, step, *values.shape[2:])
 
-    names = [f.name for f in fields(Rollout) if f.name not in _WHOLE and f.name not in ("tip", "shape", "catheters")]
+    names = [f.name for f in fields(Rollout) if f.name not in (*_WHOLE, *_APART)]
     shape = None if cycles.shape is None else at_end(cycles.shape)
     tip = TipProjection(**{f.name: at_end(getattr(cycles.tip, f.name)) for f in fields(TipProjection)})
     return replace(
@@ -291,12 +291,12 @@ _WHOLE = (
     "control", "slip", "rotation_slip", "iterations", "node_iterations",
 )  # fmt: skip
 """What a rollout holds once a world, or what is gathered over the cycles of a period."""
+_APART = ("tip", "shape", "catheters", "vessel_to_laboratory")
+"""What it holds otherwise, or not at all: a navigation's vessel lies still."""
 
 
 def _first(rollout: Rollout, samples: int) -> Rollout:
-    names = [
-        f.name for f in fields(Rollout) if f.name not in _WHOLE[:4] and f.name not in ("tip", "shape", "catheters")
-    ]
+    names = [f.name for f in fields(Rollout) if f.name not in (*_WHOLE[:4], *_APART)]
     tip = TipProjection(**{f.name: getattr(rollout.tip, f.name)[:, :samples] for f in fields(TipProjection)})
     shape = None if rollout.shape is None else rollout.shape[:, :samples]
     return replace(rollout, **{name: getattr(rollout, name)[:, :samples] for name in names}, tip=tip, shape=shape)
