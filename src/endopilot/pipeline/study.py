@@ -47,12 +47,18 @@ from endopilot.types import Rollout, Volume
 VOLUME_SUFFIX = ".nii.gz"
 EVALUATED = 48
 """Navigations that are evaluated in each split; each is simulated seven times."""
+MISMATCH = (0.8, 1.2)
+"""Friction and tip stiffness of the navigations that the packaged networks are evaluated on, over those they know."""
 _EXTRAS = ("learn", "report")
 """Extras that the stages need, the last one after minutes of work."""
 _PRETRAINED_DEVICE = "workhorse-014"
 DEMO_ORIGIN = (
     "The patients are synthetic: right coronary arteries drawn from published statistics, and a CT angiogram of each, "
     "made with noise, blur, calcium, chambers and veins. Everything after the CT is made from it alone."
+)
+UNKNOWN_WIRE = (
+    "The networks are not given the wires as they are: friction and tip stiffness differ by up to 20 % from what they "
+    "know."
 )
 RUN_ORIGIN = "One CT angiogram, given by the user; everything is made from it alone."
 
@@ -125,15 +131,20 @@ class _Run:
     navigation: Path | None = None
 
     @property
+    def trains(self) -> bool:
+        """Whether networks are trained here, rather than taken from the package."""
+        return self.config.training_seconds > 0
+
+    @property
     def trained(self) -> Path:
         """The run whose networks are evaluated: this study's, or that of the package."""
-        return self.output / "training" if self.config.training_seconds > 0 else Path(PRETRAINED)
+        return self.output / "training" if self.trains else Path(PRETRAINED)
 
     @property
     def evaluates(self) -> bool:
         """Whether there are networks for the wire: those of the package know one wire alone."""
         packaged = read_device(_PRETRAINED_DEVICE)
-        return self.config.training_seconds > 0 or self.device.constants == packaged.constants
+        return self.trains or self.device.constants == packaged.constants
 
 
 def run_demo(output: Path, config: DemoConfig) -> dict[str, Any]:
@@ -298,14 +309,16 @@ def _learn(run: _Run, anatomies: Sequence[Path]) -> None:
     from endopilot.models.train import train  # torch takes seconds to import
     from endopilot.report.evaluation_report import report_evaluation
 
-    output, config = run.output, run.config
-    trains = config.training_seconds > 0
+    output, config, trains = run.output, run.config, run.trains
     tested = len(anatomies) // 3 if trains else len(anatomies) - len(anatomies) // 3  # one at least is of another split
     shares = (1 - tested / len(anatomies), 0.0, tested / len(anatomies)) if tested else None
+    friction = (MISMATCH[0] * run.device.friction, MISMATCH[1] * run.device.friction)
     dataset = DatasetConfig(
         sequences=config.sequences,
         seconds=config.seconds,
         seed=config.seed,
+        friction=None if trains else friction,
+        tip_stiffness_factor=None if trains else MISMATCH,
         anatomy_shares=shares,
         seen_test_share=DatasetConfig.seen_test_share if trains else 0.0,  # all are new to the packaged networks
     )
@@ -341,7 +354,7 @@ def _report(run: _Run, names: Sequence[str]) -> None:
     )
     content = ReportContent(
         title="endopilot: from a CT angiogram to guidewire control",
-        origin=run.origin,
+        origin=f"{run.origin} {UNKNOWN_WIRE}" if run.evaluates and not run.trains else run.origin,
         command=run.command,
         patients=patients,
         evaluation=output / "evaluation" if run.evaluates else None,
@@ -382,9 +395,10 @@ def _replay(output: Path, device: Device) -> tuple[Path, Rollout]:
     folder = dataset.anatomy_folder(str(one.anatomy[0]))
     initial = np.stack([one.initial_inserted_length, one.initial_rotation], axis=-1)
     anatomy = read_anatomy(folder)
+    wire = device.with_tip(bend_rad=float(one.tip_bend[0]), stiffness_factor=float(one.tip_stiffness_factor[0]))
     settings = SimulatorConfig(**dataset.manifest["config"]["simulator"])
     options = {"initial": initial, "config": settings, "friction": one.friction, "record_shape": True}
-    return folder, simulate(anatomy, device, one.control, **options)
+    return folder, simulate(anatomy, wire, one.control, **options)
 
 
 def _finish(run: _Run) -> dict[str, Any]:
