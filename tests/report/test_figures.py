@@ -130,3 +130,11 @@ def test_stages_are_drawn_in_their_order():
     ax = figures.stage_figure(tables.stage_table({"first": 2.0, "second": 5.0})).axes[0]
     assert [bar.get_width() for bar in ax.patches] == [2.0, 5.0]
     assert png(ax.figure).startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(("lowest", "scale"), [(0.1, "log"), (-1.5, "linear")])
+def test_every_loss_is_in_the_picture(lowest, scale):
+    curve = {"network": "ff", "curve": "training", "epoch": [1, 2, 3], "loss": [2.0, 0.5, lowest]}
+    ax = figures.loss_figure(pd.DataFrame(curve)).axes[0]
+    low, high = ax.get_ylim()
+    assert ax.get_yscale() == scale and low < lowest < 2.0 < high

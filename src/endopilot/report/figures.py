@@ -188,7 +188,8 @@ def loss_figure(table: pd.DataFrame) -> Figure:
             for curve, color in zip(distinct(part, "curve"), (BLUE, ORANGE, GREEN), strict=False):
                 line = rows(part, curve=curve)
                 ax.plot(values(line, "epoch"), values(line, "loss"), color=color, label=curve)
-            ax.set(xlabel="Epoch", ylabel="Loss", yscale="log")
+            positive = min(values(part, "loss")) > 0  # a likelihood's is not
+            ax.set(xlabel="Epoch", ylabel="Loss", yscale="log" if positive else "linear")
             ax.set_title(network)
         _legend_below(figure, axes)
     return figure
