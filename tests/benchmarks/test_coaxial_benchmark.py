@@ -8,14 +8,14 @@ from functools import partial
 import pytest
 
 from endopilot import cli
-from endopilot.benchmarks import coaxial, scenes
+from endopilot.benchmarks import beside, coaxial, scenes
 from endopilot.simulation.catheter import read_catheter
 
 
 @pytest.fixture(autouse=True)
 def one_patient(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scenes, "KINDS", {"right": "rca"})
-    monkeypatch.setattr(coaxial, "REPEATS", 1)
+    monkeypatch.setattr(beside, "REPEATS", 1)
 
 
 def test_the_figures_belong_together(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
+from endopilot.benchmarks.beside import bench_beside, error_in_time, fine_steps
 from endopilot.benchmarks.scenes import SAMPLES, SEED, WORLDS, Scene, make_scenes
 from endopilot.simulation.catheter import Catheter
-from endopilot.simulation.config import PRESETS, Preset, SimulatorConfig
+from endopilot.simulation.config import Preset, SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, random_controls
 from endopilot.simulation.simulate import simulate
-from endopilot.types import SAMPLE_PERIOD_S, Rollout
+from endopilot.types import Rollout
 
 LEAST_SHARE = 1 / 3
 """Of the real-time factor of a wire alone, that wire and catheter must reach."""
-COMPARED = 2
-"""Worlds of each scene that the error in time is measured on."""
-REPEATS = 3
-"""Times that the worlds are simulated for the timing; the fastest counts."""
 
 
 def bench_coaxial(
@@ -36,55 +31,35 @@ def bench_coaxial(
         samples: of each world.
 
     Returns:
-        `realtime_factor_per_core` (simulated seconds per second of processor time on one thread) of wire and catheter,
-        that of the wire alone on the same worlds, and `share`, the first over the second, with its `bar` and whether it
-        `passed`; the share of valid worlds, the iterations a time step, the largest wall force, and the error in time
-        of both tips: against a time step of 1 ms, on a few of the worlds.
+        The figures of `bench_beside`, the catheter's name, and the error in time of both tips: against a time step of
+        1 ms, on a few of the worlds.
 
     Raises:
         InputError: the catheter does not fit the wire or a patient.
     """
-    scenes, config = make_scenes(worlds, samples), replace(PRESETS[preset], threads=1)
+    scenes = make_scenes(worlds, samples)
     starts, controls = zip(*(_catheter_drive(scene, place) for place, scene in enumerate(scenes)), strict=True)
-    simulated = SAMPLE_PERIOD_S * sum(scene.control.shape[0] * scene.control.shape[1] for scene in scenes)
 
-    def run(config: SimulatorConfig, count: int | None = None) -> list[Rollout]:
+    def run(config: SimulatorConfig, worlds: int | None = None) -> list[Rollout]:
         return [
             simulate(
                 scene.anatomy,
                 scene.device,
-                np.concatenate([scene.control, control], axis=-1)[:count],
+                np.concatenate([scene.control, control], axis=-1)[:worlds],
                 catheters=[catheter],
-                initial=np.concatenate([scene.initial, start], axis=-1)[:count],
+                initial=np.concatenate([scene.initial, start], axis=-1)[:worlds],
                 config=config,
             )
             for scene, start, control in zip(scenes, starts, controls, strict=True)
         ]
 
-    alone, both = [], []
-    rollouts: list[Rollout] = []
-    for _ in range(REPEATS):
-        begun = time.process_time()
-        for scene in scenes:
-            scene.run(config)
-        alone.append(time.process_time() - begun)
-        begun = time.process_time()
-        rollouts = run(config)
-        both.append(time.process_time() - begun)
-    share = min(alone) / min(both)
+    figures, rollouts = bench_beside(run, scenes, preset, beside="wire_alone", least_share=LEAST_SHARE)
+    fine = fine_steps(run, preset)
     return {
         "catheter": catheter.name,
-        "preset": preset,
-        "realtime_factor_per_core": round(simulated / min(both), 1),
-        "wire_alone_realtime_factor_per_core": round(simulated / min(alone), 1),
-        "share": round(share, 3),
-        "bar": round(LEAST_SHARE, 3),
-        "passed": share >= LEAST_SHARE,
-        "valid_worlds": round(float(np.mean([rollout.valid[:, -1].mean() for rollout in rollouts])), 5),
-        "iterations_per_step": round(float(np.mean([r.iterations[r.valid].mean() for r in rollouts])), 3),
-        "largest_wall_force_n": round(max(float(r.wall_force[r.valid].max()) for r in rollouts), 4),
-        **_error_in_time(rollouts, run(replace(config, time_step_s=1e-3, tolerance_mm=1e-6, threads=0), COMPARED)),
-        "worlds": sum(len(scene.control) for scene in scenes),
+        **figures,
+        **error_in_time("wire_tip_error", rollouts, fine, lambda rollout: rollout.tip_position),
+        **error_in_time("catheter_tip_error", rollouts, fine, _catheter_tip),
     }
 
 
@@ -101,17 +76,6 @@ def _catheter_drive(scene: Scene, place: int) -> tuple[np.ndarray, np.ndarray]:
     )
 
 
-def _error_in_time(rollouts: Sequence[Rollout], fine: Sequence[Rollout]) -> dict[str, float]:
-    errors: dict[str, list[np.ndarray]] = {"wire": [], "catheter": []}
-    for coarse, exact in zip(rollouts, fine, strict=True):
-        count = len(exact.valid)
-        valid = exact.valid & coarse.valid[:count]
-        errors["wire"].append(np.linalg.norm(exact.tip_position - coarse.tip_position[:count], axis=-1)[valid])
-        if exact.catheters is not None and coarse.catheters is not None:
-            off = exact.catheters.tip_position - coarse.catheters.tip_position[:count]
-            errors["catheter"].append(np.linalg.norm(off[:, :, 0], axis=-1)[valid])
-    return {
-        f"{name}_tip_error_{figure}_mm": round(float(np.percentile(np.concatenate(parts), percent)), 5)
-        for name, parts in errors.items()
-        for figure, percent in (("median", 50), ("p95", 95))
-    }
+def _catheter_tip(rollout: Rollout) -> Float[np.ndarray, "worlds samples 3"]:
+    assert rollout.catheters is not None
+    return rollout.catheters.tip_position[:, :, 0]

@@ -12,6 +12,7 @@ from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, random_controls
 from endopilot.simulation.device import Device, read_device
+from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulate import simulate
 from endopilot.types import Anatomy, Rollout
 
@@ -45,9 +46,16 @@ class Scene:
     initial: Float[np.ndarray, "worlds 2"]
     control: Float[np.ndarray, "worlds samples 2"]
 
-    def run(self, config: SimulatorConfig, worlds: int | None = None) -> Rollout:
-        """Simulate the worlds, or the first of them."""
-        return simulate(self.anatomy, self.device, self.control[:worlds], initial=self.initial[:worlds], config=config)
+    def run(self, config: SimulatorConfig, worlds: int | None = None, *, motion: Motion | None = None) -> Rollout:
+        """Simulate the worlds, or the first of them; the vessel lies still, or moves."""
+        return simulate(
+            self.anatomy,
+            self.device,
+            self.control[:worlds],
+            initial=self.initial[:worlds],
+            config=config,
+            motion=motion,
+        )
 
 
 def make_scenes(worlds: int = WORLDS, samples: int = SAMPLES) -> list[Scene]:

@@ -55,6 +55,10 @@ class Attempt:
         config = WorldConfig(simulator=replace(CORE, threads=1))
         return World(self.task.ladder_navigation(self.place), config, seed=self.seed)
 
+    def session(self, *parts: Any) -> GameSession:
+        """Return the session that plays and scores it, of the parts that every session takes."""
+        return GameSession(self, *parts)
+
 
 class GameSession(Session):
     """A session that is a game until its end, and an ordinary one afterwards.

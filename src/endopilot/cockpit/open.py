@@ -6,10 +6,9 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.cockpit.fluoroscopy import XrayUnit
@@ -23,6 +22,9 @@ from endopilot.simulation.device import Device, read_device
 from endopilot.tasks.navigation import Navigation, Target
 from endopilot.types import Anatomy, Volume
 from endopilot.xray.image import XrayImager
+
+if TYPE_CHECKING:
+    from endopilot.cockpit.game import Attempt
 
 _START_MM = 5.0
 _DEEP = 0.8
@@ -80,18 +82,9 @@ def open_task(name: str, place: int = 0, *, output: Path = Path("runs/cockpit"))
     Raises:
         InputError: the ladder has no such task, or the task no such patient.
     """
-    from endopilot.cockpit.game import Attempt, GameSession  # slow to import, and needed for tasks alone
-    from endopilot.tasks.task import find_task
-
-    tried = Attempt(find_task(name), place)
-    return _driven(
-        tried.world(),
-        Where(task=name, place=place),
-        output,
-        None,
-        seed=tried.seed,
-        make=partial(GameSession, tried),
-    )
+    tried = _attempt(name, place)
+    where = Where(task=name, place=place)
+    return _driven(tried.world(), where, output, None, seed=tried.seed, make=tried.session)
 
 
 def open_replay(
@@ -139,19 +132,18 @@ def resume_session(path: Path, *, ct: Path | None = None) -> Opened:
     _drop_half_line(path)
     where, make = recording.where, Session
     if where.task is not None and not any("score" in event for event in recording.events):
-        make = _game(where.task, where.place)
+        make = _attempt(where.task, where.place).session
     opened = _driven(first[0], where, path.parent, ct, path=path, seed=recording.seed, make=make)
     assert isinstance(opened.stage, Session)
     opened.stage.restore(chain([first], history))
     return opened
 
 
-def _game(task: str, place: int) -> Callable[..., Session]:
-    """Return what makes the session of a task."""
-    from endopilot.cockpit.game import Attempt, GameSession  # slow to import, and needed for tasks alone
+def _attempt(task: str, place: int) -> Attempt:
+    from endopilot.cockpit.game import Attempt  # slow to import, and needed for tasks alone
     from endopilot.tasks.task import find_task
 
-    return partial(GameSession, Attempt(find_task(task), place))
+    return Attempt(find_task(task), place)
 
 
 def _driven(

@@ -219,10 +219,9 @@ class Sequences:
         sequence, form = target[:, 0], target[:, 1]
         inputs, others, change = (kept[network][sequence, form % 2] for kept in (self.inputs, self.others, self.change))
         mirrored = (form >= 2)[:, None, None]  # and the others by 1: one product is cheaper than a choice of two
-        sign = np.append(play.mirrored(), np.ones(inputs.shape[-1] - play.N_FEATURES))
+        ones = np.ones(inputs.shape[-1] - play.N_FEATURES)
+        sign = torch.as_tensor(np.append(play.mirrored(), ones), dtype=torch.float32)
         turned = torch.tensor([1.0, 1.0 if network == "ff" else -1.0, 1.0])
-        inputs *= torch.where(
-            mirrored, torch.as_tensor(sign, dtype=torch.float32), 1.0
-        )  # of the copies that indexing made
+        inputs *= torch.where(mirrored, sign, 1.0)  # indexing made copies, which may be changed
         change *= torch.where(mirrored, turned, 1.0)
         return inputs, others, change
