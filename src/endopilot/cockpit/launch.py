@@ -40,7 +40,8 @@ def serve(
     """
     token = secrets.token_urlsafe(_TOKEN_BYTES)
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    with socket.socket(family, socket.SOCK_STREAM) as listener:
+    # The protocol is named so that asyncio sends each message at once: it asks for that (TCP_NODELAY) only then.
+    with socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP) as listener:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             listener.bind((host, port))
