@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -18,14 +18,8 @@ COMPARED = 2
 """Worlds of each scene that the error in time is measured on."""
 REPEATS = 3
 """Times that the worlds are simulated for the timing; the fastest counts."""
-
-
-class Run(Protocol):
-    """Simulates the scenario."""
-
-    def __call__(self, config: SimulatorConfig, worlds: int | None = None) -> list[Rollout]:
-        """Return a rollout of the worlds of each scene, or of the first of them."""
-        ...
+Run = Callable[[SimulatorConfig, int | None], list[Rollout]]
+"""Simulates the scenario: a rollout of the worlds of each scene, or of the first so many of them."""
 
 
 def bench_beside(
@@ -55,7 +49,7 @@ def bench_beside(
             scene.run(config)
         alone.append(time.process_time() - begun)
         begun = time.process_time()
-        rollouts = run(config)
+        rollouts = run(config, None)
         ours.append(time.process_time() - begun)
     share = min(alone) / min(ours)
     return {

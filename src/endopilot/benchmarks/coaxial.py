@@ -40,7 +40,7 @@ def bench_coaxial(
     scenes = make_scenes(worlds, samples)
     starts, controls = zip(*(_catheter_drive(scene, place) for place, scene in enumerate(scenes)), strict=True)
 
-    def run(config: SimulatorConfig, worlds: int | None = None) -> list[Rollout]:
+    def run(config: SimulatorConfig, worlds: int | None) -> list[Rollout]:
         return [
             simulate(
                 scene.anatomy,

@@ -30,7 +30,7 @@ def bench_motion(
     """
     scenes = make_scenes(worlds, samples)
 
-    def run(config: SimulatorConfig, worlds: int | None = None) -> list[Rollout]:
+    def run(config: SimulatorConfig, worlds: int | None) -> list[Rollout]:
         return [scene.run(config, worlds, motion=motion) for scene in scenes]
 
     figures, rollouts = bench_beside(run, scenes, preset, beside="still", least_share=LEAST_SHARE)
