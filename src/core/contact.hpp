@@ -171,20 +171,40 @@ struct Touching {
 template <class V>
 struct Touching<V, 0> {};
 
-// Adds the wall's elastic reaction, energy k/2 (radius - distance)² where positive. Returns the energy. Where `sticky`,
-// gradient and Hessian are those of a wall that can also pull: otherwise a node that has just lost contact would move
-// freely in the next Newton step and hit the wall.
+// The wall's spring at a contact point: it yields by d to the force k d exp(s d²).
+struct WallSpring {
+    double stiffness;    // k, N/mm
+    double stiffening;   // s, 1/mm²; 0 for a spring that does not stiffen
+
+    template <class V>
+    ENDOPILOT_DEVICE V force(const V& depth) const {
+        V force = stiffness * depth;
+        if (stiffening > 0) force *= exponential<V>(stiffening * depth * depth);
+        return force;
+    }
+};
+
+// Adds the wall's elastic reaction where the depth d = radius - distance is positive, energy k/2 d², of a spring that stiffens
+// k/2s (exp(s d²) - 1). Returns the energy. Where `sticky`, gradient and Hessian are those of a wall that can also pull:
+// otherwise a node that has just lost contact would move freely in the next Newton step and hit the wall.
 template <class V, int T, class Radius>
-ENDOPILOT_DEVICE inline V add_wall(double stiffness, const Radius& radius, const Single<V>& geometric, Mask<V> sticky,
+ENDOPILOT_DEVICE inline V add_wall(const WallSpring& spring, const Radius& radius, const Single<V>& geometric, Mask<V> sticky,
                                    const Distance<V>& d, Diagonal<V, T>& own) {
     using S = Single<V>;
     const Mask<V> clear = d.value >= radius;  // false for NaN, so that NaN reaches the energy
     const V gap = radius - d.value;
     const V touch = select<V>(clear, V{}, gap);
     const V depth = select<V>(sticky, gap, touch);
-    const V reaction = stiffness * depth;  // N, of the wall on the wire
+    V reaction = spring.stiffness * depth;  // N, of the wall on the wire
+    V tangent = broadcast<V>(spring.stiffness), energy = 0.5 * spring.stiffness * touch * touch;
+    if (spring.stiffening > 0) {
+        const V exponent = spring.stiffening * touch * touch, stiffer = exponential<V>(exponent);
+        reaction *= stiffer;
+        tangent *= stiffer * (1.0 + 2.0 * exponent);
+        energy = 0.5 * spring.stiffness / spring.stiffening * (stiffer - 1.0);
+    }
     own.gradient_x -= reaction * d.gradient;
-    const S k = narrow(select<V>(clear, select<V>(sticky, broadcast<V>(stiffness), V{}), broadcast<V>(stiffness)));
+    const S k = narrow(select<V>(clear, select<V>(sticky, tangent, V{}), tangent));
     const S bend = geometric * narrow(reaction);
     const Vec3<S> n = narrow(d.gradient), kn = k * n;
     own.xx.xx += kn.x * n.x - bend * d.hessian.xx;
@@ -193,7 +213,7 @@ ENDOPILOT_DEVICE inline V add_wall(double stiffness, const Radius& radius, const
     own.xx.xy += kn.x * n.y - bend * d.hessian.xy;
     own.xx.xz += kn.x * n.z - bend * d.hessian.xz;
     own.xx.yz += kn.y * n.z - bend * d.hessian.yz;
-    return 0.5 * stiffness * touch * touch;
+    return energy;
 }
 
 // Adds smoothed Coulomb friction of the touching surface, energy limit (sqrt(|s|² + eps²) - eps) with s the tangential

@@ -16,7 +16,10 @@ namespace endopilot {
 
 struct Options {
     double stick_velocity;     // slip velocity below which friction falls off, mm/s
-    double wall_stiffness;     // N/mm
+    double wall_stiffness;     // of a contact point, N/mm
+    double foundation;         // of a compliant wall, for each mm of wire, N/mm²: in place of it where not 0
+    double foundation_stiffening;  // the compliant wall yields by d to foundation × d exp(stiffening × d²), 1/mm²
+    double tip_takes_along;    // length of the compliant wall that the tip displaces beyond its own, mm
     double tolerance;          // a step has converged when Newton's step moves no node farther, mm (rotations: rad)
     double sample_tolerance;   // the same for the step that ends a sample: its forces are recorded
     double largest_step;       // displacement that one Newton step is clamped to, mm (rotations: rad)

@@ -213,6 +213,13 @@ ENDOPILOT_DEVICE inline V square_root(V a) {
 }
 
 template <class V>
+ENDOPILOT_DEVICE inline V exponential(const V& a) {
+    V result{};
+    for (int lane = 0; lane < kWidth<V>; ++lane) set(result, lane, std::exp(get(a, lane)));
+    return result;
+}
+
+template <class V>
 struct Vec3 {
     V x, y, z;
     ENDOPILOT_DEVICE friend Vec3 operator+(const Vec3& a, const Vec3& b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }

@@ -316,9 +316,11 @@ private:
     ENDOPILOT_DEVICE DriveBlock drive_block(const Carried<V, T>& carried) const;
     template <class Radius>
     ENDOPILOT_DEVICE static bool near_wall(const ContactPoint<V>& point, const Vec3<V>& x, const Radius& radius, Mask<V> on);
+    ENDOPILOT_DEVICE WallSpring spring_at_node(int i) const;
+    ENDOPILOT_DEVICE WallSpring spring_at_middle(int i) const;
     template <class Radius>
     ENDOPILOT_LARGE bool add_contact(ContactPoint<V>& point, const Vec3<V>& x, const Vec3<V>& moved, const Quaternion<V>& turned,
-                                     const Radius& radius, const Touching<V, T>& touching, Mask<V> on, Diagonal<V, T>& block);
+                                     const WallSpring& spring, const Radius& radius, const Touching<V, T>& touching, Mask<V> on, Diagonal<V, T>& block);
     ENDOPILOT_LARGE void add_surroundings(int first, int count);
     ENDOPILOT_DEVICE void add_lumen(int k, int i, const Vec3<V>& moved, const Quaternion<V>& turned);
     ENDOPILOT_DEVICE void add_drag(int i, const Vec3<V>& moved, const Quaternion<V>& turned, Diagonal<V, T>& own);
@@ -327,7 +329,7 @@ private:
     ENDOPILOT_LARGE V solve(int n);
     ENDOPILOT_LARGE void update(int n, const Decision (&decision)[W], const V& factor);
     template <class Radius>
-    ENDOPILOT_DEVICE void freeze(ContactPoint<V>& point, const Vec3<V>& step, const Vec3<V>& axis, const Radius& radius,
+    ENDOPILOT_DEVICE void freeze(ContactPoint<V>& point, const Vec3<V>& step, const Vec3<V>& axis, const WallSpring& spring, const Radius& radius,
                                  const V& friction, Mask<V> on, const V& weight) const;
     ENDOPILOT_LARGE void freeze_contacts(int n, Mask<V> mask, const V& weight);
     ENDOPILOT_LARGE void finish_step(int n, Mask<V> mask, Mask<V> restart, const V& weight);

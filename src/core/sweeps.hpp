@@ -131,12 +131,27 @@ bool Stepper<V, T>::near_wall(const ContactPoint<V>& point, const Vec3<V>& x, co
     return any<V>(on & ~clear);
 }
 
+// The wall's spring at node i and at the middle of the element behind it. A compliant wall yields along the wire: half an element
+// stands for its middle, and a quarter of either one for the node between them. The tip takes more of the wall along.
+template <class V, int T>
+WallSpring Stepper<V, T>::spring_at_node(int i) const {
+    if (options_.foundation == 0) return {options_.wall_stiffness, 0};
+    const double along = 0.25 * (rod_.length[i] + (i > 0 ? rod_.length[i - 1] : 0.0)) + (i > 0 ? 0.0 : options_.tip_takes_along);
+    return {options_.foundation * along, options_.foundation_stiffening};
+}
+
+template <class V, int T>
+WallSpring Stepper<V, T>::spring_at_middle(int i) const {
+    if (options_.foundation == 0) return {options_.wall_stiffness, 0};
+    return {0.5 * options_.foundation * rod_.length[i], options_.foundation_stiffening};
+}
+
 // The wall's reaction and friction at one contact point of the lanes in `on`: at x, moved by `moved` since the step's start.
 // Returns whether anything was added to `block`.
 template <class V, int T>
 template <class Radius>
 bool Stepper<V, T>::add_contact(ContactPoint<V>& point, const Vec3<V>& x, const Vec3<V>& moved, const Quaternion<V>& turned,
-                                const Radius& radius, const Touching<V, T>& touching, Mask<V> on, Diagonal<V, T>& block) {
+                                const WallSpring& spring, const Radius& radius, const Touching<V, T>& touching, Mask<V> on, Diagonal<V, T>& block) {
     const V zero{};
     point.last_gap = select<V>(accepted_, point.gap, point.last_gap);
     point.gap = broadcast<V>(kStickyReach);
@@ -153,7 +168,7 @@ bool Stepper<V, T>::add_contact(ContactPoint<V>& point, const Vec3<V>& x, const 
         point.wall = {d.value, d.gradient};
         d.value = select<V>(on, d.value, broadcast<V>(Lumen::kDeep));
         const Mask<V> sticky = (first_ > zero) & (point.friction.limit > zero) & (d.value < radius + kStickyReach);
-        energy_ += add_wall<V, T, Radius>(options_.wall_stiffness, radius, geometric_, sticky, d, block);
+        energy_ += add_wall<V, T, Radius>(spring, radius, geometric_, sticky, d, block);
     } else {
         point.wall = {broadcast<V>(Lumen::kDeep), {zero, zero, zero}};
     }
@@ -187,10 +202,11 @@ void Stepper<V, T>::add_lumen(int k, int i, const Vec3<V>& moved, const Quaterni
     const Node<V, T>& behind = node_[i + 1];
     const Mask<V> on = active_ > broadcast<V>(i), middle_on = active_ > broadcast<V>(i + 1);
     const Vec3<V> middle = half * (node.x + behind.x) + node.at_middle.offset, middle_moved = half * (moved + (behind.x - behind.start));
+    const WallSpring at_node = spring_at_node(i), at_middle = spring_at_middle(i);
     bool touches;
     if constexpr (T == 0) {
-        add_contact(node.at_node, node.x + node.at_node.offset, moved, turned, rod_.radius[i], {}, on, block_[k]);
-        touches = add_contact(node.at_middle, middle, middle_moved, turned, rod_.radius[i], {}, middle_on, middle_);
+        add_contact(node.at_node, node.x + node.at_node.offset, moved, turned, at_node, rod_.radius[i], {}, on, block_[k]);
+        touches = add_contact(node.at_middle, middle, middle_moved, turned, at_middle, rod_.radius[i], {}, middle_on, middle_);
     } else {
         const auto touching = [&](const TubeContact<V, T>& contact) {
             Touching<V, T> t{.weight = {}, .twisted = {}, .spin = contact.spin};
@@ -201,8 +217,8 @@ void Stepper<V, T>::add_lumen(int k, int i, const Vec3<V>& moved, const Quaterni
             return t;
         };
         const TubeContact<V, T>&here = node.tubes.at_node, &there = node.tubes.at_middle;
-        add_contact(node.at_node, node.x + node.at_node.offset, moved + here.slide, turned, here.radius, touching(here), on, block_[k]);
-        touches = add_contact(node.at_middle, middle, middle_moved + there.slide, turned, there.radius, touching(there), middle_on, middle_);
+        add_contact(node.at_node, node.x + node.at_node.offset, moved + here.slide, turned, at_node, here.radius, touching(here), on, block_[k]);
+        touches = add_contact(node.at_middle, middle, middle_moved + there.slide, turned, at_middle, there.radius, touching(there), middle_on, middle_);
     }
     if (!touches) return;
     add_middle(middle_, block_[k], block_[k + 1], link_[k]);
@@ -346,14 +362,14 @@ void Stepper<V, T>::update(int n, const Decision (&decision)[W], const V& factor
 // Freezes the wall at a contact point that has come to rest after the move `step`: friction in the coming step then has a potential.
 template <class V, int T>
 template <class Radius>
-void Stepper<V, T>::freeze(ContactPoint<V>& point, const Vec3<V>& step, const Vec3<V>& axis, const Radius& radius, const V& friction,
-                           Mask<V> on, const V& weight) const {
+void Stepper<V, T>::freeze(ContactPoint<V>& point, const Vec3<V>& step, const Vec3<V>& axis, const WallSpring& spring, const Radius& radius,
+                           const V& friction, Mask<V> on, const V& weight) const {
     const V zero{}, one = broadcast<V>(1.0);
     const Vec3<V>& gradient = point.wall.gradient;
     const V distance = point.wall.distance + dot(gradient, step);
     const V norm = square_root(dot(gradient, gradient));
     const Mask<V> touches = (distance < radius) & (norm > 1e-3);
-    const V push = select<V>(touches, options_.wall_stiffness * (radius - distance) * norm, zero);
+    const V push = select<V>(touches, spring.force<V>(radius - distance) * norm, zero);
     // friction in the coming step acts with the normal force at its middle, extrapolated
     V ahead = push + select<V>(point.normal_force > zero, 0.5 * weight * (push - point.normal_force), zero);
     ahead = select<V>(ahead > 2.0 * push, 2.0 * push, ahead);
@@ -378,12 +394,12 @@ void Stepper<V, T>::freeze_contacts(int n, Mask<V> mask, const V& weight) {
         const Vec3<V> axis = frame(node.q).d3;
         const Vec3<V> middle_step = broadcast<V>(0.5) * (node.step + node_[i + 1].step);
         if constexpr (T == 0) {
-            freeze(node.at_node, node.step, axis, rod_.radius[i], friction_, on, weight);
-            freeze(node.at_middle, middle_step, axis, rod_.radius[i], friction_, middle, weight);
+            freeze(node.at_node, node.step, axis, spring_at_node(i), rod_.radius[i], friction_, on, weight);
+            freeze(node.at_middle, middle_step, axis, spring_at_middle(i), rod_.radius[i], friction_, middle, weight);
         } else {
             const TubeContact<V, T>&here = node.tubes.at_node, &there = node.tubes.at_middle;
-            freeze(node.at_node, node.step, axis, here.radius, here.friction, on, weight);
-            freeze(node.at_middle, middle_step, axis, there.radius, there.friction, middle, weight);
+            freeze(node.at_node, node.step, axis, spring_at_node(i), here.radius, here.friction, on, weight);
+            freeze(node.at_middle, middle_step, axis, spring_at_middle(i), there.radius, there.friction, middle, weight);
         }
         const Vec3<V> bent_behind = broadcast<V>(1.0 / rod_.joint_length[i + 1]) * (ahead - behind);
         const double l = rod_.length[i], around = i > 0 ? rod_.length[i - 1] * l / 24 : l * l / 8;

@@ -25,6 +25,9 @@ class Motion:
 class Options:
     stick_velocity: float
     wall_stiffness: float
+    foundation: float
+    foundation_stiffening: float
+    tip_takes_along: float
     tolerance: float
     sample_tolerance: float
     largest_step: float

@@ -83,9 +83,9 @@ inline Pair elastic_energy(const RodModel& rod, const Pose& distal, const Pose& 
     return pair_of(energy, own, next, link);
 }
 
-inline Block wall_energy(const Lumen& lumen, double stiffness, double radius, const Vec3<double>& x) {
+inline Block wall_energy(const Lumen& lumen, const WallSpring& spring, double radius, const Vec3<double>& x) {
     Diagonal<double> own{};
-    const double energy = add_wall<double>(stiffness, radius, 1.0f, false, distance_to_wall<double>(lumen, x), own);
+    const double energy = add_wall<double>(spring, radius, 1.0f, false, distance_to_wall<double>(lumen, x), own);
     return {energy, gradient_of(own), hessian_of(own)};
 }
 

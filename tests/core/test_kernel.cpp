@@ -78,7 +78,7 @@ OwnedScene make_scene(bool with_loads, bool moving = false) {
             .lumen = std::make_shared<LumenMap>(make_map()),
             .loads = with_loads ? std::make_shared<OwnedLoads>(make_loads(40)) : nullptr,
             .base = {.origin = {-3.0, 0.0, 0.0}, .orientation = {half, {0, half, 0}}},
-            .options = {.stick_velocity = 0.05, .wall_stiffness = 100.0, .tolerance = 1e-3, .sample_tolerance = 1e-6,
+            .options = {.stick_velocity = 0.05, .wall_stiffness = 100.0, .foundation = 0.0, .foundation_stiffening = 0.0, .tip_takes_along = 0.0, .tolerance = 1e-3, .sample_tolerance = 1e-6,
                         .largest_step = 0.3, .largest_jump = 0.1, .max_iterations = 400, .free_behind = 3.0,
                         .approach_velocity = 20.0, .push_limit = 0.05, .pull_limit = 0.05,
                         .torque_limit = 0.5, .introducer_friction = 0.05, .introducer_drag = 0.002},

@@ -23,6 +23,25 @@ def test_helical_buckling() -> None:
     assert force.error <= 0.05
 
 
+def test_a_rod_sinks_into_a_compliant_wall() -> None:
+    # Winkler: w = F β/(2k) exp(-β|x|) (cos βx + sin β|x|), β = (k/4EI)^¼ (Hetényi 1946), along the whole rod.
+    (case,) = tube.compliant_wall()
+    assert case.error <= 0.01
+    assert case.picture is not None
+    exact, core = case.picture.curves
+    assert np.abs(core.y - exact.y).max() < 0.005 * exact.y.max()
+    assert exact.y.min() < 0  # it lifts beside the load
+
+
+def test_a_compliant_wall_stiffens() -> None:
+    # A rod of weight w per length sinks to where K d exp(s d²) = w (Holzapfel and Ogden 2009, simple shear).
+    (case,) = tube.stiffening_wall()
+    assert case.error <= 0.001
+    assert case.picture is not None
+    _, core = case.picture.curves
+    np.testing.assert_allclose(core.x, [0.5, 1.0, 1.5, 2.0], rtol=1e-3)
+
+
 def test_torque_whip() -> None:
     # GJ θ'' = EI k0 kt sin θ; the tip jumps when L sqrt(EI k0 kt/GJ) > π/2.
     (case,) = tube.torque_whip()

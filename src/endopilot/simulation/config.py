@@ -23,6 +23,16 @@ _DENT_MM = 0.015
 """Depth to which a node that bears the whole push limit dents the wall, mm, where the stiffness is not given."""
 _HARD_PUSH_N = 2.0
 """Push that stands for the limit of a drive that has none, N."""
+_RIGID_REACH_MM, _COMPLIANT_REACH_MM = 0.5, 2.4
+"""How far outside the wall a wire may lie, mm; distance maps reach 2.5 mm."""
+_ARTERY_MM = 4.0
+"""Width of the artery that displaces the muscle around it, mm."""
+COMPLIANT_WALL_STIFFENING_MM2 = 8.023 / _ARTERY_MM**2
+"""A compliant wall yields by d to K d exp(s d²), s in 1/mm²: muscle in simple shear by γ = d/4 mm bears γ exp(8.023 γ²)
+times its modulus (Holzapfel and Ogden, Phil Trans R Soc A 2009, isotropic part, from shear tests of porcine muscle)."""
+COMPLIANT_WALL_AT_TIP_MM = 6.4
+"""The tip bears on a point, and takes along as much wall as this length has, mm: a rigid disc as wide as the artery, on
+the muscle of docs/physics.md, is held by E B/(1 - ν²) = 0.064 N/mm (Boussinesq), and K is 0.01 N/mm²."""
 Actuation = Literal["velocity", "force"]
 """What a control is: translation (mm/s) and rotation (rad/s), or the drive's axial force (N) and torque (N·mm)."""
 
@@ -42,6 +52,11 @@ class SimulatorConfig:
     """Length of the wire's elements at its tip, mm; towards the base they grow to five times that."""
     wall_stiffness_n_mm: Positive | None = None
     """Stiffness of the vessel wall at a node, N/mm. If not given, the device's push limit dents it by 0.015 mm."""
+    compliant_wall_n_mm2: Annotated[float, Within(0.01)] | None = None
+    """Stiffness of a compliant wall, N/mm of wire and mm of displacement: each place of the wall yields by itself, as a
+    bed of springs (Winkler) that stiffen as the heart's muscle does. It takes the place of `wall_stiffness_n_mm` if
+    given. An artery that lies in that muscle has 0.01; docs/physics.md derives it. A softer wall would yield farther
+    than distance maps reach."""
     stick_velocity_mm_s: Positive = 0.05
     """Slip velocity under which smoothed Coulomb friction falls off, mm/s; a wire at rest creeps more slowly."""
     approach_velocity_mm_s: Positive = 20.0
@@ -70,6 +85,11 @@ class SimulatorConfig:
     def steps_per_sample(self) -> int:
         """Time steps in a sample period of 0.5 s."""
         return round(SAMPLE_PERIOD_S / self.time_step_s)
+
+    @property
+    def wall_reach_mm(self) -> float:
+        """How far outside the wall a wire may lie before it counts as having left the vessel, mm."""
+        return _RIGID_REACH_MM if self.compliant_wall_n_mm2 is None else _COMPLIANT_REACH_MM
 
     def steps_of(self, duration_s: float) -> int:
         """Return into how many time steps, of `time_step_s` at most, some time is cut."""

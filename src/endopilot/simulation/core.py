@@ -7,7 +7,15 @@ from jaxtyping import Float
 
 from endopilot import _core
 from endopilot.progress import Advance, progress
-from endopilot.simulation.config import FREE_BEHIND_MM, LANES, Actuation, SimulatorConfig, wall_stiffness
+from endopilot.simulation.config import (
+    COMPLIANT_WALL_AT_TIP_MM,
+    COMPLIANT_WALL_STIFFENING_MM2,
+    FREE_BEHIND_MM,
+    LANES,
+    Actuation,
+    SimulatorConfig,
+    wall_stiffness,
+)
 from endopilot.simulation.processor import CoreMotion, Lumen, Options, Processor, core_for, gpu_errors
 from endopilot.simulation.rod import RodLayout
 from endopilot.simulation.tubes import TubeLayout
@@ -149,6 +157,9 @@ def core_options(
     options = core_for(config.processor).Options()
     options.stick_velocity = config.stick_velocity_mm_s
     options.wall_stiffness = wall_stiffness(config, push_limit_n)
+    options.foundation = config.compliant_wall_n_mm2 or 0.0
+    options.foundation_stiffening = COMPLIANT_WALL_STIFFENING_MM2
+    options.tip_takes_along = COMPLIANT_WALL_AT_TIP_MM
     options.tolerance = config.tolerance_mm
     options.sample_tolerance = min(config.sample_tolerance_mm, config.tolerance_mm)
     options.largest_step = _LARGEST_NEWTON_STEP
@@ -164,15 +175,24 @@ def core_options(
     return options
 
 
-def make_lumen(distance_map: DistanceMap, radius_mm: float, processor: Processor = "cpu") -> Lumen:
-    """Return the wall as the core wants it, a quadratic B-spline through the map, for a wire of some radius."""
+def make_lumen(
+    distance_map: DistanceMap, radius_mm: float, processor: Processor = "cpu", *, far_mm: float = 0.5
+) -> Lumen:
+    """Return the wall as the core wants it, a quadratic B-spline through the map.
+
+    Args:
+        distance_map: of the vessel.
+        radius_mm: of the wire.
+        processor: where it is used.
+        far_mm: a wire farther outside the wall than this has left the map.
+    """
     spacing = float(distance_map.spacing_mm)
     return core_for(processor).make_lumen(
         values=np.ascontiguousarray(distance_map.values, dtype=np.float32),
         origin=np.asarray(distance_map.origin_mm, dtype=float),
         spacing=spacing,
         near=radius_mm + spacing,
-        far=0.5,
+        far=far_mm,
     )
 
 

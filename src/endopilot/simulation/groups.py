@@ -33,6 +33,7 @@ class Group:
         stack: the wire and its catheters, as the first of them has it.
         rod: its nodes and stiffnesses.
         lumen: the wall, as the core has it.
+        wall_reach_mm: how far outside the wall it goes.
         motion: of the vessel, as the core has it; None if it lies still.
         simulation: the worlds, as the core has them.
         index: their numbers, ascending.
@@ -45,6 +46,7 @@ class Group:
     stack: Stack
     rod: RodLayout
     lumen: Lumen
+    wall_reach_mm: float
     motion: CoreMotion | None
     simulation: Simulation
     index: Integer[np.ndarray, "members"]
@@ -79,7 +81,11 @@ def make_groups(
             or negative at the ostium; more worlds than the memory holds.
     """
     core = core_for(config.processor)
-    prepared = [group for group in sharing if isinstance(group.lumen, core.Lumen)]
+    prepared = [
+        group
+        for group in sharing
+        if isinstance(group.lumen, core.Lumen) and group.wall_reach_mm == config.wall_reach_mm
+    ]
     lumens = {(group.anatomy.identity, group.stack.outer_radius_mm): group.lumen for group in prepared}
     projectors = {group.anatomy.identity: group.project for group in sharing}
     members: dict[GroupKey, list[int]] = {}
@@ -92,7 +98,9 @@ def make_groups(
         key = (anatomy.identity, stack.outer_radius_mm)
         if key not in lumens:
             check_distance_map(anatomy)
-            lumens[key] = make_lumen(anatomy.distance_map, stack.outer_radius_mm, config.processor)
+            lumens[key] = make_lumen(
+                anatomy.distance_map, stack.outer_radius_mm, config.processor, far_mm=config.wall_reach_mm
+            )
         if anatomy.identity not in projectors:
             projectors[anatomy.identity] = TipProjector(anatomy.tree, anatomy.insertion)
         path_mm = float(anatomy.tree.longest_path().abscissa[-1])
@@ -118,7 +126,21 @@ def make_groups(
             worlds=len(worlds),
         )
         index, project = np.array(worlds), projectors[anatomy.identity]
-        groups.append(Group(anatomy, stack, rod, lumens[key], moving, simulation, index, path_mm, longest_mm, project))
+        groups.append(
+            Group(
+                anatomy,
+                stack,
+                rod,
+                lumens[key],
+                config.wall_reach_mm,
+                moving,
+                simulation,
+                index,
+                path_mm,
+                longest_mm,
+                project,
+            )
+        )
     return groups
 
 

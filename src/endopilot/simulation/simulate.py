@@ -124,7 +124,7 @@ def simulate(
     moving = None if motion is None else motion.core(np.asarray(anatomy.insertion.position), config.processor)
     result = run_core(
         rod,
-        make_lumen(anatomy.distance_map, stack.outer_radius_mm, config.processor),
+        make_lumen(anatomy.distance_map, stack.outer_radius_mm, config.processor, far_mm=config.wall_reach_mm),
         anatomy.insertion,
         config=config,
         initial=initial,

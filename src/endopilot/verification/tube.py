@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float
 from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from endopilot import _core
-from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.config import COMPLIANT_WALL_STIFFENING_MM2, SimulatorConfig
 from endopilot.simulation.core import make_lumen
 from endopilot.simulation.rod import RodLayout
 from endopilot.types import DistanceMap, Insertion
 from endopilot.verification.case import (
+    STATIC,
     Case,
     Curve,
     Loading,
@@ -46,16 +51,19 @@ WHIP_WIRE_CURVATURE = 0.02
 WHIP_BEND = 10.0
 WHIP_TWIST = 8.0
 WHIP_SHARES = np.array([0.85, 0.9, 0.95])
+PRESSED_BEND_N_MM2 = 5.0
+"""EI of the rod that is pressed into a compliant wall, N·mm²."""
 
 
-def straight_tube(*, length_mm: float, radius_mm: float, spacing_mm: float = 0.2) -> DistanceMap:
-    """Return the distance map of a tube about the x-axis from 0 to a length, with open ends."""
-    margin = 4 * spacing_mm
-    across = np.arange(-radius_mm - margin, radius_mm + margin + spacing_mm / 2, spacing_mm)
-    along = np.arange(-margin, length_mm + margin, spacing_mm)
+def straight_tube(
+    *, length_mm: float, radius_mm: float, spacing_mm: float = 0.2, outside_mm: float = 0.8
+) -> DistanceMap:
+    """Return the distance map of a tube about the x-axis from 0 to a length, with open ends, and of some mm outside."""
+    across = np.arange(-radius_mm - outside_mm, radius_mm + outside_mm + spacing_mm / 2, spacing_mm)
+    along = np.arange(-outside_mm, length_mm + outside_mm, spacing_mm)
     values = radius_mm - np.sqrt(across[None, :, None] ** 2 + across[:, None, None] ** 2) + 0 * along
     origin = np.array([along[0], across[0], across[0]])
-    return DistanceMap(values=np.maximum(values, -1.0), spacing_mm=spacing_mm, origin_mm=origin)
+    return DistanceMap(values=np.maximum(values, -outside_mm - 0.2), spacing_mm=spacing_mm, origin_mm=origin)
 
 
 def rod_in_tube(
@@ -300,4 +308,76 @@ def _pendulum(length_mm: float, rate: float) -> tuple[Float[np.ndarray, "n"], Fl
     return base[shown], tip[shown]
 
 
-CASES = (sinusoidal_buckling, helical_buckling, torque_whip)
+def rod_on_wall(
+    foundation_n_mm2: float, weight_n_mm: float, *, load_n: float = 0.0
+) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+    """Lay a long rod on a tube's compliant bottom; return places on it and how far it sinks there, mm.
+
+    Args:
+        foundation_n_mm2: stiffness of the wall.
+        weight_n_mm: of the rod, by which all of it sinks.
+        load_n: on the node in the middle, besides.
+    """
+    elements, length, radius = 241, 120.0, 0.1
+    rod = straight_rod(
+        elements=elements, length_mm=length, bend=PRESSED_BEND_N_MM2, twist=PRESSED_BEND_N_MM2, shear=1e5, stretch=1e5
+    )
+    tube = straight_tube(length_mm=length + 10, radius_mm=2.0, outside_mm=4.0)
+    sinks = stiffening_depth(weight_n_mm / foundation_n_mm2)
+    start = Insertion(position=np.array([5.0, 0.0, radius - 2.0 - sinks]), direction=np.array([1.0, 0.0, 0.0]))
+    config = replace(STATIC, compliant_wall_n_mm2=foundation_n_mm2)
+    loading = Loading.none(len(rod.abscissa_mm))
+    loading.force_n[:elements, 2] = -weight_n_mm * rod.abscissa_mm[1]
+    loading.force_n[elements // 2, 2] -= load_n
+    lumen = make_lumen(tube, radius, far_mm=config.wall_reach_mm)
+    shape = equilibrium(rod, loading, samples=2, lumen=lumen, insertion=start, config=config)["shape"][-1]
+    return rod.abscissa_mm[:elements] - rod.abscissa_mm[elements // 2], radius - 2.0 - shape[:elements, 2]
+
+
+def stiffening_depth(unstiffened_mm: float) -> float:
+    """Return d with d exp(s d²) = `unstiffened_mm`: how far a compliant wall yields that would, if linear, by that."""
+    depth: Any = brentq(lambda d: d * np.exp(COMPLIANT_WALL_STIFFENING_MM2 * d**2) - unstiffened_mm, 0.0, 3.0)
+    return float(depth)
+
+
+def compliant_wall() -> list[Case]:
+    """Compare a long rod that is pressed into a compliant straight wall with δ = F β/(2 k), β = (k/(4 EI))^¼.
+
+    EI d⁴w/dx⁴ + k w = 0 beside the load: w = δ exp(-β |x|) (cos β x + sin β |x|). M. Hetényi, Beams on Elastic
+    Foundation, 1946. A weight keeps the rod on the wall where it would lift, which the equation, being linear, allows;
+    the wall hardly stiffens over these hundredths of a millimetre.
+    """
+    stiffness, load = 0.01, 0.01
+    beta = (stiffness / (4 * PRESSED_BEND_N_MM2)) ** 0.25
+    (along, resting), (_, pressed) = (rod_on_wall(stiffness, 0.05 * load * beta, load_n=extra) for extra in (0.0, load))
+    sunk, exact, away = pressed - resting, load * beta / (2 * stiffness), beta * np.abs(along)
+    line = exact * np.exp(-away) * (np.cos(away) + np.sin(away))
+    picture = Picture(
+        "distance from the load, mm",
+        "displacement of the wall, mm",
+        (Curve("F β/(2k) exp(−βx) (cos βx + sin βx)", along, line, "reference"), Curve("core", along, sunk)),
+    )
+    return [compare("rod pressed into a compliant wall, δ, mm", exact, float(sunk.max()), 0.01, picture)]
+
+
+def stiffening_wall() -> list[Case]:
+    """Compare how far a long rod sinks into a compliant wall by its weight w with w = k d exp(s d²)."""
+    stiffness, depths = 0.01, np.array([0.5, 1.0, 1.5, 2.0])
+    weights = stiffness * depths * np.exp(COMPLIANT_WALL_STIFFENING_MM2 * depths**2)
+    found = [rod_on_wall(stiffness, weight) for weight in weights]
+    sunk = np.array([float(np.median(depth)) for _, depth in found])
+    line = np.linspace(0, depths[-1], 100)
+    picture = Picture(
+        "displacement of the wall, mm",
+        "force, N/mm",
+        (
+            Curve(
+                "k d exp(s d²)", line, stiffness * line * np.exp(COMPLIANT_WALL_STIFFENING_MM2 * line**2), "reference"
+            ),
+            Curve("core", sunk, weights, "mark"),
+        ),
+    )
+    return [compare("rod's weight on a wall that stiffens, d, mm", depths[-1], sunk[-1], 0.001, picture)]
+
+
+CASES = (sinusoidal_buckling, helical_buckling, torque_whip, compliant_wall, stiffening_wall)
