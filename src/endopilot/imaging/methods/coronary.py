@@ -42,11 +42,14 @@ _FAT_HU = -90.0
 _LOW_SHARE = 0.25
 """A vessel's voxels rise by this share of the step from what surrounds them to lumen; the blur dims small vessels."""
 _POOL_RADIUS_MM = 3.5
-"""A ball of this radius fits in chambers and great vessels, and in no coronary artery."""
+"""A ball of this radius fits in chambers and great vessels, and in no coronary artery but a dilated one."""
+_CORE_RADIUS_MM = 5.5
+_NEAR_CORE_MM = 3.0
+"""A ball of this radius fits in no dilated artery either: what is wide so near to where it fits is a pool."""
 _RESPONSE = 0.15
 """Vesselness of a vessel's voxels."""
-_SCALES_MM = (0.6, 0.9, 1.3, 1.9)
-"""Scales of the vesselness: they answer most to radii of 0.8 to 2.7 mm."""
+_SCALES_MM = (0.6, 0.9, 1.3, 1.9, 2.8)
+"""Scales of the vesselness: they answer most to radii of 0.8 to 4 mm."""
 _GAP_MM = 1.0
 """Voxels between vessels this close together are bridged, if they are bright."""
 _SEED_MM = 5.0
@@ -62,7 +65,7 @@ COARSEST_MM = 1.25
 
 _MOUTH_MM = 4.0
 """Length of the artery's beginning where the aorta's blood hides its radius, mm."""
-_WIDEST_MM = 3.0
+_WIDEST_MM = 5.0
 """Largest radius expected of a coronary artery, mm."""
 _MARGIN_MM = 8.0
 """Width of surroundings kept around the tree for the contour, mm."""
@@ -184,7 +187,7 @@ def _find_vessels(grid: Volume, lumen_hu: float) -> _Scan:
     body = resample(grid, _BODY_GRID_MM)
     above_muscle = _MUSCLE_HU + _LOW_SHARE * (lumen_hu - _MUSCLE_HU)
     above_fat = _FAT_HU + _LOW_SHARE * (lumen_hu - _FAT_HU)
-    pools = _thick(body, above_muscle, grid)
+    pools = _pools(body, above_muscle, grid)
     # A small vessel in fat is dimmer than muscle, but visible where no thick tissue is.
     thin = ((hu > above_muscle) & ~pools) | ((hu > above_fat) & ~_thick(body, above_fat, grid))
     response = vesselness(
@@ -200,12 +203,27 @@ def _find_vessels(grid: Volume, lumen_hu: float) -> _Scan:
     return _Scan(grid, hu, lumen_hu, pools, vessels, response)
 
 
-def _thick(body: Volume, level_hu: float, grid: Volume) -> Bool[np.ndarray, "nz ny nx"]:
-    """Return where the tissue above a level is thick: the opening by a ball wider than a coronary artery."""
+def _pools(body: Volume, level_hu: float, grid: Volume) -> Bool[np.ndarray, "nz ny nx"]:
+    """Return where blood above a level is thick and near to where it is thicker than in any artery of the heart."""
     depth = distance_to_outside(body.voxels > level_hu, _BODY_GRID_MM)
+    from_core = _beyond_balls(depth, _CORE_RADIUS_MM) - _NEAR_CORE_MM
+    return _inside(np.maximum(_beyond_balls(depth, _POOL_RADIUS_MM), from_core), body, grid)
+
+
+def _thick(body: Volume, level_hu: float, grid: Volume) -> Bool[np.ndarray, "nz ny nx"]:
+    """Return where the tissue above a level is thick: the opening by a ball wider than most coronary arteries."""
+    depth = distance_to_outside(body.voxels > level_hu, _BODY_GRID_MM)
+    return _inside(_beyond_balls(depth, _POOL_RADIUS_MM), body, grid)
+
+
+def _beyond_balls(depth: Float[np.ndarray, "nz ny nx"], radius_mm: float) -> Float[np.ndarray, "nz ny nx"]:
+    """Return the distance from all balls that fit where `depth` is the distance to the outside, mm."""
     # Half a voxel of the body's grid more, so that no rim is left.
-    beyond = distance_to_outside(depth < _POOL_RADIUS_MM, _BODY_GRID_MM) - _POOL_RADIUS_MM - _BODY_GRID_MM / 2
-    return interpolate_like(Volume(beyond, body.spacing_mm, body.origin_mm, body.direction), grid, outside=1.0) <= 0
+    return distance_to_outside(depth < radius_mm, _BODY_GRID_MM) - radius_mm - _BODY_GRID_MM / 2
+
+
+def _inside(distance: Float[np.ndarray, "nz ny nx"], body: Volume, grid: Volume) -> Bool[np.ndarray, "nz ny nx"]:
+    return interpolate_like(Volume(distance, body.spacing_mm, body.origin_mm, body.direction), grid, outside=1.0) <= 0
 
 
 def _aorta(scan: _Scan, root: AorticRoot) -> Bool[np.ndarray, "nz ny nx"]:
@@ -368,7 +386,7 @@ def _cut(excluded: np.ndarray, crop: Volume, ostium: Insertion) -> None:
 def _rough_radius(lines: list[np.ndarray], scan: _Scan) -> list[Float[np.ndarray, "_"]]:
     """Return the lumen radius along each path, mm, from the distance to voxels below half height."""
     index = np.round(scan.grid.world_to_index(np.concatenate(lines))).astype(int)[:, ::-1]
-    box = box_around(index, np.full(3, 4.0 / _GRID_MM), scan.hu.shape)
+    box = box_around(index, np.full(3, (_WIDEST_MM + 1.0) / _GRID_MM), scan.hu.shape)
     blood = scan.hu[box] > scan.blood_hu
     depth = np.asarray(ndimage.maximum_filter(distance_to_outside(blood, _GRID_MM), 3)) - _GRID_MM / 2
     pieces = []
