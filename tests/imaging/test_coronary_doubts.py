@@ -117,6 +117,14 @@ def test_a_second_vessel_beside_the_ostium_is_no_graft(found):
     assert coronary_doubts(with_vessel(found, conus, 1.2), "rca") == ()
 
 
+@pytest.mark.parametrize(("vessel", "told"), [("rca", 0), ("lca", 1)])
+def test_the_left_artery_leaves_the_aorta_above_the_right_one(found, vessel, told):
+    other = line((-12.0, 0.0, 26.0), (-15.0, 0.0, 26.0))
+    other = np.concatenate([other, line((-15.0, 0.0, 26.0), (-14.0, 16.0, 26.0))])
+    doubts = coronary_doubts(with_vessel(found, other, 1.8), vessel)
+    assert sum("bypass graft" in doubt for doubt in doubts) == told
+
+
 def test_a_vein_in_the_tree_is_told(found):
     vein = line((60.0, 0.0, 6.0), (60.0, 16.0, 20.0))
     dim = with_vessel(found, vein, 1.6, 0.6 * BLOOD_HU, in_tree=True)
@@ -144,6 +152,17 @@ def test_steps_are_told_with_their_place(spacing):
         assert len(told) == expected
         if told:
             assert "step artefacts at z 115 mm" in told[0]
+
+
+def test_a_flat_surface_between_slices_is_no_step():
+    grid = empty_grid((60, 120, 120), (0.4, 0.4, 0.5), (0.0, 0.0, 100.0))
+    x = positions(grid)
+    places = [(8.0, 8.0), (24.0, 8.0), (40.0, 8.0), (8.0, 24.0), (24.0, 24.0), (40.0, 24.0)]
+    slant = 0.3 * (x[..., 2:] - 110.0)
+    tube = np.min([np.linalg.norm(x[..., :2] - place - slant, axis=-1) for place in places], axis=0) < 6.0
+    roof = (x[..., 2] > 115.0) & (x[..., 1] > 38.0)
+    hu = np.where(tube | roof, BLOOD_HU, FAT_HU)
+    assert _steps(scan(grid, hu, blur_mm=0.4, noise_hu=40.0)) == []
 
 
 def test_a_volume_of_few_slices_is_taken():

@@ -285,7 +285,8 @@ def _rival_aortas(
         if (other & aorta).any() or root.blood_hu < _RIVAL_SHARE * scan.lumen_hu:
             continue
         found = openings(scan.hu, scan.blood_hu, other, label, _GRID_MM)
-        if any(sizes[o.vessel] >= _LEAST_TREE_MM3 and _on_side(scan, root, o.voxel, vessel) for o in found):
+        large = [o.voxel for o in found if sizes[o.vessel] >= _LEAST_TREE_MM3]
+        if large and _on_side(scan, root, np.array(large), vessel).any():
             x, y, z = root.centres[len(root.centres) // 2]
             told.append(
                 f"two vessels may be the ascending aorta; the one not taken passes ({x:.0f}, {y:.0f}, {z:.0f}) mm, and "
@@ -319,23 +320,24 @@ def _tree_at_aorta(
     touching = np.argwhere((gap <= TO_WALL_MM) & (label[box] > 0))
     sizes = np.bincount(label.ravel())
     best, start = 0, None
+    corner = np.array([part.start for part in box])
+    # A vein may join the vessel and touch the aorta too: only where the ostium may be is it looked for.
+    touching = touching[_on_side(scan, root, touching + corner, vessel)]
     for name in np.unique(label[box][tuple(touching.T)]):
         voxels = touching[label[box][tuple(touching.T)] == name]
-        nearest = voxels[gap[tuple(voxels.T)].argmin()] + [part.start for part in box]
-        if _on_side(scan, root, nearest, vessel) and sizes[name] > sizes[best] * (best > 0):
-            best, start = int(name), nearest
+        if sizes[name] > sizes[best] * (best > 0):
+            best, start = int(name), voxels[gap[tuple(voxels.T)].argmin()] + corner
     if start is None or sizes[best] * _GRID_MM**3 < _LEAST_TREE_MM3:
         return None
     return label == best, start
 
 
-def _on_side(scan: _Scan, root: AorticRoot, voxel: np.ndarray, vessel: str) -> bool:
-    """Return whether a voxel at the aorta's wall is where the wanted artery's ostium may be."""
-    point = scan.grid.index_to_world(voxel[::-1].astype(float))
-    disc = int(np.abs(root.centres[:, 2] - point[2]).argmin())
-    if point[2] < root.centres[0, 2]:  # what comes to a chamber below is no ostium
-        return False
-    return bool((point[:2] - root.centres[disc, :2]) @ np.array(_SIDE[vessel]) > 0)
+def _on_side(scan: _Scan, root: AorticRoot, voxels: Int[np.ndarray, "n 3"], vessel: str) -> Bool[np.ndarray, "n"]:
+    """Return which voxels at the aorta's wall are where the wanted artery's ostium may be."""
+    points = scan.grid.index_to_world(voxels[:, ::-1].astype(float))
+    disc = np.abs(root.centres[:, 2] - points[:, 2, None]).argmin(axis=1)
+    outward = (points[:, :2] - root.centres[disc, :2]) @ np.array(_SIDE[vessel])
+    return (points[:, 2] >= root.centres[0, 2]) & (outward > 0)  # what comes to a chamber below is no ostium
 
 
 def _vessel_near(scan: _Scan, vessels: np.ndarray, seed: tuple[float, float, float]) -> Int[np.ndarray, "3"]:
