@@ -218,6 +218,14 @@ def test_a_seed_draws_the_same_start_whatever_the_number_of_worlds(anatomy: Anat
     assert not np.array_equal(many.position[1], few.position[1])
 
 
+def test_a_reset_leaves_other_wires_as_they_are(anatomy: Anatomy) -> None:
+    simulator = begun(Simulator(anatomy, [DEVICE, STIFF]), 2)
+    kept, moved = simulator.position[1], simulator.position[0]
+    simulator.reset(inserted_length=[30.0, 0.0], rotation=[1.0, 0.0], worlds=[0])
+    assert np.array_equal(simulator.position[1], kept)
+    assert not np.array_equal(simulator.position[0], moved)
+
+
 def test_forces_replay_a_velocity_run(anatomy: Anatomy) -> None:
     # The drive's force and torque are the gradient of the step's potential in the drive's motion; taken as loads,
     # they make that motion the minimum.

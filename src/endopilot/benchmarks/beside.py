@@ -36,17 +36,18 @@ def bench_beside(
 
     Returns:
         The figures: `realtime_factor_per_core` (simulated seconds per second of processor time) of both, `share`, the
-        first over the second, with its `bar` and whether it `passed`; the share of valid worlds, the iterations a time
-        step and the largest wall force (N). And the rollouts that they were taken from.
+        first over the second, with its `bar` and whether it `passed`; `node_iterations_per_second` of both, the nodes
+        evaluated in a simulated second; the share of valid worlds, the iterations a time step and the largest wall
+        force (N). And the rollouts that they were taken from.
     """
     config = replace(PRESETS[preset], threads=1)
     simulated = SAMPLE_PERIOD_S * sum(scene.control.shape[0] * scene.control.shape[1] for scene in scenes)
     rollouts: list[Rollout] = []
+    still: list[Rollout] = []
     ours, alone = [], []
     for _ in range(REPEATS):
         begun = time.process_time()
-        for scene in scenes:
-            scene.run(config)
+        still = [scene.run(config) for scene in scenes]
         alone.append(time.process_time() - begun)
         begun = time.process_time()
         rollouts = run(config, None)
@@ -59,11 +60,17 @@ def bench_beside(
         "share": round(share, 3),
         "bar": round(least_share, 3),
         "passed": share >= least_share,
+        "node_iterations_per_second": _node_iterations(rollouts, simulated),
+        f"{beside}_node_iterations_per_second": _node_iterations(still, simulated),
         "valid_worlds": round(float(np.mean([rollout.valid[:, -1].mean() for rollout in rollouts])), 5),
         "iterations_per_step": round(float(np.mean([r.iterations[r.valid].mean() for r in rollouts])), 3),
         "largest_wall_force_n": round(max(float(r.wall_force[r.valid].max()) for r in rollouts), 4),
         "worlds": sum(len(scene.control) for scene in scenes),
     }, rollouts
+
+
+def _node_iterations(rollouts: Sequence[Rollout], simulated_s: float) -> float:
+    return round(sum(float(rollout.node_iterations.sum()) for rollout in rollouts) / simulated_s, 1)
 
 
 def fine_steps(run: Run, preset: Preset) -> list[Rollout]:

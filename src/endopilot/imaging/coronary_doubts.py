@@ -47,8 +47,8 @@ _VEIN_SHARE, _VEIN_MM, _VEIN_RADIUS_MM = 0.8, 15.0, 1.0
 _GRAFT_MM = 12.0
 """A vessel that leaves the aorta so far above the ostium is a bypass graft,"""
 _LEFT_ABOVE_MM = 26.0
-"""unless it may be the left artery: in seven patients' CT angiograms the left ostium lies 9 to 24 mm above the right one,
-on the other side of the aorta, since the aortic root is tilted."""
+"""unless it may be the left artery: in seven patients' CT angiograms the left ostium lies 9 to 24 mm above the right
+one, on the other side of the aorta, since the aortic root is tilted."""
 _LEAST_GRAFT_MM3 = 100.0
 _METAL_HU = 2000.0
 """Brighter than calcium: leads, stents, clips."""

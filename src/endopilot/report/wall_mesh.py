@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Float32, Int
 from scipy.ndimage import zoom
 from skimage.measure import marching_cubes
 
@@ -48,19 +48,19 @@ def wall_mesh(distance_map: DistanceMap, *, max_triangles: int = MAX_TRIANGLES) 
 
 
 def _march(
-    values: Float[np.ndarray, "nz ny nx"], spacing: Float[np.ndarray, "3"]
+    values: Float32[np.ndarray, "nz ny nx"], spacing: Float[np.ndarray, "3"]
 ) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "triangles 3"]]:
     vertices, triangles, _, _ = marching_cubes(values, level=0.0, spacing=tuple(spacing))
     return vertices.astype(float), triangles.astype(np.int64)
 
 
-def _cropped(distance_map: DistanceMap) -> tuple[Float[np.ndarray, "nz ny nx"], Float[np.ndarray, "3"]]:
+def _cropped(distance_map: DistanceMap) -> tuple[Float32[np.ndarray, "nz ny nx"], Float[np.ndarray, "3"]]:
     """Return the part of the map around the lumen with one layer of outside about it, and its origin, LPS mm."""
     inside = np.asarray(distance_map.values) > 0
     found = [np.flatnonzero(inside.any(axis=others)) for others in ((1, 2), (0, 2), (0, 1))]
     start = np.array([max(index[0] - 2, 0) for index in found])
     stop = np.array([index[-1] + 3 for index in found])
-    box = np.asarray(distance_map.values[tuple(slice(a, b) for a, b in zip(start, stop, strict=True))], dtype=float)
     # A lumen that reaches the edge of the map is closed there.
-    padded = np.pad(box, 1, constant_values=-distance_map.spacing_mm)
+    padded = np.full(np.minimum(stop, inside.shape) - start + 2, -distance_map.spacing_mm, dtype=np.float32)
+    padded[1:-1, 1:-1, 1:-1] = distance_map.values[tuple(slice(a, b) for a, b in zip(start, stop, strict=True))]
     return padded, distance_map.origin_mm + (start[::-1] - 1) * distance_map.spacing_mm

@@ -170,6 +170,8 @@ class Simulator:
         initial = np.stack([np.column_stack([start, inner]), np.column_stack([turn, inner_turn])], axis=-1)
         for group in self._groups:
             mine = np.isin(group.index, chosen)
+            if not mine.any():
+                continue
             index = group.index[mine]
             group.simulation.reset(
                 index=np.flatnonzero(mine),

@@ -222,7 +222,8 @@ def _beyond_balls(depth: Float[np.ndarray, "nz ny nx"], radius_mm: float) -> Flo
     return distance_to_outside(depth < radius_mm, _BODY_GRID_MM) - radius_mm - _BODY_GRID_MM / 2
 
 
-def _inside(distance: Float[np.ndarray, "nz ny nx"], body: Volume, grid: Volume) -> Bool[np.ndarray, "nz ny nx"]:
+def _inside(distance: Float[np.ndarray, "k j i"], body: Volume, grid: Volume) -> Bool[np.ndarray, "nz ny nx"]:
+    """Return where a distance on the body's grid is 0 or less, on the vessels' grid."""
     return interpolate_like(Volume(distance, body.spacing_mm, body.origin_mm, body.direction), grid, outside=1.0) <= 0
 
 
