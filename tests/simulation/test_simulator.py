@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import read_device
+from endopilot.simulation.readout import Readout
 from endopilot.simulation.simulate import simulate
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import SimulatorState
@@ -150,6 +151,7 @@ import numpy as np
 from bend import vessel
 from endopilot.simulation.device import read_device
 from endopilot.simulation.state import SimulatorState
+from endopilot.simulation.readout import Readout
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import SimulatorState
 from pathlib import Path
@@ -388,8 +390,9 @@ def test_every_public_name_has_an_example_that_runs(anatomy: Anatomy) -> None:
     simulator = Simulator(anatomy, DEVICE, worlds=4)
     simulator.reset(seed=1)
     known = {"np": np, "Simulator": Simulator, "anatomy": anatomy, "device": DEVICE, "simulator": simulator}
-    examples = doctest.DocTestFinder(recurse=True).find(Simulator, "Simulator", globs=known)
-    public = {name for name in vars(Simulator) if not name.startswith("_")}
+    finder = doctest.DocTestFinder(recurse=True)
+    examples = [test for part in (Simulator, Readout) for test in finder.find(part, "Simulator", globs=known)]
+    public = {name for name in dir(Simulator) if not name.startswith("_")}
     assert {test.name.split(".")[-1] for test in examples if test.examples} >= public
     runner = doctest.DocTestRunner()
     for test in examples:

@@ -13,7 +13,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from endopilot.errors import InputError
@@ -21,12 +21,13 @@ from endopilot.simulation.catheter import Catheter
 from endopilot.simulation.checks import check_control, check_memory, check_travel
 from endopilot.simulation.config import LANES, Actuation, SimulatorConfig
 from endopilot.simulation.device import Device
-from endopilot.simulation.groups import Group, group_key, make_groups, merge
+from endopilot.simulation.groups import Group, group_key, make_groups
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.processor import gpu_errors
+from endopilot.simulation.readout import Readout
 from endopilot.simulation.state import SimulatorState, Step, SupportsDLPack
 from endopilot.simulation.tubes import Stack
-from endopilot.types import SAMPLE_PERIOD_S, Anatomy, TipProjection
+from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
 _DEEPEST_START = 0.8
 """Share of the longest path that a random start may lie at."""
@@ -34,7 +35,7 @@ _LEAST_BYTES = 4000
 """No world takes less memory, bytes; a number of worlds that needs more is refused before they are listed."""
 
 
-class Simulator:
+class Simulator(Readout):
     """Many worlds at once, each with an anatomy, a device and controls of its own.
 
     A world's result does not depend on the others: neither on their number nor on the threads that step them.
@@ -230,36 +231,6 @@ class Simulator:
             **{name: self._merge([result[name][:, 0] for result in results]) for name in Step.__dataclass_fields__}
         )
 
-    def project(self, device: int = 0) -> TipProjection:
-        """Project tips to the centerline: Δtip (mm), γtip (mm), branch and lumen radius (mm), a row a world.
-
-        Args:
-            device: whose tips, those of the wires (0) or of a catheter (1, 2), from the inside out.
-
-        Raises:
-            InputError: there is no such device.
-
-        Example:
-            >>> tip = simulator.project()
-            >>> bool((tip.offset < tip.radius).all())
-            True
-        """
-        tips = [group.project(points) for group, points in zip(self._groups, self._tips(device), strict=True)]
-        names = TipProjection.__dataclass_fields__
-        return TipProjection(**{name: self._merge([getattr(tip, name) for tip in tips]) for name in names})
-
-    def tips(self, device: int = 0) -> Float[np.ndarray, "worlds 3"]:
-        """Return where tips are, LPS mm, those of the wires (0) or of a catheter (1, 2), from the inside out.
-
-        Raises:
-            InputError: there is no such device.
-
-        Example:
-            >>> np.array_equal(simulator.tips(), simulator.position[:, 0])  # wires alone
-            True
-        """
-        return self._merge(self._tips(device))
-
     @property
     def state(self) -> SimulatorState:
         """The worlds' state, to be kept and given to `set_state`.
@@ -340,209 +311,6 @@ class Simulator:
         """
         return self._config
 
-    @property
-    def worlds(self) -> int:
-        """Number of worlds.
-
-        Example:
-            >>> simulator.worlds
-            4
-        """
-        return len(self._device)
-
-    @property
-    def nodes(self) -> int:
-        """Nodes of the longest wire; arrays with a row a node are padded to this.
-
-        Example:
-            >>> simulator.contacts.shape == (4, simulator.nodes)
-            True
-        """
-        return max(group.simulation.nodes for group in self._groups)
-
-    @property
-    def inserted_length(self) -> Float[np.ndarray, "worlds"]:
-        """Inserted lengths Δ, mm.
-
-        Example:
-            >>> simulator.inserted_length.shape
-            (4,)
-        """
-        return self._of_tubes(0)[:, 0] if self._stacks[0].catheters else self._gather("inserted_length")
-
-    @property
-    def catheter_inserted_length(self) -> Float[np.ndarray, "worlds catheters"]:
-        """Inserted lengths of the catheters, mm.
-
-        Example:
-            >>> simulator.catheter_inserted_length.shape  # a wire alone
-            (4, 0)
-        """
-        return self._of_tubes(0)[:, 1:]
-
-    @property
-    def catheter_rotation(self) -> Float[np.ndarray, "worlds catheters"]:
-        """Rotations of the catheters' drives, rad.
-
-        Example:
-            >>> simulator.catheter_rotation.shape
-            (4, 0)
-        """
-        return self._of_tubes(1)[:, 1:]
-
-    @property
-    def catheter_drive_load(self) -> Float[np.ndarray, "worlds catheters 2"]:
-        """Force (N) and torque (N·mm) of the catheters' drives.
-
-        Example:
-            >>> simulator.catheter_drive_load.shape
-            (4, 0, 2)
-        """
-        return np.stack([self._of_tubes(9)[:, 1:], self._of_tubes(10)[:, 1:]], axis=-1)
-
-    @property
-    def rotation(self) -> Float[np.ndarray, "worlds"]:
-        """Rotations φ of the drive, rad.
-
-        Example:
-            >>> simulator.reset(inserted_length=np.full(4, 5.0), rotation=[0.0, 0.5, 1.0, 1.5])
-            >>> simulator.rotation
-            array([0. , 0.5, 1. , 1.5])
-        """
-        return self._gather("rotation")
-
-    @property
-    def time(self) -> Float[np.ndarray, "worlds"]:
-        """Time since each world was put to its first inserted length, s; it is what the vessel moves with.
-
-        Example:
-            >>> simulator.reset(seed=0)
-            >>> _ = simulator.step(np.zeros((4, 2)), duration=0.25)
-            >>> simulator.time
-            array([0.25, 0.25, 0.25, 0.25])
-        """
-        return self._gather("time")
-
-    @property
-    def vessel_to_laboratory(self) -> Float[np.ndarray, "worlds 3 4"]:
-        """Where each vessel lies now: affine maps of its points, as CT shows them, to the laboratory, LPS mm.
-
-        Example:
-            >>> bool((simulator.vessel_to_laboratory[:, :, :3] == np.eye(3)).all())  # a vessel that lies still
-            True
-        """
-        still = np.eye(3, 4)
-        return self._merge(
-            [
-                np.tile(still, (len(group.index), 1, 1))
-                if group.motion is None
-                else group.motion.placements(group.simulation.time())[0]
-                for group in self._groups
-            ]
-        )
-
-    @property
-    def position(self) -> Float[np.ndarray, "worlds nodes 3"]:
-        """Positions of the nodes from the tip to the base, LPS mm; NaN beyond the nodes of a shorter wire.
-
-        With catheters the first node is the foremost tip.
-
-        Example:
-            >>> simulator.position.shape == (4, simulator.nodes, 3)
-            True
-        """
-        return self._per_node("positions", np.nan)
-
-    @property
-    def orientation(self) -> Float[np.ndarray, "worlds nodes 4"]:
-        """Orientations of the elements as quaternions w x y z; the third director points along the wire to its tip.
-
-        Example:
-            >>> bool(np.allclose(np.linalg.norm(simulator.orientation, axis=-1), 1.0))
-            True
-        """
-        return self._per_node("attitudes", np.nan)
-
-    @property
-    def tip_direction(self) -> Float[np.ndarray, "worlds 3"]:
-        """Unit vectors along the wires at their tips.
-
-        Example:
-            >>> bool(np.allclose(np.linalg.norm(simulator.tip_direction, axis=-1), 1.0))
-            True
-        """
-        return self._merge([group.simulation.tip_directions() for group in self._groups])
-
-    @property
-    def contacts(self) -> Float[np.ndarray, "worlds nodes"]:
-        """Force of the wall at each node and at the middle of the element behind it, added up, N.
-
-        Example:
-            >>> bool((simulator.contacts >= 0).all())
-            True
-        """
-        return self._per_node("contacts", 0.0)
-
-    @property
-    def active_nodes(self) -> Float[np.ndarray, "worlds"]:
-        """Number of nodes ahead of the catheter, those that are solved for.
-
-        Example:
-            >>> bool((simulator.active_nodes <= simulator.nodes).all())
-            True
-        """
-        return self._gather("active")
-
-    @property
-    def base_load(self) -> Float[np.ndarray, "worlds 2"]:
-        """Axial force (N, positive when it pushes) and torque (N·mm) that hold the wire in the catheter.
-
-        Example:
-            >>> force_n, torque_n_mm = simulator.base_load.T
-            >>> force_n.shape
-            (4,)
-        """
-        return np.column_stack([self._gather("base_force"), self._gather("base_torque")])
-
-    @property
-    def drive_load(self) -> Float[np.ndarray, "worlds 2"]:
-        """Force (N) and torque (N·mm) of the drive: `base_load` and what the introducer's valve takes.
-
-        As controls of a force-driven simulator they make the same motion.
-
-        Example:
-            >>> simulator.drive_load.shape
-            (4, 2)
-        """
-        return np.column_stack([self._gather("drive_force"), self._gather("drive_torque")])
-
-    @property
-    def valid(self) -> Bool[np.ndarray, "worlds"]:
-        """False for a world that left the finite numbers or did not converge; it stays as it was until it is reset.
-
-        Example:
-            >>> simulator.valid
-            array([ True,  True,  True,  True])
-        """
-        return self.reason == 0
-
-    @property
-    def reason(self) -> Int[np.ndarray, "worlds"]:
-        """Why a world is invalid: 0 it is valid, 1 it left the finite numbers, 2 it did not converge.
-
-        Example:
-            >>> simulator.reason
-            array([0, 0, 0, 0])
-        """
-        return self._gather("reason").astype(int)
-
-    def _tips(self, device: int) -> list[Float[np.ndarray, "members 3"]]:
-        """Return where tips are, an array a group."""
-        count = len(self._stacks[0].devices)
-        if not 0 <= device < count:
-            raise InputError(f"device: {device}; give 0 for the wire" + (f", to {count - 1}" if count > 1 else ""))
-        return [group.simulation.tips(device) for group in self._groups]
-
     def _random_start(self, seed: int | None) -> tuple[np.ndarray, np.ndarray]:
         if seed is None:
             return np.zeros(self.worlds), np.zeros(self.worlds)
@@ -580,25 +348,6 @@ class Simulator:
             world = int(np.argwhere(~np.isfinite(array))[0][0])
             raise InputError(f"{name}: world {world}: not a finite number; correct it")
         return array
-
-    def _of_tubes(self, number: int) -> Float[np.ndarray, "worlds tubes"]:
-        """Return one of the core's numbers of the wire and its catheters."""
-        if not self._stacks[0].catheters:
-            return np.zeros((self.worlds, 1))
-        return self._merge([group.simulation.tubes()[:, :, number] for group in self._groups])
-
-    def _merge(self, parts: Sequence[np.ndarray]) -> np.ndarray:
-        return merge(self._groups, parts)
-
-    def _gather(self, name: str) -> Float[np.ndarray, "worlds"]:
-        return self._merge([getattr(group.simulation, name)() for group in self._groups])
-
-    def _per_node(self, name: str, pad: float) -> np.ndarray:
-        parts = [getattr(group.simulation, name)() for group in self._groups]
-        out = np.full((self.worlds, self.nodes, *parts[0].shape[2:]), pad)
-        for group, part in zip(self._groups, parts, strict=True):
-            out[group.index, : part.shape[1]] = part
-        return out
 
     @cached_property
     def _fingerprint(self) -> str:
