@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from endopilot.control.mismatch import ModelMismatch
 from endopilot.control.navigate import NavigateConfig, NavigationLoop, navigate
 from endopilot.control.policy import Decision, Observation, Policy
 from endopilot.control.robot import CYCLE_S, RobotConfig
+from endopilot.simulation.motion import Motion
 from endopilot.tasks.navigation import Navigation, Target
 from endopilot.xray.fluoroscope import FluoroscopeConfig
 
@@ -186,3 +189,40 @@ def test_an_image_without_a_wire_is_taken_again_and_counts(straight, monkeypatch
     assert record.exposed.tolist() == [True, True, True, False, False, False]
     assert record.exposures == 3
     assert [tip is not None for tip in record.measured] == [False, False, True, False, False, False]
+
+
+def breathing(**changed: float) -> Motion:
+    """Return a breath that shifts the vessel and does not turn it."""
+    still = {"annulus_mm": 0.0, "heart_volume_share": 0.0, "heart_rotation_deg": 0.0}
+    turned = {"breathing_dorsal_deg": 0.0, "breathing_dextral_deg": 0.0}
+    return Motion(**(still | turned | {"breathing_caudal_mm": 6.0, "breathing_anterior_mm": 0.0} | changed))
+
+
+def test_an_exposure_shows_a_moving_vessel_where_it_is_less_what_the_c_arm_knows(straight) -> None:
+    """The ostium's axis is z: a breath of 6 mm towards the feet, sin⁴(πt/4 s), moves the tip by so much along it."""
+    sharp = FluoroscopeConfig(pixel_sd=1e-3, along_sd=1e-3)
+    base = NavigateConfig(robot=PERFECT, fluoroscope=sharp, motion=breathing())
+
+    def errors(known: Motion | None) -> np.ndarray:
+        record = navigate(straight, Forward(3.0, expose_every=1), config=replace(base, known_motion=known))
+        shown = [tip for tip in record.measured if tip is not None]
+        return np.array([tip.position for tip in shown]) - record.tip_position[: len(shown)]
+
+    unknown, half, exact = (errors(known) for known in (None, breathing(breathing_caudal_mm=3.0), breathing()))
+    time_s = 0.5 * np.arange(len(unknown))
+    shift = -6.0 * np.sin(np.pi * time_s / 4.0) ** 4
+    seen = slice(8, None)  # deep enough in the vessel to be seen in it
+    np.testing.assert_allclose(unknown[seen, 2], shift[seen], atol=0.3)
+    np.testing.assert_allclose(half[seen, 2], 0.5 * shift[seen], atol=0.3)
+    assert np.abs(exact).max() < 0.05
+    assert np.abs(unknown[seen, 2]).max() > 4.0
+
+
+def test_a_heartbeat_moves_the_wire_in_the_vessel(straight) -> None:
+    config = NavigateConfig(robot=PERFECT)
+    still, beating = (
+        navigate(straight, Forward(3.0), config=replace(config, motion=motion)) for motion in (None, Motion())
+    )
+    both = min(len(still.time_s), len(beating.time_s))
+    assert beating.reason != "invalid"
+    assert np.abs(still.tip_position[:both] - beating.tip_position[:both]).max() > 0.05

@@ -57,6 +57,17 @@ def test_the_command_writes_the_image(fork, tmp_path, capsys):
     np.testing.assert_array_equal(grey, image.grey)
 
 
+def test_a_breath_moves_vessel_and_wire_in_the_image(fork):
+    """Two seconds into a breath the vessel lies 4.9 mm nearer to the feet: lower in a view from the front."""
+    plain, inspired = shown(fork, dose=10.0), shown(fork, dose=10.0, motion="breathing", time_s=2.0)
+    down = inspired.tip_pixel[0] - plain.tip_pixel[0]
+    assert down * plain.mm_per_pixel == pytest.approx(4.9, abs=0.5)
+    row, column = np.rint(inspired.tip_pixel).astype(int)
+    below = row + round(5.0 / plain.mm_per_pixel)
+    assert max(darker(inspired, below, column + side) for side in range(-4, 5)) > 30
+    assert shown(fork, motion="breathing").tip_pixel == pytest.approx(plain.tip_pixel, abs=0.5)
+
+
 def test_refuses_what_is_no_png(fork, tmp_path):
     with pytest.raises(InputError, match=r"image.jpg: an image is written as PNG"):
         shown(fork).write(tmp_path / "image.jpg")

@@ -9,6 +9,7 @@ from dataclasses import field, replace
 from typing import Literal
 
 import numpy as np
+from jaxtyping import Float
 
 from endopilot.control.mismatch import ModelMismatch
 from endopilot.control.policies import make_policy
@@ -18,6 +19,7 @@ from endopilot.control.robot import CYCLE_S, RobotConfig, SimulatedRobot
 from endopilot.settings import settings
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.drive_limits import DriveLimits
+from endopilot.simulation.motion import Motion, place, relative
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import DECISION_PERIOD_S, SUCCESS_MM, Navigation, check_wire_alone
 from endopilot.xray.fluoroscope import Fluoroscope, FluoroscopeConfig, TipMeasurement
@@ -39,6 +41,11 @@ class NavigateConfig:
     images of a patient whose pose is registered by one injection of contrast)."""
     simulator: SimulatorConfig = field(default_factory=lambda: SimulatorConfig(threads=1))
     """The rod core."""
+    motion: Motion | None = None
+    """How heart and breath move the vessel and its guiding catheter; they lie still if not given."""
+    known_motion: Motion | None = None
+    """The motion that the C-arm, which knows the phase of heart and breath, takes off what it measures; none if not
+    given. What it does not take off, an exposure shows as an error."""
 
 
 class NavigationLoop:
@@ -88,7 +95,10 @@ class NavigationLoop:
         config, truth = config or NavigateConfig(), truth or ModelMismatch()
         self.navigation = navigation
         self.policy = make_policy(policy) if isinstance(policy, str) else policy
-        self.simulator = start_world(navigation, truth, config.simulator)
+        self.simulator = start_world(navigation, truth, config.simulator, motion=config.motion)
+        ostium = np.asarray(navigation.anatomy.insertion.position)
+        self._moves = config.motion is not None
+        self._known = None if config.known_motion is None else config.known_motion.core(ostium)
         self._limits = tuple(DriveLimits.of(device, navigation.anatomy) for device in navigation.devices)
         drive = replace(config.robot, latency_s=config.robot.latency_s * truth.latency_factor)
         self.robot = SimulatedRobot(self.simulator, self._limits, drive, seed=seed, ostium_mm=truth.ostium_mm)
@@ -192,8 +202,22 @@ class NavigationLoop:
     def _measure(self, inserted_length: float) -> TipMeasurement | None:
         if isinstance(self.fluoroscope, Fluoroscope):
             tip, heading = self.simulator.tips()[0], self.simulator.tip_direction[0]
+            if self._moves:
+                seen = self._seen()
+                tip, heading = place(seen, tip), seen[:, :3] @ heading
+                heading = heading / np.linalg.norm(heading)
             return self.fluoroscope.expose(tip, heading, inserted_length, self._random)
-        return self.fluoroscope.expose(self.simulator.position[0], inserted_length, self._random)
+        nodes = self.simulator.position[0]
+        if self._moves:
+            nodes = place(self._seen(), nodes)
+        return self.fluoroscope.expose(nodes, inserted_length, self._random)
+
+    def _seen(self) -> Float[np.ndarray, "3 4"]:
+        """Return where the C-arm takes points of the moving vessel to lie in the vessel as CT shows it."""
+        placed = self.simulator.vessel_to_laboratory[0]
+        if self._known is None:
+            return placed
+        return relative(placed, self._known.placements(np.array([self.time_s]))[0][0])
 
     def _decide(self, observation: Observation, by_hand: Decision | None) -> Decision:
         if by_hand is None:
@@ -246,13 +270,16 @@ def navigate(
     return loop.record()
 
 
-def start_world(navigation: Navigation, truth: ModelMismatch, config: SimulatorConfig) -> Simulator:
+def start_world(
+    navigation: Navigation, truth: ModelMismatch, config: SimulatorConfig, *, motion: Motion | None = None
+) -> Simulator:
     """Return the world as it truly is, with the wire and its catheters at the start of the navigation.
 
     Args:
         navigation: as a policy is given it.
         truth: how reality differs.
         config: settings of the rod core.
+        motion: of the vessel; it lies still if not given.
 
     Raises:
         InputError: the wire does not fit the vessel, or starts deeper than it is long.
@@ -260,7 +287,7 @@ def start_world(navigation: Navigation, truth: ModelMismatch, config: SimulatorC
     device = navigation.device
     wire = device.with_tip(bend_rad=device.tip_bend_rad, stiffness_factor=truth.stiffness_factor)
     catheters = truth.catheters(navigation.catheters)
-    simulator = Simulator(navigation.anatomy, wire, catheters=catheters, config=config)
+    simulator = Simulator(navigation.anatomy, wire, catheters=catheters, motion=motion, config=config)
     simulator.reset(
         inserted_length=[max(navigation.start_inserted_mm + truth.ostium_mm, 0.0)],
         rotation=[navigation.start_rotation],

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -28,10 +28,12 @@ from endopilot.settings import Finite, NonNegative, Positive, Seed, ShareBelowOn
 from endopilot.simulation.catheter import Catheter, read_catheter
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import Device, read_device
+from endopilot.simulation.motion import Motion, MotionName, motion_named
 from endopilot.simulation.simulate import simulate
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Arrives, Navigation
 from endopilot.types import Anatomy, Rollout, TipProjection
 
+MotionKnown = Literal["nothing", "published", "exact"]
 _Factor = Annotated[float, Within(0.2, 5)]
 
 
@@ -64,6 +66,13 @@ class NavigatePatientConfig:
     xray: XrayKind = "assumed"
     """What an exposure is: assumed (the tip, with the C-arm's errors of detection) or images (the tip is found in X-ray
     images of a patient whose pose is registered by one injection of contrast)."""
+    motion: MotionName = "still"
+    """How heart and breath move the vessel and the guiding catheter: still, breathing, heartbeat or both."""
+    motion_seed: Seed | None = None
+    """Draws the patient's amplitudes from the published distributions; their means if not given."""
+    motion_known: MotionKnown = "published"
+    """What the C-arm, which knows the phase of heart and breath, takes off what it measures: nothing, the published
+    mean of that motion, or exactly the patient's own."""
     seed: Seed = 0
     """Seed of encoder noise, detection errors, the policy, and of the sides that `mismatch` draws."""
     mismatch: ShareBelowOne = 0.0
@@ -114,6 +123,17 @@ class SetUp:
     def true_catheters(self) -> tuple[Catheter, ...]:
         """The catheters as they truly are."""
         return self.truth.catheters(self.navigation.catheters)
+
+    @property
+    def motion(self) -> Motion | None:
+        """How the vessel moves; None if it lies still."""
+        return motion_named(self.config.motion, self.config.motion_seed)
+
+    @property
+    def known_motion(self) -> Motion | None:
+        """What of it the C-arm takes off what it measures."""
+        known = self.config.motion_known
+        return None if known == "nothing" else self.motion if known == "exact" else motion_named(self.config.motion)
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,7 +213,12 @@ def set_up_navigation(anatomy: Anatomy | str | Path, target: str, config: Naviga
 def navigate_patient(set_up: SetUp) -> PatientNavigation:
     """Let the policy drive the wire in the simulated reality, and return what happened."""
     navigation, policy = set_up.navigation, set_up.policy
-    config = NavigateConfig(simulator=set_up.simulator, xray=set_up.config.xray)
+    config = NavigateConfig(
+        simulator=set_up.simulator,
+        xray=set_up.config.xray,
+        motion=set_up.motion,
+        known_motion=set_up.known_motion,
+    )
     loop = NavigationLoop(navigation, policy, config=config, seed=set_up.config.seed, truth=set_up.truth)
     began = loop.robot.proximal.ravel()
     wires: list[Float[np.ndarray, "wires nodes 3"]] = []
@@ -252,6 +277,7 @@ def _driven_again(set_up: SetUp, record: NavigationRecord, began: Float[np.ndarr
         config=set_up.simulator,
         record_shape=True,
         period_s=CYCLE_S,
+        motion=set_up.motion,
     )
 
 
@@ -270,10 +296,12 @@ def sampled(cycles: Rollout) -> Rollout:
 
     names = [f.name for f in fields(Rollout) if f.name not in (*_WHOLE, *_APART)]
     shape = None if cycles.shape is None else at_end(cycles.shape)
+    placed = cycles.vessel_to_laboratory
     tip = TipProjection(**{f.name: at_end(getattr(cycles.tip, f.name)) for f in fields(TipProjection)})
     return replace(
         cycles,
         catheters=None,
+        vessel_to_laboratory=None if placed is None else placed[step - 1 :: step],
         **{name: at_end(getattr(cycles, name)) for name in names},
         sample_period_s=DECISION_PERIOD_S,
         control=together(cycles.control).mean(axis=2),
@@ -292,11 +320,18 @@ _WHOLE = (
 )  # fmt: skip
 """What a rollout holds once a world, or what is gathered over the cycles of a period."""
 _APART = ("tip", "shape", "catheters", "vessel_to_laboratory")
-"""What it holds otherwise, or not at all: a navigation's vessel lies still."""
+"""What it holds otherwise, or not at all."""
 
 
 def _first(rollout: Rollout, samples: int) -> Rollout:
     names = [f.name for f in fields(Rollout) if f.name not in (*_WHOLE[:4], *_APART)]
     tip = TipProjection(**{f.name: getattr(rollout.tip, f.name)[:, :samples] for f in fields(TipProjection)})
     shape = None if rollout.shape is None else rollout.shape[:, :samples]
-    return replace(rollout, **{name: getattr(rollout, name)[:, :samples] for name in names}, tip=tip, shape=shape)
+    placed = rollout.vessel_to_laboratory
+    return replace(
+        rollout,
+        **{name: getattr(rollout, name)[:, :samples] for name in names},
+        tip=tip,
+        shape=shape,
+        vessel_to_laboratory=None if placed is None else placed[:samples],
+    )

@@ -227,6 +227,10 @@ def _commands(found: PatientNavigation, folder: Path, driven_in: Path, target: s
     again = ["endopilot", "simulate", str(driven_in), "--device", str(output / WIRE_FILE)]
     files = _catheter_files(found.set_up, output)
     again += ["--catheter", *map(str, files)] if files else []
+    config = found.set_up.config
+    if config.motion != "still":
+        again += ["--motion", config.motion]
+        again += [] if config.motion_seed is None else ["--motion-seed", str(config.motion_seed)]
     again += ["--controls", str(output / CONTROLS_FILE), "-o", "again.csv"]
     beside = ["endopilot", "train", "runs/dataset", str(output / EPISODE_FOLDER), "-o", "runs/training"]
     return {

@@ -156,6 +156,11 @@ def place(
     return np.einsum("...ij,...j->...i", maps[..., :3], points) + maps[..., 3]
 
 
+def relative(maps: Float[np.ndarray, "3 4"], to: Float[np.ndarray, "3 4"]) -> Float[np.ndarray, "3 4"]:
+    """Return the affine map `to`⁻¹ ∘ `maps`: where points that `maps` moves lie in a frame that `to` moves."""
+    return np.linalg.solve(to[:, :3], maps - np.column_stack([np.zeros((3, 3)), to[:, 3]]))
+
+
 def _spline_coefficients(values: Float[np.ndarray, "knots 12"]) -> Float[np.ndarray, "knots 12"]:
     """Return the coefficients of the periodic cubic B-spline through values at equal times."""
     wave = np.cos(2 * np.pi * np.arange(len(values)) / len(values))

@@ -15,6 +15,7 @@ from scipy.ndimage import gaussian_filter, zoom
 
 from endopilot.settings import Count, Finite, NonNegative, Positive, Share, settings
 from endopilot.simulation.device import Device
+from endopilot.simulation.motion import place
 from endopilot.types import Anatomy, Volume
 from endopilot.xray.absorbers import (
     CATHETER_MM,
@@ -88,6 +89,7 @@ class Plane:
         scatter: scattered light, in units of the beam without a patient.
         vessel_mm: path of each ray through what contrast fills, mm.
         reference: logarithm of the usual signal, about which grey values are spread.
+        placed: affine map of the vessel, and of what lies in it, from where CT shows it to where it lies, LPS mm.
     """
 
     view: View
@@ -96,10 +98,11 @@ class Plane:
     scatter: Float32[np.ndarray, "rows columns"]
     vessel_mm: Float32[np.ndarray, "rows columns"]
     reference: float
+    placed: Float[np.ndarray, "3 4"]
 
     def pixel(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 2"]:
-        """Return row and column of points, LPS mm of the CT."""
-        right_up = self.view.project(points)
+        """Return row and column of points of the vessel or in it, LPS mm of the CT."""
+        right_up = self.view.project(place(self.placed, points))
         middle = (len(self.background) - 1) / 2
         return middle + np.stack([-right_up[..., 1], right_up[..., 0]], axis=-1)
 
@@ -124,7 +127,13 @@ class XrayImager:
         self._filled = [lumen_points(anatomy), catheter_lumen_points(anatomy)]
 
     def plane(
-        self, angles_deg: tuple[float, float], zoom_factor: float = 1.0, *, rays: int = 256, pose: Pose | None = None
+        self,
+        angles_deg: tuple[float, float],
+        zoom_factor: float = 1.0,
+        *,
+        rays: int = 256,
+        pose: Pose | None = None,
+        placed: Float[np.ndarray, "3 4"] | None = None,
     ) -> Plane:
         """Compute what does not move under some angles.
 
@@ -133,7 +142,10 @@ class XrayImager:
             zoom_factor: magnification of the image.
             rays: cast through the CT, along each side of the image; their result is interpolated.
             pose: of the patient; as the CT has it if not given.
+            placed: affine map of vessel and catheter from where CT shows them to where heart and breath have moved
+                them, LPS mm; the chest around stays.
         """
+        placed = np.eye(3, 4) if placed is None else placed
         config, pixels = self.config, self.config.pixels
         view = view_at(angles_deg, self.isocenter, config.geometry).magnified(zoom_factor)
         if pose is not None:
@@ -146,13 +158,14 @@ class XrayImager:
             background = np.asarray(wide, dtype=np.float32)
         blur = self._blur_px(zoom_factor)
         points, size = catheter_points(self.anatomy)
-        background += splat(view, pixels, points, size * CATHETER_MM, blur_px=blur)
+        background += splat(view, pixels, place(placed, points), size * CATHETER_MM, blur_px=blur)
         vessel = np.zeros((pixels, pixels), dtype=np.float32)
         for (places, sizes), width in zip(self._filled, (self.anatomy.distance_map.spacing_mm / 2, 0.1), strict=True):
-            vessel += splat(view, pixels, places, sizes, width_mm=width, blur_px=blur)
+            vessel += splat(view, pixels, place(placed, places), sizes, width_mm=width, blur_px=blur)
         primary = np.exp(-background)
         scatter = self._scattered(primary, zoom_factor)
-        return Plane(view, zoom_factor, background, scatter, vessel, float(np.log(np.median(primary + scatter))))
+        usual = float(np.log(np.median(primary + scatter)))
+        return Plane(view, zoom_factor, background, scatter, vessel, usual, placed)
 
     def signal(
         self,
@@ -218,6 +231,7 @@ class XrayImager:
         radius = self.device.tip_radius_mm
         points, size = wire_points(in_catheter(self.anatomy, nodes), radius, self.config.opaque_tip_mm)
         blur = self._blur_px(plane.zoom)
+        points = place(plane.placed, points)
         return splat(plane.view, self.config.pixels, points, size, width_mm=radius / 2, blur_px=blur)
 
     def air_kerma_ugy(self, plane: Plane, dose: float) -> float:

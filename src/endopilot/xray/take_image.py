@@ -14,12 +14,15 @@ from endopilot.errors import InputError
 from endopilot.files import writing
 from endopilot.settings import Finite, NonNegative, Positive, Seed, Share, Text, Within, settings
 from endopilot.simulation.device import Device, read_device
+from endopilot.simulation.motion import Motion, MotionName, motion_named, place, relative
 from endopilot.simulation.simulate import simulate
-from endopilot.types import Anatomy, Volume
+from endopilot.types import SAMPLE_PERIOD_S, Anatomy, Volume
 from endopilot.xray.absorbers import surroundings
 from endopilot.xray.image import ImageConfig, XrayImager
 
 _REST = np.zeros((1, 1, 2))
+_SHORTEST_S = 0.0125
+"""The wire is held for this long at least before the image, s: one time step."""
 _MASK_SEED = 2**32
 """The image without contrast has noise of its own."""
 
@@ -47,6 +50,12 @@ class TakeImageConfig:
     """Rotation of the wire as it goes in, rad."""
     speed_mm_s: Finite = 0.0
     """Speed of the wire along its axis while it is exposed, mm/s: it is blurred."""
+    motion: MotionName = "still"
+    """How heart and breath move vessel, catheter and wire: still, breathing, heartbeat or both."""
+    motion_seed: Seed | None = None
+    """Draws the patient's amplitudes from the published distributions; their means if not given."""
+    time_s: NonNegative = 0.0
+    """Time of the image, s, from mid-diastole at the end of expiration on, where CT shows the vessel."""
     seed: Seed = 0
     """Seed of the quantum noise."""
     image: ImageConfig = field(default_factory=ImageConfig)
@@ -96,16 +105,22 @@ def take_image(anatomy: Anatomy, config: TakeImageConfig | None = None, ct: Volu
     """
     config = config or TakeImageConfig()
     device = read_device(config.device)
-    nodes = _pushed(anatomy, device, config.inserted_mm, config.rotation_rad)
+    motion = motion_named(config.motion, config.motion_seed)
+    nodes = _pushed(anatomy, device, config, motion)
     imager = XrayImager(anatomy, device, surroundings(anatomy) if ct is None else ct, config.image)
-    plane = imager.plane(config.view_deg, config.zoom)
-    forwards = -np.gradient(nodes, axis=0) if len(nodes) else nodes
+    placed, before = np.eye(3, 4), np.eye(3, 4)  # at the end of the pulse and at its start
+    if motion is not None:
+        times = np.array([config.time_s, config.time_s - config.image.pulse_s])
+        placed, before = motion.core(np.asarray(anatomy.insertion.position)).placements(times)[0]
+    plane = imager.plane(config.view_deg, config.zoom, placed=placed)
+    velocity = nodes
     if len(nodes):
-        forwards /= np.linalg.norm(forwards, axis=1, keepdims=True)
+        forwards = -np.gradient(nodes, axis=0)
+        velocity = config.speed_mm_s * forwards / np.linalg.norm(forwards, axis=1, keepdims=True)
+        if motion is not None:
+            velocity = velocity + (nodes - place(relative(before, placed), nodes)) / max(config.image.pulse_s, 1e-9)
     share = config.contrast if config.show in ("contrast", "dsa") else 0.0
-    signal = imager.signal(
-        plane, nodes, contrast=share, dose=config.dose, seed=config.seed, velocity=config.speed_mm_s * forwards
-    )
+    signal = imager.signal(plane, nodes, contrast=share, dose=config.dose, seed=config.seed, velocity=velocity)
     mask = None
     if config.show == "dsa":
         mask = imager.signal(plane, nodes[:0], dose=config.dose, seed=config.seed + _MASK_SEED)
@@ -121,11 +136,14 @@ def take_image(anatomy: Anatomy, config: TakeImageConfig | None = None, ct: Volu
     )
 
 
-def _pushed(anatomy: Anatomy, device: Device, inserted_mm: float, rotation_rad: float) -> Float[np.ndarray, "n 3"]:
-    """Return the nodes of a wire that was pushed in, from its tip on, LPS mm; none at 0 mm."""
-    if inserted_mm == 0:
+def _pushed(
+    anatomy: Anatomy, device: Device, config: TakeImageConfig, motion: Motion | None
+) -> Float[np.ndarray, "n 3"]:
+    """Return the nodes of a wire that was pushed in, from its tip on, in the vessel as CT shows it; none at 0 mm."""
+    if config.inserted_mm == 0:
         return np.zeros((0, 3))
-    initial = np.array([[inserted_mm, rotation_rad]])
-    rollout = simulate(anatomy, device, _REST, initial=initial, record_shape=True)
+    initial = np.array([[config.inserted_mm, config.rotation_rad]])
+    period_s = max(config.time_s, _SHORTEST_S) if motion is not None else SAMPLE_PERIOD_S
+    rollout = simulate(anatomy, device, _REST, initial=initial, record_shape=True, motion=motion, period_s=period_s)
     assert rollout.shape is not None
     return rollout.shape[0, -1]
