@@ -1,8 +1,8 @@
 """Write tasks and scores into docs/ladder.md: `python docs/figures/ladder.py [FOLDER [MISMATCH]]`.
 
-FOLDER, runs/ladder if not given, holds what `endopilot ladder` made of each policy, and MISMATCH,
-runs/ladder-mismatch if not given, what it made with `--mismatch 0.2`. A folder that is not there leaves its table as
-it is.
+FOLDER, runs/ladder if not given, holds what `endopilot ladder` made of each policy in the newest version and, with
+`--version coaxial`, of those that drive a catheter. MISMATCH, runs/ladder-mismatch if not given, holds what it made
+with `--mismatch 0.2`. A folder that is not there leaves its table as it is.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 
 from endopilot.ladder.mismatch import title_of
-from endopilot.tasks.task import NEWEST, ladder_tasks
+from endopilot.tasks.task import NEWEST, LadderVersion, ladder_tasks
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "ladder.md"
@@ -37,33 +37,48 @@ def tasks() -> list[str]:
     return lines
 
 
-def scores(folder: Path) -> list[str]:
-    """Return one table of the policies' scores: safe success, and in brackets success, %.
+def coaxial_tasks() -> list[str]:
+    """Return the table of the tasks of wire and catheter."""
+    head = ("level", "task", "what", "atlas", "wire, catheter", "time, s", "limit, N", "patients")
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    for task in ladder_tasks("coaxial"):
+        tip = f"{task.device}, {task.tip_bend_deg:g}° over {task.tip_bend_mm:g} mm; {task.catheter}"
+        what = f"{task.title}: {task.depth_mm:g} mm into {task.section}"
+        row = (task.level, task.name, what, task.anatomy, tip, f"{task.seconds:g}", task.force_limit_n, task.chosen_for)
+        lines.append("| " + " | ".join(str(cell) for cell in row) + " |")
+    return lines
 
-    A policy that is not in the folder keeps its column as the page has it.
+
+def scores(folder: Path, version: LadderVersion, mark: str) -> list[str]:
+    """Return one table of the policies' scores in a version: safe success, and in brackets success, %.
+
+    A policy that is not in the folder keeps its column as the page has it between its marks.
     """
-    columns = _kept()
+    columns = _kept(mark)
     for path in sorted(folder.glob("*/ladder.json")):
         content = json.loads(path.read_text(encoding="utf-8"))
-        if content["ladder"] != NEWEST:
+        if content["ladder"] != version:
             continue
         table = {row["task"]: row for row in content["scores"]}
         column = {name: f"{100 * row['safe_success']:.0f} ({100 * row['success']:.0f})" for name, row in table.items()}
-        if (over := table.get("all twelve") or table.get("upper eight")) is not None:
+        if (over := table.get("all twelve") or table.get("upper eight") or table.get("both coaxial")) is not None:
             column |= {title: f"{over[key]:.3g}" for title, key in _MEANS}
         columns[path.parent.name] = column | {"patients a task": str(content["patients"])}
-    names = [task.name for task in ladder_tasks()] + ["lower four", "upper eight", "all twelve"]
+    sums = ["both coaxial"] if version == "coaxial" else ["lower four", "upper eight", "all twelve"]
+    names = [task.name for task in ladder_tasks(version)] + sums
     names += [*(title for title, _ in _MEANS), "patients a task"]
     policies = sorted(columns)
     lines = ["| task | " + " | ".join(policies) + " |", "|---|" + "---|" * len(policies)]
     for name in names:
-        lines.append(f"| {name} | " + " | ".join(columns[policy].get(name, "–") for policy in policies) + " |")
+        cells = [columns[policy].get(name, "–") for policy in policies]
+        if set(cells) != {"–"}:
+            lines.append(f"| {name} | " + " | ".join(cells) + " |")
     return lines
 
 
-def _kept() -> dict[str, dict[str, str]]:
-    """Return the columns that stand in the page."""
-    text = PAGE.read_text(encoding="utf-8").split("<!-- scores:begin -->")[1].split("<!-- scores:end -->")[0]
+def _kept(mark: str) -> dict[str, dict[str, str]]:
+    """Return the columns that stand in the page between marks of some name."""
+    text = PAGE.read_text(encoding="utf-8").split(f"<!-- {mark}:begin -->")[1].split(f"<!-- {mark}:end -->")[0]
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.strip().splitlines()]
     if not rows:
         return {}
@@ -89,8 +104,10 @@ def main() -> None:
     given = [Path(argument) for argument in sys.argv[1:]]
     ladder, mismatched = [*given, *[ROOT / "runs" / name for name in ("ladder", "ladder-mismatch")][len(given) :]]
     fill("tasks", tasks())
+    fill("coaxial tasks", coaxial_tasks())
     if ladder.is_dir():
-        fill("scores", scores(ladder))
+        fill("scores", scores(ladder, NEWEST, "scores"))
+        fill("coaxial scores", scores(ladder, "coaxial", "coaxial scores"))
     if mismatched.is_dir():
         fill("mismatch", mismatch(mismatched))
 

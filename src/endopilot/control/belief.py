@@ -1,5 +1,7 @@
 """The belief about the wire between X-ray exposures: an ensemble of simulated wires, driven like the real one.
 
+Catheters around the real wire are around each simulated one too, and driven like the real ones.
+
 Its members differ in what is uncertain: friction, the stiffness of the tip, and how deep the ostium lies (as
 `models/twin.py` has it). Each follows the robot's encoders. A measurement of the tip weights them by their errors.
 """
@@ -13,6 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.stats import qmc
 
+from endopilot.control.policy import Proximals
 from endopilot.settings import Count, NonNegative, Positive, ShareBelowOne, Within, settings
 from endopilot.simulation.config import PRESETS, SimulatorConfig
 from endopilot.simulation.drive_limits import DriveLimits
@@ -77,17 +80,24 @@ class Belief:
             factor: device.with_tip(bend_rad=device.tip_bend_rad, stiffness_factor=float(factor))
             for factor in np.unique(parameters[:, 1])
         }
+        catheters = len(navigation.catheters)
         self.simulator = Simulator(
-            navigation.anatomy, [self.wires[factor] for factor in parameters[:, 1]], config=config.core
+            navigation.anatomy,
+            [self.wires[factor] for factor in parameters[:, 1]],
+            catheters=navigation.catheters,
+            config=config.core,
         )
         self._ostium = parameters[:, 2]
         self.simulator.reset(
             inserted_length=np.maximum(navigation.start_inserted_mm + self._ostium, 0.0),
             rotation=np.full(len(parameters), navigation.start_rotation),
             friction=device.friction * parameters[:, 0],
+            catheter_inserted_length=np.tile(
+                np.maximum(navigation.start_catheter_mm + self._ostium, 0.0)[:, None], (1, catheters)
+            ),
         )
-        self._limits = DriveLimits.of(device, navigation.anatomy)
-        self._score = np.zeros(len(parameters))
+        self._limits = [DriveLimits.of(each, navigation.anatomy) for each in navigation.devices]
+        self._score, self._coaxial = np.zeros(len(parameters)), bool(navigation.catheters)
         self.tip = self.simulator.project()
 
     @staticmethod
@@ -108,16 +118,16 @@ class Belief:
         weight = np.exp(score - score.max())
         return weight / weight.sum()
 
-    def follow(self, inserted_length: float, rotation: float) -> None:
-        """Move every member's proximal end to where the encoders say that it is, in one decision period."""
+    def follow(self, inserted_length: float, rotation: float, catheters: Proximals = ()) -> None:
+        """Move every member's proximal ends to where the encoders say that they are, in one decision period."""
         simulator = self.simulator
-        motion = np.column_stack(
-            [
-                np.maximum(inserted_length + self._ostium, 0.0) - simulator.inserted_length,
-                rotation - simulator.rotation,
-            ]
-        )
-        control = self._limits.clip(motion / DECISION_PERIOD_S, simulator.inserted_length, DECISION_PERIOD_S)
+        inserted = np.column_stack([simulator.inserted_length, simulator.catheter_inserted_length])
+        turned = np.column_stack([simulator.rotation, simulator.catheter_rotation])
+        controls = []
+        for k, (length, turn) in enumerate([(inserted_length, rotation), *catheters]):
+            motion = np.column_stack([np.maximum(length + self._ostium, 0.0) - inserted[:, k], turn - turned[:, k]])
+            controls.append(self._limits[k].clip(motion / DECISION_PERIOD_S, inserted[:, k], DECISION_PERIOD_S))
+        control = np.concatenate(controls, axis=1)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a member that fails has no weight
             simulator.step(control, DECISION_PERIOD_S)
@@ -125,10 +135,13 @@ class Belief:
 
     def errors(self, measured: TipMeasurement) -> Float[np.ndarray, "members 2"]:
         """Return the distances of the members' tips from a measured one, along and across each wire, mm."""
-        nodes = self.simulator.position[:, :2]
-        along = nodes[:, 0] - nodes[:, 1]
-        along /= np.linalg.norm(along, axis=1, keepdims=True)
-        error = measured.position - nodes[:, 0]
+        if self._coaxial:  # the first nodes are the foremost tube's
+            end, along = self.simulator.tips(), self.simulator.tip_direction
+        else:
+            nodes = self.simulator.position[:, :2]
+            end, along = nodes[:, 0], nodes[:, 0] - nodes[:, 1]
+            along /= np.linalg.norm(along, axis=1, keepdims=True)
+        error = measured.position - end
         shift = np.einsum("mi,mi->m", error, along)
         return np.column_stack([np.abs(shift), np.linalg.norm(error - shift[:, None] * along, axis=1)])
 

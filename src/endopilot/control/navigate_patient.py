@@ -42,8 +42,8 @@ class NavigatePatientConfig:
     """Policy, wire, limits, and how reality differs from what the policy is given."""
 
     policy: Text = "agent"
-    """What decides: agent, twin, open-loop, forward, spin, retract-rotate, with a catheter in-turn or catheter-alone,
-    or MODULE:OBJECT of your own."""
+    """What decides: agent, twin, open-loop, forward, spin, retract-rotate, with a catheter coaxial-agent, in-turn or
+    catheter-alone, or MODULE:OBJECT of your own."""
     device: Text = "workhorse-014"
     """Name of a device (`endopilot devices`) or a YAML file."""
     catheter: tuple[Text, ...] = ()

@@ -16,6 +16,7 @@ POLICIES = Registry(
         "retract-rotate": "endopilot.control.baseline_policies:RetractRotate",
         "catheter-alone": "endopilot.control.coaxial_policies:CatheterAlone",
         "in-turn": "endopilot.control.coaxial_policies:InTurn",
+        "coaxial-agent": "endopilot.control.coaxial_agent:CoaxialAgent",
         "twin": "endopilot.control.agent:TwinPolicy",
         "agent": "endopilot.control.agent:AgentPolicy",
         "open-loop": "endopilot.control.agent:OpenLoopPolicy",

@@ -1,0 +1,193 @@
+"""The policy that plans for a wire in a catheter: `CoaxialAgent`.
+
+It searches a course from the believed state of both and follows it by the encoders. An ensemble of simulated wires in
+catheters is driven alike; its spread says when X-ray is asked for, and an exposure weights it. Where the course leaves
+what the likeliest wire does, another is searched; where no simulated wire explains the image, the wire is pulled back
+until one does.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import field, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from endopilot.control.agent import CALIBRATED
+from endopilot.control.belief import Belief, BeliefConfig
+from endopilot.control.coaxial_copies import CoaxialCourse, CoaxialSearchConfig
+from endopilot.control.coaxial_policies import check_catheter
+from endopilot.control.coaxial_search import CoaxialSearch
+from endopilot.control.policy import BelievedTip, Decision, Observation
+from endopilot.control.route import check_passable
+from endopilot.errors import InputError
+from endopilot.settings import Count, Positive, settings
+from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
+from endopilot.xray.adviser import AdviserConfig, XrayAdviser
+from endopilot.xray.bands import Calibration
+from endopilot.xray.fluoroscope import TipMeasurement
+
+
+@settings
+class CoaxialAgentConfig:
+    """Settings of an agent: search, belief, and when the plan or the wire counts as lost."""
+
+    search: CoaxialSearchConfig = field(default_factory=CoaxialSearchConfig)
+    """The search for a course. Its rod core gets the settings of the simulated wires."""
+    belief: BeliefConfig = field(default_factory=lambda: BeliefConfig(members=4, stiffness_levels=1, element_mm=1.25))
+    """The simulated wires in catheters."""
+    off_course_mm: Positive = 3.0
+    """Another course is searched when the likeliest tip is this far from where a passed waypoint should see it, mm."""
+    tries: Count = 2
+    """Failed searches, one after another, after which the agent gives up."""
+    lost_along_mm: Positive = 5.0
+    """A measured tip this far along the wire from all simulated ones is explained by none, mm."""
+    lost_across_radii: Positive = 0.5
+    """The same across the wire, in radii of the lumen."""
+
+
+_RETRACT_MM_S = 5.0
+"""Translation of a wire that no simulated one explains, mm/s."""
+_CREEP_MM_S, _CREEP_PERIODS = 1.0, 6
+"""A catheter that should have arrived and did not is moved ahead and back by this, for as many periods and twice."""
+
+
+class CoaxialAgent:
+    """Plans a course of wire and catheter in the rod core, and follows it with X-ray where its adviser asks.
+
+    Attributes:
+        plans: how often a course was searched.
+        planning_s: processor time that the searches took, s.
+    """
+
+    def __init__(self, config: CoaxialAgentConfig | None = None, *, calibration: Calibration | None = None) -> None:
+        """Take the settings.
+
+        Args:
+            config: search and belief.
+            calibration: of the adviser's bands around what the simulated wires predict; the package's own if not
+                given, which was made with wires alone.
+        """
+        self.config = config or CoaxialAgentConfig()
+        self._calibration = calibration or Calibration.read(CALIBRATED)
+
+    def start(self, navigation: Navigation, seed: int) -> None:
+        """Lay out the simulated wires in catheters, and start the adviser.
+
+        Raises:
+            InputError: there is no catheter, or more than one, or the lumen is narrower than the wire on the route.
+        """
+        check_catheter(navigation)
+        if len(navigation.catheters) > 1:
+            raise InputError(f"policy: drives one catheter, and there are {len(navigation.catheters)}; give one")
+        self.navigation = navigation
+        self.belief = Belief(
+            navigation, Belief.around(np.array([1.0, 1.0, 0.0]), self.config.belief), self.config.belief
+        )
+        config = replace(self.config.search, core=self.config.belief.core)
+        self._search = CoaxialSearch(navigation, config, sharing=self.belief.simulator)
+        self.route = self._search.route
+        for device in navigation.devices:
+            check_passable(self.route, device)
+        self._course: CoaxialCourse | None = None
+        self._at, self._lost, self._began, self._crept = 0, False, False, 0
+        self.plans, self.planning_s, self._failed, self._halt = 0, 0.0, 0, ""
+        self._adviser = XrayAdviser(self._calibration, AdviserConfig(), navigation.device.tip_radius_mm)
+        proximal, tip, _, radius = self._adviser_input()
+        self._adviser.start(proximal, tip, radius)
+
+    def decide(self, observation: Observation) -> Decision:
+        """Follow the course, search another one, or pull back, as the module describes."""
+        if self._began:
+            self.belief.follow(observation.inserted_length, observation.rotation, observation.catheters)
+        self._began = True
+        if observation.tip is not None:
+            self._update(observation.tip)
+        due = bool(self._adviser.advise(*self._adviser_input())[0])
+        if self._lost:
+            return self._pull_back(observation)
+        if self._course is None or self._off_course():
+            self._plan()
+        assert self._course is not None
+        if self._at < len(self._course.proximal):
+            return self._follow(observation, expose=due)
+        if not self._course.reached:
+            ends = self._failed >= self.config.tries
+            self._course = None
+            return Decision(0.0, 0.0, expose=True, gives_up=self._halt if ends else "")
+        return self._creep()
+
+    def believed(self) -> BelievedTip:
+        """Return where the likeliest wire has its tip."""
+        tip = self.belief.likeliest_tip()
+        return BelievedTip(float(tip.abscissa[0]), float(tip.offset[0]))
+
+    def believed_wires(self) -> Float[np.ndarray, "wires nodes 3"]:
+        """Return the simulated wires, the likeliest first: nodes from the foremost tip on, LPS mm."""
+        return self.belief.simulator.position[np.argsort(-self.belief.weight, kind="stable")]
+
+    def _update(self, measured: TipMeasurement) -> None:
+        """Weight the simulated wires by a measurement, and note whether all are wrong."""
+        self.belief.weigh(measured)
+        along, across = self.belief.errors(measured)[self._best]
+        most = self.config.lost_across_radii * float(self.belief.tip.radius[self._best])
+        self._lost = bool(along > self.config.lost_along_mm or across > max(most, self.config.lost_along_mm / 2))
+        if self._lost:
+            self._course = None
+
+    @property
+    def _best(self) -> int:
+        return int(np.argmax(self.belief.weight))
+
+    def _adviser_input(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return (Δ, φ), (Δtip, γtip), the spread of these and the lumen's radius at the tip, of the likeliest wire."""
+        tip, wires = self.belief.likeliest_tip(), self.belief.simulator
+        proximal = np.array([[wires.inserted_length[self._best], wires.rotation[self._best]]])
+        ends = np.array([[tip.abscissa[0], tip.offset[0]]])
+        return proximal, ends, self.belief.tip_spread()[None], tip.radius
+
+    def _pull_back(self, observation: Observation) -> Decision:
+        """Pull the wire back, and the catheter too once the wire's tip is in it, with X-ray on."""
+        inside = observation.inserted_length <= observation.catheters[0][0]
+        return Decision(-_RETRACT_MM_S, 0.0, expose=True, catheters=((-_RETRACT_MM_S if inside else 0.0, 0.0),))
+
+    def _off_course(self) -> bool:
+        """Return whether a waypoint was to be passed just now, and the likeliest wire is not where it should be."""
+        course, at = self._course, self._at - 1
+        if course is None or at < 0 or not course.settled[at]:
+            return False
+        tip = self.belief.likeliest_tip()
+        error = abs(course.abscissa[at] - tip.abscissa[0])
+        return bool(self.route.off_route(tip)[0] > course.off_route[at] + 1e-9 or error > self.config.off_course_mm)
+
+    def _plan(self) -> None:
+        """Search a course from where the likeliest wire and catheter are."""
+        worked = time.process_time()
+        self._at, self._crept, self.plans = 0, 0, self.plans + 1
+        self._course = self._search.find(self.belief.simulator, self._best)
+        self._ostium = float(self.belief.parameters[self._best, 2])
+        halted = self._search.halted_mm
+        self._failed = 0 if self._course.reached else self._failed + 1
+        self._halt = "" if halted is None else f"no course was found past {halted:.0f} mm of the route"
+        self.planning_s += time.process_time() - worked
+
+    def _follow(self, observation: Observation, *, expose: bool) -> Decision:
+        """Go to the next place of the course; X-ray shows where each waypoint's end has led."""
+        course, at = self._course, self._at
+        assert course is not None
+        wanted = course.proximal[at] - [self._ostium, 0.0, self._ostium, 0.0]
+        now = np.array([(observation.inserted_length, observation.rotation), *observation.catheters]).ravel()
+        wire, turn, catheter, other = ((wanted - now) / DECISION_PERIOD_S).tolist()
+        self._at += 1
+        return Decision(wire, turn, expose=expose or bool(course.settled[at]), catheters=((catheter, other),))
+
+    def _creep(self) -> Decision:
+        """Move what is to arrive a little ahead and back, with X-ray on; then search again."""
+        step, self._crept = self._crept, self._crept + 1
+        if step >= 3 * _CREEP_PERIODS:
+            self._course = None
+        speed = _CREEP_MM_S if step < _CREEP_PERIODS else -_CREEP_MM_S
+        if self.navigation.arriving:
+            return Decision(0.0, 0.0, expose=True, catheters=((speed, 0.0),))
+        return Decision(speed, 0.0, expose=True)
