@@ -44,8 +44,10 @@ _LOW_SHARE = 0.25
 _POOL_RADIUS_MM = 3.5
 """A ball of this radius fits in chambers and great vessels, and in no coronary artery but a dilated one."""
 _CORE_RADIUS_MM = 5.5
-_NEAR_CORE_MM = 3.0
+_NEAR_CORE_MM = 4.0
 """A ball of this radius fits in no dilated artery either: what is wide so near to where it fits is a pool."""
+_CORE_SMOOTHING_MM = 1.0
+"""Width of the Gaussian against noise where the large balls are sought, mm."""
 _RESPONSE = 0.15
 """Vesselness of a vessel's voxels."""
 _SCALES_MM = (0.6, 0.9, 1.3, 1.9, 2.8)
@@ -206,7 +208,10 @@ def _find_vessels(grid: Volume, lumen_hu: float) -> _Scan:
 def _pools(body: Volume, level_hu: float, grid: Volume) -> Bool[np.ndarray, "nz ny nx"]:
     """Return where blood above a level is thick and near to where it is thicker than in any artery of the heart."""
     depth = distance_to_outside(body.voxels > level_hu, _BODY_GRID_MM)
-    from_core = _beyond_balls(depth, _CORE_RADIUS_MM) - _NEAR_CORE_MM
+    # Noise leaves holes in a dim pool, between which no large ball fits.
+    smooth = np.asarray(ndimage.gaussian_filter(body.voxels, _CORE_SMOOTHING_MM / _BODY_GRID_MM))
+    core_depth = distance_to_outside(smooth > level_hu, _BODY_GRID_MM)
+    from_core = _beyond_balls(core_depth, _CORE_RADIUS_MM) - _NEAR_CORE_MM
     return _inside(np.maximum(_beyond_balls(depth, _POOL_RADIUS_MM), from_core), body, grid)
 
 
