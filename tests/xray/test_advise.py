@@ -193,3 +193,26 @@ def test_too_few_patients_or_another_wire_leave_nothing_behind(folder, hold_slac
     with pytest.raises(InputError, match=r"its wire is workhorse-014, and that of .* is j-035"):
         advise(tmp_path, folder / "dataset", tmp_path / "out", AdviseConfig())
     assert not (tmp_path / "out").exists() and not (tmp_path / "xray.json").exists()
+
+
+def test_the_same_calibration_is_measured_on_navigations_made_otherwise(
+    folder, split, hold_slack, tmp_path, monkeypatch
+) -> None:
+    shape = {"patients": 12, "sequences": 1, "seconds": 25.0, "seen_test_share": 0.0}
+    shares = (1 / 12, 10 / 12, 1 / 12)
+    make_toy_dataset(tmp_path / "other", **shape, anatomy_shares=shares, friction=(0.3, 0.3))
+    make_toy_dataset(tmp_path / "all", **shape, anatomy_shares=(0.0, 0.0, 1.0))
+    monkeypatch.setattr(advise_module, "PERIODS", (1, 90))
+    monkeypatch.setattr(advise_module, "WIDTHS", (1.0,))
+    monkeypatch.setattr(advise_module, "THRESHOLDS", ())
+    run, dataset, output = folder / "run", folder / "dataset", tmp_path / "out"
+    found = advise(run, dataset, output, AdviseConfig(), also_test=[dataset, tmp_path / "other"])
+    same, other = found["made_otherwise"]
+    assert same["differs"] == {} and other["differs"] == {"friction": [0.3, 0.3]}
+    assert same["coverage"] == found["coverage"] and same["adviser"] == {
+        name: value for name, value in found["adviser"].items() if name != "width"
+    }
+    assert other["coverage"]["patients"] == 1
+    with pytest.raises(InputError, match="which the bands are fitted to"):
+        advise(run, dataset, tmp_path / "no", AdviseConfig(), also_test=[tmp_path / "all"])
+    assert not (tmp_path / "no").exists()

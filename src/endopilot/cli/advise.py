@@ -17,6 +17,7 @@ def command(
     /,
     *,
     output: OutputFolder,
+    also_test: tuple[Path, ...] = (),
     json: bool = False,
     config: AdviseConfig = AdviseConfig(),
 ) -> None:
@@ -29,10 +30,12 @@ def command(
             model that comes with endopilot; the calibration is then written to the output.
         dataset: folder made by `endopilot dataset`, with at least 9 patients in its split 'calibrate'.
         output: folder of advice.json and advice.png.
+        also_test: datasets that were made otherwise, with another wall or other elements: the same calibration is
+            measured on their test patients too, which the bands must not have been fitted to.
         json: print the figures as JSON.
         config: the events that X-ray must show, and the errors of X-ray.
     """
-    found = advise(run, existing(dataset), output, config)
+    found = advise(run, existing(dataset), output, config, also_test=[existing(folder) for folder in also_test])
     if json:
         show(found, as_json=True)
         return
@@ -48,6 +51,13 @@ def command(
             "exposures_per_minute": at["exposures_per_minute"],
             "share_of_the_exposures_of_periodic_imaging": found["share_of_the_exposures_of_periodic_imaging"],
             "fewer_frames_than_fluoroscopy": at["fewer_frames_than_fluoroscopy"],
+            **{
+                other["dataset"]: (
+                    f"coverage {other['coverage']['simultaneous']:.3f}, missed {other['adviser']['missed_share']:.3f}, "
+                    f"{other['adviser']['exposures_per_minute']:.1f} exposures a minute"
+                )
+                for other in found["made_otherwise"]
+            },
         },
         as_json=False,
     )

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from endopilot.dataset.loader import load_dataset
+from endopilot.dataset.loader import Dataset, load_dataset
+from endopilot.errors import InputError
 from endopilot.files import manifest, write_json, writing
 from endopilot.models.config import PRETRAINED, read_run
 from endopilot.models.provenance import check_wire
 from endopilot.progress import progress
 from endopilot.xray import monitoring
-from endopilot.xray.bands import CALIBRATION_FILE, check_enough
-from endopilot.xray.monitoring import AdviseConfig
+from endopilot.xray.bands import CALIBRATION_FILE, Calibration, check_enough
+from endopilot.xray.monitoring import AdviseConfig, Monitored
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -29,7 +30,9 @@ THRESHOLDS = tuple((ratio, mm) for ratio in (0.6, 0.7, 0.8, 0.9) for mm in (1.0,
 """Other values of τ and of δ, mm, that the adviser is measured with."""
 
 
-def advise(run: Path, dataset: Path, output: Path, config: AdviseConfig) -> dict[str, Any]:
+def advise(
+    run: Path, dataset: Path, output: Path, config: AdviseConfig, *, also_test: Sequence[Path] = ()
+) -> dict[str, Any]:
     """Calibrate the X-ray adviser of a run on a dataset's calibration patients, and measure it on its test patients.
 
     Writes the calibration beside the run (`xray.json`; for "pretrained", to the output), and `advice.json` and
@@ -41,13 +44,15 @@ def advise(run: Path, dataset: Path, output: Path, config: AdviseConfig) -> dict
             are of its split 'train'.
         output: where the figures go.
         config: what is advised.
+        also_test: datasets of the same wire that were made otherwise, with another wall or other elements: their test
+            patients are advised with the same calibration, and measured apart.
 
     Returns:
         The content of `advice.json`.
 
     Raises:
-        InputError: the run or the dataset is missing or damaged, they are of different wires, or there are too few
-            calibration patients.
+        InputError: the run or a dataset is missing or damaged, they are of different wires, there are too few
+            calibration patients, or one of `also_test` tests on patients that the bands are fitted to.
     """
     from endopilot.models.rollout import load_model  # brings torch
     from endopilot.plotting import png  # brings matplotlib, which takes a second to import
@@ -58,6 +63,7 @@ def advise(run: Path, dataset: Path, output: Path, config: AdviseConfig) -> dict
     check_wire(run, read_run(run), episodes)
     splits = [episodes.of_split(name) for name in ("train", "calibrate", "test")]
     check_enough(len(set(splits[1].anatomy)), config.adviser.level)
+    others = [_other(run, folder, splits[:2]) for folder in also_test]
     fitted, own, test = (monitoring.monitor(predictor, split, config) for split in splits)
     calibration = monitoring.calibrate(fitted, own, config.adviser.level)
     with progress("Advising", len(PERIODS) + len(WIDTHS) + len(THRESHOLDS) + 1) as advance:
@@ -85,6 +91,10 @@ def advise(run: Path, dataset: Path, output: Path, config: AdviseConfig) -> dict
         oracle = monitoring.oracle_policy(test, config.adviser)
         curves["oracle"] = [monitoring.measure_policy(test, oracle, config.adviser)]
         advance()
+    otherwise = [
+        _measure_otherwise(monitoring.monitor(predictor, other, config), other, episodes, calibration, config)
+        for other in others
+    ]
     at = next(point for point in curves["adviser"] if point["width"] == 1.0)
     equal = monitoring.periodic_equal(curves["periodic"], at["missed_share"])
     content = {
@@ -96,10 +106,15 @@ def advise(run: Path, dataset: Path, output: Path, config: AdviseConfig) -> dict
         "share_of_the_exposures_of_periodic_imaging": at["exposures_per_minute"] / equal,
         "curves": curves,
         "other_thresholds": thresholds,
+        "made_otherwise": otherwise,
         "manifest": manifest(
             config=config,
             seed=config.seed,
-            inputs={"run": str(run), "dataset": episodes.manifest["key"]},
+            inputs={
+                "run": str(run),
+                "dataset": episodes.manifest["key"],
+                **{f"also_test {other.folder}": other.manifest["key"] for other in others},
+            },
             wall_seconds=time.perf_counter() - start,
         ),
     }
@@ -109,6 +124,54 @@ def advise(run: Path, dataset: Path, output: Path, config: AdviseConfig) -> dict
     calibration.write(beside)
     write_json(output / FIGURES_FILE, content | {"calibration_file": str(beside / CALIBRATION_FILE)})
     return content
+
+
+def _other(run: Path, folder: Path, ours: Sequence[Dataset]) -> Dataset:
+    """Return the test patients of a dataset that was made otherwise.
+
+    Args:
+        run: of the model.
+        folder: of the dataset.
+        ours: what the bands are fitted to and scaled on.
+
+    Raises:
+        InputError: it is of another wire, or tests on patients of `ours`.
+    """
+    made = load_dataset(folder)
+    check_wire(run, read_run(run), made)
+    test = made.of_split("test")
+    fitted = {split.patients[name] for split in ours for name in split.anatomy.tolist()}
+    both = sorted({name for name in test.anatomy.tolist() if test.patients[name] in fitted})
+    if both:
+        raise InputError(
+            f"{folder}: tests on {', '.join(both[:3])}{' ...' if len(both) > 3 else ''}, which the bands are fitted "
+            "to; make it of other patients, or of the first dataset's test patients alone"
+        )
+    return test
+
+
+def _measure_otherwise(
+    test: Monitored, made: Dataset, calibrated: Dataset, calibration: Calibration, config: AdviseConfig
+) -> dict[str, Any]:
+    """Return what the calibrated adviser misses and costs on navigations that were made otherwise, and how."""
+    theirs, ours = (_leaves(data.manifest["config"]) for data in (made, calibrated))
+    cover = monitoring.coverage(test, calibration)
+    test.model.reset()
+    policy = monitoring.adviser_policy(test, calibration, config.adviser)
+    return {
+        "dataset": str(made.folder),
+        "differs": {name: value for name, value in theirs.items() if value != ours.get(name)},
+        "coverage": cover,
+        "adviser": monitoring.measure_policy(test, policy, config.adviser),
+    }
+
+
+def _leaves(record: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return the settings in a record of nested settings, by their dotted names."""
+    found: dict[str, Any] = {}
+    for name, value in record.items():
+        found |= _leaves(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {prefix + name: value}
+    return found
 
 
 def _picture(content: Mapping[str, Any]) -> Figure:
