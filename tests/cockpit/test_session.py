@@ -8,7 +8,7 @@ import pytest
 from endopilot.cockpit.frames import decode
 from endopilot.cockpit.messages import Contrast, Drive, Pedal, Target
 from endopilot.cockpit.recording import Recorder, read_recording, replayed
-from endopilot.cockpit.session import SILENCE_S, Session
+from endopilot.cockpit.session import HICCUP_S, SILENCE_S, Session
 from endopilot.errors import InputError
 
 
@@ -42,10 +42,34 @@ def test_silence_stops_the_wire(session):
     (header, _), _ = run(session, 0.3, start=SILENCE_S + 0.02)
     assert moving[0] == 5.0
     assert header["stopped"] == "silence" and header["velocity"] == [0.0, 0.0]
-    drive = Drive(type="drive", translation=5.0, rotation=0.0)
-    assert run(session, 0.3, message=drive, start=0.6)[0][0]["velocity"] == [0.0, 0.0]  # until the hands let go
-    session.handle(Drive(type="drive", translation=0.0, rotation=0.0), 0.9)
-    assert run(session, 0.3, message=drive, start=0.9)[0][0]["velocity"] == [5.0, 0.0]
+
+
+def test_a_hand_that_was_silent_for_long_must_let_go_first(session):
+    drive, pedal = Drive(type="drive", translation=5.0, rotation=0.0), Pedal(type="pedal", down=True)
+    session.handle(drive, 0.0)
+    session.handle(pedal, 0.0)
+    run(session, HICCUP_S + 0.1)
+    frames = session.xray.frames
+    (header, _), _ = run(session, 0.3, message=drive, start=HICCUP_S + 0.1)
+    session.handle(pedal, 1.0)
+    run(session, 0.15, start=1.0)
+    assert header["velocity"] == [0.0, 0.0] and not session.xray.pedal and session.xray.frames == frames
+    session.handle(Drive(type="drive", translation=0.0, rotation=0.0), 1.2)
+    session.handle(Pedal(type="pedal", down=False), 1.2)
+    session.handle(pedal, 1.2)
+    (header, _), _ = run(session, 0.3, message=drive, start=1.2)
+    assert header["velocity"] == [5.0, 0.0] and session.xray.pedal
+
+
+def test_after_a_hiccup_what_is_held_goes_on(session):
+    drive, pedal = Drive(type="drive", translation=5.0, rotation=0.0), Pedal(type="pedal", down=True)
+    session.handle(drive, 0.0)
+    session.handle(pedal, 0.0)
+    (header, _), _ = run(session, HICCUP_S - 0.1)
+    assert header["velocity"] == [0.0, 0.0] and not session.xray.pedal
+    session.handle(pedal, HICCUP_S - 0.08)
+    (header, _), _ = run(session, 0.15, message=drive, start=HICCUP_S - 0.08)
+    assert header["velocity"][0] > 0.0 and header["stopped"] == "" and session.xray.pedal
 
 
 def test_the_pedal_counts_and_silence_lets_it_go(session):

@@ -1,7 +1,8 @@
 """Simulates worlds with an older build of endopilot; run by `Baseline` as a script, apart from today's package.
 
 Arguments: the build's folder and, as JSON, kinds of patients, seed, device, worlds and samples. For each line read, it
-simulates them all on one thread and prints the processor time, s. It uses only what the older build has.
+simulates them all on one thread and prints the processor time, s. It uses only what the older build has, whose patients are
+those that are called textbook today.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ def main(folder: str, work: dict) -> None:
     assert Path(folder).resolve() in Path(endopilot.__file__).resolve().parents, "another endopilot comes first"
     scenes = []
     for place, kind in enumerate(work["kinds"]):
-        anatomy = make_patient(AtlasConfig(anatomy=kind, seed=work["seed"], population="textbook"), 0)
+        anatomy = make_patient(AtlasConfig(anatomy=kind, seed=work["seed"]), 0)
         initial, control = random_controls(
             ControlConfig(),
             n_sequences=work["worlds"],

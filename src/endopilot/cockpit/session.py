@@ -22,6 +22,8 @@ from endopilot.tasks.navigation import Target
 
 SILENCE_S = 0.2
 """The drive stops after this time without a message from whose hand drives, s."""
+HICCUP_S = 0.5
+"""What a hand holds goes on after a silence up to this long; after a longer one it must let go first, s."""
 AUTOPILOT_SILENCE_S = 1.0
 """The autopilot pauses after this time without a message from the page that started it, s."""
 
@@ -53,7 +55,9 @@ class Session:
         self.target: Target = world.navigation.target
         self.sight = True
         self._command, self._moving, self._heard_s = (0.0, 0.0), False, -np.inf
-        self._stopped, self._locked = "", False
+        self._stopped = ""
+        self._held: set[str] = set()  # what silence stopped
+        self._locked: set[str] = set()  # what of it must be let go
 
     def handle(self, message: messages.Message, now_s: float) -> None:
         """Do what the page of who drives asks for.
@@ -66,11 +70,11 @@ class Session:
             InputError: it cannot be done; one line says why.
         """
         if isinstance(message, messages.Drive):
-            self._heard_s = now_s
+            self._hear(now_s)
             self._drive(message.translation, message.rotation)
         elif isinstance(message, messages.Pedal):
-            self._heard_s = now_s
-            self.xray.pedal = message.down
+            self._hear(now_s)
+            self._pedal(message.down)
         elif isinstance(message, messages.Contrast):
             self.xray.inject(self.world.time_s)
             self._record(contrast=True)
@@ -81,7 +85,7 @@ class Session:
         elif isinstance(message, messages.Target):
             self._aim(message)
         elif isinstance(message, messages.Autopilot):
-            self._heard_s = now_s
+            self._hear(now_s)
             self._steer(message)
         else:
             raise InputError(f"{message.type}: not here")
@@ -130,8 +134,9 @@ class Session:
         """
         limit = AUTOPILOT_SILENCE_S if self.autopilot.drives else SILENCE_S
         if (self._moving or self.autopilot.drives or self.xray.pedal) and now_s - self._heard_s > limit:
+            self._held = {"drive"} if self._moving else set()
+            self._held |= {"pedal"} if self.xray.pedal else set()
             self.halt("silence")
-            self._locked = True
         sent = self._think()
         if not self.autopilot.waits:
             self.world.advance()
@@ -179,11 +184,24 @@ class Session:
         if self._recorder is not None:
             self._recorder.close()
 
+    def _hear(self, now_s: float) -> None:
+        """Take a sign of life of who drives, the first one after a silence perhaps."""
+        if self._held:
+            self._locked = self._held if now_s - self._heard_s > HICCUP_S else set()
+            self._held = set()
+        self._heard_s = now_s
+
+    def _pedal(self, down: bool) -> None:
+        if not down:
+            self._locked.discard("pedal")
+        self.xray.pedal = down and "pedal" not in self._locked
+
     def _drive(self, translation: float, rotation: float) -> None:
         command = self.world.limits.safe(translation, rotation)
-        if self._locked and command != (0.0, 0.0):
-            return  # after silence the hands must let go before the wire moves again
-        self._locked = False
+        if command == (0.0, 0.0):
+            self._locked.discard("drive")
+        elif "drive" in self._locked:
+            return
         if self.autopilot.drives:
             if command == (0.0, 0.0):
                 return  # the page only says that it is there

@@ -1,6 +1,6 @@
 // The X-ray view: grey images into canvases, the C-arm's controls, and what is counted.
 
-const MOST_WAITING = 2; // images that wait for a frame
+const MOST_WAITING = 3; // images that wait for a frame
 const CONTROLS = ["roadmap", "biplane", "which", "lao", "cran", "zoom", "rate", "dose"];
 
 /** The images of one or two planes, and the bar below them. */

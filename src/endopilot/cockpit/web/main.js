@@ -65,7 +65,7 @@ function showFigures(state) {
     drive: `${state.velocity[0].toFixed(1)} mm/s, ${state.velocity[1].toFixed(1)} rad/s`,
     tip: state.sight ? `${state.section}, ${state.tip_mm.toFixed(1)} mm` : "hidden",
     "peak force": state.sight ? `${state.peak_force_n.toFixed(3)} N` : "hidden",
-    state: !state.valid ? "simulation failed" : slips ? "the drive slips" : state.stopped === "silence" ? "stopped: 200 ms without a message; let the keys go" : state.stopped ? `stopped: ${state.stopped}` : "ready",
+    state: !state.valid ? "simulation failed" : slips ? "the drive slips" : state.stopped === "silence" ? "stopped: 200 ms without a message; let the keys go if it stays so" : state.stopped ? `stopped: ${state.stopped}` : "ready",
   });
 }
 
