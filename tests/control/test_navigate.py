@@ -95,6 +95,19 @@ def test_friction_and_stiffness_of_the_truth_change_what_happens(straight) -> No
         assert np.abs(changed.tip_position[:both] - plain.tip_position[:both]).max() > 1e-3
 
 
+def test_a_catheter_that_leans_in_reality_leads_the_wire_elsewhere(straight) -> None:
+    truth = ModelMismatch(axis_deg=20.0, axis_side_deg=90.0)
+    given, real = straight.anatomy.insertion, truth.anatomy(straight.anatomy).insertion
+    assert np.degrees(np.arccos(given.direction @ real.direction)) == pytest.approx(20.0, abs=1e-6)
+    assert np.linalg.norm(real.direction) == pytest.approx(1.0) and (real.position == given.position).all()
+    other = ModelMismatch(axis_deg=20.0, axis_side_deg=270.0).anatomy(straight.anatomy).insertion
+    middle = real.direction + other.direction  # opposite sides: the given axis lies between them
+    assert middle / np.linalg.norm(middle) == pytest.approx(given.direction, abs=1e-6)
+    world = NavigationLoop(straight, Forward(6.0), truth=truth).simulator
+    along = world.position[0, -1] - world.position[0, -2]  # the base lies in the catheter
+    assert abs(along @ real.direction) == pytest.approx(np.linalg.norm(along), rel=1e-6)
+
+
 def test_what_a_policy_asks_is_kept_within_the_limits(straight) -> None:
     for asked in ((np.nan, 1.0), (1e9, 0.0), (5.0, -np.inf)):
         record = navigate(straight, Forward(asked[0], rotation=asked[1]))

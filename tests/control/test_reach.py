@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from endopilot.anatomy.catheter_axis import with_axis
 from endopilot.control.reach import ROTATIONS, forks, lateral_reach, rotations_that_enter
 from endopilot.control.route import Route
-from endopilot.control.set_up import choose_tip, with_axis
+from endopilot.control.set_up import choose_tip
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.core import run_core

@@ -1,8 +1,8 @@
 """Simulates worlds with an older build of endopilot; run by `Baseline` as a script, apart from today's package.
 
 Arguments: the build's folder and, as JSON, kinds of patients, seed, device, worlds and samples. For each line read, it
-simulates them all on one thread and prints the processor time, s. It uses only what the older build has, whose patients are
-those that are called textbook today.
+simulates them all on one thread and prints the processor time, s. It uses only what the older build has; its
+patients are those that are called textbook today.
 """
 
 from __future__ import annotations

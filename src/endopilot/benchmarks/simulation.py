@@ -26,7 +26,7 @@ COMPARED = 8
 REPEATS = 3
 """Times that the worlds are simulated for the timing; the fastest counts."""
 MANY = 4
-"""Times as many worlds for the speedup of two threads: the reference's worlds leave a third of two threads' lanes idle."""
+"""Times as many worlds for the speedup of two threads: the reference's own leave a third of their lanes idle."""
 
 
 def bench_simulation(

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Annotated
 
 import numpy as np
 
-from endopilot.settings import Finite, NonNegative, Positive, settings
+from endopilot.anatomy.catheter_axis import turned_axis, with_axis
+from endopilot.settings import Finite, NonNegative, Positive, Within, settings
 from endopilot.simulation.catheter import Catheter
 from endopilot.types import Anatomy
 
@@ -28,6 +30,16 @@ class ModelMismatch:
     """The wire is inserted this much deeper than the encoder says, mm: the ostium lies elsewhere along the catheter."""
     latency_factor: NonNegative = 1.0
     """Factor on the robot's latency."""
+    axis_deg: Annotated[float, Within(0, 45)] = 0.0
+    """The guiding catheter leans by this angle off its given axis, degrees."""
+    axis_side_deg: Finite = 0.0
+    """To which side it leans, degrees around the given axis."""
+
+    def anatomy(self, given: Anatomy) -> Anatomy:
+        """Return the vessel with its guiding catheter as it is in reality."""
+        if self.axis_deg == 0:
+            return given
+        return with_axis(given, turned_axis(given.insertion.direction, self.axis_deg, self.axis_side_deg))
 
     def catheters(self, given: Sequence[Catheter]) -> tuple[Catheter, ...]:
         """Return catheters as they are in reality: their friction on the wall differs as the wire's does."""

@@ -287,7 +287,7 @@ def start_world(
     device = navigation.device
     wire = device.with_tip(bend_rad=device.tip_bend_rad, stiffness_factor=truth.stiffness_factor)
     catheters = truth.catheters(navigation.catheters)
-    simulator = Simulator(navigation.anatomy, wire, catheters=catheters, motion=motion, config=config)
+    simulator = Simulator(truth.anatomy(navigation.anatomy), wire, catheters=catheters, motion=motion, config=config)
     simulator.reset(
         inserted_length=[max(navigation.start_inserted_mm + truth.ostium_mm, 0.0)],
         rotation=[navigation.start_rotation],

@@ -84,6 +84,8 @@ class NavigatePatientConfig:
     """Factor on the stiffness of the wire's distal 10 mm in reality."""
     true_ostium_mm: Finite | None = None
     """The wire is this much deeper in reality than the encoder says, mm: the ostium lies elsewhere."""
+    true_axis_deg: Annotated[float, Within(0, 45)] = 0.0
+    """In reality the guiding catheter leans off its given axis by this angle, degrees, to a side drawn by the seed."""
     true_latency_s: NonNegative | None = None
     """Time from a command to the motion in reality, s; 0.05 if not given."""
 
@@ -251,7 +253,9 @@ def navigate_patient(set_up: SetUp) -> PatientNavigation:
 
 
 def _truth(config: NavigatePatientConfig, vessel: Anatomy) -> ModelMismatch:
-    drawn = mismatch_by(drawn_sides(config.mismatch, np.random.default_rng([config.seed, 3])), vessel)
+    random = np.random.default_rng([config.seed, 3])
+    drawn = mismatch_by(drawn_sides(config.mismatch, random), vessel)
+    side_deg = float(random.uniform(0.0, 360.0)) if config.true_axis_deg else 0.0
     latency_s = NavigateConfig().robot.latency_s
     given = {
         "friction_factor": config.true_friction,
@@ -259,7 +263,8 @@ def _truth(config: NavigatePatientConfig, vessel: Anatomy) -> ModelMismatch:
         "ostium_mm": config.true_ostium_mm,
         "latency_factor": None if config.true_latency_s is None else config.true_latency_s / latency_s,
     }
-    return replace(drawn, **{name: value for name, value in given.items() if value is not None})
+    given_too = {name: value for name, value in given.items() if value is not None}
+    return replace(drawn, axis_deg=config.true_axis_deg, axis_side_deg=side_deg, **given_too)
 
 
 def _driven_again(set_up: SetUp, record: NavigationRecord, began: Float[np.ndarray, "numbers"]) -> Rollout:
@@ -269,7 +274,7 @@ def _driven_again(set_up: SetUp, record: NavigationRecord, began: Float[np.ndarr
     control = np.zeros((1, periods * per_period, len(began)))
     control[0, : len(record.driven)] = record.driven
     return simulate(
-        set_up.navigation.anatomy,
+        set_up.truth.anatomy(set_up.navigation.anatomy),
         set_up.true_wire,
         control,
         catheters=set_up.true_catheters,

@@ -31,9 +31,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from endopilot.anatomy.catheter_axis import with_axis
 from endopilot.control.plan_config import Plan, PlanConfig
 from endopilot.control.plan_xray import PlannedXray
-from endopilot.control.set_up import tip_name, with_axis
+from endopilot.control.set_up import tip_name
 from endopilot.errors import InputError
 from endopilot.files import json_text, manifest, read_json, sha256, writing
 from endopilot.settings import from_record

@@ -12,14 +12,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from endopilot.anatomy.distance import add_catheter
-from endopilot.anatomy.tree import cross_axes
+from endopilot.anatomy.catheter_axis import turned_axis, with_axis
 from endopilot.control.reach import ROTATIONS, Fork, forks, lateral_reach, rotations_that_enter
 from endopilot.control.route import Route
 from endopilot.errors import InputError
 from endopilot.simulation.device import Device
 from endopilot.tasks.navigation import Navigation
-from endopilot.types import Anatomy, Insertion
 
 SHAPES = ((45.0, 3.0), (60.0, 4.0), (75.0, 5.0), (90.0, 6.5), (90.0, 8.0), (90.0, 10.0))
 """Tips that are tried, angle in degrees and length in mm: from the usual one to the largest that a hand bends."""
@@ -175,19 +173,10 @@ def _towards(route: Route, tilt_deg: float) -> Float[np.ndarray, "3"]:
 
 def _axes(route: Route, tilt_deg: float) -> list[Float[np.ndarray, "3"]]:
     """Return the catheter's axis, turned to all sides, that nearest to the route's direction first."""
-    axis, angle = route.anatomy.insertion.direction, np.radians(tilt_deg)
-    one, two = (side[0] for side in cross_axes(axis[None]))
-    around = 2 * np.pi * np.arange(_AZIMUTHS) / _AZIMUTHS
-    turned = [np.cos(angle) * axis + np.sin(angle) * (np.cos(a) * one + np.sin(a) * two) for a in around]
+    axis, sides_deg = route.anatomy.insertion.direction, 360.0 * np.arange(_AZIMUTHS) / _AZIMUTHS
+    turned = [turned_axis(axis, tilt_deg, side_deg) for side_deg in sides_deg]
     onwards = route.position(_CATHETER_MM) - route.position(0.0)
     return sorted(turned, key=lambda axis: -float(axis @ onwards))
-
-
-def with_axis(anatomy: Anatomy, axis: Float[np.ndarray, "3"]) -> Anatomy:
-    """Return the anatomy with its catheter turned about the ostium; where the catheter lay, the map stays open."""
-    insertion = Insertion(anatomy.insertion.position, axis)
-    opened = add_catheter(anatomy.distance_map, insertion, anatomy.catheter_radius_mm)
-    return replace(anatomy, distance_map=opened, insertion=insertion)
 
 
 def _refused(places: tuple[Fork, ...], count: Count) -> Fork | None:

@@ -1,0 +1,32 @@
+"""The guiding catheter's axis at the ostium, turned: `turned_axis`, `with_axis`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from endopilot.anatomy.distance import add_catheter
+from endopilot.anatomy.tree import cross_axes
+from endopilot.types import Anatomy, Insertion
+
+
+def turned_axis(axis: Float[np.ndarray, "3"], tilt_deg: float, side_deg: float) -> Float[np.ndarray, "3"]:
+    """Return an axis turned to some side.
+
+    Args:
+        axis: unit vector.
+        tilt_deg: angle between it and what is returned, degrees.
+        side_deg: to which side, degrees around the axis from the first of its `cross_axes`.
+    """
+    one, two = (side[0] for side in cross_axes(axis[None]))
+    tilt, side = np.radians(tilt_deg), np.radians(side_deg)
+    return np.cos(tilt) * axis + np.sin(tilt) * (np.cos(side) * one + np.sin(side) * two)
+
+
+def with_axis(anatomy: Anatomy, axis: Float[np.ndarray, "3"]) -> Anatomy:
+    """Return the anatomy with its catheter turned about the ostium; where the catheter lay, the map stays open."""
+    insertion = Insertion(anatomy.insertion.position, axis)
+    opened = add_catheter(anatomy.distance_map, insertion, anatomy.catheter_radius_mm)
+    return replace(anatomy, distance_map=opened, insertion=insertion)
