@@ -106,7 +106,7 @@ struct Sweeps {
     void elements() {
         Diagonal<V> own{}, next;
         for (int i = 0; i < kNodes; ++i) {
-            sink += add_element<V>(rod, i, full, x[i], x[i + 1], frame(q[i]), own, next, link[i]);
+            sink += add_element<V>(rod.length[i], rod.shear[i], rod.stretch[i], full, x[i], x[i + 1], frame(q[i]), own, next, link[i]);
             sink += add_joint<V>(rod, i + 1, full, one, one, q[i], q[i + 1], own, next, link[i]);
             diagonal[i] = own;
             own = next;
@@ -115,12 +115,12 @@ struct Sweeps {
     void wall() {
         for (int i = 0; i < kNodes; ++i) {
             distance[i] = distance_to_wall<V>(lumen, x[i]);
-            sink += add_wall<V>(5.0, 0.18, full, distance[i].value > 1e6, distance[i], diagonal[i]);
+            sink += add_wall<V, 0>(WallSpring{5.0, 0.0}, 0.18, full, distance[i].value > 1e6, distance[i], diagonal[i]);
         }
     }
     void friction() {
         const FrictionState<V> friction{0.01 * one, {one, 0.0 * one, 0.0 * one}, {0.0 * one, 0.18 * one, 0.0 * one}};
-        for (int i = 0; i < kNodes; ++i) sink += add_friction<V>(friction, 1e-3 * one, full, x[i] - x[0], q[i], diagonal[i]);
+        for (int i = 0; i < kNodes; ++i) sink += add_friction<V, 0>(friction, 1e-3 * one, full, x[i] - x[0], q[i], {}, diagonal[i]);
     }
     void elimination() {
         Carried<V> carried{};
