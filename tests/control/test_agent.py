@@ -60,6 +60,16 @@ def test_the_twin_gets_into_a_side_branch_that_pushing_misses(side_branch) -> No
     assert record.exposures == len(record.time_s) - 1  # X-ray is always on
 
 
+def test_the_twin_knows_a_catheter_that_leans(side_branch) -> None:
+    truth = ModelMismatch(axis_deg=20.0, axis_side_deg=90.0)
+    policy = TwinPolicy(truth, config=QUICK)
+    policy.start(side_branch, seed=1)
+    nodes = policy.belief.simulator.position[0]
+    along = nodes[-1] - nodes[-2]  # the base lies in the catheter
+    axis = truth.anatomy(side_branch.anatomy).insertion.direction
+    assert abs(along @ axis) == pytest.approx(np.linalg.norm(along), rel=1e-6)
+
+
 def test_a_course_is_what_the_simulator_does_under_its_controls(side_branch) -> None:
     policy = TwinPolicy(config=QUICK)
     policy.start(side_branch, 0)

@@ -245,6 +245,10 @@ class TwinPolicy(_PlanningPolicy):
         super().__init__(config)
         self._truth = truth or ModelMismatch()
 
+    def start(self, navigation: Navigation, seed: int) -> None:
+        """Lay out the simulated wire in the vessel as it truly is, its catheter among it."""
+        super().start(replace(navigation, anatomy=self._truth.anatomy(navigation.anatomy)), seed)
+
     def _parameters(self) -> Float[np.ndarray, "members 3"]:
         truth = self._truth
         return np.array([[truth.friction_factor, truth.stiffness_factor, truth.ostium_mm]])
