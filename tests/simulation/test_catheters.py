@@ -10,12 +10,15 @@ import numpy as np
 import pytest
 
 import endopilot
+from endopilot.atlas.atlas import AtlasConfig, make_patient
+from endopilot.benchmarks.manoeuvres import paired_controls
 from endopilot.errors import InputError
 from endopilot.simulation.catheter import Catheter, list_catheters, read_catheter
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import read_controls_csv
 from endopilot.simulation.device import read_device
 from endopilot.simulation.table import write_rollout
+from endopilot.simulation.tubes import Stack
 from endopilot.types import Anatomy
 
 SHIPPED = Path(endopilot.__file__).parent / "simulation/catheters"
@@ -202,6 +205,21 @@ def test_neither_drive_passes_its_limit_where_both_meet_an_obstacle() -> None:
     assert (np.abs(rollout.slip).sum(axis=1) > 5).any() and (np.abs(motion.slip).sum(axis=1) > 5).any()
     for force in (rollout.base_force, motion.base_force[..., 0]):
         assert 0.9 * 0.3 < np.abs(force).max() < 1.1 * 0.3
+
+
+def test_tubes_that_rest_at_a_drive_limit_end_their_steps() -> None:
+    """A catheter that is pushed at its limit rests where Newton's steps do not shrink below the energy's rounding."""
+    vessel = make_patient(AtlasConfig(), 5)
+    stack = Stack(read_device("workhorse-014"), (read_catheter("jl4-5f"),))
+    seed = int(np.random.SeedSequence([0, 5]).generate_state(1, np.uint64)[0])
+    initial, control = paired_controls(vessel, stack, rollouts=4, samples=120, seed=seed)
+    config = SimulatorConfig(threads=1)
+    rollout = endopilot.simulate(
+        vessel, stack.wire, control[3:, :8], catheters=stack.catheters, initial=initial[3:], config=config
+    )
+    assert rollout.catheters is not None
+    assert np.abs(rollout.catheters.base_force).max() > 0.99 * stack.catheters[0].device.push_limit_n
+    assert rollout.valid.all()
 
 
 def test_a_rollout_written_as_csv_is_simulated_again(vessel: Anatomy, catheter: Catheter, tmp_path: Path) -> None:
