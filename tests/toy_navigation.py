@@ -49,7 +49,7 @@ def toy_anatomy(name: str) -> Anatomy:
     )
 
 
-def toy_simulate(anatomy: Anatomy, device, control, *, initial, config, friction) -> Rollout:
+def toy_simulate(anatomy: Anatomy, device, control, *, initial, config, friction, motion=None) -> Rollout:
     """Return what the toy wire does under the controls; takes what `simulate` takes."""
     worlds, samples, _ = control.shape
     proximal = initial[:, None] + SAMPLE_PERIOD_S * np.cumsum(control, axis=1)
@@ -109,7 +109,7 @@ def write_toy_anatomies(folder: Path, patients: int) -> list[Path]:
 def toy_navigate(simulate=toy_simulate):
     """Return a stand-in for `simulate_navigations`: the drawn controls, driven as they are through the toy."""
 
-    def simulate_navigations(anatomy, devices, initial, control, friction, config, *, actuation, advance):
+    def simulate_navigations(anatomy, devices, initial, control, friction, config, *, actuation, motion, advance):
         control = control.astype(np.float32).astype(float)
         rollout = simulate(anatomy, devices[0], control, initial=initial, config=config, friction=friction)
         advance(control.shape[0] * control.shape[1])

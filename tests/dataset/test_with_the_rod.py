@@ -11,10 +11,12 @@ import pytest
 from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.dataset.config import DatasetConfig
-from endopilot.dataset.draw import TIP_GROUP, draw_navigations
+from endopilot.dataset.draw import TIP_GROUP, draw_navigations, patient_motion
 from endopilot.dataset.generate import generate_dataset
 from endopilot.dataset.loader import load_dataset
 from endopilot.dataset.navigations import PULL_BACK_MM, STOP_SHORT_MM, simulate_navigations
+from endopilot.evaluation.replay import Recorded
+from endopilot.models.config import WINDOW
 from endopilot.simulation.device import read_device
 from endopilot.simulation.simulate import simulate
 
@@ -143,3 +145,22 @@ def test_a_dataset_driven_by_force(tmp_path, patient):
     )
     np.testing.assert_array_equal(again.tip.abscissa.astype(np.float32), one.tip_abscissa)
     assert sum(data.manifest["manoeuvres"].values()) == pytest.approx(1)
+
+
+def test_vessels_move_as_it_is_drawn_for_each_patient(tmp_path, patient):
+    config = DatasetConfig(sequences=2, seconds=16.0, seed=2, motion="both", anatomy_shares=(1.0, 0.0, 0.0))
+    generate_dataset([patient], tmp_path / "dataset", DEVICE, config)
+    data = load_dataset(tmp_path / "dataset")
+    name = str(data.anatomy[0])
+    assert data.motion(name) == patient_motion(config, name) != patient_motion(config, "somebody else")
+    assert patient_motion(replace(config, motion="still"), name) is None
+    initial = np.stack([data.initial_inserted_length, data.initial_rotation], axis=-1)
+    moved, still = (
+        simulate(read_anatomy(patient), DEVICE, data.command, initial=initial, config=config.simulator, motion=motion)
+        for motion in (data.motion(name), None)
+    )
+    np.testing.assert_array_equal(moved.tip.abscissa.astype(np.float32), data.tip_abscissa)
+    assert np.abs(still.tip.abscissa - data.tip_abscissa).max() > 0.3
+    recorded = Recorded.of(data)
+    ((_, again),) = recorded.simulated({"true_replay": data.command[:, WINDOW:]})
+    np.testing.assert_array_equal(again.tip.abscissa.astype(np.float32), data.tip_abscissa)

@@ -24,6 +24,7 @@ from endopilot.env.vector import (
     NavigateVectorEnv,
 )
 from endopilot.errors import InputError
+from endopilot.simulation.motion import motion_named
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import Navigation, Target
 from endopilot.tasks.task import in_catheter, reference_navigation
@@ -309,3 +310,18 @@ def test_bad_arguments_are_one_clear_line(near):
     slow = replace(near, device=replace(near.device, max_velocity_mm_s=1.0))
     with pytest.raises(InputError, match="max_velocity_mm_s"):
         NavigateVectorEnv(1, navigations=slow)
+
+
+def test_vessels_move_where_a_motion_is_given_and_go_on_from_a_pickle(near):
+    beating = {"navigations": near, "motion": motion_named("heartbeat")}
+    still, env = NavigateVectorEnv(WORLDS, navigations=near), NavigateVectorEnv(WORLDS, **beating)
+    assert np.array_equal(still.reset(seed=4)[0], env.reset(seed=4)[0])  # every episode begins at the phase of the CT
+    actions = _actions(near, steps=6)
+    lain, moved = _rollout(still, actions), _rollout(env, actions)
+    assert np.abs(moved[0] - lain[0]).max() > 0.01
+    one = NavigateEnv(navigation=near, motion=motion_named("heartbeat"))
+    one.reset(seed=5)
+    for step, row in enumerate(actions):
+        assert np.array_equal(one.step(row[1])[0], moved[0][step, 1])
+    copy = pickle.loads(pickle.dumps(env))
+    assert _same(_rollout(copy, actions), _rollout(env, actions))

@@ -102,7 +102,7 @@ def test_recorded_controls_lead_back_to_the_recorded_tips(evaluated):
 def test_the_core_is_replayed_with_other_friction(toy_dataset, evaluated):
     asked = {}
 
-    def watched(anatomy, device, control, *, initial, config, friction):
+    def watched(anatomy, device, control, *, initial, config, friction, motion):
         asked[anatomy.name] = friction
         return toy_simulate(anatomy, device, control, initial=initial, config=config, friction=friction)
 

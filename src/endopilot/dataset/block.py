@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 
 from endopilot.anatomy.io import read_anatomy
 from endopilot.dataset import parquet, schema
-from endopilot.dataset.draw import Draw, draw_navigations
+from endopilot.dataset.draw import Draw, draw_navigations, patient_motion
 from endopilot.dataset.layout import Block, BlockContext
 from endopilot.dataset.navigations import simulate_navigations
 from endopilot.errors import InputError
@@ -46,6 +46,7 @@ def write_block(
             draw.friction,
             replace(config.simulator, threads=threads),
             actuation=config.control,
+            motion=patient_motion(config, anatomy.name),
             advance=advance,
         )
     store_block(context, block, draw, rollout, applied, stopped)

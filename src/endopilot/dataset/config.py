@@ -10,6 +10,7 @@ from pydantic import model_validator
 from endopilot.settings import Ascending, Count, NonNegative, Positive, Seed, Share, ShareBelowOne, Within, settings
 from endopilot.simulation.config import Actuation, SimulatorConfig
 from endopilot.simulation.controls import ControlConfig
+from endopilot.simulation.motion import MotionName
 from endopilot.types import SAMPLE_PERIOD_S
 
 
@@ -47,6 +48,9 @@ class DatasetConfig:
     """Range of a factor on the angle of the device's bent tip, drawn uniformly for each eight navigations."""
     tip_stiffness_factor: Annotated[tuple[_Stiffness, _Stiffness], Ascending] | None = None
     """Range of a factor on the stiffness of the distal 10 mm, drawn likewise."""
+    motion: MotionName = "still"
+    """How heart and breath move the vessel and the guiding catheter: still, breathing, heartbeat or both. The
+    amplitudes of each anatomy are drawn from the published distributions."""
     anatomy_shares: tuple[Share, Share, Share] | None = None
     """Shares of the anatomies that train, calibrate and test; 0.6 0.2 0.2 if not given, and a single anatomy is then
     split by sequence alone. 0 0 1 makes a dataset to test on."""

@@ -1,4 +1,4 @@
-"""The random part of a dataset: controls, friction and tip of every navigation.
+"""The random part of a dataset: controls, friction and tip of every navigation, and the motion of every patient.
 
 Everything follows from the seed, the anatomy's name and the navigation's index, through random streams of their own.
 """
@@ -15,6 +15,7 @@ from endopilot.dataset.config import DatasetConfig
 from endopilot.simulation.controls import free_wire_load, random_controls
 from endopilot.simulation.device import Device
 from endopilot.simulation.drive_limits import DriveLimits
+from endopilot.simulation.motion import Motion, motion_named
 from endopilot.types import Anatomy
 
 TIP_GROUP = 8
@@ -54,8 +55,7 @@ class Draw:
 
 def draw_navigations(config: DatasetConfig, device: Device, anatomy: Anatomy, sequences: range) -> Draw:
     """Draw some navigations of an anatomy; each is the same whatever the number of the others."""
-    name_number = int.from_bytes(hashlib.sha256(anatomy.name.encode()).digest()[:8], "little")
-    controls, friction, tip, surplus = np.random.SeedSequence([config.seed, name_number]).spawn(4)
+    controls, friction, tip, surplus, _ = _streams(config, anatomy.name)
     initial, control = random_controls(
         config.navigation,
         n_sequences=len(sequences),
@@ -77,6 +77,22 @@ def draw_navigations(config: DatasetConfig, device: Device, anatomy: Anatomy, se
         tip_bend_rad=device.tip_bend_rad * _within(config.tip_bend_factor, bend),
         tip_stiffness_factor=_within(config.tip_stiffness_factor, stiffness),
     )
+
+
+def patient_motion(config: DatasetConfig, anatomy: str) -> Motion | None:
+    """Return how the vessel of an anatomy moves in the navigations of a dataset; None if it lies still.
+
+    Args:
+        config: of the dataset.
+        anatomy: its name.
+    """
+    return motion_named(config.motion, int(_streams(config, anatomy)[-1].generate_state(1, np.uint64)[0]))
+
+
+def _streams(config: DatasetConfig, anatomy: str) -> list[np.random.SeedSequence]:
+    """Return the random streams of an anatomy: of controls, friction, tip, surplus and motion."""
+    name_number = int.from_bytes(hashlib.sha256(anatomy.encode()).digest()[:8], "little")
+    return np.random.SeedSequence([config.seed, name_number]).spawn(5)
 
 
 def _uniform(

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
+from endopilot.dataset.config import DatasetConfig
+from endopilot.dataset.draw import patient_motion
 from endopilot.dataset.layout import identify, version
 from endopilot.dataset.schema import (
     INFO_PATH,
@@ -22,6 +24,7 @@ from endopilot.errors import InputError
 from endopilot.extras import extra_named
 from endopilot.files import read_json
 from endopilot.runs import RECORD_FILE
+from endopilot.simulation.motion import Motion
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +132,10 @@ class Dataset:
     def patients(self) -> dict[str, str]:
         """SHA-256 of what a simulation depends on in each anatomy, by the anatomy's name."""
         return {record["name"]: record["sha256"] for record in self.manifest["anatomies"]}
+
+    def motion(self, anatomy: str) -> Motion | None:
+        """Return how the vessel of an anatomy, given by name, moves in the episodes; None if it lies still."""
+        return patient_motion(DatasetConfig(**self.manifest["config"]), anatomy)
 
     def anatomy_folder(self, name: str) -> Path:
         """Return the folder of an anatomy of the dataset.

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from endopilot.env.vector import NavigateVectorEnv, NavigationState
 from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import Navigation
 from endopilot.tasks.task import CORE
@@ -35,6 +36,7 @@ class NavigateEnv(gymnasium.Env):
         task: str | None = None,
         patient: int = 0,
         catheter: str | None = None,
+        motion: Motion | None = None,
         config: SimulatorConfig = CORE,
     ) -> None:
         """Lay the wire out; `reset` starts the first episode.
@@ -44,6 +46,7 @@ class NavigateEnv(gymnasium.Env):
             task: in its place, the name of a task of the ladder.
             patient: which of its training patients.
             catheter: name of a catheter around the wire, or a YAML file; its tip is to arrive then.
+            motion: how heart and breath move the vessel and its guiding catheter; they lie still if not given.
             config: settings of the rod core.
         """
         self._worlds = NavigateVectorEnv(
@@ -52,6 +55,7 @@ class NavigateEnv(gymnasium.Env):
             patient=patient,
             catheter=catheter,
             autoreset_mode=AutoresetMode.DISABLED,
+            motion=motion,
             config=config,
         )
         self.metadata = {"render_modes": []}

@@ -20,6 +20,7 @@ from endopilot.env.route_tables import RouteTables
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.drive_limits import far_end_mm, within_travel
+from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import SimulatorState
 from endopilot.tasks.navigation import Navigation, reached
@@ -168,7 +169,8 @@ class NavigateVectorEnv(VectorEnv):
     microcatheter (`microcatheter-1.7f`) is to be brought over the wire. The others are the tasks of the ladder's
     version 1, as `endopilot/Crux-v0`, in patients of their own, which are not those that the ladder is scored on; world
     i has patient (`patient` + i) modulo `patients`. With `catheter` a task is to be done by the tip of that catheter.
-    Or give `navigations` of your own.
+    Or give `navigations` of your own. With `motion` the vessels move; positions are those in the vessel as CT shows
+    it, and every episode begins at the phase of the CT.
 
     ## Version history
 
@@ -185,6 +187,7 @@ class NavigateVectorEnv(VectorEnv):
         patients: int = 1,
         catheter: str | None = None,
         autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
+        motion: Motion | None = None,
         config: SimulatorConfig = CORE,
     ) -> None:
         """Lay the wires out; `reset` starts the first episodes.
@@ -197,6 +200,7 @@ class NavigateVectorEnv(VectorEnv):
             patients: number of its training patients that the worlds have.
             catheter: name of a catheter around the wire, or a YAML file; its tip is to arrive then.
             autoreset_mode: whether an ended world is reset at the next step.
+            motion: how heart and breath move all vessels and their guiding catheters; they lie still if not given.
             config: settings of the rod core.
 
         Raises:
@@ -213,9 +217,15 @@ class NavigateVectorEnv(VectorEnv):
         elif catheter:
             raise InputError(f"catheter: {catheter}; give it to the navigations")
         given = [navigations] if isinstance(navigations, Navigation) else list(navigations)
-        self._prepare([given[world % len(given)] for world in range(num_envs)], autoreset_mode, config)
+        self._prepare([given[world % len(given)] for world in range(num_envs)], autoreset_mode, motion, config)
 
-    def _prepare(self, navigations: list[Navigation], autoreset_mode: AutoresetMode, config: SimulatorConfig) -> None:
+    def _prepare(
+        self,
+        navigations: list[Navigation],
+        autoreset_mode: AutoresetMode,
+        motion: Motion | None,
+        config: SimulatorConfig,
+    ) -> None:
         first = navigations[0]
         if any((other.catheters, other.arrives) != (first.catheters, first.arrives) for other in navigations):
             raise InputError("navigations: differ in catheters, or in which tip is to arrive; give all the same")
@@ -227,7 +237,7 @@ class NavigateVectorEnv(VectorEnv):
                     f"{ROTATION_RAD_S:g} rad/s; give a faster device"
                 )
         count = len(navigations)
-        self.navigations, self._config = tuple(navigations), config
+        self.navigations, self._motion, self._config = tuple(navigations), motion, config
         self.metadata = {"autoreset_mode": autoreset_mode, "render_modes": []}
         self.num_envs = count
         self._drives, self._counted = len(first.devices), 1 + first.arriving
@@ -240,6 +250,7 @@ class NavigateVectorEnv(VectorEnv):
             [navigation.anatomy for navigation in navigations],
             [navigation.device for navigation in navigations],
             catheters=first.catheters,
+            motion=motion,
             config=config,
         )
         self._routes = RouteTables.of(navigations)
@@ -420,12 +431,13 @@ class NavigateVectorEnv(VectorEnv):
         return {
             "navigations": list(self.navigations),
             "autoreset_mode": self.metadata["autoreset_mode"],
+            "motion": self._motion,
             "config": self._config,
             "state": self.state,
             "spec": self.spec,
         }
 
     def __setstate__(self, kept: dict[str, Any]) -> None:
-        self._prepare(kept["navigations"], kept["autoreset_mode"], kept["config"])
+        self._prepare(kept["navigations"], kept["autoreset_mode"], kept["motion"], kept["config"])
         self.set_state(kept["state"])
         self.spec = kept["spec"]

@@ -93,7 +93,15 @@ class Recorded:
             friction = np.concatenate([REPLAYED.get(name, 1.0) * data.friction[chosen] for name in controls])
             yield (
                 chosen,
-                simulate(anatomy, wire, np.nan_to_num(driven), initial=initial, config=settings, friction=friction),
+                simulate(
+                    anatomy,
+                    wire,
+                    np.nan_to_num(driven),
+                    initial=initial,
+                    config=settings,
+                    friction=friction,
+                    motion=data.motion(anatomy.name),
+                ),
             )
             if advance and (kind + 1 == len(kinds) or kinds[kind + 1][0] != index):
                 advance(1, anatomy.name)

@@ -397,6 +397,7 @@ def _replay(output: Path, device: Device) -> tuple[Path, Rollout]:
     wire = device.with_tip(bend_rad=float(one.tip_bend[0]), stiffness_factor=float(one.tip_stiffness_factor[0]))
     settings = SimulatorConfig(**dataset.manifest["config"]["simulator"])
     options = {"initial": initial, "config": settings, "friction": one.friction, "record_shape": True}
+    options["motion"] = dataset.motion(anatomy.name)
     return folder, simulate(anatomy, wire, one.control, **options)
 
 
