@@ -63,7 +63,6 @@ def test_a_heartbeat_contracts_towards_a_resting_apex() -> None:
     ostium, apex = place(found, OSTIUM), place(found, OSTIUM + 94 * axis)
     assert np.ptp(ostium @ axis) == pytest.approx(11.6, rel=0.01)
     assert np.ptp(apex, axis=0).max() < 0.01
-    assert np.ptp(np.linalg.det(found[:, :, :3]) / (1 - np.ptp(ostium @ axis) / 94)) > 0.05
     across = np.sqrt(np.linalg.det(found[:, :, :3]) / np.linalg.norm(found[:, :, :3] @ axis, axis=-1))
     assert across.min() / across.max() == pytest.approx(np.sqrt(1 - 0.082), abs=0.003)
 
@@ -180,6 +179,10 @@ def test_wires_in_catheters_move_with_the_vessel_too(anatomy: Anatomy) -> None:
     assert moving.catheters is not None and still.catheters is not None
     np.testing.assert_allclose(moving.tip_position, still.tip_position, atol=2e-3)
     np.testing.assert_allclose(moving.catheters.tip_position, still.catheters.tip_position, atol=2e-3)
+    beating = simulate(anatomy, DEVICE, both, catheters=catheters, initial=start, config=config, motion=BEATS)
+    assert beating.catheters is not None
+    assert np.abs(beating.tip_position - still.tip_position).max() > 0.3
+    assert np.abs(beating.catheters.tip_position - still.catheters.tip_position).max() > 0.3
 
 
 def test_the_command_tells_tips_in_the_vessel_and_in_the_laboratory(anatomy: Anatomy, tmp_path: Path) -> None:
