@@ -62,7 +62,7 @@ def main() -> None:
     head, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
     table = "\n".join(
         [
-            "| motion | known to the C-arm | reached safely | median time, s | exposures a minute "
+            "| motion | known | reached safely | median time, s | exposures a minute "
             "| decisions in both bands | largest wall force, N |",
             "|---|---|---|---|---|---|---|",
             *rows,

@@ -16,11 +16,12 @@ from endopilot.control.belief import Belief, BeliefConfig
 from endopilot.control.course import Course, Log
 from endopilot.control.halt import describe_halt
 from endopilot.control.mismatch import ModelMismatch
-from endopilot.control.navigate import NavigationLoop, navigate
+from endopilot.control.navigate import NavigationLoop, navigate, start_world
 from endopilot.control.period import drive_period
 from endopilot.control.policy import Decision, Observation, Policy
 from endopilot.control.route import Route
 from endopilot.control.search import Search
+from endopilot.simulation.motion import motion_named
 from endopilot.tasks.navigation import Navigation, Target
 from endopilot.xray.adviser import AdviserConfig
 from endopilot.xray.bands import Calibration
@@ -70,7 +71,9 @@ def test_the_twin_knows_a_catheter_that_leans(side_branch) -> None:
     assert abs(along @ axis) == pytest.approx(np.linalg.norm(along), rel=1e-6)
 
 
-def test_a_course_is_what_the_simulator_does_under_its_controls(side_branch) -> None:
+@pytest.mark.parametrize("known", ["still", "both"])
+def test_a_course_is_what_the_simulator_does_under_its_controls(side_branch, known) -> None:
+    side_branch = replace(side_branch, known_motion=motion_named(known))
     policy = TwinPolicy(config=QUICK)
     policy.start(side_branch, 0)
     course = policy.find_course(side_branch.seconds)
@@ -116,6 +119,21 @@ def test_measurements_weigh_the_member_that_they_are_of(side_branch) -> None:
     assert belief.tip_spread()[0] < 0.8 * wide[0]
     best, share = belief.likeliest()
     assert 4 in best and share.sum() == pytest.approx(1.0) and best[share.argmax()] == 4
+
+
+def test_simulated_wires_slide_in_a_vessel_that_beats_as_far_as_that_is_known(side_branch) -> None:
+    """One is as the real wire, and driven likewise."""
+    beat, same = motion_named("heartbeat"), np.array([[1.0, 1.0, 0.0]])
+    true = start_world(side_branch, ModelMismatch(), QUICK.belief.core, motion=beat)
+    knows, knows_not = (Belief(replace(side_branch, known_motion=known), same, QUICK.belief) for known in (beat, None))
+    errors = []
+    for _ in range(8):
+        true.step([[6.0, 0.0]], 0.5)
+        for belief in (knows, knows_not):
+            belief.follow(float(true.inserted_length[0]), 0.0)
+        errors.append([float(abs(belief.tip.abscissa - true.project().abscissa)[0]) for belief in (knows, knows_not)])
+    assert np.max(errors, axis=0)[0] < 0.01
+    assert np.max(errors, axis=0)[1] > 0.3
 
 
 def test_an_unsure_measurement_weighs_little(side_branch) -> None:

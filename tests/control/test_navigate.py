@@ -9,9 +9,10 @@ import pytest
 
 from endopilot.control.mismatch import ModelMismatch
 from endopilot.control.navigate import NavigateConfig, NavigationLoop, navigate
+from endopilot.control.navigate_patient import NavigatePatientConfig, set_up_navigation
 from endopilot.control.policy import Decision, Observation, Policy
 from endopilot.control.robot import CYCLE_S, RobotConfig
-from endopilot.simulation.motion import Motion
+from endopilot.simulation.motion import Motion, motion_named
 from endopilot.tasks.navigation import Navigation, Target
 from endopilot.xray.fluoroscope import FluoroscopeConfig
 
@@ -214,10 +215,10 @@ def breathing(**changed: float) -> Motion:
 def test_an_exposure_shows_a_moving_vessel_where_it_is_less_what_the_c_arm_knows(straight) -> None:
     """The ostium's axis is z: a breath of 6 mm towards the feet, sin⁴(πt/4 s), moves the tip by so much along it."""
     sharp = FluoroscopeConfig(pixel_sd=1e-3, along_sd=1e-3)
-    base = NavigateConfig(robot=PERFECT, fluoroscope=sharp, motion=breathing())
+    config = NavigateConfig(robot=PERFECT, fluoroscope=sharp, motion=breathing())
 
     def errors(known: Motion | None) -> np.ndarray:
-        record = navigate(straight, Forward(3.0, expose_every=1), config=replace(base, known_motion=known))
+        record = navigate(replace(straight, known_motion=known), Forward(3.0, expose_every=1), config=config)
         shown = [tip for tip in record.measured if tip is not None]
         return np.array([tip.position for tip in shown]) - record.tip_position[: len(shown)]
 
@@ -239,3 +240,26 @@ def test_a_heartbeat_moves_the_wire_in_the_vessel(straight) -> None:
     both = min(len(still.time_s), len(beating.time_s))
     assert beating.reason != "invalid"
     assert np.abs(still.tip_position[:both] - beating.tip_position[:both]).max() > 0.05
+
+
+def test_images_show_a_moving_vessel_where_it_is_less_what_is_known(straight) -> None:
+    """A breath of 6 mm, of which 5 mm are known, moves the tip by 1 mm along the vessel's axis, z, when inspired."""
+    known = replace(straight, known_motion=breathing(breathing_caudal_mm=5.0))
+    config = NavigateConfig(robot=PERFECT, xray="images", motion=breathing())
+    record = navigate(replace(known, seconds=4.0), Forward(6.0, expose_every=2), config=config, seed=2)
+    at = np.flatnonzero([tip is not None and k >= 2 for k, tip in enumerate(record.measured)])
+    assert len(at) >= 3
+    seen = np.array([record.measured[k].position[2] for k in at])
+    shift = -(np.sin(np.pi * 0.5 * at / 4.0) ** 4)
+    np.testing.assert_allclose(seen - record.tip_position[at, 2], shift, atol=0.4)
+    assert np.ptp(shift) > 0.7
+
+
+def test_what_is_known_of_the_motion_stands_in_the_navigation(fork) -> None:
+    own = motion_named("both", 3)
+    for known, wanted in (("nothing", None), ("published", Motion()), ("exact", own)):
+        config = NavigatePatientConfig(tip="own", motion="both", motion_seed=3, motion_known=known)
+        set_up = set_up_navigation(fork, "0,0,33", config)
+        assert set_up.motion == own and set_up.navigation.known_motion == wanted
+    at_rest = set_up_navigation(fork, "0,0,33", NavigatePatientConfig(tip="own"))
+    assert at_rest.motion is None and at_rest.navigation.known_motion is None

@@ -3,7 +3,8 @@
 Catheters around the real wire are around each simulated one too, and driven like the real ones.
 
 Its members differ in what is uncertain: friction, the stiffness of the tip, and how deep the ostium lies (as
-`models/twin.py` has it). Each follows the robot's encoders. A measurement of the tip weights them by their errors.
+`models/twin.py` has it). Each follows the robot's encoders, in a
+vessel that moves as it is known to. A measurement of the tip weights them by their errors.
 """
 
 from __future__ import annotations
@@ -85,6 +86,7 @@ class Belief:
             navigation.anatomy,
             [self.wires[factor] for factor in parameters[:, 1]],
             catheters=navigation.catheters,
+            motion=navigation.known_motion,
             config=config.core,
         )
         self._ostium = parameters[:, 2]

@@ -89,6 +89,7 @@ class Copies:
             navigation.device,
             catheters=catheters,
             worlds=worlds,
+            motion=navigation.known_motion,
             config=config.core,
             sharing=like,
         )

@@ -42,10 +42,8 @@ class NavigateConfig:
     simulator: SimulatorConfig = field(default_factory=lambda: SimulatorConfig(threads=1))
     """The rod core."""
     motion: Motion | None = None
-    """How heart and breath move the vessel and its guiding catheter; they lie still if not given."""
-    known_motion: Motion | None = None
-    """The motion that the C-arm, which knows the phase of heart and breath, takes off what it measures; none if not
-    given. What it does not take off, an exposure shows as an error."""
+    """How heart and breath truly move the vessel and its guiding catheter; they lie still if not given. The navigation
+    says what of it is known; the rest an exposure shows as an error."""
 
 
 class NavigationLoop:
@@ -98,7 +96,8 @@ class NavigationLoop:
         self.simulator = start_world(navigation, truth, config.simulator, motion=config.motion)
         ostium = np.asarray(navigation.anatomy.insertion.position)
         self._moves = config.motion is not None
-        self._known = None if config.known_motion is None else config.known_motion.core(ostium)
+        known = navigation.known_motion
+        self._known = None if known is None else known.core(ostium)
         self._limits = tuple(DriveLimits.of(device, navigation.anatomy) for device in navigation.devices)
         drive = replace(config.robot, latency_s=config.robot.latency_s * truth.latency_factor)
         self.robot = SimulatedRobot(self.simulator, self._limits, drive, seed=seed, ostium_mm=truth.ostium_mm)

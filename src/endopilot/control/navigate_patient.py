@@ -71,8 +71,8 @@ class NavigatePatientConfig:
     motion_seed: Seed | None = None
     """Draws the patient's amplitudes from the published distributions; their means if not given."""
     motion_known: MotionKnown = "published"
-    """What the C-arm, which knows the phase of heart and breath, takes off what it measures: nothing, the published
-    mean of that motion, or exactly the patient's own."""
+    """What is known of that motion, with the phase of heart and breath: nothing, the published mean, or exactly the
+    patient's own. The C-arm takes it off what it measures, and agents simulate it."""
     seed: Seed = 0
     """Seed of encoder noise, detection errors, the policy, and of the sides that `mismatch` draws."""
     mismatch: ShareBelowOne = 0.0
@@ -130,12 +130,6 @@ class SetUp:
     def motion(self) -> Motion | None:
         """How the vessel moves; None if it lies still."""
         return motion_named(self.config.motion, self.config.motion_seed)
-
-    @property
-    def known_motion(self) -> Motion | None:
-        """What of it the C-arm takes off what it measures."""
-        known = self.config.motion_known
-        return None if known == "nothing" else self.motion if known == "exact" else motion_named(self.config.motion)
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,6 +190,7 @@ def set_up_navigation(anatomy: Anatomy | str | Path, target: str, config: Naviga
         start_rotation=config.start_rotation,
         seconds=config.seconds,
         force_limit_n=config.force_limit_n,
+        known_motion=_known_motion(config),
     )
     check_passable(Route.to(vessel, goal), given.devices[given.arriving])
     choice = choose_tip(given, config.tip, catheter_tilt_deg=config.catheter_tilt_deg)
@@ -219,7 +214,6 @@ def navigate_patient(set_up: SetUp) -> PatientNavigation:
         simulator=set_up.simulator,
         xray=set_up.config.xray,
         motion=set_up.motion,
-        known_motion=set_up.known_motion,
     )
     loop = NavigationLoop(navigation, policy, config=config, seed=set_up.config.seed, truth=set_up.truth)
     began = loop.robot.proximal.ravel()
@@ -250,6 +244,13 @@ def navigate_patient(set_up: SetUp) -> PatientNavigation:
         plans=getattr(policy, "plans", None),
         planning_s=getattr(policy, "planning_s", None),
     )
+
+
+def _known_motion(config: NavigatePatientConfig) -> Motion | None:
+    """Return what is known of how the vessel moves."""
+    if config.motion_known == "nothing":
+        return None
+    return motion_named(config.motion, config.motion_seed if config.motion_known == "exact" else None)
 
 
 def _truth(config: NavigatePatientConfig, vessel: Anatomy) -> ModelMismatch:

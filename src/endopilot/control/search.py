@@ -100,9 +100,10 @@ class Search:
         self.navigation, self.route, self.config = navigation, route, config
         self._random = np.random.default_rng([seed, 0x5EA])
         candidates = [wire for wire in wires for _ in range(config.candidates)]
-        anatomy, core = navigation.anatomy, sharing.config
-        self.single, self._kept = (Simulator(anatomy, wires, config=core, sharing=sharing) for _ in range(2))
-        self._many = Simulator(anatomy, candidates, config=core, sharing=sharing)
+        anatomy, motion, core = navigation.anatomy, navigation.known_motion, sharing.config
+        self.single, self._kept, self._many = (
+            Simulator(anatomy, some, motion=motion, config=core, sharing=sharing) for some in (wires, wires, candidates)
+        )
         limits = DriveLimits.of(wires[0], anatomy)
         self._limits = replace(limits, travel_mm=(limits.travel_mm[0], limits.travel_mm[1] - _SHORT_MM))
         self._wire_radius = wires[0].tip_radius_mm

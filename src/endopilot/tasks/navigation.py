@@ -13,6 +13,7 @@ from endopilot.errors import InputError
 from endopilot.settings import CountOrZero, Finite, NonNegative, Positive, settings
 from endopilot.simulation.catheter import Catheter, check_nested
 from endopilot.simulation.device import Device
+from endopilot.simulation.motion import Motion
 from endopilot.types import Anatomy, TipProjection
 
 DECISION_PERIOD_S = 0.5
@@ -58,6 +59,8 @@ class Navigation:
         start_catheter_mm: inserted length of the catheters at the start, mm; their rotations are 0.
         seconds: time in which the target is to be reached, s.
         force_limit_n: largest force of the wall on one node that is safe, N.
+        known_motion: how heart and breath are known to move the vessel, which the C-arm takes off what it measures and
+            policies simulate; it is taken to lie still if not given.
     """
 
     anatomy: InstanceOf[Anatomy]
@@ -70,6 +73,7 @@ class Navigation:
     start_catheter_mm: NonNegative = 0.0
     seconds: Positive = 60.0
     force_limit_n: Positive = 0.5
+    known_motion: Motion | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> Navigation:
