@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -131,7 +131,7 @@ def _run(scenes: Sequence[Scene], config: SimulatorConfig) -> tuple[list[Rollout
     return rollouts, time.perf_counter() - wall, time.process_time() - processor
 
 
-def _threads_speedup(recipe: dict[str, Any], config: SimulatorConfig) -> float:
+def _threads_speedup(recipe: Mapping[str, Any], config: SimulatorConfig) -> float:
     scenes = make_scenes(MANY * recipe["worlds"], recipe["samples"])
     alone, together = (_run(scenes, replace(config, threads=threads))[1] for threads in (1, 2))
     return alone / together
