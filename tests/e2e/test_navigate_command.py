@@ -65,7 +65,7 @@ def test_the_folder_tells_what_happened(driven, patient):
     asked = (table["asks_for_xray"].fillna("") != "").to_numpy()
     np.testing.assert_array_equal(asked[1:-2], (table["xray"] == 1).to_numpy()[2:-1])
     truth = {"friction_factor": 1.2, "stiffness_factor": 0.8, "ostium_mm": 0.4, "latency_factor": 2.0}
-    assert record["truth"] == truth
+    assert record["truth"] == truth | {"axis_deg": 0.0, "axis_side_deg": 0.0}
     assert record["anatomy"]["identity"] == read_anatomy(patient).identity
     # it starts deeper than the encoder says
     assert table["inserted_length_mm"].iloc[0] == pytest.approx(2.4, abs=1e-6)
