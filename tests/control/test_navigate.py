@@ -109,6 +109,19 @@ def test_a_catheter_that_leans_in_reality_leads_the_wire_elsewhere(straight) -> 
     assert abs(along @ real.direction) == pytest.approx(np.linalg.norm(along), rel=1e-6)
 
 
+@pytest.mark.parametrize("xray", ["assumed", "images"])
+def test_xray_shows_how_the_guiding_catheter_leans_before_the_wire_is_shaped(fork, xray) -> None:
+    config = NavigatePatientConfig(tip="own", policy="forward", true_axis_deg=20.0, xray=xray)
+    set_up = set_up_navigation(fork, "0,0,33", config)
+    seen, real = set_up.navigation.anatomy.insertion.direction, set_up.true_anatomy.insertion.direction
+    off_deg = [float(np.degrees(np.arccos(axis @ real))) for axis in (fork.insertion.direction, seen)]
+    assert off_deg[0] == pytest.approx(20.0, abs=1e-6)
+    if xray == "assumed":
+        assert 0.05 < off_deg[1] < 2.0
+    else:  # the images show no catheter
+        assert off_deg[1] == off_deg[0]
+
+
 def test_what_a_policy_asks_is_kept_within_the_limits(straight) -> None:
     for asked in ((np.nan, 1.0), (1e9, 0.0), (5.0, -np.inf)):
         record = navigate(straight, Forward(asked[0], rotation=asked[1]))

@@ -100,6 +100,24 @@ def test_recorded_controls_make_the_same_wire(driven, patient, capsys, tmp_path)
     np.testing.assert_allclose(wire["inserted_length_mm"][9::10], table["inserted_length_mm"][1:], atol=1e-9)
 
 
+def test_a_guiding_catheter_that_leans_is_seen_and_written(patient, capsys, tmp_path):
+    folder, drives = tmp_path / "leans", ("--policy", "forward", "--true-axis-deg", "15", "--seed", "3", *SHORT)
+    run(capsys, "navigate", patient, "--target", "1", "-o", folder, *drives)
+    assert sorted(path.name for path in folder.iterdir()) == ["anatomy", *FILES]
+    record, page = read_json(folder / "manifest.json"), (folder / "navigation.html").read_text(encoding="utf-8")
+    given, real = (read_anatomy(each).insertion.direction for each in (patient, folder / "anatomy"))
+    seen, unseen_deg = np.array(record["catheter_axis"]), record["truth"]["axis_deg"]
+    off_deg = np.degrees(np.arccos([given @ real, seen @ real]))
+    assert off_deg == pytest.approx([15.0, unseen_deg], abs=1e-3) and 0.0 < unseen_deg < 2.0
+    assert f"15° off its given axis; X-ray shows it to {unseen_deg:.1f}°" in page
+    run(
+        *(capsys, "simulate", folder / "anatomy", "--device", folder / "wire.yaml"),
+        *("--controls", folder / "controls.csv", "-o", tmp_path / "again.csv"),
+    )
+    table, wire = pd.read_csv(folder / "navigation.csv"), pd.read_csv(tmp_path / "again.csv")
+    np.testing.assert_allclose(wire["tip_z_mm"].to_numpy()[9::10], table["tip_z_mm"].to_numpy()[1:], atol=1e-9)
+
+
 def test_a_catheter_follows_its_wire_and_both_are_written(patient, capsys, tmp_path):
     folder = tmp_path / "coaxial"
     command = ("navigate", patient, "--target", "1", "--policy", "in-turn", "--arrives", "catheter", *SHORT)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from endopilot.anatomy.catheter_axis import turned_axis
 from endopilot.errors import InputError
 from endopilot.xray.fluoroscope import Fluoroscope, FluoroscopeConfig
 
@@ -54,6 +55,32 @@ def test_the_branch_is_observed(fork) -> None:
         tip = arm.expose(line.points[index], np.array([np.sqrt(0.75), 0, 0.5]), float(line.abscissa[index]), random)
         assert tip.branch == 2
         assert abs(tip.abscissa - line.abscissa[index]) < 2.0
+
+
+def leaning(fork, side_deg: float) -> np.ndarray:
+    return turned_axis(fork.insertion.direction, 20.0, float(side_deg))
+
+
+def test_two_views_show_how_the_guiding_catheter_leans(fork) -> None:
+    """A point errs by √(1/2) of a pixel across each view; two points 20 mm apart turn a line by √2 of that."""
+    arm, random = Fluoroscope(fork, RADIUS), np.random.default_rng(2)
+    true = np.repeat([leaning(fork, side) for side in range(0, 360, 30)], 20, axis=0)
+    off = np.array([arm.catheter_axis(axis, random) for axis in true]) - true
+    assert np.linalg.norm(off[:, :2], axis=1).max() < np.sin(np.radians(2.0))
+    # the views stand at right angles: each tells one of the two components
+    assert off[:, :2].std() == pytest.approx(np.sqrt(2) * 0.5 * PIXEL_MM / 20.0, rel=0.15)
+
+
+def test_one_view_shows_the_lean_across_its_beam_alone(fork) -> None:
+    """What it does not show is taken to be as given: the catheter leans not at all along the beam."""
+    arm = Fluoroscope(fork, RADIUS, FluoroscopeConfig(biplane=False, pixel_sd=1e-3))
+    beam, across = np.array([-0.5, -np.sqrt(0.75), 0.0]), np.array([np.sqrt(0.75), -0.5, 0.0])  # RAO 30°
+    for side in range(0, 360, 45):
+        true = leaning(fork, side)
+        found = arm.catheter_axis(true, np.random.default_rng(0))
+        assert np.arctan2(found @ across, found[2]) == pytest.approx(np.arctan2(true @ across, true[2]), abs=0.02)
+        assert abs(found @ beam) < 0.03
+        assert np.linalg.norm(found) == pytest.approx(1.0)
 
 
 def test_refuses_bad_settings() -> None:

@@ -1,4 +1,4 @@
-"""The guiding catheter's axis at the ostium, turned: `turned_axis`, `with_axis`."""
+"""The guiding catheter's axis at the ostium, turned: `turned_axis`, `lean_between`, `with_axis`."""
 
 from __future__ import annotations
 
@@ -23,6 +23,13 @@ def turned_axis(axis: Float[np.ndarray, "3"], tilt_deg: float, side_deg: float) 
     one, two = (side[0] for side in cross_axes(axis[None]))
     tilt, side = np.radians(tilt_deg), np.radians(side_deg)
     return np.cos(tilt) * axis + np.sin(tilt) * (np.cos(side) * one + np.sin(side) * two)
+
+
+def lean_between(axis: Float[np.ndarray, "3"], other: Float[np.ndarray, "3"]) -> tuple[float, float]:
+    """Return by how much and to which side another axis leans off this one, as `turned_axis` takes both, degrees."""
+    first, second = (float(other @ side[0]) for side in cross_axes(axis[None]))
+    tilt, side = np.arctan2(np.hypot(first, second), other @ axis), np.arctan2(second, first)
+    return float(np.degrees(tilt)), float(np.degrees(side))
 
 
 def with_axis(anatomy: Anatomy, axis: Float[np.ndarray, "3"]) -> Anatomy:

@@ -1,7 +1,8 @@
 """One wire driven to a named place of one patient's vessel, in closed loop: `navigate_patient`.
 
-The navigation is that of `endopilot.navigate`. Here its vessel is read, its wire is shaped, and reality is made to
-differ from what the policy is given. The whole wire is kept, as it truly was and as the policy believed it to be.
+The navigation is that of `endopilot.navigate`. Here its vessel is read, X-ray shows how the guiding catheter lies, the
+wire is shaped, and reality is made to differ from what the policy is given. The whole wire is kept, as it truly was and
+as the policy believed it to be.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from typing import Annotated, Literal
 import numpy as np
 from jaxtyping import Float
 
+from endopilot.anatomy.catheter_axis import lean_between, with_axis
 from endopilot.anatomy.io import read_anatomy
 from endopilot.control.agent import TwinPolicy
 from endopilot.control.mismatch import ModelMismatch, drawn_sides, mismatch_by
@@ -32,6 +34,7 @@ from endopilot.simulation.motion import Motion, MotionName, motion_named
 from endopilot.simulation.simulate import simulate
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Arrives, Navigation
 from endopilot.types import Anatomy, Rollout, TipProjection
+from endopilot.xray.fluoroscope import Fluoroscope
 
 MotionKnown = Literal["nothing", "published", "exact"]
 _Factor = Annotated[float, Within(0.2, 5)]
@@ -85,7 +88,8 @@ class NavigatePatientConfig:
     true_ostium_mm: Finite | None = None
     """The wire is this much deeper in reality than the encoder says, mm: the ostium lies elsewhere."""
     true_axis_deg: Annotated[float, Within(0, 45)] = 0.0
-    """In reality the guiding catheter leans off its given axis by this angle, degrees, to a side drawn by the seed."""
+    """In reality the guiding catheter leans off its given axis by this angle, degrees, to a side drawn by the seed. An
+    exposure shows its axis before the wire is shaped; X-ray images do not, since it is not drawn in them."""
     true_latency_s: NonNegative | None = None
     """Time from a command to the motion in reality, s; 0.05 if not given."""
 
@@ -96,10 +100,11 @@ class SetUp:
 
     Attributes:
         config: what it was made of.
-        anatomy: the patient's vessel as it was given; that of `navigation` may have its catheter turned.
+        anatomy: the patient's vessel as it was given; that of `navigation` has its catheter as X-ray shows it, and
+            as it was turned.
         navigation: as the policy is given it.
         choice: of the tip's shape and the catheter's axis.
-        truth: how reality differs from it.
+        truth: how reality differs from the navigation.
         snapped_mm: distance from a target that was given as a point to the centerline, mm; None for a section.
         policy: what decides.
         simulator: settings of the simulated reality.
@@ -113,6 +118,11 @@ class SetUp:
     snapped_mm: float | None
     policy: Policy
     simulator: SimulatorConfig
+
+    @property
+    def true_anatomy(self) -> Anatomy:
+        """The vessel with its guiding catheter as it truly lies."""
+        return self.truth.anatomy(self.navigation.anatomy)
 
     @property
     def true_wire(self) -> Device:
@@ -179,9 +189,10 @@ def set_up_navigation(anatomy: Anatomy | str | Path, target: str, config: Naviga
     device, goal = read_device(config.device), parse_target(vessel, target)
     catheters = tuple(read_catheter(name) for name in config.catheter)
     truth = _truth(config, vessel)
+    seen, truth = _see_catheter(vessel, device, truth, config)
     policy = TwinPolicy(truth) if config.policy == "twin" else make_policy(config.policy)
     given = Navigation(
-        anatomy=vessel,
+        anatomy=seen,
         device=device,
         target=goal,
         catheters=catheters,
@@ -192,7 +203,7 @@ def set_up_navigation(anatomy: Anatomy | str | Path, target: str, config: Naviga
         force_limit_n=config.force_limit_n,
         known_motion=_known_motion(config),
     )
-    check_passable(Route.to(vessel, goal), given.devices[given.arriving])
+    check_passable(Route.to(seen, goal), given.devices[given.arriving])
     choice = choose_tip(given, config.tip, catheter_tilt_deg=config.catheter_tilt_deg)
     place, parts = goal.position(vessel), target.split(",")
     return SetUp(
@@ -268,6 +279,22 @@ def _truth(config: NavigatePatientConfig, vessel: Anatomy) -> ModelMismatch:
     return replace(drawn, axis_deg=config.true_axis_deg, axis_side_deg=side_deg, **given_too)
 
 
+def _see_catheter(
+    vessel: Anatomy, device: Device, truth: ModelMismatch, config: NavigatePatientConfig
+) -> tuple[Anatomy, ModelMismatch]:
+    """Return the vessel with its guiding catheter as an exposure shows it, and how reality differs from that.
+
+    A catheter that lies as it is given, and one that X-ray does not show, stays as it is given.
+    """
+    if truth.axis_deg == 0 or config.xray == "images":
+        return vessel, truth
+    real = truth.anatomy(vessel).insertion.direction
+    c_arm = Fluoroscope(vessel, device.tip_radius_mm)
+    axis = c_arm.catheter_axis(real, np.random.default_rng([config.seed, 4]))
+    unseen_deg, side_deg = lean_between(axis, real)
+    return with_axis(vessel, axis), replace(truth, axis_deg=unseen_deg, axis_side_deg=side_deg)
+
+
 def _driven_again(set_up: SetUp, record: NavigationRecord, began: Float[np.ndarray, "numbers"]) -> Rollout:
     """Return wire and catheters, driven again as they were, and then held at rest until the navigation's limit."""
     periods = int(np.ceil(set_up.navigation.seconds / DECISION_PERIOD_S - 1e-9))
@@ -275,7 +302,7 @@ def _driven_again(set_up: SetUp, record: NavigationRecord, began: Float[np.ndarr
     control = np.zeros((1, periods * per_period, len(began)))
     control[0, : len(record.driven)] = record.driven
     return simulate(
-        set_up.truth.anatomy(set_up.navigation.anatomy),
+        set_up.true_anatomy,
         set_up.true_wire,
         control,
         catheters=set_up.true_catheters,

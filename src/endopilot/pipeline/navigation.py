@@ -83,10 +83,10 @@ def _write(found: PatientNavigation, folder: Path, target: str, output: Path) ->
 
     set_up = found.set_up
     driven_in = folder
-    if set_up.choice.tilt_deg:  # the catheter was turned: an anatomy of its own
+    if set_up.true_anatomy is not set_up.anatomy:  # the catheter lies otherwise: an anatomy of its own
         driven_in = output / ANATOMY_FOLDER
         if not driven_in.exists():
-            write_anatomy(set_up.navigation.anatomy, driven_in)
+            write_anatomy(set_up.true_anatomy, driven_in)
     with writing(output / TABLE_FILE) as partial:
         navigation_table(found).to_csv(partial, index=False)
     cycles = found.cycles
@@ -213,7 +213,7 @@ def _manifest(found: PatientNavigation, target: str, output: Path) -> dict[str, 
         anatomy={"name": set_up.anatomy.name, "identity": set_up.anatomy.identity},
         device=asdict(navigation.device),
         catheters=[asdict(catheter) for catheter in navigation.catheters],
-        catheter_axis=navigation.anatomy.insertion.direction.tolist() if set_up.choice.tilt_deg else None,
+        catheter_axis=None if navigation.anatomy is set_up.anatomy else navigation.anatomy.insertion.direction.tolist(),
         target={"asked": target, **asdict(navigation.target)},
         truth=asdict(set_up.truth),
         simulator=asdict(set_up.simulator),

@@ -93,6 +93,9 @@ def _facts(found: PatientNavigation) -> list[tuple[str, str]]:
         ("Latency in reality", f"{truth.latency_factor:g} of the given one"),
         ("Drive slipped for", f"{slipped_s(found):.2f} s"),
     ]
+    if set_up.config.true_axis_deg:
+        unseen = "" if truth.axis_deg == set_up.config.true_axis_deg else f"; X-ray shows it to {truth.axis_deg:.1f}°"
+        facts.append(("Guiding catheter in reality", f"{set_up.config.true_axis_deg:g}° off its given axis{unseen}"))
     if found.plans is not None:
         facts.append(("Courses searched", str(found.plans)))
     return [*facts, ("Seed", str(set_up.config.seed))]

@@ -1,9 +1,9 @@
-"""What an X-ray exposure says of the wire's tip: a measurement with the errors of a C-arm, never the truth.
+"""What an X-ray exposure says of wire and guiding catheter: measurements with the errors of a C-arm, never the truth.
 
 The tip is projected onto one or two detectors, is found there with an error in pixels, and is located in space as the
 most likely place given the pixels and the vessel: the tip of a wire lies inside the lumen, mostly on its wall, and no
-deeper than the wire is inserted. The second view or, with a single one, the vessel gives the depth. docs/xray.md says
-where the numbers come from.
+deeper than the wire is inserted. The second view or, with a single one, the vessel gives the depth. The guiding
+catheter is a line in each view. docs/xray.md says where the numbers come from.
 """
 
 from __future__ import annotations
@@ -21,7 +21,9 @@ from endopilot.types import Anatomy, TipProjection
 from endopilot.xray.carm import CArmGeometry, View, view_at
 
 _CATHETER_MM = 20.0
-"""Length of the catheter's axis behind the ostium in which a tip may be found, mm."""
+"""Length of the guiding catheter behind the ostium that is straight, in which a tip may be found, mm."""
+_LEAN_SD = np.sin(np.radians(20.0))
+"""Standard deviation of a guiding catheter's axis, a unit vector, across the given one before it is seen."""
 _ITERATIONS, _NEAR_ENOUGH_MM = 8, 1e-2
 _HOPELESS = 30.0
 """Branches whose best vertex is this much less likely than the best of all (twice the log-likelihood) are left out."""
@@ -118,6 +120,29 @@ class Fluoroscope:
         position = self.locate(tip_position, tip_direction, inserted_length, random)
         tip = project_tip(self._anatomy.tree, self._anatomy.insertion, position[None])
         return TipMeasurement(position, float(tip.abscissa[0]), float(tip.offset[0]), int(tip.branch[0]))
+
+    def catheter_axis(self, axis: Float[np.ndarray, "3"], random: np.random.Generator) -> Float[np.ndarray, "3"]:
+        """Take one exposure of every view and return the guiding catheter's axis as it shows, a unit vector.
+
+        In a view the catheter is a line, and spans a plane with the source. The likeliest axis is returned, given these
+        planes, each known as well as two points of the line, and how a catheter may lie before it is seen.
+
+        Args:
+            axis: unit vector along the catheter as it truly lies, into the vessel.
+            random: where the errors of detection are drawn from.
+        """
+        insertion, pixel_sd = self._anatomy.insertion, self._config.pixel_sd
+        ends = insertion.position - np.array([[0.0], [_CATHETER_MM]]) * axis
+        information = np.eye(3) / _LEAN_SD**2
+        for view in self._views:
+            pixels = view.project(ends) + pixel_sd * random.standard_normal((2, 2))
+            one, other = np.column_stack([pixels, np.full(2, view.scale)]) @ view.axes
+            normal = np.cross(one, other)
+            pixels_per_mm = view.scale / self._config.geometry.source_to_isocenter_mm
+            sd = np.sqrt(2) * pixel_sd / (pixels_per_mm * _CATHETER_MM)
+            information += np.outer(normal, normal) / (sd**2 * (normal @ normal))
+        found = np.linalg.solve(information, insertion.direction / _LEAN_SD**2)
+        return found / np.linalg.norm(found)
 
     def locate(
         self,
