@@ -61,6 +61,19 @@ def test_a_hand_that_was_silent_for_long_must_let_go_first(session):
     assert header["velocity"] == [5.0, 0.0] and session.xray.pedal
 
 
+def test_a_pedal_that_silence_let_go_says_so_until_it_is_pressed_anew(session):
+    pedal = Pedal(type="pedal", down=True)
+    session.handle(pedal, 0.0)
+    run(session, HICCUP_S + 0.1)
+    session.handle(pedal, HICCUP_S + 0.1)
+    (header, _), _ = run(session, 0.1, start=HICCUP_S + 0.1)
+    assert header["stopped"] == "silence" and not session.xray.pedal
+    session.handle(Pedal(type="pedal", down=False), 0.8)
+    session.handle(pedal, 0.8)
+    (header, _), _ = run(session, 0.1, start=0.8)
+    assert header["stopped"] == "" and session.xray.pedal
+
+
 def test_after_a_hiccup_what_is_held_goes_on(session):
     drive, pedal = Drive(type="drive", translation=5.0, rotation=0.0), Pedal(type="pedal", down=True)
     session.handle(drive, 0.0)

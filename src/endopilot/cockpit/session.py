@@ -117,13 +117,15 @@ class Session:
         Args:
             why: goes into the page and the recording.
         """
-        self.xray.pedal = False
         if self.autopilot.drives:
             self.autopilot.pause(True)
             self._moving = True
+        if self._moving or self.xray.pedal:
+            self._stopped = why
+        self.xray.pedal = False
         if self._moving:
             self.world.stop()
-            self._command, self._moving, self._stopped = (0.0, 0.0), False, why
+            self._command, self._moving = (0.0, 0.0), False
             self._record(stop=why)
 
     def cycle(self, now_s: float) -> list[tuple[str, bytes]]:
@@ -195,6 +197,8 @@ class Session:
         if not down:
             self._locked.discard("pedal")
         self.xray.pedal = down and "pedal" not in self._locked
+        if self.xray.pedal and not self._locked and self._stopped == "silence":
+            self._stopped = ""
 
     def _drive(self, translation: float, rotation: float) -> None:
         command = self.world.limits.safe(translation, rotation)
