@@ -17,19 +17,6 @@
 namespace endopilot {
 
 constexpr int kTicks = 64;     // a step may be halved down to 1/64
-constexpr int kMaxRejections = 12;
-constexpr int kTurnabout = 10;         // iterations after which friction's tangent and its secant take turns
-constexpr int kSnapIterations = 5;   // times max_iterations that the shortest step may take: a snap takes many at any step
-constexpr double kStickyReach = 0.1;     // mm: in a step's first iteration, a wall that was touched and is this near still holds
-constexpr double kSteepest = 1.5;        // more than any slope of the spline through a distance map
-constexpr double kBackInside = 0.02;    // of a move that left the map, that is tried next
-constexpr double kLeastOfMove = 1e-4, kMostOfMove = 0.7;   // of a move that raised the energy, that is tried next
-constexpr double kMostPower = 8;         // of the share, that the energy is taken to grow with beyond its slope
-constexpr double kFirstDamping = 1e-3;   // N/mm (rotations: N mm/rad), where the Hessian is indefinite even without geometric terms
-constexpr double kMaxDamping = 1e3;
-constexpr double kMaxBoost = 64;
-constexpr double kMaxImbalance = 1e-5;   // N that a damped solution may be out of balance
-constexpr double kDriveMotion = 1.2;     // times the drive's own motion that a node may move in a step before it counts as a jump
 
 // How tubes touch the wall at a contact point: radius (mm) and friction coefficient there, the share of it that each further tube
 // covers; how far what touches slides along the mesh in the step, mm, and the rotation that this brings.
@@ -271,7 +258,7 @@ private:
     ENDOPILOT_DEVICE void fail(int l);
     ENDOPILOT_LARGE void record(int world, int sample, double iterations, double node_iterations, const Drive& slip) const;
 
-    // Tubes (coaxial.hpp); where T is 0 none of it is used.
+    // Tubes (coaxial.hpp, coaxial_drives.hpp, coaxial_exchange.hpp); where T is 0 none of it is used.
     void aim_tubes(int l, double weight);
     void prepare_tubes(int l);
     TubeContact<double, T> tube_contact(int l, const double (&cover)[T + 1], const double (&rate)[T + 1], const Vec3<double>& axis) const;
@@ -294,7 +281,7 @@ private:
     V add_interfaces(const Node<V, T>& node, Diagonal<V, T>& own) const;
     V bundle_moment(int k, int joint, Vec3<V>& moment) const;
 
-    // The step of one lane (below).
+    // The step of one lane (step.hpp).
     ENDOPILOT_LARGE void begin(int l, bool fresh);
     ENDOPILOT_LARGE Decision decide(int l);
     ENDOPILOT_DEVICE double best_share(double energy, int l) const;
@@ -335,232 +322,12 @@ private:
     ENDOPILOT_LARGE void finish_step(int n, Mask<V> mask, Mask<V> restart, const V& weight);
 };
 
-// Begins a step of lane.stride ticks from the lane's start state; nodes ahead of the base already hold a trial.
-template <class V, int T>
-void Stepper<V, T>::begin(int l, bool fresh) {
-    Lane& lane = lane_[l];
-    const int before = lane.active;
-    if (motion_.cycles > 0) carry(l);
-    const double weight = fresh ? 0.0 : duration(lane) / lane.last_duration;
-    const Drive ahead{weight * lane.last.advance, weight * lane.last.rotation};
-    if constexpr (T > 0) {
-        aim_tubes(l, weight);
-    } else if (lane.by_force) {
-        lane.slipping = {};
-        lane.origin = lane.start;
-        lane.off = ahead;
-    } else {
-        const double inserted = lane.inserted - lane.slip.advance, rotation = lane.rotation - lane.slip.rotation;
-        const double began = elapsed(lane.tick), ends = elapsed(lane.tick + lane.stride);
-        lane.start = {inserted + lane.speed * began, rotation + lane.spin * began};
-        lane.origin = {inserted + lane.speed * ends, rotation + lane.spin * ends};
-        const auto behind = [](int side, double off) { return side * off < 0 ? off : 0.0; };
-        lane.off = {behind(lane.slipping.advance, lane.start.advance + ahead.advance - lane.origin.advance),
-                    behind(lane.slipping.rotation, lane.start.rotation + ahead.rotation - lane.origin.rotation)};
-    }
-    lane.from = lane.off;
-    lane.end = {lane.origin.advance + lane.off.advance, lane.origin.rotation + lane.off.rotation};
-    lane.active = Base::count_active(rod_, lane.start.advance, options_.free_behind);
-    for (int i = std::min(before, lane.active); i <= std::max(before, lane.active); ++i)
-        if (i >= before || i >= lane.active) place(l, i);
-    if (lane.active < before) clear(node_[lane.active - 1].at_middle, l);
-    if constexpr (T > 0) prepare_tubes(l);
-    lane.iterations = lane.rejections = lane.releases = 0;
-    lane.boost = 1;
-    lane.first = lane.finite = true;
-    lane.extrapolated = !fresh;
-    const Drive& there = lane.by_force ? lane.end : lane.origin;
-    double slides = std::abs(there.advance - lane.start.advance);
-    if (motion_.cycles > 0) slides += lane.strain * std::max(0.0, lane.start.advance);   // a vessel that stretches slides along the wire
-    const double most_x = options_.largest_jump + kDriveMotion * slides;
-    double turns = std::abs(there.rotation - lane.start.rotation);
-    if constexpr (T > 0)
-        for (int k = 1; k <= T; ++k) turns += std::abs(lane.tubes.tube[k].asked_rotation - lane.tubes.tube[k].turned);
-    const double most_theta = options_.largest_jump + kDriveMotion * turns;
-    set(active_, l, lane.active);
-    set(share_, l, Base::share_of_last_joint(rod_, lane.start.advance, options_.free_behind, lane.active));
-    set(geometric_, l, 0.0);
-    set(first_, l, 1.0);
-    set_mask<V>(accepted_, l, false);
-    set(damping_, l, 0.0);
-    set(tangent_, l, 1.0);
-    set(inverse_dt_, l, 1.0 / duration(lane));
-    set(eps_, l, options_.stick_velocity * in_.time_step);
-    set(jump_scale_x_, l, 1.0 / (most_x * most_x));
-    set(jump_scale_theta_, l, 4.0 / (most_theta * most_theta));  // of twice the imaginary part of a quaternion
-}
-
-// One evaluation, decision and update of all lanes. Returns the number of samples that ended.
-template <class V, int T>
-template <class Queue>
-int Stepper<V, T>::pass(Queue& queue) {
-    const int n = most_active();
-    evaluate(n);
-    Decision decision[W];
-    drive_a_ = drive_r_ = V{};
-    if constexpr (T > 0)
-        for (V& turn : of_tubes_.turn) turn = V{};
-    for (int l = 0; l < W; ++l) decision[l] = decide(l);
-    const V largest = solve(n);
-    V factor{};
-    for (int l = 0; l < W; ++l)
-        if (decision[l] == Decision::shorten) set(factor, l, lane_[l].shorten);
-    for (int l = 0; l < W; ++l) {
-        Lane& lane = lane_[l];
-        if (decision[l] != Decision::accept) continue;
-        const double size = get(largest, l);
-        if (!(size < 1e100)) {  // the direction is not finite
-            decision[l] = Decision::restart;
-            continue;
-        }
-        const bool ends_sample = lane.tick + lane.stride == kTicks * in_.steps_per_sample;
-        lane.scale = std::min(lane.boost, options_.largest_step / size);
-        set(factor, l, lane.scale);
-        // Tubes at a drive's limit may come to rest within the energy's rounding, where steps no longer shrink: the last resort ends there.
-        const bool lasts = T > 0 && lane.stride == 1 && lane.iterations > options_.max_iterations;
-        const double tolerance = ends_sample && !lasts ? options_.sample_tolerance : options_.tolerance;
-        const bool at_rest = size <= options_.tolerance && lane.damping * size <= kMaxImbalance;
-        if (lane.reduced || lane.damping > 0 ? at_rest : size <= tolerance) {
-            decision[l] = release(l) ? Decision::repeat : Decision::converged;
-            set(factor, l, 1.0);
-        }
-    }
-    update(n, decision, factor);
-    if constexpr (T > 0) refuse_leaps(n, decision);
-    return advance(n, decision, queue);
-}
-
-template <class V, int T>
-typename Stepper<V, T>::Decision Stepper<V, T>::decide(int l) {
-    Lane& lane = lane_[l];
-    if (lane.world < 0) return Decision::idle;
-    ++lane.iterations;
-    ++lane.total_iterations;
-    lane.node_iterations += lane.active;
-    const double energy = get(energy_, l) + drive_energy(lane, l).energy;
-    lane.finite = std::isfinite(energy);
-    if (lane.iterations > options_.max_iterations * (lane.stride == 1 && !lane.extrapolated ? kSnapIterations : 1)) return Decision::restart;
-    if (!lane.first && lane.stride > 1 && get(jump_, l) > 1.0) {  // a snap: follow it in shorter steps
-        lane.extrapolated = false;
-        return Decision::restart;
-    }
-    const double slack = 1e-11 * (std::abs(lane.energy) + 1e-3);
-    if (!lane.finite || !(lane.first || energy <= lane.energy + slack)) {
-        if (lane.first || ++lane.rejections > kMaxRejections) return Decision::restart;
-        lane.shorten = lane.finite ? best_share(energy, l) : kBackInside;
-        set_mask<V>(accepted_, l, false);
-        lane.scale *= lane.shorten;
-        return Decision::shorten;
-    }
-    if (!(get(pivot_, l) > 0) || !solve_drive(l)) {  // not positive definite: less of the geometric terms
-        const double g = get(geometric_, l), damping = get(damping_, l);
-        lane.energy = energy;
-        if (g > 0) {
-            set(geometric_, l, g > 0.05 ? 0.5 * g : 0.0);
-            return Decision::repeat;
-        }
-        if (damping >= kMaxDamping) return Decision::restart;
-        set(damping_, l, std::max(double{kFirstDamping}, 10 * damping));
-        return Decision::repeat;
-    }
-    lane.energy = energy;
-    lane.slope = get(descent_, l);
-    // Where friction turns, a step with its tangent overshoots, and one with its secant creeps: they take turns.
-    set(tangent_, l, lane.iterations > kTurnabout && lane.iterations / kTurnabout % 2 == 1 ? 0.0 : 1.0);
-    set_mask<V>(accepted_, l, true);
-    // Where the energy is not convex the damped steps are short: lengthen them as long as they succeed.
-    const double damping = lane.damping = get(damping_, l);
-    lane.boost = damping > 0 && lane.rejections == 0 ? std::min(2 * lane.boost, double{kMaxBoost}) : 1.0;
-    set(damping_, l, damping > kFirstDamping ? 0.25 * damping : 0.0);
-    lane.rejections = 0;
-    set(first_, l, 0.0);
-    lane.reduced = get(geometric_, l) < 1.0 && !lane.first;
-    set(geometric_, l, lane.first ? 1.0 : std::min(1.0, std::max(0.25, 2 * get(geometric_, l))));
-    lane.first = false;
-    return Decision::accept;
-}
-
-// The share of the last move, which raised the energy, at which the energy is least along it. What raises it are contacts that
-// Newton's step did not foresee. If the wire bends into a wall as it slides along it, the energy is C s^p - slope s at the share
-// s, with p from the slopes at both ends. If it hits a wall head on at a share s0, it is k (s - s0)² / 2 - slope s from there on.
-template <class V, int T>
-double Stepper<V, T>::best_share(double energy, int l) const {
-    const Lane& lane = lane_[l];
-    const double slope = lane.scale * lane.slope, excess = slope + energy - lane.energy;
-    bool drive_held = !lane.by_force && lane.slipping.advance == 0 && lane.slipping.rotation == 0;  // else `rise_` lacks its part
-    if constexpr (T > 0) drive_held = !tubes_slip(lane);
-    const double power = drive_held ? std::clamp((get(rise_, l) + slope) / excess, 2.0, double{kMostPower}) : 2.0;
-    const double sliding = std::pow(slope / (power * excess), 1 / (power - 1));
-    const double free = get(hit_, l), rest = 1 - free;
-    const double head_on = rest > 0 ? free + rest * rest * slope / (2 * excess) : 0.0;
-    return std::clamp(std::max(sliding, head_on), double{kLeastOfMove}, double{kMostOfMove});
-}
-
-// Ends the steps that converged, restarts those that failed with half the step. Returns the samples that ended.
-template <class V, int T>
-template <class Queue>
-int Stepper<V, T>::advance(int n, const Decision (&decision)[W], Queue& queue) {
-    Mask<V> finished{}, restarted{};
-    V weight{};
-    bool any_finished = false, failed[W] = {}, ended[W] = {};
-    for (int l = 0; l < W; ++l) {
-        Lane& lane = lane_[l];
-        if (decision[l] == Decision::converged) {
-            set_mask<V>(finished, l, true);
-            any_finished = true;
-            const double took = duration(lane);
-            lane.tick += lane.stride;
-            ++lane.steps;
-            lane.last_duration = took;
-            lane.last = {lane.end.advance - lane.start.advance, lane.end.rotation - lane.start.rotation};
-            if constexpr (T > 0) settle_tubes(l);
-            lane.start = lane.end;
-            if (!lane.by_force) {
-                lane.slip = {lane.slip.advance - lane.off.advance, lane.slip.rotation - lane.off.rotation};
-                if (lane.off.advance == 0) lane.slipping.advance = 0;
-                if (lane.off.rotation == 0) lane.slipping.rotation = 0;
-            }
-            ended[l] = lane.tick == kTicks * in_.steps_per_sample;
-            if (lane.stride < kTicks && lane.tick % (2 * lane.stride) == 0) lane.stride *= 2;
-            if (ended[l]) continue;
-            set(weight, l, lane.last_duration > 0 ? duration(lane) / lane.last_duration : 0.0);
-        } else if (decision[l] == Decision::restart) {
-            set_mask<V>(restarted, l, true);
-            any_finished = true;
-            if (lane.extrapolated) continue;  // perhaps only the extrapolation was bad
-            if (lane.stride == 1) {
-                failed[l] = true;
-            } else {
-                lane.stride /= 2;
-            }
-        }
-    }
-    if (!any_finished) return 0;
-    finish_step(n, finished, restarted, weight);
-    int samples = 0;
-    for (int l = 0; l < W; ++l) {
-        Lane& lane = lane_[l];
-        if constexpr (T > 0)
-            if (decision[l] == Decision::converged) pace_tubes(l);
-        if (failed[l]) {
-            samples += std::max(0, in_.samples - std::max(0, lane.sample));
-            fail(l);
-            queue.finish();
-        } else if (ended[l]) {
-            samples += lane.sample >= 0;
-            end_sample(l, queue);
-        } else if (decision[l] == Decision::converged) {
-            begin(l, get(weight, l) == 0.0);
-        } else if (decision[l] == Decision::restart) {
-            begin(l, true);
-        }
-    }
-    return samples;
-}
-
 }  // namespace endopilot
 
 #include "drive.hpp"
 #include "exchange.hpp"
 #include "coaxial.hpp"
+#include "coaxial_drives.hpp"
+#include "coaxial_exchange.hpp"
 #include "sweeps.hpp"
+#include "step.hpp"

@@ -6,6 +6,9 @@
 
 namespace endopilot {
 
+constexpr double kStickyReach = 0.1;     // mm: in a step's first iteration, a wall that was touched and is this near still holds
+constexpr double kSteepest = 1.5;        // more than any slope of the spline through a distance map
+
 template <class V, int T>
 V Stepper<V, T>::add_loads(int i, const Node<V, T>& node, const Quaternion<V>& turned, Diagonal<V, T>& own) const {
     const Vec3<double>&f = loads_->force[i], &m = loads_->moment[i], &k = loads_->spring[i], &a = loads_->anchor[i];

@@ -1,0 +1,228 @@
+// The drives of telescoping tubes: their forces, and how they give way at their limits.
+#pragma once
+
+#include "stepper.hpp"
+
+namespace endopilot {
+
+constexpr double kFaster = 1.25, kLeastPace = 1.0 / 64;   // of the share of its motion that a drive makes after it was at its limit
+constexpr double kYield = 20, kMostYield = 40;   // mm/s by which a drive at twice its limit gives way faster with each step, and at most
+constexpr double kLeap = 0.05;         // share of its limit by which a drive's force may pass it in a step that can be shortened
+constexpr double kNear = 0.4;          // share of its limit below which no force passes it in one step
+constexpr int kLeastStride = kTicks / 8;   // no shorter steps than these for the sake of a limit
+
+// The axial force of each drive, after freeze_tubes.
+template <class V, int T>
+void Stepper<V, T>::tell_forces(int l, double (&force)[T + 1]) const {
+    double pushed = 0;
+    for (int k = 0; k <= T; ++k) {
+        force[k] = (k < T ? -get(of_tubes_.bundle[k], l) : get(base_force_, l)) - pushed;
+        pushed += force[k];
+    }
+}
+
+// By how much a force of drive k is beyond its limit, as a share of that: positive where it pushes, negative where it pulls.
+template <class V, int T>
+double Stepper<V, T>::beyond_limit(int k, double force) const {
+    if (force > tubes_.push_limit[k]) return force / tubes_.push_limit[k] - 1;
+    return force < -tubes_.pull_limit[k] ? force / tubes_.pull_limit[k] + 1 : 0.0;
+}
+
+// Friction between tubes turns within some 0.04 mm, and the drives' forces with it: a step in which one leaps beyond its limit
+// is made again in shorter ones, in which the drive can give way.
+template <class V, int T>
+void Stepper<V, T>::refuse_leaps(int n, Decision (&decision)[W]) {
+    bool any_near = false, near[W] = {};
+    for (int l = 0; l < W; ++l) {
+        const Lane& lane = lane_[l];
+        if (decision[l] != Decision::converged || lane.stride <= kLeastStride) continue;
+        for (int k = 0; k <= T; ++k) {
+            const double most = kNear * std::min(tubes_.push_limit[k], tubes_.pull_limit[k]);
+            near[l] = near[l] || std::abs(get(base_force_, l)) > most || std::abs(lane.tubes.tube[k].force) > most;
+        }
+        any_near = any_near || near[l];
+    }
+    if (!any_near) return;
+    Lane before[W];
+    const TubeLanes<V, T> of_tubes = of_tubes_;
+    Mask<V> tried{};
+    for (int l = 0; l < W; ++l) {
+        if (!near[l]) continue;
+        set_mask<V>(tried, l, true);
+        before[l] = lane_[l];
+        settle_tubes(l);
+    }
+    freeze_tubes(n, tried, false);
+    double force[T + 1];
+    for (int l = 0; l < W; ++l) {
+        if (!near[l]) continue;
+        Lane& lane = lane_[l];
+        lane = before[l];
+        tell_forces(l, force);
+        for (int k = 0; k <= T; ++k) {
+            const double beyond = std::abs(beyond_limit(k, force[k])), was = std::abs(beyond_limit(k, lane.tubes.tube[k].force));
+            if (!(beyond > kLeap && beyond > was)) continue;
+            decision[l] = Decision::restart;
+            lane.extrapolated = false;
+        }
+    }
+    of_tubes_ = of_tubes;
+}
+
+// The force and torque of each drive after a step. A drive that does not lead and is beyond its limit stops and gives way; within it,
+// it takes its motion up again by and by.
+template <class V, int T>
+void Stepper<V, T>::pace_tubes(int l) {
+    Lane& lane = lane_[l];
+    double force[T + 1], pushed = 0;
+    tell_forces(l, force);
+    for (int k = 0; k <= T; ++k) {
+        Tube& tube = lane.tubes.tube[k];
+        tube.force = force[k];
+        pushed += tube.force;
+        tube.torque = k > 0 ? get(of_tubes_.torque[k - 1], l) : get(base_torque_, l);
+        const double beyond = beyond_limit(k, tube.force);
+        tube.pace = beyond * tube.speed > 0 ? 0.0 : std::min(1.0, kFaster * tube.pace + kLeastPace);
+        tube.yield = beyond == 0 ? 0.5 * tube.yield : std::clamp(tube.yield - kYield * beyond, double{-kMostYield}, double{kMostYield});
+        if (std::abs(tube.yield) < options_.stick_velocity) tube.yield = 0;
+    }
+    lane.tubes.others = pushed - lane.tubes.tube[lane.tubes.lead].force;
+}
+
+template <class V, int T>
+bool Stepper<V, T>::tubes_slip(const Lane& lane) const {
+    bool slips = lane.slipping.advance != 0 || lane.slipping.rotation != 0;
+    for (int k = 1; k <= T; ++k) slips = slips || lane.tubes.tube[k].slipping != 0;
+    return slips;
+}
+
+// The energy of drives that slip at their limits; the leading one also moves what the others held at the end of the last step.
+template <class V, int T>
+typename Stepper<V, T>::DriveEnergy Stepper<V, T>::tube_drive_energy(const Lane& lane) const {
+    const int lead = lane.tubes.lead, side = lane.slipping.advance;
+    const double force = side == 0 ? 0.0 : lane.tubes.others + (side > 0 ? tubes_.push_limit[lead] : -tubes_.pull_limit[lead]);
+    DriveEnergy e{.energy = 0, .gradient_a = -force, .gradient_r = -lane.slipping.rotation * tubes_.torque_limit[0], .aa = 0, .ar = 0, .rr = 0};
+    if (side != 0) e.energy += e.gradient_a * lane.off.advance;
+    if (lane.slipping.rotation != 0) e.energy += e.gradient_r * lane.off.rotation;
+    for (int k = 1; k <= T; ++k) {
+        const Tube& tube = lane.tubes.tube[k];
+        if (tube.slipping != 0) e.energy -= tube.slipping * tubes_.torque_limit[k] * tube.off;
+    }
+    return e;
+}
+
+// Newton's step of the drives that slip: the advance of the leading one and the rotation of each. As solve_drive.
+template <class V, int T>
+bool Stepper<V, T>::solve_tube_drives(int l) {
+    Lane& lane = lane_[l];
+    if (!tubes_slip(lane)) return true;
+    constexpr int N = 2 + T;
+    const DriveBlock& d = drive_;
+    const double damping = get(damping_, l);
+    double h[N][N] = {}, g[N] = {}, off[N], step[N] = {};
+    int side[N];
+    bool held[N];
+    g[1] = get(d.gradient_r, l);
+    h[0][0] = get(d.aa, l) + damping;
+    h[1][0] = get(d.ar, l);
+    h[1][1] = get(d.rr, l) + damping;
+    for (int k = 0; k < T; ++k) {
+        const int r = 2 + k;
+        g[r] = get(d.twists.gradient[k], l);
+        h[r][0] = get(d.twists.ap[k], l);
+        h[r][1] = get(d.twists.rp[k], l);
+        for (int c = 0; c <= k; ++c) h[r][2 + c] = get(d.twists.pp[k][c], l);
+        h[r][r] += damping;
+    }
+    const DriveEnergy load = tube_drive_energy(lane);
+    g[0] = get(d.gradient_a, l) + load.gradient_a;
+    g[1] += load.gradient_r;
+    side[0] = lane.slipping.advance, off[0] = lane.off.advance;
+    side[1] = lane.slipping.rotation, off[1] = lane.off.rotation;
+    for (int k = 1; k <= T; ++k) {
+        const Tube& tube = lane.tubes.tube[k];
+        side[k + 1] = tube.slipping, off[k + 1] = tube.off;
+        g[k + 1] -= tube.slipping * tubes_.torque_limit[k];
+    }
+    for (int r = 0; r < N; ++r) {
+        held[r] = side[r] == 0;
+        for (int c = 0; c < r; ++c) h[c][r] = h[r][c];
+    }
+    for (bool again = true; again;) {  // an unknown that would go beyond its bound is held there
+        double a[N][N], b[N];
+        for (int r = 0; r < N; ++r) {
+            b[r] = held[r] ? -off[r] : -g[r];
+            for (int c = 0; c < N; ++c) {
+                a[r][c] = held[r] ? double(r == c) : held[c] ? 0.0 : h[r][c];
+                if (!held[r] && held[c]) b[r] += h[r][c] * off[c];
+            }
+        }
+        for (int r = 0; r < N; ++r) {
+            if (!(a[r][r] > 0)) return false;
+            for (int s = r + 1; s < N; ++s) {
+                const double f = a[s][r] / a[r][r];
+                for (int c = r; c < N; ++c) a[s][c] -= f * a[r][c];
+                b[s] -= f * b[r];
+            }
+        }
+        for (int r = N - 1; r >= 0; --r) {
+            for (int c = r + 1; c < N; ++c) b[r] -= a[r][c] * step[c];
+            step[r] = b[r] / a[r][r];
+        }
+        again = false;
+        for (int r = 0; r < N; ++r) {
+            if (held[r] || !(side[r] * (off[r] + step[r]) > 0)) continue;
+            held[r] = again = true;
+        }
+    }
+    set(drive_a_, l, step[0]);
+    set(drive_r_, l, step[1]);
+    double descent = get(descent_, l);
+    for (int r = 0; r < N; ++r) {
+        if (r >= 2) set(of_tubes_.turn[r - 2], l, step[r]);
+        if (side[r] != 0) descent -= g[r] * step[r];
+    }
+    set(descent_, l, descent);
+    return true;
+}
+
+// As `release`; the lead bears its own limit of the force on all tubes, the others theirs by `pace_tubes`.
+template <class V, int T>
+bool Stepper<V, T>::release_tubes(int l) {
+    Lane& lane = lane_[l];
+    if (lane.releases == kMaxReleases) return false;
+    const int lead = lane.tubes.lead;
+    const double force = get(drive_.gradient_a, l) - lane.tubes.others;
+    bool released = false;
+    const auto let_go = [&](int& slipping, int side) {
+        released = released || slipping != side;
+        slipping = side;
+    };
+    if (lane.off.advance == 0 && force > tubes_.push_limit[lead]) let_go(lane.slipping.advance, 1);
+    if (lane.off.advance == 0 && force < -tubes_.pull_limit[lead]) let_go(lane.slipping.advance, -1);
+    const double first = get(drive_.gradient_r, l);
+    for (int k = 1; k <= T; ++k) {
+        Tube& tube = lane.tubes.tube[k];
+        const double torque = get(drive_.twists.gradient[k - 1], l);
+        if (tube.off == 0 && std::abs(torque) > tubes_.torque_limit[k]) let_go(tube.slipping, torque > 0 ? 1 : -1);
+    }
+    if (lane.off.rotation == 0 && std::abs(first) > tubes_.torque_limit[0]) let_go(lane.slipping.rotation, first > 0 ? 1 : -1);
+    lane.releases += released;
+    return released;
+}
+
+// The rotations of drives that slip, after Newton's step.
+template <class V, int T>
+void Stepper<V, T>::turn_tubes(int l, bool keeps, bool takes, bool shortens, double factor) {
+    for (int k = 1; k <= T; ++k) {
+        Tube& tube = lane_[l].tubes.tube[k];
+        if (keeps) tube.from = tube.off;
+        if (takes) tube.move = factor * get(of_tubes_.turn[k - 1], l);
+        if (shortens) tube.move *= factor;
+        if (!takes && !shortens) continue;
+        tube.off = tube.from + tube.move;
+        tube.end_rotation = tube.asked_rotation + tube.off;
+    }
+}
+
+}  // namespace endopilot
