@@ -109,11 +109,13 @@ def write_toy_anatomies(folder: Path, patients: int) -> list[Path]:
 def toy_navigate(simulate=toy_simulate):
     """Return a stand-in for `simulate_navigations`: the drawn controls, driven as they are through the toy."""
 
-    def simulate_navigations(anatomy, devices, initial, control, friction, config, *, actuation, motion, advance):
+    def simulate_navigations(
+        anatomy, devices, initial, control, friction, config, *, catheters, actuation, motion, advance
+    ):
         control = control.astype(np.float32).astype(float)
         rollout = simulate(anatomy, devices[0], control, initial=initial, config=config, friction=friction)
         advance(control.shape[0] * control.shape[1])
-        return rollout, control, np.zeros(len(control), dtype=bool)
+        return rollout, initial, control, np.zeros(len(control), dtype=bool)
 
     return simulate_navigations
 

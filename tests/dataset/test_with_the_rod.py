@@ -89,7 +89,7 @@ def test_wires_stay_inside_the_imaged_vessel_and_repeat_from_the_recorded_contro
     control[:, :, 1] = np.linspace(-2, 2, 6)[:, None]
     initial = np.column_stack([np.linspace(70.0, 1.5 * ends[np.isfinite(ends)].max(), 6), np.zeros(6)])
     friction = np.linspace(0.05, 0.2, 6)
-    rollout, applied, stopped = simulate_navigations(anatomy, [DEVICE] * 6, initial, control, friction, config)
+    rollout, started, applied, stopped = simulate_navigations(anatomy, [DEVICE] * 6, initial, control, friction, config)
     assert rollout.valid.all()
     assert stopped.all()
     assert (rollout.tip.abscissa < ends[rollout.tip.branch] - 0.5 * STOP_SHORT_MM).all()
@@ -99,7 +99,6 @@ def test_wires_stay_inside_the_imaged_vessel_and_repeat_from_the_recorded_contro
     assert 0.5 * 12.0 * longest == pytest.approx(PULL_BACK_MM, abs=6.1)
     free = ~pulled & (applied[..., 0] == 12.0)
     assert free.mean() > 0.3
-    started = np.column_stack([rollout.initial_inserted_length, rollout.initial_rotation])
     again = simulate(anatomy, DEVICE, applied, initial=started, friction=friction, config=config)
     np.testing.assert_array_equal(again.tip_position, rollout.tip_position)
     np.testing.assert_array_equal(again.inserted_length, rollout.inserted_length)

@@ -9,6 +9,7 @@ from tyro.conf import Positional
 from endopilot.cli.arguments import OutputFolder, existing, show
 from endopilot.dataset.config import DatasetConfig
 from endopilot.files import read_json
+from endopilot.simulation.catheter import read_catheter
 from endopilot.simulation.device import read_device
 
 
@@ -18,6 +19,7 @@ def command(
     *,
     output: OutputFolder,
     device: str = "workhorse-014",
+    catheter: tuple[str, ...] = (),
     scheduler: str | None = None,
     json: bool = False,
     config: DatasetConfig = DatasetConfig(),
@@ -30,6 +32,8 @@ def command(
         anatomies: folders made by `endopilot anatomy` or `endopilot atlas`.
         output: folder of the dataset.
         device: name of a device (`endopilot devices`) or a YAML file.
+        catheter: up to two catheters around it, from the inside out: names (docs/devices.md) or YAML files; each is
+            driven at random and independently, by velocity.
         scheduler: address of a Dask scheduler (tcp://host:8786) whose workers simulate and share these folders; the
             cores of this machine if not given.
         json: print the figures as JSON.
@@ -38,7 +42,12 @@ def command(
     from endopilot.dataset.generate import generate_dataset  # an extra brings its libraries; --help needs none
 
     generate_dataset(
-        [existing(folder) for folder in anatomies], output, read_device(device), config, scheduler=scheduler
+        [existing(folder) for folder in anatomies],
+        output,
+        read_device(device),
+        config,
+        catheters=[read_catheter(name) for name in catheter],
+        scheduler=scheduler,
     )
     info = read_json(output / "meta" / "info.json")
     show(

@@ -20,10 +20,11 @@ from endopilot.settings import Count, Seed, Within, settings
 from endopilot.simulation.catheter import read_catheter
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, random_controls, read_controls_csv
-from endopilot.simulation.device import Device, read_device
+from endopilot.simulation.device import read_device
 from endopilot.simulation.motion import Motion, MotionName, motion_named
 from endopilot.simulation.simulate import simulate, wall_force_events
 from endopilot.simulation.table import write_rollout
+from endopilot.simulation.tubes import Stack
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, Rollout
 
 
@@ -91,11 +92,19 @@ def command(
         script = read_controls_csv(existing(controls), catheters=len(catheters))
         initial, control, period_s = script.initial, script.control, script.period_s
     else:
-        initial, control = _random(random, patient, drives=1 + len(catheters))
+        initial, control = random_controls(
+            ControlConfig(),
+            catheters=len(catheters),
+            n_sequences=random.sequences,
+            n_samples=round(random.seconds / SAMPLE_PERIOD_S),
+            seed=random.seed,
+            max_inserted_length_mm=float(patient.tree.longest_path().abscissa[-1]),
+        )
     rollout, stopped, record_shape = None, None, shape or picture is not None
-    if controls is None and random.stop_short and not catheters:
-        rollout, control, stopped = _stopped_short(patient, wire, initial, control, moves, config)
-        initial = np.column_stack([rollout.initial_inserted_length, rollout.initial_rotation])
+    if controls is None and random.stop_short:
+        rollout, initial, control, stopped = _stopped_short(
+            patient, Stack(wire, catheters), initial, control, moves, config
+        )
     # The controls that were made give the same navigations again.
     if rollout is None or record_shape or moves is not None:
         rollout = simulate(
@@ -140,36 +149,27 @@ def command(
     show(figures, as_json=json)
 
 
-def _random(config: RandomConfig, patient: Anatomy, *, drives: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return random starts and controls of a wire, and of catheters that are driven independently of it."""
-    drawn = [
-        random_controls(
-            ControlConfig(),
-            n_sequences=config.sequences,
-            n_samples=round(config.seconds / SAMPLE_PERIOD_S),
-            seed=config.seed,
-            max_inserted_length_mm=float(patient.tree.longest_path().abscissa[-1]),
-            first=drive * 2**32,
-        )
-        for drive in range(drives)
-    ]
-    return np.concatenate([start for start, _ in drawn], axis=-1), np.concatenate([part for _, part in drawn], axis=-1)
-
-
 def _stopped_short(
     patient: Anatomy,
-    wire: Device,
+    stack: Stack,
     initial: np.ndarray,
     control: np.ndarray,
     motion: Motion | None,
     config: SimulatorConfig,
-) -> tuple[Rollout, np.ndarray, np.ndarray]:
-    """Return random navigations that stop short of the ends, their controls, and which of them were stopped."""
+) -> tuple[Rollout, np.ndarray, np.ndarray, np.ndarray]:
+    """Return random navigations that stop short of the ends, their starts, their controls, and which were stopped."""
     worlds, samples = control.shape[:2]
-    friction = np.full(worlds, wire.friction)
     with progress("Simulating the wire", total=worlds * samples) as advance:
         return simulate_navigations(
-            patient, [wire] * worlds, initial, control, friction, config, motion=motion, advance=advance
+            patient,
+            [stack.wire] * worlds,
+            initial,
+            control,
+            np.full(worlds, stack.wire.friction),
+            config,
+            catheters=stack.catheters,
+            motion=motion,
+            advance=advance,
         )
 
 

@@ -198,6 +198,7 @@ def _rollout(path: Path, anatomy: Any, device: str, world: int) -> Film:
 def _episode(folder: Path, number: int) -> Film:
     """Return a film of an episode of a data set, driven again by what the drive was commanded."""
     data = load_dataset(folder)
+    data.check_wire_alone("a replay")
     if number >= len(data):
         raise InputError(f"world: {number}; {folder} has episodes 0 to {len(data) - 1}")
     settings = data.manifest["settings"]

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from endopilot.anatomy.io import read_anatomy
+from endopilot.anatomy.projection import project_tip
 from endopilot.dataset import parquet, schema
 from endopilot.dataset.draw import Draw, draw_navigations, patient_motion
 from endopilot.dataset.layout import Block, BlockContext
@@ -35,21 +36,22 @@ def write_block(
         advance: called with the number of samples that were simulated since the last call.
     """
     config, anatomy = context.config, _read(block.folder, block.identity)
-    draw = draw_navigations(config, context.device, anatomy, block.sequences)
+    draw = draw_navigations(config, context.device, anatomy, block.sequences, catheters=len(context.catheters))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # invalid worlds are listed in the dataset's manifest
-        rollout, applied, stopped = simulate_navigations(
+        rollout, started, applied, stopped = simulate_navigations(
             anatomy,
             draw.devices(context.device),
             draw.initial,
             draw.control,
             draw.friction,
             replace(config.simulator, threads=threads),
+            catheters=context.catheters,
             actuation=config.control,
             motion=patient_motion(config, anatomy.name),
             advance=advance,
         )
-    store_block(context, block, draw, rollout, applied, stopped)
+    store_block(context, block, replace(draw, initial=started), rollout, applied, stopped)
 
 
 def store_block(
@@ -57,7 +59,7 @@ def store_block(
     block: Block,
     draw: Draw,
     rollout: Rollout,
-    applied: Float[np.ndarray, "n samples 2"],
+    applied: Float[np.ndarray, "n samples numbers"],
     stopped: Bool[np.ndarray, "n"],
 ) -> None:
     """Write navigations: their episodes, then their samples, which mark both as complete.
@@ -65,14 +67,18 @@ def store_block(
     Args:
         context: what all blocks share.
         block: which navigations.
-        draw: their friction and tips.
+        draw: their starts, friction and tips.
         rollout: their motion.
         applied: control of each, where it is a load (N, N·mm).
         stopped: which were stopped short of an end of the vessel.
     """
     config = context.config
     data_path, episodes_path = schema.paths_of_file(context.output, block.number)
-    samples = parquet.sample_table(rollout, applied, config.control, block.first_episode, context.key)
+    tips = None
+    if rollout.catheters is not None:
+        anatomy = _read(block.folder, block.identity)
+        tips = project_tip(anatomy.tree, anatomy.insertion, rollout.catheters.tip_position)
+    samples = parquet.sample_table(rollout, applied, config.control, block.first_episode, context.key, tips)
     for path, table in (
         (episodes_path, parquet.episode_table(_episodes(context, block, draw, rollout, stopped), context.key)),
         (data_path, samples),
@@ -120,9 +126,21 @@ def _episodes(
         "tip_stiffness_factor": draw.tip_stiffness_factor,
         "initial_inserted_length_mm": rollout.initial_inserted_length,
         "initial_rotation_rad": rollout.initial_rotation,
+        **_of_catheters(context, draw),
         "stopped_short": stopped,
         "valid": whole,
         "invalid_reason": ["" if valid else why_invalid(rollout, world) for world, valid in enumerate(whole)],
         "meta/episodes/chunk_index": np.full(n, chunk),
         "meta/episodes/file_index": np.full(n, file),
     }
+
+
+def _of_catheters(context: BlockContext, draw: Draw) -> dict[str, Any]:
+    """Return the columns of each catheter: its name, and Δ and φ before the first period."""
+    columns: dict[str, Any] = {}
+    for k, catheter in enumerate(context.catheters):
+        prefix = f"catheter_{k + 1}"
+        columns[prefix] = [catheter.name] * len(draw.initial)
+        columns[f"{prefix}_initial_inserted_length_mm"] = draw.initial[:, 2 * k + 2]
+        columns[f"{prefix}_initial_rotation_rad"] = draw.initial[:, 2 * k + 3]
+    return columns

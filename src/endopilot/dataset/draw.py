@@ -30,15 +30,15 @@ class Draw:
     """The drawn controls, friction and tips of navigations.
 
     Attributes:
-        initial: Δ (mm) and φ (rad) before the first period.
-        control: velocities (mm/s, rad/s) or loads (N, N·mm) of the drive.
+        initial: Δ (mm) and φ (rad) before the first period, of the wire, then of each catheter.
+        control: velocities (mm/s, rad/s) or loads (N, N·mm) of the drive, likewise.
         friction: friction coefficient.
         tip_bend_rad: angle of the unloaded tip.
         tip_stiffness_factor: factor on the stiffness of the distal 10 mm.
     """
 
-    initial: Float[np.ndarray, "n 2"]
-    control: Float[np.ndarray, "n samples 2"]
+    initial: Float[np.ndarray, "n numbers"]
+    control: Float[np.ndarray, "n samples numbers"]
     friction: Float[np.ndarray, "n"]
     tip_bend_rad: Float[np.ndarray, "n"]
     tip_stiffness_factor: Float[np.ndarray, "n"]
@@ -53,11 +53,23 @@ class Draw:
         return [made[tip] for tip in zip(self.tip_bend_rad.tolist(), self.tip_stiffness_factor.tolist(), strict=True)]
 
 
-def draw_navigations(config: DatasetConfig, device: Device, anatomy: Anatomy, sequences: range) -> Draw:
-    """Draw some navigations of an anatomy; each is the same whatever the number of the others."""
+def draw_navigations(
+    config: DatasetConfig, device: Device, anatomy: Anatomy, sequences: range, *, catheters: int = 0
+) -> Draw:
+    """Draw some navigations of an anatomy; each is the same whatever the number of the others.
+
+    Args:
+        config: how they are drawn.
+        device: the wire.
+        anatomy: the vessel.
+        sequences: their indices among those of the anatomy.
+        catheters: number of catheters around the wire, each driven independently; the wire's draw is the same with
+            and without them.
+    """
     controls, friction, tip, surplus, _ = _streams(config, anatomy.name)
     initial, control = random_controls(
         config.navigation,
+        catheters=catheters,
         n_sequences=len(sequences),
         n_samples=config.samples,
         seed=int(controls.generate_state(1, np.uint64)[0]),

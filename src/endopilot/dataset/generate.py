@@ -23,6 +23,7 @@ from endopilot.dataset.workers import run_locally, run_on_cluster
 from endopilot.files import manifest, read_json, write_json, writing
 from endopilot.progress import progress
 from endopilot.runs import claim
+from endopilot.simulation.catheter import Catheter
 from endopilot.simulation.device import Device
 
 _WORK_PATH = "meta/work.json"
@@ -35,6 +36,7 @@ def generate_dataset(
     device: Device,
     config: DatasetConfig | None = None,
     *,
+    catheters: Sequence[Catheter] = (),
     scheduler: str | None = None,
 ) -> None:
     """Simulate random navigations of every anatomy and store them in the LeRobot v3 layout.
@@ -47,14 +49,17 @@ def generate_dataset(
         output: folder of the dataset.
         device: the wire.
         config: number, length, distribution and split of the navigations; the defaults if not given.
+        catheters: around the wire, from the inside out; each is driven at random and independently.
         scheduler: address of a Dask scheduler whose workers simulate; the cores of this machine if not given.
 
     Raises:
         InputError: too few anatomies for the split, two anatomies of one name, an output folder that holds something
-            else or was begun with other settings, a scheduler that cannot be reached, or a full disk.
+            else or was begun with other settings, catheters that do not fit around the wire or are to be driven by
+            force, a scheduler that cannot be reached, or a full disk.
     """
     config = config or DatasetConfig()
-    layout = make_layout([Path(folder) for folder in anatomy_folders], Path(output), device, config)
+    folders = [Path(folder) for folder in anatomy_folders]
+    layout = make_layout(folders, Path(output), device, config, catheters=catheters)
     blocks = layout.blocks()
     claim(layout.context.output, "endopilot dataset", **layout.settings)
     if _is_finished(layout, blocks):
@@ -124,9 +129,11 @@ def describe(layout: Layout, blocks: Sequence[Block]) -> None:
     files = [schema.paths_of_file(context.output, block.number) for block in blocks]
     columns = ("episode_index", "anatomy", "sequence", "split", "stopped_short", "valid", "invalid_reason")
     episodes = [row for _, path in files for row in parquet.read_table(path, context.key).select(columns).to_pylist()]
-    started = time.process_time()
+    started, count = time.process_time(), len(context.catheters)
     with progress("Describing the dataset", total=len(files)) as advance:
-        stats, shares = parquet.statistics(context.config.control, [path for path, _ in files], context.key, advance)
+        stats, shares = parquet.statistics(
+            context.config.control, [path for path, _ in files], context.key, advance, count
+        )
     work = read_work(context.output)
     work["processor_seconds"] += time.process_time() - started
     write_json(context.output / schema.STATS_PATH, stats)
@@ -134,7 +141,7 @@ def describe(layout: Layout, blocks: Sequence[Block]) -> None:
     with writing(context.output / schema.TASKS_PATH) as partial:
         tasks.to_parquet(partial)
     samples = context.config.samples
-    write_json(context.output / schema.INFO_PATH, schema.info(context.config.control, len(episodes), samples))
+    write_json(context.output / schema.INFO_PATH, schema.info(context.config.control, len(episodes), samples, count))
     reported = ("episode_index", "anatomy", "sequence", "invalid_reason")
     invalid = [{name: row[name] for name in reported} for row in episodes if not row["valid"]]
     counts = Counter(row["split"] for row in episodes)
@@ -147,6 +154,7 @@ def describe(layout: Layout, blocks: Sequence[Block]) -> None:
         files=len(files),
         samples_per_episode=samples,
         device=asdict(context.device),
+        **({"catheters": [asdict(catheter) for catheter in context.catheters]} if count else {}),
         anatomies=[_anatomy_record(layout, i) for i in range(len(layout.names))],
         splits={name: counts[name] for name in SPLITS if counts[name]},
         manoeuvres=shares,

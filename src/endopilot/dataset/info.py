@@ -93,6 +93,7 @@ def describe_dataset(folder: Path) -> Description:
     branch_visits = np.array([visits[n] / total for n in range(max(visits, default=0) + 1)])
     reasons = Counter(re.sub(r" after .*", "", reason) for reason in episodes["invalid_reason"] if reason)
     files = [file for file in folder.rglob("*") if file.is_file()]
+    catheters = [catheter["device"]["name"] for catheter in manifest.get("catheters", ())]
     figures = {
         "anatomies": len(manifest["anatomies"]),
         "navigations": info["total_episodes"],
@@ -100,6 +101,7 @@ def describe_dataset(folder: Path) -> Description:
         "hours": round(info["total_frames"] * SAMPLE_PERIOD_S / 3600, 2),
         "megabytes": round(sum(file.stat().st_size for file in files) / 1e6, 2),
         "device": manifest["device"]["name"],
+        **({"catheters": catheters} if catheters else {}),
         "control": schema.actuation_of(info["features"]),
         "made_by": manifest["settings"]["version"],
         "splits": dict(Counter(episodes["split"])),

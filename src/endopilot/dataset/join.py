@@ -25,11 +25,11 @@ def load_joined(folders: Sequence[Path]) -> Dataset:
     trained on.
 
     Args:
-        folders: of the datasets, made with one wire and with episodes of one length.
+        folders: of the datasets, made with the same devices and with episodes of one length.
 
     Raises:
-        InputError: none is given; one cannot be read, was made with another wire, has episodes of another length, or
-            has another patient of the same name.
+        InputError: none is given; one cannot be read, was made with another wire or other catheters, has episodes of
+            another length, or has another patient of the same name.
     """
     if not folders:
         raise InputError("dataset: none given; name at least one folder made by `endopilot dataset`")
@@ -67,6 +67,12 @@ def _check_alike(first: Dataset, other: Dataset) -> None:
                 f"{other.folder}: its wire is {theirs['name']}, and that of {first.folder} is {ours['name']}, with "
                 f"another {name}; join datasets of one wire"
             )
+    if first.catheters != other.catheters:
+        around = [", ".join(each.name for each in data.catheters) or "no catheter" for data in (other, first)]
+        raise InputError(
+            f"{other.folder}: its wire lies in {around[0]}, and that of {first.folder} in {around[1]}; join datasets "
+            "of the same devices"
+        )
     length, other_length = (dataset.valid.shape[1] * dataset.sample_period_s for dataset in (first, other))
     if length != other_length:
         raise InputError(

@@ -19,6 +19,7 @@ from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.splits import assign_splits
 from endopilot.errors import InputError
 from endopilot.files import json_text, read_json
+from endopilot.simulation.catheter import Catheter, check_nested
 from endopilot.simulation.device import Device
 
 FORMAT_VERSION = 5
@@ -58,6 +59,7 @@ class BlockContext:
         device: the wire.
         key: marks the files of this dataset; it follows from all settings.
         task: what the navigations do, as LeRobot names it.
+        catheters: around the wire, from the inside out.
     """
 
     output: Path
@@ -65,6 +67,7 @@ class BlockContext:
     device: Device
     key: str
     task: str = schema.TASK
+    catheters: tuple[Catheter, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +107,7 @@ def make_layout(
     device: Device,
     config: DatasetConfig,
     *,
+    catheters: Sequence[Catheter] = (),
     task: str = schema.TASK,
     origin: Mapping[str, Any] | None = None,
 ) -> Layout:
@@ -114,12 +118,17 @@ def make_layout(
         output: folder of the dataset.
         device: the wire.
         config: number, length, distribution and split of the navigations.
+        catheters: around the wire, from the inside out.
         task: what they do.
         origin: what else they follow from, where they were not drawn at random.
 
     Raises:
-        InputError: no anatomy, or a folder that is none; two of one name; too few for the split.
+        InputError: no anatomy, or a folder that is none; two of one name; too few for the split; catheters that do not
+            fit around the wire, or are to be driven by force.
     """
+    check_nested(device, catheters)
+    if catheters and config.control == "force":
+        raise InputError("control: 'force' with catheters; give 'velocity'")
     if not folders:
         raise InputError("anatomies: none given; name at least one folder made by `endopilot anatomy`")
     names, identities = zip(*(identify(Path(folder)) for folder in folders), strict=True)
@@ -136,11 +145,12 @@ def make_layout(
         "device": asdict(device),
         "anatomies": dict(zip(names, identities, strict=True)),
         "version": version(),
+        **({"catheters": [asdict(catheter) for catheter in catheters]} if catheters else {}),
         **(origin or {}),
     }
     settings = json.loads(json_text(settings))  # as JSON gives them back, so that they compare equal
     key = hashlib.sha256(json_text(settings).encode()).hexdigest()
-    context = BlockContext(Path(output), config, device, key, task)
+    context = BlockContext(Path(output), config, device, key, task, tuple(catheters))
     return Layout(context, tuple(map(Path, folders)), names, identities, splits, settings)
 
 

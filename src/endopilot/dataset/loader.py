@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,9 @@ from endopilot.dataset.schema import (
     INFO_PATH,
     LEROBOT_VERSION,
     MANIFEST_PATH,
+    OF_CATHETER,
     actuation_of,
+    catheters_of,
     paths_of_file,
     signals,
 )
@@ -24,6 +27,8 @@ from endopilot.errors import InputError
 from endopilot.extras import extra_named
 from endopilot.files import read_json
 from endopilot.runs import RECORD_FILE
+from endopilot.settings import from_record
+from endopilot.simulation.catheter import Catheter
 from endopilot.simulation.motion import Motion
 
 
@@ -38,7 +43,7 @@ class Dataset:
         anatomy: name of each episode's anatomy.
         sequence: index of each episode among those of its anatomy.
         split: "train", "seen_test", "calibrate" or "test".
-        device: name of the device.
+        device: name of the wire.
         friction: friction coefficient between wire and wall.
         tip_bend: angle by which the unloaded tip is bent, rad.
         tip_stiffness_factor: factor on the stiffness of the device's distal 10 mm.
@@ -62,6 +67,8 @@ class Dataset:
         slip: advance that was commanded and not made over the period, mm; nearly always 0.
         rotation_slip: rotation likewise, rad.
         valid: false from the sample in which the simulation of that episode failed.
+        catheter_initial: (Δ mm, φ rad) of each catheter before the first period; the fields of catheters that follow
+            mean what those of the wire do. A wire alone has none: their axis has the length 0.
     """
 
     folder: Path
@@ -94,19 +101,63 @@ class Dataset:
     slip: Float[np.ndarray, "episodes samples"]
     rotation_slip: Float[np.ndarray, "episodes samples"]
     valid: Bool[np.ndarray, "episodes samples"]
+    catheter_initial: Float[np.ndarray, "episodes catheters 2"]
+    catheter_control: Float[np.ndarray, "episodes samples catheters 2"]
+    catheter_inserted_length: Float[np.ndarray, "episodes samples catheters"]
+    catheter_rotation: Float[np.ndarray, "episodes samples catheters"]
+    catheter_tip_abscissa: Float[np.ndarray, "episodes samples catheters"]
+    catheter_tip_offset: Float[np.ndarray, "episodes samples catheters"]
+    catheter_tip_position: Float[np.ndarray, "episodes samples catheters 3"]
+    catheter_branch: Int[np.ndarray, "episodes samples catheters"]
+    catheter_base_force: Float[np.ndarray, "episodes samples catheters"]
+    catheter_base_torque: Float[np.ndarray, "episodes samples catheters"]
+    catheter_drive_force: Float[np.ndarray, "episodes samples catheters"]
+    catheter_drive_torque: Float[np.ndarray, "episodes samples catheters"]
+    catheter_slip: Float[np.ndarray, "episodes samples catheters"]
+    catheter_rotation_slip: Float[np.ndarray, "episodes samples catheters"]
 
     def __len__(self) -> int:
         """Return the number of episodes."""
         return len(self.anatomy)
 
     @property
-    def command(self) -> Float[np.ndarray, "episodes samples 2"]:
-        """Control that the drive was commanded (mm/s, rad/s): `control` and the slip of the drive.
+    def catheters(self) -> tuple[Catheter, ...]:
+        """Catheters around the wire, from the inside out; none around a wire alone."""
+        return tuple(from_record(Catheter, record) for record in self.manifest.get("catheters", ()))
+
+    def check_wire_alone(self, what: str) -> None:
+        """Check that the dataset's wire has no catheter around it, for what takes a wire alone.
+
+        Args:
+            what: what takes a wire alone, as the line ends.
+
+        Raises:
+            InputError: it has one.
+        """
+        if self.catheters:
+            names = ", ".join(catheter.name for catheter in self.catheters)
+            raise InputError(
+                f"{self.folder}: its wires lie in {names}, and {what} takes a wire alone; "
+                "make a dataset without --catheter"
+            )
+
+    @property
+    def initial(self) -> Float[np.ndarray, "episodes numbers"]:
+        """(Δ mm, φ rad) before the first period, of the wire, then of each catheter, as `simulate` takes them."""
+        wire = np.column_stack([self.initial_inserted_length, self.initial_rotation])
+        return np.concatenate([wire, self.catheter_initial.reshape(len(self), -1)], axis=1)
+
+    @property
+    def command(self) -> Float[np.ndarray, "episodes samples numbers"]:
+        """Control that the drives were commanded (mm/s, rad/s): `control` and the slip, of the wire and each catheter.
 
         Simulated again it gives the same navigation to the bit, which `control` does not: a drive that pushes at one
         speed until it slips strains the wire otherwise than one that is slower from the start.
         """
-        return commanded(self.control, np.stack([self.slip, self.rotation_slip], axis=-1), self.sample_period_s)
+        wire = commanded(self.control, np.stack([self.slip, self.rotation_slip], axis=-1), self.sample_period_s)
+        slip = np.stack([self.catheter_slip, self.catheter_rotation_slip], axis=-1)
+        others = commanded(self.catheter_control, slip, self.sample_period_s)
+        return np.concatenate([wire, others.reshape(*wire.shape[:2], -1)], axis=-1)
 
     def select(self, episodes: Shaped[np.ndarray, "chosen"]) -> Dataset:
         """Return the chosen episodes, given as a mask or as indices."""
@@ -196,7 +247,7 @@ def load_dataset(folder: Path) -> Dataset:
     folder = Path(folder)
     manifest, info = read_manifest(folder)
     samples, total = manifest["samples_per_episode"], info["total_episodes"]
-    actuation = actuation_of(info["features"])
+    actuation, catheters = actuation_of(info["features"]), catheters_of(info["features"])
     episodes: dict[str, list[np.ndarray]] = {}
     signal: dict[str, np.ndarray] = {}
     filled = 0
@@ -214,7 +265,7 @@ def load_dataset(folder: Path) -> Dataset:
         end = filled + table.num_rows
         if end > total:
             break
-        for name in signals(actuation):
+        for name in signals(actuation, catheters):
             values = column_values(data, name)
             values = values.reshape(table.num_rows, samples, *values.shape[1:])
             if name not in signal:  # in place, so that a large dataset is never held twice
@@ -242,7 +293,7 @@ def load_dataset(folder: Path) -> Dataset:
         tip_stiffness_factor=episode["tip_stiffness_factor"],
         initial_inserted_length=episode["initial_inserted_length_mm"],
         initial_rotation=episode["initial_rotation_rad"],
-        control=signal["velocity" if actuation == "force" else "action"],
+        control=signal["velocity" if actuation == "force" else "action"][..., :2],
         inserted_length=state[..., 0],
         rotation=state[..., 1],
         tip_abscissa=state[..., 2],
@@ -260,4 +311,34 @@ def load_dataset(folder: Path) -> Dataset:
         slip=signal["slip_mm"],
         rotation_slip=signal["rotation_slip_rad"],
         valid=signal["valid"],
+        **_of_catheters(episode, signal, catheters),
     )
+
+
+def _of_catheters(
+    episode: dict[str, np.ndarray], signal: dict[str, np.ndarray], catheters: int
+) -> dict[str, np.ndarray]:
+    """Return the fields of a `Dataset` that tell of its catheters."""
+    prefixes = [f"catheter_{k + 1}_" for k in range(catheters)]
+    names = (f"{prefix}initial_{name}" for prefix in prefixes for name in ("inserted_length_mm", "rotation_rad"))
+    total, samples = signal["valid"].shape
+    first = np.array([episode[name] for name in names]).reshape(2 * catheters, total).T
+    state = signal["observation.state"][..., 4:].reshape(total, samples, catheters, 4)
+    made = {
+        "catheter_initial": first.reshape(total, catheters, 2),
+        "catheter_control": signal["action"][..., 2:].reshape(total, samples, catheters, 2),
+        "catheter_inserted_length": state[..., 0],
+        "catheter_rotation": state[..., 1],
+        "catheter_tip_abscissa": state[..., 2],
+        "catheter_tip_offset": state[..., 3],
+    }
+    for name in OF_CATHETER:
+        like = np.empty((total, samples, 0, *signal[name].shape[2:]), dtype=signal[name].dtype)
+        parts = [like, *(signal[prefix + name][:, :, None] for prefix in prefixes)]
+        made[f"catheter_{_plain(name)}"] = np.concatenate(parts, axis=2)
+    return made
+
+
+def _plain(column: str) -> str:
+    """Return the name of a column without its unit."""
+    return re.sub(r"_(mm|rad|n|nmm)$", "", column)

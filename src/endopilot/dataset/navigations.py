@@ -4,21 +4,23 @@ A segmented vessel ends where the scan no longer shows it, not where blood stops
 buckles against a wall that does not exist. So before every sample the drive checks the tip, as an operator does: it
 stops pushing shortly before the end of the tip's branch. There, and where the wire is caught, it pulls instead of
 pushing until the wire has come back far enough. Simulating the recorded controls without these checks gives the same
-navigation again.
+navigation again. Catheters around the wire are held back by the same rules, each by its own tip and load.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from endopilot.simulation.catheter import Catheter
 from endopilot.simulation.config import Actuation, SimulatorConfig
 from endopilot.simulation.device import Device
 from endopilot.simulation.drive_limits import within_travel
 from endopilot.simulation.motion import Motion
-from endopilot.simulation.simulate import RECORDED, make_rollout
+from endopilot.simulation.simulate import RECORDED, catheter_motion, make_rollout
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import Step
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, Rollout, TipProjection, VesselTree
@@ -36,81 +38,98 @@ _ROUNDING_MM = 1e-2
 def simulate_navigations(
     anatomy: Anatomy,
     devices: Sequence[Device],
-    initial: Float[np.ndarray, "worlds 2"],
-    control: Float[np.ndarray, "worlds samples 2"],
+    initial: Float[np.ndarray, "worlds numbers"],
+    control: Float[np.ndarray, "worlds samples numbers"],
     friction: Float[np.ndarray, "worlds"],
     config: SimulatorConfig,
     *,
+    catheters: Sequence[Catheter] = (),
     actuation: Actuation = "velocity",
     motion: Motion | None = None,
     advance: Callable[[int], None] = lambda samples: None,
-) -> tuple[Rollout, Float[np.ndarray, "worlds samples 2"], Bool[np.ndarray, "worlds"]]:
+) -> tuple[
+    Rollout,
+    Float[np.ndarray, "worlds numbers"],
+    Float[np.ndarray, "worlds samples numbers"],
+    Bool[np.ndarray, "worlds"],
+]:
     """Simulate navigations, stopped short of the ends of the vessel.
 
     Args:
         anatomy: the vessel.
         devices: the wire of each world.
-        initial: (Δ mm, φ rad) before the first period.
-        control: velocities (mm/s, rad/s) or loads (N, N·mm) that were drawn.
+        initial: (Δ mm, φ rad) before the first period, of the wire, then of each catheter.
+        control: velocities (mm/s, rad/s) or loads (N, N·mm) that were drawn, likewise.
         friction: friction coefficient of each world.
         config: settings of the rod core.
+        catheters: around the wires, from the inside out; driven by velocity.
         actuation: what the controls are.
         motion: how the vessel moves with time; it lies still if not given.
         advance: called after each sample with the number of worlds.
 
     Returns:
-        The rollout; the controls that were applied, rounded to float32 as they are stored; and which worlds were
-        stopped short.
+        The rollout; Δ and φ that the devices really began with; the controls that were applied, rounded to float32 as
+        they are stored; and which worlds were stopped short.
     """
-    watch = _PushRoom(anatomy.tree, devices)
-    simulator = Simulator(anatomy, list(devices), actuation=actuation, motion=motion, config=config)
+    stack = [list(devices), *([catheter.device] * len(devices) for catheter in catheters)]
+    watch = _PushRoom(anatomy.tree, stack)
+    simulator = Simulator(
+        anatomy, list(devices), catheters=catheters, actuation=actuation, motion=motion, config=config
+    )
     started = _begin(simulator, watch, initial, friction)
     applied, stopped = np.empty_like(control), np.zeros(len(control), dtype=bool)
     result: dict[str, np.ndarray] = {}
-    inserted, last, slip = started[:, 0], np.zeros(len(control)), np.zeros(len(control))
+    inserted, last, slip = started[:, ::2], np.zeros_like(started[:, ::2]), np.zeros_like(started[:, ::2])
     for sample in range(control.shape[1]):
-        drawn = control[:, sample]
-        caught = (slip > 0) | (simulator.base_load[:, 0] > watch.caught_n)
+        drawn = control[:, sample, ::2]
+        base = np.column_stack([simulator.base_load[:, 0], simulator.catheter_base_load[..., 0]])
+        caught = (slip > 0) | (base > watch.caught_n)
         # How far a load moves the wire is not known: about as far as the last one did.
-        needed = last if actuation == "force" else np.zeros(len(control))
-        room = watch.room(simulator.project(), inserted, needed, caught)
-        held = np.where(room > 0, drawn[:, 0], -np.abs(drawn[:, 0]))
+        needed = last if actuation == "force" else np.zeros_like(last)
+        room = watch.room(_project(simulator), inserted, needed, caught)
+        held = np.where(room > 0, drawn, -np.abs(drawn))
         if actuation == "velocity":
             held = within_travel(np.minimum(held, room / SAMPLE_PERIOD_S), inserted, SAMPLE_PERIOD_S)
-        applied[:, sample] = np.column_stack([held, drawn[:, 1]]).astype(np.float32)
-        stopped |= (drawn[:, 0] > 0) & (held < drawn[:, 0])
+        made = control[:, sample].copy()
+        made[:, ::2] = held
+        applied[:, sample] = made.astype(np.float32)
+        stopped |= ((drawn > 0) & (held < drawn)).any(axis=1)
         step = simulator.step(applied[:, sample], SAMPLE_PERIOD_S)
         _record(result, sample, control.shape[1], step, simulator)
-        slip, last, inserted = step.slip, step.inserted_length - inserted, step.inserted_length
+        now = _inserted(simulator)
+        slip, last, inserted = np.column_stack([step.slip, simulator.catheter_slip[..., 0]]), now - inserted, now
         advance(len(control))
     result["reason"] = simulator.reason
-    return make_rollout(anatomy, actuation, started, applied, result), applied, stopped
+    rollout = make_rollout(anatomy, actuation, started[:, :2], applied[..., :2], result)
+    if catheters:
+        rollout = replace(rollout, catheters=catheter_motion(applied, result["catheters"], SAMPLE_PERIOD_S))
+    return rollout, started, applied, stopped
 
 
 class _PushRoom:
-    """How far each wire may still be pushed.
+    """How far each device may still be pushed. Arrays have a row a world and a column a device, the wire first.
 
     Attributes:
-        deepest_mm: inserted length that no wire may exceed.
-        caught_n: push at which each wire counts as caught, N.
+        deepest_mm: inserted length that no device may exceed.
+        caught_n: push at which each counts as caught, N.
     """
 
-    def __init__(self, tree: VesselTree, devices: Sequence[Device]) -> None:
+    def __init__(self, tree: VesselTree, stack: Sequence[Sequence[Device]]) -> None:
         self._ends = np.full(len(tree.branches), np.inf)
         for leaf in tree.leaves():
             self._ends[leaf] = tree.branches[leaf].centerline.abscissa[-1]
         self.deepest_mm = max(float(self._ends[np.isfinite(self._ends)].max()) - STOP_SHORT_MM, 0.0)
-        self.caught_n = CAUGHT * np.array([device.push_limit_n for device in devices])
-        self._limit = np.full(len(devices), np.inf)
+        self.caught_n = CAUGHT * np.array([[device.push_limit_n for device in each] for each in stack]).T
+        self._limit = np.full(self.caught_n.shape, np.inf)
 
     def room(
         self,
         tip: TipProjection,
-        inserted: Float[np.ndarray, "worlds"],
-        needed: Float[np.ndarray, "worlds"],
-        caught: Bool[np.ndarray, "worlds"],
-    ) -> Float[np.ndarray, "worlds"]:
-        """Return the advance (mm) that is left to each wire; 0 where it is `needed` or less, or until it is back."""
+        inserted: Float[np.ndarray, "worlds devices"],
+        needed: Float[np.ndarray, "worlds devices"],
+        caught: Bool[np.ndarray, "worlds devices"],
+    ) -> Float[np.ndarray, "worlds devices"]:
+        """Return the advance (mm) that is left to each; 0 where it is `needed` or less, or until it is back."""
         ahead = np.minimum(self.deepest_mm - inserted, self.ahead(tip))
         stop = caught | (ahead <= np.maximum(needed, _ROUNDING_MM))
         back = np.maximum(inserted - PULL_BACK_MM, 0.0)
@@ -119,7 +138,7 @@ class _PushRoom:
         self._limit = np.where(is_back, np.inf, self._limit)
         return np.where(np.isinf(self._limit), ahead, 0.0)
 
-    def ahead(self, tip: TipProjection) -> Float[np.ndarray, "worlds"]:
+    def ahead(self, tip: TipProjection) -> Float[np.ndarray, "worlds devices"]:
         """Return how far each tip is from where it is stopped in its branch, mm; negative beyond."""
         return self._ends[tip.branch] - STOP_SHORT_MM - tip.abscissa
 
@@ -127,33 +146,64 @@ class _PushRoom:
 def _begin(
     simulator: Simulator,
     watch: _PushRoom,
-    initial: Float[np.ndarray, "worlds 2"],
+    initial: Float[np.ndarray, "worlds numbers"],
     friction: Float[np.ndarray, "worlds"],
-) -> Float[np.ndarray, "worlds 2"]:
-    """Push the wires to their first inserted length, or as deep as they go freely, and return Δ and φ there."""
-    start, again = np.minimum(initial[:, 0], watch.deepest_mm), np.arange(len(initial))
+) -> Float[np.ndarray, "worlds numbers"]:
+    """Push the devices to their first inserted length, or as deep as they go freely, and return Δ and φ there."""
+    start, turn, again = np.minimum(initial[:, ::2], watch.deepest_mm), initial[:, 1::2], np.arange(len(initial))
     while True:
-        simulator.reset(inserted_length=start, rotation=initial[:, 1], friction=friction, worlds=again.tolist())
-        tip = simulator.project()
-        slipped = simulator.inserted_length < start
-        far = np.where(slipped, STOP_SHORT_MM, -watch.ahead(tip))
-        again = np.flatnonzero((slipped | (far > _ROUNDING_MM)) & (start > 0) & simulator.valid)
+        simulator.reset(
+            inserted_length=start[:, 0],
+            rotation=turn[:, 0],
+            friction=friction,
+            catheter_inserted_length=start[:, 1:],
+            catheter_rotation=turn[:, 1:],
+            worlds=again.tolist(),
+        )
+        inserted = _inserted(simulator)
+        slipped = inserted != start  # a weakly driven device is also carried along by another one
+        far = np.where(slipped, STOP_SHORT_MM, -watch.ahead(_project(simulator)))
+        bad = (slipped | (far > _ROUNDING_MM)) & (start > 0) & simulator.valid[:, None]
+        again = np.flatnonzero(bad.any(axis=1))
         if len(again) == 0:
-            return np.column_stack([simulator.inserted_length, simulator.rotation])
-        start[again] = np.maximum(simulator.inserted_length[again] - np.maximum(far[again], 1.0), 0.0)
+            turned = np.column_stack([simulator.rotation, simulator.catheter_rotation])
+            return np.stack([inserted, turned], axis=-1).reshape(initial.shape)
+        start[bad] = np.maximum(np.minimum(inserted, start)[bad] - np.maximum(far[bad], 1.0), 0.0)
+
+
+def _inserted(simulator: Simulator) -> Float[np.ndarray, "worlds devices"]:
+    return np.column_stack([simulator.inserted_length, simulator.catheter_inserted_length])
+
+
+def _project(simulator: Simulator) -> TipProjection:
+    """Return where all tips lie, a column a device."""
+    tips = [simulator.project(k) for k in range(1 + simulator.catheter_rotation.shape[1])]
+    names = TipProjection.__dataclass_fields__
+    return TipProjection(**{name: np.column_stack([getattr(tip, name) for tip in tips]) for name in names})
 
 
 def _record(result: dict[str, np.ndarray], sample: int, samples: int, step: Step, simulator: Simulator) -> None:
     """Put what the worlds did in one sample into arrays of all samples."""
     base, drive = simulator.base_load, simulator.drive_load
-    loads = {
+    read = {
         "base_force": base[:, 0],
         "base_torque": base[:, 1],
         "drive_force": drive[:, 0],
         "drive_torque": drive[:, 1],
     }
-    for name in (*RECORDED, "inserted_length", "rotation"):
-        values = loads[name] if name in loads else getattr(step, name)
+    if simulator.catheter_rotation.size:
+        read["catheters"] = _of_catheters(simulator)
+    for name in dict.fromkeys((*RECORDED, "inserted_length", "rotation", *read)):
+        values = read[name] if name in read else getattr(step, name)
         if sample == 0:
             result[name] = np.empty((len(values), samples, *values.shape[1:]), dtype=values.dtype)
         result[name][:, sample] = values
+
+
+def _of_catheters(simulator: Simulator) -> Float[np.ndarray, "worlds catheters 11"]:
+    """Return what `catheter_motion` takes of one sample."""
+    count = simulator.catheter_rotation.shape[1]
+    place = np.stack([simulator.catheter_inserted_length, simulator.catheter_rotation], axis=-1)
+    tips = np.stack([simulator.tips(k + 1) for k in range(count)], axis=1)
+    loads = (simulator.catheter_base_load, simulator.catheter_drive_load)
+    return np.concatenate([place, *loads, simulator.catheter_slip, tips], axis=-1)

@@ -10,11 +10,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from endopilot.dataset.schema import INDEX_COLUMNS, MANOEUVRES, manoeuvres, signals
+from endopilot.dataset.schema import INDEX_COLUMNS, MANOEUVRES, OF_CATHETER, manoeuvres, signals
 from endopilot.errors import InputError
 from endopilot.progress import Advance
 from endopilot.simulation.config import Actuation
-from endopilot.types import Rollout
+from endopilot.types import CatheterMotion, Rollout, TipProjection
 
 _KEY = b"endopilot_key"
 _LEVEL = 5
@@ -23,7 +23,14 @@ _FEW_VALUES = {"timestamp"}
 """Columns that repeat their values: a dictionary is the smallest."""
 
 
-def sample_table(rollout: Rollout, applied: np.ndarray, actuation: Actuation, first_episode: int, key: str) -> pa.Table:
+def sample_table(
+    rollout: Rollout,
+    applied: np.ndarray,
+    actuation: Actuation,
+    first_episode: int,
+    key: str,
+    catheter_tip: TipProjection | None = None,
+) -> pa.Table:
     """Return the samples of a rollout as rows, one episode after the other.
 
     Args:
@@ -32,6 +39,7 @@ def sample_table(rollout: Rollout, applied: np.ndarray, actuation: Actuation, fi
         actuation: what the control is.
         first_episode: index in the dataset of the rollout's first world.
         key: marks the dataset that the file belongs to.
+        catheter_tip: where the catheters' tips lie (worlds, samples, catheters), if there are any.
     """
     worlds, samples = rollout.valid.shape
     state = (rollout.inserted_length, rollout.rotation, rollout.tip.abscissa, rollout.tip.offset)
@@ -59,9 +67,47 @@ def sample_table(rollout: Rollout, applied: np.ndarray, actuation: Actuation, fi
         "rotation_slip_rad": rollout.rotation_slip,
         "valid": rollout.valid,
     }
-    kinds = dict.fromkeys(INDEX_COLUMNS, ("int64", None)) | {"timestamp": ("float32", None)} | signals(actuation)
+    count = 0
+    if rollout.catheters is not None and catheter_tip is not None:
+        count = rollout.catheters.rotation.shape[2]
+        for k in range(count):
+            _add_catheter(columns, k, rollout.catheters, catheter_tip)
+        _add_exact_slip(columns, applied, rollout.sample_period_s)
+    kinds = dict.fromkeys(INDEX_COLUMNS, ("int64", None)) | {"timestamp": ("float32", None)}
+    kinds |= signals(actuation, count)
     arrays = {name: _column(columns[name], *kinds[name]) for name in columns if name in kinds}
     return pa.table(arrays).replace_schema_metadata({_KEY: key.encode()})
+
+
+def _add_catheter(columns: dict[str, np.ndarray], k: int, motion: CatheterMotion, tip: TipProjection) -> None:
+    """Add what catheter k did to the samples' columns."""
+    state = (motion.inserted_length, motion.rotation, tip.abscissa, tip.offset)
+    columns["action"] = np.concatenate([columns["action"], motion.control[:, :, k]], axis=-1)
+    added = np.stack([values[:, :, k] for values in state], axis=-1)
+    columns["observation.state"] = np.concatenate([columns["observation.state"], added], axis=-1)
+    own = (
+        motion.tip_position,
+        tip.branch,
+        motion.base_force,
+        motion.base_torque,
+        motion.drive_force,
+        motion.drive_torque,
+        motion.slip,
+        motion.rotation_slip,
+    )
+    for name, values in zip(OF_CATHETER, own, strict=True):
+        columns[f"catheter_{k + 1}_{name}"] = values[:, :, k]
+
+
+def _add_exact_slip(columns: dict[str, np.ndarray], applied: np.ndarray, sample_period_s: float) -> None:
+    """Put slips in place of the recorded ones that give the commands back to the bit, whatever float32 makes of motion.
+
+    A drive that is asked to rest beside one that moves is often carried along: it then slips more than it is asked.
+    """
+    slip = sample_period_s * (applied - columns["action"].astype(np.float32))
+    for k in range(applied.shape[2] // 2):
+        prefix = f"catheter_{k}_" if k else ""
+        columns[f"{prefix}slip_mm"], columns[f"{prefix}rotation_slip_rad"] = slip[..., 2 * k], slip[..., 2 * k + 1]
 
 
 def episode_table(columns: Mapping[str, Any], key: str) -> pa.Table:
@@ -123,7 +169,7 @@ def column_values(table: pa.Table, name: str) -> np.ndarray:
 
 
 def statistics(
-    actuation: Actuation, paths: Iterable[Path], key: str, advance: Advance
+    actuation: Actuation, paths: Iterable[Path], key: str, advance: Advance, catheters: int = 0
 ) -> tuple[dict[str, dict[str, list[float]]], dict[str, float]]:
     """Return the content of `meta/stats.json`, and the share of each manoeuvre in what was driven.
 
@@ -134,6 +180,7 @@ def statistics(
         paths: the data files.
         key: key of the dataset.
         advance: called once for each file that has been read.
+        catheters: their number; the manoeuvres are the wire's.
     """
     sums: dict[str, list[np.ndarray]] = {}
     count, driven = 0, np.zeros(len(MANOEUVRES))
@@ -143,7 +190,7 @@ def statistics(
         count += int(valid.sum())
         velocity = column_values(table, "velocity" if actuation == "force" else "action")[valid]
         driven += np.bincount(manoeuvres(velocity), minlength=len(driven))
-        for name, (dtype, _) in signals(actuation).items():
+        for name, (dtype, _) in signals(actuation, catheters).items():
             if dtype == "bool" or not valid.any():
                 continue
             values = column_values(table, name)[valid].astype(np.float64).reshape(int(valid.sum()), -1)

@@ -46,19 +46,41 @@ _SIGNALS: dict[str, tuple[str, list[str] | None]] = {
     "rotation_slip_rad": ("float64", None),
     "valid": ("bool", None),
 }
+OF_CATHETER = (
+    "tip_position_mm",
+    "branch",
+    "base_force_n",
+    "base_torque_nmm",
+    "drive_force_n",
+    "drive_torque_nmm",
+    "slip_mm",
+    "rotation_slip_rad",
+)
+"""Columns that each catheter has of its own; their names begin with `catheter_1_` and `catheter_2_`."""
 MANOEUVRES = ("insertion", "retraction", "spin", "pause")
 _MOVES_MM_S, _TURNS_RAD_S = 0.1, 0.02
 """Below these a drive rests: mm/s, rad/s."""
 
 
-def signals(actuation: Actuation) -> dict[str, tuple[str, list[str] | None]]:
+def signals(actuation: Actuation, catheters: int = 0) -> dict[str, tuple[str, list[str] | None]]:
     """Return the name of each simulated column, its type, and the names of its components if it is a vector.
 
     `action` is the control that was applied. Under force control, `velocity` is the resulting velocity. The load of
-    the drive is always in `drive_force_n` and `drive_torque_nmm`.
+    the drive is always in `drive_force_n` and `drive_torque_nmm`. `action` and `observation.state` have further
+    components for each catheter, and there are columns `catheter_1_...`.
     """
     velocity = {"velocity": ("float32", VELOCITY)} if actuation == "force" else {}
-    return {"action": ("float32", LOAD if actuation == "force" else VELOCITY), **velocity, **_SIGNALS}
+    wire = {"action": ("float32", LOAD if actuation == "force" else VELOCITY), **velocity, **_SIGNALS}
+    prefixes = [f"catheter_{k + 1}_" for k in range(catheters)]
+    for name in ("action", "observation.state"):
+        kind, of_wire = wire[name]
+        wire[name] = kind, [prefix + component for prefix in ("", *prefixes) for component in of_wire or ()]
+    return wire | {prefix + name: _SIGNALS[name] for prefix in prefixes for name in OF_CATHETER}
+
+
+def catheters_of(described: Mapping[str, Any]) -> int:
+    """Return how many catheters a dataset has, from the `features` of its `meta/info.json`."""
+    return sum(name.startswith("catheter_") and name.endswith("_rotation_slip_rad") for name in described)
 
 
 def actuation_of(described: Mapping[str, Any]) -> Actuation:
@@ -67,7 +89,7 @@ def actuation_of(described: Mapping[str, Any]) -> Actuation:
 
 
 def manoeuvres(velocity: np.ndarray) -> np.ndarray:
-    """Return the manoeuvre of each row of velocities (mm/s, rad/s), as an index of `MANOEUVRES`.
+    """Return the wire's manoeuvre in each row of velocities (mm/s, rad/s), as an index of `MANOEUVRES`.
 
     A wire that advances is inserted, whether it turns or not; slower than 0.1 mm/s and 0.02 rad/s it rests.
     """
@@ -75,11 +97,11 @@ def manoeuvres(velocity: np.ndarray) -> np.ndarray:
     return np.select([along > _MOVES_MM_S, along < -_MOVES_MM_S, turn > _TURNS_RAD_S], [0, 1, 2], 3)
 
 
-def features(actuation: Actuation) -> dict[str, dict[str, Any]]:
+def features(actuation: Actuation, catheters: int = 0) -> dict[str, dict[str, Any]]:
     """Return the `features` entry of `meta/info.json`: type, shape and component names of every column."""
     described = {"timestamp": {"dtype": "float32", "shape": [1], "names": None}}
     described |= {name: {"dtype": "int64", "shape": [1], "names": None} for name in INDEX_COLUMNS}
-    for name, (dtype, names) in signals(actuation).items():
+    for name, (dtype, names) in signals(actuation, catheters).items():
         described[name] = {"dtype": dtype, "shape": [len(names) if names else 1], "names": names}
     return described
 
@@ -91,7 +113,7 @@ def paths_of_file(folder: Path, number: int) -> tuple[Path, Path]:
     return folder / DATA_PATH.format(**where), folder / EPISODES_PATH.format(**where)
 
 
-def info(actuation: Actuation, episodes: int, samples_per_episode: int) -> dict[str, Any]:
+def info(actuation: Actuation, episodes: int, samples_per_episode: int, catheters: int = 0) -> dict[str, Any]:
     """Return the content of `meta/info.json`.
 
     LeRobot's `splits` are ranges of episodes, which ours are not: they are in the episode table, column `split`.
@@ -107,5 +129,5 @@ def info(actuation: Actuation, episodes: int, samples_per_episode: int) -> dict[
         "splits": {},
         "data_path": DATA_PATH,
         "video_path": None,
-        "features": features(actuation),
+        "features": features(actuation, catheters),
     }

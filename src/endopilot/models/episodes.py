@@ -111,8 +111,9 @@ class Episodes:
         """Return the navigations of a dataset, with their true tips.
 
         Raises:
-            InputError: they are no longer than the states that a predictor is given.
+            InputError: they are no longer than the states that a predictor is given, or have catheters.
         """
+        dataset.check_wire_alone("a model")
         samples = dataset.valid.shape[1]
         if samples <= WINDOW:
             seconds = (WINDOW + 1) * dataset.sample_period_s

@@ -31,8 +31,9 @@ def check_wire(run: Path, record: Mapping[str, Any], dataset: Dataset) -> None:
         dataset: what it is to be measured on.
 
     Raises:
-        InputError: it was made with another wire.
+        InputError: it was made with another wire, or with catheters.
     """
+    dataset.check_wire_alone("a model")
     ours, theirs = record["device"], dataset.manifest["device"]
     for name in _WIRE:
         if not np.array_equal(ours[name], theirs[name]):

@@ -84,6 +84,7 @@ def train(
 
 def _train(folders: list[Path], run_folder: Path, config: TrainConfig, group: ProcessGroup) -> None:
     dataset = load_joined(folders)
+    dataset.check_wire_alone("a model")
     with group.first():  # which writes the settings and prepares the patients, where need be
         if group.writes:
             identity = {"config": config, "dataset": dataset.manifest["key"], "version": __version__}

@@ -21,6 +21,8 @@ from endopilot.types import SAMPLE_PERIOD_S
 
 _COLUMNS = ("time_s", "translation_mm_s", "rotation_rad_s")
 _KINDS = ("insertion", "retraction", "spin", "pause")
+_DRIVE = 2**32
+"""From the key of a navigation's wire to that of its catheter; no study has that many navigations."""
 
 
 @settings
@@ -66,7 +68,8 @@ def random_controls(
     seed: int,
     max_inserted_length_mm: float,
     first: int = 0,
-) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n samples 2"]]:
+    catheters: int = 0,
+) -> tuple[Float[np.ndarray, "n numbers"], Float[np.ndarray, "n samples numbers"]]:
     """Draw random navigations; sequence i is the same whatever `n_sequences`.
 
     Args:
@@ -76,9 +79,10 @@ def random_controls(
         seed: key of the random streams.
         max_inserted_length_mm: largest inserted length that a navigation reaches, mm; the smallest is 0.
         first: index of the first of them.
+        catheters: number of catheters around the wire; each is driven independently of it, with the same distribution.
 
     Returns:
-        Initial (Δ mm, φ rad), and controls (mm/s, rad/s).
+        Initial (Δ mm, φ rad), and controls (mm/s, rad/s), of the wire, then of each catheter.
 
     Raises:
         InputError: a number that is not positive, or a negative seed.
@@ -89,15 +93,19 @@ def random_controls(
         raise InputError(f"seed: {seed}; give a whole number from 0 to 2^64 - 1")
     if not 0 < max_inserted_length_mm < np.inf:
         raise InputError(f"max_inserted_length_mm: {max_inserted_length_mm}; give a positive length")
-    initial, control = np.empty((n_sequences, 2)), np.empty((n_sequences, n_samples, 2))
-    for index in range(n_sequences):
-        generator = np.random.Generator(np.random.Philox(key=np.array([seed, first + index], dtype=np.uint64)))
-        initial[index], control[index] = _navigation(config, generator, n_samples, max_inserted_length_mm)
-    inserted = initial[:, 0].copy()
+    initial, control = np.empty((n_sequences, 1 + catheters, 2)), np.empty((n_sequences, n_samples, 1 + catheters, 2))
+    for index, drive in np.ndindex(n_sequences, 1 + catheters):
+        key = np.array([seed, first + index + drive * _DRIVE], dtype=np.uint64)
+        generator = np.random.Generator(np.random.Philox(key=key))
+        start, driven = _navigation(config, generator, n_samples, max_inserted_length_mm)
+        initial[index, drive], control[index, :, drive] = start, driven
+    inserted = initial[..., 0].copy()
     for sample in np.moveaxis(control, 1, 0):
-        sample[:, 0] = within_travel(sample[:, 0], inserted, SAMPLE_PERIOD_S, travel_mm=(0.0, max_inserted_length_mm))
-        inserted += sample[:, 0] * SAMPLE_PERIOD_S
-    return initial, control
+        sample[..., 0] = within_travel(
+            sample[..., 0], inserted, SAMPLE_PERIOD_S, travel_mm=(0.0, max_inserted_length_mm)
+        )
+        inserted += sample[..., 0] * SAMPLE_PERIOD_S
+    return initial.reshape(n_sequences, -1), control.reshape(n_sequences, n_samples, -1)
 
 
 def free_wire_load(

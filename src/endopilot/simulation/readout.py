@@ -113,6 +113,26 @@ class Readout:
         return np.stack([self._of_tubes(9)[:, 1:], self._of_tubes(10)[:, 1:]], axis=-1)
 
     @property
+    def catheter_base_load(self) -> Float[np.ndarray, "worlds catheters 2"]:
+        """Axial force (N, positive when it pushes) and torque (N·mm) that hold each catheter where it enters.
+
+        Example:
+            >>> simulator.catheter_base_load.shape
+            (4, 0, 2)
+        """
+        return np.stack([self._of_tubes(7)[:, 1:], self._of_tubes(8)[:, 1:]], axis=-1)
+
+    @property
+    def catheter_slip(self) -> Float[np.ndarray, "worlds catheters 2"]:
+        """Advance (mm) and rotation (rad) that the catheters' drives were asked for in the last step and did not make.
+
+        Example:
+            >>> simulator.catheter_slip.shape
+            (4, 0, 2)
+        """
+        return np.stack([self._of_tubes(16)[:, 1:], self._of_tubes(17)[:, 1:]], axis=-1)
+
+    @property
     def rotation(self) -> Float[np.ndarray, "worlds"]:
         """Rotations φ of the drive, rad.
 

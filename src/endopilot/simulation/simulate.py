@@ -147,7 +147,7 @@ def simulate(
     if moving is not None:
         rollout = replace(rollout, vessel_to_laboratory=moving.placements(period_s * np.arange(1, samples + 1))[0])
     if catheters:
-        rollout = replace(rollout, catheters=_catheter_motion(control, result["tubes"], period_s))
+        rollout = replace(rollout, catheters=catheter_motion(control, result["tubes"][:, :, 1:, :11], period_s))
     _report(rollout)
     return rollout
 
@@ -172,18 +172,26 @@ def _check_drives(
     return max(commanded for commanded, _ in lengths), max(possible for _, possible in lengths)
 
 
-def _catheter_motion(
+def catheter_motion(
     control: Float[np.ndarray, "worlds samples numbers"],
-    tubes: Float[np.ndarray, "worlds samples tubes 12"],
+    recorded: Float[np.ndarray, "worlds samples catheters 11"],
     period_s: float,
 ) -> CatheterMotion:
+    """Return what the core recorded of catheters as their motion.
+
+    Args:
+        control: what was asked of the drives, of the wire's first.
+        recorded: of each catheter Δ (mm), φ (rad), force and torque that hold it, those of its drive (N, N·mm), slip
+            (mm, rad) and tip (LPS mm).
+        period_s: time of a sample, s.
+    """
     asked = control[..., 2:].reshape(*control.shape[:2], -1, 2)
-    numbers = np.moveaxis(tubes[:, :, 1:], -1, 0)
+    numbers = np.moveaxis(recorded, -1, 0)
     return CatheterMotion(
         control=asked - np.stack([numbers[6], numbers[7]], axis=-1) / period_s,
         inserted_length=numbers[0],
         rotation=numbers[1],
-        tip_position=tubes[:, :, 1:, 8:11],
+        tip_position=recorded[..., 8:11],
         base_force=numbers[2],
         base_torque=numbers[3],
         drive_force=numbers[4],
