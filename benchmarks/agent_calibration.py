@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from endopilot.control.agent import AgentConfig, AgentPolicy
+from endopilot.control.agent import CALIBRATED, AgentConfig, AgentPolicy
 from endopilot.control.mismatch import ModelMismatch
 from endopilot.control.navigate import NavigateConfig, navigate
 from endopilot.errors import InputError
@@ -26,7 +26,6 @@ from endopilot.ladder.ladder import identity
 from endopilot.runs import claim, make_missing
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.tasks.task import CORE, Task, find_task, ladder_tasks
-from endopilot.xray import adviser as xray
 from endopilot.xray.bands import Calibration, conformal_scale, fit_spread, spread_of
 
 ROOT = Path(__file__).parents[1]
@@ -168,7 +167,7 @@ def main() -> None:
     calibration, lines = calibrate(folder)
     print(calibration, *lines, sep="\n")
     if "--write" in sys.argv:
-        calibration.write(Path(xray.__file__).parent)
+        calibration.write(CALIBRATED)
         page = ROOT / "docs" / "xray.md"
         begin, end = "<!-- agent:begin -->", "<!-- agent:end -->"
         text = page.read_text(encoding="utf-8")

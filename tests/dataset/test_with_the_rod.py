@@ -12,12 +12,14 @@ from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.draw import TIP_GROUP, draw_navigations, patient_motion
+from endopilot.dataset.episode import write_episode
 from endopilot.dataset.generate import generate_dataset
 from endopilot.dataset.loader import load_dataset
 from endopilot.dataset.navigations import PULL_BACK_MM, STOP_SHORT_MM, simulate_navigations
 from endopilot.evaluation.replay import Recorded
 from endopilot.models.config import WINDOW
 from endopilot.simulation.device import read_device
+from endopilot.simulation.motion import motion_named
 from endopilot.simulation.simulate import simulate
 
 DEVICE = read_device("workhorse-014")
@@ -163,3 +165,19 @@ def test_vessels_move_as_it_is_drawn_for_each_patient(tmp_path, patient):
     recorded = Recorded.of(data)
     ((_, again),) = recorded.simulated({"true_replay": data.command[:, WINDOW:]})
     np.testing.assert_array_equal(again.tip.abscissa.astype(np.float32), data.tip_abscissa)
+
+
+def test_an_episode_names_the_motion_of_its_vessel_and_is_replayed_in_it(tmp_path, patient):
+    motion, simulator = motion_named("heartbeat", 7), DatasetConfig().simulator
+    drawn = draw_navigations(DatasetConfig(sequences=1, seconds=16.0), DEVICE, read_anatomy(patient), range(1))
+    options = {"initial": drawn.initial, "config": simulator, "motion": motion}
+    rollout = simulate(read_anatomy(patient), DEVICE, drawn.control, **options)
+    wire = {"friction": DEVICE.friction, "tip_stiffness_factor": 1.0}
+    told = {"task": "navigate", "seed": 7, "origin": {}, "simulator": simulator}
+    write_episode(rollout, patient, tmp_path / "episode", DEVICE, **wire, **told, motion=motion)
+    data = load_dataset(tmp_path / "episode")
+    assert data.motion(str(data.anatomy[0])) == motion
+    ((_, again),) = Recorded.of(data).simulated({"true_replay": data.command[:, WINDOW:]})
+    np.testing.assert_allclose(again.tip.abscissa, data.tip_abscissa, atol=1e-3)
+    write_episode(rollout, patient, tmp_path / "still", DEVICE, **wire, **told)
+    assert load_dataset(tmp_path / "still").motion(str(data.anatomy[0])) is None

@@ -17,6 +17,7 @@ from endopilot.dataset.loader import load_dataset
 from endopilot.files import read_json
 from endopilot.pipeline import navigation
 from endopilot.simulation.catheter import read_catheter
+from endopilot.simulation.motion import motion_named
 
 SHORT = ("--tip", "own", "--seconds", "20")
 FILES = ["controls.csv", "episode", "manifest.json", "navigation.csv", "navigation.html", "navigation.png", "run.json",
@@ -184,6 +185,12 @@ def test_the_episode_trains_beside_simulated_data(driven, patient, capsys, tmp_p
     run(capsys, "dataset", patient, "-o", tmp_path / "long", "--sequences", "4", "--seconds", "30")
     line = refused(capsys, "train", tmp_path / "long", folder / "episode", "-o", tmp_path / "no")
     assert "episodes of 20 s, and those of" in line and "--seconds 30" in line
+
+
+def test_the_episode_of_a_moving_patient_names_the_motion(patient, capsys, tmp_path):
+    moved = ("--motion", "both", "--motion-seed", "3", "--policy", "forward", "--tip", "own", "--seconds", "5")
+    run(capsys, "navigate", patient, "--target", "2", *moved, "-o", tmp_path / "moving")
+    assert load_dataset(tmp_path / "moving" / "episode").motion(patient.name) == motion_named("both", 3)
 
 
 def test_a_finished_folder_is_left_alone_and_another_run_is_refused(driven, patient, capsys):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from endopilot.dataset.layout import make_layout
 from endopilot.runs import claim
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import Device
+from endopilot.simulation.motion import Motion
 from endopilot.types import Rollout
 
 
@@ -29,6 +31,7 @@ def write_episode(
     friction: float,
     tip_stiffness_factor: float,
     simulator: SimulatorConfig,
+    motion: Motion | None = None,
     seed: int,
     origin: Mapping[str, Any],
 ) -> None:
@@ -43,6 +46,7 @@ def write_episode(
         friction: the true friction coefficient.
         tip_stiffness_factor: the true factor on the stiffness of the distal 10 mm.
         simulator: settings of the rod core.
+        motion: how the vessel moved; it lay still if not given.
         seed: of the navigation.
         origin: what else it followed from, such as target and policy.
 
@@ -57,7 +61,9 @@ def write_episode(
         anatomy_shares=(1.0, 0.0, 0.0),
         seen_test_share=0.0,
     )
-    layout = make_layout([anatomy_folder], output, device, config, task=task, origin=dict(origin))
+    moved = {"motion": None if motion is None else asdict(motion)}
+    layout = make_layout([anatomy_folder], output, device, config, task=task, origin={**origin, **moved})
+    layout = replace(layout, motions=(motion,))  # it was not drawn with the seed
     (block,) = layout.blocks()
     claim(output, "endopilot navigate", **layout.settings)
     start = np.column_stack([rollout.initial_inserted_length, rollout.initial_rotation])

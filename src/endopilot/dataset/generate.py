@@ -167,6 +167,12 @@ def describe(layout: Layout, blocks: Sequence[Block]) -> None:
 
 
 def _anatomy_record(layout: Layout, index: int) -> dict[str, Any]:
-    """Return name, folder relative to the dataset, and identity of an anatomy."""
+    """Return name, folder relative to the dataset, identity and motion of an anatomy."""
     folder = os.path.relpath(layout.folders[index].resolve(), layout.context.output.resolve())
-    return {"name": layout.names[index], "folder": folder, "sha256": layout.identities[index]}
+    motion = layout.motions[index]
+    return {
+        "name": layout.names[index],
+        "folder": folder,
+        "sha256": layout.identities[index],
+        "motion": None if motion is None else asdict(motion),
+    }

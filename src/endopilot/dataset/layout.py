@@ -16,11 +16,13 @@ from endopilot import __version__
 from endopilot.anatomy.io import read_anatomy
 from endopilot.dataset import schema
 from endopilot.dataset.config import DatasetConfig
+from endopilot.dataset.draw import patient_motion
 from endopilot.dataset.splits import assign_splits
 from endopilot.errors import InputError
 from endopilot.files import json_text, read_json
 from endopilot.simulation.catheter import Catheter, check_nested
 from endopilot.simulation.device import Device
+from endopilot.simulation.motion import Motion
 
 FORMAT_VERSION = 5
 """Counts changes of the columns or of their meaning."""
@@ -80,6 +82,7 @@ class Layout:
         names: their names.
         identities: their SHA-256s.
         splits: of every navigation.
+        motions: how the vessel of each anatomy moves; None for one that lies still.
         settings: what a resumed run must share with the run it continues, as plain JSON values.
     """
 
@@ -88,6 +91,7 @@ class Layout:
     names: tuple[str, ...]
     identities: tuple[str, ...]
     splits: Shaped[np.ndarray, "anatomies sequences"]
+    motions: tuple[Motion | None, ...]
     settings: dict[str, Any]
 
     def blocks(self) -> list[Block]:
@@ -151,7 +155,8 @@ def make_layout(
     settings = json.loads(json_text(settings))  # as JSON gives them back, so that they compare equal
     key = hashlib.sha256(json_text(settings).encode()).hexdigest()
     context = BlockContext(Path(output), config, device, key, task, tuple(catheters))
-    return Layout(context, tuple(map(Path, folders)), names, identities, splits, settings)
+    motions = tuple(patient_motion(config, name) for name in names)
+    return Layout(context, tuple(map(Path, folders)), names, identities, splits, motions, settings)
 
 
 def version() -> str:

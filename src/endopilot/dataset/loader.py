@@ -10,8 +10,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
-from endopilot.dataset.config import DatasetConfig
-from endopilot.dataset.draw import patient_motion
 from endopilot.dataset.layout import identify, version
 from endopilot.dataset.schema import (
     INFO_PATH,
@@ -186,7 +184,11 @@ class Dataset:
 
     def motion(self, anatomy: str) -> Motion | None:
         """Return how the vessel of an anatomy, given by name, moves in the episodes; None if it lies still."""
-        return patient_motion(DatasetConfig(**self.manifest["config"]), anatomy)
+        found = self._record(anatomy).get("motion")
+        return None if found is None else Motion(**found)
+
+    def _record(self, anatomy: str) -> dict[str, Any]:
+        return next(record for record in self.manifest["anatomies"] if record["name"] == anatomy)
 
     def anatomy_folder(self, name: str) -> Path:
         """Return the folder of an anatomy of the dataset.
@@ -194,7 +196,7 @@ class Dataset:
         Raises:
             InputError: the anatomy is missing, or is another one than the dataset was made in.
         """
-        record = next(record for record in self.manifest["anatomies"] if record["name"] == name)
+        record = self._record(name)
         folder = (self.folder / record["folder"]).resolve()
         if identify(folder) != (name, record["sha256"]):
             raise InputError(f"{folder}: is not the anatomy that {self.folder} was made in; make the dataset again")

@@ -171,6 +171,7 @@ def _write_episode(found: PatientNavigation, anatomy_folder: Path, output: Path)
         friction=device.friction * truth.friction_factor,
         tip_stiffness_factor=truth.stiffness_factor,
         simulator=set_up.simulator,
+        motion=set_up.motion,
         seed=set_up.config.seed,
         origin={
             "target": asdict(set_up.navigation.target),
