@@ -9,10 +9,12 @@ import pytest
 from scipy.spatial import KDTree
 from shapes import BLOOD_HU, FAT_HU, dice, empty_grid, inside_tube, positions, scan
 
+from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.cli import segment as segment_command
 from endopilot.errors import InputError
 from endopilot.imaging.segment import SegmentConfig, segment
 from endopilot.imaging.volume import write_volume
+from endopilot.phantom.phantom import PhantomConfig, make_phantom
 from endopilot.types import Volume
 
 CTA = Path(__file__).parents[3] / "shared" / "data" / "cta_thorax" / "cta_thorax_1p5mm.nii.gz"
@@ -85,6 +87,14 @@ def test_the_left_tree_is_another_one(heart):
     assert left.ostium is not None
     assert left.ostium.position[0] > 15.0
     assert positions(heart[0])[left.volume.voxels][:, 0].min() > 14.0
+
+
+def test_an_artery_beside_a_chamber_is_not_taken_for_a_part_of_it():
+    """A Gaussian of 1 mm closes the fat between them, and another vessel, 36 mm away, is taken for the right artery."""
+    patient = make_patient(AtlasConfig(anatomy="rca", seed=0, population="textbook"), 0)
+    ct = make_phantom(patient, PhantomConfig(in_plane_mm=1.0, slice_mm=1.0), 0)
+    found = segment(ct, SegmentConfig(method="coronary", vessel="rca"))
+    assert np.linalg.norm(found.ostium.position - patient.insertion.position) < 0.5
 
 
 def test_seeds_choose_the_vessel(heart, right_tree):

@@ -51,7 +51,7 @@ class NavigationLoop:
 
     `navigate` is a plain loop over it. A program that shows the navigation starts, pauses and ends it by calling `step`
     or not. Whoever takes over gives decisions of their own; the policy watches. It goes on when none is given, with
-    X-ray on at its first decision:
+    X-ray on at its first decision::
 
         loop = NavigationLoop(navigation, "agent", seed=1)
         while loop.reason is None:

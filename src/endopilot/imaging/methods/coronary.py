@@ -46,8 +46,9 @@ _POOL_RADIUS_MM = 3.5
 _CORE_RADIUS_MM = 5.5
 _NEAR_CORE_MM = 4.0
 """A ball of this radius fits in no dilated artery either: what is wide so near to where it fits is a pool."""
-_CORE_SMOOTHING_MM = 1.0
-"""Width of the Gaussian against noise where the large balls are sought, mm."""
+_CORE_MEDIAN = 3
+"""Edge of the median filter against noise where the large balls are sought, voxels of the body's grid. A Gaussian would
+close the fat between an artery and a pool."""
 _RESPONSE = 0.15
 """Vesselness of a vessel's voxels."""
 _SCALES_MM = (0.6, 0.9, 1.3, 1.9, 2.8)
@@ -209,7 +210,7 @@ def _pools(body: Volume, level_hu: float, grid: Volume) -> Bool[np.ndarray, "nz 
     """Return where blood above a level is thick and near to where it is thicker than in any artery of the heart."""
     depth = distance_to_outside(body.voxels > level_hu, _BODY_GRID_MM)
     # Noise leaves holes in a dim pool, between which no large ball fits.
-    smooth = np.asarray(ndimage.gaussian_filter(body.voxels, _CORE_SMOOTHING_MM / _BODY_GRID_MM))
+    smooth = np.asarray(ndimage.median_filter(body.voxels, _CORE_MEDIAN))
     core_depth = distance_to_outside(smooth > level_hu, _BODY_GRID_MM)
     from_core = _beyond_balls(core_depth, _CORE_RADIUS_MM) - _NEAR_CORE_MM
     return _inside(np.maximum(_beyond_balls(depth, _POOL_RADIUS_MM), from_core), body, grid)
