@@ -11,6 +11,8 @@ from endopilot.control.plan import plan
 from endopilot.control.plan_config import PlanConfig
 from endopilot.control.plan_file import write_plan
 from endopilot.control.plan_xray import plan_xray, read_calibration
+from endopilot.errors import InputError
+from endopilot.simulation.catheter import read_catheter
 
 
 def command(
@@ -21,6 +23,7 @@ def command(
     output: OutputFolder,
     model: Path | None = None,
     device: str | None = None,
+    catheter: tuple[str, ...] = (),
     xray: bool = False,
     json: bool = False,
     config: PlanConfig = PlanConfig(),
@@ -36,12 +39,17 @@ def command(
             the methods inverse and mppi.
         device: name of a device (`endopilot devices`) or a YAML file; by default the model's device, or workhorse-014
             without a model.
+        catheter: one around the wire, which is planned for too (method twin): a name such as microcatheter-1.7f, or a
+            YAML file.
         xray: also predict when X-ray will be needed, with the calibration that `endopilot advise` wrote into the run
             (inverse, mppi), or with that of the agent's simulated wires (other methods).
         json: print the figures as JSON.
         config: method, limits and cost.
     """
+    if xray and catheter:
+        raise InputError("--xray: is foreseen for a wire alone; leave --xray or --catheter out")
     calibration = read_calibration(config, model) if xray else None
-    found = plan(existing(anatomy), target, config, model=model, device=device)
+    catheters = [read_catheter(name) for name in catheter]
+    found = plan(existing(anatomy), target, config, model=model, device=device, catheters=catheters)
     needed = None if calibration is None else plan_xray(found, calibration)
     show(write_plan(found, output, needed), as_json=json)

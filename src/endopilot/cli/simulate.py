@@ -14,7 +14,6 @@ from endopilot.anatomy.io import read_anatomy
 from endopilot.cli.arguments import OutputFile, existing, show
 from endopilot.control.plan_file import read_plan
 from endopilot.dataset.navigations import simulate_navigations
-from endopilot.errors import InputError
 from endopilot.progress import progress
 from endopilot.settings import Count, Seed, Within, settings
 from endopilot.simulation.catheter import read_catheter
@@ -82,12 +81,9 @@ def command(
     wire, catheters = read_device(device), tuple(read_catheter(name) for name in catheter)
     moves, period_s = motion_named(motion, motion_seed), SAMPLE_PERIOD_S
     if controls is not None and controls.is_dir():
-        if catheters:
-            raise InputError(f"--controls {controls}: a plan drives a wire alone; leave --catheter out")
-        plan = read_plan(controls, patient, wire)
+        plan = read_plan(controls, patient, wire, catheters)
         patient, wire = plan.navigation.anatomy, plan.navigation.device
-        begin = plan.navigation.start_inserted_mm, plan.navigation.start_rotation
-        initial, control = np.array([begin]), plan.control[None]
+        initial, control = plan.navigation.start[None], plan.control[None]
     elif controls is not None:
         script = read_controls_csv(existing(controls), catheters=len(catheters))
         initial, control, period_s = script.initial, script.control, script.period_s

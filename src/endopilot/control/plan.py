@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
 from endopilot.anatomy.io import read_anatomy
+from endopilot.anatomy.projection import project_tip
 from endopilot.control.agent import AgentConfig, TwinPolicy
 from endopilot.control.belief import BeliefConfig
 from endopilot.control.course import Course
 from endopilot.control.desired import last_place, read_tips, tips_along
 from endopilot.control.navigate import NavigateConfig, navigate
-from endopilot.control.plan_config import NETWORK_METHODS, Plan, PlanConfig, Steps
+from endopilot.control.plan_config import NETWORK_METHODS, Controls, Plan, PlanConfig, Steps
+from endopilot.control.plan_pair import check_pair, search_pair
 from endopilot.control.robot import RobotConfig
 from endopilot.control.route import Route, check_passable, parse_target
 from endopilot.control.search import SearchConfig
@@ -25,6 +27,7 @@ from endopilot.extras import extra_named
 from endopilot.models.config import read_run
 from endopilot.progress import progress
 from endopilot.settings import from_record
+from endopilot.simulation.catheter import Catheter
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import Device, read_device
 from endopilot.simulation.drive_limits import DriveLimits
@@ -48,6 +51,7 @@ def plan(
     *,
     model: str | Path | None = None,
     device: Device | str | Path | None = None,
+    catheters: Sequence[Catheter] = (),
 ) -> Plan:
     """Plan a navigation.
 
@@ -58,15 +62,18 @@ def plan(
         model: run made by `endopilot train`, or "pretrained", the model of the package; needed for the methods inverse
             and mppi.
         device: the wire, its name or its YAML file; the model's if not given, the workhorse if there is none.
+        catheters: one around the wire, which is then planned for too, by the method twin.
 
     Raises:
         InputError: a target outside the tree, behind an occlusion or too far for the time; a model of another device or
             without the network that the method needs; with the method twin, no path found, or one that in the rod core
-            at its own settings breaks the force limit or does not reach the target.
+            at its own settings breaks the force limit or does not reach the target; more than one catheter, or what
+            is for a wire alone with one.
     """
     config = config or PlanConfig()
     vessel = anatomy if isinstance(anatomy, Anatomy) else read_anatomy(anatomy)
     model = None if model is None else Path(model)
+    check_pair(catheters, config, target, model)
     wire = _wire(model, device, config.method)
     tips = (
         read_tips(Path(target), wire.max_velocity_mm_s, config.start_inserted_mm) if target.endswith(".csv") else None
@@ -76,13 +83,16 @@ def plan(
         anatomy=vessel,
         device=wire,
         target=goal,
+        catheters=tuple(catheters),
+        arrives=config.arrives,
         start_inserted_mm=config.start_inserted_mm,
         start_rotation=config.start_rotation,
         seconds=config.seconds if tips is None else len(tips) * DECISION_PERIOD_S,
         force_limit_n=config.force_limit_n,
     )
     route = Route.to(vessel, goal)
-    check_passable(route, wire)
+    for each in navigation.devices:
+        check_passable(route, each)
     choice, began = None, _clock()
     if model is None:
         choice = choose_tip(navigation, config.tip, catheter_tilt_deg=config.catheter_tilt_deg)
@@ -106,6 +116,7 @@ def plan(
     else:
         desired = tips[["abscissa", "offset"]].to_numpy(float)
     made, trials = None, _TRIALS if config.method == "twin" and tips is None else 1
+    trials = min(trials, 2) if catheters else trials  # nothing of theirs is drawn at random
     for trial in range(trials):
         find = _method(navigation, config, model, desired, route, follow=tips is not None, trial=trial)
         began = _clock()
@@ -128,7 +139,7 @@ def _clock() -> Float[np.ndarray, "2"]:
 def _method(
     navigation: Navigation, config: PlanConfig, model: Path | None, desired: Steps, route: Route, *,
     follow: bool, trial: int,
-) -> Callable[[], tuple[Steps, Steps]]:  # fmt: skip
+) -> Callable[[], tuple[Controls, Steps]]:  # fmt: skip
     """Return a function that finds controls and predicts their tips; loading a model is done before it is called."""
     if config.method in NETWORK_METHODS:
         with extra_named(f"plan by {config.method}"):
@@ -136,6 +147,8 @@ def _method(
 
         assert model is not None
         return network_planner(navigation, model, desired, route, config)
+    if navigation.catheters:
+        return lambda: search_pair(navigation, config, trial)
     if config.method != "twin":
         return lambda: _by_policy(navigation, config)
     return lambda: _track(navigation, desired) if follow else _search(navigation, config, trial)
@@ -207,7 +220,7 @@ def _check_kept(made: Plan) -> None:
             f"with {made.force.max():.3g} N; give a larger force_limit_n, another seed or a softer wire"
         )
     if not made.reached:
-        tip = made.simulated
+        tip = made.arriving_tip
         far, branch = float(tip.abscissa[-1]), int(tip.branch[-1])
         where = f"at {far:.1f} of {navigation.target.abscissa:.1f} mm"
         if branch != navigation.target.branch:
@@ -247,16 +260,31 @@ def _by_policy(navigation: Navigation, config: PlanConfig) -> tuple[Steps, Steps
 
 def _checked(
     navigation: Navigation, config: PlanConfig, model: Path | None, choice: TipChoice | None,
-    desired: Float[np.ndarray, "wanted 2"], control: Steps, predicted: Steps, spent: Float[np.ndarray, "2"],
+    desired: Float[np.ndarray, "wanted 2"], control: Controls, predicted: Steps, spent: Float[np.ndarray, "2"],
 ) -> Plan:  # fmt: skip
     """Put the controls within the limits, drive the rod core with them, and return the plan."""
-    limits = DriveLimits.of(navigation.device, navigation.anatomy)
-    control = within_limits(control, limits, navigation.start_inserted_mm)
-    start = np.array([navigation.start_inserted_mm, navigation.start_rotation])
+    start = navigation.start
+    parts = [
+        within_limits(control[:, 2 * k : 2 * k + 2], DriveLimits.of(device, navigation.anatomy), start[2 * k])
+        for k, device in enumerate(navigation.devices)
+    ]
+    control = np.concatenate(parts, axis=1)
     rollout = simulate(
-        navigation.anatomy, navigation.device, control[None], initial=start[None], config=SimulatorConfig(threads=1)
+        navigation.anatomy,
+        navigation.device,
+        control[None],
+        catheters=navigation.catheters,
+        initial=start[None],
+        config=SimulatorConfig(threads=1),
     )
     tip = TipProjection(**{name: getattr(rollout.tip, name)[0] for name in TipProjection.__dataclass_fields__})
+    catheter_position = None if rollout.catheters is None else rollout.catheters.tip_position[0, :, 0]
+    catheter_tip = (
+        None
+        if catheter_position is None
+        else project_tip(navigation.anatomy.tree, navigation.anatomy.insertion, catheter_position)
+    )
+    tips = (tip,) if catheter_tip is None else (tip, catheter_tip)
     wanted = np.concatenate([desired, np.repeat(desired[-1:], max(len(control) - len(desired), 0), axis=0)])
     return Plan(
         navigation=navigation,
@@ -269,11 +297,13 @@ def _checked(
         simulated=tip,
         position=rollout.tip_position[0],
         force=rollout.contact_force_max[0],
-        reached=bool(navigation.reached(tip).any()),
+        reached=bool(navigation.reached(*tips).any()),
         why=choice.why if choice else "",
         tilt_deg=choice.tilt_deg if choice else 0.0,
         seconds_to_plan=float(spent[0]),
         processor_seconds=float(spent[1]),
+        catheter_tip=catheter_tip,
+        catheter_position=catheter_position,
     )
 
 

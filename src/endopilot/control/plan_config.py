@@ -13,13 +13,14 @@ from endopilot.control.cost import Cost
 from endopilot.control.set_up import TILT_DEG
 from endopilot.settings import Count, Finite, NonNegative, Positive, Seed, Text, Within, settings
 from endopilot.simulation.drive_limits import DriveLimits
-from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
+from endopilot.tasks.navigation import DECISION_PERIOD_S, Arrives, Navigation
 from endopilot.types import TipProjection
 
 Method = Literal["twin", "inverse", "mppi", "forward", "spin", "retract-rotate"]
 NETWORK_METHODS = ("inverse", "mppi")
 """Methods that ask a trained network."""
 Steps = Float[np.ndarray, "samples 2"]
+Controls = Float[np.ndarray, "samples numbers"]
 
 
 @settings
@@ -54,6 +55,8 @@ class PlanConfig:
     as 75/5, 75 degrees over 5 mm. A trained model goes with its device's own."""
     catheter_tilt_deg: Annotated[float, Within(0, 45)] = TILT_DEG
     """How far the guiding catheter may be turned at the ostium where a fork cannot be entered otherwise, degrees."""
+    arrives: Arrives = "wire"
+    """Whose tip is to go to the target: wire, or catheter, the one around the wire."""
     start_inserted_mm: NonNegative = 2.0
     """Inserted length at the start, mm."""
     start_rotation: Finite = 0.0
@@ -76,12 +79,14 @@ class Plan:
         navigation: what is to be done.
         config: its settings.
         model: the trained run that it was found with, if any.
-        control: π, mm/s and rad/s.
-        proximal: (Δ mm, φ rad), its integral.
+        control: π, mm/s and rad/s, of the wire, then of a catheter.
+        proximal: (Δ mm, φ rad), its integral, likewise.
         desired: desired tip states (Δtip, γtip), mm.
         predicted: tip states that the model predicts, mm.
         simulated: where the rod core, at its own settings, has the tip under these controls.
         position: of that tip, LPS mm.
+        catheter_tip: where the catheter's tip lies then; None for a wire alone.
+        catheter_position: of that tip, LPS mm; None likewise.
         force: largest wall force on one node in the rod core, N.
         reached: whether the target is reached at the end of a period in the rod core.
         why: why the tip has its shape and the catheter its axis; empty where both are the given ones.
@@ -93,8 +98,8 @@ class Plan:
     navigation: Navigation
     config: PlanConfig
     model: str | None
-    control: Steps
-    proximal: Steps
+    control: Controls
+    proximal: Controls
     desired: Steps
     predicted: Steps
     simulated: TipProjection
@@ -105,6 +110,8 @@ class Plan:
     tilt_deg: float
     seconds_to_plan: float
     processor_seconds: float
+    catheter_tip: TipProjection | None = None
+    catheter_position: Float[np.ndarray, "samples 3"] | None = None
 
     @property
     def seconds(self) -> float:
@@ -118,22 +125,27 @@ class Plan:
         return safety_ratio(tip.offset, tip.radius, self.navigation.device.tip_radius_mm)
 
     @property
+    def arriving_tip(self) -> TipProjection:
+        """Where the tip that is to go to the target lies in the rod core."""
+        return self.catheter_tip if self.navigation.arriving and self.catheter_tip is not None else self.simulated
+
+    @property
     def within_force_limit(self) -> bool:
         """Whether no node ever presses on the wall with more than the navigation's limit, in the rod core."""
         return bool(self.force.max() <= self.navigation.force_limit_n)
 
     def cost_terms(self) -> dict[str, float]:
-        """Return what each term of the cost comes to in the rod core, mm."""
+        """Return what each term of the cost comes to in the rod core, mm; all but `end` are the wire's."""
         device, weights = self.navigation.device, self.config.cost
         error = np.abs(self.simulated.abscissa - self.desired[:, 0])
         share = self.force / self.navigation.force_limit_n
         fastest = DriveLimits.of(device).fastest
         h = DECISION_PERIOD_S
         return {
-            "end": abs(float(self.simulated.abscissa[-1]) - self.navigation.target.abscissa),
+            "end": abs(float(self.arriving_tip.abscissa[-1]) - self.navigation.target.abscissa),
             "tip": float(weights.tip_weight * error.sum() * h),
             "ratio": float(weights.ratio_weight * (np.maximum(self.ratio - weights.safe_ratio, 0) ** 2).sum() * h),
             "force": float(weights.force_weight * (share**2).sum() * h),
             "time": float(weights.time_weight * len(error) * h),
-            "smooth": float(weights.roughness(self.control[:-1], self.control[1:], fastest).sum()),
+            "smooth": float(weights.roughness(self.control[:-1, :2], self.control[1:, :2], fastest).sum()),
         }

@@ -18,12 +18,14 @@ xray                                              1 where an exposure will be du
 band_tip_abscissa_mm, band_tip_offset_mm          half-widths of the adviser's bands around the prediction
 ================================================  ====================================================================
 
-The last three are there if the plan holds X-ray.
+The last three are there if the plan holds X-ray. A plan for wire and catheter has columns `catheter_1_...` too:
+translation, rotation, inserted length and rotation, tip and lumen radius of the catheter.
 """
 
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -38,10 +40,13 @@ from endopilot.control.set_up import tip_name
 from endopilot.errors import InputError
 from endopilot.files import json_text, manifest, read_json, sha256, writing
 from endopilot.settings import from_record
+from endopilot.simulation.catheter import Catheter
 from endopilot.simulation.device import Device
+from endopilot.simulation.tubes import Stack
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target
 from endopilot.types import Anatomy, TipProjection
 
+_CATHETER = "catheter_1_"
 _TABLE, _RECORD, PICTURE = "plan.csv", "manifest.json", "plan.png"
 _COLUMNS = (
     "time_s", "translation_mm_s", "rotation_rad_s", "inserted_length_mm", "rotation_rad",
@@ -70,8 +75,9 @@ def write_plan(plan: Plan, folder: Path, xray: PlannedXray | None = None) -> dic
     navigation, tip = plan.navigation, plan.simulated
     values = np.column_stack(
         [
-            DECISION_PERIOD_S * np.arange(1, len(plan.control) + 1), plan.control, plan.proximal, plan.desired,
-            plan.predicted, tip.abscissa, tip.offset, tip.branch, plan.position, tip.radius, plan.ratio, plan.force,
+            DECISION_PERIOD_S * np.arange(1, len(plan.control) + 1), plan.control[:, :2], plan.proximal[:, :2],
+            plan.desired, plan.predicted, tip.abscissa, tip.offset, tip.branch, plan.position, tip.radius, plan.ratio,
+            plan.force,
         ]
     )  # fmt: skip
     figures = {
@@ -83,7 +89,7 @@ def write_plan(plan: Plan, folder: Path, xray: PlannedXray | None = None) -> dic
         "within_force_limit": plan.within_force_limit,
         "seconds": plan.seconds,
         "target_mm": round(navigation.target.abscissa, 2),
-        "tip_error_mm": round(float(np.abs(tip.abscissa[-1] - navigation.target.abscissa)), 3),
+        "tip_error_mm": round(float(np.abs(plan.arriving_tip.abscissa[-1] - navigation.target.abscissa)), 3),
         "model_error_mm": round(float(np.abs(plan.predicted[:, 0] - tip.abscissa).mean()), 3),
         "peak_force_n": round(float(plan.force.max()), 4),
         "largest_safety_ratio": round(float(plan.ratio.max()), 3),
@@ -97,6 +103,9 @@ def write_plan(plan: Plan, folder: Path, xray: PlannedXray | None = None) -> dic
         partial.mkdir()
         table = pd.DataFrame(values, columns=list(_COLUMNS))
         table["branch"] = table["branch"].astype(int)
+        if plan.catheter_tip is not None and plan.catheter_position is not None:
+            for name, values in _of_catheter(plan, plan.catheter_tip, plan.catheter_position).items():
+                table[f"{_CATHETER}{name}"] = values
         if xray is not None:
             table["xray"] = xray.exposure.astype(int)
             table["band_tip_abscissa_mm"], table["band_tip_offset_mm"] = xray.half_width.T
@@ -108,6 +117,7 @@ def write_plan(plan: Plan, folder: Path, xray: PlannedXray | None = None) -> dic
             inputs={},
             anatomy={"name": navigation.anatomy.name, "identity": navigation.anatomy.identity},
             device=asdict(navigation.device),
+            **({"catheters": [asdict(each) for each in navigation.catheters]} if navigation.catheters else {}),
             catheter_axis=navigation.anatomy.insertion.direction.tolist() if plan.tilt_deg else None,
             model=plan.model,
             target=asdict(navigation.target),
@@ -122,8 +132,23 @@ def write_plan(plan: Plan, folder: Path, xray: PlannedXray | None = None) -> dic
     return {"plan": str(folder), **figures}
 
 
-def read_plan(folder: Path, anatomy: Anatomy, device: Device) -> Plan:
-    """Read a plan that `write_plan` wrote, for the anatomy and the wire that it was made for.
+def _of_catheter(plan: Plan, tip: TipProjection, position: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the columns of the catheter."""
+    return {
+        "translation_mm_s": plan.control[:, 2],
+        "rotation_rad_s": plan.control[:, 3],
+        "inserted_length_mm": plan.proximal[:, 2],
+        "rotation_rad": plan.proximal[:, 3],
+        "tip_abscissa_mm": tip.abscissa,
+        "tip_offset_mm": tip.offset,
+        "branch": tip.branch,
+        "lumen_radius_mm": tip.radius,
+        **{f"tip_{axis}_mm": position[:, k] for k, axis in enumerate("xyz")},
+    }
+
+
+def read_plan(folder: Path, anatomy: Anatomy, device: Device, catheters: Sequence[Catheter] = ()) -> Plan:
+    """Read a plan that `write_plan` wrote, for the anatomy and the devices that it was made for.
 
     The plan's own wire has the tip, and its anatomy the catheter's axis, that were chosen for it.
 
@@ -147,21 +172,42 @@ def read_plan(folder: Path, anatomy: Anatomy, device: Device) -> Plan:
         )
     planned = from_record(Device, record["device"])
     tip = {"tip_bend_rad": planned.tip_bend_rad, "tip_bend_length_mm": planned.tip_bend_length_mm}
-    if planned.constants != replace(device, **tip).constants:
-        raise InputError(f"{folder}: the plan is for another device ({planned.name}), not for {device.name}; plan anew")
+    around = tuple(from_record(Catheter, catheter) for catheter in record.get("catheters", ()))
+    if Stack(planned, around).constants != Stack(replace(device, **tip), tuple(catheters)).constants:
+        names = [
+            " in ".join([wire.name, *(each.name for each in others)])
+            for wire, others in ((planned, around), (device, catheters))
+        ]
+        raise InputError(
+            f"{folder}: the plan is for another device ({names[0]}), not for {names[1]}; plan anew, or give the plan's"
+        )
     if not (folder / _TABLE).exists() or sha256(folder / _TABLE) != record["table_sha256"]:
         raise InputError(f"{folder / _TABLE}: is missing or differs from what {_RECORD} records; plan anew")
     table = pd.read_csv(folder / _TABLE)
-    column = {name: table[name].to_numpy() for name in _COLUMNS}
+    column = {str(name): table[name].to_numpy() for name in table.columns}
+    prefixes = ["", *(_CATHETER for _ in around)]
 
     def pair(first: str, second: str) -> np.ndarray:
         return np.column_stack([column[first], column[second]])
+
+    def tip_of(prefix: str) -> TipProjection:
+        return TipProjection(
+            abscissa=column[f"{prefix}tip_abscissa_mm"],
+            offset=column[f"{prefix}tip_offset_mm"],
+            branch=column[f"{prefix}branch"],
+            radius=column[f"{prefix}lumen_radius_mm"],
+        )
+
+    def position_of(prefix: str) -> np.ndarray:
+        return np.column_stack([column[f"{prefix}tip_{axis}_mm"] for axis in "xyz"])
 
     return Plan(
         navigation=Navigation(
             anatomy=anatomy,
             device=planned,
             target=Target(**record["target"]),
+            catheters=around,
+            arrives=config.arrives,
             start_inserted_mm=record["start"]["inserted_length_mm"],
             start_rotation=record["start"]["rotation_rad"],
             seconds=record["limits"]["seconds"],
@@ -169,21 +215,18 @@ def read_plan(folder: Path, anatomy: Anatomy, device: Device) -> Plan:
         ),
         config=config,
         model=record["model"],
-        control=pair("translation_mm_s", "rotation_rad_s"),
-        proximal=pair("inserted_length_mm", "rotation_rad"),
+        control=np.hstack([pair(f"{each}translation_mm_s", f"{each}rotation_rad_s") for each in prefixes]),
+        proximal=np.hstack([pair(f"{each}inserted_length_mm", f"{each}rotation_rad") for each in prefixes]),
         desired=pair("desired_tip_abscissa_mm", "desired_tip_offset_mm"),
         predicted=pair("predicted_tip_abscissa_mm", "predicted_tip_offset_mm"),
-        simulated=TipProjection(
-            abscissa=column["tip_abscissa_mm"],
-            offset=column["tip_offset_mm"],
-            branch=column["branch"],
-            radius=column["lumen_radius_mm"],
-        ),
-        position=np.column_stack([column[f"tip_{axis}_mm"] for axis in "xyz"]),
+        simulated=tip_of(""),
+        position=position_of(""),
         force=column["contact_force_n"],
         reached=record["reached"],
         why=record["why"],
         tilt_deg=record["catheter_tilt_deg"],
         seconds_to_plan=record["seconds_to_plan"],
         processor_seconds=record["processor_seconds"],
+        catheter_tip=tip_of(_CATHETER) if around else None,
+        catheter_position=position_of(_CATHETER) if around else None,
     )

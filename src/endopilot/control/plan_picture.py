@@ -23,7 +23,8 @@ def draw_plan(plan: Plan, path: Path, xray: PlannedXray | None = None) -> None:
     """Write a PNG of a plan, with the X-ray that it will need if that is known."""
     figure = plt.figure(figsize=(13, 8), facecolor="white", layout="constrained")
     grid = figure.add_gridspec(4, 2, width_ratios=(1.0, 1.25))
-    title = f"{plan.navigation.anatomy.name}, {plan.navigation.device.name}: {plan.config.method}"
+    names = " in ".join(device.name for device in plan.navigation.devices)
+    title = f"{plan.navigation.anatomy.name}, {names}: {plan.config.method}"
     draw_route(figure.add_subplot(grid[:, 0]), plan.navigation, plan.position, title)
     time_s = DECISION_PERIOD_S * np.arange(1, len(plan.control) + 1)
     panels = [figure.add_subplot(grid[row, 1]) for row in range(4)]
@@ -36,6 +37,9 @@ def draw_plan(plan: Plan, path: Path, xray: PlannedXray | None = None) -> None:
     edges = np.append(0.0, time_s)
     for axis, color, label in ((0, "tab:blue", "translation, mm/s"), (1, "tab:orange", "rotation, rad/s")):
         panels[3].stairs(plan.control[:, axis], edges, baseline=None, color=color, linewidth=1.5, label=label)
+    for axis, color, label in ((2, "tab:cyan", "catheter, mm/s"), (3, "tab:red", "catheter, rad/s")):
+        if axis < plan.control.shape[1]:
+            panels[3].stairs(plan.control[:, axis], edges, baseline=None, color=color, linestyle=":", label=label)
     legend_above(panels[3])
     panels[3].set_ylabel("control")
     panels[3].set_xlabel("time, s")
@@ -76,6 +80,8 @@ def _draw_tip(plan: Plan, time_s: np.ndarray, axes: Axes) -> None:
     axes.plot(time_s, plan.desired[:, 0], color="tab:green", label="desired")
     axes.plot(time_s, plan.predicted[:, 0], color="tab:orange", linestyle="--", label="predicted by the model")
     axes.plot(time_s, tip.abscissa, color="tab:blue", linewidth=1, label="in the rod core")
+    if plan.catheter_tip is not None:
+        axes.plot(time_s, plan.catheter_tip.abscissa, color="tab:cyan", linewidth=1, label="the catheter's")
     if off_route.any():
         axes.plot(time_s[off_route], tip.abscissa[off_route], "x", color="tab:red", label="in a wrong branch")
     for junction in route.junctions:

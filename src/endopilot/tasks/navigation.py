@@ -103,6 +103,12 @@ class Navigation:
         """Place among `devices` of the one whose tip is to go to the target."""
         return _ARRIVING[self.arrives]
 
+    @property
+    def start(self) -> Float[np.ndarray, "numbers"]:
+        """(Δ mm, φ rad) at the start, of the wire, then of each catheter, as `simulate` takes them."""
+        catheters = [self.start_catheter_mm, 0.0] * len(self.catheters)
+        return np.array([self.start_inserted_mm, self.start_rotation, *catheters])
+
     def reached(self, *tips: TipProjection) -> Bool[np.ndarray, "..."]:
         """Return which worlds have reached the target, see `reached`.
 
