@@ -25,8 +25,8 @@ from endopilot.files import read_json, write_json
 from endopilot.ladder.ladder import identity
 from endopilot.runs import claim, make_missing
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
-from endopilot.tasks.task import CORE, Task, find_task, ladder_tasks
-from endopilot.xray.bands import Calibration, conformal_scale, fit_spread, spread_of
+from endopilot.tasks.task import CORE, NEWEST, Task, find_task, ladder_tasks
+from endopilot.xray.bands import Calibration, balanced, conformal_scale, fit_spread, spread_of
 
 ROOT = Path(__file__).parents[1]
 ROLES = {"fit": range(4), "calibrate": range(4, 9), "test": range(3)}
@@ -114,19 +114,20 @@ def gather(folder: Path, role: str) -> tuple[list[tuple[np.ndarray, ...]], np.nd
     return rows, np.array(owner)
 
 
-def scores(rows: list[tuple[np.ndarray, ...]], terms: tuple[tuple[float, ...], tuple[float, ...]]) -> np.ndarray:
-    """Return of each interval the largest error over the spread."""
-    return np.array([np.max(np.abs(error) / spread_of(terms, *rest)) for error, *rest in rows])
+def worst(rows: list[tuple[np.ndarray, ...]], terms: tuple[tuple[float, ...], tuple[float, ...]]) -> np.ndarray:
+    """Return of each interval the largest error over the spread, of Δtip and of γtip."""
+    return np.array([np.max(np.abs(error) / spread_of(terms, *rest), axis=0) for error, *rest in rows])
 
 
 def calibrate(folder: Path) -> tuple[Calibration, list[str]]:
     """Return the calibration, and a table of its coverage as lines of Markdown."""
     fitted, _ = gather(folder, "fit")
     terms = fit_spread(*(np.concatenate(column) for column in zip(*fitted, strict=True)))
+    terms = balanced(terms, worst(fitted, terms), LEVEL)
     rows, owner = gather(folder, "calibrate")
     calibration = Calibration(
         level=LEVEL,
-        scale=conformal_scale(scores(rows, terms), owner, LEVEL),
+        scale=conformal_scale(worst(rows, terms).max(axis=1), owner, LEVEL),
         abscissa_terms=terms[0],
         offset_terms=terms[1],
         anatomies=len(np.unique(owner)),
@@ -136,7 +137,7 @@ def calibrate(folder: Path) -> tuple[Calibration, list[str]]:
     lines = ["| patients | intervals without X-ray | in which both bands hold throughout |", "|---|---|---|"]
     for title, role in (("calibrated on", "calibrate"), ("the ladder's, not calibrated on", "test")):
         rows, owner = gather(folder, role)
-        held = float(np.mean(scores(rows, terms) <= calibration.scale))
+        held = float(np.mean(worst(rows, terms).max(axis=1) <= calibration.scale))
         lines.append(f"| {title}: {len(np.unique(owner))} | {len(rows)} | {100 * held:.1f} % |")
     half = calibration.scale * np.concatenate([spread_of(terms, *rest) for _, *rest in rows])
     error = np.abs(np.concatenate([row[0] for row in rows]))
@@ -160,7 +161,7 @@ def main() -> None:
         for place in places
     ]
     try:
-        claim(folder, "benchmarks/agent_calibration.py", **identity("agent"), agent=AgentConfig())
+        claim(folder, "benchmarks/agent_calibration.py", **identity("agent", NEWEST), agent=AgentConfig())
         make_missing("Calibrating the agent's adviser", wanted, measure)
     except InputError as error:
         raise SystemExit(str(error)) from error

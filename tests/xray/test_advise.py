@@ -103,6 +103,45 @@ def test_an_observation_changes_later_predictions_and_nothing_before(split) -> N
     np.testing.assert_array_equal(model.tip, before)
 
 
+class Errs:
+    """Errs by given amounts and states no spread."""
+
+    def __init__(self, tip: np.ndarray) -> None:
+        self.tip, self.spread = tip, np.zeros_like(tip)
+
+    def reset(self) -> None:
+        pass
+
+    def observe(self, episodes, sample, tip, branch) -> None:
+        pass
+
+
+def jumping(split, patients: int, seed: int) -> monitoring.Monitored:
+    """Return six navigations of each patient: Δtip errs by 0.1 mm or by many mm, γtip by 0.01 mm always."""
+    random, count = np.random.default_rng(seed), 6 * patients
+    chosen = np.arange(count) % len(split.truth)
+    truth = split.truth[chosen]
+    size = np.stack([0.1 * np.exp(2 * random.standard_normal(count)), np.full(count, 0.01)], axis=-1)
+    names = np.repeat([f"patient-{seed}-{k}" for k in range(patients)], 6)
+    return replace(
+        split,
+        truth=truth,
+        ratio=split.ratio[chosen],
+        episodes=replace(split.episodes.select(chosen), anatomy=names),
+        model=Errs(truth + size[:, None] * random.standard_normal(truth.shape)),
+    )
+
+
+def test_each_band_holds_as_often_as_the_other_though_their_errors_are_spread_otherwise(split) -> None:
+    """Were both stretched by what the rare large errors of Δtip need, that of γtip would nearly always hold."""
+    calibration = monitoring.calibrate(jumping(split, 60, 0), jumping(split, 100, 1), 0.9)
+    found = monitoring.coverage(jumping(split, 300, 2), calibration)
+    assert found["simultaneous"] == pytest.approx(0.9, abs=0.03)
+    abscissa, offset = found["each_band"]
+    assert abscissa == pytest.approx(offset, abs=0.03)
+    assert abscissa * offset == pytest.approx(found["simultaneous"], abs=0.02)  # the errors are independent here
+
+
 class Unsure(HoldSlack):
     """Holds the slack of the last observed tip; its spread is 0.1 mm for each sample since."""
 

@@ -1,8 +1,9 @@
 """Bands around what a model predicts, calibrated to hold over a whole interval without X-ray.
 
 A band is `scale` times a spread. The spread grows from the last exposure with time, travel and the model's own
-estimate of its error. The scale is conformal: on calibration patients, each interval scores its worst error in units of
-the spread, over all samples and over Δtip and γtip together. docs/xray.md measures the coverage.
+estimate of its error, and is brought to a size at which either band by itself holds throughout equally many intervals.
+The scale is conformal: on calibration patients, each interval scores its worst error in units of the spread, over all
+samples and over Δtip and γtip together. docs/xray.md measures the coverage.
 """
 
 from __future__ import annotations
@@ -106,6 +107,25 @@ def fit_spread(
         nnls(_features(seconds, travel_mm, spread[..., i]).reshape(-1, len(TERMS)), np.abs(error[..., i]).ravel())[0]
         for i in range(2)
     ]
+    return tuple(found[0].tolist()), tuple(found[1].tolist())
+
+
+def balanced(
+    terms: tuple[tuple[float, ...], tuple[float, ...]], worst: Float[np.ndarray, "intervals 2"], level: float
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return terms under which the bands of Δtip and γtip each hold throughout the same share of the intervals.
+
+    The scale is common to both bands. Were the spread of one too narrow for its errors, it would widen the other too.
+
+    Args:
+        terms: as they were fitted.
+        worst: of each interval, the largest error over the spread of these terms, of Δtip and of γtip.
+        level: share of the intervals that both hold throughout, under a scale of 1.
+    """
+    bounds = np.quantile(worst, np.linspace(level, 1.0, 201), axis=0, method="higher")
+    both = (worst <= bounds[:, None]).all(axis=2).mean(axis=1)
+    bound = bounds[np.argmax(both >= level)]
+    found = np.where(bound > 0, bound, 1.0)[:, None] * np.array(terms)
     return tuple(found[0].tolist()), tuple(found[1].tolist())
 
 

@@ -19,7 +19,7 @@ from endopilot.settings import NonNegative, Seed, from_record, settings
 from endopilot.simulation.device import Device
 from endopilot.types import SAMPLE_PERIOD_S, VesselTree
 from endopilot.xray.adviser import AdviserConfig, XrayAdviser, count_events, near_exposures
-from endopilot.xray.bands import Calibration, conformal_scale, fit_spread, spread_of
+from endopilot.xray.bands import Calibration, balanced, conformal_scale, fit_spread, spread_of
 from endopilot.xray.fluoroscope import Fluoroscope, FluoroscopeConfig
 from endopilot.xray.online_predictors import OnlinePredictor, online_predictor
 
@@ -168,17 +168,24 @@ def calibrate(fitted: Monitored, own: Monitored, level: float) -> Calibration:
     seconds, travel = fitted.since
     error = (fitted.model.tip - fitted.truth)[:, WINDOW:]
     terms = fit_spread(error, seconds, travel, fitted.model.spread[:, WINDOW:])
-    own.model.reset()
-    score = np.abs((own.model.tip - own.truth)[:, WINDOW:] / spread_of(terms, *own.since, own.model.spread[:, WINDOW:]))
+    terms = balanced(terms, _worst(fitted, terms), level)
+    score = _worst(own, terms).max(axis=1)
     return Calibration(
         level=level,
-        scale=conformal_scale(score.max(axis=(1, 2)), own.episodes.anatomy, level),
+        scale=conformal_scale(score, own.episodes.anatomy, level),
         abscissa_terms=terms[0],
         offset_terms=terms[1],
         anatomies=len(np.unique(own.episodes.anatomy)),
         intervals=len(score),
         dataset=own.dataset,
     )
+
+
+def _worst(monitored: Monitored, terms: tuple[tuple[float, ...], tuple[float, ...]]) -> Float[np.ndarray, "episodes 2"]:
+    """Return the largest error over the spread in each interval, of Δtip and of γtip."""
+    monitored.model.reset()
+    spread = spread_of(terms, *monitored.since, monitored.model.spread[:, WINDOW:])
+    return np.abs((monitored.model.tip - monitored.truth)[:, WINDOW:] / spread).max(axis=1)
 
 
 def coverage(monitored: Monitored, calibration: Calibration) -> dict[str, Any]:
@@ -192,6 +199,7 @@ def coverage(monitored: Monitored, calibration: Calibration) -> dict[str, Any]:
     worst = each[: max(1, round(len(each) / 10))]
     return {
         "simultaneous": float(np.mean(each)),
+        "each_band": inside.all(axis=1).mean(axis=0).tolist(),
         "worst_decile_of_patients": float(worst.mean()),
         "samplewise": float(inside.all(axis=2).mean()),
         "median_half_width_mm": np.median(half, axis=(0, 1)).tolist(),
