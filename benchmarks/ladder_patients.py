@@ -6,7 +6,8 @@ search knows the full state of the wire. It stops before each fork and tries twe
 neither advantage. The training patients are the first twenty eligible ones of another atlas, without the search.
 
 Of the coaxial tasks' atlases the first twenty eligible patients are taken in which the wire alone, pushed straight on,
-arrives from at most two of eight rotations; no search shows that both together can arrive.
+arrives from at most two of eight rotations. A straight catheter goes where its wire goes: there the search must reach
+the target with the wire alone. A catheter with a shape may enter what its wire does not; there nothing is searched.
 
 With `--write` the numbers go into the tasks' files.
 """
@@ -26,11 +27,20 @@ from endopilot.atlas.atlas import make_patient_tree
 from endopilot.errors import InputError
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import Navigation, Target
-from endopilot.tasks.task import CORE, NEWEST, LadderVersion, Task, ladder_tasks, target_in_section, turn_rad
+from endopilot.tasks.task import (
+    CORE,
+    NEWEST,
+    LadderVersion,
+    Task,
+    ladder_tasks,
+    target_in_section,
+    turn_rad,
+    without_catheter,
+)
 from endopilot.types import TipProjection, VesselTree
 
 WANTED = 20
-MOST_EXAMINED = 400
+MOST_EXAMINED = 800
 TRIES = 12
 """Directions of the tip that the search tries at a fork."""
 PUSH_MM_S, PERIOD_S = 4.0, 0.5
@@ -70,6 +80,7 @@ ELIGIBLE: dict[str, Callable[[VesselTree, dict[str, Any], Target], bool]] = {
     "carotid": _turns("left common carotid", 90),
     "follow": _turns("4", 40),
     "steep-carotid": _turns("left common carotid", 90),
+    "side-branch": _turns("RV", 90),
 }
 
 
@@ -154,8 +165,7 @@ def _never(tip: TipProjection) -> np.ndarray:
 
 
 def wire_alone_fails(navigation: Navigation) -> bool:
-    """Return whether the wire, pushed straight on without its catheter, arrives from at most two of eight rotations."""
-    navigation = replace(navigation, catheters=(), arrives="wire", start_catheter_mm=0.0)
+    """Return whether the wire, pushed straight on, arrives from at most two of eight rotations."""
     count = 8
     simulator = Simulator(navigation.anatomy, navigation.device, worlds=count, config=CORE)
     turn = 2 * np.pi * np.arange(count) / count
@@ -167,6 +177,15 @@ def wire_alone_fails(navigation: Navigation) -> bool:
         simulator.step(np.column_stack([speed, np.zeros(count)]), PERIOD_S)
         arrived |= navigation.reached(simulator.project())
     return int(arrived.sum()) <= 2
+
+
+def suits(navigation: Navigation) -> bool:
+    """Return whether the target can be reached, and with a catheter is not by pushing its wire alone."""
+    alone = without_catheter(navigation)
+    if navigation.catheters and not wire_alone_fails(alone):
+        return False
+    shaped = any(catheter.shape for catheter in navigation.catheters)
+    return shaped or _Search(alone).reachable()
 
 
 def choose(task: Task, seed: int, *, search: bool) -> tuple[list[int], int, int]:
@@ -186,8 +205,7 @@ def choose(task: Task, seed: int, *, search: bool) -> tuple[list[int], int, int]
         count += 1
         patients = replace(task.ladder, seed=seed, numbers=(number,))
         navigation = task.navigation(task.patient(patients, 0)) if search else None
-        hard = wire_alone_fails if task.catheter else lambda given: _Search(given).reachable()
-        if navigation is None or hard(navigation):
+        if navigation is None or suits(navigation):
             chosen.append(number)
             if len(chosen) == WANTED:
                 return chosen, count, number + 1

@@ -61,10 +61,10 @@ def scores(folder: Path, version: LadderVersion, mark: str) -> list[str]:
             continue
         table = {row["task"]: row for row in content["scores"]}
         column = {name: f"{100 * row['safe_success']:.0f} ({100 * row['success']:.0f})" for name, row in table.items()}
-        if (over := table.get("all twelve") or table.get("upper eight") or table.get("both coaxial")) is not None:
+        if (over := table.get("all twelve") or table.get("upper eight") or table.get("all coaxial")) is not None:
             column |= {title: f"{over[key]:.3g}" for title, key in _MEANS}
         columns[path.parent.name] = column | {"patients a task": str(content["patients"])}
-    sums = ["both coaxial"] if version == "coaxial" else ["lower four", "upper eight", "all twelve"]
+    sums = ["all coaxial"] if version == "coaxial" else ["lower four", "upper eight", "all twelve"]
     names = [task.name for task in ladder_tasks(version)] + sums
     names += [*(title for title, _ in _MEANS), "patients a task"]
     policies = sorted(columns)

@@ -76,6 +76,13 @@ def test_the_controls_of_a_course_lead_where_it_says(side_branch, found) -> None
     assert side_branch.reached(again.project(), again.project(1))[0]
 
 
+def test_a_wire_that_leads_by_little_ends_little_beyond_the_target(side_branch, monkeypatch) -> None:
+    monkeypatch.setattr("endopilot.control.coaxial_search._LEADS_MM", (3.0,))
+    course = CoaxialSearch(side_branch, CONFIG).find(start_world(side_branch, ModelMismatch(), CORE))
+    assert course.reached
+    assert course.abscissa[-1] - side_branch.target.abscissa == pytest.approx(3.0, abs=2.0)
+
+
 def test_where_no_manoeuvre_passes_the_search_says_where(side_branch, found) -> None:
     weak = replace(side_branch, force_limit_n=1e-6)
     search = CoaxialSearch(weak, replace(CONFIG, turns=1))

@@ -14,7 +14,7 @@ from endopilot.errors import InputError
 from endopilot.ladder.scores import COAXIAL
 from endopilot.settings import read_settings
 from endopilot.tasks import task
-from endopilot.tasks.task import Task, find_task, ladder_tasks, target_in_section
+from endopilot.tasks.task import Task, find_task, ladder_tasks, target_in_section, turn_rad, without_catheter
 
 FOLDER = Path(task.__file__).parent
 FILES = sorted(FOLDER.glob("ladder_*/*.yaml"))
@@ -50,6 +50,16 @@ def test_coaxial_tasks_are_done_by_the_tip_of_a_catheter():
         assert each.start_catheter_mm < each.start_inserted_mm < target.abscissa
     navigation = find_task("follow", "coaxial").ladder_navigation(0)
     assert navigation.arrives == "catheter" and [c.name for c in navigation.catheters] == ["microcatheter-1.7f"]
+    alone = without_catheter(navigation)
+    assert alone.arrives == "wire" and not alone.catheters and alone.start_inserted_mm == navigation.start_inserted_mm
+    assert (alone.target, alone.start_rotation) == (navigation.target, navigation.start_rotation)
+
+
+def test_the_side_branch_leaves_at_ninety_degrees_or_more():
+    steep = find_task("side-branch", "coaxial")
+    for place in (0, 7):
+        tree, _ = make_patient_tree(steep.atlas(steep.ladder.seed), steep.ladder.numbers[place])
+        assert turn_rad(tree, target_in_section(tree, steep.section, 0.5).branch) >= np.pi / 2
 
 
 @pytest.mark.parametrize("name", ["straight", "crux", "carotid"])
@@ -73,7 +83,7 @@ def test_a_ladder_navigation_is_the_same_every_time():
 @pytest.mark.parametrize(
     ("old", "new", "line"),
     [
-        ("level: 6", "level: 15", "level: 15; give a whole number from 1 to 14"),
+        ("level: 6", "level: 17", "level: 17; give a whole number from 1 to 16"),
         ("seconds: 90", "seconds: -1", "seconds: -1; give a positive number"),
         ("force_limit_n: 0.2", "force_limit_n: .nan", "force_limit_n: nan; give a positive number"),
         ("anatomy: rca", "anatomy: knee", "anatomy: 'knee'; choose from"),

@@ -34,8 +34,8 @@ _PLACE_RADII, _PLACE_MM = 1.4, 4.0
 """The catheter is placed this many lumen radii, and this far at least, before and beyond a fork."""
 _AT_MM, _REST_MM = 1.0, 0.1
 """A catheter this near to its place is there, mm; what is this near to its goal rests."""
-_BEYOND_MM = 10.0
-"""The wire goes this far beyond a target to which the catheter's tip is to go, mm."""
+_AHEAD_MM = 10.0
+"""A wire that is not past its waypoint is pushed as though it had this far to go, mm."""
 _OFF_MM, _OFF_RADII = 5.0, 2.0
 """A tip that is this far in a wrong branch, and as many radii of the route's lumen, does not come back by itself."""
 _STRETCH_MM = 20.0
@@ -44,6 +44,7 @@ _PLACES = [*product((-1.0, 0.0, 1.0), (-3.0, 6.0), (0.0,))]
 _SHAPED = [
     [*product((-1.0, 0.0, 1.0), (-15.0, -40.0), (0.0,))],
     [*product((1.0, 2.0, 3.0), (-3.0, 6.0), (-1.5,))],
+    [*product((-0.5, -0.25, 0.5), (-15.0, 6.0), (0.0,))],
 ]
 _UNSHAPED = [[*product((-4.0, -8.0), (-3.0, 6.0, 15.0), (0.0,))]]
 """The grids of manoeuvres: the first, then those of catheters with a shape of their own, or those of others. Each tells
@@ -247,15 +248,19 @@ class CoaxialSearch:
     def _left(
         self, copies: Copies, tip: TipProjection, waypoint: float, behind: Float[np.ndarray, "worlds"]
     ) -> tuple[Float[np.ndarray, "worlds"], Float[np.ndarray, "worlds"]]:
-        """Return how far wires and catheters that follow them have still to go for a waypoint, mm."""
+        """Return how far wires and catheters that follow them have still to go for a waypoint, mm.
+
+        Beyond a target to which the catheter's tip is to go, the wire goes as far as the catheter stays behind it
+        elsewhere: the less, the fewer of its stiffer parts lie in the bends behind.
+        """
         route = self.route
         if waypoint < route.target.abscissa:
-            wire = np.where(self._passed(tip, waypoint), 0.0, _BEYOND_MM)
+            wire = np.where(self._passed(tip, waypoint), 0.0, _AHEAD_MM)
             return wire, copies.wire - behind - copies.catheter
         if not self._navigation.arriving:
             return waypoint - route.progress(tip), copies.wire - behind - copies.catheter
         end = float(self._navigation.anatomy.tree.branches[route.target.branch].centerline.abscissa[-1])
-        goal = max(min(waypoint + _BEYOND_MM, end - _REST_MM), waypoint)
+        goal = np.clip(waypoint + behind, waypoint, max(end - _REST_MM, waypoint))
         left = waypoint - copies.simulator.project(1).abscissa
         return goal - route.progress(tip), np.minimum(left, copies.wire - copies.catheter)
 

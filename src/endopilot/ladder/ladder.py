@@ -35,7 +35,7 @@ class LadderConfig:
 
     version: LadderVersion = NEWEST
     """Version of the ladder: 2 in patients that resemble real ones, 1 in the textbook patients of before, or coaxial,
-    two tasks of wire and catheter in patients as of version 2."""
+    four tasks of wire and catheter in patients as of version 2."""
 
     @model_validator(mode="after")
     def _consistent(self) -> LadderConfig:

@@ -11,12 +11,12 @@ from endopilot.tasks.task import Task
 
 UPPER = range(5, 13)
 """Levels of the upper eight tasks, which pushing alone must not solve."""
-COAXIAL = range(13, 15)
+COAXIAL = range(13, 17)
 """Levels of the tasks of wire and catheter, which a wire alone must not solve."""
 
 
 def score(tasks: Sequence[Task], results: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:
-    """Return the scores of tasks, and over the lower four, the upper eight, all twelve, and both coaxial ones.
+    """Return the scores of tasks, and over the lower four, the upper eight, all twelve, and all coaxial ones.
 
     Several tasks are scored together where all of them were done.
 
@@ -28,7 +28,7 @@ def score(tasks: Sequence[Task], results: Mapping[str, Sequence[Mapping[str, Any
     """
     rows = [{"level": task.level, "task": task.name} | score_navigations(results[task.name]) for task in tasks]
     levels = {task.level: task.name for task in tasks}
-    groups = {"lower four": range(1, 5), "upper eight": UPPER, "all twelve": range(1, 13), "both coaxial": COAXIAL}
+    groups = {"lower four": range(1, 5), "upper eight": UPPER, "all twelve": range(1, 13), "all coaxial": COAXIAL}
     for title, wanted in groups.items():
         if all(level in levels for level in wanted):
             together = [result for level in wanted for result in results[levels[level]]]

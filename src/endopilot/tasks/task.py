@@ -26,7 +26,7 @@ CORE = SimulatorConfig(element_mm=1.25, time_step_s=1 / 14, sample_tolerance_mm=
 and forces that are exact to a micronewton; docs/environment.md states the accuracy that they keep."""
 LadderVersion = Literal[1, 2, "coaxial"]
 NEWEST: LadderVersion = 2
-"""The ladder's versions: 1 in textbook patients of the atlas, 2 in patients that resemble real ones, coaxial for two
+"""The ladder's versions: 1 in textbook patients of the atlas, 2 in patients that resemble real ones, coaxial for four
 tasks of wire and catheter in patients of the latter kind."""
 _FOLDERS = {version: Path(__file__).parent / f"ladder_{version}" for version in get_args(LadderVersion)}
 
@@ -50,7 +50,7 @@ class Task:
 
     Attributes:
         name: short name.
-        level: place on the ladder, 1 to 12, or 13 and 14 of those with a catheter.
+        level: place on the ladder, 1 to 12, or 13 to 16 of those with a catheter.
         title: what is to be done, in a few words.
         anatomy: kind of vessel tree of the atlas.
         device: shipped device.
@@ -72,7 +72,7 @@ class Task:
     """
 
     name: str
-    level: Annotated[int, Within(1, 14)]
+    level: Annotated[int, Within(1, 16)]
     title: str
     anatomy: str
     device: str
@@ -223,6 +223,11 @@ def in_catheter(navigations: Sequence[Navigation], name: str) -> list[Navigation
     """
     catheter = read_catheter(name)
     return [replace(navigation, catheters=(catheter,), arrives="catheter") for navigation in navigations]
+
+
+def without_catheter(navigation: Navigation) -> Navigation:
+    """Return a navigation to the same target by its wire alone, whose tip is to arrive."""
+    return replace(navigation, catheters=(), arrives="wire", start_catheter_mm=0.0)
 
 
 @lru_cache(maxsize=1)

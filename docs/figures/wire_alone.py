@@ -1,0 +1,67 @@
+"""Measures how far a wire alone comes in the tasks of wire and catheter, for a table of docs/ladder.md.
+
+`python docs/figures/wire_alone.py FOLDER [PATIENTS]`: FOLDER gets a file for each navigation; those that are there are
+kept. PATIENTS are the first of each task, 6 if not given.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+from endopilot.files import read_json, write_json
+from endopilot.ladder.attempt import attempt, navigation_seed
+from endopilot.ladder.scores import score_navigations
+from endopilot.runs import make_missing
+from endopilot.tasks.task import find_task, ladder_tasks, without_catheter
+
+PAGE = Path(__file__).parents[1] / "ladder.md"
+BEGIN, END = "<!-- wire alone:begin -->\n", "<!-- wire alone:end -->"
+POLICIES = ("forward", "spin", "agent")
+
+
+def navigate(path: Path) -> None:
+    """Let a policy drive the wire of a task without its catheter, from the task's start and with its seed."""
+    policy, name, place = path.parts[-3], path.parts[-2], int(path.stem)
+    task = find_task(name, "coaxial")
+    navigation = without_catheter(task.ladder_navigation(place))
+    write_json(path, attempt(policy, navigation, seed=navigation_seed(task, place)))
+
+
+def table(folder: Path, patients: int) -> list[str]:
+    """Return the table: safe success, and in brackets success, %."""
+    lines = ["| task | " + " | ".join(f"`{policy}`" for policy in POLICIES) + " |", "|---|" + "---|" * len(POLICIES)]
+    together: dict[str, list[dict[str, Any]]] = {policy: [] for policy in POLICIES}
+    for task in ladder_tasks("coaxial"):
+        results = {
+            policy: [read_json(folder / policy / task.name / f"{place:02d}.json") for place in range(patients)]
+            for policy in POLICIES
+        }
+        lines.append(f"| {task.name} | " + " | ".join(cell(results[policy]) for policy in POLICIES) + " |")
+        for policy in POLICIES:
+            together[policy] += results[policy]
+    return [*lines, "| all coaxial | " + " | ".join(cell(together[policy]) for policy in POLICIES) + " |"]
+
+
+def cell(results: list[dict[str, Any]]) -> str:
+    """Return the scores of some navigations."""
+    scores = score_navigations(results)
+    return f"{100 * scores['safe_success']:.0f} ({100 * scores['success']:.0f})"
+
+
+def main() -> None:
+    """Do what is missing, and fill the page."""
+    folder, patients = Path(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 6
+    names = [task.name for task in ladder_tasks("coaxial")]
+    for policy in POLICIES:
+        paths = [folder / policy / name / f"{place:02d}.json" for name in names for place in range(patients)]
+        make_missing(f"Wire alone, {policy}", paths, navigate)
+    page = PAGE.read_text(encoding="utf-8")
+    head, tail = page.split(BEGIN)[0], page.split(END)[1]
+    text = "\n".join([*table(folder, patients), f"\nPatients a task: {patients}.\n"])
+    PAGE.write_text(f"{head}{BEGIN}{text}{END}{tail}", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
