@@ -68,7 +68,7 @@ def simulate_navigations(
         advance: called after each sample with the number of worlds.
 
     Returns:
-        The rollout; Δ and φ that the devices really began with; the controls that were applied, rounded to float32 as
+        The rollout; Δ and φ that it is simulated again from; the controls that were applied, rounded to float32 as
         they are stored; and which worlds were stopped short.
     """
     stack = [list(devices), *([catheter.device] * len(devices) for catheter in catheters)]
@@ -79,7 +79,7 @@ def simulate_navigations(
     started = _begin(simulator, watch, initial, friction)
     applied, stopped = np.empty_like(control), np.zeros(len(control), dtype=bool)
     result: dict[str, np.ndarray] = {}
-    inserted, last, slip = started[:, ::2], np.zeros_like(started[:, ::2]), np.zeros_like(started[:, ::2])
+    inserted, last, slip = _inserted(simulator), np.zeros_like(started[:, ::2]), np.zeros_like(started[:, ::2])
     for sample in range(control.shape[1]):
         drawn = control[:, sample, ::2]
         base = np.column_stack([simulator.base_load[:, 0], simulator.catheter_base_load[..., 0]])
@@ -102,7 +102,12 @@ def simulate_navigations(
     result["reason"] = simulator.reason
     rollout = make_rollout(anatomy, actuation, started[:, :2], applied[..., :2], result)
     if catheters:
-        rollout = replace(rollout, catheters=catheter_motion(applied, result["catheters"], SAMPLE_PERIOD_S))
+        rollout = replace(
+            rollout,
+            inserted_length=result["inserted_length"],
+            rotation=result["rotation"],
+            catheters=catheter_motion(applied, result["catheters"], SAMPLE_PERIOD_S),
+        )
     return rollout, started, applied, stopped
 
 
@@ -149,7 +154,12 @@ def _begin(
     initial: Float[np.ndarray, "worlds numbers"],
     friction: Float[np.ndarray, "worlds"],
 ) -> Float[np.ndarray, "worlds numbers"]:
-    """Push the devices to their first inserted length, or as deep as they go freely, and return Δ and φ there."""
+    """Push the devices to their first inserted length, or as deep as they go freely.
+
+    Returns:
+        Δ and φ of a wire alone as it then lies; of wire and catheters what they were pushed to, from which they are
+        simulated again to the bit, though one may carry the other a little farther.
+    """
     start, turn, again = np.minimum(initial[:, ::2], watch.deepest_mm), initial[:, 1::2], np.arange(len(initial))
     while True:
         simulator.reset(
@@ -166,8 +176,9 @@ def _begin(
         bad = (slipped | (far > _ROUNDING_MM)) & (start > 0) & simulator.valid[:, None]
         again = np.flatnonzero(bad.any(axis=1))
         if len(again) == 0:
-            turned = np.column_stack([simulator.rotation, simulator.catheter_rotation])
-            return np.stack([inserted, turned], axis=-1).reshape(initial.shape)
+            if inserted.shape[1] > 1:  # pushed there again, they slip again
+                return np.stack([start, turn], axis=-1).reshape(initial.shape)
+            return np.column_stack([inserted, simulator.rotation])
         start[bad] = np.maximum(np.minimum(inserted, start)[bad] - np.maximum(far[bad], 1.0), 0.0)
 
 
