@@ -47,6 +47,7 @@ def found():
         ostium=path[0],
         paths=[path],
         radius=[taper(2.0, 0.7, path)],
+        lumen=tree,
     )
 
 
@@ -110,6 +111,20 @@ def test_a_bypass_graft_is_told(found, joined, ending):
         graft = np.concatenate([graft, line((60.0, 0.0, 24.0), (60.0, 0.0, 6.0))])
     (told,) = coronary_doubts(with_vessel(found, graft, 1.8, in_tree=joined), "rca")
     assert "18 mm above the ostium: probably a bypass graft" in told and told.endswith(ending)
+
+
+def test_calcium_at_which_the_mask_ends_is_told_once(found):
+    x = positions(found.volume)[..., 0]
+    plaque = inside_tube(found.volume, line((49.0, 0.0, 6.0), (52.0, 0.0, 6.0)), 1.5)
+    ill = replace(found, volume=replace(found.volume, voxels=np.where(plaque, 3.0 * BLOOD_HU, found.volume.voxels)))
+    branch = line((47.0, 0.0, 6.0), (47.0, 30.0, 6.0))
+    both = replace(ill, paths=[*ill.paths, branch], radius=[*ill.radius, taper(1.0, 0.7, branch)])
+    (told,) = coronary_doubts(replace(both, lumen=found.tree & (x < 50)), "rca")
+    assert told.startswith("calcium or metal fills a vessel at (50, 0, 6) mm: the mask ends there, and 33 mm of")
+    assert coronary_doubts(ill, "rca") == ()  # the mask goes on behind it
+    assert coronary_doubts(replace(found, lumen=found.tree & (x < 50)), "rca") == ()  # nothing fills it
+    end = replace(found.volume, voxels=np.where(x > 74, 3.0 * BLOOD_HU, found.volume.voxels))
+    assert coronary_doubts(replace(found, volume=end, lumen=found.tree & (x < 76)), "rca") == ()  # a thin end's mask
 
 
 def test_a_second_vessel_beside_the_ostium_is_no_graft(found):

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from endopilot.imaging.grid import connected_components, distance_to_outside
-from endopilot.imaging.openings import openings
+from endopilot.imaging.openings import box_around, openings
 from endopilot.types import Volume
 
 _BLOCK_MM = 1.5
@@ -54,6 +54,10 @@ _METAL_HU = 2000.0
 """Brighter than calcium: leads, stents, clips."""
 _METAL_MM3, _METAL_NEAR_MM = 4.0, 15.0
 """Metal of this volume, so near to the tree, disturbs it."""
+_BEYOND_MM = 10.0
+"""The mask of a thin distal end may be this much shorter than its path."""
+_FILLED, _FILLED_MM = 1.5, 2.0
+"""Times the lumen's HU; what is brighter, so near to where the mask ends, is calcium or metal in the vessel."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +76,7 @@ class FoundTree:
         ostium: LPS mm.
         paths: from the ostium to every distal end, each from where it leaves those before it, LPS mm.
         radius: radius at the points of each path, mm.
+        lumen: the mask, on the voxels of `volume`.
     """
 
     volume: Volume
@@ -85,6 +90,7 @@ class FoundTree:
     ostium: Float[np.ndarray, "3"]
     paths: Sequence[Float[np.ndarray, "_ 3"]]
     radius: Sequence[Float[np.ndarray, "_"]]
+    lumen: Bool[np.ndarray, "_ _ _"]
 
 
 def coronary_doubts(found: FoundTree, vessel: str) -> tuple[str, ...]:
@@ -93,6 +99,7 @@ def coronary_doubts(found: FoundTree, vessel: str) -> tuple[str, ...]:
         *_steps(found.volume),
         *_metal(found),
         *_lost_ends(found),
+        *_filled(found),
         *_missing(found, vessel),
         *_grafts(found, vessel),
         *_veins(found),
@@ -198,6 +205,28 @@ def _goes_on(path: np.ndarray, points: np.ndarray, numbers: np.ndarray, found: F
         if bright and np.ptp(reach) >= _LEAST_CONTINUATION_MM and along > 0:
             return True
     return False
+
+
+def _filled(found: FoundTree) -> list[str]:
+    """Tell where the mask ends at calcium or metal long before the vessel does."""
+    told, places = [], np.zeros((0, 3))
+    for path in found.paths:
+        index = np.round(found.volume.world_to_index(path)).astype(int)[:, ::-1]
+        index = np.clip(index, 0, np.array(found.lumen.shape) - 1)
+        inside = np.flatnonzero(found.lumen[tuple(index.T)])
+        if len(inside) == 0:  # it leaves a vessel that is told
+            continue
+        last = inside[-1]
+        beyond = float(np.linalg.norm(np.diff(path[last:], axis=0), axis=1).sum())
+        box = box_around(index[last : last + 1], _FILLED_MM / found.volume.spacing_mm[::-1], found.lumen.shape)
+        known = (np.linalg.norm(places - path[last], axis=1) < _STUB_MM).any()  # of a branch that leaves there
+        if not known and beyond > _BEYOND_MM and float(found.volume.voxels[box].max()) > _FILLED * found.lumen_hu:
+            places = np.vstack([places, path[last]])
+            told.append(
+                f"calcium or metal fills a vessel at {_place(path[last])}: the mask ends there, and {beyond:.0f} mm of "
+                "the vessel beyond are not in it"
+            )
+    return told
 
 
 def _missing(found: FoundTree, vessel: str) -> list[str]:

@@ -152,6 +152,7 @@ def segment_lumen(volume: Volume, config: SegmentConfig) -> LumenMask:
             ostium=ostium.position,
             paths=paths,
             radius=radius,
+            lumen=mask,
         )
         warnings = coronary_doubts(found, config.vessel)
         if not config.seeds:
