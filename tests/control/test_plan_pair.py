@@ -81,7 +81,7 @@ def test_the_commands_plan_and_simulate_take_a_catheter(vessel, tmp_path, capsys
     assert "catheter_1_translation_mm_s" in Path(table).read_text(encoding="utf-8").splitlines()[0]
     with pytest.raises(SystemExit) as leaving:
         main(["plan", str(vessel), *options, *both, "--xray", "-o", str(tmp_path / "no")])
-    assert leaving.value.code == 2 and "--xray: is foreseen for a wire alone" in capsys.readouterr().err
+    assert leaving.value.code == 2 and "--xray: takes a wire alone" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

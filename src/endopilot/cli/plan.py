@@ -47,7 +47,7 @@ def command(
         config: method, limits and cost.
     """
     if xray and catheter:
-        raise InputError("--xray: is foreseen for a wire alone; leave --xray or --catheter out")
+        raise InputError("--xray: takes a wire alone; leave --xray or --catheter out")
     calibration = read_calibration(config, model) if xray else None
     catheters = [read_catheter(name) for name in catheter]
     found = plan(existing(anatomy), target, config, model=model, device=device, catheters=catheters)
