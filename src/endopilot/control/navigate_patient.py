@@ -89,7 +89,7 @@ class NavigatePatientConfig:
     """The wire is this much deeper in reality than the encoder says, mm: the ostium lies elsewhere."""
     true_axis_deg: Annotated[float, Within(0, 45)] = 0.0
     """In reality the guiding catheter leans off its given axis by this angle, degrees, to a side drawn by the seed. An
-    exposure shows its axis before the wire is shaped; X-ray images do not, since it is not drawn in them."""
+    exposure shows its axis before the wire is shaped; in X-ray images it lies as given, and is not looked for."""
     true_latency_s: NonNegative | None = None
     """Time from a command to the motion in reality, s; 0.05 if not given."""
 
