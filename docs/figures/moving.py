@@ -9,7 +9,6 @@ import numpy as np
 
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.control.navigate_patient import NavigatePatientConfig, navigate_patient, set_up_navigation
-from endopilot.control.record import NavigationRecord
 
 PAGE = Path(__file__).parents[1] / "navigation.md"
 BEGIN, END = "<!-- moving:begin -->\n", "<!-- moving:end -->"
@@ -28,15 +27,6 @@ CASES: tuple[dict[str, Any], ...] = (
 )
 
 
-def covered(record: NavigationRecord) -> np.ndarray:
-    """Return whether the bands held Δtip and γtip at each decision."""
-    assert record.believed is not None and record.half_width is not None
-    true = np.stack([record.tip.abscissa, record.tip.offset], axis=-1)
-    told = np.isfinite(record.half_width).all(axis=1)
-    inside = np.less_equal(np.abs(true - record.believed), record.half_width).all(axis=1)
-    return np.asarray(inside)[told]
-
-
 def main() -> None:
     """Write the table in place of the one that is there."""
     rows = []
@@ -49,7 +39,7 @@ def main() -> None:
             config = NavigatePatientConfig(mismatch=0.2, seed=seed, motion_seed=seed, **case)
             found = navigate_patient(set_up_navigation(patient, ",".join(f"{x:.2f}" for x in place), config))
             records.append(found.record)
-        inside = np.concatenate([covered(record) for record in records])
+        inside = np.concatenate([record.in_bands for record in records])
         minutes = sum(record.seconds for record in records) / 60
         known = "" if case["motion"] == "still" else case.get("motion_known", "published")
         safe = sum(record.success and record.safe for record in records)

@@ -93,6 +93,14 @@ def test_the_agent_arrives_though_the_wire_is_another_than_believed(side_branch)
     record = navigate(side_branch, AgentPolicy(QUICK), seed=2, truth=truth)
     assert record.success and record.safe and record.faults == 0
     assert 1 <= record.exposures < (len(record.time_s) - 1) / 2  # it looks seldom
+    held, half = record.in_bands, record.half_width
+    assert half is not None and len(held) == np.isfinite(half).all(axis=1).sum() > len(record.time_s) / 2
+    assert held.mean() > 0.5
+    assert (
+        replace(record, half_width=half + 1e3).in_bands.all()
+        and not replace(record, half_width=0 * half).in_bands.any()
+    )
+    assert len(replace(record, half_width=None).in_bands) == 0
 
 
 def measured(belief: Belief, member: int) -> TipMeasurement:

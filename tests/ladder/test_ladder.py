@@ -149,15 +149,15 @@ def test_the_events_of_a_navigation_are_at_the_wall_and_where_the_agent_errs():
     exposed = np.array([1, 0, 0, 0, 0, 0, 1, 0, 0], dtype=bool)
     believed = np.arange(8.0)
     believed[5] += 2.0
-    assert attempts._events(tip, exposed, believed, 0.18) == (2, 1)
+    assert attempts.navigation_events(tip, exposed, believed, 0.18) == (2, 1)
     believed[4] += 2.0  # it begins sooner, before the exposure
-    assert attempts._events(tip, exposed, believed, 0.18) == (2, 2)
+    assert attempts.navigation_events(tip, exposed, believed, 0.18) == (2, 2)
 
 
 def test_a_wire_that_begins_to_fill_the_lumen_is_an_event():
     radius = np.array([1.0, 1.0, 0.18, 0.18, 1.0, 1.0])
     tip = TipProjection(offset=np.zeros(6), radius=radius, abscissa=np.arange(6.0), branch=np.zeros(6, dtype=int))
-    assert attempts._events(tip, np.zeros(6, dtype=bool), np.arange(5.0), 0.18) == (1, 1)
+    assert attempts.navigation_events(tip, np.zeros(6, dtype=bool), np.arange(5.0), 0.18) == (1, 1)
 
 
 def test_events_are_counted_for_the_agent_alone():

@@ -75,6 +75,15 @@ class NavigationRecord:
     reason: str
     gives_up: str
 
+    @property
+    def in_bands(self) -> Bool[np.ndarray, "decisions"]:
+        """Whether the adviser's bands held Δtip and γtip, at each decision that had bands."""
+        if self.believed is None or self.half_width is None:
+            return np.zeros(0, dtype=bool)
+        true = np.stack([self.tip.abscissa, self.tip.offset], axis=-1)
+        held = np.less_equal(np.abs(true - self.believed), self.half_width).all(axis=1)
+        return np.asarray(held)[np.isfinite(self.half_width).all(axis=1)]
+
 
 class Track:
     """Gathers what happens in a navigation."""

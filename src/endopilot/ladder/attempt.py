@@ -180,17 +180,24 @@ def figures(navigation: Navigation, record: NavigationRecord, recording: Recordi
     }
     if recording.believed_mm is not None:
         radius = navigation.device.tip_radius_mm
-        scored["events"] = list(_events(record.tip, record.exposed, recording.believed_mm, radius))
+        scored["events"] = list(navigation_events(record.tip, record.exposed, recording.believed_mm, radius))
     return scored | {"sha256": _digest(record, recording)}
 
 
-def _events(
+def navigation_events(
     tip: TipProjection,
     exposed: Bool[np.ndarray, "samples"],
     believed_mm: Float[np.ndarray, "decisions"],
     wire_radius_mm: float,
 ) -> tuple[int, int]:
-    """Return how many events a navigation had, as `AdviserConfig` defines them, and how many X-ray did not show."""
+    """Return how many events a navigation had, as `AdviserConfig` defines them, and how many X-ray did not show.
+
+    Args:
+        tip: as it truly was, at the start and after each decision period.
+        exposed: whether X-ray was on, at the same moments.
+        believed_mm: Δtip as the policy believed it at each decision, mm.
+        wire_radius_mm: radius of the wire at its tip, mm.
+    """
     count, advice = len(believed_mm), AdviserConfig()
     at_wall = safety_ratio(tip.offset, tip.radius, wire_radius_mm)[:count] >= advice.wall_ratio
     errs = np.abs(believed_mm - tip.abscissa[:count]) >= advice.abscissa_mm
