@@ -166,6 +166,27 @@ def test_a_tip_that_no_wire_explains_is_pulled_back_under_xray(side_branch) -> N
     assert policy.plans == 2  # found again, it searches another path
 
 
+def test_a_lost_wire_that_is_back_in_its_catheter_unseen_sets_out_again(side_branch) -> None:
+    policy = AgentPolicy(QUICK)
+    policy.start(side_branch, 0)
+    far = replace(measured(policy.belief, 0), position=np.full(3, 50.0))
+    assert policy.decide(Observation(0.0, 6.0, 0.0, far)).translation < 0
+    assert policy.decide(Observation(0.5, 4.0, 0.0, None)).translation < 0  # not there yet
+    again = policy.decide(Observation(1.0, 1.9, 0.0, None))
+    assert again.translation > 0 and not again.expose
+
+
+def test_a_tip_that_is_measured_badly_is_not_lost(side_branch) -> None:
+    """6 mm are more than `lost_along_mm` and `lost_across_mm`, and less than three standard deviations of 2.5 mm."""
+    for sd_mm, lost in ((0.0, True), (1.0, True), (2.5, False)):
+        policy = AgentPolicy(QUICK)
+        policy.start(side_branch, 0)
+        shown = measured(policy.belief, int(np.argmax(policy.belief.weight)))
+        aside = np.cross(side_branch.anatomy.insertion.direction, [1.0, 0.0, 0.0])
+        off = replace(shown, position=shown.position + 6.0 * aside / np.linalg.norm(aside), sd_mm=(sd_mm, sd_mm))
+        assert (policy.decide(Observation(0.0, 2.0, 0.0, off)).translation < 0) == lost
+
+
 def test_with_a_calibration_the_adviser_says_when_to_look(side_branch) -> None:
     """A band of Δtip that widens by 0.5 mm a second is 1 mm wide after 2 s: X-ray every fourth period."""
     calibration = Calibration(

@@ -57,6 +57,8 @@ class AgentConfig:
     """The same across the wire, mm."""
 
 
+_SURE_SDS = 3.0
+"""A measured tip is taken for another than the simulated ones beyond this many of its own standard deviations."""
 _TURNS = (0.0, np.pi)
 """Angles by which the wire may be turned before it goes in, rad."""
 _CREEP_MM_S = 2.0
@@ -119,6 +121,8 @@ class _PlanningPolicy:
         self._began = True
         if observation.tip is not None:
             self._update(observation.tip)
+        elif observation.inserted_length <= self.navigation.start_inserted_mm:
+            self._lost = False  # back where it began, the wire lies as it did, unseen in its catheter
         if self._lost:
             translation, rotation = -self.config.search.speed_mm_s, 0.0
         else:
@@ -149,7 +153,9 @@ class _PlanningPolicy:
         """Weight the simulated wires by a measurement, and note whether all are wrong."""
         self.belief.weigh(measured)
         along, across = self.belief.errors(measured)[int(np.argmax(self.belief.weight))]
-        lost = bool(along > self.config.lost_along_mm or across > self.config.lost_across_mm)
+        along_sd, across_sd = measured.sd_mm
+        lost = along > max(self.config.lost_along_mm, _SURE_SDS * along_sd)
+        lost = bool(lost or across > max(self.config.lost_across_mm, _SURE_SDS * across_sd))
         if lost or self._lost:
             self._course = None
         self._lost = lost
