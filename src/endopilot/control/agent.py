@@ -152,10 +152,9 @@ class _PlanningPolicy:
     def _update(self, measured: TipMeasurement) -> None:
         """Weight the simulated wires by a measurement, and note whether all are wrong."""
         self.belief.weigh(measured)
-        along, across = self.belief.errors(measured)[int(np.argmax(self.belief.weight))]
-        along_sd, across_sd = measured.sd_mm
-        lost = along > max(self.config.lost_along_mm, _SURE_SDS * along_sd)
-        lost = bool(lost or across > max(self.config.lost_across_mm, _SURE_SDS * across_sd))
+        errors = self.belief.errors(measured)[int(np.argmax(self.belief.weight))]
+        explained = [self.config.lost_along_mm, self.config.lost_across_mm]
+        lost = bool((errors > np.maximum(explained, _SURE_SDS * np.array(measured.sd_mm))).any())
         if lost or self._lost:
             self._course = None
         self._lost = lost

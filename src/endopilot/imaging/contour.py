@@ -22,7 +22,7 @@ _WALL_HU = 0.0
 """Even in fat and lung, the vessel's own wall lies next to the lumen: half a millimetre of soft tissue, blurred."""
 _BLOCK = 8
 """Edge of the blocks in which voxels near the vessel are looked for, voxels."""
-_CALCIUM = 1.5
+CALCIUM = 1.5
 """Times the lumen's HU; brighter voxels are calcium or metal."""
 _FEWEST_VOXELS = 5
 """Smaller bright specks are noise."""
@@ -65,7 +65,7 @@ def lumen_at_half_height(
     # A blurred disc has less than half its height at its own edge, the less the smaller it is (to first order in σ/r).
     share = 0.5 - 0.2 * np.minimum(_BLUR_MM / np.maximum(local_radius, 0.1), 1.0)
     level = surroundings + share * (lumen_hu - surroundings)
-    calcium = band & (hu >= _CALCIUM * lumen_hu)
+    calcium = band & (hu >= CALCIUM * lumen_hu)
     inside = band & (hu > level) & ~calcium
     _drop_rims(inside, _large_parts(calcium), distance, spacing)
     return inside

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
+from endopilot.imaging.contour import CALCIUM
 from endopilot.imaging.grid import connected_components, distance_to_outside
 from endopilot.imaging.openings import box_around, openings
 from endopilot.types import Volume
@@ -56,8 +57,8 @@ _METAL_MM3, _METAL_NEAR_MM = 4.0, 15.0
 """Metal of this volume, so near to the tree, disturbs it."""
 _BEYOND_MM = 10.0
 """The mask of a thin distal end may be this much shorter than its path."""
-_FILLED, _FILLED_MM = 1.5, 2.0
-"""Times the lumen's HU; what is brighter, so near to where the mask ends, is calcium or metal in the vessel."""
+_FILLED_MM = 2.0
+"""Calcium or metal so near to where the mask ends fills the vessel."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,7 +221,7 @@ def _filled(found: FoundTree) -> list[str]:
         beyond = float(np.linalg.norm(np.diff(path[last:], axis=0), axis=1).sum())
         box = box_around(index[last : last + 1], _FILLED_MM / found.volume.spacing_mm[::-1], found.lumen.shape)
         known = (np.linalg.norm(places - path[last], axis=1) < _STUB_MM).any()  # of a branch that leaves there
-        if not known and beyond > _BEYOND_MM and float(found.volume.voxels[box].max()) > _FILLED * found.lumen_hu:
+        if not known and beyond > _BEYOND_MM and float(found.volume.voxels[box].max()) > CALCIUM * found.lumen_hu:
             places = np.vstack([places, path[last]])
             told.append(
                 f"calcium or metal fills a vessel at {_place(path[last])}: the mask ends there, and {beyond:.0f} mm of "

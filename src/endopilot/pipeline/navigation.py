@@ -82,11 +82,11 @@ def _write(found: PatientNavigation, folder: Path, target: str, output: Path) ->
     from endopilot.report.navigation_page import write_navigation_page
 
     set_up = found.set_up
-    driven_in = folder
-    if set_up.true_anatomy is not set_up.anatomy:  # the catheter lies otherwise: an anatomy of its own
+    driven_in, real = folder, set_up.true_anatomy
+    if real is not set_up.anatomy:  # the catheter lies otherwise: an anatomy of its own
         driven_in = output / ANATOMY_FOLDER
         if not driven_in.exists():
-            write_anatomy(set_up.true_anatomy, driven_in)
+            write_anatomy(real, driven_in)
     with writing(output / TABLE_FILE) as partial:
         navigation_table(found).to_csv(partial, index=False)
     cycles = found.cycles
