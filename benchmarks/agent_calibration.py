@@ -85,7 +85,14 @@ def measure(path: Path) -> None:
 
 
 NO_BANDS = Calibration(
-    level=LEVEL, scale=0.0, abscissa_terms=(0.0,) * 4, offset_terms=(0.0,) * 4, anatomies=0, intervals=0, dataset=""
+    level=LEVEL,
+    scale=0.0,
+    abscissa_terms=(0.0,) * 4,
+    offset_terms=(0.0,) * 4,
+    anatomies=0,
+    intervals=0,
+    dataset="",
+    heeded=1.0,
 )
 
 
@@ -133,6 +140,7 @@ def calibrate(folder: Path) -> tuple[Calibration, list[str]]:
         anatomies=len(np.unique(owner)),
         intervals=len(rows),
         dataset="patients to learn on of the ladder's tasks",
+        heeded=1.0,
     )
     lines = ["| patients | intervals without X-ray | in which both bands hold throughout |", "|---|---|---|"]
     for title, role in (("calibrated on", "calibrate"), ("the ladder's, not calibrated on", "test")):

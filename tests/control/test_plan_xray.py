@@ -26,7 +26,14 @@ STILL = (0.0, 0.0, 0.0, 0.0)
 
 def calibration(abscissa=STILL, offset=STILL) -> Calibration:
     return Calibration(
-        level=0.9, scale=1.0, abscissa_terms=abscissa, offset_terms=offset, anatomies=9, intervals=36, dataset="key"
+        level=0.9,
+        scale=1.0,
+        abscissa_terms=abscissa,
+        offset_terms=offset,
+        anatomies=9,
+        intervals=36,
+        dataset="key",
+        heeded=1.0,
     )
 
 

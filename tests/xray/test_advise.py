@@ -116,6 +116,16 @@ class Errs:
         pass
 
 
+class Straight:
+    """A lumen of one radius."""
+
+    def __init__(self, radius_mm: float) -> None:
+        self._radius_mm = radius_mm
+
+    def radius(self, branch, abscissa_mm) -> np.ndarray:
+        return np.full(len(branch), self._radius_mm)
+
+
 def jumping(split, patients: int, seed: int) -> monitoring.Monitored:
     """Return six navigations of each patient: Δtip errs by 0.1 mm or by many mm, γtip by 0.01 mm always."""
     random, count = np.random.default_rng(seed), 6 * patients
@@ -129,17 +139,61 @@ def jumping(split, patients: int, seed: int) -> monitoring.Monitored:
         ratio=split.ratio[chosen],
         episodes=replace(split.episodes.select(chosen), anatomy=names),
         model=Errs(truth + size[:, None] * random.standard_normal(truth.shape)),
+        lumen=Straight(1.0),
     )
 
 
 def test_each_band_holds_as_often_as_the_other_though_their_errors_are_spread_otherwise(split) -> None:
     """Were both stretched by what the rare large errors of Δtip need, that of γtip would nearly always hold."""
-    calibration = monitoring.calibrate(jumping(split, 60, 0), jumping(split, 100, 1), 0.9)
+    calibration = monitoring.calibrate(jumping(split, 60, 0), jumping(split, 100, 1), AdviserConfig())
     found = monitoring.coverage(jumping(split, 300, 2), calibration)
     assert found["simultaneous"] == pytest.approx(0.9, abs=0.03)
     abscissa, offset = found["each_band"]
     assert abscissa == pytest.approx(offset, abs=0.03)
     assert abscissa * offset == pytest.approx(found["simultaneous"], abs=0.02)  # the errors are independent here
+
+
+def approaching(split, half: float) -> monitoring.Monitored:
+    """Return ten navigations of each of three patients, in which the tip comes to the wall at one of the samples.
+
+    The model puts it further from there than it is, by 5 % of a half-width in the first navigation, 15 % in the next.
+    """
+    count, samples = 30, split.truth.shape[1]
+    place = np.arange(count) % 10
+    arrived = np.arange(samples) >= (WINDOW + 3 + place)[:, None]
+    at_wall = EVENTS.wall_ratio * (1.0 - split.wire_radius_mm)
+    truth = np.stack([np.full((count, samples), 20.0), np.where(arrived, at_wall + 1e-6, 0.0)], axis=-1)
+    predicted = truth - np.stack([0 * arrived, arrived * half * (place[:, None] + 0.5) / 10], axis=-1)
+    chosen = np.zeros(count, dtype=int)
+    return replace(
+        split,
+        truth=truth,
+        ratio=np.where(arrived, 1.0, 0.0),
+        episodes=replace(split.episodes.select(chosen), anatomy=np.repeat(["a", "b", "c"], 10)),
+        model=Errs(predicted),
+        lumen=Straight(1.0),
+    )
+
+
+@pytest.mark.parametrize(("may_miss", "heeded"), [(0.45, 0.6), (0.25, 0.8), (0.001, 1.0)])
+def test_the_adviser_heeds_as_little_of_the_bands_as_what_it_may_miss_allows(split, may_miss, heeded) -> None:
+    """With a share s of the bands it sees 10 s of 10 arrivals; the patients are alike, so that no error is added."""
+    bands = Calibration(
+        level=0.9, scale=1.0, abscissa_terms=(0.0,) * 4, offset_terms=(0.1, 0.0, 0.0, 0.0), anatomies=3, intervals=30,
+        dataset="", heeded=1.0,
+    )  # fmt: skip
+    config = replace(EVENTS, missed=may_miss)
+    assert monitoring.least_heeded(approaching(split, half=0.1), bands, config) == heeded
+
+
+def test_no_share_of_the_bands_beyond_the_first_that_misses_too_much_is_chosen(split, monkeypatch) -> None:
+    missed = iter([0.01, 0.02, 0.06, *[0.01] * len(monitoring.HEEDED)])
+    monkeypatch.setattr(monitoring, "surely_missed", lambda *_: next(missed))
+    bands = Calibration(
+        level=0.9, scale=1.0, abscissa_terms=(0.0,) * 4, offset_terms=(0.0,) * 4, anatomies=3, intervals=30, dataset="",
+        heeded=1.0,
+    )  # fmt: skip
+    assert monitoring.least_heeded(approaching(split, half=0.1), bands, EVENTS) == monitoring.HEEDED[1]
 
 
 class Unsure(HoldSlack):
@@ -204,7 +258,9 @@ def test_the_command_calibrates_measures_and_draws(folder, hold_slack, capsys) -
     assert 0 <= figures["coverage"]["simultaneous"] <= figures["coverage"]["samplewise"] <= 1
     assert (output / "advice.png").stat().st_size > 10_000
     widest = figures["curves"]["adviser"][-1]
-    assert widest["width"] == 2.5 and figures["curves"]["adviser"][0]["width"] == 0.0
+    assert widest["heeded"] == 2.5 and figures["curves"]["adviser"][0]["heeded"] == 0.0
+    heeded = figures["calibration"]["heeded"]
+    assert figures["adviser"]["heeded"] == heeded == Calibration.read(run).heeded
 
 
 def test_the_calibration_of_the_model_of_the_package_goes_to_the_output(
@@ -212,7 +268,7 @@ def test_the_calibration_of_the_model_of_the_package_goes_to_the_output(
 ) -> None:
     monkeypatch.setattr(monitoring, "monitor", lambda *_: split)
     monkeypatch.setattr(advise_module, "PERIODS", (1, 90))
-    monkeypatch.setattr(advise_module, "WIDTHS", (1.0,))
+    monkeypatch.setattr(advise_module, "SHARES", ())
     monkeypatch.setattr(advise_module, "THRESHOLDS", ())
     packaged = Calibration.read(run_path(Path("pretrained")))
     found = advise(Path("pretrained"), folder / "dataset", tmp_path / "out", AdviseConfig())
@@ -242,14 +298,14 @@ def test_the_same_calibration_is_measured_on_navigations_made_otherwise(
     make_toy_dataset(tmp_path / "other", **shape, anatomy_shares=shares, friction=(0.3, 0.3))
     make_toy_dataset(tmp_path / "all", **shape, anatomy_shares=(0.0, 0.0, 1.0))
     monkeypatch.setattr(advise_module, "PERIODS", (1, 90))
-    monkeypatch.setattr(advise_module, "WIDTHS", (1.0,))
+    monkeypatch.setattr(advise_module, "SHARES", ())
     monkeypatch.setattr(advise_module, "THRESHOLDS", ())
     run, dataset, output = folder / "run", folder / "dataset", tmp_path / "out"
     found = advise(run, dataset, output, AdviseConfig(), also_test=[dataset, tmp_path / "other"])
     same, other = found["made_otherwise"]
     assert same["differs"] == {} and other["differs"] == {"friction": [0.3, 0.3]}
     assert same["coverage"] == found["coverage"] and same["adviser"] == {
-        name: value for name, value in found["adviser"].items() if name != "width"
+        name: value for name, value in found["adviser"].items() if name != "heeded"
     }
     assert other["coverage"]["patients"] == 1
     with pytest.raises(InputError, match="which the bands are fitted to"):

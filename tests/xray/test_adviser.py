@@ -7,10 +7,10 @@ import pytest
 
 from endopilot.errors import InputError
 from endopilot.xray.adviser import AdviserConfig, XrayAdviser, count_events, near_exposures
-from endopilot.xray.bands import Calibration, conformal_scale, fit_spread, spread_of
+from endopilot.xray.bands import Calibration, conformal_scale, fit_spread, spread_of, surely_missed
 
 
-def calibration(scale: float = 1.0, abscissa: float = 0.1, offset: float = 0.05) -> Calibration:
+def calibration(scale: float = 1.0, abscissa: float = 0.1, offset: float = 0.05, heeded: float = 1.0) -> Calibration:
     return Calibration(
         level=0.9,
         scale=scale,
@@ -19,6 +19,7 @@ def calibration(scale: float = 1.0, abscissa: float = 0.1, offset: float = 0.05)
         anatomies=10,
         intervals=40,
         dataset="key",
+        heeded=heeded,
     )
 
 
@@ -64,11 +65,28 @@ def test_the_spread_is_fitted_to_the_errors() -> None:
     assert (np.array(fit_spread(error, seconds, travel, np.zeros_like(own))) >= 0).all()
 
 
+def test_what_is_missed_for_sure_is_the_share_and_its_standard_error() -> None:
+    alike = np.array([20.0, 40.0, 60.0])
+    assert surely_missed(alike / 20, alike) == pytest.approx(0.05)  # all patients alike: no error
+    # 1 of 20 is missed; residuals of ±1/2, of two patients: a variance of 2 (1/4 + 1/4) over 20 events squared
+    assert surely_missed(np.array([1.0, 0.0]), np.array([10.0, 10.0])) == pytest.approx(0.05 + 1 / 20)
+    assert surely_missed(np.zeros(3), np.zeros(3)) == 0.0
+    assert surely_missed(np.array([1.0]), np.array([50.0])) > 1.0  # one patient says nothing of others
+
+
+def test_what_is_missed_for_sure_is_seldom_less_than_new_patients_miss() -> None:
+    random = np.random.default_rng(3)
+    events = random.poisson(40.0, (400, 25))
+    missed = random.binomial(events, random.beta(0.5, 9.5, events.shape))  # 5 %; patients differ by as much
+    below = [surely_missed(*patients) < 0.05 for patients in zip(missed, events, strict=True)]
+    assert 0.1 < np.mean(below) < 0.25  # 16 % of a normal distribution lie more than one standard error below
+
+
 def test_a_calibration_is_read_again_and_its_absence_named(tmp_path) -> None:
     with pytest.raises(InputError, match=r"the model has no calibration.*endopilot advise"):
         Calibration.read(tmp_path)
-    calibration().write(tmp_path)
-    assert Calibration.read(tmp_path) == calibration()
+    calibration(heeded=0.25).write(tmp_path)
+    assert Calibration.read(tmp_path) == calibration(heeded=0.25)
     (tmp_path / "xray.json").write_text('{"level": 0.9, "abscissa_terms": [], "offset_terms": []}')
     with pytest.raises(InputError, match=r"xray.json: scale: missing; .* run `endopilot advise` again"):
         Calibration.read(tmp_path)
@@ -109,6 +127,19 @@ def test_an_exposure_is_due_where_the_wire_begins_to_fill_the_lumen() -> None:
     radius = [1.2, 1.2, 1.2, 0.2, 0.1, 0.1, 0.1]
     due = [bool(adviser.advise(still, centred, np.zeros((1, 2)), np.full(1, r))[0]) for r in radius]
     assert due == [False, False, False, True, False, False, False]
+
+
+def test_the_adviser_heeds_a_share_of_the_bands_and_reports_them_whole() -> None:
+    inserted = [2.0 * abs(6 - i) for i in range(20)]  # back and forth by 2 mm a sample: the band grows by 0.2 mm
+    assert advices([0.3] * 20, inserted, config=AdviserConfig(abscissa_mm=1.0), heeded=0.5) == [10]
+    offset = [0.3] * 5 + [0.56] * 4 + [0.585] * 4 + [0.61] * 4 + [0.63] * 4
+    due = advices(offset, [10.0] * len(offset), config=AdviserConfig(wall_ratio=0.6), abscissa=0.0, heeded=0.4)
+    assert due == [9, 13, 17]  # ±0.02 mm: the upper edge, the tip, the lower edge
+    adviser = XrayAdviser(calibration(abscissa=0.0, heeded=0.4), AdviserConfig(), wire_radius_mm=0.2)
+    still = np.zeros((1, 2))
+    adviser.start(still, still, np.ones(1))
+    adviser.advise(still, still, still, np.ones(1))
+    assert adviser.half_width[0, 1] == 0.05
 
 
 def test_exposures_keep_their_distance() -> None:

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 FIGURES_FILE, PICTURE_FILE = "advice.json", "advice.png"
 PERIODS = (1, 2, 3, 4, 5, 6, 8, 10, 15, 20, 30, 45, 90)
 """Samples between two exposures of periodic imaging."""
-WIDTHS = (0.0, 0.1, 0.25, 0.5, 0.75, 1.0, 1.5, 2.5)
-"""Factors on the calibrated bands, for the curve of the adviser."""
+SHARES = (0.0, 0.1, 0.25, 0.5, 0.75, 1.0, 1.5, 2.5)
+"""Shares of the bands that the adviser heeds, for its curve; the calibrated one is measured too."""
 THRESHOLDS = tuple((ratio, mm) for ratio in (0.6, 0.7, 0.8, 0.9) for mm in (1.0, 2.0))
 """Other values of τ and of δ, mm, that the adviser is measured with."""
 
@@ -65,8 +65,9 @@ def advise(
     check_enough(len(set(splits[1].anatomy)), config.adviser.level)
     others = [_other(run, folder, splits[:2]) for folder in also_test]
     fitted, own, test = (monitoring.monitor(predictor, split, config) for split in splits)
-    calibration = monitoring.calibrate(fitted, own, config.adviser.level)
-    with progress("Advising", len(PERIODS) + len(WIDTHS) + len(THRESHOLDS) + 1) as advance:
+    calibration = monitoring.calibrate(fitted, own, config.adviser)
+    shares = sorted({*SHARES, calibration.heeded})
+    with progress("Advising", len(PERIODS) + len(shares) + len(THRESHOLDS) + 1) as advance:
         curves: dict[str, list[dict[str, float]]] = {"periodic": [], "adviser": []}
         thresholds: list[dict[str, float]] = []
         for period in PERIODS:
@@ -74,12 +75,12 @@ def advise(
                 monitoring.measure_policy(test, monitoring.periodic_policy(test, period), config.adviser)
             )
             advance()
-        for width in WIDTHS:
-            bands = replace(calibration, scale=width * calibration.scale)
+        for share in shares:
+            bands = replace(calibration, heeded=share)
             test.model.reset()
             policy = monitoring.adviser_policy(test, bands, config.adviser)
             point = monitoring.measure_policy(test, policy, config.adviser)
-            curves["adviser"].append({"width": width, **point})
+            curves["adviser"].append({"heeded": share, **point})
             advance()
         for ratio, mm in THRESHOLDS:
             other = replace(config.adviser, wall_ratio=ratio, abscissa_mm=mm)
@@ -95,7 +96,7 @@ def advise(
         _measure_otherwise(monitoring.monitor(predictor, other, config), other, episodes, calibration, config)
         for other in others
     ]
-    at = next(point for point in curves["adviser"] if point["width"] == 1.0)
+    at = next(point for point in curves["adviser"] if point["heeded"] == calibration.heeded)
     equal = monitoring.periodic_equal(curves["periodic"], at["missed_share"])
     content = {
         "calibration": calibration,
@@ -184,13 +185,21 @@ def _picture(content: Mapping[str, Any]) -> Figure:
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(6.4, 4.0), layout="constrained")
         axes = figure.add_subplot()
-        lines = (("periodic", GREY, "Periodic imaging"), ("adviser", BLUE, "Adviser, its bands narrowed or widened"))
+        lines = (
+            ("periodic", GREY, "Periodic imaging"),
+            ("adviser", BLUE, "Adviser that heeds less or more of its bands"),
+        )
         for name, color, label in lines:
             curve = content["curves"][name]
             points = sorted((point["exposures_per_minute"], 100 * point["missed_share"]) for point in curve)
             axes.plot(*zip(*points, strict=True), color=color, marker="o", markersize=3.5, label=label)
         marks = (
-            (content["adviser"], "o", VERMILLION, f"Adviser as calibrated, level {content['calibration'].level:g}"),
+            (
+                content["adviser"],
+                "o",
+                VERMILLION,
+                f"Adviser as calibrated: {content['calibration'].heeded:g} of its bands",
+            ),
             (content["curves"]["oracle"][0], "*", BLACK, "Oracle"),
         )
         for point, marker, color, label in marks:

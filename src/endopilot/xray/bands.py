@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Float, Real, Shaped
 from pydantic import Field
 from scipy.optimize import nnls
 
@@ -37,6 +37,7 @@ class Calibration:
     Attributes:
         level: share of new intervals that the bands are to hold throughout.
         scale: half-width of a band in units of the spread.
+        heeded: share of the half-widths by which the adviser asks for X-ray; 1 is the bands themselves.
         abscissa_terms: of the spread of Δtip, its terms as `TERMS` names them.
         offset_terms: of the spread of γtip.
         anatomies: patients that it was calibrated on.
@@ -51,6 +52,7 @@ class Calibration:
     anatomies: Count
     intervals: Count
     dataset: str
+    heeded: NonNegative
 
     def half_width(self, seconds: Float[np.ndarray, "*n"], travel_mm: Float[np.ndarray, "*n"], spread: Tips) -> Tips:
         """Return the half-widths of the bands, mm.
@@ -174,3 +176,27 @@ def conformal_scale(
         covered += (score[anatomy == name] <= bounds[:, None]).mean(axis=1) / len(names)
     enough = np.append(shares[covered >= level - 1e-9], 1.0)[0]
     return float(np.quantile(score, enough, method="higher"))
+
+
+def surely_missed(missed: Real[np.ndarray, "patients"], events: Real[np.ndarray, "patients"]) -> float:
+    """Return the share of its events that an adviser misses, as large as a few patients leave possible.
+
+    It is the share of all their events plus its standard error. Events of one patient are alike, so patients count, not
+    events: the share is a ratio of two sums over patients, with the error that such a ratio has (W. G. Cochran,
+    *Sampling techniques*, 1977, section 6.3).
+
+    Args:
+        missed: events of each patient that are missed.
+        events: of each patient.
+
+    Returns:
+        The share; 0 without events, and more than 1 where the patients say next to nothing.
+    """
+    count, total = len(events), float(np.sum(events))
+    if total == 0:
+        return 0.0
+    share = float(np.sum(missed)) / total
+    if count < 2:
+        return 1.0 + share
+    variance = float(np.sum((missed - share * events) ** 2)) * count / (count - 1)
+    return share + float(np.sqrt(variance)) / total

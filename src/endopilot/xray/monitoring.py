@@ -19,12 +19,14 @@ from endopilot.settings import NonNegative, Seed, from_record, settings
 from endopilot.simulation.device import Device
 from endopilot.types import SAMPLE_PERIOD_S, VesselTree
 from endopilot.xray.adviser import AdviserConfig, XrayAdviser, count_events, near_exposures
-from endopilot.xray.bands import Calibration, balanced, conformal_scale, fit_spread, spread_of
+from endopilot.xray.bands import Calibration, balanced, conformal_scale, fit_spread, spread_of, surely_missed
 from endopilot.xray.fluoroscope import Fluoroscope, FluoroscopeConfig
 from endopilot.xray.online_predictors import OnlinePredictor, online_predictor
 
 FLUOROSCOPY_HZ = 7.5
 """Frame rate of the fluoroscopy that advice is compared with."""
+HEEDED = (2.0, 1.5, 1.25, 1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1, 0.0)
+"""Shares of the bands that are tried when an adviser is calibrated: with 2, it is warier than they are."""
 _GRID_MM = 0.25
 ExposurePolicy = Callable[[int, Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]], Bool[np.ndarray, "n"]]
 """From sample, predicted tip and its spread (mm), which navigations are exposed."""
@@ -153,13 +155,13 @@ def monitor(predictor: Predictor, dataset: Dataset, config: AdviseConfig) -> Mon
     )
 
 
-def calibrate(fitted: Monitored, own: Monitored, level: float) -> Calibration:
+def calibrate(fitted: Monitored, own: Monitored, config: AdviserConfig) -> Calibration:
     """Return the calibration of a model.
 
     Args:
         fitted: navigations that the terms of the spread are fitted to; they need be no calibration patients.
         own: navigations of the calibration patients.
-        level: share of the intervals that the bands shall hold throughout.
+        config: how many of the intervals the bands shall hold throughout, and how many events the adviser may miss.
 
     Raises:
         InputError: there are too few calibration patients for that level.
@@ -168,17 +170,44 @@ def calibrate(fitted: Monitored, own: Monitored, level: float) -> Calibration:
     seconds, travel = fitted.since
     error = (fitted.model.tip - fitted.truth)[:, WINDOW:]
     terms = fit_spread(error, seconds, travel, fitted.model.spread[:, WINDOW:])
-    terms = balanced(terms, _worst(fitted, terms), level)
+    terms = balanced(terms, _worst(fitted, terms), config.level)
     score = _worst(own, terms).max(axis=1)
-    return Calibration(
-        level=level,
-        scale=conformal_scale(score, own.episodes.anatomy, level),
+    bands = Calibration(
+        level=config.level,
+        scale=conformal_scale(score, own.episodes.anatomy, config.level),
         abscissa_terms=terms[0],
         offset_terms=terms[1],
         anatomies=len(np.unique(own.episodes.anatomy)),
         intervals=len(score),
         dataset=own.dataset,
+        heeded=1.0,
     )
+    return replace(bands, heeded=least_heeded(own, bands, config))
+
+
+def least_heeded(own: Monitored, bands: Calibration, config: AdviserConfig) -> float:
+    """Return the smallest share of the bands by which the adviser surely misses no more events than it may.
+
+    The shares of `HEEDED` are tried from the largest on. The last one before the first that misses too many is taken,
+    so that chance among many shares favours none; the largest, where even that misses too many.
+
+    Args:
+        own: navigations of the calibration patients.
+        bands: the calibration of these.
+        config: the events, and the share of them that may be missed.
+    """
+    names, owner = np.unique(own.episodes.anatomy, return_inverse=True)
+    least = HEEDED[0]
+    with progress("Heeding less of the bands", len(HEEDED)) as advance:
+        for share in HEEDED:
+            own.model.reset()
+            found = follow_policy(own, adviser_policy(own, replace(bands, heeded=share), config), config)
+            counts = np.array([np.sum(found.count(owner == index), axis=0) for index in range(len(names))])
+            if surely_missed(counts[:, 1], counts[:, 0]) > config.missed:
+                break
+            least = share
+            advance()
+    return least
 
 
 def _worst(monitored: Monitored, terms: tuple[tuple[float, ...], tuple[float, ...]]) -> Float[np.ndarray, "episodes 2"]:
@@ -209,17 +238,38 @@ def coverage(monitored: Monitored, calibration: Calibration) -> dict[str, Any]:
     }
 
 
-def measure_policy(monitored: Monitored, policy: ExposurePolicy, config: AdviserConfig) -> dict[str, float]:
-    """Let a policy decide when X-ray is on, let the model observe what it shows, and count exposures and events.
+@dataclass(frozen=True, eq=False)
+class Followed:
+    """Navigations in which a policy decided when X-ray is on, from the last given sample on.
+
+    Attributes:
+        exposed: which samples were exposed.
+        near: which have an exposure within 0.5 s.
+        wall: whether the tip is at the wall.
+        astray: whether the predicted Δtip errs by δ.
+    """
+
+    exposed: Bool[np.ndarray, "episodes samples"]
+    near: Bool[np.ndarray, "episodes samples"]
+    wall: Bool[np.ndarray, "episodes samples"]
+    astray: Bool[np.ndarray, "episodes samples"]
+
+    def count(self, episodes: Bool[np.ndarray, "episodes"] | slice = slice(None)) -> list[tuple[int, int]]:
+        """Return how many events there are at the wall and of Δtip, each with how many of them are missed."""
+        return [count_events(state[episodes], self.near[episodes]) for state in (self.wall, self.astray)]
+
+
+def follow_policy(monitored: Monitored, policy: ExposurePolicy, config: AdviserConfig) -> Followed:
+    """Let a policy decide when X-ray is on, and let the model observe what it shows.
 
     An event begins where the true ratio reaches τ, or the error of the predicted Δtip reaches δ, after a sample at
     which it had not. It is missed where no exposure is within 0.5 s, a sample, of its beginning.
     """
-    model, truth, samples = monitored.model, monitored.truth, monitored.truth.shape[1]
+    model, truth = monitored.model, monitored.truth
     model.reset()
     exposed = np.zeros(truth.shape[:2], dtype=bool)
     episodes = monitored.episodes
-    for sample in range(WINDOW, samples):
+    for sample in range(WINDOW, truth.shape[1]):
         on = np.flatnonzero(policy(sample, model.tip[:, sample], model.spread[:, sample]))
         exposed[on, sample] = True
         if len(on):
@@ -229,9 +279,15 @@ def measure_policy(monitored: Monitored, policy: ExposurePolicy, config: Adviser
     wall = monitored.ratio >= config.wall_ratio
     astray = np.abs(model.tip[..., 0] - truth[..., 0]) >= config.abscissa_mm
     astray[:, WINDOW - 1] = False
-    counts = [count_events(state[:, WINDOW - 1 :], near[:, WINDOW - 1 :]) for state in (wall, astray)]
-    (wall_events, missed_wall), (abscissa_events, missed_abscissa) = counts
-    minutes = exposed[:, WINDOW:].size * SAMPLE_PERIOD_S / 60
+    return Followed(*(part[:, WINDOW - 1 :] for part in (exposed, near, wall, astray)))
+
+
+def measure_policy(monitored: Monitored, policy: ExposurePolicy, config: AdviserConfig) -> dict[str, float]:
+    """Return what a policy costs and misses: see `follow_policy`."""
+    found = follow_policy(monitored, policy, config)
+    (wall_events, missed_wall), (abscissa_events, missed_abscissa) = found.count()
+    exposed, unseen, wall = (part[:, 1:] for part in (found.exposed, found.wall & ~found.near, found.wall))
+    minutes = exposed.size * SAMPLE_PERIOD_S / 60
     events = wall_events + abscissa_events
     rate = float(exposed.sum() / minutes)
     return {
@@ -242,7 +298,7 @@ def measure_policy(monitored: Monitored, policy: ExposurePolicy, config: Adviser
         "missed_wall_share": missed_wall / max(wall_events, 1),
         "missed_abscissa_share": missed_abscissa / max(abscissa_events, 1),
         "fewer_frames_than_fluoroscopy": 1 - rate / (60 * FLUOROSCOPY_HZ),
-        "wall_samples_without_exposure_share": float((wall & ~near)[:, WINDOW:].sum() / max(wall[:, WINDOW:].sum(), 1)),
+        "wall_samples_without_exposure_share": float(unseen.sum() / max(wall.sum(), 1)),
     }
 
 
