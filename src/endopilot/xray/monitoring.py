@@ -25,8 +25,8 @@ from endopilot.xray.online_predictors import OnlinePredictor, online_predictor
 
 FLUOROSCOPY_HZ = 7.5
 """Frame rate of the fluoroscopy that advice is compared with."""
-HEEDED = (2.0, 1.5, 1.25, 1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1, 0.0)
-"""Shares of the bands that are tried when an adviser is calibrated: with 2, it is warier than they are."""
+HEEDED = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1, 0.0)
+"""Shares of the bands that are tried when an adviser is calibrated."""
 _GRID_MM = 0.25
 ExposurePolicy = Callable[[int, Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]], Bool[np.ndarray, "n"]]
 """From sample, predicted tip and its spread (mm), which navigations are exposed."""
@@ -189,7 +189,7 @@ def least_heeded(own: Monitored, bands: Calibration, config: AdviserConfig) -> f
     """Return the smallest share of the bands by which the adviser surely misses no more events than it may.
 
     The shares of `HEEDED` are tried from the largest on. The last one before the first that misses too many is taken,
-    so that chance among many shares favours none; the largest, where even that misses too many.
+    so that chance among many shares favours none; 1, where even the whole bands miss too many.
 
     Args:
         own: navigations of the calibration patients.
