@@ -18,7 +18,7 @@ from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import read_controls_csv
 from endopilot.simulation.device import read_device
 from endopilot.simulation.table import write_rollout
-from endopilot.simulation.tubes import Stack
+from endopilot.simulation.tubes import Stack, lines_from_tips
 from endopilot.types import Anatomy
 
 SHIPPED = Path(endopilot.__file__).parent / "simulation/catheters"
@@ -235,3 +235,15 @@ def test_a_rollout_written_as_csv_is_simulated_again(vessel: Anatomy, catheter: 
     assert second.catheters.tip_position == pytest.approx(first.catheters.tip_position, abs=1e-3)
     with pytest.raises(InputError, match="column catheter_2_translation_mm_s is missing"):
         read_controls_csv(tmp_path / "rollout.csv", catheters=2)
+
+
+@pytest.mark.parametrize(("wire_mm", "catheter_mm"), [(30.0, 12.3), (12.3, 30.0), (20.0, 20.0)])
+def test_the_line_that_devices_share_is_cut_at_each_tip(vessel, catheter, wire_mm, catheter_mm) -> None:
+    simulator = endopilot.Simulator(vessel, read_device("workhorse-014"), catheters=[catheter])
+    simulator.reset(inserted_length=[wire_mm], rotation=[0.0], catheter_inserted_length=[[catheter_mm]])
+    inserted = np.append(simulator.inserted_length, simulator.catheter_inserted_length)
+    lines = lines_from_tips(simulator.position[0], inserted)
+    for device, line in enumerate(lines):
+        np.testing.assert_allclose(line[0], simulator.tips(device)[0], atol=0.01)
+        np.testing.assert_array_equal(line[-1], simulator.position[0, -1])
+        assert np.linalg.norm(np.diff(line, axis=0), axis=1).min() > 0

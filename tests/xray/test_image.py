@@ -9,8 +9,19 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.special import erf
 
+from endopilot.simulation.catheter import read_catheter
 from endopilot.types import Insertion, Volume
-from endopilot.xray.absorbers import COIL_MM, STEEL_MM, WATER_MM, catheter_line, in_catheter
+from endopilot.xray.absorbers import (
+    CATHETER_MM,
+    COIL_MM,
+    MARKER_LENGTH_MM,
+    MARKER_MM,
+    MARKER_WALL_MM,
+    STEEL_MM,
+    WATER_MM,
+    catheter_line,
+    in_catheter,
+)
 from endopilot.xray.carm import Pose
 from endopilot.xray.image import PHOTONS_MM2_UGY, ImageConfig, XrayImager
 
@@ -34,6 +45,36 @@ def test_a_wire_takes_away_what_its_metal_does(imager):
     radius = imager.device.tip_radius_mm
     metal = np.pi * radius**2 * (30.0 * COIL_MM + 10.0 * STEEL_MM)
     assert wire.sum() * side**2 == pytest.approx(metal, rel=2e-3)
+
+
+@pytest.mark.parametrize("name", ["microcatheter-1.7f", "microcatheter-2.4f", "straight-5f"])
+def test_a_driven_catheter_takes_away_what_its_wall_and_marker_do(fork, wire, name):
+    """Summed over the image, attenuation × pixel area = μ π (R² - r²) L of the wall, and that of the tip's ring."""
+    catheter = read_catheter(name)
+    imager = XrayImager(fork, wire, catheters=[catheter])
+    plane = imager.plane((0.0, 0.0))
+    side = imager.config.geometry.pixel_mm / magnification(imager)
+    nodes = imager.isocenter + np.linspace(-15, 15, 9)[:, None] * np.array([0.6, 0.0, 0.8])
+    drawn = imager.catheter(plane, nodes)
+    outer, inner = catheter.device.diameter_mm / 2, catheter.inner_diameter_mm / 2
+    wall = CATHETER_MM * np.pi * (outer**2 - inner**2) * 30.0
+    ring = 2 * np.pi * (outer + inner) / 2 * MARKER_WALL_MM * MARKER_LENGTH_MM * MARKER_MM
+    marked = name.startswith("micro")  # a diagnostic catheter has none
+    assert drawn.sum() * side**2 == pytest.approx(wall + marked * ring, rel=5e-3)
+    row, column = np.rint(plane.pixel(nodes[0])).astype(int)
+    tip, shaft = drawn[row - 6 : row + 7, column - 6 : column + 7].max(), drawn[250:262, 250:262].max()
+    assert (tip > 3 * shaft) == marked
+
+
+def test_a_frame_adds_the_catheter_to_the_wire(fork, wire, imager):
+    pair = XrayImager(fork, wire, catheters=[read_catheter("microcatheter-1.7f")])
+    plane = pair.plane((0.0, 0.0))
+    nodes = pair.isocenter + np.linspace(0, 20, 41)[:, None] * np.array([0, 0, 1.0])
+    alone, both = (pair.signal(plane, nodes, dose=1e8, catheters=shown) for shown in ([], [nodes[20:]]))
+    np.testing.assert_array_equal(alone, imager.signal(imager.plane((0.0, 0.0)), nodes, dose=1e8))
+    marker, ahead = (tuple(np.rint(plane.pixel(nodes[at])).astype(int)) for at in (21, 2))
+    assert both[marker] < alone[marker] - 0.1
+    assert both[ahead] == pytest.approx(alone[ahead], abs=1e-3)
 
 
 def test_a_wire_along_the_beam_is_dark_and_short(imager):
@@ -125,7 +166,7 @@ def test_motion_blurs_a_wire_along_its_path(imager):
     plane = imager.plane((0.0, 0.0))
     nodes = imager.isocenter + np.linspace(-5, 5, 9)[:, None] * np.array([0.0, 0.0, 1.0])
     speed = np.tile([250.0, 0.0, 0.0], (9, 1))  # 2 mm in a pulse of 8 ms
-    still, moving = imager._moving_wire(plane, nodes, None), imager._moving_wire(plane, nodes, speed)
+    still, moving = (imager._moving(plane, imager.wire, nodes, velocity) for velocity in (None, speed))
     columns = np.arange(512)
 
     def middle_and_variance(image):

@@ -11,6 +11,7 @@ import pytest
 from endopilot.anatomy.io import write_anatomy
 from endopilot.cli import main
 from endopilot.errors import InputError
+from endopilot.xray.image import XrayImager
 from endopilot.xray.take_image import TakeImageConfig, take_image
 
 
@@ -66,6 +67,18 @@ def test_a_breath_moves_vessel_and_wire_in_the_image(fork):
     below = row + round(5.0 / plain.mm_per_pixel)
     assert max(darker(inspired, below, column + side) for side in range(-4, 5)) > 30
     assert shown(fork, motion="breathing").tip_pixel == pytest.approx(plain.tip_pixel, abs=0.5)
+
+
+def test_a_catheter_is_shown_up_to_its_own_tip(fork, monkeypatch):
+    """The line that both share, cut at each tip, ends where the core has the tips."""
+    seen = {}
+    signal = XrayImager.signal
+    monkeypatch.setattr(XrayImager, "signal", lambda *given, **how: seen.update(how) or signal(*given, **how))
+    for deep in (7.0, 14.0):  # behind the wire's tip, at 12 mm, and ahead of it
+        image = shown(fork, catheter=("microcatheter-1.7f",), catheter_inserted_mm=deep)
+        (line,) = seen["catheters"]
+        assert line[0, 2] == pytest.approx(deep, abs=0.3)
+        assert np.linalg.norm(image.tip_pixel - shown(fork).tip_pixel) * image.mm_per_pixel < 1.0
 
 
 def test_refuses_what_is_no_png(fork, tmp_path):

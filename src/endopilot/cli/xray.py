@@ -1,4 +1,4 @@
-"""`endopilot xray`: anatomy -> X-ray image of a wire in it."""
+"""`endopilot xray`: anatomy -> X-ray image of a wire in it, alone or in a catheter."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def command(
     json: bool = False,
     config: TakeImageConfig = TakeImageConfig(),
 ) -> None:
-    """Push a wire into a vessel, and take an X-ray image of it: fluoroscopy, contrast, DSA or roadmap.
+    """Push a wire, alone or in a catheter, into a vessel, and take an X-ray image: fluoroscopy, contrast, DSA, roadmap.
 
     Args:
         anatomy: folder made by `endopilot anatomy` or `endopilot atlas`.

@@ -17,6 +17,8 @@ from endopilot.types import Anatomy
 
 _SPACING_MM = 0.25
 """Distance between the points of a profile, mm."""
+_APART_MM = 1e-6
+"""Nodes nearer to a tip than this are the tip, mm."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,6 +120,27 @@ class Stack:
             length_mm: length that the profiles must cover.
         """
         return _lay_out(self.wire, self.catheters, length_mm) if self.catheters else None
+
+
+def lines_from_tips(
+    nodes: Float[np.ndarray, "n 3"], inserted_mm: Float[np.ndarray, "devices"]
+) -> list[Float[np.ndarray, "_ 3"]]:
+    """Return the line that telescoping devices share, as each of them has it: from its own tip on.
+
+    Args:
+        nodes: of the line, from the foremost tip on, LPS mm.
+        inserted_mm: inserted length of each device; the foremost tip is that of the largest.
+    """
+    behind = inserted_mm.max() - inserted_mm
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(nodes, axis=0), axis=1))])
+    return [
+        nodes if at == 0 else np.vstack([_at(nodes, along, at), nodes[along > at + _APART_MM]])
+        for at in behind.tolist()
+    ]
+
+
+def _at(nodes: Float[np.ndarray, "n 3"], along: Float[np.ndarray, "n"], at_mm: float) -> Float[np.ndarray, "3"]:
+    return np.array([np.interp(at_mm, along, axis) for axis in nodes.T])
 
 
 def _lay_out(wire: Device, catheters: Sequence[Catheter], length_mm: float) -> TubeLayout:

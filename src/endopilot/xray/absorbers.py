@@ -1,4 +1,4 @@
-"""What takes away X-rays: the patient, the lumen with its contrast, the guiding catheter and the wire.
+"""What takes away X-rays: the patient, the lumen with its contrast, the guiding catheter, the wire and its catheters.
 
 Each but the patient is a cloud of small volumes, which `projector.splat` turns into line integrals.
 """
@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from endopilot.phantom.chest import is_left
 from endopilot.phantom.phantom import PhantomConfig, make_phantom
+from endopilot.simulation.catheter import Catheter
 from endopilot.types import Anatomy, Volume
 
 WATER_MM = 0.0206
@@ -17,12 +18,18 @@ WATER_MM = 0.0206
 STEEL_MM, COIL_MM = 0.95, 3.0
 """Attenuation of a wire's steel shaft, and of the tungsten or platinum coil over its tip, partly filled, 1/mm."""
 CATHETER_MM, _CATHETER_WALL_MM = 0.23, 0.25
-"""Attenuation of a catheter's wall with its barium and its steel braid, 1/mm, and its thickness, mm."""
+"""Attenuation of a catheter's wall with its barium and its steel braid, 1/mm, and the guiding catheter's thickness,
+mm."""
+MARKER_MM, MARKER_WALL_MM, MARKER_LENGTH_MM = 9.0, 0.03, 1.0
+"""Attenuation of the platinum ring at a microcatheter's tip, 1/mm, its thickness and its length, mm."""
+_MARKED_MM = 1.1
+"""A catheter up to this wide, mm, is a microcatheter: it has a marker."""
 _STRAIGHT_MM, _BEND_MM, _SHOWN_MM = 10.0, 25.0, 180.0
 """Length of the catheter behind the ostium that is straight, radius of its bend into the aorta, and the length that is
 shown, mm."""
 _BLOOD_HU = 40.0
 _STEP_MM, _RING, _RINGS, _SPOKES = 0.15, 48, 4, 16
+_MARKER_STEP_MM = 0.05
 _SURROUNDINGS = PhantomConfig(  # without contrast, as the chest is between two injections
     in_plane_mm=1.5, slice_mm=1.5, margin_mm=60.0, lumen_hu=(45.0, 45.0), noise_hu=(0.0, 0.0), calcium=0.0
 )
@@ -158,3 +165,38 @@ def wire_points(
     points = np.stack([np.interp(at, along, axis) for axis in nodes.T], axis=-1)
     per_mm = np.where(at <= opaque_tip_mm, COIL_MM, STEEL_MM)
     return points, per_mm * np.pi * radius_mm**2 * step_mm
+
+
+def driven_catheter_points(
+    catheter: Catheter, nodes: Places
+) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m"]]:
+    """Return a driven catheter as small volumes: their places, LPS mm, and sizes times their attenuation, mm².
+
+    Its wall is that of the guiding catheter's kind. A microcatheter has a ring of platinum in the wall at its tip.
+
+    Args:
+        catheter: its diameters.
+        nodes: of its axis from the tip on, LPS mm.
+    """
+    outer, inner = catheter.device.tip_radius_mm, catheter.inner_diameter_mm / 2
+    radius = (outer + inner) / 2
+    wall, sizes = _tube(nodes, radius, outer - inner, _STEP_MM, CATHETER_MM)
+    if 2 * outer > _MARKED_MM:
+        return wall, sizes
+    ring, ring_sizes = _tube(nodes, radius, MARKER_WALL_MM, _MARKER_STEP_MM, MARKER_MM, MARKER_LENGTH_MM)
+    return np.concatenate([wall, ring]), np.concatenate([sizes, ring_sizes])
+
+
+def _tube(
+    nodes: Places, radius_mm: float, wall_mm: float, step_mm: float, per_mm: float, most_mm: float = np.inf
+) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m"]]:
+    """Return a tube about a line, from its begin up to a length, as `driven_catheter_points` does."""
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(nodes, axis=0), axis=1))])
+    at = np.arange(step_mm / 2, min(along[-1], most_mm), step_mm)
+    axis = np.stack([np.interp(at, along, part) for part in nodes.T], axis=-1)
+    heading = np.stack([np.interp(at, along, part) for part in np.gradient(nodes, along, axis=0).T], axis=-1)
+    first, second = _across(heading)
+    spokes = int(np.ceil(2 * np.pi * radius_mm / _STEP_MM))
+    turn = np.linspace(0, 2 * np.pi, spokes, endpoint=False)[:, None, None]
+    points = (axis + radius_mm * (np.cos(turn) * first + np.sin(turn) * second)).reshape(-1, 3)
+    return points, np.full(len(points), per_mm * 2 * np.pi * radius_mm * wall_mm * step_mm / spokes)

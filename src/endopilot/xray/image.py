@@ -1,19 +1,23 @@
-"""A fluoroscopic image: the patient, the contrasted vessel, catheter and wire as their attenuation, with quantum noise.
+"""A fluoroscopic image: the patient, the contrasted vessel, catheters and wire as what they take away, and noise.
 
 What does not move (`Plane`) is computed once for a direction of the C-arm: line integrals of the attenuation through a
-CT, the path through the lumen, the catheter, the scattered light. A frame adds the wire and the noise. All lengths and
+CT, the path through the lumen, the guiding catheter, the scattered light. A frame adds the wire, the catheters that are
+driven with it, and the noise. All lengths and
 attenuations are physical; docs/xray.md says where the constants come from.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 from scipy.ndimage import gaussian_filter, zoom
 
 from endopilot.settings import Count, Finite, NonNegative, Positive, Share, settings
+from endopilot.simulation.catheter import Catheter
 from endopilot.simulation.device import Device
 from endopilot.simulation.motion import place
 from endopilot.types import Anatomy, Volume
@@ -22,6 +26,7 @@ from endopilot.xray.absorbers import (
     WATER_MM,
     catheter_lumen_points,
     catheter_points,
+    driven_catheter_points,
     in_catheter,
     lumen_points,
     wire_points,
@@ -108,10 +113,16 @@ class Plane:
 
 
 class XrayImager:
-    """Makes the images of one patient and one wire."""
+    """Makes the images of one patient and one wire, alone or with catheters around it."""
 
     def __init__(
-        self, anatomy: Anatomy, device: Device, ct: Volume | None = None, config: ImageConfig | None = None
+        self,
+        anatomy: Anatomy,
+        device: Device,
+        ct: Volume | None = None,
+        config: ImageConfig | None = None,
+        *,
+        catheters: Sequence[Catheter] = (),
     ) -> None:
         """Bring the middle of the vessel to the isocenter.
 
@@ -120,8 +131,10 @@ class XrayImager:
             device: the wire.
             ct: of the patient, HU; 200 mm of water if not given. The blood in the vessel loses its contrast.
             config: detector and beam.
+            catheters: driven around the wire, from the inside out.
         """
         self.anatomy, self.device, self.config = anatomy, device, config or ImageConfig()
+        self.catheters = tuple(catheters)
         self.isocenter = isocenter_of(anatomy)
         self._ct = None if ct is None else without_contrast(ct, anatomy)
         self._filled = [lumen_points(anatomy), catheter_lumen_points(anatomy)]
@@ -176,6 +189,8 @@ class XrayImager:
         dose: float = 1.0,
         seed: int = 0,
         velocity: Float[np.ndarray, "n 3"] | None = None,
+        catheters: Sequence[Float[np.ndarray, "_ 3"]] = (),
+        catheter_velocities: Sequence[Float[np.ndarray, "_ 3"]] | None = None,
     ) -> Float32[np.ndarray, "rows columns"]:
         """Return what the detector reads: the logarithm of the light over the usual one; the same seed, the same noise.
 
@@ -186,11 +201,16 @@ class XrayImager:
             dose: multiple of the usual dose.
             seed: of the noise.
             velocity: of the nodes, mm/s, which blurs the wire over the pulse; at rest if not given.
+            catheters: nodes of each catheter from its tip on, LPS mm of the CT; none if not given.
+            catheter_velocities: of these nodes, mm/s; at rest if not given.
         """
         config = self.config
         attenuation = plane.background.copy()
         if len(nodes):
-            attenuation += self._moving_wire(plane, nodes, velocity)
+            attenuation += self._moving(plane, self.wire, nodes, velocity)
+        moving = catheter_velocities or [None] * len(catheters)
+        for number, (line, its_velocity) in enumerate(zip(catheters, moving, strict=True)):
+            attenuation += self._moving(plane, partial(self.catheter, number=number), line, its_velocity)
         if contrast > 0:
             attenuation += np.float32(contrast * config.iodine_mm) * plane.vessel_mm
         light = np.exp(-attenuation)
@@ -234,6 +254,23 @@ class XrayImager:
         points = place(plane.placed, points)
         return splat(plane.view, self.config.pixels, points, size, width_mm=radius / 2, blur_px=blur)
 
+    def catheter(
+        self, plane: Plane, nodes: Float[np.ndarray, "n 3"], number: int = 0
+    ) -> Float32[np.ndarray, "rows columns"]:
+        """Return the attenuation of a catheter that is driven around the wire along each ray.
+
+        Args:
+            plane: the view.
+            nodes: of its axis from its tip on, LPS mm.
+            number: which one, from the inside out.
+        """
+        catheter = self.catheters[number]
+        points, size = driven_catheter_points(catheter, in_catheter(self.anatomy, nodes))
+        wall_mm = catheter.device.tip_radius_mm - catheter.inner_diameter_mm / 2
+        blur = self._blur_px(plane.zoom)
+        points = place(plane.placed, points)
+        return splat(plane.view, self.config.pixels, points, size, width_mm=wall_mm / np.sqrt(12), blur_px=blur)
+
     def air_kerma_ugy(self, plane: Plane, dose: float) -> float:
         """Return the air kerma of a frame at the patient's entrance reference point, µGy."""
         geometry = self.config.geometry
@@ -246,16 +283,20 @@ class XrayImager:
         config, side = self.config, self.config.geometry.pixel_mm / plane.zoom
         return PHOTONS_MM2_UGY * config.efficiency * config.detector_ugy * dose * side**2
 
-    def _moving_wire(
-        self, plane: Plane, nodes: Float[np.ndarray, "n 3"], velocity: Float[np.ndarray, "n 3"] | None
+    def _moving(
+        self,
+        plane: Plane,
+        draw: Callable[[Plane, Float[np.ndarray, "n 3"]], Float32[np.ndarray, "rows columns"]],
+        nodes: Float[np.ndarray, "n 3"],
+        velocity: Float[np.ndarray, "n 3"] | None,
     ) -> Float32[np.ndarray, "rows columns"]:
-        """Return the mean attenuation of a wire over the pulse, which ends with the wire at its nodes."""
+        """Return the mean attenuation of a device over the pulse, which ends with the device at its nodes."""
         if velocity is None:
-            return self.wire(plane, nodes)
+            return draw(plane, nodes)
         path_px = float(np.linalg.norm(velocity, axis=1).max()) * self.config.pulse_s
         path_px *= plane.view.scale / self.config.geometry.source_to_isocenter_mm
         times = self.config.pulse_s * (np.arange(count := min(1 + int(2 * path_px), _MOST_PULSES)) + 0.5) / count
-        drawn = [self.wire(plane, nodes - time * velocity) for time in times]
+        drawn = [draw(plane, nodes - time * velocity) for time in times]
         return np.asarray(np.mean(drawn, axis=0), dtype=np.float32)
 
     def _blur_px(self, zoom_factor: float) -> float:

@@ -1,4 +1,4 @@
-"""One X-ray image of a wire that was pushed into a vessel: `take_image`."""
+"""One X-ray image of a wire that was pushed into a vessel, alone or in a catheter: `take_image`."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from jaxtyping import Float, UInt8
 from endopilot.errors import InputError
 from endopilot.files import writing
 from endopilot.settings import Finite, NonNegative, Positive, Seed, Share, Text, Within, settings
-from endopilot.simulation.device import Device, read_device
+from endopilot.simulation.catheter import read_catheter
+from endopilot.simulation.device import read_device
 from endopilot.simulation.motion import Motion, MotionName, motion_named, place, relative
 from endopilot.simulation.simulate import simulate
+from endopilot.simulation.tubes import Stack, lines_from_tips
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, Volume
 from endopilot.xray.absorbers import surroundings
 from endopilot.xray.image import ImageConfig, XrayImager
 
-_REST = np.zeros((1, 1, 2))
 _SHORTEST_S = 0.0125
 """The wire is held for this long at least before the image, s: one time step."""
 _MASK_SEED = 2**32
@@ -45,9 +46,13 @@ class TakeImageConfig:
     device: Text = "workhorse-014"
     """Name of a device (`endopilot devices`) or a YAML file."""
     inserted_mm: NonNegative = 60.0
-    """Length of wire that is pushed in before, mm; 0 shows the vessel without a wire."""
+    """Length of wire that is pushed in before, mm; 0 shows the vessel without wire and catheters."""
     rotation_rad: Finite = 0.0
     """Rotation of the wire as it goes in, rad."""
+    catheter: tuple[Text, ...] = ()
+    """Up to two catheters around the wire, from the inside out: names such as microcatheter-1.7f, or YAML files."""
+    catheter_inserted_mm: NonNegative = 40.0
+    """Length of the catheters that is pushed in with it, mm."""
     speed_mm_s: Finite = 0.0
     """Speed of the wire along its axis while it is exposed, mm/s: it is blurred."""
     motion: MotionName = "still"
@@ -104,23 +109,35 @@ def take_image(anatomy: Anatomy, config: TakeImageConfig | None = None, ct: Volu
         InputError: no such device, or it does not fit the vessel.
     """
     config = config or TakeImageConfig()
-    device = read_device(config.device)
+    stack = Stack(read_device(config.device), tuple(read_catheter(name) for name in config.catheter))
     motion = motion_named(config.motion, config.motion_seed)
-    nodes = _pushed(anatomy, device, config, motion)
-    imager = XrayImager(anatomy, device, surroundings(anatomy) if ct is None else ct, config.image)
+    nodes, *catheters = _pushed(anatomy, stack, config, motion)
+    patient = surroundings(anatomy) if ct is None else ct
+    imager = XrayImager(anatomy, stack.wire, patient, config.image, catheters=stack.catheters)
     placed, before = np.eye(3, 4), np.eye(3, 4)  # at the end of the pulse and at its start
     if motion is not None:
         times = np.array([config.time_s, config.time_s - config.image.pulse_s])
         placed, before = motion.core(np.asarray(anatomy.insertion.position)).placements(times)[0]
     plane = imager.plane(config.view_deg, config.zoom, placed=placed)
-    velocity = nodes
+    velocity, catheter_velocities = nodes, [np.zeros_like(line) for line in catheters]
     if len(nodes):
         forwards = -np.gradient(nodes, axis=0)
         velocity = config.speed_mm_s * forwards / np.linalg.norm(forwards, axis=1, keepdims=True)
         if motion is not None:
-            velocity = velocity + (nodes - place(relative(before, placed), nodes)) / max(config.image.pulse_s, 1e-9)
+            was, pulse_s = relative(before, placed), max(config.image.pulse_s, 1e-9)
+            velocity = velocity + (nodes - place(was, nodes)) / pulse_s
+            catheter_velocities = [(line - place(was, line)) / pulse_s for line in catheters]
     share = config.contrast if config.show in ("contrast", "dsa") else 0.0
-    signal = imager.signal(plane, nodes, contrast=share, dose=config.dose, seed=config.seed, velocity=velocity)
+    signal = imager.signal(
+        plane,
+        nodes,
+        contrast=share,
+        dose=config.dose,
+        seed=config.seed,
+        velocity=velocity,
+        catheters=catheters,
+        catheter_velocities=catheter_velocities,
+    )
     mask = None
     if config.show == "dsa":
         mask = imager.signal(plane, nodes[:0], dose=config.dose, seed=config.seed + _MASK_SEED)
@@ -137,13 +154,29 @@ def take_image(anatomy: Anatomy, config: TakeImageConfig | None = None, ct: Volu
 
 
 def _pushed(
-    anatomy: Anatomy, device: Device, config: TakeImageConfig, motion: Motion | None
-) -> Float[np.ndarray, "n 3"]:
-    """Return the nodes of a wire that was pushed in, from its tip on, in the vessel as CT shows it; none at 0 mm."""
+    anatomy: Anatomy, stack: Stack, config: TakeImageConfig, motion: Motion | None
+) -> list[Float[np.ndarray, "_ 3"]]:
+    """Return the nodes of a wire and its catheters that were pushed in, each from its tip on.
+
+    They lie in the vessel as CT shows it. At 0 mm there is a wire without nodes, and nothing else.
+    """
     if config.inserted_mm == 0:
-        return np.zeros((0, 3))
-    initial = np.array([[config.inserted_mm, config.rotation_rad]])
+        return [np.zeros((0, 3))]
+    around = len(stack.catheters)
+    initial = np.array([[config.inserted_mm, config.rotation_rad, *[config.catheter_inserted_mm, 0.0] * around]])
     period_s = max(config.time_s, _SHORTEST_S) if motion is not None else SAMPLE_PERIOD_S
-    rollout = simulate(anatomy, device, _REST, initial=initial, record_shape=True, motion=motion, period_s=period_s)
+    rollout = simulate(
+        anatomy,
+        stack.wire,
+        np.zeros((1, 1, initial.shape[1])),
+        catheters=stack.catheters,
+        initial=initial,
+        record_shape=True,
+        motion=motion,
+        period_s=period_s,
+    )
     assert rollout.shape is not None
-    return rollout.shape[0, -1]
+    inserted = [rollout.inserted_length[0, -1:]]
+    if rollout.catheters is not None:
+        inserted.append(rollout.catheters.inserted_length[0, -1])
+    return lines_from_tips(rollout.shape[0, -1], np.concatenate(inserted))
