@@ -22,10 +22,10 @@ def world(navigation):
 
 
 @pytest.fixture
-def xray(fork, wire):
+def xray(navigation):
     from endopilot.cockpit.open import xray_unit
 
-    unit = xray_unit(fork, wire, None)
+    unit = xray_unit(navigation, None)
     until = time.monotonic() + 20
     while not unit.ready and time.monotonic() < until:
         time.sleep(0.01)

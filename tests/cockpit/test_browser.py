@@ -206,3 +206,34 @@ def test_a_task_is_driven_by_x_ray_alone(context, tmp_path):
         until(page, "document.querySelector('#scores')?.innerText.includes('you')")
         page.wait_for_selector("#blind", state="hidden")
         assert value(page, "cockpit.state.nodes.length") > 10
+
+
+def test_the_hand_takes_the_catheter_and_both(context, vessel, tmp_path):
+    errors = []
+    with serving(vessel, "--catheter", "microcatheter-1.7f", "--output", tmp_path) as server:
+        page = opened(context, server)
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        assert "in microcatheter-1.7f" in page.inner_text("#patient")
+        says(page, "#holds .on", "wire")
+        hold(page, "KeyW", "cockpit.shown.inserted_mm > 9")
+        assert value(page, "cockpit.shown.catheters[0].inserted_mm") == 0
+        page.keyboard.press("KeyQ")  # W stays pressed, and moves nothing more
+        says(page, "#holds .on", "microcatheter-1.7f")
+        until(page, "cockpit.shown.velocity.every((v) => v === 0)")
+        page.keyboard.up("KeyW")
+        wire = value(page, "cockpit.shown.inserted_mm")
+        hold(page, "KeyW", "cockpit.shown.catheters[0].inserted_mm > 4")
+        page.keyboard.up("KeyW")
+        until(page, "cockpit.shown.velocity.every((v) => v === 0)")
+        assert value(page, "cockpit.shown.inserted_mm") == pytest.approx(wire, abs=0.2)
+        says(page, "#figures", "microcatheter-1.7f")
+        page.click("#holds button:last-child")
+        says(page, "#holds .on", "both")
+        hold(page, "KeyS", "cockpit.shown.catheters[0].inserted_mm < 3")
+        page.keyboard.up("KeyS")
+        assert value(page, "cockpit.shown.inserted_mm") < wire - 0.5
+        drawn = "cockpit.space.catheters[0].mesh.geometry.drawRange.count"
+        assert 0 < value(page, drawn) < value(page, "cockpit.space.wire.mesh.geometry.drawRange.count")
+        page.click("#holds button >> nth=0")
+        says(page, "#holds .on", "wire")
+    assert not errors

@@ -28,7 +28,7 @@ def run(session, seconds, *, message=None, start=0.0):
 def test_the_wire_follows_the_drive_within_its_limits(session):
     before = session.world.snapshot().inserted_mm
     (header, arrays), _ = run(session, 1.0, message=Drive(type="drive", translation=900.0, rotation=0.0))
-    fastest = session.world.limits.max_velocity_mm_s
+    fastest = session.world.navigation.device.max_velocity_mm_s
     assert header["command"] == [fastest, 0.0]
     # 50 ms of latency and a ramp of 40/200 s: the rest at full speed; what the drive slips over is lost.
     assert 10 < header["inserted_mm"] - before <= fastest * (1.0 - 0.05 - 0.1)

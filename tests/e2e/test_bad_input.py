@@ -142,3 +142,14 @@ def test_a_device_of_ones_own(patient, tmp_path, capsys):
     made = tmp_path / "data"
     run(capsys, "dataset", patient, "--device", own, "-o", made, "--sequences", "2", "--seconds", "1")
     assert read_json(made / "meta" / "manifest.json")["device"]["diameter_mm"] == 0.40
+
+
+def test_the_cockpits_catheters(patient, tmp_path, capsys):
+    recordings = ("--output", tmp_path / "recordings")
+    narrow = refused(capsys, "cockpit", patient, "--device", "j-035", "--catheter", "microcatheter-1.7f", *recordings)
+    assert "is too wide for the bore of catheter microcatheter-1.7f" in narrow
+    assert "no such catheter" in refused(capsys, "cockpit", patient, "--catheter", "nonesuch", *recordings)
+    brought = refused(capsys, "cockpit", "--task", "follow", "--catheter", "microcatheter-1.7f", *recordings)
+    assert brought.endswith("catheter: a task and a session have theirs; leave it out")
+    assert "follow" in refused(capsys, "cockpit", "--task", "nonesuch", *recordings)
+    assert not (tmp_path / "recordings").exists()

@@ -20,6 +20,7 @@ import numpy as np
 
 from endopilot.anatomy.io import write_anatomy
 from endopilot.errors import InputError
+from endopilot.simulation.catheter import read_catheter
 from endopilot.tasks.task import reference_navigation
 
 BARS = {
@@ -71,8 +72,11 @@ _COUNT = """() => {
 }"""
 
 
-def bench_cockpit() -> dict[str, Any]:
+def bench_cockpit(catheter: str | None = None) -> dict[str, Any]:
     """Measure the cockpit in the reference patient, and return each figure with its bar.
+
+    Args:
+        catheter: around the wire, a name or a YAML file; both are then pushed and turned while the views are measured.
 
     Returns:
         `realtime_reserve`: simulated time over the time that simulating it takes, while the wire moves and both views
@@ -82,8 +86,10 @@ def bench_cockpit() -> dict[str, Any]:
         frame; `bars` and `passed`.
 
     Raises:
-        InputError: there is no browser, or playwright is not installed.
+        InputError: there is no browser, or playwright is not installed; no such catheter.
     """
+    if catheter is not None:
+        read_catheter(catheter)  # or the server's error would be all that is told
     browser_path = find_browser()
     if browser_path is None:
         raise InputError("browser: none found; install Chromium or Chrome")
@@ -98,12 +104,14 @@ def bench_cockpit() -> dict[str, Any]:
         browser = driver.chromium.launch(executable_path=browser_path, args=list(BROWSER_FLAGS))
         page = browser.new_page(viewport={"width": 1280, "height": 800})
         began = time.perf_counter()
-        with serving(patient, Path(folder) / "recordings") as address:
+        with serving(patient, Path(folder) / "recordings", catheter) as address:
             page.goto(address)
             wait_for(page, "window.cockpit?.shown && cockpit.frames > 0")
+            page.evaluate("() => cockpit.hands.hold(cockpit.hands.choices().length - 1)")  # all devices at once
             figures["ready_seconds"] = time.perf_counter() - began
             wait_for(page, "cockpit.shown.xray.background === 'phantom' && cockpit.shown.xray.ready")
             figures |= _views(page)
+            page.evaluate("() => cockpit.hands.hold(0)")
             figures |= _latency(page)
         browser.close()
     rounded = {name: round(float(value), 3) for name, value in figures.items()}
@@ -160,14 +168,16 @@ def _latency(page: Any) -> dict[str, float]:
 
 
 @contextmanager
-def serving(patient: Path, output: Path) -> Iterator[str]:
+def serving(patient: Path, output: Path, catheter: str | None = None) -> Iterator[str]:
     """Run `endopilot cockpit` in a process of its own and yield the page's address.
 
     Args:
         patient: folder of the anatomy.
         output: folder of the recordings.
+        catheter: around the wire.
     """
     command = [sys.executable, "-m", "endopilot.cli", "cockpit", str(patient), "--no-browser", "--output", str(output)]
+    command += [] if catheter is None else ["--catheter", catheter]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
         assert process.stdout is not None

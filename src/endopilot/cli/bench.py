@@ -274,15 +274,16 @@ def imaging(
     _leave(all(measured[name]["met"] for name in BARS))
 
 
-def cockpit(*, json: bool = False) -> None:
+def cockpit(*, catheter: str | None = None, json: bool = False) -> None:
     """Measure the cockpit in a headless browser without a GPU: time in reserve, latency, frames per second, start.
 
     Args:
+        catheter: around the wire (a name or a YAML file); both are driven at once.
         json: print the figures as JSON.
     """
     from endopilot.benchmarks.cockpit import BARS, bench_cockpit
 
-    measured = bench_cockpit()
+    measured = bench_cockpit(catheter)
     if json:
         show(measured, as_json=True)
     else:

@@ -1,4 +1,4 @@
-"""`endopilot cockpit`: watch a wire in a browser, drive it by hand, or let a policy drive it."""
+"""`endopilot cockpit`: watch a wire, alone or in catheters, in a browser, drive by hand, or let a policy drive."""
 
 from __future__ import annotations
 
@@ -28,6 +28,7 @@ def command(
     /,
     *,
     device: str = "workhorse-014",
+    catheter: tuple[str, ...] = (),
     task: str | None = None,
     world: CountOrZero = 0,
     replay: Path | None = None,
@@ -38,11 +39,14 @@ def command(
     browser: bool = True,
     listen: ListenConfig = ListenConfig(),
 ) -> None:
-    """Open a web page on this machine in which a wire is driven by hand or by a policy. No medical device.
+    """Open a web page on this machine in which a wire, alone or in catheters, is driven by hand or by a policy.
+
+    No medical device.
 
     Args:
         patient: folder made by `endopilot anatomy` or `endopilot atlas`; a synthetic one if nothing is given.
         device: name of a device (`endopilot devices`) or a YAML file.
+        catheter: up to two catheters around it, from the inside out: names such as microcatheter-1.7f, or YAML files.
         task: task of the ladder to drive by hand, with X-ray as the only sight until the end.
         world: which patient of the task, world of the rollout, or episode of the data set.
         replay: session, rollout, plan, data set or file of the ladder to look at instead.
@@ -62,13 +66,17 @@ def command(
 
     folder, volume = patient and existing(patient), ct and existing(ct)
     if replay is not None:
-        opened = open_replay(existing(replay), folder, device=device, world=world, task=task, ct=volume)
+        opened = open_replay(
+            existing(replay), folder, device=device, catheters=catheter, world=world, task=task, ct=volume
+        )
+    elif catheter and (task is not None or resume is not None):
+        raise InputError("catheter: a task and a session have theirs; leave it out")
     elif task is not None:
         opened = open_task(task, world, output=output)
     elif resume is not None:
         opened = resume_session(existing(resume), ct=volume)
     else:
-        opened = open_session(folder, device=device, ct=volume, output=output)
+        opened = open_session(folder, device=device, catheters=catheter, ct=volume, output=output)
 
     def listening(address: str) -> None:
         print(f"page       {address}", flush=True)

@@ -25,6 +25,7 @@ from endopilot.xray.fluoroscope import Fluoroscope, FluoroscopeConfig, TipMeasur
 SECONDS = 600.0
 """Time that a policy is given, s."""
 _SEED = 1
+_UNTURNED_RAD = np.radians(5.0)
 
 
 class Autopilot:
@@ -49,6 +50,7 @@ class Autopilot:
         self._fluoroscope: Fluoroscope | None = None
         self._due = self._began = 0
         self._expose, self._started = True, False
+        self._turned: tuple[float, ...] = ()  # of catheters as the policy began
 
     @property
     def drives(self) -> bool:
@@ -98,21 +100,29 @@ class Autopilot:
             return self._collect(snapshot)
         if self._due > self._world.cycle or not (self.drives or self.status == "watches"):
             return None
-        if self.drives and bool(self._world.navigation_to(self._target).reached(snapshot.tip)[0]):
+        if self.drives and self._world.reaches(self._target):
             self.status, self.asks = "reached", ""
             return Decision(0.0, 0.0)
         state, tip = self._world.robot.proximal_state(), None
+        if not self._started:
+            self._turned = tuple(turn for _, turn in state.catheters)
+            if crooked := self._turned_catheter():
+                self.status, self.asks = "failed", ""
+                self.failure = f"{self.policy_name}: begins with unturned catheters; turn {crooked} back to 0° first"
+                return Decision(0.0, 0.0)
         if self.drives and self._expose:
             expose()
             tip = self._measure(snapshot, state.inserted_length)
         time_s = (self._world.cycle - self._began) * self._world.config.cycle_s
-        observation = Observation(time_s, state.inserted_length, state.rotation, tip)
+        catheters = tuple((at, turn - began) for (at, turn), began in zip(state.catheters, self._turned, strict=True))
+        observation = Observation(time_s, state.inserted_length, state.rotation, tip, catheters)
         start = None
         if not self._started:
             start = replace(
                 self._world.navigation_to(self._target),
                 start_inserted_mm=max(state.inserted_length, 0.0),
                 start_rotation=state.rotation,
+                start_catheter_mm=max([0.0, *(at for at, _ in state.catheters)]),
                 seconds=SECONDS,
             )
             self._started = True
@@ -146,7 +156,7 @@ class Autopilot:
             return None
         wires = self._policy.believed_wires()
         length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(wires[0], axis=0), axis=1))])
-        shown = wires[:, length <= snapshot.inserted_mm + SHOWN_BEHIND_MM]
+        shown = wires[:, length <= snapshot.deepest_mm + SHOWN_BEHIND_MM]
         line = self._world.navigation.anatomy.tree.path(self._target.branch)
         half = self._believed.half_width[0]
         within = np.abs(line.abscissa - self._believed.abscissa) <= (half if np.isfinite(half) else -1.0)
@@ -189,6 +199,13 @@ class Autopilot:
         told = "" if self._believed is None else self._believed.asks
         self.asks = (told or "the policy asks for it") if decision.expose else ""
         return decision
+
+    def _turned_catheter(self) -> str:
+        """Return the name of a curved catheter that the policy would take for unturned and is not; empty if none is."""
+        for catheter, turn in zip(self._world.navigation.catheters, self._turned, strict=True):
+            if catheter.shape and np.cos(turn) < np.cos(_UNTURNED_RAD):
+                return catheter.name
+        return ""
 
     def _measure(self, snapshot: Snapshot, inserted_mm: float) -> TipMeasurement:
         navigation = self._world.navigation

@@ -13,7 +13,7 @@ from endopilot.control.navigate_patient import sampled
 from endopilot.dataset.episode import write_episode
 from endopilot.errors import InputError
 from endopilot.simulation.simulate import simulate
-from endopilot.tasks.navigation import DECISION_PERIOD_S
+from endopilot.tasks.navigation import DECISION_PERIOD_S, check_wire_alone
 
 
 def write_session_episode(session: Path, output: Path) -> None:
@@ -27,9 +27,11 @@ def write_session_episode(session: Path, output: Path) -> None:
         output: folder of the data set.
 
     Raises:
-        InputError: no such session, one shorter than a sample, or an output folder that holds something else.
+        InputError: no such session, one with a catheter or shorter than a sample, or an output folder that holds
+            something else.
     """
     recording = read_recording(session)
+    check_wire_alone(recording.navigation, f"{session}: an episode")
     per_sample = round(DECISION_PERIOD_S / recording.config.cycle_s)
     samples = recording.cycles // per_sample
     if samples == 0:

@@ -6,8 +6,9 @@ Each becomes a `Film`: the wire every 50 ms, driven again by its recorded contro
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +24,12 @@ from endopilot.dataset.loader import load_dataset
 from endopilot.errors import InputError
 from endopilot.files import read_json
 from endopilot.ladder.attempt import Recording, Repeated, navigation_seed
+from endopilot.simulation.catheter import read_catheter
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import read_controls_csv
 from endopilot.simulation.device import read_device
 from endopilot.simulation.simulator import Simulator
-from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target, check_wire_alone
+from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target
 from endopilot.tasks.task import CORE, find_task
 
 FRAME_S = 0.05
@@ -86,7 +88,13 @@ class Film:
 
 
 def open_film(
-    path: Path, patient: Path | None = None, *, device: str = "workhorse-014", world: int = 0, task: str | None = None
+    path: Path,
+    patient: Path | None = None,
+    *,
+    device: str = "workhorse-014",
+    catheters: Sequence[str] = (),
+    world: int = 0,
+    task: str | None = None,
 ) -> Film:
     """Open what is to be replayed.
 
@@ -95,6 +103,7 @@ def open_film(
             of a data set; a submission.json, or a navigation's result of the ladder.
         patient: folder of the anatomy, for rollouts and plans.
         device: wire of a rollout or plan.
+        catheters: around it, from the inside out.
         world: which of a rollout's worlds, a data set's episodes, or a task's patients.
         task: of the ladder's files.
 
@@ -104,16 +113,19 @@ def open_film(
     if path.name.endswith(SUFFIX):
         return _session(path)
     if (path / "plan.csv").exists():
-        plan = read_plan(path, read_anatomy(_given(patient, path)), read_device(device))
-        return _controls(plan.navigation, plan.control, DECISION_PERIOD_S, f"plan {path.name}")
+        around = tuple(read_catheter(name) for name in catheters)
+        plan = read_plan(path, read_anatomy(_given(patient, path)), read_device(device), around)
+        start = plan.navigation.start
+        return _controls(plan.navigation, start, plan.control, DECISION_PERIOD_S, f"plan {path.name}")
     if (path / "navigation.csv").exists():
-        return _rollout(path / "controls.csv", read_anatomy(_given(patient, path)), str(path / "wire.yaml"), 0)
+        vessel, files = read_anatomy(_given(patient, path)), sorted(path.glob("catheter-*.yaml"))
+        return _rollout(path / "controls.csv", vessel, str(path / "wire.yaml"), list(map(str, files)), 0)
     if (path / "meta").is_dir():
         return _episode(path, world)
     if path.suffix == ".json":
         return _ladder(path, task, world)
     if path.suffix == ".csv":
-        return _rollout(path, read_anatomy(_given(patient, path)), device, world)
+        return _rollout(path, read_anatomy(_given(patient, path)), device, catheters, world)
     raise InputError(
         f"{path}: cannot be replayed; give a session ({SUFFIX}), a rollout (.csv), a folder of a plan, a navigation "
         "or a data set, or a file of the ladder (.json)"
@@ -141,47 +153,64 @@ def _session(path: Path) -> Film:
 
 def _controls(
     navigation: Navigation,
-    control: Float[np.ndarray, "n 2"],
+    start: Float[np.ndarray, "numbers"],
+    control: Float[np.ndarray, "n numbers"],
     period_s: float,
     title: str,
     config: SimulatorConfig | None = None,
     friction: float | None = None,
 ) -> Film:
-    """Return a film of controls, mm/s and rad/s, each held for a period, s."""
+    """Return a film of controls, mm/s and rad/s of the wire, then of each catheter, each held for a period, s.
+
+    Args:
+        navigation: vessel, wire and catheters.
+        start: inserted length, mm, and rotation, rad, of the wire, then of each catheter.
+        control: a row a period.
+        period_s: time that each is held, s.
+        title: of the film.
+        config: settings of the rod core.
+        friction: of the wire; the device's own if not given.
+    """
     parts = max(round(period_s / FRAME_S), 1)
+    lengths = np.maximum(start[::2], 0.0)  # what was computed back from the end of a period may lie below by a rounding
 
     def make() -> Iterator[Frame]:
         simulator = Simulator(
-            navigation.anatomy, navigation.device, config=replace(config or SimulatorConfig(), threads=1)
+            navigation.anatomy,
+            navigation.device,
+            catheters=navigation.catheters,
+            config=replace(config or SimulatorConfig(), threads=1),
         )
         simulator.reset(
-            inserted_length=[navigation.start_inserted_mm],
-            rotation=[navigation.start_rotation],
+            inserted_length=lengths[:1],
+            rotation=start[1:2],
+            catheter_inserted_length=lengths[None, 1:],
+            catheter_rotation=start[None, 3::2],
             friction=[navigation.device.friction if friction is None else friction],
         )
-        frame = {"cycle": 0, "time_s": 0.0, "force_n": 0.0, "velocity": (0.0, 0.0)}
+        frame = {"cycle": 0, "time_s": 0.0, "force_n": 0.0, "velocity": (0.0,) * control.shape[1]}
         yield Frame(take_snapshot(simulator, None, **frame))
-        for number, (along, turn) in enumerate(control.tolist()):
+        for number, velocity in enumerate(control.tolist()):
             for part in range(parts):
-                step = simulator.step([[along, turn]], period_s / parts)
+                step = simulator.step([velocity], period_s / parts)
                 frame = {
                     "cycle": number * parts + part + 1,
                     "time_s": (number + (part + 1) / parts) * period_s,
                     "force_n": float(step.contact_force_max[0]),
-                    "velocity": (along, turn),
+                    "velocity": tuple(velocity),
                 }
                 yield Frame(take_snapshot(simulator, step, **frame))
 
     return Film(navigation, len(control) * period_s, title, make)
 
 
-def _rollout(path: Path, anatomy: Any, device: str, world: int) -> Film:
+def _rollout(path: Path, anatomy: Any, device: str, catheters: Sequence[str], world: int) -> Film:
     """Return a film of a rollout's or script's controls."""
-    script = read_controls_csv(path)
+    script = read_controls_csv(path, catheters=len(catheters))
     worlds = len(script.control)
     if world >= worlds:
         raise InputError(f"world: {world}; {path} has worlds 0 to {worlds - 1}")
-    start, turn = script.initial[world].tolist()
+    start = script.initial[world]
     wire = read_device(device)
     leaf = max(anatomy.tree.leaves(), key=lambda branch: anatomy.tree.branches[branch].centerline.abscissa[-1])
     end = float(anatomy.tree.branches[leaf].centerline.abscissa[-1])
@@ -189,16 +218,14 @@ def _rollout(path: Path, anatomy: Any, device: str, world: int) -> Film:
         anatomy=anatomy,
         device=wire,
         target=Target(branch=leaf, abscissa=end),
-        start_inserted_mm=start,
-        start_rotation=turn,
+        catheters=tuple(read_catheter(name) for name in catheters),
     )
-    return _controls(navigation, script.control[world], script.period_s, f"rollout {path.name}, world {world}")
+    return _controls(navigation, start, script.control[world], script.period_s, f"rollout {path.name}, world {world}")
 
 
 def _episode(folder: Path, number: int) -> Film:
     """Return a film of an episode of a data set, driven again by what the drive was commanded."""
     data = load_dataset(folder)
-    data.check_wire_alone("a replay")
     if number >= len(data):
         raise InputError(f"world: {number}; {folder} has episodes 0 to {len(data) - 1}")
     settings = data.manifest["settings"]
@@ -212,13 +239,13 @@ def _episode(folder: Path, number: int) -> Film:
         anatomy=anatomy,
         device=wire,
         target=Target(branch=branch, abscissa=float(np.clip(data.tip_abscissa[number, -1], line[0], line[-1]))),
-        start_inserted_mm=float(data.initial_inserted_length[number]),
-        start_rotation=float(data.initial_rotation[number]),
+        catheters=data.catheters,
     )
     config = SimulatorConfig(**(settings["config"]["simulator"] | {"threads": 1}))
     friction = float(data.friction[number])
     title = f"episode {number} of {folder.name}"
-    return _controls(navigation, data.command[number], data.sample_period_s, title, config, friction)
+    start = data.initial[number]
+    return _controls(navigation, start, data.command[number], data.sample_period_s, title, config, friction)
 
 
 def _ladder(path: Path, name: str | None, place: int) -> Film:
@@ -237,25 +264,25 @@ def _ladder(path: Path, name: str | None, place: int) -> Film:
         raise InputError(f"{path}: is no file of the ladder; give a submission.json or TASK/NUMBER.json")
     task = find_task(name, content.get("ladder") or 1)
     navigation = task.ladder_navigation(place)
-    check_wire_alone(navigation, f"{path}: the replay")
-    recording = Recording.unpacked(entry["recording"])
+    devices = len(navigation.devices)
+    recording = Recording.unpacked(entry["recording"], devices)
 
     def make() -> Iterator[Frame]:
         config = NavigateConfig(simulator=replace(CORE, threads=1))
         loop = NavigationLoop(navigation, Repeated(recording), config=config, seed=navigation_seed(task, place))
-        yield Frame(_of_loop(loop, 0.0, (0.0, 0.0)))
+        yield Frame(_of_loop(loop, 0.0, (0.0, 0.0) * devices))
         while loop.reason is None:
-            decision = loop.begin()
+            velocity = tuple(chain.from_iterable(loop.begin().velocities(devices)))
             exposed = loop.observation is not None and loop.observation.tip is not None
             while loop.reason is None and not loop.between_periods:
                 peak = loop.advance(FRAME_S)
-                yield Frame(_of_loop(loop, peak, (decision.translation, decision.rotation)), exposed)
+                yield Frame(_of_loop(loop, peak, velocity), exposed)
                 exposed = False
 
     return Film(navigation, len(recording.control) * DECISION_PERIOD_S, f"{task.title}, patient {place}", make)
 
 
-def _of_loop(loop: NavigationLoop, force_n: float, velocity: tuple[float, float]) -> Snapshot:
+def _of_loop(loop: NavigationLoop, force_n: float, velocity: tuple[float, ...]) -> Snapshot:
     return take_snapshot(
         loop.simulator,
         loop.robot.last_step,

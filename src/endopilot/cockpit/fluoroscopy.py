@@ -153,7 +153,14 @@ class XrayUnit:
             if share >= 0.9:
                 self._roadmap[key] = plane.vessel_mm
             seed = 2 * self.frames + number
-            signal = self._imager.signal(plane, snapshot.nodes, contrast=share, dose=self.settings.dose, seed=seed)
+            signal = self._imager.signal(
+                plane,
+                snapshot.nodes,
+                contrast=share,
+                dose=self.settings.dose,
+                seed=seed,
+                catheters=[catheter.nodes for catheter in snapshot.catheters],
+            )
             roadmap = self._roadmap.get(key) if self.settings.roadmap and share == 0 else None
             image = self._imager.grey(signal, roadmap=roadmap)
             header = {"plane": number, "angles_deg": key[0], "frame": self.frames, "time_s": round(snapshot.time_s, 4)}

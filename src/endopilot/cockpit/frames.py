@@ -56,8 +56,29 @@ def decode(message: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 
 
 def wire_arrays(snapshot: Snapshot) -> dict[str, np.ndarray]:
-    """Return what the page needs to draw the wire: nodes, LPS mm, and the wall's force at each, N."""
-    return {"nodes": snapshot.nodes.astype("<f4"), "node_force": snapshot.node_force.astype("<f4")}
+    """Return what the page needs to draw wire and catheters: nodes of each, LPS mm, and the wall's force there, N."""
+    arrays = {"nodes": snapshot.nodes.astype("<f4"), "node_force": snapshot.node_force.astype("<f4")}
+    for number, catheter in enumerate(snapshot.catheters, start=1):
+        arrays[f"catheter_{number}_nodes"] = catheter.nodes.astype("<f4")
+        arrays[f"catheter_{number}_force"] = catheter.node_force.astype("<f4")
+    return arrays
+
+
+def catheter_values(snapshot: Snapshot, ostium_mm: float = 0.0) -> dict[str, Any]:
+    """Return how far catheters are inserted and turned, for the page's figures; nothing for a wire alone.
+
+    Args:
+        snapshot: the world.
+        ostium_mm: how much deeper they truly are than the drives' encoders say, mm.
+    """
+    shown = [
+        {
+            "inserted_mm": round(catheter.inserted_mm - ostium_mm, 3),
+            "rotation_deg": round(float(np.rad2deg(catheter.rotation)), 2),
+        }
+        for catheter in snapshot.catheters
+    ]
+    return {"catheters": shown} if shown else {}
 
 
 def tip_values(anatomy: Anatomy, snapshot: Snapshot) -> dict[str, Any]:
@@ -65,7 +86,8 @@ def tip_values(anatomy: Anatomy, snapshot: Snapshot) -> dict[str, Any]:
     branch = int(snapshot.tip.branch[0])
     line, labels = anatomy.tree.branches[branch].centerline, anatomy.tree.branches[branch].section
     nearest = int(np.abs(line.abscissa - snapshot.tip.abscissa[0]).argmin())
-    return {
+    ends = [round(float(catheter.tip.abscissa[0]), 2) for catheter in snapshot.catheters]
+    return ({"catheter_tips_mm": ends} if ends else {}) | {
         "tip_mm": round(float(snapshot.tip.abscissa[0]), 2),
         "offset_mm": round(float(snapshot.tip.offset[0]), 3),
         "section": anatomy.tree.section_names[int(labels[nearest])],
@@ -75,10 +97,10 @@ def tip_values(anatomy: Anatomy, snapshot: Snapshot) -> dict[str, Any]:
 
 
 def scene(navigation: Navigation, about: dict[str, Any]) -> bytes:
-    """Return what does not move: the lumen, the centerlines with the names of their sections, the wire, the target.
+    """Return what does not move: the lumen, the centerlines with the names of their sections, the devices, the target.
 
     Args:
-        navigation: vessel, wire and target.
+        navigation: vessel, wire, catheters and target.
         about: further entries of the header.
     """
     from endopilot.report.wall_mesh import wall_mesh  # slow to import, and needed in the thread that makes the scene
@@ -109,6 +131,11 @@ def scene(navigation: Navigation, about: dict[str, Any]) -> bytes:
         "catheter_direction": anatomy.insertion.direction.round(5).tolist(),
         "catheter_radius_mm": float(anatomy.catheter_radius_mm),
     }
+    if navigation.catheters:
+        header["catheters"] = [
+            {"name": each.name, "diameter_mm": each.device.diameter_mm, "push_limit_n": each.device.push_limit_n}
+            for each in navigation.catheters
+        ]
     return encode(
         "scene",
         header,

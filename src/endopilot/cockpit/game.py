@@ -28,8 +28,8 @@ from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import DECISION_PERIOD_S
 from endopilot.tasks.task import CORE, Task
 
-RIVAL = "agent"
-"""The policy whose score stands beside a person's."""
+RIVALS = ("agent", "coaxial-agent")
+"""The policies whose score stands beside a person's: of a wire alone, and of a wire in a catheter."""
 _SHOWN = ("success", "safe", "seconds", "exposures", "peak_force_n", "path_ratio", "reason")
 
 
@@ -49,6 +49,11 @@ class Attempt:
     def seed(self) -> int:
         """Of the navigation, the same for policies."""
         return navigation_seed(self.task, self.place)
+
+    @property
+    def rival(self) -> str:
+        """Name of the policy that drives the same task."""
+        return RIVALS[self.task.catheter is not None]
 
     def world(self) -> World:
         """Return the world at the task's start, with the ladder's rod core."""
@@ -90,7 +95,7 @@ class GameSession(Session):
         self.result: dict[str, Any] | None = None
         self._tried = tried
         self._track = Track(world.simulator)
-        self._commands: list[tuple[float, float]] = []
+        self._commands: list[tuple[float, ...]] = []
         self._exposed: list[bool] = []
         self._peak_n, self._counted_before = 0.0, 0
         self._period = round(DECISION_PERIOD_S / world.config.cycle_s)
@@ -168,7 +173,7 @@ class GameSession(Session):
             elif "move" in event:
                 self._command = tuple(event["move"])
             elif "stop" in event:
-                self._command = (0.0, 0.0)
+                self._command = self._rest
 
     def _cycle_is_over(self) -> list[tuple[str, bytes]]:
         self._peak_n = max(self._peak_n, self.world.force_n)
@@ -179,12 +184,14 @@ class GameSession(Session):
         self._exposed.append(self.xray.frames > self._counted_before)
         self._counted_before = self.xray.frames
         simulator: Simulator = self.world.simulator
-        self._track.decided((self._commands[-1],), None, None, exposed=self._exposed[-1], fault=False)
+        command = self._commands[-1]
+        pairs = tuple(zip(command[::2], command[1::2], strict=True))
+        self._track.decided(pairs, None, None, exposed=self._exposed[-1], fault=False)
         self._track.moved(simulator, self._peak_n)
         self._peak_n = 0.0
         if not simulator.valid[0]:
             return self._end("invalid")
-        if bool(self.world.navigation.reached(simulator.project())[0]):
+        if self.world.reaches(self.world.navigation.target):
             return self._end("reached")
         if self.world.time_s >= self.world.navigation.seconds - 1e-9:
             return self._end("time")
@@ -208,15 +215,16 @@ class GameSession(Session):
         if self._rival is not None and self._rival.done():
             error = self._rival.exception()
             rival = None if error else self._rival.result()
-            failure = f"{RIVAL} could not drive: {error}" if error else ""
+            failure = f"{self._tried.rival} could not drive: {error}" if error else ""
             self._rival = None
         assert self.result is not None
-        scores = {"you": {name: self.result[name] for name in _SHOWN}, RIVAL: rival, "failure": failure}
+        you = {name: self.result[name] for name in _SHOWN}
+        scores = {"you": you, "rival": self._tried.rival, "agent": rival, "failure": failure}
         return "result", encode("result", {"scores": scores})
 
 
 def _rival(tried: Attempt) -> dict[str, Any]:
     """Let the agent drive the same task in the same patient."""
     navigation = tried.task.ladder_navigation(tried.place)
-    scored = attempt(RIVAL, navigation, seed=tried.seed)
+    scored = attempt(tried.rival, navigation, seed=tried.seed)
     return {name: scored[name] for name in _SHOWN}

@@ -6,6 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
+from endopilot.simulation.catheter import MOST_CATHETERS
+
 LONGEST_MESSAGE = 2048
 """A longer message closes the connection, bytes."""
 _Speed = Annotated[float, Field(ge=-1e3, le=1e3, allow_inf_nan=False)]
@@ -17,16 +19,18 @@ class _Message(BaseModel):
 
 
 class Drive(_Message):
-    """Move the wire at a velocity until the next such message, which must come within 200 ms.
+    """Move wire and catheters at a velocity until the next such message, which must come within 200 ms.
 
     Attributes:
-        translation: mm/s.
-        rotation: rad/s.
+        translation: of the wire, mm/s.
+        rotation: of the wire, rad/s.
+        catheters: both of each catheter, from the inside out; those that are not given stand still.
     """
 
     type: Literal["drive"]
     translation: _Speed
     rotation: _Speed
+    catheters: Annotated[tuple[tuple[_Speed, _Speed], ...], Field(max_length=MOST_CATHETERS)] = ()
 
 
 class Pedal(_Message):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import chain
@@ -18,6 +18,7 @@ from endopilot.cockpit.recording import SUFFIX, Recorder, Where, read_recording,
 from endopilot.cockpit.session import Session
 from endopilot.cockpit.world import World
 from endopilot.control.policies import POLICIES
+from endopilot.simulation.catheter import Catheter, read_catheter
 from endopilot.simulation.device import Device, read_device
 from endopilot.tasks.navigation import Navigation, Target
 from endopilot.types import Anatomy, Volume
@@ -52,6 +53,7 @@ def open_session(
     patient: Path | None = None,
     *,
     device: str = "workhorse-014",
+    catheters: Sequence[str] = (),
     ct: Path | None = None,
     output: Path = Path("runs/cockpit"),
 ) -> Opened:
@@ -60,14 +62,16 @@ def open_session(
     Args:
         patient: folder of an anatomy; a synthetic one is written into `output` if not given.
         device: name of a wire or a YAML file.
+        catheters: names or YAML files of catheters around it, from the inside out.
         ct: CT angiogram of the patient, for the X-ray's background.
         output: folder of the recordings.
 
     Raises:
-        InputError: a file that is missing or bad, or a wire that does not fit.
+        InputError: a file that is missing or bad, or a device that does not fit.
     """
     patient = patient or _synthetic(output)
-    navigation = _start_of(read_anatomy(patient), read_device(device))
+    around = tuple(read_catheter(name) for name in catheters)
+    navigation = _start_of(read_anatomy(patient), read_device(device), around)
     return _driven(World(navigation), Where(patient=patient), output, ct)
 
 
@@ -92,6 +96,7 @@ def open_replay(
     patient: Path | None = None,
     *,
     device: str = "workhorse-014",
+    catheters: Sequence[str] = (),
     world: int = 0,
     task: str | None = None,
     ct: Path | None = None,
@@ -102,6 +107,7 @@ def open_replay(
         path: as for `open_film`.
         patient: folder of the anatomy, for rollouts and plans.
         device: wire of a rollout or plan.
+        catheters: around it, from the inside out.
         world: which of a rollout's worlds, a data set's episodes, or a task's patients.
         task: of the ladder's files.
         ct: CT angiogram of the patient, for the X-ray's background.
@@ -112,9 +118,9 @@ def open_replay(
     from endopilot.cockpit.film import FRAME_S, open_film  # slow to import, and needed for replays alone
     from endopilot.cockpit.replay import ReplayStage
 
-    film = open_film(path, patient, device=device, world=world, task=task)
+    film = open_film(path, patient, device=device, catheters=catheters, world=world, task=task)
     navigation = film.navigation
-    stage = ReplayStage(film, xray_unit(navigation.anatomy, navigation.device, read_ct(ct)))
+    stage = ReplayStage(film, xray_unit(navigation, read_ct(ct)))
     return Opened(stage, scene_of(navigation, {}), FRAME_S, None)
 
 
@@ -141,9 +147,9 @@ def resume_session(path: Path, *, ct: Path | None = None) -> Opened:
 
 def _attempt(task: str, place: int) -> Attempt:
     from endopilot.cockpit.game import Attempt  # slow to import, and needed for tasks alone
-    from endopilot.tasks.task import find_task
+    from endopilot.tasks.task import task_by_hand
 
-    return Attempt(find_task(task), place)
+    return Attempt(task_by_hand(task), place)
 
 
 def _driven(
@@ -160,13 +166,14 @@ def _driven(
     name = f"{where.task or navigation.anatomy.name}-{time.strftime('%Y%m%d-%H%M%S')}"
     recorder = Recorder(path or _free(output, name), world, where, seed)
     policies = POLICIES.names()
-    session = make(world, xray_unit(navigation.anatomy, navigation.device, read_ct(ct)), recorder, policies)
+    session = make(world, xray_unit(navigation, read_ct(ct)), recorder, policies)
     return Opened(session, scene_of(navigation, {"policies": policies}), world.config.cycle_s, recorder.path)
 
 
-def xray_unit(anatomy: Anatomy, device: Device, ct: Volume | None) -> XrayUnit:
-    """Return the X-ray unit around a patient, with a CT of theirs or without."""
-    return XrayUnit(anatomy, lambda volume: XrayImager(anatomy, device, volume), ct)
+def xray_unit(navigation: Navigation, ct: Volume | None) -> XrayUnit:
+    """Return the X-ray unit around a navigation's patient, with a CT of theirs or without."""
+    anatomy, device, catheters = navigation.anatomy, navigation.device, navigation.catheters
+    return XrayUnit(anatomy, lambda volume: XrayImager(anatomy, device, volume, catheters=catheters), ct)
 
 
 def scene_of(navigation: Navigation, about: dict[str, Any]) -> Callable[[], bytes]:
@@ -190,13 +197,13 @@ def read_ct(path: Path | None) -> Volume | None:
     return read_volume(path)
 
 
-def _start_of(anatomy: Anatomy, device: Device) -> Navigation:
+def _start_of(anatomy: Anatomy, device: Device, catheters: tuple[Catheter, ...]) -> Navigation:
     """Return a navigation from the ostium to a first target, far down the longest path."""
     tree = anatomy.tree
     leaf = max(tree.leaves(), key=lambda branch: tree.branches[branch].centerline.abscissa[-1])
     line = tree.branches[leaf].centerline.abscissa
     target = Target(branch=leaf, abscissa=float(max(_DEEP * line[-1], line[0])))
-    return Navigation(anatomy=anatomy, device=device, target=target, start_inserted_mm=_START_MM)
+    return Navigation(anatomy=anatomy, device=device, target=target, catheters=catheters, start_inserted_mm=_START_MM)
 
 
 def _synthetic(output: Path) -> Path:

@@ -1,9 +1,9 @@
 """A session on disk: one line an event, written as it happens, so that nothing is lost when the server is killed.
 
 The first line says what the session was held in: vessel, wire, robot, rod core, seed. Each further line is a JSON
-object with the cycle at which it acted: `move` (mm/s, rad/s after the drive's limits), `stop` (and why), `exposure`,
-`contrast`, and every quarter of a second `check`, a hash of the wire. The same commands in the same cycles give the
-same bits, so `replayed` drives a session again and proves each check.
+object with the cycle at which it acted: `move` (mm/s, rad/s of the wire, then of each catheter, after the drives'
+limits), `stop` (and why), `exposure`, `contrast`, and every quarter of a second `check`, a hash of wire and catheters.
+The same commands in the same cycles give the same bits, so `replayed` drives a session again and proves each check.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from endopilot.cockpit.world import World, WorldConfig
 from endopilot.errors import InputError
 from endopilot.files import json_text
 from endopilot.settings import from_record
+from endopilot.simulation.catheter import Catheter
 from endopilot.simulation.device import Device
 from endopilot.tasks.navigation import Navigation, Target
 
@@ -150,7 +151,7 @@ def replayed(recording: Recording) -> Iterator[tuple[World, list[dict[str, Any]]
                     f"replay it with the version and on the kind of processor that recorded it"
                 )
             if "move" in event:
-                world.robot.command(*event["move"])
+                world.command(event["move"])
             elif "stop" in event:
                 world.stop()
         yield world, events
@@ -175,14 +176,17 @@ def _header(world: World, where: Where, seed: int) -> dict[str, Any]:
         "config": asdict(world.config),
         "seed": seed,
     }
+    if navigation.catheters:
+        values["catheters"] = [asdict(catheter) for catheter in navigation.catheters]
+        values |= {"arrives": navigation.arrives, "start_catheter_mm": navigation.start_catheter_mm}
     return json.loads(json_text(values))
 
 
 def _navigation(path: Path, header: dict[str, Any], where: Where) -> Navigation:
     if where.task is not None:
-        from endopilot.tasks.task import find_task  # slow to import, and needed for tasks alone
+        from endopilot.tasks.task import task_by_hand  # slow to import, and needed for tasks alone
 
-        anatomy = find_task(where.task).ladder_navigation(where.place).anatomy
+        anatomy = task_by_hand(where.task).ladder_navigation(where.place).anatomy
     elif where.patient is not None:
         anatomy = read_anatomy(where.patient)
     else:
@@ -197,6 +201,9 @@ def _navigation(path: Path, header: dict[str, Any], where: Where) -> Navigation:
         start_rotation=header["start"][1],
         seconds=header["seconds"],
         force_limit_n=header["force_limit_n"],
+        catheters=tuple(from_record(Catheter, catheter) for catheter in header.get("catheters", ())),
+        arrives=header.get("arrives", "wire"),
+        start_catheter_mm=header.get("start_catheter_mm", 0.0),
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from endopilot.cockpit import messages
 from endopilot.cockpit.film import FRAME_S, Film
 from endopilot.cockpit.fluoroscopy import XrayUnit
-from endopilot.cockpit.frames import encode, target_values, tip_values, wire_arrays
+from endopilot.cockpit.frames import catheter_values, encode, target_values, tip_values, wire_arrays
 from endopilot.errors import InputError
 
 
@@ -87,6 +87,7 @@ class ReplayStage:
             "time_s": round(snapshot.time_s, 4),
             "inserted_mm": round(snapshot.inserted_mm, 3),
             "rotation_deg": round(float(np.rad2deg(snapshot.rotation)), 2),
+            **catheter_values(snapshot),
             "command": snapshot.velocity,
             "velocity": snapshot.velocity,
             "drive_load": snapshot.drive_load,

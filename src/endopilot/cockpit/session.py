@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ import numpy as np
 from endopilot.cockpit import messages
 from endopilot.cockpit.autopilot import Autopilot, check_policy
 from endopilot.cockpit.fluoroscopy import XrayUnit
-from endopilot.cockpit.frames import encode, target_values, tip_values, wire_arrays
+from endopilot.cockpit.frames import catheter_values, encode, target_values, tip_values, wire_arrays
 from endopilot.cockpit.recording import Recorder
 from endopilot.cockpit.world import Snapshot, World
 from endopilot.errors import InputError
@@ -51,10 +52,11 @@ class Session:
             policies: names of those that a page may choose.
         """
         self.world, self.xray, self._recorder, self._policies = world, xray, recorder, policies
+        self._rest = world.safe(())
         self.autopilot = Autopilot(world)
         self.target: Target = world.navigation.target
         self.sight = True
-        self._command, self._moving, self._heard_s = (0.0, 0.0), False, -np.inf
+        self._command, self._moving, self._heard_s = self._rest, False, -np.inf
         self._stopped = ""
         self._held: set[str] = set()  # what silence stopped
         self._locked: set[str] = set()  # what of it must be let go
@@ -71,7 +73,7 @@ class Session:
         """
         if isinstance(message, messages.Drive):
             self._hear(now_s)
-            self._drive(message.translation, message.rotation)
+            self._drive((message.translation, message.rotation, *chain.from_iterable(message.catheters)))
         elif isinstance(message, messages.Pedal):
             self._hear(now_s)
             self._pedal(message.down)
@@ -99,7 +101,7 @@ class Session:
         for _, events in history:
             self._relive(events)
         self.world.stop()
-        self._command = (0.0, 0.0)
+        self._command = self._rest
         self._record(stop="resumed")
 
     def _relive(self, events: Sequence[dict[str, Any]]) -> None:
@@ -125,7 +127,7 @@ class Session:
         self.xray.pedal = False
         if self._moving:
             self.world.stop()
-            self._command, self._moving = (0.0, 0.0), False
+            self._command, self._moving = self._rest, False
             self._record(stop=why)
 
     def cycle(self, now_s: float) -> list[tuple[str, bytes]]:
@@ -155,13 +157,14 @@ class Session:
 
     def values(self, snapshot: Snapshot) -> dict[str, Any]:
         """Return the figures that the page shows."""
-        anatomy = self.world.navigation.anatomy
+        anatomy, ostium_mm = self.world.navigation.anatomy, self.world.config.truth.ostium_mm
         shown = {
             "mode": "drive",
             "cycle": snapshot.cycle,
             "time_s": round(snapshot.time_s, 4),
-            "inserted_mm": round(snapshot.inserted_mm - self.world.config.truth.ostium_mm, 3),
+            "inserted_mm": round(snapshot.inserted_mm - ostium_mm, 3),
             "rotation_deg": round(float(np.rad2deg(snapshot.rotation)), 2),
+            **catheter_values(snapshot, ostium_mm),
             "command": self._command,
             "velocity": snapshot.velocity,
             "drive_load": snapshot.drive_load,
@@ -200,20 +203,20 @@ class Session:
         if self.xray.pedal and not self._locked and self._stopped == "silence":
             self._stopped = ""
 
-    def _drive(self, translation: float, rotation: float) -> None:
-        command = self.world.limits.safe(translation, rotation)
-        if command == (0.0, 0.0):
+    def _drive(self, velocity: tuple[float, ...]) -> None:
+        command = self.world.safe(velocity)
+        if command == self._rest:
             self._locked.discard("drive")
         elif "drive" in self._locked:
             return
         if self.autopilot.drives:
-            if command == (0.0, 0.0):
+            if command == self._rest:
                 return  # the page only says that it is there
             self._take_over()
         if command != self._command:
-            self._command = self.world.command(*command)
+            self._command = self.world.command(command)
             self._record(move=command)
-        self._moving = self._command != (0.0, 0.0)
+        self._moving = self._command != self._rest
         if self._moving:
             self._stopped = ""
 
@@ -239,13 +242,13 @@ class Session:
         else:
             self.autopilot.pause(message.action == "pause")
             if message.action == "pause":
-                self._command = self.world.command(0.0, 0.0)
+                self._command = self.world.command(self._rest)
                 self._record(move=self._command)
         self._record(autopilot=message.action, policy=message.policy)
 
     def _take_over(self) -> None:
         if self.autopilot.drives:
-            self._command = self.world.command(0.0, 0.0)
+            self._command = self.world.command(self._rest)
             self._record(move=self._command)
         self.autopilot.stop()
 
@@ -257,7 +260,8 @@ class Session:
         before = self.autopilot.values()
         decision = self.autopilot.think(snapshot, lambda: images.extend(self._counted(self.xray.expose(snapshot))))
         if decision is not None:
-            self._command = self.world.command(decision.translation, decision.rotation)
+            asked = decision.velocities(len(self.world.navigation.devices))
+            self._command = self.world.command(tuple(chain.from_iterable(asked)))
             self._record(move=self._command)
         sent = _images(images)
         if self.sight and self.autopilot.values() != before:

@@ -1,9 +1,13 @@
-"""The world behind the page: one wire in one vessel, held by the simulated robot, advanced in short cycles."""
+"""The world behind the page: a wire, alone or in catheters, in one vessel, held by the simulated robot.
+
+It advances in short cycles.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -12,16 +16,18 @@ from jaxtyping import Float
 from endopilot.control.mismatch import ModelMismatch
 from endopilot.control.navigate import start_world
 from endopilot.control.robot import RobotConfig, SimulatedRobot
+from endopilot.errors import InputError
 from endopilot.settings import Positive, settings
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import Step
-from endopilot.tasks.navigation import Navigation, Target, check_wire_alone
+from endopilot.simulation.tubes import lines_from_tips
+from endopilot.tasks.navigation import Navigation, Target
 from endopilot.types import TipProjection
 
 SHOWN_BEHIND_MM = 20.0
-"""Length of wire that is shown behind the ostium, in the guiding catheter, mm."""
+"""Length of wire and catheters that is shown behind the ostium, in the guiding catheter, mm."""
 
 
 @settings
@@ -39,6 +45,25 @@ class WorldConfig:
 
 
 @dataclass(frozen=True, eq=False)
+class ShownCatheter:
+    """A catheter around the wire, at the end of a cycle.
+
+    Attributes:
+        nodes: of its axis from its tip to a little behind the ostium, LPS mm.
+        node_force: of the wall at each of them, N; 0 where it lies in another catheter.
+        tip: Δtip, γtip, branch and lumen radius, as arrays of one.
+        inserted_mm: inserted length as it truly is, mm.
+        rotation: of its drive, rad.
+    """
+
+    nodes: Float[np.ndarray, "n 3"]
+    node_force: Float[np.ndarray, "n"]
+    tip: TipProjection
+    inserted_mm: float
+    rotation: float
+
+
+@dataclass(frozen=True, eq=False)
 class Snapshot:
     """The world at the end of a cycle.
 
@@ -46,17 +71,18 @@ class Snapshot:
         cycle: how many have passed.
         time_s: since the start, s.
         nodes: of the wire from its tip to a little behind the ostium, LPS mm.
-        node_force: of the wall at each of them, N.
+        node_force: of the wall at each of them, N; 0 where it lies in a catheter.
         tip_direction: unit vector along the wire at its tip.
         tip: Δtip, γtip, branch and lumen radius, as arrays of one.
         inserted_mm: Δ, mm, as it truly is.
         rotation: φ, rad.
-        velocity: of the drive's motor, mm/s and rad/s.
+        velocity: of the drive's motor, mm/s and rad/s of the wire, then of each catheter.
         force_n: largest wall force on one node during the cycle, N.
         wall_force_n: largest resultant of the wall on 2 mm of the wire, N.
-        drive_load: push (N) and torque (N·mm) of the drive.
-        slip: advance (mm) and rotation (rad) that the drive was asked for and slipped over in the cycle.
+        drive_load: push (N) and torque (N·mm) of the wire's drive, then of each catheter's.
+        slip: advance (mm) and rotation (rad) that each drive was asked for and slipped over in the cycle.
         valid: false once the simulation has failed.
+        catheters: around the wire, from the inside out.
     """
 
     cycle: int
@@ -67,44 +93,56 @@ class Snapshot:
     tip: TipProjection
     inserted_mm: float
     rotation: float
-    velocity: tuple[float, float]
+    velocity: tuple[float, ...]
     force_n: float
     wall_force_n: float
-    drive_load: tuple[float, float]
-    slip: tuple[float, float]
+    drive_load: tuple[float, ...]
+    slip: tuple[float, ...]
     valid: bool
+    catheters: tuple[ShownCatheter, ...] = ()
+
+    @property
+    def tips(self) -> tuple[TipProjection, ...]:
+        """Those of the wire and of each catheter, as `Navigation.reached` takes them."""
+        return (self.tip, *(catheter.tip for catheter in self.catheters))
+
+    @property
+    def deepest_mm(self) -> float:
+        """Largest inserted length, mm."""
+        return max([self.inserted_mm, *(catheter.inserted_mm for catheter in self.catheters)])
 
 
 class World:
-    """One wire in one vessel behind the simulated robot. The same commands in the same cycles give the same bits.
+    """One wire, alone or in catheters, behind the simulated robot.
+
+    The same commands in the same cycles give the same bits.
 
     Attributes:
-        navigation: vessel, wire, target and start.
+        navigation: vessel, wire, catheters, target and start.
         config: robot, rod core and length of a cycle.
-        robot: the drive, whose encoders a policy reads.
+        robot: the drives, whose encoders a policy reads.
         cycle: how many cycles have passed.
         force_n: largest wall force on one node in the last cycle, N.
         peak_force_n: the same so far, N.
     """
 
     def __init__(self, navigation: Navigation, config: WorldConfig | None = None, *, seed: int = 0) -> None:
-        """Bring the wire to the navigation's start.
+        """Bring wire and catheters to the navigation's start.
 
         Args:
-            navigation: vessel, wire and start.
+            navigation: vessel, wire, catheters and start.
             config: robot, rod core and length of a cycle.
             seed: of the encoders' noise.
 
         Raises:
-            InputError: the wire does not fit the vessel, or starts deeper than it is long; a navigation with catheters.
+            InputError: a device does not fit the vessel, or starts deeper than it is long.
         """
-        check_wire_alone(navigation, "cockpit: it")
         self.navigation, self.config = navigation, config or WorldConfig()
         truth = self.config.truth
         self.simulator = start_world(navigation, truth, self.config.simulator)
-        self.limits = DriveLimits.of(navigation.device, navigation.anatomy)
+        self._limits = tuple(DriveLimits.of(device, navigation.anatomy) for device in navigation.devices)
         drive = replace(self.config.robot, latency_s=self.config.robot.latency_s * truth.latency_factor)
-        self.robot = SimulatedRobot(self.simulator, (self.limits,), drive, seed=seed, ostium_mm=truth.ostium_mm)
+        self.robot = SimulatedRobot(self.simulator, self._limits, drive, seed=seed, ostium_mm=truth.ostium_mm)
         self.cycle, self.peak_force_n, self.force_n = 0, 0.0, 0.0
         self._taken_s = self.config.cycle_s / 10
 
@@ -126,14 +164,40 @@ class World:
         """
         return self.navigation if target is None else replace(self.navigation, target=target)
 
-    def command(self, translation: float, rotation: float) -> tuple[float, float]:
-        """Command the drive, mm/s and rad/s, and return what is left of it within the drive's limits."""
-        safe = self.limits.safe(translation, rotation)
-        self.robot.command(*safe)
+    def reaches(self, target: Target | None) -> bool:
+        """Return whether a target is reached: the navigation's own if none is given."""
+        navigation = self.navigation_to(target)
+        return bool(navigation.reached(*map(self.simulator.project, range(navigation.arriving + 1)))[0])
+
+    def safe(self, velocity: Sequence[float]) -> tuple[float, ...]:
+        """Return what is left of velocities within the drives' limits.
+
+        Args:
+            velocity: mm/s and rad/s of the wire, then of each catheter; catheters that are not given stand still.
+
+        Raises:
+            InputError: more catheters are given than there are.
+        """
+        around = len(self._limits) - 1
+        if len(velocity) > 2 * len(self._limits):
+            raise InputError(f"catheters: {len(velocity) // 2 - 1}; this wire has {around} around it")
+        padded = [*velocity, *[0.0] * (2 * len(self._limits) - len(velocity))]
+        return tuple(
+            each for k, limits in enumerate(self._limits) for each in limits.safe(padded[2 * k], padded[2 * k + 1])
+        )
+
+    def command(self, velocity: Sequence[float]) -> tuple[float, ...]:
+        """Command the drives, and return what is left of it, as `safe` does.
+
+        Raises:
+            InputError: more catheters are given than there are.
+        """
+        safe = self.safe(velocity)
+        self.robot.command(safe[0], safe[1], *zip(safe[2::2], safe[3::2], strict=True))
         return safe
 
     def stop(self) -> None:
-        """Let the drive brake at once."""
+        """Let the drives brake at once."""
         self.robot.stop()
 
     def advance(self) -> None:
@@ -153,13 +217,14 @@ class World:
             cycle=self.cycle,
             time_s=self.time_s,
             force_n=self.force_n,
-            velocity=(float(velocity[0]), float(velocity[1])),
+            velocity=tuple(velocity.tolist()),
         )
 
     def digest(self) -> str:
-        """Return a hash of the wire's state, to the bit."""
+        """Return a hash of the state of wire and catheters, to the bit."""
         simulator = self.simulator
-        parts = (simulator.position, simulator.inserted_length, simulator.rotation, simulator.contacts)
+        parts = [simulator.position, simulator.inserted_length, simulator.rotation, simulator.contacts]
+        parts += [simulator.catheter_inserted_length, simulator.catheter_rotation]  # nothing for a wire alone
         return hashlib.sha256(b"".join(part.astype("<f8").tobytes() for part in parts)).hexdigest()[:16]
 
 
@@ -170,7 +235,7 @@ def take_snapshot(
     cycle: int,
     time_s: float,
     force_n: float,
-    velocity: tuple[float, float],
+    velocity: tuple[float, ...],
 ) -> Snapshot:
     """Return how the one world of a simulator is now.
 
@@ -180,25 +245,52 @@ def take_snapshot(
         cycle: how many have passed.
         time_s: since the start, s.
         force_n: largest wall force on one node in the cycle, N.
-        velocity: of the drive, mm/s and rad/s.
+        velocity: of the drives, mm/s and rad/s of the wire, then of each catheter.
     """
-    nodes, inserted = simulator.position[0], float(simulator.inserted_length[0])
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(nodes, axis=0), axis=1))])
-    shown = along <= inserted + SHOWN_BEHIND_MM
-    load = simulator.drive_load[0]
+    inserted = np.append(simulator.inserted_length, simulator.catheter_inserted_length)
+    (nodes, force), *around = _lines(simulator, inserted)
+    turned = simulator.catheter_rotation[0].tolist()
+    catheters = tuple(
+        ShownCatheter(*line, simulator.project(k + 1), float(inserted[k + 1]), turned[k])
+        for k, line in enumerate(around)
+    )
+    slip = np.zeros((1, 2)) if step is None else np.column_stack([step.slip, step.rotation_slip])
+    catheter_slip = np.zeros((len(around), 2)) if step is None else simulator.catheter_slip[0]
     return Snapshot(
         cycle=cycle,
         time_s=time_s,
-        nodes=nodes[shown],
-        node_force=simulator.contacts[0][shown],
+        nodes=nodes,
+        node_force=force,
         tip_direction=simulator.tip_direction[0],
         tip=simulator.project(),
-        inserted_mm=inserted,
+        inserted_mm=float(inserted[0]),
         rotation=float(simulator.rotation[0]),
         velocity=velocity,
         force_n=force_n,
         wall_force_n=0.0 if step is None else float(step.wall_force[0]),
-        drive_load=(float(load[0]), float(load[1])),
-        slip=(0.0, 0.0) if step is None else (float(step.slip[0]), float(step.rotation_slip[0])),
+        drive_load=tuple(np.append(simulator.drive_load, simulator.catheter_drive_load).tolist()),
+        slip=tuple(np.append(slip, catheter_slip).tolist()),
         valid=bool(simulator.valid[0]),
+        catheters=catheters,
     )
+
+
+def _lines(
+    simulator: Simulator, inserted_mm: Float[np.ndarray, "devices"]
+) -> list[tuple[Float[np.ndarray, "_ 3"], Float[np.ndarray, "_"]]]:
+    """Return what is shown of each device: nodes from its tip on, LPS mm, and the wall's force at each, N.
+
+    The wall presses on the outermost device alone.
+    """
+    nodes, force = simulator.position[0], simulator.contacts[0]
+    found, covered = [], 0.0
+    for device, line in reversed(list(enumerate(lines_from_tips(nodes, inserted_mm)))):
+        own = force[len(nodes) - len(line) :]
+        along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+        if len(inserted_mm) > 1:
+            line[0] = simulator.tips(device)[0]
+            own = np.where(inserted_mm[device] - along > covered, own, 0.0)
+            covered = max(covered, float(inserted_mm[device]))
+        shown = along <= inserted_mm[device] + SHOWN_BEHIND_MM
+        found.append((line[shown], own[shown]))
+    return found[::-1]

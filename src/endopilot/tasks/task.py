@@ -193,10 +193,23 @@ def find_task(name: str, version: LadderVersion = NEWEST) -> Task:
     Raises:
         InputError: the ladder has no such task.
     """
-    for task in ladder_tasks(version):
+    return _named(name, ladder_tasks(version))
+
+
+def task_by_hand(name: str) -> Task:
+    """Return a task by its name, of the newest version of the ladder or of wire and catheter.
+
+    Raises:
+        InputError: there is no such task.
+    """
+    return _named(name, ladder_tasks(NEWEST) + ladder_tasks("coaxial"))
+
+
+def _named(name: str, tasks: Sequence[Task]) -> Task:
+    for task in tasks:
         if task.name == name:
             return task
-    raise InputError(f"task: {name!r}; choose from {', '.join(task.name for task in ladder_tasks(version))}")
+    raise InputError(f"task: {name!r}; choose from {', '.join(task.name for task in tasks)}")
 
 
 def training_navigations(name: str, first: int, count: int) -> list[Navigation]:

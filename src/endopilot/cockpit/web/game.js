@@ -31,9 +31,9 @@ export class GameBar {
     if (this.text.textContent !== text) this.text.textContent = text;
   }
 
-  scores({ you, agent, failure }) {
+  scores({ you, rival, agent, failure }) {
     const columns = [["", ...ROWS.map(([name]) => name)], ["you", ...ROWS.map(([, of]) => of(you))]];
-    columns.push(["agent", ...ROWS.map(([, of]) => (agent ? of(agent) : failure ? "–" : "it drives …"))]);
+    columns.push([rival, ...ROWS.map(([, of]) => (agent ? of(agent) : failure ? "–" : "it drives …"))]);
     this.table.replaceChildren(...columns.map((cells) => {
       const row = document.createElement("tr");
       row.append(...cells.map((cell, i) => {

@@ -8,16 +8,18 @@ const KEYS = {
 };
 const DEAD = 0.15;
 
-/** Turns what is held into messages. `drives()` tells whether the page drives, `policyDrives()` whether its autopilot does; `wake()` is called as a motion begins. */
+/** Turns what is held into messages. The hand holds one of the `devices`, the wire first, or all at once. `drives()` tells whether the page drives, `policyDrives()` whether its autopilot does; `wake()` is called as a motion begins. */
 export class Hands {
-  constructor(connection, drives, policyDrives, wake) {
+  constructor(connection, devices, drives, policyDrives, wake) {
     this.connection = connection;
+    this.devices = devices;
+    this.hold(0);
     this.wake = wake;
     this.drives = drives;
     this.policyDrives = policyDrives;
     this.held = new Set();
     this.pedalHeld = new Set();
-    this.sent = [0, 0];
+    this.sent = this.rest();
     this.pedalSent = false;
     this.before = [];
     addEventListener("keydown", (event) => this.key(event, true));
@@ -28,6 +30,40 @@ export class Hands {
     for (const end of ["pointerup", "pointerleave", "pointercancel"]) this.button("pedal", end, () => this.pedal("mouse", false));
     this.button("contrast", "click", () => this.connection.send("contrast"));
     setInterval(() => this.beat(), HEARTBEAT_MS);
+  }
+
+  rest() {
+    return this.devices.flatMap(() => [0, 0]);
+  }
+
+  /** What the hand may hold: each device, and all of them if there are several. */
+  choices() {
+    const names = this.devices.map((device) => device.name);
+    return names.length > 1 ? [...names, names.length > 2 ? "all" : "both"] : names;
+  }
+
+  /** Take another device into the hand; keys that are pressed are let go, so that they do not move it. */
+  hold(choice) {
+    this.held?.clear();
+    this.choice = choice % this.choices().length;
+    this.showHeld();
+  }
+
+  /** Show what the hand holds, if there is a choice and a hand. */
+  showHeld(driven = true) {
+    const bar = document.getElementById("holds");
+    bar.hidden = this.devices.length === 1 || !driven;
+    if (!bar.children.length) {
+      const label = document.createElement("span");
+      label.innerHTML = "in hand <kbd>Q</kbd>";
+      bar.append(label, ...this.choices().map((name, choice) => {
+        const button = document.createElement("button");
+        button.textContent = name;
+        button.onclick = () => { this.hold(choice); button.blur(); };
+        return button;
+      }));
+    }
+    [...bar.children].slice(1).forEach((button, choice) => button.classList.toggle("on", choice === this.choice));
   }
 
   button(id, event, act) {
@@ -46,6 +82,8 @@ export class Hands {
       if (!repeated) this.pedal("key", down);
     } else if (event.code === "KeyC") {
       if (down && !repeated) this.connection.send("contrast");
+    } else if (event.code === "KeyQ") {
+      if (down && !repeated) this.hold(this.choice + 1);
     } else if (event.code === "Space") {
       if (down) this.stop();
     } else if (!event.code.startsWith("Shift") && !event.code.startsWith("Alt")) {
@@ -58,7 +96,7 @@ export class Hands {
   stop() {
     this.held.clear();
     this.connection.send("autopilot", { action: "stop" });
-    this.send([0, 0]);
+    this.send(this.rest());
   }
 
   release() {
@@ -94,25 +132,31 @@ export class Hands {
       const contrast = Boolean(pad.buttons[0]?.pressed);
       if (contrast && !this.padContrast) this.connection.send("contrast");
       this.padContrast = contrast;
+      const next = Boolean(pad.buttons[3]?.pressed);
+      if (next && !this.padNext) this.hold(this.choice + 1);
+      this.padNext = next;
     }
     const [v, w] = SPEEDS[speed];
-    return [Math.sign(along) * Math.min(Math.abs(along), 1) * v, Math.sign(turn) * Math.min(Math.abs(turn), 1) * w];
+    const velocity = [Math.sign(along) * Math.min(Math.abs(along), 1) * v, Math.sign(turn) * Math.min(Math.abs(turn), 1) * w];
+    return this.devices.flatMap((_, device) => (device === this.choice || this.choice === this.devices.length ? velocity : [0, 0]));
   }
 
   update() {
     const wanted = this.wanted();
-    if (wanted[0] !== this.sent[0] || wanted[1] !== this.sent[1]) this.send(wanted);
+    if (wanted.some((value, i) => value !== this.sent[i])) this.send(wanted);
   }
 
   beat() {
     this.update();
-    if (this.sent[0] || this.sent[1] || this.policyDrives()) this.send(this.sent);
+    if (this.sent.some(Boolean) || this.policyDrives()) this.send(this.sent);
     if (this.pedalSent && this.drives()) this.connection.send("pedal", { down: true });
   }
 
-  send([translation, rotation]) {
-    if (!this.sent[0] && !this.sent[1]) this.wake();
-    this.sent = [translation, rotation];
-    if (this.drives()) this.connection.send("drive", { translation, rotation });
+  send(velocity) {
+    if (!this.sent.some(Boolean)) this.wake();
+    this.sent = velocity;
+    const [translation, rotation, ...others] = velocity;
+    const catheters = this.devices.slice(1).map((_, k) => [others[2 * k], others[2 * k + 1]]);
+    if (this.drives()) this.connection.send("drive", { translation, rotation, ...(catheters.length && { catheters }) });
   }
 }

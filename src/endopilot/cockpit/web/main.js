@@ -45,8 +45,11 @@ function showRole(role) {
 
 function showForce(state) {
   const blind = !state.sight;
-  const value = blind ? Math.abs(state.drive_load[0]) : state.force_n;
-  const limit = blind ? page.scene.push_limit_n : page.scene.force_limit_n;
+  let [value, limit] = [state.force_n, page.scene.force_limit_n];
+  if (blind) { // of the drive that is nearest to its limit
+    const loads = devices().map((device, k) => [Math.abs(state.drive_load[2 * k]), device.push_limit_n]);
+    [value, limit] = loads.reduce((most, one) => (one[0] / one[1] > most[0] / most[1] ? one : most));
+  }
   const share = value / limit, bar = document.querySelector("#force i");
   bar.style.width = `${Math.min(100, share * 80)}%`;
   bar.className = share >= 1 ? "over" : share > 0.6 ? "near" : "";
@@ -56,13 +59,28 @@ function showForce(state) {
   page.sound.set(share);
 }
 
+/** The wire, and the catheters around it from the inside out. */
+function devices() {
+  return [{ name: "wire", push_limit_n: page.scene.push_limit_n }, ...(page.scene.catheters ?? [])];
+}
+
+/** Where each device is and how its drive moves, in one row for a pair and three for a wire alone. */
+function placesOf(state) {
+  const speed = (k) => `${state.velocity[2 * k].toFixed(1)} mm/s, ${state.velocity[2 * k + 1].toFixed(1)} rad/s`;
+  if (!state.catheters) {
+    return { inserted: `${state.inserted_mm.toFixed(1)} mm`, rotation: `${state.rotation_deg.toFixed(0)}°`, drive: speed(0) };
+  }
+  const rows = [state, ...state.catheters].map((one, k) => [
+    devices()[k].name, `${one.inserted_mm.toFixed(1)} mm, ${one.rotation_deg.toFixed(0)}°, ${speed(k)}`,
+  ]);
+  return Object.fromEntries(rows);
+}
+
 function showFigures(state) {
-  const slips = Math.abs(state.slip[0]) > 1e-6 || Math.abs(state.slip[1]) > 1e-6;
+  const slips = state.slip.some((value) => Math.abs(value) > 1e-6);
   list("figures", {
     time: `${state.time_s.toFixed(1)} s`,
-    inserted: `${state.inserted_mm.toFixed(1)} mm`,
-    rotation: `${state.rotation_deg.toFixed(0)}°`,
-    drive: `${state.velocity[0].toFixed(1)} mm/s, ${state.velocity[1].toFixed(1)} rad/s`,
+    ...placesOf(state),
     tip: state.sight ? `${state.section}, ${state.tip_mm.toFixed(1)} mm` : "hidden",
     "peak force": state.sight ? `${state.peak_force_n.toFixed(3)} N` : "hidden",
     state: !state.valid ? "simulation failed" : slips ? "the drive slips" : state.stopped === "silence" ? "stopped: 200 ms without a message; let the keys go if it stays so" : state.stopped ? `stopped: ${state.stopped}` : "ready",
@@ -75,6 +93,7 @@ function showText(state) {
   showFigures(state);
   page.autopilot?.show(state.autopilot, state.target);
   if (state.replay) page.replay.show(state.replay, state.time_s);
+  page.hands.showHeld(state.mode === "drive");
   if (state.game) page.game.show(state.game);
   page.space.believe(Boolean(page.autopilot?.shown.checked));
   document.getElementById("blind").hidden = state.sight;
@@ -108,7 +127,7 @@ async function start() {
     banner(`The page cannot be shown: ${error.message}`);
     return;
   }
-  put("patient", `${page.scene.name}, ${page.scene.wire}`);
+  put("patient", [page.scene.name, page.scene.wire, ...devices().slice(1).map((one) => `in ${one.name}`)].join(", "));
   put("scale-text", `wall force, 0 to ${page.scene.force_limit_n} N`);
   page.sound = new Sound(document.getElementById("sound"));
   page.connection = new Connection(handlers, (why) => { if (!page.fatal) banner(why); });
@@ -118,7 +137,7 @@ async function start() {
   page.game = new GameBar(page.connection);
   page.replay = new ReplayBar(page.connection);
   if (page.scene.policies) page.autopilot = new AutopilotBar(page.connection, page.scene);
-  page.hands = new Hands(page.connection, () => page.role.drives, () => Boolean(page.autopilot?.drives), () => page.space.wake());
+  page.hands = new Hands(page.connection, devices(), () => page.role.drives, () => Boolean(page.autopilot?.drives), () => page.space.wake());
   setInterval(countFrames, 1000);
   requestAnimationFrame(frame);
 }

@@ -48,7 +48,8 @@ export class Space {
     this.controls.addEventListener("change", () => { this.changed = true; });
     this.changed = true;
     this.wire = new Wire(scene.diameter_mm, scene.force_limit_n);
-    this.scene.add(this.wire.mesh);
+    this.catheters = (scene.catheters ?? []).map((one) => new Wire(one.diameter_mm, scene.force_limit_n, true));
+    for (const tube of [this.wire, ...this.catheters]) this.scene.add(tube.mesh);
     this.addLumen(scene);
     this.addCatheter(scene);
     this.addCenterlines(scene);
@@ -150,12 +151,10 @@ export class Space {
     });
   }
 
-  /** Show the state's wire, target and believed wires. */
+  /** Show the state's wire, catheters and target. */
   show(state) {
-    if (state.nodes && this.moved(state.nodes)) {
-      this.wire.set(state.nodes, state.node_force);
-      this.changed = true;
-    }
+    this.follow(this.wire, state.nodes, state.node_force);
+    this.catheters.forEach((tube, k) => this.follow(tube, state[`catheter_${k + 1}_nodes`], state[`catheter_${k + 1}_force`]));
     const target = state.target?.position.join();
     if (target !== this.targetAt) {
       this.targetAt = target;
@@ -165,12 +164,13 @@ export class Space {
     }
   }
 
-  /** Whether the wire has moved visibly since it was drawn. */
-  moved(nodes) {
-    const before = this.drawnNodes;
-    const still = before?.length === nodes.length && nodes.every((value, i) => Math.abs(value - before[i]) < STILL_MM);
-    if (!still) this.drawnNodes = nodes;
-    return !still;
+  /** Let a tube follow its nodes, if they have moved visibly since it was drawn. */
+  follow(tube, nodes, force) {
+    const before = tube.drawn;
+    if (!nodes || (before?.length === nodes.length && nodes.every((value, i) => Math.abs(value - before[i]) < STILL_MM))) return;
+    tube.drawn = nodes;
+    tube.set(nodes, force);
+    this.changed = true;
   }
 
   /** Show or hide what a policy believes. */

@@ -1,4 +1,4 @@
-// The wire as a tube of its true diameter, coloured by the wall's force.
+// The wire and each catheter as a tube of its true diameter, coloured by the wall's force.
 import * as THREE from "three";
 
 const SIDES = 8;
@@ -6,12 +6,15 @@ const PIECES = 2; // between two nodes
 const MOST = 1600; // rings
 
 const COLD = new THREE.Color("#f6f7fb");
+const CATHETER = new THREE.Color("#19b5c8"); // where no wall presses on a catheter
+const CATHETER_OPACITY = 0.6; // the wire is seen in it
 const WARM = new THREE.Color("#ffd34d");
 const HOT = new THREE.Color("#ff2d1a");
 
-/** A tube whose rings follow the nodes that `set` is given. */
+/** A tube whose rings follow the nodes that `set` is given; a catheter's is seen through. */
 export class Wire {
-  constructor(diameter, forceScale) {
+  constructor(diameter, forceScale, isCatheter = false) {
+    this.cold = isCatheter ? CATHETER : COLD;
     this.radius = diameter / 2;
     this.forceScale = forceScale;
     this.position = new Float32Array(MOST * SIDES * 3);
@@ -30,9 +33,10 @@ export class Wire {
     }
     geometry.setIndex(index);
     geometry.setDrawRange(0, 0);
-    this.mesh = new THREE.Mesh(geometry, new THREE.MeshLambertMaterial({ vertexColors: true, side: THREE.DoubleSide }));
+    const seen = isCatheter ? { transparent: true, opacity: CATHETER_OPACITY } : {};
+    this.mesh = new THREE.Mesh(geometry, new THREE.MeshLambertMaterial({ vertexColors: true, side: THREE.DoubleSide, ...seen }));
     this.mesh.frustumCulled = false;
-    this.mesh.renderOrder = 1;
+    this.mesh.renderOrder = isCatheter ? 2 : 1;
     this.tip = new THREE.Vector3();
   }
 
@@ -53,7 +57,7 @@ export class Wire {
       catmullRom(points, whole, share, at, tangent);
       side.crossVectors(tangent, up).normalize();
       up.crossVectors(side, tangent).normalize();
-      const color = forceColor((force[whole] * (1 - share) + force[whole + 1] * share) / this.forceScale);
+      const color = forceColor((force[whole] * (1 - share) + force[whole + 1] * share) / this.forceScale, this.cold);
       for (let k = 0; k < SIDES; k++) {
         const angle = (2 * Math.PI * k) / SIDES, c = Math.cos(angle), s = Math.sin(angle), to = 3 * (ring * SIDES + k);
         for (const [axis, name] of [[0, "x"], [1, "y"], [2, "z"]]) {
@@ -77,10 +81,10 @@ export class Wire {
   }
 }
 
-/** Return the colour of a force, given as a share of the largest that is safe. */
-export function forceColor(share) {
+/** Return the colour of a force, given as a share of the largest that is safe; `cold` is that of none. */
+export function forceColor(share, cold = COLD) {
   const color = new THREE.Color();
-  return share < 0.5 ? color.lerpColors(COLD, WARM, Math.max(0, 2 * share)) : color.lerpColors(WARM, HOT, Math.min(1, 2 * share - 1));
+  return share < 0.5 ? color.lerpColors(cold, WARM, Math.max(0, 2 * share)) : color.lerpColors(WARM, HOT, Math.min(1, 2 * share - 1));
 }
 
 function catmullRom(points, whole, t, at, tangent) {

@@ -1,0 +1,247 @@
+"""Wire and catheter in the cockpit: both are driven, shown, recorded and replayed."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+from test_game import Rival, play
+from test_session import run
+
+from endopilot.cockpit import game
+from endopilot.cockpit.film import open_film
+from endopilot.cockpit.frames import decode, scene
+from endopilot.cockpit.game import Attempt, GameSession
+from endopilot.cockpit.messages import Autopilot, Drive, Game, Pedal
+from endopilot.cockpit.open import resume_session
+from endopilot.cockpit.recording import read_recording, replayed
+from endopilot.cockpit.session import SILENCE_S, Session
+from endopilot.cockpit.world import World
+from endopilot.errors import InputError
+from endopilot.simulation.catheter import read_catheter
+from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.device import read_device
+from endopilot.simulation.simulate import simulate
+from endopilot.simulation.table import write_rollout
+from endopilot.tasks.task import task_by_hand
+
+NAME = "microcatheter-1.7f"
+
+
+@pytest.fixture
+def navigation(navigation):
+    return replace(navigation, device=read_device("workhorse-014"), catheters=(read_catheter(NAME),))
+
+
+def both(wire=(0.0, 0.0), catheter=(0.0, 0.0)):
+    return Drive(type="drive", translation=wire[0], rotation=wire[1], catheters=(catheter,))
+
+
+def test_each_device_follows_its_own_drive(session):
+    (header, arrays), _ = run(session, 0.8, message=both((12.0, 2.0), (9.0, -1.0)))
+    assert header["command"] == header["velocity"] == [12.0, 2.0, 9.0, -1.0]
+    snapshot = session.world.snapshot()
+    (catheter,) = snapshot.catheters
+    assert 5.0 < catheter.inserted_mm < 9.0 * 0.8 < snapshot.inserted_mm
+    assert header["catheters"] == [
+        {"inserted_mm": round(catheter.inserted_mm, 3), "rotation_deg": round(np.degrees(catheter.rotation), 2)}
+    ]
+    assert header["catheter_tips_mm"][0] < header["tip_mm"]
+    simulator = session.world.simulator
+    np.testing.assert_array_equal(arrays["nodes"][0], simulator.tips(0)[0].astype("<f4"))
+    np.testing.assert_array_equal(arrays["catheter_1_nodes"][0], simulator.tips(1)[0].astype("<f4"))
+    assert len(arrays["catheter_1_force"]) == len(arrays["catheter_1_nodes"]) < len(arrays["nodes"])
+    # A catheter that is not named stands still.
+    (header, _), _ = run(session, 0.3, message=Drive(type="drive", translation=-3.0, rotation=0.0))
+    assert header["velocity"] == [-3.0, 0.0, 0.0, 0.0]
+
+
+def test_the_wall_presses_on_what_touches_it(session):
+    """Forces are shown on the wire ahead of the catheter, on the catheter behind its tip, and each but once."""
+    run(session, 1.3, message=both((15.0, 3.0), (6.0, 0.0)))
+    snapshot = session.world.snapshot()
+    (catheter,) = snapshot.catheters
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(snapshot.nodes, axis=0), axis=1))])
+    inside = along > snapshot.inserted_mm - catheter.inserted_mm + 1.0
+    assert inside.any() and not snapshot.node_force[inside].any()
+    shown = snapshot.node_force.sum() + catheter.node_force.sum()
+    assert shown == pytest.approx(session.world.simulator.contacts[0].sum(), rel=1e-6) and shown > 0
+
+
+def test_silence_stops_both(session):
+    session.handle(both((5.0, 1.0), (4.0, 1.0)), 0.0)
+    run(session, SILENCE_S)
+    assert session.world.robot.velocity.tolist() == [5.0, 1.0, 4.0, 1.0]
+    (header, _), _ = run(session, 0.3, start=SILENCE_S + 0.02)
+    assert header["stopped"] == "silence" and header["velocity"] == [0.0] * 4
+
+
+def test_more_catheters_than_there_are_are_refused(session):
+    with pytest.raises(InputError, match=r"^catheters: 2; this wire has 1 around it$"):
+        session.handle(Drive(type="drive", translation=1.0, rotation=0.0, catheters=((1.0, 0.0), (1.0, 0.0))), 0.0)
+
+
+def test_x_ray_shows_the_catheters_marker(session):
+    run(session, 1.0, message=both((15.0, 0.0), (8.0, 0.0)))
+    session.xray.settings = replace(session.xray.settings, dose=10.0)
+    _, images = run(session, 0.3, message=Pedal(type="pedal", down=True), start=1.0)
+    snapshot, unit = session.world.snapshot(), session.xray
+    plane = unit._planes[unit.settings.planes[0]]
+    grey = images[-1][1]["grey"].astype(float)
+    imager = unit._imager
+    marker = imager.catheter(plane, snapshot.catheters[0].nodes) > 0.2
+    wire = imager.wire(plane, snapshot.nodes) > 0.6
+    assert 2 < marker.sum() < 40
+    assert grey[marker & wire].mean() < grey[wire & ~marker].mean() - 5
+
+
+def test_the_scene_names_the_catheter(navigation):
+    header, _ = decode(scene(navigation, {}))
+    (shown,) = header["catheters"]
+    assert (shown["name"], shown["diameter_mm"]) == (NAME, 0.57)
+    alone, _ = decode(scene(replace(navigation, catheters=()), {}))
+    assert "catheters" not in alone
+
+
+def test_a_session_replays_to_the_bit_and_goes_on(session, tmp_path):
+    path, seen = tmp_path / "a.cockpit.jsonl", {}
+    for wire, catheter in (((12.0, 2.0), (8.0, 1.0)), ((-6.0, -4.0), (9.0, 0.0)), ((20.0, 0.0), (-5.0, 3.0))):
+        (header, arrays), _ = run(session, 0.8, message=both(wire, catheter))
+        seen[header["cycle"]] = arrays["nodes"], arrays["catheter_1_nodes"]
+    session.close()
+    film = open_film(path)
+    film.start()
+    until = time.monotonic() + 60
+    while not film.done and time.monotonic() < until:
+        time.sleep(0.01)
+    shown = {frame.snapshot.cycle: frame.snapshot for frame in film.frames}
+    assert not film.failure and film.navigation.catheters[0].name == NAME
+    for cycle, (wire, catheter) in seen.items():
+        np.testing.assert_array_equal(shown[cycle].nodes.astype("<f4"), wire)
+        np.testing.assert_array_equal(shown[cycle].catheters[0].nodes.astype("<f4"), catheter)
+    resumed = resume_session(path).stage
+    assert isinstance(resumed, Session) and resumed.world.digest() == session.world.digest()
+    run(resumed, 0.4, message=both(catheter=(-5.0, 0.0)))
+    resumed.close()
+    *_, (world, _events) = replayed(read_recording(path))
+    assert world.digest() == resumed.world.digest() != session.world.digest()
+    path.write_text(path.read_text().replace("[12.0, 2.0, 8.0, 1.0]", "[12.0, 2.0, 8.0, 1.1]"))
+    with pytest.raises(InputError, match="not where it was"):
+        list(replayed(read_recording(path)))
+
+
+def test_a_session_is_no_episode_yet(session, tmp_path):
+    pytest.importorskip("pyarrow", reason="the extra `learn` is not installed")
+    from endopilot.cockpit.episode import write_session_episode
+
+    session.close()
+    with pytest.raises(InputError, match=f"an episode takes a wire alone, and there is {NAME} around it; leave"):
+        write_session_episode(tmp_path / "a.cockpit.jsonl", tmp_path / "episode")
+
+
+def drive_alone(session, until, most_s=20.0):
+    began = time.monotonic()
+    while not until() and time.monotonic() - began < most_s:
+        now = time.monotonic() - began
+        session.handle(both(), now)
+        session.cycle(now)
+        time.sleep(0.0005)
+    assert until(), session.autopilot.values()
+
+
+def start(session, policy):
+    session._policies = (policy,)
+    session.handle(Autopilot(type="autopilot", action="start", policy=policy), 0.0)
+
+
+def test_a_policy_drives_both(session):
+    start(session, "in-turn")
+    drive_alone(session, lambda: session.autopilot.status == "reached")
+    assert abs(session.world.snapshot().tip.abscissa[0] - session.target.abscissa) <= 2.0
+    run(session, 0.5, message=both(catheter=(6.0, 0.0)), start=1e3)
+    start(session, "catheter-alone")  # begins with the catheter where it is
+    assert session.autopilot.status == "drives" or session.autopilot.status == "thinking"
+
+
+def test_a_policy_for_a_wire_alone_says_so(session):
+    start(session, "agent")
+    drive_alone(session, lambda: session.autopilot.status == "failed")
+    assert "takes a wire alone, and there is " + NAME in session.autopilot.failure
+
+
+def test_a_curved_catheter_is_turned_back_before_a_policy_begins(navigation, xray):
+    curved = replace(navigation.catheters[0], shape=((10.0, 0.5),))
+    session = Session(World(replace(navigation, catheters=(curved,))), xray)
+    run(session, 0.5, message=both(catheter=(0.0, 3.0)))
+    start(session, "in-turn")
+    drive_alone(session, lambda: session.autopilot.status == "failed")
+    assert session.autopilot.failure == f"in-turn: begins with unturned catheters; turn {NAME} back to 0° first"
+    session.close()
+
+
+def test_a_task_of_wire_and_catheter_is_scored(navigation, xray):
+    """The catheter is to arrive: the wire at the target is not enough. The coaxial agent's score stands beside."""
+    tried = Attempt(task_by_hand("follow"), 0)
+    assert tried.rival == "coaxial-agent"
+    wanted = replace(navigation.target, abscissa=10.0)
+    world = World(replace(navigation, arrives="catheter", target=wanted, seconds=6.0, force_limit_n=0.3))
+    with patch.object(game, "ProcessPoolExecutor", Rival):
+        played = GameSession(tried, world, xray)
+        played.handle(Game(type="game", action="start"), 0.0)
+        play(played, both((8.0, 0.0)), 1.5)
+        assert world.snapshot().tip.abscissa[0] > 10.0 and played.phase == "on"
+        last = play(played, both(catheter=(8.0, 0.0)), 2.5)
+        played.close()
+    scores = last["result"][0]["scores"]
+    assert played.phase == "over" and scores["you"]["reason"] == "reached"
+    assert scores["rival"] == "coaxial-agent" and scores["agent"] == {"success": True}
+
+
+def test_a_rollout_of_a_pair_is_driven_again(fork, vessel, navigation, tmp_path):
+    control = np.array([[[8.0, 1.0, 6.0, 0.0], [4.0, -2.0, 0.0, 2.0], [-6.0, 1.0, 8.0, 0.0]]])
+    initial = np.array([[2.0, 0.1, 1.0, 0.0]])
+    config = SimulatorConfig(threads=1)
+    rollout = simulate(fork, navigation.device, control, catheters=navigation.catheters, initial=initial, config=config)
+    write_rollout(rollout, tmp_path / "r.csv")
+    film = open_film(tmp_path / "r.csv", vessel, catheters=(NAME,))
+    film._drive()
+    last = film.frames[-1].snapshot
+    assert not film.failure and rollout.catheters is not None
+    assert last.inserted_mm == pytest.approx(rollout.inserted_length[0, -1], abs=1e-9)
+    assert last.catheters[0].inserted_mm == pytest.approx(rollout.catheters.inserted_length[0, -1, 0], abs=1e-9)
+    np.testing.assert_allclose(last.catheters[0].nodes[0], rollout.catheters.tip_position[0, -1, 0], atol=0.02)
+
+
+def test_a_navigation_of_a_pair_is_shown(vessel, tmp_path):
+    from endopilot.control.navigate_patient import NavigatePatientConfig
+    from endopilot.pipeline.navigation import navigate_into
+
+    config = NavigatePatientConfig(policy="in-turn", catheter=(NAME,), seconds=2.0)
+    navigate_into(vessel, "0,0,15", tmp_path / "navigation", config)
+    film = open_film(tmp_path / "navigation", vessel)
+    film._drive()
+    assert not film.failure
+    last = film.frames[-1].snapshot
+    table = np.genfromtxt(tmp_path / "navigation" / "navigation.csv", delimiter=",", names=True)
+    assert last.inserted_mm == pytest.approx(table["inserted_length_mm"][-1], abs=0.05)
+    assert last.catheters[0].inserted_mm == pytest.approx(table["catheter_1_inserted_length_mm"][-1], abs=0.05)
+
+
+def test_an_episode_of_pairs_is_shown(navigation, vessel, tmp_path):
+    pytest.importorskip("pyarrow", reason="the extra `learn` is not installed")
+    from endopilot.dataset.config import DatasetConfig
+    from endopilot.dataset.generate import generate_dataset
+    from endopilot.dataset.loader import load_dataset
+
+    config = DatasetConfig(sequences=1, seconds=3.0, anatomy_shares=(1.0, 0.0, 0.0), seen_test_share=0.0)
+    generate_dataset([vessel], tmp_path / "data", navigation.device, config, catheters=navigation.catheters)
+    data = load_dataset(tmp_path / "data")
+    film = open_film(tmp_path / "data")
+    film._drive()
+    assert not film.failure
+    last = film.frames[-1].snapshot
+    np.testing.assert_allclose(last.nodes[0], data.tip_position[0, -1], atol=0.05)
+    np.testing.assert_allclose(last.catheters[0].nodes[0], data.catheter_tip_position[0, -1, 0], atol=0.05)
