@@ -1,16 +1,19 @@
-"""Pictures of the cockpit for README and docs: the agent drives the reference patient in a headless browser.
+"""Pictures of the cockpit for README and docs, from a headless browser, in the reference patient.
 
-    python docs/figures/cockpit.py
+    python docs/figures/cockpit.py [agent] [catheter]
 
-writes docs/images/cockpit.png, docs/images/cockpit.gif and docs/images/cockpit-contrast.png.
+writes docs/images/cockpit.png, docs/images/cockpit.gif and docs/images/cockpit-contrast.png, in which the agent drives,
+and docs/images/cockpit-catheter.png, in which a hand drives wire and catheter; both if neither is named.
 """
 
 from __future__ import annotations
 
 import io
+import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 from PIL import Image
 from playwright.sync_api import sync_playwright
@@ -22,10 +25,60 @@ from endopilot.tasks.task import reference_navigation
 IMAGES = Path(__file__).parents[1] / "images"
 SIZE, SMALL = {"width": 1280, "height": 760}, (720, 428)
 FRAMES, EVERY_S = 26, 0.6
+CATHETER, WIRE_MM, CATHETER_MM = "microcatheter-2.4f", 62.0, 40.0
 
 
 def main() -> None:
-    """Drive, take pictures, and write them."""
+    """Make the pictures that are asked for."""
+    makers = {"agent": agent, "catheter": catheter}
+    for name in sys.argv[1:] or makers:
+        makers[name]()
+
+
+def catheter() -> None:
+    """Push the wire, then the catheter, and look at both."""
+    with tempfile.TemporaryDirectory() as name, sync_playwright() as driver:
+        folder = Path(name)
+        write_anatomy(reference_navigation().anatomy, folder / "patient")
+        browser = driver.chromium.launch(executable_path=find_browser(), args=list(BROWSER_FLAGS))
+        page = browser.new_page(viewport=SIZE)
+        with serving(folder / "patient", folder / "recordings", CATHETER) as address:
+            page.goto(address)
+            wait_for(page, "window.cockpit?.shown?.xray.background === 'phantom' && cockpit.shown.xray.ready")
+            page.evaluate("() => cockpit.connection.send('c_arm', { zoom: 1.75 })")
+            wait_for(page, "cockpit.shown.xray.zoom === 1.75 && cockpit.shown.xray.ready")
+            hold(page, "KeyC", "cockpit.shown.xray.contrast > 0.9")
+            hold(page, "KeyX", "cockpit.shown.xray.has_roadmap")
+            page.check("#roadmap")
+            hold(page, "KeyW", f"cockpit.shown.inserted_mm > {WIRE_MM}")
+            page.keyboard.press("KeyQ")
+            hold(page, "KeyW", f"cockpit.shown.catheters[0].inserted_mm > {CATHETER_MM}")
+            wait_for(page, "cockpit.shown.xray.contrast === 0")
+            hold(page, "KeyX", "cockpit.shown.xray.age_s < 0.05 && cockpit.shown.xray.on")
+            page.click("text=to the tip")
+            nearer = "const c = cockpit.space; c.camera.position.lerp(c.controls.target, 0.55); c.controls.update();"
+            page.evaluate(f"() => {{ {nearer} }}")
+            time.sleep(1.5)
+            page.screenshot(path=IMAGES / "cockpit-catheter.png")
+        browser.close()
+
+
+def hold(page: Any, key: str, script: str) -> None:
+    """Hold a key, fast, until an expression is true; press it again where a busy machine made the page fall silent."""
+    page.keyboard.down("Shift")
+    page.keyboard.down(key)
+    while not page.evaluate(f"() => Boolean({script})"):
+        if page.evaluate("() => cockpit.state.stopped") == "silence":
+            page.keyboard.up(key)
+            time.sleep(0.1)
+            page.keyboard.down(key)
+        time.sleep(0.02)
+    page.keyboard.up(key)
+    page.keyboard.up("Shift")
+
+
+def agent() -> None:
+    """Let the agent drive, take pictures, and write them."""
     with tempfile.TemporaryDirectory() as name, sync_playwright() as driver:
         folder = Path(name)
         write_anatomy(reference_navigation().anatomy, folder / "patient")

@@ -25,6 +25,7 @@ from endopilot.simulation.catheter import read_catheter
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import read_device
 from endopilot.simulation.simulate import simulate
+from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.table import write_rollout
 from endopilot.tasks.task import task_by_hand
 
@@ -59,16 +60,15 @@ def test_each_device_follows_its_own_drive(session):
     assert header["velocity"] == [-3.0, 0.0, 0.0, 0.0]
 
 
-def test_the_wall_presses_on_what_touches_it(session):
-    """Forces are shown on the wire ahead of the catheter, on the catheter behind its tip, and each but once."""
-    run(session, 1.3, message=both((15.0, 3.0), (6.0, 0.0)))
-    snapshot = session.world.snapshot()
-    (catheter,) = snapshot.catheters
+@pytest.mark.parametrize(("wire_mm", "catheter_mm"), [(10.0, 4.0), (4.0, 10.0)])
+def test_the_wall_presses_on_the_outermost_device_alone(world, wire_mm, catheter_mm):
+    """A wall that presses everywhere is shown on the wire as far as it leads, and on the catheter."""
+    world.simulator.reset(inserted_length=[wire_mm], rotation=[0.0], catheter_inserted_length=[[catheter_mm]])
+    with patch.object(Simulator, "contacts", property(lambda self: np.ones((1, self.nodes)))):
+        snapshot = world.snapshot()
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(snapshot.nodes, axis=0), axis=1))])
-    inside = along > snapshot.inserted_mm - catheter.inserted_mm + 1.0
-    assert inside.any() and not snapshot.node_force[inside].any()
-    shown = snapshot.node_force.sum() + catheter.node_force.sum()
-    assert shown == pytest.approx(session.world.simulator.contacts[0].sum(), rel=1e-6) and shown > 0
+    np.testing.assert_array_equal(snapshot.node_force > 0, wire_mm - along > catheter_mm)
+    np.testing.assert_array_equal(snapshot.catheters[0].node_force, 1.0)
 
 
 def test_silence_stops_both(session):
@@ -245,3 +245,20 @@ def test_an_episode_of_pairs_is_shown(navigation, vessel, tmp_path):
     last = film.frames[-1].snapshot
     np.testing.assert_allclose(last.nodes[0], data.tip_position[0, -1], atol=0.05)
     np.testing.assert_allclose(last.catheters[0].nodes[0], data.catheter_tip_position[0, -1, 0], atol=0.05)
+
+
+def test_a_plan_of_a_pair_is_shown(vessel, tmp_path):
+    from endopilot.control.plan import plan
+    from endopilot.control.plan_config import PlanConfig
+    from endopilot.control.plan_file import write_plan
+
+    made = plan(vessel, "0,0,9", PlanConfig(seconds=20.0, tip="own"), catheters=[read_catheter(NAME)])
+    write_plan(made, tmp_path / "plan")
+    film = open_film(tmp_path / "plan", vessel, catheters=(NAME,))
+    film._drive()
+    last = film.frames[-1].snapshot
+    assert not film.failure and made.catheter_position is not None
+    np.testing.assert_allclose(last.nodes[0], made.position[-1], atol=0.05)
+    np.testing.assert_allclose(last.catheters[0].nodes[0], made.catheter_position[-1], atol=0.05)
+    with pytest.raises(InputError, match=f"for another device .workhorse-014 in {NAME}., not for workhorse-014"):
+        open_film(tmp_path / "plan", vessel)

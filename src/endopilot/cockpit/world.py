@@ -283,7 +283,7 @@ def _lines(
     The wall presses on the outermost device alone.
     """
     nodes, force = simulator.position[0], simulator.contacts[0]
-    found, covered = [], 0.0
+    found, covered = [], -np.inf
     for device, line in reversed(list(enumerate(lines_from_tips(nodes, inserted_mm)))):
         own = force[len(nodes) - len(line) :]
         along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
