@@ -46,7 +46,7 @@ def drive_session(number: int, folder: Path) -> Path:
     while world.time_s < 20.0:
         if world.cycle % 20 == 0:
             left_mm = navigation.target.abscissa - float(world.snapshot().tip.abscissa[0])
-            recorder.event(move=world.command(*hand(left_mm, world.time_s)))
+            recorder.event(move=world.command(hand(left_mm, world.time_s)))
         world.advance()
         recorder.cycle()
     recorder.close()

@@ -29,7 +29,7 @@ _STRAIGHT_MM, _BEND_MM, _SHOWN_MM = 10.0, 25.0, 180.0
 shown, mm."""
 _BLOOD_HU = 40.0
 _STEP_MM, _RING, _RINGS, _SPOKES = 0.15, 48, 4, 16
-_MARKER_STEP_MM = 0.05
+_MARKER_STEP_MM, _SPOKE_MM = 0.05, 0.25
 _SURROUNDINGS = PhantomConfig(  # without contrast, as the chest is between two injections
     in_plane_mm=1.5, slice_mm=1.5, margin_mm=60.0, lumen_hu=(45.0, 45.0), noise_hu=(0.0, 0.0), calcium=0.0
 )
@@ -196,7 +196,7 @@ def _tube(
     axis = np.stack([np.interp(at, along, part) for part in nodes.T], axis=-1)
     heading = np.stack([np.interp(at, along, part) for part in np.gradient(nodes, along, axis=0).T], axis=-1)
     first, second = _across(heading)
-    spokes = int(np.ceil(2 * np.pi * radius_mm / _STEP_MM))
+    spokes = int(np.ceil(2 * np.pi * radius_mm / _SPOKE_MM))
     turn = np.linspace(0, 2 * np.pi, spokes, endpoint=False)[:, None, None]
     points = (axis + radius_mm * (np.cos(turn) * first + np.sin(turn) * second)).reshape(-1, 3)
     return points, np.full(len(points), per_mm * 2 * np.pi * radius_mm * wall_mm * step_mm / spokes)

@@ -2,7 +2,7 @@
 import * as THREE from "three";
 
 const SIDES = 8;
-const PIECES = 2; // between two nodes
+const PIECES = 2; // between two nodes; a catheter, which bends less, has one
 const MOST = 1600; // rings
 
 const COLD = new THREE.Color("#f6f7fb");
@@ -15,6 +15,7 @@ const HOT = new THREE.Color("#ff2d1a");
 export class Wire {
   constructor(diameter, forceScale, isCatheter = false) {
     this.cold = isCatheter ? CATHETER : COLD;
+    this.pieces = isCatheter ? 1 : PIECES;
     this.radius = diameter / 2;
     this.forceScale = forceScale;
     this.position = new Float32Array(MOST * SIDES * 3);
@@ -33,8 +34,9 @@ export class Wire {
     }
     geometry.setIndex(index);
     geometry.setDrawRange(0, 0);
-    const seen = isCatheter ? { transparent: true, opacity: CATHETER_OPACITY } : {};
-    this.mesh = new THREE.Mesh(geometry, new THREE.MeshLambertMaterial({ vertexColors: true, side: THREE.DoubleSide, ...seen }));
+    // the faces of a tube look inwards
+    const seen = isCatheter ? { transparent: true, opacity: CATHETER_OPACITY, side: THREE.BackSide } : { side: THREE.DoubleSide };
+    this.mesh = new THREE.Mesh(geometry, new THREE.MeshLambertMaterial({ vertexColors: true, ...seen }));
     this.mesh.frustumCulled = false;
     this.mesh.renderOrder = isCatheter ? 2 : 1;
     this.tip = new THREE.Vector3();
@@ -47,13 +49,13 @@ export class Wire {
     const points = Array.from({ length: count }, (_, i) => point(i));
     if (count < 2) return;
     this.tip.copy(points[0]);
-    const rings = Math.min((count - 1) * PIECES + 1, MOST);
+    const rings = Math.min((count - 1) * this.pieces + 1, MOST);
     const up = new THREE.Vector3(), side = new THREE.Vector3(), tangent = new THREE.Vector3(), at = new THREE.Vector3();
     tangent.subVectors(points[1], points[0]).normalize();
     up.set(0, 0, 1);
     if (Math.abs(tangent.z) > 0.9) up.set(1, 0, 0);
     for (let ring = 0; ring < rings; ring++) {
-      const whole = Math.min(Math.floor(ring / PIECES), count - 2), share = ring / PIECES - whole;
+      const whole = Math.min(Math.floor(ring / this.pieces), count - 2), share = ring / this.pieces - whole;
       catmullRom(points, whole, share, at, tangent);
       side.crossVectors(tangent, up).normalize();
       up.crossVectors(side, tangent).normalize();
