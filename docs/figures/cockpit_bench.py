@@ -1,7 +1,7 @@
 """Measure the cockpit's speed and write it into docs/cockpit.md: `python docs/figures/cockpit_bench.py [alone] [pair]`.
 
-Runs `endopilot bench cockpit` five times, which takes four minutes, and three times more with a catheter; nothing else
-should run meanwhile. `pair` is the second alone.
+Runs `endopilot bench cockpit` five times, then three times in turn with a catheter, which takes ten minutes; nothing
+else should run meanwhile. `alone` and `pair` make one of the two tables.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import subprocess
 import sys
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 from endopilot.benchmarks.cockpit import BARS
 from endopilot.files import processor_name
@@ -19,11 +20,10 @@ from endopilot.files import processor_name
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "cockpit.md"
 COMMAND = (sys.executable, "-m", "endopilot.cli", "bench", "cockpit", "--json")
-RUNS = {"alone": 5, "pair": 3}
+RUNS, PAIR_RUNS = 5, 3
 CATHETER = "microcatheter-1.7f"
 QUIET = 2.5
 """Mean number of busy programs over five minutes, the measurement's own among them, below which nothing else ran."""
-MARKS = {"alone": "bench", "pair": "bench-pair"}
 WHAT = {
     "realtime_reserve": "simulated time over the time that it takes",
     "latency_p95_ms": "from the key to the first frame with the wire moved, the robot's latency of 50 ms included",
@@ -32,39 +32,55 @@ WHAT = {
 }
 
 
-def others() -> str:
-    """Return what else ran lately, in words."""
-    load = os.getloadavg()[1]
-    return "nothing else running" if load < QUIET else f"other work running beside (load {load:.0f})"
-
-
 def main() -> None:
     """Fill the tables that are asked for."""
-    for kind in sys.argv[1:] or RUNS:
-        fill(kind)
+    makers = {"alone": alone, "pair": pair}
+    for name in sys.argv[1:] or makers:
+        makers[name]()
 
 
-def fill(kind: str) -> None:
-    """Fill the table of a wire `alone` or of a `pair` between the page's marks."""
-    command = [*COMMAND, *(["--catheter", CATHETER] if kind == "pair" else [])]
-    runs = RUNS[kind]
-    found = [json.loads(subprocess.run(command, cwd=ROOT, capture_output=True, text=True).stdout) for _ in range(runs)]
-    lines = [
-        f"{processor_name()}, two cores, {others()}, {runs} runs:",
-        "",
-        "| figure | median | from | to | bar | met in |",
-        "|---|---|---|---|---|---|",
-    ]
+def alone() -> None:
+    """Fill the table of a wire alone."""
+    found = [measured() for _ in range(RUNS)]
+    rows = ["| figure | median | from | to | bar | met in |", "|---|---|---|---|---|---|"]
     for name in BARS:
         values = [run[name] for run in found]
         met = sum(run["passed"][name] for run in found)
-        lines.append(
+        rows.append(
             f"| `{name}`: {WHAT[name]} | {median(values):.4g} | {min(values):.4g} | {max(values):.4g} | "
-            f"{found[0]['bars'][name].replace('>=', '≥').replace('<=', '≤')} | {met} of {runs} |"
+            f"{bar(found[0], name)} | {met} of {RUNS} |"
         )
-    begin, end = f"<!-- {MARKS[kind]}:begin -->", f"<!-- {MARKS[kind]}:end -->"
+    write("bench", RUNS, rows)
+
+
+def pair() -> None:
+    """Fill the table of a wire in a catheter, measured in turn with the wire alone."""
+    found = [(measured(), measured("--catheter", CATHETER)) for _ in range(PAIR_RUNS)]
+    rows = ["| figure, median | wire alone | wire and catheter | bar |", "|---|---|---|---|"]
+    for name in BARS:
+        middle = [median(both[which][name] for both in found) for which in (0, 1)]
+        rows.append(f"| `{name}` | {middle[0]:.4g} | {middle[1]:.4g} | {bar(found[0][0], name)} |")
+    write("bench-pair", PAIR_RUNS, rows)
+
+
+def measured(*more: str) -> dict[str, Any]:
+    """Return what `endopilot bench cockpit` prints."""
+    return json.loads(subprocess.run([*COMMAND, *more], cwd=ROOT, capture_output=True, text=True).stdout)
+
+
+def bar(run: dict[str, Any], name: str) -> str:
+    """Return the bar of a figure as the table has it."""
+    return run["bars"][name].replace(">=", "≥").replace("<=", "≤")
+
+
+def write(mark: str, runs: int, rows: list[str]) -> None:
+    """Write a table between the page's marks."""
+    load = os.getloadavg()[1]
+    others = "nothing else running" if load < QUIET else f"other work running beside (load {load:.0f})"
+    begin, end = f"<!-- {mark}:begin -->", f"<!-- {mark}:end -->"
+    lines = [begin, f"{processor_name()}, two cores, {others}, {runs} runs:", "", *rows, end]
     page = PAGE.read_text(encoding="utf-8")
-    PAGE.write_text(page.split(begin)[0] + "\n".join([begin, *lines, end]) + page.split(end)[1], encoding="utf-8")
+    PAGE.write_text(page.split(begin)[0] + "\n".join(lines) + page.split(end)[1], encoding="utf-8")
 
 
 if __name__ == "__main__":
