@@ -57,6 +57,19 @@ def test_two_views_find_the_tip_in_space(imager, planes, fork, branch):
     assert np.linalg.norm(found.wire[0] - start) < 1.0 and np.linalg.norm(found.wire[-1] - nodes[0]) < 1.0
 
 
+@pytest.mark.parametrize("length", [4.0, 14.0])
+def test_a_view_along_the_wire_does_not_lengthen_it(imager, planes, fork, length):
+    """There the wire is one dark spot: every deeper place of the vessel lies in it, and none of them is evidence."""
+    along = imager.plane((0.0, 84.0))
+    at = np.arange(length, -30.0, -0.5)
+    nodes = np.stack([0.3 + 0 * at, 0 * at, at], axis=-1)
+    seen = along.view.slope(nodes[0]) @ [0.0, 0.0, 1.0]
+    assert np.linalg.norm(seen) < 0.2 * np.linalg.norm(along.view.slope(nodes[0]), 2)
+    both = [planes[0], along]
+    found = found_in(imager, both, exposed(imager, both, nodes), length + 1.5)
+    assert abs(found.position[2] - length) < 0.5
+
+
 def test_one_view_leaves_the_depth_to_the_vessel(imager, planes, fork):
     nodes = wire_to(fork, 2)
     found = found_in(imager, planes, exposed(imager, planes, nodes), TIP[2], shown=(0,))
