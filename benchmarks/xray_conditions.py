@@ -4,7 +4,7 @@ PATIENTS of each coronary task of the ladder (2 if not given), with friction, ti
 20 %, up or down: with assumed errors of detection in a patient at rest; with X-ray images in a patient whose pose is
 registered; in a patient whom heart and breath move by amplitudes of their own, of which the published mean is known;
 with both. runs/xray-conditions gets one file a navigation; an interrupted run goes on with the others. With `--write`
-the table goes into docs/xray.md.
+the table goes into docs/xray.md; `--only` drives under some of the conditions, and leaves the other rows as they are.
 """
 
 from __future__ import annotations
@@ -95,25 +95,32 @@ def main() -> None:
     """Run what is missing, print the table, and write it if asked to."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("patients", nargs="?", type=int, default=2)
+    parser.add_argument("--only", nargs="+", choices=CONDITIONS, default=list(CONDITIONS))
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     tasks = [task for task in ladder_tasks() if task.anatomy in ("rca", "lca")]
     wanted = {
         name: [FOLDER / name / task.name / f"{place:02d}.json" for place in range(options.patients) for task in tasks]
-        for name in CONDITIONS
+        for name in options.only
     }
     claim(FOLDER, "benchmarks/xray_conditions.py", **identity("agent", NEWEST))
     make_missing("The agent under X-ray", [path for paths in wanted.values() for path in paths], measure)
+    head, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
+    before, rest = rest.split(END)
+    rows = {title: line for line in before.splitlines() for title, *_ in CONDITIONS.values() if f"| {title} |" in line}
+    rows |= {
+        CONDITIONS[name][0]: row(CONDITIONS[name][0], [read_json(path) for path in paths])
+        for name, paths in wanted.items()
+    }
     lines = [
         "| exposures and patient | reached safely | exposures a navigation | a minute | fluoroscopy, s "
         "| fewer frames than at 7.5 Hz | events missed | decisions in both bands |",
         "|---|---|---|---|---|---|---|---|",
-        *(row(CONDITIONS[name][0], [read_json(path) for path in paths]) for name, paths in wanted.items()),
+        *rows.values(),
     ]
     print("\n".join(lines))
     if options.write:
-        head, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
-        PAGE.write_text(f"{head}{BEGIN}" + "\n".join(lines) + f"\n{END}{rest.split(END)[1]}", encoding="utf-8")
+        PAGE.write_text(f"{head}{BEGIN}" + "\n".join(lines) + f"\n{END}{rest}", encoding="utf-8")
 
 
 if __name__ == "__main__":

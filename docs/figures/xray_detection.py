@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from endopilot.files import read_json
@@ -43,6 +44,10 @@ def tables(found: dict[str, Any]) -> str:
         f"one view ≤ {bars['registration_error_one_view_mm']:g} "
         f"| {found['registration_error_one_view_mm']:.2f} ({max(single):.2f}) mm |",
         "",
+        "| error of the vessel's place, median (largest), mm | contrast | and one wire | and four wires |",
+        "|---|---|---|---|",
+        *refined_rows(poses),
+        "",
         f"A wire is found in {100 * found['false_alarms_share']:.0f} % of the exposures without one, over all doses, "
         f"with and without contrast. An image without contrast is refused by registration in "
         f"{sum(row['told_without_contrast'] for row in poses)} of {len(poses)} patients. "
@@ -59,6 +64,24 @@ def tables(found: dict[str, Any]) -> str:
         if row["images"]
     ]
     return "\n".join(rows)
+
+
+def refined_rows(poses: list[dict[str, Any]]) -> list[str]:
+    """Return how the error of a registered pose changes with images of wires, as rows of Markdown."""
+    two = [[row["two_views_mm"], *row["refined_mm"]["two_views"]] for row in poses]
+    rows = {"two views, wires in both": two}
+    for name, title in (("one_view", "one view, wires in it"), ("other_view", "one view, wires in another")):
+        rows[title] = [
+            [before, *after]
+            for row in poses
+            for before, after in zip(row["one_view_mm"], row["refined_mm"][name], strict=True)
+        ]
+    return [
+        f"| {title} | "
+        + " | ".join(f"{median([e[i] for e in errors]):.2f} ({max(e[i] for e in errors):.2f})" for i in (0, 1, -1))
+        + " |"
+        for title, errors in rows.items()
+    ]
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from endopilot.control import search
-from endopilot.control.agent import AgentConfig, AgentPolicy, OpenLoopPolicy, TwinPolicy
+from endopilot.control.agent import CALIBRATIONS, AgentConfig, AgentPolicy, OpenLoopPolicy, TwinPolicy
 from endopilot.control.belief import Belief, BeliefConfig
 from endopilot.control.course import Course, Log
 from endopilot.control.halt import describe_halt
@@ -206,6 +206,17 @@ def test_without_another_the_agent_takes_the_calibration_of_the_package(side_bra
     half = policy._calibration.half_width(np.array([5.0]), np.array([20.0]), np.array([[0.5, 0.1]]))
     assert policy._calibration.level == 0.9 and policy._calibration.anatomies >= 9
     assert 0.5 < half[0, 0] < 5.0 and 0.05 < half[0, 1] < 1.0
+
+
+def test_images_have_a_calibration_of_their_own(side_branch) -> None:
+    """The navigation says how exposures find the tip."""
+    found = {}
+    for xray in ("assumed", "images"):
+        policy = AgentPolicy(QUICK)
+        policy.start(replace(side_branch, xray=xray), 0)
+        found[xray] = policy._calibration
+        assert found[xray] == Calibration.read(CALIBRATIONS[xray]) and found[xray].anatomies >= 9
+    assert found["images"] != found["assumed"]
 
 
 def test_open_loop_plans_once_and_looks_no_more(side_branch) -> None:

@@ -197,7 +197,9 @@ def test_hands_take_over_and_hand_back(straight) -> None:
 
 def test_images_show_the_tip(straight) -> None:
     """In a patient who lies in a pose of their own: as far along as the tip is, and how sure that is."""
-    record = navigate(straight, Forward(8.0, expose_every=4), config=NavigateConfig(xray="images"), seed=2)
+    policy = Forward(8.0, expose_every=4)
+    record = navigate(straight, policy, config=NavigateConfig(xray="images"), seed=2)
+    assert policy.navigation.xray == "images" and straight.xray == "assumed"
     assert record.reason == "reached" and record.exposures >= 2
     for sample in np.flatnonzero(record.exposed):
         shown = record.measured[sample]

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from endopilot.control.agent import AgentPolicy
+from endopilot.control.agent import CALIBRATED
 from endopilot.control.belief import Belief
 from endopilot.control.plan_config import PlanConfig
 from endopilot.control.plan_file import read_plan, write_plan
@@ -152,7 +152,7 @@ def test_the_agents_wires_follow_the_plan_and_observe_its_tip(found, monkeypatch
 
 def test_the_agents_own_calibration_asks_seldom_along_a_straight_vessel(found):
     own = read_calibration(found.config, None)
-    assert own == AgentPolicy()._calibration
+    assert own == Calibration.read(CALIBRATED)
     xray = plan_xray(found, own)
     assert (xray.half_width > 0).all()
     assert xray.exposure.sum() < len(found.control) / 3

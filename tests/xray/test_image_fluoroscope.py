@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from copy import copy
+
 import numpy as np
 import pytest
 
 from endopilot.errors import InputError
 from endopilot.xray import image_fluoroscope
+from endopilot.xray.carm import Pose
 from endopilot.xray.image_fluoroscope import ImageFluoroscope
-from endopilot.xray.registration import vessel_error_mm
+from endopilot.xray.pose_refinement import PoseRefiner
+from endopilot.xray.registration import Registration, vessel_error_mm
 
 
 @pytest.fixture(scope="module")
@@ -31,6 +35,23 @@ def test_an_exposure_measures_the_tip_with_its_uncertainty(arm):
     assert all(0.02 < sd < 1.0 for sd in shown.sd_mm)
     again = arm.expose(nodes, 15.3, np.random.default_rng(0))
     np.testing.assert_array_equal(shown.position, again.position)
+
+
+def test_exposures_refine_a_pose_that_is_not_sure(arm, fork):
+    """The patient lies 2.5 mm beside where registration has them. Wires show it, to less than the room in the lumen."""
+    moved = Pose(arm.registration.pose.rotation_rad, arm.registration.pose.translation_mm + np.array([0.0, 2.5, 0.0]))
+    covariance = np.diag(np.array([*np.full(3, np.deg2rad(0.2)), *np.full(3, 1.5)]) ** 2)
+    unsure = copy(arm)
+    unsure.refiner = PoseRefiner(fork, Registration(moved, covariance, 1.0, ""))
+    unsure._slack_mm = unsure.refiner.slack_mm(arm._views, 0.3)
+    at, errors = np.arange(15.0, -30.0, -0.5), []
+    for index, side in enumerate((0.7, -0.7)):  # on one wall, then on the other
+        nodes = np.stack([0 * at, np.where(at > 0, side, 0.0), at], axis=-1)
+        shown = unsure.expose(nodes, 15.3, np.random.default_rng(index))
+        errors.append(np.linalg.norm(shown.position - nodes[0]))
+    room_mm = 1.0 - 0.18  # of the lumen and of the wire
+    assert vessel_error_mm(fork, arm.pose, unsure.refiner.pose) < room_mm and errors[1] < room_mm
+    np.testing.assert_array_equal(arm.refiner.pose.vector, arm.registration.pose.vector)
 
 
 def test_an_image_without_a_wire_measures_nothing(arm):

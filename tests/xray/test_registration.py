@@ -44,6 +44,10 @@ def test_one_view_finds_what_it_sees(fork, exposures):
     pixels = [views[0].project(pose.move(points, isocenter)) for pose in (POSE, found.pose)]
     assert found.failure == ""
     assert np.linalg.norm(pixels[0] - pixels[1], axis=1).mean() < 2.0
+    beam, error = views[0].axes[2], found.pose.vector - POSE.vector
+    depth, aside = (axis @ found.covariance[3:, 3:] @ axis for axis in (beam, views[0].axes[0]))
+    assert np.sqrt(depth) > 5 * np.sqrt(aside) and np.sqrt(depth) < 3.5
+    assert error @ np.linalg.solve(found.covariance, error) < 16.8  # 99 % of normal errors in six numbers
 
 
 def test_an_image_without_contrast_is_told(fork, exposures):

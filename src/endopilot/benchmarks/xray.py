@@ -14,6 +14,7 @@ from endopilot.anatomy.projection import project_tip
 from endopilot.settings import Count, Seed, settings
 from endopilot.xray.carm import Pose
 from endopilot.xray.detector import TipDetector
+from endopilot.xray.pose_refinement import PoseRefiner
 from endopilot.xray.registration import Registration, register, vessel_error_mm
 from endopilot.xray.scenes import Scene, SceneConfig, draw_scenes
 from endopilot.xray.tracker import TipEstimate
@@ -33,6 +34,8 @@ MISSED_PX = 10.0
 DOSES, CONTRASTS = (0.25, 1.0, 4.0), (0.0, 0.7)
 _TIMED = 30
 _NO_WIRE = 3
+_REFINING = 4
+"""Images of wires, each another, that refine a pose."""
 _OVERLAP_PX = 6.0
 _BONE = 0.25
 """A tip lies before bone or liver where the background takes away this much more than in the middle, in powers of e."""
@@ -101,7 +104,8 @@ def bench_xray(config: XrayBenchConfig) -> dict[str, Any]:
         The figures of `BARS` for two views at the usual dose without contrast, with their bars; `one_view` likewise;
         `by`: the same by dose, contrast, view, overlap, bone and foreshortening; `false_alarms_share`: images without a
         wire in which one is found; `inside_own_95_share`: tips within the ellipsoid that the detector
-        is 95 % sure of; `registration`: every patient's errors.
+        is 95 % sure of; `registration`: every patient's errors, in `refined_mm` after
+        each of some exposures of wires: in both views, in the registered view alone, and in the other alone.
     """
     exposures: list[_Exposure] = []
     registrations: list[dict[str, Any]] = []
@@ -131,15 +135,41 @@ def _register(scene: Scene) -> tuple[Registration, dict[str, Any]]:
     lit, before = scene.signals(None, contrast=1.0, seed=900_001), scene.signals(None, seed=900_002)
     both = register(scene.anatomy, views, lit, before)
     alone = [register(scene.anatomy, views[i : i + 1], lit[i : i + 1], before[i : i + 1]) for i in (0, 1)]
+    refined = {
+        "two_views": _refined(scene, both, (0, 1)),
+        "one_view": [_refined(scene, one, (i,)) for i, one in enumerate(alone)],
+        "other_view": [_refined(scene, one, (1 - i,)) for i, one in enumerate(alone)],
+    }
     empty = register(scene.anatomy, views, scene.signals(None, seed=900_003), before)
     return both, {
         "patient": scene.anatomy.name,
         "before_mm": vessel_error_mm(scene.anatomy, scene.pose, Pose()),
         "two_views_mm": vessel_error_mm(scene.anatomy, scene.pose, both.pose),
         "one_view_mm": [vessel_error_mm(scene.anatomy, scene.pose, one.pose) for one in alone],
+        "refined_mm": refined,
         "failures": sum(bool(one.failure) for one in (both, *alone)),
         "told_without_contrast": bool(empty.failure),
     }
+
+
+def _refined(scene: Scene, registered: Registration, used: Sequence[int]) -> list[float]:
+    """Return the error of a registered pose, mm, after each of some exposures of wires in these views."""
+    detector, refiner = TipDetector(scene.anatomy, scene.device), PoseRefiner(scene.anatomy, registered)
+    views, errors = [scene.view(i) for i in used], []
+    slack_mm = refiner.slack_mm(views, detector.config.slack_mm)
+    for wire in range(_REFINING):
+        signals = scene.signals(wire, seed=910_000 + wire)
+        found = detector.find(
+            refiner.views(views),
+            [signals[i] for i in used],
+            [scene.imager.photons(scene.planes[i]) for i in used],
+            float(scene.inserted_length[wire]),
+            slack_mm,
+        )
+        if found is not None:
+            refiner.refine(views, found, slack_mm)
+        errors.append(vessel_error_mm(scene.anatomy, scene.pose, refiner.pose))
+    return errors
 
 
 def _expose(scene: Scene, registered: Registration, wires: int) -> list[_Exposure]:

@@ -24,7 +24,7 @@ from endopilot.control.search import Search, SearchConfig
 from endopilot.progress import Advance
 from endopilot.settings import Count, Positive, settings
 from endopilot.simulation.drive_limits import DriveLimits
-from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, check_wire_alone
+from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, XrayKind, check_wire_alone
 from endopilot.types import TipProjection
 from endopilot.xray.adviser import AdviserConfig, XrayAdviser
 from endopilot.xray.bands import Calibration
@@ -32,6 +32,8 @@ from endopilot.xray.fluoroscope import TipMeasurement
 
 CALIBRATED = Path(__file__).parent
 """Where the calibration of the agent's ensemble lies."""
+CALIBRATIONS: dict[XrayKind, Path] = {"assumed": CALIBRATED, "images": CALIBRATED / "images"}
+"""The same by how its exposures find the tip."""
 AdviserInput = tuple[
     Float[np.ndarray, "1 2"], Float[np.ndarray, "1 2"], Float[np.ndarray, "1 2"], Float[np.ndarray, "1"]
 ]
@@ -289,15 +291,17 @@ class AgentPolicy(_PlanningPolicy):
         Args:
             config: search and belief.
             calibration: of the bands around what the simulated wires predict, by which `XrayAdviser` asks for
-                X-ray; the package's own, which `benchmarks/agent_calibration.py` makes, if not given.
+                X-ray; if not given, the package's own for the navigation's X-ray, which
+                `benchmarks/agent_calibration.py` makes.
             advice: which events the adviser watches for.
         """
         super().__init__(config)
-        self._calibration, self._advice = calibration or Calibration.read(CALIBRATED), advice or AdviserConfig()
+        self._given, self._advice = calibration, advice or AdviserConfig()
 
     def start(self, navigation: Navigation, seed: int) -> None:
         """Lay out the simulated wires, and start the adviser."""
         super().start(navigation, seed)
+        self._calibration = self._given or Calibration.read(CALIBRATIONS[navigation.xray])
         self._adviser = XrayAdviser(self._calibration, self._advice, navigation.device.tip_radius_mm)
         self._due = False
         self._start_adviser()

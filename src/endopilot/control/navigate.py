@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 from dataclasses import field, replace
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -21,11 +20,10 @@ from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.simulation.motion import Motion, place, relative
 from endopilot.simulation.simulator import Simulator
-from endopilot.tasks.navigation import DECISION_PERIOD_S, SUCCESS_MM, Navigation, check_wire_alone
+from endopilot.tasks.navigation import DECISION_PERIOD_S, SUCCESS_MM, Navigation, XrayKind, check_wire_alone
 from endopilot.xray.fluoroscope import Fluoroscope, FluoroscopeConfig, TipMeasurement
 
 _CYCLES = round(DECISION_PERIOD_S / CYCLE_S)
-XrayKind = Literal["assumed", "images"]
 
 
 @settings
@@ -91,7 +89,7 @@ class NavigationLoop:
                 or the vessel is not recognised in X-ray images.
         """
         config, truth = config or NavigateConfig(), truth or ModelMismatch()
-        self.navigation = navigation
+        self.navigation = navigation = replace(navigation, xray=config.xray)
         self.policy = make_policy(policy) if isinstance(policy, str) else policy
         self.simulator = start_world(navigation, truth, config.simulator, motion=config.motion)
         ostium = np.asarray(navigation.anatomy.insertion.position)

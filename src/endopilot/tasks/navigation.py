@@ -22,6 +22,8 @@ SUCCESS_MM = 2.0
 """A target counts as reached when the tip lies in its branch, this near to it along the centerline, mm."""
 Arrives = Literal["wire", "catheter"]
 """Whose tip is to reach the target: the wire's, or that of the catheter next to it."""
+XrayKind = Literal["assumed", "images"]
+"""How an exposure finds the tip: with assumed errors of detection, or in X-ray images."""
 _ARRIVING: dict[Arrives, int] = {"wire": 0, "catheter": 1}
 
 
@@ -61,6 +63,7 @@ class Navigation:
         force_limit_n: largest force of the wall on one node that is safe, N.
         known_motion: how heart and breath are known to move the vessel, which the C-arm takes off what it measures and
             policies simulate; it is taken to lie still if not given.
+        xray: how an exposure finds the tip; `NavigationLoop` says what its C-arm does.
     """
 
     anatomy: InstanceOf[Anatomy]
@@ -74,6 +77,7 @@ class Navigation:
     seconds: Positive = 60.0
     force_limit_n: Positive = 0.5
     known_motion: Motion | None = None
+    xray: XrayKind = "assumed"
 
     @model_validator(mode="after")
     def _consistent(self) -> Navigation:

@@ -87,7 +87,12 @@ class TipDetector:
         self._filled = np.concatenate([points, behind[near]]), np.concatenate([volume, size[near]])
 
     def find(
-        self, views: Sequence[View], signals: Sequence[Signal], photons: Sequence[float], inserted_length: float
+        self,
+        views: Sequence[View],
+        signals: Sequence[Signal],
+        photons: Sequence[float],
+        inserted_length: float,
+        slack_mm: float | None = None,
     ) -> TipEstimate | None:
         """Find the tip in the images of one exposure.
 
@@ -96,21 +101,28 @@ class TipDetector:
             signals: from `XrayImager.signal`.
             photons: that a pixel of usual brightness counts, in each image.
             inserted_length: Δ by the robot's encoder, mm.
+            slack_mm: how far outside the lumen the wire is looked for, mm; the configuration's if not given.
 
         Returns:
             The tip; None where there is no wire.
         """
-        found = self.estimate(views, signals, photons, inserted_length)
+        found = self.estimate(views, signals, photons, inserted_length, slack_mm)
         return found if found.log_odds >= self.config.least_log_odds else None
 
     def estimate(
-        self, views: Sequence[View], signals: Sequence[Signal], photons: Sequence[float], inserted_length: float
+        self,
+        views: Sequence[View],
+        signals: Sequence[Signal],
+        photons: Sequence[float],
+        inserted_length: float,
+        slack_mm: float | None = None,
     ) -> TipEstimate:
         """Return where the tip is if there is a wire, and how likely that is; the arguments are those of `find`."""
         plain = [self.without_contrast(view, signal) for view, signal in zip(views, signals, strict=True)]
         evidence = [self._saturated(self._evidence(one, count)) for one, count in zip(plain, photons, strict=True)]
         deepest = _AHEAD_SHARE * max(inserted_length, 0.0) + _AHEAD_MM
-        corridor = make_corridor(self._anatomy, self._radius_mm, self.config.slack_mm, deepest)
+        slack_mm = self.config.slack_mm if slack_mm is None else slack_mm
+        corridor = make_corridor(self._anatomy, self._radius_mm, slack_mm, deepest)
         return _refined(track(corridor, views, evidence, inserted_length), views, plain, self._radius_mm)
 
     def _saturated(self, log_ratio: Signal) -> Signal:

@@ -1,7 +1,8 @@
 """A C-arm whose exposures are images: the tip is found in them, in a patient whose pose is not known beforehand.
 
 It stands for `Fluoroscope`, which assumes the errors of detection. One injection of contrast registers the patient;
-then every exposure makes an image of each view, and the detector finds the tip, or says that it finds none.
+then every exposure makes an image of each view, and the detector finds the tip, or says that it finds none. Each wire
+that is found bounds the pose.
 """
 
 from __future__ import annotations
@@ -18,9 +19,12 @@ from endopilot.xray.carm import Pose, view_at
 from endopilot.xray.detector import TipDetector
 from endopilot.xray.fluoroscope import FluoroscopeConfig, TipMeasurement
 from endopilot.xray.image import ImageConfig, Plane, XrayImager
-from endopilot.xray.registration import Registration, register
+from endopilot.xray.pose_refinement import PoseRefiner
+from endopilot.xray.registration import Registration, register, vessel_error_mm
 
 _NO_WIRE = np.zeros((0, 3))
+_MOVED_MM = 0.1
+"""A tip is looked for again where its image has moved the vessel by more than this, mm."""
 
 
 class ImageFluoroscope:
@@ -29,6 +33,7 @@ class ImageFluoroscope:
     Attributes:
         pose: in which the patient truly lies; nothing that is measured knows it.
         registration: the pose as one injection of contrast shows it.
+        refiner: the pose as that and all wires so far show it.
     """
 
     def __init__(
@@ -51,13 +56,14 @@ class ImageFluoroscope:
         self.pose, self._anatomy = Pose.draw(random), anatomy
         self._imager = XrayImager(anatomy, device, surroundings(anatomy), ImageConfig(geometry=config.geometry))
         self._planes = [self._imager.plane(angle, pose=self.pose) for angle in angles]
-        views = [view_at(angle, self._imager.isocenter, config.geometry) for angle in angles]
+        self._views = [view_at(angle, self._imager.isocenter, config.geometry) for angle in angles]
         lit, before = ([self._signal(plane, _NO_WIRE, random, share) for plane in self._planes] for share in (1.0, 0.0))
-        self.registration: Registration = register(anatomy, views, lit, before, self._imager.config)
+        self.registration: Registration = register(anatomy, self._views, lit, before, self._imager.config)
         if self.registration.failure:
             raise InputError(f"X-ray images: {anatomy.name} cannot be registered: {self.registration.failure}")
-        self._views = self.registration.views(views, self._imager.isocenter)
+        self.refiner = PoseRefiner(anatomy, self.registration)
         self._detector = TipDetector(anatomy, device)
+        self._slack_mm = self.refiner.slack_mm(self._views, self._detector.config.slack_mm)
 
     def expose(
         self, nodes: Float[np.ndarray, "n 3"], inserted_length: float, random: np.random.Generator
@@ -71,9 +77,14 @@ class ImageFluoroscope:
         """
         signals = [self._signal(plane, nodes, random) for plane in self._planes]
         photons = [self._imager.photons(plane) for plane in self._planes]
-        found = self._detector.find(self._views, signals, photons, inserted_length)
+        image = signals, photons, inserted_length
+        found = self._detector.find(self.refiner.views(self._views), *image, self._slack_mm)
         if found is None:
             return None
+        before = self.refiner.pose
+        moved_mm = vessel_error_mm(self._anatomy, before, self.refiner.refine(self._views, found, self._slack_mm))
+        if moved_mm > _MOVED_MM or self._slack_mm > self._detector.config.slack_mm:
+            found = self._detector.find(self.refiner.views(self._views), *image) or found
         tip = project_tip(self._anatomy.tree, self._anatomy.insertion, found.position[None])
         along = found.wire[-1] - found.wire[max(-5, -len(found.wire))]
         along = along / max(float(np.linalg.norm(along)), 1e-9)

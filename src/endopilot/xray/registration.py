@@ -36,6 +36,8 @@ _DARKEST = 0.05
 """Share of the light below which none is taken to be unscattered."""
 _AGREES = 0.8
 """Least correlation of image and projected vessel. Without contrast it is near 0."""
+_FELT = 0.02
+"""Pixels that a pose changes by more than this share of what it changes the most show how well it fits."""
 _MISFIT = 0.1
 """Residuals are scaled by this share of the full contrast; beyond it they count less."""
 
@@ -46,11 +48,13 @@ class Registration:
 
     Attributes:
         pose: of the patient.
+        covariance: of its rotation vector, rad, and translation, mm.
         correlation: of the contrast in the images and of the vessel projected in this pose.
         failure: why it is not to be believed, in words; empty if it is.
     """
 
     pose: Pose
+    covariance: Float[np.ndarray, "6 6"]
     correlation: float
     failure: str
 
@@ -77,7 +81,7 @@ def register(
     """
     config, isocenter = config or ImageConfig(), isocenter_of(anatomy)
     points, size = _sampled(anatomy)
-    found, correlation = np.zeros(6), 0.0
+    found, correlation, covariance = np.zeros(6), 0.0, np.diag(_PRIOR**2)
     for averaged, blur in _LEVELS:
         observed = [
             gaussian_filter(_added(lit, mask, averaged, config), blur)
@@ -96,14 +100,14 @@ def register(
             xtol=1e-4,
             ftol=1e-4,
         ).x
-        correlation = level.correlation(found)
+        correlation, covariance = level.correlation(found), level.covariance(found)
     far = float(np.abs(found / _PRIOR).max()) + 1e-2
     failure = ""
     if correlation < _AGREES:
         failure = f"the image and the vessel agree by {correlation:.2f} only; inject contrast, or choose another view"
     elif far > _FAR:
         failure = "the vessel fits the image only far from where the patient was laid; check the views' angles"
-    return Registration(Pose.of_vector(found), correlation, failure)
+    return Registration(Pose.of_vector(found), covariance, correlation, failure)
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,6 +144,16 @@ class _Level:
         steps = _STEP_SHARE * self.averaged * np.diag(_PRIOR)
         columns = [(self.residuals(pose + step) - self.residuals(pose - step)) / (2 * step.sum()) for step in steps]
         return np.stack(columns, axis=-1)
+
+    def covariance(self, pose: Float[np.ndarray, "6"]) -> Float[np.ndarray, "6 6"]:
+        """Return the covariance of a pose that fits: what the pixels leave open, with the prior.
+
+        Neighbouring pixels that were blurred together err together.
+        """
+        slope, residual = self.slope(pose)[:-6], self.residuals(pose)[:-6]
+        near = np.abs(slope).max(axis=1) > _FELT * np.abs(slope).max()
+        variance = float(np.mean(residual[near] ** 2)) * 4 * np.pi * self.blur**2
+        return np.linalg.inv(slope.T @ slope / variance + np.diag(_PRIOR**-2.0))
 
     def correlation(self, pose: Float[np.ndarray, "6"]) -> float:
         """Return the correlation of what was expected and observed around the vessel."""
