@@ -18,6 +18,12 @@ pytest.importorskip("websockets", reason="the extra `cockpit` is not installed")
 
 pytestmark = pytest.mark.skipif(find_browser() is None, reason="no Chromium or Chrome is installed")
 IMAGE = "Array.from(document.getElementById('plane0').getContext('2d').getImageData(0, 0, 100, 100).data).join()"
+PAD = """() => {
+    const buttons = Array.from({length: 16}, () => ({pressed: false}));
+    window.pad = {connected: true, axes: [0, 0, 0, 0], buttons};
+    navigator.getGamepads = () => [null, window.pad];
+}"""
+"""A gamepad that tests hold."""
 
 
 @pytest.fixture(scope="module")
@@ -71,11 +77,7 @@ def test_keys_move_the_wire_and_the_pedal_counts(context, server):
 
 
 def test_a_gamepad_drives_turns_and_exposes(context, server):
-    context.add_init_script(
-        """const buttons = Array.from({length: 16}, () => ({pressed: false}));
-        window.pad = {connected: true, axes: [0, 0, 0, 0], buttons};
-        navigator.getGamepads = () => [null, window.pad];"""
-    )
+    context.add_init_script(f"({PAD})()")
     page = opened(context, server)
     began = value(page, "cockpit.shown.inserted_mm")
     page.evaluate("() => { pad.axes[1] = -0.5; pad.axes[2] = 1; pad.buttons[7].pressed = true; }")
@@ -236,4 +238,9 @@ def test_the_hand_takes_the_catheter_and_both(context, vessel, tmp_path):
         assert 0 < value(page, drawn) < value(page, "cockpit.space.wire.mesh.geometry.drawRange.count")
         page.click("#holds button >> nth=0")
         says(page, "#holds .on", "wire")
+        page.evaluate(PAD)
+        page.evaluate("() => { pad.buttons[3].pressed = true; }")
+        says(page, "#holds .on", "microcatheter-1.7f")
+        page.evaluate("() => { pad.buttons[3].pressed = false; pad.axes[1] = -0.5; }")
+        until(page, "cockpit.shown.velocity[2] > 0 && cockpit.shown.velocity[0] === 0")
     assert not errors
