@@ -34,6 +34,7 @@ void Stepper<V, T>::aim_tubes(int l, double weight) {
     }
     if (lead != lane.tubes.lead) lane.slipping.advance = 0;
     lane.tubes.lead = lead;
+    lane.tubes.given = 0;
     const Tube &first = lane.tubes.tube[0], &leading = lane.tubes.tube[lead];
     lane.start = {foremost, first.turned};
     lane.origin = {leading.asked_advance, first.asked_rotation};
@@ -166,100 +167,119 @@ V Stepper<V, T>::add_interfaces(const Node<V, T>& node, Diagonal<V, T>& own) con
     return energy;
 }
 
+// What freeze_tubes needs of a node of lane l.
+template <class V, int T>
+TubePlace<T> Stepper<V, T>::tube_place(int i, int l) const {
+    const Node<V, T>& node = node_[i];
+    const TubeNode<V, T>& from = node.tubes;
+    TubePlace<T> place{.x = take(node.x, l), .q = take(node.q, l), .axes = {}, .stretch = get(from.stretch, l)};
+    place.axes = frame(place.q);
+    for (int k = 0; k <= T; ++k) {
+        place.inside[k] = get(from.inside[k], l);
+        place.outside[k] = get(from.outside[k], l);
+        place.joint.rest[k] = get(from.joint.rest[k], l);
+        place.joint.c[k] = get(from.joint.c[k], l);
+        if (k == 0) continue;
+        place.twist[k - 1] = get(from.twist[k - 1], l);
+        double turned = place.twist[k - 1] - get(from.start[k - 1], l) + get(from.rate[k], l) * get(of_tubes_.slide[k], l) -
+                        get(from.rate[k - 1], l) * get(of_tubes_.slide[k - 1], l);
+        if (k > 1) turned -= place.twist[k - 2] - get(from.start[k - 2], l);
+        place.turned[k - 1] = turned;
+    }
+    for (int p = 0; p < TubeJoint<V, T>::kPairs; ++p) place.joint.d[p] = get(from.joint.d[p], l);
+    place.joint.bend = get(from.joint.bend, l);
+    return place;
+}
+
 // The bending moment that tubes 0 to k - 1 carry at a joint, N mm. Returns the twist rate of tube 0 there, rad/mm.
 template <class V, int T>
-V Stepper<V, T>::bundle_moment(int k, int joint, Vec3<V>& moment) const {
-    const Node<V, T> &distal = node_[joint - 1], &proximal = node_[joint];
-    const TubeJoint<V, T>& own = proximal.tubes.joint;
-    const Rotation<V> rotation(distal.q, proximal.q);
-    const RestCurvature<V, T> rest(own, distal.tubes.twist, proximal.tubes.twist);
-    const V one = broadcast<V>(1.0), share = select<V>(active_ == broadcast<V>(joint), share_, one);
-    const V scale = (2.0 / rod_.joint_length[joint]) * rotation.g, bend = own.bend / share;
-    V rest_x, rest_y, part{}, x{}, y{};
+double Stepper<V, T>::bundle_moment(int k, int joint, int l, const TubePlace<T>& ahead, const TubePlace<T>& behind,
+                                    Vec3<double>& moment) const {
+    const TubeJoint<double, T>& own = behind.joint;
+    const Rotation<double> rotation(ahead.q, behind.q);
+    const RestCurvature<double, T> rest(own, ahead.twist, behind.twist);
+    const double share = lane_[l].active == joint ? get(share_, l) : 1.0;
+    const double scale = (2.0 / rod_.joint_length[joint]) * rotation.g, bend = own.bend / share;
+    double rest_x, rest_y, part = 0, x = 0, y = 0;
     rest.sum(own, rest_x, rest_y);
-    for (int l = 0; l < k; ++l) {
-        part += own.c[l];
-        for (int m = k; m <= T; ++m) {
-            x += own.d[own.pair(l, m)] * (rest.x[m] - rest.x[l]);
-            y += own.d[own.pair(l, m)] * (rest.y[m] - rest.y[l]);
+    for (int i = 0; i < k; ++i) {
+        part += own.c[i];
+        for (int o = k; o <= T; ++o) {
+            x += own.d[own.pair(i, o)] * (rest.x[o] - rest.x[i]);
+            y += own.d[own.pair(i, o)] * (rest.y[o] - rest.y[i]);
         }
     }
     x += part * bend * (scale * rotation.v.x - share * rest_x);
     y += part * bend * (scale * rotation.v.y - share * rest_y);
-    const Frame<V> ahead = frame(distal.q), behind = frame(proximal.q);
-    moment = (0.5 * x) * (ahead.d1 + behind.d1) + (0.5 * y) * (ahead.d2 + behind.d2);
+    moment = (0.5 * x) * (ahead.axes.d1 + behind.axes.d1) + (0.5 * y) * (ahead.axes.d2 + behind.axes.d2);
     return scale * rotation.v.z;
 }
 
-// For the lanes in `mask`, whose step has come to rest: the lateral force between tubes, which friction in the coming step acts with,
-// the axial force of each at the base, and the rates of twist.
+// For lane l, whose step has come to rest: the lateral force between tubes, which friction in the coming step acts with, the axial
+// force of each at the base, and the rates of twist.
 //
 // The inner tubes of an interface carry the force n_i = T_i t_i + Q_i through element i, Q from the slope of their moment. At each node
 // the outer tubes hold them with the force n_i - n_(i-1). Its part across the wire makes friction; that along it is friction.
 //
 // Where `kept` is false only the tension of each bundle at the base is found, and the nodes stay as they were.
 template <class V, int T>
-void Stepper<V, T>::freeze_tubes(int n, Mask<V> mask, bool kept) {
-    const V zero{}, half = broadcast<V>(0.5);
+void Stepper<V, T>::freeze_tubes(int l, bool kept) {
+    const double eps = get(eps_, l);
     for (int k = 1; k <= T; ++k) {
-        const double friction = tubes_.bore_friction[k], radius = tubes_.radius[k - 1];
-        const V along = of_tubes_.slide[k] - of_tubes_.slide[k - 1], slid = (along < zero ? -along : along) + eps_;
-        V tension{}, rate_ahead{};
-        Vec3<V> moment{zero, zero, zero}, tangent{zero, zero, zero}, shear{zero, zero, zero};
-        for (int i = 0; i < n; ++i) {
-            Node<V, T>& node = node_[i];
-            const Mask<V> on = mask & (active_ > broadcast<V>(i));
-            const Vec3<V> t = frame(node.q).d3;
+        const double friction = tubes_.bore_friction[k], radius = tubes_.radius[k - 1], grip = get(of_tubes_.grip[k - 1], l);
+        const double slid = std::abs(get(of_tubes_.slide[k], l) - get(of_tubes_.slide[k - 1], l)) + eps;
+        double tension = 0, rate_ahead = 0;
+        Vec3<double> moment{0, 0, 0}, tangent{0, 0, 0}, shear{0, 0, 0};
+        TubePlace<T> here = tube_place(0, l);
+        for (int i = 0; i < lane_[l].active; ++i) {
+            const TubePlace<T> behind = tube_place(i + 1, l);
+            const Vec3<double> t = here.axes.d3;
             const double length = rod_.length[i];
-            const V total = node.tubes.stretch * ((1.0 / length) * dot(t, node.x - node_[i + 1].x) - 1.0);
-            Vec3<V> moment_behind;
-            const V rate = bundle_moment(k, i + 1, moment_behind);
-            const Vec3<V> q = broadcast<V>(1.0 / length) * cross(moment_behind - moment, t);
+            const double total = here.stretch * ((1.0 / length) * dot(t, here.x - behind.x) - 1.0);
+            Vec3<double> moment_behind;
+            const double rate = bundle_moment(k, i + 1, l, here, behind, moment_behind);
+            const Vec3<double> q = (1.0 / length) * cross(moment_behind - moment, t);
             // the moment in the joint behind bears on this node too
-            const TubeNode<V, T>&here = node.tubes, &behind = node_[i + 1].tubes;
-            const V inside = here.inside[k], overlap = minimum<V>(inside, here.outside[k]);
-            const V both = maximum<V>(overlap, minimum<V>(behind.inside[k], behind.outside[k]));
-            V limit{};
+            const double inside = here.inside[k], overlap = std::min(inside, here.outside[k]);
+            const double both = std::max(overlap, std::min(behind.inside[k], behind.outside[k]));
+            double limit = 0;
             if (i == 0) {   // at the tip, the curve's tangent is half a joint ahead of the element's; the foremost bear the load on it
-                const Vec3<V> mean = t + half * (t - frame(node_[1].q).d3);
-                Vec3<V> of_all;
-                bundle_moment(T + 1, 1, of_all);
-                const V share = inside - overlap;
-                const Vec3<V> bent = share * (broadcast<V>(1.0 / length) * cross(of_all, t)) - q;
-                tension = share * total + dot(bent, mean) / dot(t, mean);
+                const Vec3<double> mean = t + 0.5 * (t - behind.axes.d3);
+                Vec3<double> of_all;
+                bundle_moment(T + 1, 1, l, here, behind, of_all);
+                const Vec3<double> bent = (inside - overlap) * ((1.0 / length) * cross(of_all, t)) - q;
+                tension = (inside - overlap) * total + dot(bent, mean) / dot(t, mean);
+            } else if (!(both > 0)) {
+                tension = inside > 0 ? total : 0.0;
             } else {
-                const Vec3<V> sum = t + tangent, bent = shear - q;
-                const Vec3<V> mean = (1.0 / square_root(dot(sum, sum))) * sum;
-                const V inverse = 1.0 / dot(t, mean), free = (tension * dot(tangent, mean) + dot(bent, mean)) * inverse;
-                V turned = node.tubes.twist[k - 1] - node.tubes.start[k - 1] + node.tubes.rate[k] * of_tubes_.slide[k] -
-                           node.tubes.rate[k - 1] * of_tubes_.slide[k - 1];
-                if constexpr (T > 1)
-                    if (k > 1) turned -= node.tubes.twist[k - 2] - node.tubes.start[k - 2];
-                const V slip = radius * turned, straight = slid / square_root(slid * slid + slip * slip);
-                V marched = free;
+                const Vec3<double> sum = t + tangent, bent = shear - q;
+                const Vec3<double> mean = (1.0 / std::sqrt(dot(sum, sum))) * sum;
+                const double inverse = 1.0 / dot(t, mean), free = (tension * dot(tangent, mean) + dot(bent, mean)) * inverse;
+                const double slip = radius * here.turned[k - 1], straight = slid / std::sqrt(slid * slid + slip * slip);
+                double marched = free;
                 for (int twice = 0; twice < 2; ++twice) {
-                    const Vec3<V> p = marched * t - tension * tangent - bent;
-                    const V pm = dot(p, mean), across = dot(p, p) - pm * pm;
-                    limit = friction * square_root(maximum<V>(across, zero));
-                    marched = free + of_tubes_.grip[k - 1] * straight * limit * inverse;
+                    const Vec3<double> p = marched * t - tension * tangent - bent;
+                    const double pm = dot(p, mean), across = dot(p, p) - pm * pm;
+                    limit = friction * std::sqrt(std::max(across, 0.0));
+                    marched = free + grip * straight * limit * inverse;
                 }
-                const V alone = select<V>(inside > zero, total, zero);
-                limit = select<V>(both > zero, limit, zero);
-                tension = select<V>(both > zero, marched, alone);
+                tension = marched;
             }
-            of_tubes_.bundle[k - 1] = select<V>(mask & (active_ == broadcast<V>(i + 1)), tension, of_tubes_.bundle[k - 1]);
             if (kept) {
-                node.tubes.limit[k - 1] = select<V>(on, limit, node.tubes.limit[k - 1]);
-                const V between = (1.0 / rod_.joint_length[i + 1]) * (node.tubes.twist[k - 1] - node_[i + 1].tubes.twist[k - 1]);
-                const V turn = rate + between, before = i > 0 ? rate_ahead : turn;
-                if (k == 1) node.tubes.rate[0] = select<V>(on, rate, node.tubes.rate[0]);
-                node.tubes.rate[k] = select<V>(on, half * (turn + before), node.tubes.rate[k]);
+                TubeNode<V, T>& node = node_[i].tubes;
+                set(node.limit[k - 1], l, limit);
+                const double between = (1.0 / rod_.joint_length[i + 1]) * (here.twist[k - 1] - behind.twist[k - 1]);
+                const double turn = rate + between, before = i > 0 ? rate_ahead : turn;
+                if (k == 1) set(node.rate[0], l, rate);
+                set(node.rate[k], l, 0.5 * (turn + before));
                 rate_ahead = turn;
             }
             moment = moment_behind;
             tangent = t;
             shear = q;
+            here = behind;
         }
+        set(of_tubes_.bundle[k - 1], l, tension);
     }
 }
 
@@ -282,6 +302,7 @@ void Stepper<V, T>::settle_tubes(int l) {
         Tube& inner = lane.tubes.tube[k - 1];
         const double along = get(of_tubes_.slide[k], l) - get(of_tubes_.slide[k - 1], l);
         inner.grip = std::clamp(inner.grip + along / kGripLength, -1.0, 1.0);
+        inner.grip += lane.tubes.given * (lane.tubes.side - inner.grip);
         set(of_tubes_.grip[k - 1], l, inner.grip);
     }
 }

@@ -1,6 +1,10 @@
 // The drives of telescoping tubes: their forces, and how they give way at their limits.
 #pragma once
 
+#include <algorithm>
+#include <cstdio>
+#include <cstring>
+
 #include "stepper.hpp"
 
 namespace endopilot {
@@ -28,45 +32,75 @@ double Stepper<V, T>::beyond_limit(int k, double force) const {
     return force < -tubes_.pull_limit[k] ? force / tubes_.pull_limit[k] + 1 : 0.0;
 }
 
-// Friction between tubes turns within some 0.04 mm, and the drives' forces with it: a step in which one leaps beyond its limit
-// is made again in shorter ones, in which the drive can give way.
+// Friction between tubes turns within some 0.04 mm, and the drives' forces with it. Where one would leap beyond its limit in a step,
+// that drive gives way by so little: friction is as near to where it would turn as the drives bear. Where no friction keeps them within
+// their limits, the step is made again in shorter ones.
 template <class V, int T>
-void Stepper<V, T>::refuse_leaps(int n, Decision (&decision)[W]) {
-    bool any_near = false, near[W] = {};
+void Stepper<V, T>::refuse_leaps(Decision (&decision)[W]) {
+    bool tried[W] = {};
     for (int l = 0; l < W; ++l) {
         const Lane& lane = lane_[l];
-        if (decision[l] != Decision::converged || lane.stride <= kLeastStride) continue;
+        if (decision[l] != Decision::converged) continue;
         for (int k = 0; k <= T; ++k) {
             const double most = kNear * std::min(tubes_.push_limit[k], tubes_.pull_limit[k]);
-            near[l] = near[l] || std::abs(get(base_force_, l)) > most || std::abs(lane.tubes.tube[k].force) > most;
+            tried[l] = tried[l] || std::abs(get(base_force_, l)) > most || std::abs(lane.tubes.tube[k].force) > most;
         }
-        any_near = any_near || near[l];
     }
-    if (!any_near) return;
-    Lane before[W];
-    const TubeLanes<V, T> of_tubes = of_tubes_;
-    Mask<V> tried{};
-    for (int l = 0; l < W; ++l) {
-        if (!near[l]) continue;
-        set_mask<V>(tried, l, true);
-        before[l] = lane_[l];
-        settle_tubes(l);
+    Leap turned[W], other[W];   // with friction where it would turn, and as far to one side as it can be
+    if (!try_forces(tried, turned)) return;
+    for (int l = 0; l < W; ++l) tried[l] = tried[l] && turned[l].drive >= 0;
+    for (const double side : {-1.0, 1.0}) {
+        bool on[W];
+        for (int l = 0; l < W; ++l) {
+            on[l] = tried[l] && lane_[l].tubes.given == 0;
+            if (on[l]) lane_[l].tubes.side = side, lane_[l].tubes.given = 1;
+        }
+        try_forces(on, other);
+        for (int l = 0; l < W; ++l) {
+            if (!on[l]) continue;
+            const int k = turned[l].drive;
+            const double was = turned[l].force[k], change = other[l].force[k] - was;
+            const double most = (1 + 0.5 * kLeap) * (was > 0 ? tubes_.push_limit[k] : -tubes_.pull_limit[k]);
+            const double share = (most - was) / change;
+            lane_[l].tubes.given = share > 0 && share <= 1 ? share : 0.0;
+        }
     }
-    freeze_tubes(n, tried, false);
-    double force[T + 1];
+    try_forces(tried, other);
     for (int l = 0; l < W; ++l) {
-        if (!near[l]) continue;
         Lane& lane = lane_[l];
-        lane = before[l];
-        tell_forces(l, force);
+        if (!tried[l] || other[l].drive < 0) continue;
+        lane.tubes.given = 0;
+        if (lane.stride <= kLeastStride) continue;
+        decision[l] = Decision::restart;
+        lane.extrapolated = false;
+    }
+}
+
+// Finds the drives' forces in some lanes, if the step ended now, and which of them has leaped beyond its limit the farthest; nothing is
+// kept. Returns whether any has.
+template <class V, int T>
+bool Stepper<V, T>::try_forces(const bool (&on)[W], Leap (&leap)[W]) {
+    const TubeLanes<V, T> of_tubes = of_tubes_;
+    bool any = false;
+    for (int l = 0; l < W; ++l) {
+        if (!on[l]) continue;
+        const Lane before = lane_[l];
+        settle_tubes(l);
+        freeze_tubes(l, false);
+        lane_[l] = before;
+        leap[l].drive = -1;
+        tell_forces(l, leap[l].force);
+        double farthest = kLeap;
         for (int k = 0; k <= T; ++k) {
-            const double beyond = std::abs(beyond_limit(k, force[k])), was = std::abs(beyond_limit(k, lane.tubes.tube[k].force));
-            if (!(beyond > kLeap && beyond > was)) continue;
-            decision[l] = Decision::restart;
-            lane.extrapolated = false;
+            const double beyond = std::abs(beyond_limit(k, leap[l].force[k])), was = std::abs(beyond_limit(k, before.tubes.tube[k].force));
+            if (!(beyond > farthest && beyond > was)) continue;
+            farthest = beyond;
+            leap[l].drive = k;
+            any = true;
         }
     }
     of_tubes_ = of_tubes;
+    return any;
 }
 
 // The force and torque of each drive after a step. A drive that does not lead and is beyond its limit stops and gives way; within it,

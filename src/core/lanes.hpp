@@ -116,6 +116,14 @@ ENDOPILOT_DEVICE inline void set_mask(Mask<V>& mask, int lane, bool value) {
 }
 
 template <class V>
+ENDOPILOT_DEVICE inline bool holds(const Mask<V>& mask, int lane) {
+    if constexpr (kWidth<V> == 1)
+        return mask;
+    else
+        return mask[lane] != 0;
+}
+
+template <class V>
 ENDOPILOT_DEVICE inline bool any(const Mask<V>& mask) {
     if constexpr (kWidth<V> == 1) {
         return mask;

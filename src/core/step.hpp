@@ -108,7 +108,7 @@ int Stepper<V, T>::pass(Queue& queue) {
         }
     }
     update(n, decision, factor);
-    if constexpr (T > 0) refuse_leaps(n, decision);
+    if constexpr (T > 0) refuse_leaps(decision);
     return advance(n, decision, queue);
 }
 

@@ -40,6 +40,19 @@ struct TubeNode {
 template <class V>
 struct TubeNode<V, 0> {};
 
+// A node of one lane, as far as the forces between its tubes need it.
+template <int T>
+struct TubePlace {
+    Vec3<double> x;
+    Quaternion<double> q;
+    Frame<double> axes;
+    double twist[T], turned[T];   // the latter: in the step, on the tube inside, less what sliding brings; rad
+    double inside[T + 1], outside[T + 1], stretch;
+    TubeJoint<double, T> joint;
+};
+template <>
+struct TubePlace<0> {};
+
 // A tube of a lane: its drive, as far as it is not the lane's own.
 struct Tube {
     double inserted, rotation, speed, spin, depth;    // at the start of the sample; mm/s, rad/s; where the approach ends
@@ -57,6 +70,7 @@ template <int T>
 struct TubeLane {
     Tube tube[T + 1];
     int lead;            // the tube whose tip is foremost: the mesh follows it
+    double given, side;  // share by which drives at their limits give way to friction along the tubes, and the way it turns
     double others;       // force of the drives of the others at the end of the last step, N
 };
 template <>
@@ -165,6 +179,12 @@ private:
         }
     };
 
+    // The drives' forces, N, and which of them has leaped beyond its limit; -1: none.
+    struct Leap {
+        double force[T + 1] = {};
+        int drive = -1;
+    };
+
     struct Lane {
         int world = -1, sample = 0;       // -1: the lane is idle; samples before 0 are the approach
         int tick = 0, stride = 0;         // time since the start of the sample, and the step, in time_step / kTicks
@@ -269,17 +289,19 @@ private:
     DriveEnergy tube_drive_energy(const Lane& lane) const;
     bool solve_tube_drives(int l);
     bool release_tubes(int l);
-    void freeze_tubes(int n, Mask<V> mask, bool kept);
+    TubePlace<T> tube_place(int i, int l) const;
+    void freeze_tubes(int l, bool kept);
     void tell_forces(int l, double (&force)[T + 1]) const;
     double beyond_limit(int k, double force) const;
-    void refuse_leaps(int n, Decision (&decision)[W]);
+    void refuse_leaps(Decision (&decision)[W]);
+    bool try_forces(const bool (&on)[W], Leap (&leap)[W]);
     void load_tubes(int l);
     void store_tubes(int l);
     void read_tube_controls(int l);
     void end_tubes(int l);
     void record_tubes(int world, int sample) const;
     V add_interfaces(const Node<V, T>& node, Diagonal<V, T>& own) const;
-    V bundle_moment(int k, int joint, Vec3<V>& moment) const;
+    double bundle_moment(int k, int joint, int l, const TubePlace<T>& ahead, const TubePlace<T>& behind, Vec3<double>& moment) const;
 
     // The step of one lane (step.hpp).
     ENDOPILOT_LARGE void begin(int l, bool fresh);

@@ -420,7 +420,9 @@ template <class V, int T>
 void Stepper<V, T>::finish_step(int n, Mask<V> mask, Mask<V> restart, const V& weight) {
     const V zero{};
     if (lumen_) freeze_contacts(n, mask, weight);
-    if constexpr (T > 0) freeze_tubes(n, mask, true);
+    if constexpr (T > 0)
+        for (int l = 0; l < W; ++l)
+            if (holds<V>(mask, l)) freeze_tubes(l, true);
     for (int i = 0; i < n; ++i) {
         Node<V, T>& node = node_[i];
         const Mask<V> on = mask & (active_ > broadcast<V>(i));

@@ -120,8 +120,8 @@ ENDOPILOT_DEVICE inline void sine_cosine(const V& angle, V& sine, V& cosine) {
     constexpr double kRound = 6755399441055744.0;   // adding it rounds to whole numbers
     const V turns = (angle * 0.15915494309189535 + kRound) - kRound;
     const V r = 0.25 * ((angle - 6.283185307179586 * turns) - 2.449293598294706e-16 * turns), u = r * r;
-    V s = r * (1.0 - u / 6.0 * (1.0 - u / 20.0 * (1.0 - u / 42.0 * (1.0 - u / 72.0 * (1.0 - u / 110.0 * (1.0 - u / 156.0))))));
-    V c = 1.0 - u / 2.0 * (1.0 - u / 12.0 * (1.0 - u / 30.0 * (1.0 - u / 56.0 * (1.0 - u / 90.0 * (1.0 - u / 132.0 * (1.0 - u / 182.0))))));
+    V s = r * (1.0 - (1.0 / 6) * u * (1.0 - (1.0 / 20) * u * (1.0 - (1.0 / 42) * u * (1.0 - (1.0 / 72) * u * (1.0 - (1.0 / 110) * u * (1.0 - (1.0 / 156) * u))))));
+    V c = 1.0 - (1.0 / 2) * u * (1.0 - (1.0 / 12) * u * (1.0 - (1.0 / 30) * u * (1.0 - (1.0 / 56) * u * (1.0 - (1.0 / 90) * u * (1.0 - (1.0 / 132) * u * (1.0 - (1.0 / 182) * u))))));
     for (int twice = 0; twice < 2; ++twice) {
         const V both = 2.0 * s * c;
         c = 1.0 - 2.0 * s * s;

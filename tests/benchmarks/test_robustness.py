@@ -109,7 +109,8 @@ def test_non_finite_numbers_in_valid_worlds_are_counted(patient) -> None:
     torque[:, 1] = np.nan
     valid = rollout.valid.copy()
     valid[0, 1] = False
-    chunk = robustness._describe(patient, replace(rollout, base_torque=torque, valid=valid), 5.0, 0.0)
+    config = SimulatorConfig(wall_stiffness_n_mm=5.0)
+    chunk = robustness._describe(patient, Stack(DEVICE), replace(rollout, base_torque=torque, valid=valid), config, 0.0)
     assert chunk.non_finite.tolist() == [0, 1]
     np.testing.assert_allclose(chunk.penetration_mm, rollout.contact_force_max / 5.0, rtol=1e-6)
 
@@ -139,6 +140,7 @@ def test_a_crash_and_an_invalid_world_miss_their_bars(tmp_path: Path) -> None:
         base_force_n=np.array([[0.3, -0.4, -9.0, 9.0]], dtype=np.float32),
         to_end_mm=np.zeros((1, 4), dtype=np.float32),
         base_torque_n_mm=np.array([[0.1, -0.2, 9.0, 9.0]], dtype=np.float32),
+        over_limit=np.array([[1.0, 1.07, 9.0, 9.0]], dtype=np.float32),
         wall_force_n=np.array([[0.1, 0.8, 9.0, 9.0]], dtype=np.float32),
         slipped=np.zeros((1, 4), dtype=bool),
         valid=np.array([[True, True, False, False]]),
@@ -157,6 +159,7 @@ def test_a_crash_and_an_invalid_world_miss_their_bars(tmp_path: Path) -> None:
     # the largest loads of valid samples, and a world that presses the wall with 0.8 N
     row = measured["by_anatomy"]["rca"]
     assert [row[f"largest_{name}"] for name in ("push_n", "pull_n", "torque_n_mm")] == [0.3, 0.4, 0.2]
+    assert (row["drive_over_limit_max"], row["share_over_limit_by_6_percent"]) == (1.07, 0.5)
     assert (row["largest_wall_force_n"], row["wall_force_worlds"], row["invalid"]) == (0.8, 1, 1)
 
 

@@ -207,6 +207,24 @@ def test_neither_drive_passes_its_limit_where_both_meet_an_obstacle() -> None:
         assert 0.9 * 0.3 < np.abs(force).max() < 1.1 * 0.3
 
 
+def test_drives_of_random_pairs_keep_their_limits() -> None:
+    # A force that would leap beyond its limit because friction turns is kept within 5 % of it.
+    vessel = make_patient(AtlasConfig(), 5)
+    stack = Stack(read_device("workhorse-014"), (read_catheter("microcatheter-1.7f"),))
+    initial, control = paired_controls(vessel, stack, rollouts=16, samples=240, seed=11)
+    worlds = [10, 15]  # those in which it would leap to 1.07 and 1.14 times its limit
+    config = SimulatorConfig(threads=1)
+    rollout = endopilot.simulate(
+        vessel, stack.wire, control[worlds, :30], catheters=stack.catheters, initial=initial[worlds], config=config
+    )
+    assert rollout.catheters is not None and rollout.valid.all()
+    forces = np.stack([rollout.base_force, rollout.catheters.base_force[..., 0]], axis=-1)
+    limits = np.array([[device.push_limit_n, -device.pull_limit_n] for device in stack.devices])
+    share = (forces[..., None] / limits).max(axis=-1)
+    assert (share > 0.99).mean() > 0.01
+    assert share.max() < 1.055
+
+
 def test_tubes_that_rest_at_a_drive_limit_end_their_steps() -> None:
     """A catheter that is pushed at its limit rests where Newton's steps do not shrink below the energy's rounding."""
     vessel = make_patient(AtlasConfig(), 5)

@@ -77,6 +77,7 @@ class Chunk:
         penetration_mm: depth of the deepest node in the wall, mm: its contact force over the wall's stiffness.
         base_force_n: force of the drive, N, positive where it pushes.
         base_torque_n_mm: torque of the drive, N·mm.
+        over_limit: force of the drive as a share of its limit, of the drive that is nearest to its limit.
         wall_force_n: largest resultant of the wall's forces on 2 mm of the wire, N.
         to_end_mm: distance of the tip from the end of its branch, mm; negative beyond it.
         slipped: whether the drive slipped in the sample.
@@ -88,6 +89,7 @@ class Chunk:
     penetration_mm: Float[np.ndarray, "rollouts samples"]
     base_force_n: Float[np.ndarray, "rollouts samples"]
     base_torque_n_mm: Float[np.ndarray, "rollouts samples"]
+    over_limit: Float[np.ndarray, "rollouts samples"]
     wall_force_n: Float[np.ndarray, "rollouts samples"]
     to_end_mm: Float[np.ndarray, "rollouts samples"]
     slipped: Bool[np.ndarray, "rollouts samples"]
@@ -102,8 +104,9 @@ def measure_robustness(config: RobustnessConfig) -> dict[str, Any]:
     Returns:
         `figures`, one row a bar: figure, value, bar, passed; `rollouts` and `simulated_hours`; `by_device`,
         `by_manoeuvre` and `by_anatomy`, of each the invalid worlds, the penetration's 99.9th percentile and maximum
-        (mm), the drive's largest push, pull (N) and torque (N·mm), the largest wall force (N) and the worlds in which
-        it exceeds its limit; `invalid_worlds` and `crashed`, one sentence each: reason, anatomy, device, rollout,
+        (mm), the largest share of its limit that a drive's force came to and the share of samples beyond 1.06 of it,
+        the drive's largest push, pull (N) and torque (N·mm), the largest wall force (N) and the worlds in which it
+        exceeds its limit; `invalid_worlds` and `crashed`, one sentence each: reason, anatomy, device, rollout,
         seconds.
 
     Raises:
@@ -150,7 +153,7 @@ def run_chunk(path: Path, config: RobustnessConfig, index: int, stack: Stack, ro
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # invalid worlds are listed below, each with its reason
         rollout = simulate(anatomy, stack.wire, control, catheters=stack.catheters, initial=initial, config=simulator)
-    chunk = _describe(anatomy, rollout, wall_stiffness(simulator, stack.push_limit_n), time.process_time() - began)
+    chunk = _describe(anatomy, stack, rollout, simulator, time.process_time() - began)
     invalid = [
         f"{anatomy.name}, {name_of(stack)}, rollout {world} ({MANOEUVRES[world % len(MANOEUVRES)]}): "
         + why_invalid(rollout, world)
@@ -161,7 +164,8 @@ def run_chunk(path: Path, config: RobustnessConfig, index: int, stack: Stack, ro
     write_json(path.with_suffix(".json"), {"anatomy": anatomy.name, "invalid": invalid})
 
 
-def _describe(anatomy: Anatomy, rollout: Rollout, wall_n_mm: float, seconds: float) -> Chunk:
+def _describe(anatomy: Anatomy, stack: Stack, rollout: Rollout, config: SimulatorConfig, seconds: float) -> Chunk:
+    wall_n_mm = wall_stiffness(config, stack.push_limit_n)
     end = np.array([branch.centerline.abscissa[-1] for branch in anatomy.tree.branches])
     numbers = np.concatenate(
         [
@@ -184,11 +188,13 @@ def _describe(anatomy: Anatomy, rollout: Rollout, wall_n_mm: float, seconds: flo
         slipped |= (catheters.slip != 0).any(axis=-1) | (catheters.rotation_slip != 0).any(axis=-1)
         others = (catheters.base_force, catheters.base_torque, catheters.inserted_length, catheters.rotation)
         numbers = np.concatenate([numbers, *others, *np.moveaxis(catheters.tip_position, 2, 0)], axis=-1)
+    most = [[device.push_limit_n, -device.pull_limit_n] for device in stack.devices]
     bad = (~np.isfinite(numbers) & rollout.valid[..., None]).sum(axis=(1, 2))
     return Chunk(
         penetration_mm=(rollout.contact_force_max / wall_n_mm).astype(np.float32),
         base_force_n=_largest(force).astype(np.float32),
         base_torque_n_mm=_largest(torque).astype(np.float32),
+        over_limit=(force[..., None] / most).max(axis=(-2, -1)).astype(np.float32),
         wall_force_n=rollout.wall_force.astype(np.float32),
         to_end_mm=(end[rollout.tip.branch] - rollout.tip.abscissa).astype(np.float32),
         slipped=slipped,
@@ -335,12 +341,14 @@ class _Tally:
         self.rollouts = self.invalid = self.pressing = 0
         self.push = self.pull = self.torque = self.wall = 0.0
         self.penetration: list[np.ndarray] = []
+        self.over_limit: list[np.ndarray] = []
 
     def add(self, chunk: Chunk, rows: Any) -> None:
         valid = chunk.valid[rows]
         self.rollouts += len(valid)
         self.invalid += int((~valid.all(axis=1)).sum())
         self.penetration.append(chunk.penetration_mm[rows][valid])
+        self.over_limit.append(chunk.over_limit[rows][valid])
         force, torque = chunk.base_force_n[rows][valid], chunk.base_torque_n_mm[rows][valid]
         wall = np.where(valid, chunk.wall_force_n[rows], 0.0)
         self.push = max(self.push, float(force.max(initial=0.0)))
@@ -353,6 +361,7 @@ class _Tally:
         depth = np.concatenate(self.penetration) if self.penetration else np.zeros(0)
         if len(depth) == 0:
             return {"rollouts": self.rollouts, "invalid": self.invalid, "penetration_p999_mm": None}
+        over_limit = np.concatenate(self.over_limit)
         return {
             "rollouts": self.rollouts,
             "invalid": self.invalid,
@@ -360,6 +369,8 @@ class _Tally:
             "penetration_p999_mm": round(float(np.percentile(depth, 99.9)), 4),
             "penetration_max_mm": round(float(depth.max()), 4),
             "share_deeper_than_bar": round(float((depth > MOST_PENETRATION_MM).mean()), 5),
+            "drive_over_limit_max": round(float(over_limit.max()), 3),
+            "share_over_limit_by_6_percent": round(float((over_limit > 1.06).mean()), 6),
             "largest_push_n": round(self.push, 3),
             "largest_pull_n": round(self.pull, 3),
             "largest_torque_n_mm": round(self.torque, 3),
