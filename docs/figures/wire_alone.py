@@ -1,7 +1,7 @@
 """Measures how far a wire alone comes in the tasks of wire and catheter, for a table of docs/ladder.md.
 
 `python docs/figures/wire_alone.py FOLDER [PATIENTS]`: FOLDER gets a file for each navigation; those that are there are
-kept. PATIENTS are the first of each task, 6 if not given.
+kept. The simple policies drive in all patients of a task, the agent in the first PATIENTS of them, 5 if not given.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from endopilot.files import read_json, write_json
 from endopilot.ladder.attempt import attempt, navigation_seed
 from endopilot.ladder.scores import score_navigations
 from endopilot.runs import make_missing
-from endopilot.tasks.task import find_task, ladder_tasks, without_catheter
+from endopilot.tasks.task import Task, find_task, ladder_tasks, without_catheter
 
 PAGE = Path(__file__).parents[1] / "ladder.md"
 BEGIN, END = "<!-- wire alone:begin -->\n", "<!-- wire alone:end -->"
-POLICIES = ("forward", "spin", "agent")
+SIMPLE, PLANS = ("forward", "spin"), "agent"
 
 
 def navigate(path: Path) -> None:
@@ -29,19 +29,27 @@ def navigate(path: Path) -> None:
     write_json(path, attempt(policy, navigation, seed=navigation_seed(task, place)))
 
 
+def paths_of(folder: Path, policy: str, task: Task, patients: int) -> list[Path]:
+    """Return the files of a policy's navigations in a task."""
+    count = patients if policy == PLANS else len(task.ladder.numbers)
+    return [folder / policy / task.name / f"{place:02d}.json" for place in range(count)]
+
+
 def table(folder: Path, patients: int) -> list[str]:
     """Return the table: safe success, and in brackets success, %."""
-    lines = ["| task | " + " | ".join(f"`{policy}`" for policy in POLICIES) + " |", "|---|" + "---|" * len(POLICIES)]
-    together: dict[str, list[dict[str, Any]]] = {policy: [] for policy in POLICIES}
+    policies = (*SIMPLE, PLANS)
+    lines = ["| task | " + " | ".join(f"`{policy}`" for policy in policies) + " |", "|---|" + "---|" * len(policies)]
+    together: dict[str, list[dict[str, Any]]] = {policy: [] for policy in policies}
     for task in ladder_tasks("coaxial"):
         results = {
-            policy: [read_json(folder / policy / task.name / f"{place:02d}.json") for place in range(patients)]
-            for policy in POLICIES
+            policy: [read_json(path) for path in paths_of(folder, policy, task, patients)] for policy in policies
         }
-        lines.append(f"| {task.name} | " + " | ".join(cell(results[policy]) for policy in POLICIES) + " |")
-        for policy in POLICIES:
+        lines.append(f"| {task.name} | " + " | ".join(cell(results[policy]) for policy in policies) + " |")
+        for policy in policies:
             together[policy] += results[policy]
-    return [*lines, "| all coaxial | " + " | ".join(cell(together[policy]) for policy in POLICIES) + " |"]
+    lines.append("| all coaxial | " + " | ".join(cell(together[policy]) for policy in policies) + " |")
+    counts = [len(together[policy]) // len(ladder_tasks("coaxial")) for policy in policies]
+    return [*lines, "| patients a task | " + " | ".join(map(str, counts)) + " |"]
 
 
 def cell(results: list[dict[str, Any]]) -> str:
@@ -52,14 +60,13 @@ def cell(results: list[dict[str, Any]]) -> str:
 
 def main() -> None:
     """Do what is missing, and fill the page."""
-    folder, patients = Path(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 6
-    names = [task.name for task in ladder_tasks("coaxial")]
-    for policy in POLICIES:
-        paths = [folder / policy / name / f"{place:02d}.json" for name in names for place in range(patients)]
+    folder, patients = Path(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 5
+    for policy in (*SIMPLE, PLANS):
+        paths = [path for task in ladder_tasks("coaxial") for path in paths_of(folder, policy, task, patients)]
         make_missing(f"Wire alone, {policy}", paths, navigate)
     page = PAGE.read_text(encoding="utf-8")
     head, tail = page.split(BEGIN)[0], page.split(END)[1]
-    text = "\n".join([*table(folder, patients), f"\nPatients a task: {patients}.\n"])
+    text = "\n".join([*table(folder, patients), ""])
     PAGE.write_text(f"{head}{BEGIN}{text}{END}{tail}", encoding="utf-8")
 
 
