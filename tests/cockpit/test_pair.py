@@ -133,13 +133,22 @@ def test_a_session_replays_to_the_bit_and_goes_on(session, tmp_path):
         list(replayed(read_recording(path)))
 
 
-def test_a_session_is_no_episode_yet(session, tmp_path):
+def test_a_session_becomes_an_episode_of_both(session, tmp_path):
     pytest.importorskip("pyarrow", reason="the extra `learn` is not installed")
     from endopilot.cockpit.episode import write_session_episode
+    from endopilot.dataset.loader import load_dataset
 
+    run(session, 1.0, message=both((12.0, 2.0), (8.0, 1.0)))
+    snapshot = session.world.snapshot()
     session.close()
-    with pytest.raises(InputError, match=f"an episode takes a wire alone, and there is {NAME} around it; leave"):
-        write_session_episode(tmp_path / "a.cockpit.jsonl", tmp_path / "episode")
+    write_session_episode(tmp_path / "a.cockpit.jsonl", tmp_path / "episode")
+    data = load_dataset(tmp_path / "episode")
+    assert [catheter.name for catheter in data.catheters] == [NAME]
+    assert data.catheter_inserted_length[0, -1, 0] == pytest.approx(snapshot.catheters[0].inserted_mm, abs=1e-4)
+    np.testing.assert_allclose(data.tip_position[0, -1], snapshot.nodes[0], atol=1e-4)
+    made = np.diff([data.catheter_initial[0, 0, 0], *data.catheter_inserted_length[0, :, 0]])
+    asked = 0.5 * data.catheter_control[0, :, 0, 0]
+    np.testing.assert_allclose(made, asked, atol=1e-4)
 
 
 def drive_alone(session, until, most_s=20.0):

@@ -124,13 +124,16 @@ def test_a_catheter_follows_its_wire_and_both_are_written(patient, capsys, tmp_p
     command = ("navigate", patient, "--target", "1", "--policy", "in-turn", "--arrives", "catheter", *SHORT)
     figures = run(capsys, *command, "--true-friction", "1.1", "--catheter", "microcatheter-1.7f", "-o", folder)
     assert figures["reached"]
-    files = sorted({*FILES, "catheter-1.yaml"} - {"episode"})  # a dataset holds wires alone
-    assert sorted(path.name for path in folder.iterdir()) == files
-    given, true = read_catheter("microcatheter-1.7f"), read_catheter(folder / "catheter-1.yaml")
-    assert true.device.friction == 1.1 * given.device.friction
-    assert true == replace(given, device=replace(given.device, friction=true.device.friction))
+    assert sorted(path.name for path in folder.iterdir()) == sorted({*FILES, "catheter-1.yaml"})
     table = pd.read_csv(folder / "navigation.csv")
     assert table["catheter_1_inserted_length_mm"].iloc[-1] > 0.8 * figures["target_mm"]
+    given, true = read_catheter("microcatheter-1.7f"), read_catheter(folder / "catheter-1.yaml")
+    episode = load_dataset(folder / "episode")
+    lengths = episode.catheter_inserted_length[0, : len(table) - 1, 0]
+    np.testing.assert_allclose(lengths, table["catheter_1_inserted_length_mm"][1:], atol=1e-4)
+    assert true.device.friction == 1.1 * given.device.friction
+    assert true == replace(given, device=replace(given.device, friction=true.device.friction))
+    assert episode.catheters == (given,) and episode.catheter_initial[0, 0].tolist() == [0.0, 0.0]
     again = run(
         *(capsys, "simulate", patient, "--device", folder / "wire.yaml", "--catheter", folder / "catheter-1.yaml"),
         *("--controls", folder / "controls.csv", "-o", tmp_path / "again.csv"),

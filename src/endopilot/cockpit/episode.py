@@ -13,11 +13,11 @@ from endopilot.control.navigate_patient import sampled
 from endopilot.dataset.episode import write_episode
 from endopilot.errors import InputError
 from endopilot.simulation.simulate import simulate
-from endopilot.tasks.navigation import DECISION_PERIOD_S, check_wire_alone
+from endopilot.tasks.navigation import DECISION_PERIOD_S
 
 
 def write_session_episode(session: Path, output: Path) -> None:
-    """Write a recorded session as a data set of one episode, which `endopilot train` reads beside others.
+    """Write a recorded session as a data set of one episode. `endopilot train` reads that of a wire alone.
 
     The session is driven again and sampled every 0.5 s; what is left after the last whole sample is dropped. The vessel
     of a task is written beside the episode, into `OUTPUT-anatomy`.
@@ -27,11 +27,10 @@ def write_session_episode(session: Path, output: Path) -> None:
         output: folder of the data set.
 
     Raises:
-        InputError: no such session, one with a catheter or shorter than a sample, or an output folder that holds
+        InputError: no such session, one shorter than a sample, or an output folder that holds
             something else.
     """
     recording = read_recording(session)
-    check_wire_alone(recording.navigation, f"{session}: an episode")
     per_sample = round(DECISION_PERIOD_S / recording.config.cycle_s)
     samples = recording.cycles // per_sample
     if samples == 0:
@@ -41,12 +40,15 @@ def write_session_episode(session: Path, output: Path) -> None:
     *_, (world, _events) = replayed(recording)
     device = navigation.device
     wire = device.with_tip(bend_rad=device.tip_bend_rad, stiffness_factor=truth.stiffness_factor)
+    behind = max(navigation.start_catheter_mm + truth.ostium_mm, 0.0)
     start = [max(navigation.start_inserted_mm + truth.ostium_mm, 0.0), navigation.start_rotation]
+    start += [behind, 0.0] * len(navigation.catheters)
     friction = device.friction * truth.friction_factor
     cycles = simulate(
         navigation.anatomy,
         replace(wire, friction=friction),
         np.array(world.robot.driven)[None, : samples * per_sample],
+        catheters=truth.catheters(navigation.catheters),
         initial=np.array([start]),
         config=recording.config.simulator,
         period_s=recording.config.cycle_s,
@@ -65,6 +67,7 @@ def write_session_episode(session: Path, output: Path) -> None:
         friction=friction,
         tip_stiffness_factor=truth.stiffness_factor,
         simulator=recording.config.simulator,
+        catheters=navigation.catheters,
         seed=recording.seed,
         origin={"session": session.name, "target_branch": int(target[0]), "target_mm": float(target[1])},
     )

@@ -33,7 +33,7 @@ from endopilot.simulation.device import Device, read_device
 from endopilot.simulation.motion import Motion, MotionName, motion_named
 from endopilot.simulation.simulate import simulate
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Arrives, Navigation
-from endopilot.types import Anatomy, Rollout, TipProjection
+from endopilot.types import Anatomy, CatheterMotion, Rollout, TipProjection
 from endopilot.xray.fluoroscope import Fluoroscope
 
 MotionKnown = Literal["nothing", "published", "exact"]
@@ -315,10 +315,7 @@ def _driven_again(set_up: SetUp, record: NavigationRecord, began: Float[np.ndarr
 
 
 def sampled(cycles: Rollout) -> Rollout:
-    """Return a rollout of a drive's cycles, which divide a decision period, as it is recorded at each period's end.
-
-    It tells nothing of catheters.
-    """
+    """Return a rollout of a drive's cycles, which divide a decision period, as it is recorded at each period's end."""
     step = round(DECISION_PERIOD_S / cycles.sample_period_s)
 
     def at_end(values: np.ndarray) -> np.ndarray:
@@ -331,9 +328,17 @@ def sampled(cycles: Rollout) -> Rollout:
     shape = None if cycles.shape is None else at_end(cycles.shape)
     placed = cycles.vessel_to_laboratory
     tip = TipProjection(**{f.name: at_end(getattr(cycles.tip, f.name)) for f in fields(TipProjection)})
+    catheters = cycles.catheters
+    if catheters is not None:
+        catheters = CatheterMotion(
+            control=together(catheters.control).mean(axis=2),
+            slip=together(catheters.slip).sum(axis=2),
+            rotation_slip=together(catheters.rotation_slip).sum(axis=2),
+            **{f.name: at_end(getattr(catheters, f.name)) for f in fields(CatheterMotion) if f.name not in _WHOLE},
+        )
     return replace(
         cycles,
-        catheters=None,
+        catheters=catheters,
         vessel_to_laboratory=None if placed is None else placed[step - 1 :: step],
         **{name: at_end(getattr(cycles, name)) for name in names},
         sample_period_s=DECISION_PERIOD_S,
@@ -360,11 +365,14 @@ def _first(rollout: Rollout, samples: int) -> Rollout:
     names = [f.name for f in fields(Rollout) if f.name not in (*_WHOLE[:4], *_APART)]
     tip = TipProjection(**{f.name: getattr(rollout.tip, f.name)[:, :samples] for f in fields(TipProjection)})
     shape = None if rollout.shape is None else rollout.shape[:, :samples]
-    placed = rollout.vessel_to_laboratory
+    placed, catheters = rollout.vessel_to_laboratory, rollout.catheters
+    if catheters is not None:
+        catheters = CatheterMotion(**{f.name: getattr(catheters, f.name)[:, :samples] for f in fields(CatheterMotion)})
     return replace(
         rollout,
         **{name: getattr(rollout, name)[:, :samples] for name in names},
         tip=tip,
+        catheters=catheters,
         shape=shape,
         vessel_to_laboratory=None if placed is None else placed[:samples],
     )

@@ -103,8 +103,7 @@ def _write(found: PatientNavigation, folder: Path, target: str, output: Path) ->
     write_device(set_up.true_wire, output / WIRE_FILE)
     for path, catheter in zip(_catheter_files(set_up, output), set_up.true_catheters, strict=True):
         write_catheter(catheter, path)
-    if not set_up.true_catheters:  # models, which train on it, are of a wire alone
-        _write_episode(found, driven_in, output / EPISODE_FOLDER)
+    _write_episode(found, driven_in, output / EPISODE_FOLDER)
     picture = navigation_picture(found)
     with writing(output / PICTURE_FILE) as partial:
         partial.write_bytes(picture)
@@ -171,6 +170,7 @@ def _write_episode(found: PatientNavigation, anatomy_folder: Path, output: Path)
         friction=device.friction * truth.friction_factor,
         tip_stiffness_factor=truth.stiffness_factor,
         simulator=set_up.simulator,
+        catheters=set_up.navigation.catheters,
         motion=set_up.motion,
         seed=set_up.config.seed,
         origin={
