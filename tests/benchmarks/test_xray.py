@@ -5,7 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from endopilot.anatomy.io import write_anatomy
+from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.benchmarks.xray import BARS, _Exposure, _figures
+from endopilot.errors import InputError
+from endopilot.xray.scenes import SceneConfig, draw_scenes
 
 
 def exposure(**changes) -> _Exposure:
@@ -40,3 +44,12 @@ def test_a_tip_found_elsewhere_is_missed_and_one_found_without_a_wire_is_a_false
         for name in BARS
     }
     assert figures["images_per_second"] == 20.0
+
+
+def test_anatomies_of_ones_own_lie_on_the_table(tmp_path):
+    patient = make_patient(AtlasConfig(population="textbook"), 0)
+    write_anatomy(patient, tmp_path / "mine")
+    (scene,) = draw_scenes(SceneConfig(given=(tmp_path / "mine",)))
+    assert scene.anatomy.identity == patient.identity
+    with pytest.raises(InputError, match="no such folder"):
+        next(draw_scenes(SceneConfig(given=(tmp_path / "absent",))))

@@ -6,6 +6,7 @@ import itertools
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -54,6 +55,8 @@ class XrayBenchConfig:
     """Wires of each patient; each is exposed at the usual dose, with two views and with each alone."""
     seed: Seed = 1
     """Seed of patients, poses, wires and noise."""
+    given: tuple[Path, ...] = ()
+    """Folders of anatomies of your own in place of synthetic patients, as `endopilot anatomy` makes them."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +113,7 @@ def bench_xray(config: XrayBenchConfig) -> dict[str, Any]:
     exposures: list[_Exposure] = []
     registrations: list[dict[str, Any]] = []
     rates: list[float] = []
-    for scene in draw_scenes(SceneConfig(patients=config.patients, seed=config.seed)):
+    for scene in draw_scenes(SceneConfig(patients=config.patients, seed=config.seed, given=config.given)):
         rates.append(_images_per_second(scene))
         registered, row = _register(scene)
         registrations.append(row)

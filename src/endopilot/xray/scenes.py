@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Float32
 
+from endopilot.anatomy.io import read_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.progress import progress
 from endopilot.settings import Count, Finite, Seed, settings
@@ -39,6 +41,8 @@ class SceneConfig:
     """Pairs of views, LAO (positive) or RAO and cranial (positive) or caudal, degrees: patients take them in turn."""
     device: str = "workhorse-014"
     """The wire."""
+    given: tuple[Path, ...] = ()
+    """Folders of anatomies in place of synthetic patients; `patients` does not count then."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,13 +100,16 @@ def draw_scenes(config: SceneConfig, image: ImageConfig | None = None) -> Iterat
     Args:
         config: patients, poses and angles.
         image: detector and beam.
+
+    Raises:
+        InputError: a given folder holds no anatomy.
     """
-    device = read_device(config.device)
-    with progress("Patients on the table", config.patients) as advance:
-        for index in range(config.patients):
+    device, patients = read_device(config.device), len(config.given) or config.patients
+    with progress("Patients on the table", patients) as advance:
+        for index in range(patients):
             random = np.random.default_rng([config.seed, index, 0x7363656E])
             atlas = AtlasConfig(anatomy=("rca", "lca")[index % 2], seed=config.seed)
-            anatomy = make_patient(atlas, index)
+            anatomy = read_anatomy(config.given[index]) if config.given else make_patient(atlas, index)
             imager = XrayImager(anatomy, device, surroundings(anatomy), image)
             angles = config.view_angles_deg[index // 2 % len(config.view_angles_deg)]
             pose = Pose.draw(random)
