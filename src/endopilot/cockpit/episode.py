@@ -40,16 +40,15 @@ def write_session_episode(session: Path, output: Path) -> None:
     *_, (world, _events) = replayed(recording)
     device = navigation.device
     wire = device.with_tip(bend_rad=device.tip_bend_rad, stiffness_factor=truth.stiffness_factor)
-    behind = max(navigation.start_catheter_mm + truth.ostium_mm, 0.0)
-    start = [max(navigation.start_inserted_mm + truth.ostium_mm, 0.0), navigation.start_rotation]
-    start += [behind, 0.0] * len(navigation.catheters)
+    start = navigation.start
+    start[::2] = np.maximum(start[::2] + truth.ostium_mm, 0.0)
     friction = device.friction * truth.friction_factor
     cycles = simulate(
         navigation.anatomy,
         replace(wire, friction=friction),
         np.array(world.robot.driven)[None, : samples * per_sample],
         catheters=truth.catheters(navigation.catheters),
-        initial=np.array([start]),
+        initial=start[None],
         config=recording.config.simulator,
         period_s=recording.config.cycle_s,
     )
