@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 # Okabe & Ito, "Color universal design" (2008): distinguishable with any kind of colour vision.
 BLACK, ORANGE, SKY, GREEN = "#1a1a1a", "#E69F00", "#56B4E9", "#009E73"
 YELLOW, BLUE, VERMILLION, PURPLE, GREY = "#F0E442", "#0072B2", "#D55E00", "#CC79A7", "#8a8f98"
+CATHETER_COLORS = ("#19b5c8", "#8e6cf0")  # from the inside out; the first is that of the cockpit
 
 STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",

@@ -13,9 +13,11 @@ from command import refused, run
 from endopilot.anatomy.io import read_anatomy
 from endopilot.cli import main
 from endopilot.control.navigate_patient import NavigatePatientConfig, navigate_patient, set_up_navigation
+from endopilot.control.outcome import tell_outcome
 from endopilot.dataset.loader import load_dataset
 from endopilot.files import read_json
 from endopilot.pipeline import navigation
+from endopilot.report.navigation_figure import navigation_figure
 from endopilot.simulation.catheter import read_catheter
 from endopilot.simulation.motion import motion_named
 
@@ -143,13 +145,37 @@ def test_a_catheter_follows_its_wire_and_both_are_written(patient, capsys, tmp_p
     for name in ("tip_z_mm", "inserted_length_mm", "catheter_1_inserted_length_mm"):
         count = len(table) - 1
         np.testing.assert_allclose(motion[name][9::10][:count], table[name][1:], atol=1e-4, err_msg=name)
-    assert "--catheter microcatheter-1.7f" in (folder / "navigation.html").read_text(encoding="utf-8")
+    page = (folder / "navigation.html").read_text(encoding="utf-8")
+    for part in ("--catheter microcatheter-1.7f", "Guidewire workhorse-014", "Catheter microcatheter-1.7f"):
+        assert part in page
+    assert "The catheter is turquoise, and covers what lies in it." in page
     line = refused(
         capsys, "navigate", patient, "--target", "1", "--catheter", "microcatheter-1.7f", "-o", tmp_path / "n"
     )
     assert "policy: it takes a wire alone, and there is microcatheter-1.7f around it; leave the catheter out" in line
     line = refused(capsys, *command, "-o", tmp_path / "n")
     assert "arrives: catheter; there is none" in line
+
+
+def test_the_picture_shows_wire_and_catheter(patient):
+    config = NavigatePatientConfig(
+        tip="own", seconds=6.0, policy="in-turn", catheter=("microcatheter-1.7f",), arrives="catheter"
+    )
+    found = navigate_patient(set_up_navigation(patient, "2", config))
+    record, motion = found.record, found.rollout.catheters
+    np.testing.assert_allclose(record.catheter_tip_position[1:], motion.tip_position[0], atol=1e-3)
+    assert "after 6 s the catheter's tip is in section 1 at 0.0 mm" in tell_outcome(found)
+    route, tip, _, _, pushes, translation, rotation = navigation_figure(found).axes
+    names = {axes: [text.get_text() for text in axes.get_legend().get_texts()] for axes in (route, tip, pushes)}
+    for shown in names[route], names[tip]:
+        assert {"wire's tip", "tip of microcatheter-1.7f"} < set(shown)
+    line = tip.lines[names[tip].index("tip of microcatheter-1.7f")]
+    np.testing.assert_array_equal(line.get_ydata(), record.catheter_tips[0].abscissa)
+    assert names[pushes] == ["workhorse-014", "microcatheter-1.7f"]
+    np.testing.assert_array_equal(pushes.lines[1].get_ydata(), motion.drive_force[0, :, 0])
+    for axes, column in ((translation, 0), (rotation, 1)):
+        for line, of_device in zip(axes.lines, record.control[:, column::2].T, strict=False):
+            np.testing.assert_array_equal(line.get_ydata(), of_device)
 
 
 def test_the_replayed_wire_is_the_navigations_to_the_bit(patient):

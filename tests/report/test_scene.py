@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from endopilot.report import still
-from endopilot.report.scene import SHOWN_BEHIND_MM, navigation_scene, visible_wire
+from endopilot.report.scene import navigation_scene, visible_devices
 from endopilot.report.still import LIBRARIES_MISSING, render_still
 from endopilot.report.wall_mesh import wall_mesh
-from endopilot.types import DistanceMap
+from endopilot.simulation.catheter import read_catheter
+from endopilot.simulation.tubes import SHOWN_BEHIND_MM, Stack
+from endopilot.types import CatheterMotion, DistanceMap, Rollout
 
 CENTRE, SQUEEZE = np.array([1.0, 2.0, 3.0]), np.array([1.0, 2.0, 1.5])
 
@@ -38,7 +40,7 @@ def test_a_lumen_that_reaches_the_edge_of_its_map_is_closed_there():
 
 
 def test_the_wire_is_shown_from_its_tip_to_just_behind_the_ostium(rollout):
-    wire = visible_wire(rollout, 0, 3)
+    (wire,) = visible_devices(rollout, 0, 3)
     np.testing.assert_array_equal(wire[0], rollout.tip_position[0, 3])
     length = np.linalg.norm(np.diff(wire, axis=0), axis=1).sum()
     assert (
@@ -50,7 +52,7 @@ def test_the_wire_is_shown_from_its_tip_to_just_behind_the_ostium(rollout):
 
 def test_a_rollout_without_shapes_is_refused(rollout):
     with pytest.raises(ValueError, match="record_shape"):
-        visible_wire(dataclasses.replace(rollout, shape=None), 0, 0)
+        visible_devices(dataclasses.replace(rollout, shape=None), 0, 0)
 
 
 def test_every_sample_is_a_frame_and_a_step_of_the_slider(anatomy, rollout):
@@ -63,6 +65,56 @@ def test_every_sample_is_a_frame_and_a_step_of_the_slider(anatomy, rollout):
     assert "Δtip = 24.0 mm" in frames[4].data[0].hovertemplate
     # The frames replace the wire, its trail and its tip, not the vessel.
     assert [figure.data[index].name for index in frames[4].traces] == ["Guidewire", "Tip, last 20 s", "Tip"]
+
+
+@pytest.fixture
+def pair(rollout) -> Rollout:
+    """Return the wire with a catheter that stays behind it until the last sample, in which it leads by 2 mm."""
+    inserted = np.array([0.0, 3.0, 7.0, 9.0, 12.0, 30.0])[None, :, None]
+    deepest = np.maximum(rollout.inserted_length[..., None], inserted)
+    shape = rollout.shape.copy()
+    shape[..., 2] = -deepest + 2.0 * np.arange(shape.shape[2])
+    none, pushed = np.zeros_like(inserted), np.full_like(inserted, 0.25)
+    at = np.concatenate([none, none, -inserted], axis=-1)[:, :, None]
+    motion = CatheterMotion(
+        control=np.zeros((1, 6, 1, 2)),
+        inserted_length=inserted,
+        rotation=none + np.pi,
+        tip_position=at,
+        base_force=none,
+        base_torque=none,
+        drive_force=pushed,
+        drive_torque=none,
+        slip=none,
+        rotation_slip=none,
+    )
+    return dataclasses.replace(rollout, shape=shape, catheters=motion, drive_force=np.full((1, 6), 0.5))
+
+
+@pytest.fixture
+def devices(wire):
+    """Return a wire and a catheter around it."""
+    return Stack(wire, (read_catheter("microcatheter-2.4f"),)).devices
+
+
+def test_a_catheter_covers_its_wire_and_both_are_named(anatomy, pair, devices):
+    wire, catheter, *others = navigation_scene(anatomy, pair, devices=devices).frames[2].data
+    assert (wire.name, catheter.name) == ("Guidewire workhorse-014", "Catheter microcatheter-2.4f")
+    assert [trace.name for trace in others] == ["Tip, last 20 s", "Tip"]
+    assert wire.line.color != catheter.line.color
+    assert catheter.line.width / wire.line.width == pytest.approx(devices[1].diameter_mm / 0.36, rel=0.05)
+    z = np.array(wire.z), np.array(catheter.z)
+    np.testing.assert_allclose(z[0], [-16.0, -14.0, -12.0, -10.0, -8.0, -7.0])
+    np.testing.assert_allclose(z[1][[0, 1, -1]], [-7.0, -6.0, SHOWN_BEHIND_MM])
+    assert "Δtip = 16.0 mm" in wire.hovertemplate and "push of its drive = 0.50 N" in wire.hovertemplate
+    for state in ("Δ = 7.0 mm", "φ = 180°", "push of its drive = 0.25 N"):
+        assert state in catheter.hovertemplate
+
+
+def test_of_a_wire_in_its_catheter_the_tip_is_left(anatomy, pair, devices):
+    wire, catheter = navigation_scene(anatomy, pair, devices=devices).frames[5].data[:2]
+    np.testing.assert_allclose(wire.z, [-28.0])
+    assert np.array(catheter.z)[0] == -30.0 and len(catheter.z) > 20
 
 
 def test_samples_after_a_failure_are_not_shown(anatomy, rollout):
@@ -87,7 +139,7 @@ def test_sections_are_lines_of_their_own_and_joined(anatomy):
 
 def test_a_renderer_that_dies_is_one_line_and_no_picture(anatomy, tmp_path, monkeypatch):
     monkeypatch.setattr(still.sys, "executable", "/bin/false")
-    assert render_still(anatomy, None, tmp_path / "scene.png") == LIBRARIES_MISSING
+    assert render_still(anatomy, [], tmp_path / "scene.png") == LIBRARIES_MISSING
     assert "apt-get install" in LIBRARIES_MISSING
     assert "\n" not in LIBRARIES_MISSING
     assert list(tmp_path.iterdir()) == []
@@ -96,9 +148,20 @@ def test_a_renderer_that_dies_is_one_line_and_no_picture(anatomy, tmp_path, monk
 def test_the_still_picture_shows_the_vessel(anatomy, rollout, tmp_path):
     from matplotlib.image import imread
 
-    if render_still(anatomy, visible_wire(rollout, 0, 5), tmp_path / "scene.png") is not None:
+    if render_still(anatomy, visible_devices(rollout, 0, 5), tmp_path / "scene.png") is not None:
         pytest.skip("VTK finds no graphics library here")
     picture = imread(tmp_path / "scene.png")[..., :3]
     reddish = (picture[..., 0] > picture[..., 2] + 0.1).mean()
     assert 0.01 < reddish < 0.6
     assert (picture.min(axis=-1) > 0.6).mean() > 1e-4  # the wire
+
+
+def test_the_still_picture_shows_wire_and_catheter(anatomy, pair, devices, tmp_path):
+    from matplotlib.image import imread
+
+    if render_still(anatomy, visible_devices(pair, 0, 4), tmp_path / "scene.png", devices=devices) is not None:
+        pytest.skip("VTK finds no graphics library here")
+    picture = imread(tmp_path / "scene.png")[..., :3]
+    turquoise = (picture[..., 1:].min(axis=-1) > picture[..., 0] + 0.3).mean()
+    assert turquoise > 1e-3
+    assert (picture.min(axis=-1) > 0.6).mean() > 1e-4

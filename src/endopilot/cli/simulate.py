@@ -72,7 +72,7 @@ def command(
         motion: how heart and breath move the vessel and the guiding catheter: still, breathing, heartbeat or both.
         motion_seed: draws the patient's amplitudes from the published distributions; their means by default.
         shape: also record the positions of all nodes, mm (.npz only).
-        picture: PNG of the vessel and of the first navigation's wire at its end.
+        picture: PNG of the vessel with the first navigation's wire and catheters at its end.
         json: print the figures as JSON.
         random: the random controls, if no others are given.
         config: settings of the rod core.
@@ -134,10 +134,11 @@ def command(
         figures["largest_catheter_force_n"] = _largest(np.abs(rollout.catheters.base_force).max(axis=-1), valid)
         figures["largest_catheter_torque_n_mm"] = _largest(np.abs(rollout.catheters.base_torque).max(axis=-1), valid)
     if picture is not None:
-        from endopilot.report.scene import visible_wire  # plotly is slow to import
+        from endopilot.report.scene import visible_devices  # plotly is slow to import
         from endopilot.report.still import render_still
 
-        missing = render_still(patient, visible_wire(rollout, 0, -1), picture)
+        shown, devices = visible_devices(rollout, 0, -1), Stack(wire, catheters).devices
+        missing = render_still(patient, shown, picture, devices=devices)
         if missing is None:
             figures["picture"] = str(picture)
         else:

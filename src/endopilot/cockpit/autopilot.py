@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 
 from endopilot.cockpit.frames import encode
-from endopilot.cockpit.world import SHOWN_BEHIND_MM, Snapshot, World
+from endopilot.cockpit.world import Snapshot, World
 from endopilot.control.policies import make_policy
 from endopilot.control.policy import BelievedTip, Believer, Decision, Led, Observation, Policy
 from endopilot.errors import InputError
+from endopilot.simulation.tubes import shown_part
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target
 from endopilot.xray.fluoroscope import Fluoroscope, FluoroscopeConfig, TipMeasurement
 
@@ -155,8 +156,7 @@ class Autopilot:
         if self._target is None or not isinstance(self._policy, Believer) or self._believed is None:
             return None
         wires = self._policy.believed_wires()
-        length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(wires[0], axis=0), axis=1))])
-        shown = wires[:, length <= snapshot.deepest_mm + SHOWN_BEHIND_MM]
+        shown = wires[:, : len(shown_part(wires[0], snapshot.deepest_mm))]
         line = self._world.navigation.anatomy.tree.path(self._target.branch)
         half = self._believed.half_width[0]
         within = np.abs(line.abscissa - self._believed.abscissa) <= (half if np.isfinite(half) else -1.0)

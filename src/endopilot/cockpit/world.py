@@ -22,12 +22,9 @@ from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import Step
-from endopilot.simulation.tubes import lines_from_tips
+from endopilot.simulation.tubes import lines_from_tips, shown_part
 from endopilot.tasks.navigation import Navigation, Target
 from endopilot.types import TipProjection
-
-SHOWN_BEHIND_MM = 20.0
-"""Length of wire and catheters that is shown behind the ostium, in the guiding catheter, mm."""
 
 
 @settings
@@ -282,15 +279,14 @@ def _lines(
 
     The wall presses on the outermost device alone.
     """
-    nodes, force = simulator.position[0], simulator.contacts[0]
+    nodes, force = shown_part(simulator.position[0], float(inserted_mm.max())), simulator.contacts[0]
     found, covered = [], -np.inf
     for device, line in reversed(list(enumerate(lines_from_tips(nodes, inserted_mm)))):
-        own = force[len(nodes) - len(line) :]
-        along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+        own = force[len(nodes) - len(line) : len(nodes)]
         if len(inserted_mm) > 1:
+            along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
             line[0] = simulator.tips(device)[0]
             own = np.where(inserted_mm[device] - along > covered, own, 0.0)
             covered = max(covered, float(inserted_mm[device]))
-        shown = along <= inserted_mm[device] + SHOWN_BEHIND_MM
-        found.append((line[shown], own[shown]))
+        found.append((line, own))
     return found[::-1]

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Float
 
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.control.navigate_patient import PatientNavigation, SetUp
 from endopilot.control.robot import CYCLE_S
 from endopilot.control.route import Route
 from endopilot.tasks.navigation import DECISION_PERIOD_S, SUCCESS_MM
-from endopilot.types import VesselTree
+from endopilot.types import Rollout, VesselTree
 
 _TIGHT_RATIO = 0.8
 """A wire that fills this share of a lumen is held up by its walls."""
@@ -60,8 +61,10 @@ def why_not(found: PatientNavigation) -> str:
     if record.reason == "invalid":
         return f"the simulation failed after {record.seconds:g} s"
     route = Route.to(navigation.anatomy, navigation.target)
-    tree, branch, at = navigation.anatomy.tree, int(record.tip.branch[-1]), float(record.tip.abscissa[-1])
-    where = f"after {record.seconds:g} s the tip is in section {section_at(tree, branch, at)} at {at:.1f} mm"
+    tree, tip = navigation.anatomy.tree, record.tips[navigation.arriving]
+    branch, at = int(tip.branch[-1]), float(tip.abscissa[-1])
+    whose = "the catheter's tip" if navigation.arriving else "the tip"
+    where = f"after {record.seconds:g} s {whose} is in section {section_at(tree, branch, at)} at {at:.1f} mm"
     departs = tree.departures(navigation.target.branch)[branch]
     if np.isfinite(departs):
         where += f", off the route, which it left at the fork at {departs:.1f} mm"
@@ -73,22 +76,24 @@ def why_not(found: PatientNavigation) -> str:
 
 
 def _held_up(found: PatientNavigation, route: Route) -> str:
-    """Return what is likeliest to have held the wire up."""
+    """Return what is likeliest to have held up the device that was to arrive, or the wire ahead of it."""
     record, navigation = found.record, found.set_up.navigation
-    device, came = navigation.device, float(route.progress(record.tip).max())
-    refused = found.set_up.choice.refused
-    if refused is not None and abs(came - refused.abscissa) <= _AT_FORK_MM + device.tip_bend_length_mm:
+    wire, device, tip = navigation.device, navigation.devices[navigation.arriving], record.tips[navigation.arriving]
+    refused, wire_came = found.set_up.choice.refused, float(route.progress(record.tip).max())
+    if refused is not None and abs(wire_came - refused.abscissa) <= _AT_FORK_MM + wire.tip_bend_length_mm:
         return f"no rotation of the tip enters {refused}"
-    narrow = _narrowest(route, came, device.tip_radius_mm)
+    progress = route.progress(tip)
+    narrow = _narrowest(route, float(progress.max()), device.tip_radius_mm)
     if narrow is not None:
         at, width = narrow
-        return f"at {at:.1f} mm the lumen is {width:.2f} mm wide, and the wire {device.diameter_mm:g} mm"
-    slipped = int((found.rollout.slip[0] > 0).sum())
-    if slipped:
-        return f"the wire is caught; the drive slipped at its limit of {device.push_limit_n:g} N {slipped} times"
-    if route.off_route(record.tip)[-1] > 0:
+        what = "catheter" if navigation.arriving else "wire"
+        return f"at {at:.1f} mm the lumen is {width:.2f} mm wide, and the {what} {device.diameter_mm:g} mm"
+    for k, (each, slip) in enumerate(zip(navigation.devices, _slips(found.rollout), strict=True)):
+        slipped, caught = int((slip[:, 0] > 0).sum()), "catheter" if k else "wire"
+        if slipped:
+            return f"the {caught} is caught; the drive slipped at its limit of {each.push_limit_n:g} N {slipped} times"
+    if route.off_route(tip)[-1] > 0:
         return "it took another branch"
-    progress = route.progress(record.tip)
     still = min(round(_STILL_S / DECISION_PERIOD_S), len(progress) - 1)
     if progress[-1] - progress[-1 - still] > _STILL_MM:
         return "it was still on its course; give more --seconds"
@@ -116,7 +121,15 @@ def worst_ratio(found: PatientNavigation) -> float:
 
 
 def slipped_s(found: PatientNavigation) -> float:
-    """Return for how long the drive slipped, s."""
-    cycles = len(found.record.driven)
-    slip = (found.cycles.slip[0, :cycles] != 0) | (found.cycles.rotation_slip[0, :cycles] != 0)
-    return float(slip.sum()) * CYCLE_S
+    """Return for how long a drive slipped, s."""
+    slip = np.hstack(_slips(found.cycles))[: len(found.record.driven)]
+    return float((slip != 0).any(axis=1).sum()) * CYCLE_S
+
+
+def _slips(rollout: Rollout) -> list[Float[np.ndarray, "samples 2"]]:
+    """Return advance (mm) and rotation (rad) that the drive of each device slipped over in each period."""
+    wire = np.stack([rollout.slip[0], rollout.rotation_slip[0]], axis=-1)
+    if rollout.catheters is None:
+        return [wire]
+    around = np.stack([rollout.catheters.slip[0], rollout.catheters.rotation_slip[0]], axis=-1)
+    return [wire, *np.moveaxis(around, 1, 0)]

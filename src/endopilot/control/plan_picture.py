@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib as mpl
@@ -16,6 +17,7 @@ from endopilot.control.plan_config import Plan
 from endopilot.control.plan_xray import PlannedXray
 from endopilot.control.route import Route
 from endopilot.files import writing
+from endopilot.plotting import CATHETER_COLORS
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 
 
@@ -25,7 +27,8 @@ def draw_plan(plan: Plan, path: Path, xray: PlannedXray | None = None) -> None:
     grid = figure.add_gridspec(4, 2, width_ratios=(1.0, 1.25))
     names = " in ".join(device.name for device in plan.navigation.devices)
     title = f"{plan.navigation.anatomy.name}, {names}: {plan.config.method}"
-    draw_route(figure.add_subplot(grid[:, 0]), plan.navigation, plan.position, title)
+    around = [] if plan.catheter_position is None else [plan.catheter_position]
+    draw_route(figure.add_subplot(grid[:, 0]), plan.navigation, plan.position, title, around)
     time_s = DECISION_PERIOD_S * np.arange(1, len(plan.control) + 1)
     panels = [figure.add_subplot(grid[row, 1]) for row in range(4)]
     _draw_tip(plan, time_s, panels[0])
@@ -37,9 +40,9 @@ def draw_plan(plan: Plan, path: Path, xray: PlannedXray | None = None) -> None:
     edges = np.append(0.0, time_s)
     for axis, color, label in ((0, "tab:blue", "translation, mm/s"), (1, "tab:orange", "rotation, rad/s")):
         panels[3].stairs(plan.control[:, axis], edges, baseline=None, color=color, linewidth=1.5, label=label)
-    for axis, color, label in ((2, "tab:cyan", "catheter, mm/s"), (3, "tab:red", "catheter, rad/s")):
+    for axis, color, label in ((2, CATHETER_COLORS[0], "catheter, mm/s"), (3, "tab:red", "catheter, rad/s")):
         if axis < plan.control.shape[1]:
-            panels[3].stairs(plan.control[:, axis], edges, baseline=None, color=color, linestyle=":", label=label)
+            panels[3].stairs(plan.control[:, axis], edges, baseline=None, color=color, linestyle="--", label=label)
     legend_above(panels[3])
     panels[3].set_ylabel("control")
     panels[3].set_xlabel("time, s")
@@ -54,8 +57,22 @@ def draw_plan(plan: Plan, path: Path, xray: PlannedXray | None = None) -> None:
     plt.close(figure)
 
 
-def draw_route(axes: Axes, navigation: Navigation, position: Float[np.ndarray, "n 3"], title: str) -> None:
-    """Draw the tree from the front with the route, the target and the path of the tip (LPS mm)."""
+def draw_route(
+    axes: Axes,
+    navigation: Navigation,
+    position: Float[np.ndarray, "n 3"],
+    title: str,
+    catheters: Sequence[Float[np.ndarray, "n 3"]] = (),
+) -> None:
+    """Draw the tree from the front with the route, the target and the paths of the tips, LPS mm.
+
+    Args:
+        axes: where.
+        navigation: vessel and target.
+        position: of the wire's tip.
+        title: of the panel.
+        catheters: positions of the tip of each catheter, if their paths are to be drawn.
+    """
     tree, route = navigation.anatomy.tree, Route.to(navigation.anatomy, navigation.target)
     for branch in tree.branches:
         x, _, z = branch.centerline.points.T
@@ -63,7 +80,11 @@ def draw_route(axes: Axes, navigation: Navigation, position: Float[np.ndarray, "
     ahead = route.line.abscissa <= navigation.target.abscissa
     x, _, z = route.line.points[ahead].T
     axes.plot(x, z, color="tab:green", linewidth=5, alpha=0.4, label="route")
-    axes.plot(position[:, 0], position[:, 2], ".-", color="tab:blue", linewidth=0.8, markersize=3, label="tip")
+    names = (f"tip of {catheter.name}" for catheter in navigation.catheters)
+    paths = [("wire's tip" if catheters else "tip", "tab:blue", position)]
+    paths += zip(names, CATHETER_COLORS, catheters, strict=False)
+    for label, color, path in paths:
+        axes.plot(path[:, 0], path[:, 2], ".-", color=color, linewidth=0.8, markersize=3, label=label)
     goal = navigation.target.position(navigation.anatomy)
     axes.plot(goal[0], goal[2], "*", color="tab:red", markersize=14, label="target")
     axes.set_aspect("equal")
@@ -81,7 +102,7 @@ def _draw_tip(plan: Plan, time_s: np.ndarray, axes: Axes) -> None:
     axes.plot(time_s, plan.predicted[:, 0], color="tab:orange", linestyle="--", label="predicted by the model")
     axes.plot(time_s, tip.abscissa, color="tab:blue", linewidth=1, label="in the rod core")
     if plan.catheter_tip is not None:
-        axes.plot(time_s, plan.catheter_tip.abscissa, color="tab:cyan", linewidth=1, label="the catheter's")
+        axes.plot(time_s, plan.catheter_tip.abscissa, color=CATHETER_COLORS[0], linewidth=1, label="the catheter's")
     if off_route.any():
         axes.plot(time_s[off_route], tip.abscissa[off_route], "x", color="tab:red", label="in a wrong branch")
     for junction in route.junctions:
@@ -103,7 +124,7 @@ def _draw_xray(plan: Plan, xray: PlannedXray, time_s: np.ndarray, panels: list[A
 
 def legend_above(axes: Axes) -> None:
     """Put the legend in a row above a panel, where it covers no curve."""
-    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=6, fontsize=8, frameon=False, borderaxespad=0.1)
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=8, fontsize=8, frameon=False, borderaxespad=0.1)
 
 
 def _draw_safety(plan: Plan, time_s: np.ndarray, axes: Axes) -> None:

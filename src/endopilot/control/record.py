@@ -29,6 +29,8 @@ class NavigationRecord:
         exposed: whether X-ray was on at this moment.
         catheter_inserted_length: of each catheter, mm.
         catheter_rotation: of each catheter, rad.
+        catheter_tip_position: of each catheter, LPS mm.
+        catheter_tips: Δtip, γtip, branch and lumen radius of each catheter.
         control: what was commanded from this moment on, within the limits, mm/s and rad/s of the wire, then of each
             catheter; 0 at the end.
         measured: what X-ray showed at this moment; None where it was off, or no wire was found in the images.
@@ -59,6 +61,8 @@ class NavigationRecord:
     exposed: Bool[np.ndarray, "samples"]
     catheter_inserted_length: Float[np.ndarray, "samples catheters"]
     catheter_rotation: Float[np.ndarray, "samples catheters"]
+    catheter_tip_position: Float[np.ndarray, "samples catheters 3"]
+    catheter_tips: tuple[TipProjection, ...]
     control: Float[np.ndarray, "samples numbers"]
     measured: tuple[TipMeasurement | None, ...]
     believed: Float[np.ndarray, "samples 2"] | None
@@ -74,6 +78,11 @@ class NavigationRecord:
     faults: int
     reason: str
     gives_up: str
+
+    @property
+    def tips(self) -> tuple[TipProjection, ...]:
+        """Those of the wire and of each catheter, as `Navigation.reached` takes them."""
+        return (self.tip, *self.catheter_tips)
 
     @property
     def in_bands(self) -> Bool[np.ndarray, "decisions"]:
@@ -115,10 +124,11 @@ class Track:
         self._faults += fault
 
     def moved(self, simulator: Simulator, peak_n: float) -> None:
-        """Take where the wire is at the end of a period, and the largest wall force in it, N."""
+        """Take where the devices are at the end of a period, and the largest wall force in it, N."""
         self._columns["inserted"].append(np.append(simulator.inserted_length, simulator.catheter_inserted_length))
         self._columns["turned"].append(np.append(simulator.rotation, simulator.catheter_rotation))
-        self._columns["position"].append(simulator.tips()[0])
+        devices = 1 + simulator.catheter_inserted_length.shape[1]
+        self._columns["position"].append([simulator.tips(k)[0] for k in range(devices)])
         self._columns["force"].append(peak_n)
 
     def record(self, navigation: Navigation, driven: list[np.ndarray], reason: str, gives_up: str) -> NavigationRecord:
@@ -134,6 +144,9 @@ class Track:
         inserted, turned, position, force = (
             np.array(self._columns[name]) for name in ("inserted", "turned", "position", "force")
         )
+        tip, *catheter_tips = (
+            project_tip(anatomy.tree, anatomy.insertion, position[:, k]) for k in range(position.shape[1])
+        )
         numbers = 2 * inserted.shape[1]
         periods = len(force) - 1  # a decision whose period is not over does not count
         measured = (*self._measured[:periods], None)
@@ -143,12 +156,14 @@ class Track:
             time_s=DECISION_PERIOD_S * np.arange(len(force)),
             inserted_length=inserted[:, 0],
             rotation=turned[:, 0],
-            tip_position=position,
-            tip=project_tip(anatomy.tree, anatomy.insertion, position),
+            tip_position=position[:, 0],
+            tip=tip,
             contact_force_max=force,
             exposed=np.array([*self._exposed[:periods], False]),
             catheter_inserted_length=inserted[:, 1:],
             catheter_rotation=turned[:, 1:],
+            catheter_tip_position=position[:, 1:],
+            catheter_tips=tuple(catheter_tips),
             control=np.array([*map(np.ravel, self._controls[:periods]), np.zeros(numbers)]),
             measured=measured,
             believed=np.array([(tip.abscissa, tip.offset) for tip in believed]) if tells else None,
@@ -160,7 +175,7 @@ class Track:
             seconds=DECISION_PERIOD_S * periods,
             peak_force_n=float(force.max()),
             exposures=sum(self._exposed[:periods]),
-            path_mm=float(np.linalg.norm(np.diff(position, axis=0), axis=1).sum()),
+            path_mm=float(np.linalg.norm(np.diff(position[:, 0], axis=0), axis=1).sum()),
             faults=self._faults,
             reason=reason,
             gives_up=gives_up,

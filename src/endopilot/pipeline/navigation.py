@@ -78,7 +78,8 @@ def navigate_into(
 
 def _write(found: PatientNavigation, folder: Path, target: str, output: Path) -> None:
     """Write all files, the manifest last."""
-    from endopilot.report.navigation_figure import navigation_picture  # matplotlib and plotly are slow to import
+    from endopilot.plotting import png  # matplotlib and plotly are slow to import
+    from endopilot.report.navigation_figure import navigation_figure
     from endopilot.report.navigation_page import write_navigation_page
 
     set_up = found.set_up
@@ -104,7 +105,7 @@ def _write(found: PatientNavigation, folder: Path, target: str, output: Path) ->
     for path, catheter in zip(_catheter_files(set_up, output), set_up.true_catheters, strict=True):
         write_catheter(catheter, path)
     _write_episode(found, driven_in, output / EPISODE_FOLDER)
-    picture = navigation_picture(found)
+    picture = png(navigation_figure(found))
     with writing(output / PICTURE_FILE) as partial:
         partial.write_bytes(picture)
     record = _manifest(found, target, output)
@@ -236,7 +237,7 @@ def _commands(found: PatientNavigation, folder: Path, driven_in: Path, target: s
     beside = ["endopilot", "train", "runs/dataset", str(output / EPISODE_FOLDER), "-o", "runs/training"]
     return {
         "The navigation": shlex.join(line),
-        "The same wire from the recorded controls, without the policy": shlex.join(again),
+        f"The same {'motion' if files else 'wire'} from the recorded controls, without the policy": shlex.join(again),
         **({} if files else {"Train on it beside a dataset of the same wire": shlex.join(beside)}),
     }
 

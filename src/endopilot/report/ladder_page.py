@@ -95,7 +95,7 @@ def _section(output: Path, task: Task, patients: int) -> dict[str, Any]:
 def _replay_scene(task: Task, navigation: Navigation, result: dict[str, Any]) -> go.Figure:
     """Return a navigation replayed in space, with its target, what X-ray showed, and what came of it."""
     course = result["course"]
-    figure = navigation_scene(navigation.anatomy, _replay(navigation, course))
+    figure = navigation_scene(navigation.anatomy, _replay(navigation, course), devices=navigation.devices)
     exposed = np.array(course["exposed"])
     observed, seconds = np.array(course["tip_position"])[exposed], np.array(course["time_s"])[exposed]
     mark_target(figure, navigation.target.position(navigation.anatomy), observed, seconds)
@@ -113,7 +113,7 @@ def _outcome(result: dict[str, Any]) -> str:
 
 
 def _replay(navigation: Navigation, course: dict[str, Any]) -> Rollout:
-    """Return the whole wire over a navigation, by driving its proximal end along the same course again."""
+    """Return wire and catheters over a navigation, by driving its proximal end along the same course again."""
     numbers = [course["inserted_length"], course["rotation"]]
     for inserted, turned in zip(
         np.array(course["catheter_inserted_length"]).T, np.array(course["catheter_rotation"]).T, strict=True

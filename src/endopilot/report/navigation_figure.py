@@ -1,4 +1,4 @@
-"""A picture of a navigation: the tip's path, Δtip with what was believed, safety ratio, wall force, controls, X-ray."""
+"""A picture of a navigation: paths of the tips, Δtip with what was believed, safety ratio, forces, controls, X-ray."""
 
 from __future__ import annotations
 
@@ -12,30 +12,35 @@ from endopilot.control.navigate_patient import PatientNavigation
 from endopilot.control.outcome import section_at
 from endopilot.control.plan_picture import draw_route, legend_above
 from endopilot.control.route import Route
-from endopilot.plotting import BLACK, BLUE, GREY, ORANGE, PURPLE, STYLE, VERMILLION, png
+from endopilot.plotting import BLACK, BLUE, CATHETER_COLORS, GREY, ORANGE, PURPLE, STYLE, VERMILLION
+from endopilot.tasks.navigation import DECISION_PERIOD_S
 from endopilot.xray.adviser import AdviserConfig
 
+_DEVICE_COLORS = (BLUE, *CATHETER_COLORS)
 _LABEL_SHARE = 0.06
 """Labels of forks are this share of the axis apart, at least."""
 
 
-def navigation_picture(found: PatientNavigation) -> bytes:
-    """Draw a navigation as a PNG."""
+def navigation_figure(found: PatientNavigation) -> Figure:
+    """Draw a navigation."""
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(13, 10.5), layout="constrained", facecolor="white")
-        grid = figure.add_gridspec(5, 2, width_ratios=(1.0, 1.35), height_ratios=(2.0, 1.0, 1.0, 0.8, 0.8))
-        navigation = found.set_up.navigation
+        navigation, record = found.set_up.navigation, found.record
+        heights = (2.0, 1.0, 1.0, *((1.0,) if navigation.catheters else ()), 0.8, 0.8)
+        figure = Figure(figsize=(13, 1.875 * sum(heights)), layout="constrained", facecolor="white")
+        grid = figure.add_gridspec(len(heights), 2, width_ratios=(1.0, 1.35), height_ratios=heights)
         title = f"{navigation.anatomy.name}, seen from the front"
         left = figure.add_subplot(grid[:, 0])
-        draw_route(left, navigation, found.record.tip_position, title)
+        draw_route(left, navigation, record.tip_position, title, list(np.moveaxis(record.catheter_tip_position, 1, 0)))
         _mark_sections(left, found)
-        panels = [figure.add_subplot(grid[row, 1]) for row in range(5)]
+        panels = [figure.add_subplot(grid[row, 1]) for row in range(len(heights))]
         _draw_tip(panels[0], found)
         _draw_safety(panels[1], found)
         _draw_force(panels[2], found)
-        _draw_controls(panels[3:], found)
+        if navigation.catheters:
+            _draw_pushes(panels[3], found)
+        _draw_controls(panels[-2:], found)
         _finish(panels, found)
-        return png(figure)
+        return figure
 
 
 def _mark_sections(axes: Axes, found: PatientNavigation) -> None:
@@ -63,7 +68,10 @@ def _draw_tip(axes: Axes, found: PatientNavigation) -> None:
         middle, half = record.believed[:, 0], record.half_width[:, 0]
         axes.plot(time_s, middle, color=ORANGE, linestyle="--", label="believed")
         axes.fill_between(time_s, middle - half, middle + half, color=ORANGE, alpha=0.25, linewidth=0, label="band")
-    axes.plot(time_s, record.tip.abscissa, color=BLUE, label="true")
+    around = found.set_up.navigation.catheters
+    axes.plot(time_s, record.tip.abscissa, color=BLUE, label="wire's tip" if around else "true")
+    for catheter, color, tip in zip(around, CATHETER_COLORS, record.catheter_tips, strict=False):
+        axes.plot(time_s, tip.abscissa, color=color, label=f"tip of {catheter.name}")
     off = Route.to(navigation.anatomy, navigation.target).off_route(record.tip) > 0
     if off.any():
         axes.plot(time_s[off], record.tip.abscissa[off], "x", color=VERMILLION, label="in a wrong branch")
@@ -106,6 +114,19 @@ def _draw_force(axes: Axes, found: PatientNavigation) -> None:
     axes.set_ylabel("largest wall\nforce, N")
 
 
+def _draw_pushes(axes: Axes, found: PatientNavigation) -> None:
+    """Draw how hard each drive pushes, or pulls below zero."""
+    rollout = found.rollout
+    assert rollout.catheters is not None
+    time_s = DECISION_PERIOD_S * np.arange(1, rollout.drive_force.shape[1] + 1)
+    pushes = [rollout.drive_force[0], *rollout.catheters.drive_force[0].T]
+    for device, color, push in zip(found.set_up.navigation.devices, _DEVICE_COLORS, pushes, strict=False):
+        axes.plot(time_s, push, color=color, label=device.name)
+    axes.axhline(0.0, color="0.75", linewidth=0.8, zorder=0)
+    axes.set_ylabel("push of\nthe drive, N")
+    legend_above(axes)
+
+
 def _draw_controls(panels: list[Axes], found: PatientNavigation) -> None:
     control, time_s = found.record.control, found.record.time_s
     for axes, axis, color, label in (
@@ -113,6 +134,8 @@ def _draw_controls(panels: list[Axes], found: PatientNavigation) -> None:
         (panels[1], 1, ORANGE, "rotation,\nrad/s"),
     ):
         axes.step(time_s, control[:, axis], where="post", color=color)
+        for catheter_color, speed in zip(CATHETER_COLORS, control[:, axis + 2 :: 2].T, strict=False):
+            axes.step(time_s, speed, where="post", color=catheter_color, linewidth=1.4)
         axes.axhline(0.0, color="0.75", linewidth=0.8, zorder=0)
         axes.set_ylabel(label)
 

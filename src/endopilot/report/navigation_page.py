@@ -51,6 +51,8 @@ def write_navigation_page(
         plotly=Markup(get_plotlyjs()),
         scene=Markup(_scene(found)),
         believes=found.wires is not None,
+        catheters=len(found.set_up.navigation.catheters),
+        devices="Wire, catheter" if found.set_up.navigation.catheters else "Wire",
         picture=image(picture, f"Course of the navigation in {name}"),
         exposures=_exposures(found),
         commands=commands,
@@ -63,13 +65,13 @@ def write_navigation_page(
 def _tiles(found: PatientNavigation) -> list[tuple[str, str, str]]:
     """Return figure, meaning and comparison of each tile."""
     record, navigation = found.record, found.set_up.navigation
-    minutes = max(record.seconds, 0.5) / 60
+    minutes, whose = max(record.seconds, 0.5) / 60, "wire's " if navigation.catheters else ""
     tiles = [
         (f"{record.seconds:g} s", "until the target" if record.success else "until it ended",
          f"of {navigation.seconds:g} s given"),
         (str(record.exposures), "X-ray exposures", f"{record.exposures / minutes:.1f} a minute"),
         (f"{record.peak_force_n:.3f} N", "largest force on the wall", f"limit {navigation.force_limit_n:g} N"),
-        (f"{worst_ratio(found):.2f}", "largest safety ratio of the tip", "1 is the wall"),
+        (f"{worst_ratio(found):.2f}", f"largest safety ratio of the {whose}tip", "1 is the wall"),
     ]  # fmt: skip
     if record.believed is not None:
         errors = np.abs(record.believed[:-1, 0] - record.tip.abscissa[:-1])
@@ -86,12 +88,13 @@ def _facts(found: PatientNavigation) -> list[tuple[str, str]]:
         ("Policy", set_up.config.policy),
         ("Wire", f"{device.name}, {device.diameter_mm:g} mm"),
         *(("Catheter", f"{each.name}, {each.device.diameter_mm:g} mm") for each in navigation.catheters),
+        *((("Arrives", "the catheter's tip"),) if navigation.arriving else ()),
         ("Tip", set_up.choice.why),
         ("Friction in reality", f"{device.friction * truth.friction_factor:.3g}, given {device.friction:g}"),
         ("Tip stiffness in reality", f"{truth.stiffness_factor:g} of the given one"),
         ("Ostium in reality", f"{truth.ostium_mm:+.2f} mm along the catheter"),
         ("Latency in reality", f"{truth.latency_factor:g} of the given one"),
-        ("Drive slipped for", f"{slipped_s(found):.2f} s"),
+        ("A drive slipped for" if navigation.catheters else "Drive slipped for", f"{slipped_s(found):.2f} s"),
     ]
     if set_up.config.true_axis_deg:
         unseen = "" if truth.axis_deg == set_up.config.true_axis_deg else f"; X-ray shows it to {truth.axis_deg:.1f}°"
@@ -104,7 +107,7 @@ def _facts(found: PatientNavigation) -> list[tuple[str, str]]:
 def _scene(found: PatientNavigation) -> str:
     """Return the replay in space as HTML."""
     record, navigation = found.record, found.set_up.navigation
-    figure = navigation_scene(navigation.anatomy, found.rollout, believed=found.wires)
+    figure = navigation_scene(navigation.anatomy, found.rollout, devices=navigation.devices, believed=found.wires)
     exposed = record.exposed
     place = navigation.target.position(navigation.anatomy)
     mark_target(figure, place, record.tip_position[exposed], record.time_s[exposed])

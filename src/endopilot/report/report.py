@@ -22,7 +22,7 @@ from endopilot.files import json_text, read_json, writing
 from endopilot.imaging.volume import read_mask, read_volume
 from endopilot.plotting import png
 from endopilot.report import figures, report_text
-from endopilot.report.scene import navigation_scene, visible_wire
+from endopilot.report.scene import navigation_scene, visible_devices
 from endopilot.report.still import render_still
 from endopilot.report.tables import stage_table
 from endopilot.types import Anatomy, Rollout
@@ -169,7 +169,7 @@ def _scene(content: ReportContent, still: Path, remarks: list[str]) -> dict[str,
         div_id="navigation",
         config={"displaylogo": False, "responsive": True, "modeBarButtonsToRemove": ["toImage"]},
     )
-    problem = render_still(anatomy, _farthest_wire(replay), still)
+    problem = render_still(anatomy, _farthest(replay), still)
     if problem is not None:
         remarks.append(problem)
     return {
@@ -180,12 +180,12 @@ def _scene(content: ReportContent, still: Path, remarks: list[str]) -> dict[str,
     }
 
 
-def _farthest_wire(replay: Rollout | None) -> np.ndarray | None:
-    """Return the first world's wire where its tip is deepest in the vessel."""
+def _farthest(replay: Rollout | None) -> list[np.ndarray]:
+    """Return the first world's wire where its tip is deepest in the vessel; nothing without a replay."""
     if replay is None or replay.shape is None or not replay.valid[0].any():
-        return None
+        return []
     depth = np.where(replay.valid[0], replay.tip.abscissa[0], -np.inf)
-    return visible_wire(replay, 0, int(np.argmax(depth)))
+    return visible_devices(replay, 0, int(np.argmax(depth)))
 
 
 def _scene_caption(anatomy: Anatomy, replay: Rollout | None) -> str:

@@ -1,4 +1,4 @@
-"""The vessel tree in space with a navigation in it, for a browser: turned by hand, replayed with a slider."""
+"""The vessel tree in space with wire and catheters in it, for a browser: turned by hand, replayed with a slider."""
 
 from __future__ import annotations
 
@@ -8,16 +8,19 @@ import numpy as np
 import plotly.graph_objects as go
 from jaxtyping import Float
 
+from endopilot.plotting import CATHETER_COLORS
 from endopilot.report.figures import section_color
 from endopilot.report.wall_mesh import wall_mesh
+from endopilot.simulation.device import Device
+from endopilot.simulation.tubes import lines_from_tips, shown_part
 from endopilot.types import Anatomy, Rollout
 
 BACKGROUND, INK, FAINT = "#0d1424", "#dfe6f2", "#31405c"
 WALL, WIRE, TIP, BELIEVED = "#d98a8a", "#f6f7fb", "#ffd34d", "#5fb8ff"
 Wires = Float[np.ndarray, "wires nodes 3"]
 
-SHOWN_BEHIND_MM = 20.0
-"""Length of wire that is shown behind the ostium, in the guiding catheter, mm."""
+_WIRE_WIDTH = 7.0
+"""Width of the wire's line, pixels; a catheter's is as much wider as its diameter."""
 
 TRAIL_S = 20.0
 """How long the path of the tip stays in the picture, s."""
@@ -34,6 +37,7 @@ def navigation_scene(
     rollout: Rollout | None = None,
     *,
     world: int = 0,
+    devices: Sequence[Device] = (),
     believed: Sequence[Wires] | None = None,
 ) -> go.Figure:
     """Return a plotly figure of the wall, the centerline by section, and one world of a rollout replayed.
@@ -42,13 +46,15 @@ def navigation_scene(
         anatomy: the vessel.
         rollout: navigations with `shape`; without one the vessel is shown alone.
         world: which of its worlds is replayed.
+        devices: the wire and the catheters of the rollout, whose names and diameters are shown; a wire alone is drawn
+            without.
         believed: wires that a policy holds possible at each sample, nodes from the tip on, LPS mm.
     """
     wall = _wall(anatomy)
     figure = go.Figure([wall, *_centerlines(anatomy)])
     figure.update_layout(_layout(np.ptp([np.asarray(axis) for axis in (wall.x, wall.y, wall.z)], axis=1)))
     if rollout is not None and rollout.shape is not None:
-        _add_navigation(figure, rollout, world, believed)
+        _add_navigation(figure, rollout, world, devices, believed)
     return figure
 
 
@@ -76,21 +82,22 @@ def mark_target(
         figure.add_trace(go.Scatter3d(x=x, y=y, z=z, mode="markers", marker=marker, name=name, **hover))
 
 
-def visible_wire(rollout: Rollout, world: int, sample: int) -> Float[np.ndarray, "nodes 3"]:
-    """Return the nodes of the wire from its tip to `SHOWN_BEHIND_MM` behind the ostium, LPS mm.
+def visible_devices(rollout: Rollout, world: int, sample: int) -> list[Float[np.ndarray, "_ 3"]]:
+    """Return the nodes of the wire, then of each catheter, from its tip to a little behind the ostium, LPS mm.
 
     Raises:
         ValueError: the rollout was made without `record_shape`.
     """
     if rollout.shape is None:
         raise ValueError("the rollout holds no wire shapes; simulate with record_shape=True")
-    return _from_tip(rollout.shape[world, sample], rollout.inserted_length[world, sample] + SHOWN_BEHIND_MM)
+    inserted = _inserted(rollout, world, sample)
+    return lines_from_tips(shown_part(rollout.shape[world, sample], float(inserted.max())), inserted)
 
 
-def _from_tip(nodes: Float[np.ndarray, "nodes 3"], length_mm: float) -> Float[np.ndarray, "shown 3"]:
-    nodes = nodes[np.isfinite(nodes).all(axis=1)]
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(nodes, axis=0), axis=1))])
-    return nodes[along <= length_mm]
+def _inserted(rollout: Rollout, world: int, sample: int) -> Float[np.ndarray, "devices"]:
+    """Return the inserted length of each device, mm."""
+    around = [] if rollout.catheters is None else rollout.catheters.inserted_length[world, sample]
+    return np.append(rollout.inserted_length[world, sample], around)
 
 
 def _wall(anatomy: Anatomy) -> go.Mesh3d:
@@ -143,15 +150,19 @@ def _centerlines(anatomy: Anatomy) -> list[go.Scatter3d]:
     return lines
 
 
-def _add_navigation(figure: go.Figure, rollout: Rollout, world: int, believed: Sequence[Wires] | None) -> None:
+def _add_navigation(
+    figure: go.Figure, rollout: Rollout, world: int, devices: Sequence[Device], believed: Sequence[Wires] | None
+) -> None:
     samples = np.flatnonzero(rollout.valid[world]).tolist()
     if not samples:
         return
     first = len(list(figure.data))
 
     def moving(sample: int) -> list[go.Scatter3d]:
-        behind = [] if believed is None else [_possible(believed[sample], rollout.inserted_length[world, sample])]
-        return [*behind, *_moving(rollout, world, sample)]
+        behind = []
+        if believed is not None:
+            behind = [_possible(believed[sample], float(_inserted(rollout, world, sample).max()))]
+        return [*behind, *_moving(rollout, world, sample, devices)]
 
     figure.add_traces(moving(samples[0]))
     traces = list(range(first, len(list(figure.data))))
@@ -200,13 +211,14 @@ def _add_navigation(figure: go.Figure, rollout: Rollout, world: int, believed: S
     )
 
 
-def _moving(rollout: Rollout, world: int, sample: int) -> list[go.Scatter3d]:
-    """Return what changes from frame to frame: wire, tip and the tip's trail."""
-    wire = np.round(visible_wire(rollout, world, sample), 2).astype(np.float32)
+def _moving(rollout: Rollout, world: int, sample: int, devices: Sequence[Device]) -> list[go.Scatter3d]:
+    """Return what changes from frame to frame: wire, catheters, the wire's tip and the tip's trail."""
+    wire, *around = (np.round(line, 2).astype(np.float32) for line in _uncovered(rollout, world, sample))
     begin = max(0, sample - round(TRAIL_S / rollout.sample_period_s))
     trail = np.round(rollout.tip_position[world, begin : sample + 1], 2).astype(np.float32)
     tip = trail[-1:]
-    label = (
+    time = f"<extra>{(sample + 1) * rollout.sample_period_s:g} s</extra>"
+    hover = (
         f"Δ = {rollout.inserted_length[world, sample]:.1f} mm<br>"
         f"φ = {np.rad2deg(rollout.rotation[world, sample]):.0f}°<br>"
         f"Δtip = {rollout.tip.abscissa[world, sample]:.1f} mm<br>"
@@ -214,27 +226,69 @@ def _moving(rollout: Rollout, world: int, sample: int) -> list[go.Scatter3d]:
         f"lumen radius = {rollout.tip.radius[world, sample]:.2f} mm<br>"
         f"largest wall force = {rollout.contact_force_max[world, sample]:.3f} N"
     )
-    hover = f"{label}<extra>{(sample + 1) * rollout.sample_period_s:g} s</extra>"
-
-    def trace(points: np.ndarray, **how: object) -> go.Scatter3d:
-        return go.Scatter3d(x=points[:, 0], y=points[:, 1], z=points[:, 2], **how)
-
+    name = "Guidewire"
+    if around:
+        name += f" {devices[0].name}"
+        hover += f"<br>push of its drive = {rollout.drive_force[world, sample]:.2f} N"
+    hover += time
+    tubes = [
+        _line(
+            line,
+            color=CATHETER_COLORS[k],
+            width=round(_WIRE_WIDTH * devices[k + 1].diameter_mm / devices[0].diameter_mm, 1),
+            name=f"Catheter {devices[k + 1].name}",
+            hovertemplate=_catheter_state(rollout, world, sample, k) + time,
+        )
+        for k, line in enumerate(around)
+    ]
+    x, y, z = tip.T
+    marker = {"color": TIP, "size": 5}
     return [
-        trace(wire, mode="lines", line={"color": WIRE, "width": 7}, name="Guidewire", hovertemplate=hover),
-        trace(trail, mode="lines", line={"color": TIP, "width": 2}, name=f"Tip, last {TRAIL_S:g} s", hoverinfo="skip"),
-        trace(tip, mode="markers", marker={"color": TIP, "size": 5}, name="Tip", hovertemplate=hover),
+        _line(wire, color=WIRE, width=_WIRE_WIDTH, name=name, hovertemplate=hover),
+        *tubes,
+        _line(trail, color=TIP, width=2.0, name=f"Tip, last {TRAIL_S:g} s", hoverinfo="skip"),
+        go.Scatter3d(x=x, y=y, z=z, mode="markers", marker=marker, name="Tip", hovertemplate=hover),
     ]
 
 
-def _possible(wires: Wires, inserted_mm: float) -> go.Scatter3d:
+def _uncovered(rollout: Rollout, world: int, sample: int) -> list[Float[np.ndarray, "_ 3"]]:
+    """Return the nodes of each device up to where the one around it ends; its tip alone if it lies within."""
+    lines, inserted = visible_devices(rollout, world, sample), _inserted(rollout, world, sample)
+    found = []
+    for k, line in enumerate(lines):
+        outer = max(range(k + 1, len(lines)), key=lambda j: inserted[j], default=None)
+        if outer is None:
+            found.append(line)
+        elif inserted[outer] >= inserted[k]:
+            found.append(line[:1])  # draws nothing, and keeps the name in the legend
+        else:
+            ahead = len(line) - len(lines[outer]) + 1  # lines share the nodes behind their tips
+            found.append(np.vstack([line[:ahead], lines[outer][:1]]))
+    return found
+
+
+def _catheter_state(rollout: Rollout, world: int, sample: int, k: int) -> str:
+    """Return how far catheter k is inserted and turned, and how its drive pushes it."""
+    motion = rollout.catheters
+    assert motion is not None
+    return (
+        f"Δ = {motion.inserted_length[world, sample, k]:.1f} mm<br>"
+        f"φ = {np.rad2deg(motion.rotation[world, sample, k]):.0f}°<br>"
+        f"push of its drive = {motion.drive_force[world, sample, k]:.2f} N"
+    )
+
+
+def _line(points: np.ndarray, *, color: str, width: float, **how: object) -> go.Scatter3d:
+    x, y, z = points.T
+    return go.Scatter3d(x=x, y=y, z=z, mode="lines", line={"color": color, "width": width}, **how)
+
+
+def _possible(wires: Wires, deepest_mm: float) -> go.Scatter3d:
     """Return the wires that a policy holds possible, as one line with gaps."""
     gap = np.full((1, 3), np.nan)
-    parts = [part for nodes in wires for part in (_from_tip(nodes, inserted_mm + SHOWN_BEHIND_MM), gap)]
-    x, y, z = np.round(np.concatenate(parts), 2).astype(np.float32).T
-    line = {"color": BELIEVED, "width": 2}
-    return go.Scatter3d(
-        x=x, y=y, z=z, mode="lines", line=line, opacity=0.5, name="Wires held possible", hoverinfo="skip"
-    )
+    parts = [part for nodes in wires for part in (shown_part(nodes, deepest_mm), gap)]
+    points = np.round(np.concatenate(parts), 2).astype(np.float32)
+    return _line(points, color=BELIEVED, width=2.0, opacity=0.5, name="Wires held possible", hoverinfo="skip")
 
 
 def _layout(size_mm: Float[np.ndarray, "3"]) -> dict:

@@ -1,4 +1,4 @@
-"""A still picture of the vessel with the wire in it, rendered by VTK without a screen, in a process of its own.
+"""A still picture of the vessel, wire and catheters in it, rendered by VTK without a screen in a process of its own.
 
 VTK aborts its process where it finds no graphics library, so it must not run in ours: `render_still` writes what is to
 be seen to a file and starts this module as a program, whose failure is then one clear line.
@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,9 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.files import writing
+from endopilot.plotting import CATHETER_COLORS
 from endopilot.report.wall_mesh import wall_mesh
+from endopilot.simulation.device import Device
 from endopilot.types import Anatomy
 
 LIBRARIES_MISSING = (
@@ -26,30 +29,37 @@ LIBRARIES_MISSING = (
 )
 SIZE = (1600, 1000)
 TIMEOUT_S = 180
+_CATHETER_OPACITY = 0.45
 
 
-def render_still(anatomy: Anatomy, wire: Float[np.ndarray, "nodes 3"] | None, path: Path) -> str | None:
-    """Render the vessel's translucent wall, its centerline and the wire to a PNG.
+def render_still(
+    anatomy: Anatomy, lines: Sequence[Float[np.ndarray, "_ 3"]], path: Path, *, devices: Sequence[Device] = ()
+) -> str | None:
+    """Render the vessel's translucent wall, its centerline, the wire and translucent catheters to a PNG.
 
     Args:
         anatomy: the vessel.
-        wire: nodes of the wire from the tip backwards, LPS mm, if one is to be shown.
+        lines: nodes of the wire, then of each catheter, from its tip backwards, LPS mm; none to show the vessel alone.
         path: where the picture goes.
+        devices: wire and catheters, which are drawn as wide as each other's diameters; needed with catheters.
 
     Returns:
         None when the picture is there; otherwise one line that says what to install.
     """
     surface = wall_mesh(anatomy.distance_map, max_triangles=400_000)
-    lines = [branch.centerline.points for branch in anatomy.tree.branches]
+    centerlines = [branch.centerline.points for branch in anatomy.tree.branches]
+    widths = [device.diameter_mm / devices[0].diameter_mm for device in devices] or [1.0] * len(lines)
     with tempfile.TemporaryDirectory() as folder:
         scene, picture = Path(folder) / "scene.npz", Path(folder) / "picture.png"
         np.savez(
             scene,
             vertices=surface.vertices,
             triangles=surface.triangles,
-            centerline=np.concatenate(lines),
-            centerline_lengths=np.array([len(line) for line in lines]),
-            wire=np.empty((0, 3)) if wire is None else wire,
+            centerline=np.concatenate(centerlines),
+            centerline_lengths=np.array([len(line) for line in centerlines]),
+            devices=np.concatenate([np.empty((0, 3)), *lines]),
+            device_lengths=np.array([len(line) for line in lines], dtype=int),
+            device_widths=np.array(widths),
         )
         command = [sys.executable, "-m", "endopilot.report.still", str(scene), str(picture)]
         try:
@@ -77,19 +87,24 @@ def _render(scene: Path, path: Path) -> None:
     plotter.add_mesh(wall, color="#e2595e", opacity=0.30, **look)
     for line in np.split(arrays["centerline"], np.cumsum(arrays["centerline_lengths"])[:-1]):
         plotter.add_mesh(pv.lines_from_points(line), color="#ffc9b8", line_width=1.5, opacity=0.55)
-    if len(arrays["wire"]) > 1:
+    lines = np.split(arrays["devices"], np.cumsum(arrays["device_lengths"]))[:-1]
+    for k, (line, width) in enumerate(zip(lines, arrays["device_widths"], strict=True)):
+        if len(line) < 2:
+            continue
         # Drawn thicker than it is, or it would not show at this scale.
-        wire: Any = pv.Spline(arrays["wire"], 4 * len(arrays["wire"]))
-        plotter.add_mesh(wire.tube(radius=0.0017 * size), color="white", ambient=0.65, smooth_shading=True)
-        tip = pv.Sphere(radius=0.005 * size, center=arrays["wire"][0])
-        plotter.add_mesh(tip, color="#ffd34d", ambient=0.5, smooth_shading=True)
+        tube: Any = pv.Spline(line, 4 * len(line)).tube(radius=0.0017 * size * width)
+        seen = {"color": CATHETER_COLORS[k - 1], "opacity": _CATHETER_OPACITY} if k else {"color": "white"}
+        plotter.add_mesh(tube, ambient=0.65, smooth_shading=True, **seen)
+        if k == 0:
+            tip = pv.Sphere(radius=0.005 * size, center=line[0])
+            plotter.add_mesh(tip, color="#ffd34d", ambient=0.5, smooth_shading=True)
     plotter.enable_depth_peeling(8)
     plotter.enable_anti_aliasing("ssaa")
     # From the front, a little from the left and above, as from someone who stands before the patient.
     centre = np.mean([arrays["vertices"].min(axis=0), arrays["vertices"].max(axis=0)], axis=0)
     plotter.camera_position = [centre + np.array([0.35, -1.0, 0.22]) * size, centre, (0.0, 0.0, 1.0)]
     plotter.reset_camera()
-    plotter.camera.zoom(0.94 / _filled(plotter.camera, np.concatenate([arrays["vertices"], arrays["wire"]])))
+    plotter.camera.zoom(0.94 / _filled(plotter.camera, np.concatenate([arrays["vertices"], arrays["devices"]])))
     plotter.screenshot(str(path))
     plotter.close()
 

@@ -15,6 +15,8 @@ from endopilot.simulation.processor import Processor, Tubes, core_for
 from endopilot.simulation.rod import POISSON_RATIO, SHEAR_CORRECTION
 from endopilot.types import Anatomy
 
+SHOWN_BEHIND_MM = 20.0
+"""Length of devices that pictures show behind the ostium, in the guiding catheter, mm."""
 _SPACING_MM = 0.25
 """Distance between the points of a profile, mm."""
 _APART_MM = 1e-6
@@ -132,11 +134,27 @@ def lines_from_tips(
         inserted_mm: inserted length of each device; the foremost tip is that of the largest.
     """
     behind = inserted_mm.max() - inserted_mm
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(nodes, axis=0), axis=1))])
+    along = _along(nodes)
     return [
         nodes if at == 0 else np.vstack([_at(nodes, along, at), nodes[along > at + _APART_MM]])
         for at in behind.tolist()
     ]
+
+
+def shown_part(nodes: Float[np.ndarray, "n 3"], deepest_mm: float) -> Float[np.ndarray, "shown 3"]:
+    """Return what pictures show of a line: from its tip to `SHOWN_BEHIND_MM` behind the ostium, LPS mm.
+
+    Args:
+        nodes: of the line, from the foremost tip on, LPS mm; NaN beyond its end.
+        deepest_mm: inserted length of the device with that tip.
+    """
+    nodes = nodes[np.isfinite(nodes).all(axis=1)]
+    return nodes[_along(nodes) <= deepest_mm + SHOWN_BEHIND_MM]
+
+
+def _along(nodes: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    """Return how far from the first node each one lies along the line, mm."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(nodes, axis=0), axis=1))])
 
 
 def _at(nodes: Float[np.ndarray, "n 3"], along: Float[np.ndarray, "n"], at_mm: float) -> Float[np.ndarray, "3"]:
