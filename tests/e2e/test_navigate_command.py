@@ -164,7 +164,9 @@ def test_the_picture_shows_wire_and_catheter(patient):
     found = navigate_patient(set_up_navigation(patient, "2", config))
     record, motion = found.record, found.rollout.catheters
     np.testing.assert_allclose(record.catheter_tip_position[1:], motion.tip_position[0], atol=1e-3)
-    assert "after 6 s the catheter's tip is in section 1 at 0.0 mm" in tell_outcome(found)
+    outcome = tell_outcome(found)
+    assert "after 6 s the catheter's tip is in section 1 at 0.0 mm" in outcome  # the wire goes first
+    assert "it was still on its course; give more --seconds" in outcome
     route, tip, _, _, pushes, translation, rotation = navigation_figure(found).axes
     names = {axes: [text.get_text() for text in axes.get_legend().get_texts()] for axes in (route, tip, pushes)}
     for shown in names[route], names[tip]:

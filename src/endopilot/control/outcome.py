@@ -62,7 +62,7 @@ def why_not(found: PatientNavigation) -> str:
         return f"the simulation failed after {record.seconds:g} s"
     route = Route.to(navigation.anatomy, navigation.target)
     tree, tip = navigation.anatomy.tree, record.tips[navigation.arriving]
-    branch, at = int(tip.branch[-1]), float(tip.abscissa[-1])
+    branch, at = int(tip.branch[-1]), round(float(tip.abscissa[-1]), 1) + 0.0  # no "-0.0"
     whose = "the catheter's tip" if navigation.arriving else "the tip"
     where = f"after {record.seconds:g} s {whose} is in section {section_at(tree, branch, at)} at {at:.1f} mm"
     departs = tree.departures(navigation.target.branch)[branch]
@@ -82,8 +82,7 @@ def _held_up(found: PatientNavigation, route: Route) -> str:
     refused, wire_came = found.set_up.choice.refused, float(route.progress(record.tip).max())
     if refused is not None and abs(wire_came - refused.abscissa) <= _AT_FORK_MM + wire.tip_bend_length_mm:
         return f"no rotation of the tip enters {refused}"
-    progress = route.progress(tip)
-    narrow = _narrowest(route, float(progress.max()), device.tip_radius_mm)
+    narrow = _narrowest(route, float(route.progress(tip).max()), device.tip_radius_mm)
     if narrow is not None:
         at, width = narrow
         what = "catheter" if navigation.arriving else "wire"
@@ -94,8 +93,9 @@ def _held_up(found: PatientNavigation, route: Route) -> str:
             return f"the {caught} is caught; the drive slipped at its limit of {each.push_limit_n:g} N {slipped} times"
     if route.off_route(tip)[-1] > 0:
         return "it took another branch"
-    still = min(round(_STILL_S / DECISION_PERIOD_S), len(progress) - 1)
-    if progress[-1] - progress[-1 - still] > _STILL_MM:
+    still = min(round(_STILL_S / DECISION_PERIOD_S), len(record.time_s) - 1)
+    progress = [route.progress(each) for each in record.tips[: navigation.arriving + 1]]
+    if any(each[-1] - each[-1 - still] > _STILL_MM for each in progress):
         return "it was still on its course; give more --seconds"
     if found.plans is not None and found.plans > 1:
         return f"none of {found.plans} searched courses led on"
