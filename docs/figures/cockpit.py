@@ -12,18 +12,19 @@ import io
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from PIL import Image
-from playwright.sync_api import sync_playwright
+from playwright.sync_api import Page, ViewportSize, sync_playwright
 
 from endopilot.anatomy.io import write_anatomy
 from endopilot.benchmarks.cockpit import BROWSER_FLAGS, find_browser, serving, wait_for
 from endopilot.tasks.task import reference_navigation
 
 IMAGES = Path(__file__).parents[1] / "images"
-SIZE, SMALL = {"width": 1280, "height": 760}, (720, 428)
+SIZE, SMALL = ViewportSize(width=1280, height=760), (720, 428)
 FRAMES, EVERY_S = 26, 0.6
 CATHETER, WIRE_MM, CATHETER_MM = "microcatheter-2.4f", 62.0, 40.0
 
@@ -35,35 +36,42 @@ def main() -> None:
         makers[name]()
 
 
-def catheter() -> None:
-    """Push the wire, then the catheter, and look at both."""
+@contextmanager
+def opened(catheter: str | None = None) -> Iterator[Page]:
+    """Serve the cockpit in the reference patient, with a catheter if one is named, and give its page in a browser."""
     with tempfile.TemporaryDirectory() as name, sync_playwright() as driver:
         folder = Path(name)
         write_anatomy(reference_navigation().anatomy, folder / "patient")
         browser = driver.chromium.launch(executable_path=find_browser(), args=list(BROWSER_FLAGS))
         page = browser.new_page(viewport=SIZE)
-        with serving(folder / "patient", folder / "recordings", CATHETER) as address:
+        with serving(folder / "patient", folder / "recordings", catheter) as address:
             page.goto(address)
             wait_for(page, "window.cockpit?.shown?.xray.background === 'phantom' && cockpit.shown.xray.ready")
-            page.evaluate("() => cockpit.connection.send('c_arm', { zoom: 1.75 })")
-            wait_for(page, "cockpit.shown.xray.zoom === 1.75 && cockpit.shown.xray.ready")
-            hold(page, "KeyC", "cockpit.shown.xray.contrast > 0.9")
-            hold(page, "KeyX", "cockpit.shown.xray.has_roadmap")
-            page.check("#roadmap")
-            hold(page, "KeyW", f"cockpit.shown.inserted_mm > {WIRE_MM}")
-            page.keyboard.press("KeyQ")
-            hold(page, "KeyW", f"cockpit.shown.catheters[0].inserted_mm > {CATHETER_MM}")
-            wait_for(page, "cockpit.shown.xray.contrast === 0")
-            hold(page, "KeyX", "cockpit.shown.xray.age_s < 0.05 && cockpit.shown.xray.on")
-            page.click("text=to the tip")
-            nearer = "const c = cockpit.space; c.camera.position.lerp(c.controls.target, 0.55); c.controls.update();"
-            page.evaluate(f"() => {{ {nearer} }}")
-            time.sleep(1.5)
-            page.screenshot(path=IMAGES / "cockpit-catheter.png")
+            yield page
         browser.close()
 
 
-def hold(page: Any, key: str, script: str) -> None:
+def catheter() -> None:
+    """Push the wire, then the catheter, and look at both."""
+    with opened(CATHETER) as page:
+        page.evaluate("() => cockpit.connection.send('c_arm', { zoom: 1.75 })")
+        wait_for(page, "cockpit.shown.xray.zoom === 1.75 && cockpit.shown.xray.ready")
+        hold(page, "KeyC", "cockpit.shown.xray.contrast > 0.9")
+        hold(page, "KeyX", "cockpit.shown.xray.has_roadmap")
+        page.check("#roadmap")
+        hold(page, "KeyW", f"cockpit.shown.inserted_mm > {WIRE_MM}")
+        page.keyboard.press("KeyQ")
+        hold(page, "KeyW", f"cockpit.shown.catheters[0].inserted_mm > {CATHETER_MM}")
+        wait_for(page, "cockpit.shown.xray.contrast === 0")
+        hold(page, "KeyX", "cockpit.shown.xray.age_s < 0.05 && cockpit.shown.xray.on")
+        page.click("text=to the tip")
+        nearer = "const c = cockpit.space; c.camera.position.lerp(c.controls.target, 0.55); c.controls.update();"
+        page.evaluate(f"() => {{ {nearer} }}")
+        time.sleep(1.5)
+        page.screenshot(path=IMAGES / "cockpit-catheter.png")
+
+
+def hold(page: Page, key: str, script: str) -> None:
     """Hold a key, fast, until an expression is true; press it again where a busy machine made the page fall silent."""
     page.keyboard.down("Shift")
     page.keyboard.down(key)
@@ -79,33 +87,25 @@ def hold(page: Any, key: str, script: str) -> None:
 
 def agent() -> None:
     """Let the agent drive, take pictures, and write them."""
-    with tempfile.TemporaryDirectory() as name, sync_playwright() as driver:
-        folder = Path(name)
-        write_anatomy(reference_navigation().anatomy, folder / "patient")
-        browser = driver.chromium.launch(executable_path=find_browser(), args=list(BROWSER_FLAGS))
-        page = browser.new_page(viewport=SIZE)
-        with serving(folder / "patient", folder / "recordings") as address:
-            page.goto(address)
-            wait_for(page, "window.cockpit?.shown?.xray.background === 'phantom' && cockpit.shown.xray.ready")
-            page.evaluate("() => cockpit.space.look(-20, -8)")
-            page.select_option("#autopilot-target", "4")
-            page.keyboard.down("KeyX")
-            page.keyboard.press("KeyC")
-            time.sleep(1.5)
-            page.keyboard.up("KeyX")
-            page.screenshot(path=IMAGES / "cockpit-contrast.png")
-            page.check("#roadmap")
-            page.click("#autopilot-start")
-            shots, best = [], None
-            for _ in range(FRAMES):
-                shots.append(page.screenshot())
-                tip = page.evaluate("() => cockpit.shown.tip_mm")
-                best = shots[-1] if best is None or tip < 80 else best
-                if page.evaluate("() => cockpit.shown.autopilot.status") == "reached":
-                    break
-                time.sleep(EVERY_S)
+    with opened() as page:
+        page.evaluate("() => cockpit.space.look(-20, -8)")
+        page.select_option("#autopilot-target", "4")
+        page.keyboard.down("KeyX")
+        page.keyboard.press("KeyC")
+        time.sleep(1.5)
+        page.keyboard.up("KeyX")
+        page.screenshot(path=IMAGES / "cockpit-contrast.png")
+        page.check("#roadmap")
+        page.click("#autopilot-start")
+        shots, best = [], None
+        for _ in range(FRAMES):
             shots.append(page.screenshot())
-        browser.close()
+            tip = page.evaluate("() => cockpit.shown.tip_mm")
+            best = shots[-1] if best is None or tip < 80 else best
+            if page.evaluate("() => cockpit.shown.autopilot.status") == "reached":
+                break
+            time.sleep(EVERY_S)
+        shots.append(page.screenshot())
     assert best is not None
     (IMAGES / "cockpit.png").write_bytes(best)
     small = [Image.open(io.BytesIO(shot)).convert("RGB").resize(SMALL, Image.Resampling.LANCZOS) for shot in shots]
