@@ -7,9 +7,10 @@ as the policy believed it to be.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -36,6 +37,7 @@ from endopilot.tasks.navigation import DECISION_PERIOD_S, Arrives, Navigation
 from endopilot.types import Anatomy, CatheterMotion, Rollout, TipProjection
 from endopilot.xray.fluoroscope import Fluoroscope
 
+_Samples = TypeVar("_Samples", bound=Rollout | CatheterMotion | TipProjection)
 MotionKnown = Literal["nothing", "published", "exact"]
 _Factor = Annotated[float, Within(0.2, 5)]
 
@@ -249,7 +251,7 @@ def navigate_patient(set_up: SetUp) -> PatientNavigation:
     return PatientNavigation(
         set_up=set_up,
         record=record,
-        rollout=_first(shown, whole),
+        rollout=_each_sample(shown, lambda values: values[:, :whole]),
         cycles=replace(cycles, shape=None),
         wires=tuple(wires) if wires else None,
         plans=getattr(policy, "plans", None),
@@ -318,61 +320,49 @@ def sampled(cycles: Rollout) -> Rollout:
     """Return a rollout of a drive's cycles, which divide a decision period, as it is recorded at each period's end."""
     step = round(DECISION_PERIOD_S / cycles.sample_period_s)
 
-    def at_end(values: np.ndarray) -> np.ndarray:
-        return values[:, step - 1 :: step]
+    def gathered(motion: Rollout | CatheterMotion) -> dict[str, np.ndarray]:
+        """Return what is a mean or a sum over the cycles of each period."""
+        names = [name for name in _GATHERED if hasattr(motion, name)]
+        parts = {name: getattr(motion, name) for name in names}
+        return {
+            name: _GATHERED[name](part.reshape(part.shape[0], -1, step, *part.shape[2:]), axis=2)
+            for name, part in parts.items()
+        }
 
-    def together(values: np.ndarray) -> np.ndarray:
-        return values.reshape(values.shape[0], -1, step, *values.shape[2:])
-
-    names = [f.name for f in fields(Rollout) if f.name not in (*_WHOLE, *_APART)]
-    shape = None if cycles.shape is None else at_end(cycles.shape)
-    placed = cycles.vessel_to_laboratory
-    tip = TipProjection(**{f.name: at_end(getattr(cycles.tip, f.name)) for f in fields(TipProjection)})
-    catheters = cycles.catheters
-    if catheters is not None:
-        catheters = CatheterMotion(
-            control=together(catheters.control).mean(axis=2),
-            slip=together(catheters.slip).sum(axis=2),
-            rotation_slip=together(catheters.rotation_slip).sum(axis=2),
-            **{f.name: at_end(getattr(catheters, f.name)) for f in fields(CatheterMotion) if f.name not in _WHOLE},
-        )
-    return replace(
-        cycles,
-        catheters=catheters,
-        vessel_to_laboratory=None if placed is None else placed[step - 1 :: step],
-        **{name: at_end(getattr(cycles, name)) for name in names},
-        sample_period_s=DECISION_PERIOD_S,
-        control=together(cycles.control).mean(axis=2),
-        slip=together(cycles.slip).sum(axis=2),
-        rotation_slip=together(cycles.rotation_slip).sum(axis=2),
-        iterations=together(cycles.iterations).mean(axis=2),
-        node_iterations=together(cycles.node_iterations).sum(axis=2),
-        tip=tip,
-        shape=shape,
-    )
+    ends = _each_sample(cycles, lambda values: values[:, step - 1 :: step])
+    if cycles.catheters is not None and ends.catheters is not None:
+        ends = replace(ends, catheters=replace(ends.catheters, **gathered(cycles.catheters)))
+    return replace(ends, sample_period_s=DECISION_PERIOD_S, **gathered(cycles))
 
 
-_WHOLE = (
-    "sample_period_s", "initial_inserted_length", "initial_rotation", "reason",
-    "control", "slip", "rotation_slip", "iterations", "node_iterations",
-)  # fmt: skip
-"""What a rollout holds once a world, or what is gathered over the cycles of a period."""
-_APART = ("tip", "shape", "catheters", "vessel_to_laboratory")
-"""What it holds otherwise, or not at all."""
+_GATHERED = {
+    "control": np.mean,
+    "slip": np.sum,
+    "rotation_slip": np.sum,
+    "iterations": np.mean,
+    "node_iterations": np.sum,
+}
+"""What a sample tells of its period, not of its end, and how it follows from the cycles."""
+_PER_WORLD = ("sample_period_s", "initial_inserted_length", "initial_rotation", "reason")
+"""What a rollout holds once, or once a world."""
 
 
-def _first(rollout: Rollout, samples: int) -> Rollout:
-    names = [f.name for f in fields(Rollout) if f.name not in (*_WHOLE[:4], *_APART)]
-    tip = TipProjection(**{f.name: getattr(rollout.tip, f.name)[:, :samples] for f in fields(TipProjection)})
-    shape = None if rollout.shape is None else rollout.shape[:, :samples]
-    placed, catheters = rollout.vessel_to_laboratory, rollout.catheters
-    if catheters is not None:
-        catheters = CatheterMotion(**{f.name: getattr(catheters, f.name)[:, :samples] for f in fields(CatheterMotion)})
-    return replace(
-        rollout,
-        **{name: getattr(rollout, name)[:, :samples] for name in names},
-        tip=tip,
-        catheters=catheters,
-        shape=shape,
-        vessel_to_laboratory=None if placed is None else placed[:samples],
-    )
+def _each_sample(record: _Samples, take: Callable[[np.ndarray], np.ndarray]) -> _Samples:
+    """Return a rollout, or a part of one, with some of its samples.
+
+    Args:
+        record: all of them.
+        take: chooses of an array with a row a world and a column a sample.
+    """
+
+    def chosen(name: str) -> Any:
+        value = getattr(record, name)
+        if value is None or name in _PER_WORLD:
+            return value
+        if isinstance(value, TipProjection | CatheterMotion):
+            return _each_sample(value, take)
+        if name == "vessel_to_laboratory":  # that of all worlds
+            return take(value[None])[0]
+        return take(value)
+
+    return replace(record, **{field.name: chosen(field.name) for field in fields(record)})
