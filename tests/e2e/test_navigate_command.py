@@ -129,6 +129,7 @@ def test_a_catheter_follows_its_wire_and_both_are_written(patient, capsys, tmp_p
     assert sorted(path.name for path in folder.iterdir()) == sorted({*FILES, "catheter-1.yaml"})
     table = pd.read_csv(folder / "navigation.csv")
     assert table["catheter_1_inserted_length_mm"].iloc[-1] > 0.8 * figures["target_mm"]
+    assert abs(table["catheter_1_tip_abscissa_mm"].iloc[-1] - figures["target_mm"]) <= 2.0
     given, true = read_catheter("microcatheter-1.7f"), read_catheter(folder / "catheter-1.yaml")
     episode = load_dataset(folder / "episode")
     lengths = episode.catheter_inserted_length[0, : len(table) - 1, 0]
@@ -142,7 +143,7 @@ def test_a_catheter_follows_its_wire_and_both_are_written(patient, capsys, tmp_p
     )
     assert again["valid_worlds"] == 1
     motion = pd.read_csv(tmp_path / "again.csv")
-    for name in ("tip_z_mm", "inserted_length_mm", "catheter_1_inserted_length_mm"):
+    for name in ("tip_z_mm", "inserted_length_mm", "catheter_1_inserted_length_mm", "catheter_1_tip_z_mm"):
         count = len(table) - 1
         np.testing.assert_allclose(motion[name][9::10][:count], table[name][1:], atol=1e-4, err_msg=name)
     page = (folder / "navigation.html").read_text(encoding="utf-8")

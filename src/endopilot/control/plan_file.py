@@ -9,17 +9,18 @@ column                                            meaning
 time_s                                            end of the period, s
 translation_mm_s, rotation_rad_s                  control π over the period
 inserted_length_mm, rotation_rad                  Δ and φ at its end
+tip_abscissa_mm, tip_offset_mm, branch            where the rod core has the tip under these controls
+lumen_radius_mm                                   lumen radius r there
+tip_x_mm, tip_y_mm, tip_z_mm                      the tip in space, LPS
 desired_tip_abscissa_mm, desired_tip_offset_mm    desired Δtip and γtip
 predicted_tip_abscissa_mm, …_offset_mm            those that the method's model predicts
-tip_abscissa_mm, tip_offset_mm, branch            where the rod core has the tip under these controls
-tip_x_mm, tip_y_mm, tip_z_mm                      likewise, LPS
-lumen_radius_mm, safety_ratio, contact_force_n    lumen radius r there, γ/(r − r_w), largest wall force on one node
+safety_ratio, contact_force_n                     γ/(r − r_w), largest wall force on one node
 xray                                              1 where an exposure will be due at the end of the period, else 0
 band_tip_abscissa_mm, band_tip_offset_mm          half-widths of the adviser's bands around the prediction
 ================================================  ====================================================================
 
-The last three are there if the plan holds X-ray. A plan for wire and catheter has columns `catheter_1_...` too:
-translation, rotation, inserted length and rotation, tip and lumen radius of the catheter.
+The last three are there if the plan holds X-ray. A plan for wire and catheter has columns `catheter_1_...` before them:
+those from the translation to the tip in space, of the catheter.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ import numpy as np
 import pandas as pd
 
 from endopilot.anatomy.catheter_axis import with_axis
+from endopilot.control.columns import device_columns
 from endopilot.control.plan_config import Plan, PlanConfig
 from endopilot.control.plan_xray import PlannedXray
 from endopilot.control.set_up import tip_name
@@ -48,12 +50,6 @@ from endopilot.types import Anatomy, TipProjection
 
 _CATHETER = "catheter_1_"
 _TABLE, _RECORD, PICTURE = "plan.csv", "manifest.json", "plan.png"
-_COLUMNS = (
-    "time_s", "translation_mm_s", "rotation_rad_s", "inserted_length_mm", "rotation_rad",
-    "desired_tip_abscissa_mm", "desired_tip_offset_mm", "predicted_tip_abscissa_mm", "predicted_tip_offset_mm",
-    "tip_abscissa_mm", "tip_offset_mm", "branch", "tip_x_mm", "tip_y_mm", "tip_z_mm",
-    "lumen_radius_mm", "safety_ratio", "contact_force_n",
-)  # fmt: skip
 
 
 def write_plan(plan: Plan, folder: Path, xray: PlannedXray | None = None) -> dict[str, Any]:
@@ -73,13 +69,6 @@ def write_plan(plan: Plan, folder: Path, xray: PlannedXray | None = None) -> dic
     if folder.exists() and not (folder.is_dir() and ((folder / _TABLE).exists() or not any(folder.iterdir()))):
         raise InputError(f"{folder}: exists and is not a plan; choose another output folder")
     navigation, tip = plan.navigation, plan.simulated
-    values = np.column_stack(
-        [
-            DECISION_PERIOD_S * np.arange(1, len(plan.control) + 1), plan.control[:, :2], plan.proximal[:, :2],
-            plan.desired, plan.predicted, tip.abscissa, tip.offset, tip.branch, plan.position, tip.radius, plan.ratio,
-            plan.force,
-        ]
-    )  # fmt: skip
     figures = {
         "method": plan.config.method,
         "tip": tip_name(navigation.device),
@@ -101,15 +90,7 @@ def write_plan(plan: Plan, folder: Path, xray: PlannedXray | None = None) -> dic
         figures["xray_due_s"] = (DECISION_PERIOD_S * (1 + np.flatnonzero(xray.exposure))).tolist()
     with writing(folder) as partial:
         partial.mkdir()
-        table = pd.DataFrame(values, columns=list(_COLUMNS))
-        table["branch"] = table["branch"].astype(int)
-        if plan.catheter_tip is not None and plan.catheter_position is not None:
-            for name, values in _of_catheter(plan, plan.catheter_tip, plan.catheter_position).items():
-                table[f"{_CATHETER}{name}"] = values
-        if xray is not None:
-            table["xray"] = xray.exposure.astype(int)
-            table["band_tip_abscissa_mm"], table["band_tip_offset_mm"] = xray.half_width.T
-        table.to_csv(partial / _TABLE, index=False)
+        _table(plan, xray).to_csv(partial / _TABLE, index=False)
         draw_plan(plan, partial / PICTURE, xray)
         record = manifest(
             config=plan.config,
@@ -132,19 +113,25 @@ def write_plan(plan: Plan, folder: Path, xray: PlannedXray | None = None) -> dic
     return {"plan": str(folder), **figures}
 
 
-def _of_catheter(plan: Plan, tip: TipProjection, position: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the columns of the catheter."""
-    return {
-        "translation_mm_s": plan.control[:, 2],
-        "rotation_rad_s": plan.control[:, 3],
-        "inserted_length_mm": plan.proximal[:, 2],
-        "rotation_rad": plan.proximal[:, 3],
-        "tip_abscissa_mm": tip.abscissa,
-        "tip_offset_mm": tip.offset,
-        "branch": tip.branch,
-        "lumen_radius_mm": tip.radius,
-        **{f"tip_{axis}_mm": position[:, k] for k, axis in enumerate("xyz")},
+def _table(plan: Plan, xray: PlannedXray | None) -> pd.DataFrame:
+    """Return a row for the end of each sample period."""
+    columns: dict[str, Any] = {
+        "time_s": DECISION_PERIOD_S * np.arange(1, len(plan.control) + 1),
+        **device_columns(0, plan.control[:, :2], plan.proximal[:, :2], plan.simulated, plan.position),
+        "desired_tip_abscissa_mm": plan.desired[:, 0],
+        "desired_tip_offset_mm": plan.desired[:, 1],
+        "predicted_tip_abscissa_mm": plan.predicted[:, 0],
+        "predicted_tip_offset_mm": plan.predicted[:, 1],
+        "safety_ratio": plan.ratio,
+        "contact_force_n": plan.force,
     }
+    if plan.catheter_tip is not None and plan.catheter_position is not None:
+        moved = plan.control[:, 2:], plan.proximal[:, 2:], plan.catheter_tip, plan.catheter_position
+        columns |= device_columns(1, *moved)
+    if xray is not None:
+        columns["xray"] = xray.exposure.astype(int)
+        columns["band_tip_abscissa_mm"], columns["band_tip_offset_mm"] = xray.half_width.T
+    return pd.DataFrame(columns)
 
 
 def read_plan(folder: Path, anatomy: Anatomy, device: Device, catheters: Sequence[Catheter] = ()) -> Plan:

@@ -14,6 +14,7 @@ import pandas as pd
 from endopilot import __version__
 from endopilot.anatomy.io import write_anatomy
 from endopilot.anatomy.projection import safety_ratio
+from endopilot.control.columns import device_columns
 from endopilot.control.navigate_patient import (
     NavigatePatientConfig,
     PatientNavigation,
@@ -124,19 +125,12 @@ def navigation_table(found: PatientNavigation) -> pd.DataFrame:
     nothing = np.full((count, 2), np.nan)
     believed = nothing if record.believed is None else record.believed
     band = nothing if record.half_width is None else record.half_width
+    proximal = np.column_stack([record.inserted_length, record.rotation])
     columns: dict[str, Any] = {
         "time_s": record.time_s,
-        "translation_mm_s": record.control[:, 0],
-        "rotation_rad_s": record.control[:, 1],
-        "inserted_length_mm": record.inserted_length,
-        "rotation_rad": record.rotation,
-        "tip_abscissa_mm": tip.abscissa,
-        "tip_offset_mm": tip.offset,
-        "branch": tip.branch,
+        **device_columns(0, record.control[:, :2], proximal, tip, record.tip_position),
         "section": [section_at(tree, branch, at) for branch, at in places],
-        "lumen_radius_mm": tip.radius,
         "safety_ratio": safety_ratio(tip.offset, tip.radius, navigation.device.tip_radius_mm),
-        **{f"tip_{axis}_mm": record.tip_position[:, i] for i, axis in enumerate("xyz")},
         "contact_force_n": record.contact_force_max,
         "xray": record.exposed.astype(int),
         "measured_tip_abscissa_mm": np.array(measured)[:, 0],
@@ -147,13 +141,10 @@ def navigation_table(found: PatientNavigation) -> pd.DataFrame:
         "band_tip_offset_mm": band[:, 1],
         "asks_for_xray": list(record.asks),
     }
-    for k in range(len(navigation.catheters)):
-        columns |= {
-            f"catheter_{k + 1}_translation_mm_s": record.control[:, 2 * k + 2],
-            f"catheter_{k + 1}_rotation_rad_s": record.control[:, 2 * k + 3],
-            f"catheter_{k + 1}_inserted_length_mm": record.catheter_inserted_length[:, k],
-            f"catheter_{k + 1}_rotation_rad": record.catheter_rotation[:, k],
-        }
+    for k, catheter_tip in enumerate(record.catheter_tips, start=1):
+        proximal = np.column_stack([record.catheter_inserted_length[:, k - 1], record.catheter_rotation[:, k - 1]])
+        control, position = record.control[:, 2 * k : 2 * k + 2], record.catheter_tip_position[:, k - 1]
+        columns |= device_columns(k, control, proximal, catheter_tip, position)
     return pd.DataFrame(columns)
 
 
