@@ -229,6 +229,7 @@ def test_the_hand_takes_the_catheter_and_both(context, vessel, tmp_path):
         until(page, "cockpit.shown.velocity.every((v) => v === 0)")
         assert value(page, "cockpit.shown.inserted_mm") == pytest.approx(wire, abs=0.2)
         says(page, "#figures", "microcatheter-1.7f")
+        says(page, "#figures", ", microcatheter-1.7f ")  # where its tip is
         page.click("#holds button:last-child")
         says(page, "#holds .on", "both")
         hold(page, "KeyS", "cockpit.shown.catheters[0].inserted_mm < 3")

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -31,6 +30,7 @@ from endopilot.simulation.device import read_device
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target
 from endopilot.tasks.task import CORE, find_task
+from endopilot.types import Anatomy
 
 FRAME_S = 0.05
 """Time from one frame of a film to the next, s."""
@@ -204,7 +204,7 @@ def _controls(
     return Film(navigation, len(control) * period_s, title, make)
 
 
-def _rollout(path: Path, anatomy: Any, device: str, catheters: Sequence[str], world: int) -> Film:
+def _rollout(path: Path, anatomy: Anatomy, device: str, catheters: Sequence[str], world: int) -> Film:
     """Return a film of a rollout's or script's controls."""
     script = read_controls_csv(path, catheters=len(catheters))
     worlds = len(script.control)

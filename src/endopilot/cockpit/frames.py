@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from endopilot.cockpit.world import Snapshot
+from endopilot.cockpit.world import ShownCatheter, Snapshot
 from endopilot.tasks.navigation import Navigation, Target
 from endopilot.types import Anatomy
 
@@ -55,7 +55,7 @@ def decode(message: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     return header, arrays
 
 
-def wire_arrays(snapshot: Snapshot) -> dict[str, np.ndarray]:
+def device_arrays(snapshot: Snapshot) -> dict[str, np.ndarray]:
     """Return what the page needs to draw wire and catheters: nodes of each, LPS mm, and the wall's force there, N."""
     arrays = {"nodes": snapshot.nodes.astype("<f4"), "node_force": snapshot.node_force.astype("<f4")}
     for number, catheter in enumerate(snapshot.catheters, start=1):
@@ -64,25 +64,35 @@ def wire_arrays(snapshot: Snapshot) -> dict[str, np.ndarray]:
     return arrays
 
 
-def catheter_values(snapshot: Snapshot, ostium_mm: float = 0.0) -> dict[str, Any]:
-    """Return how far catheters are inserted and turned, for the page's figures; nothing for a wire alone.
+def motion_values(snapshot: Snapshot, ostium_mm: float = 0.0) -> dict[str, Any]:
+    """Return how far wire and catheters are inserted and turned, and what their drives do, for the page's figures.
 
     Args:
         snapshot: the world.
         ostium_mm: how much deeper they truly are than the drives' encoders say, mm.
     """
-    shown = [
-        {
-            "inserted_mm": round(catheter.inserted_mm - ostium_mm, 3),
-            "rotation_deg": round(float(np.rad2deg(catheter.rotation)), 2),
+
+    def place(device: Snapshot | ShownCatheter) -> dict[str, float]:
+        return {
+            "inserted_mm": round(device.inserted_mm - ostium_mm, 3),
+            "rotation_deg": round(float(np.rad2deg(device.rotation)), 2),
         }
-        for catheter in snapshot.catheters
-    ]
-    return {"catheters": shown} if shown else {}
+
+    catheters = [place(catheter) for catheter in snapshot.catheters]
+    return {
+        "cycle": snapshot.cycle,
+        "time_s": round(snapshot.time_s, 4),
+        **place(snapshot),
+        **({"catheters": catheters} if catheters else {}),
+        "velocity": snapshot.velocity,
+        "drive_load": snapshot.drive_load,
+        "slip": snapshot.slip,
+        "valid": snapshot.valid,
+    }
 
 
 def tip_values(anatomy: Anatomy, snapshot: Snapshot) -> dict[str, Any]:
-    """Return where the tip is and what the wall does to the wire, for the page's figures."""
+    """Return where the tips are and what the wall does to the devices, for the page's figures."""
     branch = int(snapshot.tip.branch[0])
     line, labels = anatomy.tree.branches[branch].centerline, anatomy.tree.branches[branch].section
     nearest = int(np.abs(line.abscissa - snapshot.tip.abscissa[0]).argmin())
@@ -128,8 +138,10 @@ def scene(navigation: Navigation, about: dict[str, Any]) -> bytes:
         "parents": [branch.parent for branch in anatomy.tree.branches],
         "sections": [{"label": label, "name": names[label]} for label in present],
         "ostium": anatomy.insertion.position.round(3).tolist(),
-        "catheter_direction": anatomy.insertion.direction.round(5).tolist(),
-        "catheter_radius_mm": float(anatomy.catheter_radius_mm),
+        "guiding_catheter": {
+            "direction": anatomy.insertion.direction.round(5).tolist(),
+            "radius_mm": float(anatomy.catheter_radius_mm),
+        },
     }
     if navigation.catheters:
         header["catheters"] = [

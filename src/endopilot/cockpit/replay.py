@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from endopilot.cockpit import messages
 from endopilot.cockpit.film import FRAME_S, Film
 from endopilot.cockpit.fluoroscopy import XrayUnit
-from endopilot.cockpit.frames import catheter_values, encode, target_values, tip_values, wire_arrays
+from endopilot.cockpit.frames import device_arrays, encode, motion_values, target_values, tip_values
 from endopilot.errors import InputError
 
 
@@ -63,7 +61,7 @@ class ReplayStage:
                 images = self._xray.expose(frame.snapshot)
             self._shown = self.at
             sent = [(f"image{number}", image) for number, image in enumerate(images or [])]
-        sent.append(("state", encode("state", self._values(), **wire_arrays(frame.snapshot))))
+        sent.append(("state", encode("state", self._values(), **device_arrays(frame.snapshot))))
         if self.playing and self.at + 1 < len(self.film.frames):
             self.at += 1
         elif self.playing and self.film.done:
@@ -83,17 +81,9 @@ class ReplayStage:
         anatomy = film.navigation.anatomy
         return {
             "mode": "replay",
-            "cycle": snapshot.cycle,
-            "time_s": round(snapshot.time_s, 4),
-            "inserted_mm": round(snapshot.inserted_mm, 3),
-            "rotation_deg": round(float(np.rad2deg(snapshot.rotation)), 2),
-            **catheter_values(snapshot),
+            **motion_values(snapshot),
             "command": snapshot.velocity,
-            "velocity": snapshot.velocity,
-            "drive_load": snapshot.drive_load,
-            "slip": snapshot.slip,
             "stopped": "",
-            "valid": snapshot.valid,
             "peak_force_n": round(film.frames[self.at].peak_n, 4),
             "sight": True,
             "target": target_values(anatomy, film.navigation.target),

@@ -15,11 +15,12 @@ import numpy as np
 from endopilot.cockpit import messages
 from endopilot.cockpit.autopilot import Autopilot, check_policy
 from endopilot.cockpit.fluoroscopy import XrayUnit
-from endopilot.cockpit.frames import catheter_values, encode, target_values, tip_values, wire_arrays
+from endopilot.cockpit.frames import device_arrays, encode, motion_values, target_values, tip_values
 from endopilot.cockpit.recording import Recorder
 from endopilot.cockpit.world import Snapshot, World
 from endopilot.errors import InputError
 from endopilot.tasks.navigation import Target
+from endopilot.types import VesselTree
 
 SILENCE_S = 0.2
 """The drive stops after this time without a message from whose hand drives, s."""
@@ -152,7 +153,7 @@ class Session:
 
     def state(self, snapshot: Snapshot) -> bytes:
         """Return the message that shows the world as it is."""
-        arrays = wire_arrays(snapshot) if self.sight else {}
+        arrays = device_arrays(snapshot) if self.sight else {}
         return encode("state", self.values(snapshot), **arrays)
 
     def values(self, snapshot: Snapshot) -> dict[str, Any]:
@@ -160,17 +161,9 @@ class Session:
         anatomy, ostium_mm = self.world.navigation.anatomy, self.world.config.truth.ostium_mm
         shown = {
             "mode": "drive",
-            "cycle": snapshot.cycle,
-            "time_s": round(snapshot.time_s, 4),
-            "inserted_mm": round(snapshot.inserted_mm - ostium_mm, 3),
-            "rotation_deg": round(float(np.rad2deg(snapshot.rotation)), 2),
-            **catheter_values(snapshot, ostium_mm),
+            **motion_values(snapshot, ostium_mm),
             "command": self._command,
-            "velocity": snapshot.velocity,
-            "drive_load": snapshot.drive_load,
-            "slip": snapshot.slip,
             "stopped": self._stopped,
-            "valid": snapshot.valid,
             "peak_force_n": round(self.world.peak_force_n, 4),
             "sight": self.sight,
             "reserve": round(self.world.reserve, 1),
@@ -286,7 +279,7 @@ def _images(images: list[bytes]) -> list[tuple[str, bytes]]:
     return [(f"image{number}", image) for number, image in enumerate(images)]
 
 
-def middle_of_section(tree: Any, section: str) -> Target:
+def middle_of_section(tree: VesselTree, section: str) -> Target:
     """Return the place half along a section, in the branch that holds most of it.
 
     Raises:

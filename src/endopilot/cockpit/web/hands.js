@@ -13,11 +13,12 @@ export class Hands {
   constructor(connection, devices, drives, policyDrives, wake) {
     this.connection = connection;
     this.devices = devices;
-    this.hold(0);
     this.wake = wake;
     this.drives = drives;
     this.policyDrives = policyDrives;
     this.held = new Set();
+    this.choice = 0;
+    this.addChoices();
     this.pedalHeld = new Set();
     this.sent = this.rest();
     this.pedalSent = false;
@@ -44,26 +45,29 @@ export class Hands {
 
   /** Take another device into the hand; keys that are pressed are let go, so that they do not move it. */
   hold(choice) {
-    this.held?.clear();
+    this.held.clear();
     this.choice = choice % this.choices().length;
+    this.showHeld();
+  }
+
+  /** Add a button for each choice. */
+  addChoices() {
+    const label = document.createElement("span");
+    label.innerHTML = "in hand <kbd>Q</kbd>";
+    this.choiceButtons = this.choices().map((name, choice) => {
+      const button = document.createElement("button");
+      button.textContent = name;
+      button.onclick = () => { this.hold(choice); button.blur(); };
+      return button;
+    });
+    document.getElementById("holds").append(label, ...this.choiceButtons);
     this.showHeld();
   }
 
   /** Show what the hand holds, if there is a choice and a hand. */
   showHeld(driven = true) {
-    const bar = document.getElementById("holds");
-    bar.hidden = this.devices.length === 1 || !driven;
-    if (!bar.children.length) {
-      const label = document.createElement("span");
-      label.innerHTML = "in hand <kbd>Q</kbd>";
-      bar.append(label, ...this.choices().map((name, choice) => {
-        const button = document.createElement("button");
-        button.textContent = name;
-        button.onclick = () => { this.hold(choice); button.blur(); };
-        return button;
-      }));
-    }
-    [...bar.children].slice(1).forEach((button, choice) => button.classList.toggle("on", choice === this.choice));
+    document.getElementById("holds").hidden = this.devices.length === 1 || !driven;
+    this.choiceButtons.forEach((button, choice) => button.classList.toggle("on", choice === this.choice));
   }
 
   button(id, event, act) {

@@ -76,12 +76,18 @@ function placesOf(state) {
   return Object.fromEntries(rows);
 }
 
+/** Where the wire's tip is, and how far along the vessel those of catheters are. */
+function tipsOf(state) {
+  const around = (state.catheter_tips_mm ?? []).map((at, k) => `, ${devices()[k + 1].name} ${at.toFixed(1)} mm`);
+  return `${state.section}, ${state.tip_mm.toFixed(1)} mm${around.join("")}`;
+}
+
 function showFigures(state) {
   const slips = state.slip.some((value) => Math.abs(value) > 1e-6);
   list("figures", {
     time: `${state.time_s.toFixed(1)} s`,
     ...placesOf(state),
-    tip: state.sight ? `${state.section}, ${state.tip_mm.toFixed(1)} mm` : "hidden",
+    tip: state.sight ? tipsOf(state) : "hidden",
     "peak force": state.sight ? `${state.peak_force_n.toFixed(3)} N` : "hidden",
     state: !state.valid ? "simulation failed" : slips ? "the drive slips" : state.stopped === "silence" ? "stopped: 200 ms without a message; let the keys go if it stays so" : state.stopped ? `stopped: ${state.stopped}` : "ready",
   });

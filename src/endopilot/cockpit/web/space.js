@@ -1,7 +1,7 @@
-// The 3-D view: translucent lumen, centerlines with the names of their sections, wire, target, believed wires.
+// The 3-D view: translucent lumen, centerlines with the names of their sections, wire, catheters, target, believed wires.
 import * as THREE from "three";
 import { OrbitControls } from "./vendor/OrbitControls.js";
-import { Wire } from "./wire.js";
+import { Tube } from "./tube.js";
 
 const LUMEN_VERTEX = `
   varying vec3 vNormal;
@@ -47,11 +47,11 @@ export class Space {
     this.controls.enableDamping = false;
     this.controls.addEventListener("change", () => { this.changed = true; });
     this.changed = true;
-    this.wire = new Wire(scene.diameter_mm, scene.force_limit_n);
-    this.catheters = (scene.catheters ?? []).map((one) => new Wire(one.diameter_mm, scene.force_limit_n, true));
+    this.wire = new Tube(scene.diameter_mm, scene.force_limit_n);
+    this.catheters = (scene.catheters ?? []).map((one) => new Tube(one.diameter_mm, scene.force_limit_n, true));
     for (const tube of [this.wire, ...this.catheters]) this.scene.add(tube.mesh);
     this.addLumen(scene);
-    this.addCatheter(scene);
+    this.addGuidingCatheter(scene);
     this.addCenterlines(scene);
     this.target = ring("#59c08b");
     this.scene.add(this.target);
@@ -80,15 +80,16 @@ export class Space {
     this.controls.target.copy(this.centre);
   }
 
-  addCatheter(scene) {
-    const length = 25, radius = scene.catheter_radius_mm + 0.25;
+  /** Show the end of the guiding catheter, which holds the devices in the ostium and does not move. */
+  addGuidingCatheter({ ostium, guiding_catheter: { direction, radius_mm } }) {
+    const length = 25, radius = radius_mm + 0.25;
     const tube = new THREE.Mesh(
       new THREE.CylinderGeometry(radius, radius, length, 20, 1, true),
       new THREE.MeshLambertMaterial({ color: "#5f7396", transparent: true, opacity: 0.35, side: THREE.DoubleSide, depthWrite: false }),
     );
-    const axis = new THREE.Vector3(...scene.catheter_direction);
+    const axis = new THREE.Vector3(...direction);
     tube.quaternion.setFromUnitVectors(new THREE.Vector3(0, 1, 0), axis);
-    tube.position.set(...scene.ostium).addScaledVector(axis, -length / 2);
+    tube.position.set(...ostium).addScaledVector(axis, -length / 2);
     tube.renderOrder = 2;
     this.scene.add(tube);
   }

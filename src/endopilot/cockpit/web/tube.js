@@ -2,7 +2,7 @@
 import * as THREE from "three";
 
 const SIDES = 8;
-const PIECES = 2; // between two nodes; a catheter, which bends less, has one
+const PIECES = 2; // of a wire between two nodes; a catheter, which bends less, has one
 const MOST = 1600; // rings
 
 const COLD = new THREE.Color("#f6f7fb");
@@ -11,8 +11,8 @@ const CATHETER_OPACITY = 0.6; // the wire is seen in it
 const WARM = new THREE.Color("#ffd34d");
 const HOT = new THREE.Color("#ff2d1a");
 
-/** A tube whose rings follow the nodes that `set` is given; a catheter's is seen through. */
-export class Wire {
+/** A wire or a catheter, whose rings follow the nodes that `set` is given; a catheter is seen through. */
+export class Tube {
   constructor(diameter, forceScale, isCatheter = false) {
     this.cold = isCatheter ? CATHETER : COLD;
     this.pieces = isCatheter ? 1 : PIECES;
@@ -42,7 +42,7 @@ export class Wire {
     this.tip = new THREE.Vector3();
   }
 
-  /** Show the wire with these nodes (x, y, z one after the other), tip first, and the force of the wall at each. */
+  /** Show the tube with these nodes (x, y, z one after the other), tip first, and the force of the wall at each. */
   set(nodes, force) {
     const count = nodes.length / 3;
     const point = (i) => new THREE.Vector3(nodes[3 * i], nodes[3 * i + 1], nodes[3 * i + 2]);
@@ -84,7 +84,7 @@ export class Wire {
 }
 
 /** Return the colour of a force, given as a share of the largest that is safe; `cold` is that of none. */
-export function forceColor(share, cold = COLD) {
+function forceColor(share, cold) {
   const color = new THREE.Color();
   return share < 0.5 ? color.lerpColors(cold, WARM, Math.max(0, 2 * share)) : color.lerpColors(WARM, HOT, Math.min(1, 2 * share - 1));
 }
