@@ -1,7 +1,8 @@
 """Write the pictures and tables of docs/navigation.md.
 
-The first part drives the agent in a synthetic patient. The second needs what `make cta` leaves in `runs/cta-thorax`; it
-pushes the J wire without a policy, at first rotations all around, to see where it goes.
+The first part drives the agent in a synthetic patient, and the coaxial agent with a catheter too. The second needs what
+`make cta` leaves in `runs/cta-thorax`; it pushes the J wire without a policy, at first rotations all around, to see
+where it goes.
 """
 
 from __future__ import annotations
@@ -27,15 +28,19 @@ BLIND_END_MM = 80.0
 def main() -> None:
     """Write what can be written."""
     command = [sys.executable, "-m", "endopilot.cli"]
-    patients, output = ROOT / "runs" / "patients", ROOT / "runs" / "navigation"
+    patients = ROOT / "runs" / "patients"
     if not (patients / "lca-41-0000").exists():
         subprocess.run([*command, "atlas", "-o", patients, "--anatomy", "lca", "--seed", "41"], check=True)
-    subprocess.run(
-        [*command, "navigate", patients / "lca-41-0000", "--target", "12", "--mismatch", "0.2", "-o", output],
-        check=True,
-    )
-    shutil.copyfile(output / "navigation.png", IMAGES / "navigation.png")
-    _replace("outcome", f"    {read_json(output / 'manifest.json')['figures']['outcome']}")
+    navigate = [*command, "navigate", patients / "lca-41-0000", "--target", "12", "--mismatch", "0.2"]
+    pair = ("--catheter", "microcatheter-2.4f", "--arrives", "catheter", "--policy", "coaxial-agent")
+    for options, folder, picture, part in (
+        ((), "navigation", "navigation.png", "outcome"),
+        (pair, "pair", "navigation-pair.png", "pair"),
+    ):
+        output = ROOT / "runs" / folder
+        subprocess.run([*navigate, *options, "-o", output], check=True)
+        shutil.copyfile(output / "navigation.png", IMAGES / picture)
+        _replace(part, f"    {read_json(output / 'manifest.json')['figures']['outcome']}")
     if (CTA / "navigation" / "manifest.json").exists():
         _replace("dissection", _dissection())
 

@@ -170,9 +170,9 @@ def test_the_picture_shows_wire_and_catheter(patient):
     assert "it was still on its course; give more --seconds" in outcome
     route, tip, _, _, pushes, translation, rotation = navigation_figure(found).axes
     names = {axes: [text.get_text() for text in axes.get_legend().get_texts()] for axes in (route, tip, pushes)}
-    for shown in names[route], names[tip]:
-        assert {"wire's tip", "tip of microcatheter-1.7f"} < set(shown)
-    line = tip.lines[names[tip].index("tip of microcatheter-1.7f")]
+    assert {"wire's tip", "tip of microcatheter-1.7f"} < set(names[route])
+    assert names[tip][:2] == ["wire's tip", "catheter's tip"]
+    line = tip.lines[1]
     np.testing.assert_array_equal(line.get_ydata(), record.catheter_tips[0].abscissa)
     assert names[pushes] == ["workhorse-014", "microcatheter-1.7f"]
     np.testing.assert_array_equal(pushes.lines[1].get_ydata(), motion.drive_force[0, :, 0])

@@ -124,7 +124,7 @@ def _draw_xray(plan: Plan, xray: PlannedXray, time_s: np.ndarray, panels: list[A
 
 def legend_above(axes: Axes) -> None:
     """Put the legend in a row above a panel, where it covers no curve."""
-    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=8, fontsize=8, frameon=False, borderaxespad=0.1)
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=7, fontsize=8, frameon=False, borderaxespad=0.1)
 
 
 def _draw_safety(plan: Plan, time_s: np.ndarray, axes: Axes) -> None:

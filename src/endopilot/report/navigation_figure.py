@@ -70,8 +70,9 @@ def _draw_tip(axes: Axes, found: PatientNavigation) -> None:
         axes.fill_between(time_s, middle - half, middle + half, color=ORANGE, alpha=0.25, linewidth=0, label="band")
     around = found.set_up.navigation.catheters
     axes.plot(time_s, record.tip.abscissa, color=BLUE, label="wire's tip" if around else "true")
-    for catheter, color, tip in zip(around, CATHETER_COLORS, record.catheter_tips, strict=False):
-        axes.plot(time_s, tip.abscissa, color=color, label=f"tip of {catheter.name}")
+    names = ("catheter's tip", "outer catheter's tip")
+    for name, color, tip in zip(names, CATHETER_COLORS, record.catheter_tips, strict=False):
+        axes.plot(time_s, tip.abscissa, color=color, label=name)
     off = Route.to(navigation.anatomy, navigation.target).off_route(record.tip) > 0
     if off.any():
         axes.plot(time_s[off], record.tip.abscissa[off], "x", color=VERMILLION, label="in a wrong branch")
