@@ -6,6 +6,10 @@ from unittest.mock import patch
 
 import pytest
 
+from shape_checks import check_quickly
+
+check_quickly()
+
 
 @pytest.fixture(scope="session")
 def toy_dataset(tmp_path_factory):

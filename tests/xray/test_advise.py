@@ -116,7 +116,7 @@ class Errs:
         pass
 
 
-class Straight:
+class Straight(monitoring.Lumen):
     """A lumen of one radius."""
 
     def __init__(self, radius_mm: float) -> None:
