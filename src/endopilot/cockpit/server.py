@@ -12,6 +12,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from time import monotonic
 from urllib.parse import urlsplit
 
 from starlette.applications import Starlette
@@ -168,14 +169,13 @@ class Cockpit:
                     await socket.send_bytes(page.waiting.pop(channel))
 
     async def _receive(self, socket: WebSocket, page: _Page) -> None:
-        clock = asyncio.get_running_loop().time
-        began, count = clock(), 0
+        began, count = monotonic(), 0
         while socket.client_state == WebSocketState.CONNECTED:
             incoming = await socket.receive()
             if incoming["type"] == "websocket.disconnect":
                 return
-            if clock() - began > 1.0:
-                began, count = clock(), 0
+            if monotonic() - began > 1.0:
+                began, count = monotonic(), 0
             count += 1
             if count > MOST_PER_SECOND:
                 await socket.close(BUSY, "too many messages")
