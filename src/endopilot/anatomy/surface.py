@@ -86,29 +86,18 @@ class Surface:
 
     def refined(self, edge_mm: float) -> Surface:
         """Return the same wall with triangles whose edges are no longer than `edge_mm`, by halving the longest."""
-        vertices, faces = [self.vertices], self.faces
-        count = len(self.vertices)
+        vertices, faces = self.vertices, self.faces
         done: list[np.ndarray] = []
-        everything = self.vertices
         while len(faces):
-            corners = everything[faces]
+            corners = vertices[faces]
             squares = np.stack([_edge_squares(corners, i) for i in range(3)], axis=1)
             long = squares.max(axis=1) > edge_mm**2
             done.append(faces[~long])
-            faces, squares = faces[long], squares[long]
-            if len(faces) == 0:
+            if not long.any():
                 break
-            longest = squares.argmax(axis=1)
-            rows = np.arange(len(faces))
-            one, two, opposite = faces[rows, longest], faces[rows, (longest + 1) % 3], faces[rows, (longest + 2) % 3]
-            edges, inverse = np.unique(np.sort(np.stack([one, two], axis=1), axis=1), axis=0, return_inverse=True)
-            middle = everything[edges].mean(axis=1)
-            new = count + inverse.reshape(-1)
-            vertices.append(middle)
-            everything = np.concatenate([everything, middle])
-            count += len(middle)
-            faces = np.concatenate([np.stack([one, new, opposite], axis=1), np.stack([new, two, opposite], axis=1)])
-        return Surface(np.concatenate(vertices), np.concatenate(done))
+            faces, middle = _halved(faces[long], squares[long].argmax(axis=1), vertices)
+            vertices = np.concatenate([vertices, middle])
+        return Surface(vertices, np.concatenate(done))
 
     def inside(
         self, shape: tuple[int, int, int], origin: Float[np.ndarray, "3"], spacing_mm: float
@@ -199,6 +188,18 @@ def _finer(values: Float[np.ndarray, "a b c"], axis: int, factor: int) -> Float[
     size = values.shape[axis]
     weights = CubicSpline(np.arange(size), np.eye(size))(np.linspace(0.0, size - 1.0, factor * size))
     return np.moveaxis(np.tensordot(weights.astype(values.dtype), values, axes=(1, axis)), 0, axis)
+
+
+def _halved(
+    faces: Int[np.ndarray, "m 3"], longest: Int[np.ndarray, "m"], vertices: Float[np.ndarray, "n 3"]
+) -> tuple[Int[np.ndarray, "halves 3"], Float[np.ndarray, "edges 3"]]:
+    """Return triangles split at the middles of their longest edges, and these middles, which follow the vertices."""
+    rows = np.arange(len(faces))
+    one, two, opposite = faces[rows, longest], faces[rows, (longest + 1) % 3], faces[rows, (longest + 2) % 3]
+    edges, inverse = np.unique(np.sort(np.stack([one, two], axis=1), axis=1), axis=0, return_inverse=True)
+    new = len(vertices) + inverse.reshape(-1)
+    halves = np.concatenate([np.stack([one, new, opposite], axis=1), np.stack([new, two, opposite], axis=1)])
+    return halves, vertices[edges].mean(axis=1)
 
 
 def _edge_squares(corners: Float[np.ndarray, "m 3 3"], edge: int) -> Float[np.ndarray, "m"]:

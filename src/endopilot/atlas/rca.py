@@ -7,10 +7,11 @@ the artery and the origins of branches, measured on sixteen manually segmented r
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from jaxtyping import Float
@@ -209,7 +210,8 @@ def _main_vessel(generator: np.random.Generator, targets: _Targets) -> tuple[Flo
         found = (shape.abscissa(points)[-1], shape.tortuosity(points), shape.curvature(points).mean())
         return np.log(np.array(found) / wanted)
 
-    solution = root(misfit, np.array([np.log(length / keep) - 0.05, 0.0, 0.5]), tol=1e-3, options={"maxfev": 60})
+    solve = cast("Callable[..., Any]", root)  # what it returns without stubs takes type checkers half a minute to infer
+    solution = solve(misfit, np.array([np.log(length / keep) - 0.05, 0.0, 0.5]), tol=1e-3, options={"maxfev": 60})
     points = curve(np.clip(solution.x, (-1, -2, -4), (1, 2, 3)))
     if np.abs(misfit(solution.x)).max() > 0.01 or shape.curvature(points).max() > 0.28:
         raise NoShape
