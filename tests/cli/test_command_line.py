@@ -84,6 +84,11 @@ def test_info_is_json_and_imports_nothing_heavy() -> None:
     assert json.loads(result.stdout)["endopilot"]
 
 
+def test_a_missing_input_is_reported_in_one_line_by_a_process(tmp_path: Path) -> None:
+    assert_one_line(run("run", "missing.nii.gz", "-o", "out", cwd=tmp_path), "missing")
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -94,11 +99,17 @@ def test_info_is_json_and_imports_nothing_heavy() -> None:
         ("dataset", "missing", "-o", "out"),
         ("train", "missing", "-o", "out"),
         ("evaluate", "missing", "-o", "out"),
-        ("run", "missing.nii.gz", "-o", "out"),
     ],
 )
-def test_a_missing_input_is_reported_in_one_line(arguments: tuple[str, ...], tmp_path: Path) -> None:
-    assert_one_line(run(*arguments, cwd=tmp_path), "missing")
+def test_a_missing_input_is_reported_in_one_line(
+    arguments: tuple[str, ...], tmp_path: Path, monkeypatch, capsys
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as leaving:
+        main(list(arguments))
+    told = capsys.readouterr()
+    assert leaving.value.code == 2 and told.out == ""
+    assert len(told.err.strip().splitlines()) == 1 and "missing" in told.err, told.err
     assert list(tmp_path.iterdir()) == []
 
 

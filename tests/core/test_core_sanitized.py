@@ -13,7 +13,7 @@ HERE = Path(__file__).parent
 SOURCES = Path(__file__).parents[2] / "src" / "core"
 SANITIZERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 WARNINGS = ("-Wall", "-Wextra", "-Wno-psabi")
-FLAGS = ("-std=gnu++20", "-O1", "-g", "-march=native", "-ffp-contract=off", *WARNINGS, *SANITIZERS)
+FLAGS = ("-std=gnu++20", "-O1", "-g1", "-march=native", "-ffp-contract=off", *WARNINGS, *SANITIZERS)
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,8 @@ import subprocess
 import sys
 import time
 
+import command
+
 from endopilot import __version__
 from endopilot.files import read_json
 from endopilot.pipeline.study import DemoConfig
@@ -21,8 +23,8 @@ STAGES = ["atlas", "phantom", "segmentation", "anatomy", "navigation", "dataset"
 
 def test_killed_and_started_again_it_ends_with_a_report(tmp_path):
     folder = tmp_path / "demo"
-    command = [sys.executable, "-m", "endopilot.cli", "demo", "-o", str(folder), *SIZE]
-    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as first:
+    line = [sys.executable, "-m", "endopilot.cli", "demo", "-o", str(folder), *SIZE]
+    with subprocess.Popen(line, stderr=subprocess.DEVNULL) as first:
         deadline = time.monotonic() + 300
         while not (folder / "stages.json").exists():  # written as the first stage ends
             assert first.poll() is None and time.monotonic() < deadline
@@ -32,7 +34,7 @@ def test_killed_and_started_again_it_ends_with_a_report(tmp_path):
     assert not (folder / "report.html").exists()
     before = {path: path.stat().st_mtime_ns for path in (folder / "truth").rglob("*.json")}
 
-    again = subprocess.run([*command, "--json"], capture_output=True, encoding="utf-8", timeout=600)
+    again = subprocess.run([*line, "--json"], capture_output=True, encoding="utf-8", timeout=600)
     assert again.returncode == 0, again.stderr
     assert {path: path.stat().st_mtime_ns for path in before} == before  # finished work is not done twice
 
@@ -56,13 +58,13 @@ def test_killed_and_started_again_it_ends_with_a_report(tmp_path):
     assert partial == []
 
     finished = (folder / "report.html").stat().st_mtime_ns
-    third = subprocess.run([*command, "--json"], capture_output=True, encoding="utf-8", timeout=120)
+    third = subprocess.run([*line, "--json"], capture_output=True, encoding="utf-8", timeout=120)
     assert third.returncode == 0, third.stderr
     assert json.loads(third.stdout) == json.loads(again.stdout)
     assert (folder / "report.html").stat().st_mtime_ns == finished
 
 
-def test_settings_that_the_packaged_networks_do_not_fit_are_refused(tmp_path):
+def test_settings_that_the_packaged_networks_do_not_fit_are_refused(tmp_path, capsys):
     for arguments, message in (
         (
             ("demo", "--device", "j-035"),
@@ -71,13 +73,11 @@ def test_settings_that_the_packaged_networks_do_not_fit_are_refused(tmp_path):
         (("demo", "--training-seconds", "-1"), "training_seconds: -1.0; give a number of 0 or more"),
         (("run", "ct.nii.gz", "--training-seconds", "-1"), "training_seconds: -1.0; give a number of 0 or more"),
     ):
-        command = [sys.executable, "-m", "endopilot.cli", *arguments, "-o", str(tmp_path / "out")]
-        result = subprocess.run(command, capture_output=True, text=True)
-        assert result.returncode == 2 and message in result.stderr
+        assert message in command.refused(capsys, *arguments, "-o", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
-def test_another_size_in_the_same_folder_is_refused(tmp_path):
+def test_another_size_in_the_same_folder_is_refused(tmp_path, capsys):
     claim(
         tmp_path,
         "endopilot demo",
@@ -86,8 +86,5 @@ def test_another_size_in_the_same_folder_is_refused(tmp_path):
         version=__version__,
     )
     (tmp_path / "stages.json").write_text("{}")
-    command = [sys.executable, "-m", "endopilot.cli", "demo", "-o", str(tmp_path), *SIZE]
-    result = subprocess.run(command, capture_output=True, text=True)
-    assert result.returncode == 2
-    assert len(result.stderr.strip().splitlines()) == 1
-    assert "was begun with config.sequences = 60, now it is 6" in result.stderr
+    line = command.refused(capsys, "demo", "-o", tmp_path, *SIZE)
+    assert "was begun with config.sequences = 60, now it is 6" in line
