@@ -9,8 +9,9 @@ INSTALLED := $(VENV)/.installed
 demo: $(INSTALLED)
 	$(BIN)/endopilot demo
 
+# Written bytecode spares the processes that tests start from compiling the package, each by itself.
 test: $(INSTALLED)
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
+	OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
 # Wheel from sdist, installed into an environment of its own; the tests run against it, with no source of the package near.
 CLEAN := build/test-wheel
@@ -110,8 +111,10 @@ $(INSTALLED): pyproject.toml constraints.txt CMakeLists.txt $(wildcard src/core/
 	$(PYTHON) -c 'import sys; sys.exit("endopilot needs Python 3.11 or newer; name one: make PYTHON=python3.12 demo" if sys.version_info < (3, 11) else 0)'
 	@command -v c++ >/dev/null || { echo "endopilot needs a C++ compiler: apt install g++" >&2; exit 2; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install -q -c constraints.txt torch
-	$(BIN)/python -m pip install -q -c constraints.txt -e '.[dev]'
+	$(BIN)/python -m pip install -q --no-compile -c constraints.txt torch
+	$(BIN)/python -m pip install -q --no-compile -c constraints.txt -e '.[dev]'
+	@# on all cores, where pip compiles on one; some packages hold files that are no Python of this version
+	$(BIN)/python -m compileall -qq -j 0 $(VENV)/lib || true
 	touch $@
 
 clean:
