@@ -7,7 +7,7 @@ namespace endopilot {
 
 constexpr int kMaxRejections = 12;
 constexpr int kTurnabout = 10;         // iterations after which friction's tangent and its secant take turns
-constexpr int kSnapIterations = 5;   // times max_iterations that the shortest step may take: a snap takes many at any step
+constexpr int kSnapIterations = 25;   // times max_iterations that the shortest step may take: a snap takes many at any step
 constexpr double kBackInside = 0.02;    // of a move that left the map, that is tried next
 constexpr double kLeastOfMove = 1e-4, kMostOfMove = 0.7;   // of a move that raised the energy, that is tried next
 constexpr double kMostPower = 8;         // of the share, that the energy is taken to grow with beyond its slope

@@ -96,8 +96,8 @@ class Stack:
 
     @property
     def push_limit_n(self) -> float:
-        """Largest push limit of the devices, N."""
-        return max(device.push_limit_n for device in self.devices)
+        """What all drives together can push with, N: it sizes the wall's stiffness."""
+        return sum(device.push_limit_n for device in self.devices)
 
     @property
     def constants(self) -> tuple[Any, ...]:
