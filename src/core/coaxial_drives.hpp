@@ -2,8 +2,8 @@
 #pragma once
 
 #include <algorithm>
-#include <limits>
 
+#include "bounds.hpp"
 #include "stepper.hpp"
 
 namespace endopilot {
@@ -144,59 +144,6 @@ typename Stepper<V, T>::DriveEnergy Stepper<V, T>::tube_drive_energy(const Lane&
     return e;
 }
 
-// Solves h s = -g for those s that are not held; a held one is given by s = -off. Returns whether their part of h is positive definite.
-template <int N>
-bool solve_with_held(const double (&h)[N][N], const double (&g)[N], const double (&off)[N], const bool (&held)[N], double (&s)[N]) {
-    double a[N][N];
-    for (int r = 0; r < N; ++r) {
-        s[r] = held[r] ? -off[r] : -g[r];
-        for (int c = 0; c < N; ++c) {
-            a[r][c] = held[r] ? double(r == c) : held[c] ? 0.0 : h[r][c];
-            if (!held[r] && held[c]) s[r] += h[r][c] * off[c];
-        }
-    }
-    for (int r = 0; r < N; ++r) {
-        if (!(a[r][r] > 0)) return false;
-        for (int below = r + 1; below < N; ++below) {
-            const double f = a[below][r] / a[r][r];
-            for (int c = r; c < N; ++c) a[below][c] -= f * a[r][c];
-            s[below] -= f * s[r];
-        }
-    }
-    for (int r = N - 1; r >= 0; --r) {
-        for (int c = r + 1; c < N; ++c) s[r] -= a[r][c] * s[c];
-        s[r] /= a[r][r];
-    }
-    return true;
-}
-
-// The least g·s + ½ s·h s with side * (off + s) <= 0; s = -off where side is 0. Tries which unknowns its bounds hold: none, as a rule.
-// Returns whether h is positive definite.
-template <int N>
-bool bounded_minimum(const double (&h)[N][N], const double (&g)[N], const int (&side)[N], const double (&off)[N], double (&least)[N]) {
-    double lowest = std::numeric_limits<double>::infinity();
-    for (int bounds = 0; bounds < 1 << N; ++bounds) {
-        bool held[N], within = true;
-        for (int r = 0; r < N; ++r) {
-            held[r] = side[r] == 0 || (bounds >> r & 1);
-            within = within && (side[r] != 0 || !(bounds >> r & 1));  // those that do not slip are held once
-        }
-        double s[N], value = 0;
-        if (!within) continue;
-        if (!solve_with_held(h, g, off, held, s)) return false;
-        for (int r = 0; r < N; ++r) {
-            within = within && (held[r] || side[r] * (off[r] + s[r]) <= 0);
-            value += g[r] * s[r];
-            for (int c = 0; c < N; ++c) value += 0.5 * h[r][c] * s[r] * s[c];
-        }
-        if (!within || !(value < lowest)) continue;
-        lowest = value;
-        std::copy(s, s + N, least);
-        if (bounds == 0) break;
-    }
-    return true;
-}
-
 // Newton's step of the drives that slip: the advance of the leading one and the rotation of each. As solve_drive.
 template <class V, int T>
 bool Stepper<V, T>::solve_tube_drives(int l) {
@@ -205,7 +152,7 @@ bool Stepper<V, T>::solve_tube_drives(int l) {
     constexpr int N = 2 + T;
     const DriveBlock& d = drive_;
     const double damping = get(damping_, l);
-    double h[N][N] = {}, g[N] = {}, off[N], step[N];
+    double h[N][N] = {}, g[N] = {}, off[N], step[N] = {};
     int side[N];
     g[1] = get(d.gradient_r, l);
     h[0][0] = get(d.aa, l) + damping;

@@ -1,5 +1,5 @@
 // Tests of the core's telescoping tubes: the energy of a joint against finite differences, the block solver with further unknowns
-// against a dense product, and joints that a tube's end passes.
+// against a dense product, joints that a tube's end passes, and drives at their bounds.
 #include <cmath>
 #include <cstdio>
 #include <cstdlib>
@@ -7,6 +7,7 @@
 #include <string>
 #include <vector>
 
+#include "bounds.hpp"
 #include "solve.hpp"
 #include "tubes.hpp"
 
@@ -259,9 +260,55 @@ void test_sine_and_cosine() {
     }
 }
 
+// Karush, Kuhn and Tucker: with q = g + h s, q is 0 where s is free, and points out of the bound where that holds it. Bounds that
+// hold one unknown often free another, so that those which Newton's full step would pass are not those that are held.
+void test_bounded_minimum() {
+    constexpr int N = 4;
+    int held_by_bounds = 0, freed = 0;
+    for (int trial = 0; trial < 400; ++trial) {
+        double root[N][N], h[N][N], g[N], off[N], s[N] = {9e9, 9e9, 9e9, 9e9}, newton[N];
+        int side[N];
+        const bool none[N] = {};
+        for (auto& row : root)
+            for (double& each : row) each = uniform(-1, 1);
+        for (int r = 0; r < N; ++r) {
+            side[r] = int(generator() % 3) - 1;
+            off[r] = -side[r] * uniform(0, 0.5);
+            g[r] = uniform(-1, 1);
+            for (int c = 0; c < N; ++c) {
+                h[r][c] = r == c ? 0.02 : 0.0;
+                for (int k = 0; k < N; ++k) h[r][c] += root[r][k] * root[c][k];
+            }
+        }
+        expect(solve_with_held(h, g, off, none, newton), "a positive definite matrix");
+        expect(bounded_minimum(h, g, side, off, s), "a positive definite matrix");
+        for (int r = 0; r < N; ++r) {
+            double q = g[r], scale = std::abs(g[r]);
+            for (int c = 0; c < N; ++c) q += h[r][c] * s[c], scale += std::abs(h[r][c] * s[c]);
+            const double beyond = side[r] * (off[r] + s[r]);
+            if (side[r] == 0) {
+                expect(s[r] == -off[r], "a drive that grips");
+            } else if (beyond == 0) {
+                expect(side[r] * q <= 1e-9 * scale, "a bound holds what would pass it");
+                ++held_by_bounds;
+            } else {
+                expect(beyond < 0, "within its bound");
+                expect_near(q, 0, 1e-9 * scale, "the gradient where none holds");
+                freed += side[r] * (off[r] + newton[r]) > 0;
+            }
+        }
+    }
+    expect(held_by_bounds > 100 && freed > 10, "cases that tell");
+    const double saddle[2][2] = {{1, 2}, {2, 1}}, g[2] = {}, off[2] = {};
+    const int side[2] = {1, 1};
+    double s[2];
+    expect(!bounded_minimum(saddle, g, side, off, s), "a saddle is told");
+}
+
 }  // namespace
 
 int main() {
+    test_bounded_minimum();
     test_sine_and_cosine();
     test_partly_covered_joint();
     test_joint_energy<1>(0.3, 0.0, 1.0);
