@@ -1,13 +1,14 @@
-"""Calibrate the X-ray adviser of the ladder's `agent`: `python benchmarks/agent_calibration.py [XRAY] [--write]`.
+"""Calibrate the X-ray adviser of the ladder's agents: `python benchmarks/agent_calibration.py [KIND] [--write]`.
 
 The agent navigates in training patients of every task of the ladder. Friction, tip stiffness and ostium differ from
 its model by up to the spread of its ensemble. There is one exposure every 10 s; in between, its predictions are
 compared with the truth. In some patients of each task the spread is fitted, and in the next the bands are scaled. Some
-that the ladder is scored on test whether the bands hold. With XRAY `assumed`, the default, exposures have the assumed
+that the ladder is scored on test whether the bands hold. With KIND `assumed`, the default, exposures have the assumed
 errors and patients lie at rest. With `images` the tip is found in X-ray images of patients whose pose is registered,
 in the coronary tasks, and heart and breath move each patient by amplitudes of their own, of which the published mean
-is known; the bands of `assumed` are scaled anew. runs/agent-calibration-XRAY gets one file a navigation; an
-interrupted run goes on with the others.
+is known; the bands of `assumed` are scaled anew. With `coaxial` the coaxial agent drives wire and catheter in the
+coaxial tasks, as in `assumed` otherwise. runs/agent-calibration-KIND gets one file a navigation; an interrupted run
+goes on with the others.
 
 With `--write` the calibration goes into the package, and the figures into docs/xray.md.
 """
@@ -15,14 +16,15 @@ With `--write` the calibration goes into the package, and the figures into docs/
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 
-from endopilot.control.agent import CALIBRATED, CALIBRATIONS, AgentConfig, AgentPolicy
+from endopilot.control.agent import CALIBRATED, CALIBRATIONS, AdviserInput, AgentConfig, AgentPolicy
+from endopilot.control.coaxial_agent import COAXIAL_CALIBRATED, CoaxialAgent, CoaxialAgentConfig
 from endopilot.control.mismatch import ModelMismatch
 from endopilot.control.navigate import NavigateConfig, navigate
 from endopilot.control.policy import Decision, Observation
@@ -31,29 +33,78 @@ from endopilot.files import read_json, write_json
 from endopilot.ladder.ladder import identity
 from endopilot.runs import claim, make_missing
 from endopilot.simulation.motion import Motion, motion_named
-from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, XrayKind
-from endopilot.tasks.task import CORE, NEWEST, Task, find_task, ladder_tasks
+from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
+from endopilot.tasks.task import CORE, NEWEST, LadderVersion, Task, find_task, ladder_tasks
 from endopilot.xray.bands import Calibration, balanced, conformal_scale, fit_spread, spread_of
 
 ROOT = Path(__file__).parents[1]
 RUNS = ROOT / "runs"
-ROLES: dict[XrayKind, dict[str, range]] = {
-    "assumed": {"fit": range(4), "calibrate": range(4, 9), "test": range(3)},
-    "images": {"calibrate": range(2)},
-}
-"""Places of the patients in the task's lists: in the training list, and for the test in the ladder's."""
-ANATOMIES: dict[XrayKind, tuple[str, ...]] = {
-    "assumed": ("rca", "lca", "cerebral", "arch", "portal"),
-    "images": ("rca", "lca"),
-}
-PLACES = {"assumed": ("agent", "the ladder's tasks"), "images": ("agent-images", "the ladder's coronary tasks")}
-"""Mark of the table in docs/xray.md, and whose patients they are."""
 LEVEL, EXPOSED_EVERY, SECONDS = 0.9, 20, 30.0
 """Share of the intervals that the bands shall cover; periods of 0.5 s between exposures; seconds of a navigation."""
 
 
-class Monitored(AgentPolicy):
-    """The agent with exposures at fixed times; it keeps every prediction."""
+@dataclass(frozen=True)
+class Kind:
+    """What is calibrated.
+
+    Attributes:
+        policy: name of the agent in the ladder.
+        config: its settings.
+        version: of the ladder; `tasks` are those of it that count.
+        roles: places of the patients in a task's lists: in the training list, and for the test in the ladder's.
+        folder: where the calibration goes in the package.
+        mark: of the table in docs/xray.md.
+        whose: whose patients they are, in words.
+    """
+
+    policy: str
+    config: AgentConfig | CoaxialAgentConfig
+    version: LadderVersion
+    tasks: list[Task]
+    roles: dict[str, range]
+    folder: Path
+    mark: str
+    whose: str
+
+
+KINDS = {
+    "assumed": Kind(
+        policy="agent",
+        config=AgentConfig(),
+        version=NEWEST,
+        tasks=ladder_tasks(),
+        roles={"fit": range(4), "calibrate": range(4, 9), "test": range(3)},
+        folder=CALIBRATIONS["assumed"],
+        mark="agent",
+        whose="the ladder's tasks",
+    ),
+    "images": Kind(
+        policy="agent",
+        config=AgentConfig(),
+        version=NEWEST,
+        tasks=[task for task in ladder_tasks() if task.anatomy in ("rca", "lca")],
+        roles={"calibrate": range(2)},
+        folder=CALIBRATIONS["images"],
+        mark="agent-images",
+        whose="the ladder's coronary tasks",
+    ),
+    "coaxial": Kind(
+        policy="coaxial-agent",
+        config=CoaxialAgentConfig(),
+        version="coaxial",
+        tasks=ladder_tasks("coaxial"),
+        roles={"fit": range(3), "calibrate": range(3, 7), "test": range(3)},
+        folder=COAXIAL_CALIBRATED,
+        mark="agent-coaxial",
+        whose="the ladder's coaxial tasks",
+    ),
+}
+
+
+class _Monitored:
+    """A policy with exposures at fixed times; it keeps every prediction."""
+
+    adviser_input: Callable[[], AdviserInput]
 
     def start(self, navigation: Navigation, seed: int) -> None:
         """Begin a navigation without predictions."""
@@ -72,9 +123,17 @@ class Monitored(AgentPolicy):
         return (len(self.kept) + 1) % EXPOSED_EVERY == 0
 
 
-def truth_of(task: Task, place: int, role: str, xray: XrayKind) -> ModelMismatch:
+class MonitoredAgent(_Monitored, AgentPolicy):
+    """The agent, monitored."""
+
+
+class MonitoredCoaxialAgent(_Monitored, CoaxialAgent):
+    """The coaxial agent, monitored; besides, it looks where each waypoint's end has led, as it always does."""
+
+
+def truth_of(task: Task, place: int, role: str, kind: Kind) -> ModelMismatch:
     """Return a patient's model mismatch, drawn within the spread of the agent's ensemble."""
-    belief, roles = AgentConfig().belief, list(ROLES[xray])
+    belief, roles = kind.config.belief, list(kind.roles)
     off = np.random.default_rng([task.level, place, roles.index(role)]).uniform(-1.0, 1.0, 3)
     return ModelMismatch(
         friction_factor=1 + belief.friction_spread * off[0],
@@ -83,25 +142,29 @@ def truth_of(task: Task, place: int, role: str, xray: XrayKind) -> ModelMismatch
     )
 
 
-def measure(path: Path, xray: XrayKind) -> None:
+def measure(path: Path, name: str) -> None:
     """Navigate in a patient, and write prediction and truth of each period after the first."""
-    task, role, place = find_task(path.parent.name), *path.stem.split("-")
+    kind, moves = KINDS[name], name == "images"
+    task, role, place = find_task(path.parent.name, kind.version), *path.stem.split("-")
     number = int(place)
     if role == "test":
         navigation = task.ladder_navigation(number)
     else:
         turn = np.random.default_rng([task.training.seed, number]).uniform(0.0, 2 * np.pi)
         navigation = task.navigation(task.patient(task.training, number), start_rotation=turn)
-    policy = Monitored(AgentConfig(tries=2), calibration=NO_BANDS)
-    seed, moves = 1000 + 100 * task.level + number, xray == "images"
+    agent = MonitoredCoaxialAgent if name == "coaxial" else partial(MonitoredAgent, AgentConfig(tries=2))
+    policy = agent(calibration=NO_BANDS)
+    seed = 1000 + 100 * task.level + number
     record = navigate(
         replace(navigation, seconds=min(SECONDS, navigation.seconds), known_motion=Motion() if moves else None),
         policy,
         config=NavigateConfig(
-            simulator=replace(CORE, threads=1), xray=xray, motion=motion_named("both", seed) if moves else None
+            simulator=replace(CORE, threads=1),
+            xray="images" if moves else "assumed",
+            motion=motion_named("both", seed) if moves else None,
         ),
         seed=seed,
-        truth=truth_of(task, number, role, xray),
+        truth=truth_of(task, number, role, kind),
     )
     kept, count = np.array(policy.kept), len(policy.kept)
     true = np.column_stack([record.tip.abscissa, record.tip.offset])[:count]
@@ -151,9 +214,9 @@ def worst(rows: list[tuple[np.ndarray, ...]], terms: tuple[tuple[float, ...], tu
     return np.array([np.max(np.abs(error) / spread_of(terms, *rest), axis=0) for error, *rest in rows])
 
 
-def calibrate(folder: Path, xray: XrayKind) -> tuple[Calibration, list[str]]:
+def calibrate(folder: Path, kind: Kind) -> tuple[Calibration, list[str]]:
     """Return the calibration, and a table of its coverage as lines of Markdown."""
-    if "fit" in ROLES[xray]:
+    if "fit" in kind.roles:
         fitted, _ = gather(folder, "fit")
         terms = fit_spread(*(np.concatenate(column) for column in zip(*fitted, strict=True)))
         terms = balanced(terms, worst(fitted, terms), LEVEL)
@@ -168,12 +231,12 @@ def calibrate(folder: Path, xray: XrayKind) -> tuple[Calibration, list[str]]:
         offset_terms=terms[1],
         anatomies=len(np.unique(owner)),
         intervals=len(rows),
-        dataset=f"patients to learn on of {PLACES[xray][1]}",
+        dataset=f"patients to learn on of {kind.whose}",
         heeded=1.0,
     )
     lines = ["| patients | intervals without X-ray | in which both bands hold throughout |", "|---|---|---|"]
     for title, role in (("calibrated on", "calibrate"), ("the ladder's, not calibrated on", "test")):
-        if role not in ROLES[xray]:
+        if role not in kind.roles:
             continue
         rows, owner = gather(folder, role)
         held = float(np.mean(worst(rows, terms).max(axis=1) <= calibration.scale))
@@ -192,29 +255,29 @@ def calibrate(folder: Path, xray: XrayKind) -> tuple[Calibration, list[str]]:
 def main() -> None:
     """Run the missing navigations, calibrate, print, and write if asked to."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("xray", nargs="?", choices=get_args(XrayKind), default="assumed")
+    parser.add_argument("kind", nargs="?", choices=list(KINDS), default="assumed")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
-    xray: XrayKind = options.xray
-    folder, tasks = RUNS / f"agent-calibration-{xray}", [t for t in ladder_tasks() if t.anatomy in ANATOMIES[xray]]
+    kind = KINDS[options.kind]
+    folder = RUNS / f"agent-calibration-{options.kind}"
     wanted = [
         folder / task.name / f"{role}-{place:02d}.json"
-        for role, places in ROLES[xray].items()
+        for role, places in kind.roles.items()
         for place in places
-        for task in tasks
+        for task in kind.tasks
     ]
     try:
-        claim(folder, f"benchmarks/agent_calibration.py {xray}", **identity("agent", NEWEST), agent=AgentConfig())
-        make_missing("Calibrating the agent's adviser", wanted, partial(measure, xray=xray))
+        found = identity(kind.policy, kind.version)
+        claim(folder, f"benchmarks/agent_calibration.py {options.kind}", **found, agent=kind.config)
+        make_missing("Calibrating the agent's adviser", wanted, partial(measure, name=options.kind))
     except InputError as error:
         raise SystemExit(str(error)) from error
-    calibration, lines = calibrate(folder, xray)
+    calibration, lines = calibrate(folder, kind)
     print(calibration, *lines, sep="\n")
     if options.write:
-        calibration.write(CALIBRATIONS[xray])
+        calibration.write(kind.folder)
         page = ROOT / "docs" / "xray.md"
-        name = PLACES[xray][0]
-        begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
+        begin, end = f"<!-- {kind.mark}:begin -->", f"<!-- {kind.mark}:end -->"
         text = page.read_text(encoding="utf-8")
         text = "\n".join([text.split(begin)[0] + begin, *lines, end + text.split(end)[1]])
         page.write_text(text, encoding="utf-8")

@@ -59,7 +59,7 @@ class AgentConfig:
     """The same across the wire, mm."""
 
 
-_SURE_SDS = 3.0
+SURE_SDS = 3.0
 """A measured tip is taken for another than the simulated ones beyond this many of its own standard deviations."""
 _TURNS = (0.0, np.pi)
 """Angles by which the wire may be turned before it goes in, rad."""
@@ -156,7 +156,7 @@ class _PlanningPolicy:
         self.belief.weigh(measured)
         errors = self.belief.errors(measured)[int(np.argmax(self.belief.weight))]
         explained = [self.config.lost_along_mm, self.config.lost_across_mm]
-        lost = bool((errors > np.maximum(explained, _SURE_SDS * np.array(measured.sd_mm))).any())
+        lost = bool((errors > np.maximum(explained, SURE_SDS * np.array(measured.sd_mm))).any())
         if lost or self._lost:
             self._course = None
         self._lost = lost

@@ -14,7 +14,7 @@ from dataclasses import field, replace
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.control.agent import CALIBRATED
+from endopilot.control.agent import CALIBRATED, SURE_SDS, AdviserInput
 from endopilot.control.belief import Belief, BeliefConfig
 from endopilot.control.coaxial_copies import CoaxialCourse, CoaxialSearchConfig
 from endopilot.control.coaxial_policies import check_catheter
@@ -27,6 +27,9 @@ from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.xray.adviser import AdviserConfig, XrayAdviser
 from endopilot.xray.bands import Calibration
 from endopilot.xray.fluoroscope import TipMeasurement
+
+COAXIAL_CALIBRATED = CALIBRATED / "coaxial"
+"""Where the calibration of the ensemble of wires in catheters lies."""
 
 
 @settings
@@ -66,11 +69,11 @@ class CoaxialAgent:
 
         Args:
             config: search and belief.
-            calibration: of the adviser's bands around what the simulated wires predict; the package's own if not
-                given, which was made with wires alone.
+            calibration: of the adviser's bands around what the simulated wires predict; if not given, the package's
+                own for wires in catheters, which `benchmarks/agent_calibration.py coaxial` makes.
         """
         self.config = config or CoaxialAgentConfig()
-        self._calibration = calibration or Calibration.read(CALIBRATED)
+        self._calibration = calibration or Calibration.read(COAXIAL_CALIBRATED)
 
     def start(self, navigation: Navigation, seed: int) -> None:
         """Lay out the simulated wires in catheters, and start the adviser.
@@ -94,7 +97,7 @@ class CoaxialAgent:
         self._at, self._lost, self._began, self._crept = 0, False, False, 0
         self.plans, self.planning_s, self._failed, self._halt = 0, 0.0, 0, ""
         self._adviser = XrayAdviser(self._calibration, AdviserConfig(), navigation.device.tip_radius_mm)
-        proximal, tip, _, radius = self._adviser_input()
+        proximal, tip, _, radius = self.adviser_input()
         self._adviser.start(proximal, tip, radius)
 
     def decide(self, observation: Observation) -> Decision:
@@ -104,7 +107,7 @@ class CoaxialAgent:
         self._began = True
         if observation.tip is not None:
             self._update(observation.tip)
-        due = bool(self._adviser.advise(*self._adviser_input())[0])
+        due = self.wants_xray()
         if self._lost:
             return self._pull_back(observation)
         if self._course is None or self._off_course():
@@ -127,25 +130,30 @@ class CoaxialAgent:
         """Return the simulated wires, the likeliest first: nodes from the foremost tip on, LPS mm."""
         return self.belief.simulator.position[np.argsort(-self.belief.weight, kind="stable")]
 
+    def adviser_input(self) -> AdviserInput:
+        """Return what the adviser is given: the likeliest wire, and the spread of all wires."""
+        tip, wires = self.belief.likeliest_tip(), self.belief.simulator
+        proximal = np.array([[wires.inserted_length[self._best], wires.rotation[self._best]]])
+        ends = np.array([[tip.abscissa[0], tip.offset[0]]])
+        return proximal, ends, self.belief.tip_spread()[None], tip.radius
+
+    def wants_xray(self) -> bool:
+        """Ask the adviser."""
+        return bool(self._adviser.advise(*self.adviser_input())[0])
+
     def _update(self, measured: TipMeasurement) -> None:
         """Weight the simulated wires by a measurement, and note whether all are wrong."""
         self.belief.weigh(measured)
-        along, across = self.belief.errors(measured)[self._best]
-        most = self.config.lost_across_radii * float(self.belief.tip.radius[self._best])
-        self._lost = bool(along > self.config.lost_along_mm or across > max(most, self.config.lost_along_mm / 2))
+        along_mm = self.config.lost_along_mm
+        across_mm = max(self.config.lost_across_radii * float(self.belief.tip.radius[self._best]), along_mm / 2)
+        explained = np.maximum([along_mm, across_mm], SURE_SDS * np.array(measured.sd_mm))
+        self._lost = bool((self.belief.errors(measured)[self._best] > explained).any())
         if self._lost:
             self._course = None
 
     @property
     def _best(self) -> int:
         return int(np.argmax(self.belief.weight))
-
-    def _adviser_input(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return (Δ, φ), (Δtip, γtip), the spread of these and the lumen's radius at the tip, of the likeliest wire."""
-        tip, wires = self.belief.likeliest_tip(), self.belief.simulator
-        proximal = np.array([[wires.inserted_length[self._best], wires.rotation[self._best]]])
-        ends = np.array([[tip.abscissa[0], tip.offset[0]]])
-        return proximal, ends, self.belief.tip_spread()[None], tip.radius
 
     def _pull_back(self, observation: Observation) -> Decision:
         """Pull the wire back, and the catheter too once the wire's tip is in it, with X-ray on."""
