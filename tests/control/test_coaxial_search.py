@@ -15,6 +15,7 @@ from endopilot.control.mismatch import ModelMismatch
 from endopilot.control.navigate import NavigateConfig, navigate, start_world
 from endopilot.control.policy import Observation
 from endopilot.errors import InputError
+from endopilot.ladder.attempt import Recording, attempt, repeat
 from endopilot.simulation.catheter import read_catheter
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.simulator import Simulator
@@ -103,8 +104,8 @@ def test_a_wire_that_no_simulated_one_explains_is_pulled_back_until_one_does(sid
     policy.start(side_branch, 0)
     believed = policy.belief.simulator.tips()[0]
 
-    def seen(shift_mm: float) -> Observation:
-        tip = TipMeasurement(believed + np.array([0.0, 0.0, shift_mm]), 10.0 + shift_mm, 0.0, 0)
+    def seen(shift_mm: float, sd_mm: float = 0.0) -> Observation:
+        tip = TipMeasurement(believed + np.array([0.0, 0.0, shift_mm]), 10.0 + shift_mm, 0.0, 0, (sd_mm, sd_mm))
         return Observation(0.0, 10.0, np.pi, tip, ((0.0, 0.0),))
 
     lost = policy.decide(seen(8.0))
@@ -113,6 +114,16 @@ def test_a_wire_that_no_simulated_one_explains_is_pulled_back_until_one_does(sid
     assert inside.translation < 0 and inside.catheters[0][0] < 0
     policy.start(side_branch, 0)
     assert policy.decide(seen(0.5)).translation >= 0 and policy.plans == 1
+    policy.start(side_branch, 0)
+    assert policy.decide(seen(8.0, sd_mm=4.0)).translation >= 0 and policy.plans == 1  # a poor image proves little
+
+
+def test_a_ladder_counts_the_events_that_the_agent_misses(side_branch) -> None:
+    beside = replace(side_branch, target=Target(branch=0, abscissa=16.0), start_inserted_mm=14.0)
+    result = attempt("coaxial-agent", beside, seed=1)
+    events, missed = result["events"]
+    assert result["success"] and 0 <= missed <= events
+    assert repeat(Recording.unpacked(result["recording"], devices=2), beside, seed=1)["events"] == result["events"]
 
 
 def test_the_agent_drives_one_catheter(side_branch) -> None:
