@@ -20,7 +20,7 @@ FREE_BEHIND_MM = 3.0
 LANES = _core.LANES
 """Worlds that one thread steps side by side."""
 _DENT_MM = 0.015
-"""Depth to which a node that bears the whole push limit dents the wall, mm, where the stiffness is not given."""
+"""Depth to which a node that bears all that the drives can push with dents a wall of no given stiffness, mm."""
 _HARD_PUSH_N = 2.0
 """Push that stands for the limit of a drive that has none, N."""
 _RIGID_REACH_MM, _COMPLIANT_REACH_MM = 0.5, 2.4
@@ -51,7 +51,8 @@ class SimulatorConfig:
     element_mm: Annotated[float, Within(0.02, 5)] = 0.75
     """Length of the wire's elements at its tip, mm; towards the base they grow to five times that."""
     wall_stiffness_n_mm: Positive | None = None
-    """Stiffness of the vessel wall at a node, N/mm. If not given, the device's push limit dents it by 0.015 mm."""
+    """Stiffness of the vessel wall at a node, N/mm. If not given, the push limits of all devices together dent it by
+    0.015 mm."""
     compliant_wall_n_mm2: Annotated[float, Within(0.01)] | None = None
     """Stiffness of a compliant wall, N/mm of wire and mm of displacement: each place of the wall yields by itself, as a
     bed of springs (Winkler) that stiffen as the heart's muscle does. It takes the place of `wall_stiffness_n_mm` if
@@ -116,5 +117,5 @@ PRESETS: Mapping[Preset, SimulatorConfig] = MappingProxyType(
 
 
 def wall_stiffness(config: SimulatorConfig, push_limit_n: float) -> float:
-    """Return the stiffness of the wall at a contact, N/mm, for a device of some push limit or without one."""
+    """Return the stiffness of the wall at a contact, N/mm, for devices of some push limit together or without one."""
     return config.wall_stiffness_n_mm or (push_limit_n if push_limit_n < np.inf else _HARD_PUSH_N) / _DENT_MM
