@@ -176,8 +176,8 @@ def approaching(split, half: float) -> monitoring.Monitored:
 
 
 @pytest.mark.parametrize(("may_miss", "heeded"), [(0.45, 0.6), (0.25, 0.8), (0.001, 1.0)])
-def test_the_adviser_heeds_as_little_of_the_bands_as_what_it_may_miss_allows(split, may_miss, heeded) -> None:
-    """With a share s of the bands it sees 10 s of 10 arrivals; the patients are alike, so that no error is added."""
+def test_the_adviser_heeds_as_little_of_the_band_as_what_it_may_miss_allows(split, may_miss, heeded) -> None:
+    """With a share s of the band it sees 10 s of 10 arrivals; the patients are alike, so that no error is added."""
     bands = Calibration(
         level=0.9, scale=1.0, abscissa_terms=(0.0,) * 4, offset_terms=(0.1, 0.0, 0.0, 0.0), anatomies=3, intervals=30,
         dataset="", heeded=1.0,
@@ -186,7 +186,7 @@ def test_the_adviser_heeds_as_little_of_the_bands_as_what_it_may_miss_allows(spl
     assert monitoring.least_heeded(approaching(split, half=0.1), bands, config) == heeded
 
 
-def test_no_share_of_the_bands_beyond_the_first_that_misses_too_much_is_chosen(split, monkeypatch) -> None:
+def test_no_share_of_the_band_beyond_the_first_that_misses_too_much_is_chosen(split, monkeypatch) -> None:
     missed = iter([0.01, 0.02, 0.06, *[0.01] * len(monitoring.HEEDED)])
     monkeypatch.setattr(monitoring, "surely_missed", lambda *_: next(missed))
     bands = Calibration(

@@ -129,9 +129,9 @@ def test_an_exposure_is_due_where_the_wire_begins_to_fill_the_lumen() -> None:
     assert due == [False, False, False, True, False, False, False]
 
 
-def test_the_adviser_heeds_a_share_of_the_bands_and_reports_them_whole() -> None:
+def test_the_adviser_heeds_a_share_of_the_band_across_and_all_of_that_along() -> None:
     inserted = [2.0 * abs(6 - i) for i in range(20)]  # back and forth by 2 mm a sample: the band grows by 0.2 mm
-    assert advices([0.3] * 20, inserted, config=AdviserConfig(abscissa_mm=1.0), heeded=0.5) == [10]
+    assert advices([0.3] * 20, inserted, config=AdviserConfig(abscissa_mm=1.0), heeded=0.5) == [5, 10, 15]
     offset = [0.3] * 5 + [0.56] * 4 + [0.585] * 4 + [0.61] * 4 + [0.63] * 4
     due = advices(offset, [10.0] * len(offset), config=AdviserConfig(wall_ratio=0.6), abscissa=0.0, heeded=0.4)
     assert due == [9, 13, 17]  # ±0.02 mm: the upper edge, the tip, the lower edge

@@ -338,7 +338,7 @@ class AgentPolicy(_PlanningPolicy):
         if self._lost or len(half) == 0:
             return replace(tip, asks="no simulated wire explains the last image" if self._lost else "")
         along, across = half[0].tolist()
-        wide = self._calibration.heeded * along >= self._advice.abscissa_mm
+        wide = along >= self._advice.abscissa_mm
         asks = f"Δtip is known to ±{along:.1f} mm only" if wide else "the tip may be reaching the wall"
         asks = "the tip should be at the target" if self._arrived else asks
         return replace(tip, half_width=(along, across), asks=asks if self._due else "")

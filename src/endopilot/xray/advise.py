@@ -25,7 +25,7 @@ FIGURES_FILE, PICTURE_FILE = "advice.json", "advice.png"
 PERIODS = (1, 2, 3, 4, 5, 6, 8, 10, 15, 20, 30, 45, 90)
 """Samples between two exposures of periodic imaging."""
 SHARES = (0.0, 0.1, 0.25, 0.5, 0.75, 1.0, 1.5, 2.5)
-"""Shares of the bands that the adviser heeds, for its curve; the calibrated one is measured too."""
+"""Shares of γtip's band that the adviser heeds, for its curve; the calibrated one is measured too."""
 THRESHOLDS = tuple((ratio, mm) for ratio in (0.6, 0.7, 0.8, 0.9) for mm in (1.0, 2.0))
 """Other values of τ and of δ, mm, that the adviser is measured with."""
 
@@ -187,7 +187,7 @@ def _picture(content: Mapping[str, Any]) -> Figure:
         axes = figure.add_subplot()
         lines = (
             ("periodic", GREY, "Periodic imaging"),
-            ("adviser", BLUE, "Adviser that heeds less or more of its bands"),
+            ("adviser", BLUE, "Adviser that heeds less or more of γtip's band"),
         )
         for name, color, label in lines:
             curve = content["curves"][name]
@@ -198,7 +198,7 @@ def _picture(content: Mapping[str, Any]) -> Figure:
                 content["adviser"],
                 "o",
                 VERMILLION,
-                f"Adviser as calibrated: {content['calibration'].heeded:g} of its bands",
+                f"Adviser as calibrated: {content['calibration'].heeded:g} of γtip's band",
             ),
             (content["curves"]["oracle"][0], "*", BLACK, "Oracle"),
         )

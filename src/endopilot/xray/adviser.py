@@ -25,7 +25,7 @@ class AdviserConfig:
     abscissa_mm: Positive = SUCCESS_MM
     """δ: an event begins where Δtip errs by this much, mm; as near as a target counts as reached if not given."""
     missed: OpenShare = 0.05
-    """Share of the events that may be missed: the calibration finds how much of the bands the adviser must heed."""
+    """Share of the events that may be missed: the calibration finds how much of γtip's band the adviser must heed."""
 
 
 def near_exposures(exposed: Bool[np.ndarray, "*n samples"]) -> Bool[np.ndarray, "*n samples"]:
@@ -53,11 +53,11 @@ def count_events(state: Bool[np.ndarray, "*n samples"], near: Bool[np.ndarray, "
 class XrayAdviser:
     """Says when to switch X-ray on, for one navigation or many side by side.
 
-    Between exposures it watches two bands, or the share of them that the calibration says is to be heeded. Where that
-    of Δtip is as wide as δ, an exposure is due. That of γtip, over the clearance of the lumen there, lies below τ,
-    above it, or across it. Below, nothing threatens; above, the tip is known to be at the wall; across, either may be.
-    An exposure is due where the band reaches τ, where the predicted tip crosses it, and where the band has left it
-    below. It shows what is within 0.5 s of it, so none follows another sooner than after 1.5 s.
+    Between exposures it watches two bands. Where that of Δtip is as wide as δ, an exposure is due. Of that of γtip it
+    heeds the share that the calibration found. This, over the clearance of the lumen there, lies below τ, above it, or
+    across it. Below, nothing threatens; above, the tip is known to be at the wall; across, either may be. An exposure
+    is due where the band reaches τ, where the predicted tip crosses it, and where the band has left it below. It shows
+    what is within 0.5 s of it, so none follows another sooner than after 1.5 s.
 
     Attributes:
         half_width: of the whole bands of Δtip and γtip at the last call of `advise`, mm, a row for each navigation.
@@ -100,11 +100,11 @@ class XrayAdviser:
         self._since, self._travel = self._since + 1, self._travel + np.abs(proximal[:, 0] - self._proximal[:, 0])
         self._proximal = proximal
         self.half_width = half = self._calibration.half_width(self._since * DECISION_PERIOD_S, self._travel, spread)
-        heeded = self._calibration.heeded * half
-        edges = [tip[:, 1] + side * heeded[:, 1] for side in (1.0, 0.0, -1.0)]
+        heeded = self._calibration.heeded * half[:, 1]
+        edges = [tip[:, 1] + side * heeded for side in (1.0, 0.0, -1.0)]
         beyond = [self._ratio(edge, radius_mm) >= self._config.wall_ratio for edge in edges]
         crossed = np.any([now & ~before for now, before in zip(beyond, self._beyond, strict=True)], axis=0)
-        due = (crossed | (heeded[:, 0] >= self._config.abscissa_mm)) & (self._since >= _SPACING)
+        due = (crossed | (half[:, 0] >= self._config.abscissa_mm)) & (self._since >= _SPACING)
         self._beyond = [np.where(crossed & ~due, before, now) for now, before in zip(beyond, self._beyond, strict=True)]
         self._since, self._travel = np.where(due, 0, self._since), np.where(due, 0.0, self._travel)
         return due

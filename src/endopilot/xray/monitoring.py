@@ -26,7 +26,7 @@ from endopilot.xray.online_predictors import OnlinePredictor, online_predictor
 FLUOROSCOPY_HZ = 7.5
 """Frame rate of the fluoroscopy that advice is compared with."""
 HEEDED = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1, 0.0)
-"""Shares of the bands that are tried when an adviser is calibrated."""
+"""Shares of γtip's band that are tried when an adviser is calibrated."""
 _GRID_MM = 0.25
 ExposurePolicy = Callable[[int, Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]], Bool[np.ndarray, "n"]]
 """From sample, predicted tip and its spread (mm), which navigations are exposed."""
@@ -186,10 +186,12 @@ def calibrate(fitted: Monitored, own: Monitored, config: AdviserConfig) -> Calib
 
 
 def least_heeded(own: Monitored, bands: Calibration, config: AdviserConfig) -> float:
-    """Return the smallest share of the bands by which the adviser surely misses no more events than it may.
+    """Return the smallest share of γtip's band by which the adviser surely misses no more events than it may.
+
+    Events of Δtip are too few to find a share for: the adviser heeds the whole of that band.
 
     The shares of `HEEDED` are tried from the largest on. The last one before the first that misses too many is taken,
-    so that chance among many shares favours none; 1, where even the whole bands miss too many.
+    so that chance among many shares favours none; 1, where even the whole band misses too many.
 
     Args:
         own: navigations of the calibration patients.
