@@ -71,7 +71,6 @@ struct TubeLane {
     Tube tube[T + 1];
     int lead;            // the tube whose tip is foremost: the mesh follows it
     double given, side;  // share by which drives at their limits give way to friction along the tubes, and the way it turns
-    double others;       // force of the drives of the others at the end of the last step, N
 };
 template <>
 struct TubeLane<0> {};
@@ -285,6 +284,7 @@ private:
     void turn_tubes(int l, bool keeps, bool takes, bool shortens, double factor);
     void settle_tubes(int l);
     void pace_tubes(int l);
+    double borne_by_others(const Lane& lane) const;
     bool tubes_slip(const Lane& lane) const;
     DriveEnergy tube_drive_energy(const Lane& lane) const;
     bool solve_tube_drives(int l);
