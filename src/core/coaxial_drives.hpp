@@ -107,26 +107,33 @@ bool Stepper<V, T>::try_forces(const bool (&on)[W], Leap (&leap)[W]) {
 template <class V, int T>
 void Stepper<V, T>::pace_tubes(int l) {
     Lane& lane = lane_[l];
-    double force[T + 1];
+    double force[T + 1], pushed = 0;
     tell_forces(l, force);
     for (int k = 0; k <= T; ++k) {
         Tube& tube = lane.tubes.tube[k];
         tube.force = force[k];
+        pushed += tube.force;
         tube.torque = k > 0 ? get(of_tubes_.torque[k - 1], l) : get(base_torque_, l);
         const double beyond = beyond_limit(k, tube.force);
         tube.pace = beyond * tube.speed > 0 ? 0.0 : std::min(1.0, kFaster * tube.pace + kLeastPace);
         tube.yield = beyond == 0 ? 0.5 * tube.yield : std::clamp(tube.yield - kYield * beyond, double{-kMostYield}, double{kMostYield});
         if (std::abs(tube.yield) < options_.stick_velocity) tube.yield = 0;
     }
+    lane.tubes.others = pushed - lane.tubes.tube[lane.tubes.lead].force;
 }
 
-// What the other drives than the leading one bear of the force on all tubes, as at the end of the last step: none more than its limit.
+// What the other drives than the leading one bear of the force on all tubes, as at the end of the last step. Nothing holds tubes that are
+// all out: there it counts no more than the others' limits.
 template <class V, int T>
 double Stepper<V, T>::borne_by_others(const Lane& lane) const {
-    double borne = 0;
-    for (int k = 0; k <= T; ++k)
-        if (k != lane.tubes.lead) borne += std::clamp(lane.tubes.tube[k].force, -tubes_.pull_limit[k], tubes_.push_limit[k]);
-    return borne;
+    if (lane.start.advance > 0) return lane.tubes.others;
+    double most = 0, least = 0;
+    for (int k = 0; k <= T; ++k) {
+        if (k == lane.tubes.lead) continue;
+        most += tubes_.push_limit[k];
+        least -= tubes_.pull_limit[k];
+    }
+    return std::clamp(lane.tubes.others, least, most);
 }
 
 template <class V, int T>
@@ -141,7 +148,8 @@ template <class V, int T>
 typename Stepper<V, T>::DriveEnergy Stepper<V, T>::tube_drive_energy(const Lane& lane) const {
     const int lead = lane.tubes.lead, side = lane.slipping.advance;
     const double force = side == 0 ? 0.0 : borne_by_others(lane) + (side > 0 ? tubes_.push_limit[lead] : -tubes_.pull_limit[lead]);
-    DriveEnergy e{.energy = 0, .gradient_a = -force, .gradient_r = -lane.slipping.rotation * tubes_.torque_limit[0], .aa = 0, .ar = 0, .rr = 0};
+    const double torque = lane.slipping.rotation == 0 ? 0.0 : lane.slipping.rotation * tubes_.torque_limit[0];   // a limit may be infinite
+    DriveEnergy e{.energy = 0, .gradient_a = -force, .gradient_r = -torque, .aa = 0, .ar = 0, .rr = 0};
     if (side != 0) e.energy += e.gradient_a * lane.off.advance;
     if (lane.slipping.rotation != 0) e.energy += e.gradient_r * lane.off.rotation;
     for (int k = 1; k <= T; ++k) {
@@ -181,7 +189,7 @@ bool Stepper<V, T>::solve_tube_drives(int l) {
     for (int k = 1; k <= T; ++k) {
         const Tube& tube = lane.tubes.tube[k];
         side[k + 1] = tube.slipping, off[k + 1] = tube.off;
-        g[k + 1] -= tube.slipping * tubes_.torque_limit[k];
+        if (tube.slipping != 0) g[k + 1] -= tube.slipping * tubes_.torque_limit[k];
     }
     for (int r = 0; r < N; ++r) {
         for (int c = 0; c < r; ++c) h[c][r] = h[r][c];

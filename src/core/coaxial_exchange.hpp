@@ -9,6 +9,7 @@ template <class V, int T>
 void Stepper<V, T>::load_tubes(int l) {
     Lane& lane = lane_[l];
     const World w = world_[lane.world];
+    double pushed = 0;
     lane.tubes.lead = 0;
     for (int k = 0; k <= T; ++k) {
         Tube& tube = lane.tubes.tube[k];
@@ -24,9 +25,11 @@ void Stepper<V, T>::load_tubes(int l) {
         tube.grip = from[World::kTubeGrip];
         tube.force = from[World::kTubeBaseForce];
         tube.torque = from[World::kTubeBaseTorque];
+        pushed += tube.force;
         if (from[World::kTubeLeads] != 0) lane.tubes.lead = k;
         set(of_tubes_.friction[k], l, from[World::kTubeFriction]);
     }
+    lane.tubes.others = pushed - lane.tubes.tube[lane.tubes.lead].force;
 }
 
 template <class V, int T>

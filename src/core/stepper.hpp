@@ -71,6 +71,7 @@ struct TubeLane {
     Tube tube[T + 1];
     int lead;            // the tube whose tip is foremost: the mesh follows it
     double given, side;  // share by which drives at their limits give way to friction along the tubes, and the way it turns
+    double others;       // force of the drives of the others at the end of the last step, N
 };
 template <>
 struct TubeLane<0> {};
