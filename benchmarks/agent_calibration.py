@@ -60,7 +60,7 @@ class Kind:
     policy: str
     config: AgentConfig | CoaxialAgentConfig
     version: LadderVersion
-    tasks: list[Task]
+    tasks: tuple[Task, ...]
     roles: dict[str, range]
     folder: Path
     mark: str
@@ -82,7 +82,7 @@ KINDS = {
         policy="agent",
         config=AgentConfig(),
         version=NEWEST,
-        tasks=[task for task in ladder_tasks() if task.anatomy in ("rca", "lca")],
+        tasks=tuple(task for task in ladder_tasks() if task.anatomy in ("rca", "lca")),
         roles={"calibrate": range(2)},
         folder=CALIBRATIONS["images"],
         mark="agent-images",

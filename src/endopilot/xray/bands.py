@@ -37,7 +37,7 @@ class Calibration:
     Attributes:
         level: share of new intervals that the bands are to hold throughout.
         scale: half-width of a band in units of the spread.
-        heeded: share of the half-width of γtip's band by which the adviser asks for X-ray; it heeds the whole of Δtip's.
+        heeded: share of γtip's half-width by which the adviser asks for X-ray; of Δtip it heeds the whole band.
         abscissa_terms: of the spread of Δtip, its terms as `TERMS` names them.
         offset_terms: of the spread of γtip.
         anatomies: patients that it was calibrated on.
