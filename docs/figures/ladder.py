@@ -17,6 +17,7 @@ from endopilot.tasks.task import NEWEST, LadderVersion, ladder_tasks
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "ladder.md"
 _MEANS = (("peak force, median, N", "peak_force_n"), ("exposures, mean", "exposures"))
+_MISSED = "events missed, %"
 
 
 def fill(name: str, lines: list[str]) -> None:
@@ -63,10 +64,11 @@ def scores(folder: Path, version: LadderVersion, mark: str) -> list[str]:
         column = {name: f"{100 * row['safe_success']:.0f} ({100 * row['success']:.0f})" for name, row in table.items()}
         if (over := table.get("all twelve") or table.get("upper eight") or table.get("all coaxial")) is not None:
             column |= {title: f"{over[key]:.3g}" for title, key in _MEANS}
+            column |= {_MISSED: f"{100 * over['missed_events']:.1f}"} if "missed_events" in over else {}
         columns[path.parent.name] = column | {"patients a task": str(content["patients"])}
     sums = ["all coaxial"] if version == "coaxial" else ["lower four", "upper eight", "all twelve"]
     names = [task.name for task in ladder_tasks(version)] + sums
-    names += [*(title for title, _ in _MEANS), "patients a task"]
+    names += [*(title for title, _ in _MEANS), _MISSED, "patients a task"]
     policies = sorted(columns)
     lines = ["| task | " + " | ".join(policies) + " |", "|---|" + "---|" * len(policies)]
     for name in names:

@@ -97,6 +97,8 @@ def test_the_agent_arrives_with_little_xray(side_branch) -> None:
     record = navigate(side_branch, policy, config=NavigateConfig(simulator=CORE), seed=2)
     assert record.reason == "reached" and record.safe
     assert policy.plans >= 1 and record.exposures < len(record.time_s) / 2
+    along, across = policy.believed().half_width
+    assert along > 0 and across > 0
 
 
 def test_a_wire_that_no_simulated_one_explains_is_pulled_back_until_one_does(side_branch) -> None:

@@ -122,9 +122,13 @@ class CoaxialAgent:
         return self._creep()
 
     def believed(self) -> BelievedTip:
-        """Return where the likeliest wire has its tip."""
-        tip = self.belief.likeliest_tip()
-        return BelievedTip(float(tip.abscissa[0]), float(tip.offset[0]))
+        """Return where the likeliest wire has its tip, and the adviser's bands around it."""
+        tip, half = self.belief.likeliest_tip(), self._adviser.half_width
+        believed = BelievedTip(float(tip.abscissa[0]), float(tip.offset[0]))
+        if self._lost or len(half) == 0:
+            return believed
+        along, across = half[0].tolist()
+        return replace(believed, half_width=(along, across))
 
     def believed_wires(self) -> Float[np.ndarray, "wires nodes 3"]:
         """Return the simulated wires, the likeliest first: nodes from the foremost tip on, LPS mm."""
