@@ -245,15 +245,16 @@ def test_an_episode_of_pairs_is_shown(navigation, vessel, tmp_path):
     from endopilot.dataset.generate import generate_dataset
     from endopilot.dataset.loader import load_dataset
 
-    config = DatasetConfig(sequences=1, seconds=3.0, anatomy_shares=(1.0, 0.0, 0.0), seen_test_share=0.0)
+    # With this seed no device jumps within a sample: then the replay is exact.
+    config = DatasetConfig(sequences=1, seconds=3.0, anatomy_shares=(1.0, 0.0, 0.0), seen_test_share=0.0, seed=1)
     generate_dataset([vessel], tmp_path / "data", navigation.device, config, catheters=navigation.catheters)
     data = load_dataset(tmp_path / "data")
     film = open_film(tmp_path / "data")
     film._drive()
     assert not film.failure
     last = film.frames[-1].snapshot
-    np.testing.assert_allclose(last.nodes[0], data.tip_position[0, -1], atol=0.05)
-    np.testing.assert_allclose(last.catheters[0].nodes[0], data.catheter_tip_position[0, -1, 0], atol=0.05)
+    np.testing.assert_allclose(last.nodes[0], data.tip_position[0, -1], atol=1e-4)
+    np.testing.assert_allclose(last.catheters[0].nodes[0], data.catheter_tip_position[0, -1, 0], atol=1e-4)
 
 
 def test_a_plan_of_a_pair_is_shown(vessel, tmp_path):
