@@ -12,7 +12,7 @@ constexpr double kFaster = 1.25, kLeastPace = 1.0 / 64;   // of the share of its
 constexpr double kYield = 20, kMostYield = 40;   // mm/s by which a drive at twice its limit gives way faster with each step, and at most
 constexpr double kLeap = 0.05;         // share of its limit by which a drive's force may pass it in a step that can be shortened
 constexpr double kNear = 0.4;          // share of its limit below which no force passes it in one step
-constexpr int kLeastStride = kTicks / 8;   // no shorter steps than these for the sake of a limit
+constexpr int kLeastStride = kTicks / 16;   // no shorter steps than these for the sake of a limit
 
 // The axial force of each drive, after freeze_tubes.
 template <class V, int T>
