@@ -13,8 +13,9 @@ from typing import Any
 PAGE = Path(__file__).parents[1] / "bench.md"
 TITLES = {
     "prediction": "Predictions",
-    "sensitivity": "The same with one assumption changed: what the force depends on",
-    "calibration": "Calibrations, which are no predictions",
+    "unpublished": "Predictions that no published figure can judge",
+    "sensitivity": "The same with one assumption changed: what the figures depend on",
+    "calibration": "Calibrations and what was drawn, which are no predictions",
 }
 BEGIN, END = "<!-- published:begin -->", "<!-- published:end -->"
 
@@ -24,8 +25,13 @@ def text(rows: list[dict[str, Any]]) -> str:
     lines: list[str] = []
     for kind, title in TITLES.items():
         lines += [f"{title}:", "", "| test | published | ours: median [5-95 %] | draws within | verdict | remarks |"]
-        lines += ["|---|---|---|---|---|---|", *(_line(row) for row in rows if row["kind"] == kind), ""]
+        lines += ["|---|---|---|---|---|---|", *(_line(row) for row in rows if _table(row) == kind), ""]
     return "\n".join(lines).rstrip()
+
+
+def _table(row: dict[str, Any]) -> str:
+    """Return which of the tables a row belongs to."""
+    return "unpublished" if row["kind"] == "prediction" and row["published_least"] is None else row["kind"]
 
 
 def _line(row: dict[str, Any]) -> str:
@@ -35,6 +41,7 @@ def _line(row: dict[str, Any]) -> str:
     else:
         published = f"{least:g} {unit}" if least == largest else f"{least:g} to {largest:g} {unit}"
     ours = f"{row['ours']:g} [{row['ours_p5']:g} to {row['ours_p95']:g}]" if row["draws"] > 1 else f"{row['ours']:g}"
+    ours += f" {unit}" if least is None else ""
     within = "" if row["share_within"] is None or row["draws"] == 1 else f"{100 * row['share_within']:.0f} %"
     error = f"{100 * (row['ours'] / least - 1):+.1f} %" if least is not None and least == largest else ""
     verdict = error or row["verdict"] or ("not judged" if row["kind"] == "prediction" else "")

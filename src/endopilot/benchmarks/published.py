@@ -12,6 +12,17 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
+from endopilot.benchmarks.straightening import (
+    STIFFENS_OVER_MM,
+    TISSUE_MPA,
+    TORTUOSITY,
+    WIRES_GPA,
+    Straightened,
+    draw_path,
+    stiff_wire,
+    straighten,
+    tortuosity_index,
+)
 from endopilot.benchmarks.three_point import SPAN_MM, flexural_modulus
 from endopilot.benchmarks.tubing import BORE_MM, LENGTH_MM, draw_tubing, push_through
 from endopilot.progress import progress
@@ -24,6 +35,7 @@ from endopilot.simulation.tip_load import simulate_tip_load
 Kind = Literal["prediction", "calibration", "sensitivity"]
 HARRISON = "Harrison et al., J Endovasc Ther 18 (2011) 797-801"
 ZOARSKI = "Zoarski, Mathis and Hebel, AJNR 19 (1998) 1571-1576"
+TORTUOUS = "Iliac artery tortuosity index in Chinese patients, Ann Vasc Surg 2023, S0890-5096(23)00149-8"
 SOFTEST_GPA = (9.5, 14.5)
 """Flexural moduli of Harrison's softest wires, GPa: the plain Amplatz wire and those called heavy duty."""
 WIRE_ALONE_N = (0.0, 0.078)
@@ -122,7 +134,7 @@ def bench_published(config: PublishedConfig) -> list[dict[str, Any]]:
     Raises:
         RuntimeError: the rod core did not converge in a test of one wire.
     """
-    comparisons = [*bending(config), *tip_loads(), *tubing_pushes(config)]
+    comparisons = [*bending(config), *tip_loads(), *tubing_pushes(config), *straightenings(config)]
     return [comparison.row() for comparison in comparisons]
 
 
@@ -256,6 +268,74 @@ class _Drawn:
 
     def catheter(self, catheter: Catheter) -> Catheter:
         return replace(catheter, device=replace(catheter.device, friction=self.coated), bore_friction=self.bore)
+
+
+def straightenings(config: PublishedConfig) -> list[Comparison]:
+    """Push stiff wires through aorto-iliac paths in yielding tissue, all of which are drawn at random.
+
+    Nobody published how far a wire displaces a path that is stated, so none of these figures is judged.
+
+    Raises:
+        RuntimeError: the rod core did not converge in any draw of a test.
+    """
+    softest, stiffest = min(WIRES_GPA, key=WIRES_GPA.__getitem__), max(WIRES_GPA, key=WIRES_GPA.__getitem__)
+    beds: dict[str, dict[str, float]] = {
+        f"tissue of {1000 * TISSUE_MPA[0]:g} kPa": {"tissue_mpa": TISSUE_MPA[0]},
+        f"tissue of {1000 * TISSUE_MPA[1]:g} kPa": {"tissue_mpa": TISSUE_MPA[1]},
+        f"tissue that stiffens over {STIFFENS_OVER_MM[0]:g} mm": {"stiffens_over_mm": STIFFENS_OVER_MM[0]},
+        f"tissue that stiffens over {STIFFENS_OVER_MM[1]:g} mm": {"stiffens_over_mm": STIFFENS_OVER_MM[1]},
+    }
+    yielding: dict[str, list[Straightened]] = {name: [] for name in WIRES_GPA}
+    rigid: dict[str, list[Straightened]] = {name: [] for name in (softest, stiffest)}
+    other: dict[str, list[Straightened]] = {name: [] for name in beds}
+    before: list[float] = []
+    with progress("Iliac arteries", total=config.draws) as advance, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # worlds that fail are counted
+        for draw in range(config.draws):
+            path = draw_path(np.random.default_rng([config.seed, 2, draw]))
+            before.append(tortuosity_index(path.iliac_mm))
+            wires = {name: stiff_wire(modulus, friction=path.friction) for name, modulus in WIRES_GPA.items()}
+            anatomy = path.anatomy()
+            for name, wire in wires.items():
+                yielding[name].append(straighten(path, anatomy, wire))
+            for name, tests in rigid.items():
+                tests.append(straighten(path, anatomy, wires[name], rigid=True))
+            for name, changed in beds.items():
+                bed = replace(path, **changed)
+                at_its_scale = anatomy if bed.scale == path.scale else bed.anatomy()
+                other[name].append(straighten(bed, at_its_scale, wires[stiffest]))
+            advance()
+    spread = (round(TORTUOSITY[0] - TORTUOSITY[1], 2), round(TORTUOSITY[0] + TORTUOSITY[1], 2))
+    drawn = Comparison("tortuosity index of iliac arteries, drawn", TORTUOUS, "calibration", "", spread, tuple(before))
+    rows = [_measured("no wire: tortuosity index", "tortuosity_before", "", yielding[softest])]
+    rows += [row for name, tests in yielding.items() for row in _straightened(name, tests)]
+    rows += [
+        _measured(f"{name}, rigid wall: force of the wall", "force_n", "N", tests) for name, tests in rigid.items()
+    ]
+    changed = [
+        _measured(f"{stiffest}, {name}: largest displacement", "largest_mm", "mm", tests, "sensitivity")
+        for name, tests in other.items()
+    ]
+    return [*rows, *changed, drawn]
+
+
+def _straightened(name: str, tests: list[Straightened]) -> list[Comparison]:
+    quantities = (
+        ("largest displacement", "largest_mm", "mm"),
+        ("mean displacement", "mean_mm", "mm"),
+        ("tortuosity index", "tortuosity", ""),
+        ("force of the wall", "force_n", "N"),
+    )
+    return [_measured(f"{name}: {what}", quantity, unit, tests) for what, quantity, unit in quantities]
+
+
+def _measured(case: str, quantity: str, unit: str, tests: list[Straightened], kind: Kind = "prediction") -> Comparison:
+    """Return what was measured in the draws that converged, which no published figure can be held against."""
+    figures = tuple(float(getattr(test, quantity)) for test in tests if test.valid)
+    if not figures:
+        raise RuntimeError(f"the aorto-iliac path with {case} did not converge in any draw")
+    note = _note(sum(test.valid and not test.through for test in tests), sum(not test.valid for test in tests))
+    return Comparison(f"aorto-iliac path, {case}", HARRISON, kind, unit, None, figures, note)
 
 
 def unreinforced(catheter: Catheter) -> Catheter:

@@ -1,9 +1,9 @@
 """An aorto-iliac path, drawn at random, and stiff wires that straighten it.
 
-The compliant wall of the rod core stiffens over 4 mm, the width of a coronary artery. Pelvic arteries are wider, and more
-tissue lies around them. The same physics holds at another scale: with lengths in units of λ mm, EI is divided by λ² and
-the bed's stiffness, a force for each length and displacement, is multiplied by λ². So paths are simulated at the scale at
-which their bed stiffens over 4 units. Forces are the same at every scale.
+The compliant wall of the rod core stiffens over 4 mm, the width of a coronary artery. Pelvic arteries are wider, and
+more tissue lies around them. The same physics holds at another scale: with lengths in units of λ mm, EI is divided by
+λ², and the bed's stiffness, a force for each length and displacement, is multiplied by λ². So a path is simulated at
+the scale at which its bed stiffens over 4 units. Forces are the same at every scale.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
+from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq
 from scipy.spatial import KDTree
 
@@ -30,39 +31,43 @@ WIRE_MM = 0.889
 """Diameter of these wires, mm: 0.035 inch."""
 FLOPPY_MM, TAPER_MM, FLOPPY_N_MM2 = 40.0, 30.0, 8.0
 """Length of their floppy tip, of the taper behind it, mm, and EI of the tip, N·mm², assumed as that of the J wire."""
-TORTUOSITY, TORTUOSITY_LIMITS = (1.36, 0.21), (1.05, 1.9)
+TORTUOSITY, TORTUOSITY_LIMITS = (1.36, 0.21), (1.05, 1.7)
 """Length of the common and external iliac artery over the distance of their ends: mean and SD of 110 patients with an
 aneurysm (Ann Vasc Surg 2023, S0890-5096(23)00149-8), and the least and largest that are drawn."""
 COMMON_MM = (40.0, 70.0)
-"""Least and largest length of the common iliac artery, mm, assumed about the published means of 52.8 mm on the right and
-56.3 mm on the left (Yun and Park, Ann Surg Treat Res 88 (2015) 334-340)."""
+"""Least and largest length of the common iliac artery, mm, assumed about the published means of 52.8 mm on the right
+and 56.3 mm on the left (Yun and Park, Ann Surg Treat Res 88 (2015) 334-340)."""
 EXTERNAL_MM = (90.0, 120.0)
 """Least and largest length of the external iliac artery, mm, assumed."""
 COMMON_WIDTH_MM, EXTERNAL_WIDTH_MM, AORTA_WIDTH_MM = (9.0, 15.0), (7.0, 9.0), 20.0
-"""Least and largest diameter of the common and the external iliac artery, and the aorta's, mm. Published: 9 and 7.5 mm in
-healthy adults (CT, 112 patients of a hospital in Riyadh, PAIRS 2022), 13.6 ± 1.5 mm for common iliac arteries that hold
-a stent graft (PMC5624232), 20.1 ± 2.9 mm for the aorta (Surg Radiol Anat 35 (2013) 411-417)."""
+"""Least and largest diameter of the common and of the external iliac artery, and the aorta's, mm. Published: 9 and
+7.5 mm in healthy adults (CT of 112 patients, PAIRS 2022, e-poster 1643), 13.6 ± 1.5 mm for common iliac arteries in
+which stent grafts end (PMC5624232), 20.1 ± 2.9 mm for the aorta (Surg Radiol Anat 35 (2013) 411-417)."""
 APART_DEG = (35.0, 11.1)
-"""Mean and SD of the angle between the common iliac arteries, degrees (70 bifurcations; Arteriosclerosis 6 (1986))."""
+"""Mean and SD of the angle between the common iliac arteries, degrees, of 70 bifurcations (Bargeron et al.,
+Arteriosclerosis 6 (1986) 109-113)."""
 TISSUE_MPA = (0.0023, 0.012)
-"""Least and largest modulus of the tissue around, MPA: three times the shear modulus of fat in living people, 752 Pa
+"""Least and largest modulus of the tissue around, MPa: three times the shear modulus of fat in living people, 752 Pa
 (J Mech Behav Biomed Mater 2023), and that of the heart's muscle in docs/physics.md."""
 STIFFENS_OVER_MM = (12.0, 30.0)
-"""Least and largest width of the tissue that shears, mm, assumed: from the artery's own to its distance from the bone."""
+"""Least and largest width of the tissue that shears, mm, assumed: from the artery's own width to what lies between it
+and the bone."""
 FRICTION = (0.02, 0.1)
 """Least and largest Coulomb coefficient of a PTFE-coated wire on wet intima, assumed."""
 PUSH_LIMIT_N = 10.0
 """Force at which the hand slips on the wire, N, assumed."""
 _CORE_STIFFENS_OVER_MM = 4.0
-_STEP_MM, _ELEMENT_MM, _SPACING_MM = 1.0, 1.5, 0.9
+_STEP_MM, _COARSE_MM, _ELEMENT_MM = 1.0, 5.0, 1.5
+_SPACING = 0.25
+"""Grid spacing of the distance map, in radii of the narrowest artery."""
 _AORTA_MM, _BEYOND_MM = 220.0, 130.0
 """Length of the aorta, and of the wire in it, mm: the floppy tip lies beyond the iliac arteries."""
-_LEAST_BEND_MM, _CLEAR_MM = 15.0, 20.0
-"""Least radius of the path's curvature, and least distance of parts that lie farther apart along it than twice that, mm."""
-_LEAVES_DEG = 60.0
-"""Largest angle between the beginning of the common iliac artery and the aorta, degrees."""
-_TIMES = 3
-"""The path has as many half waves."""
+_HALF_WAVES, _TRIALS = 3, 300
+_NARROWS_MM = 10.0
+"""The arteries narrow over this length to either side of the iliac bifurcation, mm."""
+_LEAVES_DEG, _LEAST_BEND_MM, _CLEAR_MM = 60.0, 15.0, 20.0
+"""Largest angle at which the common iliac artery leaves the aorta's direction, degrees; least radius of a bend, mm;
+least distance of parts that lie farther apart along the path than twice that, mm: assumed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +118,7 @@ class AortoIliac:
         tree = VesselTree(tuple(branches), ("aorto-iliac",))
         first = unit * self.iliac_mm[:2]
         insertion = Insertion(first[0], (first[1] - first[0]) / np.linalg.norm(first[1] - first[0]))
-        inside = distance_map_from_spheres(tree, spacing_mm=_SPACING_MM * unit)
+        inside = distance_map_from_spheres(tree, spacing_mm=_SPACING * unit * float(self.radius_mm.min()))
         sheath = float(unit * self.radius_mm[0])
         return Anatomy(
             name="aorto-iliac path",
@@ -132,30 +137,30 @@ def draw_path(random: np.random.Generator) -> AortoIliac:
     """
     while True:
         tortuosity = random.normal(*TORTUOSITY)
-        length = random.uniform(*COMMON_MM), random.uniform(*EXTERNAL_MM)
-        widths = random.uniform(*COMMON_WIDTH_MM), random.uniform(*EXTERNAL_WIDTH_MM)
         apart = np.deg2rad(random.normal(*APART_DEG))
-        waves = random.normal(size=(_TIMES, 2)) / np.arange(1, _TIMES + 1)[:, None]
-        tissue = np.exp(random.uniform(*np.log(TISSUE_MPA)))
-        stiffens, friction = random.uniform(*STIFFENS_OVER_MM), random.uniform(*FRICTION)
+        common, external = random.uniform(*COMMON_MM), random.uniform(*EXTERNAL_MM)
         if not TORTUOSITY_LIMITS[0] <= tortuosity <= TORTUOSITY_LIMITS[1]:
             continue
-        axis = _hung(_wound(sum(length), tortuosity, waves), apart / 2)
-        leaves = (axis[0, 2] - axis[1, 2]) / np.linalg.norm(axis[1] - axis[0])
-        if leaves < np.cos(np.deg2rad(_LEAVES_DEG)):
-            continue
-        if _curvature(axis).max() > 1 / _LEAST_BEND_MM or not _clear_of_itself(axis):
-            continue
-        along = np.linspace(0, 1, len(axis)) * sum(length)
-        radius = np.interp(along, [length[0] - 10, length[0] + 10], [widths[0] / 2, widths[1] / 2])
-        return AortoIliac(
-            iliac_mm=axis[::-1],
-            radius_mm=radius[::-1],
-            aorta_mm=np.outer(np.arange(0, _AORTA_MM, _STEP_MM), [0.0, 0.0, 1.0]),
-            tissue_mpa=float(tissue),
-            stiffens_over_mm=stiffens,
-            friction=friction,
-        )
+        for _ in range(_TRIALS):
+            waves = random.normal(size=(_HALF_WAVES, 2)) / np.arange(1, _HALF_WAVES + 1)[:, None]
+            axis = _hung(_wound(common + external, tortuosity, waves), apart / 2)
+            if _is_open(axis):
+                return _surrounded(axis, common, random)
+
+
+def _surrounded(axis: Float[np.ndarray, "n 3"], common_mm: float, random: np.random.Generator) -> AortoIliac:
+    """Draw the widths of the arteries along an axis that begins at the bifurcation, and the tissue around."""
+    widths = random.uniform(*COMMON_WIDTH_MM), random.uniform(*EXTERNAL_WIDTH_MM)
+    narrows = [common_mm - _NARROWS_MM, common_mm + _NARROWS_MM]
+    radius = np.interp(_STEP_MM * np.arange(len(axis)), narrows, np.array(widths) / 2)
+    return AortoIliac(
+        iliac_mm=axis[::-1],
+        radius_mm=radius[::-1],
+        aorta_mm=np.outer(np.arange(0, _AORTA_MM, _STEP_MM), [0.0, 0.0, 1.0]),
+        tissue_mpa=float(np.exp(random.uniform(*np.log(TISSUE_MPA)))),
+        stiffens_over_mm=random.uniform(*STIFFENS_OVER_MM),
+        friction=random.uniform(*FRICTION),
+    )
 
 
 def _wound(length_mm: float, tortuosity: float, waves: Float[np.ndarray, "waves 2"]) -> Float[np.ndarray, "n 3"]:
@@ -178,18 +183,17 @@ def _hung(axis: Float[np.ndarray, "n 3"], angle_rad: float) -> Float[np.ndarray,
     return axis @ np.stack([down, across, np.cross(down, across)])
 
 
-def _curvature(axis: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-    first, second = (
-        np.gradient(axis, _STEP_MM, axis=0),
-        np.gradient(np.gradient(axis, _STEP_MM, axis=0), _STEP_MM, axis=0),
-    )
-    return np.linalg.norm(np.cross(first, second), axis=1) / np.linalg.norm(first, axis=1) ** 3
-
-
-def _clear_of_itself(axis: Float[np.ndarray, "n 3"]) -> bool:
-    points = np.concatenate([np.outer(np.arange(_AORTA_MM, 0, -5 * _STEP_MM), [0.0, 0.0, 1.0]), axis[::5]])
+def _is_open(axis: Float[np.ndarray, "n 3"]) -> bool:
+    """Return whether a path from the bifurcation on leaves the aorta, bends gently enough and stays off itself."""
+    first = np.gradient(axis, _STEP_MM, axis=0)
+    second = np.gradient(first, _STEP_MM, axis=0)
+    curvature = np.linalg.norm(np.cross(first, second), axis=1) / np.linalg.norm(first, axis=1) ** 3
+    if -first[0, 2] < np.cos(np.deg2rad(_LEAVES_DEG)) or curvature.max() > 1 / _LEAST_BEND_MM:
+        return False
+    aorta = np.outer(np.arange(_AORTA_MM, 0, -_COARSE_MM), [0.0, 0.0, 1.0])
+    points = np.concatenate([aorta, _evenly(axis, _COARSE_MM)])
     apart = np.linalg.norm(points[:, None] - points[None], axis=-1)
-    along = 5 * _STEP_MM * np.abs(np.subtract.outer(np.arange(len(points)), np.arange(len(points))))
+    along = _COARSE_MM * np.abs(np.subtract.outer(np.arange(len(points)), np.arange(len(points))))
     return bool((apart[along > 2 * _CLEAR_MM] > _CLEAR_MM).all())
 
 
@@ -238,9 +242,11 @@ class Straightened:
     """What a wire does to a path.
 
     Attributes:
-        moved_mm: by how much the axis of the iliac arteries is displaced beside points of the wire, 0.1 grid steps apart
-            from the bifurcation on, mm.
+        moved_mm: by how much the axis of the iliac arteries is displaced beside points of the wire, from the
+            bifurcation on, mm.
         axis_mm: where it lies then, in the unit of the path's scale.
+        begun_mm: where it lay before, likewise. The aorta's radius next to the bifurcation, where the arteries share
+            one lumen, is left out of all three.
         force_n: sum of the wall's forces, N.
         through: whether the wire came as far as commanded; not where the hand slipped.
         valid: whether the simulation converged and the wire stayed within the tissue.
@@ -248,6 +254,7 @@ class Straightened:
 
     moved_mm: Float[np.ndarray, "n"]
     axis_mm: Float[np.ndarray, "n 3"]
+    begun_mm: Float[np.ndarray, "m 3"]
     force_n: float
     through: bool
     valid: bool
@@ -266,6 +273,11 @@ class Straightened:
     def tortuosity(self) -> float:
         """Length of the displaced axis over the distance of its ends."""
         return tortuosity_index(self.axis_mm)
+
+    @property
+    def tortuosity_before(self) -> float:
+        """The same before the wire came."""
+        return tortuosity_index(self.begun_mm)
 
 
 def straighten(
@@ -299,6 +311,7 @@ def straighten(
     return Straightened(
         moved_mm=unit * moved,
         axis_mm=displaced,
+        begun_mm=axis,
         force_n=float(rollout.contact_force_sum[0, -1]),
         through=bool(valid and abs(rollout.inserted_length[0, -1] - inserted) < 1e-6),
         valid=valid,
@@ -328,11 +341,11 @@ def displaced_axis(
     within = (nearest > 0) & (nearest < len(near) - 1)
     beside, near = beside[within], near[nearest[within]]
     aside = (beside - near) / np.maximum(np.linalg.norm(beside - near, axis=1, keepdims=True), 1e-12)
-    moved = np.maximum(radius_mm - sample(distance_map, beside), 0.0)
+    moved = np.maximum(radius_mm - sample(distance_map, beside, order=2), 0.0)
     return moved, near + moved[:, None] * aside
 
 
 def _evenly(line: Float[np.ndarray, "n 3"], step: float) -> Float[np.ndarray, "m 3"]:
+    """Return evenly spaced points on a smooth curve through those of a line: a wire's elements are long chords."""
     along = np.append(0, np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1)))
-    at = np.arange(0, along[-1], step)
-    return np.column_stack([np.interp(at, along, column) for column in line.T])
+    return CubicSpline(along, line)(np.arange(0, along[-1], step))
