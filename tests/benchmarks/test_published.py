@@ -162,12 +162,14 @@ def test_straightened_paths_are_shown_without_a_verdict_and_those_that_fail_are_
     softest = of["Amplatz: largest displacement"]
     assert softest.published is None and softest.row()["verdict"] is None
     assert softest.ours == (9.5, 9.5) and softest.note == "1 did not pass"
-    assert of["Lunderquist Extra Stiff: mean displacement"].ours == (79.2, 79.2)
+    assert of["Lunderquist Extra Stiff: mean displacement"].ours == pytest.approx((79.2, 79.2))
     assert of["Amplatz: tortuosity index"].ours == (1.0, 1.0)
     assert of["no wire: tortuosity index"].ours == pytest.approx((10 / 6, 10 / 6))
     assert of["Lunderquist Extra Stiff, rigid wall: force of the wall"].ours == (1.0, 1.0)
     failed = of["Amplatz Super Stiff: force of the wall"]
     assert failed.ours == (61.3,) and failed.note == "1 did not converge"
+    assert of["Amplatz Extra Stiff over Amplatz: largest displacement"].ours == pytest.approx((29.2 / 9.5,) * 2)
+    assert len(of["Lunderquist Extra Stiff over Amplatz Super Stiff: largest displacement"].ours) == 1
     assert len([each for each in of.values() if each.kind == "sensitivity"]) == 4
     drawn = of["tortuosity index of iliac arteries, drawn"]
     assert drawn.kind == "calibration" and len(set(drawn.ours)) == 2

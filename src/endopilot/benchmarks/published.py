@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -273,7 +274,7 @@ class _Drawn:
 def straightenings(config: PublishedConfig) -> list[Comparison]:
     """Push stiff wires through aorto-iliac paths in yielding tissue, all of which are drawn at random.
 
-    Nobody published how far a wire displaces a path that is stated, so none of these figures is judged.
+    No article was found that states a path and by how much a wire displaces it, so none of these figures is judged.
 
     Raises:
         RuntimeError: the rod core did not converge in any draw of a test.
@@ -309,6 +310,7 @@ def straightenings(config: PublishedConfig) -> list[Comparison]:
     drawn = Comparison("tortuosity index of iliac arteries, drawn", TORTUOUS, "calibration", "", spread, tuple(before))
     rows = [_measured("no wire: tortuosity index", "tortuosity_before", "", yielding[softest])]
     rows += [row for name, tests in yielding.items() for row in _straightened(name, tests)]
+    rows += _in_order(yielding)
     rows += [
         _measured(f"{name}, rigid wall: force of the wall", "force_n", "N", tests) for name, tests in rigid.items()
     ]
@@ -327,6 +329,18 @@ def _straightened(name: str, tests: list[Straightened]) -> list[Comparison]:
         ("force of the wall", "force_n", "N"),
     )
     return [_measured(f"{name}: {what}", quantity, unit, tests) for what, quantity, unit in quantities]
+
+
+def _in_order(yielding: dict[str, list[Straightened]]) -> list[Comparison]:
+    """Return by how much more each wire displaces a path than the next softer one, as a ratio."""
+    rows: list[Comparison] = []
+    for softer, stiffer in pairwise(yielding):
+        pairs = zip(yielding[stiffer], yielding[softer], strict=True)
+        ratios = tuple(more.largest_mm / less.largest_mm for more, less in pairs if more.valid and less.valid)
+        case = f"aorto-iliac path, {stiffer} over {softer}: largest displacement"
+        if ratios:
+            rows.append(Comparison(case, HARRISON, "prediction", "", None, ratios))
+    return rows
 
 
 def _measured(case: str, quantity: str, unit: str, tests: list[Straightened], kind: Kind = "prediction") -> Comparison:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -49,9 +50,8 @@ Arteriosclerosis 6 (1986) 109-113)."""
 TISSUE_MPA = (0.0023, 0.012)
 """Least and largest modulus of the tissue around, MPa: three times the shear modulus of fat in living people, 752 Pa
 (J Mech Behav Biomed Mater 2023), and that of the heart's muscle in docs/physics.md."""
-STIFFENS_OVER_MM = (12.0, 30.0)
-"""Least and largest width of the tissue that shears, mm, assumed: from the artery's own width to what lies between it
-and the bone."""
+STIFFENS_OVER_MM = (20.0, 40.0)
+"""Least and largest width of the tissue that shears, mm, assumed: what may lie between the artery and the bone."""
 FRICTION = (0.02, 0.1)
 """Least and largest Coulomb coefficient of a PTFE-coated wire on wet intima, assumed."""
 PUSH_LIMIT_N = 10.0
@@ -171,7 +171,7 @@ def _wound(length_mm: float, tortuosity: float, waves: Float[np.ndarray, "waves 
     def line(amplitude: float) -> Float[np.ndarray, "n 3"]:
         return np.column_stack([fine, amplitude * sines])
 
-    amplitude = float(brentq(lambda size: tortuosity_index(line(size)) - tortuosity, 0.0, 10.0))
+    amplitude: Any = brentq(lambda size: tortuosity_index(line(size)) - tortuosity, 0.0, 10.0)
     points = line(amplitude)
     points *= length_mm / np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
     return _evenly(points, _STEP_MM)
