@@ -45,8 +45,8 @@ COMMON_WIDTH_MM, EXTERNAL_WIDTH_MM, AORTA_WIDTH_MM = (9.0, 15.0), (7.0, 9.0), 20
 7.5 mm in healthy adults (CT of 112 patients, PAIRS 2022, e-poster 1643), 13.6 ± 1.5 mm for common iliac arteries in
 which stent grafts end (PMC5624232), 20.1 ± 2.9 mm for the aorta (Surg Radiol Anat 35 (2013) 411-417)."""
 APART_DEG = (35.0, 11.1)
-"""Mean and SD of the angle between the common iliac arteries, degrees, of 70 bifurcations (Bargeron et al.,
-Arteriosclerosis 6 (1986) 109-113)."""
+"""Mean and SD of the angle between the common iliac arteries, degrees, of 70 people ("Distribution of the geometric
+parameters of human aortic bifurcations", Arteriosclerosis 1986)."""
 TISSUE_MPA = (0.0023, 0.012)
 """Least and largest modulus of the tissue around, MPa: three times the shear modulus of fat in living people, 752 Pa
 (J Mech Behav Biomed Mater 2023), and that of the heart's muscle in docs/physics.md."""
