@@ -57,7 +57,7 @@ def test_a_wire_straightens_waves_as_a_beam_on_an_elastic_bed_does(waves, modulu
     third = len(found.moved_mm) // 3  # the wave in the middle
     assert found.moved_mm[third : 2 * third].max() == pytest.approx(expected, rel=0.02)
     # What the wall bears is what the bed bears: the integral of K d over the wire.
-    length = path.scale * np.linalg.norm(np.diff(found.begun_mm, axis=0), axis=1).sum()
+    length = np.linalg.norm(np.diff(found.begun_mm, axis=0), axis=1).sum()
     d = found.moved_mm
     assert found.force_n == pytest.approx(bed * (d * np.exp(stiffening * d**2)).mean() * length, rel=0.03)
 

@@ -244,9 +244,9 @@ class Straightened:
     Attributes:
         moved_mm: by how much the axis of the iliac arteries is displaced beside points of the wire, from the
             bifurcation on, mm.
-        axis_mm: where it lies then, in the unit of the path's scale.
-        begun_mm: where it lay before, likewise. The aorta's radius next to the bifurcation, where the arteries share
-            one lumen, is left out of all three.
+        axis_mm: where it lies then, mm.
+        begun_mm: where it lay before, from the groin on, mm. The aorta's radius next to the bifurcation, where the
+            arteries share one lumen, is left out of all three.
         force_n: sum of the wall's forces, N.
         through: whether the wire came as far as commanded; not where the hand slipped.
         valid: whether the simulation converged and the wire stayed within the tissue.
@@ -310,8 +310,8 @@ def straighten(
     moved, displaced = displaced_axis(anatomy.distance_map, axis, shape, device.tip_radius_mm)
     return Straightened(
         moved_mm=unit * moved,
-        axis_mm=displaced,
-        begun_mm=axis,
+        axis_mm=unit * displaced,
+        begun_mm=unit * axis,
         force_n=float(rollout.contact_force_sum[0, -1]),
         through=bool(valid and abs(rollout.inserted_length[0, -1] - inserted) < 1e-6),
         valid=valid,
