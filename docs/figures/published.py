@@ -39,9 +39,9 @@ def _line(row: dict[str, Any]) -> str:
     if least is None:
         published = "no figure"
     else:
-        published = f"{least:g} {unit}" if least == largest else f"{least:g} to {largest:g} {unit}"
+        published = (f"{least:g} {unit}" if least == largest else f"{least:g} to {largest:g} {unit}").rstrip()
     ours = f"{row['ours']:g} [{row['ours_p5']:g} to {row['ours_p95']:g}]" if row["draws"] > 1 else f"{row['ours']:g}"
-    ours += f" {unit}" if least is None else ""
+    ours += f" {unit}" if least is None and unit else ""
     within = "" if row["share_within"] is None or row["draws"] == 1 else f"{100 * row['share_within']:.0f} %"
     error = f"{100 * (row['ours'] / least - 1):+.1f} %" if least is not None and least == largest else ""
     verdict = error or row["verdict"] or ("not judged" if row["kind"] == "prediction" else "")
