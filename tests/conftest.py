@@ -57,7 +57,7 @@ def evaluated(toy_dataset, tmp_path_factory):
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # small batches gain nothing from two, and lose much where cores are shared
     make_untrained_run(toy_dataset, folder / "run")
-    with patch("endopilot.evaluation.replay.simulate", toy_simulate):
+    with patch("endopilot.dataset.again.simulate", toy_simulate):
         settings = EvaluateConfig(sequences=8)
         metrics = evaluate(folder / "run", folder / "evaluation", settings, other_seeds=[folder / "run"])
     torch.set_num_threads(threads)

@@ -49,7 +49,9 @@ def toy_anatomy(name: str) -> Anatomy:
     )
 
 
-def toy_simulate(anatomy: Anatomy, device, control, *, initial, config, friction, motion=None) -> Rollout:
+def toy_simulate(
+    anatomy: Anatomy, device, control, *, initial, config, friction, motion=None, record_shape=False
+) -> Rollout:
     """Return what the toy wire does under the controls; takes what `simulate` takes."""
     worlds, samples, _ = control.shape
     proximal = initial[:, None] + SAMPLE_PERIOD_S * np.cumsum(control, axis=1)
@@ -92,7 +94,14 @@ def toy_simulate(anatomy: Anatomy, device, control, *, initial, config, friction
         node_iterations=np.ones((worlds, samples)),
         valid=np.ones((worlds, samples), dtype=bool),
         reason=np.zeros(worlds, dtype=int),
+        shape=_straight(abscissa, offset) if record_shape else None,
     )
+
+
+def _straight(abscissa: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """Return the nodes of wires that lie straight behind their tips, 0.5 mm apart."""
+    along = abscissa[..., None] - 0.5 * np.arange(260)
+    return np.stack([along, np.broadcast_to(offset[..., None], along.shape), np.zeros_like(along)], axis=-1)
 
 
 def write_toy_anatomies(folder: Path, patients: int) -> list[Path]:

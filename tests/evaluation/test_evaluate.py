@@ -78,7 +78,7 @@ def test_patients_are_predicted_one_after_the_other_with_the_error_so_far(toy_da
     data = load_dataset(toy_dataset)
     data = data.select(np.random.default_rng(0).permutation(len(data)))
     remarks, predictor = [], Parroting()
-    with patch("endopilot.evaluation.replay.simulate", toy_simulate):
+    with patch("endopilot.dataset.again.simulate", toy_simulate):
         result = run_protocols(predictor, data, None, lambda amount=1, remark="": remarks.append(remark))
     np.testing.assert_array_equal(result.tips["P1"].abscissa, result.true.abscissa)
     assert len(remarks) == count_steps(data)
@@ -102,11 +102,11 @@ def test_recorded_controls_lead_back_to_the_recorded_tips(evaluated):
 def test_the_core_is_replayed_with_other_friction(toy_dataset, evaluated):
     asked = {}
 
-    def watched(anatomy, device, control, *, initial, config, friction, motion):
+    def watched(anatomy, device, control, *, friction, **others):
         asked[anatomy.name] = friction
-        return toy_simulate(anatomy, device, control, initial=initial, config=config, friction=friction)
+        return toy_simulate(anatomy, device, control, friction=friction, **others)
 
-    with patch("endopilot.evaluation.replay.simulate", watched):
+    with patch("endopilot.dataset.again.simulate", watched):
         metrics = evaluate(evaluated[0] / "run", evaluated[0] / "again", EvaluateConfig(sequences=2))
     true = load_dataset(toy_dataset).friction[0]
     for friction in asked.values():
@@ -154,7 +154,7 @@ def chosen(dataset, mask) -> set[tuple[str, int]]:
 
 def test_all_navigations_of_a_dataset_of_new_patients_are_evaluated(elsewhere, trained_on, tmp_path):
     dataset, out = load_dataset(elsewhere), tmp_path / "out"
-    with patch("endopilot.evaluation.replay.simulate", toy_simulate):
+    with patch("endopilot.dataset.again.simulate", toy_simulate):
         metrics = evaluate(trained_on(elsewhere, set()), out, EvaluateConfig(), elsewhere)
     results = read_results(out / "evaluation.npz")
     assert {"train", "calibrate", "test"} <= set(dataset.split.tolist())
@@ -173,7 +173,7 @@ def test_known_patients_among_new_ones_stay_known(elsewhere, trained_on, tmp_pat
     dataset = load_dataset(elsewhere)
     names = {str(dataset.anatomy[dataset.split == split][0]) for split in ("train", "calibrate", "test")}
     known, training = np.isin(dataset.anatomy, sorted(names)), dataset.split == "train"
-    with patch("endopilot.evaluation.replay.simulate", toy_simulate):
+    with patch("endopilot.dataset.again.simulate", toy_simulate):
         metrics = evaluate(trained_on(elsewhere, names), tmp_path / "out", EvaluateConfig(), elsewhere)
     results = read_results(tmp_path / "out" / "evaluation.npz")
     assert rows(results["test"]) == chosen(dataset, ~known)

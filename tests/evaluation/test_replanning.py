@@ -51,7 +51,7 @@ def planned(recorded, predictor):
 
 def test_each_plan_is_given_the_drive_and_what_was_exposed_and_nothing_else(recorded) -> None:
     predictor, data = HoldSlack(), recorded.data
-    with patch("endopilot.evaluation.replay.simulate", toy_simulate):
+    with patch("endopilot.dataset.again.simulate", toy_simulate):
         _, control = planned(recorded, predictor)
         done = replay(recorded, {"P4": recorded.drivable(control)}, lambda *_: None)["P4"]
     assert (
@@ -81,7 +81,7 @@ def test_each_plan_is_given_the_drive_and_what_was_exposed_and_nothing_else(reco
 
 def test_x_ray_brings_the_tip_back_to_its_desired_path(recorded) -> None:
     predictor, data = HoldSlack(), recorded.data
-    with patch("endopilot.evaluation.replay.simulate", toy_simulate):
+    with patch("endopilot.dataset.again.simulate", toy_simulate):
         first, control = planned(recorded, predictor)
         series = {"P4": recorded.drivable(first.control), "P4_replanned": recorded.drivable(control)}
         done = replay(recorded, series, lambda *_: None)
@@ -98,7 +98,7 @@ def test_a_world_that_fails_has_no_controls_from_there_on(recorded) -> None:
         valid[0, 60:] = False  # first episode of each patient
         return replace(rollout, valid=valid)
 
-    with patch("endopilot.evaluation.replay.simulate", failing):
+    with patch("endopilot.dataset.again.simulate", failing):
         _, control = planned(recorded, HoldSlack())
     firsts = [int(np.flatnonzero(recorded.anatomy_of == i)[0]) for i in range(len(recorded.anatomies))]
     lost = np.isnan(control).any(axis=-1)

@@ -18,10 +18,11 @@ from endopilot.control.robot import CYCLE_S, RobotConfig, SimulatedRobot
 from endopilot.settings import settings
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.drive_limits import DriveLimits
-from endopilot.simulation.motion import Motion, place, relative
+from endopilot.simulation.motion import Motion, place
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import DECISION_PERIOD_S, SUCCESS_MM, Navigation, XrayKind, check_wire_alone
 from endopilot.xray.fluoroscope import Fluoroscope, FluoroscopeConfig, TipMeasurement
+from endopilot.xray.moving_patient import seen, turned
 
 _CYCLES = round(DECISION_PERIOD_S / CYCLE_S)
 
@@ -200,9 +201,8 @@ class NavigationLoop:
         if isinstance(self.fluoroscope, Fluoroscope):
             tip, heading = self.simulator.tips()[0], self.simulator.tip_direction[0]
             if self._moves:
-                seen = self._seen()
-                tip, heading = place(seen, tip), seen[:, :3] @ heading
-                heading = heading / np.linalg.norm(heading)
+                shown = self._seen()
+                tip, heading = place(shown, tip), turned(shown, heading)
             return self.fluoroscope.expose(tip, heading, inserted_length, self._random)
         nodes = self.simulator.position[0]
         if self._moves:
@@ -211,10 +211,7 @@ class NavigationLoop:
 
     def _seen(self) -> Float[np.ndarray, "3 4"]:
         """Return where the C-arm takes points of the moving vessel to lie in the vessel as CT shows it."""
-        placed = self.simulator.vessel_to_laboratory[0]
-        if self._known is None:
-            return placed
-        return relative(placed, self._known.placements(np.array([self.time_s]))[0][0])
+        return seen(self.simulator.vessel_to_laboratory[:1], self._known, np.array([self.time_s]))[0]
 
     def _decide(self, observation: Observation, by_hand: Decision | None) -> Decision:
         if by_hand is None:

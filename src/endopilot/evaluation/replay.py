@@ -9,15 +9,14 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from endopilot.anatomy.io import read_anatomy
+from endopilot.dataset.again import simulate_again
 from endopilot.dataset.loader import Dataset
 from endopilot.evaluation.results import REPLAYED, TipSeries
 from endopilot.models.config import WINDOW
 from endopilot.progress import Advance
 from endopilot.settings import from_record
-from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import Device
 from endopilot.simulation.drive_limits import DriveLimits
-from endopilot.simulation.simulate import simulate
 from endopilot.types import Anatomy, Rollout
 
 Control = Float[np.ndarray, "episodes samples 2"]
@@ -80,30 +79,14 @@ class Recorded:
             Episodes that one simulation serves, and the simulation: a world for each series and episode, series by
             series.
         """
-        data, settings = self.data, SimulatorConfig(**self.data.manifest["config"]["simulator"])
-        # a simulation has one anatomy and one wire
-        alike = np.stack([self.anatomy_of, data.tip_bend, data.tip_stiffness_factor], axis=-1).astype(float)
-        kinds, kind_of = np.unique(alike, axis=0, return_inverse=True)
-        for kind, (index, bend, factor) in enumerate(kinds):
-            anatomy, chosen = self.anatomies[int(index)], np.flatnonzero(kind_of.ravel() == kind)
-            wire = self.device.with_tip(bend_rad=float(bend), stiffness_factor=float(factor))
-            driven = np.concatenate([self._whole(control)[chosen] for control in controls.values()])
-            worlds = np.tile(chosen, len(controls))
-            initial = np.stack([data.initial_inserted_length[worlds], data.initial_rotation[worlds]], axis=-1)
-            friction = np.concatenate([REPLAYED.get(name, 1.0) * data.friction[chosen] for name in controls])
-            yield (
-                chosen,
-                simulate(
-                    anatomy,
-                    wire,
-                    np.nan_to_num(driven),
-                    initial=initial,
-                    config=settings,
-                    friction=friction,
-                    motion=data.motion(anatomy.name),
-                ),
-            )
-            if advance and (kind + 1 == len(kinds) or kinds[kind + 1][0] != index):
+        for index, anatomy in enumerate(self.anatomies):
+            mine = np.flatnonzero(self.anatomy_of == index)
+            worlds = self.data.select(np.tile(mine, len(controls)))
+            driven = np.nan_to_num(np.concatenate([self._whole(control)[mine] for control in controls.values()]))
+            friction = np.concatenate([REPLAYED.get(name, 1.0) * self.data.friction[mine] for name in controls])
+            for chosen, rollout in simulate_again(worlds, anatomy, driven, friction=friction):
+                yield mine[chosen[: len(chosen) // len(controls)]], rollout
+            if advance:
                 advance(1, anatomy.name)
 
     def _whole(self, control: Control) -> Float[np.ndarray, "episodes all_samples 2"]:

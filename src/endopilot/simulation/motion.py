@@ -130,6 +130,22 @@ def motion_named(name: MotionName, seed: int | None = None) -> Motion | None:
     return motion
 
 
+def published_mean(motion: Motion) -> Motion | None:
+    """Return what is published of a patient's motion: the mean amplitudes of what moves, with the patient's periods.
+
+    Args:
+        motion: the patient's own; None is returned where nothing of it moves.
+    """
+    beats = bool(motion.annulus_mm or motion.heart_volume_share or motion.heart_rotation_deg)
+    shifts = motion.breathing_caudal_mm or motion.breathing_anterior_mm
+    breathes = bool(shifts or motion.breathing_dorsal_deg or motion.breathing_dextral_deg)
+    name: MotionName = ("both" if breathes else "heartbeat") if beats else ("breathing" if breathes else "still")
+    mean = motion_named(name)
+    if mean is None:
+        return None
+    return replace(mean, heart_period_s=motion.heart_period_s, breathing_period_s=motion.breathing_period_s)
+
+
 def draw_motion(seed: int) -> Motion:
     """Return the motion of one patient, drawn from normal distributions as published, within the published ranges."""
     random = np.random.default_rng(seed)
@@ -156,9 +172,13 @@ def place(
     return np.einsum("...ij,...j->...i", maps[..., :3], points) + maps[..., 3]
 
 
-def relative(maps: Float[np.ndarray, "3 4"], to: Float[np.ndarray, "3 4"]) -> Float[np.ndarray, "3 4"]:
-    """Return the affine map `to`⁻¹ ∘ `maps`: where points that `maps` moves lie in a frame that `to` moves."""
-    return np.linalg.solve(to[:, :3], maps - np.column_stack([np.zeros((3, 3)), to[:, 3]]))
+def relative(
+    maps: Float[np.ndarray, "*maps 3 4"], to: Float[np.ndarray, "*maps 3 4"]
+) -> Float[np.ndarray, "*maps 3 4"]:
+    """Return the affine maps `to`⁻¹ ∘ `maps`: where points that `maps` moves lie in a frame that `to` moves."""
+    away = maps.copy()
+    away[..., 3] -= to[..., 3]
+    return np.linalg.solve(to[..., :3], away)
 
 
 def _spline_coefficients(values: Float[np.ndarray, "knots 12"]) -> Float[np.ndarray, "knots 12"]:

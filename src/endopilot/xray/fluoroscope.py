@@ -17,8 +17,10 @@ from endopilot.anatomy.projection import project_tip
 from endopilot.anatomy.tree import tangents
 from endopilot.dataset.loader import Dataset
 from endopilot.settings import Finite, Positive, settings
+from endopilot.simulation.motion import place
 from endopilot.types import Anatomy, TipProjection
 from endopilot.xray.carm import CArmGeometry, View, view_at
+from endopilot.xray.moving_patient import seen_in_episodes, turned
 
 _CATHETER_MM = 20.0
 """Length of the guiding catheter behind the ostium that is straight, in which a tip may be found, mm."""
@@ -167,21 +169,24 @@ class Fluoroscope:
     ) -> TipProjection:
         """Return where an exposure would show the tip, at every sample of episodes of this patient.
 
+        Where the patient moves, it shows the tip where it is then, less the published mean of that motion.
+
         Args:
             episodes: navigations, with the tip as it truly is.
             inserted_length: Δ by the robot's encoder, mm, which helps to find the tip.
             seed: of the errors; those of a navigation depend on it, the patient and the sequence alone.
         """
-        position = np.zeros_like(episodes.tip_position, dtype=float)
+        tip, heading = episodes.tip_position.astype(float), episodes.tip_direction.astype(float)
+        position, name = np.zeros_like(tip), self._anatomy.name
+        ostium = np.asarray(self._anatomy.insertion.position)
+        shown = seen_in_episodes(episodes.motion(name), ostium, tip.shape[1], episodes.sample_period_s)
+        if shown is not None:
+            tip, heading = place(shown, tip), turned(shown, heading)
         for index, sequence in enumerate(episodes.sequence):
-            random = np.random.default_rng([seed, 3, int(sequence), *self._anatomy.name.encode()])
+            random = np.random.default_rng([seed, 3, int(sequence), *name.encode()])
             for sample in range(position.shape[1]):
-                position[index, sample] = self.locate(
-                    episodes.tip_position[index, sample].astype(float),
-                    episodes.tip_direction[index, sample].astype(float),
-                    float(inserted_length[index, sample]),
-                    random,
-                )
+                depth = float(inserted_length[index, sample])
+                position[index, sample] = self.locate(tip[index, sample], heading[index, sample], depth, random)
         return project_tip(self._anatomy.tree, self._anatomy.insertion, position)
 
     def _detect(

@@ -27,6 +27,10 @@ _MOVED_MM = 0.1
 """A tip is looked for again where its image has moved the vessel by more than this, mm."""
 
 
+class NotRegistered(InputError):
+    """A vessel is not recognised in the X-ray images that were to register the patient."""
+
+
 class ImageFluoroscope:
     """A C-arm around one patient, whose vessel is known from the CT and whose pose is not.
 
@@ -48,7 +52,7 @@ class ImageFluoroscope:
             seed: of the pose, up to 5 mm and 3° along and about each axis, and of these images' noise.
 
         Raises:
-            InputError: the vessel is not recognised in the images.
+            NotRegistered: the vessel is not recognised in the images.
         """
         config = config or FluoroscopeConfig()
         random = np.random.default_rng([seed, 0x706F7365])
@@ -60,13 +64,22 @@ class ImageFluoroscope:
         lit, before = ([self._signal(plane, _NO_WIRE, random, share) for plane in self._planes] for share in (1.0, 0.0))
         self.registration: Registration = register(anatomy, self._views, lit, before, self._imager.config)
         if self.registration.failure:
-            raise InputError(f"X-ray images: {anatomy.name} cannot be registered: {self.registration.failure}")
-        self.refiner = PoseRefiner(anatomy, self.registration)
+            raise NotRegistered(f"X-ray images: {anatomy.name} cannot be registered: {self.registration.failure}")
         self._detector = TipDetector(anatomy, device)
+        self.forget_wires()
         self._slack_mm = self.refiner.slack_mm(self._views, self._detector.config.slack_mm)
 
+    def forget_wires(self) -> None:
+        """Take the patient's pose to be what contrast showed, whatever the wires since: another navigation begins."""
+        self.refiner = PoseRefiner(self._anatomy, self.registration)
+
     def expose(
-        self, nodes: Float[np.ndarray, "n 3"], inserted_length: float, random: np.random.Generator
+        self,
+        nodes: Float[np.ndarray, "n 3"],
+        inserted_length: float,
+        random: np.random.Generator,
+        *,
+        refine: bool = True,
     ) -> TipMeasurement | None:
         """Take one exposure of every view and say where the tip is; None where no wire is found.
 
@@ -74,6 +87,7 @@ class ImageFluoroscope:
             nodes: of the wire as it truly is, from its tip on, LPS mm.
             inserted_length: Δ by the robot's encoder, mm.
             random: where the noise is drawn from.
+            refine: whether the wire refines the pose that later exposures take the patient to lie in.
         """
         signals = [self._signal(plane, nodes, random) for plane in self._planes]
         photons = [self._imager.photons(plane) for plane in self._planes]
@@ -81,8 +95,9 @@ class ImageFluoroscope:
         found = self._detector.find(self.refiner.views(self._views), *image, self._slack_mm)
         if found is None:
             return None
-        before = self.refiner.pose
-        moved_mm = vessel_error_mm(self._anatomy, before, self.refiner.refine(self._views, found, self._slack_mm))
+        before, moved_mm = self.refiner.pose, 0.0
+        if refine:
+            moved_mm = vessel_error_mm(self._anatomy, before, self.refiner.refine(self._views, found, self._slack_mm))
         if moved_mm > _MOVED_MM or self._slack_mm > self._detector.config.slack_mm:
             found = self._detector.find(self.refiner.views(self._views), *image) or found
         tip = project_tip(self._anatomy.tree, self._anatomy.insertion, found.position[None])

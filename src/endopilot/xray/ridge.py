@@ -48,8 +48,13 @@ class RidgeEvidence:
             signal: from `XrayImager.signal`.
             photons: that a pixel of usual brightness counts.
         """
-        terms = products(features(signal, photons))
-        return (terms @ self.weight.astype(np.float32) + np.float32(self.offset)).astype(np.float32)
+        found = features(signal, photons)
+        count = found.shape[-1]
+        square = np.zeros((count, count), dtype=np.float32)
+        square[np.triu_indices(count)] = self.weight[count:] / _MOST
+        # The same as `products` times the weights, without an image for each product.
+        terms = found @ square + self.weight[:count].astype(np.float32)
+        return np.einsum("...f,...f->...", terms, found) + np.float32(self.offset)
 
 
 def features(signal: Float32[np.ndarray, "rows columns"], photons: float) -> Float32[np.ndarray, "rows columns f"]:

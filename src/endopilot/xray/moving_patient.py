@@ -1,0 +1,50 @@
+"""What a C-arm sees of a patient who moves: the wire where it is at that moment, less the motion that is known."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from endopilot.simulation.motion import Motion, published_mean, relative
+from endopilot.simulation.processor import CoreMotion
+
+
+def seen(
+    placed: Float[np.ndarray, "n 3 4"], known: CoreMotion | None, times_s: Float[np.ndarray, "n"]
+) -> Float[np.ndarray, "n 3 4"]:
+    """Return the affine maps by which the C-arm sees points of the moving vessel displaced, mm in the vessel of the CT.
+
+    Args:
+        placed: from the vessel as CT shows it to where it truly lies.
+        known: motion that the C-arm takes off; none if not given.
+        times_s: of these moments, s.
+    """
+    return placed if known is None else relative(placed, known.placements(times_s)[0])
+
+
+def seen_in_episodes(
+    motion: Motion | None, ostium: Float[np.ndarray, "3"], samples: int, period_s: float
+) -> Float[np.ndarray, "samples 3 4"] | None:
+    """Return `seen` at each sample of a dataset's navigations in one patient; None if the patient lies still.
+
+    The phase of heart and breath is known, and of the amplitudes the published mean.
+
+    Args:
+        motion: the patient's own.
+        ostium: LPS mm.
+        samples: of a navigation.
+        period_s: time between them, s.
+    """
+    if motion is None:
+        return None
+    times_s, mean = period_s * np.arange(1, samples + 1), published_mean(motion)
+    placed = motion.core(ostium).placements(times_s)[0]
+    return seen(placed, None if mean is None else mean.core(ostium), times_s)
+
+
+def turned(
+    maps: Float[np.ndarray, "*maps 3 4"], directions: Float[np.ndarray, "*directions 3"]
+) -> Float[np.ndarray, "*turned 3"]:
+    """Return the unit vectors along lines, of such directions, after affine maps; both are broadcast."""
+    along = (maps[..., :3] @ directions[..., None])[..., 0]
+    return along / np.linalg.norm(along, axis=-1, keepdims=True)
