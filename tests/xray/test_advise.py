@@ -112,7 +112,7 @@ class Errs:
     def reset(self) -> None:
         pass
 
-    def observe(self, episodes, sample, tip, branch) -> None:
+    def observe(self, episodes, sample, tip, branch, sd_mm) -> None:
         pass
 
 
@@ -235,7 +235,9 @@ def test_a_twin_weights_its_wires_by_what_is_observed(split, monkeypatch) -> Non
     monkeypatch.setattr(TwinPredictor, "ensemble", lambda self, episodes, observed: paths)
     config = TwinConfig(members=3, abscissa_sd_mm=0.05)
     model = OnlineTwin(
-        TwinPredictor(device=read_device("workhorse-014"), simulator=SimulatorConfig(), config=config), given
+        TwinPredictor(device=read_device("workhorse-014"), simulator=SimulatorConfig(), config=config),
+        given,
+        split.found,
     )
     assert (model.tip[:, WINDOW:, 0] == 19.0).all()  # all alike so far: the middle one
     assert model.spread[0, -1, 0] == pytest.approx(np.sqrt(2 / 3))
@@ -266,7 +268,7 @@ def test_the_command_calibrates_measures_and_draws(folder, hold_slack, capsys) -
 def test_the_calibration_of_the_model_of_the_package_goes_to_the_output(
     folder, split, hold_slack, tmp_path, monkeypatch
 ) -> None:
-    monkeypatch.setattr(monitoring, "monitor", lambda *_: split)
+    monkeypatch.setattr(monitoring, "monitor", lambda *_, **__: split)
     monkeypatch.setattr(advise_module, "PERIODS", (1, 90))
     monkeypatch.setattr(advise_module, "SHARES", ())
     monkeypatch.setattr(advise_module, "THRESHOLDS", ())

@@ -95,6 +95,7 @@ class Episodes:
         proximal: x^prox = (Δ mm, φ rad).
         tip: (Δtip, γtip), mm.
         branch: index of the branch that the tip lies in.
+        tip_sd: standard deviations of (Δtip, γtip) as whatever measured them states them, mm; 0 where it states none.
     """
 
     setup: Setup
@@ -105,6 +106,7 @@ class Episodes:
     proximal: Float[np.ndarray, "episodes samples 2"]
     tip: Float[np.ndarray, "episodes samples 2"]
     branch: Int[np.ndarray, "episodes samples"]
+    tip_sd: Float[np.ndarray, "episodes samples 2"]
 
     @staticmethod
     def of_dataset(dataset: Dataset) -> Episodes:
@@ -130,6 +132,7 @@ class Episodes:
             proximal=np.stack([dataset.inserted_length, dataset.rotation], axis=-1),
             tip=np.stack([dataset.tip_abscissa, dataset.tip_offset], axis=-1),
             branch=dataset.branch,
+            tip_sd=np.zeros((*dataset.branch.shape, 2), dtype=np.float32),
         )
 
     @staticmethod
@@ -159,6 +162,7 @@ class Episodes:
             proximal=initial + SAMPLE_PERIOD_S * np.cumsum(control, axis=1),
             tip=tip,
             branch=np.zeros((count, samples), dtype=np.int64),
+            tip_sd=np.zeros((count, samples, 2)),
         )
 
     def __len__(self) -> int:
@@ -184,7 +188,7 @@ class Episodes:
         """Return the episodes from a sample on; the state before it is their initial one."""
         if first == 0:
             return self
-        names = ("control", "slip", "proximal", "tip", "branch")
+        names = ("control", "slip", "proximal", "tip", "branch", "tip_sd")
         later = {name: getattr(self, name)[:, first:] for name in names}
         return replace(self, initial=self.proximal[:, first - 1], **later)
 

@@ -19,7 +19,7 @@ from scipy.stats import qmc
 
 from endopilot.models.config import WINDOW, TwinConfig
 from endopilot.models.episodes import Episodes
-from endopilot.models.open_loop import Observed, OpenLoop, Prediction, begin_after, given_states, jumps
+from endopilot.models.open_loop import EachObserved, Observed, OpenLoop, Prediction, begin_after, given_states, jumps
 from endopilot.models.tip_tracking import track
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import Device
@@ -71,22 +71,23 @@ class TwinPredictor:
     predicted: WeakKeyDictionary[Episodes, TwinPrediction] = field(default_factory=WeakKeyDictionary, repr=False)
     tracked: WeakKeyDictionary[Episodes, OpenLoop] = field(default_factory=WeakKeyDictionary, repr=False)
 
-    def predict(self, episodes: Episodes, observed: Observed) -> TwinPrediction:
+    def predict(self, episodes: Episodes, observed: Observed | EachObserved) -> TwinPrediction:
         """Predict the tips of episodes from their controls and from the observed tips.
 
         Args:
             episodes: their controls, and their tips where `observed`; no other tip is read.
-            observed: samples at which the tip was observed.
+            observed: samples at which the tip was observed, of all episodes alike or of each.
         """
         tip, spread = np.full(episodes.tip.shape, np.nan), np.full(episodes.tip.shape, np.nan)
         parameters, jump = np.full((len(episodes), 3), np.nan), np.zeros(episodes.branch.shape)
+        seen = np.broadcast_to(observed, episodes.branch.shape)
         for anatomy, chosen in _by_anatomy(episodes):
-            data = episodes.select(chosen)
-            members, paths = self._narrowed_ensemble(anatomy, data, observed)
-            weight = _weights(paths, data.tip.astype(float), observed, self.config)
+            data, each = episodes.select(chosen), seen[chosen]
+            members, paths = self._narrowed_ensemble(anatomy, data, each)
+            scale = _scales(data.tip_sd, self.config)
+            weight = _weights(paths, data.tip.astype(float), each, scale)
             tip[chosen], own = _median_and_spread(paths, weight)
-            each = np.broadcast_to(observed, data.branch.shape)
-            beyond = _unexplained(tip[chosen], data.tip.astype(float), each, self.config)
+            beyond = _unexplained(tip[chosen], data.tip.astype(float), each, scale)
             spread[chosen] = np.hypot(own, beyond)
             inserted = np.broadcast_to(data.proximal[..., 0], paths.shape[:-1])
             jump[chosen] = np.einsum(
@@ -95,23 +96,26 @@ class TwinPredictor:
             parameters[chosen] = members[weight.argmax(axis=0), np.arange(len(data))]
         return TwinPrediction(tip, spread, jump, parameters)
 
-    def ensemble(self, episodes: Episodes, observed: Observed) -> Float[np.ndarray, "members episodes samples 2"]:
+    def ensemble(
+        self, episodes: Episodes, observed: Observed | EachObserved
+    ) -> Float[np.ndarray, "members episodes samples 2"]:
         """Return the tips, mm, of every wire that is likely after the observed ones; NaN from where a simulation fails.
 
         `weigh` makes a prediction of them, and again, without another simulation, when more tips are observed.
         """
         paths = np.full((self.config.members, *episodes.tip.shape), np.nan)
         for anatomy, chosen in _by_anatomy(episodes):
-            paths[:, chosen] = self._narrowed_ensemble(anatomy, episodes.select(chosen), observed)[1]
+            seen = np.broadcast_to(observed, episodes.branch.shape)[chosen]
+            paths[:, chosen] = self._narrowed_ensemble(anatomy, episodes.select(chosen), seen)[1]
         return paths
 
     def _narrowed_ensemble(
-        self, anatomy: Anatomy, data: Episodes, observed: Observed
+        self, anatomy: Anatomy, data: Episodes, observed: EachObserved
     ) -> tuple[Members, Float[np.ndarray, "members episodes s 2"]]:
         """Return the second ensemble of the episodes of one anatomy, and its tips."""
         members = self._members(np.tile(_NOMINAL, (len(data), 1)), np.tile(self._spread, (len(data), 1)))
-        paths = self._simulate(anatomy, data, members, int(np.flatnonzero(observed).max(initial=0)) + 1)
-        weight = _weights(paths, data.tip.astype(float), observed, self.config)
+        paths = self._simulate(anatomy, data, members, int(np.nonzero(observed)[1].max(initial=0)) + 1)
+        weight = _weights(paths, data.tip.astype(float), observed, _scales(data.tip_sd, self.config))
         members = self._members(*_narrowed(members, weight, self._spread))
         return members, self._simulate(anatomy, data, members, data.samples)
 
@@ -209,6 +213,7 @@ def weigh(
     paths: Float[np.ndarray, "members episodes samples 2"],
     tips: Float[np.ndarray, "episodes samples 2"],
     observed: Bool[np.ndarray, "episodes samples"],
+    sd_mm: Float[np.ndarray, "episodes samples 2"],
     config: TwinConfig,
 ) -> tuple[Float[np.ndarray, "episodes samples 2"], Float[np.ndarray, "episodes samples 2"]]:
     """Return the tip that an ensemble predicts, and its spread, mm, from the observed tips of each episode.
@@ -217,16 +222,24 @@ def weigh(
         paths: of the members, mm, as `TwinPredictor.ensemble` gives them.
         tips: (Δtip, γtip) where `observed`, mm; no other is read.
         observed: samples at which the tip was observed.
+        sd_mm: standard deviations of these tips as whatever measured them states them, mm; 0 where it states none.
         config: scales of the error of a good member.
     """
-    return _median_and_spread(paths, _weights(paths, tips, observed, config))
+    return _median_and_spread(paths, _weights(paths, tips, observed, _scales(sd_mm, config)))
+
+
+def _scales(
+    sd_mm: Float[np.ndarray, "episodes samples 2"], config: TwinConfig
+) -> Float[np.ndarray, "episodes samples 2"]:
+    """Return the scales of a good member's error at each sample, mm: no smaller than what the measurement states."""
+    return np.maximum([config.abscissa_sd_mm, config.offset_sd_mm], sd_mm)
 
 
 def _unexplained(
     middle: Float[np.ndarray, "episodes samples 2"],
     tips: Float[np.ndarray, "episodes samples 2"],
     observed: Bool[np.ndarray, "episodes samples"],
-    config: TwinConfig,
+    scale: Float[np.ndarray, "episodes samples 2"],
 ) -> Float[np.ndarray, "episodes samples 2"]:
     """Return by how much more than a good member the median erred at every one of the last observations, mm.
 
@@ -234,7 +247,7 @@ def _unexplained(
     it. A single error may be one of the measurement.
     """
     error = np.nan_to_num(np.abs(middle - np.where(observed[..., None], tips, middle)))
-    beyond = np.maximum(error - GOOD * np.array([config.abscissa_sd_mm, config.offset_sd_mm]), 0.0)
+    beyond = np.maximum(error - GOOD * scale, 0.0)
     count = np.cumsum(observed, axis=1)
     order = np.argsort(~observed, axis=1, kind="stable")  # observed samples first
     last = np.maximum(count[..., None] - 1 - np.arange(_PERSISTENT), 0)
@@ -246,16 +259,16 @@ def _unexplained(
 def _weights(
     paths: Float[np.ndarray, "members episodes s 2"],
     tips: Float[np.ndarray, "episodes samples 2"],
-    observed: Bool[np.ndarray, "*episodes samples"],
-    config: TwinConfig,
+    observed: Bool[np.ndarray, "episodes samples"],
+    scale: Float[np.ndarray, "episodes samples 2"],
 ) -> Float[np.ndarray, "members episodes"]:
     """Return the members' weights: the product of Cauchy densities of their errors at the observed tips.
 
     Heavy tails, because a snap that comes a moment too early errs by a millimetre and says little about friction.
     """
-    at = np.flatnonzero(observed.any(axis=tuple(range(observed.ndim - 1))))
+    at = np.flatnonzero(observed.any(axis=0))
     at = at[at < paths.shape[2]]
-    error = (paths[:, :, at] - tips[:, at]) / np.array([config.abscissa_sd_mm, config.offset_sd_mm])
+    error = (paths[:, :, at] - tips[:, at]) / scale[:, at]
     score = np.where(observed[..., at, None], np.nan_to_num(-np.log1p(error**2), nan=-1e3), 0.0).sum(axis=(2, 3))
     weight = np.exp(score - score.max(axis=0))
     return weight / weight.sum(axis=0)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from endopilot.dataset.loader import Dataset, load_dataset
 from endopilot.errors import InputError
 from endopilot.files import manifest, write_json, writing
-from endopilot.models.config import PRETRAINED, read_run
+from endopilot.models.config import PRETRAINED, WINDOW, read_run
 from endopilot.models.provenance import check_wire
 from endopilot.progress import progress
 from endopilot.xray import monitoring
@@ -52,7 +52,8 @@ def advise(
 
     Raises:
         InputError: the run or a dataset is missing or damaged, they are of different wires, there are too few
-            calibration patients, or one of `also_test` tests on patients that the bands are fitted to.
+            calibration patients, or too few that can be registered in images, or one of `also_test` tests on patients
+            that the bands are fitted to.
     """
     from endopilot.models.rollout import load_model  # brings torch
     from endopilot.plotting import png  # brings matplotlib, which takes a second to import
@@ -64,7 +65,9 @@ def advise(
     splits = [episodes.of_split(name) for name in ("train", "calibrate", "test")]
     check_enough(len(set(splits[1].anatomy)), config.adviser.level)
     others = [_other(run, folder, splits[:2]) for folder in also_test]
-    fitted, own, test = (monitoring.monitor(predictor, split, config) for split in splits)
+    fitted = monitoring.monitor(predictor, splits[0], config, samples=WINDOW)
+    own, test = (monitoring.monitor(predictor, split, config) for split in splits[1:])
+    check_enough(len(set(own.episodes.anatomy)), config.adviser.level)
     calibration = monitoring.calibrate(fitted, own, config.adviser)
     shares = sorted({*SHARES, calibration.heeded})
     with progress("Advising", len(PERIODS) + len(shares) + len(THRESHOLDS) + 1) as advance:
@@ -108,6 +111,8 @@ def advise(
         "curves": curves,
         "other_thresholds": thresholds,
         "made_otherwise": otherwise,
+        "patients_not_registered": [*fitted.unregistered, *own.unregistered, *test.unregistered],
+        "images_without_a_wire_share": float(1 - test.found.mean()),
         "manifest": manifest(
             config=config,
             seed=config.seed,

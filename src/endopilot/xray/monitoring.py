@@ -17,10 +17,12 @@ from endopilot.models.open_loop import Predictor
 from endopilot.progress import progress
 from endopilot.settings import NonNegative, Seed, from_record, settings
 from endopilot.simulation.device import Device
+from endopilot.tasks.navigation import XrayKind
 from endopilot.types import SAMPLE_PERIOD_S, VesselTree
 from endopilot.xray.adviser import AdviserConfig, XrayAdviser, count_events, near_exposures
 from endopilot.xray.bands import Calibration, balanced, conformal_scale, fit_spread, spread_of, surely_missed
 from endopilot.xray.fluoroscope import Fluoroscope, FluoroscopeConfig
+from endopilot.xray.image_exposures import Exposures, ImageSettings, deeper_ostium_mm, image_exposures
 from endopilot.xray.online_predictors import OnlinePredictor, online_predictor
 
 FLUOROSCOPY_HZ = 7.5
@@ -40,10 +42,13 @@ class AdviseConfig:
     """What X-ray must not miss."""
     fluoroscope: FluoroscopeConfig = field(default_factory=FluoroscopeConfig)
     """The C-arm."""
+    xray: XrayKind = "assumed"
+    """What an exposure is: assumed (the tip, with the C-arm's errors of detection) or images (the tip is found in X-ray
+    images of patients whose pose is registered by one injection of contrast)."""
     ostium_mm: NonNegative = 0.3
     """Each patient's ostium lies up to this much deeper or less deep than in the model, mm."""
     seed: Seed = 0
-    """Seed of the detection errors and of the ostia."""
+    """Seed of the detection errors, of the ostia, and of the patients' poses."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +59,8 @@ class Monitored:
         truth: true (Δtip, γtip), mm.
         ratio: true γtip/(lumen radius − wire radius).
         episodes: Δ by the encoder, and tips as X-ray would show them.
+        found: at which samples X-ray would show a tip.
+        unregistered: names of the patients who could not be registered in X-ray images, and were left out.
         model: what predicts them.
         lumen: radii of the lumen, to look up.
         wire_radius_mm: radius of the wire, mm.
@@ -63,6 +70,8 @@ class Monitored:
     truth: Float[np.ndarray, "episodes samples 2"]
     ratio: Float[np.ndarray, "episodes samples"]
     episodes: Episodes
+    found: Bool[np.ndarray, "episodes samples"]
+    unregistered: tuple[str, ...]
     model: OnlinePredictor
     lumen: Lumen
     wire_radius_mm: float
@@ -116,39 +125,56 @@ def _onwards(tree: VesselTree, branch: int) -> tuple[np.ndarray, np.ndarray]:
     return line.abscissa, line.radius
 
 
-def monitor(predictor: Predictor, dataset: Dataset, config: AdviseConfig) -> Monitored:
+def monitor(predictor: Predictor, dataset: Dataset, config: AdviseConfig, *, samples: int | None = None) -> Monitored:
     """Return the navigations of a split with an online predictor of their tips.
 
     Args:
         predictor: the model.
         dataset: the navigations as they truly went.
         config: the C-arm, and the model mismatch.
+        samples: exposures of so many samples are needed, from the first on; of all if not given. Images take time.
+
+    Raises:
+        InputError: no patient of the split can be registered in X-ray images.
     """
+    images: dict[str, Exposures] = {}
+    unregistered: tuple[str, ...] = ()
+    if config.xray == "images":
+        count = dataset.valid.shape[1] if samples is None else samples
+        settings = ImageSettings(config.fluoroscope, config.ostium_mm, config.seed, count)
+        images, unregistered = image_exposures(dataset, settings)
+        dataset = dataset.select(~np.isin(dataset.anatomy, unregistered))
     names, owner = np.unique(dataset.anatomy, return_inverse=True)
     wire_radius = from_record(Device, dataset.manifest["device"]).tip_radius_mm
-    deeper = np.array(
-        [np.random.default_rng([config.seed, 4, *str(name).encode()]).uniform(-1.0, 1.0) for name in names]
-    )
+    deeper = np.array([deeper_ostium_mm(str(name), config.ostium_mm, config.seed) for name in names])
     by_encoder = np.zeros((len(dataset), 2))
-    by_encoder[:, 0] = -(config.ostium_mm * deeper)[owner]
+    by_encoder[:, 0] = -deeper[owner]
     true = Episodes.of_dataset(dataset)
     proximal, trees = true.proximal + by_encoder[:, None], []
     tip, branch = true.tip.astype(float), true.branch.copy()
+    sd_mm, found = np.zeros(tip.shape), np.ones(branch.shape, dtype=bool)
     with progress("Exposing", len(names)) as advance:
         for index, name in enumerate(names):
             anatomy = true.setup.anatomies[str(name)]()  # one at a time: a distance map takes memory
             trees.append(anatomy.tree)
             mine = np.flatnonzero(owner == index)
-            arm = Fluoroscope(anatomy, wire_radius, config.fluoroscope)
-            shown = arm.expose_episodes(dataset.select(mine), proximal[mine, :, 0], config.seed)
-            tip[mine], branch[mine] = np.stack([shown.abscissa, shown.offset], axis=-1), shown.branch
+            if config.xray == "images":
+                seen = images[str(name)]
+                tip[mine], branch[mine], sd_mm[mine], found[mine] = seen.tip, seen.branch, seen.sd_mm, seen.found
+            else:
+                arm = Fluoroscope(anatomy, wire_radius, config.fluoroscope)
+                shown = arm.expose_episodes(dataset.select(mine), proximal[mine, :, 0], config.seed)
+                tip[mine], branch[mine] = np.stack([shown.abscissa, shown.offset], axis=-1), shown.branch
             advance()
-    episodes = replace(true, initial=true.initial + by_encoder, proximal=proximal, tip=tip, branch=branch)
+    measured = {"proximal": proximal, "tip": tip, "branch": branch, "tip_sd": sd_mm}
+    episodes = replace(true, initial=true.initial + by_encoder, **measured)
     return Monitored(
         truth=true.tip.astype(float),
         ratio=safety_ratio(dataset.tip_offset, dataset.lumen_radius, wire_radius).astype(float),
         episodes=episodes,
-        model=online_predictor(predictor, episodes),
+        found=found,
+        unregistered=unregistered,
+        model=online_predictor(predictor, episodes, found),
         lumen=Lumen(trees, owner),
         wire_radius_mm=wire_radius,
         dataset=dataset.manifest["key"],
@@ -246,7 +272,7 @@ class Followed:
 
     Attributes:
         exposed: which samples were exposed.
-        near: which have an exposure within 0.5 s.
+        near: which have an exposure within 0.5 s that shows the tip.
         wall: whether the tip is at the wall.
         astray: whether the predicted Δtip errs by δ.
     """
@@ -265,19 +291,20 @@ def follow_policy(monitored: Monitored, policy: ExposurePolicy, config: AdviserC
     """Let a policy decide when X-ray is on, and let the model observe what it shows.
 
     An event begins where the true ratio reaches τ, or the error of the predicted Δtip reaches δ, after a sample at
-    which it had not. It is missed where no exposure is within 0.5 s, a sample, of its beginning.
+    which it had not. It is missed where no exposure that shows the tip is within 0.5 s, a sample, of its beginning.
     """
     model, truth = monitored.model, monitored.truth
     model.reset()
     exposed = np.zeros(truth.shape[:2], dtype=bool)
     episodes = monitored.episodes
     for sample in range(WINDOW, truth.shape[1]):
-        on = np.flatnonzero(policy(sample, model.tip[:, sample], model.spread[:, sample]))
-        exposed[on, sample] = True
+        exposed[:, sample] = policy(sample, model.tip[:, sample], model.spread[:, sample])
+        on = np.flatnonzero(exposed[:, sample] & monitored.found[:, sample])
         if len(on):
-            model.observe(on, sample, episodes.tip[on, sample], episodes.branch[on, sample])
-    near = near_exposures(exposed)
-    near[:, WINDOW] = True  # X-ray was on until the sample before
+            seen = episodes.tip[on, sample], episodes.branch[on, sample], episodes.tip_sd[on, sample]
+            model.observe(on, sample, *seen)
+    near = near_exposures(exposed & monitored.found)
+    near[:, WINDOW] |= monitored.found[:, WINDOW - 1]  # X-ray was on until the sample before
     wall = monitored.ratio >= config.wall_ratio
     astray = np.abs(model.tip[..., 0] - truth[..., 0]) >= config.abscissa_mm
     astray[:, WINDOW - 1] = False
@@ -312,11 +339,28 @@ def adviser_policy(monitored: Monitored, calibration: Calibration, config: Advis
     tip = monitored.model.tip[:, last]
     adviser.start(proximal[:, last], tip, monitored.lumen.radius(branch, tip[:, 0]))
 
+    def due(sample: int, tip: np.ndarray, spread: np.ndarray) -> np.ndarray:
+        return adviser.advise(proximal[:, sample], tip, spread, monitored.lumen.radius(branch, tip[:, 0]))
+
+    again = taken_again(monitored, due)
+
     def decide(sample: int, tip: np.ndarray, spread: np.ndarray) -> np.ndarray:
-        radius = monitored.lumen.radius(branch, tip[:, 0])
-        due = adviser.advise(proximal[:, sample], tip, spread, radius)
-        branch[due] = monitored.episodes.branch[due, sample]
-        return due
+        on = again(sample, tip, spread)
+        shown = on & monitored.found[:, sample]
+        branch[shown] = monitored.episodes.branch[shown, sample]
+        return on
+
+    return decide
+
+
+def taken_again(monitored: Monitored, policy: ExposurePolicy) -> ExposurePolicy:
+    """Return a policy that takes an image in which no wire is found again at the next sample."""
+    unseen = np.zeros(len(monitored.truth), dtype=bool)
+
+    def decide(sample: int, tip: np.ndarray, spread: np.ndarray) -> np.ndarray:
+        on = policy(sample, tip, spread) | unseen
+        unseen[:] = on & ~monitored.found[:, sample]
+        return on
 
     return decide
 
@@ -324,7 +368,7 @@ def adviser_policy(monitored: Monitored, calibration: Calibration, config: Advis
 def periodic_policy(monitored: Monitored, period: int) -> ExposurePolicy:
     """Return periodic imaging, each navigation with a phase of its own; `period` counts samples."""
     phase = np.arange(len(monitored.truth))
-    return lambda sample, tip, spread: (sample + phase) % period == 0
+    return taken_again(monitored, lambda sample, tip, spread: (sample + phase) % period == 0)
 
 
 def oracle_policy(monitored: Monitored, config: AdviserConfig) -> ExposurePolicy:
@@ -338,7 +382,7 @@ def oracle_policy(monitored: Monitored, config: AdviserConfig) -> ExposurePolicy
         was_astray[:] = astray
         return due
 
-    return decide
+    return taken_again(monitored, decide)
 
 
 def periodic_equal(curve: Sequence[dict[str, float]], missed_share: float) -> float:

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from endopilot.models.config import WINDOW
 from endopilot.models.episodes import Episodes
-from endopilot.models.open_loop import Predictor, ProbabilisticPredictor, given_states
+from endopilot.models.open_loop import EachObserved, Predictor, ProbabilisticPredictor, given_states
 from endopilot.models.twin import TwinPredictor, weigh
 
 Tips = Float[np.ndarray, "episodes samples 2"]
@@ -38,6 +38,7 @@ class OnlinePredictor(Protocol):
         sample: int,
         tip: Float[np.ndarray, "some 2"],
         branch: Int[np.ndarray, "some"],
+        sd_mm: Float[np.ndarray, "some 2"] | None = None,
     ) -> None:
         """Take what X-ray shows of some navigations at a sample, and predict the later samples anew.
 
@@ -46,6 +47,8 @@ class OnlinePredictor(Protocol):
             sample: of the exposure.
             tip: (Δtip, γtip) in the image, mm.
             branch: of that tip.
+            sd_mm: standard deviations of both as the detector states them, mm; none if not given. The twin weighs its
+                wires by them; networks have no such input.
         """
         ...
 
@@ -53,9 +56,10 @@ class OnlinePredictor(Protocol):
 class _OnlineProbabilistic:
     """What is common to models that take tips observed at any time: the observations, and the prediction from them."""
 
-    def __init__(self, episodes: Episodes) -> None:
-        self._observed = np.tile(given_states(episodes), (len(episodes), 1))
+    def __init__(self, episodes: Episodes, observed: EachObserved) -> None:
+        self._observed = observed & given_states(episodes)
         self._tip, self._branch = episodes.tip.astype(float), episodes.branch.copy()
+        self._sd = episodes.tip_sd.astype(float)
         self._first = self._predict(np.arange(len(episodes)))
         self.reset()
 
@@ -74,10 +78,12 @@ class _OnlineProbabilistic:
         sample: int,
         tip: Float[np.ndarray, "some 2"],
         branch: Int[np.ndarray, "some"],
+        sd_mm: Float[np.ndarray, "some 2"] | None = None,
     ) -> None:
         """Take what X-ray shows of some navigations at a sample, and predict the later samples anew."""
         self._observed[episodes, sample] = True
         self._tip[episodes, sample], self._branch[episodes, sample] = tip, branch
+        self._sd[episodes, sample] = 0.0 if sd_mm is None else sd_mm
         later = slice(sample + 1, None)
         self.tip[episodes, later], self.spread[episodes, later] = (part[:, later] for part in self._predict(episodes))
 
@@ -85,32 +91,23 @@ class _OnlineProbabilistic:
 class OnlineTwin(_OnlineProbabilistic):
     """A twin, whose ensemble is simulated once and weighted again at every exposure."""
 
-    def __init__(self, twin: TwinPredictor, episodes: Episodes) -> None:
-        """Simulate, and predict from the first `WINDOW` samples.
-
-        Args:
-            twin: the model.
-            episodes: their controls, and their tips as they are measured.
-        """
-        self._config, self._paths = twin.config, twin.ensemble(episodes, given_states(episodes))
-        super().__init__(episodes)
+    def __init__(self, twin: TwinPredictor, episodes: Episodes, observed: EachObserved) -> None:
+        """Simulate, and predict from the first `WINDOW` samples; the arguments are those of `online_predictor`."""
+        self._config, self._paths = twin.config, twin.ensemble(episodes, observed & given_states(episodes))
+        super().__init__(episodes, observed)
 
     def _predict(self, chosen: Int[np.ndarray, "some"]) -> tuple[Tips, Tips]:
-        return weigh(self._paths[:, chosen], self._tip[chosen], self._observed[chosen], self._config)
+        paths, seen = self._paths[:, chosen], self._observed[chosen]
+        return weigh(paths, self._tip[chosen], seen, self._sd[chosen], self._config)
 
 
 class OnlineCausal(_OnlineProbabilistic):
     """The causal networks, which run again over the whole navigation at every exposure."""
 
-    def __init__(self, predictor: ProbabilisticPredictor, episodes: Episodes) -> None:
-        """Predict from the first `WINDOW` samples.
-
-        Args:
-            predictor: the model.
-            episodes: their controls, and their tips as they are measured.
-        """
+    def __init__(self, predictor: ProbabilisticPredictor, episodes: Episodes, observed: EachObserved) -> None:
+        """Predict from the first `WINDOW` samples; the arguments are those of `online_predictor`."""
         self._predictor, self._episodes = predictor, episodes
-        super().__init__(episodes)
+        super().__init__(episodes, observed)
 
     def _predict(self, chosen: Int[np.ndarray, "some"]) -> tuple[Tips, Tips]:
         episodes = replace(self._episodes.select(chosen), tip=self._tip[chosen], branch=self._branch[chosen])
@@ -119,7 +116,10 @@ class OnlineCausal(_OnlineProbabilistic):
 
 
 class OnlineWindowed:
-    """The paper's networks: they go on from the last `WINDOW` states, those not observed as they predicted them."""
+    """The paper's networks: they go on from the last `WINDOW` states, those not observed as they predicted them.
+
+    Of the first `WINDOW` they need every one.
+    """
 
     def __init__(self, predictor: Predictor, episodes: Episodes) -> None:
         """Predict from the first `WINDOW` samples.
@@ -144,6 +144,7 @@ class OnlineWindowed:
         sample: int,
         tip: Float[np.ndarray, "some 2"],
         branch: Int[np.ndarray, "some"],
+        sd_mm: Float[np.ndarray, "some 2"] | None = None,
     ) -> None:
         """Take what X-ray shows of some navigations at a sample, and predict the later samples anew."""
         self._known[episodes, sample] = tip
@@ -154,15 +155,19 @@ class OnlineWindowed:
         self.tip[episodes, sample + 1 :] = self._known[episodes, sample + 1 :] = found.tip
 
 
-def online_predictor(predictor: Predictor, episodes: Episodes) -> OnlinePredictor:
+def online_predictor(predictor: Predictor, episodes: Episodes, observed: EachObserved | None = None) -> OnlinePredictor:
     """Return what predicts the tips of navigations with a model as exposures come in.
 
     Args:
         predictor: of a run.
         episodes: their controls, and their tips as they are measured.
+        observed: which of the first `WINDOW` samples were measured; all if not given. The paper's networks take the
+            others' tips as they stand in `episodes`.
     """
+    if observed is None:
+        observed = np.ones(episodes.branch.shape, dtype=bool)
     if isinstance(predictor, TwinPredictor):
-        return OnlineTwin(predictor, episodes)
+        return OnlineTwin(predictor, episodes, observed)
     if isinstance(predictor, ProbabilisticPredictor):
-        return OnlineCausal(predictor, episodes)
+        return OnlineCausal(predictor, episodes, observed)
     return OnlineWindowed(predictor, episodes)
