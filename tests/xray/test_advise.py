@@ -103,6 +103,20 @@ def test_an_observation_changes_later_predictions_and_nothing_before(split) -> N
     np.testing.assert_array_equal(model.tip, before)
 
 
+def test_an_image_in_which_no_wire_is_found_shows_nothing_and_is_taken_again(split) -> None:
+    policy = monitoring.periodic_policy(split, 4)
+    whole = monitoring.follow_policy(split, policy, EVENTS)
+    at = int(np.flatnonzero(whole.exposed[0])[1])  # from the last given sample on
+    found = split.found.copy()
+    found[0, WINDOW - 1 + at] = False
+    unseen = replace(split, found=found)
+    parts = monitoring.follow_policy(unseen, monitoring.periodic_policy(unseen, 4), EVENTS)
+    assert np.flatnonzero(parts.exposed[0] & ~whole.exposed[0]).tolist() == [at + 1]
+    assert parts.exposed[0, at]  # it counts all the same
+    assert whole.near[0, at - 1] and not parts.near[0, at - 1] and parts.near[0, at]
+    np.testing.assert_array_equal(parts.exposed[1:], whole.exposed[1:])
+
+
 class Errs:
     """Errs by given amounts and states no spread."""
 
@@ -138,6 +152,7 @@ def jumping(split, patients: int, seed: int) -> monitoring.Monitored:
         truth=truth,
         ratio=split.ratio[chosen],
         episodes=replace(split.episodes.select(chosen), anatomy=names),
+        found=split.found[chosen],
         model=Errs(truth + size[:, None] * random.standard_normal(truth.shape)),
         lumen=Straight(1.0),
     )
@@ -170,6 +185,7 @@ def approaching(split, half: float) -> monitoring.Monitored:
         truth=truth,
         ratio=np.where(arrived, 1.0, 0.0),
         episodes=replace(split.episodes.select(chosen), anatomy=np.repeat(["a", "b", "c"], 10)),
+        found=split.found[chosen],
         model=Errs(predicted),
         lumen=Straight(1.0),
     )
@@ -245,6 +261,10 @@ def test_a_twin_weights_its_wires_by_what_is_observed(split, monkeypatch) -> Non
     assert (model.tip[0, 34:, 0] == 18.0).all() and (model.tip[0, WINDOW:34, 0] == 19.0).all()
     assert (model.tip[1:, WINDOW:, 0] == 19.0).all()
     assert model.spread[0, -1, 0] < 0.2
+    model.reset()
+    unsure = np.array([[50.0, 50.0]])  # the detector's own standard deviations
+    model.observe(np.array([0]), 33, np.array([[18.0, 0.5]]), np.array([0]), unsure)
+    assert (model.tip[0, 34:, 0] == 19.0).all() and model.spread[0, -1, 0] == pytest.approx(np.sqrt(2 / 3), rel=1e-2)
 
 
 def test_the_command_calibrates_measures_and_draws(folder, hold_slack, capsys) -> None:

@@ -39,7 +39,7 @@ def command(
     if json:
         show(found, as_json=True)
         return
-    at, cover = found["adviser"], found["coverage"]
+    at, cover, left_out = found["adviser"], found["coverage"], found["patients_not_registered"]
     show(
         {
             "figures": str(output / FIGURES_FILE),
@@ -51,11 +51,7 @@ def command(
             "exposures_per_minute": at["exposures_per_minute"],
             "share_of_the_exposures_of_periodic_imaging": found["share_of_the_exposures_of_periodic_imaging"],
             "fewer_frames_than_fluoroscopy": at["fewer_frames_than_fluoroscopy"],
-            **(
-                {"patients_not_registered": ", ".join(left_out)}
-                if (left_out := found["patients_not_registered"])
-                else {}
-            ),
+            **({"patients_not_registered": ", ".join(left_out)} if left_out else {}),
             **{
                 other["dataset"]: (
                     f"coverage {other['coverage']['simultaneous']:.3f}, missed {other['adviser']['missed_share']:.3f}, "

@@ -101,9 +101,8 @@ def image_exposures(dataset: Dataset, settings: ImageSettings) -> tuple[dict[str
         if not isinstance(error, NotRegistered):
             raise InputError(f"{path.stem}: {error}")
     if len(bad) == len(paths):
-        raise InputError(
-            f"{dataset.folder}: no patient of split '{split}' can be registered; {next(iter(bad.values()))}"
-        )
+        first = next(iter(bad.values()))
+        raise InputError(f"{dataset.folder}: no patient of its split '{split}' can be registered; the first: {first}")
     return {name: _read(path) for name, path in paths.items() if path not in bad}, tuple(path.stem for path in bad)
 
 
@@ -177,10 +176,7 @@ def _held(measured: Sequence[Sequence[TipMeasurement | None]], encoder: Float[np
         for sample, one in enumerate(navigation):
             if one is not None:
                 later = slice(sample, None)
-                slack = encoder[index, sample] - one.abscissa
-                tip[index, later] = np.stack(
-                    [encoder[index, later] - slack, 0 * encoder[index, later] + one.offset], -1
-                )
-                branch[index, later] = one.branch
+                tip[index, later, 0] = encoder[index, later] - (encoder[index, sample] - one.abscissa)
+                tip[index, later, 1], branch[index, later] = one.offset, one.branch
                 sd_mm[index, sample], found[index, sample] = one.sd_mm, True
     return Exposures(tip, branch, sd_mm, found)
