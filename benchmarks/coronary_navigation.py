@@ -1,8 +1,9 @@
 """Drive the agent into the distal thirds of coronary arteries: `python benchmarks/coronary_navigation.py PATIENT...`.
 
 PATIENT is a folder that `endopilot anatomy` or `endopilot atlas` made. The targets lie at 5/6 of the anterior
-descending, the circumflex and the right coronary artery. `--mismatch`, `--true-axis-deg`, `--seed` and `--policy` are
-those of `endopilot navigate`. Prints a row as each navigation ends, and the share that was safe.
+descending, the circumflex and the right coronary artery. `--mismatch`, `--true-axis-deg`, `--seed`, `--policy`,
+`--catheter`, `--arrives` and `--seconds` are those of `endopilot navigate`. Prints a row as each navigation ends, and
+the share that was safe.
 """
 
 from __future__ import annotations
@@ -11,11 +12,13 @@ import argparse
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 
 from endopilot.anatomy.io import read_anatomy
 from endopilot.control.navigate_patient import NavigatePatientConfig, navigate_patient, set_up_navigation
+from endopilot.tasks.navigation import Arrives
 from endopilot.types import Anatomy
 
 ARTERIES = {"LAD": ("6", "7", "8"), "LCx": ("11", "13"), "RCA": ("1", "2", "3")}
@@ -54,7 +57,11 @@ def main() -> None:
     parser.add_argument("--mismatch", type=float, default=0.2)
     parser.add_argument("--true-axis-deg", type=float, default=0.0)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--catheter", nargs="+", default=())
+    parser.add_argument("--arrives", choices=get_args(Arrives), default="wire")
+    parser.add_argument("--seconds", type=float, default=60.0)
     options = vars(parser.parse_args())
+    options["catheter"] = tuple(options["catheter"])
     patients, safe = options.pop("patients"), []
     print("| patient | artery | safe | reached | peak force, N | exposures | seconds | processor, s | outcome |")
     print("|---" * 9 + "|")
