@@ -35,7 +35,7 @@ from endopilot.runs import claim, make_missing
 from endopilot.simulation.motion import Motion, motion_named
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.tasks.task import CORE, NEWEST, LadderVersion, Task, find_task, ladder_tasks
-from endopilot.xray.bands import Calibration, balanced, conformal_scale, fit_spread, spread_of
+from endopilot.xray.bands import Calibration, conformal_scale, fit_spread, narrowest, spread_of
 
 ROOT = Path(__file__).parents[1]
 RUNS = ROOT / "runs"
@@ -219,7 +219,7 @@ def calibrate(folder: Path, kind: Kind) -> tuple[Calibration, list[str]]:
     if "fit" in kind.roles:
         fitted, _ = gather(folder, "fit")
         terms = fit_spread(*(np.concatenate(column) for column in zip(*fitted, strict=True)))
-        terms = balanced(terms, worst(fitted, terms), LEVEL)
+        terms = narrowest(terms, worst(fitted, terms), LEVEL)
     else:
         known = Calibration.read(CALIBRATED)
         terms = known.abscissa_terms, known.offset_terms

@@ -112,22 +112,29 @@ def fit_spread(
     return tuple(found[0].tolist()), tuple(found[1].tolist())
 
 
-def balanced(
+def narrowest(
     terms: tuple[tuple[float, ...], tuple[float, ...]], worst: Float[np.ndarray, "intervals 2"], level: float
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return terms under which the bands of Δtip and γtip each hold throughout the same share of the intervals.
+    """Return terms under which the bands are narrowest that both hold throughout a share of the intervals.
 
-    The scale is common to both bands. Were the spread of one too narrow for its errors, it would widen the other too.
+    The scale is common to both bands, so each spread is first multiplied by a number of its own. Of all pairs of numbers
+    with which both bands hold in that share of the intervals, the one with the smallest product is taken: the prediction
+    region of the least area. Large errors that few intervals have, such as those of a tip in the wrong branch, are left
+    out where they would widen a band the most.
 
     Args:
         terms: as they were fitted.
         worst: of each interval, the largest error over the spread of these terms, of Δtip and of γtip.
         level: share of the intervals that both hold throughout, under a scale of 1.
     """
-    bounds = np.quantile(worst, np.linspace(level, 1.0, 201), axis=0, method="higher")
-    both = (worst <= bounds[:, None]).all(axis=2).mean(axis=1)
-    bound = bounds[np.argmax(both >= level)]
-    found = np.where(bound > 0, bound, 1.0)[:, None] * np.array(terms)
+    needed = int(np.ceil(level * len(worst) - 1e-9))
+    ordered = np.maximum(worst[np.argsort(worst[:, 0])], 1e-9)
+    widths = [
+        (ordered[count - 1, 0], np.partition(ordered[:count, 1], needed - 1)[needed - 1])
+        for count in range(needed, len(ordered) + 1)
+    ]
+    width = min(widths, key=lambda pair: pair[0] * pair[1])
+    found = np.array(width)[:, None] * np.array(terms)
     return tuple(found[0].tolist()), tuple(found[1].tolist())
 
 

@@ -20,7 +20,7 @@ from endopilot.simulation.device import Device
 from endopilot.tasks.navigation import XrayKind
 from endopilot.types import SAMPLE_PERIOD_S, VesselTree
 from endopilot.xray.adviser import AdviserConfig, XrayAdviser, count_events, near_exposures
-from endopilot.xray.bands import Calibration, balanced, conformal_scale, fit_spread, spread_of, surely_missed
+from endopilot.xray.bands import Calibration, conformal_scale, fit_spread, narrowest, spread_of, surely_missed
 from endopilot.xray.fluoroscope import Fluoroscope, FluoroscopeConfig
 from endopilot.xray.image_exposures import Exposures, ImageSettings, deeper_ostium_mm, image_exposures
 from endopilot.xray.online_predictors import OnlinePredictor, online_predictor
@@ -196,7 +196,7 @@ def calibrate(fitted: Monitored, own: Monitored, config: AdviserConfig) -> Calib
     seconds, travel = fitted.since
     error = (fitted.model.tip - fitted.truth)[:, WINDOW:]
     terms = fit_spread(error, seconds, travel, fitted.model.spread[:, WINDOW:])
-    terms = balanced(terms, _worst(fitted, terms), config.level)
+    terms = narrowest(terms, _worst(fitted, terms), config.level)
     score = _worst(own, terms).max(axis=1)
     bands = Calibration(
         level=config.level,
