@@ -117,10 +117,10 @@ def narrowest(
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Return terms under which the bands are narrowest that both hold throughout a share of the intervals.
 
-    The scale is common to both bands, so each spread is first multiplied by a number of its own. Of all pairs of numbers
-    with which both bands hold in that share of the intervals, the one with the smallest product is taken: the prediction
-    region of the least area. Large errors that few intervals have, such as those of a tip in the wrong branch, are left
-    out where they would widen a band the most.
+    The scale is common to both bands, so each spread is first multiplied by a number of its own. Of all pairs of
+    numbers with which both bands hold in that share of the intervals, the one with the smallest product is taken: the
+    prediction region of the least area. Large errors that few intervals have, such as those of a tip in the wrong
+    branch, are left out where they would widen a band the most.
 
     Args:
         terms: as they were fitted.
