@@ -79,6 +79,21 @@ def test_members_that_err_alike_have_a_wide_spread(folder, episodes) -> None:
     assert twin.predict(replace(few, tip=once), GIVEN).spread[0, 30:].max() < 5.0
 
 
+def test_a_wire_that_is_held_while_it_is_pulled_starts_where_it_lies(folder, episodes, monkeypatch) -> None:
+    """What a drive was commanded and did not make moves no wire: the sum of commands says nothing of where it began."""
+    starts = []
+
+    def kept(*args, initial, **kwargs):
+        starts.append(initial[:, 0])
+        return simulate(*args, initial=initial, **kwargs)
+
+    monkeypatch.setattr(twin_module, "simulate", kept)
+    held = replace(episodes, slip=episodes.slip - np.array([5.0, 0.0], dtype=episodes.slip.dtype))
+    twin = load_model(folder / "run")
+    twin.predict(held.select(np.array([0])), GIVEN)
+    assert np.abs(np.concatenate(starts) - held.initial[0, 0]).max() <= twin.config.ostium_spread_mm + 1e-6
+
+
 def test_it_finds_controls_that_lead_the_tip_along(folder, episodes) -> None:
     twin = load_model(folder / "run")
     found = twin.rollout_dual(episodes)

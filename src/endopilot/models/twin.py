@@ -192,8 +192,7 @@ class TwinPredictor:
         for stiffness in np.unique(members[..., 1]):
             member, episode = np.nonzero(members[..., 1] == stiffness)
             control = data.command[episode, :samples]
-            least = -(SAMPLE_PERIOD_S * np.cumsum(control[..., 0], axis=1)).min(axis=1).clip(max=0.0)
-            start = np.maximum(data.initial[episode, 0] + members[member, episode, 2], least)
+            start = np.maximum(data.initial[episode, 0] + members[member, episode, 2], 0.0)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # a member that fails has no weight
                 rollout = simulate(
