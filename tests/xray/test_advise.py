@@ -158,14 +158,12 @@ def jumping(split, patients: int, seed: int) -> monitoring.Monitored:
     )
 
 
-def test_each_band_holds_as_often_as_the_other_though_their_errors_are_spread_otherwise(split) -> None:
-    """Were both stretched by what the rare large errors of Δtip need, that of γtip would nearly always hold."""
+def test_both_bands_hold_together_though_their_errors_are_spread_otherwise(split) -> None:
+    """Δtip has rare large errors, γtip has not."""
     calibration = monitoring.calibrate(jumping(split, 60, 0), jumping(split, 100, 1), AdviserConfig())
     found = monitoring.coverage(jumping(split, 300, 2), calibration)
     assert found["simultaneous"] == pytest.approx(0.9, abs=0.03)
-    abscissa, offset = found["each_band"]
-    assert abscissa == pytest.approx(offset, abs=0.03)
-    assert abscissa * offset == pytest.approx(found["simultaneous"], abs=0.02)  # the errors are independent here
+    assert all(0.9 < share < 0.995 for share in found["each_band"])  # neither is wider than the other has need of
 
 
 def approaching(split, half: float) -> monitoring.Monitored:
