@@ -14,7 +14,7 @@ constexpr double kMostPower = 8;         // of the share, that the energy is tak
 constexpr double kFirstDamping = 1e-3;   // N/mm (rotations: N mm/rad), where the Hessian is indefinite even without geometric terms
 constexpr double kMaxDamping = 1e3;
 constexpr double kMaxBoost = 64;
-constexpr double kMaxImbalance = 1e-5;   // N that a damped solution may be out of balance
+constexpr double kMaxImbalance = 1e-5, kLastImbalance = 1e-4;   // N that a damped solution may be out of balance; in the last resort
 constexpr double kDriveMotion = 1.2;     // times the drive's own motion that a node may move in a step before it counts as a jump
 
 // Begins a step of lane.stride ticks from the lane's start state; nodes ahead of the base already hold a trial.
@@ -98,10 +98,10 @@ int Stepper<V, T>::pass(Queue& queue) {
         const bool ends_sample = lane.tick + lane.stride == kTicks * in_.steps_per_sample;
         lane.scale = std::min(lane.boost, options_.largest_step / size);
         set(factor, l, lane.scale);
-        // Tubes at a drive's limit may come to rest within the energy's rounding, where steps no longer shrink: the last resort ends there.
-        const bool lasts = T > 0 && lane.stride == 1 && lane.iterations > options_.max_iterations;
+        // Where a drive is at its limit, a wire may come to rest within the energy's rounding, where steps no longer shrink.
+        const bool lasts = last_resort(lane);
         const double tolerance = ends_sample && !lasts ? options_.sample_tolerance : options_.tolerance;
-        const bool at_rest = size <= options_.tolerance && lane.damping * size <= kMaxImbalance;
+        const bool at_rest = size <= options_.tolerance && lane.damping * size <= (lasts ? kLastImbalance : kMaxImbalance);
         if (lane.reduced || lane.damping > 0 ? at_rest : size <= tolerance) {
             decision[l] = release(l) ? Decision::repeat : Decision::converged;
             set(factor, l, 1.0);
@@ -128,8 +128,13 @@ typename Stepper<V, T>::Decision Stepper<V, T>::decide(int l) {
     }
     const double slack = 1e-11 * (std::abs(lane.energy) + 1e-3);
     if (!lane.finite || !(lane.first || energy <= lane.energy + slack)) {
-        if (lane.first || ++lane.rejections > kMaxRejections) return Decision::restart;
+        if (lane.first) return Decision::restart;
         lane.shorten = lane.finite ? best_share(energy, l) : kBackInside;
+        if (++lane.rejections > kMaxRejections) {   // the direction is not downhill, for rounding; a damped one is
+            if (lane.stride > 1 || lane.damping >= kMaxDamping) return Decision::restart;
+            lane.shorten = 0;
+            set(damping_, l, std::max(double{kFirstDamping}, 10 * lane.damping));
+        }
         set_mask<V>(accepted_, l, false);
         lane.scale *= lane.shorten;
         return Decision::shorten;
@@ -153,7 +158,10 @@ typename Stepper<V, T>::Decision Stepper<V, T>::decide(int l) {
     // Where the energy is not convex the damped steps are short: lengthen them as long as they succeed.
     const double damping = lane.damping = get(damping_, l);
     lane.boost = damping > 0 && lane.rejections == 0 ? std::min(2 * lane.boost, double{kMaxBoost}) : 1.0;
-    set(damping_, l, damping > kFirstDamping ? 0.25 * damping : 0.0);
+    if (last_resort(lane) && lane.rejections > 0)   // a curved valley: shorter along it, but all the way across
+        set(damping_, l, std::clamp(4 * damping, double{kFirstDamping}, double{kMaxDamping}));
+    else
+        set(damping_, l, damping > kFirstDamping ? 0.25 * damping : 0.0);
     lane.rejections = 0;
     set(first_, l, 0.0);
     lane.reduced = get(geometric_, l) < 1.0 && !lane.first;

@@ -305,6 +305,7 @@ private:
     double bundle_moment(int k, int joint, int l, const TubePlace<T>& ahead, const TubePlace<T>& behind, Vec3<double>& moment) const;
 
     // The step of one lane (step.hpp).
+    ENDOPILOT_DEVICE bool last_resort(const Lane& lane) const { return lane.stride == 1 && lane.iterations > options_.max_iterations; }
     ENDOPILOT_LARGE void begin(int l, bool fresh);
     ENDOPILOT_LARGE Decision decide(int l);
     ENDOPILOT_DEVICE double best_share(double energy, int l) const;

@@ -284,8 +284,12 @@ V Stepper<V, T>::solve(int n) {
     Vec3<S> x = drive_x, t = drive_t;
     S largest = dot(x, x) + dot(t, t);  // rounded as for the nodes of a shorter wire, which follow the drive
     S twist[T + 1]{}, drive_twist[T + 1]{};   // one more than there are: none is no array
-    if constexpr (T > 0)
-        for (int k = 0; k < T; ++k) twist[k] = drive_twist[k] = narrow(of_tubes_.turn[k]);
+    if constexpr (T > 0) {
+        for (int k = 0; k < T; ++k) {
+            twist[k] = drive_twist[k] = narrow(of_tubes_.turn[k]);
+            largest += twist[k] * twist[k];
+        }
+    }
     for (int i = n - 1; i >= 0; --i) {
         const Mask<S> on = active > broadcast<S>(i);
         substitute(factor_[i], x, t, twist);
