@@ -143,7 +143,7 @@ bool Stepper<V, T>::tubes_slip(const Lane& lane) const {
     return slips;
 }
 
-// The energy of drives that slip at their limits; the leading one also moves what the others bear.
+// The energy of drives that slip at their limits; the leading one also moves what the others bear. A stop holds tubes that are all out.
 template <class V, int T>
 typename Stepper<V, T>::DriveEnergy Stepper<V, T>::tube_drive_energy(const Lane& lane) const {
     const int lead = lane.tubes.lead, side = lane.slipping.advance;
@@ -151,6 +151,11 @@ typename Stepper<V, T>::DriveEnergy Stepper<V, T>::tube_drive_energy(const Lane&
     const double torque = lane.slipping.rotation == 0 ? 0.0 : lane.slipping.rotation * tubes_.torque_limit[0];   // a limit may be infinite
     DriveEnergy e{.energy = 0, .gradient_a = -force, .gradient_r = -torque, .aa = 0, .ar = 0, .rr = 0};
     if (side != 0) e.energy += e.gradient_a * lane.off.advance;
+    if (const double beyond = std::min(0.0, lane.end.advance); side != 0 && beyond < 0) {
+        e.energy += 0.5 * kStopStiffness * beyond * beyond;
+        e.gradient_a += kStopStiffness * beyond;
+        e.aa = kStopStiffness;
+    }
     if (lane.slipping.rotation != 0) e.energy += e.gradient_r * lane.off.rotation;
     for (int k = 1; k <= T; ++k) {
         const Tube& tube = lane.tubes.tube[k];
@@ -170,7 +175,8 @@ bool Stepper<V, T>::solve_tube_drives(int l) {
     double h[N][N] = {}, g[N] = {}, off[N], step[N] = {};
     int side[N];
     g[1] = get(d.gradient_r, l);
-    h[0][0] = get(d.aa, l) + damping;
+    const DriveEnergy load = tube_drive_energy(lane);
+    h[0][0] = load.aa + get(d.aa, l) + damping;
     h[1][0] = get(d.ar, l);
     h[1][1] = get(d.rr, l) + damping;
     for (int k = 0; k < T; ++k) {
@@ -181,7 +187,6 @@ bool Stepper<V, T>::solve_tube_drives(int l) {
         for (int c = 0; c <= k; ++c) h[r][2 + c] = get(d.twists.pp[k][c], l);
         h[r][r] += damping;
     }
-    const DriveEnergy load = tube_drive_energy(lane);
     g[0] = get(d.gradient_a, l) + load.gradient_a;
     g[1] += load.gradient_r;
     side[0] = lane.slipping.advance, off[0] = lane.off.advance;

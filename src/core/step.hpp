@@ -8,13 +8,14 @@ namespace endopilot {
 constexpr int kMaxRejections = 12;
 constexpr int kTurnabout = 10;         // iterations after which friction's tangent and its secant take turns
 constexpr int kSnapIterations = 25;   // times max_iterations that the shortest step may take: a snap takes many at any step
+constexpr double kAllowedRise = 0.85;    // of what the energy has fallen lately, that it may rise in a step that struggles
 constexpr double kBackInside = 0.02;    // of a move that left the map, that is tried next
 constexpr double kLeastOfMove = 1e-4, kMostOfMove = 0.7;   // of a move that raised the energy, that is tried next
 constexpr double kMostPower = 8;         // of the share, that the energy is taken to grow with beyond its slope
 constexpr double kFirstDamping = 1e-3;   // N/mm (rotations: N mm/rad), where the Hessian is indefinite even without geometric terms
 constexpr double kMaxDamping = 1e3;
 constexpr double kMaxBoost = 64;
-constexpr double kMaxImbalance = 1e-5, kLastImbalance = 1e-4;   // N that a damped solution may be out of balance; in the last resort
+constexpr double kMaxImbalance = 1e-5, kMostImbalance = 1e-4;   // N that a damped solution may be out of balance; in a step that struggles
 constexpr double kDriveMotion = 1.2;     // times the drive's own motion that a node may move in a step before it counts as a jump
 
 // Begins a step of lane.stride ticks from the lane's start state; nodes ahead of the base already hold a trial.
@@ -99,12 +100,14 @@ int Stepper<V, T>::pass(Queue& queue) {
         lane.scale = std::min(lane.boost, options_.largest_step / size);
         set(factor, l, lane.scale);
         // Where a drive is at its limit, a wire may come to rest within the energy's rounding, where steps no longer shrink.
-        const bool lasts = last_resort(lane);
-        const double tolerance = ends_sample && !lasts ? options_.sample_tolerance : options_.tolerance;
-        const bool at_rest = size <= options_.tolerance && lane.damping * size <= (lasts ? kLastImbalance : kMaxImbalance);
+        const double tolerance = ends_sample && !last_resort(lane) ? options_.sample_tolerance : options_.tolerance;
+        const bool at_rest = size <= options_.tolerance && lane.damping * size <= (struggles(lane) ? kMostImbalance : kMaxImbalance);
         if (lane.reduced || lane.damping > 0 ? at_rest : size <= tolerance) {
             decision[l] = release(l) ? Decision::repeat : Decision::converged;
             set(factor, l, 1.0);
+        } else if (lane.iterations > options_.max_iterations * kSnapIterations) {   // a large snap goes on in the next step
+            decision[l] = Decision::converged;
+            set(factor, l, 0.0);
         }
     }
     update(n, decision, factor);
@@ -121,13 +124,14 @@ typename Stepper<V, T>::Decision Stepper<V, T>::decide(int l) {
     lane.node_iterations += lane.active;
     const double energy = get(energy_, l) + drive_energy(lane, l).energy;
     lane.finite = std::isfinite(energy);
-    if (lane.iterations > options_.max_iterations * (lane.stride == 1 && !lane.extrapolated ? kSnapIterations : 1)) return Decision::restart;
+    const bool shortest = lane.stride == 1 && !lane.extrapolated;
+    if (lane.iterations > options_.max_iterations * (shortest ? kSnapIterations : 1) + (shortest ? 2 * kMaxRejections : 0)) return Decision::restart;
     if (!lane.first && lane.stride > 1 && get(jump_, l) > 1.0) {  // a snap: follow it in shorter steps
         lane.extrapolated = false;
         return Decision::restart;
     }
     const double slack = 1e-11 * (std::abs(lane.energy) + 1e-3);
-    if (!lane.finite || !(lane.first || energy <= lane.energy + slack)) {
+    if (!lane.finite || !(lane.first || energy <= lane.energy + lane.allowed + slack)) {
         if (lane.first) return Decision::restart;
         lane.shorten = lane.finite ? best_share(energy, l) : kBackInside;
         if (++lane.rejections > kMaxRejections) {   // the direction is not downhill, for rounding; a damped one is
@@ -139,6 +143,7 @@ typename Stepper<V, T>::Decision Stepper<V, T>::decide(int l) {
         lane.scale *= lane.shorten;
         return Decision::shorten;
     }
+    lane.allowed = struggles(lane) ? kAllowedRise * (lane.allowed + lane.energy - energy) : 0.0;
     if (!(get(pivot_, l) > 0) || !solve_drive(l)) {  // not positive definite: less of the geometric terms
         const double g = get(geometric_, l), damping = get(damping_, l);
         lane.energy = energy;
@@ -158,7 +163,7 @@ typename Stepper<V, T>::Decision Stepper<V, T>::decide(int l) {
     // Where the energy is not convex the damped steps are short: lengthen them as long as they succeed.
     const double damping = lane.damping = get(damping_, l);
     lane.boost = damping > 0 && lane.rejections == 0 ? std::min(2 * lane.boost, double{kMaxBoost}) : 1.0;
-    if (last_resort(lane) && lane.rejections > 0)   // a curved valley: shorter along it, but all the way across
+    if (struggles(lane) && lane.rejections > 0)   // a curved valley: shorter along it, but all the way across
         set(damping_, l, std::clamp(4 * damping, double{kFirstDamping}, double{kMaxDamping}));
     else
         set(damping_, l, damping > kFirstDamping ? 0.25 * damping : 0.0);

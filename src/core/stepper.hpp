@@ -17,6 +17,7 @@
 namespace endopilot {
 
 constexpr int kTicks = 64;     // a step may be halved down to 1/64
+constexpr int kStruggle = 20;  // iterations after which the step of a pair is damped where it overshoots
 
 // How tubes touch the wall at a contact point: radius (mm) and friction coefficient there, the share of it that each further tube
 // covers; how far what touches slides along the mesh in the step, mm, and the rotation that this brings.
@@ -201,7 +202,7 @@ private:
         Drive origin, off, from, move;         // what the unknown `off` = end - origin counts from; trial, accepted; Newton step
         Slipping slipping;
         int releases = 0;                      // in this step
-        double energy = 0, slope = 0, scale = 1, shorten = 1, boost = 1, damping = 0, last_duration = 0;
+        double energy = 0, slope = 0, scale = 1, shorten = 1, boost = 1, damping = 0, allowed = 0, last_duration = 0;
         bool reduced = false, first = true, extrapolated = false, finite = true, by_force = false;
         [[no_unique_address]] TubeLane<T> tubes{};   // with tubes, the advance above is that of the foremost, the rotation tube 0's
     };
@@ -305,6 +306,7 @@ private:
     double bundle_moment(int k, int joint, int l, const TubePlace<T>& ahead, const TubePlace<T>& behind, Vec3<double>& moment) const;
 
     // The step of one lane (step.hpp).
+    ENDOPILOT_DEVICE bool struggles(const Lane& lane) const { return lane.iterations > (T > 0 ? kStruggle : options_.max_iterations); }
     ENDOPILOT_DEVICE bool last_resort(const Lane& lane) const { return lane.stride == 1 && lane.iterations > options_.max_iterations; }
     ENDOPILOT_LARGE void begin(int l, bool fresh);
     ENDOPILOT_LARGE Decision decide(int l);
