@@ -8,14 +8,15 @@ namespace endopilot {
 constexpr int kMaxRejections = 12;
 constexpr int kTurnabout = 10;         // iterations after which friction's tangent and its secant take turns
 constexpr int kSnapIterations = 25;   // times max_iterations that the shortest step may take: a snap takes many at any step
-constexpr double kAllowedRise = 0.85;    // of what the energy has fallen lately, that it may rise in a step that struggles
+constexpr double kAllowedRise = 0.85;    // of what the energy has fallen lately: by so much it may rise in a step that struggles
 constexpr double kBackInside = 0.02;    // of a move that left the map, that is tried next
 constexpr double kLeastOfMove = 1e-4, kMostOfMove = 0.7;   // of a move that raised the energy, that is tried next
 constexpr double kMostPower = 8;         // of the share, that the energy is taken to grow with beyond its slope
 constexpr double kFirstDamping = 1e-3;   // N/mm (rotations: N mm/rad), where the Hessian is indefinite even without geometric terms
 constexpr double kMaxDamping = 1e3;
 constexpr double kMaxBoost = 64;
-constexpr double kMaxImbalance = 1e-5, kMostImbalance = 1e-4;   // N that a damped solution may be out of balance; in a step that struggles
+constexpr double kMaxImbalance = 1e-5;   // N that a damped solution may be out of balance
+constexpr double kLooseImbalance = 1e-4;   // the same, in a step that struggles
 constexpr double kDriveMotion = 1.2;     // times the drive's own motion that a node may move in a step before it counts as a jump
 
 // Begins a step of lane.stride ticks from the lane's start state; nodes ahead of the base already hold a trial.
@@ -101,7 +102,7 @@ int Stepper<V, T>::pass(Queue& queue) {
         set(factor, l, lane.scale);
         // Where a drive is at its limit, a wire may come to rest within the energy's rounding, where steps no longer shrink.
         const double tolerance = ends_sample && !last_resort(lane) ? options_.sample_tolerance : options_.tolerance;
-        const bool at_rest = size <= options_.tolerance && lane.damping * size <= (struggles(lane) ? kMostImbalance : kMaxImbalance);
+        const bool at_rest = size <= options_.tolerance && lane.damping * size <= (struggles(lane) ? kLooseImbalance : kMaxImbalance);
         if (lane.reduced || lane.damping > 0 ? at_rest : size <= tolerance) {
             decision[l] = release(l) ? Decision::repeat : Decision::converged;
             set(factor, l, 1.0);
@@ -124,8 +125,8 @@ typename Stepper<V, T>::Decision Stepper<V, T>::decide(int l) {
     lane.node_iterations += lane.active;
     const double energy = get(energy_, l) + drive_energy(lane, l).energy;
     lane.finite = std::isfinite(energy);
-    const bool shortest = lane.stride == 1 && !lane.extrapolated;
-    if (lane.iterations > options_.max_iterations * (shortest ? kSnapIterations : 1) + (shortest ? 2 * kMaxRejections : 0)) return Decision::restart;
+    const bool patient = lane.stride == 1 && !lane.extrapolated;   // ends at the first point accepted after its last iteration
+    if (lane.iterations > options_.max_iterations * (patient ? kSnapIterations : 1) + (patient ? 2 * kMaxRejections : 0)) return Decision::restart;
     if (!lane.first && lane.stride > 1 && get(jump_, l) > 1.0) {  // a snap: follow it in shorter steps
         lane.extrapolated = false;
         return Decision::restart;

@@ -202,7 +202,8 @@ private:
         Drive origin, off, from, move;         // what the unknown `off` = end - origin counts from; trial, accepted; Newton step
         Slipping slipping;
         int releases = 0;                      // in this step
-        double energy = 0, slope = 0, scale = 1, shorten = 1, boost = 1, damping = 0, allowed = 0, last_duration = 0;
+        double energy = 0, slope = 0, scale = 1, shorten = 1, boost = 1, damping = 0, last_duration = 0;
+        double allowed = 0;                    // by which the energy may rise, N mm
         bool reduced = false, first = true, extrapolated = false, finite = true, by_force = false;
         [[no_unique_address]] TubeLane<T> tubes{};   // with tubes, the advance above is that of the foremost, the rotation tube 0's
     };

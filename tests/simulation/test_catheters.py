@@ -106,6 +106,46 @@ def test_worlds_do_not_notice_each_other(vessel: Anatomy, catheter: Catheter) ->
         assert np.array_equal(all_worlds[3:5], two)
 
 
+@pytest.fixture(scope="module")
+def tight() -> tuple[Anatomy, Stack, np.ndarray, np.ndarray]:
+    """Drives of a catheter in an artery that is hardly wider, often at their limits."""
+    artery, stack = (
+        make_patient(AtlasConfig(seed=0), 20),
+        Stack(read_device("workhorse-014"), (read_catheter("jl4-5f"),)),
+    )
+    seed = int(np.random.SeedSequence([0, 20]).generate_state(1, np.uint64)[0])
+    return artery, stack, *paired_controls(artery, stack, rollouts=20, samples=120, seed=seed)
+
+
+def test_a_drive_that_slips_as_it_is_brought_in_does_not_notice_a_longer_neighbour(
+    tight: tuple[Anatomy, Stack, np.ndarray, np.ndarray],
+) -> None:
+    artery, stack, start, control = tight
+    start, control = start[[17, 17]], control[[17, 17], :2]
+    start[1, 2] = 60.0
+    alone, both = (
+        endopilot.simulate(artery, stack.wire, control[:count], catheters=stack.catheters, initial=start[:count])
+        for count in (1, 2)
+    )
+    assert np.array_equal(alone.tip_position[0], both.tip_position[0])
+
+
+@pytest.mark.filterwarnings("ignore:.*press the wall")
+def test_a_catheter_that_snaps_while_its_drive_pushes_with_all_its_force_goes_on(
+    tight: tuple[Anatomy, Stack, np.ndarray, np.ndarray],
+) -> None:
+    artery, stack, start, control = tight
+    rollout = endopilot.simulate(artery, stack.wire, control[[4], :28], catheters=stack.catheters, initial=start[[4]])
+    assert rollout.valid.all()
+    pushed = rollout.catheters
+    assert pushed is not None
+    at_limit = pushed.base_force[0, :, 0] > 0.99 * stack.catheters[0].device.push_limit_n
+    crept = np.diff(pushed.inserted_length[0, 18:, 0])  # mm in half a second, of some 4 that are asked for
+    assert at_limit.sum() > 5
+    assert crept.min() < 0.1  # it is held, then snaps
+    assert crept.max() > 1.0
+
+
 def test_step_by_step_and_from_a_saved_state_the_bits_are_the_same(
     vessel: Anatomy, catheter: Catheter, tmp_path: Path
 ) -> None:
