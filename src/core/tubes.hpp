@@ -4,7 +4,7 @@
 // Tubes count from the innermost, 0. The mesh reaches to the foremost tip; the tip of tube k lies `offset` mm behind. Tube 0's frame
 // is that of the elements' quaternions. Each further tube has a twist: its frame is tube 0's, turned by the twist about the third
 // director. Beyond its tip a tube goes on without bending stiffness, and carries no torque there: so its twist is known
-// where it comes to lie next.
+// where it comes to lie next. Any GJ serves there; one as small as a tip's lets frames turn so easily that steps take more iterations.
 #pragma once
 
 #include <algorithm>
@@ -12,6 +12,8 @@
 #include "rod.hpp"
 
 namespace endopilot {
+
+constexpr double kTwistBeyondTip = 50;   // GJ of a tube beyond its tip, N mm²: about that of the shafts
 
 // What the solver knows of each tube. Profiles are integrals from the tip, at equal distances; those of one tube follow each other.
 template <template <class> class Array>
@@ -54,8 +56,8 @@ struct Integrals {
 };
 
 inline Integrals integrals(const Tubes& tubes, int tube, double at) {
+    if (at <= 0) return {0, 0, at * kTwistBeyondTip, 0, 0};
     const double* twist = &tubes.twist[tube * tubes.points];
-    if (at <= 0) return {0, 0, at * twist[1] / tubes.spacing, 0, 0};
     const double place = at / tubes.spacing;
     const int i = std::min(int(place), tubes.points - 2);
     const double f = place - i;
