@@ -25,6 +25,7 @@ from jaxtyping import Bool, Float, Int
 
 from endopilot import __version__, _core
 from endopilot.anatomy.io import read_anatomy
+from endopilot.anatomy.projection import project_tip
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.benchmarks.manoeuvres import MANOEUVRES, name_of, paired_controls, stacks_of
 from endopilot.errors import InputError
@@ -81,6 +82,7 @@ class Chunk:
         wall_force_n: largest resultant of the wall's forces on 2 mm of the wire, N.
         to_end_mm: distance of the tip from the end of its branch, mm; negative beyond it.
         slipped: whether the drive slipped in the sample.
+        wedged: whether a device has come through a lumen that is no wider than itself.
         valid: whether the world was valid.
         non_finite: numbers of each rollout that are not finite though its world was valid.
         seconds: processor time that the chunk took, s.
@@ -93,6 +95,7 @@ class Chunk:
     wall_force_n: Float[np.ndarray, "rollouts samples"]
     to_end_mm: Float[np.ndarray, "rollouts samples"]
     slipped: Bool[np.ndarray, "rollouts samples"]
+    wedged: Bool[np.ndarray, "rollouts samples"]
     valid: Bool[np.ndarray, "rollouts samples"]
     non_finite: Int[np.ndarray, "rollouts"]
     seconds: float
@@ -104,10 +107,11 @@ def measure_robustness(config: RobustnessConfig) -> dict[str, Any]:
     Returns:
         `figures`, one row a bar: figure, value, bar, passed; `rollouts` and `simulated_hours`; `by_device`,
         `by_manoeuvre` and `by_anatomy`, of each the invalid worlds, the penetration's 99.9th percentile and maximum
-        (mm), the largest share of its limit that a drive's force came to and the share of samples beyond 1.06 of it,
-        the drive's largest push, pull (N) and torque (N·mm), the largest wall force (N) and the worlds in which it
-        exceeds its limit; `invalid_worlds` and `crashed`, one sentence each: reason, anatomy, device, rollout,
-        seconds.
+        (mm), that percentile where no device has come through a lumen narrower than itself, and the share of the
+        samples in which one has (`wedged_share`), the largest share of its limit that a drive's force came to and the
+        share of samples beyond 1.06 of it, the drive's largest push, pull (N) and torque (N·mm), the largest wall force
+        (N) and the worlds in which it exceeds its limit; `invalid_worlds` and `crashed`, one sentence each: reason,
+        anatomy, device, rollout, seconds.
 
     Raises:
         InputError: the folder belongs to another run, such as one of another build of the core, or cannot be written;
@@ -198,10 +202,24 @@ def _describe(anatomy: Anatomy, stack: Stack, rollout: Rollout, config: Simulato
         wall_force_n=rollout.wall_force.astype(np.float32),
         to_end_mm=(end[rollout.tip.branch] - rollout.tip.abscissa).astype(np.float32),
         slipped=slipped,
+        wedged=_wedged(anatomy, stack, rollout),
         valid=rollout.valid,
         non_finite=bad,
         seconds=seconds,
     )
+
+
+def _wedged(anatomy: Anatomy, stack: Stack, rollout: Rollout) -> Bool[np.ndarray, "rollouts samples"]:
+    tips = rollout.tip_position[:, :, None]
+    if rollout.catheters is not None:
+        tips = np.concatenate([tips, rollout.catheters.tip_position], axis=2)
+    at = project_tip(anatomy.tree, anatomy.insertion, tips)
+    narrowest = np.full(at.branch.shape, np.inf)
+    for branch in np.unique(at.branch).tolist():
+        path, here = anatomy.tree.path(branch), at.branch == branch
+        so_far = np.concatenate([[np.inf], np.minimum.accumulate(path.radius)])
+        narrowest[here] = so_far[np.searchsorted(path.abscissa, at.abscissa[here], side="right")]
+    return np.any(narrowest <= [device.tip_radius_mm for device in stack.devices], axis=-1)
 
 
 def _largest(loads: Float[np.ndarray, "rollouts samples drives"]) -> Float[np.ndarray, "rollouts samples"]:
@@ -342,6 +360,7 @@ class _Tally:
         self.push = self.pull = self.torque = self.wall = 0.0
         self.penetration: list[np.ndarray] = []
         self.over_limit: list[np.ndarray] = []
+        self.wedged: list[np.ndarray] = []
 
     def add(self, chunk: Chunk, rows: Any) -> None:
         valid = chunk.valid[rows]
@@ -349,6 +368,7 @@ class _Tally:
         self.invalid += int((~valid.all(axis=1)).sum())
         self.penetration.append(chunk.penetration_mm[rows][valid])
         self.over_limit.append(chunk.over_limit[rows][valid])
+        self.wedged.append(chunk.wedged[rows][valid])
         force, torque = chunk.base_force_n[rows][valid], chunk.base_torque_n_mm[rows][valid]
         wall = np.where(valid, chunk.wall_force_n[rows], 0.0)
         self.push = max(self.push, float(force.max(initial=0.0)))
@@ -361,13 +381,16 @@ class _Tally:
         depth = np.concatenate(self.penetration) if self.penetration else np.zeros(0)
         if len(depth) == 0:
             return {"rollouts": self.rollouts, "invalid": self.invalid, "penetration_p999_mm": None}
-        over_limit = np.concatenate(self.over_limit)
+        over_limit, wedged = np.concatenate(self.over_limit), np.concatenate(self.wedged)
+        free = depth[~wedged]
         return {
             "rollouts": self.rollouts,
             "invalid": self.invalid,
             "penetration_p99_mm": round(float(np.percentile(depth, 99)), 4),
             "penetration_p999_mm": round(float(np.percentile(depth, 99.9)), 4),
             "penetration_max_mm": round(float(depth.max()), 4),
+            "penetration_p999_where_devices_fit_mm": round(float(np.percentile(free, 99.9)), 4) if len(free) else None,
+            "wedged_share": round(float(wedged.mean()), 5),
             "share_deeper_than_bar": round(float((depth > MOST_PENETRATION_MM).mean()), 5),
             "drive_over_limit_max": round(float(over_limit.max()), 3),
             "share_over_limit_by_6_percent": round(float((over_limit > 1.06).mean()), 6),
