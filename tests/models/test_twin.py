@@ -17,6 +17,7 @@ from endopilot.models import twin as twin_module
 from endopilot.models.config import TrainConfig, TwinConfig
 from endopilot.models.episodes import Episodes
 from endopilot.models.rollout import load_model
+from endopilot.models.simulated_wires import simulated_tips
 from endopilot.models.train import train
 from endopilot.simulation.device import read_device
 from endopilot.simulation.simulate import simulate
@@ -92,6 +93,23 @@ def test_a_wire_that_is_held_while_it_is_pulled_starts_where_it_lies(folder, epi
     twin = load_model(folder / "run")
     twin.predict(held.select(np.array([0])), GIVEN)
     assert np.abs(np.concatenate(starts) - held.initial[0, 0]).max() <= twin.config.ostium_spread_mm + 1e-6
+
+
+def test_in_a_patient_who_moves_its_wires_move_as_far_as_is_known(folder, tmp_path) -> None:
+    config = DatasetConfig(sequences=3, seconds=22.5, seed=4, motion="both")
+    generate_dataset([folder / "anatomy"], tmp_path / "moving", read_device("workhorse-014"), config)
+    moving = Episodes.of_dataset(load_dataset(tmp_path / "moving"))
+    blind = replace(moving, setup=replace(moving.setup, known_motions={}))
+    twin, later = load_model(folder / "run"), slice(30, None)
+
+    def error(tip: np.ndarray) -> float:
+        return float(np.abs(tip[:, later, 0] - moving.tip[:, later, 0]).mean())
+
+    aware, unaware = (error(twin.predict(episodes, GIVEN).tip) for episodes in (moving, blind))
+    assert aware < 0.5 * unaware, (aware, unaware)
+    # so do the wires that the causal network starts from
+    aware, unaware = (error(simulated_tips(episodes)[..., 1, :]) for episodes in (moving, blind))
+    assert aware < 0.5 * unaware, (aware, unaware)
 
 
 def test_it_finds_controls_that_lead_the_tip_along(folder, episodes) -> None:

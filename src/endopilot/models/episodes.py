@@ -7,7 +7,7 @@ with what its encoder and its X-ray images have measured so far; `Setup.of_anato
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
 
@@ -22,6 +22,7 @@ from endopilot.models.patient import Patient, prepare, read_or_prepare
 from endopilot.settings import from_record
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import Device
+from endopilot.simulation.motion import Motion, published_mean
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
 PATIENTS_FOLDER = "patients"
@@ -38,6 +39,8 @@ class Setup:
         simulator: settings of the rod core that patients are prepared with.
         patients_folder: where prepared patients are kept for the next time; nowhere if None.
         identities: SHA-256 of what a simulation depends on in each anatomy, by name; needed with `patients_folder`.
+        known_motions: what is known of how vessels move with heart and breath, by the anatomy's name; those that are
+            not there lie still.
     """
 
     anatomies: Mapping[str, Callable[[], Anatomy]]
@@ -45,6 +48,7 @@ class Setup:
     simulator: SimulatorConfig
     patients_folder: Path | None = None
     identities: Mapping[str, str] | None = None
+    known_motions: Mapping[str, Motion] = field(default_factory=dict)
 
     @staticmethod
     def of_anatomy(anatomy: Anatomy, device: Device, simulator: SimulatorConfig) -> Setup:
@@ -53,17 +57,23 @@ class Setup:
 
     @staticmethod
     def of_dataset(dataset: Dataset) -> Setup:
-        """Return the setup of a dataset, which keeps its prepared patients in its folder."""
+        """Return the setup of a dataset, which keeps its prepared patients in its folder.
+
+        Of patients who move the published mean is known, with the phase of heart and breath.
+        """
 
         def read(name: str) -> Anatomy:
             return read_anatomy(dataset.anatomy_folder(name))
 
+        moving = {name: motion for name in dataset.patients if (motion := dataset.motion(name)) is not None}
+        means = {name: mean for name, motion in moving.items() if (mean := published_mean(motion)) is not None}
         return Setup(
             anatomies={name: partial(read, name) for name in dataset.patients},
             device=from_record(Device, dataset.manifest["device"]),
             simulator=SimulatorConfig(**dataset.manifest["config"]["simulator"]),
             patients_folder=dataset.folder / PATIENTS_FOLDER,
             identities=dataset.patients,
+            known_motions=means,
         )
 
     def patient(self, name: str) -> Patient:
@@ -181,7 +191,7 @@ class Episodes:
 
     def select(self, chosen: Shaped[np.ndarray, "chosen"]) -> Episodes:
         """Return the chosen episodes, given as a mask or as indices."""
-        names = [field.name for field in fields(self) if field.name != "setup"]
+        names = [each.name for each in fields(self) if each.name != "setup"]
         return replace(self, **{name: getattr(self, name)[chosen] for name in names})
 
     def from_sample(self, first: int) -> Episodes:

@@ -2,7 +2,8 @@
 
 Nominal push–pull envelopes know nothing of a wire that turns while it moves. A few wires, each with another friction,
 simulated under the commanded controls do. None of them has quite the true wire's friction and stiffness: the network
-learns from the observed tips which to trust, and where the wires part, the true one may jump.
+learns from the observed tips which to trust, and where the wires part, the true one may jump. In a patient who moves
+they are simulated in a vessel that moves as far as that is known.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ FRICTION_FACTORS = (0.8, 1.0, 1.25)
 """Friction of the simulated wires, as factors of the device's."""
 _KEPT = 4096
 """Navigations of a setup whose wires are kept in memory."""
-_FORMAT_VERSION = 1
+_FORMAT_VERSION = 2
 WireTips = Float[np.ndarray, "episodes samples wires 2"]
 """(Δtip, γtip) of the simulated wires, mm; NaN from where a simulation fails."""
 
@@ -98,6 +99,7 @@ def _of_one_patient(episodes: Episodes) -> WireTips:
         initial=data.initial,
         friction=device.friction * np.tile(factors, len(episodes)),
         config=replace(episodes.setup.simulator, threads=1),
+        motion=episodes.setup.known_motions.get(str(episodes.anatomy[0])),
     )
     tip = np.stack([rollout.tip.abscissa, rollout.tip.offset], axis=-1)
     tip[~rollout.valid] = np.nan
@@ -116,7 +118,8 @@ def read_or_simulate(folder: Path | None, episodes: Episodes) -> WireTips:
     setup = episodes.setup
     settings = (_FORMAT_VERSION, FRICTION_FACTORS, asdict(replace(setup.simulator, threads=0)))
     names = np.unique(episodes.anatomy).tolist()
-    key = json_text((settings, asdict(setup.device), [(setup.identities or {}).get(name) for name in names]))
+    vessels = [((setup.identities or {}).get(name), setup.known_motions.get(name)) for name in names]
+    key = json_text((settings, asdict(setup.device), vessels))
     digest = hashlib.sha256(key.encode() + b"".join(_digest(episodes, i) for i in range(len(episodes))))
     path = folder / f"wires-{digest.hexdigest()[:16]}.npz"
     try:

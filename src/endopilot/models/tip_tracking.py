@@ -11,6 +11,7 @@ from endopilot.models.open_loop import Steps2
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import Device
 from endopilot.simulation.drive_limits import DriveLimits
+from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulator import Simulator
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
@@ -29,6 +30,7 @@ def track(
     given: Float[np.ndarray, "episodes given 2"],
     desired: Steps2,
     config: SimulatorConfig,
+    motion: Motion | None = None,
 ) -> tuple[Steps2, Steps2]:
     """Drive each episode's wire by its given controls, then sample by sample along the desired tips.
 
@@ -43,13 +45,14 @@ def track(
         given: controls (mm/s, rad/s) that come first.
         desired: (Δtip, γtip) mm at the end of each sample period after them.
         config: settings of the rod core.
+        motion: how the vessel moves with time; it lies still if not given.
 
     Returns:
         Tip (Δtip, γtip) mm, and control (mm/s, rad/s) as the drive made it, after the given ones.
     """
     tries = np.array([(v, w) for v in TRANSLATIONS_MM_S for w in ROTATIONS_RAD_S])
     episodes, each = len(wires), len(tries)
-    simulator = Simulator(anatomy, [wire for wire in wires for _ in range(each)], config=config)
+    simulator = Simulator(anatomy, [wire for wire in wires for _ in range(each)], config=config, motion=motion)
     inserted, rotation = np.repeat(start, each, axis=0).T
     simulator.reset(inserted_length=inserted.clip(min=0.0), rotation=rotation, friction=np.repeat(friction, each))
     limits = DriveLimits.of(wires[0], anatomy)

@@ -3,7 +3,8 @@
 An ensemble of wires differs in friction, in the stiffness of the tip and in where along the catheter's axis the ostium
 lies. All are driven by the known controls; each is weighted by how well it retraces the observed tips. A second
 ensemble, drawn closer around the best of the first, is weighted likewise; its weighted median is the prediction, its
-weighted spread the uncertainty. There is nothing to train.
+weighted spread the uncertainty. There is nothing to train. In a patient who moves the wires are simulated in a vessel
+that moves as far as that is known.
 """
 
 from __future__ import annotations
@@ -161,6 +162,7 @@ class TwinPredictor:
                 given=data.command[:, :begin],
                 desired=desired[chosen],
                 config=self.simulator,
+                motion=data.setup.known_motions.get(anatomy.name),
             )
         start = episodes.proximal[:, begin - 1 : begin].astype(float)
         proximal = start + SAMPLE_PERIOD_S * np.cumsum(control, axis=1)
@@ -202,6 +204,7 @@ class TwinPredictor:
                     initial=np.column_stack([start, data.initial[episode, 1]]),
                     config=self.simulator,
                     friction=self.device.friction * members[member, episode, 0],
+                    motion=data.setup.known_motions.get(anatomy.name),
                 )
             tip = np.stack([rollout.tip.abscissa, rollout.tip.offset], axis=-1)
             paths[member, episode] = np.where(rollout.valid[..., None], tip, np.nan)
