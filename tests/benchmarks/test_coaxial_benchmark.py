@@ -29,6 +29,8 @@ def test_the_figures_belong_together(monkeypatch: pytest.MonkeyPatch, capsys: py
     assert measured["worlds"] == 2 and measured["valid_worlds"] == 1
     ratio = measured["realtime_factor_per_core"] / measured["wire_alone_realtime_factor_per_core"]
     assert measured["share"] == pytest.approx(ratio, rel=0.05)
+    of_both, of_catheter = (measured[f"{what}node_iterations_per_second"] for what in ("", "catheter_alone_"))
+    assert 0 < of_catheter != measured["wire_alone_node_iterations_per_second"] and of_catheter < of_both
     assert 0 <= measured["wire_tip_error_median_mm"] < 0.5 and 0 <= measured["catheter_tip_error_median_mm"] < 0.5
 
 

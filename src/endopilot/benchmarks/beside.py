@@ -60,8 +60,8 @@ def bench_beside(
         "share": round(share, 3),
         "bar": round(least_share, 3),
         "passed": share >= least_share,
-        "node_iterations_per_second": _node_iterations(rollouts, simulated),
-        f"{beside}_node_iterations_per_second": _node_iterations(still, simulated),
+        "node_iterations_per_second": node_iterations_per_second(rollouts),
+        f"{beside}_node_iterations_per_second": node_iterations_per_second(still),
         "valid_worlds": round(float(np.mean([rollout.valid[:, -1].mean() for rollout in rollouts])), 5),
         "iterations_per_step": round(float(np.mean([r.iterations[r.valid].mean() for r in rollouts])), 3),
         "largest_wall_force_n": round(max(float(r.wall_force[r.valid].max()) for r in rollouts), 4),
@@ -69,7 +69,9 @@ def bench_beside(
     }, rollouts
 
 
-def _node_iterations(rollouts: Sequence[Rollout], simulated_s: float) -> float:
+def node_iterations_per_second(rollouts: Sequence[Rollout]) -> float:
+    """Return how many nodes are evaluated in a simulated second."""
+    simulated_s = SAMPLE_PERIOD_S * sum(rollout.valid.size for rollout in rollouts)
     return round(sum(float(rollout.node_iterations.sum()) for rollout in rollouts) / simulated_s, 1)
 
 

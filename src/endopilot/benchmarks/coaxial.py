@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.benchmarks.beside import bench_beside, error_in_time, fine_steps
+from endopilot.benchmarks.beside import bench_beside, error_in_time, fine_steps, node_iterations_per_second
 from endopilot.benchmarks.scenes import SAMPLES, SEED, WORLDS, Scene, make_scenes
 from endopilot.simulation.catheter import Catheter
-from endopilot.simulation.config import Preset, SimulatorConfig
+from endopilot.simulation.config import PRESETS, Preset, SimulatorConfig, wall_stiffness
 from endopilot.simulation.controls import ControlConfig, random_controls
 from endopilot.simulation.simulate import simulate
+from endopilot.simulation.tubes import Stack
 from endopilot.types import Rollout
 
 LEAST_SHARE = 1 / 3
@@ -31,8 +33,9 @@ def bench_coaxial(
         samples: of each world.
 
     Returns:
-        The figures of `bench_beside`, the catheter's name, and the error in time of both tips: against a time step of
-        1 ms, on a few of the worlds.
+        The figures of `bench_beside`; the catheter's name; `catheter_alone_node_iterations_per_second`, of the catheter
+        as a single rod without the wire, in the pair's vessels; and the error in time of both tips: against a time step
+        of 1 ms, on a few of the worlds.
 
     Raises:
         InputError: the catheter does not fit the wire or a patient.
@@ -55,9 +58,22 @@ def bench_coaxial(
 
     figures, rollouts = bench_beside(run, scenes, preset, beside="wire_alone", least_share=LEAST_SHARE)
     fine = fine_steps(run, preset)
+    config = replace(PRESETS[preset], threads=1)
+    wall = wall_stiffness(config, Stack(scenes[0].device, (catheter,)).push_limit_n)
+    alone = [
+        simulate(
+            scene.anatomy,
+            catheter.device,
+            control,
+            initial=start,
+            config=replace(config, wall_stiffness_n_mm=wall),
+        )
+        for scene, start, control in zip(scenes, starts, controls, strict=True)
+    ]
     return {
         "catheter": catheter.name,
         **figures,
+        "catheter_alone_node_iterations_per_second": node_iterations_per_second(alone),
         **error_in_time("wire_tip_error", rollouts, fine, lambda rollout: rollout.tip_position),
         **error_in_time("catheter_tip_error", rollouts, fine, _catheter_tip),
     }
