@@ -15,6 +15,7 @@ PAGE = Path(__file__).parents[1] / "simulation.md"
 
 def text(measured: dict) -> str:
     """Return the figures beside their bars, those of each device and manoeuvre, and every invalid world."""
+    fitting = measured["penetration_p999_where_devices_fit_mm"]
     lines = [
         f"Of {measured['rollouts']} rollouts ({measured['simulated_hours']:.0f} simulated hours):",
         "",
@@ -24,6 +25,9 @@ def text(measured: dict) -> str:
         "",
         f"The largest force of a drive is {measured['drive_over_limit_max']:g} times its limit; in "
         f"{100 * measured['share_over_limit_by_6_percent']:.2g} % of the samples one is beyond 1.06 times.",
+        "",
+        f"In {100 * measured['wedged_share']:.2g} % of the samples a device has come through a lumen narrower than "
+        f"itself. In the others the 99.9th percentile of penetration is {fitting:g} mm.",
         "",
         "| group | rollouts | invalid | penetration p99, mm | p99.9, mm | largest, mm |",
         "|---|---|---|---|---|---|",
