@@ -122,11 +122,10 @@ void Stepper<V, T>::pace_tubes(int l) {
     lane.tubes.others = pushed - lane.tubes.tube[lane.tubes.lead].force;
 }
 
-// What the other drives than the leading one bear of the force on all tubes, as at the end of the last step. Nothing holds tubes that are
-// all out: there it counts no more than the others' limits.
+// What the other drives than the leading one bear of the force on all tubes: that of the end of the last step, and no more than their
+// limits. Else a force beyond them would stay: where the lead slips, that of all tubes is its limit and what the others bear.
 template <class V, int T>
 double Stepper<V, T>::borne_by_others(const Lane& lane) const {
-    if (lane.start.advance > 0) return lane.tubes.others;
     double most = 0, least = 0;
     for (int k = 0; k <= T; ++k) {
         if (k == lane.tubes.lead) continue;

@@ -265,6 +265,24 @@ def test_drives_of_random_pairs_keep_their_limits() -> None:
     assert share.max() < 1.055
 
 
+def test_a_force_beyond_a_follower_s_limit_does_not_stay() -> None:
+    """Where the lead slips, the force of all tubes is at most the sum of the limits; it stayed at 5.1 N, not 1 N."""
+    vessel = make_patient(AtlasConfig(), 46)
+    stack = Stack(read_device("workhorse-014"), (read_catheter("microcatheter-1.7f"),))
+    seed = int(np.random.SeedSequence([0, 46]).generate_state(1, np.uint64)[0])
+    initial, control = paired_controls(vessel, stack, rollouts=20, samples=120, seed=seed)
+    config = SimulatorConfig(threads=1)
+    rollout = endopilot.simulate(
+        vessel, stack.wire, control[15:16, :76], catheters=stack.catheters, initial=initial[15:16], config=config
+    )
+    assert rollout.catheters is not None and rollout.valid.all()
+    forces = np.stack([rollout.base_force, rollout.catheters.base_force[..., 0]], axis=-1)[0, 72:]
+    pull = sum(device.pull_limit_n for device in stack.devices)
+    assert (forces.sum(axis=-1) < -0.9 * pull).any()  # both pull in vain
+    assert forces.sum(axis=-1).min() > -1.05 * pull
+    assert forces.min() > -1.5 * stack.catheters[0].device.pull_limit_n
+
+
 def test_tubes_that_rest_at_a_drive_limit_end_their_steps() -> None:
     """A catheter that is pushed at its limit rests where Newton's steps do not shrink below the energy's rounding."""
     vessel = make_patient(AtlasConfig(), 5)
