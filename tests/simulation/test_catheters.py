@@ -11,7 +11,7 @@ import pytest
 
 import endopilot
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.benchmarks.manoeuvres import paired_controls
+from endopilot.benchmarks.manoeuvres import paired_controls, seed_of
 from endopilot.errors import InputError
 from endopilot.simulation.catheter import Catheter, list_catheters, read_catheter
 from endopilot.simulation.config import SimulatorConfig
@@ -19,7 +19,7 @@ from endopilot.simulation.controls import read_controls_csv
 from endopilot.simulation.device import read_device
 from endopilot.simulation.table import write_rollout
 from endopilot.simulation.tubes import Stack, lines_from_tips
-from endopilot.types import Anatomy
+from endopilot.types import Anatomy, Rollout
 
 SHIPPED = Path(endopilot.__file__).parent / "simulation/catheters"
 
@@ -202,6 +202,17 @@ def test_a_withdrawn_wire_leaves_the_catheter_where_it_is(vessel: Anatomy, cathe
     assert moved < 1.5  # it leans on the wall as its own stiffness has it
 
 
+def robust_world(index: int, catheter: str, world: int, *, samples: int, rollouts: int) -> tuple[Stack, Rollout]:
+    """Simulate the first samples of a world of `bench robustness --catheters`: the workhorse wire in a catheter."""
+    vessel, stack = make_patient(AtlasConfig(), index), Stack(read_device("workhorse-014"), (read_catheter(catheter),))
+    seed, one = seed_of(index, seed=0), slice(world, world + 1)
+    initial, control = paired_controls(vessel, stack, rollouts=rollouts, samples=120, seed=seed)
+    config = SimulatorConfig(threads=1)
+    return stack, endopilot.simulate(
+        vessel, stack.wire, control[one, :samples], catheters=stack.catheters, initial=initial[one], config=config
+    )
+
+
 def test_drives_keep_their_limits(vessel: Anatomy, catheter: Catheter) -> None:
     weak = replace(
         catheter, device=replace(catheter.device, push_limit_n=0.02, pull_limit_n=0.02, torque_limit_n_mm=2e-4)
@@ -267,14 +278,7 @@ def test_drives_of_random_pairs_keep_their_limits() -> None:
 
 def test_a_force_beyond_a_follower_s_limit_does_not_stay() -> None:
     """Where the lead slips, the force of all tubes is at most the sum of the limits; it stayed at 5.1 N, not 1 N."""
-    vessel = make_patient(AtlasConfig(), 46)
-    stack = Stack(read_device("workhorse-014"), (read_catheter("microcatheter-1.7f"),))
-    seed = int(np.random.SeedSequence([0, 46]).generate_state(1, np.uint64)[0])
-    initial, control = paired_controls(vessel, stack, rollouts=20, samples=120, seed=seed)
-    config = SimulatorConfig(threads=1)
-    rollout = endopilot.simulate(
-        vessel, stack.wire, control[15:16, :76], catheters=stack.catheters, initial=initial[15:16], config=config
-    )
+    stack, rollout = robust_world(46, "microcatheter-1.7f", 15, samples=76, rollouts=20)
     assert rollout.catheters is not None and rollout.valid.all()
     forces = np.stack([rollout.base_force, rollout.catheters.base_force[..., 0]], axis=-1)[0, 72:]
     pull = sum(device.pull_limit_n for device in stack.devices)
@@ -285,14 +289,7 @@ def test_a_force_beyond_a_follower_s_limit_does_not_stay() -> None:
 
 def test_tubes_that_rest_at_a_drive_limit_end_their_steps() -> None:
     """A catheter that is pushed at its limit rests where Newton's steps do not shrink below the energy's rounding."""
-    vessel = make_patient(AtlasConfig(), 5)
-    stack = Stack(read_device("workhorse-014"), (read_catheter("jl4-5f"),))
-    seed = int(np.random.SeedSequence([0, 5]).generate_state(1, np.uint64)[0])
-    initial, control = paired_controls(vessel, stack, rollouts=4, samples=120, seed=seed)
-    config = SimulatorConfig(threads=1)
-    rollout = endopilot.simulate(
-        vessel, stack.wire, control[3:, :8], catheters=stack.catheters, initial=initial[3:], config=config
-    )
+    stack, rollout = robust_world(5, "jl4-5f", 3, samples=8, rollouts=4)
     assert rollout.catheters is not None
     assert np.abs(rollout.catheters.base_force).max() > 0.99 * stack.catheters[0].device.push_limit_n
     assert rollout.valid.all()

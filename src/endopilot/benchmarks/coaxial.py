@@ -58,16 +58,10 @@ def bench_coaxial(
 
     figures, rollouts = bench_beside(run, scenes, preset, beside="wire_alone", least_share=LEAST_SHARE)
     fine = fine_steps(run, preset)
-    config = replace(PRESETS[preset], threads=1)
-    wall = wall_stiffness(config, Stack(scenes[0].device, (catheter,)).push_limit_n)
+    pair_wall = wall_stiffness(PRESETS[preset], Stack(scenes[0].device, (catheter,)).push_limit_n)
+    config = replace(PRESETS[preset], threads=1, wall_stiffness_n_mm=pair_wall)
     alone = [
-        simulate(
-            scene.anatomy,
-            catheter.device,
-            control,
-            initial=start,
-            config=replace(config, wall_stiffness_n_mm=wall),
-        )
+        simulate(scene.anatomy, catheter.device, control, initial=start, config=config)
         for scene, start, control in zip(scenes, starts, controls, strict=True)
     ]
     return {

@@ -56,6 +56,16 @@ def name_of(stack: Stack) -> str:
     return " in ".join(device.name for device in stack.devices)
 
 
+def seed_of(index: int, *, seed: int) -> int:
+    """Return the key of the controls in an anatomy.
+
+    Args:
+        index: number of the anatomy.
+        seed: of the benchmark.
+    """
+    return int(np.random.SeedSequence([seed, index]).generate_state(1, np.uint64)[0])
+
+
 def robust_controls(
     anatomy: Anatomy, device: Device, *, rollouts: int, samples: int, seed: int
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n samples 2"]]:

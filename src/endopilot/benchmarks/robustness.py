@@ -27,7 +27,7 @@ from endopilot import __version__, _core
 from endopilot.anatomy.io import read_anatomy
 from endopilot.anatomy.projection import project_tip
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.benchmarks.manoeuvres import MANOEUVRES, name_of, paired_controls, stacks_of
+from endopilot.benchmarks.manoeuvres import MANOEUVRES, name_of, paired_controls, seed_of, stacks_of
 from endopilot.errors import InputError
 from endopilot.files import read_json, sha256, write_json, writing
 from endopilot.parallel import follow_the_parent
@@ -151,7 +151,7 @@ def run_chunk(path: Path, config: RobustnessConfig, index: int, stack: Stack, ro
         return
     began = time.process_time()
     samples = round(config.seconds / SAMPLE_PERIOD_S)
-    seed = int(np.random.SeedSequence([config.seed, index]).generate_state(1, np.uint64)[0])
+    seed = seed_of(index, seed=config.seed)
     initial, control = paired_controls(anatomy, stack, rollouts=rollouts, samples=samples, seed=seed)
     simulator = SimulatorConfig(threads=config.threads)
     with warnings.catch_warnings():

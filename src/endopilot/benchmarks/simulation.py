@@ -13,6 +13,7 @@ import numpy as np
 
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.benchmarks.baseline import BASELINE_FOLDER, Baseline
+from endopilot.benchmarks.beside import node_iterations_per_second
 from endopilot.benchmarks.errors import error_figures, error_intervals
 from endopilot.benchmarks.reference import REFERENCE_FILE, check_reference, read_reference
 from endopilot.benchmarks.scenes import DEVICE, KINDS, SEED, Scene, Solution, make_scenes
@@ -69,7 +70,7 @@ def bench_simulation(
         "preset": preset,
         "realtime_factor_per_core": round(simulated / timed.processor, 1),
         "speed_over_baseline": None if timed.baseline is None else round(timed.baseline / timed.processor, 3),
-        "node_iterations_per_second": round(sum(r.node_iterations.sum() for r in timed.rollouts) / simulated, 1),
+        "node_iterations_per_second": node_iterations_per_second(timed.rollouts),
         "threads_speedup": round(_threads_speedup(exact.recipe, config), 3),
         "threads_speedup_few_worlds": round(timed.alone / timed.together, 3),
         **error_figures(found, exact.solution),

@@ -40,7 +40,7 @@ class Setup:
         patients_folder: where prepared patients are kept for the next time; nowhere if None.
         identities: SHA-256 of what a simulation depends on in each anatomy, by name; needed with `patients_folder`.
         known_motions: what is known of how vessels move with heart and breath, by the anatomy's name; those that are
-            not there lie still.
+            not there, or None, lie still.
     """
 
     anatomies: Mapping[str, Callable[[], Anatomy]]
@@ -48,7 +48,7 @@ class Setup:
     simulator: SimulatorConfig
     patients_folder: Path | None = None
     identities: Mapping[str, str] | None = None
-    known_motions: Mapping[str, Motion] = field(default_factory=dict)
+    known_motions: Mapping[str, Motion | None] = field(default_factory=dict)
 
     @staticmethod
     def of_anatomy(anatomy: Anatomy, device: Device, simulator: SimulatorConfig) -> Setup:
@@ -65,15 +65,17 @@ class Setup:
         def read(name: str) -> Anatomy:
             return read_anatomy(dataset.anatomy_folder(name))
 
-        moving = {name: motion for name in dataset.patients if (motion := dataset.motion(name)) is not None}
-        means = {name: mean for name, motion in moving.items() if (mean := published_mean(motion)) is not None}
         return Setup(
             anatomies={name: partial(read, name) for name in dataset.patients},
             device=from_record(Device, dataset.manifest["device"]),
             simulator=SimulatorConfig(**dataset.manifest["config"]["simulator"]),
             patients_folder=dataset.folder / PATIENTS_FOLDER,
             identities=dataset.patients,
-            known_motions=means,
+            known_motions={
+                name: published_mean(motion)
+                for name in dataset.patients
+                if (motion := dataset.motion(name)) is not None
+            },
         )
 
     def patient(self, name: str) -> Patient:
