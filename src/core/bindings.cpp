@@ -9,6 +9,7 @@
 #include "arrays.hpp"
 #include "levels.hpp"
 #include "projection.hpp"
+#include "refined.hpp"
 #include "simulation.hpp"
 #include "spline.hpp"
 #ifdef ENDOPILOT_CUDA
@@ -52,12 +53,30 @@ Rod make_rod(const Array<1>& abscissa, const Array<1>& shear, const Array<1>& st
     return rod;
 }
 
-LumenMap make_lumen(const Image& values, const Array<1>& origin, double spacing, double near, double far) {
+LumenMap make_lumen(const Image& values, const Array<1>& origin, double spacing, double near, double far, int finer, const Array<2>& spheres) {
     require(origin.size() == 3 && spacing > 0, "a lumen needs an origin of three numbers and a positive spacing");
     const int size[3] = {int(values.shape(2)), int(values.shape(1)), int(values.shape(0))};
     require(size[0] > 0 && size[1] > 0 && size[2] > 0, "a lumen needs at least one cell");
+    require(finer >= 1 && (finer == 1 || spheres.shape(1) == 8), "a finer lumen needs the ends of its spheres' lines and their radii, 8 numbers");
     const double o[3] = {origin.data()[0], origin.data()[1], origin.data()[2]};
-    return make_lumen_map(spline_coefficients(values.data(), size).data(), size, o, spacing, near, far);
+    const std::vector<float> coefficients = spline_coefficients(values.data(), size);
+    if (finer == 1) return make_lumen_map(coefficients.data(), size, o, spacing, near, far);
+    std::vector<InscribedSpheres> inside;
+    for (std::size_t i = 0; i < spheres.shape(0); ++i) {
+        const double* s = spheres.data() + 8 * i;
+        inside.push_back({{float(s[0]), float(s[1]), float(s[2])}, {float(s[3]), float(s[4]), float(s[5])}, float(s[6]), float(s[7])});
+    }
+    return refined_lumen_map(coefficients.data(), size, o, spacing, finer, inside, near, far);
+}
+
+// The distance to the wall at points, mm; very large where no wall is near, NaN outside the map.
+nb::object distance(const LumenMap& map, const Array<2>& points) {
+    require(points.shape(1) == 3, "points need three coordinates");
+    const std::size_t n = points.shape(0);
+    OutputArray<double> found(n);
+    const Lumen lumen = view(map, InPlace{});
+    for (std::size_t i = 0; i < n; ++i) found.data[i] = distance_to_wall<double>(lumen, vec3(points.data() + 3 * i)).value;
+    return found.array(n);
 }
 
 OwnedLoads make_loads(const Array<2>& force, const Array<2>& moment, const Array<2>& spring, const Array<2>& anchor,
@@ -198,9 +217,9 @@ NB_MODULE(ENDOPILOT_MODULE, module) {
         .def_ro("nodes", &Rod::nodes);
     module.def("make_rod", &make_rod, nb::kw_only(), nb::arg("abscissa"), nb::arg("shear"), nb::arg("stretch"),
                nb::arg("bend"), nb::arg("twist"), nb::arg("rest"), nb::arg("radius"), nb::arg("drag"), nb::arg("spin_drag"));
-    nb::class_<LumenMap>(module, "Lumen").def_prop_ro("bytes", &bytes);
+    nb::class_<LumenMap>(module, "Lumen").def_prop_ro("bytes", &bytes).def("distance", &distance, nb::arg("points"));
     module.def("make_lumen", &make_lumen, nb::kw_only(), nb::arg("values"), nb::arg("origin"), nb::arg("spacing"),
-               nb::arg("near"), nb::arg("far"));
+               nb::arg("near"), nb::arg("far"), nb::arg("finer"), nb::arg("spheres"));
     nb::class_<Projector>(module, "Projector")
         .def("project", &project, nb::arg("points"), nb::arg("nearest"), nb::arg("distance"));
     module.def("make_projector", &make_projector, nb::kw_only(), nb::arg("point"), nb::arg("tangent"), nb::arg("abscissa"),

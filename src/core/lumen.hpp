@@ -46,11 +46,12 @@ struct LumenArrays {
 using LumenMap = LumenArrays<Owned>;
 using Lumen = LumenArrays<Viewed>;   // no lumen if it refers to nothing
 
-// coefficients: nz × ny × nx, x fastest. Cells whose whole stencil is deeper inside than `near` carry no contact;
-// cells whose whole stencil is farther outside than `far` count as outside the map.
-inline LumenMap make_lumen_map(const float* coefficients, const int (&size)[3], const double (&origin)[3], double spacing, double near,
-                               double far) {
-    constexpr int kEdge = Lumen::kEdge, kStored = Lumen::kStored, kVolume = Lumen::kVolume;
+// Gathers the bricks of a grid of `size` cells. `fill` is asked for each brick: it writes its coefficients and the lowest and highest of
+// them; or it returns false and bounds of them where no wall is near. Cells whose whole stencil is deeper inside than `near` carry no contact; cells whose
+// whole stencil is farther outside than `far` count as outside the map.
+template <class Fill>
+LumenMap gather_bricks(const int (&size)[3], const double (&origin)[3], double spacing, double near, double far, Fill&& fill) {
+    constexpr int kEdge = Lumen::kEdge, kVolume = Lumen::kVolume;
     LumenMap map;
     map.inverse_spacing = 1.0 / spacing;
     for (int a = 0; a < 3; ++a) {
@@ -63,24 +64,14 @@ inline LumenMap make_lumen_map(const float* coefficients, const int (&size)[3], 
     map.index.resize(std::size_t(map.bricks[0]) * map.bricks[1] * map.bricks[2]);
     std::vector<float> brick(kVolume);
     std::size_t at = 0;
-    for (int bz = 0; bz < map.bricks[2]; ++bz)
-        for (int by = 0; by < map.bricks[1]; ++by)
-            for (int bx = 0; bx < map.bricks[0]; ++bx, ++at) {
-                float lowest = std::numeric_limits<float>::max(), highest = -lowest;
-                for (int z = 0, m = 0; z < kStored; ++z)
-                    for (int y = 0; y < kStored; ++y)
-                        for (int x = 0; x < kStored; ++x, ++m) {
-                            const int gx = std::clamp(bx * kEdge + x - 1, 0, size[0] - 1);
-                            const int gy = std::clamp(by * kEdge + y - 1, 0, size[1] - 1);
-                            const int gz = std::clamp(bz * kEdge + z - 1, 0, size[2] - 1);
-                            const float c = coefficients[(std::size_t(gz) * size[1] + gy) * size[0] + gx];
-                            brick[std::size_t(m)] = c;
-                            lowest = std::min(lowest, c);
-                            highest = std::max(highest, c);
-                        }
+    for (int z = 0; z < map.bricks[2]; ++z)
+        for (int y = 0; y < map.bricks[1]; ++y)
+            for (int x = 0; x < map.bricks[0]; ++x, ++at) {
+                float lowest, highest;
+                const bool filled = fill({x, y, z}, brick, lowest, highest);
                 if (lowest > near) {
                     map.index[at] = 0;
-                } else if (highest < -far) {
+                } else if (!filled || highest < -far) {
                     map.index[at] = 1;
                 } else {
                     map.index[at] = std::int32_t(map.pool.size() / kVolume);
@@ -89,6 +80,28 @@ inline LumenMap make_lumen_map(const float* coefficients, const int (&size)[3], 
             }
     map.pool.push_back(0.0f);  // rows are read four at a time
     return map;
+}
+
+// coefficients: nz × ny × nx, x fastest.
+inline LumenMap make_lumen_map(const float* coefficients, const int (&size)[3], const double (&origin)[3], double spacing, double near,
+                               double far) {
+    constexpr int kEdge = Lumen::kEdge, kStored = Lumen::kStored;
+    return gather_bricks(size, origin, spacing, near, far,
+                         [&](const int (&at)[3], std::vector<float>& brick, float& lowest, float& highest) {
+        lowest = std::numeric_limits<float>::max(), highest = -lowest;
+        for (int z = 0, m = 0; z < kStored; ++z)
+            for (int y = 0; y < kStored; ++y)
+                for (int x = 0; x < kStored; ++x, ++m) {
+                    const int gx = std::clamp(at[0] * kEdge + x - 1, 0, size[0] - 1);
+                    const int gy = std::clamp(at[1] * kEdge + y - 1, 0, size[1] - 1);
+                    const int gz = std::clamp(at[2] * kEdge + z - 1, 0, size[2] - 1);
+                    const float c = coefficients[(std::size_t(gz) * size[1] + gy) * size[0] + gx];
+                    brick[std::size_t(m)] = c;
+                    lowest = std::min(lowest, c);
+                    highest = std::max(highest, c);
+                }
+        return true;
+    });
 }
 
 inline std::size_t bytes(const LumenMap& map) {

@@ -10,6 +10,7 @@ class RodModel:
 
 class Lumen:
     bytes: int
+    def distance(self, points: np.ndarray) -> np.ndarray: ...
 
 class Projector:
     def project(
@@ -57,7 +58,16 @@ def make_rod(
     drag: np.ndarray,
     spin_drag: np.ndarray,
 ) -> RodModel: ...
-def make_lumen(*, values: np.ndarray, origin: np.ndarray, spacing: float, near: float, far: float) -> Lumen: ...
+def make_lumen(
+    *,
+    values: np.ndarray,
+    origin: np.ndarray,
+    spacing: float,
+    near: float,
+    far: float,
+    finer: int,
+    spheres: np.ndarray,
+) -> Lumen: ...
 def make_projector(
     *,
     point: np.ndarray,

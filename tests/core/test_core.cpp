@@ -9,6 +9,7 @@
 
 #include "core_adapter.hpp"
 #include "projection.hpp"
+#include "refined.hpp"
 
 using namespace adapter;
 
@@ -345,6 +346,51 @@ void test_spline_coefficients() {
             }
 }
 
+// On a finer grid a quadratic field stays as it is, and in a narrow tube the axis is as far from the wall as the tube is wide, which the
+// coarse spline rounds off.
+void test_refined_map() {
+    const int size[3] = {21, 13, 10};
+    const double origin[3] = {-4, -2.7, -2}, spacing = 0.45;
+    const auto fill = [&](auto&& field) {
+        std::vector<float> c;
+        for (int k = 0; k < size[2]; ++k)
+            for (int j = 0; j < size[1]; ++j)
+                for (int i = 0; i < size[0]; ++i) c.push_back(float(field(origin[0] + spacing * i, origin[1] + spacing * j, origin[2] + spacing * k)));
+        return c;
+    };
+    const auto quadratic = fill([](double x, double y, double z) { return 0.3 + 0.1 * x * y - 0.2 * z * z + 0.05 * x * x - 0.3 * y; });
+    for (const int factor : {2, 3}) {
+        const LumenMap map = make_lumen_map(quadratic.data(), size, origin, spacing, 1e9, 1e9);
+        const LumenMap finer = refined_lumen_map(quadratic.data(), size, origin, spacing, factor, {}, 1e9, 1e9);
+        const Lumen as_was = view(map, InPlace{}), refined = view(finer, InPlace{});
+        for (int trial = 0; trial < 200; ++trial) {
+            const Vec3<double> x{uniform(-3, 4), uniform(-1.7, 1.7), uniform(-1, 1)};
+            const Distance<double> d = distance_to_wall<double>(refined, x), was = distance_to_wall<double>(as_was, x);
+            expect_near(d.value, was.value, 1e-5, "a finer grid keeps a quadratic field");
+            expect_near(d.gradient.x, was.gradient.x, 1e-4, "a finer grid keeps a quadratic field's slope");
+        }
+    }
+    constexpr double kRadius = 0.9;
+    const auto tube = fill([](double, double y, double z) { return kRadius - std::hypot(y, z); });
+    const auto coefficients = spline_coefficients(tube.data(), size);
+    const std::vector<InscribedSpheres> spheres{{{-6, 0, 0}, {0, 0, 0}, kRadius, kRadius}, {{0, 0, 0}, {6, 0, 0}, kRadius, kRadius}};
+    const LumenMap map = make_lumen_map(coefficients.data(), size, origin, spacing, 1e9, 0.5);
+    const LumenMap finer = refined_lumen_map(coefficients.data(), size, origin, spacing, 3, spheres, 1e9, 0.5);
+    const LumenMap sparse_map = refined_lumen_map(coefficients.data(), size, origin, spacing, 3, spheres, 0.3, 0.5);
+    const Lumen as_was = view(map, InPlace{}), refined = view(finer, InPlace{}), sparse = view(sparse_map, InPlace{});
+    expect(bytes(sparse_map) <= bytes(finer), "bricks deep inside are left out");
+    expect(distance_to_wall<double>(as_was, {0.3, 0, 0}).value < kRadius - 0.08, "the coarse spline rounds the axis off");
+    for (int trial = 0; trial < 500; ++trial) {
+        const double rho = uniform(0, 1.3), angle = uniform(0, 6.28);
+        const Vec3<double> x{uniform(-3, 4), rho * std::cos(angle), rho * std::sin(angle)};
+        const double d = distance_to_wall<double>(refined, x).value;
+        // the fine spline errs by half of its own step at most on the axis, and beside it by what the coarse one does
+        expect_near(d, kRadius - rho, rho < 0.3 ? 0.5 * spacing / 3 : 0.1 * spacing, "distance in a tube on a finer grid");
+        const double there = distance_to_wall<double>(sparse, x).value;
+        expect(there == d || there == Lumen::kDeep, "bricks that are left out change no others");
+    }
+}
+
 void test_map_borders() {
     const LumenMap map = make_map(1e9), sparse_map = make_map(-10.0);
     const Lumen lumen = view(map, InPlace{}), sparse = view(sparse_map, InPlace{});
@@ -504,6 +550,7 @@ int main() {
     test_distance<double>();
     test_distance<double4>();
     test_spline_coefficients();
+    test_refined_map();
     test_map_borders();
     test_wall();
     test_friction();

@@ -176,7 +176,13 @@ def core_options(
 
 
 def make_lumen(
-    distance_map: DistanceMap, radius_mm: float, processor: Processor = "cpu", *, far_mm: float = 0.5
+    distance_map: DistanceMap,
+    radius_mm: float,
+    processor: Processor = "cpu",
+    *,
+    far_mm: float = 0.5,
+    finer: int = 1,
+    spheres: Float[np.ndarray, "lines 8"] | None = None,
 ) -> Lumen:
     """Return the wall as the core wants it, a quadratic B-spline through the map.
 
@@ -185,6 +191,9 @@ def make_lumen(
         radius_mm: of the wire.
         processor: where it is used.
         far_mm: a wire farther outside the wall than this has left the map.
+        finer: the spline's grid is this many times finer than the map.
+        spheres: on such a grid, spheres inside the lumen make it sharp: the ends (LPS, mm) of lines of centres, and
+            the radii at these ends, mm.
     """
     spacing = float(distance_map.spacing_mm)
     return core_for(processor).make_lumen(
@@ -193,6 +202,8 @@ def make_lumen(
         spacing=spacing,
         near=radius_mm + spacing,
         far=far_mm,
+        finer=finer,
+        spheres=np.zeros((0, 8)) if spheres is None else np.ascontiguousarray(spheres, dtype=float),
     )
 
 

@@ -12,12 +12,13 @@ from jaxtyping import Integer
 from endopilot.anatomy.projection import TipProjector
 from endopilot.simulation.checks import check_distance_map, check_memory
 from endopilot.simulation.config import FREE_BEHIND_MM, SimulatorConfig
-from endopilot.simulation.core import core_options, insertion_arguments, make_lumen
+from endopilot.simulation.core import core_options, insertion_arguments
 from endopilot.simulation.drive_limits import far_end_mm
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.processor import CoreMotion, Lumen, Simulation, core_for
 from endopilot.simulation.rod import RodLayout, lay_out
 from endopilot.simulation.tubes import Stack
+from endopilot.simulation.vessel_wall import make_wall
 from endopilot.types import Anatomy
 
 GroupKey = tuple[str, tuple[Any, ...]]
@@ -60,6 +61,11 @@ def group_key(anatomy: Anatomy, stack: Stack) -> GroupKey:
     return anatomy.identity, stack.constants
 
 
+def _wall_key(anatomy: Anatomy, stack: Stack) -> tuple[str, float, bool]:
+    """Return what worlds with the same wall have in common."""
+    return anatomy.identity, stack.outer_radius_mm, bool(stack.catheters)
+
+
 def make_groups(
     anatomies: Sequence[Anatomy],
     stacks: Sequence[Stack],
@@ -86,7 +92,7 @@ def make_groups(
         for group in sharing
         if isinstance(group.lumen, core.Lumen) and group.wall_reach_mm == config.wall_reach_mm
     ]
-    lumens = {(group.anatomy.identity, group.stack.outer_radius_mm): group.lumen for group in prepared}
+    lumens = {_wall_key(group.anatomy, group.stack): group.lumen for group in prepared}
     projectors = {group.anatomy.identity: group.project for group in sharing}
     members: dict[GroupKey, list[int]] = {}
     for world, pair in enumerate(zip(anatomies, stacks, strict=True)):
@@ -95,12 +101,10 @@ def make_groups(
     for worlds in members.values():
         anatomy, stack = anatomies[worlds[0]], stacks[worlds[0]]
         stack.check(anatomy)
-        key = (anatomy.identity, stack.outer_radius_mm)
+        key = _wall_key(anatomy, stack)
         if key not in lumens:
             check_distance_map(anatomy)
-            lumens[key] = make_lumen(
-                anatomy.distance_map, stack.outer_radius_mm, config.processor, far_mm=config.wall_reach_mm
-            )
+            lumens[key] = make_wall(anatomy, stack, config)
         if anatomy.identity not in projectors:
             projectors[anatomy.identity] = TipProjector(anatomy.tree, anatomy.insertion)
         path_mm = float(anatomy.tree.longest_path().abscissa[-1])

@@ -18,12 +18,13 @@ from endopilot.errors import InputError
 from endopilot.simulation.catheter import Catheter
 from endopilot.simulation.checks import check_distance_map, check_memory, check_sequences
 from endopilot.simulation.config import FREE_BEHIND_MM, Actuation, SimulatorConfig
-from endopilot.simulation.core import make_lumen, run_core
+from endopilot.simulation.core import run_core
 from endopilot.simulation.device import Device
 from endopilot.simulation.drive_limits import far_end_mm
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.rod import lay_out
 from endopilot.simulation.tubes import Stack
+from endopilot.simulation.vessel_wall import make_wall
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, CatheterMotion, Rollout
 
 _REASONS = {1: "left the finite numbers", 2: "did not converge"}
@@ -124,7 +125,7 @@ def simulate(
     moving = None if motion is None else motion.core(np.asarray(anatomy.insertion.position), config.processor)
     result = run_core(
         rod,
-        make_lumen(anatomy.distance_map, stack.outer_radius_mm, config.processor, far_mm=config.wall_reach_mm),
+        make_wall(anatomy, stack, config),
         anatomy.insertion,
         config=config,
         initial=initial,
