@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import asdict, astuple, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,11 +18,13 @@ from endopilot.models.open_loop import OpenLoop, Prediction
 from endopilot.models.twin import TwinPredictor
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import read_device
+from endopilot.simulation.motion import Motion
 from endopilot.xray import advise as advise_module
 from endopilot.xray import monitoring
 from endopilot.xray.advise import advise
 from endopilot.xray.adviser import AdviserConfig
 from endopilot.xray.bands import Calibration
+from endopilot.xray.image_exposures import Exposures
 from endopilot.xray.monitoring import AdviseConfig
 from endopilot.xray.online_predictors import OnlineTwin, OnlineWindowed, online_predictor
 from toy_navigation import make_toy_dataset
@@ -115,6 +117,26 @@ def test_an_image_in_which_no_wire_is_found_shows_nothing_and_is_taken_again(spl
     assert parts.exposed[0, at]  # it counts all the same
     assert whole.near[0, at - 1] and not parts.near[0, at - 1] and parts.near[0, at]
     np.testing.assert_array_equal(parts.exposed[1:], whole.exposed[1:])
+
+
+def test_models_know_the_motion_that_images_have_measured(folder, split, monkeypatch) -> None:
+    truth = load_dataset(folder / "dataset").of_split("calibrate")
+    moves = replace(Motion(), breathing_caudal_mm=7.0)
+
+    def images(dataset, settings) -> tuple[dict[str, Exposures], tuple[str, ...]]:
+        shown = {}
+        for name in sorted(set(dataset.anatomy.tolist())):
+            mine = split.episodes.select(np.flatnonzero(dataset.anatomy == name))
+            sd_mm, found = np.zeros(mine.tip.shape), np.ones(mine.branch.shape, dtype=bool)
+            motion = np.array(astuple(moves) if len(name) % 2 == 0 else ())
+            shown[name] = Exposures(mine.tip, mine.branch, sd_mm, found, motion)
+        return shown, ()
+
+    monkeypatch.setattr(monitoring, "image_exposures", images)
+    found = monitoring.monitor(HoldSlack(), truth, AdviseConfig(xray="images"))
+    known = {name: moves for name in set(truth.anatomy.tolist()) if len(name) % 2 == 0}
+    assert known and found.episodes.setup.known_motions == known
+    np.testing.assert_array_equal(found.episodes.tip, split.episodes.tip)
 
 
 class Errs:

@@ -33,6 +33,9 @@ class Arm:
         if anatomy.name.endswith("-1x"):
             raise NotRegistered(f"X-ray images: {anatomy.name} cannot be registered: nothing seen")
 
+    def measure_motion(self, motion, random) -> Motion:
+        return replace(motion, breathing_caudal_mm=motion.breathing_caudal_mm - 1.5)
+
     def forget_wires(self) -> None:
         self._images = 0
 
@@ -79,12 +82,14 @@ def test_each_sample_is_measured_by_the_wire_driven_again_and_kept_for_the_next_
     assert Arm.refined.count(False) == 2 * 2 * 2  # two patients, two navigations, the 31st and 32nd sample
 
 
-def test_where_the_patient_moves_the_wire_is_seen_displaced(dataset, monkeypatch) -> None:
+def test_where_the_patient_moves_the_wire_is_seen_displaced_by_what_was_not_measured(dataset, monkeypatch) -> None:
     still, _ = image_exposures(dataset, SETTINGS)
     motion = replace(Motion(), breathing_caudal_mm=8.0)
     monkeypatch.setattr("endopilot.dataset.loader.Dataset.motion", lambda self, name: motion)
     moving, _ = image_exposures(dataset, replace(SETTINGS, seed=3))
-    maps = seen_in_episodes(motion, np.zeros(3), 4, 0.5)
+    known = moving["patient-0"].known_motion
+    assert still["patient-0"].known_motion is None and known == replace(motion, breathing_caudal_mm=6.5)
+    maps = seen_in_episodes(motion, known, np.zeros(3), 4, 0.5)
     assert maps is not None
     before = dataset.select(dataset.anatomy == "patient-0").tip_position[:, 3].astype(float)
     after = before @ maps[3, :, :3].T + maps[3, :, 3]

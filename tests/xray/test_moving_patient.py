@@ -23,16 +23,15 @@ def test_the_published_mean_of_what_moves_is_known() -> None:
 
 def test_an_exposure_shows_what_is_not_known_of_the_motion() -> None:
     """The patient breathes 2 mm deeper than the mean; 2 s into a breath of 4 s all of it is there."""
-    assert seen_in_episodes(None, OSTIUM, 4, 0.5) is None
-    np.testing.assert_allclose(seen_in_episodes(Motion(), OSTIUM, 4, 0.5), np.tile(np.eye(3, 4), (4, 1, 1)), atol=1e-9)
+    assert seen_in_episodes(None, None, OSTIUM, 4, 0.5) is None
+    known = seen_in_episodes(Motion(), Motion(), OSTIUM, 4, 0.5)
+    np.testing.assert_allclose(known, np.tile(np.eye(3, 4), (4, 1, 1)), atol=1e-9)
     still = {"annulus_mm": 0.0, "heart_volume_share": 0.0, "heart_rotation_deg": 0.0}
     still |= {"breathing_dorsal_deg": 0.0, "breathing_dextral_deg": 0.0}
     mean = replace(Motion(), **still)
-    maps = seen_in_episodes(replace(mean, breathing_caudal_mm=6.9), OSTIUM, 8, 0.5)
+    maps = seen_in_episodes(replace(mean, breathing_caudal_mm=6.9), mean, OSTIUM, 8, 0.5)
     assert maps is not None
-    turn = published_mean(mean)
-    assert turn is not None
-    there = place(turn.core(OSTIUM).placements(np.array([2.0]))[0], place(maps[3], OSTIUM)[None])
+    there = place(mean.core(OSTIUM).placements(np.array([2.0]))[0], place(maps[3], OSTIUM)[None])
     np.testing.assert_allclose(there[0] - OSTIUM, [0.0, -1.3, -6.9], atol=1e-6)
     np.testing.assert_allclose(place(maps[7], OSTIUM), OSTIUM, atol=1e-6)  # the breath is over
 

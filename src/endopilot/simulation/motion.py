@@ -24,6 +24,16 @@ MotionName = Literal["still", "breathing", "heartbeat", "both"]
 """Names of motions: see `motion_named`."""
 Axis = Float[np.ndarray, "3"]
 
+AMPLITUDES = {
+    "annulus_mm": (11.6, 2.9, 3.0, 19.0),
+    "heart_volume_share": (0.082, 0.023, 0.048, 0.106),
+    "breathing_caudal_mm": (4.9, 1.9, 2.4, 8.0),
+    "breathing_anterior_mm": (1.3, 1.8, -0.4, 5.1),
+    "breathing_dorsal_deg": (1.5, 0.9, 0.2, 3.5),
+    "breathing_dextral_deg": (1.2, 1.3, -1.9, 3.2),
+}
+"""Amplitudes in which patients differ: published mean, standard deviation, least and most; `Motion` has the sources."""
+
 _LONG_AXIS = np.array(LEFT_VENTRICLE_AXIS) / np.linalg.norm(LEFT_VENTRICLE_AXIS)
 """From the base of the heart to its apex, LPS."""
 _LONG_AXIS_MM = 94.0
@@ -155,14 +165,7 @@ def draw_motion(seed: int) -> Motion:
         fits = drawn[(drawn >= low) & (drawn <= high)]
         return float(fits[0]) if len(fits) else mean
 
-    return Motion(
-        annulus_mm=within(11.6, 2.9, 3.0, 19.0),
-        heart_volume_share=within(0.082, 0.023, 0.048, 0.106),
-        breathing_caudal_mm=within(4.9, 1.9, 2.4, 8.0),
-        breathing_anterior_mm=within(1.3, 1.8, -0.4, 5.1),
-        breathing_dorsal_deg=within(1.5, 0.9, 0.2, 3.5),
-        breathing_dextral_deg=within(1.2, 1.3, -1.9, 3.2),
-    )
+    return Motion(**{name: within(*published) for name, published in AMPLITUDES.items()})
 
 
 def place(

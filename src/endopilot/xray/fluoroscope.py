@@ -17,7 +17,7 @@ from endopilot.anatomy.projection import project_tip
 from endopilot.anatomy.tree import tangents
 from endopilot.dataset.loader import Dataset
 from endopilot.settings import Finite, Positive, settings
-from endopilot.simulation.motion import place
+from endopilot.simulation.motion import place, published_mean
 from endopilot.types import Anatomy, TipProjection
 from endopilot.xray.carm import CArmGeometry, View, view_at
 from endopilot.xray.moving_patient import seen_in_episodes, turned
@@ -179,7 +179,9 @@ class Fluoroscope:
         tip, heading = episodes.tip_position.astype(float), episodes.tip_direction.astype(float)
         position, name = np.zeros_like(tip), self._anatomy.name
         ostium = np.asarray(self._anatomy.insertion.position)
-        shown = seen_in_episodes(episodes.motion(name), ostium, tip.shape[1], episodes.sample_period_s)
+        motion = episodes.motion(name)
+        known = None if motion is None else published_mean(motion)
+        shown = seen_in_episodes(motion, known, ostium, tip.shape[1], episodes.sample_period_s)
         if shown is not None:
             tip, heading = place(shown, tip), turned(shown, heading)
         for index, sequence in enumerate(episodes.sequence):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import warnings
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, astuple, dataclass, fields
 from functools import partial
 from pathlib import Path
 
@@ -25,7 +25,7 @@ from endopilot.models.config import WINDOW
 from endopilot.parallel import each
 from endopilot.settings import from_record
 from endopilot.simulation.device import Device
-from endopilot.simulation.motion import place
+from endopilot.simulation.motion import Motion, place
 from endopilot.types import Anatomy
 from endopilot.xray.fluoroscope import FluoroscopeConfig, TipMeasurement
 from endopilot.xray.image_fluoroscope import ImageFluoroscope, NotRegistered
@@ -33,7 +33,7 @@ from endopilot.xray.moving_patient import seen_in_episodes
 
 EXPOSURES_FOLDER = "exposures"
 """Folder of a dataset in which what images show of its navigations is kept."""
-_FORMAT_VERSION = 1
+_FORMAT_VERSION = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,12 +48,21 @@ class Exposures:
         branch: of that tip.
         sd_mm: standard deviations along and across the wire as the detector states them, mm; 0 where it states none.
         found: whether an image shows a wire.
+        motion: the patient's motion as a run of contrast shows it, the numbers of `Motion` in their order; empty for a
+            patient who lies still.
     """
 
     tip: Float[np.ndarray, "episodes samples 2"]
     branch: Int[np.ndarray, "episodes samples"]
     sd_mm: Float[np.ndarray, "episodes samples 2"]
     found: Bool[np.ndarray, "episodes samples"]
+    motion: Float[np.ndarray, "numbers"]
+
+    @property
+    def known_motion(self) -> Motion | None:
+        """What the images are taken to know of the patient's motion; None for a patient who lies still."""
+        names = (field.name for field in fields(Motion))
+        return Motion(**dict(zip(names, self.motion.tolist(), strict=True))) if len(self.motion) else None
 
 
 @dataclass(frozen=True)
@@ -126,10 +135,11 @@ def _expose_patient(path: Path, *, dataset: Path, split: str, settings: ImageSet
 
 
 def expose_navigations(data: Dataset, anatomy: Anatomy, settings: ImageSettings) -> Exposures:
-    """Register a patient, and return what images show of their navigations.
+    """Register a patient and how they move, and return what images show of their navigations.
 
-    Each navigation refines the patient's pose anew by the wires of its first `WINDOW` samples. Later exposures take the
-    pose from these, so that what one shows does not depend on which others were taken.
+    The C-arm takes the motion that it has measured off where it sees the wire. Each navigation refines the patient's
+    pose anew by the wires of its first `WINDOW` samples. Later exposures take the pose from these, so that what one
+    shows does not depend on which others were taken.
 
     Args:
         data: the patient's navigations.
@@ -144,7 +154,10 @@ def expose_navigations(data: Dataset, anatomy: Anatomy, settings: ImageSettings)
     arm = ImageFluoroscope(anatomy, from_record(Device, data.manifest["device"]), settings.fluoroscope, pose_seed)
     shape = data.inserted_length.shape
     ostium, samples = np.asarray(anatomy.insertion.position), min(shape[1], settings.samples)
-    shown = seen_in_episodes(data.motion(name), ostium, shape[1], data.sample_period_s)
+    known, motion = None, data.motion(name)
+    if motion is not None:
+        known = arm.measure_motion(motion, np.random.default_rng([seed, 6, *name.encode()]))
+    shown = seen_in_episodes(motion, known, ostium, shape[1], data.sample_period_s)
     encoder = data.inserted_length.astype(float) - deeper_ostium_mm(name, settings.ostium_mm, seed)
     measured: list[list[TipMeasurement | None]] = [[] for _ in data.sequence]
     with warnings.catch_warnings():
@@ -160,15 +173,18 @@ def expose_navigations(data: Dataset, anatomy: Anatomy, settings: ImageSettings)
                 random = np.random.default_rng([seed, 3, sequence, sample, *name.encode()])
                 depth, given = float(encoder[index, sample]), sample < WINDOW
                 measured[index].append(arm.expose(there, depth, random, refine=given))
-    return _held(measured, encoder)
+    return _held(measured, encoder, known)
 
 
-def _held(measured: Sequence[Sequence[TipMeasurement | None]], encoder: Float[np.ndarray, "episodes s"]) -> Exposures:
+def _held(
+    measured: Sequence[Sequence[TipMeasurement | None]], encoder: Float[np.ndarray, "episodes s"], known: Motion | None
+) -> Exposures:
     """Return measurements of the first samples of each navigation as arrays, with what is held where there is none.
 
     Args:
         measured: in each navigation.
         encoder: Δ, mm.
+        known: the patient's motion as it was measured.
     """
     tip = np.stack([encoder, np.zeros_like(encoder)], axis=-1)
     branch, found, sd_mm = np.zeros(encoder.shape, dtype=np.int64), np.zeros(encoder.shape, dtype=bool), 0 * tip
@@ -179,4 +195,4 @@ def _held(measured: Sequence[Sequence[TipMeasurement | None]], encoder: Float[np
                 tip[index, later, 0] = encoder[index, later] - (encoder[index, sample] - one.abscissa)
                 tip[index, later, 1], branch[index, later] = one.offset, one.branch
                 sd_mm[index, sample], found[index, sample] = one.sd_mm, True
-    return Exposures(tip, branch, sd_mm, found)
+    return Exposures(tip, branch, sd_mm, found, np.array(astuple(known) if known else (), dtype=float))

@@ -13,12 +13,14 @@ from jaxtyping import Float, Float32
 from endopilot.anatomy.projection import project_tip
 from endopilot.errors import InputError
 from endopilot.simulation.device import Device
+from endopilot.simulation.motion import Motion, published_mean
 from endopilot.types import Anatomy
 from endopilot.xray.absorbers import surroundings
 from endopilot.xray.carm import Pose, view_at
 from endopilot.xray.detector import TipDetector
 from endopilot.xray.fluoroscope import FluoroscopeConfig, TipMeasurement
 from endopilot.xray.image import ImageConfig, Plane, XrayImager
+from endopilot.xray.motion_registration import RUN_TIMES_S, register_motion
 from endopilot.xray.pose_refinement import PoseRefiner
 from endopilot.xray.registration import Registration, register, vessel_error_mm
 
@@ -59,9 +61,11 @@ class ImageFluoroscope:
         angles = config.view_angles_deg[: 2 if config.biplane else 1]
         self.pose, self._anatomy = Pose.draw(random), anatomy
         self._imager = XrayImager(anatomy, device, surroundings(anatomy), ImageConfig(geometry=config.geometry))
+        self._angles_deg = angles
         self._planes = [self._imager.plane(angle, pose=self.pose) for angle in angles]
         self._views = [view_at(angle, self._imager.isocenter, config.geometry) for angle in angles]
         lit, before = ([self._signal(plane, _NO_WIRE, random, share) for plane in self._planes] for share in (1.0, 0.0))
+        self._before = before
         self.registration: Registration = register(anatomy, self._views, lit, before, self._imager.config)
         if self.registration.failure:
             raise NotRegistered(f"X-ray images: {anatomy.name} cannot be registered: {self.registration.failure}")
@@ -72,6 +76,29 @@ class ImageFluoroscope:
     def forget_wires(self) -> None:
         """Take the patient's pose to be what contrast showed, whatever the wires since: another navigation begins."""
         self.refiner = PoseRefiner(self._anatomy, self.registration)
+
+    def measure_motion(self, motion: Motion, random: np.random.Generator) -> Motion | None:
+        """Inject contrast once more, take a run of images over a breath, and return how the patient moves by them.
+
+        Args:
+            motion: how the patient truly moves.
+            random: where the noise is drawn from.
+
+        Raises:
+            NotRegistered: the vessel is not recognised in the images.
+        """
+        if (mean := published_mean(motion)) is None:
+            return None
+        ostium, anatomy = np.asarray(self._anatomy.insertion.position), self._anatomy
+        run = []
+        for placed in motion.core(ostium).placements(np.array(RUN_TIMES_S))[0]:
+            planes = [self._imager.plane(angle, pose=self.pose, placed=placed) for angle in self._angles_deg]
+            run.append([self._signal(plane, _NO_WIRE, random, 1.0) for plane in planes])
+        views = self.registration.views(self._views, self._imager.isocenter)
+        found = register_motion(anatomy, views, run, self._before, mean, self._imager.config)
+        if found.failure:
+            raise NotRegistered(f"X-ray images: the motion of {anatomy.name} cannot be measured: {found.failure}")
+        return found.motion
 
     def expose(
         self,

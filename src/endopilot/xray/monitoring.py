@@ -153,6 +153,7 @@ def monitor(predictor: Predictor, dataset: Dataset, config: AdviseConfig, *, sam
     proximal, trees = true.proximal + by_encoder[:, None], []
     tip, branch = true.tip.astype(float), true.branch.copy()
     sd_mm, found = np.zeros(tip.shape), np.ones(branch.shape, dtype=bool)
+    known_motions = dict(true.setup.known_motions)
     with progress("Exposing", len(names)) as advance:
         for index, name in enumerate(names):
             anatomy = true.setup.anatomies[str(name)]()  # one at a time: a distance map takes memory
@@ -161,13 +162,16 @@ def monitor(predictor: Predictor, dataset: Dataset, config: AdviseConfig, *, sam
             if config.xray == "images":
                 seen = images[str(name)]
                 tip[mine], branch[mine], sd_mm[mine], found[mine] = seen.tip, seen.branch, seen.sd_mm, seen.found
+                if seen.known_motion is not None:
+                    known_motions[str(name)] = seen.known_motion
             else:
                 arm = Fluoroscope(anatomy, wire_radius, config.fluoroscope)
                 shown = arm.expose_episodes(dataset.select(mine), proximal[mine, :, 0], config.seed)
                 tip[mine], branch[mine] = np.stack([shown.abscissa, shown.offset], axis=-1), shown.branch
             advance()
     measured = {"proximal": proximal, "tip": tip, "branch": branch, "tip_sd": sd_mm}
-    episodes = replace(true, initial=true.initial + by_encoder, **measured)
+    setup = replace(true.setup, known_motions=known_motions)
+    episodes = replace(true, initial=true.initial + by_encoder, setup=setup, **measured)
     return Monitored(
         truth=true.tip.astype(float),
         ratio=safety_ratio(dataset.tip_offset, dataset.lumen_radius, wire_radius).astype(float),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.simulation.motion import Motion, published_mean, relative
+from endopilot.simulation.motion import Motion, relative
 from endopilot.simulation.processor import CoreMotion
 
 
@@ -23,23 +23,22 @@ def seen(
 
 
 def seen_in_episodes(
-    motion: Motion | None, ostium: Float[np.ndarray, "3"], samples: int, period_s: float
+    motion: Motion | None, known: Motion | None, ostium: Float[np.ndarray, "3"], samples: int, period_s: float
 ) -> Float[np.ndarray, "samples 3 4"] | None:
     """Return `seen` at each sample of a dataset's navigations in one patient; None if the patient lies still.
 
-    The phase of heart and breath is known, and of the amplitudes the published mean.
-
     Args:
         motion: the patient's own.
+        known: what is known of it, with the phase of heart and breath; nothing if not given.
         ostium: LPS mm.
         samples: of a navigation.
         period_s: time between them, s.
     """
     if motion is None:
         return None
-    times_s, mean = period_s * np.arange(1, samples + 1), published_mean(motion)
+    times_s = period_s * np.arange(1, samples + 1)
     placed = motion.core(ostium).placements(times_s)[0]
-    return seen(placed, None if mean is None else mean.core(ostium), times_s)
+    return seen(placed, None if known is None else known.core(ostium), times_s)
 
 
 def turned(

@@ -34,7 +34,7 @@ _STEP_SHARE = 0.01
 """The derivative is taken over this share of a standard deviation either way, times the averaged pixels."""
 _DARKEST = 0.05
 """Share of the light below which none is taken to be unscattered."""
-_AGREES = 0.8
+AGREES = 0.8
 """Least correlation of image and projected vessel. Without contrast it is near 0."""
 _FELT = 0.02
 """Pixels that a pose changes by more than this share of what it changes the most show how well it fits."""
@@ -80,14 +80,14 @@ def register(
         config: detector and beam.
     """
     config, isocenter = config or ImageConfig(), isocenter_of(anatomy)
-    points, size = _sampled(anatomy)
+    points, size = sampled_lumen(anatomy)
     found, correlation, covariance = np.zeros(6), 0.0, np.diag(_PRIOR**2)
     for averaged, blur in _LEVELS:
         observed = [
-            gaussian_filter(_added(lit, mask, averaged, config), blur)
+            gaussian_filter(added(lit, mask, averaged, config), blur)
             for lit, mask in zip(contrasted, before, strict=True)
         ]
-        level = _Level(points, size, views, observed, averaged, blur, config, isocenter)
+        level = Comparison(points, size, views, observed, averaged, blur, config, isocenter)
         slope: Any = level.slope  # the annotation of scipy knows names of schemes alone
         found = least_squares(
             level.residuals,
@@ -103,7 +103,7 @@ def register(
         correlation, covariance = level.correlation(found), level.covariance(found)
     far = float(np.abs(found / _PRIOR).max()) + 1e-2
     failure = ""
-    if correlation < _AGREES:
+    if correlation < AGREES:
         failure = f"the image and the vessel agree by {correlation:.2f} only; inject contrast, or choose another view"
     elif far > _FAR:
         failure = "the vessel fits the image only far from where the patient was laid; check the views' angles"
@@ -111,8 +111,19 @@ def register(
 
 
 @dataclass(frozen=True, eq=False)
-class _Level:
-    """The comparison at one resolution; the arguments are those of `register` and `_LEVELS`."""
+class Comparison:
+    """The comparison of images and projected vessel at one resolution.
+
+    Attributes:
+        points: of the lumen, LPS mm.
+        size: volume that each stands for, mm³.
+        views: of the images.
+        observed: what contrast added to each image, pixels averaged and blurred.
+        averaged: pixels along a side that are averaged.
+        blur: of what is left, in averaged pixels.
+        config: detector and beam.
+        isocenter: about which poses turn, LPS mm.
+    """
 
     points: Float[np.ndarray, "n 3"]
     size: Float[np.ndarray, "n"]
@@ -133,11 +144,14 @@ class _Level:
         return images
 
     def residuals(self, pose: Float[np.ndarray, "6"]) -> Float[np.ndarray, "n"]:
-        """Return all differences, in units of the usual misfit, and those of the pose from the prior."""
+        """Return all differences, and that of the pose from the prior."""
+        return np.concatenate([self.differences(pose), pose / _PRIOR])
+
+    def differences(self, pose: Float[np.ndarray, "6"]) -> Float[np.ndarray, "n"]:
+        """Return how the images differ from what is expected in a pose, in units of the usual misfit."""
         full = _MISFIT * self.config.iodine_mm * 3.0  # a vessel of 3 mm
         pairs = zip(self.expected(pose), self.observed, strict=True)
-        difference = [((ours - theirs) / full).ravel() for ours, theirs in pairs]
-        return np.concatenate([*difference, pose / _PRIOR])
+        return np.concatenate([((ours - theirs) / full).ravel() for ours, theirs in pairs])
 
     def slope(self, pose: Float[np.ndarray, "6"]) -> Float[np.ndarray, "n 6"]:
         """Return the derivative of the residuals by the pose."""
@@ -165,7 +179,7 @@ class _Level:
         return float(np.corrcoef(ours[wide], theirs[wide])[0, 1]) if wide.sum() > 2 else 0.0
 
 
-def _added(
+def added(
     lit: Float32[np.ndarray, "rows columns"],
     mask: Float32[np.ndarray, "rows columns"],
     averaged: int,
@@ -179,7 +193,7 @@ def _added(
     return np.log(np.maximum(before - scatter, least) / np.maximum(light - scatter, least)).astype(np.float32)
 
 
-def _sampled(anatomy: Anatomy) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]:
+def sampled_lumen(anatomy: Anatomy) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]:
     """Return a sample of the lumen, and of the catheter's straight end, which contrast fills too."""
     points, size = lumen_points(anatomy)
     behind, size_behind = catheter_lumen_points(anatomy)
