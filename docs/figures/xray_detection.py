@@ -51,6 +51,7 @@ def tables(found: dict[str, Any]) -> str:
         f"A wire is found in {100 * found['false_alarms_share']:.0f} % of the exposures without one, over all doses, "
         f"with and without contrast. An image without contrast is refused by registration in "
         f"{sum(row['told_without_contrast'] for row in poses)} of {len(poses)} patients. "
+        f"{motion_sentence(found)} "
         f"{found['images_per_second']:.0f} images a second of 512 × 512 pixels were made on one core, while others "
         "were busy.",
         "",
@@ -64,6 +65,17 @@ def tables(found: dict[str, Any]) -> str:
         if row["images"]
     ]
     return "\n".join(rows)
+
+
+def motion_sentence(found: dict[str, Any]) -> str:
+    """Return how well a run of contrast shows the patients' motion, in words."""
+    errors = [row["motion_mm"] for row in found["registration"]]
+    measured = [each["measured"] for each in errors if each["measured"] is not None]
+    return (
+        f"With heart and breath, a run of contrast says where the vessel is to {found['motion_error_mm']:.2f} mm "
+        f"(median of {len(measured)} patients; largest {max(measured):.2f}), the published mean to "
+        f"{found['motion_error_of_published_mean_mm']:.2f} mm (largest {max(each['mean'] for each in errors):.2f})."
+    )
 
 
 def refined_rows(poses: list[dict[str, Any]]) -> list[str]:

@@ -29,7 +29,11 @@ def test_a_tip_found_elsewhere_is_missed_and_one_found_without_a_wire_is_a_false
         exposure(wire=False),
         exposure(wire=False, found=False),
     ]
-    registrations = [{"two_views_mm": value, "one_view_mm": [1.0, 3.0]} for value in (0.2, 0.9)]
+    motions = [{"mean": 1.0, "measured": None}, {"mean": 0.5, "measured": 0.1}]
+    registrations = [
+        {"two_views_mm": value, "one_view_mm": [1.0, 3.0], "motion_mm": motion}
+        for value, motion in zip((0.2, 0.9), motions, strict=True)
+    ]
     figures = _figures(rows, registrations, [20.0, 30.0, 10.0])
     assert figures["missed_share"] == 0.5 and figures["images"] == 4
     assert figures["tip_along_median_px"] == 3.0
@@ -38,6 +42,8 @@ def test_a_tip_found_elsewhere_is_missed_and_one_found_without_a_wire_is_a_false
     assert figures["by"]["dose 4, contrast 0"]["missed_share"] == 1.0
     assert figures["false_alarms_share"] == 0.5
     assert figures["registration_error_mm"] == pytest.approx(0.55)
+    assert figures["motion_error_mm"] == 0.1 and figures["motions_not_measured"] == 1
+    assert figures["motion_error_of_published_mean_mm"] == 0.75
     assert figures["passed"] == {
         name: name
         not in ("tip_along_median_px", "missed_share", "registration_error_mm", "registration_error_one_view_mm")

@@ -13,11 +13,13 @@ import numpy as np
 
 from endopilot.anatomy.projection import project_tip
 from endopilot.settings import Count, Seed, settings
+from endopilot.simulation.motion import draw_motion, published_mean
 from endopilot.xray.carm import Pose
 from endopilot.xray.detector import TipDetector
+from endopilot.xray.motion_registration import motion_error_mm, register_motion, take_run
 from endopilot.xray.pose_refinement import PoseRefiner
 from endopilot.xray.registration import Registration, register, vessel_error_mm
-from endopilot.xray.scenes import Scene, SceneConfig, draw_scenes
+from endopilot.xray.scenes import Scene, SceneConfig, Signal, draw_scenes
 from endopilot.xray.tracker import TipEstimate
 
 BARS = {
@@ -108,14 +110,17 @@ def bench_xray(config: XrayBenchConfig) -> dict[str, Any]:
         `by`: the same by dose, contrast, view, overlap, bone and foreshortening; `false_alarms_share`: images without a
         wire in which one is found; `inside_own_95_share`: tips within the ellipsoid that the detector
         is 95 % sure of; `registration`: every patient's errors, in `refined_mm` after
-        each of some exposures of wires: in both views, in the registered view alone, and in the other alone.
+        each of some exposures of wires: in both views, in the registered view alone, and in the other alone;
+        `motion_error_mm`: how far a vessel that heart and breath move lies from where a run of contrast has it, and
+        `motion_error_of_published_mean_mm`, both medians of the patients.
     """
     exposures: list[_Exposure] = []
     registrations: list[dict[str, Any]] = []
     rates: list[float] = []
-    for scene in draw_scenes(SceneConfig(patients=config.patients, seed=config.seed, given=config.given)):
+    scenes = SceneConfig(patients=config.patients, seed=config.seed, given=config.given)
+    for index, scene in enumerate(draw_scenes(scenes)):
         rates.append(_images_per_second(scene))
-        registered, row = _register(scene)
+        registered, row = _register(scene, int(np.random.SeedSequence([config.seed, index]).generate_state(1)[0]))
         registrations.append(row)
         exposures += _expose(scene, registered, config.wires)
     return _figures(exposures, registrations, rates)
@@ -132,8 +137,8 @@ def _images_per_second(scene: Scene) -> float:
     return _TIMED / (time.perf_counter() - began)
 
 
-def _register(scene: Scene) -> tuple[Registration, dict[str, Any]]:
-    """Return the registration of two views, and the errors of it and of each view alone."""
+def _register(scene: Scene, seed: int) -> tuple[Registration, dict[str, Any]]:
+    """Return the registration of two views, and the errors of it, of each view alone, and of a motion drawn so."""
     views = [scene.view(0), scene.view(1)]
     lit, before = scene.signals(None, contrast=1.0, seed=900_001), scene.signals(None, seed=900_002)
     both = register(scene.anatomy, views, lit, before)
@@ -152,7 +157,32 @@ def _register(scene: Scene) -> tuple[Registration, dict[str, Any]]:
         "refined_mm": refined,
         "failures": sum(bool(one.failure) for one in (both, *alone)),
         "told_without_contrast": bool(empty.failure),
+        "motion_mm": _motion_errors(scene, both, before, seed),
     }
+
+
+def _motion_errors(
+    scene: Scene, registered: Registration, before: Sequence[Signal], seed: int
+) -> dict[str, float | None]:
+    """Return how far the vessel, moved by heart and breath, lies from where it is taken to lie, mm.
+
+    Args:
+        scene: the patient, whose motion is drawn.
+        registered: of two views.
+        before: images of both before the injection.
+        seed: of the motion and the images' noise.
+
+    Returns:
+        The error of the published `mean`, and of the motion `measured` in a run of contrast; None where that failed.
+    """
+    motion = draw_motion(seed)
+    mean = published_mean(motion)
+    assert mean is not None
+    run = take_run(scene.imager, scene.angles_deg, scene.pose, motion, np.random.default_rng(seed))
+    views = registered.views([scene.view(0), scene.view(1)], scene.imager.isocenter)
+    found = register_motion(scene.anatomy, views, run, before, mean, scene.imager.config)
+    measured = None if found.failure else motion_error_mm(scene.anatomy, motion, found.motion)
+    return {"mean": motion_error_mm(scene.anatomy, motion, mean), "measured": measured}
 
 
 def _refined(scene: Scene, registered: Registration, used: Sequence[int]) -> list[float]:
@@ -271,6 +301,7 @@ def _figures(exposures: list[_Exposure], registrations: list[dict[str, Any]], ra
         **_summary(two),
         "registration_error_mm": float(np.median([row["two_views_mm"] for row in registrations])),
         "registration_error_one_view_mm": float(np.median([row["one_view_mm"] for row in registrations])),
+        **_motion_summary([row["motion_mm"] for row in registrations]),
         "false_alarms_share": float(np.mean([one.found for one in without])),
         "one_view": _summary(single),
         "by": by,
@@ -281,6 +312,17 @@ def _figures(exposures: list[_Exposure], registrations: list[dict[str, Any]], ra
         name: bool(figures[name] >= limit if least else figures[name] <= limit) for name, (limit, least) in BARS.items()
     }
     return figures
+
+
+def _motion_summary(errors: list[dict[str, float | None]]) -> dict[str, Any]:
+    measured = [one["measured"] for one in errors if one["measured"] is not None]
+    return {
+        "motion_error_mm": float(np.median(measured)) if measured else None,
+        "motion_error_of_published_mean_mm": float(
+            np.median([one["mean"] for one in errors if one["mean"] is not None])
+        ),
+        "motions_not_measured": len(errors) - len(measured),
+    }
 
 
 def _angles(exposures: list[_Exposure]) -> list[str]:

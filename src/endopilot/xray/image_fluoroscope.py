@@ -20,7 +20,7 @@ from endopilot.xray.carm import Pose, view_at
 from endopilot.xray.detector import TipDetector
 from endopilot.xray.fluoroscope import FluoroscopeConfig, TipMeasurement
 from endopilot.xray.image import ImageConfig, Plane, XrayImager
-from endopilot.xray.motion_registration import RUN_TIMES_S, register_motion
+from endopilot.xray.motion_registration import register_motion, take_run
 from endopilot.xray.pose_refinement import PoseRefiner
 from endopilot.xray.registration import Registration, register, vessel_error_mm
 
@@ -89,15 +89,12 @@ class ImageFluoroscope:
         """
         if (mean := published_mean(motion)) is None:
             return None
-        ostium, anatomy = np.asarray(self._anatomy.insertion.position), self._anatomy
-        run = []
-        for placed in motion.core(ostium).placements(np.array(RUN_TIMES_S))[0]:
-            planes = [self._imager.plane(angle, pose=self.pose, placed=placed) for angle in self._angles_deg]
-            run.append([self._signal(plane, _NO_WIRE, random, 1.0) for plane in planes])
+        run = take_run(self._imager, self._angles_deg, self.pose, motion, random)
         views = self.registration.views(self._views, self._imager.isocenter)
-        found = register_motion(anatomy, views, run, self._before, mean, self._imager.config)
+        found = register_motion(self._anatomy, views, run, self._before, mean, self._imager.config)
         if found.failure:
-            raise NotRegistered(f"X-ray images: the motion of {anatomy.name} cannot be measured: {found.failure}")
+            name = self._anatomy.name
+            raise NotRegistered(f"X-ray images: the motion of {name} cannot be measured: {found.failure}")
         return found.motion
 
     def expose(

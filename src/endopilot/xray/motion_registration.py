@@ -17,8 +17,8 @@ from scipy.optimize import least_squares
 
 from endopilot.simulation.motion import AMPLITUDES, Motion, place
 from endopilot.types import Anatomy
-from endopilot.xray.carm import View
-from endopilot.xray.image import ImageConfig, isocenter_of
+from endopilot.xray.carm import Pose, View
+from endopilot.xray.image import ImageConfig, XrayImager, isocenter_of
 from endopilot.xray.registration import AGREES, Comparison, added, sampled_lumen
 
 RUN_TIMES_S = tuple(0.5 * np.arange(1, 9))
@@ -93,6 +93,42 @@ def register_motion(
     if correlation < AGREES:
         failure = f"the images and the moving vessel agree by {correlation:.2f} only; inject contrast, or hold the pose"
     return MotionRegistration(seen.motion(found), correlation, failure)
+
+
+def take_run(
+    imager: XrayImager,
+    angles_deg: Sequence[tuple[float, float]],
+    pose: Pose,
+    motion: Motion,
+    random: np.random.Generator,
+) -> list[list[Float32[np.ndarray, "rows columns"]]]:
+    """Inject contrast, and return an image for each of `RUN_TIMES_S` and view, as `register_motion` takes them.
+
+    Args:
+        imager: of the patient.
+        angles_deg: of the views: LAO (positive) or RAO, and cranial (positive) or caudal, degrees.
+        pose: in which the patient lies.
+        motion: how the patient moves.
+        random: where the noise is drawn from.
+    """
+    run, none = [], np.zeros((0, 3))
+    for placed in motion.core(np.asarray(imager.anatomy.insertion.position)).placements(np.array(RUN_TIMES_S))[0]:
+        planes = [imager.plane(angle, pose=pose, placed=placed) for angle in angles_deg]
+        run.append([imager.signal(each, none, contrast=1.0, seed=int(random.integers(2**31))) for each in planes])
+    return run
+
+
+def motion_error_mm(anatomy: Anatomy, true: Motion, taken: Motion) -> float:
+    """Return how far a vessel that moves in one way lies from itself moving in another, mm.
+
+    The mean is taken over its centerlines and over two breaths.
+    """
+    points = np.concatenate([branch.centerline.points for branch in anatomy.tree.branches])
+    ostium, times_s = np.asarray(anatomy.insertion.position), np.linspace(0, 2 * true.breathing_period_s, 49)
+    lies, taken_to_lie = (
+        np.stack([place(maps, points) for maps in one.core(ostium).placements(times_s)[0]]) for one in (true, taken)
+    )
+    return float(np.linalg.norm(lies - taken_to_lie, axis=-1).mean())
 
 
 class _Run:
