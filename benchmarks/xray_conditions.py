@@ -3,7 +3,7 @@
 PATIENTS of each coronary task of the ladder (2 if not given), with friction, tip stiffness, latency and ostium off by
 20 %, up or down: with assumed errors of detection in a patient at rest; with X-ray images in a patient whose pose is
 registered; in a patient whom heart and breath move by amplitudes of their own, of which the published mean is known;
-with both. runs/xray-conditions gets one file a navigation; an interrupted run goes on with the others. With `--write`
+with both; and with both where a run of contrast has measured the motion. runs/xray-conditions gets one file a navigation; an interrupted run goes on with the others. With `--write`
 the table goes into docs/xray.md; `--only` drives under some of the conditions, and leaves the other rows as they are.
 """
 
@@ -30,13 +30,14 @@ from endopilot.tasks.task import CORE, NEWEST, find_task, ladder_tasks
 ROOT = Path(__file__).parents[1]
 FOLDER, PAGE = Path("runs/xray-conditions"), ROOT / "docs" / "xray.md"
 BEGIN, END = "<!-- conditions:begin -->\n", "<!-- conditions:end -->"
-CONDITIONS: dict[str, tuple[str, XrayKind, bool]] = {
-    "assumed": ("assumed errors, a patient at rest", "assumed", False),
-    "images": ("images and registration", "images", False),
-    "moving": ("heart and breath", "assumed", True),
-    "together": ("all together", "images", True),
+CONDITIONS: dict[str, tuple[str, XrayKind, bool, bool]] = {
+    "assumed": ("assumed errors, a patient at rest", "assumed", False, False),
+    "images": ("images and registration", "images", False, False),
+    "moving": ("heart and breath", "assumed", True, False),
+    "together": ("all together", "images", True, False),
+    "measured": ("all together, the motion measured by a run of contrast", "images", True, True),
 }
-"""By folder: the title, what an exposure is, and whether heart and breath move the patient."""
+"""By folder: the title, what an exposure is, whether heart and breath move the patient, and whether that is measured."""
 FRAMES_A_SECOND = 7.5
 """Of usual fluoroscopy in coronary arteries."""
 MISMATCH = 0.2
@@ -45,12 +46,13 @@ MISMATCH = 0.2
 def measure(path: Path) -> None:
     """Navigate in one patient under one condition, and write what came of it."""
     place, task = int(path.stem), find_task(path.parent.name)
-    _, xray, moves = CONDITIONS[path.parent.parent.name]
+    _, xray, moves, measured = CONDITIONS[path.parent.parent.name]
     navigation, seed = task.ladder_navigation(place), navigation_seed(task, place)
     config = NavigateConfig(
         simulator=replace(CORE, threads=1),
         xray=xray,
         motion=motion_named("both", seed) if moves else None,
+        measure_motion=measured,
     )
     truth = mismatch_by(drawn_sides(MISMATCH, np.random.default_rng([seed, 3])), navigation.anatomy)
     navigation = replace(navigation, known_motion=Motion() if moves else None)

@@ -12,6 +12,7 @@ from endopilot.control.navigate import NavigateConfig, NavigationLoop, navigate
 from endopilot.control.navigate_patient import NavigatePatientConfig, set_up_navigation
 from endopilot.control.policy import Decision, Observation, Policy
 from endopilot.control.robot import CYCLE_S, RobotConfig
+from endopilot.errors import InputError
 from endopilot.simulation.motion import Motion, motion_named
 from endopilot.tasks.navigation import Navigation, Target
 from endopilot.xray.fluoroscope import FluoroscopeConfig
@@ -268,6 +269,26 @@ def test_images_show_a_moving_vessel_where_it_is_less_what_is_known(straight) ->
     shift = -(np.sin(np.pi * 0.5 * at / 4.0) ** 4)
     np.testing.assert_allclose(seen - record.tip_position[at, 2], shift, atol=0.4)
     assert np.ptp(shift) > 0.7
+
+
+def test_a_run_of_contrast_before_the_wire_shows_how_the_patient_moves(straight) -> None:
+    """The patient breathes by 7 mm, which the navigation takes to be 4.9 at first."""
+    deep, mean = breathing(breathing_caudal_mm=7.0), breathing(breathing_caudal_mm=4.9)
+    navigation = replace(straight, known_motion=mean, seconds=1.0)
+    config = NavigateConfig(robot=PERFECT, xray="images", motion=deep, measure_motion=True)
+    loop = NavigationLoop(navigation, Forward(6.0, expose_every=2), config=config, seed=2)
+    assert loop.navigation.known_motion.breathing_caudal_mm == pytest.approx(7.0, abs=0.3)
+    assert loop._known.placements(np.array([2.0]))[0][0, 2, 3] == pytest.approx(-7.0, abs=0.5)
+    with pytest.raises(InputError, match="measure_motion: exposures of assumed errors show no contrast"):
+        NavigationLoop(navigation, Forward(6.0), config=replace(config, xray="assumed"), seed=2)
+
+
+def test_a_motion_is_measured_by_images_alone(fork) -> None:
+    config = NavigatePatientConfig(tip="own", motion="both", motion_seed=3, motion_known="measured")
+    with pytest.raises(InputError, match="motion_known: measured; only X-ray images measure it"):
+        set_up_navigation(fork, "0,0,33", config)
+    ready = set_up_navigation(fork, "0,0,33", replace(config, xray="images"))
+    assert ready.navigation.known_motion == Motion()
 
 
 def test_what_is_known_of_the_motion_stands_in_the_navigation(fork) -> None:

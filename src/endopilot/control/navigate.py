@@ -15,6 +15,7 @@ from endopilot.control.policies import make_policy
 from endopilot.control.policy import BelievedTip, Believer, Decision, Led, Observation, Policy
 from endopilot.control.record import NavigationRecord, Track
 from endopilot.control.robot import CYCLE_S, RobotConfig, SimulatedRobot
+from endopilot.errors import InputError
 from endopilot.settings import settings
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.drive_limits import DriveLimits
@@ -43,6 +44,9 @@ class NavigateConfig:
     motion: Motion | None = None
     """How heart and breath truly move the vessel and its guiding catheter; they lie still if not given. The navigation
     says what of it is known; the rest an exposure shows as an error."""
+    measure_motion: bool = False
+    """Before the wire goes in, a run of contrast shows how the patient moves, and the navigation knows that instead. It
+    takes X-ray images."""
 
 
 class NavigationLoop:
@@ -95,8 +99,6 @@ class NavigationLoop:
         self.simulator = start_world(navigation, truth, config.simulator, motion=config.motion)
         ostium = np.asarray(navigation.anatomy.insertion.position)
         self._moves = config.motion is not None
-        known = navigation.known_motion
-        self._known = None if known is None else known.core(ostium)
         self._limits = tuple(DriveLimits.of(device, navigation.anatomy) for device in navigation.devices)
         drive = replace(config.robot, latency_s=config.robot.latency_s * truth.latency_factor)
         self.robot = SimulatedRobot(self.simulator, self._limits, drive, seed=seed, ostium_mm=truth.ostium_mm)
@@ -106,8 +108,15 @@ class NavigationLoop:
 
             check_wire_alone(navigation, "xray: images: the detector")
             self.fluoroscope = ImageFluoroscope(anatomy, device, config.fluoroscope, seed)
+            if config.measure_motion and config.motion is not None:
+                measured = self.fluoroscope.measure_motion(config.motion, np.random.default_rng([seed, 6]))
+                self.navigation = navigation = replace(navigation, known_motion=measured)
+        elif config.measure_motion:
+            raise InputError("measure_motion: exposures of assumed errors show no contrast; give xray: images")
         else:
             self.fluoroscope = Fluoroscope(anatomy, device.tip_radius_mm, config.fluoroscope)
+        known = navigation.known_motion
+        self._known = None if known is None else known.core(ostium)
         self._random = np.random.default_rng([seed, 2])
         self._track = Track(self.simulator)
         self._periods = int(np.ceil(navigation.seconds / DECISION_PERIOD_S - 1e-9))

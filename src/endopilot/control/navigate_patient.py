@@ -26,6 +26,7 @@ from endopilot.control.record import NavigationRecord
 from endopilot.control.robot import CYCLE_S
 from endopilot.control.route import Route, check_passable, parse_target
 from endopilot.control.set_up import TILT_DEG, TipChoice, choose_tip
+from endopilot.errors import InputError
 from endopilot.progress import progress
 from endopilot.settings import Finite, NonNegative, Positive, Seed, ShareBelowOne, Text, Within, settings
 from endopilot.simulation.catheter import Catheter, read_catheter
@@ -38,7 +39,7 @@ from endopilot.types import Anatomy, CatheterMotion, Rollout, TipProjection
 from endopilot.xray.fluoroscope import Fluoroscope
 
 _Samples = TypeVar("_Samples", bound=Rollout | CatheterMotion | TipProjection)
-MotionKnown = Literal["nothing", "published", "exact"]
+MotionKnown = Literal["nothing", "published", "measured", "exact"]
 _Factor = Annotated[float, Within(0.2, 5)]
 
 
@@ -76,8 +77,9 @@ class NavigatePatientConfig:
     motion_seed: Seed | None = None
     """Draws the patient's amplitudes from the published distributions; their means if not given."""
     motion_known: MotionKnown = "published"
-    """What is known of that motion, with the phase of heart and breath: nothing, the published mean, or exactly the
-    patient's own. The C-arm takes it off what it measures, and agents simulate it."""
+    """What is known of that motion, with the phase of heart and breath: nothing, the published mean, what a run of
+    contrast has measured (where exposures are images), or exactly the patient's own. The C-arm takes it off what it
+    measures, and agents simulate it."""
     seed: Seed = 0
     """Seed of encoder noise, detection errors, the policy, and of the sides that `mismatch` draws."""
     mismatch: ShareBelowOne = 0.0
@@ -184,9 +186,11 @@ def set_up_navigation(anatomy: Anatomy | str | Path, target: str, config: Naviga
 
     Raises:
         InputError: no such section, a point outside the vessel, a target behind an occlusion; no such policy, device,
-            catheter or tip; devices that do not fit.
+            catheter or tip; devices that do not fit; a motion that is measured without X-ray images.
     """
     config = config or NavigatePatientConfig()
+    if config.motion_known == "measured" and config.xray != "images":
+        raise InputError("motion_known: measured; only X-ray images measure it: give xray: images, or published")
     vessel = anatomy if isinstance(anatomy, Anatomy) else read_anatomy(anatomy)
     device, goal = read_device(config.device), parse_target(vessel, target)
     catheters = tuple(read_catheter(name) for name in config.catheter)
@@ -227,6 +231,7 @@ def navigate_patient(set_up: SetUp) -> PatientNavigation:
         simulator=set_up.simulator,
         xray=set_up.config.xray,
         motion=set_up.motion,
+        measure_motion=set_up.config.motion_known == "measured",
     )
     loop = NavigationLoop(navigation, policy, config=config, seed=set_up.config.seed, truth=set_up.truth)
     began = loop.robot.proximal.ravel()
@@ -260,7 +265,7 @@ def navigate_patient(set_up: SetUp) -> PatientNavigation:
 
 
 def _known_motion(config: NavigatePatientConfig) -> Motion | None:
-    """Return what is known of how the vessel moves."""
+    """Return what is known of how the vessel moves before it is measured."""
     if config.motion_known == "nothing":
         return None
     return motion_named(config.motion, config.motion_seed if config.motion_known == "exact" else None)
