@@ -3,8 +3,9 @@
 PATIENTS of each coronary task of the ladder (2 if not given), with friction, tip stiffness, latency and ostium off by
 20 %, up or down: with assumed errors of detection in a patient at rest; with X-ray images in a patient whose pose is
 registered; in a patient whom heart and breath move by amplitudes of their own, of which the published mean is known;
-with both; and with both where a run of contrast has measured the motion. runs/xray-conditions gets one file a navigation; an interrupted run goes on with the others. With `--write`
-the table goes into docs/xray.md; `--only` drives under some of the conditions, and leaves the other rows as they are.
+with both; and with both where a run of contrast has measured the motion. runs/xray-conditions gets one file a
+navigation; an interrupted run goes on with the others. With `--write` the table goes into docs/xray.md; `--only` drives
+under some of the conditions, and leaves the other rows as they are.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ CONDITIONS: dict[str, tuple[str, XrayKind, bool, bool]] = {
     "together": ("all together", "images", True, False),
     "measured": ("all together, the motion measured by a run of contrast", "images", True, True),
 }
-"""By folder: the title, what an exposure is, whether heart and breath move the patient, and whether that is measured."""
+"""By folder: the title, what an exposure is, whether the patient moves by heart and breath, and is measured to do so."""
 FRAMES_A_SECOND = 7.5
 """Of usual fluoroscopy in coronary arteries."""
 MISMATCH = 0.2
