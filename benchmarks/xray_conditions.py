@@ -38,7 +38,7 @@ CONDITIONS: dict[str, tuple[str, XrayKind, bool, bool]] = {
     "together": ("all together", "images", True, False),
     "measured": ("all together, the motion measured by a run of contrast", "images", True, True),
 }
-"""By folder: the title, what an exposure is, whether the patient moves by heart and breath, and is measured to do so."""
+"""By folder: the title, what an exposure is, whether heart and breath move it, and are measured."""
 FRAMES_A_SECOND = 7.5
 """Of usual fluoroscopy in coronary arteries."""
 MISMATCH = 0.2
