@@ -47,8 +47,8 @@ using LumenMap = LumenArrays<Owned>;
 using Lumen = LumenArrays<Viewed>;   // no lumen if it refers to nothing
 
 // Gathers the bricks of a grid of `size` cells. `fill` is asked for each brick: it writes its coefficients and the lowest and highest of
-// them; or it returns false and bounds of them where no wall is near. Cells whose whole stencil is deeper inside than `near` carry no contact; cells whose
-// whole stencil is farther outside than `far` count as outside the map.
+// them; or it returns false and bounds of them where no wall is near. Cells whose whole stencil is deeper inside than `near` carry no
+// contact; cells whose whole stencil is farther outside than `far` count as outside the map.
 template <class Fill>
 LumenMap gather_bricks(const int (&size)[3], const double (&origin)[3], double spacing, double near, double far, Fill&& fill) {
     constexpr int kEdge = Lumen::kEdge, kVolume = Lumen::kVolume;

@@ -12,14 +12,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Float32
-from scipy.ndimage import gaussian_filter
 from scipy.optimize import least_squares
 
 from endopilot.simulation.motion import AMPLITUDES, Motion, place
 from endopilot.types import Anatomy
 from endopilot.xray.carm import Pose, View
 from endopilot.xray.image import ImageConfig, XrayImager, isocenter_of
-from endopilot.xray.registration import AGREES, Comparison, added, sampled_lumen
+from endopilot.xray.registration import AGREES, Comparison, observed_contrast, sampled_lumen
 
 RUN_TIMES_S = tuple(0.5 * np.arange(1, 9))
 """When the images of a run are taken, s: over a breath, and at eight phases of the heart, two images a second."""
@@ -29,7 +28,7 @@ _LEVELS = ((8, 3.0), (4, 1.5))
 _FAR = 4.0
 """An amplitude is sought up to so many standard deviations from its published mean."""
 _STEP = 0.02
-"""Step of the derivative, in standard deviations."""
+"""Step of the derivative, as a share of the amplitude's distance from its mean; at the mean, what rounding allows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +37,7 @@ class MotionRegistration:
 
     Attributes:
         motion: as the images show it.
-        correlation: of the contrast in all images and of the vessel projected as it moves.
+        correlation: of the contrast in the images and of the vessel projected as it moves, at the worst moment.
         failure: why it is not to be believed, in words; empty if it is.
     """
 
@@ -65,34 +64,30 @@ def register_motion(
         mean: what is known beforehand: the published mean of what moves, with the patient's periods.
         config: detector and beam.
     """
-    config = config or ImageConfig()
-    seen = _Run(anatomy, views, mean, config)
-    found, correlation = np.zeros(len(seen.names)), 0.0
+    config, isocenter = config or ImageConfig(), isocenter_of(anatomy)
+    points, size = sampled_lumen(anatomy)
+    amplitudes = _Amplitudes(mean, np.asarray(anatomy.insertion.position))
+    found, correlation = np.zeros(len(amplitudes.names)), 0.0
     for averaged, blur in _LEVELS:
-        observed = [
-            [
-                gaussian_filter(added(lit, mask, averaged, config), blur)
-                for lit, mask in zip(images, before, strict=True)
-            ]
-            for images in contrasted
-        ]
+        observed = [observed_contrast(images, before, averaged, blur, config) for images in contrasted]
+        at_rest = [Comparison(points, size, views, images, averaged, blur, config, isocenter) for images in observed]
         found = least_squares(
-            seen.residuals,
+            amplitudes.residuals,
             found,
-            bounds=seen.bounds,
+            bounds=amplitudes.bounds,
             diff_step=_STEP,
             x_scale=1.0,
             loss="soft_l1",
             max_nfev=8,
             xtol=1e-3,
             ftol=1e-3,
-            args=(observed, averaged, blur),
+            args=(at_rest,),
         ).x
-        correlation = seen.correlation(found, observed, averaged, blur)
+        correlation = min(each.correlation(np.zeros(6)) for each in amplitudes.moved(found, at_rest))
     failure = ""
     if correlation < AGREES:
         failure = f"the images and the moving vessel agree by {correlation:.2f} only; inject contrast, or hold the pose"
-    return MotionRegistration(seen.motion(found), correlation, failure)
+    return MotionRegistration(amplitudes.motion(found), correlation, failure)
 
 
 def take_run(
@@ -131,22 +126,18 @@ def motion_error_mm(anatomy: Anatomy, true: Motion, taken: Motion) -> float:
     return float(np.linalg.norm(lies - taken_to_lie, axis=-1).mean())
 
 
-class _Run:
-    """A run of images, and what would be seen in them with other amplitudes."""
+class _Amplitudes:
+    """The amplitudes that are sought, in standard deviations from the published mean."""
 
-    def __init__(self, anatomy: Anatomy, views: Sequence[View], mean: Motion, config: ImageConfig) -> None:
+    def __init__(self, mean: Motion, ostium: Float[np.ndarray, "3"]) -> None:
         """Take the parts of the motion that are not at rest.
 
         Args:
-            anatomy: the vessel of the CT.
-            views: as `register_motion` takes them.
-            mean: the same.
-            config: detector and beam.
+            mean: as `register_motion` takes it.
+            ostium: about which the vessel moves, LPS mm.
         """
         self.names = [name for name in AMPLITUDES if getattr(mean, name) != 0]
-        self._mean, self._views, self._config = mean, views, config
-        self._points, self._size = sampled_lumen(anatomy)
-        self._ostium, self._isocenter = np.asarray(anatomy.insertion.position), isocenter_of(anatomy)
+        self._mean, self._ostium = mean, ostium
         centre = np.array([getattr(mean, name) for name in self.names])
         self._deviation = np.array([AMPLITUDES[name][1] for name in self.names])
         least = [0.0 if name in ("annulus_mm", "heart_volume_share") else -np.inf for name in self.names]
@@ -157,39 +148,19 @@ class _Run:
         pairs = zip(self.names, deviations * self._deviation, strict=True)
         return replace(self._mean, **{name: float(getattr(self._mean, name) + more) for name, more in pairs})
 
+    def moved(self, deviations: Float[np.ndarray, "amplitudes"], at_rest: Sequence[Comparison]) -> list[Comparison]:
+        """Return the comparison of the images of each moment with the vessel as it would lie then.
+
+        Args:
+            deviations: the amplitudes.
+            at_rest: the comparison of the same images with the vessel of the CT.
+        """
+        maps = self.motion(deviations).core(self._ostium).placements(np.array(RUN_TIMES_S))[0]
+        return [replace(each, points=place(one, each.points)) for one, each in zip(maps, at_rest, strict=True)]
+
     def residuals(
-        self,
-        deviations: Float[np.ndarray, "amplitudes"],
-        observed: Sequence[Sequence[np.ndarray]],
-        averaged: int,
-        blur: float,
+        self, deviations: Float[np.ndarray, "amplitudes"], at_rest: Sequence[Comparison]
     ) -> Float[np.ndarray, "n"]:
         """Return the differences of all images, and those of the amplitudes from the mean."""
-        frames = self._compared(deviations, observed, averaged, blur)
-        return np.concatenate([*(frame.differences(np.zeros(6)) for frame in frames), deviations])
-
-    def correlation(
-        self,
-        deviations: Float[np.ndarray, "amplitudes"],
-        observed: Sequence[Sequence[np.ndarray]],
-        averaged: int,
-        blur: float,
-    ) -> float:
-        """Return the correlation of what was expected and observed, the least of all moments."""
-        frames = self._compared(deviations, observed, averaged, blur)
-        return min(frame.correlation(np.zeros(6)) for frame in frames)
-
-    def _compared(
-        self,
-        deviations: Float[np.ndarray, "amplitudes"],
-        observed: Sequence[Sequence[np.ndarray]],
-        averaged: int,
-        blur: float,
-    ) -> list[Comparison]:
-        """Return the comparison of the images of each moment with the vessel as it would lie."""
-        maps = self.motion(deviations).core(self._ostium).placements(np.array(RUN_TIMES_S))[0]
-        points = [place(each, self._points) for each in maps]
-        at = averaged, blur, self._config, self._isocenter
-        return [
-            Comparison(lie, self._size, self._views, images, *at) for lie, images in zip(points, observed, strict=True)
-        ]
+        differences = [each.differences(np.zeros(6)) for each in self.moved(deviations, at_rest)]
+        return np.concatenate([*differences, deviations])

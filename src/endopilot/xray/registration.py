@@ -83,10 +83,7 @@ def register(
     points, size = sampled_lumen(anatomy)
     found, correlation, covariance = np.zeros(6), 0.0, np.diag(_PRIOR**2)
     for averaged, blur in _LEVELS:
-        observed = [
-            gaussian_filter(added(lit, mask, averaged, config), blur)
-            for lit, mask in zip(contrasted, before, strict=True)
-        ]
+        observed = observed_contrast(contrasted, before, averaged, blur, config)
         level = Comparison(points, size, views, observed, averaged, blur, config, isocenter)
         slope: Any = level.slope  # the annotation of scipy knows names of schemes alone
         found = least_squares(
@@ -179,7 +176,27 @@ class Comparison:
         return float(np.corrcoef(ours[wide], theirs[wide])[0, 1]) if wide.sum() > 2 else 0.0
 
 
-def added(
+def observed_contrast(
+    contrasted: Sequence[Float32[np.ndarray, "rows columns"]],
+    before: Sequence[Float32[np.ndarray, "rows columns"]],
+    averaged: int,
+    blur: float,
+    config: ImageConfig,
+) -> list[np.ndarray]:
+    """Return what contrast added to each image, as `Comparison` takes it.
+
+    Args:
+        contrasted: an image of the filled vessel for each view.
+        before: the image before the injection, likewise.
+        averaged: pixels along a side that are averaged.
+        blur: of what is left, in averaged pixels.
+        config: detector and beam.
+    """
+    pairs = zip(contrasted, before, strict=True)
+    return [gaussian_filter(_added(lit, mask, averaged, config), blur) for lit, mask in pairs]
+
+
+def _added(
     lit: Float32[np.ndarray, "rows columns"],
     mask: Float32[np.ndarray, "rows columns"],
     averaged: int,
