@@ -1,46 +1,69 @@
-"""The drive, on a clock of the test's own: whom it obeys, and when it stops."""
+"""The drive, on a clock of the test's own: what it obeys, and when it stops."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as some
 
-from endopilot.control.drive import Drive, _Lines
-from endopilot.control.drive_protocol import LONGEST_LINE, SILENCE_S, Message, Signer, read_secret
+from endopilot.control.drive import Drive
+from endopilot.control.drive_protocol import LONGEST_LINE, SILENCE_S, number
 from endopilot.control.robot import RobotConfig
-from endopilot.errors import InputError
 from endopilot.simulation.drive_limits import DriveLimits
 
-SECRET = b"0123456789abcdef"
 LIMITS = DriveLimits(max_velocity_mm_s=40.0, max_rotation_rad_s=12.0, travel_mm=(0.0, 100.0))
 QUIET = RobotConfig(latency_s=0.0, encoder_sd_mm=0.0, encoder_sd_rad=0.0)
+BRAKE_S = 40.0 / QUIET.max_acceleration_mm_s2 + 1e-6
+"""Time in which the drive stands from its top speed, s."""
+
+
+class State(NamedTuple):
+    """The fields of a STATE answer."""
+
+    clock: str
+    inserted: str
+    rotation: str
+    status: str
+    ticket: str
 
 
 class Client:
-    """Speaks to one session, and remembers what it sent."""
+    """Speaks to the drive, always with the newest ticket."""
 
-    def __init__(self, drive: Drive, secret: bytes = SECRET) -> None:
+    def __init__(self, drive: Drive) -> None:
         self.drive, self.session = drive, drive.open()
-        self.signer = Signer(secret, self.session.greeting.split()[-1].decode())
-        self.number, self.sent = 0, []
+        self.hear(0.0)
 
-    def say(self, verb: str, *arguments: str, now: float) -> Message | None:
-        self.number += 1
-        self.sent.append(self.signer.line(Message(self.number, verb, arguments), of_drive=False)[:-1])
-        reply = self.session.receive(self.sent[-1], now)
-        return None if reply is None else self.signer.read(reply[:-1], of_drive=True)
+    def hear(self, now: float) -> str:
+        """Ask for the state, and return the ticket that it brings."""
+        self.say("STATE", now=now)
+        return self.ticket
+
+    def say(self, verb: str, *arguments: str, now: float) -> State:
+        ticket = [self.ticket] if verb in ("ARM", "MOVE") else []
+        return self.send(" ".join([verb, *ticket, *arguments]), now=now)[-1]
+
+    def send(self, *lines: str, now: float) -> list[State]:
+        """Send lines in one read and return the answers."""
+        data = "".join(f"{line}\n" for line in lines).encode()
+        answers = [line.split(" ") for line in self.session.receive(data, now).decode("ascii").splitlines()]
+        assert len(answers) == len(lines) and all(verb == "STATE" for verb, *_ in answers)
+        states = [State(*fields) for _, *fields in answers]
+        self.ticket = states[-1].ticket
+        return states
 
 
-def moving(config: RobotConfig = QUIET) -> tuple[Drive, Client]:
-    """Return a drive that goes forward at 10 mm/s since 0 s, by its own clock 1 s."""
-    drive = Drive(LIMITS, SECRET, now=0.0, config=config, inserted_length=50.0)
+def moving(config: RobotConfig = QUIET, speed: str = "10.0") -> tuple[Drive, Client]:
+    """Return a drive that goes forward at a speed, mm/s, since 0 s, by its own clock 1 s."""
+    drive = Drive(LIMITS, now=0.0, config=config, inserted_length=20.0)
     client = Client(drive)
-    assert client.say("AUTH", now=0.0).arguments == ("40.0", "12.0", "0.0", "100.0")
-    assert client.say("ARM", now=0.0).arguments[-1] == "armed"
+    assert client.say("ARM", now=0.0).status == "armed"
     for now in np.arange(0.0, 1.01, 0.1):
-        client.say("MOVE", "10.0", "0.5", now=float(now))
+        client.hear(float(now))
+        client.say("MOVE", speed, "0.5", now=float(now))
     return drive, client
 
 
@@ -55,10 +78,11 @@ def rest(drive: Drive, now: float) -> float:
 
 def test_it_moves_as_commanded_while_commands_come() -> None:
     drive, client = moving()
+    assert drive.greeting == "endopilot-drive 2 40.0 12.0 0.0 100.0\n"
     state = client.say("STATE", now=1.0)
-    assert float(state.arguments[0]) == 1.0 and state.arguments[3] == "armed"
-    assert float(state.arguments[1]) == pytest.approx(drive.position[0], abs=1e-4)
-    assert 59.0 < drive.position[0] < 60.0
+    assert float(state.clock) == 1.0 and state.status == "armed"
+    assert float(state.inserted) == pytest.approx(drive.position[0], abs=1e-4)
+    assert 29.0 < drive.position[0] < 30.0
 
 
 @pytest.mark.parametrize("ticks", [0.001, 5.0])  # the watchdog bites in time even where the process itself was held up
@@ -71,11 +95,12 @@ def test_silence_stops_it_within_200_ms(ticks) -> None:
     # 0.2 s at 10 mm/s, then the ramp: v²/2a = 0.25 mm
     assert rest(drive, 8.0) == pytest.approx(at + 10.0 * SILENCE_S + 0.25, abs=0.02)
     # asking for the state is no command, nor is a command while it is stopped
-    assert client.say("STATE", now=70.0).arguments[3] == "stopped:silence"
-    assert client.say("MOVE", "10.0", "0.0", now=70.1).arguments[3] == "stopped:silence"
+    assert client.say("STATE", now=70.0).status == "stopped:silence"
+    assert client.say("MOVE", "10.0", "0.0", now=70.1).status == "stopped:silence"
     drive.tick(71.0)
     assert drive.at_rest
-    assert client.say("ARM", now=71.0).arguments[3] == "armed"
+    client.hear(71.0)
+    assert client.say("ARM", now=71.0).status == "armed"
 
 
 @pytest.mark.parametrize("verb", ["STATE", "ARM"])
@@ -87,121 +112,178 @@ def test_only_a_command_feeds_the_watchdog(verb) -> None:
     assert drive.stopped == "silence"
 
 
+def test_the_watchdog_counts_from_when_the_client_heard_the_drive() -> None:
+    drive, client = moving()
+    ticket = client.hear(1.05)
+    client.send(f"MOVE {ticket} 10.0 0.0", now=1.19)  # a command that waited for 140 ms
+    drive.tick(1.245)
+    assert drive.stopped is None
+    drive.tick(1.255)
+    assert drive.stopped == "silence"
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    some.lists(some.sampled_from(["MOVE", "MOVE", "MOVE", "ARM", "STATE", "STOP"]), min_size=1, max_size=40),
+    some.lists(some.tuples(some.floats(0.0, 3.0), some.integers(1, 200)), min_size=1, max_size=12),
+)
+def test_a_backlog_of_any_kind_moves_it_no_longer_than_200_ms_after_its_client_hung(verbs, pieces) -> None:
+    drive, client = moving(speed="40.0")
+    ticket = client.hear(1.0)
+    arguments = {"MOVE": f" {ticket} 40.0 0.5", "ARM": f" {ticket}"}
+    backlog = "".join(f"{verb}{arguments.get(verb, '')}\n" for verb in verbs).encode()
+    at = None
+    arrivals = [*pieces, (SILENCE_S + BRAKE_S, 0), (3.1, len(backlog))]
+    for now, length in sorted((1.0 + delay, length) for delay, length in arrivals):
+        # what the network brings at some time is what the client had sent by 1 s
+        client.session.receive(backlog[:length], now)
+        backlog = backlog[length:]
+        if now == 1.0 + SILENCE_S + BRAKE_S:
+            at = pytest.approx(drive.position, abs=1e-9)
+    assert drive.stopped is not None and drive.position == at
+    # once its client is back, the old ticket is still worth nothing
+    client.send(f"ARM {ticket}", f"MOVE {ticket} 40.0 0.0", now=5.0)
+    drive.tick(6.0)
+    assert drive.position == at
+
+
+def test_a_command_for_later_cannot_be_made() -> None:
+    drive, client = moving()
+    for guess in (client.ticket[::-1], "0" * 16, "", "9.9999"):
+        dropped = drive.dropped
+        client.send(f"MOVE {guess} 5.0 0.0", now=1.15)
+        assert drive.dropped == dropped + 1
+    drive.tick(1.21)
+    assert drive.stopped == "silence"
+
+
+def test_a_stop_voids_what_was_sent_before_the_client_knew_of_it() -> None:
+    for stopping in ("STOP", "MOVE {} nan 0", "MOVE {} 99 0", "nonsense"):
+        drive, client = moving()
+        ticket = client.hear(1.0)
+        again = f"ARM {ticket}", f"MOVE {ticket} 10.0 0.0"
+        states = client.send(stopping.format(ticket), *again, *again, now=1.0)
+        assert all(state.status.startswith("stopped:") for state in states)
+        assert rest(drive, 1.0) < 30.5
+        # having heard of it, the client may arm
+        drive.tick(70.0)
+        client.hear(70.0)
+        assert client.send(f"ARM {client.ticket}", f"MOVE {client.ticket} 10.0 0.0", now=70.0)[-1].status == "armed"
+        drive.tick(70.1)
+        assert not drive.at_rest
+
+
+def test_the_newest_command_of_a_read_alone_is_obeyed() -> None:
+    places = []
+    for speeds in (["5.0"], ["40.0"] * 3000 + ["-40.0", "5.0"]):
+        drive, client = moving(RobotConfig(latency_s=0.05))
+        client.send(*(f"MOVE {client.ticket} {speed} 0.0" for speed in speeds), now=1.05)
+        assert len(drive._motion._orders) <= 1  # a flood does not pile up behind the latency
+        drive.tick(1.15)
+        places.append(drive.position)
+    assert places[0] == places[1]
+
+
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [
         (("nan", "0"), "not-finite"),
+        (("0", "-Infinity"), "not-finite"),
         (("0", "inf"), "not-finite"),
         (("1e999", "0"), "not-finite"),
         (("40.001", "0"), "limit"),
         (("0", "-12.5"), "limit"),
+        (("1_0", "0"), "malformed"),
+        (("0", "0x1"), "malformed"),
+        (("10", ""), "malformed"),
+        (("10",), "malformed"),
+        (("10", "0", "0"), "malformed"),
     ],
 )
-def test_what_is_not_finite_or_beyond_the_limits_stops_it(arguments, reason) -> None:
+def test_what_is_no_number_not_finite_or_beyond_the_limits_stops_it(arguments, reason) -> None:
     drive, client = moving()
     at = drive.position[0]
-    assert client.say("MOVE", *arguments, now=1.0).arguments[3] == f"stopped:{reason}"
+    assert client.say("MOVE", *arguments, now=1.0).status == f"stopped:{reason}"
     assert rest(drive, 1.0) == pytest.approx(at + 0.25, abs=0.02)
+
+
+@given(some.floats())
+def test_numbers_are_read_as_they_are_written(value) -> None:
+    np.testing.assert_array_equal(number(repr(value)), value)
+    if np.isfinite(value):
+        assert number(f"{value:+.17E}") == value
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "1_0", " 1", "1 ", "1\n", "+", ".", "e5", "1e", "1e5.", "0x1", "1,5", "--1", "١", "1²", "ınf", "nan()"],
+)
+def test_what_is_no_decimal_number_is_none(text) -> None:
+    assert number(text) is None
+
+
+@pytest.mark.parametrize("line", ["", "state", "STATE ", " STATE", "STATE\r", "STATE\t", "FLY", "ARM", "é", "x" * 300])
+def test_a_line_that_is_not_of_the_protocol_stops_it(line) -> None:
+    _, client = moving()
+    assert client.send(line, now=1.0)[0].status == "stopped:malformed"
+    assert client.say("STATE", now=1.0).status == "stopped:malformed"
+
+
+def test_a_line_without_an_end_stops_it_and_closes_the_connection() -> None:
+    drive, client = moving()
+    for _ in range(LONGEST_LINE - 1):
+        assert client.session.receive(b"x", 1.0) == b"" and drive.stopped is None
+    client.session.receive(b"x", 1.0)
+    assert client.session.closed and drive.stopped == "malformed" and drive.owner is None
+    assert client.session.receive(b"\nSTATE\n", 1.0) == b""
 
 
 def test_the_end_of_the_travel_stops_it_and_it_can_go_back() -> None:
     drive, client = moving()
-    for now in np.arange(1.0, 8.0, 0.1):
+    for now in np.arange(1.0, 10.0, 0.05):
         client.say("MOVE", "10.0", "0.0", now=float(now))
     assert drive.stopped == "travel" and drive.position[0] == 100.0
-    client.say("ARM", now=8.0)
-    for now in np.arange(8.0, 9.0, 0.1):
-        assert client.say("MOVE", "-10.0", "0.0", now=float(now)).arguments[3] == "armed"
+    client.say("ARM", now=10.0)
+    for now in np.arange(10.0, 11.0, 0.05):
+        assert client.say("MOVE", "-10.0", "0.0", now=float(now)).status == "armed"
     assert drive.position[0] < 95.0
 
 
 def test_it_stops_when_asked_and_when_the_connection_is_gone() -> None:
     drive, client = moving()
-    assert client.say("STOP", now=1.0).arguments[3] == "stopped:asked"
+    assert client.say("STOP", now=1.0).status == "stopped:asked"
     drive, client = moving()
     client.session.close(1.0)
     assert drive.stopped == "connection" and drive.owner is None
     rest(drive, 1.0)
-    # the next client finds it stopped
+    # the next client finds it stopped, and tickets of the last one are worth nothing
     second = Client(drive)
-    second.say("AUTH", now=70.0)
-    assert second.say("STATE", now=70.0).arguments[3] == "stopped:connection"
+    assert second.say("STATE", now=70.0).status == "stopped:connection"
+    assert second.send(f"ARM {client.ticket}", now=70.0)[0].status == "stopped:connection"
 
 
-def test_it_obeys_one_authenticated_client_at_a_time() -> None:
+def test_it_obeys_one_client_at_a_time() -> None:
     drive, client = moving()
-    other = Client(drive)
-    for verb in ("ARM", "STOP", "STATE"):
-        assert other.say(verb, now=1.0) is None
-    assert other.say("AUTH", now=1.0).verb == "BUSY" and other.session.closed
-    stranger = Client(drive, b"another secret..")
-    assert stranger.say("AUTH", now=1.0) is None and stranger.say("STOP", now=1.0) is None
-    assert drive.stopped is None and drive.owner is client.session
-    other.session.close(1.0)
-    assert drive.stopped is None
-
-
-def test_replayed_changed_and_reflected_lines_are_dropped() -> None:
-    drive, client = moving()
-    dropped = drive.dropped
-    assert all(client.session.receive(line, 1.05) is None for line in client.sent)
-    assert drive.dropped == dropped + len(client.sent)
-    fast = client.signer.line(Message(client.number + 1, "MOVE", ("10.0", "0.0")), of_drive=False)[:-1]
-    assert client.session.receive(fast.replace(b"10.0", b"30.0"), 1.05) is None
-    reply = client.signer.line(Message(client.number + 1, "STOP"), of_drive=True)[:-1]
-    assert client.session.receive(reply, 1.05) is None
-    # a line of another connection of the same client
-    drive, again = moving()
+    assert drive.open() is None
+    client.session.close(1.0)
     later = Client(drive)
-    later.number = 100
-    assert all(later.session.receive(line, 1.05) is None for line in again.sent)
-    assert drive.stopped is None
-    drive.tick(1.25)  # and none of them fed the watchdog
-    assert drive.stopped == "silence"
+    client.session.close(1.0)  # once more
+    assert client.session.receive(b"STOP\n", 1.0) == b"" and drive.owner is later.session
 
 
-@settings(deadline=None, max_examples=30)
-@given(some.lists(some.one_of(some.binary(max_size=400), some.integers(0, 5)), max_size=20), some.data())
-def test_fuzzed_lines_never_move_it_nor_break_it(pieces, data) -> None:
+@settings(deadline=None, max_examples=50)
+@given(some.lists(some.one_of(some.binary(max_size=400), some.integers(0, 5)), min_size=1, max_size=20), some.data())
+def test_fuzzed_bytes_never_move_it_nor_break_it(pieces, data) -> None:
     drive, client = moving()
-    lines = _Lines(drive)
-    command = client.signer.line(Message(client.number + 1, "MOVE", ("5.0", "0.0")), of_drive=False)
+    client.say("STOP", now=1.0)
+    at = rest(drive, 1.0)
+    command = f"MOVE {client.hear(70.0)} 5.0 0.0\n".encode()
     for piece in pieces:
         if isinstance(piece, int):  # a genuine line, damaged in one place
             place = data.draw(some.integers(0, len(command) - 2))
             byte = data.draw(some.integers(0, 255).filter(command[place].__ne__))
             piece = command[:place] + bytes([byte]) + command[place + 1 :]
-        for line in lines.feed(piece):
-            assert client.session.receive(line, 1.0) is None
-        assert len(lines._held) < LONGEST_LINE
-    assert drive.stopped is None and drive.owner is client.session
-    # it still obeys its client afterwards
-    lines.feed(b"\n")
-    assert lines.feed(command) == [command[:-1]]
-    assert client.session.receive(command[:-1], 1.0) is not None
-    drive.tick(1.5)
-    assert drive.stopped == "silence"
-
-
-@given(some.lists(some.integers(0, 600), max_size=8), some.integers(1, 97))
-def test_long_lines_are_left_out_however_they_are_cut(lengths, piece) -> None:
-    lines = _Lines(Drive(LIMITS, SECRET, now=0.0))
-    stream = b"".join(b"x" * length + b"\n" for length in lengths)
-    found = [line for at in range(0, len(stream), piece) for line in lines.feed(stream[at : at + piece])]
-    kept = [line for line in found if len(line) < LONGEST_LINE]
-    assert kept == [b"x" * length for length in lengths if length < LONGEST_LINE]
-
-
-def test_a_secret_must_be_closed_and_long(tmp_path) -> None:
-    path = tmp_path / "secret"
-    with pytest.raises(InputError, match="openssl"):
-        read_secret(path)
-    path.write_text("0123456789abcdef\n")
-    path.chmod(0o644)
-    with pytest.raises(InputError, match="chmod 600"):
-        read_secret(path)
-    path.chmod(0o600)
-    assert read_secret(path) == SECRET
-    path.write_text("short")
-    with pytest.raises(InputError, match="5 bytes"):
-        read_secret(path)
+        client.session.receive(piece, 70.0)
+        assert len(client.session._held) < LONGEST_LINE
+    drive.tick(71.0)
+    assert drive.stopped is not None and drive.position[0] == at

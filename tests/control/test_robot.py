@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -34,7 +36,8 @@ def test_a_command_is_finite_and_within_limits_whatever_is_asked(translation, ro
 @given(some.lists(some.tuples(some.floats(), some.floats()), min_size=1, max_size=4))
 def test_what_is_sent_to_a_drive_is_finite_and_within_its_limits(orders) -> None:
     robot, sent = object.__new__(RemoteRobot), []
-    robot.limits, robot._ask = LIMITS, lambda verb, *arguments: sent.append((verb, *arguments))
+    robot._lock, robot._ticket, robot._ticket_time = threading.RLock(), "ticket", np.inf
+    robot.limits, robot._ask = LIMITS, lambda verb, ticket, *arguments: sent.append((verb, *arguments))
     for translation, rotation in orders:
         robot.command(translation, rotation)
     assert [verb for verb, *_ in sent] == ["MOVE"] * len(orders)

@@ -1,14 +1,17 @@
-"""`endopilot drive`: a simulated robotic drive that takes commands over TCP."""
+"""`endopilot drive`: a simulated robotic drive that takes commands over TLS."""
 
 from __future__ import annotations
 
 import asyncio
+import signal
+import sys
 import time
 from pathlib import Path
 from typing import Annotated
 
-from endopilot.control.drive import Drive, serve
-from endopilot.control.drive_protocol import read_secret
+from endopilot.control.drive import Drive
+from endopilot.control.drive_protocol import tls_context
+from endopilot.control.drive_server import serve
 from endopilot.control.robot import RobotConfig
 from endopilot.settings import Finite, Within, settings
 from endopilot.simulation.device import read_device
@@ -29,15 +32,15 @@ class ListenConfig:
 
 def command(
     *,
-    secret: Path,
+    certificates: Path,
     device: str = "workhorse-014",
     listen: ListenConfig = ListenConfig(),
     config: RobotConfig = RobotConfig(),
 ) -> None:
-    """Run a simulated robotic drive until Ctrl-C; one client commands it over TCP (docs/robot.md). No medical device.
+    """Run a simulated robotic drive until Ctrl-C; one client commands it over TLS (docs/robot.md). No medical device.
 
     Args:
-        secret: file with the secret that drive and client share, at least 16 bytes, readable by you alone.
+        certificates: folder with drive.key, drive.crt and client.crt; docs/robot.md makes them.
         device: name of a device (`endopilot devices`) or a YAML file; it sets the speed limits.
         listen: address and travel.
         config: latency, accelerations, backlash and encoder noise.
@@ -48,14 +51,9 @@ def command(
         max_rotation_rad_s=wire.max_rotation_rad_s,
         travel_mm=listen.travel_mm,
     )
-    drive = Drive(
-        limits,
-        read_secret(secret),
-        now=time.monotonic(),
-        config=config,
-        inserted_length=max(listen.travel_mm[0], 0.0),
-        report=lambda line: print(line, flush=True),
-    )
-    asyncio.run(
-        serve(drive, listen.host, listen.port, lambda port: print(f"listening on {listen.host}:{port}", flush=True))
-    )
+    context = tls_context(certificates, of_drive=True)
+    low, high = listen.travel_mm
+    drive = Drive(limits, now=time.monotonic(), config=config, inserted_length=min(max(low, 0.0), high))
+    asyncio.run(serve(drive, context, listen.host, listen.port, lambda line: print(line, flush=True)))
+    print("endopilot drive: terminated", file=sys.stderr)
+    sys.exit(128 + signal.SIGTERM)

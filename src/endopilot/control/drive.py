@@ -1,30 +1,28 @@
-"""A simulated drive with its own clock, behind TCP: one client sends signed commands; the drive stops on any error.
+"""A simulated drive: the machine that one client commands, and that stops on any error. `drive_server` is its process.
 
-`Drive` is the machine: time and lines come in as arguments, so that it can be tested without either. `serve` gives it a
-socket and the clock of this process. A drive that stopped stays so until it is armed again.
+Time and bytes come in as arguments, so that it can be tested without a clock or a socket. A drive that stopped stays so
+until it is armed again.
+
+What moves the drive bears a ticket: a random word that every answer of the drive brings. A ticket moves nothing once it
+is 200 ms old, and a stop makes all of them void. So a command says when its client last heard the drive. Whatever
+waited in a buffer between them is dropped, however much it is, and nobody can write a command for later.
 """
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
+import math
 import secrets
-import time
-from collections.abc import Callable
+from collections import deque
 
 import numpy as np
 
-from endopilot.control.drive_protocol import LONGEST_LINE, PROTOCOL, SILENCE_S, Message, Signer
+from endopilot.control.drive_protocol import LONGEST_LINE, PROTOCOL, SILENCE_S, number
 from endopilot.control.robot import DriveMotion, RobotConfig
-from endopilot.errors import InputError
 from endopilot.simulation.drive_limits import DriveLimits
 
 CYCLE_S = 0.01
-"""Period of the process's loop, s."""
-AUTHENTICATE_S = 2.0
-"""Time in which a client must authenticate, s."""
-MOST_WAITING = 8
-"""Connections that may wait to authenticate; one more is closed at once."""
+"""Period of the drive's loop, and time for which its answers bring the same ticket, s."""
+_MOST_NEWS = 100
 
 
 class Drive:
@@ -32,38 +30,34 @@ class Drive:
 
     Attributes:
         stopped: why the drive stands still, or None while it is armed: "start", "silence", "connection", "not-finite",
-            "limit", "travel" or "asked".
-        dropped: lines that were malformed, too long, not signed, or replayed.
+            "limit", "travel", "malformed" or "asked".
+        dropped: commands that came with a ticket too old, void or never given.
         owner: the session that commands, if any.
+        news: lines for people, on stops, clients and strangers; whoever shows them takes them out.
     """
 
     def __init__(
-        self,
-        limits: DriveLimits,
-        secret: bytes,
-        *,
-        now: float,
-        config: RobotConfig | None = None,
-        inserted_length: float = 0.0,
-        report: Callable[[str], None] = lambda line: None,
+        self, limits: DriveLimits, *, now: float, config: RobotConfig | None = None, inserted_length: float = 0.0
     ) -> None:
         """Stand still, unarmed.
 
         Args:
             limits: a command beyond them, or the end of the travel, stops the drive.
-            secret: shared with the client.
             now: time by the drive's clock, s.
             config: latency, backlash, accelerations and encoder noise.
             inserted_length: Δ at the start, mm.
-            report: called with a line for people at every stop, and when a client comes or goes.
         """
-        self._limits, self._secret, self._report, config = limits, secret, report, config or RobotConfig()
-        self._motion = DriveMotion(limits, config, (inserted_length, 0.0))
+        config = config or RobotConfig()
+        self._limits, self._motion = limits, DriveMotion(limits, config, (inserted_length, 0.0))
         self._noise, self._random = np.array([config.encoder_sd_mm, config.encoder_sd_rad]), np.random.default_rng()
-        self._began = self._now = self._commanded = now
+        self._began = self._now = self._heard = now
+        self._tickets: dict[str, float] = {}
+        self._wanted: tuple[float, float] | None = None
+        self._state: str | None = None
         self.stopped: str | None = "start"
         self.dropped = 0
         self.owner: Session | None = None
+        self.news: deque[str] = deque(maxlen=_MOST_NEWS)
 
     @property
     def position(self) -> tuple[float, float]:
@@ -75,199 +69,157 @@ class Drive:
         """Whether the motor stands still."""
         return not self._motion.velocity.any()
 
-    def open(self) -> Session:
-        """Return the drive's side of a new connection."""
-        return Session(self, Signer(self._secret, secrets.token_hex(16)))
-
     def tick(self, now: float) -> None:
         """Let the time pass up to now, s; the watchdog stops the drive when it is due, even if the call comes late."""
-        due = self._commanded + SILENCE_S
+        due = self._heard + SILENCE_S
         if self.stopped is None and now >= due:
             self._advance(max(due, self._now))
             self.stop("silence")
         self._advance(max(now, self._now))
 
     def stop(self, reason: str) -> None:
-        """Brake, and stay so until the drive is armed again."""
-        if self.stopped is None:
-            self._report(f"stopped at {self._now - self._began:.3f} s: {reason}; {self.position[0]:.2f} mm inserted")
-            self.stopped = reason
+        """Brake, and stay so until the drive is armed again; what was sent before the client knows of it is void."""
+        self._wanted, self._state = None, None
+        self._tickets.clear()
         self._motion.stop()
+        if self.stopped is None:
+            self.stopped = reason
+            self.news.append(
+                f"stopped at {self._now - self._began:.3f} s: {reason}; {self.position[0]:.2f} mm inserted"
+            )
 
-    def arm(self) -> None:
+    def arm(self, ticket: str) -> None:
         """Take commands from now on, if stopped; the watchdog runs."""
-        if self.stopped is not None:
-            self.stopped, self._commanded = None, self._now
+        heard = self._given(ticket)
+        if heard is not None and self.stopped is not None:
+            self.stopped, self._state, self._heard = None, None, heard
 
-    def move(self, translation: float, rotation: float) -> None:
-        """Take a command, mm/s and rad/s, if armed; what is not finite or beyond the limits stops the drive."""
-        if self.stopped is not None:
+    def move(self, ticket: str, translation: float, rotation: float) -> None:
+        """Take a command, mm/s and rad/s, if armed; the newest of one instant alone is obeyed.
+
+        Args:
+            ticket: that the drive gave less than `SILENCE_S` ago; with any other nothing happens.
+            translation: one that is not finite or beyond the limits stops the drive.
+            rotation: likewise.
+        """
+        heard = self._given(ticket)
+        if heard is None or self.stopped is not None:
             return
-        if not np.isfinite([translation, rotation]).all():
+        if not (math.isfinite(translation) and math.isfinite(rotation)):
             self.stop("not-finite")
-        elif (translation, rotation) != self._limits.safe(translation, rotation):
+        elif abs(translation) > self._limits.max_velocity_mm_s or abs(rotation) > self._limits.max_rotation_rad_s:
             self.stop("limit")
         else:
-            self._motion.command(translation, rotation)
-            self._commanded = self._now
+            self._wanted, self._heard = (translation, rotation), max(heard, self._heard)
 
-    def state(self) -> tuple[str, ...]:
-        """Return the fields of a STATE reply: clock, s; Δ, mm, and φ, rad, by the encoders; and armed or why not."""
-        inserted, rotation = self._motion.position + self._noise * self._random.standard_normal(2)
-        status = "armed" if self.stopped is None else f"stopped:{self.stopped}"
-        return f"{self._now - self._began:.4f}", f"{inserted:.4f}", f"{rotation:.5f}", status
+    def state(self) -> str:
+        """Return a STATE answer: clock, s; Δ, mm, and φ, rad, by the encoders; armed or why not; and a ticket."""
+        if self._state is None:  # one instant has one reading
+            inserted, rotation = self._motion.position + self._noise * self._random.standard_normal(2)
+            status = "armed" if self.stopped is None else f"stopped:{self.stopped}"
+            clock = self._now - self._began
+            self._state = f"STATE {clock:.4f} {inserted:.4f} {rotation:.5f} {status} {self._ticket()}\n"
+        return self._state
 
-    def greet(self, session: Session) -> tuple[str, ...]:
-        """Make a session the owner, and return the limits as fields of the OK reply."""
-        self.owner = session
-        self._report("a client authenticated")
-        low, high = self._limits.travel_mm
-        numbers = (self._limits.max_velocity_mm_s, self._limits.max_rotation_rad_s, low, high)
-        return tuple(repr(float(number)) for number in numbers)
+    def open(self) -> Session | None:
+        """Return the drive's side of a new connection; None while another client commands."""
+        if self.owner is not None:
+            return None
+        self.owner = Session(self)
+        self.news.append("a client is connected")
+        return self.owner
+
+    @property
+    def greeting(self) -> str:
+        """The first line to a client: protocol and limits."""
+        numbers = (self._limits.max_velocity_mm_s, self._limits.max_rotation_rad_s, *self._limits.travel_mm)
+        return " ".join([PROTOCOL, *(repr(float(value)) for value in numbers)]) + "\n"
 
     def lose_owner(self) -> None:
         """Stop, because the connection of the owner is closed."""
         self.stop("connection")
         self.owner = None
-        self._report("the client has disconnected")
+        self.news.append("the client has disconnected")
+
+    def _ticket(self) -> str:
+        """Return a ticket that is at most a cycle old, and forget those that are too old to move anything."""
+        self._tickets = {ticket: given for ticket, given in self._tickets.items() if self._now < given + SILENCE_S}
+        newest = next(reversed(self._tickets), None)
+        if newest is None or self._now >= self._tickets[newest] + CYCLE_S:
+            newest = secrets.token_hex(8)
+            self._tickets[newest] = self._now
+        return newest
+
+    def _given(self, ticket: str) -> float | None:
+        """Return when a ticket was given, s, or None if it can move nothing."""
+        given = self._tickets.get(ticket)
+        if given is None or self._now >= given + SILENCE_S:
+            self.dropped += 1
+            return None
+        return given
 
     def _advance(self, until: float) -> None:
-        self._motion.advance(until - self._now)
-        self._now = until
+        if self._wanted is not None:
+            self._motion.command(*self._wanted)
+            self._wanted = None
+        if until > self._now:
+            self._motion.advance(until - self._now)
+            self._now, self._state = until, None
         (low, high), at, speed = self._limits.travel_mm, self._motion.position[0], self._motion.velocity[0]
         if self.stopped is None and ((at <= low and speed < 0) or (at >= high and speed > 0)):
             self.stop("travel")
 
 
 class Session:
-    """The drive's side of one connection."""
+    """The drive's side of the connection of its owner."""
 
-    def __init__(self, drive: Drive, signer: Signer) -> None:
-        """Wait for the client to authenticate."""
-        self._drive, self._signer, self._last = drive, signer, 0
-        self.closed = False
+    def __init__(self, drive: Drive) -> None:
+        """Wait for the first line."""
+        self._drive, self._held, self.closed = drive, b"", False
 
-    @property
-    def greeting(self) -> bytes:
-        """The first line: protocol and nonce."""
-        return f"{PROTOCOL} {self._signer.nonce}\n".encode("ascii")
+    def receive(self, data: bytes, now: float) -> bytes:
+        """Take what one read brought and return the answers, one for each line that it ends.
 
-    def receive(self, line: bytes, now: float) -> bytes | None:
-        """Take one line, without its newline, and return the reply; None for a line that gets none.
+        A line that never ends closes the session.
 
         Args:
-            line: as it came.
+            data: bytes as they came, cut anywhere.
             now: time by the drive's clock, s.
         """
         self._drive.tick(now)
-        message = self._signer.read(line, of_drive=False)
-        if message is None or message.number <= self._last:
-            self._drive.dropped += 1
-            return None
-        self._last = message.number
-        reply = self._answer(message)
-        if reply is None:
-            self._drive.dropped += 1
-            return None
-        return self._signer.line(reply, of_drive=True)
+        if self.closed:
+            return b""
+        *lines, self._held = (self._held + data).split(b"\n")
+        answers = [self._answer(line) for line in lines]
+        if len(self._held) >= LONGEST_LINE:
+            self._drive.stop("malformed")
+            self.close(now)
+        return "".join(answers).encode("ascii")
 
     def close(self, now: float) -> None:
-        """Note that the connection is closed; a drive that it owned stops."""
+        """Note that the connection is closed, at a time by the drive's clock, s; the drive stops."""
         self._drive.tick(now)
-        self.closed = True
+        self.closed, self._held = True, b""
         if self._drive.owner is self:
             self._drive.lose_owner()
 
-    def _answer(self, message: Message) -> Message | None:
-        """Do what a genuine message asks and return the reply; None for a message without meaning."""
-        drive, verb, arguments = self._drive, message.verb, message.arguments
-        if verb == "AUTH" and not arguments and drive.owner is None:
-            return Message(message.number, "OK", drive.greet(self))
-        if verb == "AUTH" and not arguments and drive.owner is not self:
-            self.closed = True
-            return Message(message.number, "BUSY")
-        if drive.owner is not self:
-            return None
-        if verb == "MOVE" and len(arguments) == 2:
-            try:
-                translation, rotation = (float(argument) for argument in arguments)
-            except ValueError:
-                return None
-            drive.move(translation, rotation)
-        elif verb == "ARM" and not arguments:
-            drive.arm()
-        elif verb == "STOP" and not arguments:
-            drive.stop("asked")
-        elif verb != "STATE" or arguments:
-            return None
-        return Message(message.number, "STATE", drive.state())
-
-
-class _Lines:
-    """Cuts a stream of bytes into lines; one that is too long is left out, whatever its length, and counted."""
-
-    def __init__(self, drive: Drive) -> None:
-        self._drive, self._held, self._skipping = drive, b"", False
-
-    def feed(self, data: bytes) -> list[bytes]:
-        """Take bytes and return the lines that they end."""
-        *lines, rest = (self._held + data).split(b"\n")
-        if lines and self._skipping:
-            lines, self._skipping = lines[1:], False
-        if len(rest) >= LONGEST_LINE:
-            self._drive.dropped += not self._skipping
-            rest, self._skipping = b"", True
-        self._held = b"" if self._skipping else rest
-        return lines
-
-
-async def serve(drive: Drive, host: str, port: int, ready: Callable[[int], None]) -> None:
-    """Let a drive listen and run on the clock of this process until it is cancelled.
-
-    Args:
-        drive: made with `now=time.monotonic()`.
-        host: address to listen on.
-        port: TCP port; 0 for a free one.
-        ready: called with the port once clients can connect.
-
-    Raises:
-        InputError: the address cannot be listened on.
-    """
-    connections: set[asyncio.StreamWriter] = set()
-
-    async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if len(connections) > MOST_WAITING:
-            writer.close()
-            return
-        connections.add(writer)
-        session, lines, began = drive.open(), _Lines(drive), time.monotonic()
-        try:
-            writer.write(session.greeting)
-            while not session.closed:
-                waiting = drive.owner is not session
-                left = began + AUTHENTICATE_S - time.monotonic() if waiting else None
-                data = await asyncio.wait_for(reader.read(4096), timeout=left)
-                if not data:
-                    break
-                for line in lines.feed(data):
-                    reply = session.receive(line, time.monotonic())
-                    if reply is not None:
-                        writer.write(reply)
-                await writer.drain()
-        except (TimeoutError, OSError):
-            pass
-        finally:
-            session.close(time.monotonic())
-            connections.discard(writer)
-            writer.close()
-
-    try:
-        server = await asyncio.start_server(talk, host, port)
-    except OSError as error:
-        raise InputError(f"host, port: cannot listen on {host}:{port} ({error.strerror}); choose others") from error
-    async with server:
-        ready(server.sockets[0].getsockname()[1])
-        with contextlib.suppress(asyncio.CancelledError):
-            while True:
-                await asyncio.sleep(CYCLE_S)
-                drive.tick(time.monotonic())
+    def _answer(self, line: bytes) -> str:
+        """Do what a line asks and return the answer; a line that is not of the protocol stops the drive."""
+        drive = self._drive
+        text = line.decode("ascii", "replace") if len(line) < LONGEST_LINE else ""
+        match text.split(" "):
+            case ["STATE"]:
+                pass
+            case ["STOP"]:
+                drive.stop("asked")
+            case ["ARM", ticket]:
+                drive.arm(ticket)
+            case ["MOVE", ticket, first, second]:
+                translation, rotation = number(first), number(second)
+                if translation is None or rotation is None:
+                    drive.stop("malformed")
+                else:
+                    drive.move(ticket, translation, rotation)
+            case _:
+                drive.stop("malformed")
+        return drive.state()

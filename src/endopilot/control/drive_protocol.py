@@ -1,98 +1,90 @@
-"""The lines that a drive and its client exchange: signed, numbered text. docs/robot.md holds the table of messages.
+"""The lines that a drive and its client exchange, and the certificates by which they know each other.
 
-A line is `NUMBER VERB ARGUMENT... MAC`, fields separated by one space, at most `LONGEST_LINE` bytes with its newline.
-The MAC is HMAC-SHA256 over protocol, direction, the nonce of the connection and what stands before it, so that no line
-can be made without the secret, changed, sent back, or used again: numbers must grow within a connection, and no two
-connections share a nonce.
+docs/robot.md holds the table of messages. A line is ASCII text, `VERB ARGUMENT...`, fields separated by one space, at
+most `LONGEST_LINE` bytes with its newline. Lines travel over TLS 1.3, and each side trusts one certificate, that of the
+other: so nobody else can read a line, make one, change it or send it again.
 """
 
 from __future__ import annotations
 
-import hmac
+import re
+import shlex
+import ssl
 import stat
-from dataclasses import dataclass
 from pathlib import Path
 
 from endopilot.errors import InputError
 
-PROTOCOL = "endopilot-drive 1"
+PROTOCOL = "endopilot-drive 2"
 """Name and version; the drive's greeting begins with it."""
 LONGEST_LINE = 200
-"""Bytes of a line, newline included; a longer one is dropped."""
-SHORTEST_SECRET = 16
-"""Bytes of a secret, at least."""
+"""Bytes of a line, newline included."""
 SILENCE_S = 0.2
-"""Time without a valid command after which a moving drive stops, s."""
-_MAC_DIGITS, _NUMBER_DIGITS = 64, 15
+"""Age of a ticket from which on it moves nothing, s: a moving drive stops this long after its client last heard it."""
+_NUMBER = re.compile(
+    r"[+-]?(?:(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:e[+-]?[0-9]+)?|nan|inf|infinity)", re.ASCII | re.IGNORECASE
+)
 
 
-@dataclass(frozen=True)
-class Message:
-    """What a line says.
+def number(text: str) -> float | None:
+    """Return the number that a field holds, in decimal digits, NaN or infinite; None for anything else.
 
-    Attributes:
-        number: of the line; a reply bears that of the line it answers.
-        verb: what is asked or answered.
-        arguments: the other fields.
+    Python's own `float` also takes underscores, white space and the digits of other scripts.
     """
-
-    number: int
-    verb: str
-    arguments: tuple[str, ...] = ()
+    return float(text) if _NUMBER.fullmatch(text) else None
 
 
-@dataclass(frozen=True)
-class Signer:
-    """Signs the lines of one connection and checks those of the other side.
+def tls_context(folder: Path, *, of_drive: bool) -> ssl.SSLContext:
+    """Return the TLS settings of one side: its own key and certificate, and the one certificate that it trusts.
 
-    Attributes:
-        secret: that both sides share.
-        nonce: of the connection, drawn by the drive.
-    """
-
-    secret: bytes
-    nonce: str
-
-    def line(self, message: Message, *, of_drive: bool) -> bytes:
-        """Return the signed line of a message, newline included."""
-        body = " ".join([str(message.number), message.verb, *message.arguments])
-        return f"{body} {self._mac(body, of_drive)}\n".encode("ascii")
-
-    def read(self, line: bytes, *, of_drive: bool) -> Message | None:
-        """Return what a line says, without its newline; None if it is malformed, too long or not signed so."""
-        if len(line) >= LONGEST_LINE:
-            return None
-        try:
-            body, _, mac = line.decode("ascii").rpartition(" ")
-        except UnicodeDecodeError:
-            return None
-        if len(mac) != _MAC_DIGITS or not hmac.compare_digest(mac, self._mac(body, of_drive)):
-            return None
-        number, *fields = body.split(" ")
-        if not (number.isdigit() and len(number) <= _NUMBER_DIGITS and fields):
-            return None
-        return Message(int(number), fields[0], tuple(fields[1:]))
-
-    def _mac(self, body: str, of_drive: bool) -> str:
-        text = "|".join([PROTOCOL, "drive" if of_drive else "client", self.nonce, body])
-        return hmac.digest(self.secret, text.encode("ascii"), "sha256").hex()
-
-
-def read_secret(path: Path) -> bytes:
-    """Read the secret that a drive and its client share; white space around it does not count.
+    Args:
+        folder: holds PEM files: `drive.key`, `drive.crt` and `client.crt` for the drive; `client.key`, `client.crt` and
+            `drive.crt` for the client.
+        of_drive: for the drive, or for its client.
 
     Raises:
-        InputError: the file is missing, is open to other users, or holds too little.
+        InputError: a file is missing or holds something else; the key is encrypted, open to others, or of another
+            certificate.
     """
+    side, other = ("drive", "client") if of_drive else ("client", "drive")
+    key, own, trusted = folder / f"{side}.key", folder / f"{side}.crt", folder / f"{other}.crt"
+    for path in (key, own, trusted):
+        if not path.is_file():
+            raise InputError(
+                f"certificates: {path}: no such file; copy it there, or make both sides' with `{_recipe(folder)}`"
+            )
+    if key.stat().st_mode & (stat.S_IRWXG | stat.S_IRWXO):
+        raise InputError(f"certificates: {key} is open to other users; close it with `chmod 600 {key}`")
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER if of_drive else ssl.PROTOCOL_TLS_CLIENT)
+    context.minimum_version = ssl.TLSVersion.TLSv1_3
+    context.check_hostname = False  # the certificate itself is known, whatever name it bears
+    context.verify_mode = ssl.CERT_REQUIRED
+    context.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN
     try:
-        secret = path.read_bytes().strip()
-        mode = path.stat().st_mode
+        context.load_cert_chain(own, key, password=lambda: "")  # an encrypted key would ask at the terminal
     except OSError as error:
         raise InputError(
-            f"secret: {path}: {error.strerror}; make one with `(umask 077; openssl rand -hex 32 > {path})`"
+            f"certificates: {own} and {key} are no certificate and its unencrypted key ({_reason(error)}); "
+            f"make both sides' with `{_recipe(folder)}`"
         ) from error
-    if mode & (stat.S_IRWXG | stat.S_IRWXO):
-        raise InputError(f"secret: {path} is open to other users; close it with `chmod 600 {path}`")
-    if len(secret) < SHORTEST_SECRET:
-        raise InputError(f"secret: {path} holds {len(secret)} bytes; give at least {SHORTEST_SECRET}")
-    return secret
+    try:
+        context.load_verify_locations(trusted)
+    except OSError as error:
+        raise InputError(
+            f"certificates: {trusted} holds no certificate ({_reason(error)}); copy the {other}'s there"
+        ) from error
+    return context
+
+
+def _recipe(folder: Path) -> str:
+    """Return the shell command that makes a folder with the keys and certificates of both sides."""
+    place = shlex.quote(str(folder))
+    request = (
+        "openssl req -x509 -newkey rsa:3072 -nodes -days 3650 -subj /CN=$side "
+        f"-keyout {place}/$side.key -out {place}/$side.crt"
+    )
+    return f"mkdir -p {place}; for side in drive client; do {request}; done"
+
+
+def _reason(error: OSError) -> str:
+    return str(getattr(error, "reason", None) or error.strerror or error)
