@@ -23,8 +23,10 @@ GONE_S = 10.0
 """Time without a line after which a client counts as gone, s: its machine or its network may be off."""
 MOST_WAITING = 8
 """Connections that may wait to be let in; one more is closed at once."""
-MOST_UNREAD = 1 << 16
-"""Bytes of answers that may wait for a client to read them."""
+READ_BYTES = 1 << 12
+"""Bytes that are taken as one read; the socket brings up to 64 times as many at once."""
+MOST_UNREAD = 1 << 20
+"""Bytes of answers that may wait for a client to read them, or belong to what the socket brings at once."""
 REFUSALS_S = 1.0
 """Time between two lines for people on connections that were refused, s."""
 
@@ -148,13 +150,18 @@ class _Connection(asyncio.Protocol):
     def data_received(self, data: bytes) -> None:
         if self._session is None or self._transport is None:
             return
-        answers = self._session.receive(data, time.monotonic())
-        self._transport.write(answers)
-        if self._session.closed:
-            self._abort("a line of it has no end")
-        elif self._transport.get_write_buffer_size() > MOST_UNREAD:
-            self._abort("it does not read the answers")
-        elif answers:
+        written = 0
+        for begin in range(0, len(data), READ_BYTES):
+            answers = self._session.receive(data[begin : begin + READ_BYTES], time.monotonic())
+            self._transport.write(answers)
+            written += len(answers)
+            if self._session.closed:
+                self._abort("a line of it has no end")
+                return
+            if max(written, self._transport.get_write_buffer_size()) > MOST_UNREAD:
+                self._abort("it does not read the answers")
+                return
+        if written:
             self._expect()
 
     def connection_lost(self, exc: Exception | None) -> None:
