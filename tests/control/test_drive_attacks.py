@@ -119,8 +119,8 @@ def until_disconnected(process: subprocess.Popen) -> str:
     return "".join(iter(process.stdout.readline, "the client has disconnected\n"))
 
 
-def after_the_attack(process: subprocess.Popen, port: int, certificates, since: float) -> tuple[float, float]:
-    """Return when the drive stopped, s by its clock, and how far from a place, mm, a later client finds it at rest."""
+def after_the_attack(process: subprocess.Popen, port: int, certificates, since: float) -> tuple[str, float, float]:
+    """Return what the drive reported, when it stopped, s by its clock, and how far from a place, mm, it is at rest."""
     said = until_disconnected(process)
     stopped_s = float(re.findall(r"^stopped at ([\d.]+) s: (?:silence|connection|malformed);", said, re.MULTILINE)[-1])
     time.sleep(0.3)
@@ -131,7 +131,7 @@ def after_the_attack(process: subprocess.Popen, port: int, certificates, since: 
             time.sleep(0.03)
     until_disconnected(process)
     assert np.ptp(readings) < NOISE_MM
-    return stopped_s, float(np.mean(readings)) - since
+    return said, stopped_s, float(np.mean(readings)) - since
 
 
 @pytest.mark.parametrize(
@@ -153,12 +153,14 @@ def test_nothing_moves_200_ms_after_the_client_heard_the_drive(drive, certificat
     attacker.drive(0.3)
     attacker.ask(moves(attacker).decode().strip())
     attack(attacker, process)
-    time.sleep(0.5)  # it hangs
+    time.sleep(0.4)  # it hangs
     attacker.close()
-    stopped_s, moved_mm = after_the_attack(process, port, certificates, attacker.place)
+    said, stopped_s, moved_mm = after_the_attack(process, port, certificates, attacker.place)
     print(f"{attack.__name__}: stopped {stopped_s - attacker.clock:.3f} s and {moved_mm:.2f} mm after the last answer")
     assert stopped_s - attacker.clock <= SILENCE_S + 1e-3
     assert moved_mm <= MOST_MM
+    if attack is ask_and_never_read:
+        assert "it does not read the answers" in said
 
 
 def test_a_client_that_is_held_up_moves_nothing(drive, certificates) -> None:
@@ -175,9 +177,9 @@ def test_a_client_that_is_held_up_moves_nothing(drive, certificates) -> None:
     for line in client.stdout:  # what it printed before it was held up
         place = float(line)
     client.stdout.close()
-    _, moved_mm = after_the_attack(process, port, certificates, place)
+    *_, moved_mm = after_the_attack(process, port, certificates, place)
     print(f"a client held up: {moved_mm:.2f} mm")
-    assert moved_mm <= MOST_MM + SPEED * 0.1  # it prints a place every 0.05 s
+    assert moved_mm <= MOST_MM + SPEED * 0.3  # it prints a place now and then
 
 
 def test_strangers_that_wait_do_not_hold_it_up(drive, certificates) -> None:

@@ -38,7 +38,7 @@ while True:
 
 @contextlib.contextmanager
 def running(certificates, *options):
-    """Start a drive on a free port, and yield its process and the port."""
+    """Start a drive on a free port, yield its process and the port, and check that no traceback was printed."""
     process = subprocess.Popen(
         [sys.executable, "-c", MAIN, "drive", "--certificates", str(certificates), "--port", "0", *options],
         stdout=subprocess.PIPE,
@@ -51,7 +51,8 @@ def running(certificates, *options):
         yield process, int(begun.rsplit(":", 1)[1])
     finally:
         process.kill()
-        process.communicate(timeout=20)
+        _, errors = process.communicate(timeout=20)
+    assert "Traceback" not in errors
 
 
 @pytest.fixture
