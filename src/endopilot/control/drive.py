@@ -3,9 +3,10 @@
 Time and bytes come in as arguments, so that it can be tested without a clock or a socket. A drive that stopped stays so
 until it is armed again.
 
-What moves the drive bears a ticket: a random word that every answer of the drive brings. A ticket moves nothing once it
-is 200 ms old, and a stop makes all of them void. So a command says when its client last heard the drive. Whatever
-waited in a buffer between them is dropped, however much it is, and nobody can write a command for later.
+What moves the drive bears a ticket: a random word that every answer of the drive brings. A ticket lasts for 200 ms less
+the time that braking takes, and a stop makes all of them void. So a command says when its client last heard the drive,
+and 200 ms after that the drive stands still. Whatever waited in a buffer between them is dropped, however much it is,
+and nobody can write a command for later.
 """
 
 from __future__ import annotations
@@ -51,6 +52,7 @@ class Drive:
         self._limits, self._motion = limits, DriveMotion(limits, config, (inserted_length, 0.0))
         self._noise, self._random = np.array([config.encoder_sd_mm, config.encoder_sd_rad]), np.random.default_rng()
         self._began = self._now = self._heard = now
+        self._lasts_s = SILENCE_S - config.braking_s
         self._tickets: dict[str, float] = {}
         self._wanted: tuple[float, float] | None = None
         self._state: str | None = None
@@ -71,7 +73,7 @@ class Drive:
 
     def tick(self, now: float) -> None:
         """Let the time pass up to now, s; the watchdog stops the drive when it is due, even if the call comes late."""
-        due = self._heard + SILENCE_S
+        due = self._heard + self._lasts_s
         if self.stopped is None and now >= due:
             self._advance(max(due, self._now))
             self.stop("silence")
@@ -98,7 +100,7 @@ class Drive:
         """Take a command, mm/s and rad/s, if armed; the newest of one instant alone is obeyed.
 
         Args:
-            ticket: that the drive gave less than `SILENCE_S` ago; with any other nothing happens.
+            ticket: that the drive gave so lately that it lasts; with any other nothing happens.
             translation: one that is not finite or beyond the limits stops the drive.
             rotation: likewise.
         """
@@ -143,7 +145,7 @@ class Drive:
 
     def _ticket(self) -> str:
         """Return a ticket that is at most a cycle old, and forget those that are too old to move anything."""
-        self._tickets = {ticket: given for ticket, given in self._tickets.items() if self._now < given + SILENCE_S}
+        self._tickets = {ticket: given for ticket, given in self._tickets.items() if self._now < given + self._lasts_s}
         newest = next(reversed(self._tickets), None)
         if newest is None or self._now >= self._tickets[newest] + CYCLE_S:
             newest = secrets.token_hex(8)
@@ -153,7 +155,7 @@ class Drive:
     def _given(self, ticket: str) -> float | None:
         """Return when a ticket was given, s, or None if it can move nothing."""
         given = self._tickets.get(ticket)
-        if given is None or self._now >= given + SILENCE_S:
+        if given is None or self._now >= given + self._lasts_s:
             self.dropped += 1
             return None
         return given

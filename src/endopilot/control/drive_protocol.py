@@ -20,7 +20,7 @@ PROTOCOL = "endopilot-drive 2"
 LONGEST_LINE = 200
 """Bytes of a line, newline included."""
 SILENCE_S = 0.2
-"""Age of a ticket from which on it moves nothing, s: a moving drive stops this long after its client last heard it."""
+"""Time after which a drive stands still whose client has not heard it since, s."""
 _NUMBER = re.compile(
     r"[+-]?(?:(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:e[+-]?[0-9]+)?|nan|inf|infinity)", re.ASCII | re.IGNORECASE
 )

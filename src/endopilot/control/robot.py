@@ -10,12 +10,12 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Annotated, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.settings import NonNegative, Positive, settings
+from endopilot.settings import NonNegative, Positive, Within, settings
 from endopilot.simulation.drive_limits import DriveLimits, within_travel
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import Step
@@ -64,6 +64,8 @@ class RobotConfig:
     """Largest change of the translation's speed, mm/s²."""
     max_acceleration_rad_s2: Positive = 60.0
     """Largest change of the rotation's speed, rad/s²."""
+    braking_s: Annotated[float, Within(0.001, 0.1)] = 0.05
+    """Time in which a stop brings a device from its top speeds to rest, s: brakes are stronger than motors."""
     backlash_mm: NonNegative = 0.1
     """Motion that is lost where the translation reverses, mm."""
     backlash_rad: NonNegative = 0.035
@@ -87,6 +89,9 @@ class DriveMotion:
         """Begin at rest at a position, in the middle of the backlash."""
         self._limits = limits
         self._acceleration = np.array([config.max_acceleration_mm_s2, config.max_acceleration_rad_s2])
+        fastest = np.array([limits.max_velocity_mm_s, limits.max_rotation_rad_s])
+        self._braking = np.maximum(self._acceleration, fastest / config.braking_s)
+        self._ramp = self._acceleration
         self._half_gap = np.array([config.backlash_mm, config.backlash_rad]) / 2
         self._latency_s = config.latency_s
         self._orders: deque[tuple[float, Float[np.ndarray, "2"]]] = deque()
@@ -100,14 +105,14 @@ class DriveMotion:
     def stop(self) -> None:
         """Brake at once, whatever was commanded before."""
         self._orders.clear()
-        self._wanted = np.zeros(2)
+        self._wanted, self._ramp = np.zeros(2), self._braking
 
     def advance(self, duration: float) -> Float[np.ndarray, "2"]:
         """Let some time pass, s, and return how far the wire's proximal end moves in it, mm and rad."""
         before, end = self.position.copy(), self.time_s + duration
         while self.time_s < end - 1e-12:
             while self._orders and self._orders[0][0] <= self.time_s + 1e-12:
-                self._wanted = self._orders.popleft()[1]
+                self._wanted, self._ramp = self._orders.popleft()[1], self._acceleration
             until = min(self._orders[0][0], end) if self._orders else end
             self._move(until - self.time_s)
             self.time_s = until
@@ -115,8 +120,8 @@ class DriveMotion:
 
     def _move(self, duration: float) -> None:
         """Move towards the wanted velocity for a while, s: ramp, then constant; the wire follows through the gap."""
-        ramp = np.minimum(np.abs(self._wanted - self.velocity) / self._acceleration, duration)
-        reached = self.velocity + np.sign(self._wanted - self.velocity) * self._acceleration * ramp
+        ramp = np.minimum(np.abs(self._wanted - self.velocity) / self._ramp, duration)
+        reached = self.velocity + np.sign(self._wanted - self.velocity) * self._ramp * ramp
         motor = (self.velocity + reached) / 2 * ramp + reached * (duration - ramp)
         self.velocity = reached
         ahead = np.clip(self._ahead + motor, -self._half_gap, self._half_gap)
