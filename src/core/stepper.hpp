@@ -145,17 +145,18 @@ private:
 
     // Gradient and Hessian with respect to the drives' coordinates, for all lanes; row r of the Hessian begins at r (r + 1) / 2.
     struct DriveBlock {
-        V gradient[N]{}, hessian[N * (N + 1) / 2]{};
+        static constexpr int kCoordinates = N, kEntries = N * (N + 1) / 2;
+        V gradient[kCoordinates]{}, hessian[kEntries]{};
         ENDOPILOT_DEVICE V& h(int r, int c) { return hessian[r * (r + 1) / 2 + c]; }
         ENDOPILOT_DEVICE const V& h(int r, int c) const { return hessian[r * (r + 1) / 2 + c]; }
         ENDOPILOT_DEVICE friend DriveBlock operator+(DriveBlock a, const DriveBlock& b) {
-            for (int r = 0; r < N; ++r) a.gradient[r] += b.gradient[r];
-            for (int k = 0; k < N * (N + 1) / 2; ++k) a.hessian[k] += b.hessian[k];
+            for (int r = 0; r < kCoordinates; ++r) a.gradient[r] += b.gradient[r];
+            for (int k = 0; k < kEntries; ++k) a.hessian[k] += b.hessian[k];
             return a;
         }
         ENDOPILOT_DEVICE friend DriveBlock select(Mask<V> mask, const DriveBlock& yes, DriveBlock no) {
-            for (int r = 0; r < N; ++r) no.gradient[r] = endopilot::select<V>(mask, yes.gradient[r], no.gradient[r]);
-            for (int k = 0; k < N * (N + 1) / 2; ++k) no.hessian[k] = endopilot::select<V>(mask, yes.hessian[k], no.hessian[k]);
+            for (int r = 0; r < kCoordinates; ++r) no.gradient[r] = endopilot::select<V>(mask, yes.gradient[r], no.gradient[r]);
+            for (int k = 0; k < kEntries; ++k) no.hessian[k] = endopilot::select<V>(mask, yes.hessian[k], no.hessian[k]);
             return no;
         }
     };
