@@ -36,8 +36,8 @@ def run_core(
     insertion: Insertion,
     *,
     config: SimulatorConfig,
-    initial: Float[np.ndarray, "worlds *devices 2"],
-    control: Float[np.ndarray, "worlds samples *devices 2"],
+    initial: Float[np.ndarray, "worlds numbers"],
+    control: Float[np.ndarray, "worlds samples numbers"],
     friction: Float[np.ndarray, "worlds *devices"],
     period_s: float = SAMPLE_PERIOD_S,
     actuation: Actuation = "velocity",
@@ -55,7 +55,7 @@ def run_core(
 ) -> dict[str, np.ndarray]:
     """Run the C++ core on checked input. The simulator and the verification both come through here.
 
-    Devices count from the inside out; arrays of a wire alone may leave out that axis.
+    Devices count from the inside out, with two numbers each where the arrays below have numbers.
 
     Args:
         rod: nodes and stiffnesses; with tubes, the nodes alone count, and the drag.

@@ -323,7 +323,7 @@ class Simulator(Readout):
     ) -> dict[str, Any]:
         with gpu_errors(self._config.processor):
             return group.simulation.run(
-                control=control.reshape(*control.shape[:2], -1, 2),
+                control=control.reshape(*control.shape[:2], len(group.stack.devices), 2),
                 force_driven=by_force,
                 time_step=time_step,
                 steps_per_sample=steps,
