@@ -43,8 +43,11 @@ struct OutputArray {
     T* data;
     template <class... Shape>
     nb::object array(Shape... shape) {
+        return shaped({std::size_t(shape)...});
+    }
+    nb::object shaped(const std::vector<std::size_t>& shape) {
         nb::capsule owner(data, [](void* p) noexcept { delete[] static_cast<T*>(p); });
-        return nb::cast(nb::ndarray<nb::numpy, T>(data, {std::size_t(shape)...}, owner));
+        return nb::cast(nb::ndarray<nb::numpy, T>(data, shape.size(), shape.data(), owner));
     }
 };
 

@@ -14,14 +14,14 @@
 #include "spline.hpp"
 #ifdef ENDOPILOT_CUDA
 #include "gpu.hpp"
-using Device = endopilot::Gpu;
+using Processor = endopilot::Gpu;
 #else
 #include "cpu.hpp"
-using Device = endopilot::Cpu;
+using Processor = endopilot::Cpu;
 #endif
 
 using namespace endopilot;
-using Simulations = Simulation<Device>;
+using Simulations = Simulation<Processor>;
 
 namespace {
 
@@ -100,15 +100,13 @@ OwnedLoads make_loads(const Array<2>& force, const Array<2>& moment, const Array
 
 // A row a tube, the innermost first, of at most three; profiles are integrals from the tip at distances `spacing` apart.
 OwnedTubes make_tubes(double spacing, double shear_share, const Array<2>& bend, const Array<2>& twist, const Array<2>& stretch,
-                      const Array<2>& rest, const Array<1>& radius, const Array<1>& bore_friction, const Array<1>& push_limit,
-                      const Array<1>& pull_limit, const Array<1>& torque_limit) {
+                      const Array<2>& rest, const Array<1>& radius, const Array<1>& bore_friction) {
     const std::size_t n = radius.size(), points = bend.shape(1);
     require(n >= 2 && n <= 3, "give two or three tubes");
     require(spacing > 0 && points >= 2, "profiles of tubes need two points at least");
     for (const Array<2>* profile : {&bend, &twist, &stretch, &rest})
         require(profile->shape(0) == n && profile->shape(1) == points, "every profile needs a row a tube");
-    for (const Array<1>* numbers : {&bore_friction, &push_limit, &pull_limit, &torque_limit})
-        require(numbers->size() == n, "every array of tubes needs one entry a tube");
+    require(bore_friction.size() == n, "every array of tubes needs one entry a tube");
     const auto flat = [](const Array<2>& a) { return std::vector<double>(a.data(), a.data() + a.size()); };
     return {.tubes = int(n),
             .points = int(points),
@@ -119,10 +117,27 @@ OwnedTubes make_tubes(double spacing, double shear_share, const Array<2>& bend, 
             .stretch = flat(stretch),
             .rest = flat(rest),
             .radius = values(radius),
-            .bore_friction = values(bore_friction),
-            .push_limit = values(push_limit),
-            .pull_limit = values(pull_limit),
-            .torque_limit = values(torque_limit)};
+            .bore_friction = values(bore_friction)};
+}
+
+// A row a device, from the inside out: the forces (N) that its drive pushes and pulls with at most, and its torque (N mm).
+Drives make_drives(const Array<2>& limits) {
+    require(limits.shape(0) >= 1 && limits.shape(0) <= kMostDevices && limits.shape(1) == 3, "drives need three limits for each of up to three devices");
+    Drives drives{.count = int(limits.shape(0))};
+    for (int k = 0; k < drives.count; ++k) {
+        const double* row = limits.data() + 3 * k;
+        drives.push[k] = row[0], drives.pull[k] = row[1], drives.torque[k] = row[2];
+    }
+    return drives;
+}
+
+// What a run records: (name, what it has an entry of, numbers of an entry, unit, meaning).
+nb::list outputs() {
+    nb::list all;
+#define OUTPUT(Type, name, of, numbers, unit, meaning) all.append(nb::make_tuple(#name, #of, numbers, unit, meaning));
+    ENDOPILOT_OUTPUTS(OUTPUT)
+#undef OUTPUT
+    return all;
 }
 
 // `coefficients`: cycles × knots × numbers.
@@ -209,6 +224,7 @@ NB_MODULE(ENDOPILOT_MODULE, module) {
     module.doc() = "The core of endopilot: Cosserat rods, and projection to centerlines.";
     module.attr("LEVEL") = ENDOPILOT_LEVEL;
     module.attr("LANES") = kLanes;
+    module.attr("OUTPUTS") = outputs();
     module.def("supported_levels", &supported_levels);
 #ifdef ENDOPILOT_CUDA
     module.def("why_no_gpu", &why_no_gpu);
@@ -230,54 +246,42 @@ NB_MODULE(ENDOPILOT_MODULE, module) {
                nb::arg("anchor"), nb::arg("hold"), nb::arg("attitude"));
     nb::class_<OwnedTubes>(module, "Tubes");
     module.def("make_tubes", &make_tubes, nb::kw_only(), nb::arg("spacing"), nb::arg("shear_share"), nb::arg("bend"),
-               nb::arg("twist"), nb::arg("stretch"), nb::arg("rest"), nb::arg("radius"), nb::arg("bore_friction"),
-               nb::arg("push_limit"), nb::arg("pull_limit"), nb::arg("torque_limit"));
+               nb::arg("twist"), nb::arg("stretch"), nb::arg("rest"), nb::arg("radius"), nb::arg("bore_friction"));
+    nb::class_<Drives>(module, "Drives");
+    module.def("make_drives", &make_drives, nb::arg("limits"));
     nb::class_<OwnedMotion>(module, "Motion").def("placements", &placements, nb::arg("times"));
     module.def("make_motion", &make_motion, nb::kw_only(), nb::arg("ostium"), nb::arg("period"), nb::arg("coefficients"));
     nb::class_<Options>(module, "Options")
         .def(nb::init<>())
-        .def_rw("stick_velocity", &Options::stick_velocity)
-        .def_rw("wall_stiffness", &Options::wall_stiffness)
-        .def_rw("foundation", &Options::foundation)
-        .def_rw("foundation_stiffening", &Options::foundation_stiffening)
-        .def_rw("tip_takes_along", &Options::tip_takes_along)
-        .def_rw("tolerance", &Options::tolerance)
-        .def_rw("sample_tolerance", &Options::sample_tolerance)
-        .def_rw("largest_step", &Options::largest_step)
-        .def_rw("largest_jump", &Options::largest_jump)
-        .def_rw("max_iterations", &Options::max_iterations)
-        .def_rw("free_behind", &Options::free_behind)
-        .def_rw("approach_velocity", &Options::approach_velocity)
-        .def_rw("push_limit", &Options::push_limit)
-        .def_rw("pull_limit", &Options::pull_limit)
-        .def_rw("torque_limit", &Options::torque_limit)
-        .def_rw("introducer_friction", &Options::introducer_friction)
-        .def_rw("introducer_drag", &Options::introducer_drag);
+#define OPTION(Type, name, meaning) .def_rw(#name, &Options::name, meaning)
+        ENDOPILOT_OPTIONS(OPTION);
+#undef OPTION
     nb::class_<Simulations>(module, "Simulation")
         .def(nb::init<Rod, std::shared_ptr<LumenMap>, std::shared_ptr<OwnedLoads>, const Array<1>&, const Array<1>&, const Options&,
-                      std::shared_ptr<OwnedTubes>, std::shared_ptr<OwnedMotion>, int>(),
+                      const Drives&, std::shared_ptr<OwnedTubes>, std::shared_ptr<OwnedMotion>, int>(),
              nb::kw_only(), nb::arg("rod"), nb::arg("lumen").none(), nb::arg("loads").none(), nb::arg("origin"),
-             nb::arg("orientation"), nb::arg("options"), nb::arg("tubes").none() = nb::none(), nb::arg("motion").none() = nb::none(), nb::arg("worlds"))
+             nb::arg("orientation"), nb::arg("options"), nb::arg("drives"), nb::arg("tubes").none() = nb::none(), nb::arg("motion").none() = nb::none(), nb::arg("worlds"))
         .def("reset", &Simulations::reset, nb::kw_only(), nb::arg("index"), nb::arg("initial"), nb::arg("friction"), nb::arg("sample_period"))
         .def("run", &Simulations::run, nb::kw_only(), nb::arg("control"), nb::arg("force_driven"), nb::arg("time_step"),
              nb::arg("steps_per_sample"), nb::arg("record_shape"), nb::arg("record_attitude"), nb::arg("threads"),
              nb::arg("lanes"), nb::arg("progress").none())
         .def("state", &Simulations::state)
         .def("set_state", &Simulations::set_state, nb::arg("all"))
-        .def("tips", &Simulations::tips, nb::arg("device") = 0)
-        .def("tip_directions", &Simulations::tip_directions, nb::arg("device") = 0)
+        .def("tips", &Simulations::tips)
+        .def("tip_directions", &Simulations::tip_directions)
         .def("positions", &Simulations::positions)
         .def("attitudes", &Simulations::attitudes)
         .def("contacts", &Simulations::contacts)
-        .def("tubes", &Simulations::tubes)
         .def_prop_ro("nodes", &Simulations::nodes)
-        .def("inserted_length", [](Simulations& s) { return s.scalar(World::kInserted); })
         .def("time", [](Simulations& s) { return s.scalar(World::kTime); })
         .def("active", [](Simulations& s) { return s.scalar(World::kActive); })
-        .def("rotation", [](Simulations& s) { return s.scalar(World::kRotation); })
         .def("reason", [](Simulations& s) { return s.scalar(World::kReason); })
-        .def("base_force", [](Simulations& s) { return s.scalar(World::kBaseForce); })
-        .def("base_torque", [](Simulations& s) { return s.scalar(World::kBaseTorque); })
-        .def("drive_force", [](Simulations& s) { return s.scalar(World::kDriveForce); })
-        .def("drive_torque", [](Simulations& s) { return s.scalar(World::kDriveTorque); });
+        .def("inserted_length", [](Simulations& s) { return s.per_device(World::kLength); })
+        .def("rotation", [](Simulations& s) { return s.per_device(World::kRotation); })
+        .def("base_force", [](Simulations& s) { return s.per_device(World::kBaseForce); })
+        .def("base_torque", [](Simulations& s) { return s.per_device(World::kBaseTorque); })
+        .def("drive_force", [](Simulations& s) { return s.per_device(World::kDriveForce); })
+        .def("drive_torque", [](Simulations& s) { return s.per_device(World::kDriveTorque); })
+        .def("slip", [](Simulations& s) { return s.per_device(World::kSlip); })
+        .def("rotation_slip", [](Simulations& s) { return s.per_device(World::kRotationSlip); });
 }

@@ -4,11 +4,23 @@
 #include <algorithm>
 #include <limits>
 
+#include "lanes.hpp"
+
 namespace endopilot {
+
+constexpr int kUnbounded = 2;   // of an unknown's side: it has no bound
 
 // Solves h s = -g for those s that are not held; a held one is given by s = -off. Returns whether their part of h is positive definite.
 template <int N>
-bool solve_with_held(const double (&h)[N][N], const double (&g)[N], const double (&off)[N], const bool (&held)[N], double (&s)[N]) {
+ENDOPILOT_DEVICE bool solve_with_held(const double (&h)[N][N], const double (&g)[N], const double (&off)[N], const bool (&held)[N], double (&s)[N]) {
+    if constexpr (N == 2) {   // by Cramer's rule
+        if (!held[0] && !held[1]) {
+            const double determinant = h[0][0] * h[1][1] - h[1][0] * h[1][0];
+            s[0] = (h[1][0] * g[1] - h[1][1] * g[0]) / determinant;
+            s[1] = (h[1][0] * g[0] - h[0][0] * g[1]) / determinant;
+            return h[0][0] > 0 && h[1][1] > 0 && determinant > 0;
+        }
+    }
     double a[N][N];
     for (int r = 0; r < N; ++r) {
         s[r] = held[r] ? -off[r] : -g[r];
@@ -32,10 +44,10 @@ bool solve_with_held(const double (&h)[N][N], const double (&g)[N], const double
     return true;
 }
 
-// The least g·s + ½ s·h s with side * (off + s) <= 0; s = -off where side is 0. Tries which unknowns its bounds hold: none, as a rule.
+// The least g·s + ½ s·h s with side * (off + s) <= 0; s = -off where side is 0, and any where it is kUnbounded. Tries which unknowns its bounds hold: none, as a rule.
 // Returns whether h is positive definite.
 template <int N>
-bool bounded_minimum(const double (&h)[N][N], const double (&g)[N], const int (&side)[N], const double (&off)[N], double (&least)[N]) {
+ENDOPILOT_DEVICE bool bounded_minimum(const double (&h)[N][N], const double (&g)[N], const int (&side)[N], const double (&off)[N], double (&least)[N]) {
     double lowest = std::numeric_limits<double>::infinity();
     for (int bounds = 0; bounds < 1 << N; ++bounds) {
         bool held[N], within = true;
@@ -47,7 +59,7 @@ bool bounded_minimum(const double (&h)[N][N], const double (&g)[N], const int (&
         if (!within) continue;
         if (!solve_with_held(h, g, off, held, s)) return false;
         for (int r = 0; r < N; ++r) {
-            within = within && (held[r] || side[r] * (off[r] + s[r]) <= 0);
+            within = within && (held[r] || side[r] == kUnbounded || side[r] * (off[r] + s[r]) <= 0);
             value += g[r] * s[r];
             for (int c = 0; c < N; ++c) value += 0.5 * h[r][c] * s[r] * s[c];
         }

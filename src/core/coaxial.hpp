@@ -9,49 +9,6 @@
 
 namespace endopilot {
 
-constexpr double kGripLength = 0.02;   // mm of sliding that turn friction along two tubes from one direction to the other by half
-
-// Where the tubes are at the step's start and are to be at its end.
-template <class V, int T>
-void Stepper<V, T>::aim_tubes(int l, double weight) {
-    Lane& lane = lane_[l];
-    const double began = elapsed(lane.tick), ends = elapsed(lane.tick + lane.stride);
-    const auto behind = [](int side, double off) { return side * off < 0 ? off : 0.0; };
-    int lead = 0;
-    double foremost = 0;
-    for (int k = 0; k <= T; ++k) {
-        Tube& tube = lane.tubes.tube[k];
-        const double inserted = tube.inserted - tube.slipped, rotation = tube.rotation - tube.rotation_slipped;
-        tube.advanced = inserted + tube.speed * began;
-        tube.turned = rotation + tube.spin * began;
-        tube.asked_advance = inserted + tube.speed * ends;
-        tube.asked_rotation = rotation + tube.spin * ends;
-        tube.off = behind(tube.slipping, tube.turned + weight * tube.last_rotation - tube.asked_rotation);
-        tube.from = tube.off;
-        tube.end_rotation = tube.asked_rotation + tube.off;
-        if (k == 0 || tube.advanced > foremost) foremost = tube.advanced;
-        if (tube.asked_advance > lane.tubes.tube[lead].asked_advance) lead = k;
-    }
-    if (lead != lane.tubes.lead) lane.slipping.advance = 0;
-    lane.tubes.lead = lead;
-    lane.tubes.given = 0;
-    const Tube &first = lane.tubes.tube[0], &leading = lane.tubes.tube[lead];
-    lane.start = {foremost, first.turned};
-    lane.origin = {leading.asked_advance, first.asked_rotation};
-    lane.off = {behind(lane.slipping.advance, foremost + weight * lane.last.advance - lane.origin.advance), first.off};
-    const double end = lane.origin.advance + lane.off.advance;
-    for (int k = 0; k <= T; ++k) {
-        Tube& tube = lane.tubes.tube[k];
-        if (k == lead) tube.pace = 1, tube.yield = 0;
-        double made = tube.asked_advance;
-        if (tube.pace < 1 || tube.yield != 0)
-            made = std::max(0.0, tube.advanced + tube.pace * (tube.asked_advance - tube.advanced) + tube.yield * duration(lane));
-        tube.end_advance = k == lead ? end : std::min(made, end);
-        set(of_tubes_.slide[k], l, (tube.end_advance - tube.advanced) - (end - foremost));
-        if (k > 0) set(of_tubes_.grip[k - 1], l, lane.tubes.tube[k - 1].grip);
-    }
-}
-
 // What touches the wall where tube k covers the share `cover[k]` and twists by `rate[k]`; `axis` points along it.
 template <class V, int T>
 TubeContact<double, T> Stepper<V, T>::tube_contact(int l, const double (&cover)[T + 1], const double (&rate)[T + 1],
@@ -62,7 +19,7 @@ TubeContact<double, T> Stepper<V, T>::tube_contact(int l, const double (&cover)[
         const double weight = k > 0 ? left * std::min(cover[k], 1.0) : left, moved = weight * get(of_tubes_.slide[k], l);
         left -= weight;
         contact.radius += weight * tubes_.radius[k];
-        contact.friction += weight * get(of_tubes_.friction[k], l);
+        contact.friction += weight * get(friction_[k], l);
         contact.spin += moved * rate[k];
         slide += moved;
         if (k > 0) contact.weight[k - 1] = weight;
@@ -78,7 +35,7 @@ void Stepper<V, T>::prepare_tubes(int l) {
     double offset[T + 1];
     Integrals middle[T + 1], node[T + 1], next_middle[T + 1], next_node[T + 1];
     for (int k = 0; k <= T; ++k) {
-        offset[k] = std::max(0.0, lane.end.advance - lane.tubes.tube[k].end_advance);
+        offset[k] = std::max(0.0, lane.advance.end - lane.device[k].end);
         middle[k] = node[k] = integrals(tubes_, k, -offset[k]);
     }
     for (int i = 0; i <= lane.active; ++i) {
@@ -116,7 +73,7 @@ void Stepper<V, T>::prepare_tubes(int l) {
             outside = std::max(outside, cover[k]);
             set(to.outside[k], l, outside);
         }
-        const Vec3<double> axis = frame(take(n.start_q, l)).d3;
+        const Vec3<double> axis = frame(read(n.start_q, l)).d3;
         const auto put_contact = [&](TubeContact<V, T>& contact, const TubeContact<double, T>& from) {
             set(contact.radius, l, from.radius);
             set(contact.friction, l, from.friction);
@@ -172,7 +129,7 @@ template <class V, int T>
 TubePlace<T> Stepper<V, T>::tube_place(int i, int l) const {
     const Node<V, T>& node = node_[i];
     const TubeNode<V, T>& from = node.tubes;
-    TubePlace<T> place{.x = take(node.x, l), .q = take(node.q, l), .axes = {}, .stretch = get(from.stretch, l)};
+    TubePlace<T> place{.x = read(node.x, l), .q = read(node.q, l), .axes = {}, .stretch = get(from.stretch, l)};
     place.axes = frame(place.q);
     for (int k = 0; k <= T; ++k) {
         place.inside[k] = get(from.inside[k], l);
@@ -226,7 +183,7 @@ template <class V, int T>
 void Stepper<V, T>::freeze_tubes(int l, bool kept) {
     const double eps = get(eps_, l);
     for (int k = 1; k <= T; ++k) {
-        const double friction = tubes_.bore_friction[k], radius = tubes_.radius[k - 1], grip = get(of_tubes_.grip[k - 1], l);
+        const double friction = tubes_.bore_friction[k], radius = tubes_.radius[k - 1], mobilized = get(of_tubes_.mobilized[k - 1], l);
         const double slid = std::abs(get(of_tubes_.slide[k], l) - get(of_tubes_.slide[k - 1], l)) + eps;
         double tension = 0, rate_ahead = 0;
         Vec3<double> moment{0, 0, 0}, tangent{0, 0, 0}, shear{0, 0, 0};
@@ -261,7 +218,7 @@ void Stepper<V, T>::freeze_tubes(int l, bool kept) {
                     const Vec3<double> p = marched * t - tension * tangent - bent;
                     const double pm = dot(p, mean), across = dot(p, p) - pm * pm;
                     limit = friction * std::sqrt(std::max(across, 0.0));
-                    marched = free + grip * straight * limit * inverse;
+                    marched = free + mobilized * straight * limit * inverse;
                 }
                 tension = marched;
             }
@@ -280,30 +237,6 @@ void Stepper<V, T>::freeze_tubes(int l, bool kept) {
             here = behind;
         }
         set(of_tubes_.bundle[k - 1], l, tension);
-    }
-}
-
-// Where the step has brought the tubes. None comes to lie ahead of the lead.
-template <class V, int T>
-void Stepper<V, T>::settle_tubes(int l) {
-    Lane& lane = lane_[l];
-    const double led = lane.end.advance - lane.start.advance;
-    for (int k = 0; k <= T; ++k) {
-        Tube& tube = lane.tubes.tube[k];
-        tube.end_advance = k == lane.tubes.lead ? lane.end.advance : std::min(tube.end_advance, lane.end.advance);
-        if (k == 0) tube.off = lane.off.rotation;
-        tube.end_rotation = tube.asked_rotation + tube.off;
-        tube.slipped += tube.asked_advance - tube.end_advance;
-        tube.rotation_slipped -= tube.off;
-        tube.last_rotation = tube.end_rotation - tube.turned;
-        if (tube.off == 0) tube.slipping = 0;
-        set(of_tubes_.slide[k], l, (tube.end_advance - tube.advanced) - led);
-        if (k == 0) continue;
-        Tube& inner = lane.tubes.tube[k - 1];
-        const double along = get(of_tubes_.slide[k], l) - get(of_tubes_.slide[k - 1], l);
-        inner.grip = std::clamp(inner.grip + along / kGripLength, -1.0, 1.0);
-        inner.grip += lane.tubes.given * (lane.tubes.side - inner.grip);
-        set(of_tubes_.grip[k - 1], l, inner.grip);
     }
 }
 

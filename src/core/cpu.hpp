@@ -90,9 +90,9 @@ public:
     // Steps worlds, `lanes` of them side by side on each thread; `order` names those of similar length next to each other.
     void step(const Worlds& worlds, const Inputs& in, const Outputs& out, std::vector<int> order, int threads, int lanes,
               const nb::object& progress) {
-        if (scene_.tubes.tubes == 0)
+        if (scene_.drives.count == 1)
             step<0>(worlds, in, out, std::move(order), threads, lanes, progress);
-        else if (scene_.tubes.tubes == 2)
+        else if (scene_.drives.count == 2)
             step<1>(worlds, in, out, std::move(order), threads, lanes, progress);
         else
             step<2>(worlds, in, out, std::move(order), threads, lanes, progress);

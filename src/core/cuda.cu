@@ -12,7 +12,8 @@
 namespace endopilot {
 
 constexpr int kBlock = 32;            // threads: one warp, so that few worlds still spread over all multiprocessors
-constexpr int kMostNodes = 480;      // a thread's local memory has 512 KiB
+constexpr std::size_t kLocalMemory = 512 * 1024;   // of a thread, bytes
+constexpr int kMostNodes[] = {480, 320, 256};      // that it holds, of a wire, and of one with one and two catheters
 constexpr int kSamplesPerLaunch = 4;  // launches are short, so that a run can be interrupted between them
 
 static void check(cudaError_t error) {
@@ -36,21 +37,27 @@ private:
 
 // A node's working memory is local to its thread: the GPU lays local memory out so that the threads of a warp, which work on
 // the same node, read and write side by side.
-template <int Nodes>
+template <int Nodes, int T>
 __global__ void step_kernel(const __grid_constant__ Launch launch) {
-    Node<double> node[Nodes];
-    Factor<double> factor[Nodes];
-    step_worlds(launch, int(blockIdx.x * blockDim.x + threadIdx.x), node, factor);
+    static_assert(Nodes * (sizeof(Node<double, T>) + sizeof(Factor<double, T>)) <= kLocalMemory);
+    Node<double, T> node[Nodes];
+    Factor<double, T> factor[Nodes];
+    step_worlds<T>(launch, int(blockIdx.x * blockDim.x + threadIdx.x), node, factor);
 }
 
 using Kernel = void (*)(Launch);
 
-// The kernel with the least memory for so many nodes.
+// The kernel with the least memory for so many nodes, with T catheters around the wire.
+template <int T>
 static Kernel kernel_for(int nodes) {
-    if (nodes <= 128) return step_kernel<128>;
-    if (nodes <= 256) return step_kernel<256>;
-    if (nodes <= kMostNodes) return step_kernel<kMostNodes>;
-    throw std::runtime_error("a GPU steps wires of at most " + std::to_string(kMostNodes) + " nodes, not of " + std::to_string(nodes));
+    if (nodes <= 128) return step_kernel<128, T>;
+    if (nodes <= 256) return step_kernel<256, T>;
+    if (nodes <= kMostNodes[T]) return step_kernel<kMostNodes[T], T>;
+    throw std::runtime_error("a GPU steps devices of at most " + std::to_string(kMostNodes[T]) + " nodes, not of " + std::to_string(nodes));
+}
+
+static Kernel kernel_for(int nodes, int devices) {
+    return devices == 1 ? kernel_for<0>(nodes) : devices == 2 ? kernel_for<1>(nodes) : kernel_for<2>(nodes);
 }
 
 struct CudaStepper::Memory {
@@ -78,14 +85,15 @@ std::string why_no_gpu() {
 
 CudaStepper::CudaStepper(const OwnedScene& scene)
     : memory_(std::make_unique<Memory>()), scene_(view(scene, [this](const auto& v) { return (*memory_)(v); })) {
-    kernel_for(scene_.rod.nodes);
+    kernel_for(scene_.rod.nodes, scene_.drives.count);
 }
 
 CudaStepper::~CudaStepper() = default;
 
 void CudaStepper::step(const Worlds& worlds, const Inputs& in, const Outputs& out, const std::vector<int>& order,
                        const std::function<void(long)>& progress) {
-    const std::size_t count = order.size(), width = World::size(scene_.rod.nodes);
+    const std::size_t count = order.size(), samples = std::size_t(in.samples), devices = std::size_t(scene_.drives.count);
+    const std::size_t width = World::size(scene_.rod.nodes, scene_.drives.count);
     Memory memory;
     Launch launch{.scene = scene_,
                   .worlds = {},
@@ -104,8 +112,8 @@ void CudaStepper::step(const Worlds& worlds, const Inputs& in, const Outputs& ou
         most = std::max(most, world[World::kApproach]);
         for (std::size_t k = 0; k < width; ++k) values[k * count + w] = world.values[std::ptrdiff_t(k) * world.stride];
     }
-    launch.worlds = {memory(values), 1, std::ptrdiff_t(count)};
-    launch.in.control = memory(std::vector<double>(in.control, in.control + 2 * count * std::size_t(in.samples)));
+    launch.worlds = {memory(values), 1, std::ptrdiff_t(count), scene_.drives.count};
+    launch.in.control = memory(std::vector<double>(in.control, in.control + 2 * devices * count * samples));
 
     struct Copy {
         void* to;
@@ -113,21 +121,22 @@ void CudaStepper::step(const Worlds& worlds, const Inputs& in, const Outputs& ou
         std::size_t bytes;
     };
     std::vector<Copy> copies;
-    each_array(launch.out, std::size_t(in.samples), std::size_t(scene_.rod.nodes), [&](auto*& array, std::size_t numbers) {
-        auto* const host = array;
-        const std::size_t bytes = count * numbers * sizeof(*host);
-        array = memory.allocate<std::remove_reference_t<decltype(*host)>>(count * numbers);
-        check(cudaMemset(array, 0, bytes));
-        copies.push_back({host, array, bytes});
+    each_output(launch.out, [&]<class Number>(const char*, Number*& array, Of of, int numbers) {
+        if (!array) return;   // not recorded
+        Number* const host = array;
+        const std::size_t size = count * entries(of, samples, devices, std::size_t(scene_.rod.nodes)) * std::size_t(numbers);
+        array = memory.allocate<Number>(size);
+        check(cudaMemset(array, 0, size * sizeof(Number)));
+        copies.push_back({host, array, size * sizeof(Number)});
     });
 
-    const long samples = long(most) + in.samples, launches = (samples + kSamplesPerLaunch - 1) / kSamplesPerLaunch;
+    const long steps = long(most) + in.samples, launches = (steps + kSamplesPerLaunch - 1) / kSamplesPerLaunch;
     cudaLaunchConfig_t grid{};
     grid.gridDim = dim3(unsigned(count + kBlock - 1) / kBlock);
     grid.blockDim = dim3(kBlock);
     long done = 0;
     for (long k = 1; k <= launches; ++k) {
-        check(cudaLaunchKernelEx(&grid, kernel_for(scene_.rod.nodes), launch));
+        check(cudaLaunchKernelEx(&grid, kernel_for(scene_.rod.nodes, scene_.drives.count), launch));
         check(cudaDeviceSynchronize());
         const long now = long(count) * in.samples * k / launches;
         progress(now - done);

@@ -1,4 +1,4 @@
-// The core's interface: options, the base of the wire, loads, inputs and outputs.
+// The core's interface: options, the base of the wire, the drives' limits, loads, inputs and outputs.
 #pragma once
 
 #include <algorithm>
@@ -14,23 +14,35 @@
 
 namespace endopilot {
 
+// Every option, once: its type, its name, and what it is. The struct and the Python class are made of this table.
+#define ENDOPILOT_OPTIONS(OPTION)                                                                                             \
+    OPTION(double, stick_velocity, "slip velocity below which friction falls off, mm/s")                                      \
+    OPTION(double, wall_stiffness, "of a contact point, N/mm")                                                                \
+    OPTION(double, foundation, "of a compliant wall, for each mm of wire, N/mm²: in place of wall_stiffness where not 0")     \
+    OPTION(double, foundation_stiffening, "a compliant wall yields by d to foundation × d exp(stiffening × d²), 1/mm²")      \
+    OPTION(double, tip_takes_along, "length of the compliant wall that the tip displaces beyond its own, mm")                 \
+    OPTION(double, tolerance, "a step has converged when Newton's step moves no node farther, mm (rotations: rad)")           \
+    OPTION(double, sample_tolerance, "the same for the step that ends a sample: its forces are recorded")                     \
+    OPTION(double, largest_step, "displacement that one Newton step is clamped to, mm (rotations: rad)")                      \
+    OPTION(double, largest_jump, "motion of a node in a step beyond the drive's, mm (rad), above which it is shortened")      \
+    OPTION(int, max_iterations, "of one step; then the step is halved (the shortest may take kSnapIterations times as many)") \
+    OPTION(double, free_behind, "nodes farther than this behind the ostium follow the drive, mm")                             \
+    OPTION(double, approach_velocity, "of a device on its way to its first inserted length, mm/s; 0: it starts there")        \
+    OPTION(double, introducer_friction, "Coulomb friction of the introducer's valve, N")                                      \
+    OPTION(double, introducer_drag, "viscous drag of the introducer's valve, N s/mm")
+
 struct Options {
-    double stick_velocity;     // slip velocity below which friction falls off, mm/s
-    double wall_stiffness;     // of a contact point, N/mm
-    double foundation;         // of a compliant wall, for each mm of wire, N/mm²: in place of it where not 0
-    double foundation_stiffening;  // the compliant wall yields by d to foundation × d exp(stiffening × d²), 1/mm²
-    double tip_takes_along;    // length of the compliant wall that the tip displaces beyond its own, mm
-    double tolerance;          // a step has converged when Newton's step moves no node farther, mm (rotations: rad)
-    double sample_tolerance;   // the same for the step that ends a sample: its forces are recorded
-    double largest_step;       // displacement that one Newton step is clamped to, mm (rotations: rad)
-    double largest_jump;       // motion of a node in a time step beyond the drive's, mm (rotations: rad); the step is shortened
-    int max_iterations;        // of one step; then the step is halved (the shortest may take kSnapIterations times as many)
-    double free_behind;        // nodes farther than this behind the ostium follow the drive, mm
-    double approach_velocity;  // at which a wire is brought to its first inserted length, mm/s; 0: it is put there, straight
-    double push_limit, pull_limit;  // the drive slips rather than push or pull the wire harder than this, N
-    double torque_limit;       // it slips rather than turn the wire harder than this, N mm
-    double introducer_friction;  // Coulomb friction of the introducer's valve, N
-    double introducer_drag;      // its viscous drag, N s/mm
+#define OPTION(Type, name, meaning) Type name;
+    ENDOPILOT_OPTIONS(OPTION)
+#undef OPTION
+};
+
+constexpr int kMostDevices = 3;   // a wire and two catheters around it
+
+// The devices, from the inside out, and where their drives slip rather than push, pull (N) or turn (N mm) harder.
+struct Drives {
+    int count = 1;
+    double push[kMostDevices]{}, pull[kMostDevices]{}, torque[kMostDevices]{};
 };
 
 // The guiding catheter: wire enters at `origin` along the third director of `orientation`. Nodes more than
@@ -106,6 +118,7 @@ struct Scene {
     Loads loads;
     Base base;
     Options options;
+    Drives drives;
     Tubes tubes{};
     Motion motion{};
 };
@@ -116,6 +129,7 @@ struct OwnedScene {
     std::shared_ptr<const OwnedLoads> loads;     // may be null
     Base base;
     Options options;
+    Drives drives;
     std::shared_ptr<const OwnedTubes> tubes{};   // null for a wire alone; else the rod is the mesh that they share
     std::shared_ptr<const OwnedMotion> motion{};  // null for a vessel that lies still
 };
@@ -127,6 +141,7 @@ Scene view(const OwnedScene& scene, const Place& place) {
             .loads = scene.loads ? view(*scene.loads, place) : Loads{},
             .base = scene.base,
             .options = scene.options,
+            .drives = scene.drives,
             .tubes = scene.tubes ? view(*scene.tubes, place) : Tubes{},
             .motion = scene.motion ? view(*scene.motion, place) : Motion{}};
 }
@@ -136,46 +151,61 @@ struct Inputs {
     int samples, steps_per_sample;
     double time_step;         // s
     bool force_driven;        // controls are an axial force and a torque on the wire, not velocities
-    const double* control;    // worlds × samples × 2 (of each tube): mm/s and rad/s, or N and N mm
+    const double* control;    // worlds × samples × devices × 2: mm/s and rad/s, or N and N mm
 };
 
 enum Reason : std::uint8_t { kFine = 0, kNotFinite = 1, kNotConverged = 2 };
 
-// Arrays of worlds × samples (× 3, × nodes × 3). `slip` is the commanded advance (mm) that was not made, `rotation_slip`
-// the commanded rotation (rad), and `approach_slip` (worlds × 2) both before the first sample. `iterations` are Newton's, a
-// step; `node_iterations` count every evaluation of an active node, those of attempts that were given up too.
+// What an output has an entry of at each sample; `start`: of each device, once a run. Nodes and elements only where they are asked for.
+enum class Of { sample, device, node, element, start };
+
+// Every output of a run, once: its type and name, what it has entries of and the numbers of one, its unit, and what it is. The arrays of
+// `Outputs`, their allocation here and on a GPU, and `OUTPUTS` in Python are made of this table. Devices count from the inside out.
+#define ENDOPILOT_OUTPUTS(OUTPUT)                                                                                                 \
+    OUTPUT(double, inserted_length, device, 1, "mm", "how far the device is inserted")                                            \
+    OUTPUT(double, rotation, device, 1, "rad", "by which its drive has turned it")                                                \
+    OUTPUT(double, tip_position, device, 3, "mm", "of its tip, in the vessel as CT shows it")                                     \
+    OUTPUT(double, tip_direction, device, 3, "", "unit vector along it at its tip")                                               \
+    OUTPUT(double, tip_twist, device, 1, "rad", "of its frame at its tip against that of the innermost device there")             \
+    OUTPUT(double, base_force, device, 1, "N", "axial force that holds it where it enters, positive when it pushes")              \
+    OUTPUT(double, base_torque, device, 1, "N mm", "torque that holds it there")                                                  \
+    OUTPUT(double, drive_force, device, 1, "N", "of its drive: that of the base and the introducer's resistance")                 \
+    OUTPUT(double, drive_torque, device, 1, "N mm", "of its drive, likewise")                                                     \
+    OUTPUT(double, slip, device, 1, "mm", "advance that was commanded in the sample and not made")                                \
+    OUTPUT(double, rotation_slip, device, 1, "rad", "rotation that was commanded in the sample and not made")                     \
+    OUTPUT(double, contact_force_max, sample, 1, "N", "largest force of the wall at a node")                                      \
+    OUTPUT(double, contact_force_sum, sample, 1, "N", "sum of the magnitudes of the wall's forces")                               \
+    OUTPUT(double, wall_force, sample, 1, "N", "largest resultant of the wall's forces on any kResultantLength of the wire")      \
+    OUTPUT(double, iterations, sample, 1, "", "Newton's, mean over the steps of the sample")                                      \
+    OUTPUT(double, node_iterations, sample, 1, "", "evaluations of active nodes, those of attempts that were given up too")       \
+    OUTPUT(bool, valid, sample, 1, "", "false from the sample on in which the world failed")                                      \
+    OUTPUT(double, approach_slip, start, 2, "mm, rad", "advance and rotation that the approach did not make")                     \
+    OUTPUT(double, shape, node, 3, "mm", "where the nodes are, if that is recorded")                                              \
+    OUTPUT(double, attitude, element, 4, "", "of the elements, quaternions w x y z, if they are recorded")
+
 struct Outputs {
-    double *inserted, *rotation;                 // mm, rad
-    double *tip_position, *tip_direction;        // mm, unit vector
-    double *force_max, *force_sum;               // of the wall on a node, N
-    double* wall_force;                          // largest resultant on any kResultantLength of the wire, N
-    double *base_force, *base_torque;            // of the base on the wire, forwards positive, N, N mm
-    double *drive_force, *drive_torque;          // of the drive: that of the base and the introducer's resistance, N, N mm
-    double *iterations, *node_iterations, *slip, *rotation_slip;
-    bool* valid;
-    double* approach_slip;
-    double* shape;            // may be null
-    double* attitude;         // may be null: worlds × samples × nodes × 4, quaternions w x y z
-    double* tubes = nullptr;  // may be null: worlds × samples × tubes × kTubeOutputs
+#define OUTPUT(Type, name, of, numbers, unit, meaning) Type* name = nullptr;
+    ENDOPILOT_OUTPUTS(OUTPUT)
+#undef OUTPUT
 };
 
-// Numbers recorded of each tube: advance (mm) and rotation (rad), force (N) and torque (N mm) of the base on it, of its drive, advance and
-// rotation that were asked and not made, where its tip is, mm, and its twist against tube 0 there, rad.
-constexpr int kTubeOutputs = 12;
-
-// Calls f(array, numbers for each world) for every array that is recorded.
+// Calls f(name, array, what it has entries of, numbers of an entry) for every output.
 template <class F>
-void each_array(Outputs& out, std::size_t samples, std::size_t nodes, const F& f) {
-    for (double** array : {&out.inserted, &out.rotation, &out.force_max, &out.force_sum, &out.wall_force, &out.base_force,
-                           &out.base_torque, &out.drive_force, &out.drive_torque, &out.iterations, &out.node_iterations, &out.slip,
-                           &out.rotation_slip})
-        f(*array, samples);
-    f(out.tip_position, 3 * samples);
-    f(out.tip_direction, 3 * samples);
-    f(out.valid, samples);
-    f(out.approach_slip, std::size_t(2));
-    if (out.shape) f(out.shape, 3 * samples * nodes);
-    if (out.attitude) f(out.attitude, 4 * samples * nodes);
+void each_output(Outputs& out, const F& f) {
+#define OUTPUT(Type, name, of, numbers, unit, meaning) f(#name, out.name, Of::of, numbers);
+    ENDOPILOT_OUTPUTS(OUTPUT)
+#undef OUTPUT
+}
+
+// Numbers of an output that a world has, for each of its entries' numbers.
+inline std::size_t entries(Of of, std::size_t samples, std::size_t devices, std::size_t nodes) {
+    switch (of) {
+        case Of::device: return samples * devices;
+        case Of::node:
+        case Of::element: return samples * nodes;
+        case Of::start: return devices;
+        default: return samples;
+    }
 }
 
 }  // namespace endopilot

@@ -24,7 +24,7 @@ class OneWorld {
 public:
     ENDOPILOT_DEVICE OneWorld(int world, int* next, int samples) : world_(world), next_(next), left_(samples) {}
 
-    ENDOPILOT_DEVICE int take(double, int& sample) {
+    ENDOPILOT_DEVICE int next(double, int& sample) {
         if (left_ == 0 || *next_ == kFinished) return -1;
         --left_;
         sample = *next_;
@@ -41,11 +41,12 @@ private:
 };
 
 // The work of thread number `thread`. `node` and `factor` are its own, one entry a node of the rod.
-ENDOPILOT_DEVICE inline void step_worlds(const Launch& launch, int thread, Node<double>* node, Factor<double>* factor) {
+template <int T>
+ENDOPILOT_DEVICE void step_worlds(const Launch& launch, int thread, Node<double, T>* node, Factor<double, T>* factor) {
     if (thread >= launch.count) return;
     const int world = launch.order[thread];
     OneWorld queue(world, launch.next + world, launch.samples);
-    Stepper<double> stepper(launch.scene, launch.worlds, node, factor);
+    Stepper<double, T> stepper(launch.scene, launch.worlds, node, factor);
     stepper.prepare(launch.in, launch.out);
     while (stepper.turn(queue) >= 0) {
     }

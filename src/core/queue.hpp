@@ -20,7 +20,7 @@ public:
 
     // Takes a world whose number of active nodes is near `length` (any, if negative); -1 where none is ready. `sample` is
     // the one that comes next.
-    int take(double length, int& sample) {
+    int next(double length, int& sample) {
         const std::lock_guard<std::mutex> lock(mutex_);
         while (under_way_ < size_ && next_ < order_.size()) {
             const int world = order_[next_++];

@@ -14,100 +14,58 @@
 
 namespace endopilot {
 
-// Many worlds of one device in one lumen. `Device` steps them: a processor (cpu.hpp) or a GPU (gpu.hpp).
-template <class Device>
+// Many worlds of one device in one lumen. `Processor` steps them: a processor (cpu.hpp) or a GPU (gpu.hpp).
+template <class Processor>
 class Simulation {
 public:
     Simulation(Rod rod, std::shared_ptr<LumenMap> lumen, std::shared_ptr<OwnedLoads> loads, const Array<1>& origin,
-               const Array<1>& orientation, const Options& options, std::shared_ptr<OwnedTubes> tubes, std::shared_ptr<OwnedMotion> motion, int worlds)
-        : scene_(make_scene(std::move(rod), std::move(lumen), std::move(loads), origin, orientation, options, std::move(tubes), std::move(motion))),
+               const Array<1>& orientation, const Options& options, const Drives& drives, std::shared_ptr<OwnedTubes> tubes,
+               std::shared_ptr<OwnedMotion> motion, int worlds)
+        : scene_(make_scene(std::move(rod), std::move(lumen), std::move(loads), origin, orientation, options, drives, std::move(tubes), std::move(motion))),
           count_(std::size_t(worlds)) {
         require(worlds >= 1, "a simulation needs at least one world");
         values_.assign(count_ * width(), 0.0);
     }
 
-    Simulation(const Simulation&) = delete;  // `device_` refers to this one's scene
+    Simulation(const Simulation&) = delete;  // `processor_` refers to this one's scene
 
-    // Puts worlds at the ostium, ready to be pushed to their first inserted length by the next run.
-    void reset(const Indices<1>& index, const Array<2>& initial, const Array<1>& friction, double sample_period) {
-        const std::size_t n = index.size();
-        const std::size_t drives = std::size_t(this->drives());
-        require(initial.shape(0) == n && initial.shape(1) == 2 * drives && friction.size() == n * drives, "reset needs one row a world");
+    // Puts worlds at the ostium, ready to be pushed to their first inserted length by the next run. `initial` and `friction` have a row a
+    // world and a column a device.
+    void reset(const Indices<1>& index, const Array<3>& initial, const Array<2>& friction, double sample_period) {
+        const std::size_t n = index.size(), devices = std::size_t(this->devices());
+        require(initial.shape(0) == n && initial.shape(1) == devices && initial.shape(2) == 2 && friction.shape(0) == n && friction.shape(1) == devices,
+                "reset needs one row a world and one entry a device");
         for (std::size_t k = 0; k < n; ++k) {
             require(index.data()[k] >= 0 && std::size_t(index.data()[k]) < count_, "reset names no such world");
-            const double* start = initial.data() + 2 * k * drives;
-            const World w = world(std::size_t(index.data()[k]));
-            if (drives == 1)
-                start_world(view_, w, start[0], start[1], friction.data()[k], sample_period);
-            else
-                start_tubes(view_, w, start, friction.data() + k * drives, sample_period);
+            start_world(view_, world(std::size_t(index.data()[k])), initial.data() + 2 * k * devices, friction.data() + k * devices, sample_period);
         }
     }
 
-    nb::dict run(const Array<3>& control, bool force_driven, double time_step, int steps_per_sample, bool record_shape,
+    nb::dict run(const Array<4>& control, bool force_driven, double time_step, int steps_per_sample, bool record_shape,
                  bool record_attitude, int threads, int lanes, const nb::object& progress) {
-        const std::size_t worlds = count_, samples = control.shape(1), n = worlds * samples, nodes = std::size_t(scene_.rod.nodes);
-        const std::size_t drives = std::size_t(this->drives());
-        require(control.shape(0) == worlds && control.shape(2) == 2 * drives, "control needs two numbers a world, sample and drive");
-        require(drives == 1 || !force_driven, "tubes are not driven by force");
+        const std::size_t samples = control.shape(1), devices = std::size_t(this->devices()), nodes = std::size_t(scene_.rod.nodes);
+        require(control.shape(0) == count_ && control.shape(2) == devices && control.shape(3) == 2, "control needs two numbers a world, sample and device");
+        require(devices == 1 || !force_driven, "devices with catheters are not driven by force");
         require(steps_per_sample >= 1 && time_step > 0, "time step and steps per sample must be positive");
-        OutputArray<double> inserted(n), rotation(n), tip(3 * n), direction(3 * n), force_max(n), force_sum(n), wall_force(n),
-            base_force(n), base_torque(n), drive_force(n), drive_torque(n), iterations(n), node_iterations(n), slip(n),
-            rotation_slip(n), approach_slip(2 * worlds);
-        OutputArray<double> tubes(drives > 1 ? n * drives * kTubeOutputs : 0);
-        OutputArray<bool> valid(n);
-        OutputArray<double> shape(record_shape ? 3 * n * nodes : 0), attitude(record_attitude ? 4 * n * nodes : 0);
-        nb::dict result;
-        result["inserted_length"] = inserted.array(worlds, samples);
-        result["rotation"] = rotation.array(worlds, samples);
-        result["tip_position"] = tip.array(worlds, samples, 3);
-        result["tip_direction"] = direction.array(worlds, samples, 3);
-        result["contact_force_max"] = force_max.array(worlds, samples);
-        result["contact_force_sum"] = force_sum.array(worlds, samples);
-        result["wall_force"] = wall_force.array(worlds, samples);
-        result["base_force"] = base_force.array(worlds, samples);
-        result["base_torque"] = base_torque.array(worlds, samples);
-        result["drive_force"] = drive_force.array(worlds, samples);
-        result["drive_torque"] = drive_torque.array(worlds, samples);
-        result["iterations"] = iterations.array(worlds, samples);
-        result["node_iterations"] = node_iterations.array(worlds, samples);
-        result["slip"] = slip.array(worlds, samples);
-        result["rotation_slip"] = rotation_slip.array(worlds, samples);
-        result["approach_slip"] = approach_slip.array(worlds, 2);
-        result["valid"] = valid.array(worlds, samples);
-        nb::object shapes = shape.array(record_shape ? worlds : 0, samples, nodes, 3);
-        nb::object attitudes = attitude.array(record_attitude ? worlds : 0, samples, nodes, 4);
-        nb::object of_tubes = tubes.array(drives > 1 ? worlds : 0, samples, drives, kTubeOutputs);
-        if (drives > 1) result["tubes"] = of_tubes;
-        if (record_shape) result["shape"] = shapes;
-        if (record_attitude) result["attitude"] = attitudes;
-
         const Inputs in{.samples = int(samples),
                         .steps_per_sample = steps_per_sample,
                         .time_step = time_step,
                         .force_driven = force_driven,
                         .control = control.data()};
-        const Outputs out{.inserted = inserted.data,
-                          .rotation = rotation.data,
-                          .tip_position = tip.data,
-                          .tip_direction = direction.data,
-                          .force_max = force_max.data,
-                          .force_sum = force_sum.data,
-                          .wall_force = wall_force.data,
-                          .base_force = base_force.data,
-                          .base_torque = base_torque.data,
-                          .drive_force = drive_force.data,
-                          .drive_torque = drive_torque.data,
-                          .iterations = iterations.data,
-                          .node_iterations = node_iterations.data,
-                          .slip = slip.data,
-                          .rotation_slip = rotation_slip.data,
-                          .valid = valid.data,
-                          .approach_slip = approach_slip.data,
-                          .shape = record_shape ? shape.data : nullptr,
-                          .attitude = record_attitude ? attitude.data : nullptr,
-                          .tubes = drives > 1 ? tubes.data : nullptr};
-        device_.step(this->worlds(), in, out, by_depth(in), threads, lanes, progress);
+        Outputs out;
+        nb::dict result;
+        each_output(out, [&]<class T>(const char* name, T*& array, Of of, int numbers) {
+            if ((of == Of::node && !record_shape) || (of == Of::element && !record_attitude)) return;
+            std::vector<std::size_t> shape{count_};
+            if (of != Of::start) shape.push_back(samples);
+            if (of == Of::device || of == Of::start) shape.push_back(devices);
+            if (of == Of::node || of == Of::element) shape.push_back(nodes);
+            if (numbers > 1) shape.push_back(std::size_t(numbers));
+            OutputArray<T> made(count_ * entries(of, samples, devices, nodes) * std::size_t(numbers));
+            array = made.data;
+            result[name] = made.shaped(shape);
+        });
+        processor_.step(this->worlds(), in, out, by_depth(in), threads, lanes, progress);
         return result;
     }
 
@@ -129,25 +87,28 @@ public:
         return out.array(count_);
     }
 
-    // Where one of the devices ends, the wire (0) or a catheter around it.
-    nb::object tips(int device) {
-        require(device >= 0 && device < drives(), "there is no such device");
-        OutputArray<double> out(3 * count_);
+    // `size` numbers of each device, which `write(world, its pose, device, to)` writes.
+    template <class Write>
+    nb::object per_device(int size, const Write& write) {
+        OutputArray<double> out(count_ * std::size_t(devices() * size));
+        double* to = out.data;
         for (std::size_t w = 0; w < count_; ++w) {
             const Pose pose(view_, world(w));
-            put(drives() == 1 ? pose.position(0) : pose.tube_tip(device), out.data + 3 * w);
+            for (int k = 0; k < devices(); ++k, to += size) write(world(w), pose, k, to);
         }
-        return out.array(count_, 3);
+        return size == 1 ? out.array(count_, devices()) : out.array(count_, devices(), size);
     }
 
-    nb::object tip_directions(int device) {
-        require(device >= 0 && device < drives(), "there is no such device");
-        OutputArray<double> out(3 * count_);
-        for (std::size_t w = 0; w < count_; ++w) {
-            const Pose pose(view_, world(w));
-            put(drives() == 1 ? pose.tip_direction() : pose.tube_direction(device), out.data + 3 * w);
-        }
-        return out.array(count_, 3);
+    nb::object per_device(World::DeviceQuantity which) {
+        return per_device(1, [which](const World& w, const Pose&, int k, double* to) { *to = w.device(k)[which]; });
+    }
+
+    nb::object tips() {
+        return per_device(3, [](const World&, const Pose& pose, int k, double* to) { put(pose.tip(k), to); });
+    }
+
+    nb::object tip_directions() {
+        return per_device(3, [](const World&, const Pose& pose, int k, double* to) { put(pose.tip_direction(k), to); });
     }
 
     // `size` numbers of each node, which `write(world, its pose, node, to)` writes.
@@ -180,16 +141,6 @@ public:
         return per_node(1, [](const World& w, const Pose&, int i, double* to) { *to = i < w.active() ? w.force(i) : 0.0; });
     }
 
-    // The numbers of each tube, as World has them: worlds × tubes × TubeQuantity.
-    nb::object tubes() {
-        const std::size_t drives = std::size_t(this->drives());
-        require(drives > 1, "a wire alone has no tubes");
-        OutputArray<double> out(count_ * drives * World::kTubeSize);
-        for (std::size_t w = 0; w < count_; ++w)
-            for (std::size_t k = 0; k < drives * World::kTubeSize; ++k) out.data[w * drives * World::kTubeSize + k] = world(w).tube(nodes(), 0)[int(k)];
-        return out.array(count_, drives, World::kTubeSize);
-    }
-
     int nodes() const { return scene_.rod.nodes; }
 
 private:
@@ -197,21 +148,22 @@ private:
     const Scene view_ = view(scene_, InPlace{});
     const std::size_t count_;
     std::vector<double> values_;  // of all worlds, one after the other
-    Device device_{scene_};
+    Processor processor_{scene_};
 
-    int drives() const { return scene_.tubes ? scene_.tubes->tubes : 1; }
+    int devices() const { return scene_.drives.count; }
 
     static OwnedScene make_scene(Rod rod, std::shared_ptr<LumenMap> lumen, std::shared_ptr<OwnedLoads> loads, const Array<1>& origin,
-                                 const Array<1>& orientation, const Options& options, std::shared_ptr<OwnedTubes> tubes,
+                                 const Array<1>& orientation, const Options& options, const Drives& drives, std::shared_ptr<OwnedTubes> tubes,
                                  std::shared_ptr<OwnedMotion> motion) {
         require(origin.size() == 3 && orientation.size() == 4, "the base needs a position and a quaternion");
         require(!loads || int(loads->force.size()) == rod.nodes, "loads need one entry a node of the rod");
+        require(drives.count == (tubes ? tubes->tubes : 1), "every device needs the limits of its drive");
         const Base base{.origin = vec3(origin.data()), .orientation = quaternion(orientation.data())};
-        return {std::move(rod), std::move(lumen), std::move(loads), base, options, std::move(tubes), std::move(motion)};
+        return {std::move(rod), std::move(lumen), std::move(loads), base, options, drives, std::move(tubes), std::move(motion)};
     }
 
-    std::size_t width() const { return World::size(scene_.rod.nodes, drives() - 1); }
-    Worlds worlds() { return {values_.data(), std::ptrdiff_t(width()), 1}; }
+    std::size_t width() const { return World::size(scene_.rod.nodes, devices()); }
+    Worlds worlds() { return {values_.data(), std::ptrdiff_t(width()), 1, devices()}; }
     World world(std::size_t w) { return worlds()[w]; }
 
     static void put(const Vec3<double>& v, double* to) { to[0] = v.x, to[1] = v.y, to[2] = v.z; }
@@ -221,9 +173,9 @@ private:
         std::vector<double> depth;
         for (std::size_t w = 0; w < count_; ++w) {
             const World start = world(w);
-            double inserted = start[World::kApproach] > 0 ? start[World::kDepth] : start[World::kInserted], sum = inserted;
+            double inserted = start[World::kApproach] > 0 ? start.device(0)[World::kDepth] : start[World::kInserted], sum = inserted;
             for (int s = 0; s < in.samples && !in.force_driven; ++s) {
-                inserted += in.control[2 * std::size_t(drives()) * (w * std::size_t(in.samples) + std::size_t(s))] * in.time_step * in.steps_per_sample;
+                inserted += in.control[2 * std::size_t(devices()) * (w * std::size_t(in.samples) + std::size_t(s))] * in.time_step * in.steps_per_sample;
                 sum += inserted;
             }
             depth.push_back(sum);

@@ -26,25 +26,8 @@ void Stepper<V, T>::begin(int l, bool fresh) {
     const int before = lane.active;
     if (motion_.cycles > 0) carry(l);
     const double weight = fresh ? 0.0 : duration(lane) / lane.last_duration;
-    const Drive ahead{weight * lane.last.advance, weight * lane.last.rotation};
-    if constexpr (T > 0) {
-        aim_tubes(l, weight);
-    } else if (lane.by_force) {
-        lane.slipping = {};
-        lane.origin = lane.start;
-        lane.off = ahead;
-    } else {
-        const double inserted = lane.inserted - lane.slip.advance, rotation = lane.rotation - lane.slip.rotation;
-        const double began = elapsed(lane.tick), ends = elapsed(lane.tick + lane.stride);
-        lane.start = {inserted + lane.speed * began, rotation + lane.spin * began};
-        lane.origin = {inserted + lane.speed * ends, rotation + lane.spin * ends};
-        const auto behind = [](int side, double off) { return side * off < 0 ? off : 0.0; };
-        lane.off = {behind(lane.slipping.advance, lane.start.advance + ahead.advance - lane.origin.advance),
-                    behind(lane.slipping.rotation, lane.start.rotation + ahead.rotation - lane.origin.rotation)};
-    }
-    lane.from = lane.off;
-    lane.end = {lane.origin.advance + lane.off.advance, lane.origin.rotation + lane.off.rotation};
-    lane.active = Base::count_active(rod_, lane.start.advance, options_.free_behind);
+    aim(l, weight);
+    lane.active = Base::count_active(rod_, lane.advance.start, options_.free_behind);
     for (int i = std::min(before, lane.active); i <= std::max(before, lane.active); ++i)
         if (i >= before || i >= lane.active) place(l, i);
     if (lane.active < before) clear(node_[lane.active - 1].at_middle, l);
@@ -53,16 +36,13 @@ void Stepper<V, T>::begin(int l, bool fresh) {
     lane.boost = 1;
     lane.first = lane.finite = true;
     lane.extrapolated = !fresh;
-    const Drive& there = lane.by_force ? lane.end : lane.origin;
-    double slides = std::abs(there.advance - lane.start.advance);
-    if (motion_.cycles > 0) slides += lane.strain * std::max(0.0, lane.start.advance);   // a vessel that stretches slides along the wire
-    const double most_x = options_.largest_jump + kDriveMotion * slides;
-    double turns = std::abs(there.rotation - lane.start.rotation);
-    if constexpr (T > 0)
-        for (int k = 1; k <= T; ++k) turns += std::abs(lane.tubes.tube[k].asked_rotation - lane.tubes.tube[k].turned);
-    const double most_theta = options_.largest_jump + kDriveMotion * turns;
+    const auto planned = [&lane](const Coordinate& c) { return std::abs((lane.by_force ? c.end : c.commanded) - c.start); };
+    double slides = planned(lane.advance), turns = 0;
+    if (motion_.cycles > 0) slides += lane.strain * std::max(0.0, lane.advance.start);   // a vessel that stretches slides along the wire
+    for (const Device& device : lane.device) turns += planned(device.turn);
+    const double most_x = options_.largest_jump + kDriveMotion * slides, most_theta = options_.largest_jump + kDriveMotion * turns;
     set(active_, l, lane.active);
-    set(share_, l, Base::share_of_last_joint(rod_, lane.start.advance, options_.free_behind, lane.active));
+    set(share_, l, Base::share_of_last_joint(rod_, lane.advance.start, options_.free_behind, lane.active));
     set(geometric_, l, 0.0);
     set(first_, l, 1.0);
     set_mask<V>(accepted_, l, false);
@@ -81,9 +61,7 @@ int Stepper<V, T>::pass(Queue& queue) {
     const int n = most_active();
     evaluate(n);
     Decision decision[W];
-    drive_a_ = drive_r_ = V{};
-    if constexpr (T > 0)
-        for (V& turn : of_tubes_.turn) turn = V{};
+    for (V& step : drive_step_) step = V{};
     for (int l = 0; l < W; ++l) decision[l] = decide(l);
     const V largest = solve(n);
     V factor{};
@@ -123,7 +101,7 @@ typename Stepper<V, T>::Decision Stepper<V, T>::decide(int l) {
     ++lane.iterations;
     ++lane.total_iterations;
     lane.node_iterations += lane.active;
-    const double energy = get(energy_, l) + drive_energy(lane, l).energy;
+    const double energy = get(energy_, l) + drive_load(lane, l).energy;
     lane.finite = std::isfinite(energy);
     const bool patient = lane.stride == 1 && !lane.extrapolated;   // ends at the first point accepted after its last iteration
     if (lane.iterations > options_.max_iterations * (patient ? kSnapIterations : 1) + (patient ? 2 * kMaxRejections : 0)) return Decision::restart;
@@ -145,7 +123,7 @@ typename Stepper<V, T>::Decision Stepper<V, T>::decide(int l) {
         return Decision::shorten;
     }
     lane.allowed = struggles(lane) ? kAllowedRise * (lane.allowed + lane.energy - energy) : 0.0;
-    if (!(get(pivot_, l) > 0) || !solve_drive(l)) {  // not positive definite: less of the geometric terms
+    if (!(get(pivot_, l) > 0) || !solve_drives(l)) {  // not positive definite: less of the geometric terms
         const double g = get(geometric_, l), damping = get(damping_, l);
         lane.energy = energy;
         if (g > 0) {
@@ -183,9 +161,7 @@ template <class V, int T>
 double Stepper<V, T>::best_share(double energy, int l) const {
     const Lane& lane = lane_[l];
     const double slope = lane.scale * lane.slope, excess = slope + energy - lane.energy;
-    bool drive_held = !lane.by_force && lane.slipping.advance == 0 && lane.slipping.rotation == 0;  // else `rise_` lacks its part
-    if constexpr (T > 0) drive_held = !tubes_slip(lane);
-    const double power = drive_held ? std::clamp((get(rise_, l) + slope) / excess, 2.0, double{kMostPower}) : 2.0;
+    const double power = lane.drives_free() ? 2.0 : std::clamp((get(rise_, l) + slope) / excess, 2.0, double{kMostPower});   // else `rise_` lacks the drives' part
     const double sliding = std::pow(slope / (power * excess), 1 / (power - 1));
     const double free = get(hit_, l), rest = 1 - free;
     const double head_on = rest > 0 ? free + rest * rest * slope / (2 * excess) : 0.0;
@@ -208,14 +184,8 @@ int Stepper<V, T>::advance(int n, const Decision (&decision)[W], Queue& queue) {
             lane.tick += lane.stride;
             ++lane.steps;
             lane.last_duration = took;
-            lane.last = {lane.end.advance - lane.start.advance, lane.end.rotation - lane.start.rotation};
-            if constexpr (T > 0) settle_tubes(l);
-            lane.start = lane.end;
-            if (!lane.by_force) {
-                lane.slip = {lane.slip.advance - lane.off.advance, lane.slip.rotation - lane.off.rotation};
-                if (lane.off.advance == 0) lane.slipping.advance = 0;
-                if (lane.off.rotation == 0) lane.slipping.rotation = 0;
-            }
+            settle(l);
+            for (int r = 0; r < N; ++r) lane.coordinate(r).start = lane.coordinate(r).end;
             ended[l] = lane.tick == kTicks * in_.steps_per_sample;
             if (lane.stride < kTicks && lane.tick % (2 * lane.stride) == 0) lane.stride *= 2;
             if (ended[l]) continue;
@@ -236,8 +206,7 @@ int Stepper<V, T>::advance(int n, const Decision (&decision)[W], Queue& queue) {
     int samples = 0;
     for (int l = 0; l < W; ++l) {
         Lane& lane = lane_[l];
-        if constexpr (T > 0)
-            if (decision[l] == Decision::converged) pace_tubes(l);
+        if (decision[l] == Decision::converged) note_forces(l);
         if (failed[l]) {
             samples += std::max(0, in_.samples - std::max(0, lane.sample));
             fail(l);

@@ -54,44 +54,44 @@ struct TubePlace {
 template <>
 struct TubePlace<0> {};
 
-// A tube of a lane: its drive, as far as it is not the lane's own.
-struct Tube {
-    double inserted, rotation, speed, spin, depth;    // at the start of the sample; mm/s, rad/s; where the approach ends
-    double refused;                                   // mm in this sample that the tube is too short for
-    double advanced, turned, asked_advance, asked_rotation;   // step start; commanded for its end
-    double end_advance, end_rotation, last_rotation;          // trial, last increment
-    double slipped, rotation_slipped;                 // commanded in this sample and not made
-    double off, from, move;                           // of the rotation, what the unknown counts from the commanded; Newton step
-    int slipping;                                     // of the rotation
-    double pace, yield, grip;   // share of its motion that the drive makes, and mm/s that it gives way; of friction along the tube around
-    double force, torque;                             // on the tube at its drive, N, N mm
+// A coordinate of the drives: how far the foremost device is inserted (mm), or by what a device is turned (rad). It is an unknown of the
+// step where its drive slips at its limit or is driven by force: then `off` is what it has beyond where it was commanded, or started.
+struct Coordinate {
+    double start = 0, commanded = 0, end = 0;   // at the step's start; for its end; trial
+    double off = 0, from = 0, move = 0;         // end - commanded: trial, accepted; Newton step
+    double last = 0;                            // last increment
+    int slipping = 0;                           // 1: the drive slips where it would move forwards, -1: backwards, 0: it holds
 };
 
+// A device of a lane and its drive.
+struct Device {
+    double inserted = 0, rotation = 0, speed = 0, spin = 0;   // at the start of the sample; mm/s, rad/s, or N and N mm
+    double depth = 0;                                 // where the approach ends, mm
+    double refused = 0;                               // mm in this sample that the device is too short for
+    double slipped = 0, rotation_slipped = 0;         // commanded in this sample and not made
+    double start = 0, commanded = 0, end = 0;         // how far it is inserted: at the step's start; commanded for its end; trial
+    Coordinate turn;
+    double feed = 1, backdrive = 0, mobilized = 0;    // as World::DeviceQuantity has them
+    double force = 0, torque = 0;                     // on the device at its drive, N, N mm
+};
+
+// What a lane has of drives that share their limits and of friction between devices; nothing for a wire alone.
 template <int T>
 struct TubeLane {
-    Tube tube[T + 1];
-    int lead;            // the tube whose tip is foremost: the mesh follows it
-    double given, side;  // share by which drives at their limits give way to friction along the tubes, and the way it turns
-    double others;       // force of the drives of the others at the end of the last step, N
+    double given = 0, side = 0;  // share by which drives at their limits give way to friction along the devices, and the way it turns
+    double others = 0;           // force of the drives of the others at the end of the last step, N
 };
 template <>
 struct TubeLane<0> {};
 
-// For each lane: how far a tube slides along the mesh in the step, mm; friction coefficients; friction between tubes as a share of
-// its most; torques of the further tubes' drives, N mm, and their Newton steps; tension of the first k tubes at the base, N.
+// For each lane: how far a device slides along the mesh in the step, mm; friction between devices as a share of its most; tension of the
+// first k devices at the base, N.
 template <class V, int T>
 struct TubeLanes {
-    V slide[T + 1], friction[T + 1], grip[T], torque[T], turn[T], bundle[T];
+    V slide[T + 1], mobilized[T], bundle[T];
 };
 template <class V>
 struct TubeLanes<V, 0> {};
-
-template <class V, int T>
-struct TwistDrive {
-    V gradient[T], ap[T], rp[T], pp[T][T];
-};
-template <class V>
-struct TwistDrive<V, 0> {};
 
 // A node of the wires in all lanes.
 template <class V, int T = 0>
@@ -103,14 +103,14 @@ struct Node {
     [[no_unique_address]] TubeNode<V, T> tubes;
 };
 
-// T: tubes around the innermost device; 0 for a wire alone.
+// T: catheters around the wire; 0 for a wire alone.
 template <class V, int T = 0>
 class Stepper {
 public:
     // `node` and `factor` have one entry a node of the rod. The scene must outlive the stepper.
     ENDOPILOT_DEVICE Stepper(const Scene& scene, const Worlds& worlds, Node<V, T>* node, Factor<V, T>* factor)
         : rod_(scene.rod), lumen_(scene.lumen.pool ? &scene.lumen : nullptr), loads_(scene.loads.force ? &scene.loads : nullptr), tubes_(scene.tubes),
-          base_(scene.base), options_(scene.options), motion_(scene.motion), world_(worlds), node_(node), factor_(factor) {}
+          base_(scene.base), options_(scene.options), drives_(scene.drives), motion_(scene.motion), world_(worlds), node_(node), factor_(factor) {}
 
     // Sets the inputs and outputs of the next turns and frees all lanes.
     ENDOPILOT_DEVICE void prepare(const Inputs& in, const Outputs& out) {
@@ -120,12 +120,12 @@ public:
     }
 
     // Gives idle lanes a world of the queue and makes one pass. Returns the number of samples that ended, -1 if no lane has
-    // a world. A queue has `take`, `put_back` and `finish` as WorkQueue has.
+    // a world. A queue has `next`, `put_back` and `finish` as WorkQueue has.
     template <class Queue>
     ENDOPILOT_DEVICE int turn(Queue& queue) {
         bool busy = false;
         for (int l = 0; l < W; ++l) {
-            if (lane_[l].world < 0) take(l, queue);
+            if (lane_[l].world < 0) next_world(l, queue);
             busy = busy || lane_[l].world >= 0;
         }
         return busy ? pass(queue) : -1;
@@ -136,47 +136,28 @@ private:
     using S = Single<V>;
     enum class Decision { idle, accept, shorten, repeat, converged, restart };
 
-    // The drive's end of the wire: advance (mm) and rotation (rad).
-    struct Drive {
-        double advance = 0, rotation = 0;
+    static constexpr int N = 2 + T;   // coordinates of the drives: the foremost device's advance, and the rotation of each
+
+    // The energy of the drives' loads, with its gradient, and its Hessian for the first two coordinates.
+    struct DriveLoad {
+        double energy = 0, gradient[N]{}, aa = 0, ar = 0, rr = 0;
     };
 
-    // Whether the drive slips at its limit: 1 where it would move the wire forwards, -1 backwards, 0 where it grips.
-    struct Slipping {
-        int advance = 0, rotation = 0;
-    };
-
-    // An energy, its gradient and its Hessian with respect to the drive's advance a and rotation r.
-    struct DriveEnergy {
-        double energy, gradient_a, gradient_r, aa, ar, rr;
-    };
-
-    // Gradient and Hessian alone, for all lanes.
+    // Gradient and Hessian with respect to the drives' coordinates, for all lanes; row r of the Hessian begins at r (r + 1) / 2.
     struct DriveBlock {
-        V gradient_a, gradient_r, aa, ar, rr;
-        [[no_unique_address]] TwistDrive<V, T> twists{};
-        ENDOPILOT_DEVICE friend DriveBlock operator+(const DriveBlock& a, const DriveBlock& b) {
-            DriveBlock sum{a.gradient_a + b.gradient_a, a.gradient_r + b.gradient_r, a.aa + b.aa, a.ar + b.ar, a.rr + b.rr};
-            if constexpr (T > 0) merge(sum, [&](auto of) { return of(a) + of(b); });
-            return sum;
+        static constexpr int kCoordinates = N, kEntries = N * (N + 1) / 2;
+        V gradient[kCoordinates]{}, hessian[kEntries]{};
+        ENDOPILOT_DEVICE V& h(int r, int c) { return hessian[r * (r + 1) / 2 + c]; }
+        ENDOPILOT_DEVICE const V& h(int r, int c) const { return hessian[r * (r + 1) / 2 + c]; }
+        ENDOPILOT_DEVICE friend DriveBlock operator+(DriveBlock a, const DriveBlock& b) {
+            for (int r = 0; r < kCoordinates; ++r) a.gradient[r] += b.gradient[r];
+            for (int k = 0; k < kEntries; ++k) a.hessian[k] += b.hessian[k];
+            return a;
         }
-        ENDOPILOT_DEVICE friend DriveBlock select(Mask<V> mask, const DriveBlock& yes, const DriveBlock& no) {
-            DriveBlock chosen{endopilot::select<V>(mask, yes.gradient_a, no.gradient_a),
-                              endopilot::select<V>(mask, yes.gradient_r, no.gradient_r),
-                              endopilot::select<V>(mask, yes.aa, no.aa), endopilot::select<V>(mask, yes.ar, no.ar),
-                              endopilot::select<V>(mask, yes.rr, no.rr)};
-            if constexpr (T > 0) merge(chosen, [&](auto of) { return endopilot::select<V>(mask, of(yes), of(no)); });
-            return chosen;
-        }
-        // Sets all that belongs to twists to `number(of)`, where of(block) is that number of a block.
-        template <class Number>
-        ENDOPILOT_DEVICE static void merge(DriveBlock& to, const Number& number) {
-            for (int k = 0; k < T; ++k) {
-                to.twists.gradient[k] = number([k](const DriveBlock& d) { return d.twists.gradient[k]; });
-                to.twists.ap[k] = number([k](const DriveBlock& d) { return d.twists.ap[k]; });
-                to.twists.rp[k] = number([k](const DriveBlock& d) { return d.twists.rp[k]; });
-                for (int c = 0; c <= k; ++c) to.twists.pp[k][c] = number([k, c](const DriveBlock& d) { return d.twists.pp[k][c]; });
-            }
+        ENDOPILOT_DEVICE friend DriveBlock select(Mask<V> mask, const DriveBlock& yes, DriveBlock no) {
+            for (int r = 0; r < kCoordinates; ++r) no.gradient[r] = endopilot::select<V>(mask, yes.gradient[r], no.gradient[r]);
+            for (int k = 0; k < kEntries; ++k) no.hessian[k] = endopilot::select<V>(mask, yes.hessian[k], no.hessian[k]);
+            return no;
         }
     };
 
@@ -195,17 +176,24 @@ private:
         double strain = 0;                // by which the vessel stretches in the step
         Base base{};                      // at the step's end
         long total_iterations = 0, node_iterations = 0;   // of the sample; the latter count each active node
-        double inserted = 0, rotation = 0, speed = 0, spin = 0;   // at the start of the sample; mm/s, rad/s, or N, N mm
-        double refused = 0;                    // mm in this sample that the wire is too short for
-        Drive slip;                            // commanded in this sample and not made
-        Drive start, end, last;                // step start, trial; last increment
-        Drive origin, off, from, move;         // what the unknown `off` = end - origin counts from; trial, accepted; Newton step
-        Slipping slipping;
+        Coordinate advance;                    // of the device whose tip is foremost, which the mesh follows
+        Device device[T + 1];                  // from the inside out
+        int lead = 0;                          // the foremost
         int releases = 0;                      // in this step
         double energy = 0, slope = 0, scale = 1, shorten = 1, boost = 1, damping = 0, last_duration = 0;
         double allowed = 0;                    // by which the energy may rise, N mm
         bool reduced = false, first = true, extrapolated = false, finite = true, by_force = false;
-        [[no_unique_address]] TubeLane<T> tubes{};   // with tubes, the advance above is that of the foremost, the rotation tube 0's
+        [[no_unique_address]] TubeLane<T> tubes{};
+
+        // The r-th coordinate of the drives.
+        ENDOPILOT_DEVICE Coordinate& coordinate(int r) { return r == 0 ? advance : device[r - 1].turn; }
+        ENDOPILOT_DEVICE const Coordinate& coordinate(int r) const { return r == 0 ? advance : device[r - 1].turn; }
+        // Whether any of them is an unknown.
+        ENDOPILOT_DEVICE bool drives_free() const {
+            bool free = by_force;
+            for (int r = 0; r < N; ++r) free = free || coordinate(r).slipping != 0;
+            return free;
+        }
     };
 
     const RodModel& rod_;
@@ -214,6 +202,7 @@ private:
     const Tubes& tubes_;
     const Base& base_;
     const Options& options_;
+    const Drives& drives_;
     const Motion& motion_;
     Inputs in_{};
     Outputs out_{};
@@ -227,17 +216,18 @@ private:
     Carried<V, T> carried_;   // to the node that is eliminated next
     Lane lane_[W];
     // For each lane: settings of the step, then results of a sweep.
-    V active_{}, share_{}, inverse_dt_{}, eps_{}, first_{}, damping_{}, friction_{};
+    V active_{}, share_{}, inverse_dt_{}, eps_{}, first_{}, damping_{};
+    V friction_[T + 1]{};          // coefficient of each device
     S geometric_{}, tangent_{};
     Vec3<V> axis_{};               // of the guiding catheter
     WallPlace<V> wall_{};          // where the vessel is, if it moves
     V jump_scale_x_{}, jump_scale_theta_{};
-    V energy_{}, descent_{}, pivot_{}, jump_{}, base_force_{}, base_torque_{};
+    V energy_{}, descent_{}, pivot_{}, jump_{}, base_force_{}, base_torque_[T + 1]{};
     Mask<V> accepted_{};           // the last trial was accepted
     V hit_{};                      // share of the last move at which it first hits a wall that was free; 1: it hits none
     V rise_{};                     // slope of the energy along the last move, at its end
     DriveBlock drive_{};           // of the wire's energy, all nodes eliminated
-    V drive_a_{}, drive_r_{};      // the drive's Newton step
+    V drive_step_[N]{};            // Newton step of the drives' coordinates
     [[no_unique_address]] TubeLanes<V, T> of_tubes_{};
 
     ENDOPILOT_DEVICE double duration(const Lane& lane) const { return in_.time_step * lane.stride / kTicks; }
@@ -253,8 +243,8 @@ private:
         set(to.w, l, q.w);
         put(to.v, l, q.v);
     }
-    ENDOPILOT_DEVICE static Vec3<double> take(const Vec3<V>& v, int l) { return {get(v.x, l), get(v.y, l), get(v.z, l)}; }
-    ENDOPILOT_DEVICE static Quaternion<double> take(const Quaternion<V>& q, int l) { return {get(q.w, l), take(q.v, l)}; }
+    ENDOPILOT_DEVICE static Vec3<double> read(const Vec3<V>& v, int l) { return {get(v.x, l), get(v.y, l), get(v.z, l)}; }
+    ENDOPILOT_DEVICE static Quaternion<double> read(const Quaternion<V>& q, int l) { return {get(q.w, l), read(q.v, l)}; }
 
     ENDOPILOT_DEVICE int most_active() const {
         int n = 0;
@@ -265,7 +255,7 @@ private:
 
     // Between lanes and worlds (exchange.hpp).
     template <class Queue>
-    ENDOPILOT_DEVICE void take(int l, Queue& queue);
+    ENDOPILOT_DEVICE void next_world(int l, Queue& queue);
     ENDOPILOT_LARGE void load(int l);
     ENDOPILOT_LARGE void store(int l);
     ENDOPILOT_DEVICE void read_control(int l);
@@ -278,33 +268,18 @@ private:
     template <class Queue>
     ENDOPILOT_DEVICE void end_sample(int l, Queue& queue);
     ENDOPILOT_DEVICE void fail(int l);
-    ENDOPILOT_LARGE void record(int world, int sample, double iterations, double node_iterations, const Drive& slip) const;
+    ENDOPILOT_LARGE void record(int world, int sample, double iterations, double node_iterations) const;
 
-    // Tubes (coaxial.hpp, coaxial_drives.hpp, coaxial_exchange.hpp); where T is 0 none of it is used.
-    void aim_tubes(int l, double weight);
-    void prepare_tubes(int l);
-    TubeContact<double, T> tube_contact(int l, const double (&cover)[T + 1], const double (&rate)[T + 1], const Vec3<double>& axis) const;
-    void turn_tubes(int l, bool keeps, bool takes, bool shortens, double factor);
-    void settle_tubes(int l);
-    void pace_tubes(int l);
-    double borne_by_others(const Lane& lane) const;
-    bool tubes_slip(const Lane& lane) const;
-    DriveEnergy tube_drive_energy(const Lane& lane) const;
-    bool solve_tube_drives(int l);
-    bool release_tubes(int l);
-    TubePlace<T> tube_place(int i, int l) const;
-    void freeze_tubes(int l, bool kept);
-    void tell_forces(int l, double (&force)[T + 1]) const;
-    double beyond_limit(int k, double force) const;
-    void refuse_leaps(Decision (&decision)[W]);
-    bool try_forces(const bool (&on)[W], Leap (&leap)[W]);
-    void load_tubes(int l);
-    void store_tubes(int l);
-    void read_tube_controls(int l);
-    void end_tubes(int l);
-    void record_tubes(int world, int sample) const;
-    V add_interfaces(const Node<V, T>& node, Diagonal<V, T>& own) const;
-    double bundle_moment(int k, int joint, int l, const TubePlace<T>& ahead, const TubePlace<T>& behind, Vec3<double>& moment) const;
+    // Catheters around the wire (coaxial.hpp, coaxial_limits.hpp); where T is 0 none of it is used.
+    ENDOPILOT_LARGE void prepare_tubes(int l);
+    ENDOPILOT_DEVICE TubeContact<double, T> tube_contact(int l, const double (&cover)[T + 1], const double (&rate)[T + 1], const Vec3<double>& axis) const;
+    ENDOPILOT_DEVICE TubePlace<T> tube_place(int i, int l) const;
+    ENDOPILOT_LARGE void freeze_tubes(int l, bool kept);
+    ENDOPILOT_DEVICE double beyond_limit(int k, double force) const;
+    ENDOPILOT_DEVICE void refuse_leaps(Decision (&decision)[W]);
+    ENDOPILOT_DEVICE bool try_forces(const bool (&on)[W], Leap (&leap)[W]);
+    ENDOPILOT_DEVICE V add_interfaces(const Node<V, T>& node, Diagonal<V, T>& own) const;
+    ENDOPILOT_DEVICE double bundle_moment(int k, int joint, int l, const TubePlace<T>& ahead, const TubePlace<T>& behind, Vec3<double>& moment) const;
 
     // The step of one lane (step.hpp).
     ENDOPILOT_DEVICE bool struggles(const Lane& lane) const { return lane.iterations > (T > 0 ? kStruggle : options_.max_iterations); }
@@ -317,11 +292,18 @@ private:
     template <class Queue>
     ENDOPILOT_DEVICE int advance(int n, const Decision (&decision)[W], Queue& queue);
 
-    // The drive of one lane (drive.hpp).
-    ENDOPILOT_DEVICE DriveEnergy introducer(const Drive& moved, double r, int l) const;
-    ENDOPILOT_DEVICE DriveEnergy drive_energy(const Lane& lane, int l) const;
-    ENDOPILOT_LARGE bool solve_drive(int l);
+    // The drives of one lane (drives.hpp).
+    ENDOPILOT_DEVICE double device_radius(int k, const Lane& lane) const;
+    ENDOPILOT_DEVICE DriveLoad introducer(double advance, double rotation, double r, int l) const;
+    ENDOPILOT_DEVICE DriveLoad drive_load(const Lane& lane, int l) const;
+    ENDOPILOT_DEVICE double borne_by_others(const Lane& lane) const;
+    ENDOPILOT_DEVICE void aim(int l, double weight);
+    ENDOPILOT_LARGE bool solve_drives(int l);
     ENDOPILOT_DEVICE bool release(int l);
+    ENDOPILOT_DEVICE void move_drives(int l, Decision decision, double factor);
+    ENDOPILOT_DEVICE void settle(int l);
+    ENDOPILOT_DEVICE void drive_forces(int l, double (&force)[T + 1]) const;
+    ENDOPILOT_DEVICE void note_forces(int l);
 
     // Sweeps over the nodes of all lanes (sweeps.hpp).
     ENDOPILOT_LARGE void evaluate(int n);
@@ -351,10 +333,9 @@ private:
 
 }  // namespace endopilot
 
-#include "drive.hpp"
+#include "drives.hpp"
 #include "exchange.hpp"
 #include "coaxial.hpp"
-#include "coaxial_drives.hpp"
-#include "coaxial_exchange.hpp"
+#include "coaxial_limits.hpp"
 #include "sweeps.hpp"
 #include "step.hpp"

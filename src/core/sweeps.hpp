@@ -81,16 +81,18 @@ void Stepper<V, T>::add_rod(int first, int count) {
         if (!at_base) continue;
         const Vec3<V>& force = next.gradient_x;  // its component along the axis is the force that the base must exert
         base_force_ = select<V>(last, axis.x * force.x + axis.y * force.y + axis.z * force.z, base_force_);
-        base_torque_ = select<V>(last, next.gradient_theta.z, base_torque_);
+        base_torque_[0] = select<V>(last, next.gradient_theta.z, base_torque_[0]);
         // the element's stiffness for the drive comes with what is carried to the base
-        DriveBlock at_drive{base_force_, base_torque_, V{}, V{}, widen<V>(next.tt.zz)};
+        DriveBlock at_drive;
+        at_drive.gradient[0] = base_force_;
+        at_drive.gradient[1] = base_torque_[0];
+        at_drive.h(1, 1) = widen<V>(next.tt.zz);
         if constexpr (T > 0) {
             for (int p = 0; p < T; ++p) {
-                at_drive.twists.gradient[p] = next.twists.gradient[p];
-                of_tubes_.torque[p] = select<V>(last, next.twists.gradient[p], of_tubes_.torque[p]);
-                at_drive.twists.ap[p] = V{};
-                at_drive.twists.rp[p] = widen<V>(next.twists.pt[p][2]);
-                for (int c = 0; c <= p; ++c) at_drive.twists.pp[p][c] = widen<V>(next.twists.pp[p][c]);
+                base_torque_[1 + p] = select<V>(last, next.twists.gradient[p], base_torque_[1 + p]);
+                at_drive.gradient[2 + p] = next.twists.gradient[p];
+                at_drive.h(2 + p, 1) = widen<V>(next.twists.pt[p][2]);
+                for (int c = 0; c <= p; ++c) at_drive.h(2 + p, 2 + c) = widen<V>(next.twists.pp[p][c]);
             }
         }
         drive_ = select(last, at_drive, drive_);
@@ -110,15 +112,19 @@ template <class V, int T>
 typename Stepper<V, T>::DriveBlock Stepper<V, T>::drive_block(const Carried<V, T>& carried) const {
     const Vec3<S> axis = narrow(axis_);
     const Vec3<S> across{carried.tx[2][0], carried.tx[2][1], carried.tx[2][2]};
-    DriveBlock block{widen<V>(dot(axis, carried.gradient_x)), widen<V>(carried.gradient_theta.z),
-                     widen<V>(dot(axis, carried.xx * axis)), widen<V>(dot(axis, across)), widen<V>(carried.tt.zz)};
+    DriveBlock block;
+    block.gradient[0] = widen<V>(dot(axis, carried.gradient_x));
+    block.gradient[1] = widen<V>(carried.gradient_theta.z);
+    block.h(0, 0) = widen<V>(dot(axis, carried.xx * axis));
+    block.h(1, 0) = widen<V>(dot(axis, across));
+    block.h(1, 1) = widen<V>(carried.tt.zz);
     if constexpr (T > 0) {
         for (int k = 0; k < T; ++k) {
-            block.twists.gradient[k] = widen<V>(carried.twists.gradient[k]);
             const S(&px)[3] = carried.twists.px[k];
-            block.twists.ap[k] = widen<V>(axis.x * px[0] + axis.y * px[1] + axis.z * px[2]);
-            block.twists.rp[k] = widen<V>(carried.twists.pt[k][2]);
-            for (int c = 0; c <= k; ++c) block.twists.pp[k][c] = widen<V>(carried.twists.pp[k][c]);
+            block.gradient[2 + k] = widen<V>(carried.twists.gradient[k]);
+            block.h(2 + k, 0) = widen<V>(axis.x * px[0] + axis.y * px[1] + axis.z * px[2]);
+            block.h(2 + k, 1) = widen<V>(carried.twists.pt[k][2]);
+            for (int c = 0; c <= k; ++c) block.h(2 + k, 2 + c) = widen<V>(carried.twists.pp[k][c]);
         }
     }
     return block;
@@ -278,15 +284,15 @@ void Stepper<V, T>::eliminate_nodes(int first, int count) {
 // Back substitution. Returns the largest displacement (mm) or rotation (rad) of a node; NaN where the solve failed.
 template <class V, int T>
 V Stepper<V, T>::solve(int n) {
-    const Vec3<S> drive_x = narrow(drive_a_ * axis_);
-    const Vec3<S> drive_t{S{}, S{}, narrow(drive_r_)};
+    const Vec3<S> drive_x = narrow(drive_step_[0] * axis_);
+    const Vec3<S> drive_t{S{}, S{}, narrow(drive_step_[1])};
     const S active = narrow(active_);
     Vec3<S> x = drive_x, t = drive_t;
     S largest = dot(x, x) + dot(t, t);  // rounded as for the nodes of a shorter wire, which follow the drive
     S twist[T + 1]{}, drive_twist[T + 1]{};   // one more than there are: none is no array
     if constexpr (T > 0) {
         for (int k = 0; k < T; ++k) {
-            twist[k] = drive_twist[k] = narrow(of_tubes_.turn[k]);
+            twist[k] = drive_twist[k] = narrow(drive_step_[2 + k]);
             largest += twist[k] * twist[k];
         }
     }
@@ -348,22 +354,7 @@ void Stepper<V, T>::update(int n, const Decision (&decision)[W], const V& factor
             }
         }
     }
-    for (int l = 0; l < W; ++l) {
-        Lane& lane = lane_[l];
-        bool held = !lane.by_force && lane.slipping.advance == 0 && lane.slipping.rotation == 0;
-        if constexpr (T > 0) held = !tubes_slip(lane);
-        if (held || lane.world < 0) continue;
-        const double f = get(factor, l);
-        const bool takes = decision[l] == Decision::accept || decision[l] == Decision::converged;
-        if (takes || decision[l] == Decision::repeat) lane.from = lane.off;
-        if (takes) lane.move = {f * get(drive_a_, l), f * get(drive_r_, l)};
-        if (decision[l] == Decision::shorten) lane.move = {f * lane.move.advance, f * lane.move.rotation};
-        if constexpr (T > 0) turn_tubes(l, takes || decision[l] == Decision::repeat, takes, decision[l] == Decision::shorten, f);
-        if (!takes && decision[l] != Decision::shorten) continue;
-        lane.off = {lane.from.advance + lane.move.advance, lane.from.rotation + lane.move.rotation};
-        lane.end = {lane.origin.advance + lane.off.advance, lane.origin.rotation + lane.off.rotation};
-        place_base(l, lane.active);
-    }
+    for (int l = 0; l < W; ++l) move_drives(l, decision[l], get(factor, l));
 }
 
 // Freezes the wall at a contact point that has come to rest after the move `step`: friction in the coming step then has a potential.
@@ -401,8 +392,8 @@ void Stepper<V, T>::freeze_contacts(int n, Mask<V> mask, const V& weight) {
         const Vec3<V> axis = frame(node.q).d3;
         const Vec3<V> middle_step = broadcast<V>(0.5) * (node.step + node_[i + 1].step);
         if constexpr (T == 0) {
-            freeze(node.at_node, node.step, axis, spring_at_node(i), rod_.radius[i], friction_, on, weight);
-            freeze(node.at_middle, middle_step, axis, spring_at_middle(i), rod_.radius[i], friction_, middle, weight);
+            freeze(node.at_node, node.step, axis, spring_at_node(i), rod_.radius[i], friction_[0], on, weight);
+            freeze(node.at_middle, middle_step, axis, spring_at_middle(i), rod_.radius[i], friction_[0], middle, weight);
         } else {
             const TubeContact<V, T>&here = node.tubes.at_node, &there = node.tubes.at_middle;
             freeze(node.at_node, node.step, axis, spring_at_node(i), here.radius, here.friction, on, weight);

@@ -24,7 +24,6 @@ struct TubeArrays {
     Array<double> bend{}, twist{}, stretch{}, rest{};     // of EI, GJ, EA, and of the rest curvature about the first director
     Array<double> radius{};                               // outer radius, mm
     Array<double> bore_friction{};                        // friction coefficient between tube k and tube k - 1 in it; entry 0 unused
-    Array<double> push_limit{}, pull_limit{}, torque_limit{};   // of the tubes' drives, N, N mm
 };
 
 using OwnedTubes = TubeArrays<Owned>;
@@ -41,21 +40,18 @@ Tubes view(const OwnedTubes& tubes, const Place& place) {
             .stretch = place(tubes.stretch),
             .rest = place(tubes.rest),
             .radius = place(tubes.radius),
-            .bore_friction = place(tubes.bore_friction),
-            .push_limit = place(tubes.push_limit),
-            .pull_limit = place(tubes.pull_limit),
-            .torque_limit = place(tubes.torque_limit)};
+            .bore_friction = place(tubes.bore_friction)};
 }
 
 // Integrals of a tube's profiles from its tip to `at` mm behind it.
 struct Integrals {
     double length, bend, twist, stretch, rest;
-    friend Integrals operator-(const Integrals& a, const Integrals& b) {
+    ENDOPILOT_DEVICE friend Integrals operator-(const Integrals& a, const Integrals& b) {
         return {a.length - b.length, a.bend - b.bend, a.twist - b.twist, a.stretch - b.stretch, a.rest - b.rest};
     }
 };
 
-inline Integrals integrals(const Tubes& tubes, int tube, double at) {
+ENDOPILOT_DEVICE inline Integrals integrals(const Tubes& tubes, int tube, double at) {
     if (at <= 0) return {0, 0, at * kTwistBeyondTip, 0, 0};
     const double* twist = &tubes.twist[tube * tubes.points];
     const double place = at / tubes.spacing;
@@ -81,7 +77,7 @@ struct TubeJoint {
 
 // The joint between the integrals `ahead` and `behind` of each tube, `length` mm apart.
 template <int T>
-TubeJoint<double, T> tube_joint(const Integrals (&ahead)[T + 1], const Integrals (&behind)[T + 1], double length) {
+ENDOPILOT_DEVICE TubeJoint<double, T> tube_joint(const Integrals (&ahead)[T + 1], const Integrals (&behind)[T + 1], double length) {
     using Joint = TubeJoint<double, T>;
     Joint joint{};
     double bend[T + 1], share[T + 1], foremost = 0;

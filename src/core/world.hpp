@@ -12,31 +12,35 @@ namespace endopilot {
 // those at the end of the last step; node quantities are meaningful for the `active` nodes ahead of the base.
 struct World {
     enum Scalar {
-        kInserted, kRotation,          // mm, rad
-        kSpeed, kSpin, kByForce,       // the last control: mm/s and rad/s, or N and N mm
-        kLastDuration, kLastAdvance, kLastTurned,  // of the last step, s, mm, rad
-        kFriction, kStride, kActive, kReason,
-        kSlipping, kSpinSlipping,      // 1: the drive slips at its limit forwards, -1: backwards, 0: it grips
-        kBaseForce, kBaseTorque, kDriveForce, kDriveTorque,  // N, N mm
-        kApproach, kDepth,             // samples left of the approach, and the inserted length it ends at, mm
+        kInserted,                     // of the foremost device, mm
+        kByForce,                      // the last controls were N and N mm
+        kLastDuration, kLastAdvance,   // of the last step, s, mm
+        kStride, kActive, kReason,
+        kSlipping,                     // 1: the drive of the foremost device slips at its limit forwards, -1: backwards, 0: it holds
+        kApproach,                     // samples left of the approach
         kTime,                         // since the reset, s; the vessel stands still in the approach
         kScalars
+    };
+    // of each device, from the inside out
+    enum DeviceQuantity {
+        kLength, kRotation,            // inserted length, mm, and rotation, rad
+        kSpeed, kSpin,                 // the last control: mm/s and rad/s, or N and N mm
+        kLastTurned,                   // in the last step, rad
+        kFriction,
+        kTurnSlipping,                 // whether its drive slips at its limit of torque, as kSlipping
+        kBaseForce, kBaseTorque, kDriveForce, kDriveTorque,  // N, N mm
+        kSlip, kRotationSlip,          // commanded in the last sample and not made, mm, rad
+        kDepth,                        // inserted length that the approach ends at, mm
+        kFeed,                         // share of the commanded motion that a drive makes after it was at its limit
+        kMobilized,                    // friction along the device around it, as a share of its most
+        kBackdrive,                    // mm/s by which a drive beyond its limit gives way
+        kLeads,                        // 1: its tip is the foremost
+        kDeviceSize
     };
     // last increments of position and rotation; the contact points at the node and at the middle of the element behind it
     enum NodeQuantity { kX = 0, kQ = 3, kLast = 7, kLastTurn = 10, kAtNode = 13, kAtMiddle = 24, kNodeSize = 35 };
     // of a contact point: friction limit, wall normal, spin arm; normal force, N; offset of the curve from the polygon, mm
     enum PointQuantity { kLimit = 0, kNormal = 1, kSpinArm = 4, kNormalForce = 7, kOffset = 8 };
-
-    // of each tube, innermost first, where there are several: as the scalars of a wire above; kInserted is then the foremost's
-    enum TubeQuantity {
-        kTubeInserted, kTubeRotation, kTubeSpeed, kTubeSpin, kTubeLastTurned, kTubeFriction, kTubeSlipping,
-        kTubeBaseForce, kTubeBaseTorque, kTubeDriveForce, kTubeDriveTorque, kTubeDepth,
-        kTubePace, kTubeGrip,          // share of its motion that a drive makes after its limit; of friction along the tube around it
-        kTubeYield,                    // mm/s that a drive beyond its limit gives way
-        kTubeLeads,                    // 1: its tip is the foremost
-        kTubeSlip, kTubeRotationSlip,  // asked in the last sample and not made, mm, rad
-        kTubeSize
-    };
 
     // Numbers `stride` apart.
     struct Numbers {
@@ -48,20 +52,18 @@ struct World {
 
     double* values;
     std::ptrdiff_t stride;
+    int devices;
 
+    // After the scalars come all devices, the nodes, then, with catheters, the twists of each node.
+    static std::size_t size(int nodes, int devices) {
+        return kScalars + std::size_t(devices) * kDeviceSize + std::size_t(nodes) * (kNodeSize + (devices > 1 ? twist_size(devices) : 0));
+    }
     ENDOPILOT_DEVICE double& operator[](Scalar s) const { return values[s * stride]; }
-    ENDOPILOT_DEVICE Numbers node(int i) const { return Numbers{values, stride} + (kScalars + i * kNodeSize); }
-    // `further`: tubes around the innermost. After the nodes come all tubes, then the twists of each node.
-    static std::size_t size(int nodes, int further = 0) {
-        const std::size_t tubes = further ? std::size_t(further + 1) * kTubeSize + std::size_t(nodes) * twist_size(further) : 0;
-        return kScalars + std::size_t(nodes) * kNodeSize + tubes;
-    }
-    ENDOPILOT_DEVICE Numbers tube(int nodes, int k) const { return node(nodes) + k * kTubeSize; }
-    // Of node i: twists, their last increments, limits of friction between tubes, and all tubes' rates of twist.
-    ENDOPILOT_DEVICE Numbers twists(int nodes, int further, int i) const {
-        return tube(nodes, further + 1) + i * int(twist_size(further));
-    }
-    static constexpr std::size_t twist_size(int further) { return 4 * std::size_t(further) + 1; }
+    ENDOPILOT_DEVICE Numbers device(int k) const { return Numbers{values, stride} + (kScalars + k * kDeviceSize); }
+    ENDOPILOT_DEVICE Numbers node(int i) const { return device(devices) + i * kNodeSize; }
+    // Of node i, for the catheters: twists, their last increments, limits of friction between devices; all devices' rates of twist.
+    ENDOPILOT_DEVICE Numbers twists(int nodes, int i) const { return node(nodes) + i * int(twist_size(devices)); }
+    static constexpr std::size_t twist_size(int devices) { return 4 * std::size_t(devices) - 3; }
     ENDOPILOT_DEVICE int active() const { return int((*this)[kActive]); }
     // Force of the wall at node i and at the middle of the element behind it, N.
     ENDOPILOT_DEVICE double force(int i) const {
@@ -75,13 +77,13 @@ ENDOPILOT_DEVICE inline Quaternion<double> quaternion(const World::Numbers& p) {
 ENDOPILOT_DEVICE inline void write(const World::Numbers& to, const Vec3<double>& v) { to[0] = v.x, to[1] = v.y, to[2] = v.z; }
 ENDOPILOT_DEVICE inline void write(const World::Numbers& to, const Quaternion<double>& q) { to[0] = q.w, write(to + 1, q.v); }
 
-// Where tube k ends: in element `element`, at `share` of its length from its distal node.
-struct TubeEnd {
+// Where device k ends: in element `element`, at `share` of its length from its distal node.
+struct DeviceEnd {
     int element;
     double share;
 };
-ENDOPILOT_DEVICE inline TubeEnd tube_end(const RodModel& rod, const World& w, int k) {
-    const double behind = w[World::kInserted] - w.tube(rod.nodes, k)[World::kTubeInserted];
+ENDOPILOT_DEVICE inline DeviceEnd device_end(const RodModel& rod, const World& w, int k) {
+    const double behind = w[World::kInserted] - w.device(k)[World::kLength];
     int i = 0;
     while (i < rod.nodes - 2 && rod.abscissa[i + 1] < behind) ++i;
     return {i, (behind - rod.abscissa[i]) / rod.length[i]};
@@ -111,26 +113,20 @@ public:
         return moves_ ? relative(vessel_.rotation, q) : q;
     }
 
-    // The wire's direction at its tip. The first element, of length l, has the direction at its middle; the tip's offset from the
-    // polygon is l²/8 times the curvature vector.
-    ENDOPILOT_DEVICE Vec3<double> tip_direction() const {
-        Vec3<double> direction = frame(in_laboratory(0)).d3;
-        if (world_.active() > 0) direction += (4 / rod_.length[0]) * vec3(world_.node(0) + (World::kAtNode + World::kOffset));
-        return unit_in_vessel(direction);
-    }
-
-    ENDOPILOT_DEVICE Vec3<double> tube_tip(int k) const {
-        const TubeEnd end = tube_end(rod_, world_, k);
+    ENDOPILOT_DEVICE Vec3<double> tip(int k) const {
+        const DeviceEnd end = device_end(rod_, world_, k);
         const Vec3<double> ahead = position(end.element);
         return ahead + end.share * (position(end.element + 1) - ahead);
     }
 
-    // Tube k's direction where it ends: behind the foremost tip, that of the element there.
-    ENDOPILOT_DEVICE Vec3<double> tube_direction(int k) const {
-        const TubeEnd end = tube_end(rod_, world_, k);
-        if (end.element == 0 && end.share <= 0) return tip_direction();
-        const Vec3<double> direction = frame(in_laboratory(end.element)).d3;
-        return moves_ ? unit_in_vessel(direction) : direction;
+    // Device k's direction where it ends: behind the foremost tip, that of the element there. The first element, of length l, has the
+    // direction at its middle; the tip's offset from the polygon is l²/8 times the curvature vector.
+    ENDOPILOT_DEVICE Vec3<double> tip_direction(int k) const {
+        const DeviceEnd end = device_end(rod_, world_, k);
+        const bool foremost = end.element == 0 && end.share <= 0;
+        Vec3<double> direction = frame(in_laboratory(end.element)).d3;
+        if (foremost && world_.active() > 0) direction += (4 / rod_.length[0]) * vec3(world_.node(0) + (World::kAtNode + World::kOffset));
+        return foremost || moves_ ? unit_in_vessel(direction) : direction;
     }
 
 private:
@@ -146,7 +142,7 @@ private:
     }
 
     ENDOPILOT_DEVICE Quaternion<double> in_laboratory(int i) const {
-        return i < world_.active() ? quaternion(world_.node(i) + World::kQ) : base_.attitude(world_[World::kRotation]);
+        return i < world_.active() ? quaternion(world_.node(i) + World::kQ) : base_.attitude(world_.device(0)[World::kRotation]);
     }
 };
 
@@ -155,9 +151,10 @@ private:
 struct Worlds {
     double* values;
     std::ptrdiff_t between_worlds, between_numbers;
+    int devices;
 
     ENDOPILOT_DEVICE World operator[](std::size_t world) const {
-        return {values + std::ptrdiff_t(world) * between_worlds, between_numbers};
+        return {values + std::ptrdiff_t(world) * between_worlds, between_numbers, devices};
     }
 };
 

@@ -321,7 +321,7 @@ class Rollout:
         reason: why a world became invalid: 0 it is valid, 1 it left the finite numbers, 2 it did not converge.
         shape: positions of all nodes from the foremost tip to the base, LPS mm, if they were recorded.
         catheters: the motion of the catheters; None for a wire alone. With catheters, the fields above are those of the
-            wire, but for the direction of the tip and the wall's forces, which are those of all.
+            wire, but for the wall's forces, which are those of all devices.
         vessel_to_laboratory: where the vessel lies at each sample, if it moves: affine maps of its points, as CT shows
             them, to the laboratory, LPS mm. Positions and directions above are those in the vessel as CT shows it.
     """

@@ -46,7 +46,7 @@ def test_reach_is_that_of_an_arc(wire, angle_deg, length_mm, reach_mm) -> None:
         friction=np.zeros(1),
         approach=False,
     )
-    assert np.hypot(*free["tip_position"][0, -1, :2]) == pytest.approx(reach_mm, rel=0.02)
+    assert np.hypot(*free["tip_position"][0, -1, 0, :2]) == pytest.approx(reach_mm, rel=0.02)
 
 
 def test_reach_of_tips_without_and_with_more_than_half_a_turn() -> None:

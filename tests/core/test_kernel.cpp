@@ -72,69 +72,91 @@ OwnedMotion make_motion() {
     return motion;
 }
 
-OwnedScene make_scene(bool with_loads, bool moving = false) {
+// A wire with a bent tip, and catheters around it: profiles are integrals from the tip, 0.5 mm apart.
+OwnedTubes make_tubes(int devices) {
+    OwnedTubes tubes{.tubes = devices, .points = 100, .spacing = 0.5, .shear_share = 0.4};
+    for (int k = 0; k < devices; ++k) {
+        for (int i = 0; i < tubes.points; ++i) {
+            const double at = tubes.spacing * i;
+            tubes.bend.push_back((4.0 + 3 * k) * at), tubes.twist.push_back((3.0 + 2 * k) * at), tubes.stretch.push_back(500.0 * at);
+            tubes.rest.push_back((k == 0 ? 0.15 : 0.05) * std::min(at, 6.0));
+        }
+        tubes.radius.push_back(0.18 + 0.15 * k), tubes.bore_friction.push_back(k == 0 ? 0.0 : 0.1);
+    }
+    return tubes;
+}
+
+OwnedScene make_scene(int devices, bool with_loads, bool moving = false) {
     const double half = std::sqrt(0.5);
-    return {.rod = make_rod(40),
-            .lumen = std::make_shared<LumenMap>(make_map()),
-            .loads = with_loads ? std::make_shared<OwnedLoads>(make_loads(40)) : nullptr,
-            .base = {.origin = {-3.0, 0.0, 0.0}, .orientation = {half, {0, half, 0}}},
-            .options = {.stick_velocity = 0.05, .wall_stiffness = 100.0, .foundation = 0.0, .foundation_stiffening = 0.0, .tip_takes_along = 0.0, .tolerance = 1e-3, .sample_tolerance = 1e-6,
-                        .largest_step = 0.3, .largest_jump = 0.1, .max_iterations = 400, .free_behind = 3.0,
-                        .approach_velocity = 20.0, .push_limit = 0.05, .pull_limit = 0.05,
-                        .torque_limit = 0.5, .introducer_friction = 0.05, .introducer_drag = 0.002},
-            .motion = moving ? std::make_shared<OwnedMotion>(make_motion()) : nullptr};
+    OwnedScene scene{.rod = make_rod(40),
+                     .lumen = std::make_shared<LumenMap>(make_map()),
+                     .loads = with_loads ? std::make_shared<OwnedLoads>(make_loads(40)) : nullptr,
+                     .base = {.origin = {-3.0, 0.0, 0.0}, .orientation = {half, {0, half, 0}}},
+                     .options = {.stick_velocity = 0.05, .wall_stiffness = 100.0, .foundation = 0.0, .foundation_stiffening = 0.0, .tip_takes_along = 0.0, .tolerance = 1e-3, .sample_tolerance = 1e-6,
+                                 .largest_step = 0.3, .largest_jump = 0.1, .max_iterations = 400, .free_behind = 3.0,
+                                 .approach_velocity = 20.0, .introducer_friction = 0.05, .introducer_drag = 0.002},
+                     .drives = {.count = devices},
+                     .tubes = devices > 1 ? std::make_shared<OwnedTubes>(make_tubes(devices)) : nullptr,
+                     .motion = moving ? std::make_shared<OwnedMotion>(make_motion()) : nullptr};
+    for (int k = 0; k < devices; ++k) scene.drives.push[k] = scene.drives.pull[k] = 0.05, scene.drives.torque[k] = 0.5;
+    return scene;
 }
 
 // Worlds at rest and what is recorded of them.
 struct Run {
     std::size_t nodes, width;
+    int devices;
     std::vector<double> values;
     std::vector<std::vector<double>> numbers;
     std::vector<unsigned char> valid;
     Outputs out{};
 
-    explicit Run(const Scene& scene) : nodes(std::size_t(scene.rod.nodes)), width(World::size(scene.rod.nodes)) {
+    explicit Run(const Scene& scene) : nodes(std::size_t(scene.rod.nodes)), width(World::size(scene.rod.nodes, scene.drives.count)), devices(scene.drives.count) {
         values.resize(kWorlds * width);
         std::mt19937 random(3);
         std::uniform_real_distribution<double> any(0.0, 1.0);
         for (int w = 0; w < kWorlds; ++w) {
-            const double depth = 4 + 12 * any(random), turn = 6 * any(random), friction = 0.05 + 0.2 * any(random);
-            start_world(scene, worlds()[std::size_t(w)], depth, turn, friction, kPeriod);
+            double initial[2 * kMostDevices], friction[kMostDevices];
+            for (int k = 0; k < devices; ++k) {
+                initial[2 * k] = (4 + 12 * any(random)) / (1 + k), initial[2 * k + 1] = 6 * any(random);
+                friction[k] = 0.05 + 0.2 * any(random);
+            }
+            start_world(scene, worlds()[std::size_t(w)], initial, friction, kPeriod);
         }
         valid.assign(kWorlds * kSamples, 0);
         out.valid = reinterpret_cast<bool*>(valid.data());
-        double placeholder = 0;
-        out.shape = out.attitude = &placeholder;
-        each_array(out, kSamples, nodes, [this](auto*& array, std::size_t size) {
-            if constexpr (std::is_same_v<decltype(array), double*&>) array = numbers.emplace_back(kWorlds * size).data();
+        each_output(out, [this]<class T>(const char*, T*& array, Of of, int size) {
+            if constexpr (std::is_same_v<T, double>)
+                array = numbers.emplace_back(kWorlds * entries(of, kSamples, std::size_t(devices), nodes) * std::size_t(size)).data();
         });
     }
-    Worlds worlds() { return {values.data(), std::ptrdiff_t(width), 1}; }
+    Worlds worlds() { return {values.data(), std::ptrdiff_t(width), 1, devices}; }
 };
 
 bool same(const std::vector<double>& a, const std::vector<double>& b) {
     return a.size() == b.size() && std::memcmp(a.data(), b.data(), a.size() * sizeof(double)) == 0;
 }
 
+template <int T>
 void test_kernel(bool by_force, bool with_loads, bool moving = false) {
-    const OwnedScene owned = make_scene(with_loads, moving);
+    const OwnedScene owned = make_scene(1 + T, with_loads, moving);
     const Scene scene = view(owned, InPlace{});
     std::mt19937 random(4);
     std::uniform_real_distribution<double> any(-1.0, 1.0);
     std::vector<double> control;
-    for (int k = 0; k < kWorlds * kSamples; ++k) {
+    for (int k = 0; k < kWorlds * kSamples * (1 + T); ++k) {
         control.push_back(by_force ? 0.1 * any(random) : 2 + 5 * any(random));
         control.push_back(by_force ? 0.1 * any(random) : 2 * any(random));
     }
-    control[2 * (5 * kSamples + 2)] = std::numeric_limits<double>::quiet_NaN();  // ends world 5
+    control[2 * (1 + T) * (5 * kSamples + 2)] = std::numeric_limits<double>::quiet_NaN();  // ends world 5
     const Inputs in{.samples = kSamples, .steps_per_sample = kSteps, .time_step = kPeriod / kSteps, .force_driven = by_force, .control = control.data()};
 
     Run processor(scene), gpu(scene);
     std::vector<int> order;
     for (int w = 0; w < kWorlds; ++w) order.push_back((w * 7) % kWorlds);
-    std::vector<Node<double>> node(processor.nodes);
-    std::vector<Factor<double>> factor(processor.nodes);
-    Stepper<double> stepper(scene, processor.worlds(), node.data(), factor.data());
+    std::vector<Node<double, T>> node(processor.nodes);
+    std::vector<Factor<double, T>> factor(processor.nodes);
+    Stepper<double, T> stepper(scene, processor.worlds(), node.data(), factor.data());
     stepper.prepare(in, processor.out);
     WorkQueue queue(order, std::vector<double>(kWorlds, 0.0), 8);
     while (stepper.turn(queue) >= 0) {
@@ -153,8 +175,8 @@ void test_kernel(bool by_force, bool with_loads, bool moving = false) {
 
     int touching = 0, invalid = 0, slipping = 0;
     for (int k = 0; k < kWorlds * kSamples; ++k) {
-        slipping += processor.out.slip[k] > 0;
-        touching += processor.out.force_max[k] > 0;
+        slipping += processor.out.slip[(1 + T) * k] > 0;
+        touching += processor.out.contact_force_max[k] > 0;
         invalid += !processor.out.valid[k];
     }
     expect(touching > kWorlds, "wires touch the wall");
@@ -162,8 +184,8 @@ void test_kernel(bool by_force, bool with_loads, bool moving = false) {
     expect(invalid > 1 && invalid < kWorlds * kSamples / 2, "a world becomes invalid, most do not");
 }
 
-void test_longest_wire() {
-    OwnedScene scene = make_scene(false);
+void test_longest(int devices, int most) {
+    OwnedScene scene = make_scene(devices, false);
     const auto refused = [&](int nodes) {
         scene.rod = make_rod(nodes);
         try {
@@ -173,17 +195,19 @@ void test_longest_wire() {
         }
         return false;
     };
-    expect(!refused(480) && refused(481), "a wire that a thread's memory does not hold is refused");
+    expect(!refused(most) && refused(most + 1), "a device that a thread's memory does not hold is refused");
 }
 
 }  // namespace
 
 int main() {
-    test_kernel(false, false);
-    test_kernel(true, false);
-    test_kernel(false, true);
-    test_kernel(false, false, true);
-    test_longest_wire();
+    test_kernel<0>(false, false);
+    test_kernel<0>(true, false);
+    test_kernel<0>(false, true);
+    test_kernel<0>(false, false, true);
+    test_kernel<1>(false, false);
+    test_kernel<2>(false, false, true);
+    for (int devices = 1; devices <= kMostDevices; ++devices) test_longest(devices, kMostNodes[devices - 1]);
     std::printf(failures == 0 ? "all core tests passed\n" : "%d core checks failed\n", failures);
     return failures == 0 ? EXIT_SUCCESS : EXIT_FAILURE;
 }

@@ -10,7 +10,7 @@ from bend import vessel
 
 from endopilot import _core
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.core import run_core
+from endopilot.simulation.core import of_device, run_core
 from endopilot.simulation.device import read_device
 from endopilot.simulation.simulate import simulate
 from endopilot.simulation.simulator import Simulator
@@ -67,7 +67,7 @@ def held_at_its_tip(speed: float, spin: float, samples: int = 40) -> dict[str, n
         torque_limit_n_mm=TORQUE_N_MM,
     )
     assert result["valid"].all()
-    return {name: values[0] for name, values in result.items()} | {"control": control[0]}
+    return {name: values[0] for name, values in of_device(result, 0).items()} | {"control": control[0]}
 
 
 def clutch(stiffness: float, commanded: np.ndarray, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:

@@ -33,7 +33,7 @@ def test_a_free_bent_tip_lies_where_the_arc_ends(element_mm: float) -> None:
     # The polygon of elements of length h has the arc's direction at their middles. Its nodes lie beside the arc, by
     # κh²/24 along the normal there and by κh²/12 along the normal where the bend ends within an element. The core adds
     # κh²/8 along the normal at the tip, which leaves κh²/12 times the distance of the two normals, 2 sin(angle/2).
-    tip, direction = rested["tip_position"][0, -1], rested["tip_direction"][0, -1]
+    tip, direction = rested["tip_position"][0, -1, 0], rested["tip_direction"][0, -1, 0]
     most = curvature * element_mm**2 / 6 * np.sin(angle / 2) + 1e-5
     assert np.hypot(tip[0], tip[1]) == pytest.approx(across, abs=most)
     assert tip[2] == pytest.approx(inserted - length + along, abs=most)

@@ -373,10 +373,10 @@ def test_bad_starts_and_states_are_refused(anatomy: Anatomy, wider: Anatomy, tmp
     with pytest.raises(InputError, match="made with other anatomies"):
         simulator.set_state(Simulator(wider, DEVICE, worlds=2).state)
     state = Simulator(anatomy, DEVICE, worlds=2).state
-    with pytest.raises(InputError, match="state: format version 7, not 3; make the state again"):
+    with pytest.raises(InputError, match="state: format version 7, not 4; make the state again"):
         Simulator(anatomy, DEVICE, worlds=2).set_state(replace(state, format_version=7))
     replace(state, format_version=7).save(tmp_path / "new.npz")
-    with pytest.raises(InputError, match=r"new\.npz: format version 7, not 3; make the state again"):
+    with pytest.raises(InputError, match=r"new\.npz: format version 7, not 4; make the state again"):
         SimulatorState.load(tmp_path / "new.npz")
     with pytest.raises(InputError, match=r"no such file|no saved state"):
         SimulatorState.load(tmp_path / "absent.npz")

@@ -29,7 +29,7 @@ def test_three_precurved_tubes_lie_where_their_moments_balance() -> None:
     expected = (30 * 0.02 + 50 * 0.01 - 20 * 0.03) / 100
     found = curvature(result["shape"][-1][:ELEMENTS], float(rod.abscissa_mm[1]))
     assert found == pytest.approx(np.full(len(found), expected), rel=1e-5)
-    assert np.abs(result["tubes"][-1, :, 3]).max() < 1e-6  # no torque: the opposed tube is in balance there
+    assert np.abs(result["base_torque"][-1]).max() < 1e-6  # no torque: the opposed tube is in balance there
 
 
 def test_tubes_of_unequal_torsional_stiffness_share_a_torque() -> None:
@@ -40,8 +40,8 @@ def test_tubes_of_unequal_torsional_stiffness_share_a_torque() -> None:
     loading.moment_n_mm[0, 2] = moment
     result = drive(rod, lay_out((inner, outer), length), np.full(2, length), loading=loading)
     between = length - 0.5 * rod.abscissa_mm[1]  # from the clamp to the middle of the foremost element
-    assert result["tubes"][-1, 1, 11] == pytest.approx(-moment * between / inner.twist, rel=1e-6)
-    assert result["tubes"][-1, :, 3] == pytest.approx([-moment, 0.0], abs=1e-9)
+    assert result["tip_twist"][-1, 1] == pytest.approx(-moment * between / inner.twist, rel=1e-6)
+    assert result["base_torque"][-1] == pytest.approx([-moment, 0.0], abs=1e-9)
 
 
 def test_the_catheter_slides_over_a_bent_wire_and_straightens_it() -> None:
@@ -89,19 +89,19 @@ def test_a_catheter_on_a_bent_wire_is_pushed_back() -> None:
     result = drive(rod, lay_out((wire, catheter), length), np.array([length, covered]), loading=loading)
     both = wire.bend + catheter.bend
     expected = moment**2 / 2 * (1 / wire.bend - 1 / both) + catheter.bend * (moment / both) ** 2 / 2
-    assert result["tubes"][-1, 1, 2] == pytest.approx(expected, rel=0.02)
+    assert result["base_force"][-1, 1] == pytest.approx(expected, rel=0.02)
 
 
 def test_a_drive_slips_at_its_torque_limit() -> None:
     # A precurved tube in another like it resists being turned: its drive turns it no harder than its limit.
     stack = (Uniform(60.0, 46.0, 1 / 30), Uniform(60.0, 46.0, 1 / 30))
     layout = lay_out(stack, 30.0)
-    limited = TubeLayout(**{**vars(layout), "torque_limit_n_mm": np.array([np.inf, 0.5])})
+    limited = TubeLayout(**{**vars(layout), "limits": np.array([[np.inf] * 3, [np.inf, np.inf, 0.5]])})
     control = np.zeros((10, 2, 2))
     control[:, 1, 1] = 0.4
-    free = drive(mesh(30.0), layout, np.full(2, 30.0), control=control)["tubes"]
-    held = drive(mesh(30.0), limited, np.full(2, 30.0), control=control)["tubes"]
-    assert np.abs(free[:, 1, 3]).max() > 0.6
-    assert np.abs(held[:, 1, 3]).max() <= 0.5 * (1 + 1e-5)
-    assert held[-1, 1, 7] > 0.1  # rotation that was asked and not made
-    assert held[-1, 1, 1] + held[:, 1, 7].sum() == pytest.approx(0.4 * 5.0)
+    free = drive(mesh(30.0), layout, np.full(2, 30.0), control=control)
+    held = drive(mesh(30.0), limited, np.full(2, 30.0), control=control)
+    assert np.abs(free["base_torque"][:, 1]).max() > 0.6
+    assert np.abs(held["base_torque"][:, 1]).max() <= 0.5 * (1 + 1e-5)
+    assert held["rotation_slip"][-1, 1] > 0.1  # rotation that was asked and not made
+    assert held["rotation"][-1, 1] + held["rotation_slip"][:, 1].sum() == pytest.approx(0.4 * 5.0)

@@ -84,7 +84,7 @@ def bench_gpu(
         result = run(count, on_gpu)
         seconds = time.perf_counter() - started
         both = exact["valid"] & result["valid"][:compared]
-        distance = np.linalg.norm(exact["tip_position"] - result["tip_position"][:compared], axis=-1)[both]
+        distance = np.linalg.norm(exact["tip_position"] - result["tip_position"][:compared], axis=-1)[..., 0][both]
         factor = samples * SAMPLE_PERIOD_S / seconds
         rows.append(
             {

@@ -78,6 +78,6 @@ def flexural_modulus(device: Device, *, at_mm: float, deflection_mm: float, diam
     )
     if not result["valid"].all():
         raise RuntimeError(f"the bending test of device {device.name} did not converge")
-    moved = float(result["tip_position"][0, -1, 1])
+    moved = float(result["tip_position"][0, -1, 0, 1])
     section = np.pi * diameter_mm**4 / 64
     return load * SPAN_MM**3 / (48 * moved * section) / 1000

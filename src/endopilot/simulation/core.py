@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from jaxtyping import Float
 
@@ -25,6 +27,7 @@ _LARGEST_NEWTON_STEP = 0.3
 """Displacement of a node (mm) that one Newton step is clamped to; larger ones can tangle the wire for good."""
 _MAX_ITERATIONS = 400
 """Newton iterations after which a time step is halved, down to 1/64; a wire that snaps over needs some hundred."""
+_OF_DEVICES = frozenset(name for name, of, *_ in _core.OUTPUTS if of == "device")
 
 
 def run_core(
@@ -35,7 +38,7 @@ def run_core(
     config: SimulatorConfig,
     initial: Float[np.ndarray, "worlds numbers"],
     control: Float[np.ndarray, "worlds samples numbers"],
-    friction: Float[np.ndarray, "worlds *tubes"],
+    friction: Float[np.ndarray, "worlds *devices"],
     period_s: float = SAMPLE_PERIOD_S,
     actuation: Actuation = "velocity",
     loads: _core.Loads | None = None,
@@ -52,14 +55,16 @@ def run_core(
 ) -> dict[str, np.ndarray]:
     """Run the C++ core on checked input. The simulator and the verification both come through here.
 
+    Devices count from the inside out, with two numbers each where the arrays below have numbers.
+
     Args:
         rod: nodes and stiffnesses; with tubes, the nodes alone count, and the drag.
         lumen: the wall, or None for a rod in the open.
         insertion: the point and the direction along which the base slides.
         config: settings.
-        initial: inserted length (mm) and rotation (rad) of each world before the first period; of each of its tubes.
-        control: mm/s and rad/s, or N and N·mm; of each tube.
-        friction: Coulomb coefficients; with tubes, a column for each.
+        initial: inserted length (mm) and rotation (rad) of each device before the first period.
+        control: mm/s and rad/s, or N and N·mm.
+        friction: Coulomb coefficients.
         period_s: time that each control holds, and from one recorded sample to the next, s; it is cut into equal time
             steps of at most `config.time_step_s`, as `Simulator.step` cuts it.
         actuation: what the controls are.
@@ -76,64 +81,61 @@ def run_core(
         motion: of the vessel and the insertion; positions and directions are returned in the vessel as it was at first.
 
     Returns:
-        The arrays of `Rollout` that need no centerline; `reason`: 0 fine, 1 not finite, 2 not converged; `contacts`:
-        the force of the wall at each node and on the element behind it at the end, N. With tubes, the wire's arrays are
-        those of the innermost, the tip's direction is that of the foremost, and `tubes` (worlds samples tubes 12) holds
-        of each its inserted length (mm) and rotation (rad), force (N) and torque (N·mm) at the base and of the drive,
-        slip (mm, rad), where its tip is (mm), and by how much it is twisted there against the innermost (rad).
+        The arrays that `_core.OUTPUTS` lists, with an axis of devices where they are of devices; `reason`: 0 fine,
+        1 not finite, 2 not converged; `contacts`: the force of the wall at each node and on the element behind it at
+        the end, N.
     """
+    limits = np.array([[push_limit_n, pull_limit_n, torque_limit_n_mm]]) if tubes is None else tubes.limits
+    worlds, samples, devices = len(control), control.shape[1], len(limits)
+    control = np.ascontiguousarray(control, dtype=float).reshape(worlds, samples, devices, 2)
     with gpu_errors(config.processor):
         simulation = core_for(config.processor).Simulation(
             rod=rod.model(config.processor),
             lumen=lumen,
             loads=loads,
             **insertion_arguments(insertion),
-            options=core_options(
-                config,
-                push_limit_n=push_limit_n,
-                pull_limit_n=pull_limit_n,
-                torque_limit_n_mm=torque_limit_n_mm,
-                approach=approach,
-                free_behind_mm=free_behind_mm,
-            ),
+            options=core_options(config, push_limit_n=push_limit_n, approach=approach, free_behind_mm=free_behind_mm),
+            drives=core_for(config.processor).make_drives(limits),
             tubes=None if tubes is None else tubes.model(config.processor),
             motion=motion,
-            worlds=len(control),
+            worlds=worlds,
         )
     simulation.reset(
-        index=np.arange(len(control)),
-        initial=np.ascontiguousarray(initial, dtype=float),
-        friction=np.ascontiguousarray(friction, dtype=float).reshape(-1),
+        index=np.arange(worlds),
+        initial=np.ascontiguousarray(initial, dtype=float).reshape(worlds, devices, 2),
+        friction=np.ascontiguousarray(friction, dtype=float).reshape(worlds, devices),
         sample_period=SAMPLE_PERIOD_S,
     )
-    total = control.shape[0] * control.shape[1]
 
     def run(
-        control: Float[np.ndarray, "worlds samples numbers"], steps: int, time_step: float, advance: Advance | None
+        control: Float[np.ndarray, "worlds samples devices 2"], steps: int, time_step: float, advance: Advance | None
     ) -> dict:
         return simulation.run(
-            control=np.ascontiguousarray(control, dtype=float),
+            control=control,
             force_driven=actuation == "force",
             time_step=time_step,
             steps_per_sample=steps,
             record_shape=record_shape,
             record_attitude=record_attitude,
-            threads=config.threads_for(len(control), lanes),
+            threads=config.threads_for(worlds, lanes),
             lanes=lanes,
             progress=advance,
         )
 
-    with gpu_errors(config.processor), progress("Simulating the wire", total=total) as advance:
+    with gpu_errors(config.processor), progress("Simulating the wire", total=worlds * samples) as advance:
         if period_s == SAMPLE_PERIOD_S:
             result = run(control, config.steps_per_sample, config.time_step_s, advance)
         else:  # the wire is brought to its start in the usual steps
-            begun = run(control[:, :0], config.steps_per_sample, config.time_step_s, None)
+            begun = run(np.zeros((worlds, 0, devices, 2)), config.steps_per_sample, config.time_step_s, None)
             steps = config.steps_of(period_s)
             result = run(control, steps, period_s / steps, advance)
             result["approach_slip"] += begun["approach_slip"]
-    if tubes is not None:
-        result["tip_position"] = np.ascontiguousarray(result["tubes"][:, :, 0, 8:11])
     return {**result, "reason": simulation.reason().astype(int), "contacts": simulation.contacts()}
+
+
+def of_device(result: Mapping[str, np.ndarray], device: int) -> dict[str, np.ndarray]:
+    """Return what the core recorded of one device, the wire (0) or a catheter, and of all devices together."""
+    return {name: values[:, :, device] if name in _OF_DEVICES else values for name, values in result.items()}
 
 
 def insertion_arguments(insertion: Insertion) -> dict[str, np.ndarray]:
@@ -148,12 +150,10 @@ def core_options(
     config: SimulatorConfig,
     *,
     push_limit_n: float,
-    pull_limit_n: float,
-    torque_limit_n_mm: float,
     free_behind_mm: float,
     approach: bool = True,
 ) -> Options:
-    """Return the settings as the core wants them."""
+    """Return the settings as the core wants them; what all drives can push with, N, sizes the wall's stiffness."""
     options = core_for(config.processor).Options()
     options.stick_velocity = config.stick_velocity_mm_s
     options.wall_stiffness = wall_stiffness(config, push_limit_n)
@@ -166,9 +166,6 @@ def core_options(
     options.largest_jump = config.largest_jump
     options.max_iterations = _MAX_ITERATIONS
     options.free_behind = free_behind_mm
-    options.push_limit = push_limit_n
-    options.pull_limit = pull_limit_n
-    options.torque_limit = torque_limit_n_mm
     options.approach_velocity = config.approach_velocity_mm_s if approach else 0.0
     options.introducer_friction = config.introducer_friction_n
     options.introducer_drag = config.introducer_drag_n_s_mm

@@ -80,7 +80,7 @@ class Readout:
             >>> simulator.inserted_length.shape
             (4,)
         """
-        return self._of_tubes(0)[:, 0] if self._stacks[0].catheters else self._gather("inserted_length")
+        return self._of_devices("inserted_length")[:, 0]
 
     @property
     def catheter_inserted_length(self) -> Float[np.ndarray, "worlds catheters"]:
@@ -90,7 +90,7 @@ class Readout:
             >>> simulator.catheter_inserted_length.shape  # a wire alone
             (4, 0)
         """
-        return self._of_tubes(0)[:, 1:]
+        return self._of_devices("inserted_length")[:, 1:]
 
     @property
     def catheter_rotation(self) -> Float[np.ndarray, "worlds catheters"]:
@@ -100,7 +100,7 @@ class Readout:
             >>> simulator.catheter_rotation.shape
             (4, 0)
         """
-        return self._of_tubes(1)[:, 1:]
+        return self._of_devices("rotation")[:, 1:]
 
     @property
     def catheter_drive_load(self) -> Float[np.ndarray, "worlds catheters 2"]:
@@ -110,7 +110,7 @@ class Readout:
             >>> simulator.catheter_drive_load.shape
             (4, 0, 2)
         """
-        return np.stack([self._of_tubes(9)[:, 1:], self._of_tubes(10)[:, 1:]], axis=-1)
+        return self._pair_of_devices("drive_force", "drive_torque")[:, 1:]
 
     @property
     def catheter_base_load(self) -> Float[np.ndarray, "worlds catheters 2"]:
@@ -120,7 +120,7 @@ class Readout:
             >>> simulator.catheter_base_load.shape
             (4, 0, 2)
         """
-        return np.stack([self._of_tubes(7)[:, 1:], self._of_tubes(8)[:, 1:]], axis=-1)
+        return self._pair_of_devices("base_force", "base_torque")[:, 1:]
 
     @property
     def catheter_slip(self) -> Float[np.ndarray, "worlds catheters 2"]:
@@ -130,7 +130,7 @@ class Readout:
             >>> simulator.catheter_slip.shape
             (4, 0, 2)
         """
-        return np.stack([self._of_tubes(16)[:, 1:], self._of_tubes(17)[:, 1:]], axis=-1)
+        return self._pair_of_devices("slip", "rotation_slip")[:, 1:]
 
     @property
     def rotation(self) -> Float[np.ndarray, "worlds"]:
@@ -141,7 +141,7 @@ class Readout:
             >>> simulator.rotation
             array([0. , 0.5, 1. , 1.5])
         """
-        return self._gather("rotation")
+        return self._of_devices("rotation")[:, 0]
 
     @property
     def time(self) -> Float[np.ndarray, "worlds"]:
@@ -203,7 +203,7 @@ class Readout:
             >>> bool(np.allclose(np.linalg.norm(simulator.tip_direction, axis=-1), 1.0))
             True
         """
-        return self._merge([group.simulation.tip_directions() for group in self._groups])
+        return self._of_devices("tip_directions")[:, 0]
 
     @property
     def contacts(self) -> Float[np.ndarray, "worlds nodes"]:
@@ -234,7 +234,7 @@ class Readout:
             >>> force_n.shape
             (4,)
         """
-        return np.column_stack([self._gather("base_force"), self._gather("base_torque")])
+        return self._pair_of_devices("base_force", "base_torque")[:, 0]
 
     @property
     def drive_load(self) -> Float[np.ndarray, "worlds 2"]:
@@ -246,7 +246,7 @@ class Readout:
             >>> simulator.drive_load.shape
             (4, 2)
         """
-        return np.column_stack([self._gather("drive_force"), self._gather("drive_torque")])
+        return self._pair_of_devices("drive_force", "drive_torque")[:, 0]
 
     @property
     def valid(self) -> Bool[np.ndarray, "worlds"]:
@@ -273,13 +273,14 @@ class Readout:
         count = len(self._stacks[0].devices)
         if not 0 <= device < count:
             raise InputError(f"device: {device}; give 0 for the wire" + (f", to {count - 1}" if count > 1 else ""))
-        return [group.simulation.tips(device) for group in self._groups]
+        return [np.ascontiguousarray(group.simulation.tips()[:, device]) for group in self._groups]
 
-    def _of_tubes(self, number: int) -> Float[np.ndarray, "worlds tubes"]:
-        """Return one of the core's numbers of the wire and its catheters."""
-        if not self._stacks[0].catheters:
-            return np.zeros((self.worlds, 1))
-        return self._merge([group.simulation.tubes()[:, :, number] for group in self._groups])
+    def _of_devices(self, name: str) -> Float[np.ndarray, "worlds devices *numbers"]:
+        """Return one of the core's numbers of each device, the wire's first."""
+        return self._merge([getattr(group.simulation, name)() for group in self._groups])
+
+    def _pair_of_devices(self, first: str, second: str) -> Float[np.ndarray, "worlds devices 2"]:
+        return np.stack([self._of_devices(first), self._of_devices(second)], axis=-1)
 
     def _merge(self, parts: Sequence[np.ndarray]) -> np.ndarray:
         return merge(self._groups, parts)

@@ -13,12 +13,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from endopilot import _core
 from endopilot.anatomy.projection import project_tip
 from endopilot.errors import InputError
 from endopilot.simulation.catheter import Catheter
 from endopilot.simulation.checks import check_distance_map, check_memory, check_sequences
 from endopilot.simulation.config import FREE_BEHIND_MM, Actuation, SimulatorConfig
-from endopilot.simulation.core import run_core
+from endopilot.simulation.core import of_device, run_core
 from endopilot.simulation.device import Device
 from endopilot.simulation.drive_limits import far_end_mm
 from endopilot.simulation.motion import Motion
@@ -27,6 +28,8 @@ from endopilot.simulation.tubes import Stack
 from endopilot.simulation.vessel_wall import make_wall
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, CatheterMotion, Rollout
 
+_OWN = ("inserted_length", "rotation", "shape")
+"""Fields of `Rollout` that are not the core's as they are."""
 _REASONS = {1: "left the finite numbers", 2: "did not converge"}
 """Meaning of `Rollout.reason` for an invalid world."""
 WALL_FORCE_LIMIT_N = 0.7
@@ -143,12 +146,12 @@ def simulate(
     if record_shape:  # of the wire that was needed
         needed = max(path_mm, commanded_mm, float(result["inserted_length"].max())) + FREE_BEHIND_MM
         result["shape"] = result["shape"][:, :, : np.searchsorted(rod.abscissa_mm, needed) + 3]
-    started = initial[:, :2] - result["approach_slip"]
-    rollout = make_rollout(anatomy, actuation, started, control[..., :2], result, period_s=period_s)
+    started = initial[:, :2] - result["approach_slip"][:, 0]
+    rollout = make_rollout(anatomy, actuation, started, control[..., :2], of_device(result, 0), period_s=period_s)
     if moving is not None:
         rollout = replace(rollout, vessel_to_laboratory=moving.placements(period_s * np.arange(1, samples + 1))[0])
     if catheters:
-        rollout = replace(rollout, catheters=catheter_motion(control, result["tubes"][:, :, 1:, :11], period_s))
+        rollout = replace(rollout, catheters=catheter_motion(control, result, period_s))
     _report(rollout)
     return rollout
 
@@ -174,32 +177,19 @@ def _check_drives(
 
 
 def catheter_motion(
-    control: Float[np.ndarray, "worlds samples numbers"],
-    recorded: Float[np.ndarray, "worlds samples catheters 11"],
-    period_s: float,
+    control: Float[np.ndarray, "worlds samples numbers"], result: Mapping[str, np.ndarray], period_s: float
 ) -> CatheterMotion:
     """Return what the core recorded of catheters as their motion.
 
     Args:
         control: what was asked of the drives, of the wire's first.
-        recorded: of each catheter Δ (mm), φ (rad), force and torque that hold it, those of its drive (N, N·mm), slip
-            (mm, rad) and tip (LPS mm).
+        result: arrays as `run_core` returns them.
         period_s: time of a sample, s.
     """
     asked = control[..., 2:].reshape(*control.shape[:2], -1, 2)
-    numbers = np.moveaxis(recorded, -1, 0)
-    return CatheterMotion(
-        control=asked - np.stack([numbers[6], numbers[7]], axis=-1) / period_s,
-        inserted_length=numbers[0],
-        rotation=numbers[1],
-        tip_position=recorded[..., 8:11],
-        base_force=numbers[2],
-        base_torque=numbers[3],
-        drive_force=numbers[4],
-        drive_torque=numbers[5],
-        slip=numbers[6],
-        rotation_slip=numbers[7],
-    )
+    of_catheters = {name: result[name][:, :, 1:] for name in CatheterMotion.__dataclass_fields__ if name != "control"}
+    slip = np.stack([of_catheters["slip"], of_catheters["rotation_slip"]], axis=-1)
+    return CatheterMotion(control=asked - slip / period_s, **of_catheters)
 
 
 def make_rollout(
@@ -218,7 +208,7 @@ def make_rollout(
         actuation: what the controls are.
         started: inserted length (mm) and rotation (rad) before the first period.
         control: what was asked of the drive.
-        result: arrays as `run_core` returns them.
+        result: arrays as `of_device` returns them.
         period_s: time of a sample, s.
     """
     start = started[:, None, :]
@@ -244,22 +234,7 @@ def make_rollout(
     )
 
 
-RECORDED = (
-    "tip_position",
-    "tip_direction",
-    "contact_force_max",
-    "contact_force_sum",
-    "wall_force",
-    "base_force",
-    "base_torque",
-    "drive_force",
-    "drive_torque",
-    "slip",
-    "rotation_slip",
-    "iterations",
-    "node_iterations",
-    "valid",
-)
+RECORDED = tuple(name for name, *_ in _core.OUTPUTS if name in Rollout.__dataclass_fields__ and name not in _OWN)
 
 
 def _check_memory(worlds: int, samples: int, recorded_nodes: int) -> None:

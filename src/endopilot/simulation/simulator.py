@@ -20,6 +20,7 @@ from endopilot.errors import InputError
 from endopilot.simulation.catheter import Catheter
 from endopilot.simulation.checks import check_control, check_memory, check_travel
 from endopilot.simulation.config import LANES, Actuation, SimulatorConfig
+from endopilot.simulation.core import of_device
 from endopilot.simulation.device import Device
 from endopilot.simulation.groups import Group, group_key, make_groups
 from endopilot.simulation.motion import Motion
@@ -176,10 +177,10 @@ class Simulator(Readout):
             index = group.index[mine]
             group.simulation.reset(
                 index=np.flatnonzero(mine),
-                initial=initial[index].reshape(len(index), -1),
+                initial=initial[index],
                 friction=np.array(
                     [[coefficient[world], *(each.friction for each in group.stack.devices[1:])] for world in index]
-                ).reshape(-1),
+                ),
                 sample_period=SAMPLE_PERIOD_S,
             )
             no_control = np.zeros((len(group.index), 0, 2 * len(group.stack.devices)))
@@ -223,12 +224,9 @@ class Simulator(Readout):
             self._run(group, array[group.index][:, None], duration / steps, steps, by_force=self._by_force)
             for group in self._groups
         ]
-        if self._stacks[0].catheters:  # the core records the foremost tip
-            for group, result in zip(self._groups, results, strict=True):
-                result["tip_position"] = np.ascontiguousarray(result["tubes"][:, :, 0, 8:11])
-                result["tip_direction"] = group.simulation.tip_directions()[:, None]
+        of_wires = [of_device(result, 0) for result in results]
         return Step(
-            **{name: self._merge([result[name][:, 0] for result in results]) for name in Step.__dataclass_fields__}
+            **{name: self._merge([result[name][:, 0] for result in of_wires]) for name in Step.__dataclass_fields__}
         )
 
     @property
@@ -325,7 +323,7 @@ class Simulator(Readout):
     ) -> dict[str, Any]:
         with gpu_errors(self._config.processor):
             return group.simulation.run(
-                control=control,
+                control=control.reshape(*control.shape[:2], len(group.stack.devices), 2),
                 force_driven=by_force,
                 time_step=time_step,
                 steps_per_sample=steps,

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from endopilot.errors import InputError
 from endopilot.files import writing
 
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 """Of `SimulatorState`: raised when its values or its fingerprint come to mean something else."""
 
 

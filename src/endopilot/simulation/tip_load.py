@@ -100,7 +100,7 @@ def simulate_tip_load(device: Device) -> TipLoadTest:
     )
     if not result["valid"].all():
         raise RuntimeError(f"the tip-load test of device {device.name} did not converge")
-    force = _PLATE_N_MM * (result["tip_position"][0, :, 0] - HELD_MM)
+    force = _PLATE_N_MM * (result["tip_position"][0, :, 0, 0] - HELD_MM)
     pushed = _STATIC.time_step_s * np.cumsum(push[0, :, 0])
     return TipLoadTest(pushed, force, result["shape"][0, -1], float(force.max()))
 

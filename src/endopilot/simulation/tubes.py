@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,9 +37,7 @@ class TubeLayout:
         rest_curvature: curvature of the unloaded tube about its first director, 1/mm.
         radius_mm: outer radius, mm.
         bore_friction: Coulomb coefficient between a tube and the next one in it; that of the innermost is not used.
-        push_limit_n: force at which its drive slips, N.
-        pull_limit_n: the same where it pulls, N.
-        torque_limit_n_mm: torque at which its drive slips, N·mm.
+        limits: force (N) at which its drive slips where it pushes, where it pulls, and torque (N·mm) at which it slips.
         shear_share: κGA / EA of all tubes.
     """
 
@@ -51,9 +48,7 @@ class TubeLayout:
     rest_curvature: Float[np.ndarray, "tubes stretches"]
     radius_mm: Float[np.ndarray, "tubes"]
     bore_friction: Float[np.ndarray, "tubes"]
-    push_limit_n: Float[np.ndarray, "tubes"]
-    pull_limit_n: Float[np.ndarray, "tubes"]
-    torque_limit_n_mm: Float[np.ndarray, "tubes"]
+    limits: Float[np.ndarray, "tubes 3"]
     shear_share: float = SHEAR_CORRECTION / (2 * (1 + POISSON_RATIO))
 
     def model(self, processor: Processor = "cpu") -> Tubes:
@@ -71,9 +66,6 @@ class TubeLayout:
             rest=integral(self.rest_curvature),
             radius=self.radius_mm,
             bore_friction=self.bore_friction,
-            push_limit=self.push_limit_n,
-            pull_limit=self.pull_limit_n,
-            torque_limit=self.torque_limit_n_mm,
         )
 
 
@@ -100,6 +92,11 @@ class Stack:
         return sum(device.push_limit_n for device in self.devices)
 
     @property
+    def limits(self) -> Float[np.ndarray, "devices 3"]:
+        """Where the drive of each device slips: push (N), pull (N) and torque (N·mm)."""
+        return np.array([[each.push_limit_n, each.pull_limit_n, each.torque_limit_n_mm] for each in self.devices])
+
+    @property
     def constants(self) -> tuple[Any, ...]:
         """All numbers of the devices: stacks with the same constants behave the same."""
         bores = tuple((each.inner_diameter_mm, each.bore_friction, each.shape) for each in self.catheters)
@@ -121,7 +118,7 @@ class Stack:
         Args:
             length_mm: length that the profiles must cover.
         """
-        return _lay_out(self.wire, self.catheters, length_mm) if self.catheters else None
+        return _lay_out(self, length_mm) if self.catheters else None
 
 
 def lines_from_tips(
@@ -161,8 +158,8 @@ def _at(nodes: Float[np.ndarray, "n 3"], along: Float[np.ndarray, "n"], at_mm: f
     return np.array([np.interp(at_mm, along, axis) for axis in nodes.T])
 
 
-def _lay_out(wire: Device, catheters: Sequence[Catheter], length_mm: float) -> TubeLayout:
-    devices = [wire, *(catheter.device for catheter in catheters)]
+def _lay_out(stack: Stack, length_mm: float) -> TubeLayout:
+    wire, catheters, devices = stack.wire, stack.catheters, stack.devices
     stretches = int(np.ceil(length_mm / _SPACING_MM)) + 2
     edges = _SPACING_MM * np.arange(stretches + 1)
     middle = edges[:-1] + 0.5 * _SPACING_MM
@@ -179,7 +176,5 @@ def _lay_out(wire: Device, catheters: Sequence[Catheter], length_mm: float) -> T
         rest_curvature=np.diff(turned, axis=1) / _SPACING_MM,
         radius_mm=widths / 2,
         bore_friction=np.array([0.0, *(catheter.bore_friction for catheter in catheters)]),
-        push_limit_n=np.array([device.push_limit_n for device in devices]),
-        pull_limit_n=np.array([device.pull_limit_n for device in devices]),
-        torque_limit_n_mm=np.array([device.torque_limit_n_mm for device in devices]),
+        limits=stack.limits,
     )

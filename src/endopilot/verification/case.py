@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from endopilot import _core
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.core import run_core
+from endopilot.simulation.core import of_device, run_core
 from endopilot.simulation.rod import RodLayout
 from endopilot.types import Insertion
 
@@ -210,4 +210,4 @@ def equilibrium(
     )
     if not result["valid"].all():
         raise RuntimeError("a verification case did not converge")
-    return {name: values[0] for name, values in result.items()}
+    return {name: values[0] for name, values in of_device(result, 0).items()}

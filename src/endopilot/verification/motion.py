@@ -95,24 +95,27 @@ def wire_in_bend(motion: _core.Motion | None, *, hold_s: float) -> Moved:
         time_step_s=STEP_S, tolerance_mm=1e-9, sample_tolerance_mm=1e-9, wall_stiffness_n_mm=50.0, threads=1
     )
     entry = insertion_arguments(_ENTRY)
-    limits = {"push_limit_n": 100.0, "pull_limit_n": 100.0, "torque_limit_n_mm": 100.0}
     simulation = _core.Simulation(
         rod=_ROD.model(),
         lumen=make_lumen(bent_tube(np.pi / 2, radius_mm=0.6, bend_radius_mm=15.0, lead_mm=12.0), 0.2),
         loads=None,
         origin=entry["origin"],
         orientation=entry["orientation"],
-        options=core_options(config, **limits, free_behind_mm=_ELEMENT_MM, approach=False),
+        options=core_options(config, push_limit_n=100.0, free_behind_mm=_ELEMENT_MM, approach=False),
+        drives=_core.make_drives(np.full((1, 3), 100.0)),
         motion=motion,
         worlds=1,
     )
     simulation.reset(
-        index=np.zeros(1, dtype=int), initial=np.array([[2.0, 0.0]]), friction=np.full(1, FRICTION), sample_period=0.5
+        index=np.zeros(1, dtype=int),
+        initial=np.array([[[2.0, 0.0]]]),
+        friction=np.full((1, 1), FRICTION),
+        sample_period=0.5,
     )
     found = []
     for step in range(round((PUSH_S + hold_s) / STEP_S)):
         simulation.run(
-            control=np.array([[[15.0 if step < round(PUSH_S / STEP_S) else 0.0, 0.0]]]),
+            control=np.array([[[[15.0 if step < round(PUSH_S / STEP_S) else 0.0, 0.0]]]]),
             force_driven=False,
             time_step=STEP_S,
             steps_per_sample=1,

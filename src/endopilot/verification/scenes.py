@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 
 from endopilot import _core
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.core import make_lumen, run_core
+from endopilot.simulation.core import make_lumen, of_device, run_core
 from endopilot.simulation.device import read_device
 from endopilot.simulation.rod import RodLayout, lay_out
 from endopilot.types import SAMPLE_PERIOD_S, DistanceMap, Insertion
@@ -371,4 +371,4 @@ def _drive(
     )
     if not result["valid"].all():
         raise RuntimeError("a scenario did not converge")
-    return {name: values[0] for name, values in result.items()}
+    return {name: values[0] for name, values in of_device(result, 0).items()}

@@ -71,9 +71,7 @@ def lay_out(
         rest_curvature=profile([tube.curvature for tube in tubes]),
         radius_mm=0.1 * np.arange(1, count + 1),
         bore_friction=np.full(count, bore_friction),
-        push_limit_n=np.full(count, np.inf),
-        pull_limit_n=np.full(count, np.inf),
-        torque_limit_n_mm=np.full(count, np.inf),
+        limits=np.full((count, 3), np.inf),
         shear_share=1.0,
     )
 
@@ -179,7 +177,7 @@ def twisted_pair(length_mm: float, base: Float[np.ndarray, "samples"]) -> Float[
     control = np.zeros((len(base) + 1, 2, 2))
     control[1:, 1, 1] = np.diff(base, prepend=np.pi) / 0.5
     result = drive(rod, lay_out((tube, tube), float(free[0])), free, rotation=np.array([0.0, np.pi]), control=control)
-    return result["tubes"][1:, 1, 11]
+    return result["tip_twist"][1:, 1]
 
 
 def snap_rate() -> float:
@@ -358,7 +356,7 @@ class Sliding:
         )
         inserted = np.array([length, length - ahead])
         result = drive(rod, layout, inserted, control=control, loading=loading, config=config, approach=True)
-        force, torque = result["tubes"][:, 0, 2], result["tubes"][:, 0, 3]
+        force, torque = result["base_force"][:, 0], result["base_torque"][:, 0]
         return -force / self.load_n, torque / (self.load_n * float(layout.radius_mm[0]))
 
 
