@@ -246,9 +246,7 @@ def _period(table: Columns, worlds: Int[np.ndarray, "worlds samples"]) -> float:
     if not low <= period_s <= high:
         ms = period_s / 1000
         meant = f" seems to be in ms ({period_s:g} ms is {ms:g} s)" if low <= ms <= high else ""
-        raise table.fault(
-            first, "time_s", f"{meant}; give seconds, the first the length of a period, {low:g} to {high:g}"
-        )
+        raise table.fault(first, "time_s", f"{meant}; give seconds; a period has {low:g} to {high:g}")
     late = np.argwhere(np.abs(time_s[worlds] - period_s * counts) > 1e-6 * len(counts) * period_s)
     if len(late):
         rule = f"each world's rows end periods of one length and count {period_s:.10g}, {2 * period_s:.10g}, ..."
