@@ -17,10 +17,12 @@ from contextlib import contextmanager
 from dataclasses import asdict, is_dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import yaml
+from yaml.composer import ComposerError
+from yaml.constructor import ConstructorError
 
 from endopilot import __version__
 from endopilot.errors import InputError
@@ -258,17 +260,10 @@ def _commit() -> str | None:
 class _YamlLoader(yaml.SafeLoader):
     """A safe loader of plain scalars by YAML 1.2, without fields named twice and without endless aliases."""
 
-    yaml_implicit_resolvers: ClassVar[dict] = {}
-    yaml_constructors: ClassVar[dict] = {
-        tag: constructor
-        for tag, constructor in yaml.SafeLoader.yaml_constructors.items()
-        if tag is None or tag.rpartition(":")[2] in ("null", "bool", "int", "float", "str", "seq", "map")
-    }
-
     def get_single_node(self) -> Any:
         node = super().get_single_node()
         if node is not None and _written_out(node, {}) > _MOST_NODES:
-            raise yaml.composer.ComposerError(
+            raise ComposerError(
                 problem=f"its aliases stand for more than {_MOST_NODES} values", problem_mark=node.start_mark
             )
         return node
@@ -278,13 +273,17 @@ class _YamlLoader(yaml.SafeLoader):
         for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode):
                 if key.value in seen:
-                    raise yaml.constructor.ConstructorError(
-                        problem=f"{key.value} is given twice", problem_mark=key.start_mark
-                    )
+                    raise ConstructorError(problem=f"{key.value} is given twice", problem_mark=key.start_mark)
                 seen.add(key.value)
         return super().construct_mapping(node, deep)
 
 
+_YamlLoader.yaml_implicit_resolvers = {}
+_YamlLoader.yaml_constructors = {
+    tag: constructor
+    for tag, constructor in yaml.SafeLoader.yaml_constructors.items()
+    if tag is None or tag.rpartition(":")[2] in ("null", "bool", "int", "float", "str", "seq", "map")
+}
 for _tag, _pattern, _first in (
     ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
     ("bool", r"true|True|TRUE|false|False|FALSE", list("tTfF")),
@@ -300,14 +299,14 @@ def _written_out(node: Any, known: dict[int, int]) -> int:
     """Return how many values a node of YAML stands for; aliases of a node share it.
 
     Raises:
-        yaml.composer.ComposerError: the node holds itself.
+        ComposerError: the node holds itself.
     """
     if id(node) not in known:
         known[id(node)] = -1
         inner = [part for pair in node.value for part in pair] if isinstance(node, yaml.MappingNode) else node.value
         known[id(node)] = 1 if isinstance(node, yaml.ScalarNode) else 1 + sum(_written_out(n, known) for n in inner)
     if known[id(node)] < 0:
-        raise yaml.composer.ComposerError(problem="an alias stands in its own anchor", problem_mark=node.start_mark)
+        raise ComposerError(problem="an alias stands in its own anchor", problem_mark=node.start_mark)
     return known[id(node)]
 
 
