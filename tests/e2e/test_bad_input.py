@@ -118,7 +118,7 @@ def test_a_lumen_too_narrow_for_the_wire(tmp_path, capsys, patient):
 
 def test_devices(patient, tmp_path, capsys):
     """A wire of one's own needs no code: it is read by its path; a bad one is refused by every command alike."""
-    main_line = "bend_stiffness_n_mm2.value[1]: -0.3; give a positive number"
+    main_line = "bend_stiffness_n_mm2.value[1]: -0.3; give a number from 0.0001 to 1000000 N·mm²"
     text = device_yaml("workhorse-014")[1]
     bad = tmp_path / "bad.yaml"
     bad.write_text(text.replace("[0.30, 0.30", "[0.30, -0.30"))
