@@ -9,3 +9,7 @@ class InputError(Exception):
     The command line prints the message without a traceback and exits with code 2. Raise it for anything that the
     user can correct. Other exceptions are defects of endopilot itself.
     """
+
+
+class Remark(UserWarning):
+    """A warning of endopilot about a result, in one line: the command line shows it, and no library's warnings."""

@@ -330,7 +330,7 @@ def test_spheres_that_do_not_touch_are_refused():
 
 @pytest.mark.parametrize("field", ["catheter_radius_mm", "spacing_mm", "minimum_branch_length_mm", "scale"])
 def test_config_names_field_and_value(field):
-    with pytest.raises(InputError, match=rf"^{field}: -1\.0; give a positive number"):
+    with pytest.raises(InputError, match=rf"^{field}: -1\.0; give a number (from|above) 0"):
         AnatomyConfig(**{field: -1.0})
 
 

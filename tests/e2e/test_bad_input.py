@@ -94,9 +94,9 @@ def test_centerline_without_radii(tmp_path, capsys):
 
 
 def test_wire_and_controls(tmp_path, capsys, patient):
-    device = (Path(endopilot.__file__).parent / "simulation/devices/workhorse-014.yaml").read_text(encoding="utf-8")
-    assert "value: 0.36" in device
-    (tmp_path / "thick.yaml").write_text(device.replace("value: 0.36", "value: 9.0", 1), encoding="utf-8")
+    device = (Path(endopilot.__file__).parent / "simulation/devices/j-035.yaml").read_text(encoding="utf-8")
+    assert "value: 0.89" in device
+    (tmp_path / "thick.yaml").write_text(device.replace("value: 0.89", "value: 5.5", 1), encoding="utf-8")
     header = "time_s,translation_mm_s,rotation_rad_s\n"
     (tmp_path / "nan.csv").write_text(header + "0.5,5,0\n1.0,nan,0\n")
     (tmp_path / "fast.csv").write_text(header + "0.5,5000,0\n")
@@ -118,7 +118,7 @@ def test_a_lumen_too_narrow_for_the_wire(tmp_path, capsys, patient):
 
 def test_devices(patient, tmp_path, capsys):
     """A wire of one's own needs no code: it is read by its path; a bad one is refused by every command alike."""
-    main_line = "bend_stiffness_n_mm2.value[1]: -0.3; give a positive number"
+    main_line = "bend_stiffness_n_mm2.value[1]: -0.3; give a number from 0.0001 to 1000000 N·mm²"
     text = device_yaml("workhorse-014")[1]
     bad = tmp_path / "bad.yaml"
     bad.write_text(text.replace("[0.30, 0.30", "[0.30, -0.30"))

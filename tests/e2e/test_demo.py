@@ -70,8 +70,8 @@ def test_settings_that_the_packaged_networks_do_not_fit_are_refused(tmp_path, ca
             ("demo", "--device", "j-035"),
             "device: 'j-035'; the networks of the package know workhorse-014 alone",
         ),
-        (("demo", "--training-seconds", "-1"), "training_seconds: -1.0; give a number of 0 or more"),
-        (("run", "ct.nii.gz", "--training-seconds", "-1"), "training_seconds: -1.0; give a number of 0 or more"),
+        (("demo", "--training-seconds", "-1"), "training_seconds: -1.0; give a number from 0 to 864000"),
+        (("run", "ct.nii.gz", "--training-seconds", "-1"), "training_seconds: -1.0; give a number from 0 to 864000"),
     ):
         assert message in command.refused(capsys, *arguments, "-o", tmp_path / "out")
     assert not (tmp_path / "out").exists()

@@ -107,7 +107,7 @@ def test_drawn_patients_differ_and_stay_in_the_published_ranges() -> None:
     assert motion_named("both", 7) == draw_motion(7)
     heartbeat = motion_named("heartbeat", 7)
     assert heartbeat is not None and heartbeat.annulus_mm == draw_motion(7).annulus_mm
-    with pytest.raises(InputError, match=r"annulus_mm: -1\.0; give a number of 0 or more"):
+    with pytest.raises(InputError, match=r"annulus_mm: -1\.0; give a number from 0 to 200"):
         Motion(annulus_mm=-1.0)
 
 

@@ -84,7 +84,7 @@ def test_a_ladder_navigation_is_the_same_every_time():
     ("old", "new", "line"),
     [
         ("level: 6", "level: 17", "level: 17; give a whole number from 1 to 16"),
-        ("seconds: 90", "seconds: -1", "seconds: -1; give a positive number"),
+        ("seconds: 90", "seconds: -1", "seconds: -1; give a number above 0, at most 86400"),
         ("force_limit_n: 0.2", "force_limit_n: .nan", "force_limit_n: nan; give a positive number"),
         ("anatomy: rca", "anatomy: knee", "anatomy: 'knee'; choose from"),
         ("device: workhorse-014", "device: rope", "device: 'rope'; choose from"),

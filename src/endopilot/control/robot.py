@@ -58,7 +58,7 @@ class Robot(Protocol):
 class RobotConfig:
     """How a real drive differs from an ideal one. docs/robot.md says where the numbers come from."""
 
-    latency_s: NonNegative = 0.05
+    latency_s: Annotated[float, Within(0, 10)] = 0.05
     """Time from a command to the motion, s."""
     max_acceleration_mm_s2: Positive = 200.0
     """Largest change of the translation's speed, mm/s²."""

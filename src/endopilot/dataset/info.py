@@ -14,7 +14,7 @@ from jaxtyping import Float
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.dataset import parquet, schema
 from endopilot.dataset.loader import read_manifest
-from endopilot.files import read_json, writing
+from endopilot.files import read_json, reading, writing
 from endopilot.progress import progress
 from endopilot.types import SAMPLE_PERIOD_S
 
@@ -74,7 +74,11 @@ def describe_dataset(folder: Path) -> Description:
     Raises:
         InputError: the folder holds no finished dataset, or a file of it is missing, damaged or of another version.
     """
-    folder = Path(folder)
+    with reading(Path(folder), "make the dataset again"):
+        return _describe(Path(folder))
+
+
+def _describe(folder: Path) -> Description:
     manifest, info = read_manifest(folder)
     stats = read_json(folder / schema.STATS_PATH)
     wire_mm = manifest["device"]["diameter_mm"] / 2

@@ -23,7 +23,7 @@ from endopilot.dataset.schema import (
 )
 from endopilot.errors import InputError
 from endopilot.extras import extra_named
-from endopilot.files import read_json
+from endopilot.files import read_json, reading
 from endopilot.runs import RECORD_FILE
 from endopilot.settings import from_record
 from endopilot.simulation.catheter import Catheter
@@ -220,17 +220,17 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         if (folder / RECORD_FILE).exists():
             raise InputError(f"{folder}: the dataset is unfinished; run the same `endopilot dataset` command again")
         raise InputError(f"{folder}: no dataset here ({MANIFEST_PATH} is missing); make one with `endopilot dataset`")
-    manifest = read_json(folder / MANIFEST_PATH)
-    if not isinstance(manifest, dict) or not {"key", "settings"} <= manifest.keys():
-        raise InputError(f"{folder / MANIFEST_PATH}: damaged; make the dataset again")
-    made = manifest["settings"].get("version")
+    again = "make the dataset again"
+    manifest = read_json(folder / MANIFEST_PATH, keys=("key", "settings"), mend=again)
+    with reading(folder / MANIFEST_PATH, again):
+        made = manifest["settings"].get("version")
     if made != version():
         raise InputError(f"{folder}: made by {made}, which {version()} cannot read; make the dataset again")
     if not (folder / INFO_PATH).exists():
         raise InputError(
             f"{folder / INFO_PATH}: missing from the dataset; run the same `endopilot dataset` command again"
         )
-    info = read_json(folder / INFO_PATH)
+    info = read_json(folder / INFO_PATH, keys=("features", "total_episodes", "total_frames"), mend=again)
     if info.get("codebase_version") != LEROBOT_VERSION:
         found = info.get("codebase_version")
         raise InputError(f"{folder / INFO_PATH}: codebase_version is {found}, not {LEROBOT_VERSION}; make it again")
@@ -243,10 +243,14 @@ def load_dataset(folder: Path) -> Dataset:
     Raises:
         InputError: the folder holds no finished dataset, or a file of it is missing, damaged or of another version.
     """
+    with reading(Path(folder), "make the dataset again"):
+        return _load(Path(folder))
+
+
+def _load(folder: Path) -> Dataset:
     with extra_named("reading a dataset"):
         from endopilot.dataset.parquet import column_values, read_table
 
-    folder = Path(folder)
     manifest, info = read_manifest(folder)
     samples, total = manifest["samples_per_episode"], info["total_episodes"]
     actuation, catheters = actuation_of(info["features"]), catheters_of(info["features"])

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from endopilot.errors import InputError
-from endopilot.files import writing
+from endopilot.files import reading, writing
 
 METRICS_FILE, RESULTS_FILE, FIGURES_FOLDER, REPORT_FILE = "metrics.json", "evaluation.npz", "figures", "report.html"
 """What an evaluation writes into its folder."""
@@ -158,7 +158,8 @@ def read_results(path: Path) -> dict[str, SplitResult]:
         raise InputError(f"{path}: no such file; run `endopilot evaluate` first") from error
     except Exception as error:  # numpy raises many kinds on a damaged archive
         raise InputError(f"{path}: damaged ({error}); run `endopilot evaluate` again") from error
-    return {split: _read_split(arrays, split) for split in dict.fromkeys(key.split("/")[0] for key in arrays)}
+    with reading(path, "run `endopilot evaluate` again"):
+        return {split: _read_split(arrays, split) for split in dict.fromkeys(key.split("/")[0] for key in arrays)}
 
 
 def _read_split(arrays: Mapping[str, np.ndarray], split: str) -> SplitResult:

@@ -59,7 +59,7 @@ def read_network(path: Path) -> tuple[Network | CausalNetwork, dict[str, Any]]:
         size = CausalConfig if facts.get("kind") == "causal" else TransformerConfig
         network = make_network(facts["network"], size(**facts["size"]))
         network.load_state_dict(tensors)
-    except (KeyError, TypeError, RuntimeError) as error:
+    except (KeyError, TypeError, RuntimeError, InputError) as error:
         raise InputError(f"{path}: holds no network of this version ({error}); train it again") from error
     return network.eval(), facts
 
@@ -83,10 +83,11 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         with safe_open(path, framework="pt") as stream:
             facts = json.loads((stream.metadata() or {})["endopilot"])
             tensors = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118 (not a mapping)
-    except (SafetensorError, KeyError, json.JSONDecodeError, OSError) as error:
+    except (SafetensorError, KeyError, ValueError, RecursionError, OSError) as error:
         raise InputError(f"{path}: damaged, or not a checkpoint of endopilot ({error}); train it again") from error
-    if facts["format_version"] != FORMAT_VERSION:
-        raise InputError(f"{path}: format version {facts['format_version']}, not {FORMAT_VERSION}; train it again")
+    version = facts.get("format_version") if isinstance(facts, dict) else None
+    if version != FORMAT_VERSION:
+        raise InputError(f"{path}: format version {version}, not {FORMAT_VERSION}; train it again")
     return tensors, facts
 
 

@@ -19,7 +19,7 @@ class Stages:
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / "stages.json"
-        record = read_json(self._path) if self._path.exists() else {}
+        record = read_json(self._path, keys=()) if self._path.exists() else {}
         self.finished: list[str] = record.get("finished", [])
         self.seconds: dict[str, float] = record.get("seconds", {})
         self.rejected: dict[str, str] = record.get("rejected", {})

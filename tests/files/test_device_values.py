@@ -1,0 +1,176 @@
+"""Numbers of device files in another unit, or at odds with each other: refused, with the unit that would fit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from make_devices import catheter, uniform, wire, write
+
+from endopilot.errors import InputError
+from endopilot.simulation.catheter import list_catheters, read_catheter
+from endopilot.simulation.device import read_device
+from endopilot.simulation.device_files import list_devices
+
+SOURCED = "{name}.value: {value}; give a number from"
+
+
+def refused(tmp_path: Path, content: Any) -> str:
+    """Return the line that refuses a device's or a catheter's file."""
+    path = write(tmp_path / "device.yaml", content)
+    with pytest.raises(InputError) as error:
+        (read_catheter if "inner_diameter_mm" in content else read_device)(path)
+    line = str(error.value)
+    assert line.startswith(f"{path}: ") and "\n" not in line
+    return line.removeprefix(f"{path}: ")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "meant"),
+    [
+        ("diameter_mm", 0.014, "0.014 inch is 0.3556 mm"),
+        ("diameter_mm", 0.035, "0.035 inch is 0.889 mm"),
+        ("diameter_mm", 0.00036, "0.00036 m is 0.36 mm"),
+        ("diameter_mm", 360, "360 µm is 0.36 mm"),
+        ("diameter_mm", 18, "18 French is 6 mm"),
+        ("tip_load_n", 0.75, "0.75 gf is 0.007355 N"),
+        ("tip_load_n", 7.4, "7.4 gf is 0.07257 N"),
+        ("friction", 10, "10 % is 0.1"),
+        ("max_velocity_mm_s", 0.04, "0.04 m/s is 40 mm/s"),
+        ("max_velocity_mm_s", 2400, "2400 mm/min is 40 mm/s"),
+        ("max_rotation_rad_s", 720, "720 °/s is 12.57 rad/s"),
+        ("push_limit_n", 51, "51 gf is 0.5001 N"),
+        ("pull_limit_n", 500, "500 gf is 4.903 N"),
+        ("torque_limit_n_mm", 5e-4, "0.0005 N·m is 0.5 N·mm"),
+    ],
+)
+def test_a_number_in_another_unit_is_answered_with_that_unit(tmp_path, name, value, meant) -> None:
+    line = refused(tmp_path, wire(**{name: value}))
+    assert line.startswith(SOURCED.format(name=name, value=value)) and f"({meant}" in line
+
+
+def test_stiffness_in_square_metres_is_answered_in_square_millimetres(tmp_path) -> None:
+    stiffness = [3e-7, 3e-7, 1.2e-6, 8e-6, 3e-5, 8e-5]
+    line = refused(tmp_path, wire(bend_stiffness_n_mm2=stiffness))
+    assert line.startswith("bend_stiffness_n_mm2.value[0]: 3e-07; give") and "(3e-07 N·m² is 0.3 N·mm²)" in line
+    assert "0.004 N·m² is 4000 N·mm²" in refused(tmp_path, uniform(6.0, 0.004))  # in range, and yet too soft
+
+
+def test_a_radius_for_the_diameter_needs_a_metal_that_there_is_not(tmp_path) -> None:
+    line = refused(tmp_path, wire(diameter_mm=0.18))
+    assert line.startswith(
+        "bend_stiffness_n_mm2.value[4]: 30 with diameter_mm = 0.18 takes a Young's modulus of 582 GPa"
+    )
+    assert "the diameter, not the radius" in line
+
+
+@pytest.mark.parametrize(
+    ("abscissa", "what"),
+    [([0, 0.01, 0.02, 0.06, 0.15, 0.3], "0.3 m is 300 mm"), ([0, 10, 20, 60, 150, 30000], "from 0 to 5000 mm")],
+)
+def test_abscissae_in_metres_or_micrometres_are_refused(tmp_path, abscissa, what) -> None:
+    assert what in refused(tmp_path, wire(abscissa_mm=abscissa))
+
+
+@pytest.mark.parametrize(
+    ("angle", "length", "what"),
+    [
+        (0.785, 3, "0.785 rad is 44.98°"),
+        (3.1416, 9.42, "3.142 rad is 180°"),
+        (45, 0.003, "0.003 m is 3 mm"),
+        (45, 300, "from 0 to 200 mm"),
+        (360, 0.9, "less than the device's own"),
+    ],
+)
+def test_a_tip_bent_in_radians_or_metres_is_refused(tmp_path, angle, length, what) -> None:
+    bend = {"angle_deg": angle, "length_mm": length, "source": "shaped by hand"}
+    assert what in refused(tmp_path, wire(tip_bend=bend))
+
+
+def test_tip_shaping_in_radians_is_refused(tmp_path) -> None:
+    shaping = {"angle_deg": [0, 1.57], "length_mm": [2, 10], "source": "by hand"}
+    assert "1.57 rad is 89.95°" in refused(tmp_path, wire() | {"tip_shaping": shaping})
+
+
+def test_a_catheter_s_shape_in_radians_or_metres_is_refused(tmp_path) -> None:
+    for arcs, what in (
+        ([[6, 0], [9, 1.57]], "1.57 rad is 89.95°"),
+        ([[0.006, 0], [0.009, 90]], "0.006 m is 6 mm"),
+        ([[6, 0], [0.9, 180]], "less than the device's own"),
+    ):
+        assert what in refused(tmp_path, catheter(shape={"arcs": arcs, "source": "as delivered"}))
+
+
+def test_a_bore_as_wide_as_its_catheter_is_refused(tmp_path) -> None:
+    assert "give less than the outer diameter, 1.67 mm" in refused(tmp_path, catheter(inner_diameter_mm=1.67))
+    assert "0.047 inch is 1.194 mm" in refused(tmp_path, catheter(inner_diameter_mm=0.047))
+
+
+def test_profiles_listed_from_the_shaft_on_are_refused(tmp_path) -> None:
+    bend, twist = [80, 30, 8, 1.2, 0.3, 0.3], [62, 23, 6.2, 0.92, 0.23, 0.23]
+    line = refused(tmp_path, wire(bend_stiffness_n_mm2=bend, twist_stiffness_n_mm2=twist, tip_load_n=None))
+    assert line.startswith("bend_stiffness_n_mm2.value[2]: 8, and 80 nearer to the tip; list the tip first")
+
+
+def test_a_stiffness_ratio_that_no_device_has_is_refused(tmp_path) -> None:
+    profiles = {"bend_stiffness_n_mm2": [0.01, 5e3], "twist_stiffness_n_mm2": [7.5e-3, 3.8e3]}
+    line = refused(tmp_path, wire(diameter_mm=0.89, abscissa_mm=[0, 300], tip_load_n=None, **profiles))
+    assert line.startswith("bend_stiffness_n_mm2.value[1]: 5000 is more than 100000 times the least, 0.01")
+
+
+@pytest.mark.parametrize("ratio", [0.3, 1.3, 0.77e-6, 2.6])
+def test_a_wire_s_gj_follows_from_its_ei(tmp_path, ratio) -> None:
+    assert "a round section has GJ = EI/(1 + ν)" in refused(tmp_path, uniform(0.89, 500.0, ratio))
+
+
+def test_a_tip_load_of_another_tip_is_refused(tmp_path) -> None:
+    line = refused(tmp_path, wire(tip_load_n=0.3))
+    assert line.startswith("tip_load_n: 0.3; a tip of this EI buckles at 0.0074 N") and "0.3 gf is 0.00294 N" in line
+
+
+def test_a_decimal_comma_is_answered_with_a_point(tmp_path) -> None:
+    assert "'0,36'; give a number from 0.15 to 10 mm (0,36 with a decimal point is 0.36)" in refused(
+        tmp_path, wire(diameter_mm="0,36")
+    )
+
+
+def test_a_profile_of_a_million_values_is_refused(tmp_path) -> None:
+    many = {"abscissa_mm": list(range(2000)), "bend_stiffness_n_mm2": [1] * 2000, "twist_stiffness_n_mm2": [1] * 2000}
+    assert "abscissa_mm: 2000 values; give at most 1000" in refused(tmp_path, wire(**many))
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        wire(),
+        wire(diameter_mm=0.2, bend_stiffness_n_mm2=[0.02, 0.02, 0.1, 1, 4, 12], tip_load_n=0.001,
+             twist_stiffness_n_mm2=[0.015, 0.015, 0.077, 0.77, 3.1, 9.2]),  # a micro-wire of 0.008 inch
+        wire(diameter_mm=0.3, bend_stiffness_n_mm2=[0.05, 0.05, 0.2, 2, 10, 60], tip_load_n=None,
+             twist_stiffness_n_mm2=[0.038, 0.038, 0.15, 1.5, 7.7, 46]),  # of 0.012 inch
+        uniform(0.36, np.pi / 64 * 0.36**4, 1 / 1.49),  # modulus 1 MPa, of a published simulation
+        wire(diameter_mm=0.89, abscissa_mm=[0, 30], bend_stiffness_n_mm2=[0.2, 2.46], tip_load_n=None,
+             twist_stiffness_n_mm2=[0.134, 1.65]),  # of another
+        wire(diameter_mm=0.89, abscissa_mm=[0, 40, 200], bend_stiffness_n_mm2=[5, 60, 6100], tip_load_n=None,
+             twist_stiffness_n_mm2=[3.8, 46, 4700]),  # an extra-stiff wire, all steel
+        wire(diameter_mm=0.96),  # 0.038 inch
+        wire(tip_load_n=None) | {"tip_bend": {"angle_deg": 180, "length_mm": 47, "source": "J of 15 mm radius"}},
+        catheter(),
+        catheter(diameter_mm=8.0, inner_diameter_mm=6.7, abscissa_mm=[0], bend_stiffness_n_mm2=[3e5],
+                 twist_stiffness_n_mm2=[2e5], push_limit_n=20, torque_limit_n_mm=500),  # a sheath of 24 French
+        catheter(diameter_mm=0.7, inner_diameter_mm=0.57, abscissa_mm=[0], bend_stiffness_n_mm2=[0.0066],
+                 twist_stiffness_n_mm2=[0.0044]),  # modulus 1 MPa
+        catheter(twist_stiffness_n_mm2=[80, 80, 280, 390]),  # torque braid
+    ],
+)  # fmt: skip
+def test_extreme_devices_are_read(tmp_path, content) -> None:
+    path = write(tmp_path / "device.yaml", content)
+    device = read_catheter(path).device if "inner_diameter_mm" in content else read_device(path)
+    assert device.diameter_mm == content["diameter_mm"]["value"]
+    assert list(device.bend_stiffness_n_mm2) == content["bend_stiffness_n_mm2"]["value"]
+
+
+def test_shipped_devices_are_read() -> None:
+    assert all(read_device(name).name == name for name in list_devices())
+    assert all(read_catheter(name).name == name for name in list_catheters())
