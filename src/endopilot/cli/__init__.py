@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from endopilot import __version__
-from endopilot.cli.process import EXIT_BAD_INPUT, leave, own_streams, run
+from endopilot.cli.process import EXIT_BAD_INPUT, carry_out, leave, own_streams
 from endopilot.errors import InputError
 
 COMMANDS = {
@@ -64,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     elif name in COMMANDS:
         if is_process:
             own_streams()
-        code = run(name, functools.partial(_work, name, arguments[1:]))
+        code = carry_out(name, functools.partial(_work, name, arguments[1:]))
         leave(code) if is_process else sys.exit(code)
     else:
         near = difflib.get_close_matches(name, COMMANDS, n=1)

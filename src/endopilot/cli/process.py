@@ -33,7 +33,7 @@ _OUT_OF_MEMORY = re.compile("out of memory|allocate memory|bad.?alloc(ation)?", 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
-def run(name: str, work: Callable[[], object]) -> int:
+def carry_out(name: str, work: Callable[[], object]) -> int:
     """Do the work of a command and return its exit code: 0, if it does not leave with a code of its own.
 
     Args:
