@@ -10,7 +10,7 @@ import platform
 import shutil
 import subprocess
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, is_dataclass
 from importlib import metadata
 from pathlib import Path
@@ -20,6 +20,13 @@ import numpy as np
 
 from endopilot import __version__
 from endopilot.errors import InputError
+
+
+_OF_THE_PATH = tuple(
+    getattr(errno, name)
+    for name in "EACCES EPERM EROFS ENOENT ENOTDIR EISDIR EEXIST ENOTEMPTY ELOOP ENAMETOOLONG EINVAL EIO EBUSY".split()
+)
+"""Errors that another path mends."""
 
 
 @contextmanager
@@ -33,6 +40,8 @@ def writing(path: Path) -> Iterator[Path]:
         InputError: the folder cannot be written, or the disk is full.
     """
     path = Path(path)
+    if path.name in ("", ".."):
+        raise InputError(f"{path}: is no name of a file; choose another output")
     partial = path.with_name(f".part-{os.getpid()}-{path.name}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -41,14 +50,15 @@ def writing(path: Path) -> Iterator[Path]:
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise InputError(f"{path}: the disk is full; free some space and run the same command again") from error
-        if error.errno in (errno.EACCES, errno.EROFS, errno.ENOTDIR, errno.EEXIST):
+        if error.errno in _OF_THE_PATH:
             raise InputError(f"{path}: cannot be written ({error.strerror}); choose another output") from error
         raise
     finally:
-        if partial.is_dir():
-            shutil.rmtree(partial, ignore_errors=True)
-        elif partial.exists():
-            partial.unlink()
+        with suppress(OSError):
+            if partial.is_dir():
+                shutil.rmtree(partial, ignore_errors=True)
+            else:
+                partial.unlink(missing_ok=True)
 
 
 def json_text(content: Any) -> str:

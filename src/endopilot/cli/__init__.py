@@ -123,6 +123,9 @@ def _later(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
 
     @functools.wraps(command)
     def bound(*args: Any, **kwargs: Any) -> Callable[[], None]:
+        from endopilot.settings import check_call  # pydantic is slow to import
+
+        check_call(command, args, kwargs)
         return functools.partial(command, *args, **kwargs)
 
     return bound

@@ -28,13 +28,13 @@ EXIT_INTERRUPTED = 128 + signal.SIGINT
 EXIT_UNREAD = 141
 TO_END_S = 10.0
 """Time in which a command that is stopped tidies up, s; then it leaves."""
-_OUT_OF_MEMORY = re.compile("out of memory|allocate memory|bad.?alloc(ation)?", re.IGNORECASE)
+_OUT_OF_MEMORY = re.compile("out of memory|allocate memory|bad.?alloc(ation)?|maximum allowed (size|dimension) exceeded", re.IGNORECASE)
 """How libraries in C++ say it, in exceptions of several kinds."""
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 def carry_out(name: str, work: Callable[[], object]) -> int:
-    """Do the work of a command and return its exit code: 0, if it does not leave with a code of its own.
+    """Do the work of a command and return its exit code: 0, or the one that it leaves with.
 
     Args:
         name: of the command.
@@ -42,15 +42,24 @@ def carry_out(name: str, work: Callable[[], object]) -> int:
     """
     with _signals() as arrived, _remarks(name):
         try:
-            work()
+            code = _code_of(work)
             sys.stdout.flush()
         except BaseException as error:
             if arrived:  # whatever a library that was interrupted made of it
                 return _say(name, "interrupted" if arrived[0] == signal.SIGINT else "terminated", 128 + arrived[0])
-            if isinstance(error, SystemExit):
-                raise
             return _end(name, error)
-        return 0
+        return code
+
+
+def _code_of(work: Callable[[], object]) -> int:
+    """Do some work and return the code that it leaves with."""
+    try:
+        work()
+    except Stopped:
+        raise
+    except SystemExit as leaving:
+        return leaving.code if isinstance(leaving.code, int) else int(leaving.code is not None)
+    return 0
 
 
 def own_streams() -> None:
@@ -111,6 +120,8 @@ def _end(name: str, error: BaseException) -> int:
         size = re.search(r"allocate ([\d.]+ \w+)", text)
         what = f"{size[1]} of memory are asked for" if size else "the memory is used up"
         return _say(name, f"{what}, more than there is; ask for less at once: fewer, shorter or coarser", 2)
+    if isinstance(error, RuntimeError) and text.startswith("Symlink loop"):  # as pathlib has it
+        return _say(name, f"{text}; check the path", EXIT_BAD_INPUT)
     if isinstance(error, OSError) and error.errno in _FULL:
         return _say(name, "the disk is full; free some space and run the same command again", EXIT_BAD_INPUT)
     if isinstance(error, OSError) and error.errno is not None:
