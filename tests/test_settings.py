@@ -114,6 +114,23 @@ def range_of(hint: Any) -> Within:
     return next(part for part in get_args(hint)[1:] if isinstance(part, Within))
 
 
+UNBOUNDED = {"Device", "Catheter", "DriveLimits"}
+"""What code gives in the units that it likes; files hold them within `device_ranges`."""
+
+
+def test_no_number_that_a_user_gives_is_large_enough_to_run_for_ever() -> None:
+    """Counts, times, steps and sizes have bounds: a typing error is refused before the work begins."""
+    drives = r"(^|[^mdn])_s$|seconds|_period_s|spacing|slice|pixel_mm|in_plane"  # lengths of time, and voxels
+    loose = {
+        f"{kind.__name__}.{place}"
+        for kind, _, place, number, within, _ in (case.values for case in cases())
+        if kind.__name__ not in UNBOUNDED
+        if number is int or re.search(drives, place)
+        if within is not None and not math.isfinite(within.high)
+    }
+    assert loose == set()
+
+
 def holds(within: Within, value: float) -> bool:
     above = value > within.low if within.above_low else value >= within.low
     return above and (value < within.high if within.below_high else value <= within.high)
@@ -277,6 +294,10 @@ def test_a_bad_value_is_named(values: dict[str, Any], line: str) -> None:
             "rod: 3; write it as {radius_mm: ..., nodes: ..., material: ..., bend_mm: ..., points: ...}",
         ),
         ({"rod": {}}, "count: missing; add it"),
+        (
+            {"rod": {"radius_mm": "0,36"}, "count": 1},
+            "rod.radius_mm: '0,36'; give a positive number (0,36 with a decimal point is 0.36)",
+        ),
         ([1], "holds no mapping of fields; the fields are rod, count, tie"),
         ({1: 2}, "holds no mapping of fields; the fields are rod, count, tie"),
     ],
@@ -306,7 +327,7 @@ def test_a_file_is_read_and_its_faults_are_named(tmp_path: Path, suffix: str) ->
     path.write_text('{"rod": {}, "count": 0}')
     with pytest.raises(InputError) as error:
         read_settings(path, Bundle, remedy="tie it again")
-    assert str(error.value) == f"{path}: count: 0; give a whole number of 1 or more, or tie it again"
+    assert str(error.value) == f"{path}: count: 0; give a whole number from 1 to 1000000, or tie it again"
     path.write_text("{")
     with pytest.raises(InputError, match=rf"^{re.escape(str(path))}: .*not valid {suffix[1:].upper()}"):
         read_settings(path, Bundle)

@@ -1,25 +1,41 @@
-"""Atomic writes, JSON files, content hashes, and the manifest that says how a result was made."""
+"""Atomic writes, readers of text, JSON and YAML, content hashes, and the manifest that says how a result was made."""
 
 from __future__ import annotations
 
+import codecs
 import errno
 import hashlib
 import json
 import os
 import platform
+import re
 import shutil
 import subprocess
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, is_dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
+import yaml
 
 from endopilot import __version__
 from endopilot.errors import InputError
+
+_MIB = 2**20
+_LARGEST_JSON, _LARGEST_YAML = 512 * _MIB, _MIB // 4
+"""Bytes of a file that is read whole: recordings of long navigations have some MiB, settings some KiB."""
+_MOST_NODES = 100_000
+"""Values that a YAML file may hold once its aliases are written out."""
+_ENCODINGS = (
+    (codecs.BOM_UTF8, "utf-8-sig"),
+    (codecs.BOM_UTF16_LE, "utf-16"),
+    (codecs.BOM_UTF16_BE, "utf-16"),
+)
+"""What a file that begins with these bytes is written in: spreadsheets and shells of Windows begin theirs so."""
 
 
 _OF_THE_PATH = tuple(
@@ -72,18 +88,109 @@ def write_json(path: Path, content: Any) -> None:
         partial.write_text(json_text(content) + "\n", encoding="utf-8")
 
 
-def read_json(path: Path) -> Any:
-    """Read a JSON file.
+def read_text(path: Path, *, what: str = "text file", largest: int = _LARGEST_YAML) -> str:
+    """Return what a text file holds, in UTF-8, or in UTF-16 if it begins with that encoding's mark.
+
+    Args:
+        path: the file.
+        what: what it should be, for the message, such as "CSV file".
+        largest: bytes that it may have at most; no more than these are read.
 
     Raises:
-        InputError: the file is missing or is not JSON.
+        InputError: the file is missing, cannot be read, is too large, or is no text.
     """
     try:
-        return json.loads(Path(path).read_text(encoding="utf-8"))
+        with Path(path).open("rb") as stream:
+            content = stream.read(largest + 1)
     except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file; run the command that makes it first") from error
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not valid JSON ({error}); make it again") from error
+        raise InputError(f"{path}: no such file; check the path") from error
+    except (OSError, ValueError) as error:  # a path with a zero in it is a ValueError
+        raise InputError(f"{path}: cannot be read ({getattr(error, 'strerror', error)}); give a {what}") from error
+    if len(content) > largest:
+        raise InputError(f"{path}: is larger than {largest / _MIB:g} MiB, too large for a {what}; check the path")
+    encoding = next((name for mark, name in _ENCODINGS if content.startswith(mark)), "utf-8")
+    try:
+        text = content.decode(encoding)
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is no text in UTF-8; give a {what}, saved as UTF-8") from error
+    if "\0" in text:
+        raise InputError(f"{path}: is no text (it holds zero bytes); give a {what}")
+    return text
+
+
+def read_json(path: Path, *, keys: Iterable[str] | None = None, mend: str = "make it again") -> Any:
+    """Read a JSON file.
+
+    Args:
+        path: the file.
+        keys: what it must hold; None for a file that need not hold an object with names.
+        mend: what to do about a damaged file.
+
+    Raises:
+        InputError: the file is missing, is not JSON, names a key twice, or lacks one of `keys`.
+    """
+    if not Path(path).exists():
+        raise InputError(f"{path}: no such file; run the command that makes it first")
+    text = read_text(path, what="JSON file", largest=_LARGEST_JSON)
+    try:
+        content = json.loads(text, object_pairs_hook=_without_doubles)
+    except RecursionError as error:
+        raise InputError(f"{path}: not valid JSON (it is nested too deeply); {mend}") from error
+    except ValueError as error:  # not JSON, a key twice, or a number of thousands of digits
+        raise InputError(f"{path}: not valid JSON ({error}); {mend}") from error
+    if keys is None:
+        return content
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: holds {_kind(content)} where an object with names belongs; {mend}")
+    for key in keys:
+        if key not in content:
+            raise InputError(f"{path}: {key}: missing; {mend}")
+    return content
+
+
+def read_yaml(path: Path) -> Any:
+    """Read a YAML file, whose plain scalars mean what YAML 1.2 has them mean.
+
+    So `3e-1` is a number, `no` and `2024-05-01` are text, and numbers that two versions of YAML read differently
+    (`017`, `0o17`, `1_000`, `1:30`) are text, which no number's field takes.
+
+    Raises:
+        InputError: the file is missing, is not YAML, names a field twice, nests too deeply, or holds more than 100 000
+            values once its aliases are written out.
+    """
+    text = read_text(path, what="YAML file")
+    try:
+        return yaml.load(text, _YamlLoader)
+    except RecursionError as error:
+        raise InputError(f"{path}: not valid YAML (it is nested too deeply); correct the file") from error
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f"line {mark.line + 1}: " if mark else ""
+        problem = getattr(error, "problem", None) or str(error).splitlines()[0]
+        raise InputError(f"{path}: {line}not valid YAML ({problem}); correct the file") from error
+    except (ValueError, LookupError) as error:  # a number of thousands of digits, or `!!bool 3`
+        raise InputError(f"{path}: not valid YAML ({error}); correct the file") from error
+
+
+@contextmanager
+def reading(path: Path, mend: str) -> Iterator[None]:
+    """Answer what the odd content of a damaged file or folder raises in the block, in one line that names it.
+
+    It stands around the lines that take a record of ours apart, and around nothing else.
+
+    Raises:
+        InputError: the content is not what belongs there; `mend` ends the line.
+    """
+    try:
+        yield
+    except KeyError as error:
+        raise InputError(f"{path}: {error.args[0] if error.args else 'an entry'}: missing; {mend}") from error
+    except InputError as error:
+        raise error if str(path) in str(error) else InputError(f"{path}: {error}; {mend}") from None
+    except (TypeError, ValueError, AttributeError, IndexError, OverflowError) as error:
+        raise InputError(
+            f"{path}: damaged ({str(error).splitlines()[0] if str(error) else error!r}); {mend}"
+        ) from error
 
 
 def sha256(path: Path) -> str:
@@ -156,6 +263,81 @@ def _commit() -> str | None:
     except (OSError, subprocess.SubprocessError):
         return None
     return answer.stdout.strip()
+
+
+class _YamlLoader(yaml.SafeLoader):
+    """A safe loader of plain scalars by YAML 1.2, without fields named twice and without endless aliases."""
+
+    yaml_implicit_resolvers: ClassVar[dict] = {}
+    yaml_constructors: ClassVar[dict] = {
+        tag: constructor
+        for tag, constructor in yaml.SafeLoader.yaml_constructors.items()
+        if tag is None or tag.rpartition(":")[2] in ("null", "bool", "int", "float", "str", "seq", "map")
+    }
+
+    def get_single_node(self) -> Any:
+        node = super().get_single_node()
+        if node is not None and _written_out(node, {}) > _MOST_NODES:
+            raise yaml.composer.ComposerError(
+                problem=f"its aliases stand for more than {_MOST_NODES} values", problem_mark=node.start_mark
+            )
+        return node
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict:
+        seen = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode):
+                if key.value in seen:
+                    raise yaml.constructor.ConstructorError(
+                        problem=f"{key.value} is given twice", problem_mark=key.start_mark
+                    )
+                seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
+for _tag, _pattern, _first in (
+    ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
+    ("bool", r"true|True|TRUE|false|False|FALSE", list("tTfF")),
+    ("int", r"[-+]?(0|[1-9][0-9]*)", list("-+0123456789")),
+    ("float", r"[-+]?(\.[0-9]+|(0|[1-9][0-9]*)(\.[0-9]*)?)([eE][-+]?[0-9]+)?", list("-+.0123456789")),
+    ("float", r"[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)", list("-+.")),
+    ("merge", r"<<", ["<"]),
+):
+    _YamlLoader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(rf"^({_pattern})$"), _first)
+
+
+def _written_out(node: Any, known: dict[int, int]) -> int:
+    """Return how many values a node of YAML stands for; aliases of a node share it.
+
+    Raises:
+        yaml.composer.ComposerError: the node holds itself.
+    """
+    if id(node) not in known:
+        known[id(node)] = -1
+        inner = [part for pair in node.value for part in pair] if isinstance(node, yaml.MappingNode) else node.value
+        known[id(node)] = 1 if isinstance(node, yaml.ScalarNode) else 1 + sum(_written_out(n, known) for n in inner)
+    if known[id(node)] < 0:
+        raise yaml.composer.ComposerError(problem="an alias stands in its own anchor", problem_mark=node.start_mark)
+    return known[id(node)]
+
+
+def _without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return the object of a JSON file.
+
+    Raises:
+        ValueError: a name stands in it twice.
+    """
+    content = dict(pairs)
+    if len(content) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise ValueError(f"{Counter(names).most_common(1)[0][0]} is given twice")
+    return content
+
+
+def _kind(value: Any) -> str:
+    """Return what a value of a JSON file is, in words."""
+    kinds = {list: "a list", str: "text", bool: "true or false", type(None): "null", dict: "an object"}
+    return kinds.get(type(value), "a number")
 
 
 def _jsonable(value: Any) -> Any:

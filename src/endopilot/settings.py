@@ -17,20 +17,21 @@ import dataclasses
 import difflib
 import inspect
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, cast, dataclass_transform, get_args, get_origin, get_type_hints, overload
 
 import numpy as np
-import yaml
 from pydantic import AfterValidator, ConfigDict, GetCoreSchemaHandler, StringConstraints, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, core_schema
 
 from endopilot.errors import InputError
-from endopilot.files import read_json
+from endopilot.files import read_json, read_yaml
 
+_DECIMAL_COMMA = re.compile(r"[-+]?[0-9]+,[0-9]+")
 T = TypeVar("T")
 Number = int | float
 _STRICT = ConfigDict(extra="forbid")
@@ -60,12 +61,16 @@ class Within:
         high: largest value.
         above_low: whether `low` itself is refused.
         below_high: whether `high` itself is refused.
+        unit: of the number, such as "mm".
+        mistaken: other units that it may have been given in by mistake: name, and size in `unit`.
     """
 
     low: Number = -math.inf
     high: Number = math.inf
     above_low: bool = False
     below_high: bool = False
+    unit: str = ""
+    mistaken: tuple[tuple[str, float], ...] = ()
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         """Return the schema that pydantic checks by; all that it refuses is answered by one sentence."""
@@ -77,24 +82,45 @@ class Within:
             number: CoreSchema = core_schema.int_schema(strict=True, **bounds)
         else:
             number = core_schema.float_schema(strict=True, allow_inf_nan=False, **bounds)
-        plain = core_schema.no_info_before_validator_function(_without_numpy, number)
-        return core_schema.custom_error_schema(plain, "range", custom_error_message=self.mend(whole=source is int))
+
+        def check(value: Any, checked: Callable[[Any], Any]) -> Any:
+            value = _without_numpy(value)
+            try:
+                return checked(value)
+            except ValidationError:
+                mend = self.mend(whole=source is int) + self.proposal(value)
+                raise PydanticCustomError("range", "{mend}", {"mend": mend}) from None
+
+        return core_schema.no_info_wrap_validator_function(check, number)
+
+    def proposal(self, value: Any) -> str:
+        """Return what a refused value may have been meant as, in parentheses; nothing if no unit makes sense of it."""
+        if isinstance(value, str):
+            plain = value.strip().replace(",", ".", 1)
+            return f" ({value} with a decimal point is {plain})" if _DECIMAL_COMMA.fullmatch(value.strip()) else ""
+        if type(value) not in (int, float) or not math.isfinite(value):
+            return ""
+        for name, size in self.mistaken:
+            if value and self.low <= value * size <= self.high:
+                return f" ({value:g} {name} is {value * size:.4g} {self.unit})"
+        return ""
 
     def mend(self, *, whole: bool) -> str:
         """Return what to give, in words; `whole` says whether it must be a whole number."""
         number, low, high = ("whole number" if whole else "number"), _bound(self.low), _bound(self.high)
+        unit = f" {self.unit}" if self.unit else ""
         if math.isfinite(self.low) and math.isfinite(self.high):
             if self.above_low and self.below_high:
-                return f"give a {number} between {low} and {high}"
+                return f"give a {number} between {low} and {high}{unit}"
             if self.above_low:
-                return f"give a {number} above {low}, at most {high}"
-            return f"give a {number} from {low} to {'below ' if self.below_high else ''}{high}"
+                return f"give a {number} above {low}, at most {high}{unit}"
+            return f"give a {number} from {low} to {'below ' if self.below_high else ''}{high}{unit}"
         if math.isfinite(self.low):
             if not self.above_low:
-                return f"give a {number} of {low} or more"
-            return f"give a positive {number}" if self.low == 0 else f"give a {number} above {low}"
+                return f"give a {number} of {low}{unit} or more"
+            return f"give a positive {number}" if self.low == 0 else f"give a {number} above {low}{unit}"
         if math.isfinite(self.high):
-            return f"give a {number} {'below' if self.below_high else 'of at most'} {high}"
+            return f"give a {number} {'below' if self.below_high else 'of at most'} {high}{unit}"
         return f"give a {number}" if whole else "give a finite number"
 
 
@@ -116,10 +142,14 @@ OpenShare = Annotated[float, Within(0, 1, above_low=True, below_high=True)]
 """A number between 0 and 1, neither included."""
 ShareBelowOne = Annotated[float, Within(0, 1, below_high=True)]
 """A number from 0 to below 1."""
-Count = Annotated[int, Within(1)]
-"""A whole number of 1 or more."""
-CountOrZero = Annotated[int, Within(0)]
-"""A whole number of 0 or more."""
+Count = Annotated[int, Within(1, 10**6)]
+"""A whole number from 1 to a million; more would run for ever or take all memory."""
+CountOrZero = Annotated[int, Within(0, 10**6)]
+"""A whole number from 0 to a million."""
+LONGEST_S = 86_400.0
+"""Longest time that anything is simulated for, s: a day."""
+Seconds = Annotated[float, Within(0, LONGEST_S, above_low=True)]
+"""A time above 0, at most a day, s."""
 Seed = Annotated[int, Within(0, 2**64 - 1)]
 """Seed of a random stream."""
 Text = Annotated[str, StringConstraints(strip_whitespace=True, min_length=1)]
@@ -181,7 +211,7 @@ def read_settings(path: Path, cls: type[T], *, remedy: str = "") -> T:
     Raises:
         InputError: the file is missing or holds no such settings; the line names file, field, value and what to give.
     """
-    content = read_json(path) if Path(path).suffix == ".json" else _read_yaml(path)
+    content = read_json(path) if Path(path).suffix == ".json" else read_yaml(path)
     try:
         return from_record(cls, content)
     except InputError as error:
@@ -271,22 +301,10 @@ def _fields_at(cls: Any, place: Sequence[int | str]) -> list[str]:
 
 
 def _bound(value: Number) -> str:
-    return f"2^{value.bit_length()} - 1" if isinstance(value, int) and value >= 2**32 else f"{value:g}"
+    if isinstance(value, int):
+        return f"2^{value.bit_length()} - 1" if value >= 2**32 else str(value)
+    return f"{value:.10g}"
 
 
 def _without_numpy(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
-
-
-def _read_yaml(path: Path) -> Any:
-    try:
-        return yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: no such file, or it cannot be read; check the path") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: is no text in UTF-8; give a YAML file") from error
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        line = f"line {mark.line + 1}: " if mark else ""
-        problem = getattr(error, "problem", None) or str(error).splitlines()[0]
-        raise InputError(f"{path}: {line}not valid YAML ({problem}); correct the file") from error

@@ -56,7 +56,7 @@ def test_shipped_catheters_are_whole(name: str) -> None:
     [
         ("value: 0.42", "value: 0.6", "inner_diameter_mm: 0.6; give less than the outer diameter, 0.57 mm"),
         ("bore_friction:", "bore_fiction:", "bore_fiction: no such field; did you mean bore_friction?"),
-        ("arcs: []", "arcs: [[0, 30]]", "shape.arcs[0][0]: 0; give a positive number"),
+        ("arcs: []", "arcs: [[0, 30]]", "shape.arcs[0][0]: 0; give a number from 0.1 to 500 mm"),
         ("arcs: []", "arcs: [[5, 900]]", "shape.arcs[0][1]: 900; give a number from -720 to 720"),
     ],
 )

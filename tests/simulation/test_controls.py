@@ -89,7 +89,7 @@ def test_controls_from_csv_may_hold_for_another_time(tmp_path: Path) -> None:
         ("time_s,translation_mm_s,rotation_rad_s\n0.05,1,0\n0.2,1,0\n", "row 3: time_s = 0.2; .* count 0.05, 0.1"),
         ("time_s,translation_mm_s,rotation_rad_s\n0,1,0\n0.5,1,0\n", "row 2: time_s = 0; the first row ends"),
         ("time_s,translation_mm_s,rotation_rad_s\n", "no rows"),
-        ("", "cannot be read"),
+        ("", "is empty; give the columns time_s"),
     ],
 )
 def test_bad_csv_is_refused(tmp_path: Path, text: str, message: str) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import asdict
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -32,7 +32,7 @@ from endopilot.anatomy.tree import tree_from_lines
 from endopilot.anatomy.units import SMALLEST_RADIUS_MM, check_unit
 from endopilot.errors import InputError
 from endopilot.progress import progress
-from endopilot.settings import Finite, Positive, settings
+from endopilot.settings import Finite, Within, settings
 from endopilot.types import Anatomy, DistanceMap, Insertion, LumenMask, VesselTree
 
 __all__ = ["AnatomyConfig", "extract_anatomy", "read_source"]
@@ -56,14 +56,14 @@ class AnatomyConfig:
     ostium_mm: tuple[Finite, Finite, Finite] | None = None
     """Where the device enters, LPS mm, within some 5 mm; by default the mask's own ostium, or else where the vessel
     looks as if it began."""
-    catheter_radius_mm: Positive | None = None
+    catheter_radius_mm: Annotated[float, Within(0, 20, above_low=True)] | None = None
     """Inner radius of the guiding catheter, mm; by default 0.9 (6 French), the ostium's where that is narrower, and
     more where the map is too coarse for it."""
-    spacing_mm: Positive | None = None
+    spacing_mm: Annotated[float, Within(0.02, 5)] | None = None
     """Grid spacing of the distance map, mm; by default 0.45 times the narrow vessels' radius, from 0.3 to 1.5 mm."""
-    minimum_branch_length_mm: Positive = 4.0
+    minimum_branch_length_mm: Annotated[float, Within(0, 1000, above_low=True)] = 4.0
     """Side branches shorter than this beyond their parent's lumen are dropped, mm."""
-    scale: Positive = 1.0
+    scale: Annotated[float, Within(1e-4, 10000)] = 1.0
     """Factor that turns the file's unit into mm: 10 for cm, 1000 for m."""
     coordinates: Literal["lps", "ras"] = "lps"
     """Axes of a surface or VTP file, which does not state them. Masks and Slicer markups do, and ignore this."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import model_validator
@@ -20,7 +20,7 @@ from endopilot.atlas.portal import make_portal
 from endopilot.atlas.rca import make_rca
 from endopilot.atlas.through_ct import seen_through_ct, visible
 from endopilot.atlas.variation import catheter_direction, flattened
-from endopilot.settings import Count, Seed, Share, settings
+from endopilot.settings import Seed, Share, Within, settings
 from endopilot.types import Anatomy, Insertion, VesselTree
 
 CATHETER_LENGTH_MM = 30.0
@@ -45,7 +45,7 @@ class AtlasConfig:
     anatomy: str = "rca"
     """Kind of vessel tree: rca or lca (right or left coronary artery), cerebral (internal carotid with middle and
     anterior cerebral arteries), arch (aortic arch with its branches), portal (portal vein)."""
-    count: Count = 1
+    count: Annotated[int, Within(1, 100000)] = 1
     """Number of patients."""
     seed: Seed = 0
     """Seed of the atlas: patient i is the same whatever the count."""

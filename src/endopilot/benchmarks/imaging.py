@@ -26,7 +26,7 @@ from endopilot.files import manifest, read_json, write_json
 from endopilot.imaging.segment import SegmentConfig, segment
 from endopilot.phantom.phantom import make_phantom
 from endopilot.runs import claim, make_missing
-from endopilot.settings import Count, Within, settings
+from endopilot.settings import Within, settings
 
 LEAST_OVERLAP, LARGEST_OSTIUM_ERROR_MM = 0.8, 5.0
 """A result is wrong where its centerline overlap is smaller, or its ostium error larger."""
@@ -58,7 +58,7 @@ BARS = {
 class ImagingBenchConfig:
     """Number, seed and difficulty of the cases, and the folder of their results."""
 
-    cases: Count = 50
+    cases: Annotated[int, Within(1, 10000)] = 50
     """Number of synthetic CT angiograms."""
     seed: Annotated[int, Within(0, 2**63 - 1)] = 0
     """Seed of patients, scanners and noise: case i is the same however many there are."""

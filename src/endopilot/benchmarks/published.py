@@ -27,7 +27,7 @@ from endopilot.benchmarks.straightening import (
 from endopilot.benchmarks.three_point import SPAN_MM, flexural_modulus
 from endopilot.benchmarks.tubing import BORE_MM, LENGTH_MM, draw_tubing, push_through
 from endopilot.progress import progress
-from endopilot.settings import Count, Within, settings
+from endopilot.settings import Within, settings
 from endopilot.simulation.catheter import Catheter, read_catheter
 from endopilot.simulation.device import Device, read_device
 from endopilot.simulation.device_files import list_devices
@@ -65,7 +65,7 @@ POLYMER_MPA = 100.0
 class PublishedConfig:
     """How often what is not stated is drawn."""
 
-    draws: Count = 40
+    draws: Annotated[int, Within(1, 10000)] = 40
     """Number of draws of what an article does not state, such as a path's coordinates."""
     seed: Annotated[int, Within(0, 2**63 - 1)] = 0
     """Seed of the draws."""

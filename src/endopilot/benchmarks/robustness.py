@@ -31,7 +31,7 @@ from endopilot.files import read_json, sha256, write_json, writing
 from endopilot.parallel import Workers
 from endopilot.progress import progress
 from endopilot.runs import claim
-from endopilot.settings import Count, CountOrZero, Within, settings
+from endopilot.settings import Within, settings
 from endopilot.simulation.catheter import list_catheters, read_catheter
 from endopilot.simulation.config import SimulatorConfig, wall_stiffness
 from endopilot.simulation.device import read_device
@@ -50,9 +50,9 @@ MOST_PENETRATION_MM = 0.05
 class RobustnessConfig:
     """Number and length of the rollouts, the anatomies, and the folder of the results."""
 
-    rollouts: Count = 10_000
+    rollouts: Annotated[int, Within(1, 10**7)] = 10_000
     """Number of rollouts, spread over the anatomies and the devices that fit; rounded up to whole chunks."""
-    anatomies: Count = 100
+    anatomies: Annotated[int, Within(1, 100000)] = 100
     """Number of synthetic anatomies, if none are given."""
     given: tuple[Path, ...] = ()
     """Folders of anatomies of your own, made by `endopilot anatomy`."""
@@ -62,7 +62,7 @@ class RobustnessConfig:
     """Seed of the anatomies and the controls."""
     seconds: Annotated[float, Within(5, 3600)] = 60.0
     """Length of a rollout, s."""
-    threads: CountOrZero = 0
+    threads: Annotated[int, Within(0, 1024)] = 0
     """Threads of the rod core; 0 for one a processor core. The results do not depend on it."""
     folder: Path = Path("runs/bench-robustness")
     """Folder of the chunks' results; an interrupted run goes on where it stopped."""

@@ -7,12 +7,12 @@ import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from endopilot.anatomy.projection import project_tip
-from endopilot.settings import Count, Seed, settings
+from endopilot.settings import Seed, Within, settings
 from endopilot.simulation.motion import draw_motion, published_mean
 from endopilot.xray.carm import Pose
 from endopilot.xray.detector import TipDetector
@@ -51,9 +51,9 @@ _OF_95 = 2.795
 class XrayBenchConfig:
     """Patients and images."""
 
-    patients: Count = 6
+    patients: Annotated[int, Within(1, 1000)] = 6
     """Synthetic patients, right and left coronary trees in turn; none has trained the detector."""
-    wires: Count = 8
+    wires: Annotated[int, Within(1, 1000)] = 8
     """Wires of each patient; each is exposed at the usual dose, with two views and with each alone."""
     seed: Seed = 1
     """Seed of patients, poses, wires and noise."""

@@ -15,7 +15,7 @@ from endopilot.cli.arguments import OutputFile, existing, show
 from endopilot.control.plan_file import read_plan
 from endopilot.dataset.navigations import simulate_navigations
 from endopilot.progress import progress
-from endopilot.settings import Count, Seed, Within, settings
+from endopilot.settings import LONGEST_S, Seed, Within, settings
 from endopilot.simulation.catheter import read_catheter
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, random_controls, read_controls_csv
@@ -31,9 +31,9 @@ from endopilot.types import SAMPLE_PERIOD_S, Anatomy, Rollout
 class RandomConfig:
     """The random navigations that are simulated if no controls are given."""
 
-    sequences: Count = 8
+    sequences: Annotated[int, Within(1, 100000)] = 8
     """Number of navigations."""
-    seconds: Annotated[float, Within(SAMPLE_PERIOD_S)] = 60.0
+    seconds: Annotated[float, Within(SAMPLE_PERIOD_S, LONGEST_S)] = 60.0
     """Length of a navigation, s."""
     seed: Seed = 0
     """Seed of the random controls."""

@@ -208,7 +208,7 @@ def _rollout(path: Path, anatomy: Anatomy, device: str, catheters: Sequence[str]
     """Return a film of a rollout's or script's controls."""
     script = read_controls_csv(path, catheters=len(catheters))
     worlds = len(script.control)
-    if world >= worlds:
+    if not 0 <= world < worlds:
         raise InputError(f"world: {world}; {path} has worlds 0 to {worlds - 1}")
     start = script.initial[world]
     wire = read_device(device)
@@ -226,7 +226,7 @@ def _rollout(path: Path, anatomy: Anatomy, device: str, catheters: Sequence[str]
 def _episode(folder: Path, number: int) -> Film:
     """Return a film of an episode of a data set, driven again by what the drive was commanded."""
     data = load_dataset(folder)
-    if number >= len(data):
+    if not 0 <= number < len(data):
         raise InputError(f"world: {number}; {folder} has episodes 0 to {len(data) - 1}")
     settings = data.manifest["settings"]
     anatomy = read_anatomy(data.anatomy_folder(str(data.anatomy[number])))
@@ -255,7 +255,7 @@ def _ladder(path: Path, name: str | None, place: int) -> Film:
         if name is None or name not in content["navigations"]:
             raise InputError(f"task: {name!r}; {path} has {', '.join(content['navigations'])}")
         entries = content["navigations"][name]
-        if place >= len(entries):
+        if not 0 <= place < len(entries):
             raise InputError(f"world: {place}; {path} has patients 0 to {len(entries) - 1} of this task")
         entry = entries[place]
     elif isinstance(content, dict) and "recording" in content and path.stem.isdecimal():

@@ -9,6 +9,7 @@ import hashlib
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
@@ -17,7 +18,7 @@ from endopilot.control.mismatch import ModelMismatch
 from endopilot.control.navigate import start_world
 from endopilot.control.robot import RobotConfig, SimulatedRobot
 from endopilot.errors import InputError
-from endopilot.settings import Positive, settings
+from endopilot.settings import Within, settings
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.simulation.simulator import Simulator
@@ -31,7 +32,7 @@ from endopilot.types import TipProjection
 class WorldConfig:
     """The simulated reality: rod core, drive, how it differs from what is known, and the length of a cycle."""
 
-    cycle_s: Positive = 0.0125
+    cycle_s: Annotated[float, Within(1e-4, 0.5)] = 0.0125
     """Time from one command and picture to the next, s."""
     robot: RobotConfig = field(default_factory=RobotConfig)
     """The drive."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from dataclasses import field, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
@@ -22,7 +23,7 @@ from endopilot.control.policy import BelievedTip, Decision, Observation
 from endopilot.control.route import Route, check_passable
 from endopilot.control.search import Search, SearchConfig
 from endopilot.progress import Advance
-from endopilot.settings import Count, Positive, settings
+from endopilot.settings import Positive, Within, settings
 from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, XrayKind, check_wire_alone
 from endopilot.types import TipProjection
@@ -51,7 +52,7 @@ class AgentConfig:
     """The simulated wires."""
     off_course_mm: Positive = 2.5
     """Another path is searched when the likeliest tip is this far along the centerline from where it should be, mm."""
-    tries: Count = 3
+    tries: Annotated[int, Within(1, 100)] = 3
     """Failed searches, one after another and each from where the last has led, after which the agent gives up."""
     lost_along_mm: Positive = 4.0
     """A measured tip this far along the wire from all simulated ones is explained by none, mm."""

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from scipy.stats import qmc
 
 from endopilot.control.policy import Proximals
-from endopilot.settings import Count, NonNegative, Positive, ShareBelowOne, Within, settings
+from endopilot.settings import NonNegative, Positive, ShareBelowOne, Within, settings
 from endopilot.simulation.config import PRESETS, SimulatorConfig
 from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.simulation.simulator import Simulator
@@ -30,9 +30,9 @@ from endopilot.xray.fluoroscope import TipMeasurement
 class BeliefConfig:
     """The ensemble, and the accuracy of measurements."""
 
-    members: Count = 12
+    members: Annotated[int, Within(1, 4096)] = 12
     """Simulated wires."""
-    stiffness_levels: Count = 3
+    stiffness_levels: Annotated[int, Within(1, 100)] = 3
     """Different stiffnesses of the tip among them."""
     friction_spread: ShareBelowOne = 0.2
     """The friction coefficient may differ from the given one by this share, up or down."""
@@ -46,7 +46,7 @@ class BeliefConfig:
     """The same across the wire, mm."""
     element_mm: Annotated[float, Within(0.02, 5)] = 0.75
     """Length of the rod core's elements at the wire's tip, mm: longer ones catch in hairpin bends."""
-    time_step_s: Positive = 0.05
+    time_step_s: Annotated[float, Within(1e-5, 0.5)] = 0.05
     """Time step of the rod core, s."""
 
     @property

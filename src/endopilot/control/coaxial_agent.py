@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import field, replace
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
@@ -22,7 +23,7 @@ from endopilot.control.coaxial_search import CoaxialSearch
 from endopilot.control.policy import BelievedTip, Decision, Observation
 from endopilot.control.route import check_passable
 from endopilot.errors import InputError
-from endopilot.settings import Count, Positive, settings
+from endopilot.settings import Positive, Within, settings
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.xray.adviser import AdviserConfig, XrayAdviser
 from endopilot.xray.bands import Calibration
@@ -42,7 +43,7 @@ class CoaxialAgentConfig:
     """The simulated wires in catheters."""
     off_course_mm: Positive = 3.0
     """Another course is searched when the likeliest tip is this far from where a passed waypoint should see it, mm."""
-    tries: Count = 2
+    tries: Annotated[int, Within(1, 100)] = 2
     """Failed searches, one after another, after which the agent gives up."""
     lost_along_mm: Positive = 5.0
     """A measured tip this far along the wire from all simulated ones is explained by none, mm."""

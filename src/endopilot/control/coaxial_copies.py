@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -10,7 +11,7 @@ from jaxtyping import Bool, Float
 from endopilot.control.halt import SPARE_SHARE
 from endopilot.control.period import drive_period
 from endopilot.control.route import Route
-from endopilot.settings import Count, Positive, settings
+from endopilot.settings import Positive, Seconds, Within, settings
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.drive_limits import SPARE_MM, DriveLimits
 from endopilot.simulation.simulator import Simulator
@@ -24,13 +25,13 @@ from endopilot.types import TipProjection
 class CoaxialSearchConfig:
     """Settings of the search."""
 
-    turns: Count = 12
+    turns: Annotated[int, Within(1, 1000)] = 12
     """Rotations that are tried at each place."""
-    speed_mm_s: Positive = 5.0
+    speed_mm_s: Annotated[float, Within(0.1, 1000)] = 5.0
     """Translation of either device, mm/s."""
     behind_mm: Positive = 10.0
     """The catheter follows to this far behind the wire's tip, mm, except to the target if its own tip is to arrive."""
-    longest_s: Positive = 30.0
+    longest_s: Seconds = 30.0
     """A catheter is brought to its place in this time at most, s, and a wire past a fork."""
     core: SimulatorConfig = field(default_factory=lambda: replace(CORE, threads=1))
     """Settings of the rod core."""

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from endopilot.control.route import Route
 from endopilot.errors import InputError
+from endopilot.simulation.csv_file import read_columns
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Target
 from endopilot.types import Anatomy
 
@@ -32,27 +33,16 @@ def read_tips(path: Path, fastest_mm_s: float, start_mm: float) -> pd.DataFrame:
         InputError: not such a table, or it asks for the end sooner than the drive can be there; the line names file,
             column, row and mend.
     """
-    try:
-        table = pd.read_csv(path)
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read as CSV ({str(error).splitlines()[0]}); check the file") from error
     columns = ("time_s", "tip_abscissa_mm", "tip_offset_mm")
-    missing = [name for name in columns if name not in table.columns]
-    if missing or len(table) == 0:
-        what = f"column {missing[0]} is missing" if missing else "has no rows"
-        raise InputError(f"{path}: {what}; the columns are {', '.join(columns)}")
-    if "branch" not in table.columns:
-        table["branch"] = -1
-    for name in (*columns, "branch"):
-        numbers = np.asarray(pd.to_numeric(table[name], errors="coerce"), dtype=float)
-        if not np.isfinite(numbers).all():
-            row = int(np.argmin(np.isfinite(numbers)))
-            raise InputError(f"{path}: row {row + 2}: {name} = {table[name].iloc[row]} is no finite number; correct it")
-        table[name] = numbers
-    late = np.flatnonzero(np.abs(table["time_s"] - DECISION_PERIOD_S * (np.arange(len(table)) + 1)) > 1e-6)
+    read = read_columns(path, columns, ["branch"])
+    late = np.flatnonzero(np.abs(read.values["time_s"] - DECISION_PERIOD_S * (np.arange(len(read.lines)) + 1)) > 1e-6)
     if len(late):
-        row = int(late[0])
-        raise InputError(f"{path}: row {row + 2}: time_s = {table['time_s'].iloc[row]:g}; count 0.5, 1.0, 1.5, ...")
+        raise read.fault(int(late[0]), "time_s", "; count 0.5, 1.0, 1.5, ...")
+    for name, least in (("tip_abscissa_mm", 0), ("tip_offset_mm", 0), ("branch", -1)):
+        low = np.flatnonzero(read.values.get(name, np.zeros(0)) < least)
+        if len(low):
+            raise read.fault(int(low[0]), name, f"; give {least} or more")
+    table = pd.DataFrame({"branch": -1.0, **read.values}, index=range(len(read.lines)))
     length_mm, seconds = float(table["tip_abscissa_mm"].iloc[-1]) - start_mm, DECISION_PERIOD_S * len(table)
     if length_mm > fastest_mm_s * seconds:
         raise InputError(

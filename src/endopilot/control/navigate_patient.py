@@ -28,7 +28,7 @@ from endopilot.control.route import Route, check_passable, parse_target
 from endopilot.control.set_up import TILT_DEG, TipChoice, choose_tip
 from endopilot.errors import InputError
 from endopilot.progress import progress
-from endopilot.settings import Finite, NonNegative, Positive, Seed, ShareBelowOne, Text, Within, settings
+from endopilot.settings import Finite, Positive, Seconds, Seed, ShareBelowOne, Text, Within, settings
 from endopilot.simulation.catheter import Catheter, read_catheter
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import Device, read_device
@@ -61,11 +61,11 @@ class NavigatePatientConfig:
     as 75/5, 75 degrees over 5 mm."""
     catheter_tilt_deg: Annotated[float, Within(0, 45)] = TILT_DEG
     """How far the guiding catheter may be turned at the ostium where a fork cannot be entered otherwise, degrees."""
-    seconds: Positive = 60.0
+    seconds: Seconds = 60.0
     """Time in which the target is to be reached, s."""
     force_limit_n: Positive = 0.5
     """Largest force of the wall on one node that is safe, N."""
-    start_inserted_mm: NonNegative = 2.0
+    start_inserted_mm: Annotated[float, Within(0, 5000)] = 2.0
     """Inserted length at the start, mm."""
     start_rotation: Finite = 0.0
     """Rotation at the start, rad."""
@@ -94,7 +94,7 @@ class NavigatePatientConfig:
     true_axis_deg: Annotated[float, Within(0, 45)] = 0.0
     """In reality the guiding catheter leans off its given axis by this angle, degrees, to a side drawn by the seed. An
     exposure shows its axis before the wire is shaped; in X-ray images it lies as given, and is not looked for."""
-    true_latency_s: NonNegative | None = None
+    true_latency_s: Annotated[float, Within(0, 10)] | None = None
     """Time from a command to the motion in reality, s; 0.05 if not given."""
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.control.cost import Cost
 from endopilot.control.set_up import TILT_DEG
-from endopilot.settings import Count, Finite, NonNegative, Positive, Seed, Text, Within, settings
+from endopilot.settings import Finite, Positive, Seconds, Seed, Text, Within, settings
 from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Arrives, Navigation
 from endopilot.types import TipProjection
@@ -27,9 +27,9 @@ Controls = Float[np.ndarray, "samples numbers"]
 class SampleConfig:
     """Sampling through the forward network (method mppi), after Williams et al., J. Guid. Control Dyn. 40, 2017."""
 
-    candidates: Count = 12
+    candidates: Annotated[int, Within(1, 4096)] = 12
     """Control sequences that are rolled out together."""
-    iterations: Count = 4
+    iterations: Annotated[int, Within(1, 1000)] = 4
     """Rounds; each draws around the weighted mean of the one before."""
     translation_sd_mm_s: Positive = 1.0
     """Standard deviation of the translation that is drawn, mm/s."""
@@ -46,9 +46,9 @@ class PlanConfig:
     method: Method = "twin"
     """How the controls are found: twin (searched in the rod core), inverse (the inverse network of --model), mppi
     (sampled through its forward network), or a baseline: forward, spin, retract-rotate."""
-    seconds: Positive = 60.0
+    seconds: Seconds = 60.0
     """Time in which the target is to be reached, s."""
-    speed_mm_s: Positive = 10.0
+    speed_mm_s: Annotated[float, Within(0.1, 1000)] = 10.0
     """Speed of the desired tip along the route, mm/s."""
     tip: Text = "auto"
     """Shape of the wire's tip: auto (chosen for the forks of the route), own (the device's), or angle and length such
@@ -57,7 +57,7 @@ class PlanConfig:
     """How far the guiding catheter may be turned at the ostium where a fork cannot be entered otherwise, degrees."""
     arrives: Arrives = "wire"
     """Whose tip is to go to the target: wire, or catheter, the one around the wire."""
-    start_inserted_mm: NonNegative = 2.0
+    start_inserted_mm: Annotated[float, Within(0, 5000)] = 2.0
     """Inserted length at the start, mm."""
     start_rotation: Finite = 0.0
     """Rotation at the start, rad."""

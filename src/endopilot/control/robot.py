@@ -10,12 +10,12 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Annotated, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.settings import NonNegative, Positive, settings
+from endopilot.settings import NonNegative, Positive, Within, settings
 from endopilot.simulation.drive_limits import DriveLimits, within_travel
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import Step
@@ -58,7 +58,7 @@ class Robot(Protocol):
 class RobotConfig:
     """How a real drive differs from an ideal one. docs/robot.md says where the numbers come from."""
 
-    latency_s: NonNegative = 0.05
+    latency_s: Annotated[float, Within(0, 10)] = 0.05
     """Time from a command to the motion, s."""
     max_acceleration_mm_s2: Positive = 200.0
     """Largest change of the translation's speed, mm/s²."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import field, replace
 from itertools import product
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -23,7 +24,7 @@ from endopilot.control.period import drive_period
 from endopilot.control.route import Route
 from endopilot.control.sweep import TURN_PERIODS, Sweep, middle, sweep
 from endopilot.progress import Advance
-from endopilot.settings import Count, OpenShare, Positive, settings
+from endopilot.settings import OpenShare, Positive, Within, settings
 from endopilot.simulation.device import Device
 from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.simulation.simulator import Simulator
@@ -49,19 +50,19 @@ _LEAD_RADII = 1.4
 class SearchConfig:
     """Settings of the search."""
 
-    candidates: Count = 32
+    candidates: Annotated[int, Within(1, 4096)] = 32
     """Candidates that are tried side by side where pushing straight on fails."""
-    rounds: Count = 6
+    rounds: Annotated[int, Within(1, 1000)] = 6
     """Rounds of one attempt, at most."""
-    attempts: Count = 4
+    attempts: Annotated[int, Within(1, 1000)] = 4
     """Attempts, each from the same state, before a search is given up."""
-    round_periods: Count = 2
+    round_periods: Annotated[int, Within(1, 1000)] = 2
     """Decision periods of 0.5 s in a round."""
     keep_share: OpenShare = 0.25
     """Share of the candidates that a round keeps."""
-    speed_mm_s: Positive = 10.0
+    speed_mm_s: Annotated[float, Within(0.1, 1000)] = 10.0
     """Translation while it is pushed straight on, mm/s."""
-    turn_rad_s: Positive = 7.0
+    turn_rad_s: Annotated[float, Within(0.01, 1000)] = 7.0
     """Fastest rotation that is tried, rad/s."""
     lead_mm: Positive = 4.0
     """A search begins this far before a junction, mm, or 1.4 lumen radii where that is more."""

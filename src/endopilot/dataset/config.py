@@ -7,7 +7,7 @@ from typing import Annotated
 
 from pydantic import model_validator
 
-from endopilot.settings import Ascending, Count, NonNegative, Positive, Seed, Share, ShareBelowOne, Within, settings
+from endopilot.settings import Ascending, NonNegative, Seconds, Seed, Share, ShareBelowOne, Within, settings
 from endopilot.simulation.config import Actuation, SimulatorConfig
 from endopilot.simulation.controls import ControlConfig
 from endopilot.simulation.motion import MotionName
@@ -23,16 +23,16 @@ def dataset_simulator() -> SimulatorConfig:
     return SimulatorConfig(tolerance_mm=1e-2)
 
 
-_Stiffness = Annotated[float, Within(0.05)]
+_Stiffness = Annotated[float, Within(0.05, 100)]
 
 
 @settings
 class DatasetConfig:
     """How many navigations, how long, how they are driven and how they are split."""
 
-    sequences: Count = 1000
+    sequences: Annotated[int, Within(1, 10**7)] = 1000
     """Random navigations of each anatomy."""
-    seconds: Positive = 60.0
+    seconds: Seconds = 60.0
     """Length of a navigation, s; one sample every 0.5 s."""
     seed: Seed = 0
     """Seed of the random controls and parameters."""
@@ -56,7 +56,7 @@ class DatasetConfig:
     split by sequence alone. 0 0 1 makes a dataset to test on."""
     seen_test_share: ShareBelowOne = 0.2
     """Share of the navigations of a train anatomy that are held out as the split seen_test."""
-    sequences_per_file: Count = 500
+    sequences_per_file: Annotated[int, Within(1, 100000)] = 500
     """Navigations stored in one file; an interrupted run loses at most one file's work a processor core."""
 
     @model_validator(mode="after")

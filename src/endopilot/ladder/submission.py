@@ -22,7 +22,7 @@ from endopilot.files import json_text, manifest, read_json, write_json
 from endopilot.ladder.attempt import Recording, navigation_seed, repeat
 from endopilot.ladder.scores import score
 from endopilot.parallel import each
-from endopilot.settings import CountOrZero, read_settings, settings
+from endopilot.settings import CountOrZero, Seed, read_settings, settings
 from endopilot.simulation.catheter import read_catheter
 from endopilot.simulation.device import read_device
 from endopilot.tasks.task import LadderVersion, Task, find_task, ladder_tasks
@@ -47,7 +47,7 @@ class NavigationEntry:
     """One navigation: its figures (`endopilot.ladder.attempt.attempt`) and its recording."""
 
     patient: str
-    seed: CountOrZero
+    seed: Seed
     success: bool
     safe: bool
     reason: Literal["reached", "time", "invalid", "gave up"]

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import model_validator
 
 from endopilot.errors import InputError
 from endopilot.files import read_json
-from endopilot.settings import Count, NonNegative, Positive, Seed, ShareBelowOne, settings
+from endopilot.settings import NonNegative, Positive, Seed, ShareBelowOne, Within, settings
 
 WINDOW = 30
 """States that each prediction is made from: the paper gives 30 states in and one out."""
@@ -54,15 +54,15 @@ def read_run(run: str | Path) -> dict[str, Any]:
 class TransformerConfig:
     """Size of the paper's Transformer (Kim et al. 2023). The paper does not state d_model; 12 heads must divide it."""
 
-    d_model: Count = 96
+    d_model: Annotated[int, Within(1, 4096)] = 96
     """Width of the tokens."""
-    heads: Count = 12
+    heads: Annotated[int, Within(1, 256)] = 12
     """Attention heads."""
-    encoder_layers: Count = 4
+    encoder_layers: Annotated[int, Within(1, 64)] = 4
     """Layers of the encoder."""
-    decoder_layers: Count = 4
+    decoder_layers: Annotated[int, Within(1, 64)] = 4
     """Layers of the decoder."""
-    feedforward: Count = 128
+    feedforward: Annotated[int, Within(1, 65536)] = 128
     """Width of the feed-forward layers."""
     dropout: ShareBelowOne = 0.1
     """Share of activations that are dropped in training."""
@@ -78,9 +78,9 @@ class TransformerConfig:
 class CausalConfig:
     """Size of the causal network: see `models.causal`."""
 
-    width: Count = 96
+    width: Annotated[int, Within(1, 4096)] = 96
     """Width of every layer."""
-    layers: Count = 1
+    layers: Annotated[int, Within(1, 64)] = 1
     """Recurrent layers."""
     drop_share: ShareBelowOne = 0.2
     """Share of activations that are dropped in training."""
@@ -90,7 +90,7 @@ class CausalConfig:
 class TwinConfig:
     """The ensemble of rod simulations that the twin is, and its largest model mismatch."""
 
-    members: Count = 32
+    members: Annotated[int, Within(1, 4096)] = 32
     """Simulations of each navigation."""
     friction_spread: ShareBelowOne = 0.2
     """Largest relative error of the friction coefficient, in either direction."""
@@ -113,15 +113,15 @@ class TrainConfig:
     or the rod core itself, which needs no training."""
     network: Literal["both", "ff", "if"] = "both"
     """Forward network (ff), inverse network (if), or both."""
-    epochs: Count = 20
+    epochs: Annotated[int, Within(1, 100000)] = 20
     """Passes over the training windows (causal: sequences)."""
     learning_rate: Positive = 1e-3
     """Adam's peak step size."""
-    batch_size: Count = 32
+    batch_size: Annotated[int, Within(1, 65536)] = 32
     """Windows of 30 states (causal: sequences) in one step."""
-    windows_per_epoch: Count | None = None
+    windows_per_epoch: Annotated[int, Within(1, 10**9)] | None = None
     """Windows (causal: sequences) drawn in one epoch; all of the training split if not given."""
-    max_seconds: Positive | None = None
+    max_seconds: Annotated[float, Within(0, 10 * 86400, above_low=True)] | None = None
     """Wall time that each network may train for, s; epochs are shortened to what is left of it."""
     seed: Seed = 0
     """Seed of the initial weights, the order of the windows, and dropout."""

@@ -19,7 +19,7 @@ from endopilot.phantom import chest
 from endopilot.phantom.metal import add_metal, leads, stents
 from endopilot.phantom.painter import COARSE_MM, SLAB, Grid, Painter, smooth_min, window
 from endopilot.phantom.scanner import misregister, scan, smear
-from endopilot.settings import Ascending, NonNegative, Positive, Share, Within, settings
+from endopilot.settings import Ascending, NonNegative, Share, Within, settings
 from endopilot.types import Anatomy, Centerline, Volume
 
 _REACH_MM = 5.0
@@ -30,24 +30,25 @@ _WALL_MM = 0.5
 """Thickness of a coronary wall, mm."""
 
 
-_Side = Annotated[int, Within(16)]
+_Side = Annotated[int, Within(16, 2048)]
+_Blur = Annotated[float, Within(0, 20)]
 
 
 @settings
 class PhantomConfig:
     """Scanner, contrast and disease of a synthetic CT angiogram. Two numbers: a value is drawn between."""
 
-    in_plane_mm: Positive = 0.4
+    in_plane_mm: Annotated[float, Within(0.05, 10)] = 0.4
     """Voxel size in the axial plane, mm."""
-    slice_mm: Positive = 0.5
+    slice_mm: Annotated[float, Within(0.05, 20)] = 0.5
     """Distance between slices, mm."""
     lumen_hu: Annotated[tuple[NonNegative, NonNegative], Ascending] = (300.0, 550.0)
     """CT number of the contrasted arterial lumen, HU."""
     noise_hu: Annotated[tuple[NonNegative, NonNegative], Ascending] = (20.0, 50.0)
     """Standard deviation of the image noise, HU."""
-    psf_mm: Annotated[tuple[NonNegative, NonNegative], Ascending] = (0.5, 0.7)
+    psf_mm: Annotated[tuple[_Blur, _Blur], Ascending] = (0.5, 0.7)
     """Width of the point-spread function at half its height, mm."""
-    calcium: NonNegative = 2.0
+    calcium: Annotated[float, Within(0, 1000)] = 2.0
     """Mean number of calcified plaques."""
     right_heart: Annotated[tuple[NonNegative, NonNegative], Ascending] = (0.35, 0.8)
     """CT number of the right ventricle's blood as a share of the lumen's: less where saline has diluted it."""
@@ -55,11 +56,11 @@ class PhantomConfig:
     """How far the heart moves while it is scanned, mm: it is smeared along its path, most at the ends."""
     step_mm: Annotated[float, Within(0, 10)] = 0.0
     """How far the heart jumps from one heart beat's slab of slices to the next, mm: step artefacts."""
-    slab_mm: Positive = 30.0
+    slab_mm: Annotated[float, Within(1, 1000)] = 30.0
     """Height of the slabs, mm."""
-    grain_mm: NonNegative = 0.0
+    grain_mm: Annotated[float, Within(0, 20)] = 0.0
     """Additional width of the noise's grain at equal SD, mm: iterative reconstruction."""
-    blooming_mm: NonNegative = 0.0
+    blooming_mm: Annotated[float, Within(0, 20)] = 0.0
     """Calcium looks this much wider on every side, mm, over the lumen too."""
     stents: Annotated[int, Within(0, 4)] = 0
     """Number of stents in the tree's main vessels."""
@@ -67,11 +68,11 @@ class PhantomConfig:
     """Number of pacemaker leads in the right heart, with their streaks."""
     veins: Share = 0.0
     """CT number of the cardiac veins as a share of the lumen's; they touch the artery's wall. 0: dim and 2 mm off."""
-    appendage_mm: NonNegative = 0.0
+    appendage_mm: Annotated[float, Within(0, 200)] = 0.0
     """The left atrial appendage is wider by this on every side, mm, and then touches the arteries' walls."""
     graft: bool = False
     """A bypass graft runs from the ascending aorta to the artery: to the LAD of a left tree."""
-    margin_mm: Positive = 16.0
+    margin_mm: Annotated[float, Within(0, 200, above_low=True)] = 16.0
     """Width of surroundings beyond the tree on every side, mm."""
     voxels: tuple[_Side, _Side, _Side] | None = None
     """Voxels along x, y and z about the middle of the box that the margin gives; as many as fill it by default."""

@@ -38,7 +38,7 @@ from endopilot.pipeline.navigation import navigate_into
 from endopilot.pipeline.stages import Stages
 from endopilot.progress import progress
 from endopilot.runs import claim
-from endopilot.settings import Count, NonNegative, Positive, Seed, Within, settings
+from endopilot.settings import Seconds, Seed, Within, settings
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import Device, read_device
 from endopilot.simulation.simulate import simulate
@@ -69,11 +69,11 @@ class StudyConfig:
 
     device: str = "workhorse-014"
     """Name of a shipped device (`endopilot devices`) or a YAML file."""
-    sequences: Count = 60
+    sequences: Annotated[int, Within(1, 100000)] = 60
     """Random navigations simulated in each patient."""
-    seconds: Positive = 60.0
+    seconds: Seconds = 60.0
     """Length of a navigation, s."""
-    training_seconds: NonNegative = 0.0
+    training_seconds: Annotated[float, Within(0, 10 * 86400)] = 0.0
     """Training time of each of the paper's two networks, s; 0 takes the trained networks that come with the package."""
     seed: Seed = 1
     """Seed of everything random."""
@@ -83,7 +83,7 @@ class StudyConfig:
 class DemoConfig(StudyConfig):
     """The demo: synthetic right-coronary patients that the evaluated networks were not trained on."""
 
-    patients: Annotated[int, Within(3)] = 6
+    patients: Annotated[int, Within(3, 1000)] = 6
     """Number of patients, at least 3."""
 
     @model_validator(mode="after")

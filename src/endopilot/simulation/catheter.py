@@ -22,6 +22,20 @@ from endopilot.errors import InputError
 from endopilot.files import writing
 from endopilot.settings import NonNegative, Positive, Text, Within, read_settings, settings
 from endopilot.simulation.device import Device, Sourced
+from endopilot.simulation.device_files import there
+from endopilot.simulation.device_ranges import (
+    MOST_VALUES,
+    Abscissa,
+    ArcLength,
+    Force,
+    Friction,
+    Rotation,
+    Stiffness,
+    Torque,
+    Velocity,
+    Width,
+    check_built,
+)
 
 _SHIPPED = Path(__file__).parent / "catheters"
 MOST_CATHETERS = 2
@@ -53,6 +67,8 @@ class Catheter:
             raise ValueError(
                 f"inner_diameter_mm: {self.inner_diameter_mm:g}; give less than the outer diameter, {outer:g} mm"
             )
+        if len(self.shape) > MOST_VALUES:
+            raise ValueError(f"shape: {len(self.shape)} arcs; give at most {MOST_VALUES}")
         return self
 
     @property
@@ -70,7 +86,7 @@ class Catheter:
 class _Shape:
     """The arcs of a catheter's file, and where they come from."""
 
-    arcs: tuple[tuple[Positive, Annotated[float, Within(-720, 720)]], ...]
+    arcs: tuple[tuple[ArcLength, Annotated[float, Within(-720, 720)]], ...]
     source: Text
 
 
@@ -79,19 +95,19 @@ class _CatheterFile:
     """What a catheter's file holds; `Device` and `Catheter` say what each constant means."""
 
     name: Text
-    diameter_mm: Sourced[Positive]
-    inner_diameter_mm: Sourced[Positive]
-    abscissa_mm: Sourced[tuple[NonNegative, ...]]
-    bend_stiffness_n_mm2: Sourced[tuple[Positive, ...]]
-    twist_stiffness_n_mm2: Sourced[tuple[Positive, ...]]
+    diameter_mm: Sourced[Width]
+    inner_diameter_mm: Sourced[Width]
+    abscissa_mm: Sourced[tuple[Abscissa, ...]]
+    bend_stiffness_n_mm2: Sourced[tuple[Stiffness, ...]]
+    twist_stiffness_n_mm2: Sourced[tuple[Stiffness, ...]]
     shape: _Shape
-    friction: Sourced[NonNegative]
-    bore_friction: Sourced[NonNegative]
-    max_velocity_mm_s: Sourced[Positive]
-    max_rotation_rad_s: Sourced[Positive]
-    push_limit_n: Sourced[Positive]
-    pull_limit_n: Sourced[Positive]
-    torque_limit_n_mm: Sourced[Positive]
+    friction: Sourced[Friction]
+    bore_friction: Sourced[Friction]
+    max_velocity_mm_s: Sourced[Velocity]
+    max_rotation_rad_s: Sourced[Rotation]
+    push_limit_n: Sourced[Force]
+    pull_limit_n: Sourced[Force]
+    torque_limit_n_mm: Sourced[Torque]
 
 
 def list_catheters() -> tuple[str, ...]:
@@ -106,8 +122,8 @@ def read_catheter(name_or_path: str | Path) -> Catheter:
         InputError: no such catheter, or a file that is not one; the line names file, field, value and mend.
     """
     shipped = _SHIPPED / f"{name_or_path}.yaml"
-    path = shipped if shipped.is_file() else Path(name_or_path)
-    if not path.is_file():
+    path = shipped if there(shipped) else Path(name_or_path)
+    if not there(path):
         names = ", ".join(list_catheters())
         raise InputError(f"catheter '{name_or_path}': no such catheter or file; give a path, or choose from {names}")
     content = read_settings(path, _CatheterFile)
@@ -115,7 +131,7 @@ def read_catheter(name_or_path: str | Path) -> Catheter:
     constants = {name: entry.value for name, entry in entries.items() if isinstance(entry, Sourced)}
     own = {name: constants.pop(name) for name in ("inner_diameter_mm", "bore_friction")}
     try:
-        return Catheter(
+        catheter = Catheter(
             device=Device(
                 name=content.name,
                 **constants,
@@ -127,6 +143,8 @@ def read_catheter(name_or_path: str | Path) -> Catheter:
             shape=tuple((length, math.radians(angle)) for length, angle in content.shape.arcs),
             **own,
         )
+        check_built(catheter.device, bore_mm=catheter.inner_diameter_mm, arcs=catheter.shape, catheter=True)
+        return catheter
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 

@@ -11,7 +11,7 @@ from pydantic import model_validator
 
 from endopilot import _core
 from endopilot.parallel import CORES
-from endopilot.settings import CountOrZero, NonNegative, Positive, Within, settings
+from endopilot.settings import Within, settings
 from endopilot.simulation.processor import Processor
 from endopilot.types import SAMPLE_PERIOD_S
 
@@ -41,38 +41,38 @@ Actuation = Literal["velocity", "force"]
 class SimulatorConfig:
     """Settings of the rod core."""
 
-    time_step_s: Positive = 0.0125
+    time_step_s: Annotated[float, Within(1e-5, SAMPLE_PERIOD_S)] = 0.0125
     """Time step, s; it must divide the sample period of 0.5 s. The tip's error grows about linearly with it."""
-    tolerance_mm: Positive = 1e-3
+    tolerance_mm: Annotated[float, Within(1e-12, 1)] = 1e-3
     """Newton's method stops when its step moves no node farther than this, mm."""
-    sample_tolerance_mm: Positive = 1e-6
+    sample_tolerance_mm: Annotated[float, Within(1e-12, 1)] = 1e-6
     """The same for the time step that ends a sample (no more than `tolerance_mm`): its forces are recorded, and the
     wire is stiff axially."""
     element_mm: Annotated[float, Within(0.02, 5)] = 0.75
     """Length of the wire's elements at its tip, mm; towards the base they grow to five times that."""
-    wall_stiffness_n_mm: Positive | None = None
+    wall_stiffness_n_mm: Annotated[float, Within(1e-3, 1e6)] | None = None
     """Stiffness of the vessel wall at a node, N/mm. If not given, the push limits of all devices together dent it by
     0.015 mm."""
-    compliant_wall_n_mm2: Annotated[float, Within(0.01)] | None = None
+    compliant_wall_n_mm2: Annotated[float, Within(0.01, 1e6)] | None = None
     """Stiffness of a compliant wall, N/mm of wire and mm of displacement: each place of the wall yields by itself, as a
     bed of springs (Winkler) that stiffen as the heart's muscle does. It takes the place of `wall_stiffness_n_mm` if
     given. An artery that lies in that muscle has 0.01; docs/physics.md derives it. A softer wall would yield farther
     than distance maps reach."""
-    stick_velocity_mm_s: Positive = 0.05
+    stick_velocity_mm_s: Annotated[float, Within(1e-9, 1000)] = 0.05
     """Slip velocity under which smoothed Coulomb friction falls off, mm/s; a wire at rest creeps more slowly."""
-    approach_velocity_mm_s: Positive = 20.0
+    approach_velocity_mm_s: Annotated[float, Within(0.1, 1000)] = 20.0
     """Velocity at which a wire is brought to its first inserted length before the recording, mm/s."""
-    largest_jump: Positive = 0.3
+    largest_jump: Annotated[float, Within(1e-3, 1e9)] = 0.3
     """Motion of a node in a time step beyond the drive's own, mm (rotations: rad), above which the step is shortened:
     a wire that snaps over is followed in steps of down to 1/64 of `time_step_s`."""
-    introducer_friction_n: NonNegative = 0.05
+    introducer_friction_n: Annotated[float, Within(0, 1000)] = 0.05
     """Coulomb friction of the introducer's valve, N; the drive feels it, the wire ahead of the valve does not."""
-    introducer_drag_n_s_mm: NonNegative = 0.002
+    introducer_drag_n_s_mm: Annotated[float, Within(0, 1000)] = 0.002
     """Viscous drag of the introducer's valve, N·s/mm."""
     processor: Processor = "cpu"
     """Where worlds are stepped: "cpu", or "cuda" on an NVIDIA GPU, one world a thread. The two agree as closely as two
     systems' cosines; a GPU pays for thousands of worlds at once."""
-    threads: CountOrZero = 0
+    threads: Annotated[int, Within(0, 1024)] = 0
     """Threads; 0 for one a processor core. The results do not depend on it."""
 
     @model_validator(mode="after")

@@ -5,21 +5,28 @@ A control π is the mean velocity (dΔ/dt mm/s, dφ/dt rad/s) over one sample pe
 
 from __future__ import annotations
 
+import re
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from pydantic import model_validator
 
-from endopilot.errors import InputError
+from endopilot.errors import InputError, Remark
 from endopilot.files import writing
-from endopilot.settings import NonNegative, Share, Within, settings
+from endopilot.settings import LONGEST_S, Share, Within, settings
+from endopilot.simulation.checks import check_memory
+from endopilot.simulation.csv_file import Columns, read_columns
 from endopilot.simulation.drive_limits import within_travel
 from endopilot.types import SAMPLE_PERIOD_S
 
 _COLUMNS = ("time_s", "translation_mm_s", "rotation_rad_s")
+PERIODS_S = (1e-3, 4.0)
+"""How long a control of a file may hold, s: drives take a command a millisecond at best, and nobody drives blindly for
+longer."""
 _KINDS = ("insertion", "retraction", "spin", "pause")
 _DRIVE = 2**32
 """From the key of a navigation's wire to that of its catheter; no study has that many navigations."""
@@ -29,9 +36,9 @@ _DRIVE = 2**32
 class ControlConfig:
     """Random navigations: manoeuvres of random kind, length and speed, joined smoothly."""
 
-    max_velocity_mm_s: NonNegative = 12.0
+    max_velocity_mm_s: Annotated[float, Within(0, 1000)] = 12.0
     """Fastest translation, mm/s."""
-    max_rotation_rad_s: NonNegative = 3.0
+    max_rotation_rad_s: Annotated[float, Within(0, 1000)] = 3.0
     """Fastest rotation, rad/s."""
     insertion_share: Share = 0.45
     """Share of the manoeuvres that push."""
@@ -41,11 +48,11 @@ class ControlConfig:
     """Share of the manoeuvres that only rotate; what is left over are pauses."""
     rotation_share: Share = 0.6
     """Share of the pushing and pulling manoeuvres that rotate too."""
-    shortest_s: Annotated[float, Within(SAMPLE_PERIOD_S)] = 1.0
+    shortest_s: Annotated[float, Within(SAMPLE_PERIOD_S, LONGEST_S)] = 1.0
     """Shortest manoeuvre, s."""
-    longest_s: Annotated[float, Within(SAMPLE_PERIOD_S)] = 6.0
+    longest_s: Annotated[float, Within(SAMPLE_PERIOD_S, LONGEST_S)] = 6.0
     """Longest manoeuvre, s."""
-    first_inserted_length_mm: NonNegative = 5.0
+    first_inserted_length_mm: Annotated[float, Within(0, 5000)] = 5.0
     """Least inserted length that a navigation starts with, mm."""
     start_spread: Share = 0.6
     """Starts are spread from there over this share of the largest inserted length."""
@@ -93,6 +100,11 @@ def random_controls(
         raise InputError(f"seed: {seed}; give a whole number from 0 to 2^64 - 1")
     if not 0 < max_inserted_length_mm < np.inf:
         raise InputError(f"max_inserted_length_mm: {max_inserted_length_mm}; give a positive length")
+    check_memory(
+        4 * 16 * n_sequences * n_samples * (1 + catheters),  # drawn, smoothed, clipped and simulated
+        f"{n_sequences} sequences of {n_samples} samples",
+        "draw fewer, or shorter ones",
+    )
     initial, control = np.empty((n_sequences, 1 + catheters, 2)), np.empty((n_sequences, n_samples, 1 + catheters, 2))
     for index, drive in np.ndindex(n_sequences, 1 + catheters):
         key = np.array([seed, first + index + drive * _DRIVE], dtype=np.uint64)
@@ -173,10 +185,10 @@ def read_controls_csv(path: Path, *, catheters: int = 0) -> ScriptedControls:
     """Read scripted controls.
 
     The columns are `time_s` (end of each period, all of one length: 0.5, 1.0, ... or 0.05, 0.1, ...),
-    `translation_mm_s` and `rotation_rad_s`; optional are `world` (several navigations in one file), and
-    `inserted_length_mm` with `rotation_rad` (state at the end of each period, from which the initial one follows; 0 if
-    they are not there). So a rollout that was written as CSV can be simulated again. Columns of catheters begin with
-    `catheter_1_` and `catheter_2_`.
+    `translation_mm_s` and `rotation_rad_s`; optional are `world` (several navigations in one file, by whole numbers),
+    and `inserted_length_mm` with `rotation_rad` (state at the end of each period, from which the initial one follows;
+    0 if they are not there). So a rollout that was written as CSV can be simulated again. Columns of catheters begin
+    with `catheter_1_` and `catheter_2_`. `csv_file` says which ways of writing a CSV are read.
 
     Args:
         path: the file.
@@ -185,49 +197,63 @@ def read_controls_csv(path: Path, *, catheters: int = 0) -> ScriptedControls:
     Raises:
         InputError: not such a table; the line names file, column, row and mend.
     """
-    import pandas as pd  # slow to import, and needed for files alone
-
-    try:
-        table = pd.read_csv(path, float_precision="round_trip")
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read as CSV ({str(error).splitlines()[0]}); check the file") from error
     prefixes = ["", *(f"catheter_{k + 1}_" for k in range(catheters))]
     driven = [prefix + name for prefix in prefixes for name in _COLUMNS[1:]]
-    wanted = [_COLUMNS[0], *driven]
-    missing = [name for name in wanted if name not in table.columns]
-    if missing:
-        raise InputError(f"{path}: column {missing[0]} is missing; the columns are {', '.join(wanted)}")
-    if len(table) == 0:
-        raise InputError(f"{path}: has no rows; give one for each {SAMPLE_PERIOD_S} s")
-    places = [prefix + name for prefix in prefixes for name in ("inserted_length_mm", "rotation_rad")]
-    state = [name for name in places if name in table.columns]
-    for name in (*wanted, *state):
-        numbers = np.asarray(pd.to_numeric(table[name], errors="coerce"), dtype=float)
-        bad = np.flatnonzero(~np.isfinite(numbers))
-        if len(bad):
-            row = int(bad[0])
-            raise InputError(f"{path}: row {row + 2}: {name} = {table[name].iloc[row]} is no finite number; correct it")
-        table[name] = numbers
-    worlds = [rows for _, rows in table.groupby("world", sort=True)] if "world" in table.columns else [table]
-    samples, period_s = len(worlds[0]), float(worlds[0]["time_s"].iloc[0])
-    if period_s <= 0:
-        raise InputError(f"{path}: row 2: time_s = {period_s:g}; the first row ends the first period, as at 0.5")
-    for rows in worlds:
-        if len(rows) != samples:
-            raise InputError(f"{path}: worlds differ in their number of rows; give each {samples}")
-        late = np.flatnonzero(np.abs(rows["time_s"] - period_s * (np.arange(samples) + 1)) > 1e-6 * samples * period_s)
-        if len(late):
-            row = int(rows.index[late[0]])
-            raise InputError(
-                f"{path}: row {row + 2}: time_s = {table['time_s'].iloc[row]:g}; each world's rows end periods of one "
-                f"length and count {period_s:g}, {2 * period_s:g}, ..."
-            )
-    control = np.stack([rows[driven].to_numpy(dtype=float) for rows in worlds])
+    state = [prefix + name for prefix in prefixes for name in ("inserted_length_mm", "rotation_rad")]
+    table = read_columns(path, [_COLUMNS[0], *driven], ["world", *state])
+    there = [name for name in state if name in table.values]
+    if there and len(there) < len(state):
+        absent = next(name for name in state if name not in there)
+        raise InputError(f"{path}: column {absent} is missing where {there[0]} is there; give both, or neither")
+    unused = [name for name in table.header if re.fullmatch(r"catheter_\d+_translation_mm_s", name)][catheters:]
+    if unused:
+        warnings.warn(f"{path}: column {unused[0]} is not used: no such catheter is simulated", Remark, stacklevel=2)
+    worlds = _rows_of_worlds(table)
+    period_s = _period(table, worlds)
+    control = np.stack([table.values[name][worlds] for name in driven], axis=-1)
     initial = np.zeros((len(worlds), len(driven)))
-    if len(state) == len(driven):
-        ends = np.stack([rows[state].to_numpy(dtype=float)[0] for rows in worlds])
-        initial = ends - period_s * control[:, 0]
+    if there:
+        initial = np.stack([table.values[name][worlds[:, 0]] for name in state], axis=-1) - period_s * control[:, 0]
     return ScriptedControls(initial, control, period_s)
+
+
+def _rows_of_worlds(table: Columns) -> Int[np.ndarray, "worlds samples"]:
+    """Return the rows of each world, in the order of their numbers; all rows where the file knows no worlds."""
+    if "world" not in table.values:
+        return np.arange(len(table.lines))[None]
+    world = table.values["world"]
+    odd = np.flatnonzero((world != np.round(world)) | (world < 0))
+    if len(odd):
+        raise table.fault(int(odd[0]), "world", "; give a whole number of 0 or more")
+    numbers, counts = np.unique(world, return_counts=True)
+    if counts.min() < counts.max():
+        few = int(np.argmin(counts))
+        raise InputError(
+            f"{table.path}: worlds differ in their number of rows: world {numbers[few]:.0f} has {counts[few]}, world "
+            f"{numbers[np.argmax(counts)]:.0f} has {counts.max()}; give each as many"
+        )
+    return np.argsort(world, kind="stable").reshape(len(numbers), -1)
+
+
+def _period(table: Columns, worlds: Int[np.ndarray, "worlds samples"]) -> float:
+    """Return how long each control holds, s: the time of the first row, which all others count on."""
+    time_s = table.values["time_s"]
+    first, counts = int(worlds[0, 0]), np.arange(worlds.shape[1]) + 1
+    period_s = float(time_s[first])
+    if period_s <= 0:
+        raise table.fault(first, "time_s", "; the first row ends the first period, as at 0.5")
+    low, high = PERIODS_S
+    if not low <= period_s <= high:
+        ms = period_s / 1000
+        meant = f" seems to be in ms ({period_s:g} ms is {ms:g} s)" if low <= ms <= high else ""
+        raise table.fault(
+            first, "time_s", f"{meant}; give seconds, the first the length of a period, {low:g} to {high:g}"
+        )
+    late = np.argwhere(np.abs(time_s[worlds] - period_s * counts) > 1e-6 * len(counts) * period_s)
+    if len(late):
+        rule = f"each world's rows end periods of one length and count {period_s:.10g}, {2 * period_s:.10g}, ..."
+        raise table.fault(int(worlds[tuple(late[0])]), "time_s", f"; {rule}")
+    return period_s
 
 
 def write_controls_csv(

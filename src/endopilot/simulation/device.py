@@ -21,13 +21,27 @@ from pydantic import model_validator
 from endopilot.errors import InputError
 from endopilot.files import writing
 from endopilot.settings import NonNegative, Positive, Text, Within, read_settings, settings
-from endopilot.simulation.device_files import device_yaml
+from endopilot.simulation.device_files import device_file
+from endopilot.simulation.device_ranges import (
+    GRAM_FORCE_N,
+    MOST_VALUES,
+    TIP_LENGTH_MM,
+    Abscissa,
+    Angle,
+    ArcLength,
+    BendLength,
+    Force,
+    Friction,
+    Rotation,
+    Stiffness,
+    TipLoad,
+    Torque,
+    Velocity,
+    Width,
+    check_built,
+)
 from endopilot.types import Anatomy
 
-TIP_LENGTH_MM = 10.0
-"""Length of the floppy tip, mm: the buckling length of catalogues' tip loads, and the distal coil of coronary wires."""
-GRAM_FORCE_N = 9.80665e-3
-"""One gram-force in N, by the standard acceleration of gravity; catalogues give tip loads in it."""
 Value = TypeVar("Value")
 
 
@@ -103,6 +117,8 @@ class Device:
         at = self.abscissa_mm
         if at[:1] != (0.0,) or any(after <= before for before, after in pairwise(at)):
             raise ValueError(f"abscissa_mm: {list(at)}; begin at 0, the tip, and increase")
+        if len(at) > MOST_VALUES:
+            raise ValueError(f"abscissa_mm: {len(at)} values; give at most {MOST_VALUES}")
         for name in ("bend_stiffness_n_mm2", "twist_stiffness_n_mm2"):
             count = len(getattr(self, name))
             if count != len(at):
@@ -189,7 +205,7 @@ class _TipBend:
     """The bend of the tip in a device's file, and where it comes from."""
 
     angle_deg: Annotated[float, Within(-360, 360)]
-    length_mm: NonNegative
+    length_mm: BendLength
     source: Text
 
 
@@ -197,6 +213,8 @@ class _TipBend:
 class _Shaping(TipShaping):
     """The bends that a hand can give the tip, in a device's file, and where their limits come from."""
 
+    angle_deg: tuple[Angle, Angle]
+    length_mm: tuple[ArcLength, ArcLength]
     source: Text
 
 
@@ -205,17 +223,17 @@ class _DeviceFile:
     """What a device's file holds; `Device` says what each constant means."""
 
     name: Text
-    diameter_mm: Sourced[Positive]
-    friction: Sourced[NonNegative]
-    max_velocity_mm_s: Sourced[Positive]
-    max_rotation_rad_s: Sourced[Positive]
-    push_limit_n: Sourced[Positive]
-    pull_limit_n: Sourced[Positive]
-    torque_limit_n_mm: Sourced[Positive]
-    abscissa_mm: Sourced[tuple[NonNegative, ...]]
-    bend_stiffness_n_mm2: Sourced[tuple[Positive, ...]]
-    twist_stiffness_n_mm2: Sourced[tuple[Positive, ...]]
-    tip_load_n: Sourced[Positive | None]
+    diameter_mm: Sourced[Width]
+    friction: Sourced[Friction]
+    max_velocity_mm_s: Sourced[Velocity]
+    max_rotation_rad_s: Sourced[Rotation]
+    push_limit_n: Sourced[Force]
+    pull_limit_n: Sourced[Force]
+    torque_limit_n_mm: Sourced[Torque]
+    abscissa_mm: Sourced[tuple[Abscissa, ...]]
+    bend_stiffness_n_mm2: Sourced[tuple[Stiffness, ...]]
+    twist_stiffness_n_mm2: Sourced[tuple[Stiffness, ...]]
+    tip_load_n: Sourced[TipLoad | None]
     tip_bend: _TipBend
     tip_shaping: _Shaping | None = None
 
@@ -226,14 +244,14 @@ def read_device(name_or_path: str | Path) -> Device:
     Raises:
         InputError: no such device, or a file that is not a device; the line names file, field, value and mend.
     """
-    path, _ = device_yaml(name_or_path)
+    path = device_file(name_or_path)
     content = read_settings(path, _DeviceFile)
     entries = {field.name: getattr(content, field.name) for field in fields(content) if field.name != "name"}
     entries = {name: entry for name, entry in entries.items() if entry is not None}
     shaping = content.tip_shaping
     constants = {name: entry.value for name, entry in entries.items() if isinstance(entry, Sourced)}
     try:
-        return Device(
+        device = Device(
             name=content.name,
             **constants,
             tip_bend_rad=math.radians(content.tip_bend.angle_deg),
@@ -241,6 +259,8 @@ def read_device(name_or_path: str | Path) -> Device:
             sources={name: entry.source for name, entry in entries.items()},
             tip_shaping=shaping and TipShaping(angle_deg=shaping.angle_deg, length_mm=shaping.length_mm),
         )
+        check_built(device)
+        return device
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 

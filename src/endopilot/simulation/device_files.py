@@ -11,6 +11,7 @@ import os
 from pathlib import Path
 
 from endopilot.errors import InputError
+from endopilot.files import read_text
 
 FOLDER_VARIABLE = "ENDOPILOT_DEVICES"
 """Environment variable that names a folder of device files."""
@@ -36,13 +37,26 @@ def device_file(name_or_path: str | Path) -> Path:
     """Return the YAML file of a device, by its name or its path.
 
     Raises:
-        InputError: several folders hold a device of this name, or ENDOPILOT_DEVICES names no folder.
+        InputError: no such device or file, several folders hold a device of this name, or ENDOPILOT_DEVICES names no
+            folder.
     """
     folders = [_SHIPPED, *_user_folders()]
-    files = [path for folder in folders if (path := folder / f"{name_or_path}.yaml").is_file()]
+    files = [path for folder in folders if there(path := folder / f"{name_or_path}.yaml")]
     if len(files) > 1:
         raise InputError(f"device '{name_or_path}': {' and '.join(map(str, files))} both hold it; rename yours")
-    return files[0] if files else Path(name_or_path)
+    path = files[0] if files else Path(name_or_path)
+    if not there(path):
+        names = ", ".join((*list_devices(), *user_devices()))
+        raise InputError(f"device '{name_or_path}': no such device or file; give a path, or choose from {names}")
+    return path
+
+
+def there(path: Path) -> bool:
+    """Return whether a path leads to something that can be read as a file; a name no file can have leads to nothing."""
+    try:
+        return path.exists() and not path.is_dir()
+    except (OSError, ValueError):
+        return False
 
 
 def is_shipped(path: Path) -> bool:
@@ -57,15 +71,7 @@ def device_yaml(name_or_path: str | Path) -> tuple[Path, str]:
         InputError: no such device, several of this name, or a file that is no text.
     """
     path = device_file(name_or_path)
-    try:
-        return path, path.read_text(encoding="utf-8")
-    except OSError as error:
-        names = ", ".join((*list_devices(), *user_devices()))
-        raise InputError(
-            f"device '{name_or_path}': no such device or file; give a path, or choose from {names}"
-        ) from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: is no text in UTF-8; give a device's YAML file") from error
+    return path, read_text(path, what="device's YAML file")
 
 
 def _user_folders() -> list[Path]:

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from scipy.interpolate import PchipInterpolator
 
 from endopilot.atlas.heart_reference import LEFT_VENTRICLE_AXIS
-from endopilot.settings import Finite, NonNegative, Positive, Within, settings
+from endopilot.settings import Finite, Within, settings
 from endopilot.simulation.processor import CoreMotion, Processor, core_for
 
 MotionName = Literal["still", "breathing", "heartbeat", "both"]
@@ -54,9 +54,9 @@ _MID_DIASTOLE = 0.68
 class Motion:
     """How much the vessel moves. The defaults are the published means of the coronary arteries and of the heart."""
 
-    heart_period_s: Positive = 60 / 70
+    heart_period_s: Annotated[float, Within(0.1, 60)] = 60 / 70
     """Time between heartbeats, s."""
-    annulus_mm: NonNegative = 11.6
+    annulus_mm: Annotated[float, Within(0, 200)] = 11.6
     """Travel of the aortic annulus towards the apex in systole, mm: 11.6 ± 2.9, 3 to 19 (73 patients; Plonek et al.,
     BMC Cardiovasc Disord 2018). The apex stays where it is (Hoffman and Ritman, Am J Physiol 1985), so this is also how
     much the heart shortens along its axis."""
@@ -67,7 +67,7 @@ class Motion:
     """Rotation in systole about the heart's axis, anticlockwise as seen from the apex, degrees: the mean of the apex's
     10 and the base's -3 (Young and Cowan, J Cardiovasc Magn Reson 2012). The twist between them is no affine map and
     left out."""
-    breathing_period_s: Positive = 4.0
+    breathing_period_s: Annotated[float, Within(0.1, 600)] = 4.0
     """Time between breaths, s."""
     breathing_caudal_mm: Finite = 4.9
     """Shift towards the feet in inspiration, mm: 4.9 ± 1.9, 2.4 to 8.0 (ten patients' coronary arteries; Shechter et

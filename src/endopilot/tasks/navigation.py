@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from pydantic import InstanceOf, model_validator
 
 from endopilot.errors import InputError
-from endopilot.settings import CountOrZero, Finite, NonNegative, Positive, settings
+from endopilot.settings import CountOrZero, Finite, NonNegative, Positive, Seconds, Within, settings
 from endopilot.simulation.catheter import Catheter, check_nested
 from endopilot.simulation.device import Device
 from endopilot.simulation.motion import Motion
@@ -71,10 +71,10 @@ class Navigation:
     target: Target
     catheters: tuple[Catheter, ...] = ()
     arrives: Arrives = "wire"
-    start_inserted_mm: NonNegative = 2.0
+    start_inserted_mm: Annotated[float, Within(0, 5000)] = 2.0
     start_rotation: Finite = 0.0
-    start_catheter_mm: NonNegative = 0.0
-    seconds: Positive = 60.0
+    start_catheter_mm: Annotated[float, Within(0, 5000)] = 0.0
+    seconds: Seconds = 60.0
     force_limit_n: Positive = 0.5
     known_motion: Motion | None = None
     xray: XrayKind = "assumed"

@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 
 from endopilot.atlas.atlas import ANATOMIES, AtlasConfig, make_patient
 from endopilot.errors import InputError
-from endopilot.settings import CountOrZero, NonNegative, Positive, Seed, Share, Within, read_settings, settings
+from endopilot.settings import CountOrZero, NonNegative, Positive, Seconds, Seed, Share, Within, read_settings, settings
 from endopilot.simulation.catheter import list_catheters, read_catheter
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.device import read_device
@@ -81,7 +81,7 @@ class Task:
     section: str
     depth_mm: Positive
     start_inserted_mm: NonNegative
-    seconds: Positive
+    seconds: Seconds
     force_limit_n: Positive
     stenosis_share: Share
     chosen_for: str

@@ -19,7 +19,7 @@ from scipy.optimize import nnls
 
 from endopilot.errors import InputError
 from endopilot.files import write_json
-from endopilot.settings import Count, NonNegative, OpenShare, read_settings, settings
+from endopilot.settings import NonNegative, OpenShare, Within, read_settings, settings
 
 CALIBRATION_FILE = "xray.json"
 """Name of a calibration beside the run that it belongs to."""
@@ -49,8 +49,8 @@ class Calibration:
     scale: NonNegative
     abscissa_terms: _Terms
     offset_terms: _Terms
-    anatomies: Count
-    intervals: Count
+    anatomies: Annotated[int, Within(1, 10**9)]
+    intervals: Annotated[int, Within(1, 10**9)]
     dataset: str
     heeded: NonNegative
 

@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from endopilot.settings import Positive, settings
+from endopilot.settings import Within, settings
 
 
 @settings
 class CArmGeometry:
     """Distances and pixels of a C-arm."""
 
-    source_to_isocenter_mm: Positive = 765.0
+    source_to_isocenter_mm: Annotated[float, Within(0, 10000, above_low=True)] = 765.0
     """Distance of the X-ray source from the isocenter, mm."""
-    source_to_detector_mm: Positive = 1100.0
+    source_to_detector_mm: Annotated[float, Within(0, 10000, above_low=True)] = 1100.0
     """Distance of the X-ray source from the detector, mm."""
-    pixel_mm: Positive = 0.308
+    pixel_mm: Annotated[float, Within(0.01, 10)] = 0.308
     """Pixel pitch of the detector in fluoroscopy, mm."""
 
 

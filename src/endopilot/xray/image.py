@@ -11,12 +11,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 from scipy.ndimage import gaussian_filter, zoom
 
-from endopilot.settings import Count, Finite, NonNegative, Positive, Share, settings
+from endopilot.settings import Finite, Positive, Share, Within, settings
 from endopilot.simulation.catheter import Catheter
 from endopilot.simulation.device import Device
 from endopilot.simulation.motion import place
@@ -53,7 +54,7 @@ class ImageConfig:
 
     geometry: CArmGeometry = field(default_factory=CArmGeometry)
     """Distances and pixels."""
-    pixels: Count = 512
+    pixels: Annotated[int, Within(1, 4096)] = 512
     """Columns and rows of the image."""
     detector_ugy: Positive = 0.03
     """Air kerma at the detector for one frame at the usual dose, µGy."""
@@ -61,17 +62,17 @@ class ImageConfig:
     """Detective quantum efficiency."""
     scatter: Share = 0.3
     """Scattered light at the detector, as a share of the unscattered one, behind the grid."""
-    scatter_mm: Positive = 30.0
+    scatter_mm: Annotated[float, Within(0.1, 1000)] = 30.0
     """Reach of the scattered light at the detector, standard deviation, mm."""
-    focal_spot_mm: NonNegative = 0.6
+    focal_spot_mm: Annotated[float, Within(0, 10)] = 0.6
     """Width of the focal spot, mm; magnification spreads it over the detector."""
-    scintillator_mm: NonNegative = 0.16
+    scintillator_mm: Annotated[float, Within(0, 10)] = 0.16
     """Blur of the scintillator, which blurs image and quantum noise alike, standard deviation, mm."""
-    pulse_s: NonNegative = 0.008
+    pulse_s: Annotated[float, Within(0, 1)] = 0.008
     """Length of a pulse, s: what moves is blurred along its path."""
     iodine_mm: Positive = 0.14
     """Attenuation of the contrasted blood, 1/mm: 185 mg iodine/ml at 7.6 cm²/g."""
-    opaque_tip_mm: Positive = 30.0
+    opaque_tip_mm: Annotated[float, Within(0, 5000, above_low=True)] = 30.0
     """Length of the wire's radiopaque coil, mm."""
     window: Finite = 0.9
     """Half-width of the grey scale, in powers of e about the image's middle."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -12,7 +13,7 @@ from jaxtyping import Float, Float32
 from endopilot.anatomy.io import read_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.progress import progress
-from endopilot.settings import Count, Finite, Seed, settings
+from endopilot.settings import Finite, Seed, Within, settings
 from endopilot.simulation.controls import ControlConfig, random_controls
 from endopilot.simulation.device import Device, read_device
 from endopilot.simulation.simulate import simulate
@@ -30,7 +31,7 @@ Signal = Float32[np.ndarray, "rows columns"]
 class SceneConfig:
     """Patients, their poses and the C-arm's angles."""
 
-    patients: Count = 6
+    patients: Annotated[int, Within(1, 1000)] = 6
     """Synthetic patients, right and left coronary trees in turn."""
     seed: Seed = 0
     """Seed of patients, poses, wires and noise."""

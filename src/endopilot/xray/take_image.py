@@ -12,7 +12,7 @@ from jaxtyping import Float, UInt8
 
 from endopilot.errors import InputError
 from endopilot.files import writing
-from endopilot.settings import Finite, NonNegative, Positive, Seed, Share, Text, Within, settings
+from endopilot.settings import LONGEST_S, Finite, Positive, Seed, Share, Text, Within, settings
 from endopilot.simulation.catheter import read_catheter
 from endopilot.simulation.device import read_device
 from endopilot.simulation.motion import Motion, MotionName, motion_named, place, relative
@@ -45,13 +45,13 @@ class TakeImageConfig:
     """Share of the full contrast in the vessel, where it is shown."""
     device: Text = "workhorse-014"
     """Name of a device (`endopilot devices`) or a YAML file."""
-    inserted_mm: NonNegative = 60.0
+    inserted_mm: Annotated[float, Within(0, 5000)] = 60.0
     """Length of wire that is pushed in before, mm; 0 shows the vessel without wire and catheters."""
     rotation_rad: Finite = 0.0
     """Rotation of the wire as it goes in, rad."""
     catheter: tuple[Text, ...] = ()
     """Up to two catheters around the wire, from the inside out: names such as microcatheter-1.7f, or YAML files."""
-    catheter_inserted_mm: NonNegative = 40.0
+    catheter_inserted_mm: Annotated[float, Within(0, 5000)] = 40.0
     """Length of the catheters that is pushed in with it, mm."""
     speed_mm_s: Finite = 0.0
     """Speed of the wire along its axis while it is exposed, mm/s: it is blurred."""
@@ -59,7 +59,7 @@ class TakeImageConfig:
     """How heart and breath move vessel, catheter and wire: still, breathing, heartbeat or both."""
     motion_seed: Seed | None = None
     """Draws the patient's amplitudes from the published distributions; their means if not given."""
-    time_s: NonNegative = 0.0
+    time_s: Annotated[float, Within(0, LONGEST_S)] = 0.0
     """Time of the image, s, from mid-diastole at the end of expiration on, where CT shows the vessel."""
     seed: Seed = 0
     """Seed of the quantum noise."""
