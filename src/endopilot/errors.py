@@ -12,7 +12,7 @@ class InputError(Exception):
 
 
 class Stopped(SystemExit):
-    """Ctrl-C or SIGTERM, in a command and in its worker processes; `code` is the exit code, 128 and the signal's number.
+    """Ctrl-C or SIGTERM, in a command and in its worker processes; `code` is the exit code, 128 + the signal.
 
     It is no `KeyboardInterrupt`: one of those that comes out of a user's own code was raised by that code. Nothing but
     the command line catches it.

@@ -38,9 +38,9 @@ _ENCODINGS = (
 """What a file that begins with these bytes is written in: spreadsheets and shells of Windows begin theirs so."""
 
 
-_OF_THE_PATH = tuple(
-    getattr(errno, name)
-    for name in "EACCES EPERM EROFS ENOENT ENOTDIR EISDIR EEXIST ENOTEMPTY ELOOP ENAMETOOLONG EINVAL EIO EBUSY".split()
+_OF_THE_PATH = (
+    *(errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EEXIST),
+    *(errno.ENOTEMPTY, errno.ELOOP, errno.ENAMETOOLONG, errno.EINVAL, errno.EIO, errno.EBUSY),
 )
 """Errors that another path mends."""
 

@@ -53,7 +53,8 @@ def stage():
 
 @pytest.fixture
 def client(stage):
-    cockpit = Cockpit(stage, lambda: encode("scene", {}), token=TOKEN, hosts=frozenset({"localhost", "127.0.0.1"}), cycle_s=0.005)
+    hosts = frozenset({"localhost", "127.0.0.1"})
+    cockpit = Cockpit(stage, lambda: encode("scene", {}), token=TOKEN, hosts=hosts, cycle_s=0.005)
     with TestClient(cockpit.app, base_url=f"http://{HOST}") as made:
         yield made
 

@@ -104,7 +104,7 @@ def _palette(count: int) -> Any:
 
 def _list_sections(figure: Any, names: Sequence[str], palette: Any) -> None:
     """List the sections' colours below the tree, in as many columns as fit beside each other."""
-    shown = [name if len(name) <= _LONGEST_NAME else f"{name[:_LONGEST_NAME - 1]}…" for name in names[:_MOST_LISTED]]
+    shown = [name if len(name) <= _LONGEST_NAME else f"{name[: _LONGEST_NAME - 1]}…" for name in names[:_MOST_LISTED]]
     handles = [Patch(color=palette(i), label=_plain(name)) for i, name in enumerate(shown)]
     if len(names) > len(shown):
         handles.append(Patch(color="none", label=f"and {len(names) - len(shown)} more"))

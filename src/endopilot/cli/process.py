@@ -28,8 +28,10 @@ EXIT_INTERRUPTED = 128 + signal.SIGINT
 EXIT_UNREAD = 141
 TO_END_S = 10.0
 """Time in which a command that is stopped tidies up, s; then it leaves."""
-_OUT_OF_MEMORY = re.compile("out of memory|allocate memory|bad.?alloc(ation)?|maximum allowed (size|dimension) exceeded", re.IGNORECASE)
-"""How libraries in C++ say it, in exceptions of several kinds."""
+_OUT_OF_MEMORY = re.compile(
+    "out of memory|allocate memory|bad.?alloc(ation)?|maximum allowed (size|dimension) exceeded", re.IGNORECASE
+)
+"""How libraries say it in exceptions of several kinds."""
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
@@ -71,7 +73,7 @@ def own_streams() -> None:
     """
     sys.stdout.flush()
     for name, number in (("stdout", 1), ("stderr", 2)):
-        stream = open(  # noqa: SIM115: it lives as long as the process
+        stream = os.fdopen(
             os.dup(number),
             "w",
             buffering=1 if number == 2 or os.isatty(number) else -1,
@@ -127,13 +129,11 @@ def _end(name: str, error: BaseException) -> int:
     if isinstance(error, OSError) and error.errno is not None:
         place = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
         return _say(name, f"{place}{error.strerror or text}; check the path and its permissions", EXIT_BAD_INPUT)
-    place = "".join(f", {os.path.basename(at.filename)} line {at.lineno}" for at in _frames(error)[-1:])
-    line = f"a defect of endopilot, {type(error).__name__}: {text[:200]}{place}; please report it with {_record(error)}"
-    return _say(name, line, EXIT_DEFECT)
+    from endopilot.plugins import described
 
-
-def _frames(error: BaseException) -> list[traceback.FrameSummary]:
-    return list(traceback.extract_tb(error.__traceback__))
+    return _say(
+        name, f"a defect of endopilot ({described(error)}); please report it with {_record(error)}", EXIT_DEFECT
+    )
 
 
 def _record(error: BaseException) -> str:
@@ -184,6 +184,7 @@ def _signals() -> Iterator[list[int]]:
 def _remarks(name: str) -> Iterator[None]:
     """Show our own warnings in one line each; those of libraries go where their other lines go."""
     with warnings.catch_warnings():
+
         def show(message: Warning | str, category: type[Warning], *where: Any, **_: Any) -> None:
             if issubclass(category, Remark):
                 _say(name, str(message), 0)

@@ -18,7 +18,7 @@ from endopilot import __version__
 from endopilot.anatomy.io import read_anatomy
 from endopilot.cockpit.world import World, WorldConfig
 from endopilot.errors import InputError
-from endopilot.files import json_text
+from endopilot.files import json_text, reading
 from endopilot.settings import from_record
 from endopilot.simulation.catheter import Catheter
 from endopilot.simulation.device import Device
@@ -117,7 +117,7 @@ def read_recording(path: Path) -> Recording:
     header = lines[0] if lines else {}
     if header.get("format") != FORMAT:
         raise InputError(f"{path}: no session of the cockpit; give a file that ends in {SUFFIX}")
-    try:
+    with reading(path, "choose another session"):
         where = Where(
             patient=None if header["patient"] is None else Path(header["patient"]),
             task=header["task"],
@@ -128,8 +128,6 @@ def read_recording(path: Path) -> Recording:
         cycles = max((int(event["at"]) for event in events), default=0)
         config = from_record(WorldConfig, header["config"])
         return Recording(path, navigation, config, int(header["seed"]), where, events, cycles)
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: damaged session ({error!r}); choose another") from error
 
 
 def replayed(recording: Recording) -> Iterator[tuple[World, list[dict[str, Any]]]]:

@@ -40,7 +40,7 @@ from endopilot.control.plan_config import Plan, PlanConfig
 from endopilot.control.plan_xray import PlannedXray
 from endopilot.control.set_up import tip_name
 from endopilot.errors import InputError
-from endopilot.files import json_text, manifest, read_json, sha256, writing
+from endopilot.files import json_text, manifest, read_json, reading, sha256, writing
 from endopilot.settings import from_record
 from endopilot.simulation.catheter import Catheter
 from endopilot.simulation.device import Device
@@ -143,6 +143,11 @@ def read_plan(folder: Path, anatomy: Anatomy, device: Device, catheters: Sequenc
         InputError: a file is missing or damaged, or the plan is for another anatomy or device.
     """
     folder = Path(folder)
+    with reading(folder, "plan anew"):
+        return _plan_in(folder, anatomy, device, catheters)
+
+
+def _plan_in(folder: Path, anatomy: Anatomy, device: Device, catheters: Sequence[Catheter]) -> Plan:
     record = read_json(folder / _RECORD)
     if not isinstance(record, dict) or "table_sha256" not in record:
         raise InputError(f"{folder / _RECORD}: is not the manifest of a plan; make one with `endopilot plan`")

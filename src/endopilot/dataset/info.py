@@ -14,7 +14,7 @@ from jaxtyping import Float
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.dataset import parquet, schema
 from endopilot.dataset.loader import read_manifest
-from endopilot.files import read_json, writing
+from endopilot.files import read_json, reading, writing
 from endopilot.progress import progress
 from endopilot.types import SAMPLE_PERIOD_S
 
@@ -76,6 +76,11 @@ def describe_dataset(folder: Path) -> Description:
     """
     folder = Path(folder)
     manifest, info = read_manifest(folder)
+    with reading(folder, "make the dataset again"):
+        return _described(folder, manifest, info)
+
+
+def _described(folder: Path, manifest: dict[str, Any], info: dict[str, Any]) -> Description:
     stats = read_json(folder / schema.STATS_PATH)
     wire_mm = manifest["device"]["diameter_mm"] / 2
     histograms = _empty(float(stats["observation.state"]["max"][0]))

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from endopilot.errors import InputError
+from endopilot.files import reading
 from endopilot.models.causal import CausalPredictor
 from endopilot.models.checkpoint import read_network
 from endopilot.models.config import PRETRAINED, WINDOW, TwinConfig, read_run, run_path
@@ -107,6 +108,11 @@ def load_model(run_folder: str | Path = PRETRAINED) -> Predictor:
         InputError: the run is unfinished, or a file of it is damaged or of another version.
     """
     record, run_folder = read_run(run_folder), run_path(run_folder)
+    with reading(run_folder, "train anew"):
+        return _predictor(record, run_folder)
+
+
+def _predictor(record: dict[str, Any], run_folder: Path) -> Predictor:
     device = from_record(Device, record["device"])
     if record["config"]["model"] == "twin":
         return TwinPredictor(
