@@ -85,7 +85,7 @@ class Workers(ProcessPoolExecutor):
         # process alone, however early it comes.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
-            return super().submit(fn, *args, **kwargs)
+            return super().submit(_work, fn, *args, **kwargs)
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
@@ -124,6 +124,14 @@ def _follow() -> None:
         os._exit(1)
 
     threading.Thread(target=wait, daemon=True).start()
+
+
+def _work(work: Callable[..., T], *args: Any, **kwargs: Any) -> T:
+    """Do a piece of work in a worker process; one that is stopped leaves with it, and begins no other."""
+    try:
+        return work(*args, **kwargs)
+    except Stopped as stopped:
+        os._exit(stopped.code if isinstance(stopped.code, int) else 1)
 
 
 def _leave(number: int, _frame: object) -> None:

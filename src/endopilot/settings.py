@@ -294,6 +294,8 @@ def _fields(cls: type) -> list[str]:
 def _fields_at(cls: Any, place: Sequence[int | str]) -> list[str]:
     """Return the names of the fields of the settings class that lies at a place within another."""
     for part in place:
+        if not isinstance(part, int) and part not in getattr(cls, "__pydantic_fields__", {}):
+            return []
         inner = cls if isinstance(part, int) else cls.__pydantic_fields__[part].annotation
         kinds = (get_origin(kind) or kind for kind in (inner, *get_args(inner)))
         cls = next((kind for kind in kinds if _fields(kind)), inner)

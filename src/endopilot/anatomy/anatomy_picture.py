@@ -58,7 +58,7 @@ def draw_anatomy(anatomy: Anatomy, path: Path, *, volume: Volume | None = None) 
     _draw_straightened(anatomy, line, half, volume, middle)
     _draw_sections(anatomy, line, half, volume, bottom)
     with writing(Path(path)) as partial:
-        figure.savefig(partial, dpi=90)
+        figure.savefig(partial, format="png", dpi=90)
     plt.close(figure)
 
 
