@@ -152,3 +152,47 @@ def test_only_what_is_asked_for_is_imported():
 def test_a_shipped_object_that_is_missing_is_a_defect_and_no_bad_input():
     with pytest.raises(AttributeError):
         Registry("policy", {"gone": "endopilot.control.policy:Gone"}, "endopilot.none").load("gone")
+
+
+_RUDE = """
+import sys
+from endopilot.control.policy import Decision
+
+class Odd(BaseException):
+    pass
+
+class Waits:
+    def start(self, navigation, seed):
+        print("noise")
+    def decide(self, observation):
+        return Decision(0.0, 0.0)
+
+class Leaves(Waits):
+    def __init__(self):
+        sys.exit(0)
+
+class Interrupts(Waits):
+    def decide(self, observation):
+        raise KeyboardInterrupt
+
+class Throws(Waits):
+    def start(self, navigation, seed):
+        raise Odd("two\\nlines")
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "said"), [("Leaves", "SystemExit: 0"), ("Interrupts", "KeyboardInterrupt"), ("Throws", "Odd: two lines")]
+)
+def test_whatever_a_policy_raises_names_the_policy(tmp_path, monkeypatch, capsys, name, said):
+    (tmp_path / "rude.py").write_text(_RUDE)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    try:
+        with pytest.raises(InputError, match=f"policy: 'rude:{name}': .*{said}, rude.py line .*mend it"):
+            policy = make_policy(f"rude:{name}")
+            policy.start(None, 0)  # pyright: ignore[reportArgumentType]
+            policy.decide(None)  # pyright: ignore[reportArgumentType]
+    finally:
+        sys.modules.pop("rude", None)
+    assert capsys.readouterr().out == ""

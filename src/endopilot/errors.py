@@ -1,4 +1,4 @@
-"""`InputError`, the exception for what a user can correct."""
+"""How work ends that does not end well (`InputError`, `Stopped`), and what is said beside a result (`Remark`)."""
 
 from __future__ import annotations
 
@@ -8,6 +8,14 @@ class InputError(Exception):
 
     The command line prints the message without a traceback and exits with code 2. Raise it for anything that the
     user can correct. Other exceptions are defects of endopilot itself.
+    """
+
+
+class Stopped(SystemExit):
+    """Ctrl-C or SIGTERM, in a command and in its worker processes; `code` is the exit code, 128 + the signal.
+
+    It is no `KeyboardInterrupt`: one of those that comes out of a user's own code was raised by that code. Nothing but
+    the command line catches it.
     """
 
 

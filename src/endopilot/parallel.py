@@ -1,4 +1,4 @@
-"""The same work on several items at once, in several processes: `each`."""
+"""The same work on several items at once, in several processes: `each`, and the processes themselves: `Workers`."""
 
 from __future__ import annotations
 
@@ -6,17 +6,23 @@ import multiprocessing
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
+from typing import Any, TypeVar
 
-from endopilot.errors import InputError
+from endopilot.errors import InputError, Stopped
 from endopilot.progress import progress, silence
 
+T = TypeVar("T")
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 """Processor cores that this process may use: a batch system may leave it fewer than the machine has."""
 MOST_PROCESSES = 8
 """A volume being processed takes some 1 GB of memory."""
+TO_CLEAN_UP_S = 5.0
+"""Time that a process which is stopped has to remove its half-written files, s; then it is killed."""
 
 
 def each(title: str, items: Sequence[Path], work: Callable[[Path], None]) -> dict[Path, InputError]:
@@ -29,6 +35,9 @@ def each(title: str, items: Sequence[Path], work: Callable[[Path], None]) -> dic
 
     Returns:
         The items whose work raised `InputError`, each with its error. Any other exception ends the work and is raised.
+
+    Raises:
+        InputError: a process died.
     """
     bad: dict[Path, InputError] = {}
 
@@ -45,31 +54,86 @@ def each(title: str, items: Sequence[Path], work: Callable[[Path], None]) -> dic
                 settle(item, lambda item=item: work(item))
                 advance(remark=item.name)
             return bad
-        # Spawned, since a fork of a process with running threads can deadlock.
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(processes, mp_context=context, initializer=follow_the_parent) as pool:
+        with Workers(processes) as pool:
             futures: dict[Future[None], Path] = {pool.submit(work, item): item for item in items}
             try:
                 for future in as_completed(futures):
                     settle(futures[future], future.result)
                     advance(remark=futures[future].name)
-            except BaseException:
-                pool.shutdown(wait=False, cancel_futures=True)
-                for process in multiprocessing.active_children():
-                    process.terminate()
-                raise
+            except BrokenProcessPool as error:
+                raise InputError(
+                    f"{title}: a process died, perhaps for want of memory; close other programs and run the same "
+                    "command again"
+                ) from error
     return bad
 
 
-def follow_the_parent() -> None:
+class Workers(ProcessPoolExecutor):
+    """Processes for work that other processes can import; they end with this one, however it ends.
+
+    Leaving the block by an exception stops them at once; they remove their half-written files.
+    """
+
+    def __init__(self, processes: int) -> None:
+        """Make ready for so many processes; the first piece of work starts them."""
+        # Spawned, since a fork of a process with running threads can deadlock.
+        super().__init__(processes, mp_context=multiprocessing.get_context("spawn"), initializer=_follow)
+
+    def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
+        """Give them a piece of work."""
+        # Processes are started here. A blocked signal stays blocked in them, so that Ctrl-C in a terminal reaches this
+        # process alone, however early it comes.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            return super().submit(_work, fn, *args, **kwargs)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+    def stop(self) -> None:
+        """End the processes, whatever they do; those that do not end in time are killed."""
+        running = list((self._processes or {}).values())  # there is no public way to them
+        self.shutdown(wait=False, cancel_futures=True)
+        for process in running:
+            process.terminate()
+        end = time.monotonic() + TO_CLEAN_UP_S
+        for process in running:
+            process.join(max(end - time.monotonic(), 0.0))
+            if process.is_alive():
+                process.kill()
+
+    def __exit__(self, kind: type[BaseException] | None, *details: Any) -> None:
+        """Wait for the work, or stop it after an exception."""
+        if kind is None:
+            self.shutdown()
+        else:
+            self.stop()
+
+
+def _follow() -> None:
     """Leave interrupts and progress bars to the parent process, and end when it ends, even if it is killed."""
     silence()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, _leave)
     parent = multiprocessing.parent_process()
     assert parent is not None
 
     def wait() -> None:
         parent.join()
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(TO_CLEAN_UP_S)
         os._exit(1)
 
     threading.Thread(target=wait, daemon=True).start()
+
+
+def _work(work: Callable[..., T], *args: Any, **kwargs: Any) -> T:
+    """Do a piece of work in a worker process; one that is stopped leaves with it, and begins no other."""
+    try:
+        return work(*args, **kwargs)
+    except Stopped as stopped:
+        os._exit(stopped.code if isinstance(stopped.code, int) else 1)
+
+
+def _leave(number: int, _frame: object) -> None:
+    signal.signal(number, signal.SIG_IGN)
+    raise Stopped(128 + number)

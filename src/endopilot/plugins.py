@@ -6,10 +6,11 @@ of a module in the current directory or on Python's path.
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import sys
 import traceback
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -17,8 +18,11 @@ from types import ModuleType
 from typing import Any
 
 from endopilot import __version__
-from endopilot.errors import InputError
+from endopilot.errors import InputError, Stopped
 from endopilot.files import sha256
+
+_LONGEST_MESSAGE = 200
+"""More of an exception's message is left out, characters."""
 
 
 @dataclass(frozen=True)
@@ -112,20 +116,40 @@ class Registry:
         if here not in sys.path:  # the `endopilot` command does not look there by itself
             sys.path.append(here)
         importlib.invalidate_caches()
-        try:
-            return importlib.import_module(module_name)
-        except ModuleNotFoundError as error:
-            if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
-                raise self._unusable(name, module_name, error) from error
-            raise InputError(
-                f"{self.setting}: {name!r}: there is no module {error.name} in the current directory or on Python's "
-                "path; go to its folder, or add that to PYTHONPATH"
-            ) from error
-        except (Exception, SystemExit) as error:
-            raise self._unusable(name, module_name, error) from error
+        with self.running(name, f"{module_name} cannot be imported"):
+            try:
+                return importlib.import_module(module_name)
+            except ModuleNotFoundError as error:
+                if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
+                    raise
+                raise InputError(
+                    f"{self.setting}: {name!r}: there is no module {error.name} in the current directory or on "
+                    "Python's path; go to its folder, or add that to PYTHONPATH"
+                ) from error
 
-    def _unusable(self, name: str, module_name: str, error: BaseException) -> InputError:
-        return InputError(f"{self.setting}: {name!r}: {module_name} cannot be imported ({described(error)}); mend it")
+    @contextlib.contextmanager
+    def running(self, name: str, failure: str) -> Iterator[None]:
+        """Run what is behind a name, as the block does: an exception out of a user's own code names that code.
+
+        What that code prints goes to standard error: standard output is for results.
+
+        Args:
+            name: of the implementation; exceptions of the package's own pass.
+            failure: what has failed after an exception, in words.
+
+        Raises:
+            InputError: the code raised something, if only `SystemExit` or `KeyboardInterrupt`.
+        """
+        if name in self.shipped:
+            yield
+            return
+        try:
+            with contextlib.redirect_stdout(sys.stderr):
+                yield
+        except (InputError, Stopped, MemoryError):
+            raise
+        except BaseException as error:
+            raise InputError(f"{self.setting}: {name!r}: {failure} ({described(error)}); mend it") from error
 
 
 def described(error: BaseException) -> str:
@@ -134,5 +158,6 @@ def described(error: BaseException) -> str:
         place = f"{Path(error.filename or '').name} line {error.lineno}"
         return f"{type(error).__name__}: {error.msg}, {place}"
     last = traceback.extract_tb(error.__traceback__)[-1]
-    message = " ".join(str(error).split())
-    return f"{type(error).__name__}: {message}, {Path(last.filename).name} line {last.lineno}"
+    message = " ".join(str(error).split())[:_LONGEST_MESSAGE]
+    said = f"{type(error).__name__}: {message}" if message else type(error).__name__
+    return f"{said}, {Path(last.filename).name} line {last.lineno}"

@@ -45,13 +45,13 @@ def progress(title: str, total: int | float) -> Iterator[Advance]:
     console = Console(stderr=True)
     outermost, _shown = not _shown, True
     bar = Progress(
-        TextColumn("{task.description:<28}"),
+        TextColumn("{task.description:<28}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
         TextColumn("left"),
         TimeRemainingColumn(),
-        TextColumn("{task.fields[remark]}"),
+        TextColumn("{task.fields[remark]}", markup=False),
         console=console,
         disable=not (outermost and console.is_terminal),
     )
@@ -67,7 +67,7 @@ def progress(title: str, total: int | float) -> Iterator[Advance]:
     finally:
         _shown = not outermost
     if outermost and not console.is_terminal and elapsed > 2:
-        console.print(f"{title}: done in {elapsed:.1f} s", highlight=False)
+        console.print(f"{title}: done in {elapsed:.1f} s", highlight=False, markup=False)
 
 
 def silence() -> None:

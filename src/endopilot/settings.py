@@ -15,15 +15,16 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import inspect
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, cast, dataclass_transform, get_args, get_origin, overload
+from typing import Annotated, Any, TypeVar, cast, dataclass_transform, get_args, get_origin, get_type_hints, overload
 
 import numpy as np
-from pydantic import AfterValidator, ConfigDict, GetCoreSchemaHandler, StringConstraints, ValidationError
+from pydantic import AfterValidator, ConfigDict, GetCoreSchemaHandler, StringConstraints, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, core_schema
 
@@ -217,6 +218,25 @@ def read_settings(path: Path, cls: type[T], *, remedy: str = "") -> T:
         raise InputError(f"{path}: {error}{', or ' if remedy else ''}{remedy}") from None
 
 
+def check_call(function: Callable[..., Any], args: Sequence[Any], kwargs: Mapping[str, Any]) -> None:
+    """Check the arguments of a function whose annotations have a range, such as `count: Count`.
+
+    Raises:
+        InputError: one is out of its range; the line names it, its value and what to give instead.
+    """
+    hints = get_type_hints(function, include_extras=True)
+    for name, value in inspect.signature(function).bind(*args, **kwargs).arguments.items():
+        for kind in (hints[name], *get_args(hints[name])):  # as it is, or in a union
+            limits = next((part for part in getattr(kind, "__metadata__", ()) if isinstance(part, Within)), None)
+            if limits is None or value is None:
+                continue
+            try:
+                TypeAdapter(kind).validate_python(value)
+            except ValidationError:
+                whole = get_args(kind)[0] is int
+                raise InputError(f"{name}: {value}; {limits.mend(whole=whole)}") from None
+
+
 def _made(cls: type[T], eq: bool) -> type[T]:
     made: Any = dataclass(frozen=True, kw_only=True, eq=eq, config=_STRICT)(cls)
     validate = made.__init__
@@ -274,6 +294,8 @@ def _fields(cls: type) -> list[str]:
 def _fields_at(cls: Any, place: Sequence[int | str]) -> list[str]:
     """Return the names of the fields of the settings class that lies at a place within another."""
     for part in place:
+        if not isinstance(part, int) and part not in getattr(cls, "__pydantic_fields__", {}):
+            return []
         inner = cls if isinstance(part, int) else cls.__pydantic_fields__[part].annotation
         kinds = (get_origin(kind) or kind for kind in (inner, *get_args(inner)))
         cls = next((kind for kind in kinds if _fields(kind)), inner)

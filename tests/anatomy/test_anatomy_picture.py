@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import warnings
+from dataclasses import replace
+
 import numpy as np
 from analytic_shapes import forked_tree
+from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from endopilot.anatomy.anatomy_picture import draw_anatomy
 from endopilot.anatomy.extract import extract_anatomy
-from endopilot.types import Volume
+from endopilot.types import VesselTree, Volume
 
 
 def share_of(image: np.ndarray, colour: tuple[float, float, float]) -> float:
@@ -27,3 +31,30 @@ def test_picture_shows_the_wall_the_inscribed_circle_and_the_ct(tmp_path):
         assert share_of(images[name], (0.0, 1.0, 0.0)) > 5e-5  # the wall
         assert share_of(images[name], (1.0, 1.0, 0.0)) > 2e-4  # the inscribed circles
     assert share_of(images["ct"], (0.75, 0.3, 0.25)) < share_of(images["distance"], (0.75, 0.3, 0.25))
+
+
+def test_the_list_of_many_sections_lies_within_the_picture(tmp_path, monkeypatch):
+    """The names of 99 sections, some of them odd or long, neither overlap the picture's edge nor squeeze the tree."""
+    anatomy = extract_anatomy(forked_tree(), name="fork")
+    count, begin, branches = 99, 0, []
+    total = sum(len(branch.section) for branch in anatomy.tree.branches)
+    for branch in anatomy.tree.branches:
+        number = (np.arange(len(branch.section)) + begin) * count // total
+        branches.append(replace(branch, section=number.astype(np.int64)))
+        begin += len(branch.section)
+    names = ("_first", "$second", "a very long name of a section of this vessel", *map(str, range(count - 3)))
+    found = []
+    save = Figure.savefig
+
+    def saved(figure, *arguments, **options):
+        save(figure, *arguments, **options)
+        tree = figure.subfigs[0]
+        found.append((figure.bbox, tree.legends[0].get_window_extent(), [axes.bbox for axes in tree.axes]))
+
+    monkeypatch.setattr(Figure, "savefig", saved)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        draw_anatomy(replace(anatomy, tree=VesselTree(tuple(branches), names)), tmp_path / "many.png")
+    (whole, listed, axes) = found[0]
+    assert 0 <= listed.x0 < listed.x1 <= whole.x1 and listed.y0 >= 0
+    assert all(box.height > 0.15 * whole.height and not box.overlaps(listed) for box in axes)

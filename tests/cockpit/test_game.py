@@ -36,14 +36,14 @@ class Rival:
         future.set_result({"success": True})
         return future
 
-    def shutdown(self, **arguments):
+    def stop(self):
         pass
 
 
 @pytest.fixture
 def played(navigation, xray):
     world = World(replace(navigation, seconds=6.0, force_limit_n=0.3))
-    with patch.object(game, "ProcessPoolExecutor", Rival):
+    with patch.object(game, "Workers", Rival):
         made = GameSession(Attempt(find_task("straight"), 0), world, xray)
         yield made
         made.close()
@@ -112,7 +112,7 @@ def test_a_killed_game_goes_on_and_is_scored_as_if_it_had_not_been(tmp_path, xra
     """Half the drive, the server killed, and the other half: the same figures as in one go."""
     tried = Attempt(find_task("straight"), 0)
     scores = {}
-    with patch.object(game, "ProcessPoolExecutor", Rival):
+    with patch.object(game, "Workers", Rival):
         for name, parts in (("one", (16.0,)), ("two", (1.3, 14.7))):
             world = tried.world()
             path = tmp_path / f"{name}.cockpit.jsonl"

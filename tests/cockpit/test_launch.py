@@ -10,6 +10,7 @@ import pytest
 uvicorn = pytest.importorskip("uvicorn", reason="the extra `cockpit` is not installed")
 
 from endopilot.cockpit.launch import serve  # noqa: E402
+from endopilot.errors import InputError  # noqa: E402
 
 
 class Nothing:
@@ -43,3 +44,29 @@ def test_messages_to_pages_do_not_wait_for_each_other(monkeypatch):
     monkeypatch.setattr(uvicorn.Server, "run", lambda self, sockets: asyncio.run(connect(sockets[0])))
     serve(Nothing(), lambda: b"", cycle_s=0.0125, listening=lambda url: None)
     assert found == [1]
+
+
+@pytest.mark.parametrize(
+    ("host", "page"), [("0.0.0.0", "http://127.0.0.1:"), ("::", "http://[::1]:"), ("::1", "http://[::1]:")]
+)
+def test_the_address_that_is_printed_can_be_asked_for(monkeypatch, host, page):
+    if ":" in host and not socket.has_ipv6:
+        pytest.skip("no IPv6 here")
+    printed = []
+    monkeypatch.setattr(uvicorn.Server, "run", lambda self, sockets: None)
+    serve(Nothing(), lambda: b"", cycle_s=0.0125, host=host, listening=printed.append)
+    assert printed[0].startswith(page)
+
+
+@pytest.mark.parametrize("host", ["256.1.1.1", "a..b", "192.0.2.77", "nonesuch.invalid", "http://x", "[::1]"])
+def test_what_is_no_address_of_this_machine_is_refused(host):
+    with pytest.raises(InputError, match=r"host: .* give one"):
+        serve(Nothing(), lambda: b"", cycle_s=0.0125, host=host)
+
+
+def test_a_port_in_use_is_refused():
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        with pytest.raises(InputError, match=r"port: .* choose another"):
+            serve(Nothing(), lambda: b"", cycle_s=0.0125, port=taken.getsockname()[1])

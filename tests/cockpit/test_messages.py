@@ -28,6 +28,14 @@ def test_a_drive_message_is_read():
         ('{"type": "drive", "translation": NaN, "rotation": 0}', "finite"),
         ('{"type": "drive", "translation": 1e9, "rotation": 0}', "translation"),
         ('{"type": "drive", "translation": 1}', "rotation"),
+        ('{"type": "drive", "translation": "1", "rotation": 0}', "translation"),
+        ('{"type": "drive", "translation": true, "rotation": 0}', "translation"),
+        ('{"type": "pedal", "down": 1}', "down"),
+        ('{"type": "ping", "number": 1.0}', "number"),
+        ('{"type": "fly\\nhigh"}', "drive"),
+        ('{"type": "drive", "a\\nb": ' + "[" * 900 + "]" * 900 + "}", "message|rotation|translation"),
+        ("[" * 2000, "JSON"),
+        ('{"type": "' + "x" * 2000 + '"}', "tag"),
         ('{"type": "drive", "translation": 1, "rotation": 0, "force": 9}', "force"),
         ('{"type": "c_arm", "frames_per_s": 1000}', "frames_per_s"),
         ('{"type": "c_arm", "zoom": 0}', "zoom"),
@@ -37,7 +45,7 @@ def test_a_drive_message_is_read():
 def test_other_messages_are_refused_in_one_line(text, word):
     with pytest.raises(ValueError, match=word) as caught:
         read_message(text)
-    assert "\n" not in str(caught.value)
+    assert "\n" not in str(caught.value) and len(str(caught.value)) <= 300
 
 
 @given(st.one_of(st.binary(max_size=300), st.text(max_size=300)))

@@ -197,7 +197,7 @@ def test_a_task_of_wire_and_catheter_is_scored(navigation, xray):
     assert tried.rival == "coaxial-agent"
     wanted = replace(navigation.target, abscissa=10.0)
     world = World(replace(navigation, arrives="catheter", target=wanted, seconds=6.0, force_limit_n=0.3))
-    with patch.object(game, "ProcessPoolExecutor", Rival):
+    with patch.object(game, "Workers", Rival):
         played = GameSession(tried, world, xray)
         played.handle(Game(type="game", action="start"), 0.0)
         play(played, both((8.0, 0.0)), 1.5)

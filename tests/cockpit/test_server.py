@@ -53,13 +53,14 @@ def stage():
 
 @pytest.fixture
 def client(stage):
-    cockpit = Cockpit(stage, lambda: encode("scene", {}), token=TOKEN, hosts=(HOST,), cycle_s=0.005)
+    hosts = frozenset({"localhost", "127.0.0.1"})
+    cockpit = Cockpit(stage, lambda: encode("scene", {}), token=TOKEN, hosts=hosts, cycle_s=0.005)
     with TestClient(cockpit.app, base_url=f"http://{HOST}") as made:
         yield made
 
 
 def socket(client, *, token=TOKEN, headers=ORIGIN):
-    return client.websocket_connect(f"/socket?token={token}", headers=headers)
+    return client.websocket_connect(f"ws://{HOST}/socket?token={token}", headers=headers)
 
 
 def until(found, *, seconds=5.0):
@@ -92,6 +93,41 @@ def test_the_page_loads_nothing_from_elsewhere(client):
 
 def test_another_name_of_this_machine_is_refused(client):
     assert client.get(f"/?token={TOKEN}", headers={"host": "evil.example"}).status_code == 403
+
+
+@pytest.mark.parametrize(
+    ("came_in", "host", "allowed"),
+    [
+        ("192.0.2.7", "192.0.2.7:7000", True),
+        ("192.0.2.7", "localhost:7000", True),
+        ("192.0.2.7", "LOCALHOST:7000", True),
+        ("192.0.2.7", "192.0.2.8:7000", False),
+        ("192.0.2.7", "192.0.2.7:7001", False),
+        ("192.0.2.7", "192.0.2.7", False),
+        ("192.0.2.7", "evil.example:7000", False),
+        ("192.0.2.7", "192.0.2.7.evil.example:7000", False),
+        ("192.0.2.7", "evil@192.0.2.7:7000", False),
+        ("192.0.2.7", "192.0.2.7:7000/", False),
+        ("192.0.2.7", "", False),
+        ("192.0.2.7", "[", False),
+        ("192.0.2.7", "localhost:99999", False),
+        ("fe80::7%eth0", "[fe80::7]:7000", True),
+        ("fe80::7", "[fe80::8]:7000", False),
+        ("::ffff:192.0.2.7", "192.0.2.7:7000", True),
+        ("::1", "[::1]:7000", True),
+    ],
+)
+def test_the_page_is_asked_for_at_the_address_where_it_is(client, came_in, host, allowed):
+    """A server on all interfaces is asked for at many addresses; a foreign name for one of them is DNS rebinding."""
+
+    async def at(scope, receive, send):
+        await client.app(scope | {"server": (came_in, 7000)}, receive, send)
+
+    asking = TestClient(at, base_url=f"http://{HOST}")
+    for origin in (None, f"http://{host}", "http://evil.example"):
+        headers = {"host": host} | ({} if origin is None else {"origin": origin})
+        status = asking.get(f"/?token={TOKEN}", headers=headers).status_code
+        assert (status == 200) == (allowed and origin != "http://evil.example"), (origin, status)
 
 
 @pytest.mark.parametrize(
@@ -171,6 +207,7 @@ def test_too_many_messages_a_second_close_the_connection(client, monkeypatch):
     assert closed.value.code == BUSY
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 def test_an_error_of_the_server_is_told_in_the_page(client, stage):
     stage.cycles = 4990
     with socket(client) as page:

@@ -301,8 +301,12 @@ def test_loader_names_what_is_damaged(tmp_path):
     with pytest.raises(InputError, match=r"made by endopilot 0\.0\.9, format 1, which .* cannot read"):
         load_dataset(tmp_path / "d")
     (tmp_path / "d/meta/manifest.json").write_text(json.dumps({"key": "0"}))
-    with pytest.raises(InputError, match=r"manifest\.json: damaged"):
+    with pytest.raises(InputError, match=r"manifest\.json: settings: missing; make the dataset again"):
         load_dataset(tmp_path / "d")
+    for name, odd in (("settings", None), ("anatomies", "x"), ("files", []), ("key", 3), ("samples_per_episode", None)):
+        (tmp_path / "d/meta/manifest.json").write_text(json.dumps(manifest | {name: odd}))
+        with pytest.raises(InputError, match="; make the dataset again"):
+            load_dataset(tmp_path / "d")
     (tmp_path / "d/meta/manifest.json").write_text(json.dumps(manifest))
     (tmp_path / "d/meta/info.json").unlink()
     with pytest.raises(InputError, match=r"info\.json: missing from the dataset"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,10 @@ SECTIONS = 6
 WINDOW_HU = (-150.0, 650.0)
 _SECTION_COLOURS = ListedColormap(plt.get_cmap("tab10")([0, 1, 2, 3, 4, 5, 6, 8, 9]))
 """Without grey, which is the catheter's."""
+_WIDTH = 15.0
+"""Of the picture, inches."""
+_LONGEST_NAME, _MOST_LISTED = 24, 120
+"""Letters of a section's name, and number of sections, that are listed."""
 _LARGEST_GRID = 1_500_000
 _LIGHT = np.array([-0.35, -0.8, 0.5]) / np.linalg.norm([-0.35, -0.8, 0.5])
 
@@ -44,7 +49,7 @@ def draw_anatomy(anatomy: Anatomy, path: Path, *, volume: Volume | None = None) 
         path: the PNG.
         volume: the CT in HU that is shown behind the walls; without one it is the distance to the wall.
     """
-    figure = plt.figure(figsize=(15, 13), facecolor="white", layout="constrained")
+    figure = plt.figure(figsize=(_WIDTH, 13), facecolor="white", layout="constrained")
     parts: Any = figure.subfigures(3, 1, height_ratios=(2.0, 1.15, 1.0))
     top, middle, bottom = parts
     _draw_tree(anatomy, top)
@@ -53,7 +58,7 @@ def draw_anatomy(anatomy: Anatomy, path: Path, *, volume: Volume | None = None) 
     _draw_straightened(anatomy, line, half, volume, middle)
     _draw_sections(anatomy, line, half, volume, bottom)
     with writing(Path(path)) as partial:
-        figure.savefig(partial, dpi=90)
+        figure.savefig(partial, format="png", dpi=90)
     plt.close(figure)
 
 
@@ -73,11 +78,11 @@ def _draw_tree(anatomy: Anatomy, figure: Any) -> None:
     shade = 0.45 + 0.55 * np.abs(normal @ _LIGHT)
     order = np.argsort(-corners[:, :, 1].mean(axis=1))  # from the back (large y) to the front
     present = np.unique(section)
-    palette = _SECTION_COLOURS if len(present) <= _SECTION_COLOURS.N else plt.get_cmap("tab20")
+    palette = _palette(len(present))
     scale = Normalize(float(radius.min()), float(radius.max()))
     number = np.searchsorted(present, section)
     for axes, title in zip(figure.subplots(1, 2), ("sections", "radius, mm"), strict=True):
-        colour = palette(number % palette.N) if title == "sections" else plt.get_cmap("viridis")(scale(radius))
+        colour = palette(number) if title == "sections" else plt.get_cmap("viridis")(scale(radius))
         colour = np.where(catheter[:, None], [0.75, 0.75, 0.75, 1.0], colour)
         colour[:, :3] *= shade[:, None]
         visible = list(corners[order][:, :, [0, 2]])
@@ -85,10 +90,34 @@ def _draw_tree(anatomy: Anatomy, figure: Any) -> None:
         axes.set(aspect="equal", title=title, xlabel="x (to the patient's left), mm", ylabel="z (to the head), mm")
         axes.autoscale_view()
         if title == "sections":
-            handles = [Patch(color=palette(i % palette.N), label=tree.section_names[s]) for i, s in enumerate(present)]
-            axes.legend(handles=[*handles, Patch(color="0.75", label="catheter")], fontsize=8, loc="upper right")
+            _list_sections(figure, [tree.section_names[s] for s in present], palette)
         else:
             figure.colorbar(ScalarMappable(scale, "viridis"), cax=axes.inset_axes((1.03, 0.0, 0.03, 1.0)))
+
+
+def _palette(count: int) -> Any:
+    """Return a colour for each of so many sections; of many, neighbours in the list have similar ones."""
+    if count <= _SECTION_COLOURS.N:
+        return _SECTION_COLOURS
+    return plt.get_cmap("tab20") if count <= 20 else plt.get_cmap("turbo").resampled(count)
+
+
+def _list_sections(figure: Any, names: Sequence[str], palette: Any) -> None:
+    """List the sections' colours below the tree, in as many columns as fit beside each other."""
+    shown = [name if len(name) <= _LONGEST_NAME else f"{name[: _LONGEST_NAME - 1]}…" for name in names[:_MOST_LISTED]]
+    handles = [Patch(color=palette(i), label=_plain(name)) for i, name in enumerate(shown)]
+    if len(names) > len(shown):
+        handles.append(Patch(color="none", label=f"and {len(names) - len(shown)} more"))
+    handles.append(Patch(color="0.75", label="catheter"))
+    width = 0.45 + 0.075 * max(len("catheter"), *map(len, shown))  # of a column, inches
+    columns = min(len(handles), int(_WIDTH / width))
+    figure.legend(handles=handles, fontsize=8, loc="outside lower center", ncols=columns, columnspacing=1.0)
+
+
+def _plain(name: str) -> str:
+    """Return a name that matplotlib shows as it is: no formula, no line break, and not left out for its underscore."""
+    text = "".join(letter if letter.isprintable() else "?" for letter in name).replace("$", r"\$")
+    return f"\u200b{text}" if text.startswith("_") else text
 
 
 def _wall(anatomy: Anatomy) -> tuple[Float[np.ndarray, "n 3"], Any]:

@@ -9,11 +9,9 @@ with the missing chunks.
 
 from __future__ import annotations
 
-import multiprocessing
 import time
 import warnings
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, fields
 from functools import lru_cache
@@ -30,7 +28,7 @@ from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.benchmarks.manoeuvres import MANOEUVRES, name_of, paired_controls, seed_of, stacks_of
 from endopilot.errors import InputError
 from endopilot.files import read_json, sha256, write_json, writing
-from endopilot.parallel import follow_the_parent
+from endopilot.parallel import Workers
 from endopilot.progress import progress
 from endopilot.runs import claim
 from endopilot.settings import Within, settings
@@ -237,15 +235,12 @@ class _Worker:
     """A process that simulates chunks; it is replaced when it dies."""
 
     def __enter__(self) -> _Worker:
-        self._pool: ProcessPoolExecutor | None = None
+        self._pool: Workers | None = None
         return self
 
     def __exit__(self, *_: object) -> None:
         if self._pool is not None:
-            running = list(multiprocessing.active_children())
-            self._pool.shutdown(wait=False, cancel_futures=True)
-            for process in running:
-                process.terminate()
+            self._pool.stop()
 
     def run(self, path: Path, config: RobustnessConfig, index: int, stack: Stack, rollouts: int) -> None:
         """Simulate a chunk; if that raises or ends the process, record the chunk as crashed.
@@ -254,8 +249,7 @@ class _Worker:
             InputError: the folder cannot be written.
         """
         if self._pool is None:
-            context = multiprocessing.get_context("spawn")
-            self._pool = ProcessPoolExecutor(1, mp_context=context, initializer=follow_the_parent)
+            self._pool = Workers(1)
         try:
             self._pool.submit(run_chunk, path, config, index, stack, rollouts).result()
         except InputError:

@@ -5,16 +5,20 @@ Only the command that is called is imported, so that `endopilot --help` and `end
 
 from __future__ import annotations
 
+import contextlib
 import difflib
+import functools
 import importlib
-import os
+import io
+import itertools
+import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from endopilot import __version__
+from endopilot.cli.process import EXIT_BAD_INPUT, carry_out, leave, own_streams
 from endopilot.errors import InputError
-from endopilot.extras import what_is_missing
 
 COMMANDS = {
     "demo": "six synthetic patients -> everything from the CT angiogram to the report",
@@ -43,16 +47,14 @@ COMMANDS = {
 }
 """Name of each command: what it takes -> what it makes. `module_of` names its module."""
 
-EXIT_BAD_INPUT = 2
-EXIT_INTERRUPTED = 130
-EXIT_UNREAD = 141
-
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run `endopilot` with `arguments` (those of the process by default) and leave with its exit code.
 
     Bad input, or an extra that is not installed, gives one line on standard error and exit code 2; Ctrl-C gives 130.
+    With arguments of the process, standard output and standard error are for the command alone (`own_streams`).
     """
+    is_process = arguments is None
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     name = arguments[0] if arguments else "--help"
     if name in ("-h", "--help"):
@@ -60,7 +62,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     elif name == "--version":
         print(f"endopilot {__version__}")
     elif name in COMMANDS:
-        sys.exit(_run(name, arguments[1:]))
+        if is_process:
+            own_streams()
+        code = carry_out(name, functools.partial(_work, name, arguments[1:]))
+        leave(code) if is_process else sys.exit(code)
     else:
         near = difflib.get_close_matches(name, COMMANDS, n=1)
         hint = f"did you mean '{near[0]}'?" if near else "`endopilot --help` lists the commands."
@@ -90,32 +95,44 @@ def overview() -> str:
     )
 
 
-def _run(name: str, arguments: Sequence[str]) -> int:
+def _work(name: str, arguments: Sequence[str]) -> None:
+    """Read a command's arguments and do its work."""
     import tyro
 
+    module = importlib.import_module(f"endopilot.cli.{module_of(name)}")
+    subjects: dict[str, Any] | None = getattr(module, "SUBJECTS", None)
+    read: Any = tyro.cli if subjects is None else tyro.extras.subcommand_cli_from_dict
+    said = io.StringIO()
     try:
-        module = importlib.import_module(f"endopilot.cli.{module_of(name)}")
-        subjects: dict[str, Any] | None = getattr(module, "SUBJECTS", None)
-        call: Any = tyro.cli if subjects is None else tyro.extras.subcommand_cli_from_dict
-        call(
-            subjects or module.command,
-            prog=f"endopilot {name}",
-            args=arguments,
-            config=(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes),
-        )
-    except InputError as error:
-        print(f"endopilot {name}: {error}", file=sys.stderr)
-        return EXIT_BAD_INPUT
-    except ModuleNotFoundError as error:
-        missing = what_is_missing(error)
-        if missing is None:
+        with contextlib.redirect_stderr(said):
+            work = read(
+                _later(module.command) if subjects is None else {key: _later(one) for key, one in subjects.items()},
+                prog=f"endopilot {name}",
+                args=arguments,
+                config=(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes),
+            )
+    except SystemExit as error:
+        if not error.code:
             raise
-        print(f"endopilot {name}: {missing}", file=sys.stderr)
-        return EXIT_BAD_INPUT
-    except KeyboardInterrupt:
-        print(f"endopilot {name}: interrupted", file=sys.stderr)
-        return EXIT_INTERRUPTED
-    except BrokenPipeError:  # the reader has closed the output, as `head` does
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing is left to flush into
-        return EXIT_UNREAD
-    return 0
+        raise InputError(f"{_told(said.getvalue())}; `endopilot {name} --help` lists the options") from None
+    work()
+
+
+def _later(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
+    """Return what takes the arguments of a command and returns its work, still to be done."""
+
+    @functools.wraps(command)
+    def bound(*args: Any, **kwargs: Any) -> Callable[[], None]:
+        from endopilot.settings import check_call  # pydantic is slow to import
+
+        check_call(command, args, kwargs)
+        return functools.partial(command, *args, **kwargs)
+
+    return bound
+
+
+def _told(box: str) -> str:
+    """Return what tyro's box of several lines says of bad arguments, in one line: its first part, without the help."""
+    lines = [line.strip("│╭╮╰╯─\n") for line in box.splitlines()[1:]]
+    first = list(itertools.takewhile(lambda line: line.strip(" ─"), lines))
+    return re.sub(r"\.$", "", " ".join(line.strip() for line in first if not line.startswith(" " * 6)))

@@ -56,6 +56,8 @@ def command(
         for reason in rejected.values():
             print(f"endopilot anatomy: rejected: {reason}", file=sys.stderr)
         return
+    if picture is not None and picture.suffix.lower() != ".png":
+        raise InputError(f"{picture}: a picture is written as PNG; name it with .png")
     if ct is not None and picture is None:
         raise InputError(f"--ct {ct}: is only shown in a picture; give --picture FILE.png too")
     volume = None if ct is None else read_volume(existing(ct))

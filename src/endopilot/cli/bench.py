@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional
 
@@ -19,10 +19,12 @@ from endopilot.benchmarks.robustness import RobustnessConfig
 from endopilot.benchmarks.xray import XrayBenchConfig
 from endopilot.cli.arguments import OutputFolder, existing, show, show_rows
 from endopilot.errors import InputError
+from endopilot.settings import Count, Seed, Within
 from endopilot.simulation.config import Preset
 from endopilot.simulation.motion import MotionName, motion_named
 
 EXIT_FAILED = 1
+AboveZero = Annotated[float, Within(0, 1, above_low=True)]
 
 
 def simulation(
@@ -138,12 +140,12 @@ def env(*, json: bool = False) -> None:
     show(bench_env(), as_json=json)
 
 
-def dataset(*, output: OutputFolder = Path("runs/bench-dataset"), share: float = 0.05, json: bool = False) -> None:
+def dataset(*, output: OutputFolder = Path("runs/bench-dataset"), share: AboveZero = 0.05, json: bool = False) -> None:
     """Make a share of the paper's set of 100 000 navigations, and extrapolate time and size of all of it.
 
     Args:
         output: folder of this share; an interrupted run goes on where it stopped.
-        share: share of the paper's set, 0 to 1.
+        share: share of the paper's set, above 0, at most 1.
         json: print the figures as JSON.
     """
     from endopilot.benchmarks.dataset import bench_dataset
@@ -165,7 +167,7 @@ def training(*, folder: Path = Path("runs/bench-training"), json: bool = False) 
     _leave(all(row["passed"] for row in rows))
 
 
-def labels(*, count: int = 40, seed: int = 0, json: bool = False) -> None:
+def labels(*, count: Count = 40, seed: Seed = 0, json: bool = False) -> None:
     """Label the sections of synthetic patients of every kind, and compare with the truth.
 
     Args:
@@ -246,8 +248,8 @@ def ostia(folder: Positional[Path], /, *, json: bool = False) -> None:
 
 def imaging(
     *,
-    cases: int = 50,
-    seed: int = 0,
+    cases: Count = 50,
+    seed: Seed = 0,
     difficulty: Difficulty = "clean",
     folder: Path = Path("runs/bench-imaging"),
     json: bool = False,

@@ -10,15 +10,16 @@ from tyro.conf import Positional
 
 from endopilot.cli.arguments import existing
 from endopilot.errors import InputError
-from endopilot.settings import CountOrZero, Within, settings
+from endopilot.settings import CountOrZero, Text, Within, settings
 
 
 @settings
 class ListenConfig:
     """The page's address."""
 
-    host: str = "127.0.0.1"
-    """Address to listen on; by default only this machine can connect."""
+    host: Text = "127.0.0.1"
+    """Address to listen on; by default only this machine can connect. 0.0.0.0 or :: for all addresses of this machine:
+    whoever is given the page's address, token included, can then drive."""
     port: Annotated[int, Within(0, 65535)] = 0
     """TCP port; 0 for a free one."""
 

@@ -10,6 +10,7 @@ from endopilot.anatomy.io import read_anatomy
 from endopilot.cli.arguments import OutputFile, existing, show
 from endopilot.imaging.volume import check_output, write_volume
 from endopilot.phantom.phantom import PhantomConfig, make_phantom
+from endopilot.settings import Seed
 
 
 def command(
@@ -17,7 +18,7 @@ def command(
     /,
     *,
     output: OutputFile,
-    seed: int = 0,
+    seed: Seed = 0,
     json: bool = False,
     config: PhantomConfig = PhantomConfig(),
 ) -> None:

@@ -21,7 +21,7 @@ from endopilot.control.navigate import NavigateConfig, NavigationLoop
 from endopilot.control.plan_file import read_plan
 from endopilot.dataset.loader import load_dataset
 from endopilot.errors import InputError
-from endopilot.files import read_json
+from endopilot.files import read_json, reading
 from endopilot.ladder.attempt import Recording, Repeated, navigation_seed
 from endopilot.simulation.catheter import read_catheter
 from endopilot.simulation.config import SimulatorConfig
@@ -121,9 +121,11 @@ def open_film(
         vessel, files = read_anatomy(_given(patient, path)), sorted(path.glob("catheter-*.yaml"))
         return _rollout(path / "controls.csv", vessel, str(path / "wire.yaml"), list(map(str, files)), 0)
     if (path / "meta").is_dir():
-        return _episode(path, world)
+        with reading(path, "make the data set again"):
+            return _episode(path, world)
     if path.suffix == ".json":
-        return _ladder(path, task, world)
+        with reading(path, "give a file of the ladder as it was written"):
+            return _ladder(path, task, world)
     if path.suffix == ".csv":
         return _rollout(path, read_anatomy(_given(patient, path)), device, catheters, world)
     raise InputError(

@@ -7,9 +7,8 @@ patient in a process of its own, so that both scores stand side by side.
 
 from __future__ import annotations
 
-import multiprocessing
 from collections.abc import Iterable, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,6 +23,7 @@ from endopilot.cockpit.world import Snapshot, World, WorldConfig
 from endopilot.control.record import Track
 from endopilot.errors import InputError
 from endopilot.ladder.attempt import Recording, attempt, figures, navigation_seed
+from endopilot.parallel import Workers
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import DECISION_PERIOD_S
 from endopilot.tasks.task import CORE, Task
@@ -100,7 +100,7 @@ class GameSession(Session):
         self._peak_n, self._counted_before = 0.0, 0
         self._period = round(DECISION_PERIOD_S / world.config.cycle_s)
         self._rival: Future[dict[str, Any]] | None = None
-        self._pool: ProcessPoolExecutor | None = None
+        self._pool: Workers | None = None
 
     def handle(self, message: messages.Message, now_s: float) -> None:
         """Do what the page asks for; while the game is on, neither targets nor policies."""
@@ -152,7 +152,7 @@ class GameSession(Session):
         """Stop the wire, and the agent."""
         super().close()
         if self._pool is not None:
-            self._pool.shutdown(wait=False, cancel_futures=True)
+            self._pool.stop()
 
     def restore(self, history: Iterable[tuple[World, Sequence[dict[str, Any]]]]) -> None:
         """Live through what was played again, and wait for the page to start the clock."""
@@ -205,7 +205,7 @@ class GameSession(Session):
         recording = Recording(np.array(self._commands), np.array(self._exposed), None)
         self.result = figures(self.world.navigation, record, recording)
         self._record(score={name: self.result[name] for name in _SHOWN})
-        self._pool = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
+        self._pool = Workers(1)
         self._rival = self._pool.submit(_rival, self._tried)
         return [self._scores()]
 

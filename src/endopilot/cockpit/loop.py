@@ -5,7 +5,6 @@ from __future__ import annotations
 import queue
 import threading
 import time
-import traceback
 from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
@@ -94,9 +93,9 @@ class Loop:
         try:
             self._cycles()
         except Exception as error:
-            traceback.print_exc()
             text = f"{type(error).__name__}: {' '.join(str(error).split())}"
             self._publish("error", encode("error", {"text": f"The simulation has stopped. {text}", "fatal": True}))
+            raise  # which the command line tells, too
         finally:
             self._stage.close()
 

@@ -10,12 +10,13 @@ from endopilot.simulation.catheter import MOST_CATHETERS
 
 LONGEST_MESSAGE = 2048
 """A longer message closes the connection, bytes."""
+_LONGEST_ANSWER = 300
 _Speed = Annotated[float, Field(ge=-1e3, le=1e3, allow_inf_nan=False)]
 _Angle = Annotated[float, Field(ge=-180, le=180, allow_inf_nan=False)]
 
 
 class _Message(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
 
 class Drive(_Message):
@@ -147,4 +148,4 @@ def read_message(text: str | bytes) -> Message:
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         where = ".".join(str(part) for part in first["loc"]) or "message"
-        raise ValueError(f"{where}: {first['msg']}") from None
+        raise ValueError(" ".join(f"{where}: {first['msg']}".split())[:_LONGEST_ANSWER]) from None

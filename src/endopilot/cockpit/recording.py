@@ -14,11 +14,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from endopilot import __version__
 from endopilot.anatomy.io import read_anatomy
 from endopilot.cockpit.world import World, WorldConfig
 from endopilot.errors import InputError
-from endopilot.files import json_text
+from endopilot.files import json_text, reading
 from endopilot.settings import from_record
 from endopilot.simulation.catheter import Catheter
 from endopilot.simulation.device import Device
@@ -117,7 +119,7 @@ def read_recording(path: Path) -> Recording:
     header = lines[0] if lines else {}
     if header.get("format") != FORMAT:
         raise InputError(f"{path}: no session of the cockpit; give a file that ends in {SUFFIX}")
-    try:
+    with reading(path, "choose another session"):
         where = Where(
             patient=None if header["patient"] is None else Path(header["patient"]),
             task=header["task"],
@@ -125,11 +127,12 @@ def read_recording(path: Path) -> Recording:
         )
         navigation = _navigation(path, header, where)
         events = tuple(lines[1:])
+        np.random.default_rng(int(header["seed"]))  # which must not be negative
+        for event in events:
+            _check(event)
         cycles = max((int(event["at"]) for event in events), default=0)
         config = from_record(WorldConfig, header["config"])
         return Recording(path, navigation, config, int(header["seed"]), where, events, cycles)
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: damaged session ({error!r}); choose another") from error
 
 
 def replayed(recording: Recording) -> Iterator[tuple[World, list[dict[str, Any]]]]:
@@ -157,6 +160,17 @@ def replayed(recording: Recording) -> Iterator[tuple[World, list[dict[str, Any]]
         yield world, events
         if cycle < recording.cycles:
             world.advance()
+
+
+def _check(event: dict[str, Any]) -> None:
+    """Take an event apart as those who read it do; what is odd in it raises some error."""
+    if "target" in event:
+        branch, abscissa = event["target"]
+        Target(branch=branch, abscissa=abscissa)
+    if "move" in event:
+        [float(value) for value in event["move"]]
+    if "exposure" in event:
+        float(event["exposure"] + event["seconds"] + event["kerma_ugy"])
 
 
 def _header(world: World, where: Where, seed: int) -> dict[str, Any]:
@@ -218,7 +232,7 @@ def _lines(path: Path) -> list[dict[str, Any]]:
             break  # half-written
         try:
             content = json.loads(line)
-        except json.JSONDecodeError:
+        except (json.JSONDecodeError, RecursionError):
             break
         if not isinstance(content, dict):
             break

@@ -7,6 +7,7 @@ import base64
 import contextlib
 import hashlib
 import hmac
+import ipaddress
 import re
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
@@ -60,7 +61,7 @@ class Cockpit:
     """
 
     def __init__(
-        self, stage: Stage, scene: Callable[[], bytes], *, token: str, hosts: tuple[str, ...], cycle_s: float
+        self, stage: Stage, scene: Callable[[], bytes], *, token: str, hosts: frozenset[str], cycle_s: float
     ) -> None:
         """Lay the routes out.
 
@@ -68,7 +69,7 @@ class Cockpit:
             stage: what is driven or replayed.
             scene: makes the message with what does not move.
             token: that a page's address must hold.
-            hosts: names (with ports) under which the page may be asked for, such as "127.0.0.1:8000".
+            hosts: names under which the page may be asked for, besides the address that a connection comes in at.
             cycle_s: length of a cycle, s.
         """
         self._token, self._hosts, self._scene = token, hosts, scene
@@ -110,11 +111,18 @@ class Cockpit:
             page.put(channel, message)
 
     def _allowed(self, connection: HTTPConnection, *, need_origin: bool) -> bool:
-        """Return whether host, origin and token are right."""
-        origin = connection.headers.get("origin")
-        if connection.headers.get("host") not in self._hosts:
-            return False  # another name for this machine: DNS rebinding
-        if (need_origin or origin is not None) and (origin is None or urlsplit(origin).netloc not in self._hosts):
+        """Return whether host, origin and token are right.
+
+        The host must be this machine's: one of `hosts`, or the very address that the connection came in at. Another
+        name for that address would be a foreign page's that has turned its own name to it (DNS rebinding). The origin
+        must be the page itself.
+        """
+        host, origin = connection.headers.get("host", ""), connection.headers.get("origin")
+        address, port = connection.scope.get("server") or ("", None)
+        name, asked_port = _host_and_port(host)
+        if asked_port != port or not (name in self._hosts or _same_address(name, address)):
+            return False
+        if (need_origin or origin is not None) and origin != f"http://{host}":
             return False
         given = connection.query_params.get("token", "").encode()
         return hmac.compare_digest(given, self._token.encode())
@@ -220,6 +228,26 @@ class Cockpit:
         for page in self._pages:
             header = {"drives": page is self._driver, "taken": self._driver is not None, "pages": len(self._pages)}
             page.put("role", encode("role", header))
+
+
+def _host_and_port(host: str) -> tuple[str, int | None]:
+    """Return name and port of a `Host` header; 80 where it states none, and None where it is no such header."""
+    try:
+        parts = urlsplit(f"//{host}")
+        if parts.netloc != host or parts.username is not None:
+            return "", None
+        return parts.hostname or "", 80 if parts.port is None else parts.port
+    except ValueError:
+        return "", None
+
+
+def _same_address(name: str, address: str) -> bool:
+    """Return whether a name is an IP address, and which one; one of IPv4 may come in through a socket of IPv6."""
+    try:
+        asked, came_in = ipaddress.ip_address(name), ipaddress.ip_address(address.partition("%")[0])
+    except ValueError:
+        return False
+    return asked in (came_in, getattr(came_in, "ipv4_mapped", None))
 
 
 def _headers(index: str) -> dict[str, str]:

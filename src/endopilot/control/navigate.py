@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import field, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -224,7 +225,7 @@ class NavigationLoop:
 
     def _decide(self, observation: Observation, by_hand: Decision | None) -> Decision:
         if by_hand is None:
-            return self.policy.decide(observation)
+            return _checked(self.policy.decide(observation), type(self.policy).__name__)
         if isinstance(self.policy, Led):
             self.policy.watch(observation)
         else:
@@ -298,6 +299,13 @@ def start_world(
         catheter_inserted_length=np.full((1, len(catheters)), max(navigation.start_catheter_mm + truth.ostium_mm, 0.0)),
     )
     return simulator
+
+
+def _checked(decision: Any, policy: str) -> Decision:
+    """Refuse what a policy of one's own may return in place of a decision; the drives' limits check its numbers."""
+    if not isinstance(decision, Decision):
+        raise InputError(f"policy: {policy} decided {type(decision).__name__}; return a Decision")
+    return decision
 
 
 def _reached(navigation: Navigation, simulator: Simulator) -> bool:

@@ -142,11 +142,12 @@ def read_plan(folder: Path, anatomy: Anatomy, device: Device, catheters: Sequenc
     Raises:
         InputError: a file is missing or damaged, or the plan is for another anatomy or device.
     """
-    with reading(Path(folder), "plan anew"):
-        return _read(Path(folder), anatomy, device, catheters)
+    folder = Path(folder)
+    with reading(folder, "plan anew"):
+        return _plan_in(folder, anatomy, device, catheters)
 
 
-def _read(folder: Path, anatomy: Anatomy, device: Device, catheters: Sequence[Catheter]) -> Plan:
+def _plan_in(folder: Path, anatomy: Anatomy, device: Device, catheters: Sequence[Catheter]) -> Plan:
     record = read_json(folder / _RECORD)
     if not isinstance(record, dict) or "table_sha256" not in record:
         raise InputError(f"{folder / _RECORD}: is not the manifest of a plan; make one with `endopilot plan`")

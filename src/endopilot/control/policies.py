@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
+from collections.abc import Callable
 from typing import Any
 
 from endopilot.control.policy import Policy
 from endopilot.errors import InputError
-from endopilot.plugins import Registry, described
+from endopilot.plugins import Registry
 
 POLICIES = Registry(
     setting="policy",
@@ -25,6 +28,7 @@ POLICIES = Registry(
 )
 """Where the classes of policies are. Each is made without arguments."""
 _METHODS = ("start", "decide")
+_MORE_METHODS = ("believed", "watch")
 
 
 def make_policy(name: str) -> Policy:
@@ -39,11 +43,24 @@ def make_policy(name: str) -> Policy:
     kind = POLICIES.load(name)
     if not callable(kind):
         raise InputError(f"policy: {name!r} is no class and no function; name what makes the policy")
-    try:
+    with POLICIES.running(name, "cannot be made without arguments"):
         policy: Any = kind()
-    except Exception as error:
-        raise InputError(f"policy: {name!r} cannot be made without arguments ({described(error)}); mend it") from error
     lacking = [method for method in _METHODS if not callable(getattr(policy, method, None))]
     if lacking:
         raise InputError(f"policy: {name!r} has no {' and no '.join(lacking)}; add it, as endopilot's Policy has it")
+    if name not in POLICIES.shipped:
+        for method in (*_METHODS, *(method for method in _MORE_METHODS if callable(getattr(policy, method, None)))):
+            with contextlib.suppress(AttributeError):  # an object of slots alone cannot be watched
+                object.__setattr__(policy, method, _watched(name, method, getattr(policy, method)))
     return policy
+
+
+def _watched(name: str, method: str, call: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a method of a user's policy, whose exceptions name the policy."""
+
+    @functools.wraps(call)
+    def watched(*args: Any, **kwargs: Any) -> Any:
+        with POLICIES.running(name, f"{method} failed"):
+            return call(*args, **kwargs)
+
+    return watched

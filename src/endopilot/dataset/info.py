@@ -80,6 +80,11 @@ def describe_dataset(folder: Path) -> Description:
 
 def _describe(folder: Path) -> Description:
     manifest, info = read_manifest(folder)
+    with reading(folder, "make the dataset again"):
+        return _described(folder, manifest, info)
+
+
+def _described(folder: Path, manifest: dict[str, Any], info: dict[str, Any]) -> Description:
     stats = read_json(folder / schema.STATS_PATH)
     wire_mm = manifest["device"]["diameter_mm"] / 2
     histograms = _empty(float(stats["observation.state"]["max"][0]))

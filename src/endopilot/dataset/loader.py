@@ -29,6 +29,8 @@ from endopilot.settings import from_record
 from endopilot.simulation.catheter import Catheter
 from endopilot.simulation.motion import Motion
 
+_MEND = "make the dataset again"
+
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
@@ -220,17 +222,17 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         if (folder / RECORD_FILE).exists():
             raise InputError(f"{folder}: the dataset is unfinished; run the same `endopilot dataset` command again")
         raise InputError(f"{folder}: no dataset here ({MANIFEST_PATH} is missing); make one with `endopilot dataset`")
-    again = "make the dataset again"
-    manifest = read_json(folder / MANIFEST_PATH, keys=("key", "settings"), mend=again)
-    with reading(folder / MANIFEST_PATH, again):
+    manifest = read_json(folder / MANIFEST_PATH, keys=("key", "settings"), mend=_MEND)
+    with reading(folder / MANIFEST_PATH, _MEND):
         made = manifest["settings"].get("version")
+        {record["name"]: record["sha256"] + record["folder"] for record in manifest["anatomies"]}
     if made != version():
         raise InputError(f"{folder}: made by {made}, which {version()} cannot read; make the dataset again")
     if not (folder / INFO_PATH).exists():
         raise InputError(
             f"{folder / INFO_PATH}: missing from the dataset; run the same `endopilot dataset` command again"
         )
-    info = read_json(folder / INFO_PATH, keys=("features", "total_episodes", "total_frames"), mend=again)
+    info = read_json(folder / INFO_PATH, keys=("features", "fps", "total_episodes", "total_frames"), mend=_MEND)
     if info.get("codebase_version") != LEROBOT_VERSION:
         found = info.get("codebase_version")
         raise InputError(f"{folder / INFO_PATH}: codebase_version is {found}, not {LEROBOT_VERSION}; make it again")
@@ -243,15 +245,18 @@ def load_dataset(folder: Path) -> Dataset:
     Raises:
         InputError: the folder holds no finished dataset, or a file of it is missing, damaged or of another version.
     """
-    with reading(Path(folder), "make the dataset again"):
-        return _load(Path(folder))
-
-
-def _load(folder: Path) -> Dataset:
     with extra_named("reading a dataset"):
-        from endopilot.dataset.parquet import column_values, read_table
+        import endopilot.dataset.parquet  # noqa: F401
 
+    folder = Path(folder)
     manifest, info = read_manifest(folder)
+    with reading(folder, _MEND):
+        return _of_files(folder, manifest, info)
+
+
+def _of_files(folder: Path, manifest: dict[str, Any], info: dict[str, Any]) -> Dataset:
+    from endopilot.dataset.parquet import column_values, read_table
+
     samples, total = manifest["samples_per_episode"], info["total_episodes"]
     actuation, catheters = actuation_of(info["features"]), catheters_of(info["features"])
     episodes: dict[str, list[np.ndarray]] = {}

@@ -109,7 +109,8 @@ def segment(volume: Volume | str | Path, config: SegmentConfig = SegmentConfig()
     method = _method(config.method)
     if not config.seeds and method.blood_pools:
         refuse_without_contrast(volume)
-    mask = method.segment_lumen(volume, config)
+    with METHODS.running(config.method, "failed"):
+        mask = method.segment_lumen(volume, config)
     _refuse_no_mask(mask, volume, config.method)
     if not mask.volume.voxels.any():
         raise InputError(f"method: {config.method!r} found no lumen; give seeds inside the vessel")

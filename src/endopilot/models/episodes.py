@@ -17,6 +17,7 @@ from jaxtyping import Float, Int, Shaped
 from endopilot.anatomy.io import read_anatomy
 from endopilot.dataset.loader import Dataset, commanded
 from endopilot.errors import InputError
+from endopilot.files import reading
 from endopilot.models.config import WINDOW
 from endopilot.models.patient import Patient, prepare, read_or_prepare
 from endopilot.settings import from_record
@@ -65,10 +66,13 @@ class Setup:
         def read(name: str) -> Anatomy:
             return read_anatomy(dataset.anatomy_folder(name))
 
+        with reading(dataset.folder, "make the dataset again"):
+            device = from_record(Device, dataset.manifest["device"])
+            simulator = SimulatorConfig(**dataset.manifest["config"]["simulator"])
         return Setup(
             anatomies={name: partial(read, name) for name in dataset.patients},
-            device=from_record(Device, dataset.manifest["device"]),
-            simulator=SimulatorConfig(**dataset.manifest["config"]["simulator"]),
+            device=device,
+            simulator=simulator,
             patients_folder=dataset.folder / PATIENTS_FOLDER,
             identities=dataset.patients,
             known_motions={

@@ -10,6 +10,7 @@ import numpy as np
 
 from endopilot.dataset.loader import Dataset
 from endopilot.errors import InputError
+from endopilot.files import reading
 
 _WIRE = (
     "diameter_mm",
@@ -36,7 +37,9 @@ def check_wire(run: Path, record: Mapping[str, Any], dataset: Dataset) -> None:
     dataset.check_wire_alone("a model")
     ours, theirs = record["device"], dataset.manifest["device"]
     for name in _WIRE:
-        if not np.array_equal(ours[name], theirs[name]):
+        with reading(run, "train anew"):
+            same = np.array_equal(ours[name], theirs[name])
+        if not same:
             raise InputError(
                 f"{dataset.folder}: its wire is {theirs['name']}, and that of {run} is {ours['name']}, with another "
                 f"{name}; make a dataset with the run's wire"

@@ -108,7 +108,7 @@ def load_model(run_folder: str | Path = PRETRAINED) -> Predictor:
         InputError: the run is unfinished, or a file of it is damaged or of another version.
     """
     record, run_folder = read_run(run_folder), run_path(run_folder)
-    with reading(run_folder, "train it again"):
+    with reading(run_folder, "train anew"):
         return _predictor(record, run_folder)
 
 

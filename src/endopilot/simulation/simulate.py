@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from endopilot import _core
 from endopilot.anatomy.projection import project_tip
-from endopilot.errors import InputError
+from endopilot.errors import InputError, Remark
 from endopilot.simulation.catheter import Catheter
 from endopilot.simulation.checks import check_distance_map, check_memory, check_sequences
 from endopilot.simulation.config import FREE_BEHIND_MM, Actuation, SimulatorConfig
@@ -277,4 +277,4 @@ def _report(rollout: Rollout) -> None:
         import warnings
 
         for note in notes:
-            warnings.warn(note, stacklevel=3)
+            warnings.warn(note, Remark, stacklevel=3)

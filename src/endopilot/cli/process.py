@@ -1,0 +1,195 @@
+"""How a command runs and ends as a process: its signals, what reaches the screen, and its exit code.
+
+Whatever happens, a command ends in one line on standard error, and its exit code says how.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import logging
+import os
+import re
+import signal
+import sys
+import tempfile
+import threading
+import traceback
+import warnings
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from endopilot.errors import InputError, Remark, Stopped
+from endopilot.extras import what_is_missing
+
+EXIT_BAD_INPUT = 2
+EXIT_DEFECT = 70
+EXIT_INTERRUPTED = 128 + signal.SIGINT
+EXIT_UNREAD = 141
+TO_END_S = 10.0
+"""Time in which a command that is stopped tidies up, s; then it leaves."""
+_OUT_OF_MEMORY = re.compile(
+    "out of memory|allocate memory|bad.?alloc(ation)?|maximum allowed (size|dimension) exceeded", re.IGNORECASE
+)
+"""How libraries say it in exceptions of several kinds."""
+_FULL = (errno.ENOSPC, errno.EDQUOT)
+
+
+def carry_out(name: str, work: Callable[[], object]) -> int:
+    """Do the work of a command and return its exit code: 0, or the one that it leaves with.
+
+    Args:
+        name: of the command.
+        work: what it does.
+    """
+    with _signals() as arrived, _remarks(name):
+        try:
+            code = _code_of(work)
+            sys.stdout.flush()
+        except BaseException as error:
+            if arrived:  # whatever a library that was interrupted made of it
+                return _say(name, "interrupted" if arrived[0] == signal.SIGINT else "terminated", 128 + arrived[0])
+            return _end(name, error)
+        return code
+
+
+def _code_of(work: Callable[[], object]) -> int:
+    """Do some work and return the code that it leaves with."""
+    try:
+        work()
+    except Stopped:
+        raise
+    except SystemExit as leaving:
+        return leaving.code if isinstance(leaving.code, int) else int(leaving.code is not None)
+    return 0
+
+
+def own_streams() -> None:
+    """Keep standard error for our own lines and standard output for results, in a process that runs one command.
+
+    Libraries in C++ (VTK, ITK, Mesa, libtorch), logs and worker processes write to the file descriptors. What they
+    write to standard error is kept for the record of a defect; what they write to standard output goes to standard
+    error.
+    """
+    sys.stdout.flush()
+    for name, number in (("stdout", 1), ("stderr", 2)):
+        stream = os.fdopen(
+            os.dup(number),
+            "w",
+            buffering=1 if number == 2 or os.isatty(number) else -1,
+            encoding=getattr(sys, name).encoding,
+            errors="backslashreplace",  # which JSON understands
+        )
+        setattr(sys, name, stream)
+    os.dup2(sys.stderr.fileno(), 1)
+    with tempfile.TemporaryFile() as kept:
+        os.dup2(kept.fileno(), 2)
+    logging.getLogger().addHandler(logging.StreamHandler(sys.__stderr__))
+    threading.excepthook = lambda found: _end("", found.exc_value or found.exc_type())
+
+
+def leave(code: int) -> None:
+    """End the process, at once if it was stopped: threads that still work are not waited for."""
+    if code in (EXIT_INTERRUPTED, 128 + signal.SIGTERM):
+        sys.stdout.flush()
+        os._exit(code)
+    sys.exit(code)
+
+
+def one_line(text: str) -> str:
+    """Return a text with its line breaks and other control characters escaped."""
+    return re.sub(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]", lambda found: ascii(found[0])[1:-1], text.strip())
+
+
+def _say(name: str, line: str, code: int) -> int:
+    print(f"endopilot {name}: {one_line(line)}" if name else f"endopilot: {one_line(line)}", file=sys.stderr)
+    return code
+
+
+def _end(name: str, error: BaseException) -> int:
+    """Say in one line why a command ends by an exception, and return the exit code."""
+    text = " ".join(str(error).split())
+    if isinstance(error, InputError):
+        return _say(name, str(error), EXIT_BAD_INPUT)
+    if isinstance(error, ModuleNotFoundError) and (missing := what_is_missing(error)) is not None:
+        return _say(name, missing, EXIT_BAD_INPUT)
+    if isinstance(error, KeyboardInterrupt):
+        return _say(name, "interrupted", EXIT_INTERRUPTED)
+    if isinstance(error, BrokenPipeError):  # the reader has closed the output, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing is left to flush into
+        return EXIT_UNREAD
+    if isinstance(error, MemoryError) or _OUT_OF_MEMORY.search(text):
+        size = re.search(r"allocate ([\d.]+ \w+)", text)
+        what = f"{size[1]} of memory are asked for" if size else "the memory is used up"
+        return _say(name, f"{what}, more than there is; ask for less at once: fewer, shorter or coarser", 2)
+    if isinstance(error, RuntimeError) and text.startswith("Symlink loop"):  # as pathlib has it
+        return _say(name, f"{text}; check the path", EXIT_BAD_INPUT)
+    if isinstance(error, OSError) and error.errno in _FULL:
+        return _say(name, "the disk is full; free some space and run the same command again", EXIT_BAD_INPUT)
+    if isinstance(error, OSError) and error.errno is not None:
+        place = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
+        return _say(name, f"{place}{error.strerror or text}; check the path and its permissions", EXIT_BAD_INPUT)
+    from endopilot.plugins import described
+
+    return _say(
+        name, f"a defect of endopilot ({described(error)}); please report it with {_record(error)}", EXIT_DEFECT
+    )
+
+
+def _record(error: BaseException) -> str:
+    """Write a defect's traceback, and what libraries wrote to standard error, into a file, and return its path."""
+    kept = b""
+    with contextlib.suppress(OSError):
+        kept = os.pread(2, 1 << 20, 0)  # a file after `own_streams`
+    with tempfile.NamedTemporaryFile(prefix="endopilot-defect-", suffix=".txt", delete=False) as file:
+        file.write("".join(traceback.format_exception(error)).encode(errors="backslashreplace") + kept)
+    return file.name
+
+
+@contextlib.contextmanager
+def _signals() -> Iterator[list[int]]:
+    """Let Ctrl-C and SIGTERM raise `Stopped` once inside the block; yields the list that takes the signal's number."""
+    arrived: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield arrived
+        return
+    last = threading.Timer(TO_END_S, lambda: os._exit(128 + arrived[0]))
+    last.daemon = True
+
+    def stop(number: int, _frame: object) -> None:
+        if not arrived:
+            arrived.append(number)
+            last.start()
+            raise Stopped(128 + number)
+
+    def swallowed(found: Any) -> None:
+        """Stop again where the first time fell into a destructor or a callback, which cannot raise."""
+        if isinstance(found.exc_value, Stopped):
+            number = arrived.pop()
+            threading.Timer(0.1, os.kill, (os.getpid(), number)).start()
+
+    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    hook, sys.unraisablehook = sys.unraisablehook, swallowed
+    try:
+        yield arrived
+    finally:
+        last.cancel()
+        if not arrived:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+        sys.unraisablehook = hook
+
+
+@contextlib.contextmanager
+def _remarks(name: str) -> Iterator[None]:
+    """Show our own warnings in one line each; those of libraries go where their other lines go."""
+    with warnings.catch_warnings():
+
+        def show(message: Warning | str, category: type[Warning], *where: Any, **_: Any) -> None:
+            if issubclass(category, Remark):
+                _say(name, str(message), 0)
+            elif sys.__stderr__ is not None:
+                print(warnings.formatwarning(message, category, *where[:2]), end="", file=sys.__stderr__)
+
+        warnings.showwarning = show
+        yield

@@ -1,0 +1,166 @@
+"""How commands end: one line and an exit code, whatever stops them, and no library's lines on the screen."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from endopilot.cli import process
+from endopilot.cli.arguments import show, show_rows
+from endopilot.cli.process import EXIT_DEFECT, carry_out
+from endopilot.errors import InputError, Remark
+
+_SLOW = """
+import os, signal, sys, threading, time
+from pathlib import Path
+from endopilot.cli import process
+from endopilot.parallel import each
+from endopilot.files import writing
+
+def slow(item):
+    with writing(item) as partial:
+        partial.write_text("half")
+        (item.parent / f"{item.name}.begun").touch()
+        time.sleep(60)
+
+def work():
+    threading.Thread(target=time.sleep, args=(60,)).start()
+    each("Work", [Path("a"), Path("b")], slow)
+
+if __name__ == "__main__":
+    process.own_streams()
+    process.leave(process.carry_out("test", work))
+"""
+
+
+def raising(error: BaseException):
+    def work() -> None:
+        raise error
+
+    return work
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "said"),
+    [
+        (InputError("a.nii: bad\nline; mend it"), 2, r"a.nii: bad\nline; mend it"),
+        (MemoryError("Unable to allocate 14.6 TiB for an array"), 2, "14.6 TiB of memory are asked for"),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory: 12 bytes"), 2, "memory is used up"),
+        (ValueError("Maximum allowed size exceeded"), 2, "memory is used up"),
+        (OSError(28, "No space left on device", "x"), 2, "the disk is full"),
+        (IsADirectoryError(21, "Is a directory", "x.csv"), 2, "x.csv: Is a directory; check the path"),
+        (ModuleNotFoundError("no distributed", name="distributed"), 2, r"pip install 'endopilot[cluster]'"),
+        (KeyboardInterrupt(), 130, "interrupted"),
+        (KeyError("a"), EXIT_DEFECT, "a defect of endopilot (KeyError: 'a', test_process.py line"),
+    ],
+)
+def test_every_exception_ends_in_one_line(capsys, error, code, said):
+    assert carry_out("test", raising(error)) == code
+    captured = capsys.readouterr()
+    assert captured.out == "" and captured.err.startswith("endopilot test: ") and said in captured.err
+    assert len(captured.err.splitlines()) == 1
+    if code == EXIT_DEFECT:
+        record = Path(captured.err.split()[-1])
+        assert "Traceback" in record.read_text() and "raise error" in record.read_text()
+        record.unlink()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_in_one_line_even_where_a_library_turns_it_into_an_error(capsys, number):
+    def work() -> None:
+        try:
+            os.kill(os.getpid(), number)
+            time.sleep(5)
+        except SystemExit as error:
+            raise ImportError("half imported") from error
+
+    before = signal.getsignal(number)
+    try:
+        assert carry_out("test", work) == 128 + number
+    finally:
+        signal.signal(number, before)
+    assert capsys.readouterr().err == f"endopilot test: {'interrupted' if number == signal.SIGINT else 'terminated'}\n"
+
+
+@pytest.mark.parametrize("group", [True, False])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_leaves_no_process_and_no_half_written_file(tmp_path, number, group):
+    (tmp_path / "slow.py").write_text(_SLOW)
+    running = subprocess.Popen(
+        [sys.executable, "slow.py"], cwd=tmp_path, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    while not list(tmp_path.glob("*.begun")):
+        assert running.poll() is None
+        time.sleep(0.02)
+    (os.killpg if group else os.kill)(running.pid, number)
+    errors = running.communicate(timeout=30)[1]
+    assert running.returncode == 128 + number
+    assert errors == f"endopilot test: {'interrupted' if number == signal.SIGINT else 'terminated'}\n"
+    assert not list(tmp_path.glob(".part-*"))
+    end = time.monotonic() + 10
+    while time.monotonic() < end:  # the resource tracker of multiprocessing ends a moment later
+        try:
+            os.killpg(running.pid, 0)
+        except ProcessLookupError:
+            return
+        time.sleep(0.05)
+    raise AssertionError("a process is left")
+
+
+def test_our_remarks_are_shown_and_warnings_of_libraries_are_not(capsys):
+    def work() -> None:
+        warnings.warn("legend overflows", UserWarning, stacklevel=1)
+        warnings.warn("1 of 2 worlds is invalid", Remark, stacklevel=1)
+
+    assert carry_out("test", work) == 0
+    assert capsys.readouterr().err == "endopilot test: 1 of 2 worlds is invalid\n"
+
+
+def test_what_libraries_write_past_python_stays_off_the_screen():
+    script = (
+        "import os, subprocess\nfrom endopilot.cli import process\nprocess.own_streams()\n"
+        "os.write(2, b'libEGL warning'); subprocess.run(['echo', 'loud']); print('{\"result\": \"\\udc80\"}')"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert (done.stdout, done.stderr) == ('{"result": "\\udc80"}\n', "loud\n")
+
+
+def test_json_holds_no_nan(capsys):
+    show({"a": np.nan, "b": [np.inf, 1.0], "c": np.array([-np.inf])}, as_json=True)
+    assert json.loads(capsys.readouterr().out, parse_constant=pytest.fail) == {"a": None, "b": [None, 1.0], "c": [None]}
+
+
+@pytest.mark.parametrize("name", ["[/b]", "[red]", "a b", "*?"])
+def test_odd_names_are_shown_as_they_are(capsys, name):
+    show_rows([{"patient": name}], as_json=False)
+    show({"patient": f"{name}\n"}, as_json=False)
+    assert capsys.readouterr().out.count(name) == 2
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("--nonesuch", "Unrecognized options"),
+        ("--sequences x", "--sequences"),
+        ("", "Missing"),
+        ("--motion-seed -1", "motion_seed: -1; give a whole number from 0"),
+    ],
+)
+def test_bad_arguments_are_told_in_one_line(capsys, text, said):
+    from endopilot.cli import main
+
+    given = ["patient", "-o", "r.csv"] if text else []
+    with pytest.raises(SystemExit) as leaving:
+        main(["simulate", *given, *text.split()])
+    errors = capsys.readouterr().err
+    assert leaving.value.code == 2 and len(errors.splitlines()) == 1 and said in errors
+    assert process.EXIT_BAD_INPUT == 2
