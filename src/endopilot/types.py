@@ -81,7 +81,7 @@ class LumenMask:
         volume: boolean voxels, true inside the lumen.
         ostium: where the device enters, if the segmentation found it or the user gave it.
         method: name of the segmentation method, or where the mask came from.
-        warnings: what the segmentation doubts, a sentence each.
+        warnings: what reading the CT or the mask changed, and what the segmentation doubts, a sentence each.
     """
 
     volume: Volume

@@ -143,6 +143,7 @@ def read_series(path: Path, series: str | None, phase: str | None = None) -> Vol
         np.array([slice_.position for slice_ in chosen]) @ normal,
         phase,
         folder,
+        named=next((index for index, slice_ in enumerate(chosen) if slice_.path == path), None),
     )
     ordered, place = _geometry([chosen[index] for index in of_phase], axes, normal, folder)
     voxels, pixel_notes = _read_pixels(ordered)
@@ -249,7 +250,9 @@ def _choose(slices: Sequence[_Slice], series: str | None, folder: Path) -> list[
         for name, group in zip(names, groups, strict=True)
     )
     if series is None:
-        raise InputError(f"{folder}: {len(groups)} DICOM series ({listed}); choose one with --series")
+        raise InputError(
+            f"{folder}: {len(groups)} DICOM series ({listed}); choose one with --series, or give one of its files"
+        )
     raise InputError(f"{folder}: no series {series!r} (the folder holds {listed}); choose one with --series")
 
 

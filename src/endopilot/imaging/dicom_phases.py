@@ -26,7 +26,12 @@ _POSITION_MM = 1e-3
 
 
 def choose_phase(
-    values: Mapping[str, Sequence[float | None]], positions_mm: np.ndarray, phase: str | None, folder: Path
+    values: Mapping[str, Sequence[float | None]],
+    positions_mm: np.ndarray,
+    phase: str | None,
+    folder: Path,
+    *,
+    named: int | None = None,
 ) -> tuple[np.ndarray, tuple[str, ...]]:
     """Return the indices of the slices of the one phase there is, or of the one asked for, and what is to be noted.
 
@@ -35,6 +40,7 @@ def choose_phase(
         positions_mm: of the slices along their normal.
         phase: number of the phase wanted, as the field gives it.
         folder: for messages.
+        named: index of the slice whose file was given in place of the folder; its phase is taken if none is asked for.
 
     Raises:
         InputError: there are several phases and none was chosen, there is no such phase, or several images at one
@@ -60,10 +66,12 @@ def choose_phase(
                 return indices, ()
     listed = "; ".join(f"{value:g}{unit}: {slices_text(len(indices))}" for value, indices in phases.items())
     known = f"{len(phases)} phases by {tag} ({listed})"
+    if phase is None and named is not None:
+        value = next(value for value, indices in phases.items() if named in indices)
+        return phases[value], (f"the phase of the file given, {tag} {value:g}{unit}, was taken of {known}",)
     if phase is None:
         raise InputError(
-            f"{folder}: the series holds {known}; choose one: phase='{next(iter(phases)):g}' "
-            f"(--phase {next(iter(phases)):g})"
+            f"{folder}: the series holds {known}; choose one (--phase {next(iter(phases)):g}), or give one of its files"
         )
     raise InputError(f"{folder}: no phase {phase!r} (the series holds {known}); choose one with --phase")
 

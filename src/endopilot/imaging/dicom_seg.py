@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from pydicom.dataset import Dataset
 
 SUFFIX = ".dcm"
+_SAME_MM = 1e-3
+"""Frames nearer to each other than this are of one slice."""
 _SPACING_TOLERANCE = 0.05
 """Distances of frames may err by this share of the step: positions are written with few digits."""
 
@@ -202,9 +204,11 @@ def _grid(
     first = frames[0]
     axes, normal = plane(first.orientation, first.spacing_mm, path=path)
     positions = np.array([frame.position for frame in frames])
-    heights = np.round(positions @ normal, 4)
-    places, place_of = np.unique(heights, return_inverse=True)
-    distances = np.diff(places)
+    heights = positions @ normal
+    order = np.argsort(heights, kind="stable")
+    begins = np.diff(heights[order], prepend=-np.inf) > _SAME_MM
+    place_of = (np.cumsum(begins) - 1)[np.argsort(order)]
+    distances = np.diff(heights[order][begins])
     if not distances.size:
         raise InputError(f"{path}: all frames are of one slice; give a mask of a volume")
     # Without SpacingBetweenSlices, the least distance is the step.
