@@ -24,9 +24,19 @@ CORNERS = np.array([[i, j, k] for i in (0.0, 3.0) for j in (0.0, 4.0) for k in (
 _RAS = np.array([-1.0, -1.0, 1.0])[:, None]
 
 _NIFTI = {
-    **{"sizeof_hdr": ("i", 0), "dim": ("8h", 40), "intent_code": ("h", 68), "datatype": ("h", 70), "bitpix": ("h", 72)},
-    **{"pixdim": ("8f", 76), "vox_offset": ("f", 108), "scl": ("2f", 112), "xyzt_units": ("B", 123)},
-    **{"qform_code": ("h", 252), "sform_code": ("h", 254), "quatern": ("6f", 256), "srow": ("12f", 280)},
+    "sizeof_hdr": ("i", 0),
+    "dim": ("8h", 40),
+    "intent_code": ("h", 68),
+    "datatype": ("h", 70),
+    "bitpix": ("h", 72),
+    "pixdim": ("8f", 76),
+    "vox_offset": ("f", 108),
+    "scl": ("2f", 112),
+    "xyzt_units": ("B", 123),
+    "qform_code": ("h", 252),
+    "sform_code": ("h", 254),
+    "quatern": ("6f", 256),
+    "srow": ("12f", 280),
     "magic": ("4s", 344),
 }
 
@@ -42,9 +52,18 @@ def nifti(path: Path, *, axes: np.ndarray = TURN, order: str = "<", voxels: np.n
     """Write a NIfTI-1 file whose sform has these LPS axes; `fields` replaces what the header holds."""
     affine = np.c_[axes * SPACING, ORIGIN] * _RAS
     content = {
-        **{"sizeof_hdr": (348,), "dim": (3, *voxels.shape[::-1], 1, 1, 1, 1), "datatype": (4,), "bitpix": (16,)},
-        **{"pixdim": (1, *SPACING, 1, 1, 1, 1), "vox_offset": (352,), "scl": (1, 0), "xyzt_units": (2,)},
-        **{"sform_code": (1,), "srow": tuple(affine.ravel()), "magic": (b"n+1\0",), **fields},
+        "sizeof_hdr": (348,),
+        "dim": (3, *voxels.shape[::-1], 1, 1, 1, 1),
+        "datatype": (4,),
+        "bitpix": (16,),
+        "pixdim": (1, *SPACING, 1, 1, 1, 1),
+        "vox_offset": (352,),
+        "scl": (1, 0),
+        "xyzt_units": (2,),
+        "sform_code": (1,),
+        "srow": tuple(affine.ravel()),
+        "magic": (b"n+1\0",),
+        **fields,
     }
     header = bytearray(352)
     for name, values in content.items():
@@ -75,10 +94,15 @@ def nrrd(
     sizes = (*voxels.shape[:-3], *voxels.shape[:-4:-1])
     stored = np.moveaxis(voxels, 0, -1) if voxels.ndim == 4 else voxels
     content: dict[str, object] = {
-        **{"type": {"i": "int16", "u": "uint8", "f": "float"}[voxels.dtype.kind], "dimension": voxels.ndim},
-        **{"space": "left-posterior-superior", "sizes": " ".join(map(str, sizes))},
-        **{"space directions": layers + vectors, "kinds": ("list " if layers else "") + "domain domain domain"},
-        **{"endian": "little", "encoding": "raw", "space origin": "(10,20,30)"},
+        "type": {"i": "int16", "u": "uint8", "f": "float"}[voxels.dtype.kind],
+        "dimension": voxels.ndim,
+        "space": "left-posterior-superior",
+        "sizes": " ".join(map(str, sizes)),
+        "space directions": layers + vectors,
+        "kinds": ("list " if layers else "") + "domain domain domain",
+        "endian": "little",
+        "encoding": "raw",
+        "space origin": "(10,20,30)",
         **{name.replace("_", " "): value for name, value in fields.items()},
     }
     lines = [f"{name}: {value}" for name, value in content.items() if value is not None]
@@ -90,9 +114,16 @@ def nrrd(
 def metaimage(path: Path, *, axes: np.ndarray = TURN, data: bytes | None = None, **fields) -> Path:
     """Write a MetaImage file with these LPS axes; `fields` replaces what the header holds, None drops."""
     content: dict[str, object] = {
-        **{"ObjectType": "Image", "NDims": 3, "BinaryData": True, "BinaryDataByteOrderMSB": False},
-        **{"CompressedData": False, "TransformMatrix": " ".join(f"{x:.17g}" for x in axes.T.ravel())},
-        **{"Offset": "10 20 30", "ElementSpacing": "0.4 0.5 1.25", "DimSize": "4 5 6", "ElementType": "MET_SHORT"},
+        "ObjectType": "Image",
+        "NDims": 3,
+        "BinaryData": True,
+        "BinaryDataByteOrderMSB": False,
+        "CompressedData": False,
+        "TransformMatrix": " ".join(f"{x:.17g}" for x in axes.T.ravel()),
+        "Offset": "10 20 30",
+        "ElementSpacing": "0.4 0.5 1.25",
+        "DimSize": "4 5 6",
+        "ElementType": "MET_SHORT",
         **fields,
     }
     content["ElementDataFile"] = fields.get("ElementDataFile", "LOCAL")

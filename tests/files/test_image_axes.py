@@ -122,5 +122,5 @@ def test_a_dicom_seg_follows_the_rule(tmp_path):
     assert "ImageOrientationPatient" in note
     orientation.ImageOrientationPatient = [1, 0, 0, 0.3, 0.954, 0]
     content.save_as(tmp_path / "seg.dcm")
-    with pytest.raises(InputError, match="ImageOrientationPatient.*not at right angles"):
+    with pytest.raises(InputError, match=r"ImageOrientationPatient.*not at right angles"):
         read_mask(tmp_path / "seg.dcm")

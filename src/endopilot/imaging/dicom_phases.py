@@ -101,14 +101,15 @@ def _split(values: Sequence[float | None], positions_mm: np.ndarray) -> dict[flo
     if any(value is None or not np.isfinite(value) for value in values):
         return {}
     known = np.array(values, dtype=float)
-    exact = {float(value): np.flatnonzero(known == value) for value in np.unique(known)}
-    if len(exact) > 1 and all(_alone(positions_mm[indices]) for indices in exact.values()):
-        return exact
     places: defaultdict[int, list[int]] = defaultdict(list)
     order = np.argsort(positions_mm, kind="stable")
     starts = np.diff(positions_mm[order], prepend=-np.inf) >= _POSITION_MM
     for place, index in zip(np.cumsum(starts), order, strict=True):
         places[int(place)].append(int(index))
+    most = max(len(indices) for indices in places.values())
+    exact = {float(value): np.flatnonzero(known == value) for value in np.unique(known)}
+    if len(exact) == most and all(_alone(positions_mm[indices]) for indices in exact.values()):
+        return exact
     counts = {len(indices) for indices in places.values()}
     if len(counts) != 1 or counts == {1}:
         return {}
