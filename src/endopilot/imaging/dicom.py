@@ -20,7 +20,7 @@ from jaxtyping import Float
 from pydicom.dataset import Dataset
 from pydicom.errors import InvalidDicomError
 from pydicom.pixels.utils import pixel_array
-from pydicom.uid import UID
+from pydicom.uid import UID, AllTransferSyntaxes
 
 from endopilot.errors import InputError
 from endopilot.imaging.dicom_phases import PHASE_TAGS, choose_phase, slices_text
@@ -256,6 +256,11 @@ def _choose(slices: Sequence[_Slice], series: str | None, folder: Path) -> list[
     raise InputError(f"{folder}: no series {series!r} (the folder holds {listed}); choose one with --series")
 
 
+def _syntax_name(uid: str) -> str:
+    """Return what DICOM calls a transfer syntax; a UID that it does not know may be anything, and is not shown."""
+    return UID(uid).name if uid in AllTransferSyntaxes else "no transfer syntax of DICOM"
+
+
 def _check_slices(slices: Sequence[_Slice], folder: Path) -> list[str]:
     """Refuse a series that is no CT of plain single-frame slices that can be decoded; return what is to be noted."""
     for slice_ in slices:
@@ -268,7 +273,7 @@ def _check_slices(slices: Sequence[_Slice], folder: Path) -> list[str]:
             raise InputError(f"{path}: a multi-frame file; export one file a slice, or NIfTI")
         if slice_.transfer_syntax not in _DECODED:
             raise InputError(
-                f"{path}: compressed as {UID(slice_.transfer_syntax).name}, which is not supported; "
+                f"{path}: compressed as {_syntax_name(slice_.transfer_syntax)}, which is not supported; "
                 "decompress the series (gdcmconv --raw) or export it uncompressed"
             )
         for tag, value, count in (

@@ -25,6 +25,7 @@ _SPACING_TOLERANCE = 0.01
 _RAS_TO_LPS = np.array([-1.0, -1.0, 1.0])
 _SCANNER = 1
 """Code of a transform to the scanner's anatomical coordinates."""
+_LARGEST_OFFSET = 1 << 40
 _UNITS = {0: "mm", 1: "m", 2: "mm", 3: "µm"}
 _INTENTS = (0, 1001, 1002, 1003)
 """What a grey-level image or a mask may be meant as: nothing, an estimate, labels, or names of regions."""
@@ -165,9 +166,9 @@ def _type(header: _Header, path: Path) -> np.dtype:
 def _offset(header: _Header, path: Path) -> int:
     """Return where the voxels begin: behind the header and the four bytes that say whether it is extended."""
     (offset,) = header["vox_offset"]
-    if not np.isfinite(offset) or offset != int(offset) or offset < header.size + 4:
+    if not np.isfinite(offset) or offset != int(offset) or not header.size + 4 <= offset < _LARGEST_OFFSET:
         raise InputError(
-            f"{path}: vox_offset {offset:g} lies in the header, and voxels begin at {header.size + 4} or later; "
+            f"{path}: vox_offset {offset:g} is no place of voxels, which begin behind the header, at {header.size + 4} or later; "
             "export it again"
         )
     return int(offset)
