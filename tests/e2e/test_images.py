@@ -9,7 +9,6 @@ import numpy as np
 import pydicom
 import pytest
 from command import refused, run
-from scipy import ndimage
 
 from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
@@ -120,16 +119,17 @@ def test_bad_series(few, tmp_path, capsys):
     assert "contrast" in _refused(capsys, two, "--series", "4")  # six slices of aorta are read, and too few to go on
 
 
-def test_a_straightened_ct_is_told_by_every_command(few, patient, tmp_path, capsys, monkeypatch):
+def test_a_straightened_ct_is_told_by_every_command(patient, tmp_path, capsys, monkeypatch):
     """The mask lies on straightened axes: its anatomy tells it too, from the file beside the mask."""
     from endopilot.pipeline import study
 
     monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "examples"))
-    skewed = _changed(few, tmp_path / "ct", ImageOrientationPatient=["1", "0", "0", "0.002", "0.999998", "0"])
-    ct = read_volume(skewed)
-    pools, _ = ndimage.label(ct.voxels > 200)
-    bright = np.argwhere(pools == np.bincount(pools.ravel())[1:].argmax() + 1)
-    seed = [f"{x:.3f}" for x in ct.index_to_world(bright[len(bright) // 2][::-1].astype(float))]
+    _, j, i = np.indices((40, 40, 40))
+    hu = np.where(np.hypot(j - 20, i - 20) < 7, 350, -90).astype(np.int16)
+    write_volume(Volume(hu, np.array([0.5, 0.5, 1.0]), np.zeros(3), np.eye(3)), tmp_path / "straight")
+    turned = ["1", "0", "0", "0.002", "0.999998", "0"]
+    skewed = _changed(tmp_path / "straight", tmp_path / "ct", ImageOrientationPatient=turned)
+    seed = ("10", "10", "20")
     method = ("--method", "my_segmentation:threshold", "--options", "above=200", "--seeds", *seed)
     note = "ct: the axes in ImageOrientationPatient and ImagePositionPatient are off unit vectors"
     figures = run(capsys, "segment", skewed, "-o", tmp_path / "mask.nii.gz", *method)

@@ -168,7 +168,7 @@ def _offset(header: _Header, path: Path) -> int:
     (offset,) = header["vox_offset"]
     if not np.isfinite(offset) or offset != int(offset) or not header.size + 4 <= offset < _LARGEST_OFFSET:
         raise InputError(
-            f"{path}: vox_offset {offset:g} is no place of voxels, which begin behind the header, at {header.size + 4} or later; "
+            f"{path}: vox_offset {offset:g}: voxels begin behind the header, at {header.size + 4} or later; "
             "export it again"
         )
     return int(offset)
