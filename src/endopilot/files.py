@@ -12,7 +12,7 @@ import re
 import shutil
 import subprocess
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, is_dataclass
 from importlib import metadata
@@ -201,12 +201,17 @@ def sha256(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def input_hash(path: Path) -> dict[str, str]:
-    """Return the SHA-256 of an input for the manifest: of the file, or of all files of a folder in order of name."""
+def input_hash(path: Path, read: Sequence[Path] = ()) -> dict[str, str]:
+    """Return the SHA-256 of an input for the manifest.
+
+    Args:
+        path: a file, or a folder, all files of which count in order of name.
+        read: the files that were read, where `path` is one of several (a header without voxels), or a folder of more.
+    """
     path = Path(path)
-    if path.is_file():
+    parts = sorted(read) or sorted(part for part in path.rglob("*") if part.is_file())
+    if path.is_file() and (not read or parts == [path]):
         return {path.name: sha256(path)}
-    parts = sorted(part for part in path.rglob("*") if part.is_file())
     return {path.name: hashlib.sha256("".join(sha256(part) for part in parts).encode()).hexdigest()}
 
 

@@ -21,6 +21,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -39,12 +40,16 @@ class Volume:
         spacing_mm: distance between neighbouring voxel centres along i, j and k, mm.
         origin_mm: LPS position of the centre of voxel (0, 0, 0), mm.
         direction: columns are the LPS unit vectors along which i, j and k grow.
+        notes: what reading it changed or had to decide, a sentence each.
+        files: the files that it was read from; none where it was made.
     """
 
     voxels: Shaped[np.ndarray, "nz ny nx"]
     spacing_mm: Float[np.ndarray, "3"]
     origin_mm: Float[np.ndarray, "3"]
     direction: Float[np.ndarray, "3 3"]
+    notes: tuple[str, ...] = ()
+    files: tuple[Path, ...] = ()
 
     def index_to_world(self, index: Shaped[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
         """Return the LPS position in mm of continuous voxel indices (i, j, k)."""
@@ -76,7 +81,7 @@ class LumenMask:
         volume: boolean voxels, true inside the lumen.
         ostium: where the device enters, if the segmentation found it or the user gave it.
         method: name of the segmentation method, or where the mask came from.
-        warnings: what the segmentation doubts, a sentence each.
+        warnings: what reading the CT or the mask changed, and what the segmentation doubts, a sentence each.
     """
 
     volume: Volume

@@ -10,7 +10,7 @@ import pydicom
 import pytest
 from command import refused, run
 
-from endopilot.anatomy.io import write_anatomy
+from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.imaging.volume import read_mask, read_volume, write_mask, write_volume
 from endopilot.types import Insertion, LumenMask, Volume
@@ -109,7 +109,7 @@ def test_bad_series(few, tmp_path, capsys):
         phases: ("several images at one slice position",),
         two: ("2 DICOM series (1: CT, 6 slices", "4: CT, 6 slices", "--series"),
         compressed: ("compressed as High-Throughput JPEG 2000", "gdcmconv"),
-        tilted: ("gantry tilt of 9.5°",),
+        tilted: ("off by 9.5°", "gantry tilt"),
         copy("magnet", Modality="MR"): ("modality MR", "give a CT"),
         copy("mixed", every=2, PixelSpacing=["2", "2"]): ("PixelSpacing differ", "one volume alone"),
         copy("raw", RescaleSlope=None): ("no RescaleSlope",),
@@ -117,6 +117,62 @@ def test_bad_series(few, tmp_path, capsys):
         line = _refused(capsys, volume)
         assert volume.name in line and all(fragment in line for fragment in fragments), line
     assert "contrast" in _refused(capsys, two, "--series", "4")  # six slices of aorta are read, and too few to go on
+
+
+def test_a_straightened_ct_is_told_by_every_command(patient, tmp_path, capsys, monkeypatch):
+    """The mask lies on straightened axes: its anatomy tells it too, from the file beside the mask."""
+    from endopilot.pipeline import study
+
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "examples"))
+    _, j, i = np.indices((40, 40, 40))
+    hu = np.where(np.hypot(j - 20, i - 20) < 7, 350, -90).astype(np.int16)
+    write_volume(Volume(hu, np.array([0.5, 0.5, 1.0]), np.zeros(3), np.eye(3)), tmp_path / "straight")
+    turned = ["1", "0", "0", "0.002", "0.999998", "0"]
+    skewed = _changed(tmp_path / "straight", tmp_path / "ct", ImageOrientationPatient=turned)
+    seed = ("10", "10", "20")
+    method = ("--method", "my_segmentation:threshold", "--options", "above=200", "--seeds", *seed)
+    note = "ct: the axes in ImageOrientationPatient and ImagePositionPatient are off unit vectors"
+    figures = run(capsys, "segment", skewed, "-o", tmp_path / "mask.nii.gz", *method)
+    assert figures["warnings"][0].startswith(note)
+    assert read_mask(tmp_path / "mask.nii.gz").warnings[0].startswith(note)
+    image = run(capsys, "xray", patient, "-o", tmp_path / "image.png", "--ct", skewed, "--inserted-mm", "10")
+    assert image["ct_notes"][0].startswith(note)
+    monkeypatch.setattr(study, "_study", lambda run, anatomies: {"notes": list(run.notes)})
+    figures = run(capsys, "run", skewed, "-o", tmp_path / "run", *method)
+    assert figures["notes"][0].startswith(note)
+    assert read_mask(tmp_path / "run" / "masks" / "patient.nii.gz").warnings[0].startswith(note)
+    assert read_anatomy(tmp_path / "run" / "anatomies" / "patient").provenance["notes"][0].startswith(note)
+
+
+def test_a_phase_is_chosen(few, tmp_path, capsys):
+    phases = _changed(few, tmp_path / "phases", NominalPercentageOfCardiacPhase=40.0)
+    for file in _changed(few, tmp_path / "late", NominalPercentageOfCardiacPhase=75.0).iterdir():
+        shutil.copy(file, phases / f"late-{file.name}")
+    line = _refused(capsys, phases)
+    assert "2 phases by NominalPercentageOfCardiacPhase (40%: 6 slices; 75%: 6 slices)" in line and "--phase 40" in line
+    assert "no phase '60'" in _refused(capsys, phases, "--phase", "60")
+    assert "phase" not in _refused(capsys, phases, "--phase", "75")  # read, and too thin for what follows
+    refused(capsys, "run", phases, "-o", tmp_path / "run")
+
+
+def test_a_segment_is_chosen_by_name(tmp_path, capsys):
+    tubes = np.zeros((2, 40, 30, 30), dtype=np.uint8)
+    tubes[0, 2:38, 7:13, 7:13], tubes[1, 2:30, 10:16, 10:16] = 1, 1
+    stored = np.moveaxis(tubes, 0, -1).tobytes()
+    head = (
+        *("NRRD0004", "type: uint8", "dimension: 4", "space: left-posterior-superior", "sizes: 2 30 30 40"),
+        *("space directions: none (0.5,0,0) (0,0.5,0) (0,0,1)", "kinds: list domain domain domain", "encoding: raw"),
+        *("space origin: (0,0,0)", "Segment0_ID:=S1", "Segment0_Name:=RCA", "Segment0_Layer:=0"),
+        *("Segment0_LabelValue:=1", "Segment1_ID:=S2", "Segment1_Name:=vein", "Segment1_Layer:=1"),
+        "Segment1_LabelValue:=1",
+    )
+    path = tmp_path / "heart.seg.nrrd"
+    path.write_bytes("\n".join(head).encode() + b"\n\n" + stored)
+    assert "2 labels (1 (RCA), 2 (vein))" in refused(capsys, "anatomy", path, "-o", tmp_path / "none")
+    for label, z_mm in (("RCA", 37), ("1", 37), ("vein", 29), ("2", 29)):
+        start = ("--ostium-mm", "5", "5", str(z_mm), "--label", label)
+        figures = run(capsys, "anatomy", path, "-o", tmp_path / label, *start)
+        assert abs(figures["longest_path_mm"] - z_mm) < 6
 
 
 def test_a_ct_without_contrast(enhanced, tmp_path, capsys):

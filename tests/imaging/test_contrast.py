@@ -34,3 +34,23 @@ def test_blood_is_distinguished_from_bone(thorax, noise_hu):
     assert (spine.voxels > 130).mean() > 0.15  # bone
     with pytest.raises(InputError, match="no contrast: homogeneous soft tissue peaks at"):
         refuse_without_contrast(spine)
+
+
+@pytest.mark.parametrize("thickness_mm", [4.0, 8.0, 16.0])
+def test_a_thin_slab_of_an_aorta_holds_contrast(thickness_mm):
+    """Its cross-section of 7 cm² is that of any pool; its volume is what the slab leaves of it."""
+    shape = (round(thickness_mm / 0.5), 160, 160)
+    j, i = np.indices(shape[1:]) * 0.4
+    inside = np.hypot(j - 32.0, i - 32.0) < 15.0
+    noise = np.random.default_rng(0).normal(0.0, 25.0, shape)
+    for blood_hu in (400.0, 45.0):
+        voxels = (np.where(inside, blood_hu, -90.0) + noise).astype(np.int16)
+        slab = Volume(voxels, np.array([0.4, 0.4, 0.5]), np.zeros(3), np.eye(3))
+        if blood_hu > 130.0:
+            refuse_without_contrast(slab)
+            continue
+        with pytest.raises(
+            InputError, match=rf"only {thickness_mm:.0f} mm thick.*too little to recognise blood"
+        ) as caught:
+            refuse_without_contrast(slab)
+        assert "no contrast" not in str(caught.value)

@@ -100,7 +100,7 @@ def test_files_that_do_not_say_where_their_voxels_are(tmp_path, capfd):
     (tmp_path / "cut.nrrd").write_bytes(whole[:-60])
     (tmp_path / "lost.nhdr").write_bytes(whole[: whole.index(b"\n\n")] + b"\ndata file: lost.raw\n\n")
     meta = b"ObjectType = Image\nNDims = 3\nBinaryData = True\nDimSize = 4 5 6\nElementType = MET_SHORT\n"
-    meta += b"ElementDataFile = "
+    meta += b"ElementSpacing = 1 1 1\nElementDataFile = "
     (tmp_path / "lost.mhd").write_bytes(meta + b"lost.raw\n")
     (tmp_path / "cut.mha").write_bytes(meta + b"LOCAL\n" + _RAMP.tobytes()[:-60])
     for path, expected in {

@@ -15,7 +15,7 @@ from endopilot.parallel import each
 
 
 def extract_all(
-    sources: Sequence[Path], output: Path, *, label: int | None = None, config: AnatomyConfig
+    sources: Sequence[Path], output: Path, *, label: int | str | None = None, config: AnatomyConfig
 ) -> tuple[list[Path], dict[str, str]]:
     """Make one anatomy a file, each in a folder of its own, on as many processes as there are cores.
 
@@ -25,7 +25,7 @@ def extract_all(
     Args:
         sources: masks, surfaces or centerlines.
         output: folder that takes one anatomy folder a patient.
-        label: which label of masks with several is the lumen.
+        label: number or name of the segment that is the lumen, where masks have several.
         config: how to make them all.
 
     Returns:
@@ -47,7 +47,7 @@ def extract_all(
     return [folders[source] for source in sources if source not in bad], rejected
 
 
-def _make(source: Path, *, folders: dict[Path, Path], label: int | None, config: AnatomyConfig) -> None:
+def _make(source: Path, *, folders: dict[Path, Path], label: int | str | None, config: AnatomyConfig) -> None:
     folder = folders[source]
     write_anatomy(extract_anatomy(read_source(source, label=label), name=folder.name, config=config), folder)
 

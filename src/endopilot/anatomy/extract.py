@@ -73,7 +73,7 @@ def extract_anatomy(
     source: str | Path | AnatomySource | LumenMask | Surface | Polylines | VesselTree,
     *,
     name: str | None = None,
-    label: int | None = None,
+    label: int | str | None = None,
     config: AnatomyConfig = AnatomyConfig(),
 ) -> Anatomy:
     """Make an anatomy: centerline tree with section labels, distance map with guiding catheter, insertion.
@@ -81,7 +81,7 @@ def extract_anatomy(
     Args:
         source: a file with a mask, a surface or centerlines, as `read_source` reads it; or what was read or made.
         name: short name of the patient; that of the file, or "patient", if not given.
-        label: which label of a mask file with several is the lumen.
+        label: number or name of the segment that is the lumen, where a mask file has several.
         config: how to make it.
 
     Raises:
@@ -94,6 +94,7 @@ def extract_anatomy(
     wrapped = transformed(wrapped, scale=config.scale, coordinates=config.coordinates)
     name = name or wrapped.file.partition(".")[0] or "patient"
     content, notes = wrapped.content, []
+    doubts = list(content.warnings) if isinstance(content, LumenMask) else []
     given = content.ostium if isinstance(content, LumenMask) else None
     if config.ostium_mm is not None:
         given = Insertion(np.array(config.ostium_mm, dtype=float), np.zeros(3))
@@ -130,7 +131,7 @@ def extract_anatomy(
         **(inlet.record() if inlet is not None else {}),
         "catheter_tilt_deg": round(catheter_tilt_deg(ostium_radius, radius), 1),
         "dominance": crux.dominance if crux is not None else None if short else dominance(tree),
-        "notes": notes,
+        "notes": [*doubts, *notes],
     }
     return Anatomy(name, tree, distance_map, insertion, radius, provenance)
 

@@ -50,13 +50,13 @@ class AnatomySource:
     coordinates: str | None = None
 
 
-def read_source(path: str | Path, *, label: int | None = None) -> AnatomySource:
+def read_source(path: str | Path, *, label: int | str | None = None) -> AnatomySource:
     """Read a vessel from a mask, a surface or centerlines; the kind follows from the file.
 
     Args:
         path: mask (NIfTI, NRRD, MHA, DICOM-SEG), surface (STL, OBJ, PLY, VTP, VTK) or centerline (VTP with lines and
             radii, as VMTK writes it, or a Slicer markups curve `.mrk.json` with a radius measurement).
-        label: which label of a mask with several is the lumen.
+        label: number or name of the segment that is the lumen, where a mask has several.
 
     Raises:
         InputError: the file is missing, damaged, empty, of an unknown kind, or a centerline without radii.
@@ -81,7 +81,8 @@ def read_source(path: str | Path, *, label: int | None = None) -> AnatomySource:
     else:
         known = " ".join((*MASK_SUFFIXES, *SURFACE_SUFFIXES, ".mrk.json"))
         raise InputError(f"{path}: unknown kind of file; known are {known}")
-    return AnatomySource(content, path.name, files.sha256(path), coordinates)
+    read = content.volume.files if isinstance(content, LumenMask) else ()
+    return AnatomySource(content, path.name, files.input_hash(path, read)[path.name], coordinates)
 
 
 def transformed(source: AnatomySource, *, scale: float, coordinates: str) -> AnatomySource:

@@ -22,7 +22,7 @@ def command(
     *,
     output: OutputFolder,
     name: str | None = None,
-    label: int | None = None,
+    label: str | None = None,
     picture: Path | None = None,
     ct: Path | None = None,
     json: bool = False,
@@ -39,7 +39,7 @@ def command(
             Slicer .mrk.json).
         output: folder of the anatomy; for several files, the folder that takes one of each.
         name: name of the patient in datasets and reports; the folder's name by default.
-        label: label to take, where a mask holds several.
+        label: number or name of the segment to take, where a mask holds several.
         picture: PNG of the tree by section and by radius, its longest path straightened, and cross-sections.
         ct: CT angiogram in HU, shown behind the walls in the picture.
         json: print the figures as JSON.
@@ -71,6 +71,8 @@ def command(
 
         draw_anatomy(anatomy, picture, volume=volume)
         figures["picture"] = str(picture)
+    if volume is not None and volume.notes:
+        figures["ct_notes"] = list(volume.notes)
     show(figures, as_json=json)
 
 

@@ -17,6 +17,7 @@ def command(
     output: OutputFolder,
     target: str | None = None,
     series: str | None = None,
+    phase: str | None = None,
     json: bool = False,
     config: RunConfig = RunConfig(),
 ) -> None:
@@ -33,7 +34,9 @@ def command(
         output: folder of all results; the report is report.html.
         target: section label such as 4 or LAD, or point X,Y,Z in LPS mm, to which the agent drives the wire.
         series: number or instance UID of the series, where a DICOM folder holds several.
+        phase: cardiac phase, such as 75 (per cent), where a DICOM series holds several.
         json: print the figures as JSON.
         config: segmentation, device and size of the study.
     """
-    show(run_volume(existing(volume), output, config, series=series, target=target), as_json=json)
+    figures = run_volume(existing(volume), output, config, series=series, phase=phase, target=target)
+    show(figures, as_json=json)

@@ -21,6 +21,7 @@ def command(
     *,
     output: OutputFile,
     series: str | None = None,
+    phase: str | None = None,
     reference: Path | None = None,
     picture: Path | None = None,
     json: bool = False,
@@ -34,6 +35,7 @@ def command(
         volume: DICOM folder or file, NIfTI, NRRD or MHA, in HU.
         output: mask: .nii.gz, .nrrd, .mha, or .dcm for DICOM-SEG (needs the extra dicom-seg).
         series: number or instance UID of the series, where a DICOM folder holds several.
+        phase: cardiac phase, such as 75 (per cent), where a DICOM series holds several.
         reference: another mask of the same vessel; the agreement is printed, and its outline is red in the picture.
         picture: PNG of three slices with the mask's outline in green.
         json: print the figures as JSON.
@@ -43,10 +45,10 @@ def command(
     if picture is not None and picture.suffix.lower() != ".png":
         raise InputError(f"{picture}: a picture is written as PNG; name it with .png")
     other = read_mask(existing(reference)) if reference is not None else None
-    ct = read_volume(existing(volume), series=series)
+    ct = read_volume(existing(volume), series=series, phase=phase)
     mask = segment(ct, config)
     agreement = compare_masks(mask, other) if other is not None else None
-    write_mask(mask, output, manifest=manifest(config=config, inputs=input_hash(volume)))
+    write_mask(mask, output, manifest=manifest(config=config, inputs=input_hash(volume, ct.files)))
     volume_ml = float(mask.volume.voxels.sum() * mask.volume.spacing_mm.prod() / 1000)
     ostium = mask.ostium.position.round(2).tolist() if mask.ostium is not None else None
     figures = {"mask": str(output), "method": mask.method, "lumen_ml": round(volume_ml, 3), "ostium_lps_mm": ostium}

@@ -35,4 +35,6 @@ def command(
     image.write(output)
     tip = None if image.tip_pixel is None else [round(float(value), 2) for value in image.tip_pixel]
     figures = {"image": str(output), "tip_row_column": tip, "mm_per_pixel": round(image.mm_per_pixel, 4)}
+    if volume is not None and volume.notes:
+        figures["ct_notes"] = list(volume.notes)
     show(figures | {"frames": image.frames, "air_kerma_ugy": round(image.air_kerma_ugy, 3)}, as_json=json)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -194,7 +195,10 @@ def read_ct(path: Path | None) -> Volume | None:
         return None
     from endopilot.imaging.volume import read_volume  # slow to import
 
-    return read_volume(path)
+    volume = read_volume(path)
+    for note in volume.notes:
+        print(note, file=sys.stderr)
+    return volume
 
 
 def _start_of(anatomy: Anatomy, device: Device, catheters: tuple[Catheter, ...]) -> Navigation:

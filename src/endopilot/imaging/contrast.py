@@ -22,6 +22,8 @@ _BRIGHTEST_HU = 900.0
 """Metal and dense bone lie above this, no blood does."""
 _LEAST_POOL_ML = 4.0
 """Less than the inside of any heart chamber; homogeneous bone of the thorax comes in smaller pieces."""
+_POOL_MM = 20.0
+"""Diameter of a ball of that volume: a field of view that is shorter holds only a slice of a pool."""
 
 
 def refuse_other_units(volume: Volume, seeds: Sequence[Sequence[float]] = ()) -> None:
@@ -60,11 +62,13 @@ def refuse_without_contrast(volume: Volume) -> None:
     """Refuse a CT of the chest or abdomen whose blood holds no contrast.
 
     The histogram is that of homogeneous tissue. Blood with contrast is the one tissue that fills millilitres there
-    above 130 HU; blood without measures 30 to 60 HU, like muscle.
+    above 130 HU; blood without measures 30 to 60 HU, like muscle. Of a field of view shorter than a pool, a
+    proportionally smaller pool is asked for.
 
     Raises:
         InputError: no connected 4 ml of homogeneous tissue are that bright.
     """
+    extent_mm = float((volume.spacing_mm * volume.voxels.shape[::-1]).min())
     blocks, size_mm = _blocks(volume)
     mean = ndimage.uniform_filter(blocks, 3)
     variance = ndimage.uniform_filter(blocks**2, 3) - mean**2
@@ -73,13 +77,20 @@ def refuse_without_contrast(volume: Volume) -> None:
     calm = variance < max(_CALM_HU, _NOISE_FACTOR * noise_hu) ** 2
     label, _ = ndimage.label(calm & (mean > LEAST_BLOOD_HU) & (mean < _BRIGHTEST_HU))  # pyright: ignore[reportGeneralTypeIssues]
     largest_ml = float(np.bincount(label.ravel())[1:].max(initial=0) * size_mm.prod() / 1000)
-    if largest_ml < _LEAST_POOL_ML:
-        count, edge = np.histogram(mean[calm], bins=np.arange(-20.0, 400.0, 10.0))
-        peak = f"peaks at {edge[count.argmax()] + 5.0:.0f} HU" if count.any() else "is absent"
+    if largest_ml >= _LEAST_POOL_ML * min(1.0, extent_mm / _POOL_MM):
+        return
+    if extent_mm < _POOL_MM:
         raise InputError(
-            f"no contrast: homogeneous soft tissue {peak}, and its largest piece above {LEAST_BLOOD_HU:.0f} HU, "
-            f"as blood with contrast is, has {largest_ml:.1f} ml; give a CT angiogram in the arterial phase"
+            f"the volume is only {extent_mm:.0f} mm thick, and its largest piece of homogeneous tissue above "
+            f"{LEAST_BLOOD_HU:.0f} HU has {largest_ml:.1f} ml, too little to recognise blood with contrast; give a CT "
+            "angiogram that holds the aortic root, or seeds in the vessel"
         )
+    count, edge = np.histogram(mean[calm], bins=np.arange(-20.0, 400.0, 10.0))
+    peak = f"peaks at {edge[count.argmax()] + 5.0:.0f} HU" if count.any() else "is absent"
+    raise InputError(
+        f"no contrast: homogeneous soft tissue {peak}, and its largest piece above {LEAST_BLOOD_HU:.0f} HU, "
+        f"as blood with contrast is, has {largest_ml:.1f} ml; give a CT angiogram in the arterial phase"
+    )
 
 
 def _blocks(volume: Volume) -> tuple[Float[np.ndarray, "mz my mx"], Float[np.ndarray, "3"]]:

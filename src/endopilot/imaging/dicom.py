@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import warnings
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,9 +20,11 @@ from jaxtyping import Float
 from pydicom.dataset import Dataset
 from pydicom.errors import InvalidDicomError
 from pydicom.pixels.utils import pixel_array
-from pydicom.uid import UID
+from pydicom.uid import UID, AllTransferSyntaxes
 
 from endopilot.errors import InputError
+from endopilot.imaging.dicom_phases import PHASE_TAGS, choose_phase, slices_text
+from endopilot.imaging.geometry import Fields, Geometry, geometry, plane
 from endopilot.progress import progress
 from endopilot.types import Volume
 
@@ -42,6 +44,12 @@ _TAGS = (
     "ImageOrientationPatient",
     "RescaleSlope",
     "RescaleIntercept",
+    "RescaleType",
+    "PhotometricInterpretation",
+    "PixelRepresentation",
+    "PixelPaddingValue",
+    "PixelPaddingRangeLimit",
+    *PHASE_TAGS,
 )
 
 # Transfer syntaxes that are decoded: uncompressed, deflated, RLE, JPEG, JPEG-LS, JPEG 2000.
@@ -55,10 +63,15 @@ _DECODED = (*_UNCOMPRESSED, _DEFLATED, *_ENCAPSULATED)
 _PIXELS_BEGIN = (b"\xe0\x7f\x10\x00OB\0\0\xff\xff\xff\xff", b"\xe0\x7f\x10\x00OW\0\0\xff\xff\xff\xff")
 _PIXELS_END = b"\xfe\xff\xdd\xe0\0\0\0\0"
 
-_TILT_TOLERANCE_DEGREES = 0.1
 _SPACING_TOLERANCE = 0.05
 """Slice distances may differ from their median by this share: positions are written with few digits."""
 _FEWEST_SLICES = 4
+_HU_TYPES = ("", "HU")
+_PERHAPS_HU_TYPES = ("US", "HU_MOD")
+"""RescaleType of HU that the scanner modified, and of converters that leave the type open (unspecified)."""
+_AIR_HU = -1024.0
+"""What pixels are given that lie outside the scanned circle (PixelPaddingValue)."""
+_FIELDS = Fields("ImageOrientationPatient and ImagePositionPatient", "PixelSpacing", "ImagePositionPatient")
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +89,10 @@ class _Slice:
         samples: values a pixel.
         frames: images in the file.
         rescale: RescaleSlope, RescaleIntercept.
+        rescale_type: RescaleType.
+        photometric: PhotometricInterpretation.
+        padding: lowest and highest stored value of pixels that show nothing (PixelPaddingValue).
+        phase: of each field of `PHASE_TAGS`, its value.
         spacing_mm: PixelSpacing: between rows, between columns.
         position: ImagePositionPatient, LPS mm.
         orientation: ImageOrientationPatient.
@@ -91,17 +108,22 @@ class _Slice:
     samples: int
     frames: int
     rescale: tuple[float, ...]
+    rescale_type: str
+    photometric: str
+    padding: tuple[float, ...]
+    phase: dict[str, float | None]
     spacing_mm: tuple[float, ...]
     position: tuple[float, ...]
     orientation: tuple[float, ...]
 
 
-def read_series(path: Path, series: str | None) -> Volume:
+def read_series(path: Path, series: str | None, phase: str | None = None) -> Volume:
     """Read a CT series in HU.
 
     Args:
         path: a folder, its subfolders searched too, or one file of the series wanted.
         series: number or SeriesInstanceUID of the series to take where the folder holds several.
+        phase: number of the cardiac phase to take where the series holds several.
 
     Raises:
         InputError: there is no image or more than one series, or the series is no plain CT volume.
@@ -113,9 +135,26 @@ def read_series(path: Path, series: str | None) -> Volume:
     if path != folder:
         slices = [slice_ for slice_ in slices if slice_.series_uid == _series_of(path, slices)]
     chosen = _choose(slices, series, folder)
-    _check_slices(chosen, folder)
-    ordered, spacing, origin, direction = _geometry(chosen, folder)
-    return Volume(_read_pixels(ordered), spacing, origin, direction)
+    notes = _check_slices(chosen, folder)
+    first = chosen[0]
+    axes, normal = plane(first.orientation, first.spacing_mm, path=first.path)
+    of_phase, phase_notes = choose_phase(
+        {tag: [slice_.phase[tag] for slice_ in chosen] for tag in PHASE_TAGS},
+        np.array([slice_.position for slice_ in chosen]) @ normal,
+        phase,
+        folder,
+        named=next((index for index, slice_ in enumerate(chosen) if slice_.path == path), None),
+    )
+    ordered, place = _geometry([chosen[index] for index in of_phase], axes, normal, folder)
+    voxels, pixel_notes = _read_pixels(ordered)
+    return Volume(
+        voxels,
+        place.spacing_mm,
+        place.origin_mm,
+        place.direction,
+        tuple(f"{folder.name}: {note}" for note in (*notes, *phase_notes, *pixel_notes)) + place.notes,
+        tuple(sorted(slice_.path for slice_ in ordered)),
+    )
 
 
 def _read_headers(files: Sequence[Path]) -> list[_Slice]:
@@ -159,10 +198,25 @@ def _slice(file: Path, header: Dataset) -> _Slice:
         samples=int(header.get("SamplesPerPixel") or 1),
         frames=int(header.get("NumberOfFrames") or 1),
         rescale=numbers("RescaleSlope")[:1] + numbers("RescaleIntercept")[:1],
+        rescale_type=str(header.get("RescaleType") or "").strip().upper(),
+        photometric=str(header.get("PhotometricInterpretation") or "").strip().upper(),
+        padding=_padding(header, numbers),
+        phase={tag: next(iter(numbers(tag)), None) for tag in PHASE_TAGS},
         spacing_mm=numbers("PixelSpacing"),
         position=numbers("ImagePositionPatient"),
         orientation=numbers("ImageOrientationPatient"),
     )
+
+
+def _padding(header: Dataset, numbers: Callable[[str], tuple[float, ...]]) -> tuple[float, ...]:
+    """Return the stored values of pixels that show nothing, as signed as the pixels are."""
+    given = numbers("PixelPaddingValue")[:1] + numbers("PixelPaddingRangeLimit")[:1]
+    if not numbers("PixelPaddingValue"):
+        return ()
+    bits = int(header.get("BitsAllocated") or 16)
+    signed = int(header.get("PixelRepresentation") or 0) == 1
+    stored = sorted(value - 2.0**bits if signed and value >= 2.0 ** (bits - 1) else value for value in given)
+    return stored[0], stored[-1]
 
 
 def _series_of(path: Path, slices: Sequence[_Slice]) -> str:
@@ -192,16 +246,23 @@ def _choose(slices: Sequence[_Slice], series: str | None, folder: Path) -> list[
         if series in (name, group[0].series_uid):
             return group
     listed = "; ".join(
-        f"{name}: {group[0].modality}, {len(group)} slices of {group[0].size[1]}×{group[0].size[0]}"
+        f"{name}: {group[0].modality}, {slices_text(len(group))} of {group[0].size[1]}×{group[0].size[0]}"
         for name, group in zip(names, groups, strict=True)
     )
     if series is None:
-        raise InputError(f"{folder}: {len(groups)} DICOM series ({listed}); choose one with --series")
+        raise InputError(
+            f"{folder}: {len(groups)} DICOM series ({listed}); choose one with --series, or give one of its files"
+        )
     raise InputError(f"{folder}: no series {series!r} (the folder holds {listed}); choose one with --series")
 
 
-def _check_slices(slices: Sequence[_Slice], folder: Path) -> None:
-    """Refuse a series that is no CT of plain single-frame slices that can be decoded."""
+def _syntax_name(uid: str) -> str:
+    """Return what DICOM calls a transfer syntax; a UID that it does not know may be anything, and is not shown."""
+    return UID(uid).name if uid in AllTransferSyntaxes else "no transfer syntax of DICOM"
+
+
+def _check_slices(slices: Sequence[_Slice], folder: Path) -> list[str]:
+    """Refuse a series that is no CT of plain single-frame slices that can be decoded; return what is to be noted."""
     for slice_ in slices:
         path = slice_.path
         if slice_.modality != "CT":
@@ -212,7 +273,7 @@ def _check_slices(slices: Sequence[_Slice], folder: Path) -> None:
             raise InputError(f"{path}: a multi-frame file; export one file a slice, or NIfTI")
         if slice_.transfer_syntax not in _DECODED:
             raise InputError(
-                f"{path}: compressed as {UID(slice_.transfer_syntax).name}, which is not supported; "
+                f"{path}: compressed as {_syntax_name(slice_.transfer_syntax)}, which is not supported; "
                 "decompress the series (gdcmconv --raw) or export it uncompressed"
             )
         for tag, value, count in (
@@ -223,13 +284,20 @@ def _check_slices(slices: Sequence[_Slice], folder: Path) -> None:
         ):
             if len(value) != count or not np.isfinite(value).all():
                 raise InputError(f"{path}: no {tag} in its header; export the series again with its complete header")
-        if min(slice_.spacing_mm) <= 0 or slice_.rescale[0] == 0 or not _is_rotation(slice_.orientation):
-            raise InputError(f"{path}: PixelSpacing, RescaleSlope or ImageOrientationPatient is wrong; export it anew")
+        if slice_.rescale[0] == 0:
+            raise InputError(f"{path}: RescaleSlope is 0, which leaves no HU; export the series again")
+        if slice_.rescale_type not in (*_HU_TYPES, *_PERHAPS_HU_TYPES):
+            raise InputError(f"{path}: RescaleType is not HU; give the CT series in HU, not one computed from it")
+        if slice_.photometric == "MONOCHROME1":
+            raise InputError(
+                f"{path}: PhotometricInterpretation MONOCHROME1 (white is low): some programs invert such values, "
+                "others do not; export the series as MONOCHROME2"
+            )
         needed = slice_.size[0] * slice_.size[1] * slice_.bytes_per_value
         if slice_.transfer_syntax in _UNCOMPRESSED and path.stat().st_size < needed:
             raise InputError(f"{path}: truncated, its pixels are incomplete; copy or export the series again")
     if len(slices) < _FEWEST_SLICES:
-        raise InputError(f"{folder}: only {len(slices)} slices; give a series of at least {_FEWEST_SLICES}")
+        raise InputError(f"{folder}: only {slices_text(len(slices))}; give a series of at least {_FEWEST_SLICES}")
     for tag, values in (
         ("Rows and Columns", [slice_.size for slice_ in slices]),
         ("PixelSpacing", [slice_.spacing_mm for slice_ in slices]),
@@ -237,54 +305,46 @@ def _check_slices(slices: Sequence[_Slice], folder: Path) -> None:
     ):
         if np.ptp(np.array(values, dtype=float), axis=0).max() > 1e-3:
             raise InputError(f"{folder}: {tag} differ between slices; give a folder with one volume alone")
-
-
-def _is_rotation(orientation: tuple[float, ...]) -> bool:
-    """Tell whether two directions are unit vectors at right angles."""
-    axes = np.array(orientation).reshape(2, 3)
-    return bool(np.allclose(axes @ axes.T, np.eye(2), atol=1e-3))
+    open_types = sorted({slice_.rescale_type for slice_ in slices} & set(_PERHAPS_HU_TYPES))
+    return [f"RescaleType {', '.join(open_types)} was taken as HU"] if open_types else []
 
 
 def _geometry(
-    slices: Sequence[_Slice], folder: Path
-) -> tuple[list[_Slice], Float[np.ndarray, "3"], Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-    """Return slices in order, spacing, origin and direction (DICOM PS3.3 C.7.6.2.1.1), gaps and tilt refused."""
-    along_i, along_j = np.array(slices[0].orientation).reshape(2, 3)
-    along_i = along_i / np.linalg.norm(along_i)
-    normal = np.cross(along_i, along_j)
-    normal /= np.linalg.norm(normal)
-    along_j = np.cross(normal, along_i)  # headers hold few digits: the axes are made orthonormal again
+    slices: Sequence[_Slice], axes: Float[np.ndarray, "3 2"], normal: Float[np.ndarray, "3"], folder: Path
+) -> tuple[list[_Slice], Geometry]:
+    """Return slices in order, and where they lie (DICOM PS3.3 C.7.6.2.1.1); gaps are refused."""
     positions = np.array([slice_.position for slice_ in slices])
     order = np.argsort(positions @ normal, kind="stable")
     positions = positions[order]
     steps = np.diff(positions @ normal)
-    step = float(np.median(steps))
-    if np.any(steps < 1e-3):
-        raise InputError(
-            f"{folder}: several images at one slice position (cardiac phases, or a series stored twice); "
-            "keep one phase in the folder"
-        )
-    gaps = np.flatnonzero(np.abs(steps - step) > _SPACING_TOLERANCE * step)
+    usual = float(np.median(steps))
+    gaps = np.flatnonzero(np.abs(steps - usual) > _SPACING_TOLERANCE * usual)
     if gaps.size:
         first = gaps[0]
+        count = "1 irregular slice distance" if gaps.size == 1 else f"{gaps.size} irregular slice distances"
         raise InputError(
-            f"{folder}: {gaps.size} irregular slice distance(s), the first {steps[first]:.2f} mm instead of "
-            f"{step:.2f} mm after slice {first + 1}: slices are missing; export the whole series again"
+            f"{folder}: {count}, the first {steps[first]:.2f} mm instead of {usual:.2f} mm after slice {first + 1}: "
+            "slices are missing; export the whole series again"
         )
-    travel = positions[-1] - positions[0]
-    sideways = travel - (travel @ normal) * normal
-    tilt = np.degrees(np.arctan2(np.linalg.norm(sideways), travel @ normal))
-    if tilt > _TILT_TOLERANCE_DEGREES:
-        raise InputError(
-            f"{folder}: gantry tilt of {tilt:.1f}°; resample the series to straight slices (such as dcm2niix does)"
-        )
-    rows_mm, columns_mm = slices[0].spacing_mm
-    spacing = np.array([columns_mm, rows_mm, (travel @ normal) / (len(slices) - 1)])
-    return [slices[i] for i in order], spacing, positions[0], np.stack([along_i, along_j, normal], axis=1)
+    travel = (positions[-1] - positions[0]) / (len(slices) - 1)
+    step = float(np.linalg.norm(travel))
+    place = geometry(
+        np.column_stack([axes, travel / step]),
+        np.array([*slices[0].spacing_mm[::-1], step]),
+        positions[0],
+        (slices[0].size[1], slices[0].size[0], len(slices)),
+        path=folder,
+        fields=_FIELDS,
+    )
+    return [slices[i] for i in order], place
 
 
-def _read_pixels(slices: Sequence[_Slice]) -> np.ndarray:
-    """Decode slices in the order given and return HU: int16 where all are whole numbers that fit, else float32."""
+def _read_pixels(slices: Sequence[_Slice]) -> tuple[np.ndarray, list[str]]:
+    """Decode slices in the order given and return HU: int16 where all are whole numbers that fit, else float32.
+
+    Pixels that show nothing are given the HU of air, and that is noted.
+    """
+    padded = 0
     whole = all(number.is_integer() for slice_ in slices for number in slice_.rescale)
     voxels = np.empty((len(slices), *slices[0].size), dtype=np.float32)
     sitk.ProcessObject.SetGlobalWarningDisplay(False)  # GDCM's own lines may quote header values
@@ -301,11 +361,26 @@ def _read_pixels(slices: Sequence[_Slice]) -> np.ndarray:
                     f"{slice_.path}: its pixels cannot be decoded (truncated or damaged); "
                     "copy or export the series again"
                 ) from None
+            padded += _pad(slice_, plane)
             advance()
+    notes = []
+    if padded:
+        notes.append(f"{padded} pixels of PixelPaddingValue, which show nothing, were set to {_AIR_HU:g} HU")
     limits = np.iinfo(np.int16)
     if whole and limits.min <= voxels.min() and voxels.max() <= limits.max:
-        return voxels.astype(np.int16)
-    return voxels
+        return voxels.astype(np.int16), notes
+    return voxels, notes
+
+
+def _pad(slice_: _Slice, plane: Float[np.ndarray, "ny nx"]) -> int:
+    """Set the pixels of a slice that show nothing to the HU of air, and return how many were anything else."""
+    if not slice_.padding:
+        return 0
+    slope, intercept = slice_.rescale
+    low, high = sorted(np.float32(value * slope + intercept) for value in slice_.padding)
+    nothing = (plane >= low) & (plane <= high) & (plane != _AIR_HU)
+    plane[nothing] = _AIR_HU
+    return int(np.count_nonzero(nothing))
 
 
 def _decoded(slice_: _Slice, reader: sitk.ImageFileReader) -> np.ndarray:

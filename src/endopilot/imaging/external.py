@@ -70,7 +70,8 @@ def segment_by_program(
     on_grid = Volume(inside, found.spacing_mm, found.origin_mm, found.direction)
     if found.voxels.shape != volume.voxels.shape or not np.allclose(found.origin_mm, volume.origin_mm, atol=1e-2):
         inside = mask_like(LumenMask(on_grid), volume)
-    return LumenMask(Volume(inside, volume.spacing_mm, volume.origin_mm, volume.direction))
+    on_ct = Volume(inside, volume.spacing_mm, volume.origin_mm, volume.direction)
+    return LumenMask(on_ct, warnings=found.notes)
 
 
 def ostium_at_seeds(mask: LumenMask, seeds: Sequence[tuple[float, float, float]]) -> Insertion | None:

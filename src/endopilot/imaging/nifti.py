@@ -1,77 +1,266 @@
-"""Checks of NIfTI files that ITK does not make: truncated voxels, and voxels without a position in the world.
+"""NIfTI-1 and NIfTI-2 files (https://nifti.nimh.nih.gov), read as their standard says.
 
-Offsets are those of the NIfTI-1 and NIfTI-2 headers (https://nifti.nimh.nih.gov).
+Where sform and qform place the voxels elsewhere, the one in the scanner's anatomical coordinates is taken.
 """
 
 from __future__ import annotations
 
-import gzip
-import math
+import itertools
 import struct
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from endopilot.errors import InputError
+from endopilot.imaging.geometry import Fields, Geometry, converted, geometry, geometry_of_steps
+from endopilot.imaging.voxels import Encoding, opened, read_voxels, rescaled
+from endopilot.types import Volume
 
 _SPACING_TOLERANCE = 0.01
 """Voxel sizes that a header gives twice may differ by this share: they are written with few digits."""
+_RAS_TO_LPS = np.array([-1.0, -1.0, 1.0])
+_SCANNER = 1
+"""Code of a transform to the scanner's anatomical coordinates."""
+_LARGEST_OFFSET = 1 << 40
+_UNITS = {0: "mm", 1: "m", 2: "mm", 3: "µm"}
+_INTENTS = (0, 1001, 1002, 1003)
+"""What a grey-level image or a mask may be meant as: nothing, an estimate, labels, or names of regions."""
+
+_HEADERS = {
+    348: {
+        "dim": ("8h", 40),
+        "intent_code": ("h", 68),
+        "datatype": ("h", 70),
+        "bitpix": ("h", 72),
+        "pixdim": ("8f", 76),
+        "vox_offset": ("f", 108),
+        "scl": ("2f", 112),
+        "xyzt_units": ("B", 123),
+        "codes": ("2h", 252),
+        "quatern": ("6f", 256),
+        "srow": ("12f", 280),
+        "magic": ("4s", 344),
+    },
+    540: {
+        "magic": ("4s", 4),
+        "datatype": ("h", 12),
+        "bitpix": ("h", 14),
+        "dim": ("8q", 16),
+        "pixdim": ("8d", 104),
+        "vox_offset": ("q", 168),
+        "scl": ("2d", 176),
+        "codes": ("2i", 344),
+        "quatern": ("6d", 352),
+        "srow": ("12d", 400),
+        "xyzt_units": ("i", 500),
+        "intent_code": ("i", 504),
+    },
+}
+"""Of each version, by the size of its header: field: (format, offset)."""
+
+_TYPES = {
+    2: "u1",
+    4: "i2",
+    8: "i4",
+    16: "f4",
+    64: "f8",
+    256: "i1",
+    512: "u2",
+    768: "u4",
+    1024: "i8",
+    1280: "u8",
+}
+"""Grey levels, by their code `datatype`."""
 
 
 @dataclass(frozen=True)
-class _Layout:
-    """Where a header of either version holds what: (format, offset)."""
+class _Header:
+    """The fields of a header that matter here, as stored.
 
-    bits: tuple[str, int]
-    dimensions: tuple[str, int]
-    sizes: tuple[str, int]
-    offset: tuple[str, int]
-    codes: tuple[str, int]
-    rows: tuple[str, int]
+    Attributes:
+        size: of the header, bytes: 348 or 540.
+        order: "<" or ">", the byte order.
+        fields: values by name.
+    """
+
+    size: int
+    order: str
+    fields: dict[str, tuple[Any, ...]]
+
+    def __getitem__(self, name: str) -> tuple[Any, ...]:
+        return self.fields[name]
 
 
-_NIFTI_1 = _Layout(("h", 72), ("8h", 40), ("8f", 76), ("f", 108), ("2h", 252), ("12f", 280))
-_NIFTI_2 = _Layout(("h", 14), ("8q", 16), ("8d", 104), ("q", 168), ("2i", 344), ("12d", 400))
-
-
-def check_nifti(path: Path) -> None:
-    """Refuse a NIfTI file that ends before its voxels do, or that has no orientation.
-
-    Of a truncated file, ITK would fill the rest with whatever is in memory; without sform and qform it would guess.
+def read_nifti(path: Path) -> Volume:
+    """Read a NIfTI file (.nii, .nii.gz), its voxels as the rescale makes them.
 
     Raises:
-        InputError: the file is truncated or damaged, has no orientation, or two voxel sizes.
+        InputError: the file is damaged, holds no three-dimensional grey levels, or does not say where they are.
     """
-    opener = gzip.open if path.name.lower().endswith(".gz") else open
     try:
-        with opener(path, "rb") as stream:
-            header = stream.read(540)
-            order = "<" if header[:4] in (b"\x5c\x01\0\0", b"\x1c\x02\0\0") else ">"
-            layout = _NIFTI_2 if struct.unpack_from(f"{order}i", header)[0] == 540 else _NIFTI_1
-
-            def values(field: tuple[str, int]) -> tuple:
-                return struct.unpack_from(order + field[0], header, field[1])
-
-            dimensions, (bits,), (offset,) = values(layout.dimensions), values(layout.bits), values(layout.offset)
-            codes, sizes, rows = values(layout.codes), values(layout.sizes), values(layout.rows)
-            missing = int(offset) + math.prod(dimensions[1 : 1 + dimensions[0]]) * bits // 8 - len(header)
-            while missing > 0 and (chunk := stream.read(1 << 22)):
-                missing -= len(chunk)
-    except (EOFError, OSError, ValueError, zlib.error, struct.error):
+        with opened(path) as stream:
+            header = _header(stream.read(540), path)
+            size, dtype = _size(header, path), _type(header, path)
+            stream.seek(_offset(header, path))
+            stored = read_voxels(stream, Encoding(dtype), size[::-1], path=path)
+    except (EOFError, OSError, zlib.error):
         raise InputError(f"{path}: truncated or damaged; copy or export it again") from None
-    if missing > 0:
-        raise InputError(f"{path}: truncated or damaged (its voxels are incomplete); copy or export it again")
-    if max(codes) <= 0:
-        raise InputError(f"{path}: has no orientation (its sform and qform codes are 0); export it with its affine")
-    lengths = np.linalg.norm(np.array(rows).reshape(3, 4)[:, :3], axis=0)
-    if codes[1] > 0 and not np.allclose(lengths, np.abs(sizes[1:4]), rtol=_SPACING_TOLERANCE):
+    place = _geometry(header, size, path)
+    slope, intercept = header["scl"]
+    if not np.isfinite([slope, intercept]).all():
+        raise InputError(f"{path}: scl_slope {slope:g} and scl_inter {intercept:g} are not finite; export it again")
+    values = rescaled(stored, float(slope), float(intercept)) if slope else stored  # a slope of 0 means none
+    return Volume(values, place.spacing_mm, place.origin_mm, place.direction, place.notes, (path,))
+
+
+def _header(content: bytes, path: Path) -> _Header:
+    """Return the fields of a header, after making sure that it is one of a single file."""
+    for order, size in itertools.product("<>", _HEADERS):
+        if content[:4] == struct.pack(f"{order}i", size):
+            break
+    else:
+        raise InputError(f"{path}: its content does not match its suffix, or its header is damaged; export it again")
+    if len(content) < size:
+        raise InputError(f"{path}: truncated or damaged (its header is incomplete); copy or export it again")
+    fields = {name: struct.unpack_from(order + kind, content, at) for name, (kind, at) in _HEADERS[size].items()}
+    (magic,) = fields["magic"]
+    if magic[:3] in (b"ni1", b"ni2"):
+        raise InputError(f"{path}: magic {magic!r}: its voxels are in a file of their own (.img); save it as .nii.gz")
+    if magic != (b"n+1\0" if size == 348 else b"n+2\0"):
+        raise InputError(f"{path}: magic {magic!r} is not that of NIfTI (Analyze has no orientation); export it again")
+    return _Header(size, order, fields)
+
+
+def _size(header: _Header, path: Path) -> tuple[int, int, int]:
+    """Return the numbers of voxels along i, j and k."""
+    count, *extents = header["dim"]
+    if not 1 <= count <= 7 or min(extents[:count]) < 1:
+        shown = " ".join(map(str, header["dim"]))
+        raise InputError(f"{path}: dim {shown} describes no image; export it again")
+    extents = [*extents[:count], 1, 1][: max(count, 3)]
+    if any(extent > 1 for extent in extents[3:]):
+        shape = "×".join(map(str, extents))
+        raise InputError(f"{path}: {count}-D ({shape}); give a single 3-D volume, such as one cardiac phase")
+    (intent,) = header["intent_code"]
+    if intent not in _INTENTS:
+        raise InputError(f"{path}: intent_code {intent} is neither that of grey levels nor of labels; export it again")
+    return extents[0], extents[1], extents[2]
+
+
+def _type(header: _Header, path: Path) -> np.dtype:
+    (code,), (bits,) = header["datatype"], header["bitpix"]
+    if code in (128, 2304):
+        raise InputError(f"{path}: several values in every voxel (colour); give a grey-level volume")
+    if code not in _TYPES:
+        raise InputError(f"{path}: datatype {code} holds no grey levels; export it as int16 or float32")
+    dtype = np.dtype(header.order + _TYPES[code])
+    if bits != 8 * dtype.itemsize:
+        raise InputError(f"{path}: datatype {code} and bitpix {bits} contradict each other; export it again")
+    return dtype
+
+
+def _offset(header: _Header, path: Path) -> int:
+    """Return where the voxels begin: behind the header and the four bytes that say whether it is extended."""
+    (offset,) = header["vox_offset"]
+    if not np.isfinite(offset) or offset != int(offset) or not header.size + 4 <= offset < _LARGEST_OFFSET:
         raise InputError(
-            f"{path}: its affine gives voxels of {_text(lengths)}, its pixdim {_text(np.abs(sizes[1:4]))}; "
+            f"{path}: vox_offset {offset:g}: voxels begin behind the header, at {header.size + 4} or later; "
+            "export it again"
+        )
+    return int(offset)
+
+
+def _geometry(header: _Header, size: tuple[int, int, int], path: Path) -> Geometry:
+    """Return where the voxels lie, by sform or qform."""
+    qform_code, sform_code = header["codes"]
+    if max(qform_code, sform_code) <= 0:
+        raise InputError(f"{path}: has no orientation (its sform and qform codes are 0); export it with its affine")
+    sizes = np.array(header["pixdim"][1:4], dtype=float)
+    if not np.isfinite(sizes).all():
+        raise InputError(f"{path}: pixdim holds {sizes}, which is not finite; export it again")
+    unit = _UNITS.get(header["xyzt_units"][0] & 7, "")
+    factor, notes = converted(unit, sizes, path=path, field=f"xyzt_units {header['xyzt_units'][0]}")
+    first, other = ("qform", "sform") if sform_code <= 0 or qform_code == _SCANNER != sform_code else ("sform", "qform")
+    forms = {"sform": _sform, "qform": _qform}
+    chosen = forms[first](header, size, path, factor)
+    if min(qform_code, sform_code) > 0:
+        try:
+            notes += _agreement(chosen, forms[other](header, size, path, factor), size, header, path)
+        except InputError:
+            if header["codes"].count(_SCANNER) != 1:
+                raise
+            # The other one leads to an atlas, and may be any affine map.
+            notes += (f"{path.name}: {other} is no rigid placement; {first}, the scanner's, was taken",)
+    elif first == "sform" and sizes.min() < 0:
+        notes += (f"{path.name}: pixdim is negative; its sign was ignored, and the voxels lie where sform puts them",)
+    return replace(chosen, notes=(*notes, *chosen.notes))
+
+
+def _sform(header: _Header, size: tuple[int, int, int], path: Path, factor: float) -> Geometry:
+    rows = np.array(header["srow"], dtype=float).reshape(3, 4) * _RAS_TO_LPS[:, None] * factor
+    fields = Fields("srow_x, srow_y and srow_z", "srow_x, srow_y and srow_z", "srow_x, srow_y and srow_z")
+    place = geometry_of_steps(rows[:, :3], rows[:, 3], size, path=path, fields=fields)
+    pixdim = np.abs(header["pixdim"][1:4]) * factor
+    if not np.allclose(place.spacing_mm, pixdim, rtol=_SPACING_TOLERANCE):
+        raise InputError(
+            f"{path}: its affine gives voxels of {_times(place.spacing_mm)}, its pixdim {_times(pixdim)}; "
             "one of them is wrong: export it again"
         )
+    return place
 
 
-def _text(lengths: np.ndarray) -> str:
+def _qform(header: _Header, size: tuple[int, int, int], path: Path, factor: float) -> Geometry:
+    b, c, d = (float(value) for value in header["quatern"][:3])
+    offset = np.array(header["quatern"][3:], dtype=float)
+    if not np.isfinite([b, c, d]).all() or b * b + c * c + d * d > 1.01:
+        raise InputError(f"{path}: quatern_b, _c and _d ({b:g}, {c:g}, {d:g}) are no unit quaternion; export it again")
+    a = np.sqrt(max(1.0 - (b * b + c * c + d * d), 0.0))
+    a, b, c, d = np.array([a, b, c, d]) / np.linalg.norm([a, b, c, d])
+    turn = np.array(
+        [
+            [a * a + b * b - c * c - d * d, 2 * (b * c - a * d), 2 * (b * d + a * c)],
+            [2 * (b * c + a * d), a * a + c * c - b * b - d * d, 2 * (c * d - a * b)],
+            [2 * (b * d - a * c), 2 * (c * d + a * b), a * a + d * d - c * c - b * b],
+        ]
+    )
+    turn[:, 2] *= -1.0 if header["pixdim"][0] < 0 else 1.0
+    sizes = np.array(header["pixdim"][1:4], dtype=float) * factor
+    fields = Fields("quatern_b, quatern_c and quatern_d", "pixdim", "qoffset")
+    return geometry(turn * _RAS_TO_LPS[:, None], sizes, offset * _RAS_TO_LPS * factor, size, path=path, fields=fields)
+
+
+def _agreement(
+    chosen: Geometry, other: Geometry, size: tuple[int, int, int], header: _Header, path: Path
+) -> tuple[str, ...]:
+    """Say so where sform and qform put a corner of the volume half a voxel apart or more.
+
+    Raises:
+        InputError: they do, and not exactly one of them is in the scanner's coordinates.
+    """
+    corners = np.array(list(itertools.product(*((0.0, extent - 1.0) for extent in size))))
+    apart = float(np.linalg.norm(_placed(chosen, corners) - _placed(other, corners), axis=1).max())
+    if apart < chosen.spacing_mm.min() / 2.0:
+        return ()
+    codes = "qform_code {} and sform_code {}".format(*header["codes"])
+    if header["codes"].count(_SCANNER) != 1:
+        raise InputError(
+            f"{path}: sform and qform place voxels up to {apart:.3g} mm apart, and {codes} do not tell which of them "
+            "is the scanner's (1); set the other code to 0"
+        )
+    form = "qform" if header["codes"][0] == _SCANNER else "sform"
+    return (
+        f"{path.name}: sform and qform place voxels up to {apart:.3g} mm apart; {form} was taken, which {codes} say "
+        "is in the scanner's coordinates",
+    )
+
+
+def _placed(place: Geometry, index: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    return place.origin_mm + (index * place.spacing_mm) @ place.direction.T
+
+
+def _times(lengths: np.ndarray) -> str:
     return "×".join(f"{length:.3g}" for length in lengths)

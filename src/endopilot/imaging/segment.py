@@ -96,7 +96,8 @@ def segment(volume: Volume | str | Path, config: SegmentConfig = SegmentConfig()
         config: method, vessel and seeds.
 
     Returns:
-        The mask on the grid of `volume`, with the ostium and the direction into the vessel.
+        The mask on the grid of `volume`, with the ostium and the direction into the vessel. Its warnings begin with the
+        volume's notes.
 
     Raises:
         InputError: the CT cannot be read, a seed lies outside the volume, there is no contrast, or the vessel was
@@ -116,7 +117,7 @@ def segment(volume: Volume | str | Path, config: SegmentConfig = SegmentConfig()
         raise InputError(f"method: {config.method!r} found no lumen; give seeds inside the vessel")
     if not config.seeds and mask.ostium is not None:
         _refuse_cut_root(volume, mask.ostium)
-    return replace(mask, method=config.method)
+    return replace(mask, method=config.method, warnings=(*volume.notes, *mask.warnings))
 
 
 def _refuse_no_mask(mask: object, volume: Volume, name: str) -> None:

@@ -1,15 +1,14 @@
 """Reading and writing volumes and masks, in LPS mm, whatever the file format.
 
-CT comes from a DICOM series or from NIfTI, NRRD or MHA; masks from the last three or DICOM-SEG. SimpleITK turns RAS
-files into LPS and applies the rescale slope and intercept, so that voxels are HU; what it reads without complaint
-although it is not one plain three-dimensional CT is refused here in one line.
+CT comes from a DICOM series or from NIfTI, NRRD or MHA; masks from the last three or DICOM-SEG. RAS files are turned
+into LPS and the rescale slope and intercept are applied, so that voxels are HU. A file is read right, or its volume's
+notes say what was changed, or it is refused in one line.
 """
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +18,12 @@ import SimpleITK as sitk
 from endopilot.errors import InputError
 from endopilot.files import read_json, write_json, writing
 from endopilot.imaging import dicom_seg
-from endopilot.imaging.grid import from_image, to_image
-from endopilot.imaging.nifti import check_nifti
+from endopilot.imaging.grid import to_image
+from endopilot.imaging.metaimage import read_metaimage
+from endopilot.imaging.nifti import read_nifti
+from endopilot.imaging.nrrd import NrrdImage, plain, read_nrrd
+from endopilot.imaging.segments import inside_segment
+from endopilot.imaging.voxels import compact
 from endopilot.types import Insertion, LumenMask, Volume
 
 SUFFIXES = (".nii.gz", ".nii", ".nrrd", ".mha")
@@ -33,22 +36,22 @@ _READ_ONLY_SUFFIXES = (".mhd", ".nhdr")
 _SMALLEST_SIZE = 4
 """Fewer voxels than this along an axis are no volume: a slice, or a scout view."""
 
-_MOST_LABELS_LISTED = 20
 
-
-def read_volume(path: str | Path, *, series: str | None = None) -> Volume:
+def read_volume(path: str | Path, *, series: str | None = None, phase: str | None = None) -> Volume:
     """Read a CT volume in HU.
 
     Args:
         path: a folder with one DICOM series, one of its files, or a NIfTI, NRRD or MHA file.
         series: which series to take where a folder holds several: its number, or its SeriesInstanceUID.
+        phase: which cardiac phase to take where a series holds several: its number as the headers give it, such as
+            75 (per cent of the cycle).
 
     Returns:
-        The volume, int16 where the HU are whole numbers, float32 otherwise.
+        The volume, int16 where the HU are whole numbers, float32 otherwise. Its notes say what reading it changed.
 
     Raises:
         InputError: the path is missing, is of an unknown format or damaged, or holds anything but one plain
-            three-dimensional volume (several series, missing slices, gantry tilt, 4-D, RGB).
+            three-dimensional volume (several series or phases, missing slices, gantry tilt, 4-D, RGB).
     """
     path = Path(path)
     if not path.exists():
@@ -57,12 +60,17 @@ def read_volume(path: str | Path, *, series: str | None = None) -> Volume:
         if path.is_dir() or (_suffix(path) is None and _is_dicom(path)):
             from endopilot.imaging.dicom import read_series  # pydicom comes with an extra
 
-            return read_series(path, series)
+            return read_series(path, series, phase)
     except PermissionError as error:
         raise InputError(f"{path}: may not be read ({error.strerror}); ask for access to it") from error
-    if series is not None:
-        raise InputError(f"{path}: series={series!r} was given, but only DICOM has series; leave the option out")
-    volume = _read_file(path)
+    for name, value in (("series", series), ("phase", phase)):
+        if value is not None:
+            plural = "series" if name == "series" else "phases"
+            raise InputError(f"{path}: {name}={value!r} was given, but only DICOM has {plural}; leave the option out")
+    image = _read_file(path)
+    if len(image.layers) > 1:
+        raise InputError(f"{path}: a segmentation of {len(image.layers)} layers; give the CT, in HU")
+    volume = replace(image.volume, voxels=compact(image.volume.voxels))
     if not np.isfinite(volume.voxels).all():
         raise InputError(f"{path}: some voxels are not finite numbers; write it again with −1024 HU in their place")
     return volume
@@ -124,15 +132,16 @@ def write_volume(volume: Volume, path: str | Path) -> None:
             ) from error
 
 
-def read_mask(path: str | Path, *, label: int | None = None) -> LumenMask:
+def read_mask(path: str | Path, *, label: int | str | None = None) -> LumenMask:
     """Read the mask of one vessel, with its ostium where `write_mask` left a sidecar JSON beside it.
 
     Args:
         path: a NIfTI, NRRD or MHA file of whole numbers, 0 outside, or a DICOM-SEG object.
-        label: which value to take where the file holds several.
+        label: number or name of the segment to take where the file holds several; segments may overlap.
 
     Returns:
-        The mask; its ostium is None where no sidecar holds it.
+        The mask; its ostium is None where no sidecar holds it. Its warnings are those of the sidecar, and what
+        reading it changed.
 
     Raises:
         InputError: the file is missing, damaged or no mask, the label is not in it, or nothing is inside.
@@ -140,11 +149,14 @@ def read_mask(path: str | Path, *, label: int | None = None) -> LumenMask:
     path = Path(path)
     if not path.exists():
         raise InputError(f"{path}: no such file; check the path")
-    volume = dicom_seg.read_seg(path) if path.suffix.lower() == dicom_seg.SUFFIX else _read_file(path)
-    inside = _inside(volume.voxels, label, path)
+    if path.suffix.lower() == dicom_seg.SUFFIX:
+        volume = dicom_seg.read_seg(path, label)
+    else:
+        image = _read_file(path)
+        volume = replace(image.volume, voxels=inside_segment(image.layers, image.segments, label, path))
     sidecar = _sidecar(path)
-    ostium, method = _read_sidecar(sidecar) if sidecar.exists() else (None, "given")
-    return LumenMask(Volume(inside, volume.spacing_mm, volume.origin_mm, volume.direction), ostium, method)
+    ostium, method, warnings = _read_sidecar(sidecar) if sidecar.exists() else (None, "given", ())
+    return LumenMask(volume, ostium, method, (*volume.notes, *warnings))
 
 
 def write_mask(mask: LumenMask, path: str | Path, *, manifest: Mapping[str, Any]) -> None:
@@ -187,100 +199,38 @@ def _sidecar(path: Path) -> Path:
     return path.with_name(path.name[: len(path.name) - len(suffix)] + ".json")
 
 
-def _read_file(path: Path) -> Volume:
-    """Read one file whose suffix SimpleITK supports, refusing what is not a scalar volume."""
-    if path.is_dir() or _suffix(path) is None:
-        raise InputError(f"{path}: unknown format; give one of {', '.join(SUFFIXES)}, or a folder of DICOM slices")
-    reader = sitk.ImageFileReader()
-    reader.SetFileName(str(path))
+def _read_file(path: Path) -> NrrdImage:
+    """Read one file by its suffix, refusing what is not a scalar volume."""
+    suffix = None if path.is_dir() else _suffix(path)
     try:
-        with _quiet_itk():
-            reader.ReadImageInformation()
-    except RuntimeError as error:
-        raise InputError(f"{path}: {_reason(error, path)}; export it again") from error
-    size = tuple(reader.GetSize())
-    shape = "×".join(map(str, size))
-    components = reader.GetNumberOfComponents()
-    if components != 1:
-        raise InputError(f"{path}: {components} values in every voxel (colour or vectors); give a grey-level volume")
-    if len(size) > 3 and any(extent > 1 for extent in size[3:]):
-        raise InputError(f"{path}: {len(size)}-D ({shape}); give a single 3-D volume, such as one cardiac phase")
-    if len(size) < 3 or min(size[:3]) < _SMALLEST_SIZE:
-        raise InputError(f"{path}: {shape} voxels are no volume; give at least {_SMALLEST_SIZE} along each axis")
-    if path.name.lower().endswith((".nii", ".nii.gz")):
-        check_nifti(path)
-    if path.name.lower().endswith((".nrrd", ".nhdr")) and not reader.HasMetaDataKey("NRRD_space"):
-        raise InputError(f"{path}: has no orientation (no space in its header); export it with its space directions")
-    try:
-        with _quiet_itk():
-            image = reader.Execute()
-        if len(size) > 3:
-            image = sitk.Extract(image, [*size[:3], *(0 for _ in size[3:])])
-    except RuntimeError as error:
-        raise InputError(f"{path}: truncated or damaged ({_reason(error, path)}); copy or export it again") from error
-    return _compact(from_image(image))
-
-
-def _compact(volume: Volume) -> Volume:
-    """Hold whole numbers that fit as int16, all others as float32."""
-    voxels = volume.voxels
-    limits = np.iinfo(np.int16)
-    whole = voxels.dtype.kind in "iu" and voxels.min() >= limits.min and voxels.max() <= limits.max
-    voxels = voxels.astype(np.int16 if whole else np.float32)
-    return Volume(voxels, volume.spacing_mm, volume.origin_mm, volume.direction)
-
-
-def _reason(error: RuntimeError, path: Path) -> str:
-    """Say in a few words what ITK's long message means; its paths and source lines help nobody."""
-    text = str(error)
-    if "orthonormal" in text.lower():
-        return "its axes are not at right angles (a sheared affine)"
-    if "Unable to determine ImageIO reader" in text:
-        return "its content does not match its suffix, or its header is damaged"
-    if path.suffix.lower() in _READ_ONLY_SUFFIXES:
-        return "the file of voxels that it names is missing, incomplete or damaged"
-    return "its header or voxels cannot be read"
-
-
-@contextmanager
-def _quiet_itk() -> Iterator[None]:
-    """Keep ITK's and MetaIO's own lines off standard error, where they would bury ours."""
-    sitk.ProcessObject.SetGlobalWarningDisplay(False)
-    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(nowhere, 2)
-        yield
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-        os.close(nowhere)
-
-
-def _inside(values: np.ndarray, label: int | None, path: Path) -> np.ndarray:
-    """Return where a label image holds the label, after making sure that it is one."""
-    if not np.isfinite(values).all() or values.min() < 0 or not np.array_equal(values, np.round(values)):
+        if suffix in (".nrrd", ".nhdr"):
+            image = read_nrrd(path)
+        elif suffix in (".mha", ".mhd"):
+            image = plain(read_metaimage(path))
+        elif suffix in (".nii", ".nii.gz"):
+            image = plain(read_nifti(path))
+        else:
+            raise InputError(f"{path}: unknown format; give one of {', '.join(SUFFIXES)}, or a folder of DICOM slices")
+    except OSError as error:
+        raise InputError(f"{path}: may not be read ({error.strerror}); ask for access to it") from error
+    shape = image.volume.voxels.shape[::-1]
+    if min(shape) < _SMALLEST_SIZE:
         raise InputError(
-            f"{path}: values from {values.min():g} to {values.max():g} are no mask; give whole numbers ≥ 0"
+            f"{path}: {'×'.join(map(str, shape))} voxels are no volume; give at least {_SMALLEST_SIZE} along each axis"
         )
-    labels = np.unique(values[values > 0]).astype(int)
-    listed = ", ".join(map(str, labels[:_MOST_LABELS_LISTED])) + (", …" if len(labels) > _MOST_LABELS_LISTED else "")
-    if len(labels) == 0:
-        raise InputError(f"{path}: the mask is empty; segment the vessel again or give another file")
-    if label is None and len(labels) > 1:
-        raise InputError(f"{path}: the mask holds {len(labels)} labels ({listed}); choose one: label=N (--label N)")
-    if label is not None and label not in labels:
-        raise InputError(f"{path}: no voxel has label {label}; the file holds {listed}")
-    return values == (labels[0] if label is None else label)
+    return image
 
 
-def _read_sidecar(path: Path) -> tuple[Insertion | None, str]:
-    """Return ostium and method from a sidecar; JSON files that others put beside a mask have neither."""
+def _read_sidecar(path: Path) -> tuple[Insertion | None, str, tuple[str, ...]]:
+    """Return ostium, method and warnings from a sidecar; JSON files that others put beside a mask have none."""
     content = read_json(path)
     if not isinstance(content, dict) or "ostium" not in content:
-        return None, "given"
-    ostium, method = content["ostium"], str(content.get("method", "given"))
+        return None, "given", ()
+    ostium, method, warnings = content["ostium"], str(content.get("method", "given")), content.get("warnings", [])
+    if not isinstance(warnings, list) or not all(isinstance(warning, str) for warning in warnings):
+        raise InputError(f"{path}: warnings is no list of sentences; make the mask again")
     if ostium is None:
-        return None, method
+        return None, method, tuple(warnings)
     try:
         position = np.array(ostium["position_mm"], dtype=float)
         direction = np.array(ostium["direction"], dtype=float)
@@ -291,4 +241,4 @@ def _read_sidecar(path: Path) -> tuple[Insertion | None, str]:
         raise InputError(
             f"{path}: ostium needs position_mm and direction, three finite numbers each, direction not zero"
         )
-    return Insertion(position, direction / length), method
+    return Insertion(position, direction / length), method, tuple(warnings)

@@ -11,7 +11,7 @@ import hashlib
 import re
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -117,6 +117,7 @@ class _Run:
         origin: where the patients come from, for the report.
         command: what was typed, for the report.
         inputs: SHA-256 of the input files, by name.
+        notes: what reading the volume changed.
         navigation: folder of the agent's navigation; None where no target was given.
     """
 
@@ -128,6 +129,7 @@ class _Run:
     origin: str
     command: str
     inputs: Mapping[str, str] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
     navigation: Path | None = None
 
     @property
@@ -188,7 +190,13 @@ def run_demo(output: Path, config: DemoConfig) -> dict[str, Any]:
 
 
 def run_volume(
-    volume: Path, output: Path, config: RunConfig, *, series: str | None = None, target: str | None = None
+    volume: Path,
+    output: Path,
+    config: RunConfig,
+    *,
+    series: str | None = None,
+    phase: str | None = None,
+    target: str | None = None,
 ) -> dict[str, Any]:
     """Run all stages on one CT angiogram and write `output`/report.html.
 
@@ -200,6 +208,7 @@ def run_volume(
         output: folder of everything the run makes.
         config: segmentation, device and size of the study.
         series: number or instance UID of the series, where a DICOM folder holds several.
+        phase: cardiac phase, where a DICOM series holds several.
         target: a section such as "4" or "LAD", or a point "X,Y,Z" in LPS mm, that the agent drives the wire to.
 
     Returns:
@@ -210,13 +219,17 @@ def run_volume(
             such target, or the folder belongs to another run, such as that of another volume.
     """
     require_extras(*_EXTRAS)
-    content, device = read_volume(volume, series=series), read_device(config.device)
+    content, device = read_volume(volume, series=series, phase=phase), read_device(config.device)
     identity = {"volume_sha256": _digest(content), "method": METHODS.origin(config.segmentation.method)}
     claim(output, "endopilot run", **identity, config=config, device=device, version=__version__)
     copy, stages = output / "ct" / f"patient{VOLUME_SUFFIX}", Stages(output)
     folder = None if target is None else output / "navigation" / re.sub(r"[^\w.,+-]", "_", target)
     stages.do("read", lambda: write_volume(content, copy))
+    notes, inputs = content.notes, input_hash(volume, content.files)
+    for note in notes:
+        print(note, file=sys.stderr)
     del content  # up to a gigabyte
+    options = "".join(f" --{name} {value}" for name, value in (("series", series), ("phase", phase)) if value)
     run = _Run(
         output=output,
         config=config,
@@ -224,8 +237,9 @@ def run_volume(
         device=device,
         stages=stages,
         origin=RUN_ORIGIN,
-        command=f"endopilot run {volume} -o {output}" + (f" --series {series}" if series else ""),
-        inputs=input_hash(volume),
+        command=f"endopilot run {volume} -o {output}" + options,
+        inputs=inputs,
+        notes=notes,
         navigation=folder,
     )
     anatomies = _anatomies(run, [copy])
@@ -257,10 +271,10 @@ def _make_volume(folder: Path, *, output: Path, seed: int, truths: Sequence[Path
         write_volume(make_phantom(read_anatomy(folder), PhantomConfig(), seed), path)
 
 
-def _make_mask(volume: Path, *, output: Path, config: SegmentConfig) -> None:
+def _make_mask(volume: Path, *, output: Path, config: SegmentConfig, notes: tuple[str, ...]) -> None:
     path = output / "masks" / volume.name
     if not path.exists():
-        mask = segment(read_volume(volume), config)
+        mask = segment(replace(read_volume(volume), notes=notes), config)
         write_mask(mask, path, manifest=manifest(config=config, inputs=input_hash(volume)))
 
 
@@ -275,7 +289,7 @@ def _anatomies(run: _Run, volumes: Sequence[Path]) -> list[Path]:
     """Segment volumes, extract their anatomies, and return the folders of those where both succeeded."""
     output, stages, segmentation = run.output, run.stages, run.segmentation
     scheme = segmentation.vessel if segmentation.method == "coronary" else "generic"
-    make_mask = partial(_make_mask, output=output, config=segmentation)
+    make_mask = partial(_make_mask, output=output, config=segmentation, notes=run.notes)
     make_anatomy = partial(_make_anatomy, output=output, config=AnatomyConfig(vessel=scheme))
     stages.do_each("segmentation", "Segmentation", volumes, make_mask)
     stages.do_each("anatomy", "Centerlines and distance maps", volumes, make_anatomy)
@@ -408,12 +422,18 @@ def _finish(run: _Run) -> dict[str, Any]:
     wall_seconds = sum(stages.seconds.values())
     if not (output / "manifest.json").exists():
         write_json(output / "metrics.json", {**metrics, "anatomy_scores": read_json(output / "scores.json")})
-        facts = {"wall_seconds": wall_seconds, "stages": stages.seconds, "rejected": stages.rejected}
+        facts = {
+            "wall_seconds": wall_seconds,
+            "stages": stages.seconds,
+            "rejected": stages.rejected,
+            "notes": run.notes,
+        }
         record = manifest(config=run.config, seed=run.config.seed, inputs=run.inputs, **facts)
         write_json(output / "manifest.json", record)
     return {
         "report": str(output / REPORT_FILE),
         "wall_seconds": round(wall_seconds, 1),
         "rejected": stages.rejected,
+        **({"notes": list(run.notes)} if run.notes else {}),
         "findings": metrics["findings"],
     }

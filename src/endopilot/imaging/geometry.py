@@ -1,0 +1,200 @@
+"""Where the voxels of an image lie: one rule on spacing, origin and axes for every file format.
+
+Spacings are finite and positive, axes are unit vectors at right angles. Axes that miss this by less than 1e-2 are
+those of a header with few digits: they are straightened, and the volume's notes say so. Beyond, the image is sheared
+(a gantry tilt, for instance), and is refused with the name of the header's field.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from endopilot.errors import InputError
+
+AXES_TOLERANCE = 1e-2
+"""Cosine between two axes, and share by which a unit vector's length may err, below which axes are straightened."""
+_ROUNDING = 1e-5
+"""What single precision and six decimals leave: it moves no voxel by more than some micrometres, and is not noted."""
+
+MM_PER_UNIT = {
+    **dict.fromkeys(("mm", "millimeter", "millimeters", "millimetre", "millimetres"), 1.0),
+    **dict.fromkeys(("cm", "centimeter", "centimeters", "centimetre", "centimetres"), 10.0),
+    **dict.fromkeys(("dm", "decimeter", "decimeters", "decimetre", "decimetres"), 100.0),
+    **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), 1000.0),
+    **dict.fromkeys(("um", "µm", "μm", "micron", "microns", "micrometer", "micrometers", "micrometre"), 1e-3),
+    **dict.fromkeys(("in", "inch", "inches"), 25.4),
+}
+"""Millimetres in each unit of length that a header may name, in lower case."""
+_CONVERTED_MM = (1e-3, 20.0)
+"""Voxel sizes that a unit other than mm may lead to, mm: others show that the header names the wrong unit."""
+
+
+@dataclass(frozen=True)
+class Fields:
+    """What a format calls the parts of its geometry, for messages."""
+
+    direction: str
+    spacing: str
+    origin: str
+
+
+@dataclass(frozen=True, eq=False)
+class Geometry:
+    """Where voxels lie, as `Volume` holds it, and what was done to the header's numbers.
+
+    Attributes:
+        spacing_mm: distance between neighbouring voxel centres along i, j and k, mm.
+        origin_mm: LPS position of the centre of voxel (0, 0, 0), mm.
+        direction: columns are the LPS unit vectors along which i, j and k grow.
+        notes: a sentence for each change.
+    """
+
+    spacing_mm: Float[np.ndarray, "3"]
+    origin_mm: Float[np.ndarray, "3"]
+    direction: Float[np.ndarray, "3 3"]
+    notes: tuple[str, ...]
+
+
+def geometry(
+    direction: Float[np.ndarray, "3 3"],
+    spacing_mm: Float[np.ndarray, "3"],
+    origin_mm: Float[np.ndarray, "3"],
+    size: tuple[int, int, int],
+    *,
+    path: Path,
+    fields: Fields,
+) -> Geometry:
+    """Return the geometry of an image, its axes straightened to the nearest rotation about the volume's centre.
+
+    Args:
+        direction: columns are the LPS directions of i, j and k, of length 1.
+        spacing_mm: distance between voxel centres along i, j and k, mm.
+        origin_mm: centre of the first voxel, LPS mm.
+        size: number of voxels along i, j and k.
+        path: the file, for messages.
+        fields: what its format calls these, for messages.
+
+    Raises:
+        InputError: a number is not finite, a spacing is not positive, an axis is no unit vector, or axes are sheared.
+    """
+    for name, values in ((fields.spacing, spacing_mm), (fields.origin, origin_mm), (fields.direction, direction.T)):
+        if not np.isfinite(values).all():
+            raise InputError(f"{path}: {name} holds {_text(values)}, which is not finite; export it again")
+    if spacing_mm.min() <= 0:
+        raise InputError(f"{path}: {fields.spacing} gives voxels of {_times(spacing_mm)} mm; export it again")
+    lengths = np.linalg.norm(direction, axis=0)
+    if np.abs(lengths - 1.0).max() >= AXES_TOLERANCE:
+        raise InputError(
+            f"{path}: {fields.direction} holds axes of length {_times(lengths)}, which must be 1; export it again"
+        )
+    axes = direction / lengths
+    skew = float(np.abs(axes.T @ axes - np.eye(3)).max())
+    if skew >= AXES_TOLERANCE:
+        raise InputError(
+            f"{path}: {fields.direction}: its axes are not at right angles (off by {np.degrees(np.arcsin(skew)):.2g}°: "
+            "a sheared image or a gantry tilt); resample it to straight slices"
+        )
+    left, _, right = np.linalg.svd(axes)
+    straight = left @ right
+    # 0 - 0 and not -0: the axes of an upright volume stay the plain numbers that they are.
+    straight = axes if skew < 1e-12 else straight
+    error = max(skew, float(np.abs(lengths - 1.0).max()))
+    if error < _ROUNDING:
+        return Geometry(spacing_mm, origin_mm, straight, ())
+    last = np.array(size, dtype=float) - 1.0
+    origin = origin_mm + (direction - straight) @ (spacing_mm * last / 2.0)
+    corners = np.array(list(itertools.product(*((0.0, end) for end in last)))) * spacing_mm
+    moved = float(np.linalg.norm(origin_mm - origin + corners @ (direction - straight).T, axis=1).max())
+    note = (
+        f"{path.name}: the axes in {fields.direction} are off unit vectors at right angles by {error:.2g}; they were "
+        f"straightened, which moved voxels by up to {moved:.2g} mm"
+    )
+    return Geometry(spacing_mm, origin, straight, (note,))
+
+
+def geometry_of_steps(
+    steps_mm: Float[np.ndarray, "3 3"],
+    origin_mm: Float[np.ndarray, "3"],
+    size: tuple[int, int, int],
+    *,
+    path: Path,
+    fields: Fields,
+) -> Geometry:
+    """Return the geometry of an image whose header gives the steps from voxel to voxel, as `geometry` does.
+
+    Args:
+        steps_mm: columns are the steps along i, j and k, LPS mm.
+        origin_mm: centre of the first voxel, LPS mm.
+        size: number of voxels along i, j and k.
+        path: the file, for messages.
+        fields: what its format calls these, for messages.
+
+    Raises:
+        InputError: as `geometry`.
+    """
+    spacing = np.linalg.norm(steps_mm, axis=0)
+    with np.errstate(invalid="ignore"):
+        direction = np.where(spacing > 0, steps_mm / np.where(spacing > 0, spacing, 1.0), steps_mm)
+    return geometry(direction, spacing, origin_mm, size, path=path, fields=fields)
+
+
+def plane(
+    orientation: Sequence[float], spacing_mm: Sequence[float], *, path: Path
+) -> tuple[Float[np.ndarray, "3 2"], Float[np.ndarray, "3"]]:
+    """Return the directions in which i and j grow in a DICOM slice, as its header gives them, and their unit normal.
+
+    Args:
+        orientation: ImageOrientationPatient, six numbers.
+        spacing_mm: PixelSpacing: between rows, between columns, mm.
+        path: the file, for messages.
+
+    Raises:
+        InputError: they are no unit vectors at right angles, or pixels have no size.
+    """
+    axes = np.array(orientation, dtype=float).reshape(2, 3).T
+    normal = np.cross(axes[:, 0], axes[:, 1])
+    length = float(np.linalg.norm(normal))
+    normal = normal / length if length > 0.1 else np.array([0.0, 0.0, 1.0])
+    sizes, fields = np.array([*spacing_mm[::-1], 1.0]), Fields("ImageOrientationPatient", "PixelSpacing", "")
+    geometry(np.column_stack([axes, normal]), sizes, np.zeros(3), (1, 1, 1), path=path, fields=fields)
+    return axes, normal
+
+
+def converted(unit: str, sizes: Float[np.ndarray, "3"], *, path: Path, field: str) -> tuple[float, tuple[str, ...]]:
+    """Return the factor from a header's unit of length to mm, and the note that says so.
+
+    Args:
+        unit: as the header names it, in any case.
+        sizes: of the voxels in that unit.
+        path: the file, for messages.
+        field: of the header, for messages.
+
+    Raises:
+        InputError: the unit is unknown, or cannot be meant: voxels would be smaller than 1 µm or larger than 20 mm.
+    """
+    factor = MM_PER_UNIT.get(unit.strip().lower())
+    if factor is None:
+        raise InputError(f"{path}: {field} {unit!r} is no unit of length that is known; export it in mm")
+    if factor == 1.0:
+        return 1.0, ()
+    least, most = _CONVERTED_MM
+    lengths = np.abs(sizes) * factor
+    if not (lengths >= least).all() or not (lengths <= most).all():
+        raise InputError(
+            f"{path}: {field} says {unit}, but voxels would then have {_times(lengths)} mm; export it in mm"
+        )
+    return factor, (f"{path.name}: {field} says {unit}; lengths were converted to mm",)
+
+
+def _text(values: np.ndarray) -> str:
+    return " ".join(f"{value:g}" for value in np.ravel(values))
+
+
+def _times(lengths: np.ndarray) -> str:
+    return "×".join(f"{length:.3g}" for length in lengths)

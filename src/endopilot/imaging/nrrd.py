@@ -1,0 +1,253 @@
+"""NRRD files with their voxels attached (.nrrd) or beside them (.nhdr), and 3D Slicer's segmentations (.seg.nrrd).
+
+The format: https://teem.sourceforge.net/nrrd/format.html. A segmentation of Slicer is one label image, or several in
+layers where segments overlap; its header names each segment's layer and value.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from io import BufferedIOBase
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Shaped
+
+from endopilot.errors import InputError
+from endopilot.imaging.geometry import Fields, Geometry, converted, geometry_of_steps
+from endopilot.imaging.segments import Segment
+from endopilot.imaging.voxels import Encoding, read_detached_voxels, read_voxels
+from endopilot.types import Volume
+
+_LONGEST_HEADER = 1 << 20
+_TO_LPS = {"right": -1.0, "left": 1.0, "anterior": -1.0, "posterior": 1.0, "superior": 1.0, "inferior": -1.0}
+_LETTERS = {word[0]: word for word in _TO_LPS}
+_WORLD_AXES = (("right", "left"), ("anterior", "posterior"), ("inferior", "superior"))
+
+_TYPES = {
+    **dict.fromkeys(("signed char", "int8", "int8_t"), "i1"),
+    **dict.fromkeys(("uchar", "unsigned char", "uint8", "uint8_t"), "u1"),
+    **dict.fromkeys(("short", "short int", "signed short", "signed short int", "int16", "int16_t"), "i2"),
+    **dict.fromkeys(("ushort", "unsigned short", "unsigned short int", "uint16", "uint16_t"), "u2"),
+    **dict.fromkeys(("int", "signed int", "int32", "int32_t"), "i4"),
+    **dict.fromkeys(("uint", "unsigned int", "uint32", "uint32_t"), "u4"),
+    **dict.fromkeys(
+        ("longlong", "long long", "long long int", "signed long long", "signed long long int", "int64", "int64_t"),
+        "i8",
+    ),
+    **dict.fromkeys(("ulonglong", "unsigned long long", "unsigned long long int", "uint64", "uint64_t"), "u8"),
+    "float": "f4",
+    "double": "f8",
+}
+_PACKINGS = {
+    **dict.fromkeys(("raw",), "raw"),
+    **dict.fromkeys(("gzip", "gz"), "gzip"),
+    **dict.fromkeys(("bzip2", "bz2"), "bzip2"),
+    **dict.fromkeys(("txt", "text", "ascii"), "ascii"),
+}
+_SYNONYMS = {"datafile": "data file", "lineskip": "line skip", "byteskip": "byte skip"}
+_FIELDS = Fields("space directions", "space directions", "space origin")
+
+
+@dataclass(frozen=True, eq=False)
+class NrrdImage:
+    """What an NRRD file holds.
+
+    Attributes:
+        volume: the voxels, of the first layer where there are several.
+        layers: all voxels, layer first: one for a plain volume.
+        segments: of a segmentation, where the header names them.
+    """
+
+    volume: Volume
+    layers: Shaped[np.ndarray, "layers nz ny nx"]
+    segments: tuple[Segment, ...]
+
+
+def plain(volume: Volume) -> NrrdImage:
+    """Return a volume as a file of one layer whose segments have no names."""
+    return NrrdImage(volume, volume.voxels[None], ())
+
+
+def read_nrrd(path: Path) -> NrrdImage:
+    """Read an NRRD file.
+
+    Raises:
+        InputError: the file is damaged, holds no grey levels or labels, or does not say where they are.
+    """
+    with path.open("rb") as stream:
+        fields, keys = _header(stream, path)
+        sizes, domain = _axes(fields, path)
+        place = _geometry(fields, domain, tuple(sizes[axis] for axis in domain), path)
+        segments = _segments(keys, path)
+        extra = [axis for axis in range(len(sizes)) if axis not in domain]
+        count = int(np.prod([sizes[axis] for axis in extra], dtype=float))
+        if count > 1 and not segments:
+            shape = "×".join(map(str, sizes))
+            if len(extra) > 1 or _kinds(fields, extra)[:1] in (["list"], ["time"]):
+                raise InputError(f"{path}: {len(sizes)}-D ({shape}); give one 3-D volume, such as one cardiac phase")
+            raise InputError(f"{path}: {count} values in every voxel (colour or vectors); give a grey-level volume")
+        values, files = _values(fields, sizes, stream, path)
+    # The first axis of the file is the fastest, and so the last of the array.
+    order = [len(sizes) - 1 - axis for axis in (*extra, *reversed(domain))]
+    layers = values.transpose(order).reshape(count, *(sizes[axis] for axis in reversed(domain)))
+    volume = Volume(layers[0], place.spacing_mm, place.origin_mm, place.direction, place.notes, files)
+    return NrrdImage(volume, layers, segments)
+
+
+def _header(stream: BufferedIOBase, path: Path) -> tuple[dict[str, str], dict[str, str]]:
+    """Return fields and keys of a header, and leave the stream at the byte after its empty line."""
+    if not re.fullmatch(rb"NRRD000[1-5]\r?\n", stream.readline(12)):
+        raise InputError(f"{path}: its content does not match its suffix, or its header is damaged; export it again")
+    fields: dict[str, str] = {}
+    keys: dict[str, str] = {}
+    while line := stream.readline(_LONGEST_HEADER):
+        text = line.decode("utf-8", errors="replace").rstrip("\r\n")
+        if not text:
+            return fields, keys
+        if text.startswith("#"):
+            continue
+        key, sign, value = text.partition(":=")
+        field, colon, description = text.partition(": ")
+        if sign and len(key) < len(field):
+            keys[key] = value
+            continue
+        name = field.strip().lower()
+        name = _SYNONYMS.get(name, name)
+        if not colon or not name or name in fields:
+            raise InputError(f"{path}: its header is damaged ({text[:60]!r} is no field of its own); export it again")
+        fields[name] = description.strip()
+        if name == "data file" and fields[name].split()[:1] == ["LIST"]:
+            rest = stream.read(_LONGEST_HEADER).decode("utf-8", errors="replace").split("\n")
+            fields[name] += "\n" + "\n".join(part.strip() for part in rest if part.strip())
+            return fields, keys
+    if "data file" not in fields:
+        raise InputError(f"{path}: truncated or damaged (its header does not end); copy or export it again")
+    return fields, keys
+
+
+def _axes(fields: dict[str, str], path: Path) -> tuple[list[int], list[int]]:
+    """Return the size of every axis, and which three of them run through space."""
+    try:
+        sizes = [int(word) for word in fields.get("sizes", "").split()]
+        dimension = int(fields.get("dimension", ""))
+    except ValueError:
+        sizes, dimension = [], 0
+    if not sizes or dimension != len(sizes) or min(sizes) < 1:
+        raise InputError(f"{path}: its dimension and sizes describe no image; export it again")
+    if "space" not in fields:
+        raise InputError(f"{path}: has no orientation (no space in its header); export it with its space directions")
+    vectors = _vectors(fields, len(sizes), path)
+    domain = [axis for axis, vector in enumerate(vectors) if vector is not None]
+    if len(domain) != 3:
+        shape = "×".join(map(str, sizes))
+        raise InputError(f"{path}: {shape} voxels with {len(domain)} axes in space are no volume; give a 3-D volume")
+    return sizes, domain
+
+
+def _vectors(fields: dict[str, str], count: int, path: Path) -> list[list[float] | None]:
+    """Return the step along each axis of the file, None for one that does not run through space."""
+    text = fields.get("space directions", "")
+    words = re.findall(r"none|\([^()]*\)", text)
+    vectors = [None if word == "none" else _vector(word, "space directions", path) for word in words]
+    if len(words) != count or re.sub(r"none|\([^()]*\)", "", text).strip():
+        raise InputError(f"{path}: space directions {text[:80]!r} are not one vector an axis; export it again")
+    return vectors
+
+
+def _vector(text: str, field: str, path: Path) -> list[float]:
+    try:
+        numbers = [float(word) for word in text.strip().removeprefix("(").removesuffix(")").split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != 3:
+        raise InputError(f"{path}: {field} {text[:80]!r} is no vector of three numbers; export it again")
+    return numbers
+
+
+def _kinds(fields: dict[str, str], axes: list[int]) -> list[str]:
+    kinds = fields.get("kinds", "").split()
+    return [kinds[axis].lower() for axis in axes if axis < len(kinds)]
+
+
+def _geometry(fields: dict[str, str], domain: list[int], size: tuple[int, ...], path: Path) -> Geometry:
+    to_lps = _to_lps(fields["space"], path)
+    if "space origin" not in fields:
+        raise InputError(f"{path}: has no place (no space origin in its header); export it with its space origin")
+    origin = np.array(_vector(fields["space origin"], "space origin", path))
+    vectors = _vectors(fields, len(fields["sizes"].split()), path)
+    steps = np.array([vectors[axis] for axis in domain], dtype=float).T
+    units = set(re.findall(r'"([^"]*)"', fields.get("space units", ""))) - {""} or {"mm"}
+    if len(units) > 1 or ("space units" in fields and '"' not in fields["space units"]):
+        raise InputError(f"{path}: space units {fields['space units'][:60]!r} are not one unit; export it in mm")
+    lengths = np.linalg.norm(steps, axis=0)
+    factor, notes = converted(units.pop(), lengths, path=path, field="space units")
+    spacings = fields.get("spacings", "").split()
+    given = [word for axis, word in enumerate(spacings) if axis in domain and word.lower() != "nan"]
+    if given and not _same(given, lengths):
+        raise InputError(f"{path}: spacings {' '.join(given)} contradict space directions; export it again")
+    steps, origin = to_lps[:, None] * steps * factor, to_lps * origin * factor
+    place = geometry_of_steps(steps, origin, (size[0], size[1], size[2]), path=path, fields=_FIELDS)
+    return Geometry(place.spacing_mm, place.origin_mm, place.direction, (*notes, *place.notes))
+
+
+def _same(words: list[str], lengths: np.ndarray) -> bool:
+    try:
+        return len(words) == 3 and bool(np.allclose([float(word) for word in words], lengths, rtol=1e-2))
+    except ValueError:
+        return False
+
+
+def _to_lps(space: str, path: Path) -> np.ndarray:
+    """Return the signs that take the file's world axes to LPS."""
+    words = space.strip().lower().split("-")
+    if len(words) == 1 and len(words[0]) == 3:
+        words = [_LETTERS.get(letter, "") for letter in words[0]]
+    if len(words) != 3 or any(word not in pair for word, pair in zip(words, _WORLD_AXES, strict=True)):
+        raise InputError(
+            f"{path}: space {space[:40]!r} does not say where the patient's left, back and head are; export it in "
+            "left-posterior-superior"
+        )
+    return np.array([_TO_LPS[word] for word in words])
+
+
+def _values(
+    fields: dict[str, str], sizes: list[int], stream: BufferedIOBase, path: Path
+) -> tuple[Shaped[np.ndarray, "..."], tuple[Path, ...]]:
+    """Return the voxels, the slowest axis first, and the files that they are from."""
+    kind, packing = fields.get("type", "").lower(), _PACKINGS.get(fields.get("encoding", "").lower())
+    if kind not in _TYPES:
+        raise InputError(f"{path}: type {kind!r} holds no grey levels; export it as short or float")
+    if packing is None:
+        raise InputError(f"{path}: encoding {fields.get('encoding', '')!r} is not read; export it as raw or gzip")
+    endian = fields.get("endian", "").lower()
+    if endian not in ("little", "big") and _TYPES[kind][1] != "1" and packing != "ascii":
+        raise InputError(f"{path}: endian {endian!r} is neither little nor big; export it again")
+    dtype = np.dtype((">" if endian == "big" else "<") + _TYPES[kind])
+    encoding = Encoding(dtype, packing, _skip(fields, "line skip", 0, path), _skip(fields, "byte skip", -1, path))
+    if "data file" in fields:
+        values, files = read_detached_voxels(fields["data file"], encoding, sizes[::-1], header=path)
+        return values, (path, *files)
+    return read_voxels(stream, encoding, sizes[::-1], path=path), (path,)
+
+
+def _skip(fields: dict[str, str], name: str, least: int, path: Path) -> int:
+    text = fields.get(name, "0")
+    if not re.fullmatch(r"-?\d{1,12}", text) or int(text) < least:
+        raise InputError(f"{path}: {name} {text[:20]!r} is no number of {name.split()[0]}s; export it again")
+    return int(text)
+
+
+def _segments(keys: dict[str, str], path: Path) -> tuple[Segment, ...]:
+    """Return the segments that 3D Slicer names in a header; before layers, each had a layer of its own."""
+    numbers = sorted({int(found[1]) for key in keys if (found := re.match(r"Segment(\d{1,6})_(?:ID|Name)$", key))})
+    segments = []
+    for place, number in enumerate(numbers):
+        value, layer = (keys.get(f"Segment{number}_{part}", "") for part in ("LabelValue", "Layer"))
+        if not re.fullmatch(r"\d{0,9}", value) or not re.fullmatch(r"\d{0,9}", layer):
+            raise InputError(f"{path}: Segment{number} has no whole numbers as LabelValue and Layer; export it again")
+        name = keys.get(f"Segment{number}_Name") or keys.get(f"Segment{number}_ID", "")
+        plain = not value and not layer
+        segments.append(Segment(name, place if plain else int(layer or 0), int(value or 1)))
+    return tuple(segments)

@@ -1,0 +1,203 @@
+"""The voxels of image files: from bytes, packed or plain, to an array of HU or labels.
+
+Files are read here, and not by a library that looks for files of other names beside the one given. A file holds the
+voxels that its header describes, and not one byte less or more: otherwise its header or its voxels are damaged.
+"""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import math
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from io import BufferedIOBase
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+from jaxtyping import Shaped
+
+from endopilot.errors import InputError
+
+_MOST_INFLATED = {"raw": 1, "gzip": 1100, "gzip, opened": 1100, "zlib": 1100, "bzip2": 50_000}
+"""How many bytes a packed one stands for at most; a header that asks for more is wrong, and nothing is allocated."""
+_MOST_FILES = 100_000
+_GZIP = b"\x1f\x8b"
+
+
+def opened(path: Path) -> BufferedIOBase:
+    """Open a file that may be packed by gzip, whatever its name says.
+
+    Raises:
+        InputError: it may not be read.
+    """
+    try:
+        with path.open("rb") as stream:
+            packed = stream.read(2) == _GZIP
+        return gzip.open(path, "rb") if packed else path.open("rb")
+    except OSError as error:
+        unreadable(path, error)
+
+
+def unreadable(path: Path, error: OSError) -> NoReturn:
+    """Say why the system does not read a file.
+
+    Raises:
+        InputError: always.
+    """
+    raise InputError(f"{path}: cannot be read ({error.strerror or 'damaged'}); check the path") from error
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """How a file stores voxels.
+
+    Attributes:
+        dtype: type of a value, its byte order included.
+        packing: raw, gzip, zlib, bzip2, or ascii: numbers with blanks between them.
+        skipped_lines: before the voxels, to be left out.
+        skipped_bytes: then, once unpacked, to be left out; −1 if raw voxels are the last bytes of the file.
+    """
+
+    dtype: np.dtype
+    packing: str = "raw"
+    skipped_lines: int = 0
+    skipped_bytes: int = 0
+
+
+def read_voxels(
+    stream: BufferedIOBase, encoding: Encoding, shape: Sequence[int], *, path: Path
+) -> Shaped[np.ndarray, "..."]:
+    """Return the array that a stream holds from here to its end.
+
+    Args:
+        stream: where the voxels begin, or what is to be left out before them.
+        encoding: how they are stored.
+        shape: of the array; the last axis is the fastest.
+        path: the file, for messages.
+
+    Raises:
+        InputError: there are fewer or more bytes than the shape needs, or they are damaged.
+    """
+    dtype, count = encoding.dtype, math.prod(int(extent) for extent in shape)
+    try:
+        for _ in range(encoding.skipped_lines):
+            stream.readline()
+        if encoding.packing == "ascii":
+            stream.read(encoding.skipped_bytes)
+            return _numbers(stream.read(), dtype, count, path).reshape(tuple(shape))
+        content = _unpacked(stream, count * dtype.itemsize, encoding, path)
+    except (EOFError, OSError, ValueError, OverflowError, MemoryError, zlib.error):
+        raise InputError(f"{path}: truncated or damaged (its voxels); copy or export it again") from None
+    values = np.frombuffer(content, dtype=dtype).reshape(tuple(shape))
+    return values if dtype.isnative else values.astype(dtype.newbyteorder("="))
+
+
+def read_detached_voxels(
+    spec: str, encoding: Encoding, shape: Sequence[int], *, header: Path
+) -> tuple[Shaped[np.ndarray, "..."], tuple[Path, ...]]:
+    """Return the array in files beside a header, and these files.
+
+    Args:
+        spec: what NRRD and MetaImage write: a name; a pattern such as `slice%03d.raw 1 300 1`; or LIST and names, one
+            a line. Names are relative to the header; of several files each holds the same share of the array.
+        encoding: how each file stores its voxels.
+        shape: of the array; the last axis is the fastest.
+        header: the file that names them.
+
+    Raises:
+        InputError: a file is missing or damaged, or the number of files is wrong.
+    """
+    files = _detached_files(spec, header)
+    count = math.prod(int(extent) for extent in shape)
+    if not files or count % len(files):
+        shown = "×".join(map(str, shape[::-1]))
+        raise InputError(f"{header}: names {len(files)} files for {shown} voxels; export it again")
+    missing = next((file for file in files if not file.is_file()), None)
+    if missing is not None:
+        raise InputError(f"{header}: the file of voxels that it names is missing ({missing.name}); put it beside it")
+    parts = []
+    for file in files:
+        with file.open("rb") as stream:
+            parts.append(read_voxels(stream, encoding, (count // len(files),), path=file))
+    return (parts[0] if len(parts) == 1 else np.concatenate(parts)).reshape(tuple(shape)), files
+
+
+def _detached_files(spec: str, header: Path) -> tuple[Path, ...]:
+    first, *others = spec.split("\n")
+    words = first.split()
+    if words[:1] == ["LIST"]:
+        return tuple(header.parent / name for name in others)
+    if "%" not in first:
+        return (header.parent / first,)
+    try:
+        low, high, step = (int(word) for word in words[1:4])
+        return tuple(header.parent / (words[0] % number) for number in range(low, high + 1, step)[:_MOST_FILES])
+    except (TypeError, ValueError):
+        raise InputError(f"{header}: {first[:60]!r} names no files of voxels; export it as one file") from None
+
+
+def _unpacked(stream: BufferedIOBase, size: int, encoding: Encoding, path: Path) -> bytearray:
+    """Return `size` bytes, after making sure that they are all."""
+    packing = encoding.packing
+    if packing == "raw" and isinstance(stream, gzip.GzipFile):
+        packing = "gzip, opened"
+    if size > path.stat().st_size * _MOST_INFLATED[packing]:
+        raise InputError(f"{path}: truncated or damaged (its voxels are incomplete); copy or export it again")
+    if packing == "zlib":
+        unpacker = zlib.decompressobj()
+        content = bytearray(unpacker.decompress(stream.read(), size + 1))
+        found, whole = len(content), unpacker.eof
+    else:
+        source: Any = {"gzip": lambda: gzip.GzipFile(fileobj=stream), "bzip2": lambda: bz2.BZ2File(stream)}.get(
+            packing, lambda: stream
+        )()
+        if encoding.skipped_bytes < 0:
+            source.seek(max(path.stat().st_size - size, 0))
+        else:
+            source.read(encoding.skipped_bytes)
+        content = bytearray(size)
+        view, found = memoryview(content), 0
+        while found < size and (count := source.readinto(view[found:])):
+            found += count
+        whole = not source.read(1)  # gzip compares its checksum at the end
+    if found < size:
+        raise InputError(f"{path}: truncated or damaged (its voxels are incomplete); copy or export it again")
+    if found > size or not whole:
+        raise InputError(
+            f"{path}: holds more than the {size} bytes of voxels that its header describes; export it again"
+        )
+    return content
+
+
+def _numbers(content: bytes, dtype: np.dtype, count: int, path: Path) -> np.ndarray:
+    values = np.array(content.split(), dtype=float)
+    if len(values) != count:
+        raise InputError(f"{path}: holds {len(values)} numbers, and its header describes {count}; export it again")
+    limits = np.iinfo(dtype) if dtype.kind in "iu" else None
+    if limits is not None and count and not (limits.min <= values.min() and values.max() <= limits.max):
+        raise InputError(f"{path}: holds numbers that are no {dtype.name}; export it again")
+    return values.astype(dtype)
+
+
+def rescaled(values: Shaped[np.ndarray, "..."], slope: float, intercept: float) -> Shaped[np.ndarray, "..."]:
+    """Return slope × values + intercept: whole numbers stay whole where both factors are."""
+    if slope == 1.0 and intercept == 0.0:
+        return values
+    whole = values.dtype.kind in "iu" and values.dtype.itemsize <= 2
+    if whole and slope.is_integer() and intercept.is_integer() and max(abs(slope), abs(intercept)) < 2**14:
+        return values.astype(np.int32) * np.int32(slope) + np.int32(intercept)
+    kind = np.float32 if values.dtype.itemsize <= 2 or values.dtype == np.float32 else np.float64
+    return values.astype(kind) * kind(slope) + kind(intercept)
+
+
+def compact(values: Shaped[np.ndarray, "nz ny nx"]) -> Shaped[np.ndarray, "nz ny nx"]:
+    """Return whole numbers that fit as int16, all others as float32."""
+    if values.dtype == np.int16:
+        return values
+    limits = np.iinfo(np.int16)
+    whole = values.dtype.kind in "iu" and values.min() >= limits.min and values.max() <= limits.max
+    with np.errstate(over="ignore"):  # float64 beyond float32 becomes infinite, and is refused as such
+        return values.astype(np.int16 if whole else np.float32)

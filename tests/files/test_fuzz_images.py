@@ -1,0 +1,157 @@
+"""Damaged image files: read right, read with a note, or refused in one line, and never a word on standard error."""
+
+from __future__ import annotations
+
+import gzip
+import warnings
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pydicom
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from make_images import CORNERS, RAMP, SPACING, TURN, dicom, metaimage, nifti, nrrd, places
+
+from endopilot.errors import InputError
+from endopilot.imaging.volume import read_mask, read_volume
+from endopilot.types import Volume
+
+_SETTINGS = settings(
+    max_examples=60,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+_BYTES = st.one_of(st.sampled_from([0x00, 0xFF, 0x7F, 0x80, 0x20, 0x0A]), st.integers(0, 255))
+_FLIPS = st.lists(st.tuples(st.integers(0, 1 << 16), _BYTES), min_size=1, max_size=4)
+_NUMBERS = st.sampled_from(["nan", "-inf", "1e300", "-1", "0", "1e-300", "999999999999999999999", "x", "", "1 2 3 4 5"])
+
+
+def _outcome(read: Callable[[], Volume], capfd: pytest.CaptureFixture[str]) -> Volume | None:
+    """Return what a reader returns, None where it refuses in one line; it says nothing on standard error."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        try:
+            volume = read()
+        except InputError as error:
+            assert "\n" not in str(error) and len(str(error)) < 1000
+            volume = None
+    captured = capfd.readouterr()
+    assert captured.err == captured.out == ""
+    if volume is not None:
+        assert np.isfinite(volume.spacing_mm).all() and volume.spacing_mm.min() > 0
+        assert np.isfinite(volume.origin_mm).all()
+        np.testing.assert_allclose(volume.direction.T @ volume.direction, np.eye(3), atol=1e-4)
+        assert np.isfinite(volume.voxels).all()
+    return volume
+
+
+def _flipped(content: bytes, flips: list[tuple[int, int]], within: int) -> bytes:
+    damaged = bytearray(content)
+    for place, value in flips:
+        damaged[place % within] = value
+    return bytes(damaged)
+
+
+_FILES: dict[str, tuple[Callable[[Path], Path], int]] = {
+    "ct.nii": (nifti, 352),
+    "ct.nrrd": (lambda path: nrrd(path, space_units='"mm" "mm" "mm"'), 300),
+    "ct.mha": (metaimage, 350),
+}
+
+
+@pytest.mark.parametrize("name", _FILES)
+@_SETTINGS
+@given(flips=_FLIPS, cut=st.one_of(st.none(), st.integers(0, 600)))
+def test_bytes_of_a_header(tmp_path, capfd, name, flips, cut):
+    make, header = _FILES[name]
+    path = make(tmp_path / name)
+    content = path.read_bytes()
+    path.write_bytes(_flipped(content, flips, min(header, len(content)))[: None if cut is None else cut])
+    _outcome(lambda: read_volume(path), capfd)
+    _outcome(lambda: read_mask(path).volume, capfd)
+
+
+@pytest.mark.parametrize("packing", ["nii.gz", "nrrd", "mha"])
+@_SETTINGS
+@given(flips=_FLIPS)
+def test_bytes_of_packed_voxels(tmp_path, capfd, packing, flips):
+    """A checksum shows every damage but one that changes nothing."""
+    path = tmp_path / f"ct.{packing}"
+    if packing == "nii.gz":
+        content = nifti(path).read_bytes()
+    elif packing == "nrrd":
+        content = nrrd(path, encoding="gzip").read_bytes().replace(RAMP.tobytes(), gzip.compress(RAMP.tobytes()))
+    else:
+        content = metaimage(path, CompressedData=True, data=zlib.compress(RAMP.tobytes())).read_bytes()
+    # The ten bytes of gzip's own header are left alone: its time stamp means nothing.
+    begin = {"nii.gz": 10, "nrrd": content.find(b"\n\n") + 12, "mha": content.find(b"LOCAL\n") + 6}[packing]
+    path.write_bytes(content[:begin] + _flipped(content[begin:], flips, len(content) - begin))
+    volume = _outcome(lambda: read_volume(path), capfd)
+    if volume is not None:
+        np.testing.assert_array_equal(volume.voxels, RAMP)
+        np.testing.assert_allclose(volume.index_to_world(CORNERS), places(TURN), atol=1e-5)
+
+
+@_SETTINGS
+@given(
+    name=st.sampled_from(["space", "space_directions", "space_origin", "sizes", "dimension", "space_units", "kinds"]),
+    value=st.one_of(_NUMBERS, st.text(max_size=20).filter(lambda text: "\n" not in text and "\r" not in text)),
+)
+def test_fields_of_an_nrrd(tmp_path, capfd, name, value):
+    _outcome(lambda: read_volume(nrrd(tmp_path / "ct.nrrd", **{name: value})), capfd)
+    keys = {"Segment0_ID": "a", "Segment0_Layer": value, "Segment1_Name": value, "Segment1_LabelValue": value}
+    voxels = np.stack([RAMP > 0, RAMP > 9]).astype(np.uint8)
+    _outcome(lambda: read_mask(nrrd(tmp_path / "seg.nrrd", voxels=voxels, keys=keys), label=1).volume, capfd)
+
+
+@_SETTINGS
+@given(
+    name=st.sampled_from(["NDims", "DimSize", "TransformMatrix", "Offset", "ElementSpacing", "ElementSize"]),
+    other=st.sampled_from(["HeaderSize", "ElementDataFile", "AnatomicalOrientation", "ElementType", "DistanceUnits"]),
+    value=st.one_of(_NUMBERS, st.text(max_size=20).filter(lambda text: "\n" not in text and "\r" not in text)),
+)
+def test_fields_of_a_metaimage(tmp_path, capfd, name, other, value):
+    for field in (name, other):
+        _outcome(lambda field=field: read_volume(metaimage(tmp_path / "ct.mha", **{field: value})), capfd)
+
+
+@pytest.fixture(scope="module")
+def series(tmp_path_factory) -> Path:
+    return dicom(tmp_path_factory.mktemp("dicom") / "ct")
+
+
+def _slices(series: Path) -> list[bytes]:
+    return [file.read_bytes() for file in sorted(series.glob("*.dcm"))]
+
+
+@settings(_SETTINGS, max_examples=30)
+@given(flips=_FLIPS, number=st.integers(0, 5))
+def test_bytes_of_a_dicom_header(tmp_path, capfd, series, flips, number):
+    for k, content in enumerate(_slices(series)):
+        (tmp_path / f"{k}.dcm").write_bytes(_flipped(content, flips, len(content) - 40) if k == number else content)
+    _outcome(lambda: read_volume(tmp_path), capfd)
+
+
+@settings(_SETTINGS, max_examples=30)
+@given(
+    name=st.sampled_from(
+        ["PixelSpacing", "ImagePositionPatient", "ImageOrientationPatient", "RescaleSlope", "RescaleIntercept"]
+    ),
+    numbers=st.lists(st.sampled_from(["nan", "inf", "-1", "0", "1e30", "1e-30", "1"]), min_size=1, max_size=6),
+)
+def test_fields_of_a_dicom_series(tmp_path, capfd, series, name, numbers):
+    for k, content in enumerate(_slices(series)):
+        (tmp_path / f"{k}.dcm").write_bytes(content)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for k in (0, 3):
+            slice_ = pydicom.dcmread(tmp_path / f"{k}.dcm")
+            slice_.add(pydicom.DataElement(name, "DS", numbers))
+            slice_.save_as(tmp_path / f"{k}.dcm")
+    capfd.readouterr()
+    volume = _outcome(lambda: read_volume(tmp_path), capfd)
+    assert volume is None or np.allclose(volume.spacing_mm, SPACING, rtol=0.1) or name == "PixelSpacing"

@@ -1,0 +1,261 @@
+"""Fields of image headers that other programs ignore or guess at: read right, read with a note, or refused by name."""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import zlib
+
+import numpy as np
+import pytest
+from make_images import CORNERS, ORIGIN, RAMP, SPACING, TURN, metaimage, nifti, nrrd, places, quaternion, skewed
+
+from endopilot.errors import InputError
+from endopilot.imaging.volume import read_mask, read_volume
+
+_MIRROR = TURN * [1.0, 1.0, -1.0]
+
+
+def _read(path, note: str = ""):
+    """Return a volume, after making sure that it holds the ramp and that its notes are the one expected."""
+    volume = read_volume(path)
+    np.testing.assert_array_equal(volume.voxels, RAMP)
+    assert len(volume.notes) == bool(note) and all(note in text for text in volume.notes), volume.notes
+    return volume
+
+
+def _refused(path, reason: str) -> None:
+    with pytest.raises(InputError, match=rf"{path.name}: .*{reason}") as caught:
+        read_volume(path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("suffix", [".nii", ".nii.gz"])
+def test_a_nifti_of_either_byte_order(tmp_path, order, suffix):
+    _read(nifti(tmp_path / f"ct{suffix}", order=order))
+
+
+def test_a_packed_file_is_read_whatever_its_suffix(tmp_path):
+    nifti(tmp_path / "a.nii.gz").rename(tmp_path / "packed.nii")
+    nifti(tmp_path / "b.nii").rename(tmp_path / "plain.nii.gz")
+    _read(tmp_path / "packed.nii"), _read(tmp_path / "plain.nii.gz")
+
+
+@pytest.mark.parametrize(
+    ("fields", "reason"),
+    [
+        ({"magic": (b"ni1\0",)}, "magic .*file of their own"),
+        ({"magic": (b"\0\0\0\0",)}, "magic .*not that of NIfTI"),
+        ({"vox_offset": (0,)}, "vox_offset 0"),
+        ({"vox_offset": (351,)}, "vox_offset 351"),
+        ({"vox_offset": (np.nan,)}, "vox_offset"),
+        ({"vox_offset": (360,)}, "incomplete"),
+        ({"dim": (0, 4, 5, 6, 1, 1, 1, 1)}, "dim 0 4 5 6"),
+        ({"dim": (3, -4, 5, 6, 1, 1, 1, 1)}, "dim 3 -4 5 6"),
+        ({"dim": (3, 4, 5, 4, 1, 1, 1, 1)}, "more than the 160 bytes"),
+        ({"dim": (3, 32767, 32767, 32767, 1, 1, 1, 1)}, "incomplete"),
+        ({"datatype": (4,), "bitpix": (32,)}, "bitpix 32 contradict"),
+        ({"datatype": (32,), "bitpix": (64,)}, "datatype 32"),
+        ({"datatype": (128,), "bitpix": (24,)}, "colour"),
+        ({"intent_code": (1007,)}, "intent_code 1007"),
+        ({"xyzt_units": (5,)}, "xyzt_units 5"),
+        ({"scl": (np.nan, 0)}, "scl_slope nan"),
+        ({"scl": (1, np.inf)}, "scl_inter inf"),
+        ({"pixdim": (1, 4, 5, 12.5, 1, 1, 1, 1)}, "pixdim 4×5×12.5"),
+        ({"sform_code": (0,), "qform_code": (1,), "quatern": (2, 0, 0, 0, 0, 0)}, "quatern_b"),
+        ({"sform_code": (0,), "qform_code": (1,), "pixdim": (1, -0.4, 0.5, 1.25, 1, 1, 1, 1)}, "pixdim .*-0.4"),
+        ({"sform_code": (0,)}, "no orientation"),
+    ],
+)
+def test_a_nifti_header_that_cannot_be_meant_is_refused(tmp_path, fields, reason):
+    _refused(nifti(tmp_path / "ct.nii", **fields), reason)
+
+
+def test_a_negative_pixdim_beside_an_sform_is_noted(tmp_path):
+    volume = _read(nifti(tmp_path / "ct.nii", pixdim=(1, -0.4, 0.5, 1.25, 1, 1, 1, 1)), "pixdim is negative")
+    np.testing.assert_allclose(volume.index_to_world(CORNERS), places(TURN), atol=1e-5)
+
+
+@pytest.mark.parametrize("axes", [TURN, _MIRROR], ids=["right-handed", "left-handed"])
+def test_a_qform_alone(tmp_path, axes):
+    factor = -1 if axes is _MIRROR else 1
+    fields = {"sform_code": (0,), "qform_code": (1,), "pixdim": (factor, *SPACING, 1, 1, 1, 1)}
+    volume = _read(nifti(tmp_path / "ct.nii", quatern=quaternion(axes * [1, 1, factor]), **fields))
+    np.testing.assert_allclose(volume.index_to_world(CORNERS), places(axes), atol=1e-5)
+
+
+def test_sform_and_qform_that_contradict_each_other(tmp_path):
+    """The one in the scanner's coordinates (code 1) is taken and said; two of them, or none, are refused."""
+    upright = quaternion(np.eye(3))
+    _read(nifti(tmp_path / "agree.nii", qform_code=(1,), sform_code=(2,), quatern=quaternion(TURN)))
+    for qform, sform, expected in ((2, 1, TURN), (1, 2, np.eye(3)), (1, 4, np.eye(3))):
+        path = nifti(tmp_path / f"{qform}{sform}.nii", qform_code=(qform,), sform_code=(sform,), quatern=upright)
+        volume = _read(path, "sform and qform place voxels up to")
+        np.testing.assert_allclose(volume.index_to_world(CORNERS), places(expected), atol=1e-5)
+    for code in (1, 2):
+        path = nifti(tmp_path / f"{code}.nii", qform_code=(code,), sform_code=(code,), quatern=upright)
+        _refused(path, f"qform_code {code} and sform_code {code} do not tell")
+    atlas = nifti(tmp_path / "atlas.nii", axes=skewed(0.2), qform_code=(1,), sform_code=(4,), quatern=upright)
+    _read(atlas, "sform is no rigid placement")
+
+
+@pytest.mark.parametrize(("unit", "factor", "name"), [(1, 1e-3, "m"), (3, 1e3, "µm")])
+def test_a_nifti_in_another_unit_is_converted_and_it_is_said(tmp_path, unit, factor, name):
+    fields = {"pixdim": (1, *(SPACING * factor), 1, 1, 1, 1), "xyzt_units": (unit,)}
+    rows = (np.c_[TURN * SPACING, ORIGIN] * np.array([-1, -1, 1])[:, None] * factor).ravel()
+    volume = _read(nifti(tmp_path / "ct.nii", srow=tuple(rows), **fields), f"says {name}; lengths were converted")
+    np.testing.assert_allclose(volume.index_to_world(CORNERS), places(TURN), atol=1e-4)
+    _refused(nifti(tmp_path / "meant-mm.nii", xyzt_units=(unit,)), f"xyzt_units {unit} says {name}, but voxels")
+
+
+@pytest.mark.parametrize(("slope", "intercept"), [(2, -1024), (-1, 3), (0.5, 0), (0, 7)])
+def test_the_rescale_of_a_nifti(tmp_path, slope, intercept):
+    volume = read_volume(nifti(tmp_path / "ct.nii", scl=(slope, intercept)))
+    np.testing.assert_allclose(volume.voxels, RAMP * float(slope) + intercept if slope else RAMP)  # 0: no rescale
+    assert volume.voxels.dtype == (np.float32 if slope == 0.5 else np.int16)
+
+
+@pytest.mark.parametrize(
+    ("space", "signs"),
+    [
+        ("RAS", (-1, -1, 1)),
+        ("LAS", (1, -1, 1)),
+        ("LPS", (1, 1, 1)),
+        ("RPI", (-1, 1, -1)),
+        ("left-anterior-superior", (1, -1, 1)),
+        ("Right-Anterior-Superior", (-1, -1, 1)),
+    ],
+)
+def test_the_space_of_an_nrrd(tmp_path, space, signs):
+    volume = _read(nrrd(tmp_path / "ct.nrrd", space=space))
+    np.testing.assert_allclose(volume.index_to_world(CORNERS), places(TURN) * signs, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("fields", "reason"),
+    [
+        ({"space": None}, "no orientation"),
+        ({"space": "scanner-xyz"}, "space 'scanner-xyz'"),
+        ({"space": "3D-right-handed"}, "space '3D-right-handed'"),
+        ({"space": "PLS"}, "space 'PLS'"),
+        ({"space_origin": None}, "no space origin"),
+        ({"space_origin": "(1,2)"}, "space origin"),
+        ({"space_directions": "(1,0,0) (0,1,0)"}, "space directions"),
+        ({"space_directions": "(1,0,0) (0,1,0) none"}, "2 axes in space"),
+        ({"space_units": '"mm" "mm" "cm"'}, "space units .*not one unit"),
+        ({"space_units": '"parsec" "parsec" "parsec"'}, "space units 'parsec'"),
+        ({"space_units": '"m" "m" "m"'}, "says m, but voxels"),
+        ({"spacings": "1 1 1"}, "spacings 1 1 1 contradict"),
+        ({"sizes": "4 5"}, "dimension and sizes"),
+        ({"sizes": "4 5 5"}, "more than the 200 bytes"),
+        ({"sizes": "4 5 7"}, "incomplete"),
+        ({"sizes": "40000 50000 60000"}, "incomplete"),
+        ({"type": "block"}, "type 'block'"),
+        ({"endian": None}, "endian"),
+        ({"encoding": "zrl"}, "encoding 'zrl'"),
+        ({"byte_skip": "-2"}, "byte skip"),
+        ({"line_skip": "many"}, "line skip"),
+    ],
+)
+def test_an_nrrd_header_that_cannot_be_meant_is_refused(tmp_path, fields, reason):
+    _refused(nrrd(tmp_path / "ct.nrrd", **fields), reason)
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("cm", 10.0), ("m", 1000.0), ("um", 1e-3), ("micron", 1e-3)])
+def test_an_nrrd_in_another_unit_is_converted_and_it_is_said(tmp_path, unit, factor):
+    vectors = " ".join("({},{},{})".format(*step) for step in (TURN * SPACING / factor).T)
+    origin = "({},{},{})".format(*(ORIGIN / factor))
+    units = " ".join([f'"{unit}"'] * 3)
+    path = nrrd(tmp_path / "ct.nrrd", space_directions=vectors, space_origin=origin, space_units=units)
+    volume = _read(path, f"says {unit}; lengths were converted")
+    np.testing.assert_allclose(volume.index_to_world(CORNERS), places(TURN), atol=1e-6)
+
+
+def test_the_encodings_of_an_nrrd(tmp_path):
+    whole = nrrd(tmp_path / "raw.nrrd", space_units='"mm" "mm" "mm"', measurement_frame="(0,1,0) (1,0,0) (0,0,1)")
+    _read(whole)
+    raw = RAMP.tobytes()
+    text = " ".join(map(str, RAMP.ravel())).encode()
+    for encoding, data in {"gzip": gzip.compress(raw), "bzip2": bz2.compress(raw), "ascii": text}.items():
+        path = nrrd(tmp_path / f"{encoding}.nrrd", encoding=encoding)
+        path.write_bytes(path.read_bytes().replace(raw, data))
+        _read(path)
+        path.write_bytes(path.read_bytes()[:-20])
+        _refused(path, "truncated|incomplete|numbers")
+    skipping = nrrd(tmp_path / "skip.nrrd", line_skip=1, byte_skip=3)
+    skipping.write_bytes(skipping.read_bytes().replace(raw, b"a line\nabc" + raw))
+    _read(skipping)
+    last = nrrd(tmp_path / "last.nhdr", data_file="last.raw", byte_skip=-1)
+    last.write_bytes(last.read_bytes().replace(raw, b""))
+    (tmp_path / "last.raw").write_bytes(b"some header" + raw)
+    _read(last)
+
+
+def test_voxels_in_several_files(tmp_path):
+    for k, plane in enumerate(RAMP):
+        (tmp_path / f"p{k:02d}.raw").write_bytes(plane.tobytes())
+    names = "\n".join(f"p{k:02d}.raw" for k in range(6))
+    for spec in ("p%02d.raw 0 5 1", f"LIST\n{names}"):
+        header = nrrd(tmp_path / "ct.nhdr", data_file=None)
+        fields = header.read_bytes().replace(RAMP.tobytes(), b"").decode().rstrip("\n")
+        header.write_text(f"{fields}\ndata file: {spec}\n\n")
+        _read(header)
+        _read(metaimage(tmp_path / "ct.mhd", ElementDataFile=spec))
+    (tmp_path / "p03.raw").unlink()
+    _refused(header, "missing .p03.raw")
+    _refused(tmp_path / "ct.mhd", "missing .p03.raw")
+
+
+@pytest.mark.parametrize(
+    ("fields", "reason"),
+    [
+        ({"ElementSpacing": None}, "no ElementSpacing"),
+        ({"ElementSpacing": "1 1"}, "ElementSpacing '1 1' is not 3 numbers"),
+        ({"ElementSpacing": "a b c"}, "ElementSpacing"),
+        ({"TransformMatrix": "1 0 0 1"}, "TransformMatrix .* is not 9 numbers"),
+        ({"NDims": 2}, "NDims and DimSize"),
+        ({"DimSize": "4 5 7"}, "incomplete"),
+        ({"DimSize": "4 5 5"}, "more than the 200 bytes"),
+        ({"ElementNumberOfChannels": 3}, "3 values in every voxel"),
+        ({"ElementType": "MET_ASCII_CHAR"}, "ElementType"),
+        ({"CompressedData": "maybe"}, "CompressedData 'maybe'"),
+        ({"HeaderSize": "-5"}, "HeaderSize"),
+        ({"DistanceUnits": "furlong"}, "DistanceUnits 'furlong'"),
+    ],
+)
+def test_a_metaimage_header_that_cannot_be_meant_is_refused(tmp_path, fields, reason):
+    _refused(metaimage(tmp_path / "ct.mha", **fields), reason)
+
+
+def test_what_a_metaimage_leaves_open_is_noted(tmp_path):
+    assert np.allclose(
+        _read(metaimage(tmp_path / "a.mha", TransformMatrix=None), "no TransformMatrix").direction, np.eye(3)
+    )
+    assert np.allclose(_read(metaimage(tmp_path / "b.mha", Offset=None), "no Offset").origin_mm, 0.0)
+    assert np.allclose(_read(metaimage(tmp_path / "c.mha", ElementSize="1 1 1"), "ElementSize").spacing_mm, SPACING)
+    mirrored = _read(
+        metaimage(tmp_path / "d.mha", AnatomicalOrientation="LPI"), "AnatomicalOrientation LPI contradicts"
+    )
+    np.testing.assert_allclose(mirrored.index_to_world(CORNERS), places(TURN), atol=1e-6)
+    named = metaimage(tmp_path / "e.mha", AnatomicalOrientation="LPI", TransformMatrix=None)
+    np.testing.assert_allclose(_read(named, "those of AnatomicalOrientation").direction, np.diag([-1.0, -1.0, 1.0]))
+    _read(metaimage(tmp_path / "f.mha", AnatomicalOrientation="RAI"))
+    _read(metaimage(tmp_path / "g.mha", AnatomicalOrientation="???"))
+    cm = {"ElementSpacing": "0.04 0.05 0.125", "Offset": "1 2 3", "DistanceUnits": "cm"}
+    volume = _read(metaimage(tmp_path / "h.mha", **cm), "DistanceUnits says cm")
+    np.testing.assert_allclose(volume.index_to_world(CORNERS), places(TURN), atol=1e-6)
+
+
+def test_the_encodings_of_a_metaimage(tmp_path):
+    _read(metaimage(tmp_path / "packed.mha", data=zlib.compress(RAMP.tobytes()), CompressedData=True))
+    big = RAMP.astype(">i2").tobytes()
+    _read(metaimage(tmp_path / "big.mha", data=big, BinaryDataByteOrderMSB=True))
+    _read(metaimage(tmp_path / "text.mha", data=" ".join(map(str, RAMP.ravel())).encode(), BinaryData=False))
+    cut = metaimage(tmp_path / "cut.mha", data=zlib.compress(RAMP.tobytes())[:-9], CompressedData=True)
+    _refused(cut, "truncated or damaged|incomplete")
+
+
+def test_a_mask_keeps_the_notes_of_its_file(tmp_path):
+    (note,) = read_mask(nrrd(tmp_path / "mask.nrrd", axes=skewed(1e-3), voxels=(RAMP > 0).astype(np.uint8))).warnings
+    assert "straightened" in note
