@@ -148,6 +148,8 @@ def _write_tree(tree: VesselTree, path: Path) -> None:
 
 def _read_tree(path: Path, section_names: tuple[str, ...]) -> VesselTree:
     data = mesh_process.read(str(path))
+    if complaint := " ".join(str(data["complaint"]).split()):
+        raise InputError(f"{path}: is damaged ({complaint[:160]}); make the anatomy again")
     try:
         points, offsets = data["points"], data["line_offsets"]
         radius, abscissa = data["point:MaximumInscribedSphereRadius"], data["point:Abscissa"]

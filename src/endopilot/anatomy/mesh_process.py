@@ -1,9 +1,9 @@
 """Reads one mesh file with VTK and writes its arrays to standard output; `polydata.py` runs it as a process.
 
 VTK's readers crash on some damaged files, and print what they complain of. Here neither reaches the caller. The process
-imports nothing of endopilot, and writes an npz archive: `points`, `corners` (of triangles), `line_offsets` and
-`line_points` (where each line begins in the list of its points), `point:NAME` and `cell:NAME` for arrays of numbers, and
-the texts `kind`, `fields` and `complaint`.
+imports nothing of endopilot, and writes an npz archive: `points`; `corners` of triangles; `line_points` and, where each
+line begins in it, `line_offsets`; arrays of numbers as `point:NAME` and `cell:NAME`; the texts `kind`, `fields` and
+`complaint`.
 """
 
 from __future__ import annotations

@@ -167,12 +167,12 @@ def _lines(data: dict[str, np.ndarray], path: Path, notes: list[str]) -> Polylin
 
 
 def _radius_array(data: dict[str, np.ndarray], path: Path) -> np.ndarray:
-    arrays = {name.removeprefix("point:"): values for name, values in data.items() if name.startswith("point:")}
+    held = {name.removeprefix("point:"): values for name, values in data.items() if name.startswith("point:")}
     for wanted in RADIUS_NAMES:
-        for name, values in arrays.items():
-            if name.lower() == wanted:
+        for name, values in held.items():
+            if name.lower() == wanted and values.ndim == 1:
                 return values
-    found = ", ".join(arrays) or "no arrays at all"
+    found = ", ".join(held) or "no arrays at all"
     raise InputError(
         f"{path}: is a centerline without radii (it holds {found}); "
         "add a point array MaximumInscribedSphereRadius in mm, as VMTK writes it"
