@@ -322,10 +322,11 @@ def test_bad_files_give_one_line(tmp_path):
         assert "\n" not in str(error.value)
 
 
-def test_spheres_that_do_not_touch_are_refused():
+def test_spheres_that_do_not_touch_are_joined_by_straight_pieces_with_a_note():
     points = np.outer(np.arange(0, 40, 4.0), [0, 0, 1])
-    with pytest.raises(InputError, match="do not touch"):
-        extract_anatomy(Polylines((points,), (np.full(10, 1.5),)), name="beads")
+    anatomy = extract_anatomy(Polylines((points,), (np.full(10, 1.5),)), name="beads")
+    assert abs(anatomy.tree.longest_path().abscissa[-1] - 36.0) < 1e-6 and is_sound(anatomy)
+    assert any("9 neighbouring points do not touch" in note for note in anatomy.provenance["notes"])
 
 
 @pytest.mark.parametrize("field", ["catheter_radius_mm", "spacing_mm", "minimum_branch_length_mm", "scale"])

@@ -65,8 +65,9 @@ class AnatomyConfig:
     """Side branches shorter than this beyond their parent's lumen are dropped, mm."""
     scale: Annotated[float, Within(1e-4, 10000)] = 1.0
     """Factor that turns the file's unit into mm: 10 for cm, 1000 for m."""
-    coordinates: Literal["lps", "ras"] = "lps"
-    """Axes of a surface or VTP file, which does not state them. Masks and Slicer markups do, and ignore this."""
+    coordinates: Literal["lps", "ras"] | None = None
+    """Axes of a surface or centerline whose file states none; LPS if not given. A file that states others is
+    refused."""
 
 
 def extract_anatomy(
@@ -93,7 +94,7 @@ def extract_anatomy(
     wrapped = source if isinstance(source, AnatomySource) else AnatomySource(source)
     wrapped = transformed(wrapped, scale=config.scale, coordinates=config.coordinates)
     name = name or wrapped.file.partition(".")[0] or "patient"
-    content, notes = wrapped.content, []
+    content, notes, lengths = wrapped.content, list(wrapped.notes), {}
     doubts = list(content.warnings) if isinstance(content, LumenMask) else []
     given = content.ostium if isinstance(content, LumenMask) else None
     if config.ostium_mm is not None:
@@ -102,12 +103,15 @@ def extract_anatomy(
     with progress(f"anatomy {name}", 4) as advance:
         if isinstance(content, (Polylines, VesselTree)):
             _check_lines(content, config, source_name)
-            tree, rule = polylines.tree_from_polylines(content, given, source_name)
+            made = polylines.tree_from_polylines(content, given, source_name, config.vessel)
+            tree, rule, lengths = made.tree, made.rule, {"lines_mm": made.lengths_mm}
+            notes += made.notes
             inlet: CoronaryInlet | None = None
             advance(2)
             distance_map = distance_map_from_spheres(tree, spacing_mm=config.spacing_mm)
         else:
-            surface, finest, inlet, notes = _wall(content, given, config, source_name)
+            surface, finest, inlet, repairs = _wall(content, given, config, source_name)
+            notes += repairs
             advance()
             tree, rule = _tree(surface, finest, given, inlet, config, source_name)
             advance()
@@ -129,6 +133,7 @@ def extract_anatomy(
         "config": asdict(config),
         "ostium_rule": rule,
         **(inlet.record() if inlet is not None else {}),
+        **lengths,
         "catheter_tilt_deg": round(catheter_tilt_deg(ostium_radius, radius), 1),
         "dominance": crux.dominance if crux is not None else None if short else dominance(tree),
         "notes": [*doubts, *notes],

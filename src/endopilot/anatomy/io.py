@@ -21,10 +21,13 @@ from typing import Any
 import numpy as np
 
 from endopilot import files
+from endopilot.anatomy import mesh_process
 from endopilot.errors import InputError
 from endopilot.types import Anatomy, Branch, Centerline, DistanceMap, Insertion, VesselTree
 
 SCHEMA_VERSION = 1
+
+_SPACE = "left-posterior-superior"
 
 _CENTERLINE, _LUMEN, _RECORD = "centerline.vtp", "lumen.nrrd", "anatomy.json"
 
@@ -86,6 +89,13 @@ def read_anatomy(folder: str | Path) -> Anatomy:
             raise InputError(f"{folder / file}: is missing; make the anatomy again")
         if files.sha256(folder / file) != hashes.get(file):
             raise InputError(f"{folder / file}: differs from what anatomy.json records; make the anatomy again")
+    if position.shape != (3,) or direction.shape != (3,) or not np.isfinite([*position, *direction]).all():
+        raise InputError(f"{folder / _RECORD}: insertion is not two times three numbers; make the anatomy again")
+    if abs(float(np.linalg.norm(direction)) - 1.0) > 1e-6 or not (radius > 0 and np.isfinite(radius)):
+        raise InputError(
+            f"{folder / _RECORD}: insertion.direction has a length of {np.linalg.norm(direction):g} instead of 1, or "
+            f"catheter_radius_mm {radius:g} is not positive; make the anatomy again"
+        )
     anatomy = Anatomy(
         name=name,
         tree=_read_tree(folder / _CENTERLINE, names),
@@ -137,28 +147,40 @@ def _write_tree(tree: VesselTree, path: Path) -> None:
 
 
 def _read_tree(path: Path, section_names: tuple[str, ...]) -> VesselTree:
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-    from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
-
-    reader = vtkXMLPolyDataReader()
-    reader.SetFileName(str(path))
-    reader.Update()
-    polydata = reader.GetOutput()
+    data = mesh_process.read(str(path))
+    if complaint := " ".join(str(data["complaint"]).split()):
+        raise InputError(f"{path}: is damaged ({complaint[:160]}); make the anatomy again")
     try:
-        points = vtk_to_numpy(polydata.GetPoints().GetData()).astype(float)
-        offsets = vtk_to_numpy(polydata.GetLines().GetOffsetsArray())
-        point_data, cell_data = polydata.GetPointData(), polydata.GetCellData()
-        radius, abscissa, normals, section = (
-            vtk_to_numpy(point_data.GetArray(name))
-            for name in ("MaximumInscribedSphereRadius", "Abscissa", "Normals", "Section")
-        )
-        parent = vtk_to_numpy(cell_data.GetArray("Parent"))
-    except AttributeError as error:
+        points, offsets = data["points"], data["line_offsets"]
+        radius, abscissa = data["point:MaximumInscribedSphereRadius"], data["point:Abscissa"]
+        normals, section, parent = data["point:Normals"], data["point:Section"], data["cell:Parent"]
+    except KeyError as error:
         raise InputError(f"{path}: is not a centerline written by endopilot; make the anatomy again") from error
+    count = len(points)
+    whole = (
+        len(offsets) == len(parent) + 1 > 1
+        and offsets[-1] == count
+        and np.array_equal(data["line_points"], np.arange(count))
+        and np.diff(offsets).min() >= 2
+        and normals.shape == (count, 3)
+        and all(values.shape == (count,) for values in (radius, abscissa, section))
+        and all(np.isfinite(values).all() for values in (points, radius, abscissa, normals))
+        and bool((radius > 0).all())
+        and bool(((section >= 0) & (section < len(section_names))).all())
+        and parent[0] == -1
+        and bool(((parent[1:] >= 0) & (parent[1:] < np.arange(1, len(parent)))).all())
+    )
+    if not whole:
+        raise InputError(
+            f"{path}: is no tree (branches after their parents, positive radii, sections that anatomy.json names); "
+            "make the anatomy again"
+        )
     branches = []
     for index, (start, end) in enumerate(itertools.pairwise(offsets)):
         part = slice(int(start), int(end))
         line = Centerline(points[part].copy(), radius[part].copy(), abscissa[part].copy(), normals[part].copy())
+        if (np.diff(line.abscissa) <= 0).any():
+            raise InputError(f"{path}: the abscissa of branch {index} does not grow; make the anatomy again")
         branches.append(Branch(line, int(parent[index]), section[part].astype(np.int64)))
     return VesselTree(tuple(branches), section_names)
 
@@ -175,12 +197,27 @@ def _write_distance_map(distance_map: DistanceMap, path: Path) -> None:
 def _read_distance_map(path: Path) -> DistanceMap:
     import SimpleITK
 
+    reader = SimpleITK.ImageFileReader()
+    reader.SetFileName(str(path))
     try:
+        reader.ReadImageInformation()
+        keys = {key: reader.GetMetaData(key) for key in reader.GetMetaDataKeys()}
+        axes, spacing = np.array(reader.GetDirection()), np.array(reader.GetSpacing())
+        wrong = None
+        if reader.GetDimension() != 3 or reader.GetNumberOfComponents() != 1:
+            wrong = f"it has {reader.GetDimension()} dimensions of {reader.GetNumberOfComponents()} values"
+        elif keys.get("NRRD_space", _SPACE) != _SPACE:
+            wrong = f"its space is {keys['NRRD_space']}, not {_SPACE}"
+        elif np.abs(axes - np.eye(3).ravel()).max() > 1e-6:
+            wrong = f"its space directions {axes.round(4).tolist()} are not along the LPS axes"
+        elif np.ptp(spacing) > 1e-6 * spacing.max():
+            wrong = f"its spacing {spacing.tolist()} mm is not the same along all axes"
+        if wrong is not None:
+            raise InputError(f"{path}: {wrong}; make the anatomy again")
         image = SimpleITK.ReadImage(str(path), SimpleITK.sitkFloat32)
     except RuntimeError as error:
         raise InputError(f"{path}: cannot be read as NRRD; make the anatomy again") from error
-    return DistanceMap(
-        values=SimpleITK.GetArrayFromImage(image),
-        spacing_mm=float(image.GetSpacing()[0]),
-        origin_mm=np.array(image.GetOrigin(), dtype=float),
-    )
+    values = SimpleITK.GetArrayFromImage(image)
+    if not np.isfinite(values).all():
+        raise InputError(f"{path}: some distances are not finite numbers; make the anatomy again")
+    return DistanceMap(values=values, spacing_mm=float(spacing[0]), origin_mm=np.array(image.GetOrigin(), dtype=float))

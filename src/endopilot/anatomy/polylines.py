@@ -1,23 +1,33 @@
 """One tree from centerlines that overlap, as VMTK writes them, or that meet end to end, as Slicer writes them.
 
-Lines are resampled and their points made the nodes of a graph: neighbours along a line are joined, and so are points of
-different lines that coincide, and line ends that lie inside another line's spheres. The tree is then traced as in a
-lumen: farthest end first, each further line from where it leaves what is there.
+Lines are resampled and their points made the nodes of a graph (`line_graph`). The tree is then traced as in a lumen:
+farthest end first, each further line from where it leaves what is there. What the tree does not reach is noted with
+its length and place, and so are gaps that were bridged, loops that were cut and further inlets.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
+from endopilot.anatomy.line_checks import closures, further_inlets, left_out
+from endopilot.anatomy.line_graph import (
+    STEP_MM,
+    Edges,
+    LineNodes,
+    bridges,
+    dense_nodes,
+    meeting_edges,
+    with_bridges,
+)
+from endopilot.anatomy.line_order import in_order
 from endopilot.anatomy.sources import Polylines
 from endopilot.anatomy.tree import Line, tree_from_lines
 from endopilot.errors import InputError
 from endopilot.types import Insertion, VesselTree
-
-STEP_MM = 0.5
-"""Distance between the points of the tree, mm."""
 
 PARENT_VESSEL_RATIO = 2.5
 """Where lines start in spheres this many times wider than their own median, they start in a parent vessel."""
@@ -27,80 +37,90 @@ TOGETHER = 0.5
 
 _SHORTEST_MM = 2.0
 
+_RIVAL = 0.4
+"""A coronary artery's lines that are not connected to a piece this share as long are those of another artery."""
 
-def tree_from_polylines(source: Polylines | VesselTree, given: Insertion | None, label: str) -> tuple[VesselTree, str]:
-    """Return one tree from centerlines, and the rule by which its root was chosen.
+
+@dataclass(frozen=True, eq=False)
+class LineTree:
+    """One tree from centerlines, and what became of the lines.
+
+    Attributes:
+        tree: the tree.
+        rule: by which its root was chosen.
+        notes: what was done and left out, a sentence each.
+        lengths_mm: length of the lines "given", of them "covered" by the tree's spheres and "left_out" (these two add
+            up to the first), and of gaps "bridged" between them, mm.
+    """
+
+    tree: VesselTree
+    rule: str
+    notes: list[str]
+    lengths_mm: dict[str, float]
+
+
+def tree_from_polylines(
+    source: Polylines | VesselTree, given: Insertion | None, label: str, vessel: str = "generic"
+) -> LineTree:
+    """Return one tree from centerlines.
 
     Where the lines start in a parent vessel (VMTK's coronary centerlines start in the aorta), they are cut at the
     ostium: where they leave the parent's spheres.
 
+    Args:
+        source: centerlines with radii, LPS mm.
+        given: the ostium, if it is known.
+        label: name of the source, for messages.
+        vessel: "rca", "lca" or "generic".
+
     Raises:
-        InputError: the spheres of neighbouring points do not touch, or no line is near the given ostium.
+        InputError: the points of a line are in no order, no line is near the given ostium, or a coronary artery is
+            asked for and the lines are those of two.
     """
     if isinstance(source, VesselTree):
         lines = [branch.centerline for branch in source.branches]
         source = Polylines(tuple(line.points for line in lines), tuple(line.radius for line in lines))
-    _refuse_gaps(source, label)
-    points, radius, owner = _dense(source)
-    keep, cut_at = _outside_parent_vessel(points, radius, owner)
-    ends = _line_ends(owner)
-    points, radius, owner, ends = points[keep], radius[keep], owner[keep], ends[keep]
+    source, notes = in_order(source, label)
+    whole = dense_nodes(source)
+    keep, cut_at = _outside_parent_vessel(whole)
+    nodes = whole.part(keep)
+    edges = meeting_edges(nodes)
+    gaps = bridges(nodes, edges)
+    bridged = np.linalg.norm(nodes.points[gaps[:, 0]] - nodes.points[gaps[:, 1]], axis=1)
+    notes += [
+        f"a gap of {gap:.1f} mm between lines at {nodes.points[end].round(1).tolist()} mm is bridged"
+        for gap, end in zip(bridged, gaps[:, 0], strict=True)
+    ]
+    edges = with_bridges(nodes, edges, gaps)
+    piece = edges.pieces
     if given is not None:
-        gap = np.linalg.norm(points - given.position, axis=1)
+        gap = np.linalg.norm(nodes.points - given.position, axis=1)
         root, rule = int(gap.argmin()), "given"
-        if gap[root] > max(5.0, 2 * radius[root]):
+        if gap[root] > max(5.0, 2 * nodes.radius[root]):
             raise InputError(
                 f"{label}: the ostium at {np.round(given.position, 1).tolist()} mm is {gap[root]:.1f} mm from the "
                 "nearest centerline; check the coordinates (LPS mm)"
             )
     elif cut_at is not None:
-        gap = np.linalg.norm(points - cut_at, axis=1)
+        gap = np.linalg.norm(nodes.points - cut_at, axis=1)
         root, rule = int(gap.argmin()), "where the lines leave the parent vessel"
     else:
-        root, rule = _common_start(points, radius, ends), "end where the lines begin or widest end"
-    paths = _trace(points, radius, owner, ends, root)
-    return tree_from_lines(_lines(points, radius, paths)), rule
+        root, rule = _widest_end(nodes, piece, vessel, label), "widest end"
+    paths = _trace(nodes, edges, root)
+    tree = tree_from_lines(_lines(nodes.points, nodes.radius, paths))
+    lost, covered = left_out(whole, keep, tree, piece, int(piece[root]))
+    total = float(whole.share.sum())
+    lengths = {"given": total, "covered": covered, "left_out": total - covered, "bridged": float(bridged.sum())}
+    notes += [*lost, *closures(tree), *further_inlets(source, tree)]
+    return LineTree(tree, rule, notes, {name: round(value, 1) for name, value in lengths.items()})
 
 
-def _refuse_gaps(source: Polylines, label: str) -> None:
-    for number, (points, radius) in enumerate(zip(source.points, source.radius, strict=True)):
-        step = np.linalg.norm(np.diff(points, axis=0), axis=1)
-        apart = np.flatnonzero(step > radius[1:] + radius[:-1])
-        if len(apart):
-            place = points[apart[0]].round(1).tolist()
-            raise InputError(
-                f"{label}: in line {number}, the inscribed spheres of {len(apart)} neighbouring points do not touch "
-                f"(first {step[apart[0]]:.2f} mm apart at {place}); resample the line more finely or check the unit"
-            )
-
-
-def _dense(source: Polylines) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"], Int[np.ndarray, "n"]]:
-    points, radius, owner = [], [], []
-    for number, (line, size) in enumerate(zip(source.points, source.radius, strict=True)):
-        distinct = np.concatenate([[True], np.linalg.norm(np.diff(line, axis=0), axis=1) > 1e-6])
-        line, size = line[distinct], size[distinct]
-        length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
-        wanted = np.linspace(0.0, length[-1], max(2, round(length[-1] / (0.5 * STEP_MM)) + 1))
-        points.append(np.stack([np.interp(wanted, length, line[:, axis]) for axis in range(3)], axis=1))
-        radius.append(np.interp(wanted, length, size))
-        owner.append(np.full(len(wanted), number))
-    return np.concatenate(points), np.concatenate(radius), np.concatenate(owner)
-
-
-def _line_ends(owner: Int[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
-    change = np.flatnonzero(np.diff(owner))
-    ends = np.zeros(len(owner), dtype=bool)
-    ends[[0, *change, *(change + 1), len(owner) - 1]] = True
-    return ends
-
-
-def _outside_parent_vessel(
-    points: Float[np.ndarray, "n 3"], radius: Float[np.ndarray, "n"], owner: Int[np.ndarray, "n"]
-) -> tuple[Bool[np.ndarray, "n"], Float[np.ndarray, "3"] | None]:
+def _outside_parent_vessel(nodes: LineNodes) -> tuple[Bool[np.ndarray, "n"], Float[np.ndarray, "3"] | None]:
     """Return which points lie outside the parent vessel that the lines start in, and where they leave it.
 
     The parent's spheres are those at the lines' common start that are several times wider than the lines' median.
     """
+    points, radius, owner = nodes.points, nodes.radius, nodes.owner
     everywhere = np.ones(len(points), dtype=bool)
     starts = np.flatnonzero(np.diff(owner, prepend=-1))
     usual = float(np.median(radius))
@@ -108,13 +128,16 @@ def _outside_parent_vessel(
     if radius[starts[0]] < PARENT_VESSEL_RATIO * usual or not common:
         return everywhere, None
     big = radius > PARENT_VESSEL_RATIO * usual
-    gap = np.full(len(points), np.inf)
-    for centre, size in zip(points[big], radius[big], strict=True):
-        gap = np.minimum(gap, np.linalg.norm(points - centre, axis=1) - size)
+    spheres = np.flatnonzero(big)
+    # Lines that overlap repeat the parent's spheres: one in each cell of the step is enough.
+    spheres = spheres[np.unique(np.floor(points[spheres] / STEP_MM), axis=0, return_index=True)[1]]
+    within = np.zeros(len(points), dtype=bool)
+    for found in KDTree(points).query_ball_point(points[spheres], radius[spheres]):
+        within[found] = True
     keep = everywhere.copy()
     first_kept = []
     for start, end in zip(starts, [*starts[1:], len(points)], strict=True):
-        inside = np.flatnonzero((gap[start:end] < 0) | big[start:end])
+        inside = np.flatnonzero(within[start:end] | big[start:end])
         leave = int(inside[-1]) + 1 if len(inside) else 0
         keep[start : start + leave] = False
         if start + leave < end:
@@ -128,46 +151,35 @@ def _close(points: Float[np.ndarray, "n 3"]) -> bool:
     return bool(np.ptp(points, axis=0).max() < 2.0)
 
 
-def _common_start(points: Float[np.ndarray, "n 3"], radius: Float[np.ndarray, "n"], ends: Bool[np.ndarray, "n"]) -> int:
-    """Return the widest line end at which the most lines begin or that no other line touches."""
-    index = np.flatnonzero(ends)
-    return int(index[radius[index].argmax()])
+def _widest_end(nodes: LineNodes, piece: Int[np.ndarray, "n"], vessel: str, label: str) -> int:
+    """Return the widest line end of the longest connected piece.
+
+    Raises:
+        InputError: a coronary artery is asked for, and another piece is as long as an artery.
+    """
+    # Lines that overlap count once: lengths are those of the cells of 1 mm that they pass through.
+    cells = np.unique(np.column_stack([np.floor(nodes.points), piece]), axis=0)
+    length = np.bincount(cells[:, 3].astype(np.int64), minlength=int(piece.max()) + 1)
+    index = nodes.free_ends()
+    widest = {number: index[piece[index] == number] for number in np.argsort(-length, kind="stable")[:2]}
+    roots = [int(ends[nodes.radius[ends].argmax()]) for ends in widest.values()]
+    rival = len(roots) > 1 and length[piece[roots[1]]] > _RIVAL * length[piece[roots[0]]]
+    if rival and vessel != "generic":
+        one, two = (nodes.points[root].round(1).tolist() for root in roots)
+        raise InputError(
+            f"{label}: holds two trees that are not connected, with their widest ends at {one} and {two} mm (LPS); "
+            "name the ostium of one with --ostium-mm"
+        )
+    return roots[0]
 
 
-def _trace(
-    points: Float[np.ndarray, "n 3"],
-    radius: Float[np.ndarray, "n"],
-    owner: Int[np.ndarray, "n"],
-    ends: Bool[np.ndarray, "n"],
-    root: int,
-) -> list[Int[np.ndarray, "_"]]:
+def _trace(nodes: LineNodes, edges: Edges, root: int) -> list[Int[np.ndarray, "_"]]:
     """Return the tree as paths of nodes, the first from the root, each other from a node of an earlier one."""
-    from scipy.sparse import csr_matrix
     from scipy.sparse.csgraph import dijkstra
 
+    points, radius = nodes.points, nodes.radius
     places = KDTree(points)
-    along = np.flatnonzero(owner[:-1] == owner[1:])
-    near = places.query_pairs(0.8 * STEP_MM, output_type="ndarray")
-    near = near[owner[near[:, 0]] != owner[near[:, 1]]]
-    bridges = []
-    for end in np.flatnonzero(ends):
-        foreign = np.flatnonzero(owner != owner[end])
-        if len(foreign):
-            gap = np.linalg.norm(points[foreign] - points[end], axis=1)
-            best = foreign[gap.argmin()]
-            if gap.min() < max(radius[end], radius[best]):
-                bridges.append((end, best))
-    rows = np.concatenate([along, near[:, 0], [a for a, _ in bridges]]).astype(np.int64)
-    columns = np.concatenate([along + 1, near[:, 1], [b for _, b in bridges]]).astype(np.int64)
-    length = np.linalg.norm(points[rows] - points[columns], axis=1)
-    cost = np.where(np.arange(len(rows)) < len(along), length, 2 * length + 0.1)
-    size = len(points)
-    distance, before = dijkstra(
-        csr_matrix((np.maximum(cost, 1e-6), (rows, columns)), shape=(size, size)),
-        directed=False,
-        indices=root,
-        return_predecessors=True,
-    )
+    distance, before = dijkstra(edges.matrix, directed=False, indices=root, return_predecessors=True)
     covered = ~np.isfinite(distance)
     paths: list[np.ndarray] = []
     for tip in np.argsort(-np.where(covered, -1.0, distance), kind="stable"):
@@ -176,12 +188,12 @@ def _trace(
         path = [int(tip)]
         while before[path[-1]] >= 0 and not covered[path[-1]]:
             path.append(int(before[path[-1]]))
-        nodes = np.array(path[::-1])
-        new = float(distance[nodes[-1]] - distance[nodes[0]])
-        if not paths or new > max(_SHORTEST_MM, float(radius[nodes[0]])):
-            paths.append(nodes)
-        for found in places.query_ball_point(points[nodes], np.maximum(TOGETHER * radius[nodes], STEP_MM)):
-            covered[found] = True
+        found = np.array(path[::-1])
+        new = float(distance[found[-1]] - distance[found[0]])
+        if not paths or new > max(_SHORTEST_MM, float(radius[found[0]])):
+            paths.append(found)
+        for reached in places.query_ball_point(points[found], np.maximum(TOGETHER * radius[found], STEP_MM)):
+            covered[reached] = True
     return paths
 
 

@@ -19,6 +19,8 @@ SURFACE_SUFFIXES = (".stl", ".obj", ".ply", ".vtp", ".vtk")
 RADIUS_NAMES = ("maximuminscribedsphereradius", "misr", "radius", "radii")
 """Names of the point array or measurement that holds radii, in lower case: VMTK's, Slicer's, and plain ones."""
 
+RAS_TO_LPS = np.array([-1.0, -1.0, 1.0])
+
 
 @dataclass(frozen=True, eq=False)
 class Polylines:
@@ -38,16 +40,20 @@ class AnatomySource:
     """The content of a file, and which file it was.
 
     Attributes:
-        content: mask, surface (as read, perhaps open) or centerlines.
+        content: mask, surface (as read, perhaps open) or centerlines; in LPS where the file states its axes.
         file: name of the file, without its folder.
         sha256: its SHA-256.
-        coordinates: "lps" or "ras", where the file says which; None where only the user can know.
+        coordinates: axes that the file states, "lps" or "ras"; None where it states none.
+        factor: mm in the unit that the file states; `content` is in mm already where that is not 1.
+        notes: what the reader did or left out, a sentence each.
     """
 
     content: LumenMask | Surface | Polylines | VesselTree
     file: str = ""
     sha256: str = ""
     coordinates: str | None = None
+    factor: float = 1.0
+    notes: tuple[str, ...] = ()
 
 
 def read_source(path: str | Path, *, label: int | str | None = None) -> AnatomySource:
@@ -67,131 +73,82 @@ def read_source(path: str | Path, *, label: int | str | None = None) -> AnatomyS
     lower = path.name.lower()
     if label is not None and not lower.endswith(MASK_SUFFIXES):
         raise InputError(f"{path}: --label {label} was given, but only masks have labels; leave the option out")
-    coordinates: str | None = None
     if lower.endswith(MASK_SUFFIXES):
         from endopilot.imaging.volume import read_mask
 
-        content: Any = read_mask(path, label=label)
-        coordinates = "lps"
+        source = AnatomySource(read_mask(path, label=label), coordinates="lps")
     elif lower.endswith(".json"):
-        content = _read_markups(path)
-        coordinates = "lps"
+        from endopilot.anatomy.markups import read_markups
+
+        source = read_markups(path)
     elif lower.endswith(SURFACE_SUFFIXES):
-        content = _read_polydata(path)
+        from endopilot.anatomy.polydata import read_polydata
+
+        source = read_polydata(path)
     else:
         known = " ".join((*MASK_SUFFIXES, *SURFACE_SUFFIXES, ".mrk.json"))
         raise InputError(f"{path}: unknown kind of file; known are {known}")
-    read = content.volume.files if isinstance(content, LumenMask) else ()
-    return AnatomySource(content, path.name, files.input_hash(path, read)[path.name], coordinates)
+    read = source.content.volume.files if isinstance(source.content, LumenMask) else ()
+    return replace(source, file=path.name, sha256=files.input_hash(path, read)[path.name])
 
 
-def transformed(source: AnatomySource, *, scale: float, coordinates: str) -> AnatomySource:
-    """Return a source in LPS mm: multiplied by `scale` and, if its file does not say LPS, turned over from RAS."""
-    turn = np.array([-1.0, -1.0, 1.0]) if coordinates == "ras" and source.coordinates is None else np.ones(3)
-    content = source.content
-    if isinstance(content, Surface):
-        faces = content.faces
-        content = Surface(content.vertices * turn * scale, faces)
-    elif isinstance(content, Polylines):
-        content = Polylines(
-            tuple(points * turn * scale for points in content.points), tuple(r * scale for r in content.radius)
+def transformed(source: AnatomySource, *, scale: float, coordinates: str | None) -> AnatomySource:
+    """Return a source in LPS mm, with a note where nothing states the axes.
+
+    Args:
+        source: as read.
+        scale: factor that turns its unit into mm; 1 where it is mm, or where the file states its unit.
+        coordinates: "lps" or "ras" where the user states the axes, otherwise None.
+
+    Raises:
+        InputError: the user states other axes or another unit than the file.
+    """
+    label, notes = source.file or "the source", source.notes
+    if coordinates is not None and source.coordinates is not None and coordinates != source.coordinates:
+        stated = (
+            "is a mask, which is read in LPS whatever its own axes"
+            if isinstance(source.content, LumenMask)
+            else (f"states {source.coordinates.upper()}")
         )
-    elif isinstance(content, LumenMask) and scale != 1.0:
-        volume = content.volume
-        ostium = content.ostium
-        content = replace(
-            content,
-            volume=replace(volume, spacing_mm=volume.spacing_mm * scale, origin_mm=volume.origin_mm * scale),
-            ostium=None if ostium is None else replace(ostium, position=ostium.position * scale),
-        )
-    return replace(source, content=content)
-
-
-def _read_polydata(path: Path) -> Surface | Polylines:
-    import pyvista
-
-    # Some readers crash or hang on an empty or foreign file; the first bytes identify it.
-    if path.stat().st_size < 16:
-        raise InputError(f"{path}: is empty or truncated; export it again")
-    data: Any
-    try:
-        with _quiet_vtk():
-            data = pyvista.read(path)
-    except Exception as error:
-        raise InputError(f"{path}: cannot be read as {path.suffix[1:].upper()} ({error}); export it again") from error
-    if not isinstance(data, pyvista.PolyData):
-        data = data.extract_surface() if hasattr(data, "extract_surface") else None
-    if data is None or data.n_points == 0:
-        raise InputError(f"{path}: holds no points; the file is empty or truncated, export it again")
-    if not np.isfinite(data.points).all():
-        raise InputError(f"{path}: some coordinates are not finite numbers; export it again")
-    if data.n_faces > 0 or data.n_strips > 0:
-        mesh: Any = data.triangulate()
-        mesh = mesh.clean(lines_to_points=False, polys_to_lines=False, strips_to_polys=False)
-        faces = mesh.faces.reshape(-1, 4)[:, 1:] if mesh.n_faces else np.empty((0, 3), dtype=np.int64)
-        if len(faces) < 4:
-            raise InputError(f"{path}: holds {len(faces)} triangles, too few for a vessel; export it again")
-        return Surface(np.asarray(mesh.points, dtype=float), np.asarray(faces, dtype=np.int64))
-    if data.n_lines == 0:
-        raise InputError(f"{path}: holds neither triangles nor lines; export a surface or a centerline")
-    radius = _radius_array(data.point_data, path)
-    points, radii = [], []
-    connectivity, position = data.lines, 0
-    while position < len(connectivity):
-        count = int(connectivity[position])
-        index = connectivity[position + 1 : position + 1 + count]
-        if count > 1:
-            points.append(np.asarray(data.points[index], dtype=float))
-            radii.append(np.asarray(radius[index], dtype=float))
-        position += count + 1
-    return _checked(Polylines(tuple(points), tuple(radii)), path)
-
-
-def _radius_array(point_data: Any, path: Path) -> np.ndarray:
-    for wanted in RADIUS_NAMES:
-        for name in point_data:
-            if str(name).lower() == wanted:
-                return np.asarray(point_data[name], dtype=float).reshape(-1)
-    found = ", ".join(str(name) for name in point_data) or "no arrays at all"
-    raise InputError(
-        f"{path}: is a centerline without radii (it holds {found}); "
-        "add a point array MaximumInscribedSphereRadius in mm, as VMTK writes it"
-    )
-
-
-def _read_markups(path: Path) -> Polylines:
-    content = files.read_json(path)
-    markups = content.get("markups") if isinstance(content, dict) else None
-    if not markups:
-        raise InputError(f"{path}: holds no Slicer markups; export the centerline curve as .mrk.json")
-    points, radii = [], []
-    for markup in markups:
-        control = markup.get("controlPoints") or []
-        if len(control) < 2:
-            continue
-        turn = np.array([-1.0, -1.0, 1.0]) if str(markup.get("coordinateSystem", "LPS")).upper() == "RAS" else 1.0
-        measurements = {str(m.get("name", "")).lower(): m for m in markup.get("measurements") or []}
-        values = next(
-            (measurements[name]["controlPointValues"] for name in RADIUS_NAMES if _has_values(measurements, name)), None
-        )
-        if values is None or len(values) != len(control):
+        raise InputError(f"{label}: --coordinates {coordinates} was given, but the file {stated}; leave the option out")
+    if source.factor != 1.0:
+        if scale not in (1.0, source.factor):
             raise InputError(
-                f"{path}: curve {markup.get('label', len(points))!r} has no radius measurement for its {len(control)} "
-                "control points; export it from Slicer's Extract Centerline module"
+                f"{label}: --scale {scale:g} was given, but the file states a unit of {source.factor:g} mm; "
+                "leave the option out"
             )
-        try:
-            points.append(np.array([point["position"] for point in control], dtype=float).reshape(-1, 3) * turn)
-            radii.append(np.array(values, dtype=float))
-        except (KeyError, TypeError, ValueError) as error:
-            raise InputError(f"{path}: a control point has no numeric position; export the curve again") from error
-    return _checked(Polylines(tuple(points), tuple(radii)), path)
+        scale = 1.0
+    if source.coordinates is None and coordinates is None and source.file:
+        notes = (*notes, "axes not stated: taken for LPS (--coordinates ras if they are RAS)")
+    turned = coordinates == "ras" and source.coordinates is None
+    content = in_mm(source.content, scale, RAS_TO_LPS if turned else np.ones(3))
+    return replace(source, content=content, notes=notes)
 
 
-def _has_values(measurements: dict[str, Any], name: str) -> bool:
-    return bool(measurements.get(name, {}).get("controlPointValues"))
+def in_mm(content: Any, factor: float, turn: Float[np.ndarray, "3"]) -> Any:
+    """Return what a source holds with positions and radii multiplied by `factor`, and axes turned over by signs."""
+    if isinstance(content, Surface):
+        return Surface(content.vertices * turn * factor, content.faces)
+    if isinstance(content, Polylines):
+        return Polylines(
+            tuple(points * turn * factor for points in content.points), tuple(r * factor for r in content.radius)
+        )
+    if isinstance(content, LumenMask) and factor != 1.0:
+        volume, ostium = content.volume, content.ostium
+        return replace(
+            content,
+            volume=replace(volume, spacing_mm=volume.spacing_mm * factor, origin_mm=volume.origin_mm * factor),
+            ostium=None if ostium is None else replace(ostium, position=ostium.position * factor),
+        )
+    return content
 
 
-def _checked(lines: Polylines, path: Path) -> Polylines:
+def checked_lines(lines: Polylines, path: Path) -> Polylines:
+    """Return centerlines whose positions are finite and whose radii are positive.
+
+    Raises:
+        InputError: there is no line, or a position or radius is none.
+    """
     if not lines.points:
         raise InputError(f"{path}: holds no line of at least two points; export the centerline again")
     radius = np.concatenate(lines.radius)
@@ -204,19 +161,3 @@ def _checked(lines: Polylines, path: Path) -> Polylines:
             f"{path}: {int((radius <= 0).sum())} of {len(radius)} radii are not positive; mend those points"
         )
     return lines
-
-
-def _quiet_vtk():
-    from vtkmodules.vtkCommonCore import vtkLogger, vtkObject
-
-    class Quiet:
-        def __enter__(self) -> None:
-            self.level = vtkLogger.GetCurrentVerbosityCutoff()
-            vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
-            vtkObject.GlobalWarningDisplayOff()
-
-        def __exit__(self, *_: object) -> None:
-            vtkLogger.SetStderrVerbosity(self.level)
-            vtkObject.GlobalWarningDisplayOn()
-
-    return Quiet()

@@ -1,0 +1,257 @@
+"""What a tree made from centerlines does not show: what it leaves out, where vessels meet again, further inlets."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
+
+from endopilot.anatomy.line_graph import STEP_MM, LineNodes
+from endopilot.anatomy.sources import Polylines
+from endopilot.types import VesselTree
+
+_SHORTEST_MM = 2.0
+"""Shorter stretches are left out together in one note, mm."""
+
+_MOST_NOTES = 12
+"""As many stretches or loops are noted one by one."""
+
+_OPEN_MM = 0.2
+"""A loop has a hole where the spheres on its two sides are this far apart, mm."""
+
+_AS_WIDE, _WIDENS = 0.75, 1.2
+"""Another inlet is at least this share of the ostium's radius wide, and this many times as wide as the way to it."""
+
+
+def left_out(
+    nodes: LineNodes,
+    kept: Bool[np.ndarray, "n"],
+    tree: VesselTree,
+    piece: Int[np.ndarray, "m"],
+    root_piece: int,
+) -> tuple[list[str], float]:
+    """Return a note on each stretch of line outside the tree's spheres, and the length that lies inside them, mm.
+
+    Args:
+        nodes: of all lines as given.
+        kept: which nodes lie outside the parent vessel.
+        tree: what was made of them.
+        piece: connected piece of each kept node.
+        root_piece: the piece that the tree was made from.
+    """
+    points, radius, *_ = _tree_points(tree)
+    gap, nearest = KDTree(points).query(nodes.points)
+    inside = gap <= np.maximum(radius[nearest], STEP_MM)
+    covered = float(nodes.share[inside].sum())
+    lost = np.flatnonzero(~inside)
+    if len(lost) == 0:
+        return [], covered
+    own = np.full(len(kept), -1)
+    own[kept] = piece
+    stretch = _stretches(nodes, lost, kept)
+    notes, short = [], []
+    for number in range(stretch.max() + 1):
+        part = lost[stretch == number]
+        length = _length_once(nodes, part)
+        place = nodes.points[part[gap[part].argmax()]].round(1).tolist()
+        if not kept[part].any():
+            why = "it lies in the parent vessel that the lines start in"
+        elif own[part].max() != root_piece:
+            why = f"no line leads there; the nearest is {gap[part].min():.1f} mm away"
+        else:
+            why = "it is no longer than the vessel it leaves is wide"
+        (notes if length >= _SHORTEST_MM else short).append((length, f"at {place} mm is left out: {why}"))
+    notes.sort(key=lambda note: -note[0])
+    short += notes[_MOST_NOTES:]
+    texts = [f"{length:.1f} mm of line {rest}" for length, rest in notes[:_MOST_NOTES]]
+    if short:
+        total, longest = sum(length for length, _ in short), max(short)
+        texts.append(
+            f"{total:.1f} mm of line in {len(short)} short stretches left out; the longest, {longest[0]:.1f} mm, "
+            f"{longest[1].split(' mm is')[0]} mm"
+        )
+    return texts, covered
+
+
+def _stretches(nodes: LineNodes, lost: Int[np.ndarray, "l"], kept: Bool[np.ndarray, "n"]) -> Int[np.ndarray, "l"]:
+    """Return which stretch each lost node belongs to: those joined along lines, or lying on one another."""
+    from scipy.sparse import csr_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    follows = (np.diff(lost) == 1) & (nodes.owner[lost[1:]] == nodes.owner[lost[:-1]])
+    follows &= kept[lost[1:]] == kept[lost[:-1]]
+    along = np.flatnonzero(follows)
+    near = KDTree(nodes.points[lost]).query_pairs(2 * STEP_MM, output_type="ndarray")
+    near = near[kept[lost[near[:, 0]]] == kept[lost[near[:, 1]]]]
+    rows, columns = np.concatenate([along, near[:, 0]]), np.concatenate([along + 1, near[:, 1]])
+    matrix = csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(len(lost), len(lost)))
+    return connected_components(matrix, directed=False)[1]
+
+
+def _length_once(nodes: LineNodes, part: Int[np.ndarray, "p"]) -> float:
+    """Return the length of a stretch, lines that run together counted once, mm."""
+    total, seen = 0.0, np.empty((0, 3))
+    for owner in np.unique(nodes.owner[part]):
+        mine = part[nodes.owner[part] == owner]
+        fresh = mine
+        if len(seen):
+            gap = np.asarray(KDTree(seen).query(nodes.points[mine])[0])
+            fresh = mine[gap > np.maximum(0.5 * nodes.radius[mine], STEP_MM)]
+        total += float(nodes.share[fresh].sum())
+        seen = np.concatenate([seen, nodes.points[mine]])
+    return total
+
+
+def closures(tree: VesselTree) -> list[str]:
+    """Return a note on each place where vessels meet again, so that their lumens close a loop that a tree cannot hold.
+
+    Spheres of two places meet there, while on the way from one to the other along the tree some do not.
+    """
+    points, radius, abscissa, branch = _tree_points(tree)
+    keep = _thinned(radius, abscissa, branch)
+    points, radius, abscissa, branch = points[keep], radius[keep], abscissa[keep], branch[keep]
+    fork = np.stack([tree.departures(number) for number in range(len(tree.branches))])
+    pairs = KDTree(points).query_pairs(2 * float(radius.max()), output_type="ndarray")
+    one, two = pairs.T
+    overlap = radius[one] + radius[two] - np.linalg.norm(points[one] - points[two], axis=1)
+    route = _route(abscissa, branch, fork, one, two)
+    found = np.flatnonzero((overlap > 0) & (route > 2 * np.pi * np.maximum(radius[one], radius[two])))
+    if len(found) == 0:
+        return []
+    one, two, overlap, route = one[found], two[found], overlap[found], route[found]
+    places = 0.5 * (points[one] + points[two])
+    cluster = _clusters(places, float(np.median(radius[one])) + STEP_MM)
+    notes = []
+    for number in range(cluster.max() + 1):
+        mine = np.flatnonzero(cluster == number)
+        best = mine[overlap[mine].argmax()]
+        nodes = _way(tree, branch, abscissa, fork, int(one[best]), int(two[best]))
+        if not _has_hole(points[nodes], radius[nodes]):
+            continue
+        tip = any(_ends_near(tree, branch, abscissa, radius, int(end[best])) for end in (one, two))
+        what = "two lines meet" if tip else "two vessels touch"
+        notes.append(
+            (
+                float(route[best]),
+                f"{what} at {places[best].round(1).tolist()} mm and close a loop of {route[best]:.0f} mm: the tree is "
+                "cut there, the lumen is open",
+            )
+        )
+    notes.sort(key=lambda note: -note[0])
+    texts = [text for _, text in notes[:_MOST_NOTES]]
+    return texts + ([f"{len(notes) - _MOST_NOTES} shorter loops are cut too"] if len(notes) > _MOST_NOTES else [])
+
+
+def _tree_points(tree: VesselTree) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return position, radius, abscissa and branch of all points of a tree."""
+    lines = [branch.centerline for branch in tree.branches]
+    return (
+        np.concatenate([line.points for line in lines]),
+        np.concatenate([line.radius for line in lines]),
+        np.concatenate([line.abscissa for line in lines]),
+        np.concatenate([np.full(len(line.points), number) for number, line in enumerate(lines)]),
+    )
+
+
+def _thinned(
+    radius: Float[np.ndarray, "n"], abscissa: Float[np.ndarray, "n"], branch: Int[np.ndarray, "n"]
+) -> Bool[np.ndarray, "n"]:
+    """Return points of which neighbours along a branch are about a third of a radius apart."""
+    keep = np.zeros(len(radius), dtype=bool)
+    last, number = -np.inf, -1
+    for i in range(len(radius)):
+        if branch[i] != number or abscissa[i] - last >= radius[i] / 3:
+            keep[i], last, number = True, abscissa[i], branch[i]
+    return keep
+
+
+def _route(
+    abscissa: Float[np.ndarray, "n"],
+    branch: Int[np.ndarray, "n"],
+    fork: Float[np.ndarray, "b b"],
+    one: Int[np.ndarray, "m"],
+    two: Int[np.ndarray, "m"],
+) -> Float[np.ndarray, "m"]:
+    """Return the length of the way along the tree between points, mm."""
+    at = np.minimum(fork[branch[one], branch[two]], np.minimum(abscissa[one], abscissa[two]))
+    return abscissa[one] + abscissa[two] - 2 * at
+
+
+def _way(
+    tree: VesselTree,
+    branch: Int[np.ndarray, "n"],
+    abscissa: Float[np.ndarray, "n"],
+    fork: Float[np.ndarray, "b b"],
+    one: int,
+    two: int,
+) -> Int[np.ndarray, "w"]:
+    """Return the points on the way along the tree from one point to another, in order."""
+    at = min(float(fork[branch[one], branch[two]]), float(abscissa[one]), float(abscissa[two]))
+    sides = []
+    for end in (one, two):
+        number, side = int(branch[end]), []
+        while number >= 0:
+            mine = np.flatnonzero((branch == number) & (abscissa <= abscissa[end]) & (abscissa >= at))
+            side.append(mine[::-1])
+            if tree.branches[number].centerline.abscissa[0] <= at:
+                break
+            number = tree.branches[number].parent
+        sides.append(np.concatenate(side))
+    return np.concatenate([sides[0], sides[1][::-1]])
+
+
+def _has_hole(points: Float[np.ndarray, "w 3"], radius: Float[np.ndarray, "w"]) -> bool:
+    """Return whether the two halves of a way that comes back to its start lie apart somewhere in between."""
+    step = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    length = np.concatenate([[0.0], np.cumsum(step)])
+    half = length <= 0.5 * length[-1]
+    first, second = np.flatnonzero(half), np.flatnonzero(~half)
+    gap = (
+        np.linalg.norm(points[first, None] - points[None, second], axis=2) - radius[first, None] - radius[None, second]
+    )
+    return bool(gap.min(axis=1).max(initial=-np.inf) > _OPEN_MM or gap.min(axis=0).max(initial=-np.inf) > _OPEN_MM)
+
+
+def _ends_near(
+    tree: VesselTree,
+    branch: Int[np.ndarray, "n"],
+    abscissa: Float[np.ndarray, "n"],
+    radius: Float[np.ndarray, "n"],
+    index: int,
+) -> bool:
+    """Return whether a point lies within two radii of the end of its branch, and the branch ends blind there."""
+    number = int(branch[index])
+    end = float(tree.branches[number].centerline.abscissa[-1])
+    leaf = all(other.parent != number for other in tree.branches)
+    return leaf and end - float(abscissa[index]) < 2 * float(radius[index]) + STEP_MM
+
+
+def _clusters(places: Float[np.ndarray, "n 3"], apart_mm: float) -> Int[np.ndarray, "n"]:
+    from scipy.sparse import csr_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    near = KDTree(places).query_pairs(apart_mm, output_type="ndarray")
+    matrix = csr_matrix((np.ones(len(near)), (near[:, 0], near[:, 1])), shape=(len(places), len(places)))
+    return connected_components(matrix, directed=False)[1]
+
+
+def further_inlets(source: Polylines, tree: VesselTree) -> list[str]:
+    """Return a note on each end at which the vessel could be entered as well.
+
+    It is about as wide as the ostium, and lines begin there as they do at the ostium, or the vessel widens towards it.
+    """
+    root = tree.branches[0].centerline
+    starts = np.array([line[0] for line in source.points])
+    begins_here = np.linalg.norm(starts - root.points[0], axis=1).min() <= root.radius[0]
+    notes = []
+    for leaf in tree.leaves():
+        line = tree.path(leaf)
+        end, size = line.points[-1], float(np.median(line.radius[-5:]))
+        begins = begins_here and np.linalg.norm(starts - end, axis=1).min() <= size
+        widens = size > _WIDENS * float(line.radius.min())
+        if size >= _AS_WIDE * float(root.radius[0]) and (begins or widens):
+            notes.append(
+                f"the end at {end.round(1).tolist()} mm could be an inlet too (radius {size:.2f} mm, "
+                f"{root.radius[0]:.2f} mm at the ostium): the tree has one, and --ostium-mm chooses it"
+            )
+    return notes

@@ -1,0 +1,143 @@
+"""Whatever of the lines a tree does not reach is bridged, or said with its length and place; loops and inlets too."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_lines_in_order import made, straight
+
+from endopilot.errors import InputError
+
+TURN = np.linspace(0.0, 2 * np.pi, 300)
+RING = np.column_stack([20 * np.cos(TURN), 20 * np.sin(TURN), 0 * TURN])
+LOOP = r"(two lines meet|two vessels touch) at \[(.*?)\] mm and close a loop of (\d+) mm"
+
+
+def loops(found):
+    matches = [re.match(LOOP, note) for note in found.notes]
+    return [(np.array(m[2].split(","), dtype=float), float(m[3])) for m in matches if m]
+
+
+@given(
+    pieces=st.lists(
+        st.tuples(
+            st.tuples(*[st.floats(-40, 40)] * 3), st.tuples(*[st.floats(-1, 1)] * 3), st.floats(3, 60),
+            st.floats(0.5, 4.0),
+        ),
+        min_size=1, max_size=5,
+    )
+)  # fmt: skip
+@settings(max_examples=60, deadline=None, derandomize=True)
+def test_covered_left_out_and_bridged_are_all_of_the_lines(pieces):
+    lines, radii = [], []
+    for start, heading, length, radius in pieces:
+        unit = np.array(heading) + np.array([0, 0, 1.5])
+        end = np.array(start) + length * unit / np.linalg.norm(unit)
+        lines.append(straight(start, end, max(2, int(length / radius))))
+        radii.append(radius)
+    from endopilot.anatomy.polylines import tree_from_polylines
+    from endopilot.anatomy.sources import Polylines
+
+    source = Polylines(
+        tuple(lines), tuple(np.full(len(line), radius) for line, radius in zip(lines, radii, strict=True))
+    )
+    found = tree_from_polylines(source, None, "lines.vtp")
+    lengths = found.lengths_mm
+    total = sum(length for _, _, length, _ in pieces)
+    assert abs(lengths["given"] - total) < 0.3
+    assert abs(lengths["covered"] + lengths["left_out"] - lengths["given"]) < 0.3
+    # Lines that run together are said once, so what is said is at most what is left out.
+    said = sum(float(m[1]) for note in found.notes if (m := re.match(r"([\d.]+) mm of line .*left out", note)))
+    assert said <= lengths["left_out"] + 0.5
+    assert said >= lengths["left_out"] / len(pieces) - 0.5
+    bridged = sum(float(m[1]) for note in found.notes if (m := re.match(r"a gap of ([\d.]+) mm", note)))
+    assert abs(bridged - lengths["bridged"]) < 0.3
+    # By another way: what lies outside the tree's own spheres is no longer than what is said to be left out.
+    points = np.concatenate([branch.centerline.points for branch in found.tree.branches])
+    radius = np.concatenate([branch.centerline.radius for branch in found.tree.branches])
+    outside = 0.0
+    for line in lines:
+        dense = straight(line[0], line[-1], 200)
+        gap = np.linalg.norm(dense[:, None] - points, axis=2)
+        outside += (gap.min(axis=1) > radius[gap.argmin(axis=1)] + 0.5).mean() * np.linalg.norm(line[-1] - line[0])
+    assert outside <= lengths["left_out"] + 1.0
+
+
+def test_a_second_line_apart_is_said_with_its_length_and_place():
+    found = made([straight([0, 0, 0], [0, 0, 60]), straight([30, 0, 0], [30, 0, 40])])
+    assert found.lengths_mm == {"given": 100.0, "covered": 60.0, "left_out": 40.0, "bridged": 0.0}
+    assert any(re.match(r"40\.0 mm of line at \[30\.0, .*\] mm is left out", note) for note in found.notes)
+
+
+def test_a_small_gap_between_lines_is_bridged_and_noted():
+    found = made([straight([0, 0, 0], [0, 0, 30]), straight([0, 0, 34], [0, 0, 60])])
+    assert len(found.tree.branches) == 1 and found.lengths_mm["bridged"] == 4.0
+    assert any("a gap of 4.0 mm between lines at [0.0, 0.0, 30.0] mm is bridged" in note for note in found.notes)
+
+
+def test_the_longer_of_two_pieces_is_taken_though_the_other_is_wider():
+    from endopilot.anatomy.polylines import tree_from_polylines
+    from endopilot.anatomy.sources import Polylines
+
+    lines = (straight([0, 0, 0], [0, 0, 90]), straight([40, 0, 0], [40, 0, 30]))
+    found = tree_from_polylines(Polylines(lines, (np.full(100, 1.0), np.full(100, 2.0))), None, "lines.vtp")
+    assert abs(found.tree.longest_path().abscissa[-1] - 90) < 0.5
+
+
+def test_lines_of_two_coronary_arteries_are_refused_with_both_places():
+    both = [straight([0, 0, 0], [0, 0, 90]), straight([40, 0, 0], [40, 0, 80])]
+    with pytest.raises(InputError, match=r"two trees that are not connected.*--ostium-mm"):
+        made(both, vessel="rca")
+
+
+ARCH = np.column_stack([10 * np.sin(TURN / 2), 0 * TURN, 20 + 40 * TURN / TURN[-1]])
+DIAMOND = [
+    *(straight([0, 0, 0], [x, 0, 40]) for x in (25, -25)),
+    *(straight([x, 0, 40], [0, 0, 80]) for x in (25, -25)),
+    straight([0, 0, 80], [0, 0, 100]),
+    straight([0, 0, -40], [0, 0, 0]),
+]
+
+
+@pytest.mark.parametrize(
+    ("lines", "length"),
+    [
+        ([RING], 126),
+        ([RING, straight([20, 0, 0], [60, 0, 0])], 126),
+        ([straight([0, 0, 0], [0, 0, 80]), ARCH], 86),
+        (DIAMOND, 189),
+    ],
+)
+def test_loops_are_cut_with_their_place_and_length(lines, length):
+    found = made(lines)
+    assert found.lengths_mm["left_out"] < 1.0
+    (place, size), *more = loops(found)
+    assert not more and abs(size - length) < 8
+    assert min(np.linalg.norm(line - place, axis=1).min() for line in lines) < 2.0
+
+
+def test_vessels_that_touch_are_said_and_bends_without_a_hole_are_not():
+    bend = np.column_stack([8 - 8 * np.cos(TURN[:150]), 0 * TURN[:150], 40 + 8 * np.sin(TURN[:150])])
+    leg = straight([0, 0, 0], [0, 0, 40])
+    kiss = np.concatenate([leg, bend, straight([16, 0, 40], [2, 0, 20]), straight([2, 0, 20], [16, 0, 0])])
+    ((place, size),) = loops(made([kiss]))
+    assert np.linalg.norm(place - [1, 0, 20]) < 1.0 and abs(size - 70) < 3
+    narrow = np.column_stack([1.3 - 1.3 * np.cos(TURN[:150]), 0 * TURN[:150], 40 + 1.3 * np.sin(TURN[:150])])
+    assert loops(made([np.concatenate([leg, narrow, straight([2.6, 0, 40], [2.6, 0, 0])])])) == []
+    assert loops(made([straight([0, 0, 0], [0, 0, 80]), straight([0, 0, 30], [12, 0, 80])])) == []
+
+
+def test_a_second_inlet_is_said_with_its_place():
+    first = np.concatenate([straight([-15, 0, 0], [0, 0, 40]), straight([0, 0, 40.4], [0, 0, 80])])
+    found = made([first, straight([15, 0, 0], [0, 0, 40])])
+    assert any("the end at [15.0, 0.0, 0.0] mm could be an inlet too" in note for note in found.notes)
+    assert made([straight([0, 0, 0], [0, 0, 80])]).notes == []
+
+
+def test_the_root_is_an_end_and_no_place_that_a_vessel_passes():
+    lines = [straight([0, 0, 0], [0, 0, 40]), straight([0, 0, 40], [0, 0, 80]), straight([0, 0, 40], [30, 0, 60])]
+    assert np.abs(made(lines).tree.branches[0].centerline.points[0, 2] - 40) > 15
