@@ -13,7 +13,7 @@ from endopilot.anatomy.coronary_crux import Crux, find_crux
 from endopilot.anatomy.coronary_ends import OpenEnd, Skeleton, open_ends, skeleton_of
 from endopilot.anatomy.coronary_ostia import OstiumCandidate, Side, rank_ostia
 from endopilot.anatomy.distance import distance_map_from_surface
-from endopilot.anatomy.surface import Surface, surface_from_mask
+from endopilot.anatomy.surface import Surface, filled_box, surface_from_mask
 from endopilot.anatomy.units import check_unit
 from endopilot.errors import InputError
 from endopilot.types import DistanceMap, Insertion, LumenMask, Volume
@@ -144,20 +144,24 @@ def _parts(lumen: DistanceMap, inside: np.ndarray) -> Iterator[tuple[Float[np.nd
 
 def _holds_aorta(mask: Volume) -> bool:
     """Return whether a mask is somewhere too thick for a coronary artery, at a fraction of its wall's cost."""
-    from scipy.ndimage import distance_transform_edt
+    from scipy.ndimage import distance_transform_edt, minimum_filter
 
     coarse = _coarse(mask)
+    # A ball holds a cube of its radius over √3; without such a cube the costly distance need not be asked.
+    cube = 2 * np.floor(parent_vessel.AORTA_RADIUS_MM / np.sqrt(3.0) / coarse.spacing_mm[::-1]).astype(int) - 1
+    if not minimum_filter(coarse.voxels, size=np.maximum(cube, 1), mode="constant").any():
+        return False
     depth = np.asarray(distance_transform_edt(coarse.voxels, sampling=coarse.spacing_mm[::-1]))
     return bool(depth.max(initial=0.0) > parent_vessel.AORTA_RADIUS_MM)
 
 
 def _coarse(mask: Volume) -> Volume:
     """Return a mask cropped to what is in it, of voxels no finer than the ostia are looked for at."""
-    filled = np.nonzero(mask.voxels)
-    if len(filled[0]) == 0:
+    box = filled_box(mask.voxels)
+    if box[0].stop == 0:
         return mask
-    corner = np.array([index.min() for index in filled])
-    voxels = mask.voxels[tuple(slice(low, index.max() + 1) for low, index in zip(corner, filled, strict=True))]
+    corner = np.array([part.start for part in box])
+    voxels = mask.voxels[box]
     factor = np.maximum(np.floor(GRID_MM / mask.spacing_mm + 0.2).astype(int), 1)
     origin = mask.index_to_world(corner[::-1].astype(float))
     cropped = replace(mask, voxels=np.asarray(voxels, dtype=bool), origin_mm=origin)

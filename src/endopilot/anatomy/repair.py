@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from endopilot.anatomy.parent_vessel import COMPARABLE, Vessel, piece_on_side
-from endopilot.anatomy.surface import Surface, surface_from_mask
+from endopilot.anatomy.surface import Surface, filled_box, surface_from_mask
 from endopilot.errors import InputError
 from endopilot.types import Insertion, Volume
 
@@ -52,11 +52,10 @@ def connected_mask(
     from scipy.ndimage import binary_fill_holes
     from scipy.ndimage import label as components
 
-    filled = np.nonzero(mask.voxels)
-    if len(filled[0]) == 0:
+    box = filled_box(mask.voxels)
+    if box[0].stop == 0:
         raise InputError(f"{label}: the mask is empty; check the label or segment again")
-    corner = np.array([index.min() for index in filled])
-    box = tuple(slice(low, index.max() + 1) for low, index in zip(corner, filled, strict=True))
+    corner = np.array([part.start for part in box])
     voxels = np.asarray(mask.voxels[box], dtype=bool)
     _refuse_blocks_and_noise(voxels, label)
     origin = mask.index_to_world(corner[::-1].astype(float))
