@@ -14,6 +14,7 @@ from endopilot.anatomy.coronary_ends import OpenEnd, Skeleton, open_ends, skelet
 from endopilot.anatomy.coronary_ostia import OstiumCandidate, Side, rank_ostia
 from endopilot.anatomy.distance import distance_map_from_surface
 from endopilot.anatomy.surface import Surface, filled_box, surface_from_mask
+from endopilot.anatomy.topology import parted
 from endopilot.anatomy.units import check_unit
 from endopilot.errors import InputError
 from endopilot.types import DistanceMap, Insertion, LumenMask, Volume
@@ -40,12 +41,14 @@ class CoronaryInlet:
         confidence: probability that the artery begins there, 0 to 1.
         runner_up: the next best place, if any.
         crux: where the arteries meet the crux of the heart, if both are in the lumen and their ostia certain.
+        other: where the other coronary artery begins, LPS mm, if it is another piece and certain.
     """
 
     position: Float[np.ndarray, "3"]
     confidence: float
     runner_up: OstiumCandidate | None
     crux: Crux | None = None
+    other: Float[np.ndarray, "3"] | None = None
 
     def record(self) -> dict[str, object]:
         """Return what `anatomy.json` keeps: `ostium_confidence`, and where else the artery may begin."""
@@ -89,10 +92,12 @@ def coronary_inlet(content: LumenMask | Surface, side: Side, label: str) -> Coro
         raise InputError(f"{label}: {_doubt(ranked, absent, side)}")
     other = rank_ostia(pieces, "lca" if side == "rca" else "rca")[0][0]
     crux = None
-    if other.probability >= CERTAIN and other.piece != best.piece:
+    apart = other.probability >= CERTAIN and other.piece != best.piece
+    if apart:
         right, left = (best, other) if side == "rca" else (other, best)
         crux = find_crux(right.position, skeletons[right.piece].points, skeletons[left.piece].points)
-    return CoronaryInlet(best.position, best.probability, ranked[1] if len(ranked) > 1 else None, crux)
+    runner_up = ranked[1] if len(ranked) > 1 else None
+    return CoronaryInlet(best.position, best.probability, runner_up, crux, other.position if apart else None)
 
 
 def _doubt(ranked: list[OstiumCandidate], absent: float, side: Side) -> str:
@@ -121,7 +126,7 @@ def _lumens(content: LumenMask | Surface, label: str) -> Iterator[DistanceMap]:
         if mask.voxels.any():
             corners = mask.index_to_world(np.array([np.zeros(3), np.array(mask.voxels.shape[::-1]) - 1.0]))
             check_unit(corners, None, "rca", label)
-            wall = surface_from_mask(repair.joined_mask(mask))
+            wall = surface_from_mask(parted(repair.joined_mask(mask))[0])
             yield distance_map_from_surface(wall, spacing_mm=GRID_MM, band_mm=2 * GRID_MM)
         return
     for place in repair.region_places(content):

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
 from endopilot import __version__
-from endopilot.anatomy import polylines, repair
+from endopilot.anatomy import coverage, polylines, repair
 from endopilot.anatomy.centerline import refined_lines
 from endopilot.anatomy.coronary_inlet import CoronaryInlet, coronary_inlet
 from endopilot.anatomy.distance import (
@@ -26,6 +26,7 @@ from endopilot.anatomy.inlet import beyond_parent, component, entrance, grid_poi
 from endopilot.anatomy.labels import dominance, label_tree
 from endopilot.anatomy.labels_coronary import SHORT_MM
 from endopilot.anatomy.lumen_graph import lumen_graph, trace_branches
+from endopilot.anatomy.medial_lines import MedialLines, traced_lines
 from endopilot.anatomy.sources import AnatomySource, Polylines, read_source, transformed
 from endopilot.anatomy.surface import Surface, surface_from_mask
 from endopilot.anatomy.tree import tree_from_lines
@@ -93,7 +94,7 @@ def extract_anatomy(
     wrapped = source if isinstance(source, AnatomySource) else AnatomySource(source)
     wrapped = transformed(wrapped, scale=config.scale, coordinates=config.coordinates)
     name = name or wrapped.file.partition(".")[0] or "patient"
-    content, notes = wrapped.content, []
+    content, notes, balance = wrapped.content, [], None
     given = content.ostium if isinstance(content, LumenMask) else None
     if config.ostium_mm is not None:
         given = Insertion(np.array(config.ostium_mm, dtype=float), np.zeros(3))
@@ -106,11 +107,16 @@ def extract_anatomy(
             advance(2)
             distance_map = distance_map_from_spheres(tree, spacing_mm=config.spacing_mm)
         else:
-            surface, finest, inlet, notes = _wall(content, given, config, source_name)
+            wall = _wall(content, given, config, source_name)
+            surface, inlet, notes = wall.surface, wall.inlet, wall.notes
             advance()
-            tree, rule = _tree(surface, finest, given, inlet, config, source_name)
+            tree, rule = _tree(surface, wall.finest_mm, given, inlet, config, source_name)
             advance()
             distance_map = _final_map(surface, tree, config)
+            left = coverage.unreached(wall.lines, tree, wall.voxel_mm)
+            balance = coverage.record(wall.lines, wall.widened, left)
+            line = tree.branches[0].centerline
+            notes += coverage.left_out_text(left, line.points[0], 3.0 * float(line.radius[0]) + wall.voxel_mm)
         advance()
         crux = None if inlet is None else inlet.crux
         tree = label_tree(tree, config.vessel, crux=crux)
@@ -130,6 +136,7 @@ def extract_anatomy(
         **(inlet.record() if inlet is not None else {}),
         "catheter_tilt_deg": round(catheter_tilt_deg(ostium_radius, radius), 1),
         "dominance": crux.dominance if crux is not None else None if short else dominance(tree),
+        "coverage": balance,
         "notes": notes,
     }
     return Anatomy(name, tree, distance_map, insertion, radius, provenance)
@@ -140,10 +147,31 @@ def _check_lines(lines: Polylines | VesselTree, config: AnatomyConfig, label: st
         check_unit(np.concatenate(lines.points), float(np.median(np.concatenate(lines.radius))), config.vessel, label)
 
 
-def _wall(
-    content: LumenMask | Surface, given: Insertion | None, config: AnatomyConfig, label: str
-) -> tuple[Surface, float, CoronaryInlet | None, list[str]]:
-    """Return the closed wall of the wanted vessel, the voxels' shortest edge (mm), its inlet if found, and repairs."""
+@dataclass(frozen=True, eq=False)
+class _Wall:
+    """The closed wall of the wanted vessel, and what it was made from.
+
+    Attributes:
+        surface: the wall.
+        finest_mm: the voxels' shortest edge, mm; 0 where there are none.
+        voxel_mm: their longest edge, mm.
+        inlet: where the coronary artery begins, if that was looked for.
+        lines: middle of what the wall was made from: all that the tree should reach.
+        widened: thin parts of it that were widened.
+        notes: remarks on what was repaired.
+    """
+
+    surface: Surface
+    finest_mm: float
+    voxel_mm: float
+    inlet: CoronaryInlet | None
+    lines: MedialLines
+    widened: list[coverage.Stretch]
+    notes: list[str]
+
+
+def _wall(content: LumenMask | Surface, given: Insertion | None, config: AnatomyConfig, label: str) -> _Wall:
+    """Return the closed wall of the wanted vessel, with repairs stated."""
     inlet = None
     if isinstance(content, Surface):
         check_unit(content.vertices, None, config.vessel, label)
@@ -151,10 +179,14 @@ def _wall(
         inlet = coronary_inlet(content, config.vessel, label)
         given = None if inlet is None else Insertion(inlet.position, np.zeros(3))
     if isinstance(content, LumenMask):
-        mask, notes = repair.connected_mask(content.volume, given, label, config.vessel)
-        return surface_from_mask(mask), float(mask.spacing_mm.min()), inlet, notes
+        other = None if inlet is None else inlet.other
+        mask, notes = repair.connected_mask(content.volume, given, label, config.vessel, other)
+        lines = traced_lines(mask)
+        mask, wide, remarks = coverage.widened(mask, lines, config.minimum_branch_length_mm)
+        finest, longest = float(mask.spacing_mm.min()), float(mask.spacing_mm.max())
+        return _Wall(surface_from_mask(mask), finest, longest, inlet, lines, wide, notes + remarks)
     surface, notes = repair.closed_surface(content, given, label, config.vessel)
-    return surface, 0.0, inlet, notes
+    raise NotImplementedError
 
 
 def _short(tree: VesselTree, vessel: str) -> list[str]:

@@ -190,6 +190,11 @@ def filled_box(voxels: Bool[np.ndarray, "nz ny nx"]) -> tuple[slice, slice, slic
     return (box[0], box[1], box[2])
 
 
+def blur_voxels(edges_mm: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    """Return the standard deviation in voxels of the Gaussian along each axis, for voxels with these edges in mm."""
+    return SMOOTHING_VOXELS * (edges_mm.max() / edges_mm) ** ACROSS_EDGES
+
+
 def level_function(
     inside: Bool[np.ndarray, "nz ny nx"], edges_mm: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "nz ny nx"]:
@@ -208,7 +213,7 @@ def level_function(
     """
     from scipy.special import ndtri
 
-    sigma, width = SMOOTHING_VOXELS, SMOOTHING_VOXELS * (edges_mm.max() / edges_mm) ** ACROSS_EDGES
+    sigma, width = SMOOTHING_VOXELS, blur_voxels(edges_mm)
     gain, deepest = np.float32(sigma * np.sqrt(2 * np.pi)), sigma * ndtri(1 - 1e-4)
     kernels = [_blur_matrix(float(one)) for one in width]
     halo = [(kernel.shape[1] - _BLOCK) // 2 for kernel in kernels]
