@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 
 from endopilot.anatomy.distance import MAXIMUM_GRID_POINTS
 from endopilot.anatomy.medial_lines import MedialLines
-from endopilot.anatomy.surface import blur_voxels, level_function
+from endopilot.anatomy.surface import Surface, blur_voxels, level_function
 from endopilot.anatomy.topology import place_text
 from endopilot.anatomy.tree import sampled
 from endopilot.types import VesselTree, Volume
@@ -28,6 +28,8 @@ _REACH_VOXELS = 1.5
 
 _NARROWEST, _NARROWEST_STEPS = 0.75, 1.2
 """A stretch is widened to a radius of this many widths of the wall's blur, and grid steps: such a tube has no gap."""
+
+_MOST_VOXELS = 10_000_000
 
 _DIAGONAL = 0.87
 """A ball of this many grid steps in radius holds a grid point wherever it lies (√3/2)."""
@@ -48,6 +50,25 @@ class Stretch:
     length_mm: float
     beyond_mm: float
     place: Float[np.ndarray, "3"]
+
+
+def voxelised(surface: Surface, step_mm: float) -> Volume:
+    """Return the mask of all voxels that a closed wall holds or touches, so that its thinnest neck stays connected.
+
+    Args:
+        surface: the wall.
+        step_mm: edge of the voxels, mm; larger where there would be more than `_MOST_VOXELS`.
+    """
+    extent = np.ptp(surface.vertices, axis=0)
+    step = max(step_mm, float(np.prod(extent + 4 * step_mm) / _MOST_VOXELS) ** (1 / 3))
+    origin = surface.vertices.min(axis=0) - 2 * step
+    size = np.ceil(extent / step).astype(int) + 5
+    voxels = surface.inside((int(size[2]), int(size[1]), int(size[0])), origin, step)
+    fine = surface.refined(0.7 * step)
+    samples = np.concatenate([fine.vertices, fine.vertices[fine.faces].mean(axis=1)])
+    index = np.rint((samples - origin) / step).astype(int)
+    voxels[index[:, 2], index[:, 1], index[:, 0]] = True
+    return Volume(voxels, np.full(3, step), origin, np.eye(3))
 
 
 def widened(mask: Volume, lines: MedialLines, minimum_mm: float) -> tuple[Volume, list[Stretch], list[str]]:

@@ -29,6 +29,7 @@ from endopilot.anatomy.lumen_graph import lumen_graph, trace_branches
 from endopilot.anatomy.medial_lines import MedialLines, traced_lines
 from endopilot.anatomy.sources import AnatomySource, Polylines, read_source, transformed
 from endopilot.anatomy.surface import Surface, surface_from_mask
+from endopilot.anatomy.topology import place_text, side_by_side
 from endopilot.anatomy.tree import tree_from_lines
 from endopilot.anatomy.units import SMALLEST_RADIUS_MM, check_unit
 from endopilot.errors import InputError
@@ -43,6 +44,9 @@ CORONARY_RADIUS_MM = 1.6
 
 _RESOLVED_STEPS = 1.25
 """A catheter's radius in steps of the distance map, at least: wide vessels have coarse maps."""
+
+_AS_WIDE = 0.9
+"""An end of at least this share of the inlet's radius may be an inlet too."""
 
 SHORTEST_IN_DIAMETERS = 1.5
 """A lumen whose longest path is shorter than this many of its own mean diameters is no vessel."""
@@ -113,6 +117,7 @@ def extract_anatomy(
             tree, rule = _tree(surface, wall.finest_mm, given, inlet, config, source_name)
             advance()
             distance_map = _final_map(surface, tree, config)
+            notes += _other_inlets(tree, rule)
             left = coverage.unreached(wall.lines, tree, wall.voxel_mm)
             balance = coverage.record(wall.lines, wall.widened, left)
             line = tree.branches[0].centerline
@@ -178,15 +183,32 @@ def _wall(content: LumenMask | Surface, given: Insertion | None, config: Anatomy
     if given is None and config.vessel != "generic":
         inlet = coronary_inlet(content, config.vessel, label)
         given = None if inlet is None else Insertion(inlet.position, np.zeros(3))
+    other = None if inlet is None else inlet.other
     if isinstance(content, LumenMask):
-        other = None if inlet is None else inlet.other
         mask, notes = repair.connected_mask(content.volume, given, label, config.vessel, other)
         lines = traced_lines(mask)
         mask, wide, remarks = coverage.widened(mask, lines, config.minimum_branch_length_mm)
         finest, longest = float(mask.spacing_mm.min()), float(mask.spacing_mm.max())
-        return _Wall(surface_from_mask(mask), finest, longest, inlet, lines, wide, notes + remarks)
-    surface, notes = repair.closed_surface(content, given, label, config.vessel)
-    raise NotImplementedError
+        notes += [*side_by_side(lines, longest), *remarks]
+        return _Wall(surface_from_mask(mask), finest, longest, inlet, lines, wide, notes)
+    surface, notes = repair.closed_surface(content, given, label, config.vessel, other)
+    step = min(2.0 * surface.volume / surface.area, CORONARY_RADIUS_MM) / 5.0
+    voxels = coverage.voxelised(surface, max(step, SMALLEST_RADIUS_MM))
+    return _Wall(surface, 0.0, float(voxels.spacing_mm.max()), inlet, traced_lines(voxels), [], notes)
+
+
+def _other_inlets(tree: VesselTree, rule: str) -> list[str]:
+    """Say so if a vessel of unknown kind is as wide at another end as at the one that was taken for its inlet."""
+    if rule != "widest open end":
+        return []
+    first = tree.branches[0].centerline
+    usual = float(np.median(first.radius[: max(3, len(first.radius) // 4)]))
+    ends = [tree.branches[leaf].centerline for leaf in tree.leaves()]
+    wide = [line for line in ends if float(np.median(line.radius[-max(3, len(line.radius) // 4) :])) > _AS_WIDE * usual]
+    if not wide:
+        return []
+    places = ", ".join(place_text(line.points[-1]) for line in wide[:4])
+    return [f"the vessel may as well begin at {places}, where it is as wide: --ostium-mm chooses another inlet"]
 
 
 def _short(tree: VesselTree, vessel: str) -> list[str]:

@@ -125,11 +125,23 @@ def _traced_piece(
     graph = lumen_graph(index[:, ::-1] * edges_mm, clearance, edges_mm, int(clearance.argmax()))
     graph = lumen_graph(graph.points, graph.clearance, edges_mm, int(graph.length.argmax()))
     paths = trace_branches(graph, minimum_length_mm=_STUB_VOXELS * float(edges_mm.max()), slenderness=_SLENDER)
-    nodes = np.unique(np.concatenate(paths))
-    number = np.full(len(graph.points), -1)
-    number[nodes] = np.arange(len(nodes))
-    pairs = np.concatenate([np.stack([number[path[:-1]], number[path[1:]]], axis=1) for path in paths])
-    return np.rint(graph.points[nodes] / edges_mm).astype(int)[:, ::-1], graph.clearance[nodes], pairs
+    places = np.rint(graph.points / edges_mm).astype(int)[:, ::-1]
+    nodes: list[int] = []
+    pairs: list[tuple[int, int]] = []
+    for path in paths:
+        # Where a vessel is an even number of voxels wide, two paths may run side by side: they are one from there.
+        start, joint = 0, -1
+        if nodes:
+            gap, nearest = map(np.asarray, KDTree(places[nodes]).query(places[path]))
+            start = int(np.flatnonzero(gap < _NEIGHBOURS_APART)[-1])
+            joint = int(nearest[start])
+            start += int(gap[start] == 0)
+        for node in path[start:]:
+            nodes.append(int(node))
+            if joint >= 0:
+                pairs.append((joint, len(nodes) - 1))
+            joint = len(nodes) - 1
+    return places[nodes], graph.clearance[nodes], np.array(pairs, dtype=int).reshape(-1, 2)
 
 
 def _clearance(

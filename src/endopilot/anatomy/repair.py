@@ -129,11 +129,22 @@ def joined_mask(mask: Volume) -> Volume:
 
 
 def closed_surface(
-    surface: Surface, given: Insertion | None, label: str, vessel: Vessel = "generic"
+    surface: Surface,
+    given: Insertion | None,
+    label: str,
+    vessel: Vessel = "generic",
+    other_ostium: Float[np.ndarray, "3"] | None = None,
 ) -> tuple[Surface, list[str]]:
     """Return one closed wall with outward normals: largest piece (or the one at the ostium), holes capped.
 
     Where a file holds both coronary arteries and no ostium is given, `vessel` decides by the patient's side.
+
+    Args:
+        surface: one or several walls.
+        given: the ostium, if it is known.
+        label: name of the source, for messages.
+        vessel: which vessel is wanted.
+        other_ostium: ostium of the other coronary artery, LPS mm, if it is known.
 
     Raises:
         InputError: the holes cannot be closed, or the surface is nowhere near the given ostium.
@@ -153,7 +164,7 @@ def closed_surface(
         else:
             chosen = int(ids[np.linalg.norm(regions.points - given.position, axis=1).argmin()])
         mesh = regions.extract_points(ids == chosen, adjacent_cells=False).extract_surface().triangulate().clean()
-        remarks.append(f"{int(ids.max())} separate pieces of the surface left out")
+        remarks += _regions_left_out(np.asarray(regions.points, float), ids.astype(np.int64), chosen, vessel, other_ostium)
     if given is not None:
         gap = float(KDTree(mesh.points).query(given.position)[0])
         if gap > max(NEAR_OSTIUM_MM, 0.15 * float(np.ptp(mesh.points, axis=0).max())):
@@ -273,7 +284,7 @@ def _left_out(
     reach = KDTree(mask.index_to_world(np.argwhere(result)[:, ::-1].astype(float)))
     remarks = []
     for number in order[:_MOST_LISTED]:
-        if remarks and extent[number] < NOTED_MM:
+        if extent[number] < NOTED_MM:
             break
         box = boxes[lost[number] - 1]
         own = np.argwhere(labels[box] == lost[number]) + corners[number, :, 0]
@@ -286,9 +297,39 @@ def _left_out(
         )
     rest = order[len(remarks) :]
     if len(rest):
-        remarks.append(
-            f"{len(rest)} more pieces of up to {extent[rest].max():.0f} mm left out ({sizes[lost[rest]].sum()} voxels)"
-        )
+        kind = "more pieces" if remarks else "pieces apart from the lumen"
+        longest, size = float(extent[rest].max()), int(sizes[lost[rest]].sum())
+        remarks.append(f"{len(rest)} {kind} of up to {longest:.0f} mm left out ({size} voxels)")
+    return remarks
+
+
+def _regions_left_out(
+    points: Float[np.ndarray, "n 3"],
+    ids: Int[np.ndarray, "n"],
+    chosen: int,
+    vessel: Vessel,
+    other_ostium: Float[np.ndarray, "3"] | None,
+) -> list[str]:
+    """Say which separate walls of a surface were left out and where they lie."""
+    own = KDTree(points[ids == chosen])
+    found: list[tuple[float, str]] = []
+    for region in np.unique(ids[ids != chosen]):
+        place = points[ids == region]
+        extent = float(np.linalg.norm(np.ptp(place, axis=0)))
+        if other_ostium is not None and np.linalg.norm(place - other_ostium, axis=1).min() < NEAR_OSTIUM_MM:
+            other = "left" if vessel == "rca" else "right"
+            found.append((np.inf, f"the {other} coronary artery ({len(place)} vertices) is not part of this one"))
+        elif extent >= NOTED_MM:
+            gap = np.asarray(own.query(place)[0])
+            at = ", ".join(f"{value:.0f}" for value in place[gap.argmin()])
+            text = f"a separate piece of the surface left out: {extent:.0f} mm long, {gap.min():.1f} mm away at ({at}) mm"
+            found.append((extent, text))
+    remarks = [text for _, text in sorted(found, key=lambda item: -item[0])[:_MOST_LISTED]]
+    rest = len(np.unique(ids)) - 1 - len(remarks)
+    if rest:
+        longest = sorted((extent for extent, _ in found if np.isfinite(extent)), reverse=True)[_MOST_LISTED:]
+        size = f"{longest[0]:.0f}" if longest else f"{NOTED_MM:g}"
+        remarks.append(f"{rest} more separate pieces of the surface of up to {size} mm left out")
     return remarks
 
 

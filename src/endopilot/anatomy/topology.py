@@ -32,6 +32,7 @@ _SLIT_VOXELS = 3.0
 """So are those whose opposite sides come as near each other as this, in voxels."""
 
 _SAME_PLACE_MM = 5.0
+_SIDE_BY_SIDE_MM = 3.0
 
 _BRIDGE = 1.5
 """A bridge between two vessels that touch is no longer than this many times both their radii and a slit."""
@@ -39,7 +40,7 @@ _BRIDGE = 1.5
 _THROUGH = -0.6
 """Cosine of the smallest angle between a vessel's two directions where it runs past a contact."""
 
-_THICK_VOXELS = 1.2
+_THICK_VOXELS = 1.0
 _ARM_RADII = 4.0
 _ROUNDS = 4
 
@@ -74,6 +75,34 @@ def parted(mask: Volume) -> tuple[Volume, list[str]]:
         mask = replace(mask, voxels=voxels)
         done += cuts
     return mask, _remarks(done, holes)
+
+
+def side_by_side(lines: MedialLines, voxel_mm: float) -> list[str]:
+    """Return a remark if parts of a vessel that lie far from each other along it touch over a length.
+
+    Args:
+        lines: middle of the vessel, without loops.
+        voxel_mm: the voxels' longest edge, mm.
+    """
+    from scipy.sparse.csgraph import dijkstra
+
+    pairs = KDTree(lines.points).query_pairs(2.0 * float(lines.clearance.max()) + voxel_mm, output_type="ndarray")
+    gap = np.linalg.norm(lines.points[pairs[:, 0]] - lines.points[pairs[:, 1]], axis=1)
+    pairs = pairs[gap < lines.clearance[pairs].sum(axis=1) + voxel_mm]
+    sources, own = np.unique(pairs[:, 0], return_inverse=True)
+    if len(sources) == 0:
+        return []
+    along = np.asarray(dijkstra(lines.forest, indices=sources, limit=SHORTEST_LOOP_MM))
+    far = pairs[np.isinf(along[own.reshape(-1), pairs[:, 1]])]
+    touching = np.unique(far)
+    length = 0.5 * float(lines.share_mm[touching].sum())
+    if length < _SIDE_BY_SIDE_MM:
+        return []
+    place = lines.points[far[len(far) // 2]].mean(axis=0)
+    return [
+        f"distant parts of the vessel touch over {length:.0f} mm, for instance at {place_text(place)}, and are one lumen "
+        "there: look whether the tree is right, and part them in the mask"
+    ]
 
 
 def place_text(point: Float[np.ndarray, "3"]) -> str:
