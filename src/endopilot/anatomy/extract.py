@@ -29,7 +29,7 @@ from endopilot.anatomy.lumen_graph import lumen_graph, trace_branches
 from endopilot.anatomy.medial_lines import MedialLines, traced_lines
 from endopilot.anatomy.sources import AnatomySource, Polylines, read_source, transformed
 from endopilot.anatomy.surface import Surface, surface_from_mask
-from endopilot.anatomy.topology import place_text, side_by_side
+from endopilot.anatomy.topology import place_text
 from endopilot.anatomy.tree import tree_from_lines
 from endopilot.anatomy.units import SMALLEST_RADIUS_MM, check_unit
 from endopilot.errors import InputError
@@ -189,8 +189,7 @@ def _wall(content: LumenMask | Surface, given: Insertion | None, config: Anatomy
         lines = traced_lines(mask)
         mask, wide, remarks = coverage.widened(mask, lines, config.minimum_branch_length_mm)
         finest, longest = float(mask.spacing_mm.min()), float(mask.spacing_mm.max())
-        notes += [*side_by_side(lines, longest), *remarks]
-        return _Wall(surface_from_mask(mask), finest, longest, inlet, lines, wide, notes)
+        return _Wall(surface_from_mask(mask), finest, longest, inlet, lines, wide, notes + remarks)
     surface, notes = repair.closed_surface(content, given, label, config.vessel, other)
     step = min(2.0 * surface.volume / surface.area, CORONARY_RADIUS_MM) / 5.0
     voxels = coverage.voxelised(surface, max(step, SMALLEST_RADIUS_MM))

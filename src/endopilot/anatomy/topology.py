@@ -59,6 +59,7 @@ def parted(mask: Volume) -> tuple[Volume, list[str]]:
     """Return the mask without loops and contacts, each cut at its narrowest place, and remarks on them."""
     done: list[_Cut] = []
     holes: list[_Cut] = []
+    sides: list[str] = []
     for _ in range(_ROUNDS):
         lines = thinned_lines(mask)
         loops = _loops(lines, mask)
@@ -68,41 +69,14 @@ def parted(mask: Volume) -> tuple[Volume, list[str]]:
             lines = traced_lines(mask)
             cuts = _contacts(lines, mask)
         if not cuts:
+            mask, sides = _without_sides(mask, lines)
             break
         voxels = mask.voxels.copy()
         for cut in cuts:
             _sever(voxels, lines, cut.ends)
         mask = replace(mask, voxels=voxels)
         done += cuts
-    return mask, _remarks(done, holes)
-
-
-def side_by_side(lines: MedialLines, voxel_mm: float) -> list[str]:
-    """Return a remark if parts of a vessel that lie far from each other along it touch over a length.
-
-    Args:
-        lines: middle of the vessel, without loops.
-        voxel_mm: the voxels' longest edge, mm.
-    """
-    from scipy.sparse.csgraph import dijkstra
-
-    pairs = KDTree(lines.points).query_pairs(2.0 * float(lines.clearance.max()) + voxel_mm, output_type="ndarray")
-    gap = np.linalg.norm(lines.points[pairs[:, 0]] - lines.points[pairs[:, 1]], axis=1)
-    pairs = pairs[gap < lines.clearance[pairs].sum(axis=1) + voxel_mm]
-    sources, own = np.unique(pairs[:, 0], return_inverse=True)
-    if len(sources) == 0:
-        return []
-    along = np.asarray(dijkstra(lines.forest, indices=sources, limit=SHORTEST_LOOP_MM))
-    far = pairs[np.isinf(along[own.reshape(-1), pairs[:, 1]])]
-    touching = np.unique(far)
-    length = 0.5 * float(lines.share_mm[touching].sum())
-    if length < _SIDE_BY_SIDE_MM:
-        return []
-    place = lines.points[far[len(far) // 2]].mean(axis=0)
-    return [
-        f"distant parts of the vessel touch over {length:.0f} mm, for instance at {place_text(place)}, and are one lumen "
-        "there: look whether the tree is right, and part them in the mask"
-    ]
+    return mask, _remarks(done, holes) + sides
 
 
 def place_text(point: Float[np.ndarray, "3"]) -> str:
@@ -184,6 +158,46 @@ def _contacts(lines: MedialLines, mask: Volume) -> list[_Cut]:
         ):  # fmt: skip
             cuts.append(_Cut((int(node), path_two[0]), "bridge", lines.points[node], 0.0))
     return cuts
+
+
+def _without_sides(mask: Volume, lines: MedialLines) -> tuple[Volume, list[str]]:
+    """Return the mask with parts that lie far from each other along the vessel parted where they touch over a length.
+
+    Each voxel belongs to the nearest point of the middle; neighbours that belong to distant points are emptied.
+    """
+    from scipy.sparse.csgraph import dijkstra
+
+    voxel = float(mask.spacing_mm.max())
+    pairs = KDTree(lines.points).query_pairs(2.0 * float(lines.clearance.max()) + voxel, output_type="ndarray")
+    gap = np.linalg.norm(lines.points[pairs[:, 0]] - lines.points[pairs[:, 1]], axis=1)
+    pairs = pairs[gap < lines.clearance[pairs].sum(axis=1) + voxel]
+    sources, own = np.unique(pairs[:, 0], return_inverse=True)
+    if len(sources) == 0:
+        return mask, []
+    along = np.asarray(dijkstra(lines.forest, indices=sources, limit=SHORTEST_LOOP_MM))
+    far = pairs[np.isinf(along[own.reshape(-1), pairs[:, 1]])]
+    touching = np.unique(far)
+    index = np.argwhere(mask.voxels)
+    home = np.full(np.array(mask.voxels.shape) + 2, -1)
+    local = KDTree(lines.index * mask.spacing_mm[::-1])
+    home[tuple((index + 1).T)] = local.query(index * mask.spacing_mm[::-1])[1]
+    number = np.full(len(lines.points), -1)
+    number[touching] = np.arange(len(touching))
+    distant = np.isinf(np.asarray(dijkstra(lines.forest, indices=touching, limit=SHORTEST_LOOP_MM)))
+    rim = np.zeros(len(index), dtype=bool)
+    own = home[tuple((index + 1).T)]
+    asked = np.flatnonzero(number[own] >= 0) if len(touching) else np.empty(0, int)
+    for step in np.array(list(np.ndindex(3, 3, 3))) - 1:
+        beside = home[tuple((index[asked] + 1 + step).T)]
+        rim[asked] |= (beside >= 0) & distant[number[own[asked]], beside]
+    length = 0.5 * float(lines.share_mm[np.unique(own[rim])].sum()) if rim.any() else 0.0
+    if length < _SIDE_BY_SIDE_MM:
+        return mask, []
+    voxels = mask.voxels.copy()
+    voxels[tuple(index[rim].T)] = False
+    place = mask.index_to_world(index[rim][:, ::-1].mean(axis=0))
+    text = f"distant parts of the vessel touch over {length:.0f} mm around {place_text(place)} and were parted there"
+    return replace(mask, voxels=voxels), [text]
 
 
 def _crossing(lines: MedialLines, ways: list[list[int]], node: int, first: int) -> tuple[int, list[int]] | None:
