@@ -161,7 +161,9 @@ def left_out_text(left: list[Stretch], ostium: Float[np.ndarray, "3"], reach_mm:
     crumbs = sum(s.length_mm for s in left) - sum(s.length_mm for s in long)
     if crumbs >= NOTED_MM:
         count = len(left) - len(long)
-        remarks.append(f"{count} bumps and twigs of less than {NOTED_MM:g} mm, {crumbs:.0f} mm together, are no branches")
+        remarks.append(
+            f"{count} bumps and twigs of less than {NOTED_MM:g} mm, {crumbs:.0f} mm together, are no branches"
+        )
     return remarks
 
 

@@ -78,15 +78,17 @@ def connected_mask(
     labels, sizes, main, others = _pieces(cropped, given, label, vessel)
     own, piece = _cut_out(cropped, labels == main)
     whole, remarks = parted(piece)
+    severed: set[int] = set()  # what was cut off must not be bridged again
     if remarks:
         cropped = replace(cropped, voxels=voxels.copy())
         cropped.voxels[own] &= ~piece.voxels | whole.voxels
         labels, sizes, main, others = _pieces(cropped, given, label, vessel)
+        severed = {int(number) for number in np.unique(labels[own][whole.voxels])}
     result, count = labels == main, len(sizes) - 1
     if count > 1:
         pieces = [int(piece) for piece in np.argsort(-sizes)[: min(count, 200)] if piece != main]
         foreign = _piece_at(cropped, labels, sizes, other_ostium)
-        near = [p for p in pieces if sizes[p] >= SMALLEST_PIECE and p != foreign]
+        near = [p for p in pieces if sizes[p] >= SMALLEST_PIECE and p not in (foreign, *severed)]
         result, joined, beside = _bridged(result, labels, near)
         if beside:
             remarks.append(f"{beside} pieces that run alongside the lumen, not on from it, were not joined to it")
@@ -164,7 +166,9 @@ def closed_surface(
         else:
             chosen = int(ids[np.linalg.norm(regions.points - given.position, axis=1).argmin()])
         mesh = regions.extract_points(ids == chosen, adjacent_cells=False).extract_surface().triangulate().clean()
-        remarks += _regions_left_out(np.asarray(regions.points, float), ids.astype(np.int64), chosen, vessel, other_ostium)
+        remarks += _regions_left_out(
+            np.asarray(regions.points, float), ids.astype(np.int64), chosen, vessel, other_ostium
+        )
     if given is not None:
         gap = float(KDTree(mesh.points).query(given.position)[0])
         if gap > max(NEAR_OSTIUM_MM, 0.15 * float(np.ptp(mesh.points, axis=0).max())):
@@ -322,7 +326,9 @@ def _regions_left_out(
         elif extent >= NOTED_MM:
             gap = np.asarray(own.query(place)[0])
             at = ", ".join(f"{value:.0f}" for value in place[gap.argmin()])
-            text = f"a separate piece of the surface left out: {extent:.0f} mm long, {gap.min():.1f} mm away at ({at}) mm"
+            text = (
+                f"a separate piece of the surface left out: {extent:.0f} mm long, {gap.min():.1f} mm away at ({at}) mm"
+            )
             found.append((extent, text))
     remarks = [text for _, text in sorted(found, key=lambda item: -item[0])[:_MOST_LISTED]]
     rest = len(np.unique(ids)) - 1 - len(remarks)
