@@ -13,7 +13,8 @@ from endopilot.anatomy.coronary_crux import Crux, find_crux
 from endopilot.anatomy.coronary_ends import OpenEnd, Skeleton, open_ends, skeleton_of
 from endopilot.anatomy.coronary_ostia import OstiumCandidate, Side, rank_ostia
 from endopilot.anatomy.distance import distance_map_from_surface
-from endopilot.anatomy.surface import Surface, surface_from_mask
+from endopilot.anatomy.surface import Surface, filled_box, surface_from_mask
+from endopilot.anatomy.topology import parted
 from endopilot.anatomy.units import check_unit
 from endopilot.errors import InputError
 from endopilot.types import DistanceMap, Insertion, LumenMask, Volume
@@ -40,12 +41,14 @@ class CoronaryInlet:
         confidence: probability that the artery begins there, 0 to 1.
         runner_up: the next best place, if any.
         crux: where the arteries meet the crux of the heart, if both are in the lumen and their ostia certain.
+        other: where the other coronary artery begins, LPS mm, if it is another piece and certain.
     """
 
     position: Float[np.ndarray, "3"]
     confidence: float
     runner_up: OstiumCandidate | None
     crux: Crux | None = None
+    other: Float[np.ndarray, "3"] | None = None
 
     def record(self) -> dict[str, object]:
         """Return what `anatomy.json` keeps: `ostium_confidence`, and where else the artery may begin."""
@@ -89,10 +92,12 @@ def coronary_inlet(content: LumenMask | Surface, side: Side, label: str) -> Coro
         raise InputError(f"{label}: {_doubt(ranked, absent, side)}")
     other = rank_ostia(pieces, "lca" if side == "rca" else "rca")[0][0]
     crux = None
-    if other.probability >= CERTAIN and other.piece != best.piece:
+    apart = other.probability >= CERTAIN and other.piece != best.piece
+    if apart:
         right, left = (best, other) if side == "rca" else (other, best)
         crux = find_crux(right.position, skeletons[right.piece].points, skeletons[left.piece].points)
-    return CoronaryInlet(best.position, best.probability, ranked[1] if len(ranked) > 1 else None, crux)
+    runner_up = ranked[1] if len(ranked) > 1 else None
+    return CoronaryInlet(best.position, best.probability, runner_up, crux, other.position if apart else None)
 
 
 def _doubt(ranked: list[OstiumCandidate], absent: float, side: Side) -> str:
@@ -121,7 +126,7 @@ def _lumens(content: LumenMask | Surface, label: str) -> Iterator[DistanceMap]:
         if mask.voxels.any():
             corners = mask.index_to_world(np.array([np.zeros(3), np.array(mask.voxels.shape[::-1]) - 1.0]))
             check_unit(corners, None, "rca", label)
-            wall = surface_from_mask(repair.joined_mask(mask))
+            wall = surface_from_mask(parted(repair.joined_mask(mask))[0])
             yield distance_map_from_surface(wall, spacing_mm=GRID_MM, band_mm=2 * GRID_MM)
         return
     for place in repair.region_places(content):
@@ -144,20 +149,24 @@ def _parts(lumen: DistanceMap, inside: np.ndarray) -> Iterator[tuple[Float[np.nd
 
 def _holds_aorta(mask: Volume) -> bool:
     """Return whether a mask is somewhere too thick for a coronary artery, at a fraction of its wall's cost."""
-    from scipy.ndimage import distance_transform_edt
+    from scipy.ndimage import distance_transform_edt, minimum_filter
 
     coarse = _coarse(mask)
+    # A ball holds a cube of its radius over √3; without such a cube the costly distance need not be asked.
+    cube = 2 * np.floor(parent_vessel.AORTA_RADIUS_MM / np.sqrt(3.0) / coarse.spacing_mm[::-1]).astype(int) - 1
+    if not minimum_filter(coarse.voxels, size=np.maximum(cube, 1), mode="constant").any():
+        return False
     depth = np.asarray(distance_transform_edt(coarse.voxels, sampling=coarse.spacing_mm[::-1]))
     return bool(depth.max(initial=0.0) > parent_vessel.AORTA_RADIUS_MM)
 
 
 def _coarse(mask: Volume) -> Volume:
     """Return a mask cropped to what is in it, of voxels no finer than the ostia are looked for at."""
-    filled = np.nonzero(mask.voxels)
-    if len(filled[0]) == 0:
+    box = filled_box(mask.voxels)
+    if box[0].stop == 0:
         return mask
-    corner = np.array([index.min() for index in filled])
-    voxels = mask.voxels[tuple(slice(low, index.max() + 1) for low, index in zip(corner, filled, strict=True))]
+    corner = np.array([part.start for part in box])
+    voxels = mask.voxels[box]
     factor = np.maximum(np.floor(GRID_MM / mask.spacing_mm + 0.2).astype(int), 1)
     origin = mask.index_to_world(corner[::-1].astype(float))
     cropped = replace(mask, voxels=np.asarray(voxels, dtype=bool), origin_mm=origin)

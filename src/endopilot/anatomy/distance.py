@@ -130,20 +130,19 @@ def _far_field(
 
     At a distance ρ from the medial axis this errs by at most h²/2ρ, so it serves away from the wall.
     """
-    values = np.empty(inside.shape, dtype=np.float32)
     half = np.full(tuple((np.array(inside.shape) + 1) // 2 + 1), -band, dtype=np.float32)
     coarse = np.argwhere(wanted[::2, ::2, ::2])
     within = inside[::2, ::2, ::2][tuple(coarse.T)]
     for part, sign, limit in ((coarse[within], 1.0, np.inf), (coarse[~within], -1.0, band)):
         half[tuple(part.T)] = sign * surface.distance(origin + 2 * spacing * part[:, ::-1], limit_mm=limit)
-    for offset in np.ndindex(2, 2, 2):
-        pieces = [half]
-        for axis, odd in enumerate(offset):
-            if odd:
-                after = [np.roll(piece, -1, axis=axis) for piece in pieces]
-                pieces = [0.5 * (piece + following) for piece, following in zip(pieces, after, strict=True)]
-        target = values[offset[0] :: 2, offset[1] :: 2, offset[2] :: 2]
-        target[...] = pieces[0][: target.shape[0], : target.shape[1], : target.shape[2]]
+    values = half
+    for axis in (2, 1, 0):
+        size, first = inside.shape[axis], (slice(None),) * axis
+        finer = np.empty((*values.shape[:axis], size, *values.shape[axis + 1 :]), dtype=np.float32)
+        even = finer[(*first, slice(None, None, 2))] = values[(*first, slice((size + 1) // 2))]
+        after = values[(*first, slice(1, size // 2 + 1))]
+        finer[(*first, slice(1, None, 2))] = 0.5 * (even[(*first, slice(size // 2))] + after)
+        values = finer
     return values
 
 

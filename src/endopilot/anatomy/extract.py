@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
 
 from endopilot import __version__
-from endopilot.anatomy import polylines, repair
+from endopilot.anatomy import coverage, polylines, repair
 from endopilot.anatomy.centerline import refined_lines
 from endopilot.anatomy.coronary_inlet import CoronaryInlet, coronary_inlet
 from endopilot.anatomy.distance import (
@@ -26,8 +26,10 @@ from endopilot.anatomy.inlet import beyond_parent, component, entrance, grid_poi
 from endopilot.anatomy.labels import dominance, label_tree
 from endopilot.anatomy.labels_coronary import SHORT_MM
 from endopilot.anatomy.lumen_graph import lumen_graph, trace_branches
+from endopilot.anatomy.medial_lines import MedialLines, traced_lines
 from endopilot.anatomy.sources import AnatomySource, Polylines, read_source, transformed
 from endopilot.anatomy.surface import Surface, surface_from_mask
+from endopilot.anatomy.topology import place_text
 from endopilot.anatomy.tree import tree_from_lines
 from endopilot.anatomy.units import SMALLEST_RADIUS_MM, check_unit
 from endopilot.errors import InputError
@@ -42,6 +44,9 @@ CORONARY_RADIUS_MM = 1.6
 
 _RESOLVED_STEPS = 1.25
 """A catheter's radius in steps of the distance map, at least: wide vessels have coarse maps."""
+
+_AS_WIDE = 0.9
+"""An end of at least this share of the inlet's radius may be an inlet too."""
 
 SHORTEST_IN_DIAMETERS = 1.5
 """A lumen whose longest path is shorter than this many of its own mean diameters is no vessel."""
@@ -94,7 +99,7 @@ def extract_anatomy(
     wrapped = source if isinstance(source, AnatomySource) else AnatomySource(source)
     wrapped = transformed(wrapped, scale=config.scale, coordinates=config.coordinates)
     name = name or wrapped.file.partition(".")[0] or "patient"
-    content, notes, lengths = wrapped.content, list(wrapped.notes), {}
+    content, balance, notes = wrapped.content, {}, list(wrapped.notes)
     doubts = list(content.warnings) if isinstance(content, LumenMask) else []
     given = content.ostium if isinstance(content, LumenMask) else None
     if config.ostium_mm is not None:
@@ -104,18 +109,24 @@ def extract_anatomy(
         if isinstance(content, (Polylines, VesselTree)):
             _check_lines(content, config, source_name)
             made = polylines.tree_from_polylines(content, given, source_name, config.vessel)
-            tree, rule, lengths = made.tree, made.rule, {"lines_mm": made.lengths_mm}
+            tree, rule, balance = made.tree, made.rule, made.lengths_mm
             notes += made.notes
             inlet: CoronaryInlet | None = None
             advance(2)
             distance_map = distance_map_from_spheres(tree, spacing_mm=config.spacing_mm)
         else:
-            surface, finest, inlet, repairs = _wall(content, given, config, source_name)
-            notes += repairs
+            wall = _wall(content, given, config, source_name)
+            surface, inlet = wall.surface, wall.inlet
+            notes += wall.notes
             advance()
-            tree, rule = _tree(surface, finest, given, inlet, config, source_name)
+            tree, rule = _tree(surface, wall.finest_mm, given, inlet, config, source_name)
             advance()
             distance_map = _final_map(surface, tree, config)
+            notes += _other_inlets(tree, rule)
+            left = coverage.unreached(wall.lines, tree, wall.voxel_mm)
+            balance = coverage.record(wall.lines, wall.widened, left)
+            line = tree.branches[0].centerline
+            notes += coverage.left_out_text(left, line.points[0], 3.0 * float(line.radius[0]) + wall.voxel_mm)
         advance()
         crux = None if inlet is None else inlet.crux
         tree = label_tree(tree, config.vessel, crux=crux)
@@ -133,9 +144,9 @@ def extract_anatomy(
         "config": asdict(config),
         "ostium_rule": rule,
         **(inlet.record() if inlet is not None else {}),
-        **lengths,
         "catheter_tilt_deg": round(catheter_tilt_deg(ostium_radius, radius), 1),
         "dominance": crux.dominance if crux is not None else None if short else dominance(tree),
+        "coverage": balance,
         "notes": [*doubts, *notes],
     }
     return Anatomy(name, tree, distance_map, insertion, radius, provenance)
@@ -146,21 +157,62 @@ def _check_lines(lines: Polylines | VesselTree, config: AnatomyConfig, label: st
         check_unit(np.concatenate(lines.points), float(np.median(np.concatenate(lines.radius))), config.vessel, label)
 
 
-def _wall(
-    content: LumenMask | Surface, given: Insertion | None, config: AnatomyConfig, label: str
-) -> tuple[Surface, float, CoronaryInlet | None, list[str]]:
-    """Return the closed wall of the wanted vessel, the voxels' shortest edge (mm), its inlet if found, and repairs."""
+@dataclass(frozen=True, eq=False)
+class _Wall:
+    """The closed wall of the wanted vessel, and what it was made from.
+
+    Attributes:
+        surface: the wall.
+        finest_mm: the voxels' shortest edge, mm; 0 where there are none.
+        voxel_mm: their longest edge, mm.
+        inlet: where the coronary artery begins, if that was looked for.
+        lines: middle of what the wall was made from: all that the tree should reach.
+        widened: thin parts of it that were widened.
+        notes: remarks on what was repaired.
+    """
+
+    surface: Surface
+    finest_mm: float
+    voxel_mm: float
+    inlet: CoronaryInlet | None
+    lines: MedialLines
+    widened: list[coverage.Stretch]
+    notes: list[str]
+
+
+def _wall(content: LumenMask | Surface, given: Insertion | None, config: AnatomyConfig, label: str) -> _Wall:
+    """Return the closed wall of the wanted vessel, with repairs stated."""
     inlet = None
     if isinstance(content, Surface):
         check_unit(content.vertices, None, config.vessel, label)
     if given is None and config.vessel != "generic":
         inlet = coronary_inlet(content, config.vessel, label)
         given = None if inlet is None else Insertion(inlet.position, np.zeros(3))
+    other = None if inlet is None else inlet.other
     if isinstance(content, LumenMask):
-        mask, notes = repair.connected_mask(content.volume, given, label, config.vessel)
-        return surface_from_mask(mask), float(mask.spacing_mm.min()), inlet, notes
-    surface, notes = repair.closed_surface(content, given, label, config.vessel)
-    return surface, 0.0, inlet, notes
+        mask, notes = repair.connected_mask(content.volume, given, label, config.vessel, other)
+        lines = traced_lines(mask)
+        mask, wide, remarks = coverage.widened(mask, lines, config.minimum_branch_length_mm)
+        finest, longest = float(mask.spacing_mm.min()), float(mask.spacing_mm.max())
+        return _Wall(surface_from_mask(mask), finest, longest, inlet, lines, wide, notes + remarks)
+    surface, notes = repair.closed_surface(content, given, label, config.vessel, other)
+    step = min(2.0 * surface.volume / surface.area, CORONARY_RADIUS_MM) / 5.0
+    voxels = coverage.voxelised(surface, max(step, SMALLEST_RADIUS_MM))
+    return _Wall(surface, 0.0, float(voxels.spacing_mm.max()), inlet, traced_lines(voxels), [], notes)
+
+
+def _other_inlets(tree: VesselTree, rule: str) -> list[str]:
+    """Say so if a vessel of unknown kind is as wide at another end as at the one that was taken for its inlet."""
+    if rule != "widest open end":
+        return []
+    first = tree.branches[0].centerline
+    usual = float(np.median(first.radius[: max(3, len(first.radius) // 4)]))
+    ends = [tree.branches[leaf].centerline for leaf in tree.leaves()]
+    wide = [line for line in ends if float(np.median(line.radius[-max(3, len(line.radius) // 4) :])) > _AS_WIDE * usual]
+    if not wide:
+        return []
+    places = ", ".join(place_text(line.points[-1]) for line in wide[:4])
+    return [f"the vessel may as well begin at {places}, where it is as wide: --ostium-mm chooses another inlet"]
 
 
 def _short(tree: VesselTree, vessel: str) -> list[str]:

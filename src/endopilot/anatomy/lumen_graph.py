@@ -46,18 +46,29 @@ class LumenGraph:
 
 
 def lumen_graph(
-    points: Float[np.ndarray, "n 3"], clearance: Float[np.ndarray, "n"], spacing_mm: float, root: int
+    points: Float[np.ndarray, "n 3"],
+    clearance: Float[np.ndarray, "n"],
+    spacing_mm: float | Float[np.ndarray, "3"],
+    root: int,
 ) -> LumenGraph:
-    """Return the graph of grid points inside one lumen, with the paths to `root`."""
+    """Return the graph of grid points inside one lumen, with the paths to `root`.
+
+    Args:
+        points: grid points along the axes of the coordinates, mm.
+        clearance: their distance to the wall, mm.
+        spacing_mm: spacing of the grid, one or along each axis, mm; the graph keeps the largest.
+        root: index of the point that all paths lead to.
+    """
     from scipy.sparse import csr_matrix
     from scipy.sparse.csgraph import dijkstra
 
-    index = np.rint((points - points.min(axis=0)) / spacing_mm).astype(np.int64) + 1
+    edges = np.broadcast_to(np.asarray(spacing_mm, dtype=float), 3)
+    index = np.rint((points - points.min(axis=0)) / edges).astype(np.int64) + 1
     shape = index.max(axis=0) + 2
     key = np.asarray(np.ravel_multi_index(tuple(index.T), tuple(shape)))
     order = np.asarray(np.argsort(key))
     ordered = key[order]
-    weight = 1.0 / np.maximum(clearance, 0.1 * spacing_mm) ** 2
+    weight = 1.0 / np.maximum(clearance, 0.1 * edges.max()) ** 2
     rows, columns, costs = [], [], []
     for step in _HALF_NEIGHBOURHOOD:
         wanted = key + int(np.dot(step, [shape[1] * shape[2], shape[2], 1]))
@@ -66,7 +77,7 @@ def lumen_graph(
         end = order[place[start]]
         rows.append(start)
         columns.append(end)
-        costs.append(np.linalg.norm(step) * spacing_mm * 0.5 * (weight[start] + weight[end]))
+        costs.append(np.linalg.norm(step * edges) * 0.5 * (weight[start] + weight[end]))
     matrix = csr_matrix(
         (np.concatenate(costs), (np.concatenate(rows), np.concatenate(columns))), shape=(len(points), len(points))
     )
@@ -76,7 +87,7 @@ def lumen_graph(
     parent = predecessor[reached].astype(np.int64)
     parent = np.where(parent >= 0, renumber[np.maximum(parent, 0)], -1)
     kept = points[reached]
-    return LumenGraph(kept, clearance[reached], parent, _length_to_root(kept, parent), spacing_mm)
+    return LumenGraph(kept, clearance[reached], parent, _length_to_root(kept, parent), float(edges.max()))
 
 
 def trace_branches(

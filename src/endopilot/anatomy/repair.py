@@ -15,7 +15,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from endopilot.anatomy.parent_vessel import COMPARABLE, Vessel, piece_on_side
-from endopilot.anatomy.surface import Surface, surface_from_mask
+from endopilot.anatomy.surface import Surface, filled_box, surface_from_mask
+from endopilot.anatomy.topology import parted
 from endopilot.errors import InputError
 from endopilot.types import Insertion, Volume
 
@@ -34,62 +35,80 @@ _ONWARDS = 0.5
 SMALLEST_PIECE = 12
 """A piece of fewer voxels is noise."""
 
+NOTED_MM = 5.0
+"""A piece that is left out gets a remark of its own from this length."""
+
+_MOST_LISTED = 8
 
 MOST_PIECES = 12
 """At most this many pieces of a mask are looked at as coronary arteries or parts of them."""
 
 
 def connected_mask(
-    mask: Volume, given: Insertion | None, label: str, vessel: Vessel = "generic"
+    mask: Volume,
+    given: Insertion | None,
+    label: str,
+    vessel: Vessel = "generic",
+    other_ostium: Float[np.ndarray, "3"] | None = None,
 ) -> tuple[Volume, list[str]]:
     """Return the one lumen at the ostium, or the largest: gaps of a few voxels bridged, cavities filled, blobs removed.
 
-    Where a mask holds both coronary arteries and no ostium is given, `vessel` decides by the patient's side.
+    Loops of it and places where it touches itself are cut (`topology.parted`). Where a mask holds both coronary
+    arteries and no ostium is given, `vessel` decides by the patient's side.
+
+    Args:
+        mask: one or several lumens, and specks.
+        given: the ostium, if it is known.
+        label: name of the source, for messages.
+        vessel: which vessel is wanted.
+        other_ostium: ostium of the other coronary artery, LPS mm, if it is known.
 
     Raises:
         InputError: the mask is empty, a solid block, noise, or touches nothing near the given ostium.
     """
     from scipy.ndimage import binary_fill_holes
-    from scipy.ndimage import label as components
 
-    filled = np.nonzero(mask.voxels)
-    if len(filled[0]) == 0:
+    box = filled_box(mask.voxels)
+    if box[0].stop == 0:
         raise InputError(f"{label}: the mask is empty; check the label or segment again")
-    corner = np.array([index.min() for index in filled])
-    box = tuple(slice(low, index.max() + 1) for low, index in zip(corner, filled, strict=True))
+    corner = np.array([part.start for part in box])
     voxels = np.asarray(mask.voxels[box], dtype=bool)
     _refuse_blocks_and_noise(voxels, label)
-    origin = mask.index_to_world(corner[::-1].astype(float))
-    cropped = replace(mask, voxels=voxels, origin_mm=origin)
-    labels, count = components(voxels, structure=np.ones((3, 3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
-    sizes = np.bincount(labels.ravel(), minlength=count + 1)
-    sizes[0] = 0
-    remarks = []
-    if given is None:
-        main, others = _piece_on_side(cropped, labels, sizes, vessel)
-    else:
-        main, others = _nearest_piece(cropped, labels, sizes, given, label), []
-    result = labels == main
+    cropped = replace(mask, voxels=voxels, origin_mm=mask.index_to_world(corner[::-1].astype(float)))
+    labels, sizes, main, others = _pieces(cropped, given, label, vessel)
+    own, piece = _cut_out(cropped, labels == main)
+    whole, remarks = parted(piece)
+    severed: set[int] = set()  # what was cut off must not be bridged again
+    if remarks:
+        cropped = replace(cropped, voxels=voxels.copy())
+        cropped.voxels[own] &= ~piece.voxels | whole.voxels
+        labels, sizes, main, others = _pieces(cropped, given, label, vessel)
+        severed = {int(number) for number in np.unique(labels[own][whole.voxels])}
+    result, count = labels == main, len(sizes) - 1
     if count > 1:
         pieces = [int(piece) for piece in np.argsort(-sizes)[: min(count, 200)] if piece != main]
-        result, joined, beside = _bridged(result, labels, [p for p in pieces if sizes[p] >= SMALLEST_PIECE])
-        left = count - 1 - joined
+        foreign = _piece_at(cropped, labels, sizes, other_ostium)
+        near = [p for p in pieces if sizes[p] >= SMALLEST_PIECE and p not in (foreign, *severed)]
+        result, joined, beside = _bridged(result, labels, near)
         if beside:
             remarks.append(f"{beside} pieces that run alongside the lumen, not on from it, were not joined to it")
-        apart = [piece for piece in others if not result[labels == piece].any()]
+        apart = [piece for piece in others if piece != foreign and not result[labels == piece].any()]
         if apart:
             remarks.append(_other_pieces(vessel, len(apart)))
         if joined:
             remarks.append(f"{joined} gaps of up to {LARGEST_GAP_VOXELS:g} voxels bridged")
-        if left:
-            remarks.append(_left_out(cropped, result, labels, sizes, left))
+        if foreign:
+            other = "left" if vessel == "rca" else "right"
+            remarks.append(f"the {other} coronary artery ({sizes[foreign]} voxels) is not part of this one")
+        remarks += _left_out(cropped, result, labels, sizes, foreign)
     if result.sum() < SMALLEST_PIECE:
         raise InputError(f"{label}: the lumen has only {int(result.sum())} voxels; check the label or segment again")
-    closed = binary_fill_holes(result)
+    _, lumen = _cut_out(cropped, result)
+    closed = binary_fill_holes(lumen.voxels)
     assert closed is not None
-    if closed.sum() > result.sum():
-        remarks.append(f"cavities of {int(closed.sum() - result.sum())} voxels filled")
-    return replace(cropped, voxels=closed), remarks
+    if closed.sum() > lumen.voxels.sum():
+        remarks.append(f"cavities of {int(closed.sum() - lumen.voxels.sum())} voxels filled")
+    return replace(lumen, voxels=closed), remarks
 
 
 def joined_mask(mask: Volume) -> Volume:
@@ -112,11 +131,22 @@ def joined_mask(mask: Volume) -> Volume:
 
 
 def closed_surface(
-    surface: Surface, given: Insertion | None, label: str, vessel: Vessel = "generic"
+    surface: Surface,
+    given: Insertion | None,
+    label: str,
+    vessel: Vessel = "generic",
+    other_ostium: Float[np.ndarray, "3"] | None = None,
 ) -> tuple[Surface, list[str]]:
     """Return one closed wall with outward normals: largest piece (or the one at the ostium), holes capped.
 
     Where a file holds both coronary arteries and no ostium is given, `vessel` decides by the patient's side.
+
+    Args:
+        surface: one or several walls.
+        given: the ostium, if it is known.
+        label: name of the source, for messages.
+        vessel: which vessel is wanted.
+        other_ostium: ostium of the other coronary artery, LPS mm, if it is known.
 
     Raises:
         InputError: the holes cannot be closed, or the surface is nowhere near the given ostium.
@@ -136,7 +166,9 @@ def closed_surface(
         else:
             chosen = int(ids[np.linalg.norm(regions.points - given.position, axis=1).argmin()])
         mesh = regions.extract_points(ids == chosen, adjacent_cells=False).extract_surface().triangulate().clean()
-        remarks.append(f"{int(ids.max())} separate pieces of the surface left out")
+        remarks += _regions_left_out(
+            np.asarray(regions.points, float), ids.astype(np.int64), chosen, vessel, other_ostium
+        )
     if given is not None:
         gap = float(KDTree(mesh.points).query(given.position)[0])
         if gap > max(NEAR_OSTIUM_MM, 0.15 * float(np.ptp(mesh.points, axis=0).max())):
@@ -199,20 +231,112 @@ def _nearest_piece(mask: Volume, labels: np.ndarray, sizes: np.ndarray, given: I
     return int(labels[tuple(index[gap.argmin()])])
 
 
+def _pieces(
+    mask: Volume, given: Insertion | None, label: str, vessel: Vessel
+) -> tuple[np.ndarray, np.ndarray, int, list[int]]:
+    """Return the connected pieces' labels and sizes, the wanted one, and others that are nearly as large."""
+    from scipy.ndimage import label as components
+
+    labels, count = components(mask.voxels, structure=np.ones((3, 3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
+    sizes = np.bincount(labels.ravel(), minlength=count + 1)
+    sizes[0] = 0
+    if given is None:
+        return labels, sizes, *_piece_on_side(mask, labels, sizes, vessel)
+    return labels, sizes, _nearest_piece(mask, labels, sizes, given, label), []
+
+
+def _cut_out(mask: Volume, voxels: Bool[np.ndarray, "nz ny nx"]) -> tuple[tuple[slice, slice, slice], Volume]:
+    """Return the smallest box that holds some voxels of a mask, and these voxels alone as a mask of that box."""
+    box = filled_box(voxels)
+    corner = np.array([part.start for part in box][::-1], dtype=float)
+    return box, replace(mask, voxels=voxels[box], origin_mm=mask.index_to_world(corner))
+
+
+def _piece_at(mask: Volume, labels: np.ndarray, sizes: np.ndarray, place: Float[np.ndarray, "3"] | None) -> int:
+    """Return the label of the piece at a place, 0 if there is none."""
+    if place is None:
+        return 0
+    index = np.argwhere(labels > 0)
+    index = index[sizes[labels[tuple(index.T)]] >= SMALLEST_PIECE]
+    gap = np.linalg.norm(mask.index_to_world(index[:, ::-1].astype(float)) - place, axis=1)
+    return int(labels[tuple(index[gap.argmin()])]) if len(gap) and gap.min() < NEAR_OSTIUM_MM else 0
+
+
 def _left_out(
-    mask: Volume, result: Bool[np.ndarray, "nz ny nx"], labels: np.ndarray, sizes: np.ndarray, count: int
-) -> str:
-    """Say how much was left out and where the largest piece lies, since a real vessel may be lost with it."""
-    lost = np.where(np.isin(np.arange(len(sizes)), labels[result]), 0, sizes)
-    largest = np.argwhere(labels == int(lost.argmax()))
-    place = mask.index_to_world(largest[:, ::-1].astype(float))
-    gap = np.asarray(KDTree(mask.index_to_world(np.argwhere(result)[:, ::-1].astype(float))).query(place)[0])
-    at = ", ".join(f"{value:.0f}" for value in place[gap.argmin()])
-    extent = float(np.linalg.norm(np.ptp(place, axis=0)))
-    return (
-        f"{count} pieces apart from the lumen left out ({int(lost.sum())} voxels); the largest is {extent:.0f} mm "
-        f"long and begins {gap.min():.1f} mm away at ({at}) mm: close the gap in the mask if it belongs to the vessel"
-    )
+    mask: Volume, result: Bool[np.ndarray, "nz ny nx"], labels: np.ndarray, sizes: np.ndarray, foreign: int
+) -> list[str]:
+    """Say which pieces were left out and where they lie, since a real vessel may be lost with them.
+
+    Args:
+        mask: all pieces.
+        result: the lumen.
+        labels: number of each piece.
+        sizes: their voxels, by number.
+        foreign: number of a piece that belongs to another vessel, 0 if there is none.
+    """
+    from scipy.ndimage import find_objects
+
+    kept = np.isin(np.arange(len(sizes)), labels[result])
+    kept[[0, foreign]] = True
+    lost = np.flatnonzero(~kept)
+    if len(lost) == 0:
+        return []
+    boxes = find_objects(labels)
+    corners = np.array([[[part.start, part.stop - 1] for part in boxes[piece - 1]] for piece in lost])
+    extent = np.linalg.norm(np.diff(corners, axis=2)[..., 0] * mask.spacing_mm[::-1], axis=1)
+    order = np.argsort(-extent, kind="stable")
+    reach = KDTree(mask.index_to_world(np.argwhere(result)[:, ::-1].astype(float)))
+    remarks = []
+    for number in order[:_MOST_LISTED]:
+        if extent[number] < NOTED_MM:
+            break
+        box = boxes[lost[number] - 1]
+        own = np.argwhere(labels[box] == lost[number]) + corners[number, :, 0]
+        place = mask.index_to_world(own[:, ::-1].astype(float))
+        gap = np.asarray(reach.query(place)[0])
+        at = ", ".join(f"{value:.0f}" for value in place[gap.argmin()])
+        remarks.append(
+            f"a piece apart from the lumen left out ({sizes[lost[number]]} voxels): it is {extent[number]:.0f} mm long "
+            f"and begins {gap.min():.1f} mm away at ({at}) mm; close the gap in the mask if it belongs to the vessel"
+        )
+    rest = order[len(remarks) :]
+    if len(rest):
+        kind = "more pieces" if remarks else "pieces apart from the lumen"
+        longest, size = float(extent[rest].max()), int(sizes[lost[rest]].sum())
+        remarks.append(f"{len(rest)} {kind} of up to {longest:.0f} mm left out ({size} voxels)")
+    return remarks
+
+
+def _regions_left_out(
+    points: Float[np.ndarray, "n 3"],
+    ids: Int[np.ndarray, "n"],
+    chosen: int,
+    vessel: Vessel,
+    other_ostium: Float[np.ndarray, "3"] | None,
+) -> list[str]:
+    """Say which separate walls of a surface were left out and where they lie."""
+    own = KDTree(points[ids == chosen])
+    found: list[tuple[float, str]] = []
+    for region in np.unique(ids[ids != chosen]):
+        place = points[ids == region]
+        extent = float(np.linalg.norm(np.ptp(place, axis=0)))
+        if other_ostium is not None and np.linalg.norm(place - other_ostium, axis=1).min() < NEAR_OSTIUM_MM:
+            other = "left" if vessel == "rca" else "right"
+            found.append((np.inf, f"the {other} coronary artery ({len(place)} vertices) is not part of this one"))
+        elif extent >= NOTED_MM:
+            gap = np.asarray(own.query(place)[0])
+            at = ", ".join(f"{value:.0f}" for value in place[gap.argmin()])
+            text = (
+                f"a separate piece of the surface left out: {extent:.0f} mm long, {gap.min():.1f} mm away at ({at}) mm"
+            )
+            found.append((extent, text))
+    remarks = [text for _, text in sorted(found, key=lambda item: -item[0])[:_MOST_LISTED]]
+    rest = len(np.unique(ids)) - 1 - len(remarks)
+    if rest:
+        longest = sorted((extent for extent, _ in found if np.isfinite(extent)), reverse=True)[_MOST_LISTED:]
+        size = f"{longest[0]:.0f}" if longest else f"{NOTED_MM:g}"
+        remarks.append(f"{rest} more separate pieces of the surface of up to {size} mm left out")
+    return remarks
 
 
 def _bridged(

@@ -20,7 +20,12 @@ ACROSS_EDGES = 0.75
 thick slices keeps their steps, which are long in the plane; at 1, the crotch of two lumens at 30° fills."""
 
 _FIT_ITERATIONS = 8
+_BLOCK = 24
+"""Edge in voxels of the blocks that a mask is smoothed in."""
+
 _NEAREST_TRIANGLES = 4
+_WORTH_THREADS = 20_000
+"""With fewer points than this, starting threads takes longer than they save."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +48,14 @@ class Surface:
     def _centroids(self) -> KDTree:
         return KDTree(self._corners.mean(axis=1))
 
+    @cached_property
+    def _frames(self) -> Float[np.ndarray, "m 12"]:
+        """First corner of every triangle, the two edges from it, and these edges' products."""
+        corners = self._corners
+        one, two = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+        products = [np.einsum("ij,ij->i", a, b)[:, None] for a, b in ((one, one), (one, two), (two, two))]
+        return np.concatenate([corners[:, 0], one, two, *products], axis=1)
+
     @property
     def area(self) -> float:
         """Area of the wall, mm²."""
@@ -64,17 +77,15 @@ class Surface:
         details that matter (see `refined`).
         """
         result = np.full(len(points), limit_mm)
-        reach = limit_mm + self.longest_edge
+        reach, count = limit_mm + self.longest_edge, min(_NEAREST_TRIANGLES, len(self.faces))
         for start in range(0, len(points), 200_000):
             part = np.ascontiguousarray(points[start : start + 200_000])
-            gap, nearest = self._centroids.query(part, distance_upper_bound=reach, workers=-1)
-            gap, nearest = np.asarray(gap), np.asarray(nearest)
-            near = np.flatnonzero(gap < 3.0 * self.longest_edge)
-            far = np.flatnonzero((gap >= 3.0 * self.longest_edge) & np.isfinite(gap))
-            count = min(_NEAREST_TRIANGLES, len(self.faces))
-            candidates = self._centroids.query(part[near], k=[*range(1, count + 1)], workers=-1)[1]  # pyright: ignore[reportArgumentType]
-            for rows, index in ((near, np.asarray(candidates)), (far, nearest[far, None])):
-                squares = _square_distance(part[rows], self._corners, index)
+            workers = -1 if len(part) > _WORTH_THREADS else 1
+            gap, nearest = map(np.asarray, self._centroids.query(part, k=[*range(1, count + 1)], workers=workers))  # pyright: ignore[reportArgumentType]
+            near = np.flatnonzero(gap[:, 0] < 3.0 * self.longest_edge)
+            far = np.flatnonzero((gap[:, 0] >= 3.0 * self.longest_edge) & (gap[:, 0] <= reach))
+            for rows, index in ((near, nearest[near]), (far, nearest[far, :1])):
+                squares = _square_distance(part[rows], self._frames, index)
                 result[start + rows] = np.minimum(np.sqrt(squares.min(axis=1)), limit_mm)
         return result
 
@@ -137,34 +148,22 @@ class Surface:
 
 
 def surface_from_mask(mask: Volume) -> Surface:
-    """Return the smooth wall whose blurred inside equals the blurred mask.
-
-    A Gaussian of one voxel takes the staircase out of the mask, but also shrinks round vessels (by about σ²/2R).
-    Therefore the level function d is not the blurred mask itself: it starts from σ·Φ⁻¹(G∗mask), which is exact for a
-    plane, and is corrected by σ√2π·(G∗mask − G∗H(d)) until its own blurred inside agrees. H(d) is the share of a voxel
-    that lies inside. The zero level keeps the mask's local volume, so radii are unbiased down to about one voxel.
+    """Return the smooth wall whose blurred inside equals the blurred mask: the zero level of `level_function`.
 
     Args:
         mask: boolean voxels, at least one of them true.
+
+    Raises:
+        InputError: the mask is nowhere thick enough to hold a lumen.
     """
-    from scipy.ndimage import gaussian_filter
-    from scipy.special import ndtri
     from skimage.measure import marching_cubes
 
     margin = 4
-    filled = np.nonzero(mask.voxels)
-    lower = np.array([index.min() for index in filled])
-    box = tuple(slice(low, index.max() + 1) for low, index in zip(lower, filled, strict=True))
-    inside = np.pad(mask.voxels[box], margin).astype(np.float32)
+    box = filled_box(mask.voxels)
+    lower = np.array([part.start for part in box])
+    inside = np.pad(np.asarray(mask.voxels[box], dtype=bool), margin)
     edges = mask.spacing_mm[::-1]
-    sigma, width = SMOOTHING_VOXELS, SMOOTHING_VOXELS * (edges.max() / edges) ** ACROSS_EDGES
-    target = gaussian_filter(inside, width, truncate=3.0)
-    band = (target > 1e-3) & (target < 1 - 1e-3)
-    level = (sigma * ndtri(np.clip(target, 1e-4, 1 - 1e-4))).astype(np.float32)
-    gain = np.float32(sigma * np.sqrt(2 * np.pi))
-    for _ in range(_FIT_ITERATIONS):
-        share = np.clip(level + np.float32(0.5), 0.0, 1.0)
-        level[band] += gain * (target - gaussian_filter(share, width, truncate=3.0))[band]
+    level = level_function(inside, edges)
     if level.max() <= 0:
         raise InputError(
             f"the mask is nowhere thick enough to hold a lumen ({int(mask.voxels.sum())} voxels of "
@@ -179,6 +178,87 @@ def surface_from_mask(mask: Volume) -> Surface:
     index = vertices * scale - margin + lower
     surface = Surface(mask.index_to_world(index[:, ::-1].astype(float)), faces.astype(np.int64))
     return surface if surface.volume > 0 else Surface(surface.vertices, surface.faces[:, ::-1])
+
+
+def filled_box(voxels: Bool[np.ndarray, "nz ny nx"]) -> tuple[slice, slice, slice]:
+    """Return the smallest box that holds all true voxels; an empty one if there are none."""
+    box = []
+    for axis in range(3):
+        filled = np.flatnonzero(voxels.any(axis=tuple(other for other in range(3) if other != axis)))
+        box.append(slice(int(filled[0]), int(filled[-1]) + 1) if len(filled) else slice(0, 0))
+        voxels = voxels[(slice(None),) * axis + (box[-1],)]
+    return (box[0], box[1], box[2])
+
+
+def blur_voxels(edges_mm: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    """Return the standard deviation in voxels of the Gaussian along each axis, for voxels with these edges in mm."""
+    return SMOOTHING_VOXELS * (edges_mm.max() / edges_mm) ** ACROSS_EDGES
+
+
+def level_function(
+    inside: Bool[np.ndarray, "nz ny nx"], edges_mm: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "nz ny nx"]:
+    """Return about the signed distance to a mask's smooth wall in voxels, positive inside, constant far from it.
+
+    A Gaussian of one voxel takes the staircase out of the mask, but also shrinks round vessels (by about σ²/2R).
+    Therefore the level function d is not the blurred mask itself: it starts from σ·Φ⁻¹(G∗mask), which is exact for a
+    plane, and is corrected by σ√2π·(G∗mask − G∗H(d)) until its own blurred inside agrees. H(d) is the share of a voxel
+    that lies inside. The zero level keeps the mask's local volume, so radii are unbiased down to about one voxel.
+
+    A vessel fills little of its box, so the box is worked through in blocks, and only in those that hold some wall.
+
+    Args:
+        inside: the mask.
+        edges_mm: edges of its voxels along its axes, mm.
+    """
+    from scipy.special import ndtri
+
+    sigma, width = SMOOTHING_VOXELS, blur_voxels(edges_mm)
+    gain, deepest = np.float32(sigma * np.sqrt(2 * np.pi)), sigma * ndtri(1 - 1e-4)
+    kernels = [_blur_matrix(float(one)) for one in width]
+    halo = [(kernel.shape[1] - _BLOCK) // 2 for kernel in kernels]
+    count = [-(-size // _BLOCK) for size in inside.shape]
+    padding = [(h, n * _BLOCK - size + h) for h, n, size in zip(halo, count, inside.shape, strict=True)]
+    share = np.pad(inside, padding).astype(np.float32)
+    result = np.where(inside, np.float32(deepest), np.float32(-deepest))
+    blocks = []  # window with halo, window without it, target, where to correct, level
+    for place in np.ndindex(*count):
+        wide = tuple(slice(i * _BLOCK, (i + 1) * _BLOCK + 2 * h) for i, h in zip(place, halo, strict=True))
+        part = share[wide]
+        if not 0.0 < part.mean() < 1.0:
+            continue
+        target = _blurred(part, kernels)
+        level = (sigma * ndtri(np.clip(target, 1e-4, 1 - 1e-4))).astype(np.float32)
+        window = tuple(slice(w.start + h, w.stop - h) for w, h in zip(wide, halo, strict=True))
+        blocks.append((wide, window, target, gain * ((target > 1e-3) & (target < 1 - 1e-3)), level))
+    for _ in range(_FIT_ITERATIONS):
+        for _, window, _, _, level in blocks:
+            share[window] = np.clip(level + np.float32(0.5), 0.0, 1.0)
+        for wide, _, target, correction, level in blocks:
+            level += correction * (target - _blurred(share[wide], kernels))
+    for _, window, _, _, level in blocks:
+        own = tuple(slice(w.start - h, w.stop - h) for w, h in zip(window, halo, strict=True))
+        view = result[own]
+        view[...] = level[: view.shape[0], : view.shape[1], : view.shape[2]]
+    return result
+
+
+def _blur_matrix(width: float) -> Float[np.ndarray, "block wide"]:
+    """Return the matrix that blurs a block and its halo along one axis with a Gaussian cut off at three widths."""
+    reach = int(3.0 * width + 0.5)
+    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / width) ** 2)
+    matrix = np.zeros((_BLOCK, _BLOCK + 2 * reach), dtype=np.float32)
+    for row in range(_BLOCK):
+        matrix[row, row : row + 2 * reach + 1] = weights / weights.sum()
+    return matrix
+
+
+def _blurred(
+    part: Float[np.ndarray, "wz wy wx"], kernels: list[Float[np.ndarray, "block wide"]]
+) -> Float[np.ndarray, "block block block"]:
+    """Return a block, given with its halo, blurred along all axes."""
+    along_z = (kernels[0] @ np.ascontiguousarray(part).reshape(part.shape[0], -1)).reshape(-1, *part.shape[1:])
+    return (kernels[1] @ along_z) @ kernels[2].T
 
 
 def _finer(values: Float[np.ndarray, "a b c"], axis: int, factor: int) -> Float[np.ndarray, "d e f"]:
@@ -208,19 +288,29 @@ def _edge_squares(corners: Float[np.ndarray, "m 3 3"], edge: int) -> Float[np.nd
 
 
 def _square_distance(
-    points: Float[np.ndarray, "n 3"], corners: Float[np.ndarray, "m 3 3"], index: Int[np.ndarray, "n k"]
+    points: Float[np.ndarray, "n 3"], frames: Float[np.ndarray, "m 12"], index: Int[np.ndarray, "n k"]
 ) -> Float[np.ndarray, "n k"]:
-    """Return the squared distances from each point to its k candidate triangles."""
-    triangle = corners[index]
-    best = np.full(index.shape, np.inf)
-    edges = np.stack([triangle[:, :, (i + 1) % 3] - triangle[:, :, i] for i in range(3)], axis=2)
-    relative = points[:, None, None, :] - triangle
-    length = np.maximum(np.einsum("nkij,nkij->nki", edges, edges), 1e-18)
-    share = np.clip(np.einsum("nkij,nkij->nki", relative, edges) / length, 0.0, 1.0)
-    gap = relative - share[..., None] * edges
-    best = np.einsum("nkij,nkij->nki", gap, gap).min(axis=2)
-    normal = np.cross(edges[:, :, 0], edges[:, :, 1])
-    square = np.maximum(np.einsum("nkj,nkj->nk", normal, normal), 1e-18)
-    sides = np.einsum("nkij,nkj->nki", np.cross(edges, relative), normal)
-    height = np.einsum("nkj,nkj->nk", relative[:, :, 0], normal)
-    return np.where((sides >= 0).all(axis=2), np.minimum(best, height**2 / square), best)
+    """Return the squared distances from each point to its k candidate triangles, given by `Surface._frames`."""
+    frame = frames[index]
+    relative = points[:, None, :] - frame[..., 0:3]
+    own = np.einsum("nkj,nkj->nk", relative, relative)
+    first = np.einsum("nkj,nkj->nk", relative, frame[..., 3:6])
+    second = np.einsum("nkj,nkj->nk", relative, frame[..., 6:9])
+    one, both, two = frame[..., 9], frame[..., 10], frame[..., 11]
+    along, length = second - first - both + one, one - 2.0 * both + two  # of the edge between the edges' ends
+    best = _edge_square(own, first, one)
+    np.minimum(best, _edge_square(own, second, two), out=best)
+    np.minimum(best, _edge_square(own - 2.0 * first + one, along, length), out=best)
+    area = np.maximum(one * two - both * both, 1e-18)
+    u, v = (two * first - both * second) / area, (one * second - both * first) / area
+    above = (u >= 0) & (v >= 0) & (u + v <= 1)
+    height = own - u * first - v * second
+    return np.maximum(np.where(above, np.minimum(best, height), best), 0.0)
+
+
+def _edge_square(
+    own: Float[np.ndarray, "n k"], along: Float[np.ndarray, "n k"], length: Float[np.ndarray, "n k"]
+) -> Float[np.ndarray, "n k"]:
+    """Return squared distances to edges from those to their starts, the products with the edges, and their squares."""
+    share = np.clip(along / np.maximum(length, 1e-18), 0.0, 1.0)
+    return own + share * (share * length - 2.0 * along)

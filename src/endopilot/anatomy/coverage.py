@@ -1,0 +1,227 @@
+"""Nothing of a lumen is lost unsaid: what is too thin to follow is widened, and what the tree does not reach is stated.
+
+The yardstick is the middle of the mask (`traced_lines`), which has every branch of one voxel. Its length is the sum of
+what the tree reaches, of what it reaches because it was widened, and of what is left out with its length and place.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
+
+from endopilot.anatomy.distance import MAXIMUM_GRID_POINTS
+from endopilot.anatomy.medial_lines import MedialLines
+from endopilot.anatomy.surface import Surface, blur_voxels, level_function
+from endopilot.anatomy.topology import place_text
+from endopilot.anatomy.tree import sampled
+from endopilot.types import VesselTree, Volume
+
+NOTED_MM = 5.0
+"""What is left out or widened gets a remark of its own from this length; shorter pieces are summed up."""
+
+_MOST_NOTED = 8
+_REACH_VOXELS = 1.5
+"""The tree reaches what lies within its radius and this many voxels of its axis: the mask's middle is not smooth."""
+
+_NARROWEST, _NARROWEST_STEPS = 0.75, 1.2
+"""A stretch is widened to a radius of this many widths of the wall's blur, and grid steps: such a tube has no gap."""
+
+_MOST_VOXELS = 10_000_000
+
+_DIAGONAL = 0.87
+"""A ball of this many grid steps in radius holds a grid point wherever it lies (√3/2)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """A connected part of a mask's middle.
+
+    Attributes:
+        nodes: which points of the middle these are.
+        length_mm: their length.
+        beyond_mm: length of what lies beyond them as seen from the widest place.
+        place: where they begin, LPS mm.
+    """
+
+    nodes: Int[np.ndarray, "_"]
+    length_mm: float
+    beyond_mm: float
+    place: Float[np.ndarray, "3"]
+
+
+def voxelised(surface: Surface, step_mm: float) -> Volume:
+    """Return the mask of all voxels that a closed wall holds or touches, so that its thinnest neck stays connected.
+
+    Args:
+        surface: the wall.
+        step_mm: edge of the voxels, mm; larger where there would be more than `_MOST_VOXELS`.
+    """
+    extent = np.ptp(surface.vertices, axis=0)
+    step = max(step_mm, float(np.prod(extent + 4 * step_mm) / _MOST_VOXELS) ** (1 / 3))
+    origin = surface.vertices.min(axis=0) - 2 * step
+    size = np.ceil(extent / step).astype(int) + 5
+    voxels = surface.inside((int(size[2]), int(size[1]), int(size[0])), origin, step)
+    fine = surface.refined(0.7 * step)
+    samples = np.concatenate([fine.vertices, fine.vertices[fine.faces].mean(axis=1)])
+    index = np.rint((samples - origin) / step).astype(int)
+    voxels[index[:, 2], index[:, 1], index[:, 0]] = True
+    return Volume(voxels, np.full(3, step), origin, np.eye(3))
+
+
+def widened(mask: Volume, lines: MedialLines, minimum_mm: float) -> tuple[Volume, list[Stretch], list[str]]:
+    """Return the mask with a tube wherever it is too thin for the wall and the grid to carry it on, and remarks.
+
+    Args:
+        mask: one connected lumen.
+        lines: its middle.
+        minimum_mm: a thin stretch with less than this on it and beyond it stays as it is.
+    """
+    edges = mask.spacing_mm
+    extent = np.array(mask.voxels.shape[::-1]) * edges
+    step = max(0.5 * float(edges.min()), float(np.prod(extent + 2) / MAXIMUM_GRID_POINTS) ** (1 / 3))
+    thin = _thin(mask, lines, max(0.1, _DIAGONAL * step / float(edges.max()) - 0.5))
+    wanted = [s for s in stretches(lines, thin) if s.length_mm + s.beyond_mm >= minimum_mm]
+    if not wanted:
+        return mask, [], []
+    voxels = mask.voxels.copy()
+    narrowest = _NARROWEST * blur_voxels(edges[::-1])
+    reach = np.maximum(narrowest, _NARROWEST_STEPS * step / edges[::-1])
+    span = np.ceil(reach).astype(int)
+    ball = np.array(list(np.ndindex(*(2 * span + 1)))) - span
+    ball = ball[(((ball / reach) ** 2).sum(axis=1)) <= 1.0]
+    nodes = _with_neighbours(lines, np.concatenate([s.nodes for s in wanted]))
+    drawn = (lines.index[nodes][:, None, :] + ball).reshape(-1, 3)
+    drawn = drawn[((drawn >= 0) & (drawn < voxels.shape)).all(axis=1)]
+    voxels[tuple(drawn.T)] = True
+    radius = float((reach * edges[::-1]).mean())
+    return replace(mask, voxels=voxels), wanted, _widened_text(wanted, radius)
+
+
+def unreached(lines: MedialLines, tree: VesselTree, voxel_mm: float) -> list[Stretch]:
+    """Return the parts of a mask's middle that a tree does not reach, longest first.
+
+    Args:
+        lines: the middle.
+        tree: what was made of the mask.
+        voxel_mm: the voxels' longest edge, mm.
+    """
+    points, radius = sampled(tree)
+    gap, nearest = map(np.asarray, KDTree(points).query(lines.points))
+    return stretches(lines, gap > radius[nearest] + _REACH_VOXELS * voxel_mm, gap)
+
+
+def stretches(
+    lines: MedialLines, chosen: Bool[np.ndarray, "n"], order: Float[np.ndarray, "n"] | None = None
+) -> list[Stretch]:
+    """Return the connected parts of chosen points of a mask's middle, longest first.
+
+    Args:
+        lines: the middle.
+        chosen: which points.
+        order: a part begins at its point of the lowest value; by default at that nearest to the widest place.
+    """
+    from scipy.sparse.csgraph import connected_components
+
+    inner = chosen[lines.edges].all(axis=1)
+    count, part = connected_components(lines.matrix(lines.edges[inner]), directed=False)
+    length, behind = lines.from_widest
+    order = length if order is None else order
+    found = []
+    members = np.flatnonzero(chosen)
+    members = members[np.argsort(part[members], kind="stable")]
+    for nodes in np.split(members, np.flatnonzero(np.diff(part[members])) + 1) if len(members) else []:
+        own = float(lines.share_mm[nodes].sum())
+        beyond = max(0.0, float(behind[nodes[length[nodes].argmin()]]) - own)
+        found.append(Stretch(nodes, own, beyond, lines.points[nodes[order[nodes].argmin()]]))
+    return sorted(found, key=lambda stretch: -(stretch.length_mm + stretch.beyond_mm))
+
+
+def left_out_text(left: list[Stretch], ostium: Float[np.ndarray, "3"], reach_mm: float) -> list[str]:
+    """Return what is said of the parts that a tree does not reach: one remark a part, and one for all crumbs.
+
+    Args:
+        left: the parts.
+        ostium: where the tree begins, LPS mm.
+        reach_mm: a part that begins this near it lies behind it.
+    """
+    left = sorted(left, key=lambda stretch: -stretch.length_mm)
+    long = [s for s in left if s.length_mm >= NOTED_MM]
+    remarks = []
+    for stretch in long[:_MOST_NOTED]:
+        behind = " behind the ostium" if np.linalg.norm(stretch.place - ostium) < reach_mm else ""
+        remarks.append(
+            f"{stretch.length_mm:.0f} mm of the lumen{behind} from {place_text(stretch.place)} are not in the tree"
+        )
+    if len(long) > _MOST_NOTED:
+        places = ", ".join(f"{s.length_mm:.0f} mm from {place_text(s.place)}" for s in long[_MOST_NOTED:])
+        remarks.append(f"neither are {places}")
+    crumbs = sum(s.length_mm for s in left) - sum(s.length_mm for s in long)
+    if crumbs >= NOTED_MM:
+        count = len(left) - len(long)
+        remarks.append(
+            f"{count} bumps and twigs of less than {NOTED_MM:g} mm, {crumbs:.0f} mm together, are no branches"
+        )
+    return remarks
+
+
+def record(lines: MedialLines, wide: list[Stretch], left: list[Stretch]) -> dict[str, float]:
+    """Return the balance that `anatomy.json` keeps, mm: length = reached + widened + left out."""
+    out = np.zeros(len(lines.points), dtype=bool)
+    thin = out.copy()
+    for stretch in left:
+        out[stretch.nodes] = True
+    for stretch in wide:
+        thin[stretch.nodes] = True
+    share = lines.share_mm
+    parts = {
+        "reached_mm": share[~out & ~thin].sum(),
+        "widened_mm": share[thin & ~out].sum(),
+        "left_out_mm": share[out].sum(),
+    }
+    return {"length_mm": round(float(share.sum()), 1), **{name: round(float(v), 1) for name, v in parts.items()}}
+
+
+def _thin(mask: Volume, lines: MedialLines, enough: float) -> Bool[np.ndarray, "n"]:
+    """Return which points of a mask's middle the smooth wall does not carry on: it is too near, or closed in between.
+
+    Voxel centres lie up to half a diagonal off the axis, so that the deepest one around a point stands for it.
+    """
+    from scipy.ndimage import label
+
+    level = level_function(np.pad(mask.voxels, 4), mask.spacing_mm[::-1])[3:-3, 3:-3, 3:-3]
+    core, _ = label(level > enough, structure=np.ones((3, 3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
+    around = (lines.index[:, None, :] + np.array(list(np.ndindex(3, 3, 3)))).reshape(-1, 3)
+    depth = level[tuple(around.T)].reshape(-1, 27)
+    part = core[tuple(around.T)].reshape(-1, 27)[np.arange(len(depth)), depth.argmax(axis=1)]
+    thin = part == 0
+    apart = lines.edges[part[lines.edges[:, 0]] != part[lines.edges[:, 1]]]
+    thin[apart.ravel()] = True
+    return thin
+
+
+def _with_neighbours(lines: MedialLines, nodes: Int[np.ndarray, "n"]) -> Int[np.ndarray, "m"]:
+    """Return points of the middle with those next to them."""
+    chosen = np.zeros(len(lines.points), dtype=bool)
+    chosen[nodes] = True
+    touching = lines.edges[chosen[lines.edges].any(axis=1)]
+    return np.unique(np.concatenate([nodes, touching.ravel()]))
+
+
+def _widened_text(wide: list[Stretch], radius_mm: float) -> list[str]:
+    remarks = []
+    long = [s for s in wide if s.length_mm + s.beyond_mm >= NOTED_MM]
+    for stretch in long[:_MOST_NOTED]:
+        place = place_text(stretch.place)
+        beyond = f", {stretch.beyond_mm:.0f} mm of vessel lie beyond it" if stretch.beyond_mm >= 1.0 else ""
+        kind = "neck" if beyond else "thin branch"
+        remarks.append(
+            f"a {kind} of {stretch.length_mm:.1f} mm from {place} was widened to a radius of {radius_mm:.1f} mm{beyond}"
+        )
+    rest = [s for s in wide if not any(s is other for other in long[:_MOST_NOTED])]
+    if rest:
+        total = sum(s.length_mm for s in rest)
+        remarks.append(f"{len(rest)} more thin places of together {total:.0f} mm were widened likewise")
+    return remarks

@@ -1,0 +1,180 @@
+"""The middle of a mask as a graph of single voxels, which keeps every thin branch and every tunnel of the mask.
+
+It does not depend on the smooth wall or on the grid that the centerlines come from, so it is the yardstick for both:
+where it is thinner than they can show, the mask is widened; what the final tree does not reach of it is stated.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
+
+from endopilot.anatomy.lumen_graph import lumen_graph, trace_branches
+from endopilot.types import Volume
+
+_NEIGHBOURS_APART = 1.8
+"""Voxels that share a corner lie this near each other, in voxels."""
+
+_FEWEST = 4
+_STUB_VOXELS, _SLENDER = 4.0, 1.5
+"""A side branch of the middle reaches this far out of its parent: in voxels, and in its own radii."""
+
+
+@dataclass(frozen=True, eq=False)
+class MedialLines:
+    """The middle of a mask.
+
+    Attributes:
+        index: voxel indices (z, y, x).
+        points: their positions, LPS mm.
+        clearance: distance to the mask's border, mm; half a voxel where it is one or two voxels thick.
+        edges: pairs of neighbours that make a forest: of every loop the edge at its narrowest place is left out.
+        closing: these left-out edges.
+    """
+
+    index: Int[np.ndarray, "n 3"]
+    points: Float[np.ndarray, "n 3"]
+    clearance: Float[np.ndarray, "n"]
+    edges: Int[np.ndarray, "m 2"]
+    closing: Int[np.ndarray, "k 2"]
+
+    @cached_property
+    def share_mm(self) -> Float[np.ndarray, "n"]:
+        """Length that each point stands for, mm: half of that of the forest's edges at it."""
+        half = 0.5 * self.lengths(self.edges)
+        return np.bincount(self.edges.ravel(), weights=np.repeat(half, 2), minlength=len(self.points))
+
+    @cached_property
+    def forest(self) -> Any:
+        """The forest as a sparse matrix of lengths, mm, both ways."""
+        return self.matrix(self.edges)
+
+    @cached_property
+    def from_widest(self) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+        """Length of the path from each piece's widest place to each point, and of all that lies at and beyond it, mm."""
+        from scipy.sparse.csgraph import connected_components, dijkstra
+
+        length, behind = np.zeros(len(self.points)), self.share_mm.copy()
+        count, piece = connected_components(self.forest, directed=False)
+        roots = [np.flatnonzero(piece == i)[self.clearance[piece == i].argmax()] for i in range(count)]
+        length, before, _ = dijkstra(
+            self.forest, directed=False, indices=roots, return_predecessors=True, min_only=True
+        )  # pyright: ignore[reportAssignmentType]
+        for node in np.argsort(-length):
+            if before[node] >= 0:
+                behind[before[node]] += behind[node]
+        return length, behind
+
+    def lengths(self, edges: Int[np.ndarray, "m 2"]) -> Float[np.ndarray, "m"]:
+        """Return the lengths of edges, mm."""
+        return np.linalg.norm(self.points[edges[:, 0]] - self.points[edges[:, 1]], axis=1)
+
+    def matrix(self, edges: Int[np.ndarray, "m 2"]) -> Any:
+        """Return edges as a sparse matrix of lengths, mm, both ways."""
+        from scipy.sparse import coo_matrix
+
+        both = np.concatenate([edges, edges[:, ::-1]])
+        size = (len(self.points),) * 2
+        return coo_matrix((np.tile(self.lengths(edges), 2), (both[:, 0], both[:, 1])), shape=size).tocsr()
+
+
+def thinned_lines(mask: Volume) -> MedialLines:
+    """Return the middle of a mask by Lee's thinning (CVGIP 56:462, 1994): all tunnels, but not all ends."""
+    from skimage.morphology import skeletonize
+
+    voxels = np.asarray(mask.voxels, dtype=bool)
+    index = np.argwhere(skeletonize(voxels, method="lee"))
+    clearance = _clearance(voxels, index, mask.spacing_mm)
+    pairs = KDTree(index).query_pairs(_NEIGHBOURS_APART, output_type="ndarray").astype(np.int64).reshape(-1, 2)
+    edges, closing = _widest_forest(pairs, clearance, np.linalg.norm(index[pairs[:, 0]] - index[pairs[:, 1]], axis=1))
+    return MedialLines(index, mask.index_to_world(index[:, ::-1].astype(float)), clearance, edges, closing)
+
+
+def traced_lines(mask: Volume) -> MedialLines:
+    """Return the middle of a mask as paths between the ends of each piece: every end, but no tunnel."""
+    from scipy.ndimage import find_objects, label
+
+    labels, count = label(mask.voxels, structure=np.ones((3, 3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
+    index, clearance, edges = [np.empty((0, 3), int)], [np.empty(0)], [np.empty((0, 2), int)]
+    for number, box in enumerate(find_objects(labels), start=1):
+        own = np.pad(labels[box] == number, 1)
+        corner = np.array([part.start for part in box]) - 1
+        nodes, width, pairs = _traced_piece(own, mask.spacing_mm)
+        edges.append(pairs + sum(len(part) for part in index))
+        index.append(nodes + corner)
+        clearance.append(width)
+    places = np.concatenate(index)
+    points = mask.index_to_world(places[:, ::-1].astype(float))
+    joined = np.concatenate(edges)
+    return MedialLines(places, points, np.concatenate(clearance), joined, joined[:0])
+
+
+def _traced_piece(
+    voxels: Bool[np.ndarray, "nz ny nx"], edges_mm: Float[np.ndarray, "3"]
+) -> tuple[Int[np.ndarray, "n 3"], Float[np.ndarray, "n"], Int[np.ndarray, "m 2"]]:
+    """Return the voxels of the middle of one piece, their clearance, mm, and their edges."""
+    index = np.argwhere(voxels)
+    clearance = _clearance(voxels, index, edges_mm)
+    if len(index) < _FEWEST:
+        return index[:1], clearance[:1], np.empty((0, 2), int)
+    graph = lumen_graph(index[:, ::-1] * edges_mm, clearance, edges_mm, int(clearance.argmax()))
+    graph = lumen_graph(graph.points, graph.clearance, edges_mm, int(graph.length.argmax()))
+    paths = trace_branches(graph, minimum_length_mm=_STUB_VOXELS * float(edges_mm.max()), slenderness=_SLENDER)
+    places = np.rint(graph.points / edges_mm).astype(int)[:, ::-1]
+    nodes: list[int] = []
+    pairs: list[tuple[int, int]] = []
+    for path in paths:
+        # Where a vessel is an even number of voxels wide, two paths may run side by side: they are one from there.
+        start, joint = 0, -1
+        if nodes:
+            gap, nearest = map(np.asarray, KDTree(places[nodes]).query(places[path]))
+            start = int(np.flatnonzero(gap < _NEIGHBOURS_APART)[-1])
+            joint = int(nearest[start])
+            start += int(gap[start] == 0)
+        for node in path[start:]:
+            nodes.append(int(node))
+            if joint >= 0:
+                pairs.append((joint, len(nodes) - 1))
+            joint = len(nodes) - 1
+    return places[nodes], graph.clearance[nodes], np.array(pairs, dtype=int).reshape(-1, 2)
+
+
+def _clearance(
+    voxels: Bool[np.ndarray, "nz ny nx"], index: Int[np.ndarray, "n 3"], edges_mm: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "n"]:
+    """Return the distance from voxels of a mask to its border, mm: half a voxel on the border itself."""
+    border = np.argwhere(_border(voxels)) * edges_mm[::-1]
+    return np.asarray(KDTree(border).query(index * edges_mm[::-1])[0]) + 0.5 * float(edges_mm.min())
+
+
+def _border(voxels: Bool[np.ndarray, "nz ny nx"]) -> Bool[np.ndarray, "nz ny nx"]:
+    """Return the voxels of a mask with a face outside."""
+    inner = np.zeros_like(voxels)
+    core = voxels[1:-1, 1:-1, 1:-1].copy()
+    for axis in range(3):
+        for side in (slice(0, -2), slice(2, None)):
+            window = [slice(1, -1)] * 3
+            window[axis] = side
+            core &= voxels[tuple(window)]
+    inner[1:-1, 1:-1, 1:-1] = core
+    return voxels & ~inner
+
+
+def _widest_forest(
+    pairs: Int[np.ndarray, "m 2"], clearance: Float[np.ndarray, "n"], apart: Float[np.ndarray, "m"]
+) -> tuple[Int[np.ndarray, "e 2"], Int[np.ndarray, "k 2"]]:
+    """Return the forest whose paths are as wide as they can be, and the edges that would close a loop."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import minimum_spanning_tree
+
+    # Of equally wide edges the shorter is kept, so that the corners of the voxels' steps are not cut.
+    cost = 1.0 + clearance.max(initial=0.0) - clearance[pairs].min(axis=1) + 1e-3 * apart
+    size = (len(clearance),) * 2
+    tree = minimum_spanning_tree(coo_matrix((cost, (pairs[:, 0], pairs[:, 1])), shape=size).tocsr()).tocoo()
+    kept = np.isin(pairs[:, 0] * len(clearance) + pairs[:, 1], tree.row.astype(np.int64) * len(clearance) + tree.col)
+    return pairs[kept], pairs[~kept]

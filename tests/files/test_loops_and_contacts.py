@@ -1,0 +1,80 @@
+"""Masks that are no trees: loops, bypasses, two inlets, vessels that touch; a word on each, and the place."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from make_vessels import hairpin, length_of, line, lumen, tubes, with_voxels
+
+from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
+from endopilot.anatomy.topology import parted
+
+VOXELS = [(0.35, 0.35, 0.5), (0.7, 0.7, 0.5)]
+
+
+def notes_of(anatomy) -> str:
+    return " | ".join(anatomy.provenance["notes"])
+
+
+@pytest.mark.parametrize("voxel_mm", VOXELS)
+@pytest.mark.parametrize("across", [1, 2])
+def test_a_hairpin_that_touches_itself_keeps_its_length_and_its_root(voxel_mm, across):
+    mask = tubes((hairpin(50, 5.0), 1.8), voxel_mm=voxel_mm)
+    for up in np.arange(across) * voxel_mm[2]:
+        for aside in np.arange(across) * voxel_mm[1]:
+            mask = with_voxels(mask, (-1.2, aside, 20 + up), (1.2, aside, 20 + up))
+    anatomy = extract_anatomy(lumen(mask), name="hairpin")
+    assert anatomy.insertion.position[2] < 2.0 and len(anatomy.tree.branches) == 1
+    assert length_of(anatomy) > 104
+    assert "touches itself and was parted at" in notes_of(anatomy) and "0, 2" in notes_of(anatomy)
+
+
+def test_two_limbs_that_touch_over_their_length_are_parted():
+    mask = tubes((hairpin(50, 3.4), 1.8), voxel_mm=(0.35, 0.35, 0.5))
+    whole, remarks = parted(mask)
+    assert whole.voxels.sum() < mask.voxels.sum()
+    assert len(remarks) == 1 and "touch over" in remarks[0]
+
+
+@pytest.mark.parametrize("voxel_mm", VOXELS)
+def test_a_bypass_is_cut_at_its_narrowest_place_and_the_place_is_stated(voxel_mm):
+    bypass = line((0, 0, 10), (10, 0, 20), (10, 0, 40), (0, 0, 50))
+    mask = tubes((line((0, 0, 0), (0, 0, 60)), 1.8), (bypass, 1.2), voxel_mm=voxel_mm)
+    anatomy = extract_anatomy(lumen(mask), name="bypass")
+    assert length_of(anatomy) > 95.0
+    assert "a tree holds no loops: cut at" in notes_of(anatomy)
+
+
+@pytest.mark.parametrize("voxel_mm", VOXELS)
+def test_two_vessels_that_touch_in_passing_are_parted(voxel_mm):
+    vessels = tubes((line((0, 0, 0), (0, 0, 60)), 1.8), (line((4.6, -30, 30), (4.6, 30, 30)), 1.6), voxel_mm=voxel_mm)
+    anatomy = extract_anatomy(lumen(with_voxels(vessels, (1.0, 0, 30), (3.6, 0, 30))), name="passing")
+    assert len(anatomy.tree.branches) == 1 and abs(length_of(anatomy) - 60) < 3
+    assert "two vessels touch and were parted at (2, " in notes_of(anatomy)
+    assert "left out" in notes_of(anatomy) and "62 mm long" in notes_of(anatomy) or "63 mm long" in notes_of(anatomy)
+
+
+def test_a_second_inlet_is_named():
+    trunk = line((-15, 0, 0), (0, 0, 25), (0, 0, 60))
+    anatomy = extract_anatomy(lumen(tubes((trunk, 2.0), (line((15, 0, 0), (0, 0, 25)), 2.0))), name="two inlets")
+    x = anatomy.insertion.position[0]
+    assert f"({-np.sign(x) * 15:.0f}, " in notes_of(anatomy) and "--ostium-mm chooses" in notes_of(anatomy)
+
+
+def test_what_lies_behind_a_given_ostium_is_stated():
+    mask = tubes((line((0, 0, 0), (0, 0, 60)), 1.6))
+    anatomy = extract_anatomy(lumen(mask), name="mid", config=AnatomyConfig(ostium_mm=(0.0, 0.0, 30.0)))
+    assert "of the lumen behind the ostium" in notes_of(anatomy)
+
+
+def test_every_piece_of_some_length_that_is_left_out_is_named_with_its_place():
+    pieces = [(line((20.0 * i, 0, 0), (20.0 * i, 0, 60 - 15 * i)), 1.5) for i in range(3)]
+    anatomy = extract_anatomy(lumen(tubes(*pieces)), name="pieces")
+    left = [note for note in anatomy.provenance["notes"] if "apart from the lumen left out" in note]
+    assert len(left) == 2 and "at (19, " in left[0] and "at (39, " in left[1]
