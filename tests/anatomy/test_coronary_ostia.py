@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -65,14 +64,6 @@ def test_a_single_artery_is_found_and_never_taken_for_the_other(right_alone):
     assert np.linalg.norm(coronary_inlet(right_alone, "rca", "patient").position) < 4.0
     with pytest.raises(InputError, match=r"holds no left coronary artery: .* looks like the right one; .*--vessel rca"):
         coronary_inlet(right_alone, "lca", "patient")
-
-
-def test_arteries_in_other_axes_are_asked_for_with_coordinates(both):
-    volume = both.volume
-    turned = Volume(volume.voxels[:, ::-1, ::-1].copy(), volume.spacing_mm, volume.origin_mm, volume.direction)
-    with pytest.raises(InputError, match="not certain where the right coronary artery begins") as refused:
-        coronary_inlet(LumenMask(turned), "rca", "patient")
-    assert re.search(r"--ostium-mm -?\d+\.\d -?\d+\.\d -?\d+\.\d", str(refused.value))
 
 
 def test_a_short_artery_is_told(both):
@@ -146,10 +137,10 @@ def test_the_likeliest_pair_of_ends_wins_over_each_ends_own_score(both):
     ends = [open_ends(skeleton_of(*grid_points(each, each.values > 0), each.spacing_mm)) for each in lumens]
     true = max(ends[1], key=lambda end: end_score(end, "lca"))
     away = replace(true, position=true.position + np.array([25.0, -20.0, -30.0]), calibre=1.0, taper=0.6, widening=0.0)
-    ranked, absent = rank_ostia([ends[0], [*ends[1], away]], "lca")
+    ranking = rank_ostia([ends[0], [*ends[1], away]])["lca"]
     assert end_score(away, "lca") > end_score(true, "lca")
-    np.testing.assert_array_equal(ranked[0].position, true.position)
-    assert absent + sum(candidate.probability for candidate in ranked) <= 1.0 + 1e-9
+    assert np.linalg.norm(ranking.candidates[0].position - true.position) < 0.1
+    assert ranking.absent + sum(candidate.probability for candidate in ranking.candidates) <= 1.0 + 1e-9
 
 
 @pytest.mark.skipif(not REAL.exists(), reason="the real coronary masks are not here")
