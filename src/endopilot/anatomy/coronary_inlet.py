@@ -97,7 +97,7 @@ def coronary_inlet(
     if not pieces:
         raise InputError(f"{label}: holds no vessel of {SHORTEST_MM:g} mm or more; check the label and the unit")
     vessels = np.concatenate([skeleton.points[::_EVERY] for skeleton in skeletons])
-    rankings = rank_ostia(pieces, vessels)
+    rankings = rank_ostia(pieces, vessels, stated=coordinates is None)
     ranking, counterpart = rankings[side], rankings["lca" if side == "rca" else "rca"]
     best, other = ranking.candidates[0], counterpart.candidates[0]
     if best.probability < CERTAIN or ranking.touching.probability > 0.5:
@@ -116,7 +116,7 @@ def _doubt(ranking: OstiumRanking, counterpart: OstiumRanking, side: Side, coord
     first, name = _option(best.position), _NAMES[side]
     other: Side = "lca" if side == "rca" else "rca"
     if turned >= max(best.probability, absent, _WORTH_NAMING):
-        return f"its axes seem to be other ones: {_in_other_axes(axes, coordinates, 'the vessels')}"
+        return f"its axes seem to be other ones: {_in_other_axes(axes, coordinates)}"
     if ranking.touching.probability > max(0.5, absent):
         return (
             f"one lumen seems to hold both coronary arteries, or arteries and veins, which touch; give each a label of "
@@ -124,8 +124,8 @@ def _doubt(ranking: OstiumRanking, counterpart: OstiumRanking, side: Side, coord
         )
     if absent > best.probability and turned > _AS_WELL * absent:
         return (
-            f"holds no {name} in the axes that it was read in; "
-            f"{_in_other_axes(axes, coordinates, name)}; if the axes are right, it is the other artery"
+            f"holds no {name} in the axes that it was read in; {_in_other_axes(axes, coordinates)}; "
+            f"if the axes are right, say where it begins, perhaps --ostium-mm {first}"
         )
     if absent > best.probability and counterpart.candidates[0].probability >= CERTAIN:
         return (
@@ -137,13 +137,14 @@ def _doubt(ranking: OstiumRanking, counterpart: OstiumRanking, side: Side, coord
     return (
         f"it is not certain where the {name} begins: {places} (LPS mm, probability); look, and give the right "
         f"one, such as --ostium-mm {first}"
+        + (f"; or, {_in_other_axes(axes, coordinates)}" if turned > _AS_WELL * best.probability else "")
     )
 
 
-def _in_other_axes(axes: str, coordinates: str | None, what: str) -> str:
+def _in_other_axes(axes: str, coordinates: str | None) -> str:
     """Say in which other axes a file holds what it should, and what to give."""
     exchanged = ", ".join(word for word, sign in zip(_SIDES, OTHER_AXES[axes][0], strict=True) if sign < 0)
-    reads = f"with {exchanged} exchanged, {what} would look as in patients"
+    reads = f"with {exchanged} exchanged, what is in it looks as in patients"
     if coordinates is None:
         return f"{reads}: mend the orientation that the file states, or export it again"
     if axes != "ras":

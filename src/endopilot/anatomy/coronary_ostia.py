@@ -74,7 +74,7 @@ NEITHER = -14.0
 ALONE = -9.0
 """The same for a single artery, which scores 0 to −5."""
 
-TOUCHING = -12.0
+TOUCHING = -8.0
 """What it costs to take one lumen for both arteries, which touch or run together with their veins."""
 
 OTHER_AXES: dict[str, tuple[Float[np.ndarray, "3"], float]] = {
@@ -87,6 +87,9 @@ OTHER_AXES: dict[str, tuple[Float[np.ndarray, "3"], float]] = {
     "lai": (np.array([1.0, -1.0, -1.0]), -5.0),
 }
 """Axes that a file may be in instead of LPS: the signs that turn it over, and the logarithm of how likely that is."""
+
+UNSTATED = 1.5
+"""What is added for RAS axes where the file does not state its own."""
 
 _FREEDOM = 3.0
 
@@ -124,7 +127,7 @@ class OstiumRanking:
 
 
 def rank_ostia(
-    pieces: Sequence[Sequence[OpenEnd]], vessels: Float[np.ndarray, "n 3"] | None = None
+    pieces: Sequence[Sequence[OpenEnd]], vessels: Float[np.ndarray, "n 3"] | None = None, *, stated: bool = True
 ) -> dict[Side, OstiumRanking]:
     """Return where each artery may begin if it is asked for, and what else the lumen may hold.
 
@@ -133,6 +136,7 @@ def rank_ostia(
     Args:
         pieces: the open ends of every lumen that may be a coronary artery.
         vessels: points along all vessels, LPS mm: none of them may lie in the aorta.
+        stated: whether the file states its axes.
     """
     ends = [end for own in pieces for end in own]
     owner = np.array([piece for piece, own in enumerate(pieces) for _ in own])
@@ -140,6 +144,7 @@ def rank_ostia(
     vessels = np.empty((0, 3)) if vessels is None else vessels
     axes = {"lps": (np.ones(3), 0.0)} | OTHER_AXES
     scores = {name: prior + _scores(ends, owner, vessels, flip) for name, (flip, prior) in axes.items()}
+    scores["ras"] += 0.0 if stated else UNSTATED
     neither = NEITHER if len(pieces) > 1 else ABSENT + ALONE
     return {"rca": _ranking(place, owner, scores, neither, 1), "lca": _ranking(place, owner, scores, neither, 0)}
 
