@@ -143,6 +143,32 @@ def test_the_likeliest_pair_of_ends_wins_over_each_ends_own_score(both):
     assert ranking.absent + sum(candidate.probability for candidate in ranking.candidates) <= 1.0 + 1e-9
 
 
+def test_two_ends_of_one_stub_are_one_candidate_between_them(both):
+    lumens = [artery("rca"), artery("lca")]
+    ends = [open_ends(skeleton_of(*grid_points(each, each.values > 0), each.spacing_mm)) for each in lumens]
+    true = max(ends[1], key=lambda end: end_score(end, "lca"))
+    corner = replace(true, position=true.position + np.array([0.0, 0.0, 7.0]))
+    first, second = rank_ostia([ends[0], [*ends[1], corner]])["lca"].candidates[:2]
+    assert first.probability > 0.95 > 20 * second.probability
+    assert np.linalg.norm(first.position - true.position) < 5.0
+
+
+def test_no_vessel_lies_in_the_aorta_between_the_ostia():
+    lumens = [artery("rca"), artery("lca")]
+    ends = [open_ends(skeleton_of(*grid_points(each, each.values > 0), each.spacing_mm)) for each in lumens]
+    right, left = (
+        max(own, key=lambda end: end_score(end, side)) for own, side in zip(ends, ("rca", "lca"), strict=True)
+    )
+    across = right.position + np.linspace(0.1, 0.9, 9)[:, None] * (left.position - right.position)
+    free, crossed = (rank_ostia(ends, vessels)["lca"].candidates[0].probability for vessels in (None, across))
+    assert free > 0.99 and 1.0 - crossed > 2.0 * (1.0 - free)
+
+
+def test_dominance_is_the_same_from_either_artery(both):
+    anatomies = [extract_anatomy(both, name="patient", config=AnatomyConfig(vessel=side)) for side in ("rca", "lca")]
+    assert anatomies[0].provenance["dominance"] == anatomies[1].provenance["dominance"]
+
+
 @pytest.mark.skipif(not REAL.exists(), reason="the real coronary masks are not here")
 @pytest.mark.parametrize("patient", ["0002", "0134", "0640"])
 def test_ostia_of_real_patients(patient):
