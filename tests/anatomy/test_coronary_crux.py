@@ -9,7 +9,9 @@ import pytest
 
 from endopilot.anatomy.coronary_crux import CRUX_FROM_OSTIUM_MM, Crux, find_crux
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
+from endopilot.anatomy.labels import dominance as tree_dominance
 from endopilot.anatomy.labels import label_tree
+from endopilot.anatomy.labels_tree import LCA_SECTIONS
 from endopilot.anatomy.sources import Polylines
 from endopilot.anatomy.tree import Line, tree_from_lines
 
@@ -100,3 +102,37 @@ def left_tree():
 def test_a_left_posterior_descending_is_named_only_where_the_left_artery_supplies_the_crux(dominance, present):
     sections = label_tree(left_tree(), "lca", crux=Crux(CRUX, dominance)).sections_present
     assert ("15" in sections) is present and {"5", "11", "13"} <= set(sections)
+
+
+@pytest.mark.parametrize(
+    ("course", "section", "missing"),
+    [((50.0, -60.0, -70.0), "7", "circumflex"), ((35.0, 45.0, -45.0), "13", "anterior descending")],
+    ids=["forwards to the apex", "round the back"],
+)
+def test_a_left_artery_that_does_not_fork_is_no_left_main_from_end_to_end(course, section, missing):
+    line = polyline(OSTIUM, beside(OSTIUM, 10.0, 0.0, 0.0), beside(OSTIUM, *course))
+    lines = Polylines((line,), (np.full(len(line), 1.5),))
+    anatomy = extract_anatomy(lines, name="piece", config=AnatomyConfig(vessel="lca"))
+    branch = anatomy.tree.branches[0]
+    names = np.array(anatomy.tree.section_names)[branch.section]
+    assert branch.centerline.abscissa[names == "5"].max() < 15.0 and section in names
+    assert any(f"the {missing} artery is missing" in note for note in anatomy.provenance["notes"])
+    assert anatomy.provenance["dominance"] is None
+
+
+def test_segment_16_is_the_right_arterys_alone_and_the_ramus_is_17():
+    lad = polyline(OSTIUM, beside(OSTIUM, 10.0, 0.0, 0.0), beside(OSTIUM, 50.0, -60.0, -70.0))
+    lcx = polyline(lad[10], beside(lad[10], 30.0, 25.0, -25.0))
+    ramus = polyline(lad[10], beside(lad[10], 35.0, -10.0, -25.0))
+    lines = [
+        Line(points, np.full(len(points), 1.4), *on)
+        for points, on in ((lad, (-1, 0)), (lcx, (0, 10)), (ramus, (0, 10)))
+    ]
+    assert {"5", "17"} <= set(label_tree(tree_from_lines(lines), "lca").sections_present)
+    assert "16" not in LCA_SECTIONS
+
+
+def test_a_right_artery_that_reaches_the_crux_without_its_branches_leaves_dominance_open():
+    whole = label_tree(tree_of_line(right_artery()), "rca")
+    assert not {"4", "16"} & set(whole.sections_present)
+    assert whole.longest_path().abscissa[-1] > 120.0 and tree_dominance(whole) is None

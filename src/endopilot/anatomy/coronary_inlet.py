@@ -11,7 +11,7 @@ from jaxtyping import Float
 from endopilot.anatomy import parent_vessel, repair
 from endopilot.anatomy.coronary_crux import Crux, find_crux
 from endopilot.anatomy.coronary_ends import OpenEnd, Skeleton, open_ends, skeleton_of
-from endopilot.anatomy.coronary_ostia import OstiumCandidate, Side, rank_ostia
+from endopilot.anatomy.coronary_ostia import OTHER_AXES, OstiumCandidate, OstiumRanking, Side, rank_ostia
 from endopilot.anatomy.distance import distance_map_from_surface
 from endopilot.anatomy.surface import Surface, filled_box, surface_from_mask
 from endopilot.anatomy.topology import parted
@@ -19,8 +19,11 @@ from endopilot.anatomy.units import check_unit
 from endopilot.errors import InputError
 from endopilot.types import DistanceMap, Insertion, LumenMask, Volume
 
-CERTAIN = 0.7
+CERTAIN = 0.8
 """An ostium less probable than this is asked for."""
+
+PRESENT = 0.5
+"""The other artery is in the lumen if it begins in another piece with at least this probability."""
 
 SHORTEST_MM = 15.0
 """A lumen whose branches together are shorter than this is no artery but a crumb."""
@@ -30,6 +33,9 @@ GRID_MM = 0.5
 
 _NAMES = {"rca": "right coronary artery", "lca": "left coronary artery"}
 _NAMED, _WORTH_NAMING = 4, 0.02
+_AS_WELL = 0.2  # other axes explain a lumen nearly as well as the other artery does
+_SIDES = ("left and right", "front and back", "up and down")
+_EVERY = 4  # of the skeleton's points, some 0.6 mm apart, are enough to find vessels in the aorta
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,8 +46,8 @@ class CoronaryInlet:
         position: tip of the open end, LPS mm.
         confidence: probability that the artery begins there, 0 to 1.
         runner_up: the next best place, if any.
-        crux: where the arteries meet the crux of the heart, if both are in the lumen and their ostia certain.
-        other: where the other coronary artery begins, LPS mm, if it is another piece and certain.
+        crux: where the arteries meet the crux of the heart, if both are in the lumen and one reaches it.
+        other: where the other coronary artery begins, LPS mm, if it is in the lumen too, as another piece.
     """
 
     position: Float[np.ndarray, "3"]
@@ -60,22 +66,27 @@ class CoronaryInlet:
         }
 
 
-def coronary_inlet(content: LumenMask | Surface, side: Side, label: str) -> CoronaryInlet | None:
+def coronary_inlet(
+    content: LumenMask | Surface, side: Side, label: str, coordinates: str | None = None
+) -> CoronaryInlet | None:
     """Return where an artery begins, or None where the lumen holds a piece of the aorta, which shows it.
 
     Args:
         content: both coronary arteries, or one, with whatever specks.
         side: which artery is asked for.
         label: name of the source, for messages.
+        coordinates: the axes that the user gave for a file that does not state its own; None where the file does.
 
     Raises:
-        InputError: the artery is not there, or it is not certain where it begins; the candidates are named.
+        InputError: the artery is not there, the file is in other axes, or it is not certain where the artery begins;
+            the message names what to give.
     """
     pieces: list[list[OpenEnd]] = []
     skeletons: list[Skeleton] = []
-    if isinstance(content, LumenMask) and _holds_aorta(content.volume):
+    coarse = _coarse(content.volume) if isinstance(content, LumenMask) else content
+    if isinstance(coarse, Volume) and _holds_aorta(coarse):
         return None
-    for lumen in _lumens(content, label):
+    for lumen in _lumens(coarse, label):
         inside = lumen.values > 0
         for points, clearance in _parts(lumen, inside):
             if clearance.max() > parent_vessel.AORTA_RADIUS_MM:
@@ -86,47 +97,76 @@ def coronary_inlet(content: LumenMask | Surface, side: Side, label: str) -> Coro
                 skeletons.append(skeleton)
     if not pieces:
         raise InputError(f"{label}: holds no vessel of {SHORTEST_MM:g} mm or more; check the label and the unit")
-    ranked, absent = rank_ostia(pieces, side)
-    best = ranked[0]
-    if best.probability < CERTAIN:
-        raise InputError(f"{label}: {_doubt(ranked, absent, side)}")
-    other = rank_ostia(pieces, "lca" if side == "rca" else "rca")[0][0]
-    crux = None
-    apart = other.probability >= CERTAIN and other.piece != best.piece
-    if apart:
+    vessels = np.concatenate([skeleton.points[::_EVERY] for skeleton in skeletons])
+    rankings = rank_ostia(pieces, vessels, stated=coordinates is None)
+    ranking, counterpart = rankings[side], rankings["lca" if side == "rca" else "rca"]
+    best, other = ranking.candidates[0], counterpart.candidates[0]
+    if best.probability < CERTAIN or ranking.touching.probability > 0.5:
+        raise InputError(f"{label}: {_doubt(ranking, counterpart, side, coordinates)}")
+    crux, paired = None, other.probability >= PRESENT and other.piece != best.piece
+    if paired:
         right, left = (best, other) if side == "rca" else (other, best)
         crux = find_crux(right.position, skeletons[right.piece].points, skeletons[left.piece].points)
-    runner_up = ranked[1] if len(ranked) > 1 else None
-    return CoronaryInlet(best.position, best.probability, runner_up, crux, other.position if apart else None)
+    runner_up = ranking.candidates[1] if len(ranking.candidates) > 1 else None
+    return CoronaryInlet(best.position, best.probability, runner_up, crux, other.position if paired else None)
 
 
-def _doubt(ranked: list[OstiumCandidate], absent: float, side: Side) -> str:
-    first = " ".join(f"{value:.1f}" for value in ranked[0].position)
-    if absent > ranked[0].probability:
-        other = "lca" if side == "rca" else "rca"
+def _doubt(ranking: OstiumRanking, counterpart: OstiumRanking, side: Side, coordinates: str | None) -> str:
+    """Say why an artery's ostium is in doubt, and what mends it: only what the program would then accept."""
+    best, absent, (axes, turned) = ranking.candidates[0], ranking.absent, ranking.axes
+    first, name = _option(best.position), _NAMES[side]
+    other: Side = "lca" if side == "rca" else "rca"
+    if turned >= max(best.probability, absent, _WORTH_NAMING):
+        return f"its axes seem to be other ones: {_in_other_axes(axes, coordinates)}"
+    if ranking.touching.probability > max(0.5, absent):
         return (
-            f"holds no {_NAMES[side]}: what is in it looks like the {_NAMES[other].split()[0]} one; "
+            f"one lumen seems to hold both coronary arteries, or arteries and veins, which touch; give each a label of "
+            f"its own, or say where the {name} begins, perhaps --ostium-mm {_option(ranking.touching.position)}"
+        )
+    if absent > best.probability and turned > _AS_WELL * absent:
+        return (
+            f"holds no {name} in the axes that it was read in; {_in_other_axes(axes, coordinates)}; "
+            f"if the axes are right, say where it begins, perhaps --ostium-mm {first}"
+        )
+    if absent > best.probability and counterpart.candidates[0].probability >= CERTAIN:
+        return (
+            f"holds no {name}: what is in it looks like the {_NAMES[other].split()[0]} one; "
             f"take --vessel {other}, or say where it begins, perhaps --ostium-mm {first}"
         )
-    named = [candidate for candidate in ranked[:_NAMED] if candidate.probability > _WORTH_NAMING] or ranked[:1]
-    places = ", ".join(f"{_text(candidate.position)} {candidate.probability:.0%}" for candidate in named)
+    named = [candidate for candidate in ranking.candidates[:_NAMED] if candidate.probability > _WORTH_NAMING]
+    places = ", ".join(f"{_text(each.position)} {each.probability:.0%}" for each in named or ranking.candidates[:1])
     return (
-        f"it is not certain where the {_NAMES[side]} begins: {places} (LPS mm, probability); look, and give the right "
-        f"one, such as --ostium-mm {first}; surfaces in RAS axes need --coordinates ras"
+        f"it is not certain where the {name} begins: {places} (LPS mm, probability); look, and give the right "
+        f"one, such as --ostium-mm {first}"
+        + (f"; or, {_in_other_axes(axes, coordinates)}" if turned > _AS_WELL * best.probability else "")
     )
+
+
+def _in_other_axes(axes: str, coordinates: str | None) -> str:
+    """Say in which other axes a file holds what it should, and what to give."""
+    exchanged = ", ".join(word for word, sign in zip(_SIDES, OTHER_AXES[axes][0], strict=True) if sign < 0)
+    reads = f"with {exchanged} exchanged, what is in it looks as in patients"
+    if coordinates is None:
+        return f"{reads}: mend the orientation that the file states, or export it again"
+    if axes != "ras":
+        return f"{reads}: export it again in LPS axes"
+    return f"{reads}: {'leave --coordinates ras out' if coordinates == 'ras' else 'give --coordinates ras'}"
+
+
+def _option(position: Float[np.ndarray, "3"]) -> str:
+    return " ".join(f"{value:.1f}" for value in position)
 
 
 def _text(position: Float[np.ndarray, "3"]) -> str:
     return "(" + ", ".join(f"{value:.1f}" for value in position) + ")"
 
 
-def _lumens(content: LumenMask | Surface, label: str) -> Iterator[DistanceMap]:
-    if isinstance(content, LumenMask):
-        mask = _coarse(content.volume)
-        if mask.voxels.any():
-            corners = mask.index_to_world(np.array([np.zeros(3), np.array(mask.voxels.shape[::-1]) - 1.0]))
+def _lumens(content: Volume | Surface, label: str) -> Iterator[DistanceMap]:
+    if isinstance(content, Volume):
+        if content.voxels.any():
+            corners = content.index_to_world(np.array([np.zeros(3), np.array(content.voxels.shape[::-1]) - 1.0]))
             check_unit(corners, None, "rca", label)
-            wall = surface_from_mask(parted(repair.joined_mask(mask))[0])
+            wall = surface_from_mask(parted(repair.joined_mask(content))[0])
             yield distance_map_from_surface(wall, spacing_mm=GRID_MM, band_mm=2 * GRID_MM)
         return
     for place in repair.region_places(content):
@@ -147,11 +187,10 @@ def _parts(lumen: DistanceMap, inside: np.ndarray) -> Iterator[tuple[Float[np.nd
             yield lumen.origin_mm + lumen.spacing_mm * index[:, ::-1], lumen.values[tuple(index.T)].astype(float)
 
 
-def _holds_aorta(mask: Volume) -> bool:
+def _holds_aorta(coarse: Volume) -> bool:
     """Return whether a mask is somewhere too thick for a coronary artery, at a fraction of its wall's cost."""
     from scipy.ndimage import distance_transform_edt, minimum_filter
 
-    coarse = _coarse(mask)
     # A ball holds a cube of its radius over √3; without such a cube the costly distance need not be asked.
     cube = 2 * np.floor(parent_vessel.AORTA_RADIUS_MM / np.sqrt(3.0) / coarse.spacing_mm[::-1]).astype(int) - 1
     if not minimum_filter(coarse.voxels, size=np.maximum(cube, 1), mode="constant").any():

@@ -23,7 +23,7 @@ from endopilot.anatomy.distance import (
     distance_map_from_surface,
 )
 from endopilot.anatomy.inlet import beyond_parent, component, entrance, grid_points, in_front, widest_open_end
-from endopilot.anatomy.labels import dominance, label_tree
+from endopilot.anatomy.labels import dominance, label_tree, missing_main_vessel
 from endopilot.anatomy.labels_coronary import SHORT_MM
 from endopilot.anatomy.lumen_graph import lumen_graph, trace_branches
 from endopilot.anatomy.medial_lines import MedialLines, traced_lines
@@ -115,7 +115,8 @@ def extract_anatomy(
             advance(2)
             distance_map = distance_map_from_spheres(tree, spacing_mm=config.spacing_mm)
         else:
-            wall = _wall(content, given, config, source_name)
+            unstated = wrapped.coordinates is None and isinstance(content, Surface)
+            wall = _wall(content, given, config, source_name, config.coordinates if unstated else None)
             surface, inlet = wall.surface, wall.inlet
             notes += wall.notes
             advance()
@@ -131,7 +132,7 @@ def extract_anatomy(
         crux = None if inlet is None else inlet.crux
         tree = label_tree(tree, config.vessel, crux=crux)
         short = _short(tree, config.vessel)
-        notes += short
+        notes += short + missing_main_vessel(tree)
         insertion = _insertion(tree, given)
         ostium_radius = float(np.median(tree.branches[0].centerline.radius[:3]))
         resolved = max(CATHETER_RADIUS_MM, _RESOLVED_STEPS * distance_map.spacing_mm)
@@ -145,7 +146,7 @@ def extract_anatomy(
         "ostium_rule": rule,
         **(inlet.record() if inlet is not None else {}),
         "catheter_tilt_deg": round(catheter_tilt_deg(ostium_radius, radius), 1),
-        "dominance": crux.dominance if crux is not None else None if short else dominance(tree),
+        "dominance": _dominance(tree, inlet, short),
         "coverage": balance,
         "notes": [*doubts, *notes],
     }
@@ -180,13 +181,15 @@ class _Wall:
     notes: list[str]
 
 
-def _wall(content: LumenMask | Surface, given: Insertion | None, config: AnatomyConfig, label: str) -> _Wall:
+def _wall(
+    content: LumenMask | Surface, given: Insertion | None, config: AnatomyConfig, label: str, axes: str | None
+) -> _Wall:
     """Return the closed wall of the wanted vessel, with repairs stated."""
     inlet = None
     if isinstance(content, Surface):
         check_unit(content.vertices, None, config.vessel, label)
     if given is None and config.vessel != "generic":
-        inlet = coronary_inlet(content, config.vessel, label)
+        inlet = coronary_inlet(content, config.vessel, label, axes)
         given = None if inlet is None else Insertion(inlet.position, np.zeros(3))
     other = None if inlet is None else inlet.other
     if isinstance(content, LumenMask):
@@ -222,6 +225,13 @@ def _short(tree: VesselTree, vessel: str) -> list[str]:
         return []
     name = "right" if vessel == "rca" else "left"
     return [f"the {name} coronary artery is only {longest:.0f} mm long here: it is a vestige, or cut off or occluded"]
+
+
+def _dominance(tree: VesselTree, inlet: CoronaryInlet | None, short: list[str]) -> str | None:
+    """Return the dominance: which of both arteries reaches the crux, or what a single one's tree shows; else None."""
+    if inlet is not None and inlet.other is not None:
+        return None if inlet.crux is None else inlet.crux.dominance
+    return None if short else dominance(tree)
 
 
 def _source_record(source: AnatomySource) -> dict[str, str | None]:

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from endopilot.anatomy.coronary_crux import Crux
-from endopilot.anatomy.labels_coronary import label_lca, label_rca
+from endopilot.anatomy.labels_coronary import LONGEST_LEFT_MAIN_MM, NEAREST_CRUX_MM, label_lca, label_rca
 from endopilot.anatomy.labels_tree import (
     ARCH_SECTIONS,
     CEREBRAL_SECTIONS,
@@ -77,16 +77,36 @@ def label_tree(
 def dominance(tree: VesselTree) -> str | None:
     """Return "right", "balanced" or "left" for a labelled coronary tree, None for any other.
 
-    A right coronary that gives the posterior descending and a posterolateral branch is right-dominant, one that gives
-    the posterior descending alone balanced, one that gives neither left; a left coronary with a posterior descending
-    branch is left-dominant, and one with a branch to the inferior wall balanced.
+    A right coronary that gives a posterolateral branch is right-dominant, one that gives the posterior descending alone
+    balanced, one that ends long before the crux left; a left coronary with a posterior descending branch is
+    left-dominant, and one with a branch to the inferior wall balanced. None also where the right one reaches the crux
+    and gives neither, and where the left one lacks a main vessel: then parts of it are not there.
     """
     used = {tree.section_names[index] for branch in tree.branches for index in np.unique(branch.section)}
     if tree.section_names == RCA_SECTIONS:
-        return "right" if {"4", "16"} <= used else "balanced" if "4" in used else "left"
+        if not used & {"4", "16"}:
+            return "left" if float(tree.longest_path().abscissa[-1]) < NEAREST_CRUX_MM else None
+        return "right" if "16" in used else "balanced"
     if tree.section_names == LCA_SECTIONS:
+        if not {"6", "11"} <= used:
+            return None
         return "left" if "15" in used else "balanced" if _feeds_inferior_wall(tree) else "right"
     return None
+
+
+def missing_main_vessel(tree: VesselTree) -> list[str]:
+    """Say so if a labelled left coronary tree lacks one of the two main vessels: then all names are less sure."""
+    missing = [
+        name
+        for number, name in (("6", "anterior descending"), ("11", "circumflex"))
+        if number not in tree.sections_present
+    ]
+    if tree.section_names != LCA_SECTIONS or not missing:
+        return []
+    return [
+        f"the left main does not fork within {LONGEST_LEFT_MAIN_MM:g} mm here: the {missing[0]} artery is missing, cut "
+        "off or a piece apart, and the sections of the other one are named by its course alone"
+    ]
 
 
 def _feeds_inferior_wall(tree: VesselTree) -> bool:

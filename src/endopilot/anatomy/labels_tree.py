@@ -12,9 +12,10 @@ RCA_SECTIONS = ("1", "2", "3", "4", "16", "conus", "SA", "RV", "AM")
 """Proximal, mid, distal; posterior descending; posterolateral; then conus, sinus node, right ventricular and acute
 marginal branches."""
 
-LCA_SECTIONS = ("5", "6", "7", "8", "9", "10", "11", "12", "13", "14", "15", "16", "D", "septal")
+LCA_SECTIONS = ("5", "6", "7", "8", "9", "10", "11", "12", "13", "14", "15", "17", "D", "septal")
 """Left main; LAD proximal, mid, distal; first and second diagonal; LCx proximal; first obtuse marginal; LCx distal;
-further marginal or posterolateral; left posterior descending; ramus intermedius; further diagonals; septals."""
+further marginal or posterolateral; left posterior descending; ramus intermedius; further diagonals; septals. Segment 16
+is the right artery's alone (SCCT)."""
 
 ARCH_SECTIONS = (
     "descending aorta",

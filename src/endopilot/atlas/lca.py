@@ -213,7 +213,7 @@ def _draw(
     along, bends = shape.abscissa(lad.points), shape.curvature(lad.points)
     drawn = {
         "dominance": dominance,
-        "ramus": any(plan.section == "16" for plan in plans),
+        "ramus": any(plan.section == "17" for plan in plans),
         "length_mm": float(along[-1]),
         "left_main_length_mm": float(along[trunk.fork]),
         "circumflex_length_mm": float(shape.abscissa(vessels[1].points)[-1]),
@@ -340,7 +340,7 @@ def _plan_branches(
         named = {id(plan): name for plan, name in zip(own, _ORDERED[parent], strict=False)}
         plans = [replace(plan, section=named.get(id(plan), plan.section)) for plan in plans]
     if generator.random() < _RAMUS.share:
-        plans.insert(0, _plan(generator, "16", _RAMUS, 0, trunk.fork, trunk, calibre))
+        plans.insert(0, _plan(generator, "17", _RAMUS, 0, trunk.fork, trunk, calibre))
     return plans
 
 
