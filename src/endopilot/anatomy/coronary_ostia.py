@@ -3,9 +3,9 @@
 Every open end of every piece is scored as the ostium of the right and of the left artery by what anatomy demands:
 calibre, taper, course, first heading and first fork, the place of the two ostia relative to each other, and that no
 vessel runs through the aorta between them. Each score is a logarithmic likelihood with heavy tails (Student's t), so no
-single quantity decides; its weight was fitted to perturbed masks of real patients, and judged on those of patients left
-out (docs/anatomy.md). The probability of an ostium is the share of all hypotheses that agree with it within `SAME_MM`;
-among them are an absent artery, arteries that touch, other axes, and none of these.
+single quantity decides; its weight was fitted to perturbed masks of real patients (docs/anatomy.md). The probability of
+an ostium is the share of all hypotheses that agree with it within `SAME_MM`; among them are an absent artery, arteries
+that touch, other axes, and none of these.
 """
 
 from __future__ import annotations
@@ -238,7 +238,7 @@ def _pair_score(place: Float[np.ndarray, "n 3"], vessels: Float[np.ndarray, "m 3
     apart = np.log(distance / BETWEEN_MM) / BETWEEN_SD
     turn = _angle_deg(offset, LEFT_FROM_RIGHT) / LEFT_FROM_RIGHT_SD_DEG
     inside = np.minimum(_aorta_clearance(place, offset, vessels) - AORTA_MM, 0.0) / AORTA_SD_MM
-    return _log_t(apart**2) + _log_t(turn**2) + _log_t(inside**2)
+    return np.asarray(_log_t(apart**2) + _log_t(turn**2) + _log_t(inside**2))
 
 
 def _aorta_clearance(
@@ -254,7 +254,7 @@ def _aorta_clearance(
     axis = centre - (centre @ up)[..., None] * up
     square = (across**2).sum(axis=1) - 2.0 * axis @ across.T + (axis**2).sum(axis=-1)[..., None]
     beside = (height > AORTA_REACH_MM[0]) & (height < AORTA_REACH_MM[1])
-    return np.sqrt(np.where(beside, np.maximum(square, 0.0), AORTA_MM**2).min(axis=-1, initial=AORTA_MM**2))
+    return np.asarray(np.sqrt(np.where(beside, np.maximum(square, 0.0), AORTA_MM**2).min(axis=-1, initial=AORTA_MM**2)))
 
 
 def _log_t(square: Float[np.ndarray, "..."] | float) -> Float[np.ndarray, "..."] | np.float64:
