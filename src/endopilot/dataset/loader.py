@@ -225,6 +225,7 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     manifest = read_json(folder / MANIFEST_PATH, keys=("key", "settings"), mend=_MEND)
     with reading(folder / MANIFEST_PATH, _MEND):
         made = manifest["settings"].get("version")
+        manifest["key"].encode()
         {record["name"]: record["sha256"] + record["folder"] for record in manifest["anatomies"]}
     if made != version():
         raise InputError(f"{folder}: made by {made}, which {version()} cannot read; make the dataset again")
