@@ -16,6 +16,7 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 
 from endopilot.anatomy.medial_lines import MedialLines, thinned_lines, traced_lines
+from endopilot.anatomy.parent_vessel import AORTA_RADIUS_MM
 from endopilot.types import Volume
 
 CONTACT = 0.6
@@ -168,6 +169,8 @@ def _without_sides(mask: Volume, lines: MedialLines) -> tuple[Volume, list[str]]
     """
     from scipy.sparse.csgraph import dijkstra
 
+    if lines.clearance.max(initial=0.0) > AORTA_RADIUS_MM:  # a branch's first part lies inside the aorta's own middle
+        return mask, []
     voxel = float(mask.spacing_mm.max())
     pairs = KDTree(lines.points).query_pairs(2.0 * float(lines.clearance.max()) + voxel, output_type="ndarray")
     gap = np.linalg.norm(lines.points[pairs[:, 0]] - lines.points[pairs[:, 1]], axis=1)
