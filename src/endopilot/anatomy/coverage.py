@@ -126,7 +126,7 @@ def stretches(
     from scipy.sparse.csgraph import connected_components
 
     inner = chosen[lines.edges].all(axis=1)
-    count, part = connected_components(lines.matrix(lines.edges[inner]), directed=False)
+    _, part = connected_components(lines.matrix(lines.edges[inner]), directed=False)
     length, behind = lines.from_widest
     order = length if order is None else order
     found = []

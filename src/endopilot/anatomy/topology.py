@@ -12,10 +12,11 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.spatial import KDTree
 
 from endopilot.anatomy.medial_lines import MedialLines, thinned_lines, traced_lines
+from endopilot.anatomy.parent_vessel import AORTA_RADIUS_MM
 from endopilot.types import Volume
 
 CONTACT = 0.6
@@ -152,10 +153,11 @@ def _contacts(lines: MedialLines, mask: Volume) -> list[_Cut]:
         done[[*path_one, *path_two]] = True
         radius = lines.clearance[[one, two]]
         gap = float(np.linalg.norm(lines.points[one] - lines.points[two]))
-        thick = lines.clearance[node] < CONTACT * radius.min() and radius.min() > _THICK_VOXELS * mask.spacing_mm.max()
-        if thick and gap < _BRIDGE * radius.sum() + _SLIT_VOXELS * mask.spacing_mm.max() and _runs_past(lines, ways, one, path_one) and _runs_past(
-            lines, ways, two, path_two
-        ):  # fmt: skip
+        reach = _BRIDGE * radius.sum() + _SLIT_VOXELS * mask.spacing_mm.max()
+        thick = radius.min() > _THICK_VOXELS * mask.spacing_mm.max()
+        thin_and_short = lines.clearance[node] < CONTACT * radius.min() and gap < reach
+        past = thick and thin_and_short and _runs_past(lines, ways, one, path_one)
+        if past and _runs_past(lines, ways, two, path_two):
             cuts.append(_Cut((int(node), path_two[0]), "bridge", lines.points[node], 0.0))
     return cuts
 
@@ -167,6 +169,8 @@ def _without_sides(mask: Volume, lines: MedialLines) -> tuple[Volume, list[str]]
     """
     from scipy.sparse.csgraph import dijkstra
 
+    if lines.clearance.max(initial=0.0) > AORTA_RADIUS_MM:  # a branch's first part lies inside the aorta's own middle
+        return mask, []
     voxel = float(mask.spacing_mm.max())
     pairs = KDTree(lines.points).query_pairs(2.0 * float(lines.clearance.max()) + voxel, output_type="ndarray")
     gap = np.linalg.norm(lines.points[pairs[:, 0]] - lines.points[pairs[:, 1]], axis=1)
@@ -254,7 +258,8 @@ def _sever(voxels: np.ndarray, lines: MedialLines, ends: tuple[int, int]) -> Non
     first[tuple((own[near[nearest] <= far[nearest]] - [part.start for part in window]).T)] = True
     second = voxels[window] & ~first
     block = np.ones((3, 3, 3), dtype=bool)
-    rim = (first & binary_dilation(second, block)) | (second & binary_dilation(first, block))
+    beside_first, beside_second = (np.asarray(binary_dilation(side, block), dtype=bool) for side in (first, second))
+    rim = (first & beside_second) | (second & beside_first)
     voxels[window] &= ~rim
 
 
