@@ -46,16 +46,16 @@ def test_covered_left_out_and_bridged_are_all_of_the_lines(pieces):
         tuple(lines), tuple(np.full(len(line), radius) for line, radius in zip(lines, radii, strict=True))
     )
     found = tree_from_polylines(source, None, "lines.vtp")
-    lengths = found.lengths_mm
+    lengths = found.coverage
     total = sum(length for _, _, length, _ in pieces)
-    assert abs(lengths["given"] - total) < 0.3
-    assert abs(lengths["covered"] + lengths["left_out"] - lengths["given"]) < 0.3
+    assert abs(lengths["length_mm"] - total) < 0.3
+    assert abs(lengths["reached_mm"] + lengths["left_out_mm"] - lengths["length_mm"]) < 0.3
     # Lines that run together are said once, so what is said is at most what is left out.
     said = sum(float(m[1]) for note in found.notes if (m := re.match(r"([\d.]+) mm of line .*left out", note)))
-    assert said <= lengths["left_out"] + 0.5
-    assert said >= lengths["left_out"] / len(pieces) - 0.5
+    assert said <= lengths["left_out_mm"] + 0.5
+    assert said >= lengths["left_out_mm"] / len(pieces) - 0.5
     bridged = sum(float(m[1]) for note in found.notes if (m := re.match(r"a gap of ([\d.]+) mm", note)))
-    assert abs(bridged - lengths["bridged"]) < 0.3
+    assert abs(bridged - lengths["bridged_mm"]) < 0.3
     # By another way: what lies outside the tree's own spheres is no longer than what is said to be left out.
     points = np.concatenate([branch.centerline.points for branch in found.tree.branches])
     radius = np.concatenate([branch.centerline.radius for branch in found.tree.branches])
@@ -64,18 +64,18 @@ def test_covered_left_out_and_bridged_are_all_of_the_lines(pieces):
         dense = straight(line[0], line[-1], 200)
         gap = np.linalg.norm(dense[:, None] - points, axis=2)
         outside += (gap.min(axis=1) > radius[gap.argmin(axis=1)] + 0.5).mean() * np.linalg.norm(line[-1] - line[0])
-    assert outside <= lengths["left_out"] + 1.0
+    assert outside <= lengths["left_out_mm"] + 1.0
 
 
 def test_a_second_line_apart_is_said_with_its_length_and_place():
     found = made([straight([0, 0, 0], [0, 0, 60]), straight([30, 0, 0], [30, 0, 40])])
-    assert found.lengths_mm == {"given": 100.0, "covered": 60.0, "left_out": 40.0, "bridged": 0.0}
+    assert found.coverage == {"length_mm": 100.0, "reached_mm": 60.0, "left_out_mm": 40.0, "bridged_mm": 0.0}
     assert any(re.match(r"40\.0 mm of line at \[30\.0, .*\] mm is left out", note) for note in found.notes)
 
 
 def test_a_small_gap_between_lines_is_bridged_and_noted():
     found = made([straight([0, 0, 0], [0, 0, 30]), straight([0, 0, 34], [0, 0, 60])])
-    assert len(found.tree.branches) == 1 and found.lengths_mm["bridged"] == 4.0
+    assert len(found.tree.branches) == 1 and found.coverage["bridged_mm"] == 4.0
     assert any("a gap of 4.0 mm between lines at [0.0, 0.0, 30.0] mm is bridged" in note for note in found.notes)
 
 
@@ -114,7 +114,7 @@ DIAMOND = [
 )
 def test_loops_are_cut_with_their_place_and_length(lines, length):
     found = made(lines)
-    assert found.lengths_mm["left_out"] < 1.0
+    assert found.coverage["left_out_mm"] < 1.0
     (place, size), *more = loops(found)
     assert not more and abs(size - length) < 8
     assert min(np.linalg.norm(line - place, axis=1).min() for line in lines) < 2.0

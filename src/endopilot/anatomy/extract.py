@@ -109,7 +109,7 @@ def extract_anatomy(
         if isinstance(content, (Polylines, VesselTree)):
             _check_lines(content, config, source_name)
             made = polylines.tree_from_polylines(content, given, source_name, config.vessel)
-            tree, rule, balance = made.tree, made.rule, made.lengths_mm
+            tree, rule, balance = made.tree, made.rule, made.coverage
             notes += made.notes
             inlet: CoronaryInlet | None = None
             advance(2)

@@ -49,14 +49,14 @@ class LineTree:
         tree: the tree.
         rule: by which its root was chosen.
         notes: what was done and left out, a sentence each.
-        lengths_mm: length of the lines "given", of them "covered" by the tree's spheres and "left_out" (these two add
-            up to the first), and of gaps "bridged" between them, mm.
+        coverage: `length_mm` of the lines, of them `reached_mm` by the tree's spheres and `left_out_mm` (these two add
+            up to the first), and `bridged_mm` of gaps between them.
     """
 
     tree: VesselTree
     rule: str
     notes: list[str]
-    lengths_mm: dict[str, float]
+    coverage: dict[str, float]
 
 
 def tree_from_polylines(
@@ -110,9 +110,9 @@ def tree_from_polylines(
     tree = tree_from_lines(_lines(nodes.points, nodes.radius, paths))
     lost, covered = left_out(whole, keep, tree, piece, int(piece[root]))
     total = float(whole.share.sum())
-    lengths = {"given": total, "covered": covered, "left_out": total - covered, "bridged": float(bridged.sum())}
+    balance = {"length": total, "reached": covered, "left_out": total - covered, "bridged": float(bridged.sum())}
     notes += [*lost, *closures(tree), *further_inlets(source, tree)]
-    return LineTree(tree, rule, notes, {name: round(value, 1) for name, value in lengths.items()})
+    return LineTree(tree, rule, notes, {f"{name}_mm": round(value, 1) for name, value in balance.items()})
 
 
 def _outside_parent_vessel(nodes: LineNodes) -> tuple[Bool[np.ndarray, "n"], Float[np.ndarray, "3"] | None]:
