@@ -330,6 +330,7 @@ void Stepper<V, T>::end_sample(int l, Queue& queue) {
         w[World::kDriveForce] = lane.by_force ? lane.speed : w[World::kBaseForce] + valve.gradient_a;
         w[World::kDriveTorque] = lane.by_force ? lane.spin : w[World::kBaseTorque] + valve.gradient_r;
     }
+    if (T == 0 && through_wall(w)) w[World::kReason] = kThroughWall;
     if (lane.sample >= 0)
         record(lane.world, lane.sample, double(lane.total_iterations) / lane.steps, double(lane.node_iterations),
                {lane.slip.advance + lane.refused, lane.slip.rotation});
@@ -338,6 +339,19 @@ void Stepper<V, T>::end_sample(int l, Queue& queue) {
     else
         queue.finish();
     lane.world = -1;
+}
+
+// Whether a wire's middle has left the lumen of a vessel that does not yield. The wall then holds it on both sides of a septum, and
+// pushes itself apart through the wire, whatever the drive does.
+template <class V, int T>
+bool Stepper<V, T>::through_wall(const World& w) const {
+    if (options_.foundation != 0) return false;
+    for (int i = 0; i < w.active(); ++i) {
+        const double most = options_.wall_stiffness * rod_.radius[i];
+        const World::Numbers node = w.node(i);
+        if (node[World::kAtNode + World::kNormalForce] > most || node[World::kAtMiddle + World::kNormalForce] > most) return true;
+    }
+    return false;
 }
 
 // Marks the lane's world invalid from this sample on and frees the lane; its pose stays as last converged.

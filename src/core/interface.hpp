@@ -139,7 +139,7 @@ struct Inputs {
     const double* control;    // worlds × samples × 2 (of each tube): mm/s and rad/s, or N and N mm
 };
 
-enum Reason : std::uint8_t { kFine = 0, kNotFinite = 1, kNotConverged = 2 };
+enum Reason : std::uint8_t { kFine = 0, kNotFinite = 1, kNotConverged = 2, kThroughWall = 3 };
 
 // Arrays of worlds × samples (× 3, × nodes × 3). `slip` is the commanded advance (mm) that was not made, `rotation_slip`
 // the commanded rotation (rad), and `approach_slip` (worlds × 2) both before the first sample. `iterations` are Newton's, a

@@ -355,7 +355,8 @@ class Rollout:
         node_iterations: evaluations of active nodes in the period: for each Newton iteration, also those of attempts
             that were given up, the nodes ahead of the catheter.
         valid: false from the sample in which a world failed to converge or left the finite numbers.
-        reason: why a world became invalid: 0 it is valid, 1 it left the finite numbers, 2 it did not converge.
+        reason: why a world became invalid: 0 it is valid, 1 it left the finite numbers, 2 it did not converge,
+            3 the wire went through the wall.
         shape: positions of all nodes from the foremost tip to the base, LPS mm, if they were recorded.
         catheters: the motion of the catheters; None for a wire alone. With catheters, the fields above are those of the
             wire, but for the direction of the tip and the wall's forces, which are those of all.
