@@ -28,6 +28,7 @@ def make_fork(radius: tuple[float, float] = (1.0, 0.8)) -> Anatomy:
         name="fork",
         tree=tree,
         distance_map=DistanceMap(values, SPACING_MM, low),
-        insertion=Insertion(np.zeros(3), np.array([0.0, 0.0, 1.0])),
+        # At φ = 0 a tip's bend points across the fork's plane.
+        insertion=Insertion(np.zeros(3), np.array([0.0, 0.0, 1.0]), rotation_zero=np.array([0.0, -1.0, 0.0])),
         catheter_radius_mm=0.9,
     )

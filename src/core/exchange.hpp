@@ -346,12 +346,26 @@ void Stepper<V, T>::end_sample(int l, Queue& queue) {
     }
     if (lane.sample < 0) w[World::kApproach] = -lane.sample - 1;
     store(l);
+    if (T == 0 && through_wall(w)) w[World::kReason] = kThroughWall;
     if (lane.sample >= 0) record(lane.world, lane.sample, double(lane.total_iterations) / lane.steps, double(lane.node_iterations));
     if (lane.sample + 1 < in_.samples)
         queue.put_back(lane.world, lane.sample + 1, lane.active);
     else
         queue.finish();
     lane.world = -1;
+}
+
+// Whether a wire's middle has left the lumen of a vessel that does not yield. The wall then holds it on both sides of a septum, and
+// pushes itself apart through the wire, whatever the drive does.
+template <class V, int T>
+bool Stepper<V, T>::through_wall(const World& w) const {
+    if (options_.foundation != 0) return false;
+    for (int i = 0; i < w.active(); ++i) {
+        const double most = options_.wall_stiffness * rod_.radius[i];
+        const World::Numbers node = w.node(i);
+        if (node[World::kAtNode + World::kNormalForce] > most || node[World::kAtMiddle + World::kNormalForce] > most) return true;
+    }
+    return false;
 }
 
 // Marks the lane's world invalid from this sample on and frees the lane; its pose stays as last converged.

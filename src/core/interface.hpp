@@ -154,7 +154,7 @@ struct Inputs {
     const double* control;    // worlds × samples × devices × 2: mm/s and rad/s, or N and N mm
 };
 
-enum Reason : std::uint8_t { kFine = 0, kNotFinite = 1, kNotConverged = 2 };
+enum Reason : std::uint8_t { kFine = 0, kNotFinite = 1, kNotConverged = 2, kThroughWall = 3 };
 
 // What an output has an entry of at each sample; `start`: of each device, once a run. Nodes and elements only where they are asked for.
 enum class Of { sample, device, node, element, start };

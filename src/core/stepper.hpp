@@ -267,6 +267,7 @@ private:
     ENDOPILOT_LARGE void carry(int l);
     template <class Queue>
     ENDOPILOT_DEVICE void end_sample(int l, Queue& queue);
+    ENDOPILOT_DEVICE bool through_wall(const World& w) const;
     ENDOPILOT_DEVICE void fail(int l);
     ENDOPILOT_LARGE void record(int world, int sample, double iterations, double node_iterations) const;
 

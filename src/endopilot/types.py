@@ -6,7 +6,9 @@ Symbols of the paper (Kim et al. 2023), once for the whole package:
 symbol  name here                       meaning
 ======  ==============================  ======================================================================
 Δ       `inserted_length`, mm           length of wire beyond the ostium, measured along the wire
-φ       `rotation`, rad                 rotation of the wire's proximal end about its own axis, unwrapped
+φ       `rotation`, rad                 rotation of the wire's proximal end about its own axis, unwrapped; 0 where the
+                                        tip's bend points to `Insertion.rotation_zero`, and growing clockwise as
+                                        the operator sees it, who looks along the catheter into the vessel
 π       `control`, (mm/s, rad/s)        (dΔ/dt, dφ/dt), the mean over one sample period of 0.5 s
 Δtip    `tip_abscissa`, mm              distance from the ostium along the centerline to the tip's projection
 γtip    `tip_offset`, mm                distance from the tip to the centerline
@@ -19,16 +21,20 @@ indexed `voxels[k, j, i]`, where (i, j, k) count voxels along the first, second 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
 SAMPLE_PERIOD_S = 0.5
 """Time between two recorded samples, s: the paper records at 2 Hz."""
+
+_ON_AXIS = 0.05
+"""A vessel whose mean lies off the catheter's axis by less than this share of its distance from the ostium lies to no
+side. In atlas patients of all kinds it lies off by 0.12 at least (0.2 to 0.8 in the median of each kind)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,10 +73,15 @@ class Insertion:
     Attributes:
         position: centre of the ostium, LPS mm.
         direction: unit vector along the catheter, pointing into the vessel.
+        rotation_zero: unit vector across the catheter to which the bend of a tip points at φ = 0. An `Anatomy` that is
+            made without one gets that of its vessel (`VesselTree.rotation_zero`). "world axes" is the rule of anatomies
+            written before they held one: the shortest turn from the head's direction (+z) to `direction` takes −y
+            there. So it is, too, where there is no vessel.
     """
 
     position: Float[np.ndarray, "3"]
     direction: Float[np.ndarray, "3"]
+    rotation_zero: Float[np.ndarray, "3"] | Literal["world axes"] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,6 +192,24 @@ class VesselTree:
         """Return the path from the ostium to the farthest distal end."""
         return self.path(max(self.leaves(), key=lambda leaf: self.branches[leaf].centerline.abscissa[-1]))
 
+    def rotation_zero(self, insertion: Insertion) -> Float[np.ndarray, "3"]:
+        """Return where a tip's bend points at φ = 0: to the side of the catheter's axis on which the vessel lies.
+
+        That is where the mean of all centerlines, by their length, lies off the axis: it turns with the vessel, and
+        small changes of the vessel turn it little. Where the mean lies on the axis, as in a straight tube, it is the
+        patient's front; the head, where the catheter itself points to front or back.
+        """
+        lines = [branch.centerline.points for branch in self.branches]
+        length = np.concatenate([np.linalg.norm(np.diff(points, axis=0), axis=1) for points in lines])
+        middle = np.concatenate([0.5 * (points[1:] + points[:-1]) for points in lines])
+        mean = length @ (middle - insertion.position) / max(float(length.sum()), 1e-12)
+        axis, front, head = insertion.direction, np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, 1.0])
+        across = mean - (mean @ axis) * axis
+        if not np.linalg.norm(across) > _ON_AXIS * np.linalg.norm(mean):
+            side = front if abs(axis @ front) < np.cos(np.pi / 6) else head
+            across = side - (side @ axis) * axis
+        return across / np.linalg.norm(across)
+
 
 @dataclass(frozen=True, eq=False)
 class DistanceMap:
@@ -206,7 +235,7 @@ class Anatomy:
         name: short name, unique within a study; it names the patient in datasets and reports.
         tree: centerline with branches and section labels.
         distance_map: signed distance to the wall, guiding catheter included.
-        insertion: the ostium and the catheter's axis.
+        insertion: the ostium, the catheter's axis and φ's zero.
         catheter_radius_mm: inner radius of the guiding catheter's tube in the distance map, mm.
         provenance: what the anatomy was made from, and how (written to `anatomy.json`).
     """
@@ -218,6 +247,11 @@ class Anatomy:
     catheter_radius_mm: float
     provenance: dict[str, Any] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        if self.insertion.rotation_zero is None:
+            zero = self.tree.rotation_zero(self.insertion)
+            object.__setattr__(self, "insertion", replace(self.insertion, rotation_zero=zero))
+
     def __repr__(self) -> str:
         branches, length = len(self.tree.branches), float(self.tree.longest_path().abscissa[-1])
         sections = ", ".join(self.tree.sections_present)
@@ -228,7 +262,8 @@ class Anatomy:
         """SHA-256 of the vessel itself: centerlines, distance map, insertion and catheter.
 
         It is computed once, so change no array in place after that. Name, section labels and provenance do not count.
-        An anatomy has the same identity in memory as on disk, where the distance map is float32.
+        An anatomy has the same identity in memory as on disk, where the distance map is float32. φ's zero counts, but
+        for that of the world's axes, which the rest decides.
         """
         digest = hashlib.sha256()
         for branch in self.tree.branches:
@@ -241,6 +276,8 @@ class Anatomy:
             _add(digest, np.asarray(values), np.float64)
         for values in (self.insertion.position, self.insertion.direction, self.catheter_radius_mm):
             _add(digest, np.asarray(values), np.float64)
+        if isinstance(self.insertion.rotation_zero, np.ndarray):
+            _add(digest, self.insertion.rotation_zero, np.float64)
         return digest.hexdigest()
 
 
@@ -323,7 +360,8 @@ class Rollout:
         node_iterations: evaluations of active nodes in the period: for each Newton iteration, also those of attempts
             that were given up, the nodes ahead of the catheter.
         valid: false from the sample in which a world failed to converge or left the finite numbers.
-        reason: why a world became invalid: 0 it is valid, 1 it left the finite numbers, 2 it did not converge.
+        reason: why a world became invalid: 0 it is valid, 1 it left the finite numbers, 2 it did not converge,
+            3 the wire went through the wall.
         shape: positions of all nodes from the foremost tip to the base, LPS mm, if they were recorded.
         catheters: the motion of the catheters; None for a wire alone. With catheters, the fields above are those of the
             wire, but for the wall's forces, which are those of all devices.

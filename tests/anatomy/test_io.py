@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from analytic_shapes import forked_tree
 
+from endopilot.anatomy.catheter_axis import with_world_zero
 from endopilot.anatomy.distance import add_catheter, distance_map_from_spheres
 from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.errors import InputError
-from endopilot.types import Anatomy, Insertion
+from endopilot.types import Anatomy, Branch, Centerline, DistanceMap, Insertion, VesselTree
 
 
 @pytest.fixture
@@ -125,3 +126,42 @@ def test_other_versions_and_missing_fields_are_refused(anatomy, tmp_path):
         read_anatomy(tmp_path / "a")
     with pytest.raises(InputError, match="no such folder"):
         read_anatomy(tmp_path / "nowhere")
+
+
+def test_the_zero_of_the_rotation_is_kept_and_decides_the_identity(anatomy, tmp_path):
+    zero = anatomy.insertion.rotation_zero
+    write_anatomy(anatomy, tmp_path / "a")
+    assert np.array_equal(read_anatomy(tmp_path / "a").insertion.rotation_zero, zero)
+    other = replace(anatomy, insertion=replace(anatomy.insertion, rotation_zero=-zero))
+    assert len({anatomy.identity, other.identity, with_world_zero(anatomy).identity}) == 3
+    record = json.loads((tmp_path / "a" / "anatomy.json").read_text())
+    for bad in ([1.0, 0.0], "up", None, 3, [[1.0, 0.0, 0.0]]):
+        record["insertion"]["rotation_zero"] = bad
+        (tmp_path / "a" / "anatomy.json").write_text(json.dumps(record))
+        with pytest.raises(InputError, match=r"anatomy\.json: damaged"):
+            read_anatomy(tmp_path / "a")
+
+
+def test_a_record_of_schema_version_1_keeps_the_zero_of_the_world_axes(anatomy, tmp_path):
+    before = with_world_zero(anatomy)
+    write_anatomy(before, tmp_path / "a")
+    path = tmp_path / "a" / "anatomy.json"
+    record = json.loads(path.read_text())
+    del record["insertion"]["rotation_zero"]
+    path.write_text(json.dumps(record | {"schema_version": 1}))
+    back = read_anatomy(tmp_path / "a")
+    assert back.insertion.rotation_zero == "world axes" and back.identity == before.identity
+    write_anatomy(back, tmp_path / "b")
+    again = read_anatomy(tmp_path / "b")
+    assert again.insertion.rotation_zero == "world axes" and again.identity == before.identity
+
+
+def test_the_identity_of_an_anatomy_without_a_zero_is_that_of_earlier_versions():
+    points = np.arange(12.0).reshape(4, 3)
+    line = Centerline(points, np.ones(4), np.arange(4.0), np.eye(3)[[0, 0, 0, 0]])
+    tree = VesselTree((Branch(line, -1, np.zeros(4, dtype=np.int64)),), ("vessel",))
+    lumen = DistanceMap(np.ones((2, 2, 2)), 0.5, np.zeros(3))
+    insertion = Insertion(np.zeros(3), np.array([0.0, 0.6, 0.8]), "world axes")
+    assert Anatomy("one", tree, lumen, insertion, 0.9).identity == (
+        "c1b5cfc73a69637711ce04d4dca993d387197903a86cd365be9db6047e66e943"
+    )

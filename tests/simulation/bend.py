@@ -11,7 +11,10 @@ RADIUS, BEND, LEAD = 1.5, 20.0, 35.0
 
 
 def vessel(angle: float = np.pi / 2) -> Anatomy:
-    """Return a tube that goes straight, bends and goes on, with a blind end; the ostium is 5 mm before the bend."""
+    """Return a tube that goes straight, bends and goes on, with a blind end; the ostium is 5 mm before the bend.
+
+    At φ = 0 a tip's bend points to the outer side of the vessel's.
+    """
     s = np.linspace(0, 1, 80)
     arc = BEND * np.column_stack([np.sin(angle * s), 1 - np.cos(angle * s), 0 * s])
     out = np.array([np.cos(angle), np.sin(angle), 0.0])
@@ -27,6 +30,6 @@ def vessel(angle: float = np.pi / 2) -> Anatomy:
         name="bend",
         tree=VesselTree((Branch(line, -1, np.zeros(len(points), dtype=int)),), ("all",)),
         distance_map=DistanceMap(blind, field.spacing_mm, field.origin_mm),
-        insertion=Insertion(points[0], np.array([1.0, 0.0, 0.0])),
+        insertion=Insertion(points[0], np.array([1.0, 0.0, 0.0]), rotation_zero=np.array([0.0, -1.0, 0.0])),
         catheter_radius_mm=RADIUS,
     )

@@ -202,3 +202,23 @@ def test_loads_that_are_given_have_no_limit(anatomy: Anatomy) -> None:
         np.testing.assert_array_equal(getattr(weak, name), getattr(strong, name))
     np.testing.assert_array_equal(weak.slip, 0.0)
     np.testing.assert_array_equal(weak.rotation_slip, 0.0)
+
+
+def test_a_wire_that_has_gone_through_the_wall_is_no_result(anatomy: Anatomy) -> None:
+    """It is pushed on against the blind end, where a soft wall gives way by more than the wire's radius."""
+    control, initial = np.tile([10.0, 0.0], (1, 16, 1)), np.array([[40.0, 0.0]])
+    soft = SimulatorConfig(element_mm=1.0, wall_stiffness_n_mm=0.2)
+    with pytest.warns(UserWarning, match="went through the wall after"):
+        rollout = simulate(anatomy, DEVICE, control, initial=initial, config=soft)
+    assert rollout.reason[0] == 3 and not rollout.valid[0, -1]
+    before = rollout.contact_force_max[rollout.valid]
+    assert (
+        len(before) and before.max() < 2 * soft.wall_stiffness_n_mm * DEVICE.tip_radius_mm
+    )  # node and middle together
+    simulator = Simulator(anatomy, DEVICE, config=soft)
+    simulator.reset(inserted_length=initial[:, 0], rotation=initial[:, 1])
+    for sample in control[0]:
+        simulator.step(sample[None], SAMPLE_PERIOD_S)
+    assert simulator.reason[0] == 3
+    hard = simulate(anatomy, DEVICE, control, initial=initial, config=SimulatorConfig(element_mm=1.0))
+    assert hard.valid.all()

@@ -1,4 +1,5 @@
-"""The guiding catheter's axis at the ostium, turned: `turned_axis`, `lean_between`, `with_axis`."""
+"""The guiding catheter's axis at the ostium, turned, and φ's zero with it: `turned_axis`, `lean_between`, `with_axis`,
+`with_world_zero`."""
 
 from __future__ import annotations
 
@@ -32,8 +33,33 @@ def lean_between(axis: Float[np.ndarray, "3"], other: Float[np.ndarray, "3"]) ->
     return float(np.degrees(tilt)), float(np.degrees(side))
 
 
+def carried(
+    across: Float[np.ndarray, "3"], axis: Float[np.ndarray, "3"], other: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "3"]:
+    """Return where the shortest turn from an axis to another takes a unit vector across the first.
+
+    Where they are opposite, no turn is the shortest: the vector stays where it is.
+    """
+    cosine = float(axis @ other)
+    turned = across - (across @ other) / (1.0 + cosine) * (axis + other) if cosine > -1 + 1e-12 else across
+    turned = turned - (turned @ other) * other
+    return turned / np.linalg.norm(turned)
+
+
 def with_axis(anatomy: Anatomy, axis: Float[np.ndarray, "3"]) -> Anatomy:
-    """Return the anatomy with its catheter turned about the ostium; where the catheter lay, the map stays open."""
-    insertion = Insertion(anatomy.insertion.position, axis)
+    """Return the anatomy with its catheter turned about the ostium; where the catheter lay, the map stays open.
+
+    φ's zero turns with the catheter, by the shortest turn; one of the world's axes stays that of the world's axes.
+    """
+    zero = anatomy.insertion.rotation_zero
+    if isinstance(zero, np.ndarray):
+        zero = carried(zero, anatomy.insertion.direction, axis)
+    insertion = Insertion(anatomy.insertion.position, axis, zero)
     opened = add_catheter(anatomy.distance_map, insertion, anatomy.catheter_radius_mm)
     return replace(anatomy, distance_map=opened, insertion=insertion)
+
+
+def with_world_zero(anatomy: Anatomy) -> Anatomy:
+    """Return the anatomy with φ's zero by the world's axes, as before anatomies held one: recorded controls mean the
+    same in it as they did then."""
+    return replace(anatomy, insertion=replace(anatomy.insertion, rotation_zero="world axes"))

@@ -6,9 +6,12 @@ file               content
 `centerline.vtp`   one polyline a branch, LPS mm; point data MaximumInscribedSphereRadius (mm), Abscissa (mm), Normals,
                    Section (index into the section names); cell data Branch and Parent
 `lumen.nrrd`       signed distance to the wall, mm, positive inside, guiding catheter included; compressed float32
-`anatomy.json`     schema version, name, insertion, catheter radius, section names, provenance, identity (SHA-256 of the
-                   vessel itself, `Anatomy.identity`), SHA-256 of both files
+`anatomy.json`     schema version, name, insertion with φ's zero, catheter radius, section names, provenance, identity
+                   (SHA-256 of the vessel itself, `Anatomy.identity`), SHA-256 of both files
 =================  ================================================================================================
+
+Anatomies of schema version 1 hold no zero of φ: it is that of the world's axes, as when they were written, so that
+recorded controls mean the same in them.
 """
 
 from __future__ import annotations
@@ -25,7 +28,7 @@ from endopilot.anatomy import mesh_process
 from endopilot.errors import InputError
 from endopilot.types import Anatomy, Branch, Centerline, DistanceMap, Insertion, VesselTree
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 
 _SPACE = "left-posterior-superior"
 
@@ -48,7 +51,11 @@ def write_anatomy(anatomy: Anatomy, folder: str | Path) -> None:
         record = {
             "schema_version": SCHEMA_VERSION,
             "name": anatomy.name,
-            "insertion": {"position_mm": anatomy.insertion.position, "direction": anatomy.insertion.direction},
+            "insertion": {
+                "position_mm": anatomy.insertion.position,
+                "direction": anatomy.insertion.direction,
+                "rotation_zero": anatomy.insertion.rotation_zero,
+            },
             "catheter_radius_mm": float(anatomy.catheter_radius_mm),
             "identity": anatomy.identity,
             "section_names": list(anatomy.tree.section_names),
@@ -74,12 +81,12 @@ def read_anatomy(folder: str | Path) -> Anatomy:
         raise InputError(f"{folder}: holds no {_RECORD}, so it is not an anatomy; make one with `endopilot anatomy`")
     record = files.read_json(folder / _RECORD)
     version = record.get("schema_version") if isinstance(record, dict) else None
-    if version != SCHEMA_VERSION:
+    if version not in (1, SCHEMA_VERSION):
         raise InputError(
-            f"{folder / _RECORD}: schema_version is {version}, not {SCHEMA_VERSION}; make the anatomy again"
+            f"{folder / _RECORD}: schema_version is {version}, not 1 or {SCHEMA_VERSION}; make the anatomy again"
         )
     try:
-        position, direction = (np.array(record["insertion"][key], dtype=float) for key in ("position_mm", "direction"))
+        insertion = _insertion(record["insertion"], version)
         names, radius = tuple(record["section_names"]), float(record["catheter_radius_mm"])
         name, provenance, hashes = str(record["name"]), dict(record["provenance"]), dict(record["sha256"])
     except (KeyError, TypeError, ValueError) as error:
@@ -100,13 +107,23 @@ def read_anatomy(folder: str | Path) -> Anatomy:
         name=name,
         tree=_read_tree(folder / _CENTERLINE, names),
         distance_map=_read_distance_map(folder / _LUMEN),
-        insertion=Insertion(position=position, direction=direction),
+        insertion=insertion,
         catheter_radius_mm=radius,
         provenance=provenance,
     )
     if record.get("identity", anatomy.identity) != anatomy.identity:
         raise InputError(f"{folder / _RECORD}: identity is not that of the vessel in it; make the anatomy again")
     return anatomy
+
+
+def _insertion(record: dict[str, Any], version: int) -> Insertion:
+    """Return the insertion that a record of some schema version holds."""
+    zero = record["rotation_zero"] if version > 1 else "world axes"
+    vectors = (record["position_mm"], record["direction"], *([zero] if zero != "world axes" else []))
+    position, direction, *given = (np.array(vector, dtype=float) for vector in vectors)
+    if any(vector.shape != (3,) for vector in (position, direction, *given)):
+        raise ValueError("insertion: a vector without three numbers")
+    return Insertion(position, direction, given[0] if given else "world axes")
 
 
 def _write_tree(tree: VesselTree, path: Path) -> None:

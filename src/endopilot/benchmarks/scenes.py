@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from endopilot.anatomy.catheter_axis import with_world_zero
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, random_controls
@@ -67,7 +68,7 @@ def make_scenes(worlds: int = WORLDS, samples: int = SAMPLES) -> list[Scene]:
     """
     scenes = []
     for place, (name, kind) in enumerate(KINDS.items()):
-        anatomy = make_patient(AtlasConfig(anatomy=kind, seed=SEED, population="textbook"), 0)
+        anatomy = with_world_zero(make_patient(AtlasConfig(anatomy=kind, seed=SEED, population="textbook"), 0))
         initial, control = random_controls(
             ControlConfig(),
             n_sequences=worlds,

@@ -20,7 +20,7 @@ _ROUNDING_MM = 1e-2
 
 
 def check_distance_map(anatomy: Anatomy) -> None:
-    """Check that the distance map is finite, and positive at the ostium and around it along the catheter's axis.
+    """Check insertion and distance map: the map is finite, and positive around the ostium along the catheter's axis.
 
     Raises:
         InputError: it is not.
@@ -36,6 +36,14 @@ def check_distance_map(anatomy: Anatomy) -> None:
         raise InputError(f"{anatomy.name}: insertion.position = {insertion.position} is not finite; extract it again")
     if not abs(float(np.linalg.norm(insertion.direction)) - 1) <= 1e-3:
         raise InputError(f"{anatomy.name}: insertion.direction = {insertion.direction} is no unit vector; normalise it")
+    zero = insertion.rotation_zero
+    if isinstance(zero, np.ndarray):
+        along, size = float(zero @ insertion.direction), float(np.linalg.norm(zero))
+        if not (abs(along) <= 1e-3 and abs(size - 1) <= 1e-3):
+            raise InputError(
+                f"{anatomy.name}: insertion.rotation_zero = {zero} is no unit vector across insertion.direction = "
+                f"{insertion.direction}; turn both alike, or leave it out to have the vessel's"
+            )
     for along in (-FREE_BEHIND_MM, 0.0, 1.0):
         point = insertion.position + along * insertion.direction
         index = np.round((point - field.origin_mm) / field.spacing_mm).astype(int)[::-1]

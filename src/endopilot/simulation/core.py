@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from endopilot import _core
 from endopilot.progress import Advance, progress
@@ -142,7 +143,7 @@ def insertion_arguments(insertion: Insertion) -> dict[str, np.ndarray]:
     """Return an insertion as the core wants it: `origin`, mm, and `orientation`, a quaternion w x y z."""
     return {
         "origin": np.asarray(insertion.position, dtype=float),
-        "orientation": _base_orientation(np.asarray(insertion.direction, dtype=float)),
+        "orientation": _base_orientation(insertion),
     }
 
 
@@ -204,8 +205,15 @@ def make_lumen(
     )
 
 
-def _base_orientation(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4"]:
-    """Return the quaternion (w x y z) of the shortest turn that takes the third axis to `direction`."""
+def _base_orientation(insertion: Insertion) -> Float[np.ndarray, "4"]:
+    """Return the quaternion (w x y z) of the axes of a wire at φ = 0: the third along it, the second against its bend.
+
+    Where φ's zero is that of the world's axes, it is the shortest turn that takes the third axis to the direction.
+    """
+    direction, zero = np.asarray(insertion.direction, dtype=float), insertion.rotation_zero
+    if isinstance(zero, np.ndarray):
+        axes = np.column_stack([np.cross(direction, zero), -zero, direction])
+        return Rotation.from_matrix(axes).as_quat(canonical=True, scalar_first=True)
     axis = np.array([-direction[1], direction[0], 0.0])
     quaternion = np.array([1 + direction[2], *axis])
     norm = np.linalg.norm(quaternion)

@@ -260,7 +260,8 @@ class Readout:
 
     @property
     def reason(self) -> Int[np.ndarray, "worlds"]:
-        """Why a world is invalid: 0 it is valid, 1 it left the finite numbers, 2 it did not converge.
+        """Why a world is invalid: 0 it is valid, 1 it left the finite numbers, 2 it did not converge,
+        3 the wire went through the wall.
 
         Example:
             >>> simulator.reason

@@ -30,7 +30,7 @@ from endopilot.types import SAMPLE_PERIOD_S, Anatomy, CatheterMotion, Rollout
 
 _OWN = ("inserted_length", "rotation", "shape")
 """Fields of `Rollout` that are not the core's as they are."""
-_REASONS = {1: "left the finite numbers", 2: "did not converge"}
+_REASONS = {1: "left the finite numbers", 2: "did not converge", 3: "went through the wall"}
 """Meaning of `Rollout.reason` for an invalid world."""
 WALL_FORCE_LIMIT_N = 0.7
 """Force on 2 mm of the wall that no navigation should exert, N. The fibrous cap of an occlusion of up to six weeks is

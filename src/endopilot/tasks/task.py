@@ -11,6 +11,7 @@ from typing import Annotated, Literal, get_args
 import numpy as np
 from pydantic import Field, model_validator
 
+from endopilot.anatomy.catheter_axis import with_world_zero
 from endopilot.atlas.atlas import ANATOMIES, AtlasConfig, make_patient
 from endopilot.errors import InputError
 from endopilot.settings import CountOrZero, NonNegative, Positive, Seconds, Seed, Share, Within, read_settings, settings
@@ -101,10 +102,13 @@ class Task:
         return self
 
     def patient(self, patients: Patients, place: int) -> Anatomy:
-        """Return the anatomy of one of the task's patients, by its place in the list."""
+        """Return the anatomy of one of the task's patients, by its place in the list.
+
+        φ counts from the world's axes in it, as it always did: recorded submissions stay what they are.
+        """
         if not 0 <= place < len(patients.numbers):
             raise InputError(f"patient: {place}; task {self.name} has patients 0 to {len(patients.numbers) - 1}")
-        return make_patient(self.atlas(patients.seed), patients.numbers[place])
+        return with_world_zero(make_patient(self.atlas(patients.seed), patients.numbers[place]))
 
     def atlas(self, seed: int) -> AtlasConfig:
         """Return the atlas of a seed that the task's patients come from."""
@@ -246,7 +250,7 @@ def without_catheter(navigation: Navigation) -> Navigation:
 @lru_cache(maxsize=1)
 def reference_navigation() -> Navigation:
     """Return `endopilot/Navigate-v0`'s navigation: into the posterior descending artery of the reference anatomy."""
-    anatomy = make_patient(AtlasConfig(population="textbook"), 0)
+    anatomy = with_world_zero(make_patient(AtlasConfig(population="textbook"), 0))
     return Navigation(
         anatomy=anatomy,
         device=read_device("workhorse-014"),
