@@ -96,12 +96,11 @@ def read_anatomy(folder: str | Path) -> Anatomy:
             raise InputError(f"{folder / file}: is missing; make the anatomy again")
         if files.sha256(folder / file) != hashes.get(file):
             raise InputError(f"{folder / file}: differs from what anatomy.json records; make the anatomy again")
-    if position.shape != (3,) or direction.shape != (3,) or not np.isfinite([*position, *direction]).all():
-        raise InputError(f"{folder / _RECORD}: insertion is not two times three numbers; make the anatomy again")
-    if abs(float(np.linalg.norm(direction)) - 1.0) > 1e-6 or not (radius > 0 and np.isfinite(radius)):
+    length = float(np.linalg.norm(insertion.direction))
+    if abs(length - 1.0) > 1e-6 or not 0 < radius < np.inf:
         raise InputError(
-            f"{folder / _RECORD}: insertion.direction has a length of {np.linalg.norm(direction):g} instead of 1, or "
-            f"catheter_radius_mm {radius:g} is not positive; make the anatomy again"
+            f"{folder / _RECORD}: insertion.direction has a length of {length:g} instead of 1, or catheter_radius_mm "
+            f"{radius:g} is not positive; make the anatomy again"
         )
     anatomy = Anatomy(
         name=name,
@@ -121,8 +120,8 @@ def _insertion(record: dict[str, Any], version: int) -> Insertion:
     zero = record["rotation_zero"] if version > 1 else "world axes"
     vectors = (record["position_mm"], record["direction"], *([zero] if zero != "world axes" else []))
     position, direction, *given = (np.array(vector, dtype=float) for vector in vectors)
-    if any(vector.shape != (3,) for vector in (position, direction, *given)):
-        raise ValueError("insertion: a vector without three numbers")
+    if any(vector.shape != (3,) or not np.isfinite(vector).all() for vector in (position, direction, *given)):
+        raise ValueError("insertion: a vector without three finite numbers")
     return Insertion(position, direction, given[0] if given else "world axes")
 
 
