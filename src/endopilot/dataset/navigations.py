@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float
 
 from endopilot.simulation.catheter import Catheter
 from endopilot.simulation.config import Actuation, SimulatorConfig
+from endopilot.simulation.core import of_device
 from endopilot.simulation.device import Device
 from endopilot.simulation.drive_limits import within_travel
 from endopilot.simulation.motion import Motion
@@ -100,13 +101,14 @@ def simulate_navigations(
         slip, last, inserted = np.column_stack([step.slip, simulator.catheter_slip[..., 0]]), now - inserted, now
         advance(len(control))
     result["reason"] = simulator.reason
-    rollout = make_rollout(anatomy, actuation, started[:, :2], applied[..., :2], result)
+    wire = of_device(result, 0)
+    rollout = make_rollout(anatomy, actuation, started[:, :2], applied[..., :2], wire)
     if catheters:
         rollout = replace(
             rollout,
-            inserted_length=result["inserted_length"],
-            rotation=result["rotation"],
-            catheters=catheter_motion(applied, result["catheters"], SAMPLE_PERIOD_S),
+            inserted_length=wire["inserted_length"],
+            rotation=wire["rotation"],
+            catheters=catheter_motion(applied, result, SAMPLE_PERIOD_S),
         )
     return rollout, started, applied, stopped
 
@@ -194,27 +196,30 @@ def _project(simulator: Simulator) -> TipProjection:
 
 
 def _record(result: dict[str, np.ndarray], sample: int, samples: int, step: Step, simulator: Simulator) -> None:
-    """Put what the worlds did in one sample into arrays of all samples."""
-    base, drive = simulator.base_load, simulator.drive_load
-    read = {
-        "base_force": base[:, 0],
-        "base_torque": base[:, 1],
-        "drive_force": drive[:, 0],
-        "drive_torque": drive[:, 1],
-    }
-    if simulator.catheter_rotation.size:
-        read["catheters"] = _of_catheters(simulator)
-    for name in dict.fromkeys((*RECORDED, "inserted_length", "rotation", *read)):
-        values = read[name] if name in read else getattr(step, name)
+    """Put what the worlds did in one sample into arrays of all samples, as `run_core` returns them."""
+    of_devices = _of_devices(simulator)
+    for name in dict.fromkeys((*RECORDED, *of_devices)):
+        values = of_devices[name] if name in of_devices else getattr(step, name)
         if sample == 0:
             result[name] = np.empty((len(values), samples, *values.shape[1:]), dtype=values.dtype)
         result[name][:, sample] = values
 
 
-def _of_catheters(simulator: Simulator) -> Float[np.ndarray, "worlds catheters 11"]:
-    """Return what `catheter_motion` takes of one sample."""
-    count = simulator.catheter_rotation.shape[1]
-    place = np.stack([simulator.catheter_inserted_length, simulator.catheter_rotation], axis=-1)
-    tips = np.stack([simulator.tips(k + 1) for k in range(count)], axis=1)
-    loads = (simulator.catheter_base_load, simulator.catheter_drive_load)
-    return np.concatenate([place, *loads, simulator.catheter_slip, tips], axis=-1)
+def _of_devices(simulator: Simulator) -> dict[str, Float[np.ndarray, "worlds devices *numbers"]]:
+    """Return what a simulator reads of each device, the wire first."""
+    count = 1 + simulator.catheter_rotation.shape[1]
+    base = np.concatenate([simulator.base_load[:, None], simulator.catheter_base_load], axis=1)
+    drive = np.concatenate([simulator.drive_load[:, None], simulator.catheter_drive_load], axis=1)
+    slip = np.concatenate([simulator.slip[:, None], simulator.catheter_slip], axis=1)
+    return {
+        "inserted_length": np.column_stack([simulator.inserted_length, simulator.catheter_inserted_length]),
+        "rotation": np.column_stack([simulator.rotation, simulator.catheter_rotation]),
+        "tip_position": np.stack([simulator.tips(k) for k in range(count)], axis=1),
+        "tip_direction": simulator.tip_direction[:, None],
+        "base_force": base[..., 0],
+        "base_torque": base[..., 1],
+        "drive_force": drive[..., 0],
+        "drive_torque": drive[..., 1],
+        "slip": slip[..., 0],
+        "rotation_slip": slip[..., 1],
+    }

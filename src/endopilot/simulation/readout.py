@@ -249,6 +249,16 @@ class Readout:
         return self._pair_of_devices("drive_force", "drive_torque")[:, 0]
 
     @property
+    def slip(self) -> Float[np.ndarray, "worlds 2"]:
+        """Advance (mm) and rotation (rad) that the drive was asked for in the last step and did not make.
+
+        Example:
+            >>> simulator.slip.shape
+            (4, 2)
+        """
+        return self._pair_of_devices("slip", "rotation_slip")[:, 0]
+
+    @property
     def valid(self) -> Bool[np.ndarray, "worlds"]:
         """False for a world that left the finite numbers or did not converge; it stays as it was until it is reset.
 
