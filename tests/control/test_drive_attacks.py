@@ -14,15 +14,15 @@ import numpy as np
 import pytest
 from test_drive_process import CLIENT, HOST, running
 
-from endopilot.control.drive_protocol import LONGEST_LINE, SILENCE_S, tls_context
+from endopilot.control.drive import LASTS_S
+from endopilot.control.drive_protocol import BRAKING_S, LONGEST_LINE, tls_context
 from endopilot.control.remote import RemoteRobot
 from endopilot.control.robot import RobotConfig
 
 SPEED = 20.0
 """Of the wire when the attack begins, mm/s."""
 NOISE_MM = 6 * RobotConfig().encoder_sd_mm * 2**0.5
-LASTS_S = SILENCE_S - RobotConfig().braking_s
-MOST_MM = SPEED * (LASTS_S + RobotConfig().braking_s / 2) + NOISE_MM
+MOST_MM = SPEED * (LASTS_S + BRAKING_S / 2) + NOISE_MM
 """Way at full speed until the watchdog stops the drive, and, from the highest speed, the way of the braking."""
 
 

@@ -70,8 +70,8 @@ def test_a_command_acts_after_the_latency_and_the_ramp() -> None:
     assert drive.advance(0.2)[0] == pytest.approx(2.0)
     assert drive.advance(0.3)[0] == pytest.approx(6.0)
     drive.command(0.0, 0.0)
-    drive.stop()  # brakes are stronger: a = 40 mm/s in 0.05 s
-    assert drive.advance(1.0)[0] == pytest.approx(0.25)
+    drive.stop()
+    assert drive.advance(1.0)[0] == pytest.approx(2.0)
 
 
 def test_motion_is_lost_where_it_reverses() -> None:

@@ -17,12 +17,14 @@ from collections import deque
 
 import numpy as np
 
-from endopilot.control.drive_protocol import LONGEST_LINE, PROTOCOL, SILENCE_S, number
+from endopilot.control.drive_protocol import BRAKING_S, LONGEST_LINE, PROTOCOL, SILENCE_S, number
 from endopilot.control.robot import DriveMotion, RobotConfig
 from endopilot.simulation.drive_limits import DriveLimits
 
 CYCLE_S = 0.01
 """Period of the drive's loop, and time for which its answers bring the same ticket, s."""
+LASTS_S = SILENCE_S - BRAKING_S
+"""Age at which a ticket is void, s."""
 _MOST_NEWS = 100
 
 
@@ -52,7 +54,6 @@ class Drive:
         self._limits, self._motion = limits, DriveMotion(limits, config, (inserted_length, 0.0))
         self._noise, self._random = np.array([config.encoder_sd_mm, config.encoder_sd_rad]), np.random.default_rng()
         self._began = self._now = self._heard = now
-        self._lasts_s = SILENCE_S - config.braking_s
         self._tickets: dict[str, float] = {}
         self._wanted: tuple[float, float] | None = None
         self._state: str | None = None
@@ -73,7 +74,7 @@ class Drive:
 
     def tick(self, now: float) -> None:
         """Let the time pass up to now, s; the watchdog stops the drive when it is due, even if the call comes late."""
-        due = self._heard + self._lasts_s
+        due = self._heard + LASTS_S
         if self.stopped is None and now >= due:
             self._advance(max(due, self._now))
             self.stop("silence")
@@ -83,7 +84,7 @@ class Drive:
         """Brake, and stay so until the drive is armed again; what was sent before the client knows of it is void."""
         self._wanted, self._state = None, None
         self._tickets.clear()
-        self._motion.stop()
+        self._motion.stop(within_s=BRAKING_S)
         if self.stopped is None:
             self.stopped = reason
             self.news.append(
@@ -145,7 +146,7 @@ class Drive:
 
     def _ticket(self) -> str:
         """Return a ticket that is at most a cycle old, and forget those that are too old to move anything."""
-        self._tickets = {ticket: given for ticket, given in self._tickets.items() if self._now < given + self._lasts_s}
+        self._tickets = {ticket: given for ticket, given in self._tickets.items() if self._now < given + LASTS_S}
         newest = next(reversed(self._tickets), None)
         if newest is None or self._now >= self._tickets[newest] + CYCLE_S:
             newest = secrets.token_hex(8)
@@ -155,7 +156,7 @@ class Drive:
     def _given(self, ticket: str) -> float | None:
         """Return when a ticket was given, s, or None if it can move nothing."""
         given = self._tickets.get(ticket)
-        if given is None or self._now >= given + self._lasts_s:
+        if given is None or self._now >= given + LASTS_S:
             self.dropped += 1
             return None
         return given

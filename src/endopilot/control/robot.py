@@ -10,12 +10,12 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.settings import NonNegative, Positive, Within, settings
+from endopilot.settings import NonNegative, Positive, settings
 from endopilot.simulation.drive_limits import DriveLimits, within_travel
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import Step
@@ -64,8 +64,6 @@ class RobotConfig:
     """Largest change of the translation's speed, mm/s²."""
     max_acceleration_rad_s2: Positive = 60.0
     """Largest change of the rotation's speed, rad/s²."""
-    braking_s: Annotated[float, Within(0.001, 0.1)] = 0.05
-    """Time in which a stop brings a device from its top speeds to rest, s: brakes are stronger than motors."""
     backlash_mm: NonNegative = 0.1
     """Motion that is lost where the translation reverses, mm."""
     backlash_rad: NonNegative = 0.035
@@ -89,8 +87,7 @@ class DriveMotion:
         """Begin at rest at a position, in the middle of the backlash."""
         self._limits = limits
         self._acceleration = np.array([config.max_acceleration_mm_s2, config.max_acceleration_rad_s2])
-        fastest = np.array([limits.max_velocity_mm_s, limits.max_rotation_rad_s])
-        self._braking = np.maximum(self._acceleration, fastest / config.braking_s)
+        self._fastest = np.array([limits.max_velocity_mm_s, limits.max_rotation_rad_s])
         self._ramp = self._acceleration
         self._half_gap = np.array([config.backlash_mm, config.backlash_rad]) / 2
         self._latency_s = config.latency_s
@@ -102,10 +99,10 @@ class DriveMotion:
         """Take a velocity, mm/s and rad/s, which acts after the latency."""
         self._orders.append((self.time_s + self._latency_s, np.array(self._limits.safe(translation, rotation))))
 
-    def stop(self) -> None:
-        """Brake at once, whatever was commanded before."""
+    def stop(self, *, within_s: float = np.inf) -> None:
+        """Brake at once, whatever was commanded before: within a time, s, where the motor's own ramp would take longer."""
         self._orders.clear()
-        self._wanted, self._ramp = np.zeros(2), self._braking
+        self._wanted, self._ramp = np.zeros(2), np.maximum(self._acceleration, self._fastest / within_s)
 
     def advance(self, duration: float) -> Float[np.ndarray, "2"]:
         """Let some time pass, s, and return how far the wire's proximal end moves in it, mm and rad."""
