@@ -34,6 +34,14 @@ def test_a_vessel_goes_on_behind_a_neck(voxel_mm, length_mm, across):
         assert any("neck of" in note and "was widened" in note for note in anatomy.provenance["notes"])
 
 
+@pytest.mark.parametrize(("voxel_mm", "radius_mm", "across"), [(0.35, 1.2, 1), (0.45, 2.0, 1), (0.45, 2.0, 2)])
+def test_a_neck_of_few_voxels_between_wide_faces_is_widened_until_the_wall_carries_on(voxel_mm, radius_mm, across):
+    mask = thinned_at(tubes((STRAIGHT, radius_mm), voxel_mm=[voxel_mm] * 3), (0.1, 0.1, 30), 1.5, across)
+    anatomy = extract_anatomy(lumen(mask), name="neck")
+    assert abs(length_of(anatomy) - 60.0) < 2.0
+    assert any("neck of" in note and "was widened" in note for note in anatomy.provenance["notes"])
+
+
 @pytest.mark.parametrize("voxel_mm", [(0.35, 0.35, 0.5), (0.7, 0.7, 0.5)])
 def test_a_branch_of_one_voxel_is_followed(voxel_mm):
     trunk = tubes((STRAIGHT, 1.6), (line((0, 0, 30), (22, 0, 45)), 0.01), voxel_mm=voxel_mm)

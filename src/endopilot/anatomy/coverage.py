@@ -27,7 +27,10 @@ _REACH_VOXELS = 1.5
 """The tree reaches what lies within its radius and this many voxels of its axis: the mask's middle is not smooth."""
 
 _NARROWEST, _NARROWEST_STEPS = 0.75, 1.2
-"""A stretch is widened to a radius of this many widths of the wall's blur, and grid steps: such a tube has no gap."""
+"""A stretch is widened to a radius of this many widths of the wall's blur, and grid steps: such a tube has no gap.
+Between two wide faces it may have: there the radius grows by a quarter until the wall carries on."""
+
+_MOST_GROWTHS = 4
 
 _MOST_VOXELS = 10_000_000
 
@@ -82,21 +85,24 @@ def widened(mask: Volume, lines: MedialLines, minimum_mm: float) -> tuple[Volume
     edges = mask.spacing_mm
     extent = np.array(mask.voxels.shape[::-1]) * edges
     step = max(0.5 * float(edges.min()), float(np.prod(extent + 2) / MAXIMUM_GRID_POINTS) ** (1 / 3))
-    thin = _thin(mask, lines, max(0.1, _DIAGONAL * step / float(edges.max()) - 0.5))
+    enough = max(0.1, _DIAGONAL * step / float(edges.max()) - 0.5)
+    thin = _thin(mask, lines, enough)
     wanted = [s for s in stretches(lines, thin) if s.length_mm + s.beyond_mm >= minimum_mm]
     if not wanted:
         return mask, [], []
     voxels = mask.voxels.copy()
     narrowest = _NARROWEST * blur_voxels(edges[::-1])
-    reach = np.maximum(narrowest, _NARROWEST_STEPS * step / edges[::-1])
-    span = np.ceil(reach).astype(int)
-    ball = np.array(list(np.ndindex(*(2 * span + 1)))) - span
-    ball = ball[(((ball / reach) ** 2).sum(axis=1)) <= 1.0]
-    nodes = _with_neighbours(lines, np.concatenate([s.nodes for s in wanted]))
-    drawn = (lines.index[nodes][:, None, :] + ball).reshape(-1, 3)
-    drawn = drawn[((drawn >= 0) & (drawn < voxels.shape)).all(axis=1)]
-    voxels[tuple(drawn.T)] = True
-    radius = float((reach * edges[::-1]).mean())
+    reach = narrowest = np.maximum(narrowest, _NARROWEST_STEPS * step / edges[::-1])
+    asked = np.concatenate([s.nodes for s in wanted])
+    nodes = _with_neighbours(lines, asked)
+    for growth in range(_MOST_GROWTHS):
+        if growth:
+            nodes = asked[_thin(replace(mask, voxels=voxels), lines, enough)[asked]]
+            reach = 1.25 * reach
+        if len(nodes) == 0:
+            break
+        _draw_balls(voxels, lines.index[nodes], reach)
+    radius = float((narrowest * edges[::-1]).mean())
     return replace(mask, voxels=voxels), wanted, _widened_text(wanted, radius)
 
 
@@ -184,6 +190,18 @@ def record(lines: MedialLines, wide: list[Stretch], left: list[Stretch]) -> dict
     return {"length_mm": round(float(share.sum()), 1), **{name: round(float(v), 1) for name, v in parts.items()}}
 
 
+def _draw_balls(
+    voxels: Bool[np.ndarray, "nz ny nx"], centres: Int[np.ndarray, "n 3"], reach: Float[np.ndarray, "3"]
+) -> None:
+    """Fill a ball around each voxel, with a radius of `reach` voxels along each axis."""
+    span = np.ceil(reach).astype(int)
+    ball = np.array(list(np.ndindex(*(2 * span + 1)))) - span
+    ball = ball[(((ball / reach) ** 2).sum(axis=1)) <= 1.0]
+    drawn = (centres[:, None, :] + ball).reshape(-1, 3)
+    drawn = drawn[((drawn >= 0) & (drawn < voxels.shape)).all(axis=1)]
+    voxels[tuple(drawn.T)] = True
+
+
 def _thin(mask: Volume, lines: MedialLines, enough: float) -> Bool[np.ndarray, "n"]:
     """Return which points of a mask's middle the smooth wall does not carry on: it is too near, or closed in between.
 
@@ -213,13 +231,12 @@ def _with_neighbours(lines: MedialLines, nodes: Int[np.ndarray, "n"]) -> Int[np.
 def _widened_text(wide: list[Stretch], radius_mm: float) -> list[str]:
     remarks = []
     long = [s for s in wide if s.length_mm + s.beyond_mm >= NOTED_MM]
+    size = f"a radius of {radius_mm:.1f} mm or more"
     for stretch in long[:_MOST_NOTED]:
         place = place_text(stretch.place)
         beyond = f", {stretch.beyond_mm:.0f} mm of vessel lie beyond it" if stretch.beyond_mm >= 1.0 else ""
         kind = "neck" if beyond else "thin branch"
-        remarks.append(
-            f"a {kind} of {stretch.length_mm:.1f} mm from {place} was widened to a radius of {radius_mm:.1f} mm{beyond}"
-        )
+        remarks.append(f"a {kind} of {stretch.length_mm:.1f} mm from {place} was widened to {size}{beyond}")
     rest = [s for s in wide if not any(s is other for other in long[:_MOST_NOTED])]
     if rest:
         total = sum(s.length_mm for s in rest)
