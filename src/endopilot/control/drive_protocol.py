@@ -22,7 +22,7 @@ LONGEST_LINE = 200
 SILENCE_S = 0.2
 """Time after which a drive stands still whose client has not heard it since, s."""
 BRAKING_S = 0.05
-"""Time in which the drive brakes from its top speeds, s: of that a ticket lasts less than `SILENCE_S`. An assumption."""
+"""Time in which the drive brakes from its top speeds, s (an assumption): a ticket lasts that much less."""
 _NUMBER = re.compile(
     r"[+-]?(?:(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:e[+-]?[0-9]+)?|nan|inf|infinity)", re.ASCII | re.IGNORECASE
 )

@@ -10,12 +10,12 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Annotated, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.settings import NonNegative, Positive, settings
+from endopilot.settings import NonNegative, Positive, Within, settings
 from endopilot.simulation.drive_limits import DriveLimits, within_travel
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import Step
@@ -100,7 +100,7 @@ class DriveMotion:
         self._orders.append((self.time_s + self._latency_s, np.array(self._limits.safe(translation, rotation))))
 
     def stop(self, *, within_s: float = np.inf) -> None:
-        """Brake at once, whatever was commanded before: within a time, s, where the motor's own ramp would take longer."""
+        """Brake at once, whatever was commanded before: within a time, s, where the motor's ramp would take longer."""
         self._orders.clear()
         self._wanted, self._ramp = np.zeros(2), np.maximum(self._acceleration, self._fastest / within_s)
 
