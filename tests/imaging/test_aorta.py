@@ -71,6 +71,7 @@ def test_seeds_that_cannot_be_used_are_refused(arch):
     for seeds, expected in {
         (): "needs one or two points",
         ((40.0, 30.0, 30.0),): r"\d+ HU around \(40.0, 30.0, 30.0\).*130 or more",
+        (DESCENDING, DESCENDING): "lie at one place; put them farther apart",
         (DESCENDING,): "joined to one of radius 2[0-9] mm.*second seed",
     }.items():
         with pytest.raises(InputError, match=expected):

@@ -52,7 +52,9 @@ def end_score(distance_map: DistanceMap, graph: LumenGraph, path: Int[np.ndarray
     remaining = along[np.argmin(blind)] if not blind.all() else along[-1]
     if remaining < 0.35 * radius + 0.5 * graph.spacing_mm:
         return radius
-    gap = np.linalg.norm(graph.points[kept] - graph.points[kept[-1]], axis=1)
+    gap = np.abs(
+        graph.length[kept] - graph.length[kept[-1]]
+    )  # along the vessel: the other limb of a hairpin is near too
     neck = graph.clearance[kept[gap < 4 * radius]].min()
     return min(0.2 * radius, 0.5 * float(neck)) if radius > 1.3 * neck else 0.6 * radius
 

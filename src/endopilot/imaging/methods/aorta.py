@@ -117,6 +117,10 @@ def _find_path(
             path = np.concatenate([piece for piece in pieces if piece is not None])
             if len(path) > 2:
                 return path, wall_distance[tuple(path.T)]
+            raise InputError(
+                f"seeds: moved to the middle of the lumen, within {_SEED_MM:g} mm, they lie at one place; put them "
+                f"farther apart along the vessel"
+            )
     raise InputError("seeds: no contrast-filled path from seed to seed; put them in one lumen, or add one between")
 
 
