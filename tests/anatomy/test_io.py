@@ -131,7 +131,8 @@ def test_other_versions_and_missing_fields_are_refused(anatomy, tmp_path):
 def test_the_zero_of_the_rotation_is_kept_and_decides_the_identity(anatomy, tmp_path):
     zero = anatomy.insertion.rotation_zero
     write_anatomy(anatomy, tmp_path / "a")
-    assert np.array_equal(read_anatomy(tmp_path / "a").insertion.rotation_zero, zero)
+    back = read_anatomy(tmp_path / "a").insertion.rotation_zero
+    assert isinstance(back, np.ndarray) and np.array_equal(back, zero)
     other = replace(anatomy, insertion=replace(anatomy.insertion, rotation_zero=-zero))
     assert len({anatomy.identity, other.identity, with_world_zero(anatomy).identity}) == 3
     record = json.loads((tmp_path / "a" / "anatomy.json").read_text())
