@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.anatomy import parent_vessel, repair
+from endopilot.anatomy import parent_vessel, repair, repair_surface
 from endopilot.anatomy.coronary_crux import Crux, find_crux
 from endopilot.anatomy.coronary_ends import OpenEnd, Skeleton, open_ends, skeleton_of
 from endopilot.anatomy.coronary_ostia import OTHER_AXES, OstiumCandidate, OstiumRanking, Side, rank_ostia
@@ -169,8 +169,8 @@ def _lumens(content: Volume | Surface, label: str) -> Iterator[DistanceMap]:
             wall = surface_from_mask(parted(repair.joined_mask(content))[0])
             yield distance_map_from_surface(wall, spacing_mm=GRID_MM, band_mm=2 * GRID_MM)
         return
-    for place in repair.region_places(content):
-        wall, _ = repair.closed_surface(content, Insertion(place, np.zeros(3)), label)
+    for place in repair_surface.region_places(content):
+        wall, _ = repair_surface.closed_surface(content, Insertion(place, np.zeros(3)), label)
         yield distance_map_from_surface(wall, spacing_mm=GRID_MM, band_mm=2 * GRID_MM)
 
 

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import numpy as np
 
 from endopilot import __version__
-from endopilot.anatomy import coverage, polylines, repair
+from endopilot.anatomy import coverage, polylines, repair, repair_surface
 from endopilot.anatomy.centerline import refined_lines
 from endopilot.anatomy.coronary_inlet import CoronaryInlet, coronary_inlet
 from endopilot.anatomy.distance import (
@@ -198,7 +198,7 @@ def _wall(
         mask, wide, remarks = coverage.widened(mask, lines, config.minimum_branch_length_mm)
         finest, longest = float(mask.spacing_mm.min()), float(mask.spacing_mm.max())
         return _Wall(surface_from_mask(mask), finest, longest, inlet, lines, wide, notes + remarks)
-    surface, notes = repair.closed_surface(content, given, label, config.vessel, other)
+    surface, notes = repair_surface.closed_surface(content, given, label, config.vessel, other)
     step = min(2.0 * surface.volume / surface.area, CORONARY_RADIUS_MM) / 5.0
     voxels = coverage.voxelised(surface, max(step, SMALLEST_RADIUS_MM))
     return _Wall(surface, 0.0, float(voxels.spacing_mm.max()), inlet, traced_lines(voxels), [], notes)
