@@ -62,7 +62,8 @@ def closed_surface(
                 remarks.append(other_pieces_text(vessel, len(others)))
         else:
             chosen = int(ids[np.linalg.norm(regions.points - given.position, axis=1).argmin()])
-        mesh = regions.extract_points(ids == chosen, adjacent_cells=False).extract_surface().triangulate().clean()
+        faces = regions.faces.reshape(-1, 4)
+        mesh = pyvista.PolyData(regions.points, faces[ids[faces[:, 1]] == chosen].ravel()).clean()
         remarks += _regions_left_out(
             np.asarray(regions.points, float), ids.astype(np.int64), chosen, vessel, other_ostium
         )
