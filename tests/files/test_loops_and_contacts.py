@@ -96,5 +96,5 @@ def test_every_piece_of_some_length_that_is_left_out_is_named_with_its_place():
 
 def test_a_mask_of_all_its_voxels_is_refused():
     full = Volume(np.ones((96, 16, 16), dtype=bool), np.full(3, 0.5), np.zeros(3), np.eye(3))
-    with pytest.raises(InputError, match="every voxel belongs to the mask"):
+    with pytest.raises(InputError, match="every voxel belongs to it"):
         extract_anatomy(lumen(full), name="full")

@@ -72,7 +72,7 @@ def connected_mask(
     if box[0].stop == 0:
         raise InputError(f"{label}: the mask is empty; check the label or segment again")
     if mask.voxels.all():
-        raise InputError(f"{label}: every voxel belongs to the mask, so that it bounds nothing; check the label")
+        raise InputError(f"{label}: the mask is a solid block (every voxel belongs to it); segment the vessel alone")
     corner = np.array([part.start for part in box])
     voxels = np.asarray(mask.voxels[box], dtype=bool)
     _refuse_blocks_and_noise(voxels, label)
