@@ -56,7 +56,7 @@ class MedialLines:
 
     @cached_property
     def from_widest(self) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-        """Length of the path from each piece's widest place to each point, and of all that lies at and beyond it, mm."""
+        """Length of the path from each piece's widest place to each point, and of all at and beyond it, mm."""
         from scipy.sparse.csgraph import connected_components, dijkstra
 
         length, behind = np.zeros(len(self.points)), self.share_mm.copy()
@@ -99,7 +99,7 @@ def traced_lines(mask: Volume) -> MedialLines:
     """Return the middle of a mask as paths between the ends of each piece: every end, but no tunnel."""
     from scipy.ndimage import find_objects, label
 
-    labels, count = label(mask.voxels, structure=np.ones((3, 3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
+    labels, _ = label(mask.voxels, structure=np.ones((3, 3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
     index, clearance, edges = [np.empty((0, 3), int)], [np.empty(0)], [np.empty((0, 2), int)]
     for number, box in enumerate(find_objects(labels), start=1):
         own = np.pad(labels[box] == number, 1)

@@ -153,9 +153,9 @@ def _contacts(lines: MedialLines, mask: Volume) -> list[_Cut]:
         radius = lines.clearance[[one, two]]
         gap = float(np.linalg.norm(lines.points[one] - lines.points[two]))
         thick = lines.clearance[node] < CONTACT * radius.min() and radius.min() > _THICK_VOXELS * mask.spacing_mm.max()
-        if thick and gap < _BRIDGE * radius.sum() + _SLIT_VOXELS * mask.spacing_mm.max() and _runs_past(lines, ways, one, path_one) and _runs_past(
-            lines, ways, two, path_two
-        ):  # fmt: skip
+        short = gap < _BRIDGE * radius.sum() + _SLIT_VOXELS * mask.spacing_mm.max()
+        past = thick and short and _runs_past(lines, ways, one, path_one) and _runs_past(lines, ways, two, path_two)
+        if past:
             cuts.append(_Cut((int(node), path_two[0]), "bridge", lines.points[node], 0.0))
     return cuts
 
