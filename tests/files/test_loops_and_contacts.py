@@ -14,6 +14,8 @@ from make_vessels import hairpin, length_of, line, lumen, tubes, with_voxels
 
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.anatomy.topology import parted
+from endopilot.errors import InputError
+from endopilot.types import Volume
 
 VOXELS = [(0.35, 0.35, 0.5), (0.7, 0.7, 0.5)]
 
@@ -90,3 +92,9 @@ def test_every_piece_of_some_length_that_is_left_out_is_named_with_its_place():
     anatomy = extract_anatomy(lumen(tubes(*pieces)), name="pieces")
     left = [note for note in anatomy.provenance["notes"] if "apart from the lumen left out" in note]
     assert len(left) == 2 and "at (19, " in left[0] and "at (39, " in left[1]
+
+
+def test_a_mask_of_all_its_voxels_is_refused():
+    full = Volume(np.ones((96, 16, 16), dtype=bool), np.full(3, 0.5), np.zeros(3), np.eye(3))
+    with pytest.raises(InputError, match="every voxel belongs to it"):
+        extract_anatomy(lumen(full), name="full")

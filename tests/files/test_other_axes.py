@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,9 +11,11 @@ import pytest
 from endopilot.anatomy.coronary_inlet import coronary_inlet
 from endopilot.anatomy.surface import Surface, surface_from_mask
 from endopilot.errors import InputError
+from endopilot.imaging.volume import read_mask
 from endopilot.types import LumenMask
 from toy_coronaries import PLACE_MM, artery, mask_of_arteries
 
+REAL = Path(__file__).parents[3] / "shared/data/real_coronaries"
 RAS = np.array([-1.0, -1.0, 1.0])
 
 
@@ -54,3 +57,12 @@ def test_a_mask_in_other_axes_names_those_that_are_exchanged(both, turned, excha
         with pytest.raises(InputError, match=f"with {exchanged} exchanged, .* mend the orientation") as refused:
             coronary_inlet(LumenMask(replace(both.volume, voxels=voxels)), vessel, "mask")
         assert "--vessel" not in str(refused.value)
+
+
+@pytest.mark.skipif(not REAL.exists(), reason="the real coronary arteries are not here")
+def test_a_left_artery_that_may_be_a_right_one_in_other_axes_has_a_note():
+    mask = read_mask(REAL / "0491.nii.gz", label=1)
+    assert coronary_inlet(mask, "rca", "mask").notes == ()
+    turned = LumenMask(replace(mask.volume, voxels=np.flip(mask.volume.voxels, axis=(1, 2)).copy()))
+    (note,) = coronary_inlet(turned, "lca", "mask").notes
+    assert "left and right, front and back exchanged, this would be a right coronary artery" in note

@@ -48,6 +48,7 @@ class CoronaryInlet:
         runner_up: the next best place, if any.
         crux: where the arteries meet the crux of the heart, if both are in the lumen and one reaches it.
         other: where the other coronary artery begins, LPS mm, if it is in the lumen too, as another piece.
+        notes: remarks on what speaks against it.
     """
 
     position: Float[np.ndarray, "3"]
@@ -55,6 +56,7 @@ class CoronaryInlet:
     runner_up: OstiumCandidate | None
     crux: Crux | None = None
     other: Float[np.ndarray, "3"] | None = None
+    notes: tuple[str, ...] = ()
 
     def record(self) -> dict[str, object]:
         """Return what `anatomy.json` keeps: `ostium_confidence`, and where else the artery may begin."""
@@ -108,7 +110,9 @@ def coronary_inlet(
         right, left = (best, other) if side == "rca" else (other, best)
         crux = find_crux(right.position, skeletons[right.piece].points, skeletons[left.piece].points)
     runner_up = ranking.candidates[1] if len(ranking.candidates) > 1 else None
-    return CoronaryInlet(best.position, best.probability, runner_up, crux, other.position if paired else None)
+    mirrored = not paired and counterpart.axes[1] > _AS_WELL * counterpart.absent
+    notes = (_rival_axes(counterpart.axes[0], side),) if mirrored else ()
+    return CoronaryInlet(best.position, best.probability, runner_up, crux, other.position if paired else None, notes)
 
 
 def _doubt(ranking: OstiumRanking, counterpart: OstiumRanking, side: Side, coordinates: str | None) -> str:
@@ -142,10 +146,20 @@ def _doubt(ranking: OstiumRanking, counterpart: OstiumRanking, side: Side, coord
     )
 
 
+def _rival_axes(axes: str, side: Side) -> str:
+    """Say that an artery may as well be the other one in other axes."""
+    other: Side = "lca" if side == "rca" else "rca"
+    return f"{_exchanged(axes)}, this would be a {_NAMES[other]}: check the axes of the file"
+
+
+def _exchanged(axes: str) -> str:
+    """Name the directions that other axes exchange."""
+    return f"with {', '.join(w for w, sign in zip(_SIDES, OTHER_AXES[axes][0], strict=True) if sign < 0)} exchanged"
+
+
 def _in_other_axes(axes: str, coordinates: str | None) -> str:
     """Say in which other axes a file holds what it should, and what to give."""
-    exchanged = ", ".join(word for word, sign in zip(_SIDES, OTHER_AXES[axes][0], strict=True) if sign < 0)
-    reads = f"with {exchanged} exchanged, what is in it looks as in patients"
+    reads = f"{_exchanged(axes)}, what is in it looks as in patients"
     if coordinates is None:
         return f"{reads}: mend the orientation that the file states, or export it again"
     if axes != "ras":

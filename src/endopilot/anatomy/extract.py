@@ -118,7 +118,7 @@ def extract_anatomy(
             unstated = wrapped.coordinates is None and isinstance(content, Surface)
             wall = _wall(content, given, config, source_name, config.coordinates if unstated else None)
             surface, inlet = wall.surface, wall.inlet
-            notes += wall.notes
+            notes += [*wall.notes, *(inlet.notes if inlet is not None else ())]
             advance()
             tree, rule = _tree(surface, wall.finest_mm, given, inlet, config, source_name)
             advance()

@@ -62,13 +62,15 @@ def connected_mask(
         other_ostium: ostium of the other coronary artery, LPS mm, if it is known.
 
     Raises:
-        InputError: the mask is empty, a solid block, noise, or touches nothing near the given ostium.
+        InputError: the mask is empty, full, a solid block, noise, or touches nothing near the given ostium.
     """
     from scipy.ndimage import binary_fill_holes
 
     box = filled_box(mask.voxels)
     if box[0].stop == 0:
         raise InputError(f"{label}: the mask is empty; check the label or segment again")
+    if mask.voxels.all():
+        raise InputError(f"{label}: the mask is a solid block (every voxel belongs to it); segment the vessel alone")
     corner = np.array([part.start for part in box])
     voxels = np.asarray(mask.voxels[box], dtype=bool)
     _refuse_blocks_and_noise(voxels, label)
