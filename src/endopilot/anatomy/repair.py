@@ -318,7 +318,8 @@ def other_pieces_text(vessel: Vessel, count: int) -> str:
         if vessel == "generic"
         else f"the one on the {vessel.upper()}'s side was taken"
     )
-    return f"{count} other large pieces lie apart and {choice}; --ostium-mm chooses another"
+    pieces = "1 other large piece lies" if count == 1 else f"{count} other large pieces lie"
+    return f"{pieces} apart and {choice}; --ostium-mm chooses another"
 
 
 def position_text(given: Insertion) -> str:

@@ -89,7 +89,7 @@ def _remarks(cuts: list[_Cut], holes: list[_Cut]) -> list[str]:
     """Say where a mask was cut, one remark for each kind."""
     words = {
         "contact": ("the vessel touches itself and was parted at", " ({:.0f} mm of vessel between the two sides)"),
-        "loop": ("a tree holds no loops: cut at their narrowest place", " (loop of {:.0f} mm)"),
+        "loop": ("a tree holds no loops: cut at the narrowest place", " (loop of {:.0f} mm)"),
         "bridge": ("two vessels touch and were parted at", ""),
     }
     remarks = []
