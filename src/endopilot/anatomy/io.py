@@ -97,7 +97,7 @@ def read_anatomy(folder: str | Path) -> Anatomy:
         if files.sha256(folder / file) != hashes.get(file):
             raise InputError(f"{folder / file}: differs from what anatomy.json records; make the anatomy again")
     length = float(np.linalg.norm(insertion.direction))
-    if abs(length - 1.0) > 1e-6 or not 0 < radius < np.inf:
+    if abs(length - 1.0) > 1e-3 or not 0 < radius < np.inf:
         raise InputError(
             f"{folder / _RECORD}: insertion.direction has a length of {length:g} instead of 1, or catheter_radius_mm "
             f"{radius:g} is not positive; make the anatomy again"

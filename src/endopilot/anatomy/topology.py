@@ -44,6 +44,9 @@ _THROUGH = -0.6
 _THICK_VOXELS = 1.0
 _ARM_RADII = 4.0
 _ROUNDS = 4
+_MOST_CUTS = 8
+"""A lumen that closes on itself in more places is no tree that touches itself: so are the lumens of a dissection, with
+the tears between them. It is left as it is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,8 +60,11 @@ class _Cut:
 
 
 def parted(mask: Volume) -> tuple[Volume, list[str]]:
-    """Return the mask without loops and contacts, each cut at its narrowest place, and remarks on them."""
-    done: list[_Cut] = []
+    """Return the mask without loops and contacts, each cut at its narrowest place, and remarks on them.
+
+    A lumen that has more than a few of them is returned as it is.
+    """
+    whole, done = mask, list[_Cut]()
     holes: list[_Cut] = []
     sides: list[str] = []
     for _ in range(_ROUNDS):
@@ -72,12 +78,32 @@ def parted(mask: Volume) -> tuple[Volume, list[str]]:
         if not cuts:
             mask, sides = _without_sides(mask, lines)
             break
+        if len(places := _apart(done + cuts)) > _MOST_CUTS:
+            return whole, [_porous(places)]
         voxels = mask.voxels.copy()
         for cut in cuts:
             _sever(voxels, lines, cut.ends)
         mask = replace(mask, voxels=voxels)
         done += cuts
     return mask, _remarks(done, holes) + sides
+
+
+def _apart(cuts: list[_Cut]) -> list[_Cut]:
+    """Return those of some cuts that lie at places of their own, that of the longest loop first."""
+    found: list[_Cut] = []
+    for cut in sorted(cuts, key=lambda cut: -cut.around_mm):
+        if all(np.linalg.norm(cut.place - other.place) >= _SAME_PLACE_MM for other in found):
+            found.append(cut)
+    return found
+
+
+def _porous(cuts: list[_Cut]) -> str:
+    """Say that a lumen closes on itself in many places."""
+    return (
+        f"the lumen closes on itself in {len(cuts)} places or more, as those of a dissection do at tears: they are "
+        f"left open, and the tree takes one way round each; the longest ring has {cuts[0].around_mm:.0f} mm, at "
+        f"{place_text(cuts[0].place)}"
+    )
 
 
 def place_text(point: Float[np.ndarray, "3"]) -> str:
@@ -94,13 +120,8 @@ def _remarks(cuts: list[_Cut], holes: list[_Cut]) -> list[str]:
     }
     remarks = []
     for kind, (text, size) in words.items():
-        places: list[str] = []
-        told: list[_Cut] = []
-        for cut in sorted((cut for cut in cuts if cut.kind == kind), key=lambda cut: -cut.around_mm):
-            if any(np.linalg.norm(cut.place - other.place) < _SAME_PLACE_MM for other in told):
-                continue
-            told.append(cut)
-            places.append(place_text(cut.place) + size.format(cut.around_mm))
+        cut_here = _apart([cut for cut in cuts if cut.kind == kind])
+        places = [place_text(cut.place) + size.format(cut.around_mm) for cut in cut_here]
         if places:
             remarks.append(f"{text} {', '.join(places)}")
     if holes:
