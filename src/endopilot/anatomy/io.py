@@ -87,7 +87,7 @@ def read_anatomy(folder: str | Path) -> Anatomy:
         )
     try:
         insertion = _insertion(record["insertion"], version)
-        names, radius = tuple(record["section_names"]), float(record["catheter_radius_mm"])
+        names, radius = tuple(map(str, record["section_names"])), float(record["catheter_radius_mm"])
         name, provenance, hashes = str(record["name"]), dict(record["provenance"]), dict(record["sha256"])
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{folder / _RECORD}: damaged ({error!r}); make the anatomy again") from error
@@ -115,7 +115,7 @@ def read_anatomy(folder: str | Path) -> Anatomy:
     return anatomy
 
 
-def _insertion(record: dict[str, Any], version: int) -> Insertion:
+def _insertion(record: Any, version: int) -> Insertion:
     """Return the insertion that a record of some schema version holds."""
     zero = record["rotation_zero"] if version > 1 else "world axes"
     vectors = (record["position_mm"], record["direction"], *([zero] if zero != "world axes" else []))

@@ -1,0 +1,89 @@
+"""An anatomy whose files someone edited is refused in one line, even where the hashes were made to fit."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from make_meshes import arc
+
+from endopilot import files
+from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
+from endopilot.anatomy.io import read_anatomy, write_anatomy
+from endopilot.anatomy.sources import Polylines
+from endopilot.errors import InputError
+
+
+@pytest.fixture(scope="module")
+def anatomy():
+    lines = Polylines((arc(),), (np.full(60, 2.0),))
+    return extract_anatomy(lines, name="a", config=AnatomyConfig(spacing_mm=1.5))
+
+
+def resigned(folder, **change):
+    """Write the hashes of the files as they are now, without the identity."""
+    record = json.loads((folder / "anatomy.json").read_text())
+    record["sha256"] = {name: files.sha256(folder / name) for name in ("centerline.vtp", "lumen.nrrd")}
+    del record["identity"]
+    (folder / "anatomy.json").write_text(json.dumps(record | change))
+
+
+def rotated(image):
+    image.SetDirection([0, -1, 0, 1, 0, 0, 0, 0, 1])
+
+
+def unequal(image):
+    image.SetSpacing([1.5, 1.5, 3.0])
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"), [(rotated, "not along the LPS axes"), (unequal, "not the same along all")]
+)
+def test_a_distance_map_on_other_axes_is_refused(anatomy, tmp_path, edit, message):
+    import SimpleITK
+
+    write_anatomy(anatomy, tmp_path / "a")
+    path = tmp_path / "a" / "lumen.nrrd"
+    image = SimpleITK.ReadImage(str(path))
+    edit(image)
+    SimpleITK.WriteImage(image, str(path))
+    resigned(tmp_path / "a")
+    with pytest.raises(InputError, match=rf"lumen\.nrrd: .*{message}.*; make the anatomy again"):
+        read_anatomy(tmp_path / "a")
+
+
+def test_a_distance_map_in_another_space_is_refused(anatomy, tmp_path):
+    write_anatomy(anatomy, tmp_path / "a")
+    path = tmp_path / "a" / "lumen.nrrd"
+    path.write_bytes(path.read_bytes().replace(b"left-posterior-superior", b"right-anterior-superior"))
+    resigned(tmp_path / "a")
+    with pytest.raises(InputError, match=r"lumen\.nrrd: "):
+        read_anatomy(tmp_path / "a")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"insertion": {"position_mm": [1, 2], "direction": [0, 0, 1], "rotation_zero": [1, 0, 0]}},
+        {"insertion": {"position_mm": [1, 2, 3], "direction": [0, 0, 0], "rotation_zero": [1, 0, 0]}},
+        {"insertion": {"position_mm": [1, 2, float("nan")], "direction": [0, 0, 1], "rotation_zero": [1, 0, 0]}},
+        {"insertion": 7},
+        {"catheter_radius_mm": -1},
+        {"section_names": []},
+        {"provenance": 3},
+        {"sha256": []},
+    ],
+)
+def test_a_damaged_record_without_identity_is_refused(anatomy, tmp_path, change):
+    write_anatomy(anatomy, tmp_path / "a")
+    resigned(tmp_path / "a", **change)
+    with pytest.raises(InputError, match="make the anatomy again") as error:
+        read_anatomy(tmp_path / "a")
+    assert "\n" not in str(error.value)
+
+
+def test_a_record_without_identity_is_read_where_the_rest_is_whole(anatomy, tmp_path):
+    write_anatomy(anatomy, tmp_path / "a")
+    resigned(tmp_path / "a")
+    assert read_anatomy(tmp_path / "a").identity == anatomy.identity
