@@ -153,6 +153,16 @@ def test_another_command_is_noticed_by_the_replay(session, tmp_path):
         list(replayed(read_recording(path)))
 
 
+def test_an_event_that_would_take_days_to_reach_is_refused(session, tmp_path):
+    run(session, 0.5, message=Drive(type="drive", translation=10.0, rotation=1.0))
+    session.close()
+    path = tmp_path / "a.cockpit.jsonl"
+    with path.open("a") as stream:
+        stream.write('{"at": 1000000000, "stop": true}\n')
+    with pytest.raises(InputError, match=r"a\.cockpit\.jsonl: 9999999\d\d cycles without a check"):
+        read_recording(path)
+
+
 def test_a_killed_session_goes_on(session, tmp_path):
     from endopilot.cockpit.open import resume_session
 

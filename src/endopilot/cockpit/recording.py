@@ -72,7 +72,7 @@ class Recorder:
 
     def cycle(self) -> None:
         """Write a check where one is due; call it after each cycle."""
-        if self._world.cycle % round(CHECK_S / self._world.config.cycle_s) == 0:
+        if self._world.cycle % _between_checks(self._world.config) == 0:
             self.event(check=self._world.digest())
 
     def close(self) -> None:
@@ -130,9 +130,18 @@ def read_recording(path: Path) -> Recording:
         np.random.default_rng(int(header["seed"]))  # which must not be negative
         for event in events:
             _check(event)
-        cycles = max((int(event["at"]) for event in events), default=0)
         config = from_record(WorldConfig, header["config"])
+        at = np.array([0, *(int(event["at"]) for event in events)])
+        between = _between_checks(config)
+        if (apart := np.diff(np.sort(at)).max(initial=0)) > between:
+            raise InputError(f"{apart} cycles without a check, which is due after {between}")
+        cycles = int(at.max())
         return Recording(path, navigation, config, int(header["seed"]), where, events, cycles)
+
+
+def _between_checks(config: WorldConfig) -> int:
+    """Return the number of cycles from one check to the next."""
+    return max(1, round(CHECK_S / config.cycle_s))
 
 
 def replayed(recording: Recording) -> Iterator[tuple[World, list[dict[str, Any]]]]:
