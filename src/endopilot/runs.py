@@ -39,7 +39,7 @@ def claim(folder: Path, command: str, **identity: Any) -> None:
         before = read_json(record)
         change = next(_changes(before, now), None)
         if change is None:
-            _remove_partial_files(folder)
+            remove_partial_files(folder)
             return
         if any(_results(folder)):
             name, then, value = change
@@ -50,7 +50,7 @@ def claim(folder: Path, command: str, **identity: Any) -> None:
     elif folder.is_dir() and any(_results(folder)):
         raise InputError(f"{folder}: is not empty and holds no {RECORD_FILE}; choose another folder")
     write_json(record, now)
-    _remove_partial_files(folder)
+    remove_partial_files(folder)
 
 
 def make_missing(title: str, paths: Sequence[Path], make: Callable[[Path], None]) -> None:
@@ -84,7 +84,8 @@ def _results(folder: Path) -> Iterator[Path]:
     return (path for path in folder.iterdir() if path.name != RECORD_FILE and not path.name.startswith(".part-"))
 
 
-def _remove_partial_files(folder: Path) -> None:
+def remove_partial_files(folder: Path) -> None:
+    """Remove the half-written files that a process which was killed left in a folder."""
     for path in list(folder.rglob(".part-*")):
         if path.is_dir():
             shutil.rmtree(path, ignore_errors=True)

@@ -39,7 +39,7 @@ def test_of_two_vessels_the_larger_is_taken_and_the_other_named():
     for source in (mask, surface_from_mask(mask.volume)):
         anatomy = extract_anatomy(source, name="both")
         assert abs(anatomy.insertion.position[0] - 10.0) < 1.0
-        assert any("other large pieces" in note for note in anatomy.provenance["notes"])
+        assert any("other large piece" in note for note in anatomy.provenance["notes"])
 
 
 @pytest.mark.parametrize("vessel", ["rca", "lca"])

@@ -22,7 +22,7 @@ from endopilot.dataset.splits import SPLITS
 from endopilot.dataset.workers import run_locally, run_on_cluster
 from endopilot.files import manifest, read_json, write_json, writing
 from endopilot.progress import progress
-from endopilot.runs import claim
+from endopilot.runs import claim, remove_partial_files
 from endopilot.simulation.catheter import Catheter
 from endopilot.simulation.device import Device
 
@@ -126,6 +126,7 @@ def describe(layout: Layout, blocks: Sequence[Block]) -> None:
     import pandas as pd  # slow to import, and only needed here
 
     context = layout.context
+    remove_partial_files(context.output)
     files = [schema.paths_of_file(context.output, block.number) for block in blocks]
     columns = ("episode_index", "anatomy", "sequence", "split", "stopped_short", "valid", "invalid_reason")
     episodes = [row for _, path in files for row in parquet.read_table(path, context.key).select(columns).to_pylist()]
