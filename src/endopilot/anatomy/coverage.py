@@ -14,15 +14,12 @@ from scipy.spatial import KDTree
 
 from endopilot.anatomy.distance import MAXIMUM_GRID_POINTS
 from endopilot.anatomy.medial_lines import MedialLines
+from endopilot.anatomy.repair import MOST_LISTED, NOTED_MM
 from endopilot.anatomy.surface import Surface, blur_voxels, level_function
 from endopilot.anatomy.topology import place_text
 from endopilot.anatomy.tree import sampled
 from endopilot.types import VesselTree, Volume
 
-NOTED_MM = 5.0
-"""What is left out or widened gets a remark of its own from this length; shorter pieces are summed up."""
-
-_MOST_NOTED = 8
 _REACH_VOXELS = 1.5
 """The tree reaches what lies within its radius and this many voxels of its axis: the mask's middle is not smooth."""
 
@@ -156,13 +153,13 @@ def left_out_text(left: list[Stretch], ostium: Float[np.ndarray, "3"], reach_mm:
     left = sorted(left, key=lambda stretch: -stretch.length_mm)
     long = [s for s in left if s.length_mm >= NOTED_MM]
     remarks = []
-    for stretch in long[:_MOST_NOTED]:
+    for stretch in long[:MOST_LISTED]:
         behind = " behind the ostium" if np.linalg.norm(stretch.place - ostium) < reach_mm else ""
         remarks.append(
             f"{stretch.length_mm:.0f} mm of the lumen{behind} from {place_text(stretch.place)} are not in the tree"
         )
-    if len(long) > _MOST_NOTED:
-        places = ", ".join(f"{s.length_mm:.0f} mm from {place_text(s.place)}" for s in long[_MOST_NOTED:])
+    if len(long) > MOST_LISTED:
+        places = ", ".join(f"{s.length_mm:.0f} mm from {place_text(s.place)}" for s in long[MOST_LISTED:])
         remarks.append(f"neither are {places}")
     crumbs = sum(s.length_mm for s in left) - sum(s.length_mm for s in long)
     if crumbs >= NOTED_MM:
@@ -232,12 +229,12 @@ def _widened_text(wide: list[Stretch], radius_mm: float) -> list[str]:
     remarks = []
     long = [s for s in wide if s.length_mm + s.beyond_mm >= NOTED_MM]
     size = f"a radius of {radius_mm:.1f} mm or more"
-    for stretch in long[:_MOST_NOTED]:
+    for stretch in long[:MOST_LISTED]:
         place = place_text(stretch.place)
         beyond = f", {stretch.beyond_mm:.0f} mm of vessel lie beyond it" if stretch.beyond_mm >= 1.0 else ""
         kind = "neck" if beyond else "thin branch"
         remarks.append(f"a {kind} of {stretch.length_mm:.1f} mm from {place} was widened to {size}{beyond}")
-    rest = [s for s in wide if not any(s is other for other in long[:_MOST_NOTED])]
+    rest = [s for s in wide if not any(s is other for other in long[:MOST_LISTED])]
     if rest:
         total = sum(s.length_mm for s in rest)
         remarks.append(f"{len(rest)} more thin places of together {total:.0f} mm were widened likewise")

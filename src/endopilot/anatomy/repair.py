@@ -33,7 +33,7 @@ SMALLEST_PIECE = 12
 """A piece of fewer voxels is noise."""
 
 NOTED_MM = 5.0
-"""A piece that is left out gets a remark of its own from this length."""
+"""What is left out or widened gets a remark of its own from this length; shorter pieces are summed up."""
 
 MOST_LISTED = 8
 """As many pieces are listed one by one."""
