@@ -21,7 +21,7 @@ from endopilot.simulation.controls import read_controls_csv
 from endopilot.simulation.table import write_rollout
 from endopilot.types import Anatomy, Rollout
 
-SHIPPED = Path(endopilot.__file__).parent / "simulation/catheters"
+SHIPPED = Path(endopilot.__file__).parent / "devices/catheters"
 
 
 @pytest.fixture(scope="module")
