@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Float, Int, Shaped
 
 SAMPLE_PERIOD_S = 0.5
 """Time between two recorded samples, s: the paper records at 2 Hz."""
@@ -296,6 +296,10 @@ class TipProjection:
     offset: Float[np.ndarray, "..."]
     branch: Int[np.ndarray, "..."]
     radius: Float[np.ndarray, "..."]
+
+    def __getitem__(self, chosen: Any) -> TipProjection:
+        """Return some of the tips, chosen as of an array: `tip[:, 0]` are those of the wires."""
+        return TipProjection(self.abscissa[chosen], self.offset[chosen], self.branch[chosen], self.radius[chosen])
 
 
 def _add(digest: hashlib._Hash, values: np.ndarray, kind: type[np.generic]) -> None:

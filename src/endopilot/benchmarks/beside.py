@@ -12,19 +12,20 @@ from jaxtyping import Float
 
 from endopilot.benchmarks.scenes import Scene
 from endopilot.simulation.config import PRESETS, Preset, SimulatorConfig
-from endopilot.types import SAMPLE_PERIOD_S, Rollout
+from endopilot.simulation.trajectory import Trajectory
+from endopilot.types import SAMPLE_PERIOD_S
 
 COMPARED = 2
 """Worlds of each scene that the error in time is measured on."""
 REPEATS = 3
 """Times that the worlds are simulated for the timing; the fastest counts."""
-Run = Callable[[SimulatorConfig, int | None], list[Rollout]]
+Run = Callable[[SimulatorConfig, int | None], list[Trajectory]]
 """Simulates the scenario: a rollout of the worlds of each scene, or of the first so many of them."""
 
 
 def bench_beside(
     run: Run, scenes: Sequence[Scene], preset: Preset, *, beside: str, least_share: float
-) -> tuple[dict[str, Any], list[Rollout]]:
+) -> tuple[dict[str, Any], list[Trajectory]]:
     """Time a scenario and the wire alone at rest in turns, on one thread.
 
     Args:
@@ -42,8 +43,8 @@ def bench_beside(
     """
     config = replace(PRESETS[preset], threads=1)
     simulated = SAMPLE_PERIOD_S * sum(scene.control.shape[0] * scene.control.shape[1] for scene in scenes)
-    rollouts: list[Rollout] = []
-    still: list[Rollout] = []
+    rollouts: list[Trajectory] = []
+    still: list[Trajectory] = []
     ours, alone = [], []
     for _ in range(REPEATS):
         begun = time.process_time()
@@ -69,22 +70,22 @@ def bench_beside(
     }, rollouts
 
 
-def node_iterations_per_second(rollouts: Sequence[Rollout]) -> float:
+def node_iterations_per_second(rollouts: Sequence[Trajectory]) -> float:
     """Return how many nodes are evaluated in a simulated second."""
     simulated_s = SAMPLE_PERIOD_S * sum(rollout.valid.size for rollout in rollouts)
     return round(sum(float(rollout.node_iterations.sum()) for rollout in rollouts) / simulated_s, 1)
 
 
-def fine_steps(run: Run, preset: Preset) -> list[Rollout]:
+def fine_steps(run: Run, preset: Preset) -> list[Trajectory]:
     """Return the first worlds of each scene at time steps of 1 ms: what `error_in_time` compares with."""
     return run(replace(PRESETS[preset], time_step_s=1e-3, tolerance_mm=1e-6), COMPARED)
 
 
 def error_in_time(
     name: str,
-    rollouts: Sequence[Rollout],
-    fine: Sequence[Rollout],
-    tip: Callable[[Rollout], Float[np.ndarray, "worlds samples 3"]],
+    rollouts: Sequence[Trajectory],
+    fine: Sequence[Trajectory],
+    tip: Callable[[Trajectory], Float[np.ndarray, "worlds samples 3"]],
 ) -> dict[str, float]:
     """Return the median and 95th percentile of a tip's distance from where it is at fine steps, mm.
 

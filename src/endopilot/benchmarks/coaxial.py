@@ -6,7 +6,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from endopilot.benchmarks.beside import bench_beside, error_in_time, fine_steps, node_iterations_per_second
 from endopilot.benchmarks.scenes import SAMPLES, SEED, WORLDS, Scene, make_scenes
@@ -15,7 +14,7 @@ from endopilot.devices.stack import Stack
 from endopilot.simulation.config import PRESETS, Preset, SimulatorConfig, wall_stiffness
 from endopilot.simulation.controls import ControlConfig, random_controls
 from endopilot.simulation.simulate import simulate
-from endopilot.types import Rollout
+from endopilot.simulation.trajectory import Trajectory
 
 LEAST_SHARE = 1 / 3
 """Of the real-time factor of a wire alone, that wire and catheter must reach."""
@@ -43,14 +42,13 @@ def bench_coaxial(
     scenes = make_scenes(worlds, samples)
     starts, controls = zip(*(_catheter_drive(scene, place) for place, scene in enumerate(scenes)), strict=True)
 
-    def run(config: SimulatorConfig, worlds: int | None) -> list[Rollout]:
+    def run(config: SimulatorConfig, worlds: int | None) -> list[Trajectory]:
         return [
             simulate(
                 scene.anatomy,
-                scene.device,
-                np.concatenate([scene.control, control], axis=-1)[:worlds],
-                catheters=[catheter],
-                initial=np.concatenate([scene.initial, start], axis=-1)[:worlds],
+                Stack(scene.device, (catheter,)),
+                np.concatenate([scene.control, control], axis=2)[:worlds],
+                initial=np.concatenate([scene.initial, start], axis=1)[:worlds],
                 config=config,
             )
             for scene, start, control in zip(scenes, starts, controls, strict=True)
@@ -68,8 +66,8 @@ def bench_coaxial(
         "catheter": catheter.name,
         **figures,
         "catheter_alone_node_iterations_per_second": node_iterations_per_second(alone),
-        **error_in_time("wire_tip_error", rollouts, fine, lambda rollout: rollout.tip_position),
-        **error_in_time("catheter_tip_error", rollouts, fine, _catheter_tip),
+        **error_in_time("wire_tip_error", rollouts, fine, lambda rollout: rollout.tip_position[:, :, 0]),
+        **error_in_time("catheter_tip_error", rollouts, fine, lambda rollout: rollout.tip_position[:, :, 1]),
     }
 
 
@@ -84,8 +82,3 @@ def _catheter_drive(scene: Scene, place: int) -> tuple[np.ndarray, np.ndarray]:
         max_inserted_length_mm=float(scene.anatomy.tree.longest_path().abscissa[-1]),
         first=2**32 + place * worlds,
     )
-
-
-def _catheter_tip(rollout: Rollout) -> Float[np.ndarray, "worlds samples 3"]:
-    assert rollout.catheters is not None
-    return rollout.catheters.tip_position[:, :, 0]

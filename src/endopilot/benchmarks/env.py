@@ -110,11 +110,11 @@ def _tips(config: SimulatorConfig) -> Float[np.ndarray, "steps worlds 3"]:
         max_inserted_length_mm=longest,
     )
     simulator = Simulator(navigation.anatomy, navigation.device, worlds=COMPARED, config=config)
-    simulator.reset(inserted_length=initial[:, 0], rotation=initial[:, 1])
+    simulator.reset(inserted_length=initial[..., 0], rotation=initial[..., 1])
     tips = []
     for step in range(round(COMPARED_SECONDS / CONTROL_PERIOD_S)):
         sample = int(step * CONTROL_PERIOD_S / SAMPLE_PERIOD_S)
         room = (longest - simulator.inserted_length) / CONTROL_PERIOD_S
-        held = np.column_stack([np.minimum(control[:, sample, 0], room), control[:, sample, 1]])
-        tips.append(simulator.step(held, CONTROL_PERIOD_S).tip_position)
+        held = np.stack([np.minimum(control[:, sample, :, 0], room), control[:, sample, :, 1]], axis=-1)
+        tips.append(simulator.step(held, CONTROL_PERIOD_S).tip_position[:, 0])
     return np.array(tips)

@@ -104,7 +104,7 @@ def robust_controls(
 
 def paired_controls(
     anatomy: Anatomy, stack: Stack, *, rollouts: int, samples: int, seed: int
-) -> tuple[Float[np.ndarray, "n drives_2"], Float[np.ndarray, "n samples drives_2"]]:
+) -> tuple[Float[np.ndarray, "n devices 2"], Float[np.ndarray, "n samples devices 2"]]:
     """Return `robust_controls` of a wire and of the catheters around it, side by side.
 
     With catheters, each has manoeuvres of its own, shifted against the wire's, and what was pulled out is pushed in
@@ -122,14 +122,15 @@ def paired_controls(
         for drive, device in enumerate(stack.devices)
     ]
     if not stack.catheters:
-        return drawn[0]
+        initial, control = drawn[0]
+        return initial[:, None], control[:, :, None]
     rollout, again = np.arange(rollouts), round(_AGAIN_AT * samples)
     for drive, (initial, control) in enumerate(drawn):
         control[rollout % len(MANOEUVRES) >= 2, again:, 0] = _PUSH_MM_S
         group = rollout - rollout % len(MANOEUVRES)
         shifted = (group + (rollout + drive * group // len(MANOEUVRES)) % len(MANOEUVRES)) % rollouts
         initial[:], control[:] = initial[shifted], control[shifted]
-    initial, control = (np.concatenate(parts, axis=-1) for parts in zip(*drawn, strict=True))
+    initial, control = (np.stack(parts, axis=-2) for parts in zip(*drawn, strict=True))
     return initial, control
 
 

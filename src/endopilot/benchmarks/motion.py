@@ -8,7 +8,7 @@ from endopilot.benchmarks.beside import bench_beside, error_in_time, fine_steps
 from endopilot.benchmarks.scenes import SAMPLES, WORLDS, make_scenes
 from endopilot.simulation.config import Preset, SimulatorConfig
 from endopilot.simulation.motion import Motion
-from endopilot.types import Rollout
+from endopilot.simulation.trajectory import Trajectory
 
 LEAST_SHARE = 0.5
 """Of the real-time factor in a still vessel, that in a moving one must reach."""
@@ -30,9 +30,9 @@ def bench_motion(
     """
     scenes = make_scenes(worlds, samples)
 
-    def run(config: SimulatorConfig, worlds: int | None) -> list[Rollout]:
+    def run(config: SimulatorConfig, worlds: int | None) -> list[Trajectory]:
         return [scene.run(config, worlds, motion=motion) for scene in scenes]
 
     figures, rollouts = bench_beside(run, scenes, preset, beside="still", least_share=LEAST_SHARE)
-    error = error_in_time("tip_error", rollouts, fine_steps(run, preset), lambda rollout: rollout.tip_position)
+    error = error_in_time("tip_error", rollouts, fine_steps(run, preset), lambda rollout: rollout.tip_position[:, :, 0])
     return figures | error

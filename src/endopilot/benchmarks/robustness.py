@@ -23,7 +23,6 @@ from jaxtyping import Bool, Float, Int
 
 from endopilot import __version__, _core
 from endopilot.anatomy.io import read_anatomy
-from endopilot.anatomy.projection import project_tip
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.benchmarks.manoeuvres import MANOEUVRES, name_of, paired_controls, seed_of, stacks_of
 from endopilot.devices.catheter import list_catheters, read_catheter
@@ -37,8 +36,9 @@ from endopilot.progress import progress
 from endopilot.runs import claim
 from endopilot.settings import Within, settings
 from endopilot.simulation.config import SimulatorConfig, wall_stiffness
-from endopilot.simulation.simulate import WALL_FORCE_LIMIT_N, simulate, why_invalid
-from endopilot.types import SAMPLE_PERIOD_S, Anatomy, Rollout
+from endopilot.simulation.simulate import WALL_FORCE_LIMIT_N, simulate
+from endopilot.simulation.trajectory import Trajectory
+from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
 MOST_INVALID_SHARE = 1e-3
 """Bar: share of the worlds that may be invalid."""
@@ -154,11 +154,11 @@ def run_chunk(path: Path, config: RobustnessConfig, index: int, stack: Stack, ro
     simulator = SimulatorConfig(threads=config.threads)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # invalid worlds are listed below, each with its reason
-        rollout = simulate(anatomy, stack.wire, control, catheters=stack.catheters, initial=initial, config=simulator)
+        rollout = simulate(anatomy, stack, control, initial=initial, config=simulator)
     chunk = _describe(anatomy, stack, rollout, simulator, time.process_time() - began)
     invalid = [
         f"{anatomy.name}, {name_of(stack)}, rollout {world} ({MANOEUVRES[world % len(MANOEUVRES)]}): "
-        + why_invalid(rollout, world)
+        + rollout.why_invalid(world)
         for world in np.flatnonzero(rollout.reason).tolist()
     ]
     with writing(path) as partial:
@@ -166,30 +166,28 @@ def run_chunk(path: Path, config: RobustnessConfig, index: int, stack: Stack, ro
     write_json(path.with_suffix(".json"), {"anatomy": anatomy.name, "invalid": invalid})
 
 
-def _describe(anatomy: Anatomy, stack: Stack, rollout: Rollout, config: SimulatorConfig, seconds: float) -> Chunk:
+_OF_DEVICES = (
+    "tip_position",
+    "tip_direction",
+    "base_force",
+    "base_torque",
+    "slip",
+    "rotation_slip",
+    "inserted_length",
+    "rotation",
+)
+
+
+def _describe(anatomy: Anatomy, stack: Stack, rollout: Trajectory, config: SimulatorConfig, seconds: float) -> Chunk:
     wall_n_mm = wall_stiffness(config, stack.push_limit_n)
     end = np.array([branch.centerline.abscissa[-1] for branch in anatomy.tree.branches])
-    numbers = np.concatenate(
-        [
-            rollout.tip_position,
-            rollout.tip_direction,
-            *(
-                getattr(rollout, name)[..., None]
-                for name in ("contact_force_max", "contact_force_sum", "wall_force", "base_force", "base_torque")
-            ),
-            *(getattr(rollout, name)[..., None] for name in ("slip", "rotation_slip", "inserted_length", "rotation")),
-            *(getattr(rollout.tip, name)[..., None] for name in ("abscissa", "offset", "radius")),
-        ],
-        axis=-1,
-    )
-    force, torque = rollout.base_force[..., None], rollout.base_torque[..., None]
-    slipped = (rollout.slip != 0) | (rollout.rotation_slip != 0)
-    if (catheters := rollout.catheters) is not None:
-        force = np.concatenate([force, catheters.base_force], axis=-1)
-        torque = np.concatenate([torque, catheters.base_torque], axis=-1)
-        slipped |= (catheters.slip != 0).any(axis=-1) | (catheters.rotation_slip != 0).any(axis=-1)
-        others = (catheters.base_force, catheters.base_torque, catheters.inserted_length, catheters.rotation)
-        numbers = np.concatenate([numbers, *others, *np.moveaxis(catheters.tip_position, 2, 0)], axis=-1)
+    of_all = [getattr(rollout, name) for name in ("contact_force_max", "contact_force_sum", "wall_force")]
+    of_devices = [getattr(rollout, name) for name in _OF_DEVICES]
+    of_wire = [getattr(rollout.tip, name)[:, :, 0] for name in ("abscissa", "offset", "radius")]
+    rows = rollout.valid.shape
+    numbers = np.concatenate([each.reshape(*rows, -1) for each in (*of_all, *of_devices, *of_wire)], axis=-1)
+    force, torque = rollout.base_force, rollout.base_torque
+    slipped = ((rollout.slip != 0) | (rollout.rotation_slip != 0)).any(axis=-1)
     most = [[device.push_limit_n, -device.pull_limit_n] for device in stack.devices]
     bad = (~np.isfinite(numbers) & rollout.valid[..., None]).sum(axis=(1, 2))
     return Chunk(
@@ -198,7 +196,7 @@ def _describe(anatomy: Anatomy, stack: Stack, rollout: Rollout, config: Simulato
         base_torque_n_mm=_largest(torque).astype(np.float32),
         over_limit=(force[..., None] / most).max(axis=(-2, -1)).astype(np.float32),
         wall_force_n=rollout.wall_force.astype(np.float32),
-        to_end_mm=(end[rollout.tip.branch] - rollout.tip.abscissa).astype(np.float32),
+        to_end_mm=(end[rollout.tip.branch] - rollout.tip.abscissa)[:, :, 0].astype(np.float32),
         slipped=slipped,
         wedged=_wedged(anatomy, stack, rollout),
         valid=rollout.valid,
@@ -207,11 +205,8 @@ def _describe(anatomy: Anatomy, stack: Stack, rollout: Rollout, config: Simulato
     )
 
 
-def _wedged(anatomy: Anatomy, stack: Stack, rollout: Rollout) -> Bool[np.ndarray, "rollouts samples"]:
-    tips = rollout.tip_position[:, :, None]
-    if rollout.catheters is not None:
-        tips = np.concatenate([tips, rollout.catheters.tip_position], axis=2)
-    at = project_tip(anatomy.tree, anatomy.insertion, tips)
+def _wedged(anatomy: Anatomy, stack: Stack, rollout: Trajectory) -> Bool[np.ndarray, "rollouts samples"]:
+    at = rollout.tip
     narrowest = np.full(at.branch.shape, np.inf)
     for branch in np.unique(at.branch).tolist():
         path, here = anatomy.tree.path(branch), at.branch == branch

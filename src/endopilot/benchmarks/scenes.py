@@ -15,7 +15,8 @@ from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, random_controls
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulate import simulate
-from endopilot.types import Anatomy, Rollout
+from endopilot.simulation.trajectory import Trajectory
+from endopilot.types import Anatomy
 
 KINDS: Mapping[str, str] = {"right": "rca", "left": "lca", "cerebral": "cerebral"}
 """Names of the patients, and their kinds in the atlas. Nothing was calibrated on these patients."""
@@ -44,10 +45,10 @@ class Scene:
     name: str
     anatomy: Anatomy
     device: Device
-    initial: Float[np.ndarray, "worlds 2"]
-    control: Float[np.ndarray, "worlds samples 2"]
+    initial: Float[np.ndarray, "worlds 1 2"]
+    control: Float[np.ndarray, "worlds samples 1 2"]
 
-    def run(self, config: SimulatorConfig, worlds: int | None = None, *, motion: Motion | None = None) -> Rollout:
+    def run(self, config: SimulatorConfig, worlds: int | None = None, *, motion: Motion | None = None) -> Trajectory:
         """Simulate the worlds, or the first of them; the vessel lies still, or moves."""
         return simulate(
             self.anatomy,
@@ -106,15 +107,18 @@ class Solution:
     before_fork: Bool[np.ndarray, "worlds samples"]
 
     @staticmethod
-    def of(scenes: Iterable[Scene], rollouts: Iterable[Rollout]) -> Solution:
+    def of(scenes: Iterable[Scene], rollouts: Iterable[Trajectory]) -> Solution:
         """Return what rollouts of the scenes recorded."""
         columns: dict[str, list[np.ndarray]] = {field.name: [] for field in fields(Solution)}
         for scene, rollout in zip(scenes, rollouts, strict=True):
             root_mm = float(scene.anatomy.tree.branches[0].centerline.abscissa[-1])
-            columns["branch"].append(rollout.tip.branch)
-            columns["before_fork"].append((rollout.tip.branch == 0) & (rollout.tip.abscissa < root_mm))
-            for name in set(columns) - {"branch", "before_fork"}:
+            tip = rollout.tip[:, :, 0]
+            columns["branch"].append(tip.branch)
+            columns["before_fork"].append((tip.branch == 0) & (tip.abscissa < root_mm))
+            for name in ("wall_force", "contact_force_max", "valid"):
                 columns[name].append(getattr(rollout, name))
+            for name in ("tip_position", "base_force", "base_torque"):
+                columns[name].append(getattr(rollout, name)[:, :, 0])
         return Solution(**{name: np.concatenate(parts) for name, parts in columns.items()})
 
     def worlds(self, rows: Int[np.ndarray, "n"]) -> Solution:

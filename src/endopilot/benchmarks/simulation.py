@@ -20,7 +20,8 @@ from endopilot.benchmarks.scenes import DEVICE, KINDS, SEED, Scene, Solution, ma
 from endopilot.devices.device import read_device
 from endopilot.simulation.config import PRESETS, Preset, SimulatorConfig, wall_stiffness
 from endopilot.simulation.simulator import Simulator
-from endopilot.types import SAMPLE_PERIOD_S, Rollout
+from endopilot.simulation.trajectory import Trajectory
+from endopilot.types import SAMPLE_PERIOD_S
 
 COMPARED = 8
 """Worlds of each scene that the error in time alone is measured on."""
@@ -94,7 +95,7 @@ def bench_simulation(
 class _Timed:
     """The scenes' rollouts; processor time, and that of the older build, s; wall time on one and two threads, s."""
 
-    rollouts: list[Rollout]
+    rollouts: list[Trajectory]
     processor: float
     baseline: float | None
     alone: float
@@ -111,7 +112,7 @@ def _time(scenes: Sequence[Scene], config: SimulatorConfig, baseline: Path) -> _
     }
     older = Baseline(baseline, work) if baseline.exists() else None
     then, alone, together, processor = [], [], [], []
-    rollouts: list[Rollout] = []
+    rollouts: list[Trajectory] = []
     try:
         for _ in range(REPEATS):
             if older is not None:
@@ -126,7 +127,7 @@ def _time(scenes: Sequence[Scene], config: SimulatorConfig, baseline: Path) -> _
     return _Timed(rollouts, min(processor), min(then, default=None), min(alone), min(together))
 
 
-def _run(scenes: Sequence[Scene], config: SimulatorConfig) -> tuple[list[Rollout], float, float]:
+def _run(scenes: Sequence[Scene], config: SimulatorConfig) -> tuple[list[Trajectory], float, float]:
     wall, processor = time.perf_counter(), time.process_time()
     rollouts = [scene.run(config) for scene in scenes]
     return rollouts, time.perf_counter() - wall, time.process_time() - processor
@@ -138,12 +139,14 @@ def _threads_speedup(recipe: Mapping[str, Any], config: SimulatorConfig) -> floa
     return alone / together
 
 
-def _error_in_time(scenes: Sequence[Scene], config: SimulatorConfig, rollouts: Sequence[Rollout]) -> dict[str, float]:
+def _error_in_time(
+    scenes: Sequence[Scene], config: SimulatorConfig, rollouts: Sequence[Trajectory]
+) -> dict[str, float]:
     errors = []
     for scene, rollout in zip(scenes, rollouts, strict=True):
         fine = scene.run(replace(config, time_step_s=1e-3, tolerance_mm=1e-8, threads=0), COMPARED)
         both = fine.valid & rollout.valid[:COMPARED]
-        errors.append(np.linalg.norm(fine.tip_position - rollout.tip_position[:COMPARED], axis=-1)[both])
+        errors.append(np.linalg.norm(fine.tip_position - rollout.tip_position[:COMPARED], axis=-1)[:, :, 0][both])
     error = np.concatenate(errors)
     return {
         "tip_error_mean_mm": round(float(error.mean()), 5),

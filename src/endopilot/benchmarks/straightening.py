@@ -313,7 +313,7 @@ def straighten(
         axis_mm=unit * displaced,
         begun_mm=unit * axis,
         force_n=float(rollout.contact_force_sum[0, -1]),
-        through=bool(valid and abs(rollout.inserted_length[0, -1] - inserted) < 1e-6),
+        through=bool(valid and abs(rollout.inserted_length[0, -1, 0] - inserted) < 1e-6),
         valid=valid,
     )
 

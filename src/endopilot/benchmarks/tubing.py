@@ -11,6 +11,7 @@ from jaxtyping import Float
 from endopilot.benchmarks.analytic_lumens import tree_of
 from endopilot.devices.catheter import Catheter
 from endopilot.devices.device import Device
+from endopilot.devices.stack import Stack
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.simulate import simulate
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, DistanceMap, Insertion
@@ -169,17 +170,14 @@ def push_through(
         catheters: from the inside out.
         config: settings of the rod core.
     """
-    drives = 1 + len(catheters)
-    initial = np.zeros((1, 2 * drives))
-    initial[0, 0], initial[0, 2::2] = PROTRUDES_MM + 1.0, 1.0
-    samples = int((LENGTH_MM - _END_MM - initial[0, 0]) / (SPEED_MM_S * SAMPLE_PERIOD_S))
-    control = np.zeros((1, samples, 2 * drives))
-    control[..., ::2] = SPEED_MM_S
-    rollout = simulate(anatomy, wire, control, catheters=catheters, initial=initial, config=config)
-    force, slip = rollout.base_force[0].copy(), np.abs(rollout.slip[0])
-    if rollout.catheters is not None:
-        force += rollout.catheters.base_force[0].sum(axis=-1)
-        slip += np.abs(rollout.catheters.slip[0]).sum(axis=-1)
+    stack = Stack(wire, tuple(catheters))
+    initial = np.zeros((1, len(stack), 2))
+    initial[0, 0, 0], initial[0, 1:, 0] = PROTRUDES_MM + 1.0, 1.0
+    samples = int((LENGTH_MM - _END_MM - initial[0, 0, 0]) / (SPEED_MM_S * SAMPLE_PERIOD_S))
+    control = np.zeros((1, samples, len(stack), 2))
+    control[..., 0] = SPEED_MM_S
+    rollout = simulate(anatomy, stack, control, initial=initial, config=config)
+    force, slip = rollout.base_force[0].sum(axis=-1), np.abs(rollout.slip[0])
     valid = rollout.valid[0]
     return Push(
         force_n=float(force[valid].max(initial=0.0)),

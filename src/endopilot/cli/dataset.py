@@ -8,8 +8,8 @@ from tyro.conf import Positional
 
 from endopilot.cli.arguments import OutputFolder, existing, show
 from endopilot.dataset.config import DatasetConfig
-from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import read_device
+from endopilot.devices.stack import Stack
 from endopilot.files import read_json
 
 
@@ -44,9 +44,8 @@ def command(
     generate_dataset(
         [existing(folder) for folder in anatomies],
         output,
-        read_device(device),
+        Stack(read_device(device), tuple(read_catheter(name) for name in catheter)),
         config,
-        catheters=[read_catheter(name) for name in catheter],
         scheduler=scheduler,
     )
     info = read_json(output / "meta" / "info.json")

@@ -325,7 +325,7 @@ class AgentPolicy(_PlanningPolicy):
         """Return what the adviser is given: the likeliest wire, and the spread of all wires."""
         best, tip = int(np.argmax(self.belief.weight)), self.belief.likeliest_tip()
         wires = self.belief.simulator
-        proximal = np.array([[wires.inserted_length[best], wires.rotation[best]]])
+        proximal = wires.proximal[best, :1]
         return proximal, np.array([[tip.abscissa[0], tip.offset[0]]]), self.belief.tip_spread()[None], tip.radius
 
     def wants_xray(self) -> bool:

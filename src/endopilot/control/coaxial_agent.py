@@ -138,7 +138,7 @@ class CoaxialAgent:
     def adviser_input(self) -> AdviserInput:
         """Return what the adviser is given: the likeliest wire, and the spread of all wires."""
         tip, wires = self.belief.likeliest_tip(), self.belief.simulator
-        proximal = np.array([[wires.inserted_length[self._best], wires.rotation[self._best]]])
+        proximal = wires.proximal[self._best, :1]
         ends = np.array([[tip.abscissa[0], tip.offset[0]]])
         return proximal, ends, self.belief.tip_spread()[None], tip.radius
 
@@ -189,11 +189,11 @@ class CoaxialAgent:
         """Go to the next place of the course; X-ray shows where each waypoint's end has led."""
         course, at = self._course, self._at
         assert course is not None
-        wanted = course.proximal[at] - [self._ostium, 0.0, self._ostium, 0.0]
-        now = np.array([(observation.inserted_length, observation.rotation), *observation.catheters]).ravel()
-        wire, turn, catheter, other = ((wanted - now) / DECISION_PERIOD_S).tolist()
+        wanted = course.proximal[at] - [self._ostium, 0.0]
+        now = np.array([(observation.inserted_length, observation.rotation), *observation.catheters])
+        wire, catheter = ((wanted - now) / DECISION_PERIOD_S).tolist()
         self._at += 1
-        return Decision(wire, turn, expose=expose or bool(course.settled[at]), catheters=((catheter, other),))
+        return Decision(*wire, expose=expose or bool(course.settled[at]), catheters=(tuple(catheter),))
 
     def _creep(self) -> Decision:
         """Move what is to arrive a little ahead and back, with X-ray on; then search again."""

@@ -125,10 +125,9 @@ class Track:
 
     def moved(self, simulator: Simulator, peak_n: float) -> None:
         """Take where the devices are at the end of a period, and the largest wall force in it, N."""
-        self._columns["inserted"].append(np.append(simulator.inserted_length, simulator.catheter_inserted_length))
-        self._columns["turned"].append(np.append(simulator.rotation, simulator.catheter_rotation))
-        devices = 1 + simulator.catheter_inserted_length.shape[1]
-        self._columns["position"].append([simulator.tips(k)[0] for k in range(devices)])
+        self._columns["inserted"].append(simulator.inserted_length[0])
+        self._columns["turned"].append(simulator.rotation[0])
+        self._columns["position"].append(simulator.tip_position[0])
         self._columns["force"].append(peak_n)
 
     def record(self, navigation: Navigation, driven: list[np.ndarray], reason: str, gives_up: str) -> NavigationRecord:

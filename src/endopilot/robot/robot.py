@@ -208,7 +208,7 @@ class SimulatedRobot:
             inserted = self.proximal[:, 0]
             for k, travel_mm in enumerate(self._travel_mm):
                 control[2 * k] = within_travel(control[2 * k], inserted[k], period, travel_mm=travel_mm)
-            self.last_step = step = self._simulator.step(control[None], period)
+            self.last_step = step = self._simulator.step(control.reshape(1, -1, 2), period)
             self.driven.append(control)
             for drive, place in zip(self._drives, self._encoders(), strict=True):
                 drive.position = place
@@ -218,9 +218,7 @@ class SimulatedRobot:
     @property
     def proximal(self) -> Float[np.ndarray, "devices 2"]:
         """Inserted length, mm, and rotation, rad, of each device as they truly are."""
-        simulator = self._simulator
-        inserted = np.append(simulator.inserted_length, simulator.catheter_inserted_length)
-        return np.column_stack([inserted, np.append(simulator.rotation, simulator.catheter_rotation)])
+        return self._simulator.proximal[0]
 
     def _encoders(self) -> Float[np.ndarray, "devices 2"]:
         """Return what the encoders read without noise: they count from where the ostium is assumed."""

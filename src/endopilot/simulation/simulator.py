@@ -251,6 +251,7 @@ class Simulator(Readout):
         result = self._run_all(command, period_s / steps, steps, record_shape=record_shape, advance=advance)
         tips = [group.project(each) for group, each in self._of_groups(result["tip_position"])]
         names = TipProjection.__dataclass_fields__
+        recorded: dict[str, Any] = {name: result[name] for name in Step.__dataclass_fields__}
         times = began_s[:, None] + period_s * np.arange(1, command.shape[1] + 1)
         return Trajectory(
             set_up=set_up,
@@ -261,7 +262,7 @@ class Simulator(Readout):
             reason=self.reason,
             shape=result.get("shape"),
             vessel_to_laboratory=None if self._set_up.motion is None else self._placements(times),
-            **{name: result[name] for name in Step.__dataclass_fields__},
+            **recorded,
         )
 
     @property
@@ -335,6 +336,16 @@ class Simulator(Readout):
         for group, state in zip(self._groups, states, strict=True):
             group.simulation.set_state(state)
         self._set_up = replace(self._set_up, initial=np.full_like(self._set_up.initial, np.nan))
+
+    @property
+    def set_up(self) -> SetUp:
+        """What the worlds are simulated with, and where they started.
+
+        Example:
+            >>> simulator.set_up.initial.shape
+            (4, 1, 2)
+        """
+        return self._set_up
 
     @property
     def config(self) -> SimulatorConfig:

@@ -189,9 +189,8 @@ def _arrays(trajectory: Trajectory) -> dict[str, np.ndarray]:
 
 def _about(trajectory: Trajectory, arrays: Mapping[str, np.ndarray]) -> str:
     """Return what the arrays mean and what they were simulated with, as JSON."""
-    set_up, recorded = trajectory.set_up, {name: rest for name, *rest in _core.OUTPUTS}
-    meaning = dict(_MEANING)
-    for name, (of, numbers, unit, words, *_) in recorded.items():
+    set_up, meaning = trajectory.set_up, dict(_MEANING)
+    for name, of, numbers, unit, words in _core.OUTPUTS:
         if name in arrays and name not in meaning:
             meaning[name] = (_AXES[of] + (f" {numbers}" if numbers > 1 else ""), unit, words)
     stacks = list({id(stack): stack for stack in set_up.stacks}.values())

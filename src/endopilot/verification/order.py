@@ -100,7 +100,7 @@ def navigation_error() -> Float[np.ndarray, "steps"]:
         rollout = simulate(anatomy, device, control, initial=initial, config=config)
         if not rollout.valid.all():
             raise RuntimeError("a navigation of the verification did not converge")
-        return rollout.tip_position
+        return rollout.tip_position[:, :, 0]
 
     finest = tips(NAVIGATION_FINEST_S)
     return np.array([np.linalg.norm(tips(step) - finest, axis=-1).mean() for step in NAVIGATION_STEPS_S])
