@@ -65,6 +65,26 @@ def check_memory(needed: int, what: str, mend: str) -> None:
         raise InputError(f"{what} need {needed / 2**30:.1f} GiB of {available / 2**30:.1f}; {mend}")
 
 
+def with_device_axis(name: str, array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return an array with its axis of devices, which may be left out where a wire is alone.
+
+    Args:
+        name: of the array, as a message begins.
+        array: as it was given.
+        shape: that it must have; the axis of devices is the second where there are two, else the last but one.
+
+    Raises:
+        InputError: it has another shape.
+    """
+    axis = 1 if len(shape) == 2 else len(shape) - 2
+    without = shape[:axis] + shape[axis + 1 :]
+    if shape[axis] == 1 and array.shape == without:
+        return np.expand_dims(array, axis)
+    if array.shape != shape:
+        raise InputError(f"{name}: shape {array.shape}; give {without if shape[axis] == 1 else shape}")
+    return array
+
+
 def check_control(
     control: Float[np.ndarray, "worlds samples devices 2"],
     largest: Float[np.ndarray, "worlds devices 2"],

@@ -12,7 +12,7 @@ from endopilot.devices.device import Device
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError, Remark
 from endopilot.progress import progress
-from endopilot.simulation.checks import check_memory
+from endopilot.simulation.checks import check_memory, with_device_axis
 from endopilot.simulation.config import Actuation, SimulatorConfig
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulator import Simulator
@@ -84,14 +84,20 @@ def simulate(
     """
     stack = Stack.of(device)
     if control.ndim not in (3, 4) or 0 in control.shape:
-        raise InputError(f"control: shape {control.shape}; give (worlds, samples, {len(stack)}, 2), in mm/s and rad/s")
-    worlds = len(control)
-    own = np.array([each.friction for each in stack.devices])
+        raise InputError(
+            f"control: shape {control.shape}; give (worlds, samples, {len(stack)}, 2), at least one of one"
+        )
+    worlds, samples = control.shape[:2]
+    control = with_device_axis("control", control, (worlds, samples, len(stack), 2))
+    if initial is None:
+        initial = np.zeros((worlds, len(stack), 2))
+    if friction is None:
+        friction = np.tile([each.friction for each in stack.devices], (worlds, 1))
     set_up = SetUp(
         anatomies=[anatomy] * worlds,
         stacks=[stack] * worlds,
-        initial=np.zeros((worlds, len(stack), 2)) if initial is None else np.asarray(initial, dtype=float),
-        friction=np.tile(own, (worlds, 1)) if friction is None else np.asarray(friction, dtype=float),
+        initial=with_device_axis("initial", np.asarray(initial, dtype=float), (worlds, len(stack), 2)),
+        friction=with_device_axis("friction", np.asarray(friction, dtype=float), (worlds, len(stack))),
         actuation=actuation,
         motion=motion,
         config=config or SimulatorConfig(),
@@ -102,12 +108,12 @@ def simulate(
 
 
 def run_set_up(
-    set_up: SetUp, command: Float[np.ndarray, "worlds samples *devices 2"], *, period_s: float, record_shape: bool
+    set_up: SetUp, command: Float[np.ndarray, "worlds samples devices 2"], *, period_s: float, record_shape: bool
 ) -> Trajectory:
     """Drive worlds from their start with a sequence of commands each, as long as it may take.
 
     Args:
-        set_up: what is simulated; its arrays may leave out the axis of devices where a wire is alone.
+        set_up: what is simulated.
         command: mm/s and rad/s, or N and N·mm, of each world, sample and device.
         period_s: time that each holds, s.
         record_shape: record the positions of all nodes too.

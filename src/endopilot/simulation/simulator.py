@@ -21,7 +21,7 @@ from endopilot.devices.device import Device
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.progress import Advance
-from endopilot.simulation.checks import ROUNDING_MM, check_control, check_memory, check_travel
+from endopilot.simulation.checks import ROUNDING_MM, check_control, check_memory, check_travel, with_device_axis
 from endopilot.simulation.config import FREE_BEHIND_MM, LANES, Actuation, SimulatorConfig
 from endopilot.simulation.groups import Group, group_key, make_groups
 from endopilot.simulation.motion import Motion
@@ -374,7 +374,7 @@ class Simulator(Readout):
             array = np.from_dlpack(array)
         array = np.asarray(array, dtype=float)
         samples = array.shape[1:2] if sequence else ()
-        array = self._with_devices("control", array, (self.worlds, *samples, self._devices, 2))
+        array = with_device_axis("control", array, (self.worlds, *samples, self._devices, 2))
         array = np.ascontiguousarray(array if sequence else array[:, None])
         check_control(array, self._largest, self._set_up.stacks, self._set_up.actuation)
         if self._set_up.actuation == "velocity":
@@ -438,20 +438,10 @@ class Simulator(Readout):
             )
 
     def _of_devices_given(self, name: str, values: ArrayLike) -> Float[np.ndarray, "worlds devices"]:
-        array = self._with_devices(name, np.asarray(values, dtype=float), (self.worlds, self._devices))
+        array = with_device_axis(name, np.asarray(values, dtype=float), (self.worlds, self._devices))
         if not np.isfinite(array).all():
             world = int(np.argwhere(~np.isfinite(array))[0][0])
             raise InputError(f"{name}: world {world}: not a finite number; correct it")
-        return array
-
-    def _with_devices(self, name: str, array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-        """Return an array with its axis of devices, which may be left out where a wire is alone."""
-        axis = 1 if len(shape) == 2 else len(shape) - 2
-        without = shape[:axis] + shape[axis + 1 :]
-        if self._devices == 1 and array.shape == without:
-            return np.expand_dims(array, axis)
-        if array.shape != shape:
-            raise InputError(f"{name}: shape {array.shape}; give {without if self._devices == 1 else shape}")
         return array
 
     @cached_property
