@@ -92,7 +92,7 @@ gpu-figures: $(INSTALLED)
 roofline:
 	mkdir -p build
 	$(CXX) -std=gnu++20 -O3 -march=native -fno-math-errno -fno-trapping-math -fno-tree-pre -Wno-psabi \
-	  -I src/core benchmarks/roofline.cpp -o build/roofline
+	  -I src/core benchmarks/core/roofline.cpp -o build/roofline
 	build/roofline
 
 # The build that `endopilot bench simulation` compares its speed with, from the repository's history.

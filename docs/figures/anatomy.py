@@ -10,9 +10,11 @@ import json
 import sys
 from pathlib import Path
 
+sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
+
+from benchmarks.anatomy.extraction import bench_anatomy
 from endopilot.anatomy.anatomy_picture import draw_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.benchmarks.anatomy import bench_anatomy
 
 DOCS = Path(__file__).parents[1]
 PAGE = DOCS / "anatomy.md"

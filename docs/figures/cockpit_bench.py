@@ -14,7 +14,9 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from endopilot.benchmarks.cockpit import BARS
+sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
+
+from benchmarks.cockpit import BARS
 from endopilot.files import processor_name
 
 ROOT = Path(__file__).parents[2]

@@ -9,8 +9,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from endopilot.benchmarks.imaging import BARS, ImagingBenchConfig, bench_imaging
-from endopilot.benchmarks.imaging_cases import DIFFICULTIES
+sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
+
+from benchmarks.imaging.cases import DIFFICULTIES
+from benchmarks.imaging.segmentation import BARS, ImagingBenchConfig, bench_imaging
 
 PAGE = Path(__file__).parents[1] / "imaging.md"
 TITLES = {

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
 
-from endopilot.benchmarks.straightening import WIRES_GPA, draw_path, stiff_wire, straighten
+sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
+
+from benchmarks.published.straightening import WIRES_GPA, draw_path, stiff_wire, straighten
 from endopilot.plotting import BLACK, GREEN, GREY, ORANGE, SKY, STYLE, VERMILLION
 
 mpl.use("Agg")

@@ -7,8 +7,8 @@ from functools import partial
 
 import pytest
 
+from benchmarks.core import beside, coaxial, scenes
 from endopilot import cli
-from endopilot.benchmarks import beside, coaxial, scenes
 from endopilot.devices.catheter import read_catheter
 
 

@@ -8,11 +8,11 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
+from benchmarks.imaging import segmentation as imaging_bench
+from benchmarks.imaging.cases import DIFFICULTIES, draw_case
+from benchmarks.imaging.segmentation import BARS, ImagingBenchConfig, bench_imaging
 from endopilot import runs
 from endopilot.atlas.atlas import make_patient
-from endopilot.benchmarks import imaging as imaging_bench
-from endopilot.benchmarks.imaging import BARS, ImagingBenchConfig, bench_imaging
-from endopilot.benchmarks.imaging_cases import DIFFICULTIES, draw_case
 from endopilot.errors import InputError
 from endopilot.imaging.overlap import mask_like
 from endopilot.runs import claim

@@ -7,8 +7,8 @@ from functools import partial
 
 import pytest
 
+from benchmarks.core import beside, motion, scenes
 from endopilot import cli
-from endopilot.benchmarks import beside, motion, scenes
 
 
 def test_the_figures_belong_together(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

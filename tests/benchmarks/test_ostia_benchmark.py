@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from endopilot.benchmarks.ostia import bench_ostia, judged
+from benchmarks.anatomy.ostia import bench_ostia, judged
 from endopilot.errors import InputError
 from endopilot.imaging.volume import write_volume
 from toy_coronaries import artery, mask_of_arteries

@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from endopilot import cli
-from endopilot.benchmarks import published, tubing
-from endopilot.benchmarks.published import (
+from benchmarks.published import published, tubing
+from benchmarks.published.published import (
     Comparison,
     PublishedConfig,
     bending,
@@ -21,9 +20,10 @@ from endopilot.benchmarks.published import (
     tip_loads,
     unreinforced,
 )
-from endopilot.benchmarks.straightening import AortoIliac, Straightened
-from endopilot.benchmarks.three_point import flexural_modulus
-from endopilot.benchmarks.tubing import BORE_MM, LENGTH_MM, Push, draw_tubing, push_through
+from benchmarks.published.straightening import AortoIliac, Straightened
+from benchmarks.published.three_point import flexural_modulus
+from benchmarks.published.tubing import BORE_MM, LENGTH_MM, Push, draw_tubing, push_through
+from endopilot import cli
 from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import read_device
 from endopilot.simulation.config import PRESETS

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 import endopilot
+from benchmarks.core.errors import error_figures, error_intervals
+from benchmarks.core.reference import REFERENCE_FILE, check_reference, make_reference, read_reference
+from benchmarks.core.scenes import KINDS, Solution, make_scenes
+from benchmarks.core.simulation import bench_simulation
 from endopilot import cli
-from endopilot.benchmarks.errors import error_figures, error_intervals
-from endopilot.benchmarks.reference import REFERENCE_FILE, check_reference, make_reference, read_reference
-from endopilot.benchmarks.scenes import KINDS, Solution, make_scenes
-from endopilot.benchmarks.simulation import bench_simulation
 from endopilot.errors import InputError
 from endopilot.simulation.config import PRESETS, SimulatorConfig
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from command import run
 
+from benchmarks.core import robustness
 from endopilot import runs
-from endopilot.benchmarks import robustness
 from endopilot.ladder import mismatch
 
 LADDER = ("ladder", "--mismatch", "0.2", "--policy", "forward", "--tasks", "straight", "--patients", "1")

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from endopilot.benchmarks import training
+from benchmarks import training
 from endopilot.errors import InputError
 from endopilot.files import read_json
 from endopilot.models.checkpoint import read_tensors

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import endopilot
+from benchmarks.core.manoeuvres import paired_controls, seed_of
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.benchmarks.manoeuvres import paired_controls, seed_of
 from endopilot.devices.catheter import Catheter, list_catheters, read_catheter
 from endopilot.devices.device import read_device
 from endopilot.devices.stack import Stack, lines_from_tips

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.verification import contact, engine, motion, order, stability, tube, tubes, verify
 from endopilot.cli import verify as command
-from endopilot.verification import contact, engine, free_rod, motion, order, stability, tube, tubes, verify
+from endopilot.verification import free_rod
 from endopilot.verification.case import Case, compare
 
 KEYS = ["case", "reference", "value", "error", "bar", "passed"]

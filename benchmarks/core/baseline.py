@@ -15,7 +15,7 @@ from typing import Any
 
 from endopilot.errors import InputError
 
-BASELINE_FOLDER = Path(__file__).parents[3] / "build" / "core-baseline"
+BASELINE_FOLDER = Path(__file__).parents[2] / "build" / "core-baseline"
 """Where `make core-baseline` puts the build, in a checkout."""
 _WORKER = Path(__file__).with_name("baseline_worker.py")
 

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from benchmarks.verification.contact import bent_tube
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.core import make_lumen
 from endopilot.types import Insertion
 from endopilot.verification.case import Case, Curve, Loading, Picture, compare, equilibrium, straight_rod
-from endopilot.verification.contact import bent_tube
 
 BAR = 0.02
 MISSING = "MuJoCo is not installed; pip install mujoco-core"

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from endopilot.benchmarks.beside import bench_beside, error_in_time, fine_steps
-from endopilot.benchmarks.scenes import SAMPLES, WORLDS, make_scenes
+from benchmarks.core.beside import bench_beside, error_in_time, fine_steps
+from benchmarks.core.scenes import SAMPLES, WORLDS, make_scenes
 from endopilot.simulation.config import Preset, SimulatorConfig
 from endopilot.simulation.motion import Motion
 from endopilot.types import Rollout

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.benchmarks.reference import CONVERGED
+from benchmarks.core.reference import CONVERGED
 from endopilot.env.vector import CONTROL_PERIOD_S, ROTATION_RAD_S, TRANSLATION_MM_S, NavigateVectorEnv
 from endopilot.files import processor_name
 from endopilot.simulation.config import SimulatorConfig

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float, Int
 
-from endopilot.benchmarks.scenes import Solution
+from benchmarks.core.scenes import Solution
 
 _INTERVAL = (5.0, 95.0)
 """Percentiles of the resampled figures: a 90 % interval."""

@@ -224,7 +224,7 @@ def main() -> None:
         if given.tasks and task.name not in given.tasks:
             continue
         path = (
-            Path(__file__).parents[1] / "src" / "endopilot" / "tasks" / f"ladder_{task.version}" / f"{task.name}.yaml"
+            Path(__file__).parents[2] / "src" / "endopilot" / "tasks" / f"ladder_{task.version}" / f"{task.name}.yaml"
         )
         text = path.read_text(encoding="utf-8")
         search = task.version != 1 or task.level >= 5

@@ -28,7 +28,7 @@ from endopilot.simulation.mismatch import drawn_sides, mismatch_by
 from endopilot.simulation.motion import Motion, motion_named
 from endopilot.tasks.task import CORE, NEWEST, find_task, ladder_tasks
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 FOLDER, PAGE = Path("runs/xray-conditions"), ROOT / "docs" / "xray.md"
 BEGIN, END = "<!-- conditions:begin -->\n", "<!-- conditions:end -->"
 CONDITIONS: dict[str, tuple[str, XrayKind, bool, bool]] = {

@@ -37,7 +37,7 @@ from endopilot.simulation.motion import Motion, motion_named
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.tasks.task import CORE, NEWEST, LadderVersion, Task, find_task, ladder_tasks
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 RUNS = ROOT / "runs"
 LEVEL, EXPOSED_EVERY, SECONDS = 0.9, 20, 30.0
 """Share of the intervals that the bands shall cover; periods of 0.5 s between exposures; seconds of a navigation."""

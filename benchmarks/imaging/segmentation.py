@@ -16,10 +16,10 @@ import endopilot.atlas
 import endopilot.evaluation
 import endopilot.imaging
 import endopilot.phantom
+from benchmarks.imaging.cases import Difficulty, draw_case
 from endopilot import __version__
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.atlas.atlas import make_patient
-from endopilot.benchmarks.imaging_cases import Difficulty, draw_case
 from endopilot.errors import InputError
 from endopilot.evaluation.anatomy_score import score_anatomy
 from endopilot.files import manifest, read_json, write_json

@@ -1,4 +1,4 @@
-"""`endopilot bench SUBJECT`: benchmarks, one function for each subject.
+"""`python -m benchmarks SUBJECT`: benchmarks, one function for each subject.
 
 Where figures have bars, the command leaves with exit code 1 if a figure does not meet its bar.
 """
@@ -10,20 +10,21 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import tyro
 from tyro.conf import Positional
 
+from benchmarks.core.robustness import RobustnessConfig
+from benchmarks.imaging.cases import Difficulty
+from benchmarks.imaging.xray import XrayBenchConfig
+from benchmarks.published.published import PublishedConfig
 from endopilot.atlas.atlas import AtlasConfig
-from endopilot.benchmarks.imaging_cases import Difficulty
-from endopilot.benchmarks.published import PublishedConfig
-from endopilot.benchmarks.robustness import RobustnessConfig
-from endopilot.benchmarks.xray import XrayBenchConfig
 from endopilot.cli.arguments import OutputFolder, existing, show, show_rows
 from endopilot.errors import InputError
 from endopilot.settings import Count, Seed, Within
 from endopilot.simulation.config import Preset
 from endopilot.simulation.motion import MotionName, motion_named
 
-EXIT_FAILED = 1
+EXIT_FAILED, EXIT_BAD_INPUT = 1, 2
 AboveZero = Annotated[float, Within(0, 1, above_low=True)]
 
 
@@ -48,12 +49,12 @@ def simulation(
         reference: file of the converged solution; the shipped one if not given.
         json: print the figures as JSON.
     """
-    from endopilot.benchmarks.coaxial import bench_coaxial
-    from endopilot.benchmarks.gpu import bench_gpu
-    from endopilot.benchmarks.motion import bench_motion
-    from endopilot.benchmarks.reference import REFERENCE_FILE
-    from endopilot.benchmarks.reference import make_reference as make
-    from endopilot.benchmarks.simulation import bench_simulation
+    from benchmarks.core.coaxial import bench_coaxial
+    from benchmarks.core.gpu import bench_gpu
+    from benchmarks.core.motion import bench_motion
+    from benchmarks.core.reference import REFERENCE_FILE
+    from benchmarks.core.reference import make_reference as make
+    from benchmarks.core.simulation import bench_simulation
     from endopilot.devices.catheter import read_catheter
 
     moves = motion_named(motion)
@@ -93,7 +94,7 @@ def scaling(*, json: bool = False) -> None:
     Args:
         json: print the figures as JSON.
     """
-    from endopilot.benchmarks.simulation import bench_scaling
+    from benchmarks.core.simulation import bench_scaling
 
     show_rows(bench_scaling(), as_json=json)
 
@@ -107,7 +108,7 @@ def robustness(*, json: bool = False, config: RobustnessConfig = RobustnessConfi
         json: print the figures as JSON.
         config: which rollouts.
     """
-    from endopilot.benchmarks.robustness import measure_robustness
+    from benchmarks.core.robustness import measure_robustness
 
     measured = measure_robustness(config)
     if json:
@@ -124,7 +125,7 @@ def published(*, json: bool = False, config: PublishedConfig = PublishedConfig()
         json: print the figures as JSON.
         config: how often what the articles do not state is drawn.
     """
-    from endopilot.benchmarks.published import bench_published
+    from benchmarks.published.published import bench_published
 
     show_rows(bench_published(config), as_json=json)
 
@@ -135,7 +136,7 @@ def env(*, json: bool = False) -> None:
     Args:
         json: print the figures as JSON.
     """
-    from endopilot.benchmarks.env import bench_env
+    from benchmarks.core.env import bench_env
 
     show(bench_env(), as_json=json)
 
@@ -148,7 +149,7 @@ def dataset(*, output: OutputFolder = Path("runs/bench-dataset"), share: AboveZe
         share: share of the paper's set, above 0, at most 1.
         json: print the figures as JSON.
     """
-    from endopilot.benchmarks.dataset import bench_dataset
+    from benchmarks.dataset import bench_dataset
 
     show(bench_dataset(output, share=share), as_json=json)
 
@@ -160,7 +161,7 @@ def training(*, folder: Path = Path("runs/bench-training"), json: bool = False) 
         folder: folder of the patient and of the navigations to train on.
         json: print the figures as JSON.
     """
-    from endopilot.benchmarks.training import bench_training
+    from benchmarks.training import bench_training
 
     rows = bench_training(folder)
     show_rows(rows, as_json=json)
@@ -175,7 +176,7 @@ def labels(*, count: Count = 40, seed: Seed = 0, json: bool = False) -> None:
         seed: seed of the atlas.
         json: print the figures as JSON.
     """
-    from endopilot.benchmarks.labels import measure_labels
+    from benchmarks.anatomy.labels import measure_labels
 
     rows = measure_labels(count=count, seed=seed)
     show_rows(rows, as_json=json)
@@ -201,12 +202,12 @@ def anatomy(
         json: print the figures as JSON.
     """
     if compare:
-        from endopilot.benchmarks.anatomy_compare import compare_with_atlas
+        from benchmarks.anatomy.compare import compare_with_atlas
 
         rows = compare_with_atlas([existing(folder) for folder in compare], atlas)
         show_rows(rows if json else [_compared(row) for row in rows], as_json=json)
         return
-    from endopilot.benchmarks.anatomy import bench_anatomy
+    from benchmarks.anatomy.extraction import bench_anatomy
 
     rows = bench_anatomy(None if centerlines is None else existing(centerlines))
     show_rows(rows, as_json=json)
@@ -234,7 +235,7 @@ def ostia(folder: Positional[Path], /, *, json: bool = False) -> None:
             (rca, lca) `near_aorta_mm`, LPS mm.
         json: print the figures as JSON.
     """
-    from endopilot.benchmarks.ostia import bench_ostia, judged
+    from benchmarks.anatomy.ostia import bench_ostia, judged
 
     rows = bench_ostia(existing(folder))
     figures = judged(rows)
@@ -265,7 +266,7 @@ def imaging(
         folder: folder of the results, one for each difficulty; an interrupted run goes on where it stopped.
         json: print the figures as JSON.
     """
-    from endopilot.benchmarks.imaging import BARS, ImagingBenchConfig, bench_imaging
+    from benchmarks.imaging.segmentation import BARS, ImagingBenchConfig, bench_imaging
 
     measured = bench_imaging(ImagingBenchConfig(cases=cases, seed=seed, difficulty=difficulty, folder=folder))
     if json:
@@ -283,7 +284,7 @@ def cockpit(*, catheter: str | None = None, json: bool = False) -> None:
         catheter: around the wire (a name or a YAML file); both are driven at once.
         json: print the figures as JSON.
     """
-    from endopilot.benchmarks.cockpit import BARS, bench_cockpit
+    from benchmarks.cockpit import BARS, bench_cockpit
 
     measured = bench_cockpit(catheter)
     if json:
@@ -304,7 +305,7 @@ def xray(*, json: bool = False, config: XrayBenchConfig = XrayBenchConfig()) -> 
         json: print the figures as JSON.
         config: patients and images.
     """
-    from endopilot.benchmarks.xray import BARS, bench_xray
+    from benchmarks.imaging.xray import BARS, bench_xray
 
     measured = bench_xray(config)
     if json:
@@ -372,3 +373,18 @@ def _show_robustness(measured: dict[str, Any]) -> None:
     show_rows([{"group": name} | row for group in groups for name, row in measured[group].items()], as_json=False)
     rest = {name: value for name, value in measured.items() if name not in ("figures", *groups) and value}
     show(rest, as_json=False)
+
+
+def main() -> None:
+    """Run the subject that the arguments name."""
+    try:
+        tyro.extras.subcommand_cli_from_dict(
+            SUBJECTS, prog="python -m benchmarks", config=(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes)
+        )
+    except InputError as error:
+        print(f"python -m benchmarks: {error}", file=sys.stderr)
+        sys.exit(EXIT_BAD_INPUT)
+
+
+if __name__ == "__main__":  # worker processes import this module too
+    main()

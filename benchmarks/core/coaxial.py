@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.benchmarks.beside import bench_beside, error_in_time, fine_steps, node_iterations_per_second
-from endopilot.benchmarks.scenes import SAMPLES, SEED, WORLDS, Scene, make_scenes
+from benchmarks.core.beside import bench_beside, error_in_time, fine_steps, node_iterations_per_second
+from benchmarks.core.scenes import SAMPLES, SEED, WORLDS, Scene, make_scenes
 from endopilot.devices.catheter import Catheter
 from endopilot.devices.stack import Stack
 from endopilot.simulation.config import PRESETS, Preset, SimulatorConfig, wall_stiffness

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.core.baseline import BASELINE_FOLDER, Baseline
+from benchmarks.core.beside import node_iterations_per_second
+from benchmarks.core.errors import error_figures, error_intervals
+from benchmarks.core.reference import REFERENCE_FILE, check_reference, read_reference
+from benchmarks.core.scenes import DEVICE, KINDS, SEED, Scene, Solution, make_scenes
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.benchmarks.baseline import BASELINE_FOLDER, Baseline
-from endopilot.benchmarks.beside import node_iterations_per_second
-from endopilot.benchmarks.errors import error_figures, error_intervals
-from endopilot.benchmarks.reference import REFERENCE_FILE, check_reference, read_reference
-from endopilot.benchmarks.scenes import DEVICE, KINDS, SEED, Scene, Solution, make_scenes
 from endopilot.devices.device import read_device
 from endopilot.simulation.config import PRESETS, Preset, SimulatorConfig, wall_stiffness
 from endopilot.simulation.simulator import Simulator

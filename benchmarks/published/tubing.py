@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.benchmarks.analytic_lumens import tree_of
+from benchmarks.anatomy.analytic_lumens import tree_of
 from endopilot.devices.catheter import Catheter
 from endopilot.devices.device import Device
 from endopilot.simulation.config import SimulatorConfig

@@ -14,12 +14,12 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
+from benchmarks.anatomy import analytic_lumens as analytic
 from endopilot.anatomy.distance import BAND_MM, distance_map_from_mask, distance_map_from_spheres, sample
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy, read_source
 from endopilot.anatomy.io import write_anatomy
 from endopilot.anatomy.projection import project_tip
 from endopilot.anatomy.tree import sampled
-from endopilot.benchmarks import analytic_lumens as analytic
 from endopilot.errors import InputError
 from endopilot.evaluation.anatomy_score import compare_trees
 from endopilot.progress import progress

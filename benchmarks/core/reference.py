@@ -16,8 +16,8 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from endopilot.benchmarks.errors import error_figures
-from endopilot.benchmarks.scenes import DEVICE, SAMPLES, SEED, WORLDS, Scene, Solution, make_scenes
+from benchmarks.core.errors import error_figures
+from benchmarks.core.scenes import DEVICE, SAMPLES, SEED, WORLDS, Scene, Solution, make_scenes
 from endopilot.devices.device import Device
 from endopilot.errors import InputError
 from endopilot.files import json_text, manifest, writing

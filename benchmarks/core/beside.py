@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.benchmarks.scenes import Scene
+from benchmarks.core.scenes import Scene
 from endopilot.simulation.config import PRESETS, Preset, SimulatorConfig
 from endopilot.types import SAMPLE_PERIOD_S, Rollout
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import wasserstein_distance
 
+from benchmarks.anatomy.vessel_shape import vessel_shape
 from endopilot.anatomy.io import read_anatomy
 from endopilot.anatomy.labels_tree import (
     ARCH_SECTIONS,
@@ -20,7 +21,6 @@ from endopilot.anatomy.labels_tree import (
     RCA_SECTIONS,
 )
 from endopilot.atlas.atlas import AtlasConfig, make_atlas
-from endopilot.benchmarks.vessel_shape import vessel_shape
 from endopilot.errors import InputError
 from endopilot.progress import progress
 from endopilot.types import Anatomy

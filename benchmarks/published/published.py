@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from endopilot.benchmarks.straightening import (
+from benchmarks.published.straightening import (
     STIFFENS_OVER_MM,
     TISSUE_MPA,
     TORTUOSITY,
@@ -24,8 +24,8 @@ from endopilot.benchmarks.straightening import (
     straighten,
     tortuosity_index,
 )
-from endopilot.benchmarks.three_point import SPAN_MM, flexural_modulus
-from endopilot.benchmarks.tubing import BORE_MM, LENGTH_MM, draw_tubing, push_through
+from benchmarks.published.three_point import SPAN_MM, flexural_modulus
+from benchmarks.published.tubing import BORE_MM, LENGTH_MM, draw_tubing, push_through
 from endopilot.devices.catheter import Catheter, read_catheter
 from endopilot.devices.device import Device, read_device
 from endopilot.devices.device_files import list_devices

@@ -8,6 +8,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from benchmarks.verification.contact import bent_tube
+from benchmarks.verification.order import order_case
 from endopilot import _core
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.devices.device import read_device
@@ -18,9 +20,7 @@ from endopilot.simulation.rod import RodLayout
 from endopilot.simulation.simulate import simulate
 from endopilot.types import Insertion
 from endopilot.verification.case import Case, Curve, Picture, compare
-from endopilot.verification.contact import bent_tube
 from endopilot.verification.free_rod import rod_energy
-from endopilot.verification.order import order_case
 
 PERIOD_S = 1.0
 """Period of the tube's motion, s."""

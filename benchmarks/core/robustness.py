@@ -21,11 +21,11 @@ from typing import Annotated, Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from benchmarks.core.manoeuvres import MANOEUVRES, name_of, paired_controls, seed_of, stacks_of
 from endopilot import __version__, _core
 from endopilot.anatomy.io import read_anatomy
 from endopilot.anatomy.projection import project_tip
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.benchmarks.manoeuvres import MANOEUVRES, name_of, paired_controls, seed_of, stacks_of
 from endopilot.devices.catheter import list_catheters, read_catheter
 from endopilot.devices.device import read_device
 from endopilot.devices.device_files import list_devices
