@@ -1,389 +1,129 @@
-"""`python -m benchmarks SUBJECT`: benchmarks, one function for each subject.
+"""`python -m benchmarks NAME [options]`: what the rod core and every stage are measured by, one function each.
 
-Where figures have bars, the command leaves with exit code 1 if a figure does not meet its bar.
+The arguments of the function are the options. It returns its figures, which are printed as tables, or with `--json` as
+JSON. Where figures have bars, the exit code is 1 if one does not meet its bar. With `--against CHECKOUT` the benchmark
+runs in turns in another checkout and in this one, and the figures of both stand side by side.
 """
 
 from __future__ import annotations
 
+import argparse
+import functools
+import importlib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
-import tyro
-from tyro.conf import Positional
-
-from benchmarks.core.robustness import RobustnessConfig
-from benchmarks.imaging.cases import Difficulty
-from benchmarks.imaging.xray import XrayBenchConfig
-from benchmarks.published.published import PublishedConfig
-from endopilot.atlas.atlas import AtlasConfig
-from endopilot.cli.arguments import OutputFolder, existing, show, show_rows
 from endopilot.errors import InputError
-from endopilot.settings import Count, Seed, Within
-from endopilot.simulation.config import Preset
-from endopilot.simulation.motion import MotionName, motion_named
+from endopilot.extras import what_is_missing
 
-EXIT_FAILED, EXIT_BAD_INPUT = 1, 2
-AboveZero = Annotated[float, Within(0, 1, above_low=True)]
-
-
-def simulation(
-    *,
-    preset: Preset = "default",
-    catheter: str | None = None,
-    motion: MotionName = "still",
-    device: Literal["cpu", "cuda"] = "cpu",
-    make_reference: bool = False,
-    reference: Path | None = None,
-    json: bool = False,
-) -> None:
-    """Measure the speed of the rod core, and the tip's error at that speed against a converged solution.
-
-    Args:
-        preset: settings of the rod core: default, fast or accurate.
-        catheter: measure the wire in this catheter (a name or a YAML file), beside the wire alone.
-        motion: measure the wire in patients that move (breathing, heartbeat or both), beside the same at rest.
-        device: measure the processor (cpu), or up to 100 000 wires on a GPU (cuda) and how closely the two agree.
-        make_reference: compute the converged solution anew instead, which takes a quarter of an hour.
-        reference: file of the converged solution; the shipped one if not given.
-        json: print the figures as JSON.
-    """
-    from benchmarks.core.coaxial import bench_coaxial
-    from benchmarks.core.gpu import bench_gpu
-    from benchmarks.core.motion import bench_motion
-    from benchmarks.core.reference import REFERENCE_FILE
-    from benchmarks.core.reference import make_reference as make
-    from benchmarks.core.simulation import bench_simulation
-    from endopilot.devices.catheter import read_catheter
-
-    moves = motion_named(motion)
-    if catheter is not None and moves is not None:
-        raise InputError("motion: with a catheter; measure one of the two")
-    if catheter is not None:
-        coaxial = bench_coaxial(read_catheter(catheter), preset)
-        show(coaxial, as_json=json)
-        _leave(coaxial["passed"])
-        return
-    if moves is not None:
-        moving = bench_motion(moves, preset)
-        show({"motion": motion, **moving}, as_json=json)
-        _leave(moving["passed"])
-        return
-    if device == "cuda":
-        rows = bench_gpu(preset)
-        show_rows(rows, as_json=json)
-        _leave(all(row["passed"] is not False for row in rows))
-        return
-    path = reference or REFERENCE_FILE
-    if make_reference:
-        show(make(path), as_json=json)
-        return
-    measured = bench_simulation(preset, reference=path)
-    if measured["speed_over_baseline"] is None:
-        print("speed_over_baseline is missing: `make core-baseline` builds what it compares with", file=sys.stderr)
-    if json:
-        show(measured, as_json=True)
-    else:
-        _show_simulation(measured)
-
-
-def scaling(*, json: bool = False) -> None:
-    """Measure how the rod core's cost grows with elements and worlds.
-
-    Args:
-        json: print the figures as JSON.
-    """
-    from benchmarks.core.simulation import bench_scaling
-
-    show_rows(bench_scaling(), as_json=json)
-
-
-def robustness(*, json: bool = False, config: RobustnessConfig = RobustnessConfig()) -> None:
-    """Drive every shipped device through many anatomies and beyond their ends, and count failures.
-
-    The anatomies are synthetic, or those given.
-
-    Args:
-        json: print the figures as JSON.
-        config: which rollouts.
-    """
-    from benchmarks.core.robustness import measure_robustness
-
-    measured = measure_robustness(config)
-    if json:
-        show(measured, as_json=True)
-    else:
-        _show_robustness(measured)
-    _leave(all(row["passed"] for row in measured["figures"]))
-
-
-def published(*, json: bool = False, config: PublishedConfig = PublishedConfig()) -> None:
-    """Simulate published bench tests of wires and catheters, and show our figures beside theirs.
-
-    Args:
-        json: print the figures as JSON.
-        config: how often what the articles do not state is drawn.
-    """
-    from benchmarks.published.published import bench_published
-
-    show_rows(bench_published(config), as_json=json)
-
-
-def env(*, json: bool = False) -> None:
-    """Measure the steps per second of the learning environments in the reference anatomy, and the tip's error.
-
-    Args:
-        json: print the figures as JSON.
-    """
-    from benchmarks.core.env import bench_env
-
-    show(bench_env(), as_json=json)
-
-
-def dataset(*, output: OutputFolder = Path("runs/bench-dataset"), share: AboveZero = 0.05, json: bool = False) -> None:
-    """Make a share of the paper's set of 100 000 navigations, and extrapolate time and size of all of it.
-
-    Args:
-        output: folder of this share; an interrupted run goes on where it stopped.
-        share: share of the paper's set, above 0, at most 1.
-        json: print the figures as JSON.
-    """
-    from benchmarks.dataset import bench_dataset
-
-    show(bench_dataset(output, share=share), as_json=json)
-
-
-def training(*, folder: Path = Path("runs/bench-training"), json: bool = False) -> None:
-    """Compare the speed of training on one core with a plain PyTorch loop over the same model and data.
-
-    Args:
-        folder: folder of the patient and of the navigations to train on.
-        json: print the figures as JSON.
-    """
-    from benchmarks.training import bench_training
-
-    rows = bench_training(folder)
-    show_rows(rows, as_json=json)
-    _leave(all(row["passed"] for row in rows))
-
-
-def labels(*, count: Count = 40, seed: Seed = 0, json: bool = False) -> None:
-    """Label the sections of synthetic patients of every kind, and compare with the truth.
-
-    Args:
-        count: patients of each kind.
-        seed: seed of the atlas.
-        json: print the figures as JSON.
-    """
-    from benchmarks.anatomy.labels import measure_labels
-
-    rows = measure_labels(count=count, seed=seed)
-    show_rows(rows, as_json=json)
-    _leave(all(row["passed"] for row in rows))
-
-
-def anatomy(
-    *,
-    centerlines: Path | None = None,
-    compare: tuple[Path, ...] = (),
-    atlas: AtlasConfig = AtlasConfig(count=40),
-    json: bool = False,
-) -> None:
-    """Extract lumens whose centerlines are known, and print each error beside its bar; or compare with the atlas.
-
-    With --compare it measures bends, forks, calibre and ostium of given anatomies beside the atlas instead: median and
-    5th to 95th percentile, and the distance of the two distributions in standard deviations (Wasserstein-1).
-
-    Args:
-        centerlines: folder with VMTK's rca_cl.vtp and lca_cl.vtp of a real patient; left out if not given.
-        compare: anatomies, or folders of anatomies, to compare with the atlas.
-        atlas: the patients to compare with; their kind is that of the given anatomies.
-        json: print the figures as JSON.
-    """
-    if compare:
-        from benchmarks.anatomy.compare import compare_with_atlas
-
-        rows = compare_with_atlas([existing(folder) for folder in compare], atlas)
-        show_rows(rows if json else [_compared(row) for row in rows], as_json=json)
-        return
-    from benchmarks.anatomy.extraction import bench_anatomy
-
-    rows = bench_anatomy(None if centerlines is None else existing(centerlines))
-    show_rows(rows, as_json=json)
-    _leave(all(row["passed"] is not False for row in rows))
-
-
-def _compared(row: dict[str, Any]) -> dict[str, Any]:
-    def spread(name: str) -> str:
-        middle, low, high = (row[key] for key in (name, f"{name}_p5", f"{name}_p95"))
-        return "-" if middle is None else f"{middle:g} [{low:g} to {high:g}], {row[f'{name}_count']}"
-
-    titles = {"given": "given: median [5-95 %], values", "atlas": "atlas: median [5-95 %], values"}
-    return (
-        {"kind": row["kind"], "quantity": row["quantity"]}
-        | {title: spread(name) for name, title in titles.items()}
-        | {"distance": row["distance"]}
-    )
-
-
-def ostia(folder: Positional[Path], /, *, json: bool = False) -> None:
-    """Find the coronary ostia of real patients' masks without an aorta, and compare with where they are known to be.
-
-    Args:
-        folder: masks named after patients, every label a coronary lumen, and ostia.json: for each patient and vessel
-            (rca, lca) `near_aorta_mm`, LPS mm.
-        json: print the figures as JSON.
-    """
-    from benchmarks.anatomy.ostia import bench_ostia, judged
-
-    rows = bench_ostia(existing(folder))
-    figures = judged(rows)
-    if json:
-        show({"arteries": rows, "figures": figures}, as_json=True)
-    else:
-        show_rows(rows, as_json=False)
-        show_rows(figures, as_json=False)
-    _leave(all(figure["passed"] for figure in figures))
-
-
-def imaging(
-    *,
-    cases: Count = 50,
-    seed: Seed = 0,
-    difficulty: Difficulty = "clean",
-    folder: Path = Path("runs/bench-imaging"),
-    json: bool = False,
-) -> None:
-    """Segment synthetic CT angiograms from the volume alone, and compare with the truth.
-
-    Args:
-        cases: number of CT angiograms.
-        seed: seed of the patients and their scans.
-        difficulty: clean, or what disturbs the same scans: slices (thick ones), motion, steps (between heart beats),
-            grain (of iterative reconstruction), blooming (of calcium), stents, leads (of a pacemaker), veins,
-            appendage (of the left atrium), graft (a bypass).
-        folder: folder of the results, one for each difficulty; an interrupted run goes on where it stopped.
-        json: print the figures as JSON.
-    """
-    from benchmarks.imaging.segmentation import BARS, ImagingBenchConfig, bench_imaging
-
-    measured = bench_imaging(ImagingBenchConfig(cases=cases, seed=seed, difficulty=difficulty, folder=folder))
-    if json:
-        show(measured, as_json=True)
-    else:
-        show_rows([{"figure": name} | measured[name] for name in BARS], as_json=False)
-        show({name: value for name, value in measured.items() if name not in BARS}, as_json=False)
-    _leave(all(measured[name]["met"] for name in BARS))
-
-
-def cockpit(*, catheter: str | None = None, json: bool = False) -> None:
-    """Measure the cockpit in a headless browser without a GPU: time in reserve, latency, frames per second, start.
-
-    Args:
-        catheter: around the wire (a name or a YAML file); both are driven at once.
-        json: print the figures as JSON.
-    """
-    from benchmarks.cockpit import BARS, bench_cockpit
-
-    measured = bench_cockpit(catheter)
-    if json:
-        show(measured, as_json=True)
-    else:
-        rows = [
-            {"figure": name, "value": measured[name], "bar": measured["bars"][name], "passed": measured["passed"][name]}
-            for name in BARS
-        ]
-        show_rows(rows, as_json=False)
-    _leave(all(measured["passed"].values()))
-
-
-def xray(*, json: bool = False, config: XrayBenchConfig = XrayBenchConfig()) -> None:
-    """Measure how fast X-ray images are made, and how well tips and poses are found in them, in new patients.
-
-    Args:
-        json: print the figures as JSON.
-        config: patients and images.
-    """
-    from benchmarks.imaging.xray import BARS, bench_xray
-
-    measured = bench_xray(config)
-    if json:
-        show(measured, as_json=True)
-    else:
-        rows = [
-            {"figure": name, "value": measured[name], "bar": measured["bars"][name], "passed": measured["passed"][name]}
-            for name in BARS
-        ]
-        show_rows(rows, as_json=False)
-        two = {name: value for name, value in measured.items() if name in measured["one_view"]}
-        show_rows(
-            [
-                {"group": name} | row
-                for name, row in ({"two views": two, "one view": measured["one_view"]} | measured["by"]).items()
-            ],
-            as_json=False,
-        )
-        show({"false_alarms_share": measured["false_alarms_share"]}, as_json=False)
-    _leave(all(measured["passed"].values()))
-
-
-SUBJECTS: dict[str, Callable[..., None]] = {
-    function.__name__: function
-    for function in (
-        simulation,
-        scaling,
-        robustness,
-        published,
-        env,
-        dataset,
-        training,
-        labels,
-        anatomy,
-        ostia,
-        imaging,
-        cockpit,
-        xray,
-    )
+BENCHMARKS = {
+    "simulation": "core.simulation:bench_simulation",
+    "scaling": "core.simulation:bench_scaling",
+    "env": "core.env:bench_env",
+    "robustness": "core.robustness:measure_robustness",
+    "verification": "verification.verification:bench_verification",
+    "published": "published.published:bench_published",
+    "dataset": "dataset:bench_dataset",
+    "cockpit": "cockpit:bench_cockpit",
+    "anatomy": "anatomy.extraction:bench_anatomy",
+    "labels": "anatomy.labels:measure_labels",
+    "ostia": "anatomy.ostia:bench_ostia",
+    "imaging": "imaging.segmentation:bench_imaging",
+    "xray": "imaging.xray:bench_xray",
+    "wire-evidence": "imaging.wire_evidence:train_evidence",
+    "agent-calibration": "agent.calibration:calibrate_agent",
+    "agent-replanning": "agent.replanning:compare_replanning",
+    "coronary-navigation": "agent.coronary_navigation:navigate_coronaries",
+    "ladder-patients": "agent.ladder_patients:choose_patients",
+    "xray-conditions": "agent.xray_conditions:drive_under_conditions",
 }
-"""The subjects that can be measured."""
+"""Name of each benchmark, and the function that measures: module and name."""
+EXIT_FAILED, EXIT_BAD_INPUT = 1, 2
 
 
-def _leave(passed: bool) -> None:
-    if not passed:
-        sys.exit(EXIT_FAILED)
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Measure what `arguments` name (those of the process by default), and leave with 1 if a bar is not met.
 
-
-def _show_simulation(measured: dict[str, Any]) -> None:
-    groups = ("intervals", "by_anatomy", "reference_own_error")
-    errors = measured["intervals"]
-    show({name: value for name, value in measured.items() if name not in (*groups, *errors)}, as_json=False)
-    rows = [
-        {"error": name, "all": measured[name], "90 % interval": interval}
-        | {anatomy: figures[name] for anatomy, figures in measured["by_anatomy"].items()}
-        | {"reference's own": measured["reference_own_error"][name]}
-        for name, interval in errors.items()
-    ]
-    show_rows(rows, as_json=False)
-
-
-def _show_robustness(measured: dict[str, Any]) -> None:
-    groups = ("by_device", "by_manoeuvre", "by_anatomy")
-    show_rows(measured["figures"], as_json=False)
-    show_rows([{"group": name} | row for group in groups for name, row in measured[group].items()], as_json=False)
-    rest = {name: value for name, value in measured.items() if name not in ("figures", *groups) and value}
-    show(rest, as_json=False)
-
-
-def main() -> None:
-    """Run the subject that the arguments name."""
+    Bad input gives one line on standard error and exit code 2.
+    """
+    name, *given = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
+    if name in ("-h", "--help"):
+        print(overview())
+        return
+    common, options = _common().parse_known_args(given)
     try:
-        tyro.extras.subcommand_cli_from_dict(
-            SUBJECTS, prog="python -m benchmarks", config=(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes)
-        )
-    except InputError as error:
-        print(f"python -m benchmarks: {error}", file=sys.stderr)
+        if name not in BENCHMARKS:
+            raise InputError("there is none of this name; `python -m benchmarks --help` lists them")
+        if common.against is None:
+            figures = measure(name, options)
+        else:
+            from benchmarks.against import compare
+
+            figures = compare(common.against, name, options, common.rounds)
+    except (InputError, ModuleNotFoundError) as error:
+        said = what_is_missing(error) if isinstance(error, ModuleNotFoundError) else str(error)
+        if said is None:
+            raise
+        print(f"benchmarks {name}: {said}", file=sys.stderr)
         sys.exit(EXIT_BAD_INPUT)
+    from benchmarks.figures import all_passed, show_figures
+
+    if figures is not None:
+        show_figures(figures, as_json=common.json)
+    sys.exit(0 if all_passed(figures) else EXIT_FAILED)
+
+
+def measure(name: str, options: Sequence[str]) -> Any:
+    """Run a benchmark with options, and return its figures; None where it prints by itself.
+
+    Raises:
+        InputError: its input cannot be used.
+    """
+    import tyro
+
+    from endopilot.settings import check_call
+
+    function = function_of(name)
+
+    @functools.wraps(function)
+    def later(*args: Any, **kwargs: Any) -> Callable[[], Any]:
+        check_call(function, args, kwargs)
+        return functools.partial(function, *args, **kwargs)
+
+    config = (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes)
+    return tyro.cli(later, prog=f"python -m benchmarks {name}", args=options, config=config)()
+
+
+def function_of(name: str) -> Callable[..., Any]:
+    """Return the function of a benchmark."""
+    module, function = BENCHMARKS[name].split(":")
+    return getattr(importlib.import_module(f"benchmarks.{module}"), function)
+
+
+def overview() -> str:
+    """Return the text of `python -m benchmarks --help`."""
+    lines = [f"  {name:<20} {(function_of(name).__doc__ or '').splitlines()[0]}" for name in BENCHMARKS]
+    return "\n".join(
+        [
+            "usage: python -m benchmarks NAME ... [--json] [--against CHECKOUT [--rounds 3]]",
+            "",
+            *lines,
+            "",
+            "`python -m benchmarks NAME --help` gives the options of each. --json prints figures as JSON. --against",
+            "runs the benchmark in turns in another checkout, which has a .venv of its own, and here.",
+        ]
+    )
+
+
+def _common() -> argparse.ArgumentParser:
+    """Return what reads the options of every benchmark."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--against", type=Path)
+    parser.add_argument("--rounds", type=int, default=3)
+    return parser
 
 
 if __name__ == "__main__":  # worker processes import this module too

@@ -18,18 +18,18 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.figures import Bar, judged
 from endopilot.anatomy.io import write_anatomy
 from endopilot.devices.catheter import read_catheter
 from endopilot.errors import InputError
 from endopilot.tasks.task import reference_navigation
 
 BARS = {
-    "realtime_reserve": (10.0, ">="),
-    "latency_p95_ms": (100.0, "<="),
-    "frames_per_second": (30.0, ">="),
-    "ready_seconds": (3.0, "<="),
+    "realtime_reserve": Bar(10.0, at_least=True),
+    "latency_p95_ms": Bar(100.0),
+    "frames_per_second": Bar(30.0, at_least=True),
+    "ready_seconds": Bar(3.0),
 }
-"""Bar of each figure, and on which side of it the figure must lie."""
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 BROWSER_FLAGS = (
     "--no-sandbox",
@@ -72,11 +72,11 @@ _COUNT = """() => {
 }"""
 
 
-def bench_cockpit(catheter: str | None = None) -> dict[str, Any]:
-    """Measure the cockpit in the reference patient, and return each figure with its bar.
+def bench_cockpit(*, catheter: str | None = None) -> dict[str, Any]:
+    """Measure the cockpit in a headless browser without a GPU: time in reserve, latency, frames per second, start.
 
     Args:
-        catheter: around the wire, a name or a YAML file; both are then pushed and turned while the views are measured.
+        catheter: around the wire (a name or a YAML file); both are then driven at once.
 
     Returns:
         `realtime_reserve`: simulated time over the time that simulating it takes, while the wire moves and both views
@@ -96,7 +96,7 @@ def bench_cockpit(catheter: str | None = None) -> dict[str, Any]:
     try:
         from playwright.sync_api import sync_playwright
     except ModuleNotFoundError as error:
-        raise InputError("bench cockpit: needs playwright; install it with: pip install playwright") from error
+        raise InputError("needs playwright; install it with: pip install playwright") from error
     figures: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as driver:
         patient = Path(folder) / "patient"
@@ -115,10 +115,7 @@ def bench_cockpit(catheter: str | None = None) -> dict[str, Any]:
             figures |= _latency(page)
         browser.close()
     rounded = {name: round(float(value), 3) for name, value in figures.items()}
-    passed = {
-        name: rounded[name] >= bar if side == ">=" else rounded[name] <= bar for name, (bar, side) in BARS.items()
-    }
-    return rounded | {"bars": {name: f"{side} {bar:g}" for name, (bar, side) in BARS.items()}, "passed": passed}
+    return judged(rounded, BARS)
 
 
 def find_browser() -> str | None:

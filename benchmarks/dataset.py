@@ -3,36 +3,38 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from endopilot import __version__
 from endopilot.anatomy.io import write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
+from endopilot.cli.arguments import OutputFolder
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.generate import generate_dataset
 from endopilot.dataset.schema import MANIFEST_PATH
 from endopilot.devices.device import read_device
-from endopilot.errors import InputError
 from endopilot.files import processor_name, read_json
 from endopilot.progress import progress
 from endopilot.runs import claim
+from endopilot.settings import Within
 
 PAPER_ANATOMIES, PAPER_SEQUENCES = 100, 1000
 """Kim et al. 2023: random navigations of 60 s in each of 100 anatomies."""
 CORES = 2
 """Cores that the time of the full set is extrapolated to."""
+AboveZero = Annotated[float, Within(0, 1, above_low=True)]
 _DEVICE = "workhorse-014"
 
 
-def bench_dataset(output: Path, *, share: float = 0.05) -> dict[str, Any]:
-    """Make a part of the paper's dataset in synthetic right coronary arteries, and extrapolate to all of it.
+def bench_dataset(*, output: OutputFolder = Path("runs/bench-dataset"), share: AboveZero = 0.05) -> dict[str, Any]:
+    """Make a share of the paper's set of 100 000 navigations, and extrapolate time and size of all of it.
 
     The part consists of whole files: 500 navigations of 60 s in each of some anatomies. An interrupted run goes on
     where it stopped; a finished one returns at once.
 
     Args:
-        output: folder that takes the anatomies and the dataset.
-        share: of the full set's navigations, 0 to 1.
+        output: folder of this share, anatomies and dataset; an interrupted run goes on where it stopped.
+        share: share of the paper's set, above 0, at most 1.
 
     Returns:
         What was measured: `navigations`, `samples`, `measured_share` of the full set, `processor_seconds`,
@@ -41,13 +43,11 @@ def bench_dataset(output: Path, *, share: float = 0.05) -> dict[str, Any]:
         `full_set_samples`, `extrapolated_minutes_on_2_cores` (from processor time), and `extrapolated_gigabytes`.
 
     Raises:
-        InputError: the share is out of its range, or the folder belongs to another run.
+        InputError: the folder belongs to another run.
     """
-    if not 0 < share <= 1:
-        raise InputError(f"share: {share}; give a share of the full set, more than 0 and up to 1")
     size = DatasetConfig().sequences_per_file
     count = max(1, round(share * PAPER_ANATOMIES * PAPER_SEQUENCES / size))
-    claim(output, "endopilot bench dataset", share=share, version=__version__)
+    claim(output, "python -m benchmarks dataset", share=share, version=__version__)
     folders = [output / "anatomies" / f"rca-{index:04d}" for index in range(count)]
     with progress("Synthetic patients", count) as advance:
         for index, folder in enumerate(folders):

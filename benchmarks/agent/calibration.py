@@ -1,4 +1,4 @@
-"""Calibrate the X-ray adviser of the ladder's agents: `python benchmarks/agent_calibration.py [KIND] [--write]`.
+"""Calibrate the X-ray adviser of the ladder's agents: `python -m benchmarks agent-calibration [KIND]`.
 
 The agent navigates in training patients of every task of the ladder. Friction, tip stiffness and ostium differ from
 its model by up to the spread of its ensemble. There is one exposure every 10 s; in between, its predictions are
@@ -7,26 +7,24 @@ that the ladder is scored on test whether the bands hold. With KIND `assumed`, t
 errors and patients lie at rest. With `images` the tip is found in X-ray images of patients whose pose is registered,
 in the coronary tasks, and heart and breath move each patient by amplitudes of their own, of which the published mean
 is known; the bands of `assumed` are scaled anew. With `coaxial` the coaxial agent drives wire and catheter in the
-coaxial tasks, as in `assumed` otherwise. runs/agent-calibration-KIND gets one file a navigation; an interrupted run
-goes on with the others.
-
-With `--write` the calibration goes into the package, and the figures into docs/xray.md.
+coaxial tasks, as in `assumed` otherwise.
 """
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
+from tyro.conf import Positional
 
+from benchmarks.figures import fill
 from endopilot.belief.bands import Calibration, conformal_scale, fit_spread, narrowest, spread_of
 from endopilot.control.agent import CALIBRATED, CALIBRATIONS, AdviserInput, AgentConfig, AgentPolicy
 from endopilot.control.coaxial_agent import COAXIAL_CALIBRATED, CoaxialAgent, CoaxialAgentConfig
-from endopilot.errors import InputError
 from endopilot.files import read_json, write_json
 from endopilot.ladder.ladder import identity
 from endopilot.navigation.navigate import NavigateConfig, navigate
@@ -37,8 +35,7 @@ from endopilot.simulation.motion import Motion, motion_named
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.tasks.task import CORE, NEWEST, LadderVersion, Task, find_task, ladder_tasks
 
-ROOT = Path(__file__).parents[2]
-RUNS = ROOT / "runs"
+KindName = Literal["assumed", "images", "coaxial"]
 LEVEL, EXPOSED_EVERY, SECONDS = 0.9, 20, 30.0
 """Share of the intervals that the bands shall cover; periods of 0.5 s between exposures; seconds of a navigation."""
 
@@ -67,7 +64,7 @@ class Kind:
     whose: str
 
 
-KINDS = {
+KINDS: dict[KindName, Kind] = {
     "assumed": Kind(
         policy="agent",
         config=AgentConfig(),
@@ -142,7 +139,7 @@ def truth_of(task: Task, place: int, role: str, kind: Kind) -> ModelMismatch:
     )
 
 
-def measure(path: Path, name: str) -> None:
+def measure(path: Path, name: KindName) -> None:
     """Navigate in a patient, and write prediction and truth of each period after the first."""
     kind, moves = KINDS[name], name == "images"
     task, role, place = find_task(path.parent.name, kind.version), *path.stem.split("-")
@@ -252,36 +249,35 @@ def calibrate(folder: Path, kind: Kind) -> tuple[Calibration, list[str]]:
     return calibration, lines
 
 
-def main() -> None:
-    """Run the missing navigations, calibrate, print, and write if asked to."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("kind", nargs="?", choices=list(KINDS), default="assumed")
-    parser.add_argument("--write", action="store_true")
-    options = parser.parse_args()
-    kind = KINDS[options.kind]
-    folder = RUNS / f"agent-calibration-{options.kind}"
+def calibrate_agent(kind: Positional[KindName] = "assumed", /, *, write: bool = False) -> str:
+    """Calibrate the X-ray adviser of the ladder's agents, in the patients to learn on and in some of the ladder.
+
+    runs/agent-calibration-KIND gets one file a navigation; an interrupted run goes on with the others.
+
+    Args:
+        kind: exposures with assumed errors in patients at rest (assumed), X-ray images of patients whom heart and
+            breath move (images), or the coaxial agent in the coaxial tasks (coaxial).
+        write: write the calibration into the package, and its figures into docs/xray.md.
+
+    Returns:
+        The calibration, and a table of its coverage.
+
+    Raises:
+        InputError: the folder belongs to another run.
+    """
+    chosen = KINDS[kind]
+    folder = Path(f"runs/agent-calibration-{kind}")
     wanted = [
         folder / task.name / f"{role}-{place:02d}.json"
-        for role, places in kind.roles.items()
+        for role, places in chosen.roles.items()
         for place in places
-        for task in kind.tasks
+        for task in chosen.tasks
     ]
-    try:
-        found = identity(kind.policy, kind.version)
-        claim(folder, f"benchmarks/agent_calibration.py {options.kind}", **found, agent=kind.config)
-        make_missing("Calibrating the agent's adviser", wanted, partial(measure, name=options.kind))
-    except InputError as error:
-        raise SystemExit(str(error)) from error
-    calibration, lines = calibrate(folder, kind)
-    print(calibration, *lines, sep="\n")
-    if options.write:
-        calibration.write(kind.folder)
-        page = ROOT / "docs" / "xray.md"
-        begin, end = f"<!-- {kind.mark}:begin -->", f"<!-- {kind.mark}:end -->"
-        text = page.read_text(encoding="utf-8")
-        text = "\n".join([text.split(begin)[0] + begin, *lines, end + text.split(end)[1]])
-        page.write_text(text, encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()
+    found = identity(chosen.policy, chosen.version)
+    claim(folder, f"python -m benchmarks agent-calibration {kind}", **found, agent=chosen.config)
+    make_missing("Calibrating the agent's adviser", wanted, partial(measure, name=kind))
+    calibration, lines = calibrate(folder, chosen)
+    if write:
+        calibration.write(chosen.folder)
+        fill("xray.md", chosen.mark, lines)
+    return "\n".join([str(calibration), *lines])

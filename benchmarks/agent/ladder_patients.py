@@ -1,4 +1,4 @@
-"""Choose the patients of the ladder's tasks: `python benchmarks/ladder_patients.py [TASK ...] [--version N] [--write]`.
+"""Choose the patients of the ladder's tasks: `python -m benchmarks ladder-patients [TASK ...]`.
 
 The ladder gets the first twenty patients of a task's atlas that are eligible by the task's `chosen_for`. In version 2,
 and from level 5 on in version 1, a search must also reach the target with a wall force below the task's limit. The
@@ -8,21 +8,20 @@ neither advantage. The training patients are the first twenty eligible ones of a
 Of the coaxial tasks' atlases the first twenty eligible patients are taken in which the wire alone, pushed straight on,
 arrives from at most two of eight rotations. A straight catheter goes where its wire goes: there the search must reach
 the target with the wire alone. A catheter with a shape may enter what its wire does not; there nothing is searched.
-
-With `--write` the numbers go into the tasks' files.
 """
 
 from __future__ import annotations
 
 import re
-from argparse import ArgumentParser, RawDescriptionHelpFormatter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from tyro.conf import Positional
 
+import endopilot.tasks
 from endopilot.atlas.atlas import make_patient_tree
 from endopilot.errors import InputError
 from endopilot.simulation.simulator import Simulator
@@ -39,6 +38,7 @@ from endopilot.tasks.task import (
 )
 from endopilot.types import TipProjection, VesselTree
 
+TASKS = Path(endopilot.tasks.__path__[0])
 WANTED = 20
 MOST_EXAMINED = 800
 TRIES = 12
@@ -66,21 +66,21 @@ def _stenosed(tree: VesselTree, truth: dict[str, Any], target: Target) -> bool:
 ELIGIBLE: dict[str, Callable[[VesselTree, dict[str, Any], Target], bool]] = {
     "stenosis": _stenosed,
     "tortuous": lambda tree, truth, target: truth["tortuosity"] >= 2.2,
-    "portal": _turns("RPPV", 45),
-    "crux": _turns("4", 35),
-    "diagonal": _turns("10", 40),
-    "circumflex": _turns("11", 60),
-    "circumflex in version 2": _turns("11", 50),
-    "portal in version 2": _turns("RPPV", 65),
-    "middle-cerebral in version 2": _turns("M2 superior", 50),
-    "crux in version 2": _turns("4", 50),
-    "diagonal in version 2": _turns("10", 50),
-    "marginal": _turns("12", 40),
-    "anterior-cerebral": _turns("A1", 70),
-    "carotid": _turns("left common carotid", 90),
-    "follow": _turns("4", 40),
-    "steep-carotid": _turns("left common carotid", 90),
-    "side-branch": _turns("RV", 90),
+    "portal": _turns("RPPV", 45.0),
+    "crux": _turns("4", 35.0),
+    "diagonal": _turns("10", 40.0),
+    "circumflex": _turns("11", 60.0),
+    "circumflex in version 2": _turns("11", 50.0),
+    "portal in version 2": _turns("RPPV", 65.0),
+    "middle-cerebral in version 2": _turns("M2 superior", 50.0),
+    "crux in version 2": _turns("4", 50.0),
+    "diagonal in version 2": _turns("10", 50.0),
+    "marginal": _turns("12", 40.0),
+    "anterior-cerebral": _turns("A1", 70.0),
+    "carotid": _turns("left common carotid", 90.0),
+    "follow": _turns("4", 40.0),
+    "steep-carotid": _turns("left common carotid", 90.0),
+    "side-branch": _turns("RV", 90.0),
 }
 
 
@@ -209,23 +209,23 @@ def choose(task: Task, seed: int, *, search: bool) -> tuple[list[int], int, int]
             chosen.append(number)
             if len(chosen) == WANTED:
                 return chosen, count, number + 1
-    raise SystemExit(f"{task.name}: only {len(chosen)} of {MOST_EXAMINED} patients qualify; choose another seed")
+    raise InputError(f"{task.name}: only {len(chosen)} of {MOST_EXAMINED} patients qualify; choose another seed")
 
 
-def main() -> None:
-    """Choose, print, and write if asked to."""
-    parser = ArgumentParser(description=__doc__, formatter_class=RawDescriptionHelpFormatter)
-    parser.add_argument("tasks", nargs="*", metavar="TASK", help="all if none is given")
-    parser.add_argument("--version", choices=("1", "2", "coaxial"), default=str(NEWEST), help="of the ladder")
-    parser.add_argument("--write", action="store_true", help="write the numbers into the tasks' files")
-    given = parser.parse_args()
-    version: LadderVersion = "coaxial" if given.version == "coaxial" else 1 if given.version == "1" else 2
+def choose_patients(
+    tasks: Positional[tuple[str, ...]] = (), /, *, version: LadderVersion = NEWEST, write: bool = False
+) -> None:
+    """Choose the patients of the ladder's tasks, and print their numbers.
+
+    Args:
+        tasks: names of tasks; all if none is given.
+        version: of the ladder: 1, 2 or coaxial.
+        write: write the numbers into the tasks' files.
+    """
     for task in ladder_tasks(version):
-        if given.tasks and task.name not in given.tasks:
+        if tasks and task.name not in tasks:
             continue
-        path = (
-            Path(__file__).parents[2] / "src" / "endopilot" / "tasks" / f"ladder_{task.version}" / f"{task.name}.yaml"
-        )
+        path = TASKS / f"ladder_{task.version}" / f"{task.name}.yaml"
         text = path.read_text(encoding="utf-8")
         search = task.version != 1 or task.level >= 5
         for role, patients, searched in (("ladder", task.ladder, search), ("training", task.training, False)):
@@ -233,9 +233,5 @@ def main() -> None:
             print(f"{task.name}, {role}: {WANTED} of {eligible} eligible patients, of {examined}: {chosen}", flush=True)
             pattern = rf"({role}:\n  seed: \d+\n  numbers: )\[[^\]]*\]"
             text = re.sub(pattern, lambda found, chosen=chosen: found[1] + str(chosen), text)
-        if given.write:
+        if write:
             path.write_text(text, encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()

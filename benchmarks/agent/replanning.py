@@ -1,22 +1,22 @@
-"""Compare two rules for replanning: `python benchmarks/agent_replanning.py [CASE [PATIENTS [TASK ...]]]`.
+"""Compare two rules for replanning: `python -m benchmarks agent-replanning [TASK ...]`.
 
 The ladder's `agent` keeps its course at an exposure unless the tip is lost or off course. `AlwaysReplanning` plans from
 the likeliest state at every exposure. Both drive the same navigations of the ladder with the same seeds, in one
-process, since processor time is measured. CASE is one of `endopilot.ladder.mismatch.CASES`, the first if not given.
-Prints a table of each task and of all together, as Markdown.
+process, since processor time is measured.
 """
 
 from __future__ import annotations
 
-import sys
 import time
 from dataclasses import replace
 
 import numpy as np
+from tyro.conf import Positional
 
 from endopilot.control.agent import AgentPolicy
 from endopilot.ladder.mismatch import CASES, mismatch_of
 from endopilot.navigation.navigate import NavigateConfig, navigate
+from endopilot.settings import Count
 from endopilot.tasks.task import CORE, find_task
 from endopilot.xray.fluoroscope import TipMeasurement
 
@@ -47,10 +47,16 @@ def drive(name: str, place: int, case: str, rule: type[AgentPolicy]) -> list[flo
     return [record.success and record.safe, record.exposures, record.seconds, policy.plans, spent]
 
 
-def main() -> None:
-    """Drive and print."""
-    given = sys.argv[1:]
-    case, patients, tasks = given[0] if given else CASES[0], int(given[1]) if given[1:] else 6, given[2:] or TASKS
+def compare_replanning(
+    tasks: Positional[tuple[str, ...]] = TASKS, /, *, case: str = CASES[0], patients: Count = 6
+) -> None:
+    """Drive the ladder's agent by two rules for replanning, and print a table of each task and of all together.
+
+    Args:
+        tasks: of the ladder.
+        case: of model mismatch, one of `endopilot.ladder.mismatch.CASES`.
+        patients: of each task.
+    """
     found: dict[tuple[str, str], list[list[float]]] = {}
     print("| task | replans | " + " | ".join(COLUMNS) + " |\n|---|---|" + "---|" * len(COLUMNS))
     for task in (*tasks, "all"):
@@ -62,7 +68,3 @@ def main() -> None:
             safe, *means = np.mean(rows, axis=0)
             cells = [f"{round(safe * len(rows))} of {len(rows)}", *(f"{mean:.1f}" for mean in means)]
             print(f"| {task} | {rule} | " + " | ".join(cells) + " |", flush=True)
-
-
-if __name__ == "__main__":
-    main()

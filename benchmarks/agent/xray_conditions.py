@@ -1,22 +1,21 @@
-"""Drive the agent with images, in moving patients, and with both: `python benchmarks/xray_conditions.py [PATIENTS]`.
+"""Drive the agent with images, in moving patients, and with both: `python -m benchmarks xray-conditions [PATIENTS]`.
 
 PATIENTS of each coronary task of the ladder (2 if not given), with friction, tip stiffness, latency and ostium off by
 20 %, up or down: with assumed errors of detection in a patient at rest; with X-ray images in a patient whose pose is
 registered; in a patient whom heart and breath move by amplitudes of their own, of which the published mean is known;
-with both; and with both where a run of contrast has measured the motion. runs/xray-conditions gets one file a
-navigation; an interrupted run goes on with the others. With `--write` the table goes into docs/xray.md; `--only` drives
-under some of the conditions, and leaves the other rows as they are.
+with both; and with both where a run of contrast has measured the motion.
 """
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+from tyro.conf import Positional
 
+from benchmarks.figures import DOCS, fill
 from endopilot.control.agent import AgentPolicy
 from endopilot.errors import InputError
 from endopilot.files import read_json, write_json
@@ -24,14 +23,14 @@ from endopilot.ladder.attempt import navigation_events, navigation_seed
 from endopilot.ladder.ladder import identity
 from endopilot.navigation.navigate import NavigateConfig, XrayKind, navigate
 from endopilot.runs import claim, make_missing
+from endopilot.settings import Count
 from endopilot.simulation.mismatch import drawn_sides, mismatch_by
 from endopilot.simulation.motion import Motion, motion_named
 from endopilot.tasks.task import CORE, NEWEST, find_task, ladder_tasks
 
-ROOT = Path(__file__).parents[2]
-FOLDER, PAGE = Path("runs/xray-conditions"), ROOT / "docs" / "xray.md"
-BEGIN, END = "<!-- conditions:begin -->\n", "<!-- conditions:end -->"
-CONDITIONS: dict[str, tuple[str, XrayKind, bool, bool]] = {
+FOLDER = Path("runs/xray-conditions")
+Condition = Literal["assumed", "images", "moving", "together", "measured"]
+CONDITIONS: dict[Condition, tuple[str, XrayKind, bool, bool]] = {
     "assumed": ("assumed errors, a patient at rest", "assumed", False, False),
     "images": ("images and registration", "images", False, False),
     "moving": ("heart and breath", "assumed", True, False),
@@ -94,22 +93,32 @@ def row(name: str, results: list[dict[str, Any]]) -> str:
     )
 
 
-def main() -> None:
-    """Run what is missing, print the table, and write it if asked to."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("patients", nargs="?", type=int, default=2)
-    parser.add_argument("--only", nargs="+", choices=CONDITIONS, default=list(CONDITIONS))
-    parser.add_argument("--write", action="store_true")
-    options = parser.parse_args()
+def drive_under_conditions(
+    patients: Positional[Count] = 2, /, *, only: tuple[Condition, ...] = tuple(CONDITIONS), write: bool = False
+) -> str:
+    """Drive the agent with X-ray images, in moving patients, and with both, in the coronary tasks of the ladder.
+
+    runs/xray-conditions gets one file a navigation; an interrupted run goes on with the others.
+
+    Args:
+        patients: of each task.
+        only: conditions to drive under; the other rows of the table stay as they are.
+        write: write the table into docs/xray.md.
+
+    Returns:
+        The table.
+
+    Raises:
+        InputError: the folder belongs to another run.
+    """
     tasks = [task for task in ladder_tasks() if task.anatomy in ("rca", "lca")]
     wanted = {
-        name: [FOLDER / name / task.name / f"{place:02d}.json" for place in range(options.patients) for task in tasks]
-        for name in options.only
+        name: [FOLDER / name / task.name / f"{place:02d}.json" for place in range(patients) for task in tasks]
+        for name in only
     }
-    claim(FOLDER, "benchmarks/xray_conditions.py", **identity("agent", NEWEST))
+    claim(FOLDER, "python -m benchmarks xray-conditions", **identity("agent", NEWEST))
     make_missing("The agent under X-ray", [path for paths in wanted.values() for path in paths], measure)
-    head, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
-    before, rest = rest.split(END)
+    before = (DOCS / "xray.md").read_text(encoding="utf-8").split("<!-- conditions:begin -->")[1]
     rows = {title: line for line in before.splitlines() for title, *_ in CONDITIONS.values() if f"| {title} |" in line}
     rows |= {
         CONDITIONS[name][0]: row(CONDITIONS[name][0], [read_json(path) for path in paths])
@@ -121,10 +130,6 @@ def main() -> None:
         "|---|---|---|---|---|---|---|---|",
         *rows.values(),
     ]
-    print("\n".join(lines))
-    if options.write:
-        PAGE.write_text(f"{head}{BEGIN}" + "\n".join(lines) + f"\n{END}{rest}", encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()
+    if write:
+        fill("xray.md", "conditions", lines)
+    return "\n".join(lines)

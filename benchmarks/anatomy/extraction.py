@@ -15,11 +15,15 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from benchmarks.anatomy import analytic_lumens as analytic
+from benchmarks.anatomy.compare import compare_with_atlas
+from benchmarks.figures import Bar
 from endopilot.anatomy.distance import BAND_MM, distance_map_from_mask, distance_map_from_spheres, sample
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy, read_source
 from endopilot.anatomy.io import write_anatomy
 from endopilot.anatomy.projection import project_tip
 from endopilot.anatomy.tree import sampled
+from endopilot.atlas.atlas import AtlasConfig, make_patient
+from endopilot.cli.arguments import existing
 from endopilot.errors import InputError
 from endopilot.evaluation.anatomy_score import compare_trees
 from endopilot.progress import progress
@@ -36,21 +40,45 @@ NEAR_WALL_MM = 2.0
 COMPARED_POINTS = 100_000
 PROJECTED = 1_000_000
 
-VOXEL_BAR = 0.1
-STORED_MB_BAR = 20.0
-SPEED_BAR = 1e6
-OVERLAP_BAR, INSIDE_ACCURACY_BAR_MM, RADIUS_BAR_MM = 0.98, 0.15, 0.1
+VOXEL_BAR, STORED_MB_BAR, SPEED_BAR = Bar(0.1), Bar(20.0), Bar(1e6, at_least=True)
+OVERLAP_BAR, INSIDE_ACCURACY_BAR_MM, RADIUS_BAR_MM = Bar(0.98, at_least=True), Bar(0.15), Bar(0.1)
+Judged = dict[str, tuple[float, Bar | None]]
+"""Figures, each with its bar if it has one."""
 
 REBUILT_VOXEL_MM = (0.35, 0.35, 0.5)
 """Voxels of the lumens that are rebuilt from real centerlines: a coronary CTA's, mm."""
 
 
-def bench_anatomy(centerlines: Path | None = None) -> list[dict[str, Any]]:
+def bench_anatomy(
+    *, centerlines: Path | None = None, compare: tuple[Path, ...] = (), atlas: AtlasConfig = AtlasConfig(count=40)
+) -> list[dict[str, Any]]:
+    """Extract lumens whose centerlines are known, and print each error beside its bar; or compare with the atlas.
+
+    With --compare it measures bends, forks, calibre and ostium of given anatomies beside the atlas instead: median and
+    5th to 95th percentile, and the distance of the two distributions in standard deviations (Wasserstein-1).
+
+    Args:
+        centerlines: folder with VMTK's rca_cl.vtp and lca_cl.vtp of a real patient, whose lumen is rebuilt from the
+            radii and extracted again; left out if not given.
+        compare: anatomies, or folders of anatomies, to compare with the atlas.
+        atlas: the patients to compare with; their kind is that of the given anatomies.
+
+    Returns:
+        What `compare_with_atlas` does, or the rows of `extraction_errors`.
+
+    Raises:
+        InputError: a folder holds no centerlines or no anatomy.
+    """
+    if compare:
+        return compare_with_atlas([existing(folder) for folder in compare], atlas)
+    return extraction_errors(None if centerlines is None else existing(centerlines))
+
+
+def extraction_errors(centerlines: Path | None = None) -> list[dict[str, Any]]:
     """Measure centerlines, distance maps and projection where the truth is known.
 
     Args:
-        centerlines: folder that holds `rca_cl.vtp` and `lca_cl.vtp`, a patient's centerlines with radii as VMTK writes
-            them; their lumen is rebuilt from the radii and extracted again.
+        centerlines: see `bench_anatomy`.
 
     Returns:
         Rows of case, figure, value, bar and passed; figures without a bar are for comparison. Axis and radius
@@ -100,14 +128,14 @@ def _shapes() -> dict[str, VesselTree]:
     return {name: analytic.moved(tree, *POSE) for name, tree in shapes.items()}
 
 
-def _rows(case: str, figures: dict[str, tuple[float, float | None]]) -> Iterator[dict[str, Any]]:
+def _rows(case: str, figures: Judged) -> Iterator[dict[str, Any]]:
     for figure, (value, bar) in figures.items():
-        higher = figure.startswith(("overlap", "points"))
-        passed = None if bar is None else bool(value >= bar if higher else value <= bar)
-        yield {"case": case, "figure": figure, "value": float(f"{value:.4g}"), "bar": bar, "passed": passed}
+        shown = float(f"{value:.4g}")
+        plain = {"figure": figure, "value": shown, "bar": None, "passed": None}
+        yield {"case": case} | (plain if bar is None else bar.row(figure, value) | {"value": shown})
 
 
-def _axis_and_radius(tree: VesselTree, mask: LumenMask) -> dict[str, tuple[float, float | None]]:
+def _axis_and_radius(tree: VesselTree, mask: LumenMask) -> Judged:
     """Return the errors of the extracted centerline."""
     found = extract_anatomy(mask, name="bench")
     voxel = float(mask.volume.spacing_mm.min())
@@ -124,7 +152,7 @@ def _axis_and_radius(tree: VesselTree, mask: LumenMask) -> dict[str, tuple[float
     }
 
 
-def _wall(tree: VesselTree, mask: LumenMask) -> dict[str, tuple[float, float | None]]:
+def _wall(tree: VesselTree, mask: LumenMask) -> Judged:
     """Return the distance map's error near the wall, and that of a binary distance transform of the same mask."""
     voxel = float(mask.volume.spacing_mm.min())
     ours = distance_map_from_mask(mask.volume)
@@ -155,7 +183,7 @@ def _error_near_wall(tree: VesselTree, points: Float[np.ndarray, "n 3"], values:
     return float(np.sqrt(np.mean((values[away] - exact)[near] ** 2)))
 
 
-def _found_again(truth: Anatomy, name: str) -> dict[str, tuple[float, float | None]]:
+def _found_again(truth: Anatomy, name: str) -> Judged:
     lumen = distance_map_from_spheres(truth.tree, spacing_mm=0.25)
     size = np.array(REBUILT_VOXEL_MM)
     extent = lumen.spacing_mm * (np.array(lumen.values.shape[::-1]) - 1)
@@ -177,10 +205,8 @@ def _found_again(truth: Anatomy, name: str) -> dict[str, tuple[float, float | No
     }
 
 
-def _projection_speed() -> dict[str, tuple[float, float | None]]:
+def _projection_speed() -> Judged:
     """Return how many points a second are projected, the best of five, and the size of an atlas patient's map."""
-    from endopilot.atlas.atlas import AtlasConfig, make_patient
-
     patient = make_patient(AtlasConfig(seed=0, population="textbook"), 0)
     centre, size = sampled(patient.tree)
     random = np.random.default_rng(0)

@@ -8,10 +8,13 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial import KDTree
+from tyro.conf import Positional
 
+from benchmarks.figures import Bar
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.anatomy.sources import MASK_SUFFIXES
 from endopilot.anatomy.tree import sampled
+from endopilot.cli.arguments import existing
 from endopilot.errors import InputError
 from endopilot.files import read_json
 from endopilot.imaging.volume import read_volume
@@ -20,28 +23,30 @@ from endopilot.types import Anatomy, LumenMask, Volume
 
 TRUTH_FILE = "ostia.json"
 
-OSTIUM_BAR_MM, FOUND_BAR, COVERAGE_BAR, SECONDS_BAR = 5.0, 23 / 24, 0.99, 15.0
+OSTIUM_BAR_MM, FOUND_BAR = 5.0, 23 / 24
+COVERAGE_BAR, SECONDS_BAR = Bar(0.99, at_least=True), Bar(15.0)
 
 COVERED_RADII = 1.5
 """A voxel belongs to the tree if it lies within this many inscribed radii and a voxel's diagonal of its centerline:
 lumens are not round."""
 
 
-def bench_ostia(folder: Path) -> list[dict[str, Any]]:
-    """Extract the right and left coronary artery of every patient in a folder.
+def bench_ostia(folder: Positional[Path], /) -> dict[str, Any]:
+    """Find the coronary ostia of real patients' masks without an aorta, and compare with where they are known to be.
 
     Args:
-        folder: masks (NIfTI, NRRD, MHA) named after patients, every label but 0 a coronary lumen, and `ostia.json`:
-            `{"PATIENT": {"rca": {"near_aorta_mm": [x, y, z]}, "lca": …}}`, LPS mm.
+        folder: masks (NIfTI, NRRD, MHA) named after patients, every label but 0 a coronary lumen, and ostia.json:
+            {"PATIENT": {"rca": {"near_aorta_mm": [x, y, z]}, "lca": …}}, LPS mm.
 
     Returns:
-        A row for each artery: distance of the ostium from where it is known to be (mm), confidence, share of the
-        artery's voxels that the tree covers, longest path (mm), seconds, and what was told where it was refused.
+        `arteries`, a row for each: distance of the ostium from where it is known to be (mm), confidence, share of the
+        artery's voxels that the tree covers, longest path (mm), seconds, and what was told where it was refused; and
+        `figures`, those of `judged`.
 
     Raises:
         InputError: the folder holds no truth, or no mask that it names.
     """
-    if not (folder / TRUTH_FILE).is_file():
+    if not (existing(folder) / TRUTH_FILE).is_file():
         raise InputError(f"{folder / TRUTH_FILE}: is missing; it gives each artery's ostium as near_aorta_mm")
     truth = read_json(folder / TRUTH_FILE)
     masks = {patient: _mask_file(folder, patient) for patient in sorted(truth)}
@@ -52,7 +57,7 @@ def bench_ostia(folder: Path) -> list[dict[str, Any]]:
             known = np.array(truth[patient][vessel]["near_aorta_mm"], dtype=float)
             rows.append({"patient": patient, "vessel": vessel} | _measured(masks[patient], vessel, known))
             advance()
-    return rows
+    return {"arteries": rows, "figures": judged(rows)}
 
 
 def judged(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -63,15 +68,12 @@ def judged(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     slowest = max((row["seconds"] for row in rows), default=0.0)
     enough = int(np.floor(FOUND_BAR * len(rows)))
     return [
-        {
-            "figure": f"arteries of {len(rows)} whose ostium lies within {OSTIUM_BAR_MM:g} mm",
-            "value": right,
-            "bar": f">= {enough}",
-            "passed": right >= enough,
-        },
-        {"figure": "wrong and not told", "value": len(made) - right, "bar": "0", "passed": right == len(made)},
-        {"figure": "covered", "value": coverage, "bar": f">= {COVERAGE_BAR}", "passed": coverage >= COVERAGE_BAR},
-        {"figure": "slowest, s", "value": slowest, "bar": f"<= {SECONDS_BAR:g}", "passed": slowest <= SECONDS_BAR},
+        Bar(enough, at_least=True).row(
+            f"arteries of {len(rows)} whose ostium lies within {OSTIUM_BAR_MM:g} mm, at least", right
+        ),
+        Bar(0).row("wrong and not told", len(made) - right),
+        COVERAGE_BAR.row("covered, at least", coverage),
+        SECONDS_BAR.row("slowest, s", slowest),
     ]
 
 

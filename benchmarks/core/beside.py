@@ -2,24 +2,46 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from benchmarks.core.scenes import Scene
+from benchmarks.core.scenes import SAMPLES, WORLDS, Scene, make_scenes, simulated_s
+from benchmarks.figures import Bar, in_turns, spread
 from endopilot.simulation.config import PRESETS, Preset, SimulatorConfig
+from endopilot.simulation.motion import Motion
 from endopilot.types import SAMPLE_PERIOD_S, Rollout
 
 COMPARED = 2
 """Worlds of each scene that the error in time is measured on."""
-REPEATS = 3
-"""Times that the worlds are simulated for the timing; the fastest counts."""
+LEAST_SHARE_MOVING = 0.5
+"""Of the real-time factor in a still vessel, that in a moving one must reach."""
 Run = Callable[[SimulatorConfig, int | None], list[Rollout]]
 """Simulates the scenario: a rollout of the worlds of each scene, or of the first so many of them."""
+
+
+def bench_motion(
+    motion: Motion, preset: Preset = "default", *, worlds: int = WORLDS, samples: int = SAMPLES
+) -> dict[str, Any]:
+    """Drive the reference's wire at random through three synthetic patients that move, and through the same at rest.
+
+    Args:
+        motion: of each vessel about its ostium.
+        preset: name of the settings.
+        worlds: of each patient.
+        samples: of each world.
+
+    Returns:
+        The figures of `bench_beside`, and the tip's error in time: against a time step of 1 ms, on a few of the worlds.
+    """
+    scenes = make_scenes(worlds, samples)
+    run = partial(run_all, scenes, motion=motion)
+    figures, rollouts = bench_beside(run, scenes, preset, beside="still", least_share=LEAST_SHARE_MOVING)
+    return figures | error_in_time("tip_error", rollouts, fine_steps(run, preset))
 
 
 def bench_beside(
@@ -41,52 +63,60 @@ def bench_beside(
         force (N). And the rollouts that they were taken from.
     """
     config = replace(PRESETS[preset], threads=1)
-    simulated = SAMPLE_PERIOD_S * sum(scene.control.shape[0] * scene.control.shape[1] for scene in scenes)
-    rollouts: list[Rollout] = []
-    still: list[Rollout] = []
-    ours, alone = [], []
-    for _ in range(REPEATS):
-        begun = time.process_time()
-        still = [scene.run(config) for scene in scenes]
-        alone.append(time.process_time() - begun)
-        begun = time.process_time()
-        rollouts = run(config, None)
-        ours.append(time.process_time() - begun)
-    share = min(alone) / min(ours)
+    (still, _, alone), (rollouts, _, ours) = in_turns(lambda: run_all(scenes, config), lambda: run(config, None))
+    bar, share = Bar(least_share, at_least=True), alone / ours
     return {
         "preset": preset,
-        "realtime_factor_per_core": round(simulated / min(ours), 1),
-        f"{beside}_realtime_factor_per_core": round(simulated / min(alone), 1),
+        "realtime_factor_per_core": round(simulated_s(scenes) / ours, 1),
+        f"{beside}_realtime_factor_per_core": round(simulated_s(scenes) / alone, 1),
         "share": round(share, 3),
-        "bar": round(least_share, 3),
-        "passed": share >= least_share,
-        "node_iterations_per_second": node_iterations_per_second(rollouts),
+        "bar": round(bar.limit, 3),
+        "passed": bar.met(share),
+        **effort(rollouts),
         f"{beside}_node_iterations_per_second": node_iterations_per_second(still),
-        "valid_worlds": round(float(np.mean([rollout.valid[:, -1].mean() for rollout in rollouts])), 5),
-        "iterations_per_step": round(float(np.mean([r.iterations[r.valid].mean() for r in rollouts])), 3),
         "largest_wall_force_n": round(max(float(r.wall_force[r.valid].max()) for r in rollouts), 4),
         "worlds": sum(len(scene.control) for scene in scenes),
     }, rollouts
 
 
+def run_all(
+    scenes: Sequence[Scene], config: SimulatorConfig, worlds: int | None = None, *, motion: Motion | None = None
+) -> list[Rollout]:
+    """Simulate the worlds of each scene, or the first of them; the vessels lie still, or move."""
+    return [scene.run(config, worlds, motion=motion) for scene in scenes]
+
+
+def effort(rollouts: Sequence[Rollout]) -> dict[str, float]:
+    """Return the nodes evaluated in a simulated second, the iterations a time step and the share of valid worlds."""
+    return {
+        "node_iterations_per_second": node_iterations_per_second(rollouts),
+        "iterations_per_step": round(float(np.mean([r.iterations[r.valid].mean() for r in rollouts])), 3),
+        "valid_worlds": round(float(np.concatenate([r.valid[:, -1] for r in rollouts]).mean()), 5),
+    }
+
+
 def node_iterations_per_second(rollouts: Sequence[Rollout]) -> float:
     """Return how many nodes are evaluated in a simulated second."""
-    simulated_s = SAMPLE_PERIOD_S * sum(rollout.valid.size for rollout in rollouts)
-    return round(sum(float(rollout.node_iterations.sum()) for rollout in rollouts) / simulated_s, 1)
+    simulated = SAMPLE_PERIOD_S * sum(rollout.valid.size for rollout in rollouts)
+    return round(sum(float(rollout.node_iterations.sum()) for rollout in rollouts) / simulated, 1)
 
 
-def fine_steps(run: Run, preset: Preset) -> list[Rollout]:
+def fine_steps(run: Run, preset: Preset, worlds: int = COMPARED, *, tolerance_mm: float = 1e-6) -> list[Rollout]:
     """Return the first worlds of each scene at time steps of 1 ms: what `error_in_time` compares with."""
-    return run(replace(PRESETS[preset], time_step_s=1e-3, tolerance_mm=1e-6), COMPARED)
+    return run(replace(PRESETS[preset], time_step_s=1e-3, tolerance_mm=tolerance_mm), worlds)
+
+
+def _wire_tip(rollout: Rollout) -> Float[np.ndarray, "worlds samples 3"]:
+    return rollout.tip_position
 
 
 def error_in_time(
     name: str,
     rollouts: Sequence[Rollout],
     fine: Sequence[Rollout],
-    tip: Callable[[Rollout], Float[np.ndarray, "worlds samples 3"]],
+    tip: Callable[[Rollout], Float[np.ndarray, "worlds samples 3"]] = _wire_tip,
 ) -> dict[str, float]:
-    """Return the median and 95th percentile of a tip's distance from where it is at fine steps, mm.
+    """Return the `spread` of a tip's distance from where it is at fine steps, mm.
 
     Args:
         name: of the figures.
@@ -94,15 +124,8 @@ def error_in_time(
         fine: of the first of them, by `fine_steps`.
         tip: takes the tip's positions from a rollout.
     """
-    errors = np.concatenate(
-        [
-            np.linalg.norm(tip(exact) - tip(coarse)[: len(exact.valid)], axis=-1)[
-                exact.valid & coarse.valid[: len(exact.valid)]
-            ]
-            for coarse, exact in zip(rollouts, fine, strict=True)
-        ]
-    )
-    return {
-        f"{name}_median_mm": round(float(np.median(errors)), 5),
-        f"{name}_p95_mm": round(float(np.percentile(errors, 95)), 5),
-    }
+    errors = []
+    for coarse, exact in zip(rollouts, fine, strict=True):
+        both = exact.valid & coarse.valid[: len(exact.valid)]
+        errors.append(np.linalg.norm(tip(exact) - tip(coarse)[: len(exact.valid)], axis=-1)[both])
+    return spread(name, np.concatenate(errors))

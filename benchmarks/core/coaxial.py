@@ -68,7 +68,7 @@ def bench_coaxial(
         "catheter": catheter.name,
         **figures,
         "catheter_alone_node_iterations_per_second": node_iterations_per_second(alone),
-        **error_in_time("wire_tip_error", rollouts, fine, lambda rollout: rollout.tip_position),
+        **error_in_time("wire_tip_error", rollouts, fine),
         **error_in_time("catheter_tip_error", rollouts, fine, _catheter_tip),
     }
 

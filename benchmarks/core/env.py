@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from benchmarks.core.reference import CONVERGED
+from benchmarks.figures import spread
 from endopilot.env.vector import CONTROL_PERIOD_S, ROTATION_RAD_S, TRANSLATION_MM_S, NavigateVectorEnv
 from endopilot.files import processor_name
 from endopilot.simulation.config import SimulatorConfig
@@ -29,7 +30,7 @@ COMPARED, COMPARED_SECONDS = 8, 30.0
 
 
 def bench_env() -> dict[str, Any]:
-    """Measure environment steps a second in the reference anatomy, and the tip's error of the settings used for them.
+    """Measure the steps per second of the learning environments in the reference anatomy, and the tip's error.
 
     There are two kinds of actions: the random navigations of datasets (`simulation.controls`: pushes, pulls, turns and
     pauses of 1 to 6 s, from the ostium to the distal ends), and actions drawn independently at every step, for which
@@ -60,10 +61,7 @@ def bench_env() -> dict[str, Any]:
     exact = _tips(CONVERGED)
     for prefix, config in (("", CORE), ("default_", SimulatorConfig())):
         error = np.linalg.norm(_tips(config) - exact, axis=-1)
-        figures[f"{prefix}true_tip_error_median_mm"] = round(float(np.median(error)), 4)
-        figures[f"{prefix}true_tip_error_mean_mm"] = round(float(error.mean()), 4)
-        figures[f"{prefix}true_tip_error_p95_mm"] = round(float(np.percentile(error, 95)), 4)
-        figures[f"{prefix}true_tip_error_max_mm"] = round(float(error.max()), 4)
+        figures |= spread(f"{prefix}true_tip_error", error, digits=4)
     return figures | {"valid_worlds": round(float(np.mean(valid)), 5), "processor": processor_name()}
 
 

@@ -1,4 +1,4 @@
-"""What `endopilot bench robustness` drives through an anatomy, and how: devices, pairs and four kinds of controls."""
+"""What `python -m benchmarks robustness` drives through an anatomy, and how: devices, pairs and kinds of controls."""
 
 from __future__ import annotations
 

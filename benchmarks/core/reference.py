@@ -1,7 +1,7 @@
 """The solution that the rod core's error is measured against: `Reference`, converged in elements, step and tolerance.
 
-It is kept in `reference.npz` beside this module, with its recipe: `endopilot bench simulation --make-reference` makes
-it anew. Its worlds are those of `make_scenes`.
+It is kept in `reference.npz` beside this module, with its recipe: `python -m benchmarks simulation --make-reference`
+makes it anew. Its worlds are those of `make_scenes`.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def make_reference(
     recipe = manifest(
         config=_settings(converged),
         seed=SEED,
-        command="endopilot bench simulation --make-reference",
+        command="python -m benchmarks simulation --make-reference",
         wall_seconds=round(time.perf_counter() - started, 1),
         worlds=worlds,
         samples=samples,
@@ -113,7 +113,7 @@ def check_reference(path: Path, scenes: Iterable[Scene]) -> None:
         InputError: its vessels, wire or controls are others; the line says which.
     """
     reference, kept = _read(path)
-    mend = "make it anew with `endopilot bench simulation --make-reference`"
+    mend = "make it anew with `python -m benchmarks simulation --make-reference`"
     scenes = list(scenes)
     for name, value in _constants(scenes[0].device).items():
         then = reference.recipe["device"].get(name, value)
@@ -133,11 +133,11 @@ def _read(path: Path) -> tuple[Reference, dict[str, np.ndarray]]:
         solution = Solution(**{field.name: kept.pop(field.name) for field in fields(Solution)})
     except FileNotFoundError as error:
         raise InputError(
-            f"{path}: no such file; `endopilot bench simulation --make-reference` makes a reference"
+            f"{path}: no such file; `python -m benchmarks simulation --make-reference` makes a reference"
         ) from error
     except (OSError, ValueError, KeyError, BadZipFile) as error:
         raise InputError(
-            f"{path}: no reference ({error}); make it with `endopilot bench simulation --make-reference`"
+            f"{path}: no reference ({error}); make it with `python -m benchmarks simulation --make-reference`"
         ) from error
     return Reference(solution, recipe), kept
 

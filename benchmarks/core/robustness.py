@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from benchmarks.core.manoeuvres import MANOEUVRES, name_of, paired_controls, seed_of, stacks_of
+from benchmarks.figures import Bar
 from endopilot import __version__, _core
 from endopilot.anatomy.io import read_anatomy
 from endopilot.anatomy.projection import project_tip
@@ -99,8 +100,10 @@ class Chunk:
     seconds: float
 
 
-def measure_robustness(config: RobustnessConfig) -> dict[str, Any]:
-    """Simulate the missing rollouts, and count the failures in all of them.
+def measure_robustness(config: RobustnessConfig = RobustnessConfig()) -> dict[str, Any]:
+    """Drive every shipped device through many anatomies and beyond their ends, and count failures.
+
+    The anatomies are synthetic, or those given. Only the missing rollouts are simulated.
 
     Returns:
         `figures`, one row a bar: figure, value, bar, passed; `rollouts` and `simulated_hours`; `by_device`,
@@ -115,7 +118,7 @@ def measure_robustness(config: RobustnessConfig) -> dict[str, Any]:
         InputError: the folder belongs to another run, such as one of another build of the core, or cannot be written;
             a given folder holds no anatomy.
     """
-    claim(config.folder, "endopilot bench robustness", **_identity(config))
+    claim(config.folder, "python -m benchmarks robustness", **_identity(config))
     anatomies = len(config.given) or config.anatomies
     share = -(-config.rollouts // anatomies)
     with progress("Rollouts", total=anatomies * len(_stacks(config, 0))) as advance, _Worker() as worker:
@@ -310,15 +313,14 @@ def _summarise(config: RobustnessConfig) -> dict[str, Any]:
             tally.add(chunk, rows)
     everything = tallies.get(("all", "all"), _Tally()).row()
     worlds = everything["rollouts"]
-    measured: list[tuple[str, float, float]] = [
-        ("invalid worlds, share", everything["invalid"] / worlds if worlds else 0.0, MOST_INVALID_SHARE),
-        ("penetration, 99.9th percentile, mm", everything["penetration_p999_mm"] or 0.0, MOST_PENETRATION_MM),
-        ("non-finite numbers in valid worlds", non_finite, 0),
-        ("crashes", len(crashed), 0),
-    ]
     return {
         "figures": [
-            {"figure": name, "value": value, "bar": bar, "passed": value <= bar} for name, value, bar in measured
+            Bar(MOST_INVALID_SHARE).row("invalid worlds, share", everything["invalid"] / worlds if worlds else 0.0),
+            Bar(MOST_PENETRATION_MM).row(
+                "penetration, 99.9th percentile, mm", everything["penetration_p999_mm"] or 0.0
+            ),
+            Bar(0).row("non-finite numbers in valid worlds", non_finite),
+            Bar(0).row("crashes", len(crashed)),
         ],
         **everything,
         "simulated_hours": round(worlds * config.seconds / 3600, 2),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -15,7 +15,7 @@ from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, random_controls
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulate import simulate
-from endopilot.types import Anatomy, Rollout
+from endopilot.types import SAMPLE_PERIOD_S, Anatomy, Rollout
 
 KINDS: Mapping[str, str] = {"right": "rca", "left": "lca", "cerebral": "cerebral"}
 """Names of the patients, and their kinds in the atlas. Nothing was calibrated on these patients."""
@@ -79,6 +79,11 @@ def make_scenes(worlds: int = WORLDS, samples: int = SAMPLES) -> list[Scene]:
         )
         scenes.append(Scene(name, anatomy, read_device(DEVICE), initial, control))
     return scenes
+
+
+def simulated_s(scenes: Sequence[Scene]) -> float:
+    """Return the simulated time of all worlds together, s."""
+    return SAMPLE_PERIOD_S * sum(scene.control.shape[0] * scene.control.shape[1] for scene in scenes)
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,79 +4,114 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
-from benchmarks.core.baseline import BASELINE_FOLDER, Baseline
-from benchmarks.core.beside import node_iterations_per_second
+from benchmarks.core.beside import bench_motion, effort, error_in_time, fine_steps, run_all
+from benchmarks.core.coaxial import bench_coaxial
 from benchmarks.core.errors import error_figures, error_intervals
+from benchmarks.core.gpu import bench_gpu
 from benchmarks.core.reference import REFERENCE_FILE, check_reference, read_reference
-from benchmarks.core.scenes import DEVICE, KINDS, SEED, Scene, Solution, make_scenes
+from benchmarks.core.reference import make_reference as make
+from benchmarks.core.scenes import DEVICE, Solution, make_scenes, simulated_s
+from benchmarks.figures import in_turns, timed
 from endopilot.atlas.atlas import AtlasConfig, make_patient
+from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import read_device
+from endopilot.errors import InputError
 from endopilot.simulation.config import PRESETS, Preset, SimulatorConfig, wall_stiffness
+from endopilot.simulation.motion import MotionName, motion_named
 from endopilot.simulation.simulator import Simulator
-from endopilot.types import SAMPLE_PERIOD_S, Rollout
 
 COMPARED = 8
 """Worlds of each scene that the error in time alone is measured on."""
-REPEATS = 3
-"""Times that the worlds are simulated for the timing; the fastest counts."""
 MANY = 4
 """Times as many worlds for the speedup of two threads: the reference's own leave a third of their lanes idle."""
 
 
 def bench_simulation(
-    preset: Preset = "default", *, reference: Path = REFERENCE_FILE, baseline: Path = BASELINE_FOLDER
-) -> dict[str, Any]:
+    *,
+    preset: Preset = "default",
+    catheter: str | None = None,
+    motion: MotionName = "still",
+    device: Literal["cpu", "cuda"] = "cpu",
+    make_reference: bool = False,
+    reference: Path = REFERENCE_FILE,
+) -> dict[str, Any] | list[dict[str, Any]]:
+    """Measure the speed of the rod core, and the tip's error at that speed against a converged solution.
+
+    Args:
+        preset: settings of the rod core: default, fast or accurate.
+        catheter: measure the wire in this catheter (a name or a YAML file), beside the wire alone.
+        motion: measure the wire in patients that move (breathing, heartbeat or both), beside the same at rest.
+        device: measure the processor (cpu), or up to 100 000 wires on a GPU (cuda) and how closely the two agree.
+        make_reference: compute the converged solution anew instead, which takes a quarter of an hour.
+        reference: file of the converged solution.
+
+    Returns:
+        The figures of `against_reference`, or those of `bench_coaxial`, `bench_motion` or `bench_gpu`.
+
+    Raises:
+        InputError: the reference is missing or is that of other scenes; both a catheter and a motion are given; the
+            catheter does not fit; there is no GPU.
+    """
+    moves = motion_named(motion)
+    if catheter is not None and moves is not None:
+        raise InputError("motion: with a catheter; measure one of the two")
+    if catheter is not None:
+        return bench_coaxial(read_catheter(catheter), preset)
+    if moves is not None:
+        return {"motion": motion, **bench_motion(moves, preset)}
+    if device == "cuda":
+        return bench_gpu(preset)
+    return dict(make(reference)) if make_reference else against_reference(preset, reference)
+
+
+def against_reference(preset: Preset = "default", reference: Path = REFERENCE_FILE) -> dict[str, Any]:
     """Measure the rod core on the reference's scenes: random navigations of 60 s in three synthetic patients.
 
     Args:
         preset: name of the settings.
         reference: file of the converged solution.
-        baseline: folder of the older build that the speed is compared with.
 
     Returns:
         `realtime_factor_per_core` (simulated seconds per second of processor time on one thread, including everything
-        that `simulate` does), `speed_over_baseline` (the same against the older build with its default settings, in
-        turns with it; None where there is no such build), `node_iterations_per_second` (evaluations of nodes a
-        simulated second, all steps and attempts), `threads_speedup` (two threads against one, with `MANY` times as
-        many worlds) and `threads_speedup_few_worlds` (with the reference's worlds); the errors of
-        `error_figures`, their `intervals` over worlds and the figures `by_anatomy`; `tip_error_*`, the error in time
-        alone: against the same elements at 1 ms and 1e-8 mm; the iterations a time step, the share of valid worlds, the
-        largest wall forces, and `seconds_for_first_call`: of one world and sample, the first call after the imports.
-        `reference_own_error` holds the reference's figures against a finer solution.
+        that `simulate` does), `node_iterations_per_second` (evaluations of nodes a simulated second, all steps and
+        attempts), `threads_speedup` (two threads against one, with `MANY` times as many worlds) and
+        `threads_speedup_few_worlds` (with the reference's worlds); the errors of `error_figures`, their `intervals`
+        over worlds and the figures `by_anatomy`; `tip_error_*`, the error in time alone: against the same elements at
+        1 ms and 1e-8 mm; the iterations a time step, the share of valid worlds, the largest wall forces, and
+        `seconds_for_first_call`: of one world and sample, the first call after the imports. `reference_own_error` holds
+        the reference's figures against a finer solution.
 
     Raises:
-        InputError: the reference is missing or is that of other scenes; the older build does not run.
+        InputError: the reference is missing or is that of other scenes.
     """
     exact = read_reference(reference)
     scenes = make_scenes(exact.recipe["worlds"], exact.recipe["samples"])
     check_reference(reference, scenes)
     config = replace(PRESETS[preset], threads=1)
-    started = time.perf_counter()
-    scenes[0].run(config, 1)
-    first_call = time.perf_counter() - started
-    timed = _time(scenes, config, baseline)
-    found = Solution.of(scenes, timed.rollouts)
+    first_call = timed(lambda: scenes[0].run(config, 1))[1]
+    (rollouts, alone, processor), (_, together, _) = in_turns(
+        lambda: run_all(scenes, config), lambda: run_all(scenes, replace(config, threads=2))
+    )
+    found = Solution.of(scenes, rollouts)
     owner = np.repeat(np.arange(len(scenes)), [len(scene.control) for scene in scenes])
-    simulated = SAMPLE_PERIOD_S * sum(scene.control.shape[0] * scene.control.shape[1] for scene in scenes)
     force = np.percentile(found.contact_force_max[found.valid], 99.9)
+    fine = fine_steps(partial(run_all, scenes), preset, COMPARED, tolerance_mm=1e-8)
     return {
         "preset": preset,
-        "realtime_factor_per_core": round(simulated / timed.processor, 1),
-        "speed_over_baseline": None if timed.baseline is None else round(timed.baseline / timed.processor, 3),
-        "node_iterations_per_second": node_iterations_per_second(timed.rollouts),
+        "realtime_factor_per_core": round(simulated_s(scenes) / processor, 1),
         "threads_speedup": round(_threads_speedup(exact.recipe, config), 3),
-        "threads_speedup_few_worlds": round(timed.alone / timed.together, 3),
+        "threads_speedup_few_worlds": round(alone / together, 3),
         **error_figures(found, exact.solution),
-        **_error_in_time(scenes, config, timed.rollouts),
-        "iterations_per_step": round(float(np.mean([r.iterations[r.valid].mean() for r in timed.rollouts])), 3),
-        "valid_worlds": round(float(found.valid[:, -1].mean()), 5),
+        **error_in_time("tip_error", rollouts, fine),
+        **effort(rollouts),
         "contact_force_p999_n": round(float(force), 4),
         "penetration_p999_mm": round(float(force) / wall_stiffness(config, scenes[0].device.push_limit_n), 4),
         "seconds_for_first_call": round(first_call, 3),
@@ -90,67 +125,10 @@ def bench_simulation(
     }
 
 
-@dataclass(frozen=True, eq=False)
-class _Timed:
-    """The scenes' rollouts; processor time, and that of the older build, s; wall time on one and two threads, s."""
-
-    rollouts: list[Rollout]
-    processor: float
-    baseline: float | None
-    alone: float
-    together: float
-
-
-def _time(scenes: Sequence[Scene], config: SimulatorConfig, baseline: Path) -> _Timed:
-    work = {
-        "kinds": list(KINDS.values()),
-        "seed": SEED,
-        "device": DEVICE,
-        "worlds": len(scenes[0].control),
-        "samples": scenes[0].control.shape[1],
-    }
-    older = Baseline(baseline, work) if baseline.exists() else None
-    then, alone, together, processor = [], [], [], []
-    rollouts: list[Rollout] = []
-    try:
-        for _ in range(REPEATS):
-            if older is not None:
-                then.append(older.seconds())
-            rollouts, wall, spent = _run(scenes, config)
-            alone.append(wall)
-            processor.append(spent)
-            together.append(_run(scenes, replace(config, threads=2))[1])
-    finally:
-        if older is not None:
-            older.close()
-    return _Timed(rollouts, min(processor), min(then, default=None), min(alone), min(together))
-
-
-def _run(scenes: Sequence[Scene], config: SimulatorConfig) -> tuple[list[Rollout], float, float]:
-    wall, processor = time.perf_counter(), time.process_time()
-    rollouts = [scene.run(config) for scene in scenes]
-    return rollouts, time.perf_counter() - wall, time.process_time() - processor
-
-
 def _threads_speedup(recipe: Mapping[str, Any], config: SimulatorConfig) -> float:
     scenes = make_scenes(MANY * recipe["worlds"], recipe["samples"])
-    alone, together = (_run(scenes, replace(config, threads=threads))[1] for threads in (1, 2))
+    alone, together = (timed(partial(run_all, scenes, replace(config, threads=threads)))[1] for threads in (1, 2))
     return alone / together
-
-
-def _error_in_time(scenes: Sequence[Scene], config: SimulatorConfig, rollouts: Sequence[Rollout]) -> dict[str, float]:
-    errors = []
-    for scene, rollout in zip(scenes, rollouts, strict=True):
-        fine = scene.run(replace(config, time_step_s=1e-3, tolerance_mm=1e-8, threads=0), COMPARED)
-        both = fine.valid & rollout.valid[:COMPARED]
-        errors.append(np.linalg.norm(fine.tip_position - rollout.tip_position[:COMPARED], axis=-1)[both])
-    error = np.concatenate(errors)
-    return {
-        "tip_error_mean_mm": round(float(error.mean()), 5),
-        "tip_error_median_mm": round(float(np.median(error)), 5),
-        "tip_error_p95_mm": round(float(np.percentile(error, 95)), 5),
-        "tip_error_max_mm": round(float(error.max()), 5),
-    }
 
 
 def bench_scaling() -> list[dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""Patients and scans of `endopilot bench imaging`, with one difficulty of real scans at a time."""
+"""Patients and scans of `python -m benchmarks imaging`, with one difficulty of real scans at a time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Train what the tip detector knows of a wire in a pixel: `python benchmarks/wire_evidence.py --write`.
+"""Train what the tip detector knows of a wire in a pixel: `python -m benchmarks wire-evidence --write`.
 
 A logistic regression on ridges, from images of synthetic patients whose wire is known. The patients are drawn with a
 seed of their own; no patient that anything is measured on has it. It takes some 3 minutes on one core.
@@ -6,7 +6,7 @@ seed of their own; no patient that anything is measured on has it. It takes some
 
 from __future__ import annotations
 
-import argparse
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt, map_coordinates
@@ -75,33 +75,36 @@ def fit(on: np.ndarray, off: np.ndarray) -> tuple[np.ndarray, float, float]:
     return found.x[:-1] / scale, float(found.x[-1]), float(found.fun)
 
 
-def _resampled(nodes: np.ndarray, along: np.ndarray, at: np.ndarray) -> np.ndarray:
-    return np.stack([np.interp(at, along, part) for part in nodes.T], axis=-1)
+def train_evidence(*, write: bool = False) -> dict[str, Any]:
+    """Train what the tip detector knows of a wire in a pixel.
 
+    Args:
+        write: write the parameters into the package.
 
-def _inside(pixels: np.ndarray, shape: tuple[int, ...], margin: int) -> np.ndarray:
-    return pixels[((pixels >= margin) & (pixels <= np.array(shape) - 1 - margin)).all(axis=1)]
-
-
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--write", action="store_true", help="write the parameters into the package")
-    arguments = parser.parse_args()
-    stream, pairs = np.random.default_rng(SCENES.seed), []
-    for scene in draw_scenes(SCENES):
-        pairs.append(samples(scene, stream))
+    Returns:
+        What it was trained on, and the cross-entropy.
+    """
+    stream = np.random.default_rng(SCENES.seed)
+    pairs = [samples(scene, stream) for scene in draw_scenes(SCENES)]
     on, off = (np.concatenate(part) for part in zip(*pairs, strict=True))
     weight, offset, entropy = fit(on, off)
     card = {
-        "trained_by": "python benchmarks/wire_evidence.py --write",
+        "trained_by": "python -m benchmarks wire-evidence --write",
         "patients": SCENES.patients,
         "seed": SCENES.seed,
         "pixels_on_wires": len(on),
         "pixels_off_wires": len(off),
         "cross_entropy": round(entropy, 4),
     }
-    print(card)
-    if arguments.write:
-        write_json(
-            PARAMETERS, card | {"weight": [float(f"{value:.6g}") for value in weight], "offset": round(offset, 6)}
-        )
+    if write:
+        weights = [float(f"{value:.6g}") for value in weight]
+        write_json(PARAMETERS, card | {"weight": weights, "offset": round(offset, 6)})
+    return card
+
+
+def _resampled(nodes: np.ndarray, along: np.ndarray, at: np.ndarray) -> np.ndarray:
+    return np.stack([np.interp(at, along, part) for part in nodes.T], axis=-1)
+
+
+def _inside(pixels: np.ndarray, shape: tuple[int, ...], margin: int) -> np.ndarray:
+    return pixels[((pixels >= margin) & (pixels <= np.array(shape) - 1 - margin)).all(axis=1)]

@@ -126,8 +126,8 @@ class Comparison:
         }
 
 
-def bench_published(config: PublishedConfig) -> list[dict[str, Any]]:
-    """Simulate every published test.
+def bench_published(config: PublishedConfig = PublishedConfig()) -> list[dict[str, Any]]:
+    """Simulate published bench tests of wires and catheters, and show our figures beside theirs.
 
     Returns:
         A row for each figure, as `Comparison.row` gives it.

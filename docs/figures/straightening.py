@@ -19,7 +19,7 @@ import matplotlib.pyplot as plt
 
 PICTURE = Path(__file__).parents[1] / "images" / "bench-straightening.png"
 DRAW = 4
-"""Which of the paths of `endopilot bench published` is drawn."""
+"""Which of the paths of `python -m benchmarks published` is drawn."""
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""A small version of `endopilot bench robustness`, and that it counts what it says it counts."""
+"""A small version of `python -m benchmarks robustness`, and that it counts what it says it counts."""
 
 from __future__ import annotations
 

@@ -14,9 +14,9 @@ EXIT_FAILED = 1
 def command(*, json: bool = False) -> None:
     """Compare the rod core with closed forms of free rods; print case, reference, value, error, bar and verdict.
 
-    The exit code is 1 if an error exceeds its bar. In the source tree, `python -m benchmarks verification` also compares
-    walls, friction, catheters, moving vessels and an independent engine, and `python -m benchmarks --help` lists what
-    else is measured.
+    The exit code is 1 if an error exceeds its bar. In the source tree, `python -m benchmarks verification` also
+    compares walls, friction, catheters, moving vessels and an independent engine, and `python -m benchmarks --help`
+    lists what else is measured.
 
     Args:
         json: print the rows as JSON.

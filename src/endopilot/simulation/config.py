@@ -112,7 +112,7 @@ PRESETS: Mapping[Preset, SimulatorConfig] = MappingProxyType(
         "accurate": SimulatorConfig(element_mm=0.3),
     }
 )
-"""Settings by name: the usual ones, those for many rollouts, and those for measurements. `endopilot bench simulation
+"""Settings by name: the usual ones, those for many rollouts, and those for measurements. `python -m benchmarks simulation
 --preset NAME` measures speed and error of each."""
 
 
