@@ -13,6 +13,7 @@ import numpy as np
 from endopilot.cli.arguments import show, show_rows
 
 T = TypeVar("T")
+Number = float | int
 DOCS = Path(__file__).parents[1] / "docs"
 REPEATS = 3
 """Times that work is done for its timing; the fastest counts."""
@@ -22,17 +23,17 @@ REPEATS = 3
 class Bar:
     """A limit that a figure keeps: at most `limit`, or at least."""
 
-    limit: float
+    limit: Number
     at_least: bool = False
 
-    def met(self, value: float) -> bool:
+    def met(self, value: Number) -> bool:
         """Return whether a figure meets the bar; one that is no number does not."""
         return bool(value >= self.limit if self.at_least else value <= self.limit)
 
     def __str__(self) -> str:
         return f"{'≥' if self.at_least else '≤'} {self.limit:g}"
 
-    def row(self, figure: str, value: float) -> dict[str, Any]:
+    def row(self, figure: str, value: Number) -> dict[str, Any]:
         """Return a figure beside its bar, as a row of a table."""
         return {"figure": figure, "value": value, "bar": self.limit, "passed": self.met(value)}
 

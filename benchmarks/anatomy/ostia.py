@@ -63,7 +63,7 @@ def bench_ostia(folder: Positional[Path], /) -> dict[str, Any]:
 def judged(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return figures beside their bars: found, wrong without a word, least covered, slowest."""
     made = [row for row in rows if row["told"] is None]
-    right = sum(row["ostium_error_mm"] <= OSTIUM_BAR_MM for row in made)
+    right = int(sum(row["ostium_error_mm"] <= OSTIUM_BAR_MM for row in made))
     coverage = min((row["coverage"] for row in made), default=0.0)
     slowest = max((row["seconds"] for row in rows), default=0.0)
     enough = int(np.floor(FOUND_BAR * len(rows)))
