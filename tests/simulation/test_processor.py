@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from bend import vessel
 
+from benchmarks.core.gpu import bench_gpu
 from endopilot import _core
-from endopilot.benchmarks.gpu import bench_gpu
 from endopilot.devices.device import read_device
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig

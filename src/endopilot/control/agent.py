@@ -293,7 +293,7 @@ class AgentPolicy(_PlanningPolicy):
             config: search and belief.
             calibration: of the bands around what the simulated wires predict, by which `XrayAdviser` asks for
                 X-ray; if not given, the package's own for the navigation's X-ray, which
-                `benchmarks/agent_calibration.py` makes.
+                `python -m benchmarks agent-calibration` makes.
             advice: which events the adviser watches for.
         """
         super().__init__(config)

@@ -71,7 +71,7 @@ class CoaxialAgent:
         Args:
             config: search and belief.
             calibration: of the adviser's bands around what the simulated wires predict; if not given, the package's
-                own for wires in catheters, which `benchmarks/agent_calibration.py coaxial` makes.
+                own for wires in catheters, which `python -m benchmarks agent-calibration coaxial` makes.
         """
         self.config = config or CoaxialAgentConfig()
         self._calibration = calibration or Calibration.read(COAXIAL_CALIBRATED)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot import _core
+from endopilot.progress import progress
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.core import of_device, run_core
 from endopilot.simulation.rod import RodLayout
@@ -76,6 +78,16 @@ class Case:
             "bar": self.bar,
             "passed": bool(self.error <= self.bar),
         }
+
+
+def run(groups: Sequence[Callable[[], list[Case]]]) -> list[Case]:
+    """Run groups of cases under a progress bar."""
+    cases: list[Case] = []
+    with progress("Verifying the rod core", total=len(groups)) as advance:
+        for group in groups:
+            cases += group()
+            advance()
+    return cases
 
 
 def compare(case: str, reference: float, value: float, bar: float, picture: Picture | None = None) -> Case:
