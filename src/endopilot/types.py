@@ -157,10 +157,16 @@ class VesselTree:
         """Return the indices of the branches that leave at the end of `branch`."""
         return tuple(i for i, candidate in enumerate(self.branches) if candidate.parent == branch)
 
-    def leaves(self) -> tuple[int, ...]:
-        """Return the indices of the branches that end distally."""
+    def leaves(self, branch: int = 0) -> tuple[int, ...]:
+        """Return the indices of the branches that end distally, of those that a route through `branch` leads to."""
         parents = {branch.parent for branch in self.branches}
-        return tuple(i for i in range(len(self.branches)) if i not in parents)
+        ends = tuple(i for i in range(len(self.branches)) if i not in parents)
+        return ends if branch == 0 else tuple(leaf for leaf in ends if branch in self.route(leaf))
+
+    def longest_leaf(self, branch: int = 0) -> int:
+        """Return the index of the leaf, of those that a route through `branch` leads to, that ends farthest from the
+        ostium along the tree."""
+        return max(self.leaves(branch), key=lambda leaf: self.branches[leaf].centerline.abscissa[-1])
 
     def route(self, branch: int) -> tuple[int, ...]:
         """Return the indices of the branches from the root to `branch`, both included."""
@@ -190,7 +196,7 @@ class VesselTree:
 
     def longest_path(self) -> Centerline:
         """Return the path from the ostium to the farthest distal end."""
-        return self.path(max(self.leaves(), key=lambda leaf: self.branches[leaf].centerline.abscissa[-1]))
+        return self.path(self.longest_leaf())
 
     def rotation_zero(self, insertion: Insertion) -> Float[np.ndarray, "3"]:
         """Return where a tip's bend points at φ = 0: to the side of the catheter's axis on which the vessel lies.

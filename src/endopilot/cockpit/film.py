@@ -213,7 +213,7 @@ def _rollout(path: Path, anatomy: Anatomy, device: str, catheters: Sequence[str]
         raise InputError(f"world: {world}; {path} has worlds 0 to {worlds - 1}")
     start = script.initial[world]
     wire = read_device(device)
-    leaf = max(anatomy.tree.leaves(), key=lambda branch: anatomy.tree.branches[branch].centerline.abscissa[-1])
+    leaf = anatomy.tree.longest_leaf()
     end = float(anatomy.tree.branches[leaf].centerline.abscissa[-1])
     navigation = Navigation(
         anatomy=anatomy,

@@ -302,7 +302,7 @@ def _drive(run: _Run, anatomy: Path) -> None:
     """Let the agent drive to the distal end of the longest path."""
     assert run.navigation is not None
     tree = read_anatomy(anatomy).tree
-    longest = max(tree.leaves(), key=lambda leaf: tree.branches[leaf].centerline.abscissa[-1])
+    longest = tree.longest_leaf()
     target = tree.section_names[tree.branches[longest].section[-1]]
     settings = NavigatePatientConfig(device=run.config.device, seed=run.config.seed)
     navigate_into(anatomy, target, run.navigation, settings)
