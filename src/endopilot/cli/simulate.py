@@ -11,7 +11,7 @@ import numpy as np
 from tyro.conf import Positional
 
 from endopilot.anatomy.io import read_anatomy
-from endopilot.cli.arguments import OutputFile, existing, show
+from endopilot.cli.arguments import Existing, Figures, OutputFile
 from endopilot.control.plan_file import read_plan
 from endopilot.dataset.navigations import simulate_navigations
 from endopilot.devices.catheter import read_catheter
@@ -44,21 +44,20 @@ class RandomConfig:
 
 
 def command(
-    anatomy: Positional[Path],
+    anatomy: Positional[Existing],
     /,
     *,
     output: OutputFile,
     device: str = "workhorse-014",
     catheter: tuple[str, ...] = (),
-    controls: Path | None = None,
+    controls: Existing | None = None,
     motion: MotionName = "still",
     motion_seed: Seed | None = None,
     shape: bool = False,
     picture: Path | None = None,
-    json: bool = False,
     random: RandomConfig = RandomConfig(),
     config: SimulatorConfig = SimulatorConfig(),
-) -> None:
+) -> Figures:
     """Drive a guidewire through an anatomy and record it at 2 Hz, or at the end of each control of a file.
 
     Args:
@@ -74,11 +73,10 @@ def command(
         motion_seed: draws the patient's amplitudes from the published distributions; their means by default.
         shape: also record the positions of all nodes, mm (.npz only).
         picture: PNG of the vessel with the first navigation's wire and catheters at its end.
-        json: print the figures as JSON.
         random: the random controls, if no others are given.
         config: settings of the rod core.
     """
-    patient = read_anatomy(existing(anatomy))
+    patient = read_anatomy(anatomy)
     stack = Stack(read_device(device), tuple(read_catheter(name) for name in catheter))
     moves, period_s = motion_named(motion, motion_seed), SAMPLE_PERIOD_S
     if controls is not None and controls.is_dir():
@@ -86,7 +84,7 @@ def command(
         patient, stack, start = plan.navigation.anatomy, plan.navigation.stack, plan.navigation.start
         initial, control = start[None], plan.control.reshape(1, -1, *start.shape)
     elif controls is not None:
-        script = read_controls_csv(existing(controls), devices=len(stack))
+        script = read_controls_csv(controls, devices=len(stack))
         initial, control, period_s = script.initial, script.control, script.period_s
     else:
         initial, control = random_controls(
@@ -115,7 +113,7 @@ def command(
     write_trajectory(trajectory if shape else replace(trajectory, shape=None), output)
     valid, force, torque = trajectory.valid, np.abs(trajectory.base_force), np.abs(trajectory.base_torque)
     figures = {
-        "rollout": str(output),
+        "rollout": output,
         "worlds": int(valid.shape[0]),
         "samples": int(valid.shape[1]),
         "valid_worlds": int(valid[:, -1].sum()),
@@ -138,10 +136,10 @@ def command(
         shown, devices = visible_devices(trajectory, 0, -1), stack.devices
         missing = render_still(patient, shown, picture, devices=devices)
         if missing is None:
-            figures["picture"] = str(picture)
+            figures["picture"] = picture
         else:
             print(missing, file=sys.stderr)
-    show(figures, as_json=json)
+    return figures
 
 
 def _stopped_short(
