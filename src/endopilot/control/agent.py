@@ -22,7 +22,6 @@ from endopilot.control.course import Course
 from endopilot.control.halt import SPARE_SHARE
 from endopilot.control.route import Route, check_passable
 from endopilot.control.search import Search, SearchConfig
-from endopilot.devices.drive_limits import DriveLimits
 from endopilot.navigation.policy import BelievedTip, Decision, Observation
 from endopilot.progress import Advance
 from endopilot.settings import Positive, Within, settings
@@ -112,7 +111,6 @@ class _PlanningPolicy:
             seed=seed,
             sharing=self.belief.simulator,
         )
-        self._limits = DriveLimits.of(navigation.device, navigation.anatomy)
         self._course: Course | None = None
         self._at, self._lost, self._began, self._led, self._arrived = 0, False, False, False, False
         self.plans, self.planning_s, self._failed, self.halt = 0, 0.0, 0, ""
@@ -130,7 +128,6 @@ class _PlanningPolicy:
             translation, rotation = -self.config.search.speed_mm_s, 0.0
         else:
             translation, rotation = self._follow(observation)
-        translation, rotation = self._limits.safe(translation, rotation)
         gives_up = self.halt if self._failed >= self.config.tries and self._course is None and not self._lost else ""
         return Decision(((translation, rotation),), expose=self._lost or self.wants_xray(), gives_up=gives_up)
 
