@@ -193,7 +193,7 @@ class NavigationLoop:
             inserted, _ = state.devices[0]
             tip = self.c_arm.expose(self.simulator, inserted, self._random, time_s=self.time_s)
         self._exposed = self._expose
-        self.observation = Observation(self.time_s, state.devices, tip)
+        self.observation, self.believed = Observation(self.time_s, state.devices, tip), None
         return self.observation
 
     def decide(self, observation: Observation) -> Decision:
@@ -208,7 +208,9 @@ class NavigationLoop:
                 self.policy.watch(observation)
             else:
                 self.policy.decide(observation)  # what it answers is not done
-        return _checked(driver.decide(observation), type(driver).__name__)
+        decision = _checked(driver.decide(observation), type(driver).__name__)
+        self.believed = self.policy.believed() if isinstance(self.policy, Believer) else None
+        return decision
 
     def take(self, decision: Decision) -> Decision:
         """Command the robot for a period.
@@ -221,7 +223,6 @@ class NavigationLoop:
         # An image in which no wire was found is taken again.
         self._expose = bool(decision.expose) or (self._exposed and tip is None)
         self.gives_up = decision.gives_up
-        self.believed = self.policy.believed() if isinstance(self.policy, Believer) else None
         fault = taken[: len(decision.devices)] != decision.devices
         self._track.decided(taken, tip, self.believed, exposed=self._exposed, fault=fault)
         self._period, self._cycles_left, self._peak_n = self._period + 1, self.config.cycles, 0.0
