@@ -36,12 +36,12 @@ def write_session_episode(session: Path, output: Path) -> None:
     if samples == 0:
         raise InputError(f"{session}: lasts less than {DECISION_PERIOD_S:g} s; drive for longer")
     targets = [event["target"] for event in recording.events if "target" in event]
-    navigation, truth = recording.navigation, recording.config.truth
+    navigation, truth = recording.navigation, recording.truth
     *_, (world, _events) = replayed(recording)
     device = navigation.device
     wire = device.with_tip(bend_rad=device.tip_bend_rad, stiffness_factor=truth.stiffness_factor)
     start = np.maximum(navigation.start + np.array([truth.ostium_mm, 0.0]), [0.0, -np.inf])
-    commands = np.array(world.robot.driven)[: samples * per_sample].reshape(1, -1, *start.shape)
+    commands = np.array(world.loop.robot.driven)[: samples * per_sample].reshape(1, -1, *start.shape)
     friction = device.friction * truth.friction_factor
     cycles = simulate(
         navigation.anatomy,

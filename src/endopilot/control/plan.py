@@ -252,9 +252,9 @@ def _by_policy(navigation: Navigation, config: PlanConfig) -> tuple[Steps, Steps
     from endopilot.navigation.policies import make_policy
 
     record = navigate(navigation, make_policy(config.method), config=NavigateConfig(robot=_IDEAL), seed=config.seed)
-    proximal = np.column_stack([record.inserted_length, record.rotation])
+    proximal, tip = np.column_stack([record.inserted_length[:, 0], record.rotation[:, 0]]), record.tip[:, 0]
     control = np.diff(proximal, axis=0) / DECISION_PERIOD_S
-    return control, np.column_stack([record.tip.abscissa, record.tip.offset])[1:]
+    return control, np.column_stack([tip.abscissa, tip.offset])[1:]
 
 
 def _checked(
