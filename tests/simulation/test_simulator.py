@@ -345,7 +345,11 @@ def test_pulling_out_stops_at_the_ostium(anatomy: Anatomy) -> None:
     [
         (np.zeros((1, 2)), 0.1, r"shape \(1, 2\); give \(2, 2\)"),
         (np.array([[1, 0], [np.nan, 0]]), 0.1, "control: world 1: nan: translation in mm/s is no finite number"),
-        (np.array([[1, 0], [1e3, 0]]), 0.1, "control: world 1: 1000: translation in mm/s exceeds workhorse-014's limit of 40; slow"),
+        (
+            np.array([[1, 0], [1e3, 0]]),
+            0.1,
+            "control: world 1: 1000: translation in mm/s exceeds workhorse-014's limit of 40; slow",
+        ),
         (np.array([[40.0, 0], [0, 0]]), 60.0, "world 0: may insert .* laid out for .* push less"),
         (np.zeros((2, 2)), 0.0, "duration: 0.0; give a positive"),
     ],
