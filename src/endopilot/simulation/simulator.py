@@ -379,7 +379,9 @@ class Simulator(Readout):
         check_control(array, self._largest, self._set_up.stacks, self._set_up.actuation)
         if self._set_up.actuation == "velocity":
             ahead = array[..., 0] * period_s
-            check_travel(self.inserted_length + np.maximum(ahead, 0.0).sum(axis=1), self._longest)
+            # The approach may have left a loose device a little deeper than it was asked to be.
+            begun = np.fmin(self.inserted_length, self._set_up.initial[..., 0])
+            check_travel(begun + np.maximum(ahead, 0.0).sum(axis=1), self._longest)
         return array
 
     def _run_all(

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
 from endopilot.devices.stack import Stack
+from endopilot.errors import InputError
 from endopilot.simulation.config import Actuation, SimulatorConfig
 from endopilot.simulation.motion import Motion
 from endopilot.types import Anatomy, TipProjection
