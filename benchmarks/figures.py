@@ -67,22 +67,28 @@ def show_figures(figures: Any, *, as_json: bool) -> None:
     else:
         single = {name: value for name, value in figures.items() if not _is_group(value)}
         show({name: value for name, value in single.items() if not isinstance(value, Mapping)}, as_json=False)
-        alike: dict[tuple[str, ...], list[dict[str, Any]]] = {}
+        parts: dict[tuple[str, ...], dict[str, Any]] = {}
         for name, value in single.items():
             if isinstance(value, Mapping) and value:
-                alike.setdefault(tuple(value), []).append({"figure": name} | dict(value))
-        groups = {name: value for name, value in figures.items() if _is_group(value)}
-        for name, rows in groups.items():
-            named = [{name: key} | dict(one) for key, one in rows.items()] if isinstance(rows, Mapping) else rows
-            alike[name,] = named
-        for rows in alike.values():
-            _table(rows, as_json=False)
+                parts.setdefault(tuple(value), {})[name] = value
+        groups = [("figure", group) for group in parts.values()]
+        groups += [(name, value) for name, value in figures.items() if _is_group(value)]
+        for name, group in groups:
+            _table(_rows_of(name, group) if isinstance(group, Mapping) else group, as_json=False)
 
 
 def _is_group(value: Any) -> bool:
     """Return whether a figure is rows, or a row for each name."""
     rows = value.values() if isinstance(value, Mapping) else value if isinstance(value, list) else ()
     return bool(rows) and all(isinstance(row, Mapping) for row in rows)
+
+
+def _rows_of(name: str, group: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return a row for each name in a group, or where it has more figures than names, a row for each figure."""
+    figures = list({figure: None for row in group.values() for figure in row})
+    if len(figures) <= len(group):
+        return [{name: one} | dict(row) for one, row in group.items()]
+    return [{name: figure} | {one: row.get(figure) for one, row in group.items()} for figure in figures]
 
 
 def _table(rows: list[dict[str, Any]], *, as_json: bool) -> None:

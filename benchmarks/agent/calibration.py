@@ -106,11 +106,11 @@ class _Monitored:
     def start(self, navigation: Navigation, seed: int) -> None:
         """Begin a navigation without predictions."""
         self.kept: list[np.ndarray] = []
-        super().start(navigation, seed)
+        super().start(navigation, seed)  # pyright: ignore[reportAttributeAccessIssue]
 
     def decide(self, observation: Observation) -> Decision:
         """Decide as the agent does, and keep the prediction."""
-        decision = super().decide(observation)
+        decision = super().decide(observation)  # pyright: ignore[reportAttributeAccessIssue]
         proximal, tip, spread, _ = self.adviser_input()
         self.kept.append(np.concatenate([proximal[0], tip[0], spread[0]]))
         return decision

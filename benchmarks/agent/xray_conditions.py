@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from tyro.conf import Positional
@@ -30,7 +30,7 @@ from endopilot.tasks.task import CORE, NEWEST, find_task, ladder_tasks
 
 FOLDER = Path("runs/xray-conditions")
 Condition = Literal["assumed", "images", "moving", "together", "measured"]
-CONDITIONS: dict[Condition, tuple[str, XrayKind, bool, bool]] = {
+CONDITIONS: dict[str, tuple[str, XrayKind, bool, bool]] = {
     "assumed": ("assumed errors, a patient at rest", "assumed", False, False),
     "images": ("images and registration", "images", False, False),
     "moving": ("heart and breath", "assumed", True, False),
@@ -94,7 +94,7 @@ def row(name: str, results: list[dict[str, Any]]) -> str:
 
 
 def drive_under_conditions(
-    patients: Positional[Count] = 2, /, *, only: tuple[Condition, ...] = tuple(CONDITIONS), write: bool = False
+    patients: Positional[Count] = 2, /, *, only: tuple[Condition, ...] = get_args(Condition), write: bool = False
 ) -> str:
     """Drive the agent with X-ray images, in moving patients, and with both, in the coronary tasks of the ladder.
 

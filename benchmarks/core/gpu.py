@@ -90,7 +90,7 @@ def bench_gpu(
             {
                 "worlds": count,
                 "seconds": round(seconds, 3),
-                "realtime_factor": round(count * factor, 1),
+                "realtime_factor": round(count * factor, 2),
                 "realtime_factor_per_wire": round(factor, 2),
                 "valid_worlds": round(float(result["valid"][:, -1].mean()), 5),
                 "tip_distance_median_mm": float(np.median(distance)),

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from endopilot import _core
 from endopilot.devices.device import Device
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.core import run_core
-from endopilot.simulation.rod import POISSON_RATIO, SHEAR_CORRECTION, RodLayout
-from endopilot.types import Insertion
+from endopilot.simulation.rod import POISSON_RATIO, SHEAR_CORRECTION
+from endopilot.verification.case import Loading, driven, straight_rod
 
 SPAN_MM = 40.0
 """Distance of the supports in the published tests, mm."""
 _ELEMENTS = 40
 _STATIC = SimulatorConfig(time_step_s=0.5, tolerance_mm=1e-7, threads=1)
-_DRAG = 1e-12
 
 
 def flexural_modulus(device: Device, *, at_mm: float, deflection_mm: float, diameter_mm: float) -> float:
@@ -34,50 +31,29 @@ def flexural_modulus(device: Device, *, at_mm: float, deflection_mm: float, diam
         RuntimeError: the rod core did not converge.
     """
     half = SPAN_MM / 2
-    size = half / (_ELEMENTS - 0.5)  # half of the clamped element is held
-    abscissa = size * np.arange(_ELEMENTS + 1)
-    nodes = len(abscissa)
-    bend, twist = (
-        float(device.bend_stiffness(np.array([at_mm]))[0]),
-        float(device.twist_stiffness(np.array([at_mm]))[0]),
-    )
+    bend, twist = (float(of(np.array([at_mm]))[0]) for of in (device.bend_stiffness, device.twist_stiffness))
     stretch = 16.0 * bend / device.diameter_mm**2
-    rod = RodLayout(
-        abscissa_mm=abscissa,
-        shear_n=np.full(nodes, SHEAR_CORRECTION * stretch / (2 * (1 + POISSON_RATIO))),
-        stretch_n=np.full(nodes, stretch),
-        bend_n_mm2=np.full(nodes, bend),
-        twist_n_mm2=np.full(nodes, twist),
-        rest_curvature=np.zeros((nodes, 3)),
-        radius_mm=np.full(nodes, device.tip_radius_mm),
-        drag_n_s_mm=np.full(nodes, _DRAG),
-        spin_drag_n_mm_s=np.full(nodes, _DRAG),
+    rod = straight_rod(
+        elements=_ELEMENTS,
+        length_mm=half,
+        bend=bend,
+        twist=twist,
+        shear=SHEAR_CORRECTION * stretch / (2 * (1 + POISSON_RATIO)),
+        stretch=stretch,
+        radius_mm=device.tip_radius_mm,
+        clamp=1,
     )
     load = 48 * bend * deflection_mm / SPAN_MM**3
-    force, zero = np.zeros((nodes, 3)), np.zeros((nodes, 3))
-    force[0, 1] = load / 2
-    result = run_core(
+    loading = Loading.none(len(rod.abscissa_mm))
+    loading.force_n[0, 1] = load / 2
+    result = driven(
         rod,
-        None,
-        Insertion(position=np.zeros(3), direction=np.array([1.0, 0.0, 0.0])),
+        np.zeros((4, 2)),
+        initial=np.array([half, 0.0]),
         config=_STATIC,
-        initial=np.array([[half, 0.0]]),
-        control=np.zeros((1, 4, 2)),
-        friction=np.zeros(1),
-        loads=_core.make_loads(
-            force=force,
-            moment=zero,
-            spring=zero,
-            anchor=zero,
-            hold=np.zeros(nodes),
-            attitude=np.tile([1.0, 0.0, 0.0, 0.0], (nodes, 1)),
-        ),
-        lanes=1,
-        approach=False,
+        loading=loading,
         free_behind_mm=half,
     )
-    if not result["valid"].all():
-        raise RuntimeError(f"the bending test of device {device.name} did not converge")
-    moved = float(result["tip_position"][0, -1, 0, 1])
+    moved = float(result["tip_position"][-1, 1])
     section = np.pi * diameter_mm**4 / 64
     return load * SPAN_MM**3 / (48 * moved * section) / 1000

@@ -9,15 +9,12 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from benchmarks.verification.contact import bent_tube
-from benchmarks.verification.order import order_case
+from benchmarks.verification.order import navigation_order
 from endopilot import _core
-from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.devices.device import read_device
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.core import core_options, insertion_arguments, make_lumen
 from endopilot.simulation.motion import Motion, place
 from endopilot.simulation.rod import RodLayout
-from endopilot.simulation.simulate import simulate
 from endopilot.types import Insertion
 from endopilot.verification.case import Case, Curve, Picture, compare
 from endopilot.verification.free_rod import rod_energy
@@ -30,10 +27,6 @@ STEP_S = 0.005
 FRICTION = 0.2
 RIGID_BAR_MM = 1e-5
 BALANCE_BAR = 0.02
-ORDER_BAR = 0.2
-"""Largest relative error of the order in time, as in a still vessel: stick and slip make the error uneven."""
-ORDER_STEPS_S = np.array([0.02, 0.01, 0.005])
-ORDER_FINEST_S = 0.000625
 ORDER_WORLDS = 4
 ORDER_SAMPLES = 8
 _ELEMENT_MM = 0.5
@@ -231,26 +224,12 @@ def _force(nodes: Float[np.ndarray, "n 3"], attitude: Float[np.ndarray, "n 4"]) 
 def order_in_a_beating_heart() -> list[Case]:
     """Measure the order of the tip's mean error in time, in an artery that beats and breathes.
 
-    The wire is pushed and turned at different speeds. As in a still vessel, the error against a step h₀ that is not
-    zero is proportional to h - h₀.
+    The wire is pushed and turned at different speeds.
     """
-    anatomy, device = make_patient(AtlasConfig(population="textbook"), 0), read_device("workhorse-014")
     speed = np.column_stack([np.linspace(4, 10, ORDER_WORLDS), np.linspace(-2, 2, ORDER_WORLDS)])
     control = np.repeat(speed[:, None], ORDER_SAMPLES, axis=1)
     initial = np.column_stack([np.linspace(20, 50, ORDER_WORLDS), np.zeros(ORDER_WORLDS)])
-
-    def tips(step_s: float) -> Float[np.ndarray, "worlds samples 3"]:
-        config = SimulatorConfig(time_step_s=step_s, tolerance_mm=1e-6, threads=1)
-        rollout = simulate(anatomy, device, control, initial=initial, config=config, motion=Motion())
-        if not rollout.valid.all():
-            raise RuntimeError("a navigation of the verification did not converge")
-        return rollout.tip_position[:, :, 0]
-
-    finest = tips(ORDER_FINEST_S)
-    error = np.array([np.linalg.norm(tips(step) - finest, axis=-1).mean() for step in ORDER_STEPS_S])
-    names = (f"time step − {ORDER_FINEST_S:g} s, s", "mean distance of the tips, mm")
-    name, steps = "motion: order in time step, beating and breathing", ORDER_STEPS_S - ORDER_FINEST_S
-    return [order_case(name, 1.0, steps, error, names, ORDER_BAR)]
+    return [navigation_order("motion: order in time step, beating and breathing", initial, control, Motion())]
 
 
 CASES = (rigid_motion, power_balance, order_in_a_beating_heart)

@@ -9,7 +9,9 @@ from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.devices.device import read_device
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, random_controls
+from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulate import simulate
+from endopilot.types import Anatomy
 from endopilot.verification.case import Case, Curve, Loading, Picture, compare, equilibrium, straight_rod
 from endopilot.verification.free_rod import elastica_tip
 
@@ -80,41 +82,58 @@ def order_in_time_step() -> list[Case]:
     ]
 
 
-def navigation_error() -> Float[np.ndarray, "steps"]:
-    """Return the mean distance (mm) of the tip from that at the finest time step, in random navigations.
+def order_in_navigation() -> list[Case]:
+    """Measure the order of the tip's mean error in random navigations as the time step shrinks.
 
     The coronary wire goes through a synthetic right coronary artery for 10 s, pushed, pulled and turned at random.
     """
-    anatomy, device = make_patient(AtlasConfig(population="textbook"), 0), read_device("workhorse-014")
-    longest = float(anatomy.tree.longest_path().abscissa[-1])
     initial, control = random_controls(
         ControlConfig(),
         n_sequences=NAVIGATION_WORLDS,
         n_samples=NAVIGATION_SAMPLES,
         seed=0,
-        max_inserted_length_mm=longest,
+        max_inserted_length_mm=float(patient().tree.longest_path().abscissa[-1]),
     )
+    return [navigation_order("order in time step, navigation", initial, control)]
+
+
+def patient() -> Anatomy:
+    """Return the synthetic right coronary artery that navigations go through."""
+    return make_patient(AtlasConfig(population="textbook"), 0)
+
+
+def navigation_order(
+    case: str,
+    initial: Float[np.ndarray, "worlds 2"],
+    control: Float[np.ndarray, "worlds samples 2"],
+    motion: Motion | None = None,
+) -> Case:
+    """Return the order in time of the tip's mean distance (mm) from that at the finest time step.
+
+    The error against a step h₀ that is not zero is proportional to h - h₀.
+
+    Args:
+        case: what is compared.
+        initial: inserted length (mm) and rotation (rad) at the start.
+        control: of the coronary wire in `patient`, mm/s and rad/s.
+        motion: of the vessel.
+
+    Raises:
+        RuntimeError: a navigation did not converge.
+    """
+    anatomy, device = patient(), read_device("workhorse-014")
 
     def tips(step_s: float) -> Float[np.ndarray, "worlds samples 3"]:
         config = SimulatorConfig(time_step_s=step_s, tolerance_mm=1e-6, threads=1)
-        rollout = simulate(anatomy, device, control, initial=initial, config=config)
+        rollout = simulate(anatomy, device, control, initial=initial, config=config, motion=motion)
         if not rollout.valid.all():
             raise RuntimeError("a navigation of the verification did not converge")
         return rollout.tip_position[:, :, 0]
 
     finest = tips(NAVIGATION_FINEST_S)
-    return np.array([np.linalg.norm(tips(step) - finest, axis=-1).mean() for step in NAVIGATION_STEPS_S])
-
-
-def order_in_navigation() -> list[Case]:
-    """Measure the order of the tip's mean error in random navigations as the time step shrinks.
-
-    The error against a step h₀ that is not zero is proportional to h - h₀.
-    """
-    error = navigation_error()
-    steps = NAVIGATION_STEPS_S - NAVIGATION_FINEST_S
+    error = np.array([np.linalg.norm(tips(step) - finest, axis=-1).mean() for step in NAVIGATION_STEPS_S])
     names = (f"time step − {NAVIGATION_FINEST_S:g} s, s", "mean distance of the tips, mm")
-    return [order_case("order in time step, navigation", 1.0, steps, error, names, NAVIGATION_BAR)]
+    return order_case(case, 1.0, NAVIGATION_STEPS_S - NAVIGATION_FINEST_S, error, names, NAVIGATION_BAR)
 
 
 def order_case(

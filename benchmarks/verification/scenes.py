@@ -12,12 +12,12 @@ from jaxtyping import Float
 from scipy.integrate import solve_ivp
 from scipy.spatial import KDTree
 
-from endopilot import _core
 from endopilot.devices.device import read_device
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.core import make_lumen, of_device, run_core
+from endopilot.simulation.core import make_lumen
 from endopilot.simulation.rod import RodLayout, lay_out
 from endopilot.types import SAMPLE_PERIOD_S, DistanceMap, Insertion
+from endopilot.verification.case import Loading, driven, uniform_rod
 
 _FINE_MM = 0.02
 """Spacing of the points that a vessel's axis is sampled at, mm: the distance to them errs by less than 1e-4 mm."""
@@ -122,10 +122,9 @@ def drag_through_bends(bends: int, *, friction: float = 0.2, bend_n_mm2: float =
     axis = tortuous_axis(turns, bend_radius_mm=bend_radius, lead_mm=lead + 5, tail_mm=25.0)
     length = lead + bend_radius * DRAG_BEND_RAD * bends + 15.0
     nodes = int(length / size) + 3
-    rod = _uniform(nodes, size, bend_n_mm2, bend_n_mm2, shear_n=50.0, stretch_n=100.0)
-    force, zero = np.zeros((nodes, 3)), np.zeros((nodes, 3))
-    force[0] = DRAG_LOAD_N * np.array([np.cos(turns.sum()), np.sin(turns.sum()), 0.0])
-    still = np.tile([1.0, 0.0, 0.0, 0.0], (nodes, 1))
+    rod = _uniform(nodes, size, bend_n_mm2, bend_n_mm2, shear=50.0, stretch=100.0)
+    loading = Loading.none(nodes)
+    loading.force_n[0] = DRAG_LOAD_N * np.array([np.cos(turns.sum()), np.sin(turns.sum()), 0.0])
     push, pull = int((length - 4.0) / 5.0), 10
     control = np.zeros((push + pull, 2))
     control[:push, 0], control[push:, 0] = 10.0, -0.5
@@ -138,9 +137,7 @@ def drag_through_bends(bends: int, *, friction: float = 0.2, bend_n_mm2: float =
         friction=friction,
         config=SimulatorConfig(tolerance_mm=1e-5, stick_velocity_mm_s=0.02, wall_stiffness_n_mm=5.0, threads=1),
         free_behind_mm=size,
-        loads=_core.make_loads(
-            force=force, moment=zero, spring=zero, anchor=zero, hold=np.zeros(nodes), attitude=still
-        ),
+        loading=loading,
     )
     shape = result["shape"][-1]
     along = -np.diff(shape, axis=0)
@@ -258,7 +255,7 @@ def turn_in_a_bend(curved_mm: float, *, turns: float = 2.25, friction: float = 0
     size, radius, speed = 0.75, 0.2, 0.25
     axis = tortuous_axis(np.array([np.pi]), bend_radius_mm=CURVE_RADIUS_MM, lead_mm=_WHIP_LEAD_MM + 5, tail_mm=10.0)
     length = curved_mm + _WHIP_LEAD_MM
-    rod = _uniform(int(length / size) + 6, size, WHIP_BEND_N_MM2, WHIP_TWIST_N_MM2, shear_n=220.0, stretch_n=220.0)
+    rod = _uniform(int(length / size) + 6, size, WHIP_BEND_N_MM2, WHIP_TWIST_N_MM2, shear=220.0, stretch=220.0)
     rod.rest_curvature[rod.abscissa_mm <= curved_mm, 0] = -1 / CURVE_RADIUS_MM  # towards the vessel's own curve
     push, turning = int(np.ceil(length / 2.5)), round(turns * 2 * np.pi / speed / SAMPLE_PERIOD_S)
     control = np.zeros((push + 2 + turning, 2))
@@ -309,19 +306,10 @@ def _advance(speed: float, samples: int) -> Float[np.ndarray, "samples"]:
     return speed * SAMPLE_PERIOD_S * (1 + np.arange(samples))
 
 
-def _uniform(nodes: int, size_mm: float, bend: float, twist: float, *, shear_n: float, stretch_n: float) -> RodLayout:
+def _uniform(nodes: int, size_mm: float, bend: float, twist: float, *, shear: float, stretch: float) -> RodLayout:
     """Return a straight rod of 0.2 mm radius with one stiffness and next to no drag."""
-    return RodLayout(
-        abscissa_mm=size_mm * np.arange(nodes),
-        shear_n=np.full(nodes, shear_n),
-        stretch_n=np.full(nodes, stretch_n),
-        bend_n_mm2=np.full(nodes, bend),
-        twist_n_mm2=np.full(nodes, twist),
-        rest_curvature=np.zeros((nodes, 3)),
-        radius_mm=np.full(nodes, 0.2),
-        drag_n_s_mm=np.full(nodes, 1e-6),
-        spin_drag_n_mm_s=np.full(nodes, 1e-8),
-    )
+    section = {"bend": bend, "twist": twist, "shear": shear, "stretch": stretch}
+    return uniform_rod(nodes, size_mm, **section, radius_mm=0.2, drag=1e-6, spin_drag=1e-8)
 
 
 def _chamber(depth_mm: float, radius_mm: float, spacing_mm: float = 0.2) -> DistanceMap:
@@ -346,29 +334,23 @@ def _drive(
     config: SimulatorConfig,
     approach: bool = False,
     free_behind_mm: float = 3.0,
-    loads: _core.Loads | None = None,
+    loading: Loading | None = None,
 ) -> dict[str, np.ndarray]:
     """Drive one rod along x from `entry_mm` on the x axis; return the core's arrays without the world axis.
 
     Raises:
         RuntimeError: the rod core did not converge.
     """
-    result = run_core(
+    return driven(
         rod,
-        make_lumen(field, float(rod.radius_mm[0])),
-        Insertion(position=np.array([entry_mm, 0.0, 0.0]), direction=np.array([1.0, 0.0, 0.0])),
+        control,
+        initial=np.array([inserted_mm, 0.0]),
         config=config,
-        initial=np.array([[inserted_mm, 0.0]]),
-        control=control[None],
-        friction=np.array([friction]),
-        loads=loads,
-        record_shape=True,
-        record_attitude=True,
-        lanes=1,
+        loading=loading,
+        lumen=make_lumen(field, float(rod.radius_mm[0])),
+        friction=friction,
+        insertion=Insertion(position=np.array([entry_mm, 0.0, 0.0]), direction=np.array([1.0, 0.0, 0.0])),
         approach=approach,
         free_behind_mm=free_behind_mm,
         push_limit_n=100.0,  # the drive of a scenario does not slip
     )
-    if not result["valid"].all():
-        raise RuntimeError("a scenario did not converge")
-    return {name: values[0] for name, values in of_device(result, 0).items()}

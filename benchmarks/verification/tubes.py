@@ -11,17 +11,16 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.core import run_core
 from endopilot.simulation.rod import RodLayout
 from endopilot.simulation.tubes import TubeLayout
 from endopilot.verification.case import (
     STATIC,
-    X_AXIS,
     Case,
     Curve,
     Loading,
     Picture,
     compare,
+    driven,
     equilibrium,
     extrapolate_to_zero,
     straight_rod,
@@ -106,28 +105,16 @@ def drive(
         config: settings of the core.
         approach: push them out together from within the clamp; else they start there, straight.
     """
-    count = len(inserted_mm)
-    turned = np.zeros(count) if rotation is None else rotation
-    made = np.zeros((samples, count, 2)) if control is None else control
-    result = run_core(
+    turned = np.zeros(len(inserted_mm)) if rotation is None else rotation
+    return driven(
         rod,
-        None,
-        X_AXIS,
+        np.zeros((samples, len(inserted_mm), 2)) if control is None else control,
+        initial=np.column_stack([inserted_mm, turned]),
         config=replace(config, sample_tolerance_mm=1e-8),
-        initial=np.column_stack([inserted_mm, turned]).reshape(1, -1),
-        control=made.reshape(1, len(made), -1),
-        friction=np.zeros((1, count)),
-        loads=None if loading is None else loading.core(),
-        record_shape=True,
-        record_attitude=True,
-        lanes=1,
-        approach=approach,
-        free_behind_mm=0.0,
         tubes=tubes,
+        loading=loading,
+        approach=approach,
     )
-    if not result["valid"].all():
-        raise RuntimeError("a verification case of tubes did not converge")
-    return {name: values[0] for name, values in result.items()}
 
 
 def curvature(shape: Float[np.ndarray, "n 3"], size_mm: float) -> Float[np.ndarray, "m"]:
