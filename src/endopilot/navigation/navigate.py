@@ -123,7 +123,7 @@ class NavigationLoop:
         self._random = np.random.default_rng([seed, 2])
         self._track = Track()
         self._track.moved(self.simulator, self.robot.proximal, float(self.simulator.contacts.max()))
-        self._periods = int(np.ceil(navigation.seconds / DECISION_PERIOD_S - 1e-9))
+        self._periods = navigation.periods(DECISION_PERIOD_S)
         self._period, self._cycles_left, self._peak_n = 0, 0, 0.0
         self._driver: Policy | None = None
         self._expose, self._exposed = True, False

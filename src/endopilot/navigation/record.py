@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from endopilot.anatomy.projection import project_tip
 from endopilot.navigation.policy import BelievedTip, Proximals
 from endopilot.simulation.simulator import Simulator
-from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
+from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, is_safe
 from endopilot.types import TipProjection
 from endopilot.xray.fluoroscope import TipMeasurement
 
@@ -162,7 +162,7 @@ class Track:
             asks=tuple(tip.asks for tip in believed),
             driven=np.array(driven, dtype=float).reshape(-1, devices, 2),
             success=reason == "reached",
-            safe=bool(force.max() <= navigation.force_limit_n),
+            safe=bool(is_safe(force.max(), navigation.force_limit_n)),
             seconds=DECISION_PERIOD_S * periods,
             peak_force_n=float(force.max()),
             exposures=int(exposures.sum()),
