@@ -224,7 +224,9 @@ class Command:
             section = parser.add_argument_group(title)
             for one in group:
                 note = "(required)" if one.required else f"(default: {one.default})" if one.default else ""
-                kind = {"metavar": one.takes} if one.takes else {} if one.positional else {"action": "store_true"}
+                kind: dict[str, Any] = (
+                    {"metavar": one.takes} if one.takes else {} if one.positional else {"action": "store_true"}
+                )
                 section.add_argument(*one.flags, help=f"{one.meaning} {note}".replace("%", "%%"), **kind)
         return parser.format_help()
 
