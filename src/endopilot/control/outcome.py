@@ -88,7 +88,7 @@ def _held_up(found: PatientNavigation, route: Route) -> str:
         at, width = narrow
         what = "catheter" if navigation.arriving else "wire"
         return f"at {at:.1f} mm the lumen is {width:.2f} mm wide, and the {what} {device.diameter_mm:g} mm"
-    for k, (each, slip) in enumerate(zip(navigation.devices, _slips(found.rollout), strict=True)):
+    for k, (each, slip) in enumerate(zip(navigation.devices, _slips(found.record.trajectory), strict=True)):
         slipped, caught = int((slip[:, 0] > 0).sum()), "catheter" if k else "wire"
         if slipped:
             return f"the {caught} is caught; the drive slipped at its limit of {each.push_limit_n:g} N {slipped} times"
@@ -123,7 +123,8 @@ def worst_ratio(found: PatientNavigation) -> float:
 
 def slipped_s(found: PatientNavigation) -> float:
     """Return for how long a drive slipped, s."""
-    slip = np.hstack(_slips(found.cycles))[: len(found.record.driven)]
+    cycles = found.record.cycles
+    slip = np.zeros((0, 1)) if cycles is None else np.hstack(_slips(cycles))
     return float((slip != 0).any(axis=1).sum()) * CYCLE_S
 
 

@@ -91,9 +91,9 @@ def _write(found: PatientNavigation, folder: Path, target: str, output: Path) ->
             write_anatomy(real, driven_in)
     with writing(output / TABLE_FILE) as partial:
         navigation_table(found).to_csv(partial, index=False)
-    cycles = found.cycles
-    count = len(found.record.driven)
-    write_controls_csv(output / CONTROLS_FILE, cycles.command[0, :count], cycles.proximal[0, :count], cycles.period_s)
+    cycles = found.record.cycles
+    assert cycles is not None  # a navigation has a period at least
+    write_controls_csv(output / CONTROLS_FILE, cycles.command[0], cycles.proximal[0], cycles.period_s)
     write_device(set_up.true_wire, output / WIRE_FILE)
     for path, catheter in zip(_catheter_files(set_up, output), set_up.true_catheters, strict=True):
         write_catheter(catheter, path)
