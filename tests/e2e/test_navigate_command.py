@@ -193,7 +193,9 @@ def test_the_replayed_wire_is_the_navigations_to_the_bit(patient):
     assert np.median(errors) < 1.0
     # then the drive rests
     np.testing.assert_array_equal(found.episode.control[0, samples + 1 :], 0.0)
-    np.testing.assert_allclose(found.episode.inserted_length[0, :samples], found.record.inserted_length[1:], atol=1e-9)
+    np.testing.assert_allclose(
+        found.episode.inserted_length[0, :samples, 0], found.record.inserted_length[1:], atol=1e-9
+    )
 
 
 def test_the_episode_trains_beside_simulated_data(driven, patient, capsys, tmp_path):
@@ -201,7 +203,7 @@ def test_the_episode_trains_beside_simulated_data(driven, patient, capsys, tmp_p
     episode = load_dataset(folder / "episode")
     assert len(episode) == 1 and episode.valid.all() and episode.split.tolist() == ["train"]
     table = pd.read_csv(folder / "navigation.csv")
-    np.testing.assert_allclose(episode.tip_abscissa[0, : len(table) - 1], table["tip_abscissa_mm"][1:], atol=1e-4)
+    np.testing.assert_allclose(episode.tip_abscissa[0, : len(table) - 1, 0], table["tip_abscissa_mm"][1:], atol=1e-4)
     assert episode.friction[0] == pytest.approx(0.12) and episode.tip_stiffness_factor[0] == 0.8
     sizes = ("--sequences", "4", "--seconds", "20")
     run(capsys, "dataset", patient, "-o", tmp_path / "data", *sizes)
