@@ -59,7 +59,7 @@ def _dissection() -> str:
     for rate in (0.0, 1.0):
         control = np.tile([SPEED_MM_S, rate], (ROTATIONS, round(SECONDS / 0.5), 1))
         initial = np.column_stack([np.zeros(ROTATIONS), 2 * np.pi * np.arange(ROTATIONS) / ROTATIONS])
-        depth = endopilot.simulate(aorta, wire, control, initial=initial).tip.abscissa.max(axis=1)
+        depth = endopilot.simulate(aorta, wire, control, initial=initial).tip.abscissa.max(axis=(1, 2))
         over = depth > BLIND_END_MM
         turned = "without rotation" if rate == 0 else f"and turned at {rate:g} rad/s"
         lines.append(
