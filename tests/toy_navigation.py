@@ -55,36 +55,32 @@ def toy_simulate(
 ) -> Trajectory:
     """Return what the toy wire does under the controls; takes what `simulate` takes."""
     worlds, samples = control.shape[:2]
-    control, initial = control.reshape(worlds, samples, 1, 2), np.reshape(initial, (worlds, 1, 2))
+    control, initial = control.reshape(worlds, samples, 1, 2), initial.reshape(worlds, 1, 2)
+    stack, friction = Stack.of(device), friction.reshape(worlds, 1)
     proximal = initial[:, None] + SAMPLE_PERIOD_S * np.cumsum(control, axis=1)
-    advance = np.diff(proximal[..., 0], axis=1, prepend=initial[:, None, :, 0])
+    inserted, rotation = proximal[..., 0], proximal[..., 1]
+    advance = np.diff(inserted, axis=1, prepend=initial[:, None, :, 0])
     curliness = 0.02 + 0.005 * (len(anatomy.name) % 3)
     slack = np.zeros((worlds, samples, 1))
     now = curliness * initial[..., 0]
     for t in range(samples):
-        low = curliness * np.maximum(proximal[:, t, :, 0], 0)
+        low = curliness * np.maximum(inserted[:, t], 0)
         now = np.clip(now + SLACK_RATE * advance[:, t], low, low + 1.5)
         slack[:, t] = now
-    abscissa = proximal[..., 0] - slack
-    offset = 0.8 + 0.5 * np.sin(0.1 * abscissa + proximal[..., 1])
-    force = 0.01 * slack
-    stacks = [Stack.of(device)] * worlds
-    friction = np.reshape(friction, (worlds, 1))
+    abscissa = inserted - slack
+    offset = 0.8 + 0.5 * np.sin(0.1 * abscissa + rotation)
+    force, still = 0.01 * slack, np.zeros_like(slack)
+    branch = np.zeros((worlds, samples, 1), dtype=np.int64)
     return Trajectory(
-        set_up=SetUp([anatomy] * worlds, stacks, initial, friction, "velocity", motion, config),
+        set_up=SetUp([anatomy] * worlds, [stack] * worlds, initial, friction, "velocity", motion, config),
         period_s=SAMPLE_PERIOD_S,
         start=initial,
         command=control,
-        inserted_length=proximal[..., 0],
-        rotation=proximal[..., 1],
-        tip_position=np.stack([abscissa, offset, np.zeros_like(offset)], axis=-1),
+        inserted_length=inserted,
+        rotation=rotation,
+        tip_position=np.stack([abscissa, offset, still], axis=-1),
         tip_direction=np.tile([1.0, 0.0, 0.0], (worlds, samples, 1, 1)),
-        tip=TipProjection(
-            abscissa=abscissa,
-            offset=offset,
-            branch=np.zeros((worlds, samples, 1), dtype=np.int64),
-            radius=np.full((worlds, samples, 1), 1.5),
-        ),
+        tip=TipProjection(abscissa=abscissa, offset=offset, branch=branch, radius=still + 1.5),
         contact_force_max=force[..., 0],
         contact_force_sum=2 * force[..., 0],
         wall_force=force[..., 0],
@@ -92,8 +88,8 @@ def toy_simulate(
         base_torque=0.1 * force,
         drive_force=force + 0.05,
         drive_torque=0.1 * force + 0.01,
-        slip=np.zeros((worlds, samples, 1)),
-        rotation_slip=np.zeros((worlds, samples, 1)),
+        slip=still,
+        rotation_slip=still,
         iterations=np.ones((worlds, samples)),
         node_iterations=np.ones((worlds, samples)),
         valid=np.ones((worlds, samples), dtype=bool),
