@@ -79,16 +79,14 @@ def test_the_catheter_follows_in_turn_and_the_same_controls_simulate_the_same(ov
     assert moving.max() == 1  # one at a time
     again = simulate(
         over_the_wire.anatomy,
-        over_the_wire.device,
-        record.driven.reshape(1, -1, 4),
-        catheters=over_the_wire.catheters,
-        initial=np.array([[inserted[0], 0.0, 0.0, 0.0]]),
+        over_the_wire.stack,
+        record.driven[None],
+        initial=np.array([[[inserted[0], 0.0], [0.0, 0.0]]]),
         config=COARSE.simulator,
         period_s=CYCLE_S,
     )
-    np.testing.assert_allclose(again.tip_position[0, 9::10], record.tip_position[1:, 0], atol=1e-5)
-    assert again.catheters is not None
-    np.testing.assert_allclose(again.catheters.inserted_length[0, 9::10, 0], catheter[1:], atol=1e-9)
+    np.testing.assert_allclose(again.tip_position[0, 9::10], record.tip_position[1:], atol=1e-5)
+    np.testing.assert_allclose(again.inserted_length[0, 9::10], record.inserted_length[1:], atol=1e-9)
 
 
 def test_a_catheter_that_a_policy_does_not_name_stands_still(over_the_wire) -> None:
