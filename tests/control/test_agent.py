@@ -18,13 +18,13 @@ from endopilot.control.agent import CALIBRATIONS, AgentConfig, AgentPolicy, Open
 from endopilot.control.course import Course, Log
 from endopilot.control.halt import describe_halt
 from endopilot.control.period import drive_period
-from endopilot.control.route import Route
 from endopilot.control.search import Search
 from endopilot.navigation.navigate import NavigationLoop, navigate, start_world
 from endopilot.navigation.policy import Decision, Observation, Policy
 from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.simulation.motion import motion_named
 from endopilot.tasks.navigation import Navigation, Target
+from endopilot.tasks.route import Route
 from endopilot.xray.fluoroscope import TipMeasurement
 
 QUICK = AgentConfig(belief=BeliefConfig(members=6, time_step_s=0.05))

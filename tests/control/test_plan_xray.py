@@ -14,12 +14,12 @@ from endopilot.control.agent import CALIBRATED
 from endopilot.control.plan_config import PlanConfig
 from endopilot.control.plan_file import read_plan, write_plan
 from endopilot.control.plan_xray import PlannedXray, plan_xray, read_calibration
-from endopilot.control.route import Route
 from endopilot.errors import InputError
 from endopilot.files import write_json
 from endopilot.models.config import WINDOW
 from endopilot.models.episodes import Episodes
 from endopilot.models.open_loop import OpenLoop, Prediction
+from endopilot.tasks.route import Route
 
 STILL = (0.0, 0.0, 0.0, 0.0)
 

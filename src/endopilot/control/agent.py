@@ -20,7 +20,6 @@ from endopilot.belief.bands import Calibration
 from endopilot.belief.belief import Belief, BeliefConfig
 from endopilot.control.course import Course
 from endopilot.control.halt import SPARE_SHARE
-from endopilot.control.route import Route, check_passable
 from endopilot.control.search import Search, SearchConfig
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.navigation.policy import BelievedTip, Decision, Observation
@@ -28,6 +27,7 @@ from endopilot.progress import Advance
 from endopilot.settings import Positive, Within, settings
 from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, XrayKind, check_wire_alone
+from endopilot.tasks.route import Route, check_passable
 from endopilot.types import TipProjection
 from endopilot.xray.fluoroscope import TipMeasurement
 

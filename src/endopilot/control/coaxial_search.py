@@ -16,10 +16,10 @@ from jaxtyping import Bool, Float, Int
 
 from endopilot.control.coaxial_copies import CoaxialCourse, CoaxialSearchConfig, Copies, Kept
 from endopilot.control.halt import SPARE_SHARE
-from endopilot.control.route import Route
 from endopilot.control.sweep import TURN_PERIODS, middle
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
+from endopilot.tasks.route import Route
 from endopilot.types import TipProjection
 
 _ALL_ALONG_MM = 1000.0

@@ -18,7 +18,6 @@ from jaxtyping import Float
 from endopilot.anatomy.catheter_axis import lean_between, with_axis
 from endopilot.anatomy.io import read_anatomy
 from endopilot.control.agent import TwinPolicy
-from endopilot.control.route import Route, check_passable, parse_target
 from endopilot.control.set_up import TILT_DEG, TipChoice, choose_tip
 from endopilot.devices.catheter import Catheter, read_catheter
 from endopilot.devices.device import Device, read_device
@@ -35,6 +34,8 @@ from endopilot.simulation.mismatch import ModelMismatch, drawn_sides, mismatch_b
 from endopilot.simulation.motion import Motion, MotionName, motion_named
 from endopilot.simulation.simulate import simulate
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Arrives, Navigation
+from endopilot.tasks.route import Route, check_passable
+from endopilot.tasks.targets import find_target
 from endopilot.types import Anatomy, CatheterMotion, Rollout, TipProjection
 from endopilot.xray.fluoroscope import Fluoroscope
 
@@ -192,7 +193,7 @@ def set_up_navigation(anatomy: Anatomy | str | Path, target: str, config: Naviga
     if config.motion_known == "measured" and config.xray != "images":
         raise InputError("motion_known: measured; only X-ray images measure it: give xray: images, or published")
     vessel = anatomy if isinstance(anatomy, Anatomy) else read_anatomy(anatomy)
-    device, goal = read_device(config.device), parse_target(vessel, target)
+    device, goal = read_device(config.device), find_target(vessel.tree, target)
     catheters = tuple(read_catheter(name) for name in config.catheter)
     truth = _truth(config, vessel)
     seen, truth = _see_catheter(vessel, device, truth, config)

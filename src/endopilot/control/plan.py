@@ -17,7 +17,6 @@ from endopilot.control.course import Course
 from endopilot.control.desired import last_place, read_tips, tips_along
 from endopilot.control.plan_config import NETWORK_METHODS, Controls, Plan, PlanConfig, Steps
 from endopilot.control.plan_pair import check_pair, search_pair
-from endopilot.control.route import Route, check_passable, parse_target
 from endopilot.control.search import SearchConfig
 from endopilot.control.set_up import TipChoice, choose_tip
 from endopilot.devices.catheter import Catheter
@@ -33,6 +32,8 @@ from endopilot.settings import from_record
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.simulate import simulate
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
+from endopilot.tasks.route import Route, check_passable
+from endopilot.tasks.targets import find_target
 from endopilot.types import Anatomy, TipProjection
 
 _IDEAL = RobotConfig(
@@ -78,7 +79,7 @@ def plan(
     tips = (
         read_tips(Path(target), wire.max_velocity_mm_s, config.start_inserted_mm) if target.endswith(".csv") else None
     )
-    goal = parse_target(vessel, target) if tips is None else last_place(vessel, tips, target)
+    goal = find_target(vessel.tree, target) if tips is None else last_place(vessel, tips, target)
     navigation = Navigation(
         anatomy=vessel,
         device=wire,

@@ -15,10 +15,10 @@ from matplotlib.axes import Axes
 
 from endopilot.control.plan_config import Plan
 from endopilot.control.plan_xray import PlannedXray
-from endopilot.control.route import Route
 from endopilot.files import writing
 from endopilot.plotting import CATHETER_COLORS
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
+from endopilot.tasks.route import Route
 
 
 def draw_plan(plan: Plan, path: Path, xray: PlannedXray | None = None) -> None:

@@ -20,8 +20,8 @@ from endopilot.belief.bands import Calibration
 from endopilot.belief.online_predictors import online_predictor
 from endopilot.control.agent import CALIBRATED, AdviserInput, AgentPolicy
 from endopilot.control.plan_config import NETWORK_METHODS, Plan, PlanConfig
-from endopilot.control.route import Route
 from endopilot.models.config import WINDOW, run_path
+from endopilot.tasks.route import Route
 from endopilot.xray.fluoroscope import TipMeasurement
 
 

@@ -21,7 +21,6 @@ from endopilot.control.cost import Cost
 from endopilot.control.course import SLIP_SHARE, STALL_PERIODS, Controls, Course, Log
 from endopilot.control.halt import SPARE_SHARE, Halt, describe_halt, near_fork
 from endopilot.control.period import drive_period
-from endopilot.control.route import Route
 from endopilot.control.sweep import TURN_PERIODS, Sweep, middle, sweep
 from endopilot.devices.device import Device
 from endopilot.devices.drive_limits import DriveLimits
@@ -29,6 +28,7 @@ from endopilot.progress import Advance
 from endopilot.settings import OpenShare, Positive, Within, settings
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
+from endopilot.tasks.route import Route
 from endopilot.types import TipProjection
 
 _BACK_MM_S = 2.0

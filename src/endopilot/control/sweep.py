@@ -9,10 +9,10 @@ from jaxtyping import Bool, Float, Int
 
 from endopilot.control.course import SLIP_SHARE, STALL_PERIODS, STALL_SHARE, Controls
 from endopilot.control.period import drive_period
-from endopilot.control.route import Route
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import DECISION_PERIOD_S
+from endopilot.tasks.route import Route
 
 TURN_PERIODS = 2
 """Decision periods in which the wire is turned, half a turn at most."""
