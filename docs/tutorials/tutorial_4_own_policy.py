@@ -12,8 +12,8 @@ check.
 # The policy
 # ----------
 # Every 0.5 s a policy gets an :class:`endopilot.Observation`: time, the encoders' readings and, where it
-# asked for X-ray, the measured tip. It answers with a :class:`endopilot.Decision`: translation in mm/s,
-# rotation in rad/s, and whether X-ray is to be on at the next decision.
+# asked for X-ray, the measured tip. It answers with a :class:`endopilot.Decision`: of each device a
+# translation in mm/s and a rotation in rad/s, and whether X-ray is to be on at the next decision.
 #
 # ``examples/my_policy.py`` holds one. It pushes and looks once a second. After a wrong branch it pulls back to before
 # the fork, turns the wire by 120°, and pushes again.

@@ -33,7 +33,7 @@ class Scripted:
 
     def decide(self, observation):
         self.seen.append(observation)
-        return Decision(10.0, 0.0, expose=len(self.seen) % 3 == 2)
+        return Decision(((10.0, 0.0),), expose=len(self.seen) % 3 == 2)
 
     def watch(self, observation):
         self.watched += 1
@@ -54,7 +54,7 @@ class Broken(Scripted):
 
 class Hopeless(Scripted):
     def decide(self, observation):
-        return Decision(1.0, 0.0, gives_up="at the first fork")
+        return Decision(((1.0, 0.0),), gives_up="at the first fork")
 
 
 class Slow(Scripted):

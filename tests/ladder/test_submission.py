@@ -30,7 +30,7 @@ class Hurried:
         self.random = np.random.default_rng(seed)
     def decide(self, observation):
         translation, rotation = self.random.normal([9.0, 0.0], [3.0, 2.0])
-        return Decision(translation, rotation, expose=observation.time_s % 2.0 == 0.5)
+        return Decision(((translation, rotation),), expose=observation.time_s % 2.0 == 0.5)
 """
 
 

@@ -11,7 +11,7 @@ from endopilot.devices.catheter import Catheter, read_catheter
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.errors import InputError
 from endopilot.ladder.attempt import Recording, Repeated, attempt, repeat
-from endopilot.navigation.coaxial_policies import BEHIND_MM, LEAD_MM, CatheterAlone, InTurn
+from endopilot.navigation.baseline_policies import BEHIND_MM, LEAD_MM, CatheterAlone, InTurn
 from endopilot.navigation.navigate import NavigateConfig, NavigationLoop, navigate, start_world
 from endopilot.navigation.policy import Decision, Observation
 from endopilot.robot.robot import CYCLE_S, RobotConfig, SimulatedRobot
@@ -46,24 +46,23 @@ def test_wire_and_catheter_are_driven_by_drives_of_their_own(over_the_wire) -> N
     limits = [DriveLimits.of(device, over_the_wire.anatomy) for device in over_the_wire.devices]
     noiseless = RobotConfig(encoder_sd_mm=0.0, encoder_sd_rad=0.0, backlash_mm=0.0, backlash_rad=0.0)
     robot = SimulatedRobot(simulator, limits, noiseless)
-    robot.command(4.0, 0.0, (2.0, 0.5))
+    robot.command(((4.0, 0.0), (2.0, 0.5)))
     robot.run(2.0)
     state = robot.proximal_state()
     # v (t - latency) less v²/2a of the ramp
-    assert state.inserted_length == pytest.approx(2.0 + 4.0 * 1.95 - 4.0**2 / 400.0, abs=1e-6)
-    assert state.rotation == 0.0
-    assert state.catheters[0] == pytest.approx((2.0 * 1.95 - 2.0**2 / 400.0, 0.5 * 1.95 - 0.5**2 / 120.0), abs=1e-6)
+    assert state.devices[0] == pytest.approx((2.0 + 4.0 * 1.95 - 4.0**2 / 400.0, 0.0), abs=1e-6)
+    assert state.devices[1] == pytest.approx((2.0 * 1.95 - 2.0**2 / 400.0, 0.5 * 1.95 - 0.5**2 / 120.0), abs=1e-6)
     assert robot.velocity.tolist() == pytest.approx([4.0, 0.0, 2.0, 0.5])
-    robot.command(4.0, 0.0)  # a catheter that is not named stops
+    robot.command(((4.0, 0.0),))  # a catheter that is not named stops
     robot.run(1.0)
     assert robot.velocity.tolist() == pytest.approx([4.0, 0.0, 0.0, 0.0])
     robot.stop()
     robot.run(0.5)
     before = robot.proximal_state()
     robot.run(0.5)
-    assert robot.proximal_state().catheters == before.catheters
+    assert robot.proximal_state().devices[1] == before.devices[1]
     noisy = SimulatedRobot(simulator, limits, RobotConfig(), seed=1).proximal_state()
-    errors = [noisy.inserted_length - before.inserted_length, noisy.catheters[0][0] - before.catheters[0][0]]
+    errors = [now[0] - then[0] for now, then in zip(noisy.devices, before.devices, strict=True)]
     assert errors[0] != errors[1] and 0 < max(map(abs, errors)) < 0.2
 
 
@@ -106,13 +105,13 @@ def test_orders_are_kept_within_each_drive_s_limits(over_the_wire, catheter) -> 
         def start(self, navigation, seed): ...
 
         def decide(self, observation: Observation) -> Decision:
-            assert len(observation.catheters) == 1
-            return Decision(0.0, 0.0, catheters=((1e9, np.nan),))
+            assert len(observation.devices) == 2
+            return Decision(((0.0, 0.0), (1e9, np.nan)))
 
     loop = NavigationLoop(over_the_wire, Wild(), config=COARSE)
-    assert loop.step().catheters == ((0.0, 0.0),)
-    too_many = Decision(1.0, 0.0, catheters=((1e9, 0.0), (1.0, 1.0)))
-    assert loop.step(by_hand=too_many).catheters == ((catheter.device.max_velocity_mm_s, 0.0),)
+    assert loop.step().devices == ((0.0, 0.0), (0.0, 0.0))
+    too_many = Decision(((1.0, 0.0), (1e9, 0.0), (1.0, 1.0)))
+    assert loop.step(by_hand=too_many).devices == ((1.0, 0.0), (catheter.device.max_velocity_mm_s, 0.0))
     assert loop.record().faults == 2
 
 
@@ -121,8 +120,8 @@ def test_the_turns_depend_on_the_encoders_alone(over_the_wire) -> None:
     policy.start(replace(over_the_wire, arrives="wire"), 0)
 
     def who(wire: float, catheter: float) -> str:
-        decision = policy.decide(Observation(0.0, wire, 0.0, None, ((catheter, 0.0),)))
-        return "wire" if decision.translation > 0 else "catheter" if decision.catheters else "none"
+        decision = policy.decide(Observation(0.0, ((wire, 0.0), (catheter, 0.0)), None))
+        return next((who for who, (v, _) in zip(("wire", "catheter"), decision.devices, strict=False) if v > 0), "none")
 
     assert who(5.0, 0.0) == "wire" and who(36.0, 0.0) == "wire"
     assert who(5.0 + LEAD_MM, 5.0) == "catheter"
@@ -131,8 +130,8 @@ def test_the_turns_depend_on_the_encoders_alone(over_the_wire) -> None:
     assert who(37.0, 27.5) == "none"  # 20 mm deeper than the target
     alone = CatheterAlone()
     alone.start(over_the_wire, 0)
-    decisions = [alone.decide(Observation(0.0, 5.0, 0.0, None, ((at, 0.0),))) for at in (0.0, 5.1, 60.0)]
-    assert [(d.translation > 0, d.catheters[0][0] > 0) for d in decisions] == [
+    decisions = [alone.decide(Observation(0.0, ((5.0, 0.0), (at, 0.0)), None)) for at in (0.0, 5.1, 60.0)]
+    assert [(d.devices[0][0] > 0, d.devices[1][0] > 0) for d in decisions] == [
         (False, True),
         (True, True),
         (False, False),
@@ -144,7 +143,7 @@ def test_a_recording_of_both_is_driven_again_to_the_bit(over_the_wire) -> None:
     recording = Recording.unpacked(done["recording"], 2)
     figures = repeat(recording, over_the_wire, seed=3)
     assert figures == {name: done[name] for name in figures}
-    assert isinstance(Repeated(recording).decide(Observation(0.0, 0.0, 0.0, None)).catheters[0], tuple)
+    assert len(Repeated(recording).decide(Observation(0.0, (), None)).devices) == 2
     with pytest.raises(InputError, match="control: "):
         Recording.unpacked(done["recording"])
 

@@ -40,7 +40,7 @@ class Forward:
 
     def decide(self, observation: Observation) -> Decision:
         self.given.append(observation)
-        return Decision(self.speed, self.rotation, expose=len(self.given) % self.expose_every == 0)
+        return Decision(((self.speed, self.rotation),), expose=len(self.given) % self.expose_every == 0)
 
 
 @pytest.fixture
@@ -83,7 +83,7 @@ def test_it_ends_in_time_and_the_same_seed_repeats_it(straight) -> None:
 def test_encoders_count_from_where_the_ostium_is_believed_to_be(straight) -> None:
     policy = Forward(4.0)
     record = navigate(straight, policy, config=NavigateConfig(robot=PERFECT), truth=ModelMismatch(ostium_mm=1.5))
-    encoder = np.array([observation.inserted_length for observation in policy.given])
+    encoder = np.array([observation.devices[0][0] for observation in policy.given])
     np.testing.assert_allclose(record.inserted_length[:-1] - encoder, 1.5, atol=1e-9)
     np.testing.assert_allclose(np.diff(record.inserted_length), 2.0, atol=1e-6)
 
@@ -130,6 +130,18 @@ def test_what_a_policy_asks_is_kept_within_the_limits(straight) -> None:
         assert np.isfinite(record.control).all() and (np.abs(record.control) <= bound).all()
         assert record.faults == len(record.time_s) - 1
         assert record.reason != "invalid"
+
+
+@pytest.mark.parametrize("devices", [5.0, (5.0, 0.0), ((5.0,),), ((1.0, 2.0, 3.0),), None])
+def test_what_is_no_pair_for_each_device_is_refused_in_a_line(straight, devices) -> None:
+    class Odd(Forward):
+        def decide(self, observation: Observation) -> Decision:
+            decision = Decision()
+            object.__setattr__(decision, "devices", devices)  # tests check types where a user's program does not
+            return decision
+
+    with pytest.raises(InputError, match=r"policy: Odd decided devices = .*; give a pair of velocities for each"):
+        navigate(straight, Odd(1.0))
 
 
 def test_one_view_alone_locates_the_tip_by_the_vessel(straight) -> None:
@@ -185,7 +197,7 @@ def test_hands_take_over_and_hand_back(straight) -> None:
     loop = NavigationLoop(straight, policy, config=NavigateConfig(robot=PERFECT))
     loop.step()
     for _ in range(3):
-        loop.step(by_hand=Decision(-1.0, 1.0, expose=False))
+        loop.step(by_hand=Decision(((-1.0, 1.0),), expose=False))
     assert len(policy.given) == 1 and len(policy.watched) == 3
     loop.step()
     assert policy.given[1].tip is not None, "X-ray is on where the policy goes on"

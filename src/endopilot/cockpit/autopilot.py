@@ -51,7 +51,7 @@ class Autopilot:
         self._fluoroscope: Fluoroscope | None = None
         self._due = self._began = 0
         self._expose, self._started = True, False
-        self._turned: tuple[float, ...] = ()  # of catheters as the policy began
+        self._turned: tuple[float, ...] = ()  # each device as the policy began; the wire's turns are told
 
     @property
     def drives(self) -> bool:
@@ -103,27 +103,27 @@ class Autopilot:
             return None
         if self.drives and self._world.reaches(self._target):
             self.status, self.asks = "reached", ""
-            return Decision(0.0, 0.0)
+            return Decision()
         state, tip = self._world.robot.proximal_state(), None
         if not self._started:
-            self._turned = tuple(turn for _, turn in state.catheters)
+            self._turned = (0.0, *(turn for _, turn in state.devices[1:]))
             if crooked := self._turned_catheter():
                 self.status, self.asks = "failed", ""
                 self.failure = f"{self.policy_name}: begins with unturned catheters; turn {crooked} back to 0° first"
-                return Decision(0.0, 0.0)
+                return Decision()
         if self.drives and self._expose:
             expose()
-            tip = self._measure(snapshot, state.inserted_length)
+            tip = self._measure(snapshot, state.devices[0][0])
         time_s = (self._world.cycle - self._began) * self._world.config.cycle_s
-        catheters = tuple((at, turn - began) for (at, turn), began in zip(state.catheters, self._turned, strict=True))
-        observation = Observation(time_s, state.inserted_length, state.rotation, tip, catheters)
+        devices = tuple((at, turn - began) for (at, turn), began in zip(state.devices, self._turned, strict=True))
+        observation = Observation(time_s, devices, tip)
         start = None
         if not self._started:
             start = replace(
                 self._world.navigation_to(self._target),
-                start_inserted_mm=max(state.inserted_length, 0.0),
-                start_rotation=state.rotation,
-                start_catheter_mm=max([0.0, *(at for at, _ in state.catheters)]),
+                start_inserted_mm=max(devices[0][0], 0.0),
+                start_rotation=devices[0][1],
+                start_catheter_mm=max([0.0, *(at for at, _ in devices[1:])]),
                 seconds=SECONDS,
             )
             self._started = True
@@ -187,14 +187,14 @@ class Autopilot:
         except Exception as error:  # a policy may be anybody's: whatever it raises is told in the page
             self.status, self.failure, self.asks = "failed", f"{self.policy_name}: {' '.join(str(error).split())}", ""
             self._policy = None
-            return Decision(0.0, 0.0)
+            return Decision()
         if isinstance(self._policy, Believer):
             self._believed = self._policy.believed()
         if decision is None or self.status != "thinking":
             return None  # taken over or paused meanwhile
         if decision.gives_up:
             self.status, self.failure, self.asks = "gave up", f"{self.policy_name} gives up: {decision.gives_up}", ""
-            return Decision(0.0, 0.0)
+            return Decision()
         self.status, self._expose = "drives", bool(decision.expose)
         told = "" if self._believed is None else self._believed.asks
         self.asks = (told or "the policy asks for it") if decision.expose else ""
@@ -202,7 +202,7 @@ class Autopilot:
 
     def _turned_catheter(self) -> str:
         """Return the name of a curved catheter that the policy would take for unturned and is not; empty if none is."""
-        for catheter, turn in zip(self._world.navigation.catheters, self._turned, strict=True):
+        for catheter, turn in zip(self._world.navigation.catheters, self._turned[1:], strict=True):
             if catheter.shape and np.cos(turn) < np.cos(_UNTURNED_RAD):
                 return catheter.name
         return ""

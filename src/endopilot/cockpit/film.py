@@ -274,7 +274,7 @@ def _ladder(path: Path, name: str | None, place: int) -> Film:
         loop = NavigationLoop(navigation, Repeated(recording), config=config, seed=navigation_seed(task, place))
         yield Frame(_of_loop(loop, 0.0, (0.0, 0.0) * devices))
         while loop.reason is None:
-            velocity = tuple(chain.from_iterable(loop.begin().velocities(devices)))
+            velocity = tuple(chain.from_iterable(loop.begin().devices))
             exposed = loop.observation is not None and loop.observation.tip is not None
             while loop.reason is None and not loop.between_periods:
                 peak = loop.advance(FRAME_S)

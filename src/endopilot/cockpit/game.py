@@ -17,9 +17,10 @@ import numpy as np
 from endopilot.cockpit import messages
 from endopilot.cockpit.fluoroscopy import XrayUnit
 from endopilot.cockpit.frames import encode
-from endopilot.cockpit.recording import Recorder
+from endopilot.cockpit.recording import Recorder, moved
 from endopilot.cockpit.session import Session
 from endopilot.cockpit.world import Snapshot, World, WorldConfig
+from endopilot.devices.stack import Proximals
 from endopilot.errors import InputError
 from endopilot.ladder.attempt import Recording, attempt, figures, navigation_seed
 from endopilot.navigation.record import Track
@@ -95,7 +96,7 @@ class GameSession(Session):
         self.result: dict[str, Any] | None = None
         self._tried = tried
         self._track = Track(world.simulator)
-        self._commands: list[tuple[float, ...]] = []
+        self._commands: list[Proximals] = []
         self._exposed: list[bool] = []
         self._peak_n, self._counted_before = 0.0, 0
         self._period = round(DECISION_PERIOD_S / world.config.cycle_s)
@@ -171,7 +172,7 @@ class GameSession(Session):
             if "game" in event:
                 self.phase = "on"
             elif "move" in event:
-                self._command = tuple(event["move"])
+                self._command = moved(event)
             elif "stop" in event:
                 self._command = self._rest
 
@@ -184,9 +185,7 @@ class GameSession(Session):
         self._exposed.append(self.xray.frames > self._counted_before)
         self._counted_before = self.xray.frames
         simulator: Simulator = self.world.simulator
-        command = self._commands[-1]
-        pairs = tuple(zip(command[::2], command[1::2], strict=True))
-        self._track.decided(pairs, None, None, exposed=self._exposed[-1], fault=False)
+        self._track.decided(self._commands[-1], None, None, exposed=self._exposed[-1], fault=False)
         self._track.moved(simulator, self._peak_n)
         self._peak_n = 0.0
         if not simulator.valid[0]:
@@ -202,7 +201,7 @@ class GameSession(Session):
         self.phase, self.sight = "over", True
         record = self._track.record(self.world.navigation, self.world.robot.driven, reason, gives_up="")
         record = replace(record, exposures=self.xray.frames)
-        recording = Recording(np.array(self._commands), np.array(self._exposed), None)
+        recording = Recording(np.array(self._commands).reshape(len(self._commands), -1), np.array(self._exposed), None)
         self.result = figures(self.world.navigation, record, recording)
         self._record(score={name: self.result[name] for name in _SHOWN})
         self._pool = Workers(1)

@@ -21,6 +21,7 @@ from endopilot.anatomy.io import read_anatomy
 from endopilot.cockpit.world import World, WorldConfig
 from endopilot.devices.catheter import Catheter
 from endopilot.devices.device import Device
+from endopilot.devices.stack import Proximals
 from endopilot.errors import InputError
 from endopilot.files import json_text, reading
 from endopilot.settings import from_record
@@ -163,12 +164,17 @@ def replayed(recording: Recording) -> Iterator[tuple[World, list[dict[str, Any]]
                     f"replay it with the version and on the kind of processor that recorded it"
                 )
             if "move" in event:
-                world.command(event["move"])
+                world.command(moved(event))
             elif "stop" in event:
                 world.stop()
         yield world, events
         if cycle < recording.cycles:
             world.advance()
+
+
+def moved(event: dict[str, Any]) -> Proximals:
+    """Return the velocities of a `move`, a pair for each device."""
+    return tuple(zip(event["move"][::2], event["move"][1::2], strict=True))
 
 
 def _check(event: dict[str, Any]) -> None:
@@ -177,7 +183,7 @@ def _check(event: dict[str, Any]) -> None:
         branch, abscissa = event["target"]
         Target(branch=branch, abscissa=abscissa)
     if "move" in event:
-        [float(value) for value in event["move"]]
+        [(float(translation), float(rotation)) for translation, rotation in moved(event)]
     if "exposure" in event:
         float(event["exposure"] + event["seconds"] + event["kerma_ugy"])
 

@@ -17,6 +17,7 @@ from endopilot.cockpit.fluoroscopy import XrayUnit
 from endopilot.cockpit.frames import device_arrays, encode, motion_values, target_values, tip_values
 from endopilot.cockpit.recording import Recorder
 from endopilot.cockpit.world import Snapshot, World
+from endopilot.devices.stack import Proximals
 from endopilot.errors import InputError
 from endopilot.tasks.navigation import Target
 from endopilot.tasks.targets import find_target
@@ -52,11 +53,12 @@ class Session:
             policies: names of those that a page may choose.
         """
         self.world, self.xray, self._recorder, self._policies = world, xray, recorder, policies
-        self._rest = world.safe(())
+        self._rest = ((0.0, 0.0),) * len(world.navigation.devices)
         self.autopilot = Autopilot(world)
         self.target: Target = world.navigation.target
         self.sight = True
-        self._command, self._moving, self._heard_s = self._rest, False, -np.inf
+        self._command, self._asked = self._rest, self._rest  # what the robot has taken, and of what
+        self._moving, self._heard_s = False, -np.inf
         self._stopped = ""
         self._held: set[str] = set()  # what silence stopped
         self._locked: set[str] = set()  # what of it must be let go
@@ -73,7 +75,7 @@ class Session:
         """
         if isinstance(message, messages.Drive):
             self._hear(now_s)
-            self._drive((message.translation, message.rotation, *chain.from_iterable(message.catheters)))
+            self._drive(((message.translation, message.rotation), *message.catheters))
         elif isinstance(message, messages.Pedal):
             self._hear(now_s)
             self._pedal(message.down)
@@ -127,7 +129,7 @@ class Session:
         self.xray.pedal = False
         if self._moving:
             self.world.stop()
-            self._command, self._moving = self._rest, False
+            self._command, self._asked, self._moving = self._rest, self._rest, False
             self._record(stop=why)
 
     def cycle(self, now_s: float) -> list[tuple[str, bytes]]:
@@ -161,7 +163,7 @@ class Session:
         shown = {
             "mode": "drive",
             **motion_values(snapshot, ostium_mm),
-            "command": self._command,
+            "command": tuple(chain.from_iterable(self._command)),
             "stopped": self._stopped,
             "peak_force_n": round(self.world.peak_force_n, 4),
             "sight": self.sight,
@@ -195,19 +197,17 @@ class Session:
         if self.xray.pedal and not self._locked and self._stopped == "silence":
             self._stopped = ""
 
-    def _drive(self, velocity: tuple[float, ...]) -> None:
-        command = self.world.safe(velocity)
-        if command == self._rest:
+    def _drive(self, devices: Proximals) -> None:
+        if not np.any(devices):
             self._locked.discard("drive")
         elif "drive" in self._locked:
             return
         if self.autopilot.drives:
-            if command == self._rest:
+            if not np.any(devices):
                 return  # the page only says that it is there
             self._take_over()
-        if command != self._command:
-            self._command = self.world.command(command)
-            self._record(move=command)
+        if devices != self._asked:
+            self._move(devices)
         self._moving = self._command != self._rest
         if self._moving:
             self._stopped = ""
@@ -233,15 +233,18 @@ class Session:
         else:
             self.autopilot.pause(message.action == "pause")
             if message.action == "pause":
-                self._command = self.world.command(self._rest)
-                self._record(move=self._command)
+                self._move(self._rest)
         self._record(autopilot=message.action, policy=message.policy)
 
     def _take_over(self) -> None:
         if self.autopilot.drives:
-            self._command = self.world.command(self._rest)
-            self._record(move=self._command)
+            self._move(self._rest)
         self.autopilot.stop()
+
+    def _move(self, devices: Proximals) -> None:
+        """Command the robot, and write down what it has taken."""
+        self._command, self._asked = self.world.command(devices), devices
+        self._record(move=list(chain.from_iterable(self._command)))
 
     def _think(self) -> list[tuple[str, bytes]]:
         """Let the autopilot go on, and return what the pages are to see of it."""
@@ -251,9 +254,7 @@ class Session:
         before = self.autopilot.values()
         decision = self.autopilot.think(snapshot, lambda: images.extend(self._counted(self.xray.expose(snapshot))))
         if decision is not None:
-            asked = decision.velocities(len(self.world.navigation.devices))
-            self._command = self.world.command(tuple(chain.from_iterable(asked)))
-            self._record(move=self._command)
+            self._move(decision.devices)
         sent = _images(images)
         if self.sight and self.autopilot.values() != before:
             belief = self.autopilot.belief(snapshot)

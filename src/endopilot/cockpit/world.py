@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated
 
@@ -15,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.devices.drive_limits import DriveLimits
-from endopilot.devices.stack import lines_from_tips, shown_part
+from endopilot.devices.stack import Proximals, lines_from_tips, shown_part
 from endopilot.errors import InputError
 from endopilot.navigation.navigate import start_world
 from endopilot.robot.robot import RobotConfig, SimulatedRobot
@@ -138,9 +137,9 @@ class World:
         self.navigation, self.config = navigation, config or WorldConfig()
         truth = self.config.truth
         self.simulator = start_world(navigation, truth, self.config.simulator)
-        self._limits = tuple(DriveLimits.of(device, navigation.anatomy) for device in navigation.devices)
+        limits = [DriveLimits.of(device, navigation.anatomy) for device in navigation.devices]
         drive = replace(self.config.robot, latency_s=self.config.robot.latency_s * truth.latency_factor)
-        self.robot = SimulatedRobot(self.simulator, self._limits, drive, seed=seed, ostium_mm=truth.ostium_mm)
+        self.robot = SimulatedRobot(self.simulator, limits, drive, seed=seed, ostium_mm=truth.ostium_mm)
         self.cycle, self.peak_force_n, self.force_n = 0, 0.0, 0.0
         self._taken_s = self.config.cycle_s / 10
 
@@ -167,32 +166,16 @@ class World:
         navigation = self.navigation_to(target)
         return bool(navigation.reached(*map(self.simulator.project, range(navigation.arriving + 1)))[0])
 
-    def safe(self, velocity: Sequence[float]) -> tuple[float, ...]:
-        """Return what is left of velocities within the drives' limits.
-
-        Args:
-            velocity: mm/s and rad/s of the wire, then of each catheter; catheters that are not given stand still.
+    def command(self, devices: Proximals) -> Proximals:
+        """Command the drives, and return what they have taken, as `Robot` says.
 
         Raises:
             InputError: more catheters are given than there are.
         """
-        around = len(self._limits) - 1
-        if len(velocity) > 2 * len(self._limits):
-            raise InputError(f"catheters: {len(velocity) // 2 - 1}; this wire has {around} around it")
-        padded = [*velocity, *[0.0] * (2 * len(self._limits) - len(velocity))]
-        return tuple(
-            each for k, limits in enumerate(self._limits) for each in limits.safe(padded[2 * k], padded[2 * k + 1])
-        )
-
-    def command(self, velocity: Sequence[float]) -> tuple[float, ...]:
-        """Command the drives, and return what is left of it, as `safe` does.
-
-        Raises:
-            InputError: more catheters are given than there are.
-        """
-        safe = self.safe(velocity)
-        self.robot.command(safe[0], safe[1], *zip(safe[2::2], safe[3::2], strict=True))
-        return safe
+        around = len(self.navigation.catheters)
+        if len(devices) > 1 + around:
+            raise InputError(f"catheters: {len(devices) - 1}; this wire has {around} around it")
+        return self.robot.command(devices)
 
     def stop(self) -> None:
         """Let the drives brake at once."""

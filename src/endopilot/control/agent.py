@@ -120,11 +120,11 @@ class _PlanningPolicy:
     def decide(self, observation: Observation) -> Decision:
         """Follow the course, search another one, or pull back, as the module describes."""
         if self._began:
-            self.belief.follow(observation.inserted_length, observation.rotation)
+            self.belief.follow(*observation.devices[0])
         self._began = True
         if observation.tip is not None:
             self._update(observation.tip)
-        elif observation.inserted_length <= self.navigation.start_inserted_mm:
+        elif observation.devices[0][0] <= self.navigation.start_inserted_mm:
             self._lost = False  # back where it began, the wire lies as it did, unseen in its catheter
         if self._lost:
             translation, rotation = -self.config.search.speed_mm_s, 0.0
@@ -132,12 +132,12 @@ class _PlanningPolicy:
             translation, rotation = self._follow(observation)
         translation, rotation = self._limits.safe(translation, rotation)
         gives_up = self.halt if self._failed >= self.config.tries and self._course is None and not self._lost else ""
-        return Decision(translation, rotation, expose=self._lost or self.wants_xray(), gives_up=gives_up)
+        return Decision(((translation, rotation),), expose=self._lost or self.wants_xray(), gives_up=gives_up)
 
     def watch(self, observation: Observation) -> None:
         """Follow what somebody else does; a new course is searched at the next decision."""
         if self._began:
-            self.belief.follow(observation.inserted_length, observation.rotation)
+            self.belief.follow(*observation.devices[0])
         self._began, self._led, self._course, self._failed = True, True, None, 0
         if observation.tip is not None:
             self._update(observation.tip)
@@ -174,10 +174,8 @@ class _PlanningPolicy:
             return 0.0, 0.0
         wanted = self._course.inserted[self._at] - self._ostium, self._course.rotation[self._at]
         self._at += 1
-        return (
-            (wanted[0] - observation.inserted_length) / DECISION_PERIOD_S,
-            (wanted[1] - observation.rotation) / DECISION_PERIOD_S,
-        )
+        inserted, turned = observation.devices[0]
+        return (wanted[0] - inserted) / DECISION_PERIOD_S, (wanted[1] - turned) / DECISION_PERIOD_S
 
     def _off_course(self) -> bool:
         """Return whether the likeliest tip is not where the course has it now."""

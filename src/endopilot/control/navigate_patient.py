@@ -247,7 +247,7 @@ def navigate_patient(set_up: SetUp) -> PatientNavigation:
                 wires.append(policy.believed_wires())  # at the decision, which ended the period before
     if isinstance(policy, Led):
         state = loop.robot.proximal_state()
-        policy.watch(Observation(loop.time_s, state.inserted_length, state.rotation, None, state.catheters))
+        policy.watch(Observation(loop.time_s, state.devices, None))
     if isinstance(policy, Believer):
         wires.append(policy.believed_wires())
     record = loop.record()

@@ -154,11 +154,11 @@ class Repeated:
         """
         if self._at == len(self._control):
             raise InputError(f"control: holds {self._at} decisions, and the navigation goes on")
-        (wire, *catheters), expose = self._control[self._at], self._expose_next[self._at]
+        devices, expose = tuple(self._control[self._at]), self._expose_next[self._at]
         self._at += 1
         last = self._gave_up and self._at == len(self._control)
         gives_up = "as recorded" if last else ""
-        return Decision(*wire, expose=expose, gives_up=gives_up, catheters=tuple(catheters))
+        return Decision(devices, expose=expose, gives_up=gives_up)
 
 
 def figures(navigation: Navigation, record: NavigationRecord, recording: Recording) -> dict[str, Any]:

@@ -60,7 +60,7 @@ class NavigationLoop:
         loop = NavigationLoop(navigation, "agent", seed=1)
         while loop.reason is None:
             loop.step()                                      # the policy decides
-            loop.step(by_hand=Decision(2.0, 0.5))            # somebody else does
+            loop.step(by_hand=Decision(((2.0, 0.5),)))       # somebody else does
         record = loop.record()
 
     Hands that move faster than twice a second call the parts of a step: `begin`, then `advance` in cycles of `CYCLE_S`
@@ -100,9 +100,9 @@ class NavigationLoop:
         self.simulator = start_world(navigation, truth, config.simulator, motion=config.motion)
         ostium = np.asarray(navigation.anatomy.insertion.position)
         self._moves = config.motion is not None
-        self._limits = tuple(DriveLimits.of(device, navigation.anatomy) for device in navigation.devices)
+        limits = [DriveLimits.of(device, navigation.anatomy) for device in navigation.devices]
         drive = replace(config.robot, latency_s=config.robot.latency_s * truth.latency_factor)
-        self.robot = SimulatedRobot(self.simulator, self._limits, drive, seed=seed, ostium_mm=truth.ostium_mm)
+        self.robot = SimulatedRobot(self.simulator, limits, drive, seed=seed, ostium_mm=truth.ostium_mm)
         anatomy, device = navigation.anatomy, navigation.device
         if config.xray == "images":
             from endopilot.xray.image_fluoroscope import ImageFluoroscope  # slow to import
@@ -156,7 +156,7 @@ class NavigationLoop:
             by_hand: what somebody else decides; the policy does if it is not given.
 
         Returns:
-            The decision, within the drives' limits.
+            The decision, as the robot has taken it: within its limits, and with the velocities of all devices.
 
         Raises:
             ValueError: the navigation is over, or the last period is not.
@@ -167,20 +167,18 @@ class NavigationLoop:
         handed_back, self._by_hand = self._by_hand and by_hand is None, by_hand is not None
         exposed = self._expose or handed_back
         if exposed:
-            tip = self._measure(state.inserted_length)
-        observation = Observation(self.time_s, state.inserted_length, state.rotation, tip, state.catheters)
+            tip = self._measure(state.devices[0][0])
+        observation = Observation(self.time_s, state.devices, tip)
         decision = self._decide(observation, by_hand)
-        asked = decision.velocities(len(self._limits))
-        control = tuple(limits.safe(*pair) for limits, pair in zip(self._limits, asked, strict=False))
+        taken = self.robot.command(decision.devices)
+        fault = taken[: len(decision.devices)] != tuple(map(tuple, decision.devices))
         # An image in which no wire was found is taken again.
         self._expose = bool(decision.expose) or (exposed and tip is None)
         self.observation, self.gives_up = observation, decision.gives_up
         self.believed = self.policy.believed() if isinstance(self.policy, Believer) else None
-        self._track.decided(control, tip, self.believed, exposed=exposed, fault=control != asked)
-        wire, *catheters = control
-        self.robot.command(*wire, *catheters)
+        self._track.decided(taken, tip, self.believed, exposed=exposed, fault=fault)
         self._period, self._cycles_left, self._peak_n = self._period + 1, _CYCLES, 0.0
-        return Decision(*wire, expose=self._expose, gives_up=self.gives_up, catheters=tuple(catheters))
+        return Decision(taken, expose=self._expose, gives_up=self.gives_up)
 
     def advance(self, seconds: float) -> float:
         """Let robot and wire move, no farther than to the end of the period.
@@ -302,10 +300,16 @@ def start_world(
 
 
 def _checked(decision: Any, policy: str) -> Decision:
-    """Refuse what a policy of one's own may return in place of a decision; the drives' limits check its numbers."""
+    """Refuse what a policy of one's own may return in place of a decision; the robot checks its numbers."""
     if not isinstance(decision, Decision):
         raise InputError(f"policy: {policy} decided {type(decision).__name__}; return a Decision")
-    return decision
+    try:
+        return replace(decision, devices=tuple((v, w) for v, w in decision.devices))
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"policy: {policy} decided devices = {decision.devices!r}; give a pair of velocities for each device, "
+            "such as ((5.0, 0.5),)"
+        ) from error
 
 
 def _reached(navigation: Navigation, simulator: Simulator) -> bool:

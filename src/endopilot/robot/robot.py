@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.devices.drive_limits import DriveLimits, within_travel
+from endopilot.devices.stack import Proximals
 from endopilot.settings import NonNegative, Positive, Within, settings
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import Step
@@ -26,27 +27,29 @@ CYCLE_S = 0.05
 
 @dataclass(frozen=True)
 class ProximalState:
-    """A reading of a robot's encoders: the state of the wire's proximal end.
+    """A reading of a robot's encoders.
 
     Attributes:
         time_s: by the robot's clock, s.
-        inserted_length: Δ, mm.
-        rotation: φ, rad, unwrapped.
-        catheters: the same two of each catheter around the wire, from the inside out.
+        devices: inserted length Δ (mm) and rotation φ (rad, unwrapped) of each device: of the wire, then of each
+            catheter from the inside out.
     """
 
     time_s: float
-    inserted_length: float
-    rotation: float
-    catheters: tuple[tuple[float, float], ...] = ()
+    devices: Proximals
 
 
 @runtime_checkable
 class Robot(Protocol):
-    """A robot that drives a wire."""
+    """A robot that drives a wire, and the catheters around it if it has drives for them."""
 
-    def command(self, translation: float, rotation: float) -> None:
-        """Move on at a velocity, mm/s and rad/s, until the next command. What is not finite stops the wire."""
+    def command(self, devices: Proximals) -> Proximals:
+        """Move on until the next command, and return what is made of it: a pair for each device.
+
+        Args:
+            devices: mm/s and rad/s of the wire, then of each catheter. What is not finite stops that device, what is
+                beyond its drive's limits is cut off; a device that is not given stops.
+        """
         ...
 
     def proximal_state(self) -> ProximalState:
@@ -95,9 +98,11 @@ class DriveMotion:
         self._wanted, self._ahead = np.zeros(2), np.zeros(2)
         self.time_s, self.velocity, self.position = 0.0, np.zeros(2), np.array(position, dtype=float)
 
-    def command(self, translation: float, rotation: float) -> None:
-        """Take a velocity, mm/s and rad/s, which acts after the latency."""
-        self._orders.append((self.time_s + self._latency_s, np.array(self._limits.safe(translation, rotation))))
+    def command(self, translation: float, rotation: float) -> tuple[float, float]:
+        """Take a velocity, mm/s and rad/s, which acts after the latency; return it within the limits."""
+        taken = self._limits.safe(translation, rotation)
+        self._orders.append((self.time_s + self._latency_s, np.array(taken)))
+        return taken
 
     def stop(self, *, within_s: float = np.inf) -> None:
         """Brake at once, whatever was commanded before: within a time, s, where the motor's ramp would take longer."""
@@ -181,23 +186,16 @@ class SimulatedRobot:
         for drive in self._drives:
             drive.stop()
 
-    def command(self, translation: float, rotation: float, *catheters: tuple[float, float]) -> None:
-        """Move on at a velocity, mm/s and rad/s, until the next command. What is not finite stops a device.
-
-        Args:
-            translation: of the wire.
-            rotation: of the wire.
-            catheters: both of each catheter; one that is not given stops.
-        """
-        orders = [(translation, rotation), *catheters, *[(0.0, 0.0)] * len(self._drives)]
-        for drive, order in zip(self._drives, orders, strict=False):
-            drive.command(*order)
+    def command(self, devices: Proximals) -> Proximals:
+        """Move on until the next command, and return what is made of it, as `Robot` says."""
+        given = [*devices, *[(0.0, 0.0)] * len(self._drives)]
+        return tuple(drive.command(*velocity) for drive, velocity in zip(self._drives, given, strict=False))
 
     def proximal_state(self) -> ProximalState:
         """Return the readings of the encoders; every reading has a noise of its own."""
         places = self._encoders()
-        wire, *catheters = (places + self._noise * self._random.standard_normal(places.shape)).tolist()
-        return ProximalState(self._drives[0].time_s, *wire, catheters=tuple((at, turn) for at, turn in catheters))
+        read = places + self._noise * self._random.standard_normal(places.shape)
+        return ProximalState(self._drives[0].time_s, tuple((at, turn) for at, turn in read.tolist()))
 
     def run(self, duration: float) -> float:
         """Let the robot and its devices run for some time, s, and return the largest wall force on a node, N."""
