@@ -120,13 +120,17 @@ class Belief:
         weight = np.exp(score - score.max())
         return weight / weight.sum()
 
-    def follow(self, inserted_length: float, rotation: float, catheters: Proximals = ()) -> None:
-        """Move every member's proximal ends to where the encoders say that they are, in one decision period."""
+    def follow(self, devices: Proximals) -> None:
+        """Move every member's proximal ends to where the encoders say that they are, in one decision period.
+
+        Args:
+            devices: inserted length (mm) and rotation (rad) of the wire, then of each catheter.
+        """
         simulator = self.simulator
         inserted = np.column_stack([simulator.inserted_length, simulator.catheter_inserted_length])
         turned = np.column_stack([simulator.rotation, simulator.catheter_rotation])
         controls = []
-        for k, (length, turn) in enumerate([(inserted_length, rotation), *catheters]):
+        for k, (length, turn) in enumerate(devices):
             motion = np.column_stack([np.maximum(length + self._ostium, 0.0) - inserted[:, k], turn - turned[:, k]])
             controls.append(self._limits[k].clip(motion / DECISION_PERIOD_S, inserted[:, k], DECISION_PERIOD_S))
         control = np.concatenate(controls, axis=1)

@@ -83,7 +83,7 @@ def command(
     if controls is not None and controls.is_dir():
         plan = read_plan(controls, patient, wire, catheters)
         patient, wire = plan.navigation.anatomy, plan.navigation.device
-        initial, control = plan.navigation.start[None], plan.control[None]
+        initial, control = plan.navigation.start[None], plan.control.reshape(1, len(plan.control), -1)
     elif controls is not None:
         script = read_controls_csv(existing(controls), catheters=len(catheters))
         initial, control, period_s = script.initial, script.control, script.period_s

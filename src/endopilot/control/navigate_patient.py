@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from endopilot.anatomy.catheter_axis import lean_between, with_axis
 from endopilot.anatomy.io import read_anatomy
-from endopilot.control.agent import TwinPolicy
+from endopilot.control.agent import OraclePolicy
 from endopilot.control.set_up import TILT_DEG, TipChoice, choose_tip
 from endopilot.devices.catheter import Catheter, read_catheter
 from endopilot.devices.device import Device, read_device
@@ -49,8 +49,8 @@ class NavigatePatientConfig:
     """Policy, wire, limits, and how reality differs from what the policy is given."""
 
     policy: Text = "agent"
-    """What decides: agent, twin, open-loop, forward, spin, retract-rotate, with a catheter coaxial-agent, in-turn or
-    catheter-alone, or MODULE:OBJECT of your own."""
+    """What decides: agent, oracle (which is given the truth), open-loop, forward, spin, retract-rotate, with a catheter
+    in-turn or catheter-alone, or MODULE:OBJECT of your own."""
     device: Text = "workhorse-014"
     """Name of a device (`endopilot devices`) or a YAML file."""
     catheter: tuple[Text, ...] = ()
@@ -197,7 +197,7 @@ def set_up_navigation(anatomy: Anatomy | str | Path, target: str, config: Naviga
     catheters = tuple(read_catheter(name) for name in config.catheter)
     truth = _truth(config, vessel)
     seen, truth = _see_catheter(vessel, device, truth, config)
-    policy = TwinPolicy(truth) if config.policy == "twin" else make_policy(config.policy)
+    policy = OraclePolicy(truth) if config.policy == "oracle" else make_policy(config.policy)
     given = Navigation(
         anatomy=seen,
         device=device,

@@ -15,7 +15,6 @@ from jaxtyping import Bool, Float
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.belief.adviser import AdviserConfig, count_events, near_exposures
 from endopilot.control.agent import AgentPolicy
-from endopilot.control.coaxial_agent import CoaxialAgent
 from endopilot.errors import InputError
 from endopilot.navigation.navigate import NavigateConfig, navigate
 from endopilot.navigation.policies import make_policy
@@ -101,7 +100,7 @@ def attempt(policy: str, navigation: Navigation, *, seed: int, mismatch: ModelMi
     """
     driver = make_policy(policy)
     record = _drive(navigation, driver, seed, mismatch)
-    told = record.believed if isinstance(driver, AgentPolicy | CoaxialAgent) else None
+    told = record.believed if isinstance(driver, AgentPolicy) else None
     believed = None if told is None else told[:-1, 0]
     recording = Recording(record.control[:-1], record.exposed[:-1], believed, record.reason == "gave up")
     return (
