@@ -19,8 +19,10 @@ from endopilot.control.course import Course, Log, Period
 from endopilot.control.halt import describe_halt
 from endopilot.control.period import drive_period
 from endopilot.control.wire_search import WireSearch
+from endopilot.devices.drive_limits import DriveLimits
 from endopilot.navigation.navigate import NavigationLoop, navigate, start_world
 from endopilot.navigation.policy import Decision, Observation, Policy
+from endopilot.robot.robot import DriveMotion, RobotConfig
 from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.simulation.motion import motion_named
 from endopilot.tasks.navigation import Navigation, Target
@@ -241,7 +243,7 @@ def started(side_branch) -> AgentPolicy:
 
 @given(control=st.lists(st.tuples(NUMBERS, NUMBERS, NUMBERS, NUMBERS), min_size=1, max_size=4))
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_whatever_the_model_returns_commands_are_finite_and_within_limits(started, shaped, control) -> None:
+def test_whatever_the_model_returns_a_drive_takes_what_is_finite_and_within_limits(started, shaped, control) -> None:
     """The search is made to return any numbers at all."""
     wild = np.array(control)
 
@@ -256,10 +258,10 @@ def test_whatever_the_model_returns_commands_are_finite_and_within_limits(starte
 
     started._search.find, started._course, started._failed = find, None, 0
     for k in range(len(control)):
-        decision = started.decide(Observation(0.5 * k, ((2.0, 0.0),), None))
-        assert np.isfinite(decision.devices).all()
-        assert abs(decision.devices[0][0]) <= shaped.max_velocity_mm_s
-        assert abs(decision.devices[0][1]) <= shaped.max_rotation_rad_s
+        (velocity,) = started.decide(Observation(0.5 * k, ((2.0, 0.0),), None)).devices
+        taken = DriveMotion(DriveLimits.of(shaped), RobotConfig(), (2.0, 0.0)).command(*velocity)
+        assert np.isfinite(taken).all()
+        assert (np.abs(taken) <= [shaped.max_velocity_mm_s, shaped.max_rotation_rad_s]).all()
 
 
 @pytest.mark.timeout(60)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -102,6 +103,18 @@ def test_the_encoders_read_the_wire_with_noise(fork, wire) -> None:
     robot.command(((40.0, 0.0),))
     robot.run(3.0)
     assert simulator.inserted_length[0] <= DriveLimits.of(wire, fork).travel_mm[1] + 1e-6
+
+
+@pytest.mark.parametrize("ostium_mm", [0.0, 1.7, -1.7])
+def test_a_wire_is_not_driven_beyond_its_end_wherever_the_ostium_truly_is(fork, wire, ostium_mm) -> None:
+    limits = replace(DriveLimits.of(wire, fork), travel_mm=(0.0, 15.0))
+    simulator = Simulator(fork, wire, config=SimulatorConfig(element_mm=1.5, threads=1))
+    simulator.reset(inserted_length=[10.0], rotation=[0.0])
+    robot = SimulatedRobot(simulator, [limits], RobotConfig(**IDEAL), ostium_mm=ostium_mm)
+    robot.command(((20.0, 0.0),))
+    robot.run(1.0)
+    # by the encoder it goes no farther than the travel, and in truth no farther than the wire is laid out for
+    assert robot.proximal[0, 0] == pytest.approx(15.0 + min(ostium_mm, 0.0), abs=1e-6)
 
 
 def test_refuses_bad_settings() -> None:

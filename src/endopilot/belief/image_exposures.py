@@ -172,7 +172,7 @@ def expose_navigations(data: Dataset, anatomy: Anatomy, settings: ImageSettings)
                 there = nodes[sample] if shown is None else place(shown[sample], nodes[sample])
                 random = np.random.default_rng([seed, 3, sequence, sample, *name.encode()])
                 depth, given = float(encoder[index, sample]), sample < WINDOW
-                measured[index].append(arm.expose(there, depth, random, refine=given))
+                measured[index].append(arm.measure(there, depth, random, refine=given))
     return _held(measured, encoder, known)
 
 

@@ -211,7 +211,7 @@ class Autopilot:
         navigation = self._world.navigation
         if self._fluoroscope is None:
             self._fluoroscope = Fluoroscope(navigation.anatomy, navigation.device.tip_radius_mm, FluoroscopeConfig())
-        return self._fluoroscope.expose(snapshot.nodes[0], snapshot.tip_direction, inserted_mm, self._random)
+        return self._fluoroscope.measure(snapshot.nodes[0], snapshot.tip_direction, inserted_mm, self._random)
 
     def _decide(self, start: Navigation | None, observation: Observation) -> Decision:
         """Decide, in a thread of its own; a policy that is new is made and started first."""

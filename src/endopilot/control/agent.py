@@ -23,7 +23,6 @@ from endopilot.control.course import Course
 from endopilot.control.search import Search, SearchConfig
 from endopilot.control.stack_search import StackSearch
 from endopilot.control.wire_search import WireSearch
-from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.stack import Proximals
 from endopilot.errors import InputError
 from endopilot.navigation.policy import BelievedTip, Decision, Observation
@@ -134,7 +133,6 @@ class _PlanningPolicy:
             if navigation.catheters
             else WireSearch(navigation, self.route, self.belief, config=search, seed=seed)
         )
-        self._limits = [DriveLimits.of(device, navigation.anatomy) for device in navigation.devices]
         self._course: Course | None = None
         self._lost = self._began = self._led = self._arrived = self._shows = False
         self._at, self._crept, self.plans, self._failed, self.planning_s = 0, 0, 0, 0, 0.0
@@ -146,10 +144,8 @@ class _PlanningPolicy:
             self._lost = False  # back where it began, the wire lies as it did, unseen in its catheter
         self._shows = False
         wanted = self._pull_back(observation) if self._lost else self._go_on(observation)
-        every = [*wanted, *[(0.0, 0.0)] * len(self._limits)]
-        safe = tuple(limits.safe(*velocity) for limits, velocity in zip(self._limits, every, strict=False))
         ends = self._failed >= self.config.tries and self._course is None and not self._lost
-        return Decision(safe, expose=self._lost or self.wants_xray(), gives_up=self._search.halt if ends else "")
+        return Decision(wanted, expose=self._lost or self.wants_xray(), gives_up=self._search.halt if ends else "")
 
     def watch(self, observation: Observation) -> None:
         """Follow what somebody else does; a new course is searched at the next decision."""
@@ -217,7 +213,7 @@ class _PlanningPolicy:
         course, at = self._course, self._at
         if course is None or self._ended:
             self._shows = not self._search.draws  # another look, before another search
-            return ()
+            return ((0.0, 0.0),)
         self._shows, self._at = bool(course.exposed[at]), at + 1
         velocity = (course.proximal[at] - np.array(observation.devices)) / DECISION_PERIOD_S
         return tuple((translation, rotation) for translation, rotation in velocity.tolist())

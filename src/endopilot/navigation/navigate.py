@@ -9,7 +9,6 @@ from dataclasses import field, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.errors import InputError
@@ -20,11 +19,10 @@ from endopilot.robot.robot import CYCLE_S, RobotConfig, SimulatedRobot
 from endopilot.settings import settings
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.mismatch import ModelMismatch
-from endopilot.simulation.motion import Motion, place
+from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulator import Simulator
-from endopilot.tasks.navigation import DECISION_PERIOD_S, SUCCESS_MM, Navigation, XrayKind, check_wire_alone
-from endopilot.xray.fluoroscope import Fluoroscope, FluoroscopeConfig, TipMeasurement
-from endopilot.xray.moving_patient import seen, turned
+from endopilot.tasks.navigation import DECISION_PERIOD_S, SUCCESS_MM, Navigation, XrayKind
+from endopilot.xray.fluoroscope import FluoroscopeConfig, make_c_arm
 
 _CYCLES = round(DECISION_PERIOD_S / CYCLE_S)
 
@@ -71,7 +69,7 @@ class NavigationLoop:
         policy: what decides.
         simulator: the world as it truly is; its one wire is the real one.
         robot: what moves it, and its catheters.
-        fluoroscope: the C-arm.
+        c_arm: what shows its tip.
         observation: what was observed at the last decision; None before the first.
         believed: what the policy believed then; None for a policy that does not tell.
         reason: why the navigation is over, as in `NavigationRecord`; None while it goes on.
@@ -98,26 +96,14 @@ class NavigationLoop:
         self.navigation = navigation = replace(navigation, xray=config.xray)
         self.policy = make_policy(policy) if isinstance(policy, str) else policy
         self.simulator = start_world(navigation, truth, config.simulator, motion=config.motion)
-        ostium = np.asarray(navigation.anatomy.insertion.position)
-        self._moves = config.motion is not None
         limits = [DriveLimits.of(device, navigation.anatomy) for device in navigation.devices]
         drive = replace(config.robot, latency_s=config.robot.latency_s * truth.latency_factor)
         self.robot = SimulatedRobot(self.simulator, limits, drive, seed=seed, ostium_mm=truth.ostium_mm)
-        anatomy, device = navigation.anatomy, navigation.device
-        if config.xray == "images":
-            from endopilot.xray.image_fluoroscope import ImageFluoroscope  # slow to import
-
-            check_wire_alone(navigation, "xray: images: the detector")
-            self.fluoroscope = ImageFluoroscope(anatomy, device, config.fluoroscope, seed)
-            if config.measure_motion and config.motion is not None:
-                measured = self.fluoroscope.measure_motion(config.motion, np.random.default_rng([seed, 6]))
-                self.navigation = navigation = replace(navigation, known_motion=measured)
-        elif config.measure_motion:
-            raise InputError("measure_motion: exposures of assumed errors show no contrast; give xray: images")
-        else:
-            self.fluoroscope = Fluoroscope(anatomy, device.tip_radius_mm, config.fluoroscope)
-        known = navigation.known_motion
-        self._known = None if known is None else known.core(ostium)
+        self.c_arm = make_c_arm(navigation, config.fluoroscope, seed=seed)
+        if config.measure_motion:
+            measured = self.c_arm.measure_motion(config.motion, np.random.default_rng([seed, 6]))
+            self.navigation = navigation = replace(navigation, known_motion=measured)
+            self.c_arm.known_motion = measured
         self._random = np.random.default_rng([seed, 2])
         self._track = Track(self.simulator)
         self._periods = int(np.ceil(navigation.seconds / DECISION_PERIOD_S - 1e-9))
@@ -167,7 +153,8 @@ class NavigationLoop:
         handed_back, self._by_hand = self._by_hand and by_hand is None, by_hand is not None
         exposed = self._expose or handed_back
         if exposed:
-            tip = self._measure(state.devices[0][0])
+            inserted, _ = state.devices[0]
+            tip = self.c_arm.expose(self.simulator, inserted, self._random, time_s=self.time_s)
         observation = Observation(self.time_s, state.devices, tip)
         decision = self._decide(observation, by_hand)
         taken = self.robot.command(decision.devices)
@@ -204,22 +191,6 @@ class NavigationLoop:
     def record(self) -> NavigationRecord:
         """Return what has happened up to the end of the last whole period."""
         return self._track.record(self.navigation, self.robot.driven, self.reason or "stopped", self.gives_up)
-
-    def _measure(self, inserted_length: float) -> TipMeasurement | None:
-        if isinstance(self.fluoroscope, Fluoroscope):
-            tip, heading = self.simulator.tips()[0], self.simulator.tip_direction[0]
-            if self._moves:
-                shown = self._seen()
-                tip, heading = place(shown, tip), turned(shown, heading)
-            return self.fluoroscope.expose(tip, heading, inserted_length, self._random)
-        nodes = self.simulator.position[0]
-        if self._moves:
-            nodes = place(self._seen(), nodes)
-        return self.fluoroscope.expose(nodes, inserted_length, self._random)
-
-    def _seen(self) -> Float[np.ndarray, "3 4"]:
-        """Return where the C-arm takes points of the moving vessel to lie in the vessel as CT shows it."""
-        return seen(self.simulator.vessel_to_laboratory[:1], self._known, np.array([self.time_s]))[0]
 
     def _decide(self, observation: Observation, by_hand: Decision | None) -> Decision:
         if by_hand is None:

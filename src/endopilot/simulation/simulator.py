@@ -300,6 +300,16 @@ class Simulator(Readout):
             group.simulation.set_state(state)
 
     @property
+    def motion(self) -> Motion | None:
+        """How every vessel moves; None if it lies still.
+
+        Example:
+            >>> simulator.motion is None
+            True
+        """
+        return self._motion
+
+    @property
     def config(self) -> SimulatorConfig:
         """Settings of the rod core.
 
