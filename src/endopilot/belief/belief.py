@@ -1,10 +1,7 @@
 """The belief about the wire between X-ray exposures: an ensemble of simulated wires, driven like the real one.
 
-Catheters around the real wire are around each simulated one too, and driven like the real ones.
-
-Its members differ in what is uncertain: friction, the stiffness of the tip, and how deep the ostium lies (as
-`models/twin.py` has it). Each follows the robot's encoders, in a
-vessel that moves as it is known to. A measurement of the tip weights them by their errors.
+Each follows the robot's encoders, in a vessel that moves as it is known to. Catheters around the real wire are around
+each simulated one too, and driven like the real ones. A measurement of the tip weights the members by their errors.
 """
 
 from __future__ import annotations
@@ -18,9 +15,9 @@ from scipy.stats import qmc
 
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.stack import Proximals
+from endopilot.models.ensemble import Ensemble, likelihoods
 from endopilot.settings import NonNegative, Positive, ShareBelowOne, Within, settings
 from endopilot.simulation.config import PRESETS, SimulatorConfig
-from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.types import TipProjection
 from endopilot.xray.fluoroscope import TipMeasurement
@@ -62,42 +59,27 @@ class BeliefConfig:
         )
 
 
-class Belief:
-    """An ensemble of simulated wires, and how likely each is.
+class Belief(Ensemble):
+    """An ensemble of simulated wires that follow a navigation, and how likely each is.
 
     Attributes:
-        parameters: friction factor, tip stiffness factor and depth of the ostium (mm) of each member.
-        simulator: their worlds.
-        weight: their likelihoods; the sum is 1.
+        tip: of each member's wire.
     """
 
     def __init__(
         self, navigation: Navigation, parameters: Float[np.ndarray, "members 3"], config: BeliefConfig
     ) -> None:
         """Bring every member's wire to the start of the navigation."""
-        self.parameters, self._config = parameters, config
-        device = navigation.device
-        self.wires = {
-            factor: device.with_tip(bend_rad=device.tip_bend_rad, stiffness_factor=float(factor))
-            for factor in np.unique(parameters[:, 1])
-        }
-        catheters = len(navigation.catheters)
-        self.simulator = Simulator(
+        super().__init__(
             navigation.anatomy,
-            [self.wires[factor] for factor in parameters[:, 1]],
-            catheters=navigation.catheters,
-            motion=navigation.known_motion,
+            navigation.device,
+            parameters,
+            start=np.tile(navigation.start.reshape(-1, 2), (len(parameters), 1, 1)),
             config=config.core,
+            motion=navigation.known_motion,
+            catheters=navigation.catheters,
         )
-        self._ostium = parameters[:, 2]
-        self.simulator.reset(
-            inserted_length=np.maximum(navigation.start_inserted_mm + self._ostium, 0.0),
-            rotation=np.full(len(parameters), navigation.start_rotation),
-            friction=device.friction * parameters[:, 0],
-            catheter_inserted_length=np.tile(
-                np.maximum(navigation.start_catheter_mm + self._ostium, 0.0)[:, None], (1, catheters)
-            ),
-        )
+        self._accuracy_mm = config.along_sd_mm, config.across_sd_mm
         self._limits = [DriveLimits.of(each, navigation.anatomy) for each in navigation.devices]
         self._score, self._coaxial = np.zeros(len(parameters)), bool(navigation.catheters)
         self.tip = self.simulator.project()
@@ -117,8 +99,7 @@ class Belief:
     def weight(self) -> Float[np.ndarray, "members"]:
         """Likelihoods of the members; a member whose simulation failed has none."""
         score = np.where(self.simulator.valid, self._score, -1e6)
-        weight = np.exp(score - score.max())
-        return weight / weight.sum()
+        return likelihoods(score)
 
     def follow(self, devices: Proximals) -> None:
         """Move every member's proximal ends to where the encoders say that they are, in one decision period.
@@ -131,7 +112,8 @@ class Belief:
         turned = np.column_stack([simulator.rotation, simulator.catheter_rotation])
         controls = []
         for k, (length, turn) in enumerate(devices):
-            motion = np.column_stack([np.maximum(length + self._ostium, 0.0) - inserted[:, k], turn - turned[:, k]])
+            ahead = self._deeper(np.full(len(inserted), length)) - inserted[:, k]
+            motion = np.column_stack([ahead, turn - turned[:, k]])
             controls.append(self._limits[k].clip(motion / DECISION_PERIOD_S, inserted[:, k], DECISION_PERIOD_S))
         control = np.concatenate(controls, axis=1)
         with warnings.catch_warnings():
@@ -157,9 +139,7 @@ class Belief:
         The density is a Cauchy density. Its tails are heavy: a tip that snapped a moment too early says little about
         friction. Its scales are no smaller than the measurement's own standard deviations.
         """
-        scaled = self.errors(measured) / np.maximum(
-            [self._config.along_sd_mm, self._config.across_sd_mm], measured.sd_mm
-        )
+        scaled = self.errors(measured) / np.maximum(self._accuracy_mm, measured.sd_mm)
         self._score = self._score - np.log1p((scaled**2).sum(axis=1))
 
     def likeliest(self) -> tuple[Int[np.ndarray, "levels"], Float[np.ndarray, "levels"]]:

@@ -25,6 +25,7 @@ from endopilot.control.stack_search import StackSearch
 from endopilot.control.wire_search import WireSearch
 from endopilot.devices.stack import Proximals
 from endopilot.errors import InputError
+from endopilot.models.ensemble import NOMINAL
 from endopilot.navigation.policy import BelievedTip, Decision, Observation
 from endopilot.progress import Advance
 from endopilot.settings import NonNegative, Positive, Within, settings
@@ -89,7 +90,6 @@ _WIRE_CREEP_MM_S = 2.0
 _CREEP_MM_S, _CREEP_PERIODS = 1.0, 6
 """A catheter, which X-ray does not show, is moved ahead and back by this where it should have arrived, for as many
 periods and twice."""
-_NOMINAL = np.array([1.0, 1.0, 0.0])
 
 
 class _PlanningPolicy:
@@ -340,7 +340,7 @@ class AgentPolicy(_PlanningPolicy):
             self._led = False
 
     def _parameters(self) -> Float[np.ndarray, "members 3"]:
-        return Belief.around(_NOMINAL, self.config.belief)
+        return Belief.around(NOMINAL, self.config.belief)
 
     def adviser_input(self) -> AdviserInput:
         """Return what the adviser is given: the likeliest wire, and the spread of all wires."""
