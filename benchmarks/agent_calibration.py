@@ -149,7 +149,7 @@ def measure(path: Path, name: str) -> None:
         truth=truth_of(task, number, role, kind),
     )
     kept, count = np.array(policy.kept), len(policy.kept)
-    true = np.column_stack([record.tip.abscissa, record.tip.offset])[:count]
+    true = np.column_stack([record.tip.abscissa[:, 0], record.tip.offset[:, 0]])[:count]
     exposed = record.exposed[:count]
     write_json(path, {"predicted": kept.tolist(), "true": true.tolist(), "exposed": exposed.tolist()})
 

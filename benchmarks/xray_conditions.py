@@ -73,7 +73,7 @@ def measure(path: Path) -> None:
             "seconds": record.seconds,
             "exposures": record.exposures,
             "peak_force_n": record.peak_force_n,
-            "events": navigation_events(record.tip, record.exposed, record.believed[:-1, 0], radius_mm),
+            "events": navigation_events(record.tip[:, 0], record.exposed, record.believed[:-1, 0], radius_mm),
             "decisions": [int(record.in_bands.sum()), len(record.in_bands)],
         },
     )

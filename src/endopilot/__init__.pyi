@@ -29,6 +29,7 @@ from .navigation.navigate import NavigateConfig as NavigateConfig
 from .navigation.navigate import NavigationLoop as NavigationLoop
 from .navigation.navigate import navigate as navigate
 from .navigation.policy import Decision as Decision
+from .navigation.policy import Hand as Hand
 from .navigation.policy import Observation as Observation
 from .navigation.policy import Policy as Policy
 from .navigation.record import NavigationRecord as NavigationRecord

@@ -297,6 +297,10 @@ class TipProjection:
     branch: Int[np.ndarray, "..."]
     radius: Float[np.ndarray, "..."]
 
+    def __getitem__(self, index: Any) -> TipProjection:
+        """Return some of the tips, by an index of the arrays: `tip[:, 0]` is the wire's where devices have an axis."""
+        return TipProjection(self.abscissa[index], self.offset[index], self.branch[index], self.radius[index])
+
 
 @dataclass(frozen=True, eq=False)
 class CatheterMotion:

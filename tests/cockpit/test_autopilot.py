@@ -118,7 +118,7 @@ def test_a_hand_takes_over_and_hands_back(session):
         session.handle(Drive(type="drive", translation=-5.0, rotation=0.0), number * 0.0125)
         session.cycle(number * 0.0125)
         time.sleep(0.001)
-    assert session.world.robot.velocity[0] == -5.0
+    assert session.world.loop.robot.velocity[0, 0] == -5.0
     assert policy.watched >= 1 and len(policy.seen) == decisions
     start(session, "test_autopilot:Scripted")
     drive(session, until=lambda: len(policy.seen) > decisions)
@@ -147,7 +147,7 @@ def test_a_page_that_falls_silent_pauses_the_policy(session):
     assert session.autopilot.status == "paused"
     for number in range(100):
         session.cycle(100.0 + AUTOPILOT_SILENCE_S + number)
-    assert session.world.robot.velocity[0] == 0.0
+    assert session.world.loop.robot.velocity[0, 0] == 0.0
 
 
 def test_a_page_cannot_name_a_module(session):

@@ -38,7 +38,7 @@ def test_the_wire_follows_the_drive_within_its_limits(session):
 def test_silence_stops_the_wire(session):
     session.handle(Drive(type="drive", translation=5.0, rotation=1.0), 0.0)
     run(session, SILENCE_S)
-    moving = session.world.robot.velocity.copy()
+    moving = session.world.loop.robot.velocity[0].copy()
     (header, _), _ = run(session, 0.3, start=SILENCE_S + 0.02)
     assert moving[0] == 5.0
     assert header["stopped"] == "silence" and header["velocity"] == [0.0, 0.0]
@@ -191,7 +191,7 @@ def test_a_recording_that_cannot_be_written_is_told(world, vessel, tmp_path):
         Recorder(tmp_path / "file" / "a.jsonl", world, Where(patient=vessel), 0)
 
 
-@pytest.mark.parametrize("text", ["", "{}\n", "nonsense\n", '{"format": "endopilot cockpit 1"}\n'])
+@pytest.mark.parametrize("text", ["", "{}\n", "nonsense\n", '{"format": "endopilot cockpit 2"}\n'])
 def test_what_is_no_session_is_told(tmp_path, text):
     path = tmp_path / "x.cockpit.jsonl"
     path.write_text(text)

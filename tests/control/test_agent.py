@@ -21,7 +21,7 @@ from endopilot.control.period import drive_period
 from endopilot.control.wire_search import WireSearch
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.navigation.navigate import NavigationLoop, navigate, start_world
-from endopilot.navigation.policy import Decision, Observation, Policy
+from endopilot.navigation.policy import Decision, Hand, Observation, Policy
 from endopilot.robot.robot import DriveMotion, RobotConfig
 from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.simulation.motion import motion_named
@@ -60,7 +60,7 @@ def test_the_oracle_gets_into_a_side_branch_that_pushing_misses(side_branch) -> 
     assert isinstance(policy, Policy)
     record = navigate(side_branch, policy, seed=1)
     assert record.success and record.safe and record.faults == 0
-    assert record.tip.branch[-1] == 2
+    assert record.tip.branch[-1, 0] == 2
     assert record.exposures == len(record.time_s) - 1  # X-ray is always on
 
 
@@ -292,8 +292,10 @@ def test_an_agent_tells_what_it_believes_and_goes_on_after_hands(side_branch) ->
     loop = NavigationLoop(side_branch, AgentPolicy(QUICK), seed=2)
     for _ in range(4):
         loop.step()
-    for _ in range(6):  # away from its course, turned
-        loop.step(by_hand=Decision(((-2.0, 1.5),), expose=False))
+    loop.hand_over(Hand(((-2.0, 1.5),)))  # away from its course, turned
+    for _ in range(6):
+        loop.step()
+    loop.hand_over(None)
     wires, tip = loop.policy.believed_wires(), loop.policy.belief.tip
     assert wires.shape == (QUICK.belief.members, loop.policy.belief.simulator.nodes, 3)
     likeliest = int(np.argmax(loop.policy.belief.weight))
@@ -304,7 +306,7 @@ def test_an_agent_tells_what_it_believes_and_goes_on_after_hands(side_branch) ->
     record = loop.record()
     assert record.success and record.safe
     assert record.exposed[10], "the policy goes on with an image"
-    ends = np.abs(record.believed[:-1, 0] - record.tip.abscissa[:-1])
+    ends = np.abs(record.believed[:-1, 0] - record.tip.abscissa[:-1, 0])
     assert np.isnan(record.believed[-1]).all() and np.median(ends) < 0.5
     bands = record.half_width[:-1][~np.isnan(record.half_width[:-1, 0])]
     assert len(bands) > 5 and (bands > 0).all()

@@ -72,7 +72,7 @@ def test_a_course_into_a_side_branch_brings_wire_and_catheter_there(side_branch,
     ends = np.flatnonzero(course.exposed)
     assert len(ends) == 2 and ends[-1] == len(course.control) - 1 and np.array_equal(course.checked, course.exposed)
     route = Route.to(side_branch.anatomy, side_branch.target)
-    assert not any(route.off_route(course.tip_at(int(end))).any() for end in ends)
+    assert not any(route.off_route(course.tip[int(end)]).any() for end in ends)
     assert len(course.control) == len(course.proximal) == len(course.tip.abscissa) == len(course.force)
     assert (np.abs(course.control).sum(axis=(1, 2)) > 0).all()  # without pauses
 

@@ -13,7 +13,7 @@ from endopilot.errors import InputError
 from endopilot.ladder.attempt import Recording, Repeated, attempt, repeat
 from endopilot.navigation.baseline_policies import BEHIND_MM, LEAD_MM, CatheterAlone, InTurn
 from endopilot.navigation.navigate import NavigateConfig, NavigationLoop, navigate, start_world
-from endopilot.navigation.policy import Decision, Observation
+from endopilot.navigation.policy import Decision, Hand, Observation
 from endopilot.robot.robot import CYCLE_S, RobotConfig, SimulatedRobot
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.mismatch import ModelMismatch
@@ -52,10 +52,10 @@ def test_wire_and_catheter_are_driven_by_drives_of_their_own(over_the_wire) -> N
     # v (t - latency) less v²/2a of the ramp
     assert state.devices[0] == pytest.approx((2.0 + 4.0 * 1.95 - 4.0**2 / 400.0, 0.0), abs=1e-6)
     assert state.devices[1] == pytest.approx((2.0 * 1.95 - 2.0**2 / 400.0, 0.5 * 1.95 - 0.5**2 / 120.0), abs=1e-6)
-    assert robot.velocity.tolist() == pytest.approx([4.0, 0.0, 2.0, 0.5])
+    assert robot.velocity == pytest.approx(np.array([[4.0, 0.0], [2.0, 0.5]]))
     robot.command(((4.0, 0.0),))  # a catheter that is not named stops
     robot.run(1.0)
-    assert robot.velocity.tolist() == pytest.approx([4.0, 0.0, 0.0, 0.0])
+    assert robot.velocity == pytest.approx(np.array([[4.0, 0.0], [0.0, 0.0]]))
     robot.stop()
     robot.run(0.5)
     before = robot.proximal_state()
@@ -70,23 +70,23 @@ def test_the_catheter_follows_in_turn_and_the_same_controls_simulate_the_same(ov
     record = navigate(over_the_wire, "in-turn", config=COARSE, seed=1)
     assert record.reason == "reached" and record.faults == 0
     periods = len(record.time_s) - 1
-    assert record.control.shape == (periods + 1, 4) and record.driven.shape == (10 * periods, 4)
-    assert record.catheter_inserted_length.shape == record.catheter_rotation.shape == (periods + 1, 1)
-    inserted, catheter = record.inserted_length, record.catheter_inserted_length[:, 0]
+    assert record.control.shape == (periods + 1, 2, 2) and record.driven.shape == (10 * periods, 2, 2)
+    assert record.inserted_length.shape == record.rotation.shape == record.tip.abscissa.shape == (periods + 1, 2)
+    inserted, catheter = record.inserted_length.T
     assert (np.diff(inserted) > -0.1).all()  # the wire is not pulled out
     assert catheter[-1] > 15.0 and (inserted - catheter).max() < LEAD_MM + 5.0
-    moving = (np.abs(record.control[:, ::2]) > 0).sum(axis=1)
+    moving = (np.abs(record.control[..., 0]) > 0).sum(axis=1)
     assert moving.max() == 1  # one at a time
     again = simulate(
         over_the_wire.anatomy,
         over_the_wire.device,
-        record.driven[None],
+        record.driven.reshape(1, -1, 4),
         catheters=over_the_wire.catheters,
         initial=np.array([[inserted[0], 0.0, 0.0, 0.0]]),
         config=COARSE.simulator,
         period_s=CYCLE_S,
     )
-    np.testing.assert_allclose(again.tip_position[0, 9::10], record.tip_position[1:], atol=1e-5)
+    np.testing.assert_allclose(again.tip_position[0, 9::10], record.tip_position[1:, 0], atol=1e-5)
     assert again.catheters is not None
     np.testing.assert_allclose(again.catheters.inserted_length[0, 9::10, 0], catheter[1:], atol=1e-9)
 
@@ -94,8 +94,8 @@ def test_the_catheter_follows_in_turn_and_the_same_controls_simulate_the_same(ov
 def test_a_catheter_that_a_policy_does_not_name_stands_still(over_the_wire) -> None:
     wire_first = replace(over_the_wire, arrives="wire")
     record = navigate(wire_first, "forward", config=COARSE)
-    assert record.reason == "reached" and np.ptp(record.catheter_inserted_length) == 0.0
-    assert not record.control[:, 2:].any() and record.faults == 0
+    assert record.reason == "reached" and np.ptp(record.inserted_length[:, 1]) == 0.0
+    assert not record.control[:, 1].any() and record.faults == 0
     # the wire alone does not bring the catheter's tip there
     assert navigate(over_the_wire, "forward", config=COARSE).reason == "time"
 
@@ -110,8 +110,8 @@ def test_orders_are_kept_within_each_drive_s_limits(over_the_wire, catheter) -> 
 
     loop = NavigationLoop(over_the_wire, Wild(), config=COARSE)
     assert loop.step().devices == ((0.0, 0.0), (0.0, 0.0))
-    too_many = Decision(((1.0, 0.0), (1e9, 0.0), (1.0, 1.0)))
-    assert loop.step(by_hand=too_many).devices == ((1.0, 0.0), (catheter.device.max_velocity_mm_s, 0.0))
+    loop.hand_over(Hand(((1.0, 0.0), (1e9, 0.0), (1.0, 1.0))))
+    assert loop.step().devices == ((1.0, 0.0), (catheter.device.max_velocity_mm_s, 0.0))
     assert loop.record().faults == 2
 
 

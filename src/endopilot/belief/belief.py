@@ -158,4 +158,4 @@ class Belief(Ensemble):
     def likeliest_tip(self) -> TipProjection:
         """Return where the tip of the likeliest member is, as arrays of one."""
         best = [int(np.argmax(self.weight))]
-        return TipProjection(**{name: getattr(self.tip, name)[best] for name in TipProjection.__dataclass_fields__})
+        return self.tip[best]

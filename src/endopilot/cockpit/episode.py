@@ -36,7 +36,7 @@ def write_session_episode(session: Path, output: Path) -> None:
     if samples == 0:
         raise InputError(f"{session}: lasts less than {DECISION_PERIOD_S:g} s; drive for longer")
     targets = [event["target"] for event in recording.events if "target" in event]
-    navigation, truth = recording.navigation, recording.config.truth
+    navigation, truth = recording.navigation, recording.truth
     *_, (world, _events) = replayed(recording)
     device = navigation.device
     wire = device.with_tip(bend_rad=device.tip_bend_rad, stiffness_factor=truth.stiffness_factor)
@@ -46,7 +46,7 @@ def write_session_episode(session: Path, output: Path) -> None:
     cycles = simulate(
         navigation.anatomy,
         replace(wire, friction=friction),
-        np.array(world.robot.driven)[None, : samples * per_sample],
+        np.array(world.loop.robot.driven)[: samples * per_sample].reshape(1, samples * per_sample, -1),
         catheters=truth.catheters(navigation.catheters),
         initial=start[None],
         config=recording.config.simulator,

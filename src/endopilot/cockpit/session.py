@@ -37,7 +37,6 @@ class Session:
         world: the wire in its vessel.
         xray: C-arm, pedal and contrast.
         autopilot: a policy that may drive.
-        target: where the tip is to go.
         sight: whether the page may show the wire in space.
     """
 
@@ -55,13 +54,17 @@ class Session:
         self.world, self.xray, self._recorder, self._policies = world, xray, recorder, policies
         self._rest = ((0.0, 0.0),) * len(world.navigation.devices)
         self.autopilot = Autopilot(world)
-        self.target: Target = world.navigation.target
         self.sight = True
         self._command, self._asked = self._rest, self._rest  # what the robot has taken, and of what
         self._moving, self._heard_s = False, -np.inf
         self._stopped = ""
         self._held: set[str] = set()  # what silence stopped
         self._locked: set[str] = set()  # what of it must be let go
+
+    @property
+    def target(self) -> Target:
+        """Where the tip is to go."""
+        return self.world.navigation.target
 
     def handle(self, message: messages.Message, now_s: float) -> None:
         """Do what the page of who drives asks for.
@@ -110,7 +113,7 @@ class Session:
         """Take over the events of a cycle that has passed."""
         for event in events:
             if "target" in event:
-                self.target = Target(branch=event["target"][0], abscissa=event["target"][1])
+                self.world.loop.aim(Target(branch=event["target"][0], abscissa=event["target"][1]))
             elif "exposure" in event:
                 self.xray.frames = event["exposure"]
                 self.xray.seconds, self.xray.kerma_ugy = event["seconds"], event["kerma_ugy"]
@@ -149,7 +152,10 @@ class Session:
             if self._recorder is not None:
                 self._recorder.cycle()
         snapshot = self.world.snapshot()
-        sent += _images(self._counted(self.xray.pulse(snapshot)))
+        pulse = self.xray.pulse(snapshot)
+        if pulse is not None:
+            self.world.loop.exposed()
+        sent += _images(self._counted(pulse))
         return [*sent, ("state", self.state(snapshot))]
 
     def state(self, snapshot: Snapshot) -> bytes:
@@ -159,7 +165,7 @@ class Session:
 
     def values(self, snapshot: Snapshot) -> dict[str, Any]:
         """Return the figures that the page shows."""
-        anatomy, ostium_mm = self.world.navigation.anatomy, self.world.config.truth.ostium_mm
+        anatomy, ostium_mm = self.world.navigation.anatomy, self.world.truth.ostium_mm
         shown = {
             "mode": "drive",
             **motion_values(snapshot, ostium_mm),
@@ -216,9 +222,9 @@ class Session:
         """Set the target, in the middle of a section or at a place."""
         tree = self.world.navigation.anatomy.tree
         if message.section is not None:
-            self.target = find_target(tree, message.section)
+            self.world.loop.aim(find_target(tree, message.section))
         elif message.branch is not None and message.abscissa is not None:
-            self.target = find_target(tree, Target(branch=message.branch, abscissa=message.abscissa))
+            self.world.loop.aim(find_target(tree, Target(branch=message.branch, abscissa=message.abscissa)))
         else:
             raise InputError("target: give a section, or a branch and an abscissa")
         self._record(target=[self.target.branch, self.target.abscissa])
@@ -227,6 +233,9 @@ class Session:
         """Hand the wheel to a policy or back, or let it pause."""
         if message.action == "start":
             self.autopilot.start(check_policy(message.policy, self._policies), self.target)
+            if self._moving:
+                self._move(self._rest)
+                self._moving = False
             self._stopped = ""
         elif message.action == "stop":
             self._take_over()
@@ -242,8 +251,12 @@ class Session:
         self.autopilot.stop()
 
     def _move(self, devices: Proximals) -> None:
-        """Command the robot, and write down what it has taken."""
-        self._command, self._asked = self.world.command(devices), devices
+        """Command the robot by hand."""
+        self._note(self.world.command(devices), devices)
+
+    def _note(self, taken: Proximals, asked: Proximals) -> None:
+        """Note and write down what the robot has taken, and of what."""
+        self._command, self._asked = taken, asked
         self._record(move=list(chain.from_iterable(self._command)))
 
     def _think(self) -> list[tuple[str, bytes]]:
@@ -252,9 +265,9 @@ class Session:
             return []
         snapshot, images = self.world.snapshot(), []
         before = self.autopilot.values()
-        decision = self.autopilot.think(snapshot, lambda: images.extend(self._counted(self.xray.expose(snapshot))))
-        if decision is not None:
-            self._move(decision.devices)
+        taken = self.autopilot.think(lambda: images.extend(self._counted(self.xray.expose(snapshot))))
+        if taken is not None:
+            self._note(taken, taken)
         sent = _images(images)
         if self.sight and self.autopilot.values() != before:
             belief = self.autopilot.belief(snapshot)

@@ -241,7 +241,7 @@ class _PlanningPolicy:
         course, at = self._course, self._at - 1
         if course is None or at < 0 or not course.checked[at]:
             return False
-        tip, planned = self.belief.likeliest_tip(), course.tip_at(at)
+        tip, planned = self.belief.likeliest_tip(), course.tip[at]
         allowed_mm = float(self.route.off_route(planned).max())
         if allowed_mm > 0 and not course.exposed[at]:
             allowed_mm = np.inf  # within a manoeuvre a tip may lie in the mouth of another branch

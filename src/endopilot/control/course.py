@@ -47,10 +47,6 @@ class Course:
     exposed: Bool[np.ndarray, "periods"]
     reached: float
 
-    def tip_at(self, period: int) -> TipProjection:
-        """Return where the tips are at the end of a period."""
-        return TipProjection(**{name: getattr(self.tip, name)[period] for name in _TIP})
-
 
 class Period(NamedTuple):
     """What copies did in a period, and where they were at its end, as `Course` has it; a row a world."""

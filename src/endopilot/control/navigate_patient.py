@@ -308,7 +308,7 @@ def _driven_again(set_up: SetUp, record: NavigationRecord, began: Float[np.ndarr
     periods = int(np.ceil(set_up.navigation.seconds / DECISION_PERIOD_S - 1e-9))
     per_period = round(DECISION_PERIOD_S / CYCLE_S)
     control = np.zeros((1, periods * per_period, len(began)))
-    control[0, : len(record.driven)] = record.driven
+    control[0, : len(record.driven)] = record.driven.reshape(-1, len(began))
     return simulate(
         set_up.true_anatomy,
         set_up.true_wire,

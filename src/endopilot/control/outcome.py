@@ -49,7 +49,7 @@ def why_not(found: PatientNavigation) -> str:
     if record.reason == "invalid":
         return f"the simulation failed after {record.seconds:g} s"
     route = Route.to(navigation.anatomy, navigation.target)
-    tree, tip = navigation.anatomy.tree, record.tips[navigation.arriving]
+    tree, tip = navigation.anatomy.tree, record.tip[:, navigation.arriving]
     branch, at = int(tip.branch[-1]), round(float(tip.abscissa[-1]), 1) + 0.0  # no "-0.0"
     whose = "the catheter's tip" if navigation.arriving else "the tip"
     where = f"after {record.seconds:g} s {whose} is in section {section_at(tree, branch, at)} at {at:.1f} mm"
@@ -66,8 +66,8 @@ def why_not(found: PatientNavigation) -> str:
 def _held_up(found: PatientNavigation, route: Route) -> str:
     """Return what is likeliest to have held up the device that was to arrive, or the wire ahead of it."""
     record, navigation = found.record, found.set_up.navigation
-    wire, device, tip = navigation.device, navigation.devices[navigation.arriving], record.tips[navigation.arriving]
-    refused, wire_came = found.set_up.choice.refused, float(route.progress(record.tip).max())
+    wire, device, tip = navigation.device, navigation.devices[navigation.arriving], record.tip[:, navigation.arriving]
+    refused, wire_came = found.set_up.choice.refused, float(route.progress(record.tip[:, 0]).max())
     if refused is not None and abs(wire_came - refused.abscissa) <= _AT_FORK_MM + wire.tip_bend_length_mm:
         return f"no rotation of the tip enters {refused}"
     narrow = _narrowest(route, float(route.progress(tip).max()), device.tip_radius_mm)
@@ -82,7 +82,7 @@ def _held_up(found: PatientNavigation, route: Route) -> str:
     if route.off_route(tip)[-1] > 0:
         return "it took another branch"
     still = min(round(_STILL_S / DECISION_PERIOD_S), len(record.time_s) - 1)
-    progress = [route.progress(each) for each in record.tips[: navigation.arriving + 1]]
+    progress = [route.progress(record.tip[:, k]) for k in range(navigation.arriving + 1)]
     if any(each[-1] - each[-1 - still] > _STILL_MM for each in progress):
         return "it was still on its course; give more --seconds"
     if found.plans is not None and found.plans > 1:
@@ -104,7 +104,7 @@ def _narrowest(route: Route, came_mm: float, wire_radius_mm: float) -> tuple[flo
 
 def worst_ratio(found: PatientNavigation) -> float:
     """Return the largest safety ratio γ/(r − r_w) of the tip."""
-    tip, radius = found.record.tip, found.set_up.navigation.device.tip_radius_mm
+    tip, radius = found.record.tip[:, 0], found.set_up.navigation.device.tip_radius_mm
     return float(safety_ratio(tip.offset, tip.radius, radius).max())
 
 

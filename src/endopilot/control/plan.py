@@ -271,9 +271,9 @@ def _by_policy(navigation: Navigation, config: PlanConfig) -> tuple[Steps, Steps
     from endopilot.navigation.policies import make_policy
 
     record = navigate(navigation, make_policy(config.method), config=NavigateConfig(robot=_IDEAL), seed=config.seed)
-    proximal = np.column_stack([record.inserted_length, record.rotation])
+    proximal, tip = np.column_stack([record.inserted_length[:, 0], record.rotation[:, 0]]), record.tip[:, 0]
     control = np.diff(proximal, axis=0) / DECISION_PERIOD_S
-    return control, np.column_stack([record.tip.abscissa, record.tip.offset])[1:]
+    return control, np.column_stack([tip.abscissa, tip.offset])[1:]
 
 
 def _checked(
@@ -315,7 +315,7 @@ def _checked(
         seconds_to_plan=float(spent[0]),
         processor_seconds=float(spent[1]),
     )
-    reached = navigation.reached(*(made.tip_of(device) for device in range(len(limits))))
+    reached = navigation.reached(*(made.tip[:, device] for device in range(len(limits))))
     return replace(made, reached=bool(reached.any()))
 
 

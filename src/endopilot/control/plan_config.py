@@ -21,7 +21,6 @@ NETWORK_METHODS = ("inverse", "mppi")
 """Methods that ask a trained network."""
 Steps = Float[np.ndarray, "samples 2"]
 Controls = Float[np.ndarray, "samples devices 2"]
-_TIP = tuple(TipProjection.__dataclass_fields__)
 
 
 @settings
@@ -118,17 +117,13 @@ class Plan:
     @property
     def ratio(self) -> Float[np.ndarray, "samples"]:
         """Safety ratio γ/(r − r_w) of the wire in the rod core."""
-        tip = self.tip_of(0)
+        tip = self.tip[:, 0]
         return safety_ratio(tip.offset, tip.radius, self.navigation.device.tip_radius_mm)
-
-    def tip_of(self, device: int) -> TipProjection:
-        """Return where the rod core has the tip of the wire (0) or of a catheter (1)."""
-        return TipProjection(**{name: getattr(self.tip, name)[:, device] for name in _TIP})
 
     @property
     def arriving_tip(self) -> TipProjection:
         """Where the tip that is to go to the target lies in the rod core."""
-        return self.tip_of(self.navigation.arriving)
+        return self.tip[:, self.navigation.arriving]
 
     @property
     def within_force_limit(self) -> bool:

@@ -134,7 +134,7 @@ def _table(plan: Plan, xray: PlannedXray | None) -> pd.DataFrame:
 
 def _device(plan: Plan, device: int) -> dict[str, np.ndarray]:
     moved = plan.control[:, device], plan.proximal[:, device]
-    return device_columns(device, *moved, plan.tip_of(device), plan.position[:, device])
+    return device_columns(device, *moved, plan.tip[:, device], plan.position[:, device])
 
 
 def read_plan(folder: Path, anatomy: Anatomy, device: Device, catheters: Sequence[Catheter] = ()) -> Plan:

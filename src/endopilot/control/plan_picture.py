@@ -98,7 +98,7 @@ def draw_route(
 
 
 def _draw_tip(plan: Plan, time_s: np.ndarray, axes: Axes) -> None:
-    tip = plan.tip_of(0)
+    tip = plan.tip[:, 0]
     route = Route.to(plan.navigation.anatomy, plan.navigation.target)
     off_route = route.off_route(tip) > 0
     axes.plot(time_s, plan.desired[:, 0], color="tab:green", label="desired")

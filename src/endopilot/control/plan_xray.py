@@ -103,7 +103,7 @@ class _Wires:
         return self._agent.adviser_input()
 
     def observe(self, period: int) -> None:
-        tip = self._plan.tip_of(0)
+        tip = self._plan.tip[:, 0]
         self._agent.belief.weigh(
             TipMeasurement(
                 position=self._plan.position[period, 0],

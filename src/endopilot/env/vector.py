@@ -15,7 +15,7 @@ from gymnasium.vector.utils import batch_space
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
-from endopilot.devices.drive_limits import far_end_mm, within_travel
+from endopilot.devices.drive_limits import DriveLimits, within_travel
 from endopilot.env.observation import Measured, observe, space
 from endopilot.env.route_tables import RouteTables
 from endopilot.errors import InputError
@@ -23,7 +23,7 @@ from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import SimulatorState
-from endopilot.tasks.navigation import Navigation, reached
+from endopilot.tasks.navigation import Navigation, is_safe, reached
 from endopilot.tasks.task import CORE, in_catheter, reference_navigation, training_navigations
 
 CONTROL_PERIOD_S = 2 / 15
@@ -75,6 +75,10 @@ class NavigateVectorEnv(VectorEnv):
     times a second. Its tip is to reach a place on the centerline of the tree. Friction delays and smooths what the tip
     does; which branch it enters at a fork depends on where the bend points. All worlds are stepped by one `Simulator`;
     `NavigateEnv` is this class with one world. A world's course does not depend on the others, to the last bit.
+
+    It is no `NavigationLoop`: there is no robot with its latency and backlash, no C-arm, and nobody decides every
+    0.5 s. It shares with the loop what a navigation is: start, rule of success, time and force limit (`Navigation`,
+    `reached`, `is_safe`), and how fast and how far a drive goes (`DriveLimits`).
 
     ## Action space
 
@@ -230,11 +234,11 @@ class NavigateVectorEnv(VectorEnv):
         if any((other.catheters, other.arrives) != (first.catheters, first.arrives) for other in navigations):
             raise InputError("navigations: differ in catheters, or in which tip is to arrive; give all the same")
         for device in (device for navigation in navigations for device in navigation.devices):
-            if device.max_velocity_mm_s < TRANSLATION_MM_S or device.max_rotation_rad_s < ROTATION_RAD_S:
+            speed, spin = DriveLimits.of(device).fastest
+            if speed < TRANSLATION_MM_S or spin < ROTATION_RAD_S:
                 raise InputError(
-                    f"device {device.name}: max_velocity_mm_s = {device.max_velocity_mm_s:g}, max_rotation_rad_s = "
-                    f"{device.max_rotation_rad_s:g}; an action of 1 is {TRANSLATION_MM_S:g} mm/s and "
-                    f"{ROTATION_RAD_S:g} rad/s; give a faster device"
+                    f"device {device.name}: max_velocity_mm_s = {speed:g}, max_rotation_rad_s = {spin:g}; "
+                    f"an action of 1 is {TRANSLATION_MM_S:g} mm/s and {ROTATION_RAD_S:g} rad/s; give a faster device"
                 )
         count = len(navigations)
         self.navigations, self._motion, self._config = tuple(navigations), motion, config
@@ -254,10 +258,16 @@ class NavigateVectorEnv(VectorEnv):
             config=config,
         )
         self._routes = RouteTables.of(navigations)
-        self._far_ends = np.array([far_end_mm(navigation.anatomy) for navigation in navigations])
+        self._far_ends = np.array(
+            [
+                [DriveLimits.of(device, navigation.anatomy).travel_mm[1] for device in navigation.devices]
+                for navigation in navigations
+            ]
+        )
         targets = [navigation.target for navigation in navigations]
         self._target_branch = np.array([target.branch for target in targets])
         self._target_abscissa = np.array([target.abscissa for target in targets])
+        self._most_steps = np.array([navigation.periods(CONTROL_PERIOD_S) for navigation in navigations])
         self._start, start_catheter, self._seconds, self._force_limit = (
             np.array([getattr(navigation, name) for navigation in navigations])
             for name in ("start_inserted_mm", "start_catheter_mm", "seconds", "force_limit_n")
@@ -318,12 +328,10 @@ class NavigateVectorEnv(VectorEnv):
         fresh = self._ended & (self.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP)
         control = np.minimum(np.maximum(control, -1.0), 1.0) * self._fastest
         control[fresh] = 0.0
-        travel_mm = (-np.inf, self._far_ends)  # at the ostium the simulator stops the drives by itself
-        simulator = self._simulator
-        for k, inserted in enumerate((simulator.inserted_length, *simulator.catheter_inserted_length.T)):
-            control[:, 2 * k] = within_travel(control[:, 2 * k], inserted, CONTROL_PERIOD_S, travel_mm=travel_mm)
-        step = self._simulator.step(control, CONTROL_PERIOD_S)
-        now = Measured.after(step, self._simulator)
+        simulator, travel_mm = self._simulator, (-np.inf, self._far_ends)  # it stops by itself at the ostium
+        inserted = np.column_stack([simulator.inserted_length, simulator.catheter_inserted_length])
+        control[:, ::2] = within_travel(control[:, ::2], inserted, CONTROL_PERIOD_S, travel_mm=travel_mm)
+        now = Measured.after(simulator.step(control, CONTROL_PERIOD_S), simulator)
         if fresh.any():
             self._begin(fresh)
             now = Measured.current(self._simulator)
@@ -335,14 +343,14 @@ class NavigateVectorEnv(VectorEnv):
         self._steps += going
         distances = self._distances(now)
         self._distance = np.array(distances[: self._counted])
-        unsafe = ~(now.contact_force <= self._force_limit) & going
+        unsafe = ~is_safe(now.contact_force, self._force_limit) & going
         self._safe &= ~unsafe
         infos = self._infos(now)
         success = infos["success"] & going
         nearer = (before - self._distance).sum(axis=0)
         rewards = PROGRESS_REWARD * nearer + STEP_REWARD + FORCE_REWARD * unsafe + SUCCESS_REWARD * success
         terminations = (success | ~now.valid) & going
-        truncations = (infos["time_s"] > self._seconds - 1e-9) & ~terminations & going
+        truncations = (self._steps >= self._most_steps) & ~terminations & going
         self._ended = terminations | truncations
         observations = self._observe(now, distances)
         return observations, np.where(fresh, 0.0, rewards), terminations, truncations, infos

@@ -61,6 +61,25 @@ class Policy(Protocol):
         ...
 
 
+class Hand:
+    """Whoever drives by hand, as a policy: it decides what the hand holds.
+
+    Attributes:
+        devices: mm/s and rad/s of each device, as in `Decision`.
+    """
+
+    def __init__(self, devices: Proximals = ()) -> None:
+        """Hold some velocities; none to let all devices stand still."""
+        self.devices = devices
+
+    def start(self, navigation: Navigation, seed: int) -> None:
+        """Need nothing."""
+
+    def decide(self, observation: Observation) -> Decision:
+        """Go on as the hand holds it."""
+        return Decision(self.devices)
+
+
 @dataclass(frozen=True)
 class BelievedTip:
     """Where a policy believes the tip to be.

@@ -143,8 +143,7 @@ class SimulatedRobot:
     command. They count from the assumed position of the ostium.
 
     Attributes:
-        driven: velocity of each device's proximal end that its drive asked for in each cycle so far, mm/s and rad/s of
-            the wire, then of each catheter.
+        driven: velocity of each device's proximal end that its drive asked for in each cycle so far, mm/s and rad/s.
         last_step: what the wire did in the drive's last cycle; None before the first.
     """
 
@@ -174,13 +173,13 @@ class SimulatedRobot:
             DriveMotion(_by_encoder(limit, ostium_mm), config, (at, turned))
             for limit, (at, turned) in zip(limits, self._encoders().tolist(), strict=True)
         ]
-        self.driven: list[Float[np.ndarray, "numbers"]] = []
+        self.driven: list[Float[np.ndarray, "devices 2"]] = []
         self.last_step: Step | None = None
 
     @property
-    def velocity(self) -> Float[np.ndarray, "numbers"]:
-        """The motors' velocities, mm/s and rad/s of the wire's, then of each catheter's."""
-        return np.concatenate([drive.velocity for drive in self._drives])
+    def velocity(self) -> Float[np.ndarray, "devices 2"]:
+        """The motors' velocities, mm/s and rad/s."""
+        return np.array([drive.velocity for drive in self._drives])
 
     def stop(self) -> None:
         """Brake at once, whatever was commanded before."""
@@ -203,8 +202,8 @@ class SimulatedRobot:
         cycles = max(1, round(duration / CYCLE_S))
         period, peak = duration / cycles, 0.0
         for _ in range(cycles):
-            control = np.concatenate([drive.advance(period) for drive in self._drives]) / period
-            self.last_step = step = self._simulator.step(control[None], period)
+            control = np.array([drive.advance(period) for drive in self._drives]) / period
+            self.last_step = step = self._simulator.step(control.reshape(1, -1), period)
             self.driven.append(control)
             for drive, place in zip(self._drives, self._encoders(), strict=True):
                 drive.position = place

@@ -11,6 +11,7 @@ from pydantic import InstanceOf, model_validator
 
 from endopilot.devices.catheter import Catheter, check_nested
 from endopilot.devices.device import Device
+from endopilot.devices.drive_limits import Numbers
 from endopilot.errors import InputError
 from endopilot.settings import CountOrZero, Finite, NonNegative, Positive, Seconds, Within, settings
 from endopilot.simulation.motion import Motion
@@ -119,6 +120,10 @@ class Navigation:
         catheters = [self.start_catheter_mm, 0.0] * len(self.catheters)
         return np.array([self.start_inserted_mm, self.start_rotation, *catheters])
 
+    def periods(self, period_s: float) -> int:
+        """Return after how many periods of some length, s, the time is over."""
+        return int(np.ceil(self.seconds / period_s - 1e-9))
+
     def reached(self, *tips: TipProjection) -> Bool[np.ndarray, "..."]:
         """Return which worlds have reached the target, see `reached`.
 
@@ -144,6 +149,11 @@ def reached(
     wire, arriving = tips[0], tips[-1]
     there = (np.abs(arriving.abscissa - abscissa) <= SUCCESS_MM) & (arriving.branch == branch)
     return there & (wire.abscissa >= arriving.abscissa - SUCCESS_MM)
+
+
+def is_safe(force_n: Numbers, limit_n: Numbers) -> Bool[np.ndarray, "..."]:
+    """Return where the largest force of the wall on one node, N, is no larger than the limit, N; NaN is not safe."""
+    return np.asarray(np.less_equal(force_n, limit_n))
 
 
 def check_wire_alone(navigation: Navigation, what: str) -> None:
