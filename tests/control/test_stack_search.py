@@ -16,7 +16,7 @@ from endopilot.devices.catheter import read_catheter
 from endopilot.errors import InputError
 from endopilot.ladder.attempt import Recording, attempt, repeat
 from endopilot.navigation.navigate import NavigateConfig, NavigationLoop, navigate
-from endopilot.navigation.policy import Decision, Observation
+from endopilot.navigation.policy import Hand, Observation
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.simulation.simulator import Simulator
@@ -155,8 +155,10 @@ def test_the_agent_goes_on_after_hands_that_drove_both(side_branch) -> None:
     policy = AgentPolicy(agent_config(side_branch))
     loop = NavigationLoop(side_branch, policy, config=NavigateConfig(simulator=CORE), seed=2)
     loop.step()
+    loop.hand_over(Hand(((2.0, 1.5), (4.0, 0.0))))
     for _ in range(4):
-        loop.step(by_hand=Decision(((2.0, 1.5), (4.0, 0.0))))
+        loop.step()
+    loop.hand_over(None)
     followed = policy.belief.simulator.catheter_inserted_length[:, 0] - policy.belief.parameters[:, 2]
     assert loop.observation is not None and followed == pytest.approx(loop.observation.devices[1][0])
     while loop.reason is None:
