@@ -8,6 +8,7 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
+from endopilot.simulation.table import write_rollout
 from test_game import Rival, play
 from test_session import run
 
@@ -26,7 +27,6 @@ from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.simulate import simulate
 from endopilot.simulation.simulator import Simulator
-from endopilot.simulation.table import write_rollout
 from endopilot.tasks.task import task_by_hand
 
 NAME = "microcatheter-1.7f"

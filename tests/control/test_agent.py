@@ -86,7 +86,7 @@ def test_a_course_is_what_the_simulator_does_under_its_controls(side_branch, kno
     simulator = Belief(side_branch, np.array([[1.0, 1.0, 0.0]]), QUICK.belief).simulator
     for k in range(len(course.control)):
         looks = [simulator.step(course.control[k], 0.1) for _ in range(5)]
-        assert simulator.project().abscissa[0] == course.tip.abscissa[k, 0]
+        assert simulator.project().abscissa[0, 0] == course.tip.abscissa[k, 0]
         assert course.force[k, 0] == max(look.contact_force_max[0] for look in looks)
     assert side_branch.reached(simulator.project())[0]
 
@@ -124,7 +124,7 @@ def test_measurements_weigh_the_member_that_they_are_of(side_branch) -> None:
     wide = belief.tip_spread()
     for k in range(4):
         belief.follow(((4.0 + 2.0 * k, 0.0),))
-        assert np.allclose(belief.simulator.inserted_length - belief.parameters[:, 2], 4.0 + 2.0 * k)
+        assert np.allclose(belief.simulator.inserted_length[:, 0] - belief.parameters[:, 2], 4.0 + 2.0 * k)
         belief.weigh(measured(belief, 4))
     assert belief.weight.argmax() == 4 and belief.weight[4] > 0.5
     assert belief.tip_spread()[0] < 0.8 * wide[0]
@@ -141,8 +141,10 @@ def test_simulated_wires_slide_in_a_vessel_that_beats_as_far_as_that_is_known(si
     for _ in range(8):
         true.step([[6.0, 0.0]], 0.5)
         for belief in (knows, knows_not):
-            belief.follow(((float(true.inserted_length[0]), 0.0),))
-        errors.append([float(abs(belief.tip.abscissa - true.project().abscissa)[0]) for belief in (knows, knows_not)])
+            belief.follow(((float(true.inserted_length[0, 0]), 0.0),))
+        errors.append(
+            [float(abs(belief.tip.abscissa - true.project().abscissa[:, 0])[0]) for belief in (knows, knows_not)]
+        )
     assert np.max(errors, axis=0)[0] < 0.01
     assert np.max(errors, axis=0)[1] > 0.3
 

@@ -66,7 +66,7 @@ def test_a_written_plan_is_read_back_and_drives_the_simulator(found, vessel, tmp
     assert back.navigation.target == found.navigation.target and back.config == found.config
     script = read_controls_csv(tmp_path / "plan" / "plan.csv")
     rollout = simulate(anatomy, device, script.control, initial=script.initial, config=SimulatorConfig(threads=1))
-    assert np.allclose(rollout.tip_position[0], found.position[:, 0], atol=1e-3)
+    assert np.allclose(rollout.tip_position[0], found.position, atol=1e-3)
 
 
 def test_a_plan_whose_manifest_lacks_what_was_asked_is_refused(found, vessel, tmp_path):

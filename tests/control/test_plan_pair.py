@@ -52,17 +52,10 @@ def test_a_written_plan_is_read_back_and_drives_both_devices(pair, vessel, tmp_p
         assert np.allclose(getattr(back, name), getattr(pair, name), atol=1e-12), name
     assert np.allclose(back.tip.abscissa, pair.tip.abscissa)
     assert back.navigation.arrives == "catheter" and back.navigation.catheters == (CATHETER,)
-    script = read_controls_csv(tmp_path / "plan" / "plan.csv", catheters=1)
-    again = simulate(
-        anatomy,
-        wire,
-        script.control,
-        catheters=[CATHETER],
-        initial=script.initial,
-        config=SimulatorConfig(threads=1),
-    )
-    assert again.catheters is not None
-    assert np.allclose(again.catheters.tip_position[0, :, 0], pair.position[:, 1], atol=1e-3)
+    script = read_controls_csv(tmp_path / "plan" / "plan.csv", devices=2)
+    stack = pair.navigation.stack
+    again = simulate(anatomy, stack, script.control, initial=script.initial, config=SimulatorConfig(threads=1))
+    assert np.allclose(again.tip_position[0], pair.position, atol=1e-3)
     stiffer = replace(CATHETER, bore_friction=2 * CATHETER.bore_friction)
     for others in ([], [stiffer]):
         with pytest.raises(InputError, match=r"\(workhorse-014 in microcatheter-1\.7f\), not for workhorse-014"):

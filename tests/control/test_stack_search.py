@@ -67,7 +67,7 @@ def found(side_branch) -> tuple[Belief, Course]:
 def test_a_course_into_a_side_branch_brings_wire_and_catheter_there(side_branch, found) -> None:
     belief, course = found
     assert course.reached == 1.0 and 0 < course.force.max() <= 0.9 * 0.3
-    assert belief.simulator.inserted_length[0] == pytest.approx(10.0)  # the start stays as it is
+    assert belief.simulator.inserted_length[0, 0] == pytest.approx(10.0)  # the start stays as it is
     assert np.abs(course.control[:, 0, 1]).sum() * DECISION_PERIOD_S > 0.5  # it has to turn
     ends = np.flatnonzero(course.exposed)
     assert len(ends) == 2 and ends[-1] == len(course.control) - 1 and np.array_equal(course.checked, course.exposed)
@@ -80,18 +80,14 @@ def test_a_course_into_a_side_branch_brings_wire_and_catheter_there(side_branch,
 def test_the_controls_of_a_course_lead_where_it_says(side_branch, found) -> None:
     belief, course = found
     like = belief.simulator
-    again = Simulator(
-        side_branch.anatomy, belief.wires[1.0], catheters=side_branch.catheters, config=like.config, sharing=like
-    )
+    again = Simulator(side_branch.anatomy, side_branch.stack, config=like.config, sharing=like)
     again.copy_worlds([0], of=like)
     for k, control in enumerate(course.control):
         for _ in range(5):  # as `drive_period` does
-            again.step(control.reshape(1, -1), DECISION_PERIOD_S / 5)
-        ends = [again.inserted_length[0], again.rotation[0]]
-        ends += [again.catheter_inserted_length[0, 0], again.catheter_rotation[0, 0]]
-        assert ends == course.proximal[k].ravel().tolist()
-        assert again.project().abscissa[0] == course.tip.abscissa[k, 0]
-    assert side_branch.reached(again.project(), again.project(1))[0]
+            again.step(control[None], DECISION_PERIOD_S / 5)
+        assert np.array_equal(again.proximal[0], course.proximal[k])
+        assert again.project().abscissa[0, 0] == course.tip.abscissa[k, 0]
+    assert side_branch.reached(again.project())[0]
 
 
 def test_a_wire_that_leads_by_little_ends_little_beyond_the_target(side_branch, monkeypatch) -> None:
@@ -126,7 +122,7 @@ def test_the_agent_arrives_with_little_xray(side_branch) -> None:
 def test_a_wire_that_no_simulated_one_explains_is_pulled_back_until_one_does(side_branch) -> None:
     policy = AgentPolicy(agent_config(side_branch))
     policy.start(side_branch, 0)
-    believed = policy.belief.simulator.tips()[0]
+    believed = policy.belief.simulator.tip_position[0, 0]
 
     def seen(shift_mm: float, sd_mm: float = 0.0) -> Observation:
         tip = TipMeasurement(believed + np.array([0.0, 0.0, shift_mm]), 10.0 + shift_mm, 0.0, 0, (sd_mm, sd_mm))
@@ -159,7 +155,7 @@ def test_the_agent_goes_on_after_hands_that_drove_both(side_branch) -> None:
     for _ in range(4):
         loop.step()
     loop.hand_over(None)
-    followed = policy.belief.simulator.catheter_inserted_length[:, 0] - policy.belief.parameters[:, 2]
+    followed = policy.belief.simulator.inserted_length[:, 1] - policy.belief.parameters[:, 2]
     assert loop.observation is not None and followed == pytest.approx(loop.observation.devices[1][0])
     while loop.reason is None:
         loop.step()

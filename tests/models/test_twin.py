@@ -56,7 +56,7 @@ def test_identified_from_the_given_tips_it_predicts_the_others(folder, episodes)
     control = episodes.control.astype(float)
     drawn_out = -0.5 * np.cumsum(control[..., 0], axis=1).min(axis=1)
     start = np.column_stack([np.maximum(episodes.initial[:, 0], drawn_out), episodes.initial[:, 1]])
-    nominal = simulate(anatomy, twin.device, control, initial=start).tip.abscissa[:, later]
+    nominal = simulate(anatomy, twin.device, control, initial=start).tip.abscissa[:, later, 0]
     nominal_error = np.abs(nominal - episodes.tip[:, later, 0])
     # of the middle navigation: where a snap falls on the other side of its edge, one of four errs by a millimetre
     assert np.median(error[..., 0].mean(axis=1)) < 0.1  # mm
@@ -88,7 +88,7 @@ def test_a_wire_that_is_held_while_it_is_pulled_starts_where_it_lies(folder, epi
     class Kept(Ensemble):
         def __init__(self, *args, **kwargs):
             super().__init__(*args, **kwargs)
-            starts.append(self._start[:, 0, 0])
+            starts.append(self.set_up.initial[:, 0, 0])
 
     monkeypatch.setattr(twin_module, "Ensemble", Kept)
     held = replace(episodes, slip=episodes.slip - np.array([5.0, 0.0], dtype=episodes.slip.dtype))

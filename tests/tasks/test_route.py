@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.anatomy.analytic_lumens import tree_of
 from endopilot.anatomy.projection import project_tip
-from endopilot.benchmarks.analytic_lumens import tree_of
 from endopilot.errors import InputError
 from endopilot.tasks.navigation import Target
 from endopilot.tasks.route import Route, check_passable
@@ -72,7 +72,7 @@ def test_targets_by_name_and_by_place(fork):
     assert target.branch == 2 and target.abscissa == pytest.approx(30.0, abs=0.5)
     point = find_target(anatomy.tree, "0.3, 0, 31.9")
     assert point.branch == 1 and point.abscissa == pytest.approx(32.0, abs=0.3)
-    assert find_target(anatomy.tree, [0.3, 0, 31.9]) == find_target(anatomy.tree, point) == point
+    assert find_target(anatomy.tree, [0.3, 0.0, 31.9]) == find_target(anatomy.tree, point) == point
     beyond = find_target(anatomy.tree, "PDA", depth_mm=4.0)
     assert (beyond.branch, beyond.abscissa) == (2, pytest.approx(24.0))
 

@@ -72,17 +72,16 @@ class Belief(Ensemble):
         """Bring every member's wire to the start of the navigation."""
         super().__init__(
             navigation.anatomy,
-            navigation.device,
+            navigation.stack,
             parameters,
-            start=np.tile(navigation.start.reshape(-1, 2), (len(parameters), 1, 1)),
+            start=np.tile(navigation.start, (len(parameters), 1, 1)),
             config=config.core,
             motion=navigation.known_motion,
-            catheters=navigation.catheters,
         )
         self._accuracy_mm = config.along_sd_mm, config.across_sd_mm
         self._limits = [DriveLimits.of(each, navigation.anatomy) for each in navigation.devices]
         self._score, self._coaxial = np.zeros(len(parameters)), bool(navigation.catheters)
-        self.tip = self.simulator.project()
+        self.tip = self.simulator.project()[:, 0]
 
     @staticmethod
     def around(given: Float[np.ndarray, "3"], config: BeliefConfig) -> Float[np.ndarray, "members 3"]:
@@ -108,23 +107,20 @@ class Belief(Ensemble):
             devices: inserted length (mm) and rotation (rad) of the wire, then of each catheter.
         """
         simulator = self.simulator
-        inserted = np.column_stack([simulator.inserted_length, simulator.catheter_inserted_length])
-        turned = np.column_stack([simulator.rotation, simulator.catheter_rotation])
-        controls = []
+        now, control = simulator.proximal, np.empty((simulator.worlds, simulator.devices, 2))
         for k, (length, turn) in enumerate(devices):
-            ahead = self._deeper(np.full(len(inserted), length)) - inserted[:, k]
-            motion = np.column_stack([ahead, turn - turned[:, k]])
-            controls.append(self._limits[k].clip(motion / DECISION_PERIOD_S, inserted[:, k], DECISION_PERIOD_S))
-        control = np.concatenate(controls, axis=1)
+            ahead = self._deeper(np.full(len(now), length)) - now[:, k, 0]
+            motion = np.column_stack([ahead, turn - now[:, k, 1]])
+            control[:, k] = self._limits[k].clip(motion / DECISION_PERIOD_S, now[:, k, 0], DECISION_PERIOD_S)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a member that fails has no weight
             simulator.step(control, DECISION_PERIOD_S)
-        self.tip = simulator.project()
+        self.tip = simulator.project()[:, 0]
 
     def errors(self, measured: TipMeasurement) -> Float[np.ndarray, "members 2"]:
         """Return the distances of the members' tips from a measured one, along and across each wire, mm."""
         if self._coaxial:  # the first nodes are the foremost tube's
-            end, along = self.simulator.tips(), self.simulator.tip_direction
+            end, along = self.simulator.tip_position[:, 0], self.simulator.tip_direction[:, 0]
         else:
             nodes = self.simulator.position[:, :2]
             end, along = nodes[:, 0], nodes[:, 0] - nodes[:, 1]

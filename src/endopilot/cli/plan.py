@@ -6,7 +6,7 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
-from endopilot.cli.arguments import OutputFolder, existing, show
+from endopilot.cli.arguments import Existing, Figures, OutputFolder
 from endopilot.control.plan import plan
 from endopilot.control.plan_config import PlanConfig
 from endopilot.control.plan_file import write_plan
@@ -15,7 +15,7 @@ from endopilot.devices.catheter import read_catheter
 
 
 def command(
-    anatomy: Positional[Path],
+    anatomy: Positional[Existing],
     /,
     *,
     target: str,
@@ -24,9 +24,8 @@ def command(
     device: str | None = None,
     catheter: tuple[str, ...] = (),
     xray: bool = False,
-    json: bool = False,
     config: PlanConfig = PlanConfig(),
-) -> None:
+) -> Figures:
     """Plan a navigation to a target.
 
     Args:
@@ -42,11 +41,10 @@ def command(
             YAML file.
         xray: also predict when X-ray will be needed, with the calibration that `endopilot advise` wrote into the run
             (inverse, mppi), or with that of the agent's simulated wires (other methods).
-        json: print the figures as JSON.
         config: method, limits and cost.
     """
     calibration = read_calibration(config, model, devices=1 + len(catheter)) if xray else None
     catheters = [read_catheter(name) for name in catheter]
-    found = plan(existing(anatomy), target, config, model=model, device=device, catheters=catheters)
+    found = plan(anatomy, target, config, model=model, device=device, catheters=catheters)
     needed = None if calibration is None else plan_xray(found, calibration)
-    show(write_plan(found, output, needed), as_json=json)
+    return write_plan(found, output, needed)

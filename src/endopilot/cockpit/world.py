@@ -202,8 +202,8 @@ class World:
     def digest(self) -> str:
         """Return a hash of the state of wire and catheters, to the bit."""
         simulator = self.loop.simulator
-        parts = [simulator.position, simulator.inserted_length, simulator.rotation, simulator.contacts]
-        parts += [simulator.catheter_inserted_length, simulator.catheter_rotation]  # nothing for a wire alone
+        inserted, turned = simulator.inserted_length, simulator.rotation
+        parts = [simulator.position, inserted[:, 0], turned[:, 0], simulator.contacts, inserted[:, 1:], turned[:, 1:]]
         return hashlib.sha256(b"".join(part.astype("<f8").tobytes() for part in parts)).hexdigest()[:16]
 
 
@@ -226,29 +226,26 @@ def take_snapshot(
         force_n: largest wall force on one node in the cycle, N.
         velocity: of the drives, mm/s and rad/s of the wire, then of each catheter.
     """
-    inserted = np.append(simulator.inserted_length, simulator.catheter_inserted_length)
+    inserted, turned, tip = simulator.inserted_length[0], simulator.rotation[0].tolist(), simulator.project()
     (nodes, force), *around = _lines(simulator, inserted)
-    turned = simulator.catheter_rotation[0].tolist()
     catheters = tuple(
-        ShownCatheter(*line, simulator.project(k + 1), float(inserted[k + 1]), turned[k])
-        for k, line in enumerate(around)
+        ShownCatheter(*line, tip[:, k], float(inserted[k]), turned[k]) for k, line in enumerate(around, start=1)
     )
-    slip = np.zeros((1, 2)) if step is None else np.column_stack([step.slip, step.rotation_slip])
-    catheter_slip = np.zeros((len(around), 2)) if step is None else simulator.catheter_slip[0]
+    slip = np.zeros((len(inserted), 2)) if step is None else simulator.slip[0]
     return Snapshot(
         cycle=cycle,
         time_s=time_s,
         nodes=nodes,
         node_force=force,
-        tip_direction=simulator.tip_direction[0],
-        tip=simulator.project(),
+        tip_direction=simulator.tip_direction[0, 0],
+        tip=tip[:, 0],
         inserted_mm=float(inserted[0]),
-        rotation=float(simulator.rotation[0]),
+        rotation=turned[0],
         velocity=velocity,
         force_n=force_n,
         wall_force_n=0.0 if step is None else float(step.wall_force[0]),
-        drive_load=tuple(np.append(simulator.drive_load, simulator.catheter_drive_load).tolist()),
-        slip=tuple(np.append(slip, catheter_slip).tolist()),
+        drive_load=tuple(simulator.drive_load[0].ravel().tolist()),
+        slip=tuple(slip.ravel().tolist()),
         valid=bool(simulator.valid[0]),
         catheters=catheters,
     )
@@ -267,7 +264,7 @@ def _lines(
         own = force[len(nodes) - len(line) : len(nodes)]
         if len(inserted_mm) > 1:
             along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
-            line[0] = simulator.tips(device)[0]
+            line[0] = simulator.tip_position[0, device]
             own = np.where(inserted_mm[device] - along > covered, own, 0.0)
             covered = max(covered, float(inserted_mm[device]))
         found.append((line, own))

@@ -314,7 +314,7 @@ class AgentPolicy(_PlanningPolicy):
             config: search and belief; if not given, those for the navigation's devices.
             calibration: of the bands around what the simulated wires predict, by which `XrayAdviser` asks for
                 X-ray; if not given, the package's own for the navigation's X-ray and devices, which
-                `benchmarks/agent_calibration.py` makes.
+                `python -m benchmarks agent-calibration` makes.
             advice: which events the adviser watches for.
         """
         super().__init__(config)
@@ -345,9 +345,8 @@ class AgentPolicy(_PlanningPolicy):
     def adviser_input(self) -> AdviserInput:
         """Return what the adviser is given: the likeliest wire, and the spread of all wires."""
         best, tip = int(np.argmax(self.belief.weight)), self.belief.likeliest_tip()
-        wires = self.belief.simulator
-        proximal = np.array([[wires.inserted_length[best], wires.rotation[best]]])
-        return proximal, np.array([[tip.abscissa[0], tip.offset[0]]]), self.belief.tip_spread()[None], tip.radius
+        proximal, ends = self.belief.simulator.proximal[best, :1], np.array([[tip.abscissa[0], tip.offset[0]]])
+        return proximal, ends, self.belief.tip_spread()[None], tip.radius
 
     def wants_xray(self) -> bool:
         """Ask the adviser; a device that should have arrived, and the end of a manoeuvre, are looked at."""

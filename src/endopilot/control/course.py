@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -134,22 +134,13 @@ class Copies:
         """
         self.simulator = Simulator(
             navigation.anatomy,
-            wires,
-            catheters=navigation.catheters,
+            [replace(navigation.stack, wire=wire) for wire in wires],
             motion=navigation.known_motion,
             config=like.config,
             sharing=like,
         )
         self.devices = len(navigation.devices)
         self.log, self.peak = Log(), np.zeros(len(wires))
-
-    @property
-    def proximal(self) -> Float[np.ndarray, "worlds devices 2"]:
-        """Inserted length (mm) and rotation (rad) of each device."""
-        inserted = np.column_stack([self.simulator.inserted_length, self.simulator.catheter_inserted_length])
-        return np.stack(
-            [inserted, np.column_stack([self.simulator.rotation, self.simulator.catheter_rotation])], axis=-1
-        )
 
     def put(self, source: Int[np.ndarray, "worlds"], of: Simulator) -> None:
         """Put each where a world of a simulator of equal stacks is, and forget what it has done."""
@@ -159,9 +150,9 @@ class Copies:
     def drive(self, control: Float[np.ndarray, "worlds devices 2"]) -> Step:
         """Drive each for a decision period; return the worlds at its end, with the largest force within it."""
         simulator = self.simulator
-        step = drive_period(simulator, control.reshape(len(control), -1))
+        step = drive_period(simulator, control)
         self.peak = np.maximum(self.peak, np.where(step.valid, step.contact_force_max, np.inf))
-        self.log.rows.append(Period(control, self.proximal, simulator.project(), step.contact_force_max))
+        self.log.rows.append(Period(control, simulator.proximal, simulator.project()[:, 0], step.contact_force_max))
         return step
 
     def kept(self) -> Kept:

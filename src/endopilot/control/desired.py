@@ -61,8 +61,7 @@ def last_place(anatomy: Anatomy, tips: pd.DataFrame, target: str) -> Target:
     """
     tree, branch, abscissa = anatomy.tree, int(tips["branch"].iloc[-1]), float(tips["abscissa"].iloc[-1])
     if branch < 0:
-        leaf = max(tree.leaves(), key=lambda one: tree.branches[one].centerline.abscissa[-1])
-        branch = [b for b in tree.route(leaf) if tree.branches[b].centerline.abscissa[0] <= abscissa][-1]
+        branch = [b for b in tree.route(tree.longest_leaf()) if tree.branches[b].centerline.abscissa[0] <= abscissa][-1]
     try:
         return find_target(tree, Target(branch=branch, abscissa=abscissa))
     except InputError as error:

@@ -8,10 +8,10 @@ from jaxtyping import Float
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.control.navigate_patient import PatientNavigation, SetUp
 from endopilot.robot.robot import CYCLE_S
+from endopilot.simulation.trajectory import Trajectory
 from endopilot.tasks.navigation import DECISION_PERIOD_S, SUCCESS_MM
 from endopilot.tasks.route import Route
 from endopilot.tasks.targets import section_at
-from endopilot.types import Rollout
 
 _TIGHT_RATIO = 0.8
 """A wire that fills this share of a lumen is held up by its walls."""
@@ -114,10 +114,6 @@ def slipped_s(found: PatientNavigation) -> float:
     return float((slip != 0).any(axis=1).sum()) * CYCLE_S
 
 
-def _slips(rollout: Rollout) -> list[Float[np.ndarray, "samples 2"]]:
+def _slips(rollout: Trajectory) -> list[Float[np.ndarray, "samples 2"]]:
     """Return advance (mm) and rotation (rad) that the drive of each device slipped over in each period."""
-    wire = np.stack([rollout.slip[0], rollout.rotation_slip[0]], axis=-1)
-    if rollout.catheters is None:
-        return [wire]
-    around = np.stack([rollout.catheters.slip[0], rollout.catheters.rotation_slip[0]], axis=-1)
-    return [wire, *np.moveaxis(around, 1, 0)]
+    return list(np.moveaxis(np.stack([rollout.slip[0], rollout.rotation_slip[0]], axis=-1), 1, 0))

@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.anatomy.io import read_anatomy
-from endopilot.anatomy.projection import project_tip
 from endopilot.control.agent import AgentConfig, OraclePolicy
 from endopilot.control.course import Controls
 from endopilot.control.desired import last_place, read_tips, tips_along
@@ -281,24 +280,15 @@ def _checked(
     desired: Float[np.ndarray, "wanted 2"], control: Controls, predicted: Steps, spent: Float[np.ndarray, "2"],
 ) -> Plan:  # fmt: skip
     """Put the controls within the limits, drive the rod core with them, and return the plan."""
-    start, tree = navigation.start.reshape(-1, 2), navigation.anatomy.tree
+    start = navigation.start
     limits = [DriveLimits.of(device, navigation.anatomy) for device in navigation.devices]
     parts = [within_limits(control[:, k], each, start[k, 0]) for k, each in enumerate(limits)]
     control = np.stack(parts, axis=1)
     rollout = simulate(
-        navigation.anatomy,
-        navigation.device,
-        control.reshape(1, len(control), -1),
-        catheters=navigation.catheters,
-        initial=navigation.start[None],
-        config=SimulatorConfig(threads=1),
+        navigation.anatomy, navigation.stack, control[None], initial=start[None], config=SimulatorConfig(threads=1)
     )
-    position = rollout.tip_position[0][:, None]
-    if rollout.catheters is not None:
-        position = np.concatenate([position, rollout.catheters.tip_position[0]], axis=1)
-    tip = project_tip(tree, navigation.anatomy.insertion, position)
     wanted = np.concatenate([desired, np.repeat(desired[-1:], max(len(control) - len(desired), 0), axis=0)])
-    made = Plan(
+    return Plan(
         navigation=navigation,
         config=config,
         model=None if model is None else str(model),
@@ -306,17 +296,15 @@ def _checked(
         proximal=start + DECISION_PERIOD_S * np.cumsum(control, axis=0),
         desired=wanted[: len(control)],
         predicted=predicted,
-        tip=tip,
-        position=position,
+        tip=rollout.tip[0],
+        position=rollout.tip_position[0],
         force=rollout.contact_force_max[0],
-        reached=False,
+        reached=bool(navigation.reached(rollout.tip[0]).any()),
         why=choice.why if choice else "",
         tilt_deg=choice.tilt_deg if choice else 0.0,
         seconds_to_plan=float(spent[0]),
         processor_seconds=float(spent[1]),
     )
-    reached = navigation.reached(*(made.tip[:, device] for device in range(len(limits))))
-    return replace(made, reached=bool(reached.any()))
 
 
 def within_limits(control: Steps, limits: DriveLimits, inserted_mm: float) -> Steps:

@@ -90,22 +90,17 @@ class Stacks(Copies):
     @property
     def wire(self) -> Float[np.ndarray, "worlds"]:
         """Inserted lengths of the wires, mm."""
-        return self.proximal[:, 0, 0]
+        return self.simulator.inserted_length[:, 0]
 
     @property
     def catheter(self) -> Float[np.ndarray, "worlds"]:
         """Inserted lengths of the catheters, mm."""
-        return self.proximal[:, 1, 0]
-
-    def tips(self) -> list[TipProjection]:
-        """Return the tips of the wires and of the catheters."""
-        return [self.simulator.project(device) for device in range(self.devices)]
+        return self.simulator.inserted_length[:, 1]
 
     def foremost(self) -> TipProjection:
         """Return the foremost tips, those of the wires or of the catheters."""
-        leads, tips = self.wire >= self.catheter, self.tips()
-        names = TipProjection.__dataclass_fields__
-        return TipProjection(**{name: np.where(leads, *(getattr(tip, name) for tip in tips)) for name in names})
+        worlds = np.arange(self.simulator.worlds)
+        return self.simulator.project()[worlds, np.where(self.wire >= self.catheter, 0, 1)]
 
     def move(self, wire: np.ndarray | float, catheter: np.ndarray | float, turn: np.ndarray | float = 0.0) -> Step:
         """Drive those that go on for a decision period, wire and catheter at mm/s, both turned at rad/s."""
@@ -176,7 +171,7 @@ class StackSearch:
         return one.log.course((1, one.devices), reached=float(self._reached()), ostium_mm=ostium_mm, settled=settled)
 
     def _reached(self) -> bool:
-        return bool(self._navigation.reached(*self._one.tips())[0])
+        return bool(self._navigation.reached(self._one.simulator.project())[0])
 
     def _go_on(self, waypoint: float) -> bool:
         """Go past a place, straight or by a manoeuvre; return whether any passes within the force limit."""
@@ -257,7 +252,7 @@ class StackSearch:
         """Bring the catheters' tips to some abscissae, mm, and the wires so much deeper than the catheters, mm."""
         speed = 2 * self.config.speed_mm_s
         for _ in range(round(self.config.manoeuvres.longest_s / DECISION_PERIOD_S)):
-            error = wanted - copies.simulator.project(1).abscissa
+            error = wanted - copies.simulator.project().abscissa[:, 1]
             moving = np.abs(error) > _AT_MM
             catheter = np.where(moving, np.clip(error / (2 * DECISION_PERIOD_S), -speed, speed), 0.0)
             gap = np.maximum(copies.catheter + catheter * DECISION_PERIOD_S + lead, 0.0) - copies.wire
@@ -317,7 +312,7 @@ class StackSearch:
             return waypoint - route.progress(tip), copies.wire - behind - copies.catheter
         end = float(self._navigation.anatomy.tree.branches[route.target.branch].centerline.abscissa[-1])
         goal = np.clip(waypoint + behind, waypoint, max(end - _REST_MM, waypoint))
-        left = waypoint - copies.simulator.project(1).abscissa
+        left = waypoint - copies.simulator.project().abscissa[:, 1]
         return goal - route.progress(tip), np.minimum(left, copies.wire - copies.catheter)
 
     def _together(
@@ -344,7 +339,7 @@ class StackSearch:
     def _there(self, copies: Stacks, waypoint: float) -> Bool[np.ndarray, "worlds"]:
         """Return which copies are past a place, or at the target, and never pressed too hard."""
         if waypoint >= self.route.target.abscissa:
-            return self._navigation.reached(*copies.tips()) & ~copies.failed
+            return self._navigation.reached(copies.simulator.project()) & ~copies.failed
         tip = copies.foremost()
         if waypoint in self.route.waypoints:
             return (self.route.off_route(tip) == 0) & (tip.abscissa >= waypoint) & ~copies.failed

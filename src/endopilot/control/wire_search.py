@@ -138,7 +138,7 @@ class WireSearch:
     @property
     def _tip(self) -> TipProjection:
         """Where the tips of the wires are."""
-        return self._single.simulator.project()
+        return self._single.simulator.project()[:, 0]
 
     def _cut_hard(self) -> None:
         """Forget what a path that does not arrive does from where a wire presses too hard."""
@@ -192,7 +192,7 @@ class WireSearch:
         return False
 
     def _reached(self) -> float:
-        return float(self.navigation.reached(self._tip) @ self._weight)
+        return float(self.navigation.reached(self._single.simulator.project()) @ self._weight)
 
     def _push_on(self, periods: int, waypoint: float) -> Halt | None:
         """Push straight on past a waypoint; return why not, or None if all wires passed it."""
@@ -207,9 +207,9 @@ class WireSearch:
             left = waypoint - float(self.route.progress(tip) @ self._weight)
             last = waypoint >= self.route.target.abscissa
             speed = np.clip(left / DECISION_PERIOD_S, 1.0, self.config.speed_mm_s) if last else self.config.speed_mm_s
-            before = simulator.inserted_length
+            before = simulator.inserted_length[:, 0]
             self._drive(np.array([speed, 0.0]))
-            advance = (simulator.inserted_length - before)[self._weight > 0].min()
+            advance = (simulator.inserted_length[:, 0] - before)[self._weight > 0].min()
             if advance < SLIP_SHARE * log.rows[-1].control[0, 0, 0] * DECISION_PERIOD_S:
                 return "slipped"
             if self._pressed():
@@ -237,7 +237,7 @@ class WireSearch:
         for _ in range(periods - log.periods):
             tip = self._tip
             here, on_route = self.route.progress(tip) @ self._weight, self._all(self.route.off_route(tip) == 0)
-            if not on_route and self._single.simulator.inserted_length.min() > 1.0:
+            if not on_route and self._single.simulator.inserted_length[:, 0].min() > 1.0:
                 self._drive(np.array([-self.config.speed_mm_s, 0.0]))
             elif here < begin - 1.0 and not (log.periods >= STALL_PERIODS and log.stalled(self._weight > 0)):
                 self._drive(np.array([min(self.config.speed_mm_s, (begin - here) / DECISION_PERIOD_S), 0.0]))
@@ -251,7 +251,7 @@ class WireSearch:
 
     def _possible(self, control: Float[np.ndarray, "n 2"], simulator: Simulator) -> Float[np.ndarray, "n 2"]:
         """Return what the drive can do of controls: neither the shortest nor the longest wire leaves the travel."""
-        inserted = simulator.inserted_length
+        inserted = simulator.inserted_length[:, 0]
         for length in (inserted.min(), inserted.max()):
             control = self._limits.clip(control, length, DECISION_PERIOD_S)
         return control
@@ -360,7 +360,7 @@ class WireSearch:
             step = self._many.drive(np.tile(control[:, None], (wires, 1, 1)))
             tip = self._many.log.rows[-1].tip
             running = cost.running(
-                error=self._distance(step.tip_position, waypoint),
+                error=self._distance(step.tip_position[:, 0], waypoint),
                 ratio=safety_ratio(tip.offset, tip.radius, self._wire_radius),
                 force_share=step.contact_force_max / self.navigation.force_limit_n,
             )

@@ -252,8 +252,7 @@ class NavigateVectorEnv(VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, count)
         self._simulator = Simulator(
             [navigation.anatomy for navigation in navigations],
-            [navigation.device for navigation in navigations],
-            catheters=first.catheters,
+            [navigation.stack for navigation in navigations],
             motion=motion,
             config=config,
         )
@@ -268,14 +267,13 @@ class NavigateVectorEnv(VectorEnv):
         self._target_branch = np.array([target.branch for target in targets])
         self._target_abscissa = np.array([target.abscissa for target in targets])
         self._most_steps = np.array([navigation.periods(CONTROL_PERIOD_S) for navigation in navigations])
-        self._start, start_catheter, self._seconds, self._force_limit = (
-            np.array([getattr(navigation, name) for navigation in navigations])
-            for name in ("start_inserted_mm", "start_catheter_mm", "seconds", "force_limit_n")
+        self._start = np.array([navigation.start for navigation in navigations])
+        self._seconds, self._force_limit = (
+            np.array([getattr(navigation, name) for navigation in navigations]) for name in ("seconds", "force_limit_n")
         )
-        self._start_catheters = np.tile(start_catheter[:, None], len(first.catheters))
         self._everyone = np.ones(count, dtype=bool)
         self._generators = [seeding.np_random()[0] for _ in range(count)]
-        self._steps, self._distance = np.zeros(count, dtype=np.int64), np.zeros((self._counted, count))
+        self._steps, self._distance = np.zeros(count, dtype=np.int64), np.zeros((count, self._counted))
         self._safe, self._ended = np.ones(count, dtype=bool), np.zeros(count, dtype=bool)
 
     def reset(
@@ -299,7 +297,7 @@ class NavigateVectorEnv(VectorEnv):
                 self._generators[world] = seeding.np_random(seeds[world])[0]
         self._begin(mask)
         now = Measured.current(self._simulator)
-        distances = self._distances(now)
+        distances = self._routes.distance(now.tip)
         return self._observe(now, distances), self._infos(now)
 
     def step(
@@ -328,10 +326,12 @@ class NavigateVectorEnv(VectorEnv):
         fresh = self._ended & (self.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP)
         control = np.minimum(np.maximum(control, -1.0), 1.0) * self._fastest
         control[fresh] = 0.0
-        simulator, travel_mm = self._simulator, (-np.inf, self._far_ends)  # it stops by itself at the ostium
-        inserted = np.column_stack([simulator.inserted_length, simulator.catheter_inserted_length])
-        control[:, ::2] = within_travel(control[:, ::2], inserted, CONTROL_PERIOD_S, travel_mm=travel_mm)
-        now = Measured.after(simulator.step(control, CONTROL_PERIOD_S), simulator)
+        travel_mm = (-np.inf, self._far_ends[:, None])  # at the ostium the simulator stops the drives by itself
+        control = control.reshape(self.num_envs, self._drives, 2)
+        inserted = self._simulator.inserted_length
+        control[..., 0] = within_travel(control[..., 0], inserted, CONTROL_PERIOD_S, travel_mm=travel_mm)
+        step = self._simulator.step(control, CONTROL_PERIOD_S)
+        now = Measured.after(step, self._simulator)
         if fresh.any():
             self._begin(fresh)
             now = Measured.current(self._simulator)
@@ -341,13 +341,13 @@ class NavigateVectorEnv(VectorEnv):
         """Score what the worlds did in a step, of which those of `fresh` have only begun."""
         going, before = ~fresh, self._distance
         self._steps += going
-        distances = self._distances(now)
-        self._distance = np.array(distances[: self._counted])
+        distances = self._routes.distance(now.tip)
+        self._distance = distances[:, : self._counted]
         unsafe = ~is_safe(now.contact_force, self._force_limit) & going
         self._safe &= ~unsafe
         infos = self._infos(now)
         success = infos["success"] & going
-        nearer = (before - self._distance).sum(axis=0)
+        nearer = (before - self._distance).sum(axis=1)
         rewards = PROGRESS_REWARD * nearer + STEP_REWARD + FORCE_REWARD * unsafe + SUCCESS_REWARD * success
         terminations = (success | ~now.valid) & going
         truncations = (self._steps >= self._most_steps) & ~terminations & going
@@ -356,14 +356,10 @@ class NavigateVectorEnv(VectorEnv):
         return observations, np.where(fresh, 0.0, rewards), terminations, truncations, infos
 
     def _observe(
-        self, now: Measured, distances: tuple[Float[np.ndarray, "worlds"], ...]
+        self, now: Measured, distances: Float[np.ndarray, "worlds devices"]
     ) -> Float[np.ndarray, "worlds features"]:
         time_share = self._steps * CONTROL_PERIOD_S / self._seconds
         return observe(now, self._routes, distances, self._force_limit, time_share)
-
-    def _distances(self, now: Measured) -> tuple[Float[np.ndarray, "worlds"], ...]:
-        """Return the path length from each device's tips to the targets, mm."""
-        return tuple(self._routes.distance(tip) for tip in now.tips)
 
     def draw_from(self, *generators: np.random.Generator) -> None:
         """Let each world draw its starts from a generator that the caller holds."""
@@ -371,29 +367,24 @@ class NavigateVectorEnv(VectorEnv):
 
     def _begin(self, mask: Bool[np.ndarray, "worlds"]) -> None:
         """Start an episode in the worlds of a mask."""
-        turn = np.zeros(self.num_envs)
+        turn = self._start[..., 1].copy()
         worlds = np.flatnonzero(mask)
-        turn[worlds] = [self._generators[world].uniform(0.0, 2 * np.pi) for world in worlds]
-        self._simulator.reset(
-            inserted_length=self._start,
-            rotation=turn,
-            catheter_inserted_length=self._start_catheters,
-            worlds=worlds.tolist(),
-        )
+        turn[worlds, 0] = [self._generators[world].uniform(0.0, 2 * np.pi) for world in worlds]
+        self._simulator.reset(inserted_length=self._start[..., 0], rotation=turn, worlds=worlds.tolist())
         self._steps[mask], self._safe[mask], self._ended[mask] = 0, True, False
-        begun = [self._routes.distance(self._simulator.project(device)) for device in range(self._counted)]
-        self._distance = np.where(mask, np.array(begun), self._distance)
+        begun = self._routes.distance(self._simulator.project())[:, : self._counted]
+        self._distance = np.where(mask[:, None], begun, self._distance)
 
     def _infos(self, now: Measured) -> dict[str, Any]:
-        wire = now.tips[0]
+        wire = now.tip[:, 0]
         infos: dict[str, Any] = {  # the names of `_MASKS`
             "contact_force_max": now.contact_force,
             "valid": now.valid,
-            "success": reached(now.tips[: self._counted], self._target_branch, self._target_abscissa),
+            "success": reached(now.tip[:, : self._counted], self._target_branch, self._target_abscissa),
             "safe": self._safe.copy(),
-            "distance_mm": self._distance[-1],
-            "inserted_length": now.inserted_length[0],
-            "rotation": now.rotation[0],
+            "distance_mm": self._distance[:, -1],
+            "inserted_length": now.inserted_length[:, 0],
+            "rotation": now.rotation[:, 0],
             "tip_abscissa": wire.abscissa,
             "tip_offset": wire.offset,
             "tip_branch": wire.branch,
@@ -401,8 +392,8 @@ class NavigateVectorEnv(VectorEnv):
         }
         infos |= dict.fromkeys(_MASKS, self._everyone)
         for k in range(1, self._drives):
-            tip = now.tips[k]
-            values = (now.inserted_length[k], now.rotation[k], tip.abscissa, tip.offset, tip.branch)
+            tip = now.tip[:, k]
+            values = (now.inserted_length[:, k], now.rotation[:, k], tip.abscissa, tip.offset, tip.branch)
             for name, value in zip(_OF_CATHETER, values, strict=True):
                 infos[f"catheter_{k}_{name}"], infos[f"_catheter_{k}_{name}"] = value, self._everyone
         return infos

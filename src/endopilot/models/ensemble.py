@@ -8,19 +8,20 @@ agent follows a robot's encoders.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.devices.catheter import Catheter
 from endopilot.devices.device import Device
+from endopilot.devices.stack import Stack
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion
-from endopilot.simulation.simulate import simulate
+from endopilot.simulation.simulate import run_set_up
 from endopilot.simulation.simulator import Simulator
-from endopilot.types import Anatomy
+from endopilot.simulation.trajectory import SetUp
+from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
 NOMINAL = np.array([1.0, 1.0, 0.0])
 """Friction factor, tip stiffness factor and depth of the ostium (mm) of a wire that is as it is given."""
@@ -32,55 +33,53 @@ class Ensemble:
     Attributes:
         parameters: friction factor, tip stiffness factor and depth of the ostium (mm) of each member.
         wires: the wires by the stiffness factor of their tip; members share them.
+        set_up: what their worlds are simulated with.
     """
 
     def __init__(
         self,
         anatomy: Anatomy,
-        wire: Device,
+        device: Device | Stack,
         parameters: Float[np.ndarray, "members 3"],
         *,
         start: Float[np.ndarray, "members devices 2"],
         config: SimulatorConfig,
         motion: Motion | None = None,
-        catheters: Sequence[Catheter] = (),
     ) -> None:
         """Take what all have in common, and in what they differ.
 
         Args:
             anatomy: the vessel.
-            wire: as it is given.
+            device: the wire as it is given, or the wire and its catheters.
             parameters: of each member.
             start: inserted length (mm) and rotation (rad) of each device as the encoders have it at the start.
             config: settings of the rod core.
             motion: how the vessel moves, as far as that is known.
-            catheters: around each wire, from the inside out.
         """
-        self.parameters, self._anatomy, self._wire = parameters, anatomy, wire
-        self._config, self._motion, self._catheters = config, motion, tuple(catheters)
+        stack, self.parameters = Stack.of(device), parameters
+        wire = stack.wire
         self.wires = {
             factor: wire.with_tip(bend_rad=wire.tip_bend_rad, stiffness_factor=float(factor))
             for factor in np.unique(parameters[:, 1])
         }
-        self._start = np.stack([self._deeper(start[..., 0]), start[..., 1]], axis=-1)
-        self._friction = wire.friction * parameters[:, 0]
+        friction = np.tile([each.friction for each in stack.devices], (len(parameters), 1))
+        friction[:, 0] *= parameters[:, 0]
+        self.set_up = SetUp(
+            anatomies=[anatomy] * len(parameters),
+            stacks=[replace(stack, wire=self.wires[factor]) for factor in parameters[:, 1]],
+            initial=np.stack([self._deeper(start[..., 0]), start[..., 1]], axis=-1),
+            friction=friction,
+            actuation="velocity",
+            motion=motion,
+            config=config,
+        )
 
     @cached_property
     def simulator(self) -> Simulator:
         """The worlds of the members, at the start of the navigation before they are driven."""
-        simulator = Simulator(
-            self._anatomy,
-            [self.wires[factor] for factor in self.parameters[:, 1]],
-            catheters=self._catheters,
-            motion=self._motion,
-            config=self._config,
-        )
-        simulator.reset(
-            inserted_length=self._start[:, 0, 0],
-            rotation=self._start[:, 0, 1],
-            friction=self._friction,
-            catheter_inserted_length=self._start[:, 1:, 0],
-        )
+        given = self.set_up
+        simulator = Simulator(given.anatomies, given.stacks, motion=given.motion, config=given.config)
+        simulator.reset(inserted_length=given.initial[..., 0], rotation=given.initial[..., 1], friction=given.friction)
         return simulator
 
     def replay(self, command: Float[np.ndarray, "members samples 2"]) -> Float[np.ndarray, "members samples 2"]:
@@ -92,23 +91,11 @@ class Ensemble:
         Returns:
             The tips at the end of each sample; NaN from where a simulation fails.
         """
-        tips = np.full(command.shape, np.nan)
-        for factor, wire in self.wires.items():
-            chosen = self.parameters[:, 1] == factor
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # a member that fails is left out
-                rollout = simulate(
-                    self._anatomy,
-                    wire,
-                    command[chosen],
-                    initial=self._start[chosen, 0],
-                    config=self._config,
-                    friction=self._friction[chosen],
-                    motion=self._motion,
-                )
-            tip = np.stack([rollout.tip.abscissa, rollout.tip.offset], axis=-1)
-            tips[chosen] = np.where(rollout.valid[..., None], tip, np.nan)
-        return tips
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a member that fails is left out
+            made = run_set_up(self.set_up, command[:, :, None], period_s=SAMPLE_PERIOD_S, record_shape=False)
+        tip = made.tip[:, :, 0]
+        return np.where(made.valid[..., None], np.stack([tip.abscissa, tip.offset], axis=-1), np.nan)
 
     def _deeper(self, given_mm: Float[np.ndarray, "members *devices"]) -> Float[np.ndarray, "members *devices"]:
         """Return inserted lengths from each member's ostium on, mm, of those from the given one on."""

@@ -12,6 +12,7 @@ import numpy as np
 from pydantic import model_validator
 
 from endopilot.devices.drive_limits import DriveLimits
+from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.navigation.policies import make_policy
 from endopilot.navigation.policy import BelievedTip, Believer, Decision, Led, Observation, Policy
@@ -149,10 +150,10 @@ class NavigationLoop:
         line = navigation.anatomy.tree.branches[navigation.target.branch].centerline
         at, arriving = navigation.target.abscissa, navigation.arriving
         width = float(line.radius[np.abs(line.abscissa - at) <= SUCCESS_MM + 1.0].max())
-        away = np.linalg.norm(simulator.tips(arriving)[0] - navigation.target.position(navigation.anatomy))
+        away = np.linalg.norm(simulator.tip_position[0, arriving] - navigation.target.position(navigation.anatomy))
         if away > SUCCESS_MM + 3 * width:
             return False
-        return bool(navigation.reached(*(simulator.project(device) for device in range(arriving + 1)))[0])
+        return bool(navigation.reached(simulator.project())[0])
 
     def hand_over(self, to: Policy | None) -> None:
         """Let somebody else drive from the next decision on, without X-ray; or the policy again (None), with X-ray."""
@@ -320,13 +321,14 @@ def start_world(
     """
     device = navigation.device
     wire = device.with_tip(bend_rad=device.tip_bend_rad, stiffness_factor=truth.stiffness_factor)
-    catheters = truth.catheters(navigation.catheters)
-    simulator = Simulator(truth.anatomy(navigation.anatomy), wire, catheters=catheters, motion=motion, config=config)
+    stack = Stack(wire, truth.catheters(navigation.catheters))
+    simulator = Simulator(truth.anatomy(navigation.anatomy), stack, motion=motion, config=config)
+    friction, start = simulator.set_up.friction.copy(), navigation.start
+    friction[:, 0] = device.friction * truth.friction_factor
     simulator.reset(
-        inserted_length=[max(navigation.start_inserted_mm + truth.ostium_mm, 0.0)],
-        rotation=[navigation.start_rotation],
-        friction=[device.friction * truth.friction_factor],
-        catheter_inserted_length=np.full((1, len(catheters)), max(navigation.start_catheter_mm + truth.ostium_mm, 0.0)),
+        inserted_length=np.maximum(start[None, :, 0] + truth.ostium_mm, 0.0),
+        rotation=start[None, :, 1],
+        friction=friction,
     )
     return simulator
 

@@ -125,7 +125,7 @@ class Track:
     def moved(self, simulator: Simulator, proximal: Float[np.ndarray, "devices 2"], peak_n: float) -> None:
         """Take where the devices are at the end of a period, and the largest wall force in it, N."""
         self._proximal.append(proximal)
-        self._position.append(np.array([simulator.tips(k)[0] for k in range(len(proximal))]))
+        self._position.append(simulator.tip_position[0])
         self._shape.append(simulator.position[0])
         self._force.append(peak_n)
 

@@ -94,15 +94,7 @@ def _write(found: PatientNavigation, folder: Path, target: str, output: Path) ->
         navigation_table(found).to_csv(partial, index=False)
     cycles = found.cycles
     count = len(found.record.driven)
-    motions = [(cycles.inserted_length[0], cycles.rotation[0])]
-    if cycles.catheters is not None:
-        motions += zip(cycles.catheters.inserted_length[0].T, cycles.catheters.rotation[0].T, strict=True)
-    write_controls_csv(
-        output / CONTROLS_FILE,
-        found.record.driven.reshape(count, -1),
-        np.column_stack([column[:count] for motion in motions for column in motion]),
-        cycles.sample_period_s,
-    )
+    write_controls_csv(output / CONTROLS_FILE, cycles.command[0, :count], cycles.proximal[0, :count], cycles.period_s)
     write_device(set_up.true_wire, output / WIRE_FILE)
     for path, catheter in zip(_catheter_files(set_up, output), set_up.true_catheters, strict=True):
         write_catheter(catheter, path)
@@ -160,13 +152,10 @@ def _write_episode(found: PatientNavigation, anatomy_folder: Path, output: Path)
         found.episode,
         anatomy_folder,
         output,
-        device,
+        set_up.navigation.stack,
         task=f"navigate to {name_target(set_up)}",
         friction=device.friction * truth.friction_factor,
         tip_stiffness_factor=truth.stiffness_factor,
-        simulator=set_up.simulator,
-        catheters=set_up.navigation.catheters,
-        motion=set_up.motion,
         seed=set_up.config.seed,
         origin={
             "target": asdict(set_up.navigation.target),

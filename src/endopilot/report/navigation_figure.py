@@ -119,9 +119,8 @@ def _draw_force(axes: Axes, found: PatientNavigation) -> None:
 def _draw_pushes(axes: Axes, found: PatientNavigation) -> None:
     """Draw how hard each drive pushes, or pulls below zero."""
     rollout = found.rollout
-    assert rollout.catheters is not None
     time_s = DECISION_PERIOD_S * np.arange(1, rollout.drive_force.shape[1] + 1)
-    pushes = [rollout.drive_force[0], *rollout.catheters.drive_force[0].T]
+    pushes = rollout.drive_force[0].T
     for device, color, push in zip(found.set_up.navigation.devices, _DEVICE_COLORS, pushes, strict=False):
         axes.plot(time_s, push, color=color, label=device.name)
     axes.axhline(0.0, color="0.75", linewidth=0.8, zorder=0)

@@ -203,7 +203,7 @@ class SimulatedRobot:
         period, peak = duration / cycles, 0.0
         for _ in range(cycles):
             control = np.array([drive.advance(period) for drive in self._drives]) / period
-            self.last_step = step = self._simulator.step(control.reshape(1, -1), period)
+            self.last_step = step = self._simulator.step(control[None], period)
             self.driven.append(control)
             for drive, place in zip(self._drives, self._encoders(), strict=True):
                 drive.position = place
@@ -213,9 +213,7 @@ class SimulatedRobot:
     @property
     def proximal(self) -> Float[np.ndarray, "devices 2"]:
         """Inserted length, mm, and rotation, rad, of each device as they truly are."""
-        simulator = self._simulator
-        inserted = np.append(simulator.inserted_length, simulator.catheter_inserted_length)
-        return np.column_stack([inserted, np.append(simulator.rotation, simulator.catheter_rotation)])
+        return self._simulator.proximal[0]
 
     def _encoders(self) -> Float[np.ndarray, "devices 2"]:
         """Return what the encoders read without noise: they count from where the ostium is assumed."""

@@ -240,7 +240,7 @@ class Fluoroscope:
             inserted_length: Δ by the robot's encoder, mm, which helps to find the tip.
             seed: of the errors; those of a navigation depend on it, the patient and the sequence alone.
         """
-        tip, heading = episodes.tip_position.astype(float), episodes.tip_direction.astype(float)
+        tip, heading = (each[:, :, 0].astype(float) for each in (episodes.tip_position, episodes.tip_direction))
         position, name = np.zeros_like(tip), self._anatomy.name
         ostium = np.asarray(self._anatomy.insertion.position)
         motion = episodes.motion(name)

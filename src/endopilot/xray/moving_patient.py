@@ -37,8 +37,8 @@ def seen_wire(
     Returns:
         The nodes from the foremost tip on, the wire's tip, LPS mm, and the unit vector along the wire there.
     """
-    nodes, tip, heading = simulator.position[0], simulator.tips()[0], simulator.tip_direction[0]
-    if simulator.motion is None:
+    nodes, tip, heading = simulator.position[0], simulator.tip_position[0, 0], simulator.tip_direction[0, 0]
+    if simulator.set_up.motion is None:
         return nodes, tip, heading
     known_core = None if known is None else known.core(ostium)
     (maps,) = seen(simulator.vessel_to_laboratory[:1], known_core, np.array([time_s]))
