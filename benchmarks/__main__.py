@@ -8,7 +8,6 @@ runs in turns in another checkout and in this one, and the figures of both stand
 from __future__ import annotations
 
 import argparse
-import functools
 import importlib
 import sys
 from collections.abc import Callable, Sequence
@@ -81,19 +80,9 @@ def measure(name: str, options: Sequence[str]) -> Any:
     Raises:
         InputError: its input cannot be used.
     """
-    import tyro
+    from endopilot.cli.options import Command  # slow to import
 
-    from endopilot.settings import check_call
-
-    function = function_of(name)
-
-    @functools.wraps(function)
-    def later(*args: Any, **kwargs: Any) -> Callable[[], Any]:
-        check_call(function, args, kwargs)
-        return functools.partial(function, *args, **kwargs)
-
-    config = (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes)
-    return tyro.cli(later, prog=f"python -m benchmarks {name}", args=options, config=config)()
+    return Command(f"python -m benchmarks {name}", function_of(name)).answer(options)
 
 
 def function_of(name: str) -> Callable[..., Any]:

@@ -191,6 +191,13 @@ def test_a_recording_that_cannot_be_written_is_told(world, vessel, tmp_path):
         Recorder(tmp_path / "file" / "a.jsonl", world, Where(patient=vessel), 0)
 
 
+def test_a_session_of_an_older_version_says_which(tmp_path):
+    path = tmp_path / "x.cockpit.jsonl"
+    path.write_text('{"format": "endopilot cockpit 1", "version": "0.0.9"}\n')
+    with pytest.raises(InputError, match=r"a session of endopilot 0\.0\.9, whose loop differs; replay it with that"):
+        read_recording(path)
+
+
 @pytest.mark.parametrize("text", ["", "{}\n", "nonsense\n", '{"format": "endopilot cockpit 2"}\n'])
 def test_what_is_no_session_is_told(tmp_path, text):
     path = tmp_path / "x.cockpit.jsonl"

@@ -185,7 +185,8 @@ def test_the_replayed_wire_is_the_navigations_to_the_bit(patient):
     found = navigate_patient(set_up_navigation(patient, "2", NavigatePatientConfig(tip="own", seconds=20.0, seed=3)))
     samples = len(found.record.time_s) - 1
     np.testing.assert_array_equal(found.rollout.tip_position[0], found.record.tip_position[1:, 0])
-    np.testing.assert_array_equal(found.rollout.shape[0], found.record.shape[1:])
+    nodes = found.rollout.shape.shape[2]  # laid out for what is driven
+    np.testing.assert_array_equal(found.rollout.shape[0], found.record.shape[1:, :nodes])
     assert found.rollout.tip_position.shape[1] == samples == len(found.wires) < found.episode.valid.shape[1] == 40
     # the likeliest wire held possible is where the record has it, a decision later
     shown = np.array([wires[0, 0] for wires in found.wires])

@@ -186,18 +186,23 @@ def test_a_loop_that_is_over_or_within_a_period_takes_no_decision(straight) -> N
     assert record.reason == "stopped" and not record.success and record.seconds == 0.5
 
 
-def test_a_navigation_that_is_over_goes_on_and_ends_at_another_target(straight) -> None:
-    loop = NavigationLoop(replace(straight, seconds=1.0), Hand(((6.0, 0.0),)))
+def test_a_navigation_that_is_over_goes_on_to_another_target_without_a_limit_of_time(straight) -> None:
+    hand = Hand(((6.0, 0.0),))
+    loop = NavigationLoop(replace(straight, seconds=4.0, target=Target(branch=0, abscissa=12.0)), hand)
     while loop.reason is None:
         loop.step()
-    assert (loop.reason, loop.time_s) == ("time", 1.0)
-    loop.aim(Target(branch=0, abscissa=12.0))
+    assert loop.reason == "reached" and loop.reached and loop.time_s < 4.0
+    loop.aim(straight.target)
     loop.go_on()
+    hand.devices = ((2.0, 0.0),)
+    while loop.time_s < 5.0:
+        loop.step()
+    assert loop.reason is None and not loop.reached
+    hand.devices = ((6.0, 0.0),)
     while loop.reason is None:
         loop.step()
     record = loop.record()
-    assert loop.reason == "reached" and loop.reached and abs(record.tip.abscissa[-1, 0] - 12.0) <= 2.0
-    assert record.seconds == loop.time_s > 1.0
+    assert record.success and abs(record.tip.abscissa[-1, 0] - 30.0) <= 2.0 and record.seconds == loop.time_s
     with pytest.raises(InputError, match="abscissa"):
         loop.aim(Target(branch=0, abscissa=1e3))
 

@@ -152,18 +152,39 @@ class Command:
         return [tree.pop(name) for name in self._own] + list(tree.values())
 
     def run(self, arguments: Sequence[str]) -> None:
-        """Do what the arguments ask for.
+        """Do what the arguments ask for, and print what comes of it.
 
         Raises:
             InputError: the arguments or the file of `--config` are bad; the line says which, and how to mend it.
         """
+        values = self._asked(arguments)
+        if values is not None:
+            answer = self._called(values)
+            if self._answers:
+                show_answer(answer, as_json=values.json)
+
+    def answer(self, arguments: Sequence[str]) -> Any:
+        """Do what the arguments ask for, and return what comes of it; None where they ask for help.
+
+        Raises:
+            InputError: as `run`.
+        """
+        values = self._asked(arguments)
+        return None if values is None else self._called(values)
+
+    def _asked(self, arguments: Sequence[str]) -> Any:
+        """Return what the arguments set the options to; None where they ask for a text, which is printed."""
         if not {"-h", "--help", "--help-all"}.isdisjoint(arguments):
             print(self.help(everything="--help-all" in arguments), end="")
-            return
+            return None
         values = self.read(arguments)
         if "--print-config" in arguments:
             print(self.file(values), end="")
-            return
+            return None
+        return values
+
+    def _called(self, values: Any) -> Any:
+        """Return what the function returns."""
         for one in self.options(values):
             if MUST_EXIST in _notes(one.kind):
                 for path in one.value if isinstance(one.value, tuple) else (one.value,) if one.value else ():
@@ -172,9 +193,7 @@ class Command:
         places = [given.pop(name) for name, one in self._parameters.items() if one.kind is one.POSITIONAL_ONLY]
         if self._config is not NoneType:
             given["config"] = self._config(**{one.name: getattr(values, one.name) for one in fields(self._config)})
-        answer = self._function(*places, **given)
-        if self._answers:
-            show_answer(answer, as_json=values.json)
+        return self._function(*places, **given)
 
     def read(self, arguments: Sequence[str]) -> Any:
         """Return what the arguments set the options to, an instance of `settings`.
@@ -224,7 +243,9 @@ class Command:
             section = parser.add_argument_group(title)
             for one in group:
                 note = "(required)" if one.required else f"(default: {one.default})" if one.default else ""
-                kind = {"metavar": one.takes} if one.takes else {} if one.positional else {"action": "store_true"}
+                kind: dict[str, Any] = (
+                    {"metavar": one.takes} if one.takes else {} if one.positional else {"action": "store_true"}
+                )
                 section.add_argument(*one.flags, help=f"{one.meaning} {note}".replace("%", "%%"), **kind)
         return parser.format_help()
 

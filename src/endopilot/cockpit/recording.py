@@ -122,6 +122,10 @@ def read_recording(path: Path) -> Recording:
     """
     lines = _lines(path)
     header = lines[0] if lines else {}
+    if str(header.get("format")).startswith("endopilot cockpit ") and header["format"] != FORMAT:
+        raise InputError(
+            f"{path}: a session of endopilot {header.get('version')}, whose loop differs; replay it with that version"
+        )
     if header.get("format") != FORMAT:
         raise InputError(f"{path}: no session of the cockpit; give a file that ends in {SUFFIX}")
     with reading(path, "choose another session"):

@@ -326,12 +326,11 @@ class NavigateVectorEnv(VectorEnv):
         fresh = self._ended & (self.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP)
         control = np.minimum(np.maximum(control, -1.0), 1.0) * self._fastest
         control[fresh] = 0.0
-        travel_mm = (-np.inf, self._far_ends[:, None])  # at the ostium the simulator stops the drives by itself
-        control = control.reshape(self.num_envs, self._drives, 2)
-        inserted = self._simulator.inserted_length
+        travel_mm = (-np.inf, self._far_ends[:, None])  # it stops by itself at the ostium
+        control, simulator = control.reshape(self.num_envs, self._drives, 2), self._simulator
+        inserted = simulator.inserted_length
         control[..., 0] = within_travel(control[..., 0], inserted, CONTROL_PERIOD_S, travel_mm=travel_mm)
-        step = self._simulator.step(control, CONTROL_PERIOD_S)
-        now = Measured.after(step, self._simulator)
+        now = Measured.after(simulator.step(control, CONTROL_PERIOD_S), simulator)
         if fresh.any():
             self._begin(fresh)
             now = Measured.current(self._simulator)
