@@ -44,8 +44,10 @@ def draw_plan(plan: Plan, path: Path, xray: PlannedXray | None = None) -> None:
     for k, (colors, style, whose) in enumerate(zip(_CONTROL_COLORS, ("-", "--"), ("", "catheter's "), strict=True)):
         for axis, unit in enumerate(("translation, mm/s", "rotation, rad/s")):
             if k < plan.control.shape[1]:
-                look = {"color": colors[axis], "linestyle": style, "label": f"{whose}{unit}"}
-                panels[3].stairs(plan.control[:, k, axis], edges, baseline=None, linewidth=1.5 - 0.5 * k, **look)
+                panels[3].stairs(
+                    plan.control[:, k, axis], edges, baseline=None, color=colors[axis], linestyle=style,
+                    linewidth=1.5 - 0.5 * k, label=f"{whose}{unit}",
+                )  # fmt: skip
     legend_above(panels[3])
     panels[3].set_ylabel("control")
     panels[3].set_xlabel("time, s")

@@ -137,10 +137,11 @@ class StackSearch:
         Raises:
             InputError: there is more than one catheter.
         """
-        if len(navigation.catheters) > 1:
+        catheter, *others = navigation.catheters
+        if others:
             raise InputError(f"catheter: {len(navigation.catheters)}; the search drives one: give one")
         self._navigation, self.route, self.config = navigation, route, config
-        shaped = bool(navigation.catheters[0].shape)
+        shaped = bool(catheter.shape)
         self._leads = np.array(_LEADS_SHAPED_MM if shaped else _LEADS_MM)
         self._grids = [_PLACES, *(_SHAPED if shaped else _UNSHAPED)]
         wires = list(belief.wires.values())
