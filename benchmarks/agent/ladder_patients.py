@@ -26,14 +26,13 @@ from endopilot.atlas.atlas import make_patient_tree
 from endopilot.errors import InputError
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import Navigation, Target
+from endopilot.tasks.targets import find_target, turn_rad
 from endopilot.tasks.task import (
     CORE,
     NEWEST,
     LadderVersion,
     Task,
     ladder_tasks,
-    target_in_section,
-    turn_rad,
     without_catheter,
 )
 from endopilot.types import TipProjection, VesselTree
@@ -52,7 +51,7 @@ def _always(tree: VesselTree, truth: dict[str, Any], target: Target) -> bool:
 
 def _turns(section: str, degrees: float) -> Callable[[VesselTree, dict[str, Any], Target], bool]:
     def eligible(tree: VesselTree, truth: dict[str, Any], target: Target) -> bool:
-        first = target_in_section(tree, section, 0.5).branch
+        first = find_target(tree, section, depth_mm=0.5).branch
         return first > 0 and np.rad2deg(turn_rad(tree, first)) >= degrees
 
     return eligible
@@ -198,7 +197,7 @@ def choose(task: Task, seed: int, *, search: bool) -> tuple[list[int], int, int]
     for number in range(MOST_EXAMINED):
         tree, truth = make_patient_tree(atlas, number)
         try:
-            target = target_in_section(tree, task.section, task.depth_mm)
+            target = find_target(tree, task.section, depth_mm=task.depth_mm)
         except InputError:
             continue
         if not eligible(tree, truth, target):

@@ -1,6 +1,6 @@
 """Write the pictures and tables of docs/navigation.md.
 
-The first part drives the agent in a synthetic patient, and the coaxial agent with a catheter too. The second needs what
+The first part drives the agent in a synthetic patient, with a catheter too. The second needs what
 `make cta` leaves in `runs/cta-thorax`; it pushes the J wire without a policy, at first rotations all around, to see
 where it goes.
 """
@@ -32,7 +32,7 @@ def main() -> None:
     if not (patients / "lca-41-0000").exists():
         subprocess.run([*command, "atlas", "-o", patients, "--anatomy", "lca", "--seed", "41"], check=True)
     navigate = [*command, "navigate", patients / "lca-41-0000", "--target", "12", "--mismatch", "0.2"]
-    pair = ("--catheter", "microcatheter-2.4f", "--arrives", "catheter", "--policy", "coaxial-agent")
+    pair = ("--catheter", "microcatheter-2.4f", "--arrives", "catheter")
     for options, folder, picture, part in (
         ((), "navigation", "navigation.png", "outcome"),
         (pair, "pair", "navigation-pair.png", "pair"),

@@ -192,9 +192,8 @@ def test_a_curved_catheter_is_turned_back_before_a_policy_begins(navigation, xra
 
 
 def test_a_task_of_wire_and_catheter_is_scored(navigation, xray):
-    """The catheter is to arrive: the wire at the target is not enough. The coaxial agent's score stands beside."""
+    """The catheter is to arrive: the wire at the target is not enough. The agent's score stands beside."""
     tried = Attempt(task_by_hand("follow"), 0)
-    assert tried.rival == "coaxial-agent"
     wanted = replace(navigation.target, abscissa=10.0)
     world = World(replace(navigation, arrives="catheter", target=wanted, seconds=6.0, force_limit_n=0.3))
     with patch.object(game, "Workers", Rival):
@@ -206,7 +205,7 @@ def test_a_task_of_wire_and_catheter_is_scored(navigation, xray):
         played.close()
     scores = last["result"][0]["scores"]
     assert played.phase == "over" and scores["you"]["reason"] == "reached"
-    assert scores["rival"] == "coaxial-agent" and scores["agent"] == {"success": True}
+    assert scores["rival"] == "agent" and scores["agent"] == {"success": True}
 
 
 def test_a_rollout_of_a_pair_is_driven_again(fork, vessel, navigation, tmp_path):
@@ -267,8 +266,8 @@ def test_a_plan_of_a_pair_is_shown(vessel, tmp_path):
     film = open_film(tmp_path / "plan", vessel, catheters=(NAME,))
     film._drive()
     last = film.frames[-1].snapshot
-    assert not film.failure and made.catheter_position is not None
+    assert not film.failure and made.position.shape[1] == 2
     np.testing.assert_allclose(last.nodes[0], made.position[-1], atol=0.05)
-    np.testing.assert_allclose(last.catheters[0].nodes[0], made.catheter_position[-1], atol=0.05)
+    np.testing.assert_allclose(last.catheters[0].nodes[0], made.position[-1, 1], atol=0.05)
     with pytest.raises(InputError, match=f"for another device .workhorse-014 in {NAME}., not for workhorse-014"):
         open_film(tmp_path / "plan", vessel)

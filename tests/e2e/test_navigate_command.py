@@ -277,7 +277,9 @@ def test_a_point_is_moved_to_the_vessel_and_told(patient, capsys, tmp_path):
     at = len(line.points) // 3
     point = line.points[at] + 0.7 * line.normals[at]
     target = ",".join(f"{value:.4f}" for value in point)
-    figures = run(capsys, "navigate", patient, f"--target={target}", "-o", tmp_path / "out", "--policy", "twin", *SHORT)
+    figures = run(
+        capsys, "navigate", patient, f"--target={target}", "-o", tmp_path / "out", "--policy", "oracle", *SHORT
+    )
     assert figures["snapped_mm"] == pytest.approx(0.7, abs=0.02)
     assert figures["target_mm"] == pytest.approx(line.abscissa[at], abs=0.5)
     assert f"{figures['snapped_mm']:.1f} mm from the given point" in figures["outcome"]

@@ -140,9 +140,6 @@ def test_a_recording_of_both_is_driven_again_to_the_bit(over_the_wire) -> None:
 
 def test_what_takes_a_wire_alone_says_so(over_the_wire) -> None:
     line = "takes a wire alone, and there is microcatheter-1.7f around it; leave the catheter out"
-    for policy in ("agent", "twin", "open-loop"):
-        with pytest.raises(InputError, match=line):
-            navigate(over_the_wire, policy, config=COARSE)
     with pytest.raises(InputError, match=line):
         navigate(over_the_wire, "in-turn", config=replace(COARSE, xray="images"))
     alone = replace(over_the_wire, catheters=(), arrives="wire")

@@ -16,8 +16,7 @@ from jaxtyping import Float
 
 from endopilot.anatomy.catheter_axis import lean_between, with_axis
 from endopilot.anatomy.io import read_anatomy
-from endopilot.control.agent import TwinPolicy
-from endopilot.control.route import Route, check_passable, parse_target
+from endopilot.control.agent import OraclePolicy
 from endopilot.control.set_up import TILT_DEG, TipChoice, choose_tip
 from endopilot.devices.catheter import Catheter, read_catheter
 from endopilot.devices.device import Device, read_device
@@ -33,6 +32,8 @@ from endopilot.simulation.mismatch import ModelMismatch, drawn_sides, mismatch_b
 from endopilot.simulation.motion import Motion, MotionName, motion_named
 from endopilot.simulation.trajectory import Trajectory
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Arrives, Navigation
+from endopilot.tasks.route import Route, check_passable
+from endopilot.tasks.targets import find_target
 from endopilot.types import Anatomy
 from endopilot.xray.fluoroscope import Fluoroscope
 
@@ -45,8 +46,8 @@ class NavigatePatientConfig:
     """Policy, wire, limits, and how reality differs from what the policy is given."""
 
     policy: Text = "agent"
-    """What decides: agent, twin, open-loop, forward, spin, retract-rotate, with a catheter coaxial-agent, in-turn or
-    catheter-alone, or MODULE:OBJECT of your own."""
+    """What decides: agent, oracle (which is given the truth), open-loop, forward, spin, retract-rotate, with a catheter
+    in-turn or catheter-alone, or MODULE:OBJECT of your own."""
     device: Text = "workhorse-014"
     """Name of a device (`endopilot devices`) or a YAML file."""
     catheter: tuple[Text, ...] = ()
@@ -182,11 +183,11 @@ def set_up_navigation(anatomy: Anatomy | str | Path, target: str, config: Naviga
     if config.motion_known == "measured" and config.xray != "images":
         raise InputError("motion_known: measured; only X-ray images measure it: give xray: images, or published")
     vessel = anatomy if isinstance(anatomy, Anatomy) else read_anatomy(anatomy)
-    device, goal = read_device(config.device), parse_target(vessel, target)
+    device, goal = read_device(config.device), find_target(vessel.tree, target)
     catheters = tuple(read_catheter(name) for name in config.catheter)
     truth = _truth(config, vessel)
     seen, truth = _see_catheter(vessel, device, truth, config)
-    policy = TwinPolicy(truth) if config.policy == "twin" else make_policy(config.policy)
+    policy = OraclePolicy(truth) if config.policy == "oracle" else make_policy(config.policy)
     given = Navigation(
         anatomy=seen,
         device=device,

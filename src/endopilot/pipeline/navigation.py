@@ -22,7 +22,7 @@ from endopilot.control.navigate_patient import (
     navigate_patient,
     set_up_navigation,
 )
-from endopilot.control.outcome import name_target, section_at, slipped_s, tell_outcome, worst_ratio
+from endopilot.control.outcome import name_target, slipped_s, tell_outcome, worst_ratio
 from endopilot.control.set_up import tip_name
 from endopilot.devices.catheter import write_catheter
 from endopilot.devices.device import write_device
@@ -31,6 +31,7 @@ from endopilot.files import manifest, read_json, write_json, writing
 from endopilot.navigation.policies import POLICIES
 from endopilot.runs import claim
 from endopilot.simulation.controls import write_controls_csv
+from endopilot.tasks.targets import section_at
 
 PAGE_FILE, PICTURE_FILE, TABLE_FILE = "navigation.html", "navigation.png", "navigation.csv"
 CONTROLS_FILE, WIRE_FILE, EPISODE_FOLDER, ANATOMY_FOLDER = "controls.csv", "wire.yaml", "episode", "anatomy"
