@@ -92,7 +92,7 @@ OwnedScene make_scene(int devices, bool with_loads, bool moving = false) {
                      .lumen = std::make_shared<LumenMap>(make_map()),
                      .loads = with_loads ? std::make_shared<OwnedLoads>(make_loads(40)) : nullptr,
                      .base = {.origin = {-3.0, 0.0, 0.0}, .orientation = {half, {0, half, 0}}},
-                     .options = {.stick_velocity = 0.05, .wall_stiffness = 100.0, .foundation = 0.0, .foundation_stiffening = 0.0, .tip_takes_along = 0.0, .tolerance = 1e-3, .sample_tolerance = 1e-6,
+                     .options = {.stick_velocity = 0.05, .wall_stiffness = 100.0, .foundation = 0.0, .foundation_stiffening = 0.0, .foundation_at_tip = 0.0, .tolerance = 1e-3, .sample_tolerance = 1e-6,
                                  .largest_step = 0.3, .largest_jump = 0.1, .max_iterations = 400, .free_behind = 3.0,
                                  .approach_velocity = 20.0, .introducer_friction = 0.05, .introducer_drag = 0.002},
                      .drives = {.count = devices},
@@ -103,7 +103,7 @@ OwnedScene make_scene(int devices, bool with_loads, bool moving = false) {
 }
 
 // Worlds at rest and what is recorded of them.
-struct Run {
+struct Recorded {
     std::size_t nodes, width;
     int devices;
     std::vector<double> values;
@@ -111,7 +111,7 @@ struct Run {
     std::vector<unsigned char> valid;
     Outputs out{};
 
-    explicit Run(const Scene& scene) : nodes(std::size_t(scene.rod.nodes)), width(World::size(scene.rod.nodes, scene.drives.count)), devices(scene.drives.count) {
+    explicit Recorded(const Scene& scene) : nodes(std::size_t(scene.rod.nodes)), width(World::size(scene.rod.nodes, scene.drives.count)), devices(scene.drives.count) {
         values.resize(kWorlds * width);
         std::mt19937 random(3);
         std::uniform_real_distribution<double> any(0.0, 1.0);
@@ -151,20 +151,20 @@ void test_kernel(bool by_force, bool with_loads, bool moving = false) {
     control[2 * (1 + T) * (5 * kSamples + 2)] = std::numeric_limits<double>::quiet_NaN();  // ends world 5
     const Inputs in{.samples = kSamples, .steps_per_sample = kSteps, .time_step = kPeriod / kSteps, .force_driven = by_force, .control = control.data()};
 
-    Run processor(scene), gpu(scene);
+    Recorded processor(scene), gpu(scene);
     std::vector<int> order;
     for (int w = 0; w < kWorlds; ++w) order.push_back((w * 7) % kWorlds);
     std::vector<Node<double, T>> node(processor.nodes);
     std::vector<Factor<double, T>> factor(processor.nodes);
-    Stepper<double, T> stepper(scene, processor.worlds(), node.data(), factor.data());
-    stepper.prepare(in, processor.out);
+    const Run run{scene, processor.worlds(), in, processor.out};
+    Lanes<double, T> lanes(node.data(), factor.data());
     WorkQueue queue(order, std::vector<double>(kWorlds, 0.0), 8);
-    while (stepper.turn(queue) >= 0) {
+    while (iterate(run, lanes, queue) >= 0) {
     }
 
     long done = 0;
     const int before = launches;
-    CudaStepper(owned).step(gpu.worlds(), in, gpu.out, order, [&](long samples) { done += samples; });
+    CudaStepper(owned).step(gpu.worlds(), in, gpu.out, order, 1, 1, [&](long samples) { done += samples; });
     expect(launches - before >= 2, "a run takes several launches");
     expect(done == kWorlds * kSamples, "progress counts all samples");
 
