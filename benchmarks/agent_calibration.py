@@ -23,19 +23,19 @@ from pathlib import Path
 
 import numpy as np
 
+from endopilot.belief.bands import Calibration, conformal_scale, fit_spread, narrowest, spread_of
 from endopilot.control.agent import CALIBRATED, CALIBRATIONS, AdviserInput, AgentConfig, AgentPolicy
 from endopilot.control.coaxial_agent import COAXIAL_CALIBRATED, CoaxialAgent, CoaxialAgentConfig
-from endopilot.control.mismatch import ModelMismatch
-from endopilot.control.navigate import NavigateConfig, navigate
-from endopilot.control.policy import Decision, Observation
 from endopilot.errors import InputError
 from endopilot.files import read_json, write_json
 from endopilot.ladder.ladder import identity
+from endopilot.navigation.navigate import NavigateConfig, navigate
+from endopilot.navigation.policy import Decision, Observation
 from endopilot.runs import claim, make_missing
+from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.simulation.motion import Motion, motion_named
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.tasks.task import CORE, NEWEST, LadderVersion, Task, find_task, ladder_tasks
-from endopilot.xray.bands import Calibration, conformal_scale, fit_spread, narrowest, spread_of
 
 ROOT = Path(__file__).parents[1]
 RUNS = ROOT / "runs"

@@ -15,8 +15,8 @@ from dataclasses import replace
 import numpy as np
 
 from endopilot.control.agent import AgentPolicy
-from endopilot.control.navigate import NavigateConfig, navigate
 from endopilot.ladder.mismatch import CASES, mismatch_of
+from endopilot.navigation.navigate import NavigateConfig, navigate
 from endopilot.tasks.task import CORE, find_task
 from endopilot.xray.fluoroscope import TipMeasurement
 

@@ -18,13 +18,13 @@ from typing import Any
 import numpy as np
 
 from endopilot.control.agent import AgentPolicy
-from endopilot.control.mismatch import drawn_sides, mismatch_by
-from endopilot.control.navigate import NavigateConfig, XrayKind, navigate
 from endopilot.errors import InputError
 from endopilot.files import read_json, write_json
 from endopilot.ladder.attempt import navigation_events, navigation_seed
 from endopilot.ladder.ladder import identity
+from endopilot.navigation.navigate import NavigateConfig, XrayKind, navigate
 from endopilot.runs import claim, make_missing
+from endopilot.simulation.mismatch import drawn_sides, mismatch_by
 from endopilot.simulation.motion import Motion, motion_named
 from endopilot.tasks.task import CORE, NEWEST, find_task, ladder_tasks
 

@@ -21,9 +21,9 @@ from endopilot.anatomy.io import write_anatomy
 from endopilot.cockpit.episode import write_session_episode
 from endopilot.cockpit.recording import SUFFIX, Recorder, Where
 from endopilot.cockpit.world import World
-from endopilot.control.navigate import navigate
-from endopilot.control.policy import Decision, Observation
 from endopilot.dataset.loader import load_dataset
+from endopilot.navigation.navigate import navigate
+from endopilot.navigation.policy import Decision, Observation
 from endopilot.tasks.navigation import Navigation
 from endopilot.tasks.task import find_task
 

@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import math
 
-from endopilot.control.navigate import navigate
-from endopilot.control.policies import make_policy
-from endopilot.control.policy import Decision, Observation
+from endopilot.navigation.navigate import navigate
+from endopilot.navigation.policies import make_policy
+from endopilot.navigation.policy import Decision, Observation
 from endopilot.tasks.navigation import Navigation
 from endopilot.tasks.task import find_task
 

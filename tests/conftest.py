@@ -75,7 +75,7 @@ def fork():
 @pytest.fixture(scope="session")
 def wire():
     """Return the workhorse wire."""
-    from endopilot.simulation.device import read_device
+    from endopilot.devices.device import read_device
 
     return read_device("workhorse-014")
 

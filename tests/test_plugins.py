@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from endopilot import __version__
-from endopilot.control.baseline_policies import Forward
-from endopilot.control.policies import POLICIES, make_policy
 from endopilot.errors import InputError
 from endopilot.files import sha256
+from endopilot.navigation.baseline_policies import Forward
+from endopilot.navigation.policies import POLICIES, make_policy
 from endopilot.plugins import Registry
 
 _MODULE = """
@@ -67,7 +67,7 @@ def installed(tmp_path, monkeypatch):
         lines = [f"{name} = {value}" for name, value in points.items()]
         (meta / "entry_points.txt").write_text("\n".join([f"[{group}]", *lines]) + "\n")
         (folder / f"{package}_policies.py").write_text(
-            "from endopilot.control.baseline_policies import Forward\nclass Pushes(Forward):\n    pass\n"
+            "from endopilot.navigation.baseline_policies import Forward\nclass Pushes(Forward):\n    pass\n"
         )
         sys.path.insert(0, str(folder))
 
@@ -143,7 +143,7 @@ def test_an_origin_changes_with_the_file_of_a_policy(my_module):
 
 def test_only_what_is_asked_for_is_imported():
     code = (
-        "import sys\nfrom endopilot.control.policies import POLICIES\nPOLICIES.check('agent')\n"
+        "import sys\nfrom endopilot.navigation.policies import POLICIES\nPOLICIES.check('agent')\n"
         "assert 'endopilot.control.agent' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
@@ -151,12 +151,12 @@ def test_only_what_is_asked_for_is_imported():
 
 def test_a_shipped_object_that_is_missing_is_a_defect_and_no_bad_input():
     with pytest.raises(AttributeError):
-        Registry("policy", {"gone": "endopilot.control.policy:Gone"}, "endopilot.none").load("gone")
+        Registry("policy", {"gone": "endopilot.navigation.policy:Gone"}, "endopilot.none").load("gone")
 
 
 _RUDE = """
 import sys
-from endopilot.control.policy import Decision
+from endopilot.navigation.policy import Decision
 
 class Odd(BaseException):
     pass

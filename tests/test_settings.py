@@ -22,11 +22,11 @@ from hypothesis import strategies as st
 from pydantic import TypeAdapter, ValidationError, model_validator
 
 import endopilot
+from endopilot.devices.device import Device, read_device
 from endopilot.errors import InputError
 from endopilot.files import json_text
 from endopilot.settings import Ascending, Count, Finite, NonNegative, Positive, Within, from_record, read_settings
 from endopilot.settings import settings as settings_class
-from endopilot.simulation.device import Device, read_device
 
 ENDLESS = {("DriveLimits", "travel_mm[1]")}
 """Numbers that may be infinite."""

@@ -16,8 +16,8 @@ import numpy as np
 from endopilot.anatomy.io import write_anatomy
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.generate import generate_dataset
+from endopilot.devices.device import read_device
 from endopilot.files import read_json, write_json
-from endopilot.simulation.device import read_device
 from endopilot.types import (
     SAMPLE_PERIOD_S,
     Anatomy,

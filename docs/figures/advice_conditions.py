@@ -10,8 +10,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from endopilot.belief.advise import FIGURES_FILE
 from endopilot.files import read_json
-from endopilot.xray.advise import FIGURES_FILE
 
 PAGE = Path(__file__).parents[1] / "xray.md"
 BEGIN, END = "<!-- advice-conditions:begin -->\n", "<!-- advice-conditions:end -->"

@@ -10,9 +10,9 @@ from jaxtyping import Float
 
 from endopilot.anatomy.distance import sample
 from endopilot.atlas.atlas import AtlasConfig, make_patient
+from endopilot.devices.device import Device, read_device
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, random_controls
-from endopilot.simulation.device import Device, read_device
 from endopilot.simulation.rod import lay_out
 from endopilot.simulation.simulate import simulate
 from endopilot.types import Anatomy, Rollout

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from endopilot.dataset.loader import Dataset, load_dataset
+from endopilot.devices.device import read_device
 from endopilot.evaluation.metrics import OFF_WALL_MM
 from endopilot.evaluation.prediction_baselines import hold_slack
 from endopilot.files import read_json
@@ -25,7 +26,6 @@ from endopilot.models.open_loop import jumps
 from endopilot.models.rollout import load_model
 from endopilot.models.sequences import prepare_vessels, unfold
 from endopilot.models.simulated_wires import FRICTION_FACTORS, read_or_simulate
-from endopilot.simulation.device import read_device
 
 PAGE = Path(__file__).parents[1] / "learning.md"
 RUNS = {"`pretrained`": "seed-0", "seed 1": "seed-1", "seed 2": "seed-2", "`paper`": "paper"}

@@ -14,11 +14,11 @@ import numpy as np
 
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.control.agent import AgentPolicy, TwinPolicy
-from endopilot.control.mismatch import ModelMismatch
-from endopilot.control.navigate import navigate
-from endopilot.control.policies import make_policy
-from endopilot.control.policy import Policy
-from endopilot.simulation.device import Device, read_device
+from endopilot.devices.device import Device, read_device
+from endopilot.navigation.navigate import navigate
+from endopilot.navigation.policies import make_policy
+from endopilot.navigation.policy import Policy
+from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.tasks.navigation import Navigation, Target
 from endopilot.types import Anatomy
 

@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 
 from endopilot.dataset.loader import Dataset, load_dataset
+from endopilot.devices.device import Device
 from endopilot.models.config import WINDOW, TwinConfig
 from endopilot.models.episodes import Episodes
 from endopilot.models.twin import TwinPredictor
 from endopilot.settings import from_record
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.device import Device
 
 PAGE = Path(__file__).parents[1] / "models.md"
 SEED, OFF, DEEPER_MM = 600, 0.2, 0.3

@@ -9,8 +9,8 @@ import shutil
 import sys
 from pathlib import Path
 
+from endopilot.belief.advise import FIGURES_FILE, PICTURE_FILE
 from endopilot.files import read_json
-from endopilot.xray.advise import FIGURES_FILE, PICTURE_FILE
 
 PAGE, PICTURE = Path(__file__).parents[1] / "xray.md", Path(__file__).parents[1] / "images" / "xray.png"
 

@@ -10,10 +10,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from endopilot.belief.advise import FIGURES_FILE
 from endopilot.cli import main as endopilot
 from endopilot.dataset.loader import load_dataset
 from endopilot.files import read_json
-from endopilot.xray.advise import FIGURES_FILE
 
 PAGE = Path(__file__).parents[1] / "xray.md"
 BEGIN, END = "<!-- otherwise:begin -->\n", "<!-- otherwise:end -->"

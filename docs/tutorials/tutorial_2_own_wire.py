@@ -22,7 +22,7 @@ import numpy as np
 import yaml
 
 import endopilot
-from endopilot.simulation.device_files import device_yaml
+from endopilot.devices.device_files import device_yaml
 
 folder = Path(tempfile.mkdtemp())
 content = yaml.safe_load(device_yaml("workhorse-014")[1])

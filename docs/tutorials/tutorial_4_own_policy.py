@@ -38,7 +38,7 @@ print(inspect.getsource(TurnBack))
 # Try a policy on one navigation first. The task ``diagonal`` asks for the second diagonal branch of a left coronary
 # artery within 90 s and below 0.2 N. The shipped policy ``forward`` pushes and nothing else.
 
-from endopilot.control.baseline_policies import Forward
+from endopilot.navigation.baseline_policies import Forward
 from endopilot.tasks.task import find_task
 
 navigation = find_task("diagonal", 1).ladder_navigation(0)

@@ -51,8 +51,8 @@ print(f"{int(needed.exposure.sum())} exposures are due in {0.5 * len(route.contr
 # We subclass the agent only to record what it predicts.
 
 from endopilot.control.agent import AgentPolicy, OpenLoopPolicy
-from endopilot.control.baseline_policies import RetractRotate
-from endopilot.control.mismatch import ModelMismatch
+from endopilot.navigation.baseline_policies import RetractRotate
+from endopilot.simulation.mismatch import ModelMismatch
 
 
 class RecordedAgent(AgentPolicy):

@@ -9,7 +9,7 @@ import pytest
 
 from endopilot import cli
 from endopilot.benchmarks import beside, coaxial, scenes
-from endopilot.simulation.catheter import read_catheter
+from endopilot.devices.catheter import read_catheter
 
 
 @pytest.fixture(autouse=True)

@@ -24,9 +24,9 @@ from endopilot.benchmarks.published import (
 from endopilot.benchmarks.straightening import AortoIliac, Straightened
 from endopilot.benchmarks.three_point import flexural_modulus
 from endopilot.benchmarks.tubing import BORE_MM, LENGTH_MM, Push, draw_tubing, push_through
-from endopilot.simulation.catheter import read_catheter
+from endopilot.devices.catheter import read_catheter
+from endopilot.devices.device import read_device
 from endopilot.simulation.config import PRESETS
-from endopilot.simulation.device import read_device
 
 
 def test_a_full_round_wire_shows_the_modulus_of_its_steel() -> None:

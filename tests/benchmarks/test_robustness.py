@@ -14,14 +14,14 @@ from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.benchmarks import robustness
 from endopilot.benchmarks.manoeuvres import MANOEUVRES, paired_controls, robust_controls, stacks_of
 from endopilot.benchmarks.robustness import RobustnessConfig, measure_robustness
+from endopilot.devices.catheter import read_catheter
+from endopilot.devices.device import Device, read_device
+from endopilot.devices.device_files import list_devices
+from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.files import read_json
-from endopilot.simulation.catheter import read_catheter
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.device import Device, read_device
-from endopilot.simulation.device_files import list_devices
 from endopilot.simulation.simulate import simulate
-from endopilot.simulation.tubes import Stack
 from endopilot.types import Centerline
 
 DEVICE = read_device("workhorse-014")

@@ -10,8 +10,8 @@ import pytest
 from endopilot.cockpit.frames import decode
 from endopilot.cockpit.messages import Autopilot, Drive
 from endopilot.cockpit.session import AUTOPILOT_SILENCE_S, Session
-from endopilot.control.policy import BelievedTip, Decision
 from endopilot.errors import InputError
+from endopilot.navigation.policy import BelievedTip, Decision
 
 POLICIES = (
     "forward",

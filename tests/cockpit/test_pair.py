@@ -20,10 +20,10 @@ from endopilot.cockpit.open import resume_session
 from endopilot.cockpit.recording import read_recording, replayed
 from endopilot.cockpit.session import SILENCE_S, Session
 from endopilot.cockpit.world import World
+from endopilot.devices.catheter import read_catheter
+from endopilot.devices.device import read_device
 from endopilot.errors import InputError
-from endopilot.simulation.catheter import read_catheter
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.device import read_device
 from endopilot.simulation.simulate import simulate
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.table import write_rollout

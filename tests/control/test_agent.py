@@ -10,21 +10,21 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from endopilot.belief.adviser import AdviserConfig
+from endopilot.belief.bands import Calibration
+from endopilot.belief.belief import Belief, BeliefConfig
 from endopilot.control import search
 from endopilot.control.agent import CALIBRATIONS, AgentConfig, AgentPolicy, OpenLoopPolicy, TwinPolicy
-from endopilot.control.belief import Belief, BeliefConfig
 from endopilot.control.course import Course, Log
 from endopilot.control.halt import describe_halt
-from endopilot.control.mismatch import ModelMismatch
-from endopilot.control.navigate import NavigationLoop, navigate, start_world
 from endopilot.control.period import drive_period
-from endopilot.control.policy import Decision, Observation, Policy
 from endopilot.control.route import Route
 from endopilot.control.search import Search
+from endopilot.navigation.navigate import NavigationLoop, navigate, start_world
+from endopilot.navigation.policy import Decision, Observation, Policy
+from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.simulation.motion import motion_named
 from endopilot.tasks.navigation import Navigation, Target
-from endopilot.xray.adviser import AdviserConfig
-from endopilot.xray.bands import Calibration
 from endopilot.xray.fluoroscope import TipMeasurement
 
 QUICK = AgentConfig(belief=BeliefConfig(members=6, time_step_s=0.05))

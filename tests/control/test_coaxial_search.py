@@ -7,17 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from endopilot.control.belief import BeliefConfig
+from endopilot.belief.belief import BeliefConfig
 from endopilot.control.coaxial_agent import CoaxialAgent, CoaxialAgentConfig
 from endopilot.control.coaxial_copies import CoaxialCourse, CoaxialSearchConfig
 from endopilot.control.coaxial_search import CoaxialSearch
-from endopilot.control.mismatch import ModelMismatch
-from endopilot.control.navigate import NavigateConfig, navigate, start_world
-from endopilot.control.policy import Observation
+from endopilot.devices.catheter import read_catheter
 from endopilot.errors import InputError
 from endopilot.ladder.attempt import Recording, attempt, repeat
-from endopilot.simulation.catheter import read_catheter
+from endopilot.navigation.navigate import NavigateConfig, navigate, start_world
+from endopilot.navigation.policy import Observation
 from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target
 from endopilot.xray.fluoroscope import TipMeasurement

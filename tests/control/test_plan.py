@@ -18,6 +18,7 @@ from endopilot.control.desired import read_tips
 from endopilot.control.plan import plan, within_limits
 from endopilot.control.plan_config import PlanConfig
 from endopilot.control.plan_file import read_plan, write_plan
+from endopilot.devices.drive_limits import DriveLimits
 from endopilot.errors import InputError
 from endopilot.files import read_json, write_json
 from endopilot.models.config import WINDOW
@@ -25,7 +26,6 @@ from endopilot.models.episodes import Episodes
 from endopilot.models.open_loop import Observed, OpenLoop
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import read_controls_csv
-from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.simulation.simulate import simulate
 
 SLACK = 0.9

@@ -13,8 +13,8 @@ from endopilot.cli import main
 from endopilot.control.plan import plan
 from endopilot.control.plan_config import Plan, PlanConfig
 from endopilot.control.plan_file import read_plan, write_plan
+from endopilot.devices.catheter import read_catheter
 from endopilot.errors import InputError
-from endopilot.simulation.catheter import read_catheter
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import read_controls_csv
 from endopilot.simulation.simulate import simulate

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from endopilot.belief.bands import Calibration
+from endopilot.belief.belief import Belief
 from endopilot.control.agent import CALIBRATED
-from endopilot.control.belief import Belief
 from endopilot.control.plan_config import PlanConfig
 from endopilot.control.plan_file import read_plan, write_plan
 from endopilot.control.plan_xray import PlannedXray, plan_xray, read_calibration
@@ -19,7 +20,6 @@ from endopilot.files import write_json
 from endopilot.models.config import WINDOW
 from endopilot.models.episodes import Episodes
 from endopilot.models.open_loop import OpenLoop, Prediction
-from endopilot.xray.bands import Calibration
 
 STILL = (0.0, 0.0, 0.0, 0.0)
 

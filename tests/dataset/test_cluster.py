@@ -13,9 +13,9 @@ from test_generate import data_hashes
 
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.generate import generate_dataset
+from endopilot.devices.device import read_device
 from endopilot.errors import InputError
 from endopilot.files import read_json
-from endopilot.simulation.device import read_device
 from toy_navigation import make_toy_dataset, write_toy_anatomies
 
 HAS_DASK = importlib.util.find_spec("distributed") is not None

@@ -22,9 +22,9 @@ from endopilot.cli import main
 from endopilot.dataset import layout
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.loader import load_dataset
+from endopilot.devices.device_files import device_yaml
 from endopilot.errors import InputError
 from endopilot.files import read_json, sha256
-from endopilot.simulation.device_files import device_yaml
 from toy_navigation import make_toy_dataset, toy_anatomy, toy_simulate
 
 

@@ -19,12 +19,12 @@ from endopilot.dataset.info import describe_dataset
 from endopilot.dataset.join import load_joined
 from endopilot.dataset.loader import load_dataset
 from endopilot.dataset.navigations import STOP_SHORT_MM, simulate_navigations
+from endopilot.devices.catheter import read_catheter
+from endopilot.devices.device import read_device
 from endopilot.errors import InputError
 from endopilot.files import read_json
 from endopilot.models.episodes import Episodes
 from endopilot.models.provenance import check_wire
-from endopilot.simulation.catheter import read_catheter
-from endopilot.simulation.device import read_device
 from endopilot.simulation.simulate import simulate
 
 WIRE, CATHETER = read_device("workhorse-014"), read_catheter("microcatheter-1.7f")

@@ -16,9 +16,9 @@ from endopilot.dataset.episode import write_episode
 from endopilot.dataset.generate import generate_dataset
 from endopilot.dataset.loader import load_dataset
 from endopilot.dataset.navigations import PULL_BACK_MM, STOP_SHORT_MM, simulate_navigations
+from endopilot.devices.device import read_device
 from endopilot.evaluation.replay import Recorded
 from endopilot.models.config import WINDOW
-from endopilot.simulation.device import read_device
 from endopilot.simulation.motion import motion_named
 from endopilot.simulation.simulate import simulate
 

@@ -14,9 +14,9 @@ import endopilot
 from endopilot.anatomy.io import write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.cli import main
+from endopilot.devices.device_files import device_yaml
 from endopilot.files import read_json
 from endopilot.imaging.volume import write_mask, write_volume
-from endopilot.simulation.device_files import device_yaml
 from endopilot.types import Insertion, LumenMask, Volume
 
 
@@ -94,7 +94,7 @@ def test_centerline_without_radii(tmp_path, capsys):
 
 
 def test_wire_and_controls(tmp_path, capsys, patient):
-    device = (Path(endopilot.__file__).parent / "simulation/devices/j-035.yaml").read_text(encoding="utf-8")
+    device = (Path(endopilot.__file__).parent / "devices/wires/j-035.yaml").read_text(encoding="utf-8")
     assert "value: 0.89" in device
     (tmp_path / "thick.yaml").write_text(device.replace("value: 0.89", "value: 5.5", 1), encoding="utf-8")
     header = "time_s,translation_mm_s,rotation_rad_s\n"

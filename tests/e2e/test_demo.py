@@ -12,10 +12,10 @@ import time
 import command
 
 from endopilot import __version__
+from endopilot.devices.device import read_device
 from endopilot.files import read_json
 from endopilot.pipeline.study import DemoConfig
 from endopilot.runs import claim
-from endopilot.simulation.device import read_device
 
 SIZE = ("--patients", "3", "--sequences", "6", "--seconds", "25")
 STAGES = ["atlas", "phantom", "segmentation", "anatomy", "navigation", "dataset", "evaluation", "report"]

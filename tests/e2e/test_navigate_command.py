@@ -15,10 +15,10 @@ from endopilot.cli import main
 from endopilot.control.navigate_patient import NavigatePatientConfig, navigate_patient, set_up_navigation
 from endopilot.control.outcome import tell_outcome
 from endopilot.dataset.loader import load_dataset
+from endopilot.devices.catheter import read_catheter
 from endopilot.files import read_json
 from endopilot.pipeline import navigation
 from endopilot.report.navigation_figure import navigation_figure
-from endopilot.simulation.catheter import read_catheter
 from endopilot.simulation.motion import motion_named
 
 SHORT = ("--tip", "own", "--seconds", "20")

@@ -122,7 +122,7 @@ def test_a_target_behind_an_occlusion(fork, tmp_path, capsys):
 
 def test_a_branch_that_the_wire_does_not_get_into(patient, tmp_path, capsys):
     """A wire without a bend at its tip."""
-    from endopilot.simulation.device_files import device_yaml
+    from endopilot.devices.device_files import device_yaml
 
     text = device_yaml("workhorse-014")[1].replace("angle_deg: 45", "angle_deg: 0")
     (tmp_path / "straight.yaml").write_text(text)

@@ -15,11 +15,11 @@ import pydicom
 import pytest
 
 from endopilot.atlas.atlas import AtlasConfig, make_patient
+from endopilot.devices.device_files import device_yaml
 from endopilot.files import input_hash, read_json
 from endopilot.imaging.volume import write_volume
 from endopilot.phantom.phantom import PhantomConfig, make_phantom
 from endopilot.pipeline import study
-from endopilot.simulation.device_files import device_yaml
 from endopilot.types import Volume
 
 STAGES = ["read", "segmentation", "anatomy", "dataset", "training", "evaluation", "report"]

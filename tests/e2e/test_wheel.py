@@ -68,7 +68,7 @@ def test_the_wheel_holds_the_whole_package(wheel: Path) -> None:
     assert files - held == set()
     core = held - files
     assert core and all(re.fullmatch(r"endopilot/_core\w*\.[\w.-]+\.so", name) for name in core)
-    for needed in ("py.typed", "__init__.pyi", "simulation/devices/workhorse-014.yaml", "tasks/ladder_2/crux.yaml"):
+    for needed in ("py.typed", "__init__.pyi", "devices/wires/workhorse-014.yaml", "tasks/ladder_2/crux.yaml"):
         assert f"endopilot/{needed}" in held
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from endopilot.cli import main
 from endopilot.dataset.loader import load_dataset
+from endopilot.devices.drive_limits import SPARE_MM
 from endopilot.errors import InputError
 from endopilot.evaluation.evaluate import EvaluateConfig, evaluate
 from endopilot.evaluation.protocols import count_steps, run_protocols
@@ -18,7 +19,6 @@ from endopilot.files import read_json, write_json
 from endopilot.models.config import WINDOW
 from endopilot.models.open_loop import OpenLoop, begin_after
 from endopilot.report.evaluation_report import report_evaluation
-from endopilot.simulation.drive_limits import SPARE_MM
 from toy_navigation import LENGTH_MM, make_toy_dataset, toy_simulate
 
 

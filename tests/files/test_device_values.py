@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from make_devices import catheter, uniform, wire, write
 
+from endopilot.devices.catheter import list_catheters, read_catheter
+from endopilot.devices.device import read_device
+from endopilot.devices.device_files import list_devices
 from endopilot.errors import InputError
-from endopilot.simulation.catheter import list_catheters, read_catheter
-from endopilot.simulation.device import read_device
-from endopilot.simulation.device_files import list_devices
 
 SOURCED = "{name}.value: {value}; give a number from"
 

@@ -13,9 +13,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from make_devices import catheter, wire
 
+from endopilot.devices.catheter import read_catheter
+from endopilot.devices.device import read_device
 from endopilot.errors import InputError
-from endopilot.simulation.catheter import read_catheter
-from endopilot.simulation.device import read_device
 
 BOUNDED = settings(
     max_examples=50,

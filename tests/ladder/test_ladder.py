@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from endopilot import runs
+from endopilot.devices.device import read_device
 from endopilot.errors import InputError
 from endopilot.ladder import attempt as attempts
 from endopilot.ladder import ladder, submission
@@ -17,7 +18,6 @@ from endopilot.ladder.attempt import attempt
 from endopilot.ladder.ladder import LadderConfig, climb
 from endopilot.ladder.scores import score
 from endopilot.report.ladder_page import write_page
-from endopilot.simulation.device import read_device
 from endopilot.tasks.task import find_task, ladder_tasks
 from endopilot.types import TipProjection
 
@@ -98,11 +98,11 @@ def test_another_wire_of_the_same_name_or_another_version_is_refused(climbed, mo
 def test_a_changed_policy_of_one_s_own_is_refused(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     policy = tmp_path / "my_changing_policy.py"
-    policy.write_text("from endopilot.control.baseline_policies import Forward as Mine\n")
+    policy.write_text("from endopilot.navigation.baseline_policies import Forward as Mine\n")
     one = LadderConfig(policy="my_changing_policy:Mine", tasks=("straight",), patients=1)
     monkeypatch.setattr(runs, "each", lambda title, items, work: [work(item) for item in items] and {})
     climb(tmp_path / "runs", one)
-    policy.write_text("from endopilot.control.baseline_policies import Spin as Mine\n")
+    policy.write_text("from endopilot.navigation.baseline_policies import Spin as Mine\n")
     with pytest.raises(InputError, match=r"was begun with origin = my_changing_policy\.py sha256:"):
         climb(tmp_path / "runs", one)
 

@@ -12,18 +12,18 @@ import numpy as np
 import pytest
 
 from endopilot.cli import main
+from endopilot.devices.device import read_device
 from endopilot.errors import InputError
 from endopilot.files import json_text
 from endopilot.ladder import submission
 from endopilot.ladder.attempt import Recording, attempt, repeat
 from endopilot.ladder.ladder import LadderConfig, climb
 from endopilot.ladder.submission import check_submission
-from endopilot.simulation.device import read_device
 from endopilot.tasks.task import find_task
 
 _POLICY = """
 import numpy as np
-from endopilot.control.policy import Decision
+from endopilot.navigation.policy import Decision
 
 class Hurried:
     def start(self, navigation, seed):

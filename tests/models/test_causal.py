@@ -14,6 +14,8 @@ from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.generate import generate_dataset
 from endopilot.dataset.loader import Dataset, load_dataset
+from endopilot.devices.device import read_device
+from endopilot.devices.drive_limits import DriveLimits
 from endopilot.errors import InputError
 from endopilot.evaluation.prediction_baselines import follow_slack, hold_slack, mean_control
 from endopilot.files import read_json, sha256
@@ -28,8 +30,6 @@ from endopilot.models.sequences import N_INPUTS, Sequences, prepare_vessels, unf
 from endopilot.models.simulated_wires import FRICTION_FACTORS, SimulatedWires, read_or_simulate, simulated_tips
 from endopilot.models.train import train
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.device import read_device
-from endopilot.simulation.drive_limits import DriveLimits
 
 GIVEN = 30
 SMALL = CausalConfig(width=8)

@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 
 from endopilot.dataset.loader import Dataset, load_dataset
+from endopilot.devices.device import read_device
 from endopilot.errors import InputError
 from endopilot.files import read_json
 from endopilot.models.config import PRETRAINED, TrainConfig, TransformerConfig, run_path
 from endopilot.models.provenance import trained_patients
 from endopilot.models.train import train
-from endopilot.simulation.device import read_device
 from toy_navigation import make_toy_dataset
 
 SMALL = TransformerConfig(d_model=24, heads=2, encoder_layers=1, decoder_layers=1, feedforward=32)

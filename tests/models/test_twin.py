@@ -12,6 +12,7 @@ from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.generate import generate_dataset
 from endopilot.dataset.loader import load_dataset
+from endopilot.devices.device import read_device
 from endopilot.errors import InputError
 from endopilot.models import twin as twin_module
 from endopilot.models.config import TrainConfig, TwinConfig
@@ -19,7 +20,6 @@ from endopilot.models.episodes import Episodes
 from endopilot.models.rollout import load_model
 from endopilot.models.simulated_wires import simulated_tips
 from endopilot.models.train import train
-from endopilot.simulation.device import read_device
 from endopilot.simulation.simulate import simulate
 
 GIVEN = np.arange(45) < 30

@@ -5,12 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 
+from endopilot.devices.catheter import read_catheter
+from endopilot.devices.stack import SHOWN_BEHIND_MM, Stack
 from endopilot.report import still
 from endopilot.report.scene import navigation_scene, visible_devices
 from endopilot.report.still import LIBRARIES_MISSING, render_still
 from endopilot.report.wall_mesh import wall_mesh
-from endopilot.simulation.catheter import read_catheter
-from endopilot.simulation.tubes import SHOWN_BEHIND_MM, Stack
 from endopilot.types import CatheterMotion, DistanceMap, Rollout
 
 CENTRE, SQUEEZE = np.array([1.0, 2.0, 3.0]), np.array([1.0, 2.0, 1.5])

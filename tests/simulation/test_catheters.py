@@ -12,13 +12,13 @@ import pytest
 import endopilot
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.benchmarks.manoeuvres import paired_controls, seed_of
+from endopilot.devices.catheter import Catheter, list_catheters, read_catheter
+from endopilot.devices.device import read_device
+from endopilot.devices.stack import Stack, lines_from_tips
 from endopilot.errors import InputError
-from endopilot.simulation.catheter import Catheter, list_catheters, read_catheter
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import read_controls_csv
-from endopilot.simulation.device import read_device
 from endopilot.simulation.table import write_rollout
-from endopilot.simulation.tubes import Stack, lines_from_tips
 from endopilot.types import Anatomy, Rollout
 
 SHIPPED = Path(endopilot.__file__).parent / "simulation/catheters"

@@ -10,14 +10,14 @@ from bend import vessel
 
 from endopilot.anatomy.distance import sample
 from endopilot.atlas.atlas import AtlasConfig, make_patient
+from endopilot.devices.catheter import read_catheter
+from endopilot.devices.device import read_device
 from endopilot.errors import InputError
-from endopilot.simulation.catheter import read_catheter
 from endopilot.simulation.config import (
     COMPLIANT_WALL_AT_TIP_MM,
     COMPLIANT_WALL_STIFFENING_MM2,
     SimulatorConfig,
 )
-from endopilot.simulation.device import read_device
 from endopilot.simulation.simulate import simulate
 from endopilot.simulation.simulator import Simulator
 

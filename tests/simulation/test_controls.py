@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from bend import vessel
 
+from endopilot.devices.device import read_device
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, free_wire_load, random_controls, read_controls_csv
-from endopilot.simulation.device import read_device
 from endopilot.simulation.simulate import simulate
 
 

@@ -9,9 +9,9 @@ import pytest
 from bend import vessel
 
 from endopilot import _core
+from endopilot.devices.device import read_device
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.core import of_device, run_core
-from endopilot.simulation.device import read_device
 from endopilot.simulation.simulate import simulate
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import SimulatorState

@@ -13,10 +13,10 @@ from bend import vessel
 from endopilot.anatomy.io import write_anatomy
 from endopilot.atlas.heart_reference import LEFT_VENTRICLE_AXIS, TO_CRUX
 from endopilot.cli import simulate as command
+from endopilot.devices.catheter import read_catheter
+from endopilot.devices.device import read_device
 from endopilot.errors import InputError
-from endopilot.simulation.catheter import read_catheter
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.device import read_device
 from endopilot.simulation.motion import Motion, draw_motion, motion_named, place
 from endopilot.simulation.simulate import simulate
 from endopilot.simulation.simulator import Simulator

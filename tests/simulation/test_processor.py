@@ -14,9 +14,9 @@ from bend import vessel
 
 from endopilot import _core
 from endopilot.benchmarks.gpu import bench_gpu
+from endopilot.devices.device import read_device
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.device import read_device
 from endopilot.simulation.processor import core_for
 from endopilot.simulation.simulate import simulate
 from endopilot.simulation.simulator import Simulator

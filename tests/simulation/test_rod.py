@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from endopilot.devices.device import read_device
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.core import make_lumen, run_core
-from endopilot.simulation.device import read_device
 from endopilot.simulation.rod import lay_out
 from endopilot.types import DistanceMap, Insertion
 

@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 from endopilot.anatomy.catheter_axis import turned_axis, with_axis, with_world_zero
 from endopilot.anatomy.distance import add_catheter, distance_map_from_spheres
 from endopilot.anatomy.tree import Line, tree_from_lines
+from endopilot.devices.device import read_device
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.device import read_device
 from endopilot.simulation.simulate import simulate
 from endopilot.types import Anatomy, Insertion
 

@@ -12,9 +12,9 @@ import pytest
 from bend import BEND, vessel
 from jaxtyping import Float
 
+from endopilot.devices.device import read_device
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.device import read_device
 from endopilot.simulation.simulate import WALL_FORCE_LIMIT_N, WallForceEvent, simulate, wall_force_events
 from endopilot.simulation.simulator import Simulator
 from endopilot.types import Anatomy, Insertion
@@ -218,7 +218,7 @@ import numpy as np, sys
 sys.path.insert(0, sys.argv[1])
 from bend import BEND, vessel
 from endopilot.errors import InputError
-from endopilot.simulation.device import read_device
+from endopilot.devices.device import read_device
 from endopilot.simulation.simulate import WALL_FORCE_LIMIT_N, WallForceEvent, simulate, wall_force_events
 from endopilot.simulation.simulator import Simulator
 anatomy, device, good = vessel(), read_device("workhorse-014"), np.zeros((2, 4, 2))

@@ -14,9 +14,9 @@ import pytest
 from bend import vessel
 from scipy.spatial.transform import Rotation
 
+from endopilot.devices.device import read_device
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.device import read_device
 from endopilot.simulation.readout import Readout
 from endopilot.simulation.simulate import simulate
 from endopilot.simulation.simulator import Simulator
@@ -149,7 +149,7 @@ def test_restored_state_goes_on_with_the_same_bits(anatomy: Anatomy, tmp_path: P
 import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})
 import numpy as np
 from bend import vessel
-from endopilot.simulation.device import read_device
+from endopilot.devices.device import read_device
 from endopilot.simulation.state import SimulatorState
 from endopilot.simulation.readout import Readout
 from endopilot.simulation.simulator import Simulator

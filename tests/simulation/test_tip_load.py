@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from endopilot.simulation.device import read_device
-from endopilot.simulation.device_files import list_devices
+from endopilot.devices.device import read_device
+from endopilot.devices.device_files import list_devices
 from endopilot.simulation.tip_load import HELD_MM, TOLERANCE, simulate_tip_load, tip_load_row
 
 

@@ -7,11 +7,11 @@ import pytest
 
 import endopilot
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.simulation.catheter import Catheter, read_catheter
+from endopilot.devices.catheter import Catheter, read_catheter
+from endopilot.devices.device import read_device
+from endopilot.devices.stack import Stack
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.core import make_lumen
-from endopilot.simulation.device import read_device
-from endopilot.simulation.tubes import Stack
 from endopilot.simulation.vessel_wall import FINE_MM, make_wall
 from endopilot.types import Anatomy
 

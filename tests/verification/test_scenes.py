@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from endopilot.simulation.device import read_device
+from endopilot.devices.device import read_device
 from endopilot.verification import scenes as scenarios
 
 

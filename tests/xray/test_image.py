@@ -9,7 +9,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.special import erf
 
-from endopilot.simulation.catheter import read_catheter
+from endopilot.devices.catheter import read_catheter
 from endopilot.types import Insertion, Volume
 from endopilot.xray.absorbers import (
     CATHETER_MM,

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import endopilot
 from endopilot.atlas.atlas import AtlasConfig, make_patient
+from endopilot.devices.device import read_device
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, random_controls
-from endopilot.simulation.device import read_device
 from endopilot.simulation.simulate import simulate
 
 

@@ -10,11 +10,11 @@ from jaxtyping import Float
 
 from endopilot.benchmarks.beside import bench_beside, error_in_time, fine_steps, node_iterations_per_second
 from endopilot.benchmarks.scenes import SAMPLES, SEED, WORLDS, Scene, make_scenes
-from endopilot.simulation.catheter import Catheter
+from endopilot.devices.catheter import Catheter
+from endopilot.devices.stack import Stack
 from endopilot.simulation.config import PRESETS, Preset, SimulatorConfig, wall_stiffness
 from endopilot.simulation.controls import ControlConfig, random_controls
 from endopilot.simulation.simulate import simulate
-from endopilot.simulation.tubes import Stack
 from endopilot.types import Rollout
 
 LEAST_SHARE = 1 / 3

@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 
 from endopilot.anatomy.io import write_anatomy
+from endopilot.devices.catheter import read_catheter
 from endopilot.errors import InputError
-from endopilot.simulation.catheter import read_catheter
 from endopilot.tasks.task import reference_navigation
 
 BARS = {

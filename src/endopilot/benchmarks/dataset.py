@@ -11,11 +11,11 @@ from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.generate import generate_dataset
 from endopilot.dataset.schema import MANIFEST_PATH
+from endopilot.devices.device import read_device
 from endopilot.errors import InputError
 from endopilot.files import processor_name, read_json
 from endopilot.progress import progress
 from endopilot.runs import claim
-from endopilot.simulation.device import read_device
 
 PAPER_ANATOMIES, PAPER_SEQUENCES = 100, 1000
 """Kim et al. 2023: random navigations of 60 s in each of 100 anatomies."""

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.simulation.catheter import list_catheters, read_catheter
+from endopilot.devices.catheter import list_catheters, read_catheter
+from endopilot.devices.device import Device, read_device
+from endopilot.devices.device_files import list_devices
+from endopilot.devices.drive_limits import within_travel
+from endopilot.devices.stack import Stack
 from endopilot.simulation.controls import ControlConfig, random_controls
-from endopilot.simulation.device import Device, read_device
-from endopilot.simulation.device_files import list_devices
-from endopilot.simulation.drive_limits import within_travel
-from endopilot.simulation.tubes import Stack
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
 MANOEUVRES = ("within", "beyond", "against the end", "pulled out")

@@ -26,11 +26,11 @@ from endopilot.benchmarks.straightening import (
 )
 from endopilot.benchmarks.three_point import SPAN_MM, flexural_modulus
 from endopilot.benchmarks.tubing import BORE_MM, LENGTH_MM, draw_tubing, push_through
+from endopilot.devices.catheter import Catheter, read_catheter
+from endopilot.devices.device import Device, read_device
+from endopilot.devices.device_files import list_devices
 from endopilot.progress import progress
 from endopilot.settings import Within, settings
-from endopilot.simulation.catheter import Catheter, read_catheter
-from endopilot.simulation.device import Device, read_device
-from endopilot.simulation.device_files import list_devices
 from endopilot.simulation.tip_load import simulate_tip_load
 
 Kind = Literal["prediction", "calibration", "sensitivity"]

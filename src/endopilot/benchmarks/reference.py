@@ -18,10 +18,10 @@ import numpy as np
 
 from endopilot.benchmarks.errors import error_figures
 from endopilot.benchmarks.scenes import DEVICE, SAMPLES, SEED, WORLDS, Scene, Solution, make_scenes
+from endopilot.devices.device import Device
 from endopilot.errors import InputError
 from endopilot.files import json_text, manifest, writing
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.device import Device
 
 REFERENCE_FILE = Path(__file__).with_name("reference.npz")
 """The reference that is shipped."""

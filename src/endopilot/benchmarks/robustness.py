@@ -26,18 +26,18 @@ from endopilot.anatomy.io import read_anatomy
 from endopilot.anatomy.projection import project_tip
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.benchmarks.manoeuvres import MANOEUVRES, name_of, paired_controls, seed_of, stacks_of
+from endopilot.devices.catheter import list_catheters, read_catheter
+from endopilot.devices.device import read_device
+from endopilot.devices.device_files import list_devices
+from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.files import read_json, sha256, write_json, writing
 from endopilot.parallel import Workers
 from endopilot.progress import progress
 from endopilot.runs import claim
 from endopilot.settings import Within, settings
-from endopilot.simulation.catheter import list_catheters, read_catheter
 from endopilot.simulation.config import SimulatorConfig, wall_stiffness
-from endopilot.simulation.device import read_device
-from endopilot.simulation.device_files import list_devices
 from endopilot.simulation.simulate import WALL_FORCE_LIMIT_N, simulate, why_invalid
-from endopilot.simulation.tubes import Stack
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, Rollout
 
 MOST_INVALID_SHARE = 1e-3

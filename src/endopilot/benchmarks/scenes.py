@@ -10,9 +10,9 @@ from jaxtyping import Bool, Float, Int
 
 from endopilot.anatomy.catheter_axis import with_world_zero
 from endopilot.atlas.atlas import AtlasConfig, make_patient
+from endopilot.devices.device import Device, read_device
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, random_controls
-from endopilot.simulation.device import Device, read_device
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulate import simulate
 from endopilot.types import Anatomy, Rollout

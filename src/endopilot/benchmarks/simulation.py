@@ -17,8 +17,8 @@ from endopilot.benchmarks.beside import node_iterations_per_second
 from endopilot.benchmarks.errors import error_figures, error_intervals
 from endopilot.benchmarks.reference import REFERENCE_FILE, check_reference, read_reference
 from endopilot.benchmarks.scenes import DEVICE, KINDS, SEED, Scene, Solution, make_scenes
+from endopilot.devices.device import read_device
 from endopilot.simulation.config import PRESETS, Preset, SimulatorConfig, wall_stiffness
-from endopilot.simulation.device import read_device
 from endopilot.simulation.simulator import Simulator
 from endopilot.types import SAMPLE_PERIOD_S, Rollout
 

@@ -20,8 +20,8 @@ from scipy.spatial import KDTree
 
 from endopilot.anatomy.distance import add_catheter, distance_map_from_spheres, sample
 from endopilot.anatomy.tree import make_centerline
+from endopilot.devices.device import Device
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.device import Device
 from endopilot.simulation.rod import POISSON_RATIO
 from endopilot.simulation.simulate import simulate
 from endopilot.types import Anatomy, Branch, DistanceMap, Insertion, VesselTree

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from endopilot import _core
+from endopilot.devices.device import Device
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.core import run_core
-from endopilot.simulation.device import Device
 from endopilot.simulation.rod import POISSON_RATIO, SHEAR_CORRECTION, RodLayout
 from endopilot.types import Insertion
 

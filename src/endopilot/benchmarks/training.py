@@ -17,12 +17,12 @@ from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.generate import generate_dataset
 from endopilot.dataset.loader import load_dataset
+from endopilot.devices.device import read_device
 from endopilot.models.checkpoint import make_network
 from endopilot.models.config import TrainConfig
 from endopilot.models.process_group import ProcessGroup
 from endopilot.models.train import AnyNetwork, Examples, Job, examples_of
 from endopilot.runs import claim
-from endopilot.simulation.device import read_device
 
 STEPS = 20
 """Steps of each loop in one round."""

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.benchmarks.analytic_lumens import tree_of
-from endopilot.simulation.catheter import Catheter
+from endopilot.devices.catheter import Catheter
+from endopilot.devices.device import Device
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.device import Device
 from endopilot.simulation.simulate import simulate
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, DistanceMap, Insertion
 

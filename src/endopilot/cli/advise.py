@@ -6,9 +6,9 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
+from endopilot.belief.advise import FIGURES_FILE, PICTURE_FILE, advise
+from endopilot.belief.monitoring import AdviseConfig
 from endopilot.cli.arguments import OutputFolder, existing, show
-from endopilot.xray.advise import FIGURES_FILE, PICTURE_FILE, advise
-from endopilot.xray.monitoring import AdviseConfig
 
 
 def command(

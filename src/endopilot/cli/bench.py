@@ -54,7 +54,7 @@ def simulation(
     from endopilot.benchmarks.reference import REFERENCE_FILE
     from endopilot.benchmarks.reference import make_reference as make
     from endopilot.benchmarks.simulation import bench_simulation
-    from endopilot.simulation.catheter import read_catheter
+    from endopilot.devices.catheter import read_catheter
 
     moves = motion_named(motion)
     if catheter is not None and moves is not None:

@@ -8,9 +8,9 @@ from tyro.conf import Positional
 
 from endopilot.cli.arguments import OutputFolder, existing, show
 from endopilot.dataset.config import DatasetConfig
+from endopilot.devices.catheter import read_catheter
+from endopilot.devices.device import read_device
 from endopilot.files import read_json
-from endopilot.simulation.catheter import read_catheter
-from endopilot.simulation.device import read_device
 
 
 def command(

@@ -8,9 +8,9 @@ from typing import Any
 from tyro.conf import Positional
 
 from endopilot.cli.arguments import show_rows
+from endopilot.devices.device import read_device
+from endopilot.devices.device_files import device_file, device_yaml, is_shipped, list_devices, user_devices
 from endopilot.errors import InputError
-from endopilot.simulation.device import read_device
-from endopilot.simulation.device_files import device_file, device_yaml, is_shipped, list_devices, user_devices
 from endopilot.simulation.tip_load import tip_load_row
 
 EXIT_FAILED = 1

@@ -9,13 +9,13 @@ import time
 from pathlib import Path
 from typing import Annotated
 
-from endopilot.control.drive import Drive
-from endopilot.control.drive_protocol import tls_context
-from endopilot.control.drive_server import serve
-from endopilot.control.robot import RobotConfig
+from endopilot.devices.device import read_device
+from endopilot.devices.drive_limits import DriveLimits
+from endopilot.robot.drive import Drive
+from endopilot.robot.drive_protocol import tls_context
+from endopilot.robot.drive_server import serve
+from endopilot.robot.robot import RobotConfig
 from endopilot.settings import Finite, Within, settings
-from endopilot.simulation.device import read_device
-from endopilot.simulation.drive_limits import DriveLimits
 
 
 @settings

@@ -11,8 +11,8 @@ from endopilot.control.plan import plan
 from endopilot.control.plan_config import PlanConfig
 from endopilot.control.plan_file import write_plan
 from endopilot.control.plan_xray import plan_xray, read_calibration
+from endopilot.devices.catheter import read_catheter
 from endopilot.errors import InputError
-from endopilot.simulation.catheter import read_catheter
 
 
 def command(

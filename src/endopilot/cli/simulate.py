@@ -14,16 +14,16 @@ from endopilot.anatomy.io import read_anatomy
 from endopilot.cli.arguments import OutputFile, existing, show
 from endopilot.control.plan_file import read_plan
 from endopilot.dataset.navigations import simulate_navigations
+from endopilot.devices.catheter import read_catheter
+from endopilot.devices.device import read_device
+from endopilot.devices.stack import Stack
 from endopilot.progress import progress
 from endopilot.settings import LONGEST_S, Seed, Within, settings
-from endopilot.simulation.catheter import read_catheter
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, random_controls, read_controls_csv
-from endopilot.simulation.device import read_device
 from endopilot.simulation.motion import Motion, MotionName, motion_named
 from endopilot.simulation.simulate import simulate, wall_force_events
 from endopilot.simulation.table import write_rollout
-from endopilot.simulation.tubes import Stack
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, Rollout
 
 

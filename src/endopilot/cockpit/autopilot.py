@@ -16,10 +16,10 @@ import numpy as np
 
 from endopilot.cockpit.frames import encode
 from endopilot.cockpit.world import Snapshot, World
-from endopilot.control.policies import make_policy
-from endopilot.control.policy import BelievedTip, Believer, Decision, Led, Observation, Policy
 from endopilot.errors import InputError
-from endopilot.simulation.tubes import shown_part
+from endopilot.navigation.policies import make_policy
+from endopilot.navigation.policy import BelievedTip, Believer, Decision, Led, Observation, Policy
+from endopilot.devices.stack import shown_part
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target
 from endopilot.xray.fluoroscope import Fluoroscope, FluoroscopeConfig, TipMeasurement
 

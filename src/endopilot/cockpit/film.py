@@ -17,16 +17,16 @@ from jaxtyping import Float
 from endopilot.anatomy.io import read_anatomy
 from endopilot.cockpit.recording import SUFFIX, read_recording, replayed
 from endopilot.cockpit.world import Snapshot, take_snapshot
-from endopilot.control.navigate import NavigateConfig, NavigationLoop
 from endopilot.control.plan_file import read_plan
 from endopilot.dataset.loader import load_dataset
+from endopilot.devices.catheter import read_catheter
+from endopilot.devices.device import read_device
 from endopilot.errors import InputError
 from endopilot.files import read_json, reading
 from endopilot.ladder.attempt import Recording, Repeated, navigation_seed
-from endopilot.simulation.catheter import read_catheter
+from endopilot.navigation.navigate import NavigateConfig, NavigationLoop
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import read_controls_csv
-from endopilot.simulation.device import read_device
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target
 from endopilot.tasks.task import CORE, find_task

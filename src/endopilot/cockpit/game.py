@@ -20,9 +20,9 @@ from endopilot.cockpit.frames import encode
 from endopilot.cockpit.recording import Recorder
 from endopilot.cockpit.session import Session
 from endopilot.cockpit.world import Snapshot, World, WorldConfig
-from endopilot.control.record import Track
 from endopilot.errors import InputError
 from endopilot.ladder.attempt import Recording, attempt, figures, navigation_seed
+from endopilot.navigation.record import Track
 from endopilot.parallel import Workers
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import DECISION_PERIOD_S

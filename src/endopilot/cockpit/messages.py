@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from endopilot.simulation.catheter import MOST_CATHETERS
+from endopilot.devices.catheter import MOST_CATHETERS
 
 LONGEST_MESSAGE = 2048
 """A longer message closes the connection, bytes."""

@@ -18,9 +18,9 @@ from endopilot.cockpit.loop import Stage
 from endopilot.cockpit.recording import SUFFIX, Recorder, Where, read_recording, replayed
 from endopilot.cockpit.session import Session
 from endopilot.cockpit.world import World
-from endopilot.control.policies import POLICIES
-from endopilot.simulation.catheter import Catheter, read_catheter
-from endopilot.simulation.device import Device, read_device
+from endopilot.devices.catheter import Catheter, read_catheter
+from endopilot.devices.device import Device, read_device
+from endopilot.navigation.policies import POLICIES
 from endopilot.tasks.navigation import Navigation, Target
 from endopilot.types import Anatomy, Volume
 from endopilot.xray.image import XrayImager

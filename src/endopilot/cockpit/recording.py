@@ -19,11 +19,11 @@ import numpy as np
 from endopilot import __version__
 from endopilot.anatomy.io import read_anatomy
 from endopilot.cockpit.world import World, WorldConfig
+from endopilot.devices.catheter import Catheter
+from endopilot.devices.device import Device
 from endopilot.errors import InputError
 from endopilot.files import json_text, reading
 from endopilot.settings import from_record
-from endopilot.simulation.catheter import Catheter
-from endopilot.simulation.device import Device
 from endopilot.tasks.navigation import Navigation, Target
 
 FORMAT = "endopilot cockpit 1"

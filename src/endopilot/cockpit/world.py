@@ -14,16 +14,16 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.control.mismatch import ModelMismatch
-from endopilot.control.navigate import start_world
-from endopilot.control.robot import RobotConfig, SimulatedRobot
+from endopilot.devices.drive_limits import DriveLimits
+from endopilot.devices.stack import lines_from_tips, shown_part
 from endopilot.errors import InputError
+from endopilot.navigation.navigate import start_world
+from endopilot.robot.robot import RobotConfig, SimulatedRobot
 from endopilot.settings import Within, settings
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.drive_limits import DriveLimits
+from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import Step
-from endopilot.simulation.tubes import lines_from_tips, shown_part
 from endopilot.tasks.navigation import Navigation, Target
 from endopilot.types import TipProjection
 

@@ -15,20 +15,20 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.control.belief import Belief, BeliefConfig
+from endopilot.belief.adviser import AdviserConfig, XrayAdviser
+from endopilot.belief.bands import Calibration
+from endopilot.belief.belief import Belief, BeliefConfig
 from endopilot.control.course import Course
 from endopilot.control.halt import SPARE_SHARE
-from endopilot.control.mismatch import ModelMismatch
-from endopilot.control.policy import BelievedTip, Decision, Observation
 from endopilot.control.route import Route, check_passable
 from endopilot.control.search import Search, SearchConfig
+from endopilot.devices.drive_limits import DriveLimits
+from endopilot.navigation.policy import BelievedTip, Decision, Observation
 from endopilot.progress import Advance
 from endopilot.settings import Positive, Within, settings
-from endopilot.simulation.drive_limits import DriveLimits
+from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, XrayKind, check_wire_alone
 from endopilot.types import TipProjection
-from endopilot.xray.adviser import AdviserConfig, XrayAdviser
-from endopilot.xray.bands import Calibration
 from endopilot.xray.fluoroscope import TipMeasurement
 
 CALIBRATED = Path(__file__).parent

@@ -15,18 +15,18 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Float
 
+from endopilot.belief.adviser import AdviserConfig, XrayAdviser
+from endopilot.belief.bands import Calibration
+from endopilot.belief.belief import Belief, BeliefConfig
 from endopilot.control.agent import CALIBRATED, SURE_SDS, AdviserInput
-from endopilot.control.belief import Belief, BeliefConfig
 from endopilot.control.coaxial_copies import CoaxialCourse, CoaxialSearchConfig
-from endopilot.control.coaxial_policies import check_catheter
 from endopilot.control.coaxial_search import CoaxialSearch
-from endopilot.control.policy import BelievedTip, Decision, Observation
 from endopilot.control.route import check_passable
 from endopilot.errors import InputError
+from endopilot.navigation.coaxial_policies import check_catheter
+from endopilot.navigation.policy import BelievedTip, Decision, Observation
 from endopilot.settings import Positive, Within, settings
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
-from endopilot.xray.adviser import AdviserConfig, XrayAdviser
-from endopilot.xray.bands import Calibration
 from endopilot.xray.fluoroscope import TipMeasurement
 
 COAXIAL_CALIBRATED = CALIBRATED / "coaxial"

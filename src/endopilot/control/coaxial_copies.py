@@ -11,9 +11,9 @@ from jaxtyping import Bool, Float
 from endopilot.control.halt import SPARE_SHARE
 from endopilot.control.period import drive_period
 from endopilot.control.route import Route
+from endopilot.devices.drive_limits import SPARE_MM, DriveLimits
 from endopilot.settings import Positive, Seconds, Within, settings
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.drive_limits import SPARE_MM, DriveLimits
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import SimulatorState
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation

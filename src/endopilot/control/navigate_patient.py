@@ -18,20 +18,20 @@ from jaxtyping import Float
 from endopilot.anatomy.catheter_axis import lean_between, with_axis
 from endopilot.anatomy.io import read_anatomy
 from endopilot.control.agent import TwinPolicy
-from endopilot.control.mismatch import ModelMismatch, drawn_sides, mismatch_by
-from endopilot.control.navigate import NavigateConfig, NavigationLoop, XrayKind
-from endopilot.control.policies import make_policy
-from endopilot.control.policy import Believer, Led, Observation, Policy
-from endopilot.control.record import NavigationRecord
-from endopilot.control.robot import CYCLE_S
 from endopilot.control.route import Route, check_passable, parse_target
 from endopilot.control.set_up import TILT_DEG, TipChoice, choose_tip
+from endopilot.devices.catheter import Catheter, read_catheter
+from endopilot.devices.device import Device, read_device
 from endopilot.errors import InputError
+from endopilot.navigation.navigate import NavigateConfig, NavigationLoop, XrayKind
+from endopilot.navigation.policies import make_policy
+from endopilot.navigation.policy import Believer, Led, Observation, Policy
+from endopilot.navigation.record import NavigationRecord
 from endopilot.progress import progress
+from endopilot.robot.robot import CYCLE_S
 from endopilot.settings import Finite, Positive, Seconds, Seed, ShareBelowOne, Text, Within, settings
-from endopilot.simulation.catheter import Catheter, read_catheter
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.device import Device, read_device
+from endopilot.simulation.mismatch import ModelMismatch, drawn_sides, mismatch_by
 from endopilot.simulation.motion import Motion, MotionName, motion_named
 from endopilot.simulation.simulate import simulate
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Arrives, Navigation

@@ -16,13 +16,13 @@ from scipy.ndimage import convolve1d
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.control.plan_config import PlanConfig, Steps
 from endopilot.control.route import Route
+from endopilot.devices.drive_limits import DriveLimits
 from endopilot.models.config import WINDOW, read_run
 from endopilot.models.episodes import Episodes, Setup
 from endopilot.models.open_loop import Predictor
 from endopilot.models.rollout import load_model
 from endopilot.progress import progress
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import Navigation
 from endopilot.types import SAMPLE_PERIOD_S

@@ -7,8 +7,8 @@ from jaxtyping import Float
 
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.control.navigate_patient import PatientNavigation, SetUp
-from endopilot.control.robot import CYCLE_S
 from endopilot.control.route import Route
+from endopilot.robot.robot import CYCLE_S
 from endopilot.tasks.navigation import DECISION_PERIOD_S, SUCCESS_MM
 from endopilot.types import Rollout, VesselTree
 

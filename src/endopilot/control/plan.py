@@ -11,26 +11,26 @@ from jaxtyping import Float
 
 from endopilot.anatomy.io import read_anatomy
 from endopilot.anatomy.projection import project_tip
+from endopilot.belief.belief import BeliefConfig
 from endopilot.control.agent import AgentConfig, TwinPolicy
-from endopilot.control.belief import BeliefConfig
 from endopilot.control.course import Course
 from endopilot.control.desired import last_place, read_tips, tips_along
-from endopilot.control.navigate import NavigateConfig, navigate
 from endopilot.control.plan_config import NETWORK_METHODS, Controls, Plan, PlanConfig, Steps
 from endopilot.control.plan_pair import check_pair, search_pair
-from endopilot.control.robot import RobotConfig
 from endopilot.control.route import Route, check_passable, parse_target
 from endopilot.control.search import SearchConfig
 from endopilot.control.set_up import TipChoice, choose_tip
+from endopilot.devices.catheter import Catheter
+from endopilot.devices.device import Device, read_device
+from endopilot.devices.drive_limits import DriveLimits
 from endopilot.errors import InputError
 from endopilot.extras import extra_named
 from endopilot.models.config import read_run
+from endopilot.navigation.navigate import NavigateConfig, navigate
 from endopilot.progress import progress
+from endopilot.robot.robot import RobotConfig
 from endopilot.settings import from_record
-from endopilot.simulation.catheter import Catheter
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.device import Device, read_device
-from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.simulation.simulate import simulate
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.types import Anatomy, TipProjection
@@ -250,7 +250,7 @@ def _track(navigation: Navigation, desired: Steps) -> tuple[Steps, Steps]:
 
 def _by_policy(navigation: Navigation, config: PlanConfig) -> tuple[Steps, Steps]:
     """Let a policy drive the rod core with an ideal drive, and record what it did."""
-    from endopilot.control.policies import make_policy
+    from endopilot.navigation.policies import make_policy
 
     record = navigate(navigation, make_policy(config.method), config=NavigateConfig(robot=_IDEAL), seed=config.seed)
     proximal = np.column_stack([record.inserted_length, record.rotation])

@@ -11,8 +11,8 @@ from jaxtyping import Float
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.control.cost import Cost
 from endopilot.control.set_up import TILT_DEG
+from endopilot.devices.drive_limits import DriveLimits
 from endopilot.settings import Finite, Positive, Seconds, Seed, Text, Within, settings
-from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Arrives, Navigation
 from endopilot.types import TipProjection
 

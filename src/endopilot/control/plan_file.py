@@ -39,12 +39,12 @@ from endopilot.control.columns import device_columns
 from endopilot.control.plan_config import Plan, PlanConfig
 from endopilot.control.plan_xray import PlannedXray
 from endopilot.control.set_up import tip_name
+from endopilot.devices.catheter import Catheter
+from endopilot.devices.device import Device
+from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.files import json_text, manifest, read_json, reading, sha256, writing
 from endopilot.settings import from_record
-from endopilot.simulation.catheter import Catheter
-from endopilot.simulation.device import Device
-from endopilot.simulation.tubes import Stack
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target
 from endopilot.types import Anatomy, TipProjection
 

@@ -13,14 +13,14 @@ import numpy as np
 
 from endopilot.control.coaxial_copies import CoaxialSearchConfig
 from endopilot.control.coaxial_search import CoaxialSearch
-from endopilot.control.mismatch import ModelMismatch
-from endopilot.control.navigate import start_world
 from endopilot.control.period import drive_period
 from endopilot.control.plan_config import Controls, PlanConfig, Steps
+from endopilot.devices.catheter import Catheter
 from endopilot.errors import InputError
+from endopilot.navigation.navigate import start_world
 from endopilot.progress import progress
-from endopilot.simulation.catheter import Catheter
 from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 
 

@@ -15,14 +15,14 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Bool, Float
 
+from endopilot.belief.adviser import AdviserConfig, XrayAdviser
+from endopilot.belief.bands import Calibration
+from endopilot.belief.online_predictors import online_predictor
 from endopilot.control.agent import CALIBRATED, AdviserInput, AgentPolicy
 from endopilot.control.plan_config import NETWORK_METHODS, Plan, PlanConfig
 from endopilot.control.route import Route
 from endopilot.models.config import WINDOW, run_path
-from endopilot.xray.adviser import AdviserConfig, XrayAdviser
-from endopilot.xray.bands import Calibration
 from endopilot.xray.fluoroscope import TipMeasurement
-from endopilot.xray.online_predictors import online_predictor
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,9 +15,9 @@ from jaxtyping import Int
 
 from endopilot.control.route import ENTERED_MM, Route
 from endopilot.control.sweep import middle, sweep
+from endopilot.devices.device import Device
+from endopilot.devices.drive_limits import DriveLimits
 from endopilot.simulation.config import PRESETS
-from endopilot.simulation.device import Device
-from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 

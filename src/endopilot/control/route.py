@@ -8,8 +8,8 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from endopilot.devices.device import Device
 from endopilot.errors import InputError
-from endopilot.simulation.device import Device
 from endopilot.tasks.navigation import Target
 from endopilot.types import Anatomy, Centerline, TipProjection
 

@@ -23,10 +23,10 @@ from endopilot.control.halt import SPARE_SHARE, Halt, describe_halt, near_fork
 from endopilot.control.period import drive_period
 from endopilot.control.route import Route
 from endopilot.control.sweep import TURN_PERIODS, Sweep, middle, sweep
+from endopilot.devices.device import Device
+from endopilot.devices.drive_limits import DriveLimits
 from endopilot.progress import Advance
 from endopilot.settings import OpenShare, Positive, Within, settings
-from endopilot.simulation.device import Device
-from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.types import TipProjection

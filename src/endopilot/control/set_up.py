@@ -15,8 +15,8 @@ from jaxtyping import Float, Int
 from endopilot.anatomy.catheter_axis import turned_axis, with_axis
 from endopilot.control.reach import ROTATIONS, Fork, forks, lateral_reach, rotations_that_enter
 from endopilot.control.route import Route
+from endopilot.devices.device import Device
 from endopilot.errors import InputError
-from endopilot.simulation.device import Device
 from endopilot.tasks.navigation import Navigation
 
 SHAPES = ((45.0, 3.0), (60.0, 4.0), (75.0, 5.0), (90.0, 6.5), (90.0, 8.0), (90.0, 10.0))

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from endopilot.control.course import SLIP_SHARE, STALL_PERIODS, STALL_SHARE, Controls
 from endopilot.control.period import drive_period
 from endopilot.control.route import Route
-from endopilot.simulation.drive_limits import DriveLimits
+from endopilot.devices.drive_limits import DriveLimits
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import DECISION_PERIOD_S
 

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from endopilot.dataset.loader import Dataset
+from endopilot.devices.device import Device
 from endopilot.settings import from_record
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.device import Device
 from endopilot.simulation.simulate import simulate
 from endopilot.types import Anatomy, Rollout
 

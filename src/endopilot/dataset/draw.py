@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.dataset.config import DatasetConfig
+from endopilot.devices.device import Device
+from endopilot.devices.drive_limits import DriveLimits
 from endopilot.simulation.controls import free_wire_load, random_controls
-from endopilot.simulation.device import Device
-from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.simulation.motion import Motion, motion_named
 from endopilot.types import Anatomy
 

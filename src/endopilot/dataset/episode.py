@@ -15,10 +15,10 @@ from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.draw import Draw
 from endopilot.dataset.generate import describe
 from endopilot.dataset.layout import make_layout
+from endopilot.devices.catheter import Catheter
+from endopilot.devices.device import Device
 from endopilot.runs import claim
-from endopilot.simulation.catheter import Catheter
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.device import Device
 from endopilot.simulation.motion import Motion
 from endopilot.types import CatheterMotion, Rollout
 

@@ -20,11 +20,11 @@ from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.layout import Block, Layout, make_layout
 from endopilot.dataset.splits import SPLITS
 from endopilot.dataset.workers import run_locally, run_on_cluster
+from endopilot.devices.catheter import Catheter
+from endopilot.devices.device import Device
 from endopilot.files import manifest, read_json, write_json, writing
 from endopilot.progress import progress
 from endopilot.runs import claim, remove_partial_files
-from endopilot.simulation.catheter import Catheter
-from endopilot.simulation.device import Device
 
 _WORK_PATH = "meta/work.json"
 """What the files written so far have cost; it moves into the manifest when the dataset is complete."""

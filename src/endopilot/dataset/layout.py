@@ -18,10 +18,10 @@ from endopilot.dataset import schema
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.draw import patient_motion
 from endopilot.dataset.splits import assign_splits
+from endopilot.devices.catheter import Catheter, check_nested
+from endopilot.devices.device import Device
 from endopilot.errors import InputError
 from endopilot.files import json_text, read_json
-from endopilot.simulation.catheter import Catheter, check_nested
-from endopilot.simulation.device import Device
 from endopilot.simulation.motion import Motion
 
 FORMAT_VERSION = 5

@@ -21,12 +21,12 @@ from endopilot.dataset.schema import (
     paths_of_file,
     signals,
 )
+from endopilot.devices.catheter import Catheter
 from endopilot.errors import InputError
 from endopilot.extras import extra_named
 from endopilot.files import read_json, reading
 from endopilot.runs import RECORD_FILE
 from endopilot.settings import from_record
-from endopilot.simulation.catheter import Catheter
 from endopilot.simulation.motion import Motion
 
 _MEND = "make the dataset again"

@@ -15,11 +15,11 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from endopilot.simulation.catheter import Catheter
+from endopilot.devices.catheter import Catheter
+from endopilot.devices.device import Device
+from endopilot.devices.drive_limits import within_travel
 from endopilot.simulation.config import Actuation, SimulatorConfig
 from endopilot.simulation.core import of_device
-from endopilot.simulation.device import Device
-from endopilot.simulation.drive_limits import within_travel
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulate import RECORDED, catheter_motion, make_rollout
 from endopilot.simulation.simulator import Simulator

@@ -11,12 +11,12 @@ from jaxtyping import Float, Int
 from endopilot.anatomy.io import read_anatomy
 from endopilot.dataset.again import simulate_again
 from endopilot.dataset.loader import Dataset
+from endopilot.devices.device import Device
+from endopilot.devices.drive_limits import DriveLimits
 from endopilot.evaluation.results import REPLAYED, TipSeries
 from endopilot.models.config import WINDOW
 from endopilot.progress import Advance
 from endopilot.settings import from_record
-from endopilot.simulation.device import Device
-from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.types import Anatomy, Rollout
 
 Control = Float[np.ndarray, "episodes samples 2"]

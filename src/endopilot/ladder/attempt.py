@@ -13,18 +13,18 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from endopilot.anatomy.projection import safety_ratio
+from endopilot.belief.adviser import AdviserConfig, count_events, near_exposures
 from endopilot.control.agent import AgentPolicy
 from endopilot.control.coaxial_agent import CoaxialAgent
-from endopilot.control.mismatch import ModelMismatch
-from endopilot.control.navigate import NavigateConfig, navigate
-from endopilot.control.policies import make_policy
-from endopilot.control.policy import Decision, Observation, Policy
-from endopilot.control.record import NavigationRecord
 from endopilot.errors import InputError
+from endopilot.navigation.navigate import NavigateConfig, navigate
+from endopilot.navigation.policies import make_policy
+from endopilot.navigation.policy import Decision, Observation, Policy
+from endopilot.navigation.record import NavigationRecord
+from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.tasks.navigation import Navigation
 from endopilot.tasks.task import CORE, Task
 from endopilot.types import TipProjection
-from endopilot.xray.adviser import AdviserConfig, count_events, near_exposures
 
 _MOST_BYTES = 1 << 20
 """No array of a recording is larger, bytes; one that claims to be is cut off."""

@@ -16,15 +16,15 @@ from pathlib import Path
 from typing import Any, Literal
 
 from endopilot import __version__, _core
-from endopilot.control.policies import POLICIES
+from endopilot.devices.catheter import read_catheter
+from endopilot.devices.device import read_device
 from endopilot.errors import InputError
 from endopilot.files import json_text, manifest, read_json, write_json
 from endopilot.ladder.attempt import Recording, navigation_seed, repeat
 from endopilot.ladder.scores import score
+from endopilot.navigation.policies import POLICIES
 from endopilot.parallel import each
 from endopilot.settings import CountOrZero, Seed, read_settings, settings
-from endopilot.simulation.catheter import read_catheter
-from endopilot.simulation.device import read_device
 from endopilot.tasks.task import LadderVersion, Task, find_task, ladder_tasks
 
 SUBMISSION_FILE = "submission.json"

@@ -28,6 +28,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from endopilot.devices.drive_limits import DriveLimits
 from endopilot.errors import InputError
 from endopilot.models.config import WINDOW, CausalConfig
 from endopilot.models.episodes import Episodes, Setup
@@ -35,7 +36,6 @@ from endopilot.models.open_loop import EachObserved, Observed, OpenLoop, Predict
 from endopilot.models.play import Direction, Vessels
 from endopilot.models.sequences import N_INPUTS, N_WIRE_INPUTS, prepare_vessels, unfold
 from endopilot.models.simulated_wires import FRICTION_FACTORS, SimulatedWires
-from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.types import SAMPLE_PERIOD_S
 
 _GIVEN_WEIGHT = 0.3

@@ -16,13 +16,13 @@ from jaxtyping import Float, Int, Shaped
 
 from endopilot.anatomy.io import read_anatomy
 from endopilot.dataset.loader import Dataset, commanded
+from endopilot.devices.device import Device
 from endopilot.errors import InputError
 from endopilot.files import reading
 from endopilot.models.config import WINDOW
 from endopilot.models.patient import Patient, prepare, read_or_prepare
 from endopilot.settings import from_record
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.device import Device
 from endopilot.simulation.motion import Motion, published_mean
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 

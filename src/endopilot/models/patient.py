@@ -20,11 +20,11 @@ from jaxtyping import Bool, Float, Int
 
 from endopilot.anatomy.tree import curvature_torsion, make_centerline
 from endopilot.dataset.navigations import CAUGHT, STOP_SHORT_MM
+from endopilot.devices.device import Device
 from endopilot.errors import InputError
 from endopilot.files import json_text, writing
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.core import insertion_arguments
-from endopilot.simulation.device import Device
 from endopilot.simulation.simulator import Simulator
 from endopilot.types import Anatomy, Centerline, Insertion, VesselTree
 

@@ -15,8 +15,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from endopilot.devices.device import Device
 from endopilot.models.patient import STEP_MM, Patient
-from endopilot.simulation.device import Device
 
 Direction = Literal["forward", "inverse"]
 """Forward: the drive is known and the tip follows. Inverse: the tip is known and the drive's motion is predicted."""

@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from endopilot.devices.device import Device
+from endopilot.devices.drive_limits import DriveLimits
 from endopilot.errors import InputError
 from endopilot.files import reading
 from endopilot.models.causal import CausalPredictor
@@ -24,8 +26,6 @@ from endopilot.models.twin import TwinPredictor
 from endopilot.models.windows import Windows
 from endopilot.settings import from_record
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.device import Device
-from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.types import SAMPLE_PERIOD_S
 
 

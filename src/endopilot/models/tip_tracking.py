@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+from endopilot.devices.device import Device
+from endopilot.devices.drive_limits import DriveLimits
 from endopilot.models.open_loop import Steps2
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.device import Device
-from endopilot.simulation.drive_limits import DriveLimits
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulator import Simulator
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy

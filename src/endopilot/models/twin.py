@@ -18,12 +18,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.stats import qmc
 
+from endopilot.devices.device import Device
 from endopilot.models.config import WINDOW, TwinConfig
 from endopilot.models.episodes import Episodes
 from endopilot.models.open_loop import EachObserved, Observed, OpenLoop, Prediction, begin_after, given_states, jumps
 from endopilot.models.tip_tracking import track
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.device import Device
 from endopilot.simulation.simulate import simulate
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 

@@ -23,14 +23,14 @@ from endopilot.control.navigate_patient import (
     set_up_navigation,
 )
 from endopilot.control.outcome import name_target, section_at, slipped_s, tell_outcome, worst_ratio
-from endopilot.control.policies import POLICIES
 from endopilot.control.set_up import tip_name
+from endopilot.devices.catheter import write_catheter
+from endopilot.devices.device import write_device
 from endopilot.extras import require_extras
 from endopilot.files import manifest, read_json, write_json, writing
+from endopilot.navigation.policies import POLICIES
 from endopilot.runs import claim
-from endopilot.simulation.catheter import write_catheter
 from endopilot.simulation.controls import write_controls_csv
-from endopilot.simulation.device import write_device
 
 PAGE_FILE, PICTURE_FILE, TABLE_FILE = "navigation.html", "navigation.png", "navigation.csv"
 CONTROLS_FILE, WIRE_FILE, EPISODE_FOLDER, ANATOMY_FOLDER = "controls.csv", "wire.yaml", "episode", "anatomy"

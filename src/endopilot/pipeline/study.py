@@ -26,6 +26,7 @@ from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.control.navigate_patient import NavigatePatientConfig
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.loader import load_dataset
+from endopilot.devices.device import Device, read_device
 from endopilot.evaluation.anatomy_score import score_anatomy
 from endopilot.evaluation.results import REPORT_FILE
 from endopilot.extras import require_extras
@@ -40,7 +41,6 @@ from endopilot.progress import progress
 from endopilot.runs import claim
 from endopilot.settings import Seconds, Seed, Within, settings
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.device import Device, read_device
 from endopilot.simulation.simulate import simulate
 from endopilot.types import Rollout, Volume
 

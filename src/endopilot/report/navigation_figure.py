@@ -8,13 +8,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from endopilot.anatomy.projection import safety_ratio
+from endopilot.belief.adviser import AdviserConfig
 from endopilot.control.navigate_patient import PatientNavigation
 from endopilot.control.outcome import section_at
 from endopilot.control.plan_picture import draw_route, legend_above
 from endopilot.control.route import Route
 from endopilot.plotting import BLACK, BLUE, CATHETER_COLORS, GREY, ORANGE, PURPLE, STYLE, VERMILLION
 from endopilot.tasks.navigation import DECISION_PERIOD_S
-from endopilot.xray.adviser import AdviserConfig
 
 _DEVICE_COLORS = (BLUE, *CATHETER_COLORS)
 _LABEL_SHARE = 0.06

@@ -8,11 +8,11 @@ import numpy as np
 import plotly.graph_objects as go
 from jaxtyping import Float
 
+from endopilot.devices.device import Device
+from endopilot.devices.stack import lines_from_tips, shown_part
 from endopilot.plotting import CATHETER_COLORS
 from endopilot.report.figures import section_color
 from endopilot.report.wall_mesh import wall_mesh
-from endopilot.simulation.device import Device
-from endopilot.simulation.tubes import lines_from_tips, shown_part
 from endopilot.types import Anatomy, Rollout
 
 BACKGROUND, INK, FAINT = "#0d1424", "#dfe6f2", "#31405c"

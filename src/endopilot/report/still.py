@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from endopilot.devices.device import Device
 from endopilot.files import writing
 from endopilot.plotting import CATHETER_COLORS
 from endopilot.report.wall_mesh import wall_mesh
-from endopilot.simulation.device import Device
 from endopilot.types import Anatomy
 
 LIBRARIES_MISSING = (

@@ -8,11 +8,11 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
+from endopilot.devices.device import Device
+from endopilot.devices.drive_limits import SPARE_MM
+from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.simulation.config import FREE_BEHIND_MM, Actuation
-from endopilot.simulation.device import Device
-from endopilot.simulation.drive_limits import SPARE_MM
-from endopilot.simulation.tubes import Stack
 from endopilot.types import Anatomy
 
 _ROUNDING_MM = 1e-2

@@ -15,12 +15,12 @@ import numpy as np
 from jaxtyping import Float, Int
 from pydantic import model_validator
 
+from endopilot.devices.drive_limits import within_travel
 from endopilot.errors import InputError, Remark
 from endopilot.files import writing
 from endopilot.settings import LONGEST_S, Share, Within, settings
 from endopilot.simulation.checks import check_memory
 from endopilot.simulation.csv_file import Columns, read_columns
-from endopilot.simulation.drive_limits import within_travel
 from endopilot.types import SAMPLE_PERIOD_S
 
 _COLUMNS = ("time_s", "translation_mm_s", "rotation_rad_s")

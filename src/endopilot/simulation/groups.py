@@ -10,14 +10,15 @@ import numpy as np
 from jaxtyping import Integer
 
 from endopilot.anatomy.projection import TipProjector
+from endopilot.devices.drive_limits import far_end_mm
+from endopilot.devices.stack import Stack
 from endopilot.simulation.checks import check_distance_map, check_memory
 from endopilot.simulation.config import FREE_BEHIND_MM, SimulatorConfig
 from endopilot.simulation.core import core_options, insertion_arguments
-from endopilot.simulation.drive_limits import far_end_mm
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.processor import CoreMotion, Lumen, Simulation, core_for
 from endopilot.simulation.rod import RodLayout, lay_out
-from endopilot.simulation.tubes import Stack
+from endopilot.simulation.tubes import lay_out_tubes
 from endopilot.simulation.vessel_wall import make_wall
 from endopilot.types import Anatomy
 
@@ -110,7 +111,7 @@ def make_groups(
         path_mm = float(anatomy.tree.longest_path().abscissa[-1])
         longest_mm = far_end_mm(anatomy)
         rod = lay_out(stack.wire, element_mm=config.element_mm, length_mm=longest_mm + FREE_BEHIND_MM)
-        tubes = stack.lay_out(length_mm=longest_mm + FREE_BEHIND_MM)
+        tubes = lay_out_tubes(stack, length_mm=longest_mm + FREE_BEHIND_MM)
         check_memory(8 * len(worlds) * (40 * len(rod.abscissa_mm) + 40), f"worlds: {len(worlds)}", "give fewer")
         moving = None if motion is None else motion.core(np.asarray(anatomy.insertion.position), config.processor)
         simulation = core.Simulation(

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.simulation.groups import Group, merge
-from endopilot.simulation.tubes import Stack
 from endopilot.types import TipProjection
 
 

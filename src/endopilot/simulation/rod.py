@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import brentq
 
-from endopilot.simulation.device import Device
+from endopilot.devices.device import Device
 from endopilot.simulation.processor import Processor, RodModel, core_for
 
 POISSON_RATIO = 0.3

@@ -15,16 +15,17 @@ from jaxtyping import Float
 
 from endopilot import _core
 from endopilot.anatomy.projection import project_tip
+from endopilot.devices.catheter import Catheter
+from endopilot.devices.device import Device
+from endopilot.devices.drive_limits import far_end_mm
+from endopilot.devices.stack import Stack
 from endopilot.errors import InputError, Remark
-from endopilot.simulation.catheter import Catheter
 from endopilot.simulation.checks import check_distance_map, check_memory, check_sequences
 from endopilot.simulation.config import FREE_BEHIND_MM, Actuation, SimulatorConfig
 from endopilot.simulation.core import of_device, run_core
-from endopilot.simulation.device import Device
-from endopilot.simulation.drive_limits import far_end_mm
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.rod import lay_out
-from endopilot.simulation.tubes import Stack
+from endopilot.simulation.tubes import lay_out_tubes
 from endopilot.simulation.vessel_wall import make_wall
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, CatheterMotion, Rollout
 
@@ -140,7 +141,7 @@ def simulate(
         push_limit_n=stack.push_limit_n,
         pull_limit_n=device.pull_limit_n,
         torque_limit_n_mm=device.torque_limit_n_mm,
-        tubes=stack.lay_out(length_mm=length_mm),
+        tubes=lay_out_tubes(stack, length_mm=length_mm),
         motion=moving,
     )
     if record_shape:  # of the wire that was needed

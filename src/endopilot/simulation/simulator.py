@@ -16,18 +16,18 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from endopilot.devices.catheter import Catheter
+from endopilot.devices.device import Device
+from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
-from endopilot.simulation.catheter import Catheter
 from endopilot.simulation.checks import check_control, check_memory, check_travel
 from endopilot.simulation.config import LANES, Actuation, SimulatorConfig
 from endopilot.simulation.core import of_device
-from endopilot.simulation.device import Device
 from endopilot.simulation.groups import Group, group_key, make_groups
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.processor import gpu_errors
 from endopilot.simulation.readout import Readout
 from endopilot.simulation.state import SimulatorState, Step, SupportsDLPack
-from endopilot.simulation.tubes import Stack
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
 _DEEPEST_START = 0.8

@@ -21,9 +21,9 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot import _core
+from endopilot.devices.device import GRAM_FORCE_N, Device
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.core import run_core
-from endopilot.simulation.device import GRAM_FORCE_N, Device
 from endopilot.simulation.rod import POISSON_RATIO, SHEAR_CORRECTION, RodLayout
 from endopilot.types import Insertion
 

@@ -3,23 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.simulation.catheter import Catheter, check_nested
-from endopilot.simulation.device import Device, check_fits
+from endopilot.devices.stack import Stack
 from endopilot.simulation.processor import Processor, Tubes, core_for
 from endopilot.simulation.rod import POISSON_RATIO, SHEAR_CORRECTION
-from endopilot.types import Anatomy
 
-SHOWN_BEHIND_MM = 20.0
-"""Length of devices that pictures show behind the ostium, in the guiding catheter, mm."""
 _SPACING_MM = 0.25
 """Distance between the points of a profile, mm."""
-_APART_MM = 1e-6
-"""Nodes nearer to a tip than this are the tip, mm."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,96 +62,15 @@ class TubeLayout:
         )
 
 
-@dataclass(frozen=True)
-class Stack:
-    """A wire, and the catheters around it from the inside out; none for a wire alone."""
-
-    wire: Device
-    catheters: tuple[Catheter, ...] = ()
-
-    @property
-    def devices(self) -> tuple[Device, ...]:
-        """The wire, and what each catheter has in common with one."""
-        return (self.wire, *(catheter.device for catheter in self.catheters))
-
-    @property
-    def outer_radius_mm(self) -> float:
-        """Radius of the widest device, mm."""
-        return max(device.tip_radius_mm for device in self.devices)
-
-    @property
-    def push_limit_n(self) -> float:
-        """What all drives together can push with, N: it sizes the wall's stiffness."""
-        return sum(device.push_limit_n for device in self.devices)
-
-    @property
-    def limits(self) -> Float[np.ndarray, "devices 3"]:
-        """Where the drive of each device slips: push (N), pull (N) and torque (N·mm)."""
-        return np.array([[each.push_limit_n, each.pull_limit_n, each.torque_limit_n_mm] for each in self.devices])
-
-    @property
-    def constants(self) -> tuple[Any, ...]:
-        """All numbers of the devices: stacks with the same constants behave the same."""
-        bores = tuple((each.inner_diameter_mm, each.bore_friction, each.shape) for each in self.catheters)
-        return self.wire.constants + tuple(each.device.constants for each in self.catheters) + bores
-
-    def check(self, anatomy: Anatomy) -> None:
-        """Check that the devices fit into each other, and into an anatomy.
-
-        Raises:
-            InputError: one does not.
-        """
-        check_nested(self.wire, self.catheters)
-        for device in self.devices:
-            check_fits(device, anatomy)
-
-    def lay_out(self, *, length_mm: float) -> TubeLayout | None:
-        """Return the tubes that the core takes; None for a wire alone.
-
-        Args:
-            length_mm: length that the profiles must cover.
-        """
-        return _lay_out(self, length_mm) if self.catheters else None
-
-
-def lines_from_tips(
-    nodes: Float[np.ndarray, "n 3"], inserted_mm: Float[np.ndarray, "devices"]
-) -> list[Float[np.ndarray, "_ 3"]]:
-    """Return the line that telescoping devices share, as each of them has it: from its own tip on.
+def lay_out_tubes(stack: Stack, *, length_mm: float) -> TubeLayout | None:
+    """Return the tubes of a stack; None for a wire alone.
 
     Args:
-        nodes: of the line, from the foremost tip on, LPS mm.
-        inserted_mm: inserted length of each device; the foremost tip is that of the largest.
+        stack: wire and catheters.
+        length_mm: length that the profiles must cover.
     """
-    behind = inserted_mm.max() - inserted_mm
-    along = _along(nodes)
-    return [
-        nodes if at == 0 else np.vstack([_at(nodes, along, at), nodes[along > at + _APART_MM]])
-        for at in behind.tolist()
-    ]
-
-
-def shown_part(nodes: Float[np.ndarray, "n 3"], deepest_mm: float) -> Float[np.ndarray, "shown 3"]:
-    """Return what pictures show of a line: from its tip to `SHOWN_BEHIND_MM` behind the ostium, LPS mm.
-
-    Args:
-        nodes: of the line, from the foremost tip on, LPS mm; NaN beyond its end.
-        deepest_mm: inserted length of the device with that tip.
-    """
-    nodes = nodes[np.isfinite(nodes).all(axis=1)]
-    return nodes[_along(nodes) <= deepest_mm + SHOWN_BEHIND_MM]
-
-
-def _along(nodes: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-    """Return how far from the first node each one lies along the line, mm."""
-    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(nodes, axis=0), axis=1))])
-
-
-def _at(nodes: Float[np.ndarray, "n 3"], along: Float[np.ndarray, "n"], at_mm: float) -> Float[np.ndarray, "3"]:
-    return np.array([np.interp(at_mm, along, axis) for axis in nodes.T])
-
-
-def _lay_out(stack: Stack, length_mm: float) -> TubeLayout:
+    if not stack.catheters:
+        return None
     wire, catheters, devices = stack.wire, stack.catheters, stack.devices
     stretches = int(np.ceil(length_mm / _SPACING_MM)) + 2
     edges = _SPACING_MM * np.arange(stretches + 1)

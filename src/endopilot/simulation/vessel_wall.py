@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.anatomy.distance import CATHETER_LENGTH_MM
+from endopilot.devices.stack import Stack
 from endopilot.simulation.config import FREE_BEHIND_MM, SimulatorConfig
 from endopilot.simulation.core import make_lumen
 from endopilot.simulation.processor import Lumen
-from endopilot.simulation.tubes import Stack
 from endopilot.types import Anatomy
 
 FINE_MM = 0.2

@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from pydantic import InstanceOf, model_validator
 
+from endopilot.devices.catheter import Catheter, check_nested
+from endopilot.devices.device import Device
 from endopilot.errors import InputError
 from endopilot.settings import CountOrZero, Finite, NonNegative, Positive, Seconds, Within, settings
-from endopilot.simulation.catheter import Catheter, check_nested
-from endopilot.simulation.device import Device
 from endopilot.simulation.motion import Motion
 from endopilot.types import Anatomy, TipProjection
 

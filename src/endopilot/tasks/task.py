@@ -13,12 +13,12 @@ from pydantic import Field, model_validator
 
 from endopilot.anatomy.catheter_axis import with_world_zero
 from endopilot.atlas.atlas import ANATOMIES, AtlasConfig, make_patient
+from endopilot.devices.catheter import list_catheters, read_catheter
+from endopilot.devices.device import read_device
+from endopilot.devices.device_files import list_devices
 from endopilot.errors import InputError
 from endopilot.settings import CountOrZero, NonNegative, Positive, Seconds, Seed, Share, Within, read_settings, settings
-from endopilot.simulation.catheter import list_catheters, read_catheter
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.device import read_device
-from endopilot.simulation.device_files import list_devices
 from endopilot.tasks.navigation import Arrives, Navigation, Target
 from endopilot.types import Anatomy, VesselTree
 

@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from endopilot import _core
 from endopilot.atlas.atlas import AtlasConfig, make_patient
+from endopilot.devices.device import read_device
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.core import core_options, insertion_arguments, make_lumen
-from endopilot.simulation.device import read_device
 from endopilot.simulation.motion import Motion, place
 from endopilot.simulation.rod import RodLayout
 from endopilot.simulation.simulate import simulate

@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.atlas.atlas import AtlasConfig, make_patient
+from endopilot.devices.device import read_device
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, random_controls
-from endopilot.simulation.device import read_device
 from endopilot.simulation.simulate import simulate
 from endopilot.verification.case import Case, Curve, Loading, Picture, compare, equilibrium, straight_rod
 from endopilot.verification.free_rod import elastica_tip

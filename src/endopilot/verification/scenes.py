@@ -13,9 +13,9 @@ from scipy.integrate import solve_ivp
 from scipy.spatial import KDTree
 
 from endopilot import _core
+from endopilot.devices.device import read_device
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.core import make_lumen, of_device, run_core
-from endopilot.simulation.device import read_device
 from endopilot.simulation.rod import RodLayout, lay_out
 from endopilot.types import SAMPLE_PERIOD_S, DistanceMap, Insertion
 

@@ -8,9 +8,9 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from endopilot.devices.catheter import Catheter
 from endopilot.phantom.chest import is_left
 from endopilot.phantom.phantom import PhantomConfig, make_phantom
-from endopilot.simulation.catheter import Catheter
 from endopilot.types import Anatomy, Volume
 
 WATER_MM = 0.0206

@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Float32
 from scipy.ndimage import gaussian_filter
 
+from endopilot.devices.device import Device
 from endopilot.settings import Finite, NonNegative, OpenShare, Share, settings
-from endopilot.simulation.device import Device
 from endopilot.types import Anatomy
 from endopilot.xray.absorbers import catheter_lumen_points, lumen_points
 from endopilot.xray.carm import View

@@ -17,9 +17,9 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 from scipy.ndimage import gaussian_filter, zoom
 
+from endopilot.devices.catheter import Catheter
+from endopilot.devices.device import Device
 from endopilot.settings import Finite, Positive, Share, Within, settings
-from endopilot.simulation.catheter import Catheter
-from endopilot.simulation.device import Device
 from endopilot.simulation.motion import place
 from endopilot.types import Anatomy, Volume
 from endopilot.xray.absorbers import (

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from endopilot.anatomy.projection import project_tip
+from endopilot.devices.device import Device
 from endopilot.errors import InputError
-from endopilot.simulation.device import Device
 from endopilot.simulation.motion import Motion, published_mean
 from endopilot.types import Anatomy
 from endopilot.xray.absorbers import surroundings

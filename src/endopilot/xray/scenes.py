@@ -12,10 +12,10 @@ from jaxtyping import Float, Float32
 
 from endopilot.anatomy.io import read_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
+from endopilot.devices.device import Device, read_device
 from endopilot.progress import progress
 from endopilot.settings import Finite, Seed, Within, settings
 from endopilot.simulation.controls import ControlConfig, random_controls
-from endopilot.simulation.device import Device, read_device
 from endopilot.simulation.simulate import simulate
 from endopilot.types import Anatomy
 from endopilot.xray.absorbers import surroundings

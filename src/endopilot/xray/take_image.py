@@ -10,14 +10,14 @@ import numpy as np
 import SimpleITK as sitk
 from jaxtyping import Float, UInt8
 
+from endopilot.devices.catheter import read_catheter
+from endopilot.devices.device import read_device
+from endopilot.devices.stack import Stack, lines_from_tips
 from endopilot.errors import InputError
 from endopilot.files import writing
 from endopilot.settings import LONGEST_S, Finite, Positive, Seed, Share, Text, Within, settings
-from endopilot.simulation.catheter import read_catheter
-from endopilot.simulation.device import read_device
 from endopilot.simulation.motion import Motion, MotionName, motion_named, place, relative
 from endopilot.simulation.simulate import simulate
-from endopilot.simulation.tubes import Stack, lines_from_tips
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, Volume
 from endopilot.xray.absorbers import surroundings
 from endopilot.xray.image import ImageConfig, XrayImager

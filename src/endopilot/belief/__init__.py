@@ -1,0 +1,1 @@
+"""What is believed of a wire between exposures, and when X-ray is asked for."""

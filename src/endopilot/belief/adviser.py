@@ -1,0 +1,113 @@
+"""The adviser: when an X-ray exposure is due, from calibrated bands around what a model predicts."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from endopilot.anatomy.projection import safety_ratio
+from endopilot.belief.bands import Calibration, Tips
+from endopilot.settings import OpenShare, Positive, settings
+from endopilot.tasks.navigation import DECISION_PERIOD_S, SUCCESS_MM
+
+_SPACING = 3
+"""Periods from one exposure to the next, at least."""
+
+
+@settings
+class AdviserConfig:
+    """What X-ray must not miss, and how sure the bands are to be."""
+
+    level: OpenShare = 0.9
+    """Share of the intervals without X-ray in which the bands shall hold throughout."""
+    wall_ratio: Positive = 0.7
+    """τ: an event begins where γtip/(lumen radius − wire radius) reaches it; 1 is the wall."""
+    abscissa_mm: Positive = SUCCESS_MM
+    """δ: an event begins where Δtip errs by this much, mm; as near as a target counts as reached if not given."""
+    missed: OpenShare = 0.05
+    """Share of the events that may be missed: the calibration finds how much of γtip's band the adviser must heed."""
+
+
+def near_exposures(exposed: Bool[np.ndarray, "*n samples"]) -> Bool[np.ndarray, "*n samples"]:
+    """Return which samples have an exposure within 0.5 s, a sample, given which were exposed."""
+    near = exposed.copy()
+    near[..., 1:] |= exposed[..., :-1]
+    near[..., :-1] |= exposed[..., 1:]
+    return near
+
+
+def count_events(state: Bool[np.ndarray, "*n samples"], near: Bool[np.ndarray, "*n samples"]) -> tuple[int, int]:
+    """Return how many events there are, and how many of them are missed.
+
+    One begins at a sample in the state that follows one which is not; it is missed if no exposure is near. The last
+    sample is left out: the exposure that would show it may come after the end.
+
+    Args:
+        state: whether the tip is at the wall, or Δtip errs by δ.
+        near: which samples have an exposure near, see `near_exposures`.
+    """
+    begins = state[..., 1:-1] & ~state[..., :-2]
+    return int(begins.sum()), int((begins & ~near[..., 1:-1]).sum())
+
+
+class XrayAdviser:
+    """Says when to switch X-ray on, for one navigation or many side by side.
+
+    Between exposures it watches two bands. Where that of Δtip is as wide as δ, an exposure is due. Of that of γtip it
+    heeds the share that the calibration found. This, over the clearance of the lumen there, lies below τ, above it, or
+    across it. Below, nothing threatens; above, the tip is known to be at the wall; across, either may be. An exposure
+    is due where the band reaches τ, where the predicted tip crosses it, and where the band has left it below. It shows
+    what is within 0.5 s of it, so none follows another sooner than after 1.5 s.
+
+    Attributes:
+        half_width: of the whole bands of Δtip and γtip at the last call of `advise`, mm, a row for each navigation.
+    """
+
+    def __init__(self, calibration: Calibration, config: AdviserConfig, wire_radius_mm: float) -> None:
+        """Take the bands, and what must not be missed.
+
+        Args:
+            calibration: of the model whose predictions come.
+            config: τ and δ.
+            wire_radius_mm: radius of the wire at its tip, mm.
+        """
+        self._calibration, self._config, self._wire_radius_mm = calibration, config, wire_radius_mm
+        self.half_width = np.zeros((0, 2))
+
+    def start(self, proximal: Float[np.ndarray, "n 2"], tip: Tips, radius_mm: Float[np.ndarray, "n"]) -> None:
+        """Begin at an exposure.
+
+        Args:
+            proximal: Δ, mm, and φ, rad, of each navigation.
+            tip: where the model has the tip, mm.
+            radius_mm: of the lumen there, mm.
+        """
+        self._proximal, self._travel = proximal, np.zeros(len(proximal))
+        self._since = np.zeros(len(proximal), dtype=int)
+        self._beyond = [self._ratio(tip[:, 1], radius_mm) >= self._config.wall_ratio] * 3
+
+    def advise(
+        self, proximal: Float[np.ndarray, "n 2"], tip: Tips, spread: Tips, radius_mm: Float[np.ndarray, "n"]
+    ) -> Bool[np.ndarray, "n"]:
+        """Return for which navigations X-ray is due now, a period after the last call.
+
+        Args:
+            proximal: Δ, mm, and φ, rad.
+            tip: predicted for now, mm.
+            spread: the model's estimate of its own error, mm.
+            radius_mm: of the lumen at the predicted Δtip, mm.
+        """
+        self._since, self._travel = self._since + 1, self._travel + np.abs(proximal[:, 0] - self._proximal[:, 0])
+        self._proximal = proximal
+        self.half_width = half = self._calibration.half_width(self._since * DECISION_PERIOD_S, self._travel, spread)
+        heeded = self._calibration.heeded * half[:, 1]
+        edges = [tip[:, 1] + side * heeded for side in (1.0, 0.0, -1.0)]
+        beyond = [self._ratio(edge, radius_mm) >= self._config.wall_ratio for edge in edges]
+        crossed = np.any([now & ~before for now, before in zip(beyond, self._beyond, strict=True)], axis=0)
+        due = (crossed | (half[:, 0] >= self._config.abscissa_mm)) & (self._since >= _SPACING)
+        self._beyond = [np.where(crossed & ~due, before, now) for now, before in zip(beyond, self._beyond, strict=True)]
+        self._since, self._travel = np.where(due, 0, self._since), np.where(due, 0.0, self._travel)
+        return due
+
+    def _ratio(self, offset_mm: Float[np.ndarray, "n"], radius_mm: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+        return safety_ratio(offset_mm, radius_mm, self._wire_radius_mm)

@@ -1,0 +1,1 @@
+"""Devices as data: wires, catheters, and stacks of them."""

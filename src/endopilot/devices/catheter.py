@@ -1,0 +1,189 @@
+"""Catheters as data: devices around a wire, with a bore and the shape that they were formed to, read from YAML.
+
+A catheter's file is a device's (`endopilot.devices.device`) with `inner_diameter_mm`, `bore_friction` and, in place
+of a tip bend, `shape`: arcs from the tip on, each `[length_mm, angle_deg]`. All arcs lie in a plane; one with a
+negative angle bends the other side.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import yaml
+from jaxtyping import Float
+from pydantic import model_validator
+
+from endopilot.devices.device import Device, Sourced
+from endopilot.devices.device_files import there
+from endopilot.devices.device_ranges import (
+    MOST_VALUES,
+    Abscissa,
+    ArcLength,
+    Force,
+    Friction,
+    Rotation,
+    Stiffness,
+    Torque,
+    Velocity,
+    Width,
+    check_built,
+)
+from endopilot.errors import InputError
+from endopilot.files import writing
+from endopilot.settings import NonNegative, Positive, Text, Within, read_settings, settings
+
+_SHIPPED = Path(__file__).parent / "catheters"
+MOST_CATHETERS = 2
+"""Catheters that a wire can have around it."""
+
+
+@settings
+class Catheter:
+    """A catheter around a wire.
+
+    Attributes:
+        device: what it has in common with a wire: outer diameter, EI and GJ by distance from the tip, friction on the
+            vessel's wall, its drive. Its tip bend is not used.
+        inner_diameter_mm: diameter of its bore, mm.
+        bore_friction: Coulomb coefficient between its bore and what lies in it.
+        shape: arcs of constant curvature that it was formed to, from the tip on: length (mm) and angle (rad); straight
+            beyond them.
+    """
+
+    device: Device
+    inner_diameter_mm: Positive
+    bore_friction: NonNegative
+    shape: tuple[tuple[Positive, Annotated[float, Within(-4 * math.pi, 4 * math.pi)]], ...] = ()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Catheter:
+        outer = self.device.diameter_mm
+        if self.inner_diameter_mm >= outer:
+            raise ValueError(
+                f"inner_diameter_mm: {self.inner_diameter_mm:g}; give less than the outer diameter, {outer:g} mm"
+            )
+        if len(self.shape) > MOST_VALUES:
+            raise ValueError(f"shape: {len(self.shape)} arcs; give at most {MOST_VALUES}")
+        return self
+
+    @property
+    def name(self) -> str:
+        """Short name."""
+        return self.device.name
+
+    def turned(self, abscissa_mm: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+        """Return the angle by which the unloaded catheter turns from its tip to distances from it, rad."""
+        lengths, angles = (np.array([0.0, *(arc[part] for arc in self.shape)]) for part in (0, 1))
+        return np.interp(abscissa_mm, np.cumsum(lengths), np.cumsum(angles))
+
+
+@settings
+class _Shape:
+    """The arcs of a catheter's file, and where they come from."""
+
+    arcs: tuple[tuple[ArcLength, Annotated[float, Within(-720, 720)]], ...]
+    source: Text
+
+
+@settings
+class _CatheterFile:
+    """What a catheter's file holds; `Device` and `Catheter` say what each constant means."""
+
+    name: Text
+    diameter_mm: Sourced[Width]
+    inner_diameter_mm: Sourced[Width]
+    abscissa_mm: Sourced[tuple[Abscissa, ...]]
+    bend_stiffness_n_mm2: Sourced[tuple[Stiffness, ...]]
+    twist_stiffness_n_mm2: Sourced[tuple[Stiffness, ...]]
+    shape: _Shape
+    friction: Sourced[Friction]
+    bore_friction: Sourced[Friction]
+    max_velocity_mm_s: Sourced[Velocity]
+    max_rotation_rad_s: Sourced[Rotation]
+    push_limit_n: Sourced[Force]
+    pull_limit_n: Sourced[Force]
+    torque_limit_n_mm: Sourced[Torque]
+
+
+def list_catheters() -> tuple[str, ...]:
+    """Return the names of the shipped catheters."""
+    return tuple(sorted(path.stem for path in _SHIPPED.glob("*.yaml")))
+
+
+def read_catheter(name_or_path: str | Path) -> Catheter:
+    """Read a catheter by its name (`list_catheters`), or from a YAML file.
+
+    Raises:
+        InputError: no such catheter, or a file that is not one; the line names file, field, value and mend.
+    """
+    shipped = _SHIPPED / f"{name_or_path}.yaml"
+    path = shipped if there(shipped) else Path(name_or_path)
+    if not there(path):
+        names = ", ".join(list_catheters())
+        raise InputError(f"catheter '{name_or_path}': no such catheter or file; give a path, or choose from {names}")
+    content = read_settings(path, _CatheterFile)
+    entries = {field.name: getattr(content, field.name) for field in fields(content)}
+    constants = {name: entry.value for name, entry in entries.items() if isinstance(entry, Sourced)}
+    own = {name: constants.pop(name) for name in ("inner_diameter_mm", "bore_friction")}
+    try:
+        catheter = Catheter(
+            device=Device(
+                name=content.name,
+                **constants,
+                tip_bend_rad=0.0,
+                tip_bend_length_mm=0.0,
+                tip_load_n=None,
+                sources={name: entry.source for name, entry in entries.items() if name != "name"},
+            ),
+            shape=tuple((length, math.radians(angle)) for length, angle in content.shape.arcs),
+            **own,
+        )
+        check_built(catheter.device, bore_mm=catheter.inner_diameter_mm, arcs=catheter.shape, catheter=True)
+        return catheter
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def write_catheter(catheter: Catheter, path: Path) -> None:
+    """Write a catheter as a file that `read_catheter` reads, with the same constants.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+
+    def sourced(owner: Device | Catheter, name: str) -> dict[str, Any]:
+        value = getattr(owner, name)
+        return {"value": list(value) if isinstance(value, tuple) else value, "source": catheter.device.sources[name]}
+
+    content: dict[str, Any] = {"name": catheter.name}
+    for field in fields(_CatheterFile):
+        if field.name not in ("name", "shape"):
+            owner = catheter if hasattr(catheter, field.name) else catheter.device
+            content[field.name] = sourced(owner, field.name)
+    arcs = [[length, round(math.degrees(angle), 10)] for length, angle in catheter.shape]
+    content["shape"] = {"arcs": arcs, "source": catheter.device.sources["shape"]}
+    with writing(path) as partial:
+        partial.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")
+
+
+def check_nested(wire: Device, catheters: Sequence[Catheter]) -> None:
+    """Check that a wire and catheters, from the inside out, fit into each other.
+
+    Raises:
+        InputError: more catheters than two, or one that is too narrow for what lies in it.
+    """
+    if len(catheters) > MOST_CATHETERS:
+        raise InputError(f"catheters: {len(catheters)}; give at most {MOST_CATHETERS}")
+    inner = wire
+    for catheter in catheters:
+        if inner.diameter_mm >= catheter.inner_diameter_mm:
+            raise InputError(
+                f"device {inner.name}: diameter_mm = {inner.diameter_mm:g} is too wide for the bore of catheter "
+                f"{catheter.name}, {catheter.inner_diameter_mm:g} mm; choose a thinner device or a wider catheter"
+            )
+        inner = catheter.device

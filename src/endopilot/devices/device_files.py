@@ -1,0 +1,85 @@
+"""Where device files lie: the package's own, and folders of the user's.
+
+A device is called by its file's name without `.yaml`. The files are the shipped ones, those in the folder that the
+environment variable ENDOPILOT_DEVICES names, and those in `endopilot/devices` of the user's configuration folder:
+$XDG_CONFIG_HOME, or ~/.config where that is not set.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from endopilot.errors import InputError
+from endopilot.files import read_text
+
+FOLDER_VARIABLE = "ENDOPILOT_DEVICES"
+"""Environment variable that names a folder of device files."""
+_SHIPPED = Path(__file__).parent / "wires"
+
+
+def list_devices() -> tuple[str, ...]:
+    """Return the names of the shipped devices."""
+    return tuple(sorted(path.stem for path in _SHIPPED.glob("*.yaml")))
+
+
+def user_devices() -> tuple[str, ...]:
+    """Return the names of the devices in the user's folders, those that the package ships left out.
+
+    Raises:
+        InputError: ENDOPILOT_DEVICES names no folder.
+    """
+    names = {path.stem for folder in _user_folders() for path in folder.glob("*.yaml")}
+    return tuple(sorted(names - set(list_devices())))
+
+
+def device_file(name_or_path: str | Path) -> Path:
+    """Return the YAML file of a device, by its name or its path.
+
+    Raises:
+        InputError: no such device or file, several folders hold a device of this name, or ENDOPILOT_DEVICES names no
+            folder.
+    """
+    folders = [_SHIPPED, *_user_folders()]
+    files = [path for folder in folders if there(path := folder / f"{name_or_path}.yaml")]
+    if len(files) > 1:
+        raise InputError(f"device '{name_or_path}': {' and '.join(map(str, files))} both hold it; rename yours")
+    path = files[0] if files else Path(name_or_path)
+    if not there(path):
+        names = ", ".join((*list_devices(), *user_devices()))
+        raise InputError(f"device '{name_or_path}': no such device or file; give a path, or choose from {names}")
+    return path
+
+
+def there(path: Path) -> bool:
+    """Return whether a path leads to something that can be read as a file; a name no file can have leads to nothing."""
+    try:
+        return path.exists() and not path.is_dir()
+    except (OSError, ValueError):
+        return False
+
+
+def is_shipped(path: Path) -> bool:
+    """Return whether a device's file comes with the package."""
+    return path.parent == _SHIPPED
+
+
+def device_yaml(name_or_path: str | Path) -> tuple[Path, str]:
+    """Return the YAML file of a device, by its name or its path, and the text in it.
+
+    Raises:
+        InputError: no such device, several of this name, or a file that is no text.
+    """
+    path = device_file(name_or_path)
+    return path, read_text(path, what="device's YAML file")
+
+
+def _user_folders() -> list[Path]:
+    """Return the folders that may hold the user's devices, each once."""
+    configuration = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
+    folders = [configuration / "endopilot" / "devices"]
+    if named := os.environ.get(FOLDER_VARIABLE):
+        if not Path(named).is_dir():
+            raise InputError(f"{FOLDER_VARIABLE}={named}: no such folder; make it, or unset the variable")
+        folders.insert(0, Path(named))
+    return list(dict.fromkeys(folder.resolve() for folder in folders))

@@ -1,0 +1,132 @@
+"""What a drive must never exceed with a wire in a vessel: `DriveLimits`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from pydantic import model_validator
+
+from endopilot.devices.device import Device
+from endopilot.settings import Finite, Positive, settings
+from endopilot.types import Anatomy
+
+SPARE_MM = 20.0
+"""Length that a wire can be driven beyond the end of the vessel's longest path, mm. A wire lies slack along the wall:
+it takes more wire than centerline to reach the end."""
+Numbers = float | Float[np.ndarray, "..."]
+
+
+def far_end_mm(anatomy: Anatomy) -> float:
+    """Return the largest inserted length in a vessel, mm: its longest path and `SPARE_MM` more."""
+    return float(anatomy.tree.longest_path().abscissa[-1]) + SPARE_MM
+
+
+def within_travel(
+    translation: Numbers,
+    inserted_length: Numbers,
+    duration: float,
+    *,
+    travel_mm: tuple[Numbers, Numbers] = (0.0, np.inf),
+) -> Numbers:
+    """Return translations, mm/s, that leave no wire outside its travel.
+
+    A wire that is beyond its travel already is not moved farther out, and is not pushed or pulled back either.
+
+    Args:
+        translation: each is held for the whole time, mm/s; NaN stays NaN.
+        inserted_length: Δ at the start, mm, one for each translation.
+        duration: s.
+        travel_mm: least and largest inserted length, mm, of all wires or of each.
+    """
+    low, high = travel_mm
+    back = np.minimum(-(inserted_length - low) / duration, 0.0)
+    ahead = np.maximum((high - inserted_length) / duration, 0.0)
+    return np.clip(translation, back, ahead)
+
+
+@settings
+class DriveLimits:
+    """What a drive must never exceed.
+
+    Attributes:
+        max_velocity_mm_s: fastest translation, either way, mm/s.
+        max_rotation_rad_s: fastest rotation, either way, rad/s.
+        travel_mm: least and largest inserted length, mm.
+    """
+
+    max_velocity_mm_s: Positive
+    max_rotation_rad_s: Positive
+    travel_mm: tuple[Finite, float] = (0.0, np.inf)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> DriveLimits:
+        if not self.travel_mm[0] < self.travel_mm[1]:
+            raise ValueError(f"travel_mm: {self.travel_mm} is no range; give the smaller first")
+        return self
+
+    @staticmethod
+    def of(device: Device, anatomy: Anatomy | None = None) -> DriveLimits:
+        """Return the limits of a wire in a vessel: the drive's speed, the ostium and the far end (`far_end_mm`).
+
+        Without an anatomy the travel has no far end.
+        """
+        return DriveLimits(
+            max_velocity_mm_s=device.max_velocity_mm_s,
+            max_rotation_rad_s=device.max_rotation_rad_s,
+            travel_mm=(0.0, np.inf if anatomy is None else far_end_mm(anatomy)),
+        )
+
+    @property
+    def fastest(self) -> Float[np.ndarray, "2"]:
+        """Largest translation and rotation, mm/s and rad/s."""
+        return np.array([self.max_velocity_mm_s, self.max_rotation_rad_s])
+
+    def safe(self, translation: Any, rotation: Any) -> tuple[float, float]:
+        """Return one command that is finite and within the speed limits, whatever is asked; what is no number stops.
+
+        Args:
+            translation: mm/s.
+            rotation: rad/s.
+        """
+        try:
+            asked = np.array([float(translation), float(rotation)])
+        except (TypeError, ValueError, OverflowError):
+            return 0.0, 0.0
+        if not np.isfinite(asked).all():
+            return 0.0, 0.0
+        translation_mm_s, rotation_rad_s = np.clip(asked, -self.fastest, self.fastest).tolist()
+        return translation_mm_s, rotation_rad_s
+
+    def clip(
+        self, control: Float[np.ndarray, "*n 2"], inserted_length: Numbers, duration: float
+    ) -> Float[np.ndarray, "*n 2"]:
+        """Return what a drive can do of some controls, within its speed and its travel.
+
+        A control within the limits stays the same to the last bit.
+
+        Args:
+            control: mm/s and rad/s, each held for the whole time; NaN stays NaN.
+            inserted_length: Δ at the start, mm, one for each control or one for all.
+            duration: s.
+        """
+        made = np.clip(control, -self.fastest, self.fastest)
+        made[..., 0] = within_travel(made[..., 0], inserted_length, duration, travel_mm=self.travel_mm)
+        return made
+
+    def clip_sequence(
+        self, control: Float[np.ndarray, "*n samples 2"], inserted_length: Numbers, duration: float
+    ) -> Float[np.ndarray, "*n samples 2"]:
+        """Return what a drive can do of some sequences of controls, as `clip` one after the other.
+
+        Args:
+            control: mm/s and rad/s, each held for some time; NaN stays NaN, and so does all that follows it.
+            inserted_length: Δ before the first, mm, one for each sequence or one for all.
+            duration: of one control, s.
+        """
+        made, inserted = np.array(control, dtype=float), np.asarray(inserted_length, dtype=float)
+        for sample in range(made.shape[-2]):
+            made[..., sample, :] = self.clip(made[..., sample, :], inserted, duration)
+            inserted = inserted + duration * made[..., sample, 0]
+        return made

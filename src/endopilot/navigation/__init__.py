@@ -1,0 +1,1 @@
+"""One navigation: the loop of policy, robot and C-arm, and its record."""

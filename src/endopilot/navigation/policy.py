@@ -1,0 +1,116 @@
+"""The interface of a policy: `Policy`, what it observes (`Observation`) and what it commands (`Decision`).
+
+A policy that plans with simulated wires may also tell what it believes (`Believer`) and be led (`Led`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float
+
+from endopilot.devices.stack import Proximals
+from endopilot.tasks.navigation import Navigation
+from endopilot.xray.fluoroscope import TipMeasurement
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """All that a policy is given at a decision.
+
+    Attributes:
+        time_s: since the start of the navigation, s.
+        inserted_length: Δ by the robot's encoder, mm.
+        rotation: φ by the robot's encoder, rad.
+        tip: what X-ray shows now, or None where it is off.
+        catheters: inserted length (mm) and rotation (rad) of each catheter by its encoders, from the inside out.
+    """
+
+    time_s: float
+    inserted_length: float
+    rotation: float
+    tip: TipMeasurement | None
+    catheters: Proximals = ()
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What is done until the next decision.
+
+    Attributes:
+        translation: of the wire's proximal end, mm/s.
+        rotation: of the wire's proximal end, rad/s.
+        expose: whether X-ray is to be on at the next decision.
+        gives_up: where and why the policy ends the navigation with this decision, in words; empty if it goes on.
+        catheters: translation (mm/s) and rotation (rad/s) of each catheter's proximal end, from the inside out; those
+            that are not given stand still.
+    """
+
+    translation: float
+    rotation: float
+    expose: bool = False
+    gives_up: str = ""
+    catheters: Proximals = ()
+
+    def velocities(self, devices: int) -> Proximals:
+        """Return translation (mm/s) and rotation (rad/s) of the wire, then of each catheter.
+
+        Args:
+            devices: number of wire and catheters.
+        """
+        given = ((self.translation, self.rotation), *self.catheters)
+        return (*given, *[(0.0, 0.0)] * (devices - len(given)))
+
+
+@runtime_checkable
+class Policy(Protocol):
+    """Drives one navigation."""
+
+    def start(self, navigation: Navigation, seed: int) -> None:
+        """Prepare for a navigation as it is known: reality may have another friction or ostium."""
+        ...
+
+    def decide(self, observation: Observation) -> Decision:
+        """Return what to do until the next decision, `DECISION_PERIOD_S` later."""
+        ...
+
+
+@dataclass(frozen=True)
+class BelievedTip:
+    """Where a policy believes the tip to be.
+
+    Attributes:
+        abscissa: Δtip, mm.
+        offset: γtip, mm.
+        half_width: of the bands around both in which the tip is expected, mm; NaN without bands.
+        asks: why the policy asks for X-ray at the next decision; empty if it does not.
+    """
+
+    abscissa: float
+    offset: float
+    half_width: tuple[float, float] = (np.nan, np.nan)
+    asks: str = ""
+
+
+@runtime_checkable
+class Believer(Protocol):
+    """A policy that tells what it believes."""
+
+    def believed(self) -> BelievedTip:
+        """Return where the policy believed the tip to be at its last decision."""
+        ...
+
+    def believed_wires(self) -> Float[np.ndarray, "wires nodes 3"]:
+        """Return the wires that it holds possible, the likeliest first: nodes from the tip on, LPS mm."""
+        ...
+
+
+@runtime_checkable
+class Led(Protocol):
+    """A policy that can go on from wherever somebody else has driven the wire to."""
+
+    def watch(self, observation: Observation) -> None:
+        """Take what is observed while somebody else decides."""
+        ...

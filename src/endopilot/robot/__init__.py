@@ -1,0 +1,1 @@
+"""The robot that drives the devices: limits, simulated drive, remote drive."""

@@ -1,0 +1,228 @@
+"""A simulated drive: the machine that one client commands, and that stops on any error. `drive_server` is its process.
+
+Time and bytes come in as arguments, so that it can be tested without a clock or a socket. A drive that stopped stays so
+until it is armed again.
+
+What moves the drive bears a ticket: a random word that every answer of the drive brings. A ticket lasts for 200 ms less
+the time that braking takes, and a stop makes all of them void. So a command says when its client last heard the drive,
+and 200 ms after that the drive stands still. Whatever waited in a buffer between them is dropped, however much it is,
+and nobody can write a command for later.
+"""
+
+from __future__ import annotations
+
+import math
+import secrets
+from collections import deque
+
+import numpy as np
+
+from endopilot.devices.drive_limits import DriveLimits
+from endopilot.robot.drive_protocol import BRAKING_S, LONGEST_LINE, PROTOCOL, SILENCE_S, number
+from endopilot.robot.robot import DriveMotion, RobotConfig
+
+CYCLE_S = 0.01
+"""Period of the drive's loop, and time for which its answers bring the same ticket, s."""
+LASTS_S = SILENCE_S - BRAKING_S
+"""Age at which a ticket is void, s."""
+_MOST_NEWS = 100
+
+
+class Drive:
+    """The machine: motion, watchdog, and who may command.
+
+    Attributes:
+        stopped: why the drive stands still, or None while it is armed: "start", "silence", "connection", "not-finite",
+            "limit", "travel", "malformed" or "asked".
+        dropped: commands that came with a ticket too old, void or never given.
+        owner: the session that commands, if any.
+        news: lines for people, on stops, clients and strangers; whoever shows them takes them out.
+    """
+
+    def __init__(
+        self, limits: DriveLimits, *, now: float, config: RobotConfig | None = None, inserted_length: float = 0.0
+    ) -> None:
+        """Stand still, unarmed.
+
+        Args:
+            limits: a command beyond them, or the end of the travel, stops the drive.
+            now: time by the drive's clock, s.
+            config: latency, backlash, accelerations and encoder noise.
+            inserted_length: Δ at the start, mm.
+        """
+        config = config or RobotConfig()
+        self._limits, self._motion = limits, DriveMotion(limits, config, (inserted_length, 0.0))
+        self._noise, self._random = np.array([config.encoder_sd_mm, config.encoder_sd_rad]), np.random.default_rng()
+        self._began = self._now = self._heard = now
+        self._tickets: dict[str, float] = {}
+        self._wanted: tuple[float, float] | None = None
+        self._state: str | None = None
+        self.stopped: str | None = "start"
+        self.dropped = 0
+        self.owner: Session | None = None
+        self.news: deque[str] = deque(maxlen=_MOST_NEWS)
+
+    @property
+    def position(self) -> tuple[float, float]:
+        """Δ, mm, and φ, rad, as they are."""
+        return float(self._motion.position[0]), float(self._motion.position[1])
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the motor stands still."""
+        return not self._motion.velocity.any()
+
+    def tick(self, now: float) -> None:
+        """Let the time pass up to now, s; the watchdog stops the drive when it is due, even if the call comes late."""
+        due = self._heard + LASTS_S
+        if self.stopped is None and now >= due:
+            self._advance(max(due, self._now))
+            self.stop("silence")
+        self._advance(max(now, self._now))
+
+    def stop(self, reason: str) -> None:
+        """Brake, and stay so until the drive is armed again; what was sent before the client knows of it is void."""
+        self._wanted, self._state = None, None
+        self._tickets.clear()
+        self._motion.stop(within_s=BRAKING_S)
+        if self.stopped is None:
+            self.stopped = reason
+            self.news.append(
+                f"stopped at {self._now - self._began:.3f} s: {reason}; {self.position[0]:.2f} mm inserted"
+            )
+
+    def arm(self, ticket: str) -> None:
+        """Take commands from now on, if stopped; the watchdog runs."""
+        heard = self._given(ticket)
+        if heard is not None and self.stopped is not None:
+            self.stopped, self._state, self._heard = None, None, heard
+
+    def move(self, ticket: str, translation: float, rotation: float) -> None:
+        """Take a command, mm/s and rad/s, if armed; the newest of one instant alone is obeyed.
+
+        Args:
+            ticket: that the drive gave so lately that it lasts; with any other nothing happens.
+            translation: one that is not finite or beyond the limits stops the drive.
+            rotation: likewise.
+        """
+        heard = self._given(ticket)
+        if heard is None or self.stopped is not None:
+            return
+        if not (math.isfinite(translation) and math.isfinite(rotation)):
+            self.stop("not-finite")
+        elif abs(translation) > self._limits.max_velocity_mm_s or abs(rotation) > self._limits.max_rotation_rad_s:
+            self.stop("limit")
+        else:
+            self._wanted, self._heard = (translation, rotation), max(heard, self._heard)
+
+    def state(self) -> str:
+        """Return a STATE answer: clock, s; Δ, mm, and φ, rad, by the encoders; armed or why not; and a ticket."""
+        if self._state is None:  # one instant has one reading
+            inserted, rotation = self._motion.position + self._noise * self._random.standard_normal(2)
+            status = "armed" if self.stopped is None else f"stopped:{self.stopped}"
+            clock = self._now - self._began
+            self._state = f"STATE {clock:.4f} {inserted:.4f} {rotation:.5f} {status} {self._ticket()}\n"
+        return self._state
+
+    def open(self) -> Session | None:
+        """Return the drive's side of a new connection; None while another client commands."""
+        if self.owner is not None:
+            return None
+        self.owner = Session(self)
+        self.news.append("a client is connected")
+        return self.owner
+
+    @property
+    def greeting(self) -> str:
+        """The first line to a client: protocol and limits."""
+        numbers = (self._limits.max_velocity_mm_s, self._limits.max_rotation_rad_s, *self._limits.travel_mm)
+        return " ".join([PROTOCOL, *(repr(float(value)) for value in numbers)]) + "\n"
+
+    def lose_owner(self) -> None:
+        """Stop, because the connection of the owner is closed."""
+        self.stop("connection")
+        self.owner = None
+        self.news.append("the client has disconnected")
+
+    def _ticket(self) -> str:
+        """Return a ticket that is at most a cycle old, and forget those that are too old to move anything."""
+        self._tickets = {ticket: given for ticket, given in self._tickets.items() if self._now < given + LASTS_S}
+        newest = next(reversed(self._tickets), None)
+        if newest is None or self._now >= self._tickets[newest] + CYCLE_S:
+            newest = secrets.token_hex(8)
+            self._tickets[newest] = self._now
+        return newest
+
+    def _given(self, ticket: str) -> float | None:
+        """Return when a ticket was given, s, or None if it can move nothing."""
+        given = self._tickets.get(ticket)
+        if given is None or self._now >= given + LASTS_S:
+            self.dropped += 1
+            return None
+        return given
+
+    def _advance(self, until: float) -> None:
+        if self._wanted is not None:
+            self._motion.command(*self._wanted)
+            self._wanted = None
+        if until > self._now:
+            self._motion.advance(until - self._now)
+            self._now, self._state = until, None
+        (low, high), at, speed = self._limits.travel_mm, self._motion.position[0], self._motion.velocity[0]
+        if self.stopped is None and ((at <= low and speed < 0) or (at >= high and speed > 0)):
+            self.stop("travel")
+
+
+class Session:
+    """The drive's side of the connection of its owner."""
+
+    def __init__(self, drive: Drive) -> None:
+        """Wait for the first line."""
+        self._drive, self._held, self.closed = drive, b"", False
+
+    def receive(self, data: bytes, now: float) -> bytes:
+        """Take what one read brought and return the answers, one for each line that it ends.
+
+        A line that never ends closes the session.
+
+        Args:
+            data: bytes as they came, cut anywhere.
+            now: time by the drive's clock, s.
+        """
+        self._drive.tick(now)
+        if self.closed:
+            return b""
+        *lines, self._held = (self._held + data).split(b"\n")
+        answers = [self._answer(line) for line in lines]
+        if len(self._held) >= LONGEST_LINE:
+            self._drive.stop("malformed")
+            self.close(now)
+        return "".join(answers).encode("ascii")
+
+    def close(self, now: float) -> None:
+        """Note that the connection is closed, at a time by the drive's clock, s; the drive stops."""
+        self._drive.tick(now)
+        self.closed, self._held = True, b""
+        if self._drive.owner is self:
+            self._drive.lose_owner()
+
+    def _answer(self, line: bytes) -> str:
+        """Do what a line asks and return the answer; a line that is not of the protocol stops the drive."""
+        drive = self._drive
+        text = line.decode("ascii", "replace") if len(line) < LONGEST_LINE else ""
+        match text.split(" "):
+            case ["STATE"]:
+                pass
+            case ["STOP"]:
+                drive.stop("asked")
+            case ["ARM", ticket]:
+                drive.arm(ticket)
+            case ["MOVE", ticket, first, second]:
+                translation, rotation = number(first), number(second)
+                if translation is None or rotation is None:
+                    drive.stop("malformed")
+                else:
+                    drive.move(ticket, translation, rotation)
+            case _:
+                drive.stop("malformed")
+        return drive.state()

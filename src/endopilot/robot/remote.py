@@ -1,0 +1,220 @@
+"""A robot at the other end of a TLS connection: the client of a drive.
+
+The drive stops where it hears no command for 0.2 s, and a controller decides every 0.5 s; so a thread repeats the last
+command in between. It does so for a while only: where the controller itself falls silent, so does the client, and the
+drive stops. After that the thread asks for the state alone.
+"""
+
+from __future__ import annotations
+
+import socket
+import ssl
+import threading
+import time
+from pathlib import Path
+from types import TracebackType
+
+from endopilot.devices.drive_limits import DriveLimits
+from endopilot.errors import InputError
+from endopilot.robot.drive_protocol import LONGEST_LINE, PROTOCOL, SILENCE_S, number, tls_context
+from endopilot.robot.robot import ProximalState
+from endopilot.tasks.navigation import DECISION_PERIOD_S
+
+REPEAT_S = 0.02
+"""Time between two repetitions of a command, s."""
+HOLD_S = 1.5 * DECISION_PERIOD_S
+"""Time for which a command is repeated, s."""
+ANSWER_S = 2.0
+"""Time that the drive has to answer, s."""
+
+
+class RemoteRobot:
+    """Commands a drive process, and reads its encoders. Any thread may call it.
+
+    Attributes:
+        limits: of the drive, as it reported them; no command beyond them is ever sent.
+        status: "armed", or "stopped:" and why, as the drive last said.
+    """
+
+    def __init__(self, host: str, port: int, certificates: Path) -> None:
+        """Connect and arm the drive.
+
+        Args:
+            host: where the drive listens.
+            port: its TCP port.
+            certificates: folder with `client.key`, `client.crt` and `drive.crt`.
+
+        Raises:
+            InputError: a file is missing or bad; nothing listens there, it is no drive or another one, it does not know
+                this client, or it has another client.
+        """
+        context = tls_context(Path(certificates), of_drive=False)
+        self._where, self._lock = f"{host}:{port}", threading.RLock()
+        self._held, self._lost, self.status = b"", "", "stopped:start"
+        self._ticket, self._ticket_time = "", 0.0
+        self._wanted, self._until, self._closing = (0.0, 0.0), 0.0, threading.Event()
+        self._socket = self._connect(host, port, context, Path(certificates))
+        try:
+            self.limits = self._greet(Path(certificates))
+            self.arm()
+        except BaseException:
+            self._socket.close()
+            raise
+        self._repeater = threading.Thread(target=self._repeat, daemon=True)
+        self._repeater.start()
+
+    def __enter__(self) -> RemoteRobot:
+        """Return the robot; leaving the block stops it and closes the connection."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        """Close the connection."""
+        self.close()
+
+    def command(self, translation: float, rotation: float) -> None:
+        """Move on at a velocity, mm/s and rad/s, for `HOLD_S` at most. What is not finite stops the wire.
+
+        Raises:
+            InputError: the connection is lost.
+        """
+        with self._lock:
+            self._wanted, self._until = self.limits.safe(translation, rotation), time.monotonic() + HOLD_S
+            self._move()
+
+    def proximal_state(self) -> ProximalState:
+        """Return what the drive's encoders say now.
+
+        Raises:
+            InputError: the connection is lost.
+        """
+        return self._ask("STATE")
+
+    def arm(self) -> None:
+        """Let a drive that stopped move again, at the next command.
+
+        Raises:
+            InputError: the connection is lost.
+        """
+        with self._lock:
+            self._until = 0.0
+            self._ask("STATE")  # a stop that this client has not heard of made its ticket void
+            self._ask("ARM", self._ticket)
+
+    def stop(self) -> None:
+        """Stop the drive until it is armed again.
+
+        Raises:
+            InputError: the connection is lost.
+        """
+        with self._lock:
+            self._until = 0.0
+            self._ask("STOP")
+
+    def close(self) -> None:
+        """Close the connection; the drive stops."""
+        self._closing.set()
+        with self._lock:
+            self._lose("it was closed")
+        if threading.current_thread() is not self._repeater:
+            self._repeater.join()
+
+    def _connect(self, host: str, port: int, context: ssl.SSLContext, certificates: Path) -> ssl.SSLSocket:
+        try:
+            plain = socket.create_connection((host, port), timeout=ANSWER_S)
+        except (OSError, OverflowError, UnicodeError) as error:
+            raise InputError(
+                f"host, port: no drive at {self._where} ({error}); start one, `endopilot drive`"
+            ) from error
+        try:
+            plain.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            return context.wrap_socket(plain)
+        except ssl.SSLCertVerificationError as error:
+            plain.close()
+            raise InputError(
+                f"certificates: the drive at {self._where} is not that of {certificates / 'drive.crt'} "
+                f"({error.verify_message}); copy its drive.crt there"
+            ) from error
+        except OSError as error:
+            plain.close()
+            raise InputError(
+                f"host, port: {self._where} begins no TLS 1.3 ({error}); check the address, or try again if too many "
+                "connections wait there"
+            ) from error
+
+    def _greet(self, certificates: Path) -> DriveLimits:
+        """Read the drive's greeting and return its limits."""
+        try:
+            greeting = self._line()
+        except OSError as error:  # in TLS 1.3 a client learns so late that it was refused
+            raise InputError(
+                f"certificates: the drive at {self._where} closed the connection ({error}); "
+                f"copy {certificates / 'client.crt'} into its folder and start it again"
+            ) from error
+        if greeting == f"{PROTOCOL} BUSY":
+            raise InputError(f"host, port: the drive at {self._where} has another client; disconnect that first")
+        name, *fields = greeting.rsplit(" ", 4)
+        numbers = [value for value in map(number, fields) if value is not None]
+        if name != PROTOCOL or len(numbers) != 4:
+            raise InputError(f"host, port: {self._where} speaks no {PROTOCOL}; check the address and the version")
+        speed, spin, low, high = numbers
+        return DriveLimits(max_velocity_mm_s=speed, max_rotation_rad_s=spin, travel_mm=(low, high))
+
+    def _move(self) -> None:
+        if time.monotonic() > self._ticket_time + SILENCE_S / 2:
+            self._ask("STATE")  # for a ticket that still counts
+        self._ask("MOVE", self._ticket, *(repr(value) for value in self._wanted))
+
+    def _repeat(self) -> None:
+        while not self._closing.wait(REPEAT_S):
+            with self._lock:
+                try:
+                    if time.monotonic() < self._until:
+                        self._move()
+                    else:
+                        self._ask("STATE")
+                except InputError:
+                    return  # the next call of the controller says so
+
+    def _ask(self, verb: str, *arguments: str) -> ProximalState:
+        """Send a line and return what the drive answers; with the connection lost it stays so."""
+        with self._lock:
+            if self._lost:
+                raise self._gone()
+            asked = time.monotonic()
+            try:
+                self._socket.settimeout(ANSWER_S)
+                self._socket.sendall(" ".join([verb, *arguments]).encode("ascii") + b"\n")
+                fields = self._line().split(" ")
+                values = [value for value in map(number, fields[1:4]) if value is not None]
+                if fields[0] != "STATE" or len(fields) != 6 or len(values) != 3:
+                    raise ConnectionError("its answer is not of the protocol")
+            except OSError as error:
+                self._lose(str(error))
+                raise self._gone() from error
+            except BaseException:  # Ctrl-C between question and answer: the next answer would be that of this question
+                self._lose("a question was interrupted")
+                raise
+            self.status, self._ticket, self._ticket_time = fields[4], fields[5], asked
+            if self.status != "armed":
+                self._until = 0.0
+            clock, inserted, rotation = values
+            return ProximalState(clock, inserted, rotation)
+
+    def _lose(self, reason: str) -> None:
+        self._lost = self._lost or reason
+        self._socket.close()
+
+    def _gone(self) -> InputError:
+        return InputError(f"drive at {self._where}: the connection is lost ({self._lost}); connect again")
+
+    def _line(self) -> str:
+        """Return the next line, without its newline."""
+        until = time.monotonic() + ANSWER_S
+        while b"\n" not in self._held:
+            self._socket.settimeout(max(until - time.monotonic(), 1e-3))
+            data = self._socket.recv(4096)
+            if not data or len(self._held) > LONGEST_LINE:
+                raise ConnectionError("closed by the drive" if not data else "its line is too long")
+            self._held += data
+        line, _, self._held = self._held.partition(b"\n")
+        return line.decode("ascii", "replace")

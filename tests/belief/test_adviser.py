@@ -1,0 +1,176 @@
+"""The adviser: bands that hold over whole intervals, and when an exposure is due."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from endopilot.belief.adviser import AdviserConfig, XrayAdviser, count_events, near_exposures
+from endopilot.belief.bands import Calibration, conformal_scale, fit_spread, narrowest, spread_of, surely_missed
+from endopilot.errors import InputError
+
+
+def calibration(scale: float = 1.0, abscissa: float = 0.1, offset: float = 0.05, heeded: float = 1.0) -> Calibration:
+    return Calibration(
+        level=0.9,
+        scale=scale,
+        abscissa_terms=(0.0, 0.0, abscissa, 0.0),
+        offset_terms=(offset, 0.0, 0.0, 0.0),
+        anatomies=10,
+        intervals=40,
+        dataset="key",
+        heeded=heeded,
+    )
+
+
+@pytest.mark.parametrize("unlike", [0.0, 0.5])  # patients alike, and patients that differ
+def test_bands_hold_over_whole_intervals_of_new_patients(unlike) -> None:
+    random = np.random.default_rng(5)
+    covered, samplewise = [], []
+    for _ in range(100):
+        size = np.exp(unlike * random.standard_normal(17))  # the last patient is new
+        errors = np.abs(size[:, None, None] * random.standard_normal((17, 6, 40)))
+        score, anatomy = errors.max(axis=2), np.repeat(np.arange(16), 6)
+        scale = conformal_scale(score[:16].ravel(), anatomy, 0.9)
+        covered.append((score[16] <= scale).mean())
+        samplewise.append((score[16] <= np.quantile(errors[:16], 0.9)).mean())
+    assert abs(np.mean(covered) - 0.9) < 0.03
+    assert np.mean(samplewise) < 0.5  # bands made sample by sample hold too few whole intervals
+
+
+def test_an_event_is_where_a_state_begins_and_an_exposure_beside_it_shows_it() -> None:
+    state = np.array([[1, 1, 0, 1, 1, 0, 0, 1, 0, 1], [0, 0, 0, 0, 1, 0, 0, 0, 0, 0]], dtype=bool)
+    exposed = np.zeros((2, 10), dtype=bool)
+    assert count_events(state, near_exposures(exposed)) == (3, 3)  # not what was so at first, nor the last sample
+    exposed[0, [2, 9]] = True  # one period before the first; two after the second
+    exposed[1, 5] = True
+    assert count_events(state, near_exposures(exposed)) == (3, 1)
+
+
+def test_too_few_patients_are_refused() -> None:
+    with pytest.raises(InputError, match=r"needs at least 9 patients.* has 8"):
+        conformal_scale(np.ones(16), np.repeat(np.arange(8), 2), 0.9)
+    assert conformal_scale(np.arange(9.0), np.arange(9), 0.9) == 8.0
+
+
+def test_the_spread_is_fitted_to_the_errors() -> None:
+    random = np.random.default_rng(2)
+    seconds = np.tile(np.arange(40) * 0.5, (200, 1))
+    travel, own = random.uniform(0, 100, (200, 40)), random.uniform(0, 1, (200, 40, 2))
+    wanted = ((0.05, 0.0, 0.01, 0.0), (0.02, 0.004, 0.0, 0.5))
+    size = spread_of(wanted, seconds, travel, own)
+    error = size * random.choice([-1.0, 1.0], size.shape) * random.uniform(0.5, 1.5, size.shape)
+    found = fit_spread(error, seconds, travel, own)
+    np.testing.assert_allclose(found, wanted, atol=0.01, rtol=0.2)
+    assert (np.array(fit_spread(error, seconds, travel, np.zeros_like(own))) >= 0).all()
+
+
+def test_the_bands_are_the_narrowest_that_both_hold() -> None:
+    """No other pair of widths with which both bands hold in 90 % of the intervals has a smaller product."""
+    worst = np.random.default_rng(4).lognormal(size=(61, 2))
+    terms = ((1.0, 0.0, 0.0, 2.0), (0.5, 0.0, 0.0, 0.0))
+    found = narrowest(terms, worst, 0.9)
+    widths = np.array([found[0][0], found[1][0] / 0.5])
+    np.testing.assert_allclose(found[0], widths[0] * np.array(terms[0]))
+    first, second = np.meshgrid(*worst.T, indexing="ij")
+    hold = ((worst[:, 0] <= first[..., None]) & (worst[:, 1] <= second[..., None])).mean(axis=2) >= 0.9
+    assert (worst <= widths).all(axis=1).mean() >= 0.9
+    assert widths.prod() == pytest.approx((first * second)[hold].min())
+
+
+def test_a_few_tips_in_the_wrong_branch_widen_no_band() -> None:
+    """In 8 of 100 intervals Δtip errs by decimetres and γtip by no more than elsewhere."""
+    worst = np.random.default_rng(5).uniform(0.5, 1.0, (100, 2))
+    worst[:8, 0] = 1000.0
+    (along, *_), (across, *_) = narrowest(((1.0, 0.0, 0.0, 0.0),) * 2, worst, 0.9)
+    assert along <= 1.0 and across <= 1.0
+
+
+def test_what_is_missed_for_sure_is_the_share_and_its_standard_error() -> None:
+    alike = np.array([20.0, 40.0, 60.0])
+    assert surely_missed(alike / 20, alike) == pytest.approx(0.05)  # all patients alike: no error
+    # 1 of 20 is missed; residuals of ±1/2, of two patients: a variance of 2 (1/4 + 1/4) over 20 events squared
+    assert surely_missed(np.array([1.0, 0.0]), np.array([10.0, 10.0])) == pytest.approx(0.05 + 1 / 20)
+    assert surely_missed(np.zeros(3), np.zeros(3)) == 0.0
+    assert surely_missed(np.array([1.0]), np.array([50.0])) > 1.0  # one patient says nothing of others
+
+
+def test_what_is_missed_for_sure_is_seldom_less_than_new_patients_miss() -> None:
+    random = np.random.default_rng(3)
+    events = random.poisson(40.0, (400, 25))
+    missed = random.binomial(events, random.beta(0.5, 9.5, events.shape))  # 5 %; patients differ by as much
+    below = [surely_missed(*patients) < 0.05 for patients in zip(missed, events, strict=True)]
+    assert 0.1 < np.mean(below) < 0.25  # 16 % of a normal distribution lie more than one standard error below
+
+
+def test_a_calibration_is_read_again_and_its_absence_named(tmp_path) -> None:
+    with pytest.raises(InputError, match=r"the model has no calibration.*endopilot advise"):
+        Calibration.read(tmp_path)
+    calibration(heeded=0.25).write(tmp_path)
+    assert Calibration.read(tmp_path) == calibration(heeded=0.25)
+    (tmp_path / "xray.json").write_text('{"level": 0.9, "abscissa_terms": [], "offset_terms": []}')
+    with pytest.raises(InputError, match=r"xray.json: scale: missing; .* run `endopilot advise` again"):
+        Calibration.read(tmp_path)
+
+
+def advices(at: list[float], inserted: list[float], *, config: AdviserConfig, **bands: float) -> list[int]:
+    """Return at which samples an exposure is due; the lumen leaves a clearance of 1 mm."""
+    adviser = XrayAdviser(calibration(**bands), config, wire_radius_mm=0.2)
+    proximal = np.stack([inserted, np.zeros(len(inserted))], axis=1)[:, None]
+    tips, radius = np.stack([inserted, at], axis=1)[:, None], np.full(1, 1.2)
+    adviser.start(proximal[0], tips[0], radius)
+    return [
+        index
+        for index in range(1, len(at))
+        if adviser.advise(proximal[index], tips[index], np.zeros((1, 2)), radius)[0]
+    ]
+
+
+def test_an_exposure_is_due_when_the_band_of_the_abscissa_is_as_wide_as_delta() -> None:
+    inserted = [2.0 * abs(6 - i) for i in range(20)]  # back and forth by 2 mm a sample: the band grows by 0.2 mm
+    due = advices([0.3] * 20, inserted, config=AdviserConfig(abscissa_mm=1.0))
+    assert due == [5, 10, 15]
+
+
+def test_an_exposure_is_due_where_the_band_meets_the_wall() -> None:
+    offset = [0.3] * 5 + [0.56, 0.56, 0.56, 0.56, 0.61, 0.61, 0.61, 0.61, 0.71, 0.71, 0.71, 0.71] + [0.3] * 8
+    due = advices(offset, [10.0] * len(offset), config=AdviserConfig(wall_ratio=0.6), abscissa=0.0)
+    assert due == [5, 9, 13]  # the band reaches it, the tip crosses it, the band has left it behind
+    again = advices(offset * 2, [10.0] * 50, config=AdviserConfig(wall_ratio=0.6), abscissa=0.0)
+    assert again == [5, 9, 13, 30, 34, 38]  # it is armed again below
+    assert advices(offset, [10.0] * 25, config=AdviserConfig(wall_ratio=0.9), abscissa=0.0) == []
+
+
+def test_an_exposure_is_due_where_the_wire_begins_to_fill_the_lumen() -> None:
+    adviser = XrayAdviser(calibration(abscissa=0.0, offset=0.0), AdviserConfig(), wire_radius_mm=0.2)
+    still, centred = np.zeros((1, 2)), np.zeros((1, 2))
+    adviser.start(still, centred, np.full(1, 1.2))
+    radius = [1.2, 1.2, 1.2, 0.2, 0.1, 0.1, 0.1]
+    due = [bool(adviser.advise(still, centred, np.zeros((1, 2)), np.full(1, r))[0]) for r in radius]
+    assert due == [False, False, False, True, False, False, False]
+
+
+def test_the_adviser_heeds_a_share_of_the_band_across_and_all_of_that_along() -> None:
+    inserted = [2.0 * abs(6 - i) for i in range(20)]  # back and forth by 2 mm a sample: the band grows by 0.2 mm
+    assert advices([0.3] * 20, inserted, config=AdviserConfig(abscissa_mm=1.0), heeded=0.5) == [5, 10, 15]
+    offset = [0.3] * 5 + [0.56] * 4 + [0.585] * 4 + [0.61] * 4 + [0.63] * 4
+    due = advices(offset, [10.0] * len(offset), config=AdviserConfig(wall_ratio=0.6), abscissa=0.0, heeded=0.4)
+    assert due == [9, 13, 17]  # ±0.02 mm: the upper edge, the tip, the lower edge
+    adviser = XrayAdviser(calibration(abscissa=0.0, heeded=0.4), AdviserConfig(), wire_radius_mm=0.2)
+    still = np.zeros((1, 2))
+    adviser.start(still, still, np.ones(1))
+    adviser.advise(still, still, still, np.ones(1))
+    assert adviser.half_width[0, 1] == 0.05
+
+
+def test_exposures_keep_their_distance() -> None:
+    offset = [0.3, 0.58, 0.62, 0.66, 0.66, 0.3, 0.3, 0.9, 0.3, 0.9, 0.3, 0.9, 0.9]
+    due = advices(offset, [10.0] * len(offset), config=AdviserConfig(wall_ratio=0.6), abscissa=0.0, offset=0.01)
+    assert np.diff(due).min() >= 3
+    assert due[0] in (2, 3)
+
+
+def test_refuses_bad_settings() -> None:
+    for change, message in (({"level": 1.0}, "level: 1.0"), ({"wall_ratio": 0.0}, "wall_ratio: 0.0")):
+        with pytest.raises(InputError, match=message):
+            AdviserConfig(**change)

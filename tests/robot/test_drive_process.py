@@ -1,0 +1,251 @@
+"""The drive as a process, over TLS: a controller drives it, and the plug is pulled."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from endopilot.errors import InputError
+from endopilot.robot import remote
+from endopilot.robot.drive_protocol import tls_context
+from endopilot.robot.remote import RemoteRobot
+from endopilot.robot.robot import Robot
+
+HOST = "127.0.0.1"
+OBEYED = ("armed", "stopped:silence")  # a machine under load may need more than 200 ms between two lines
+MAIN = "from endopilot.cli import main; main()"
+CLIENT = """
+import sys, time
+from pathlib import Path
+from endopilot.robot.remote import RemoteRobot
+robot = RemoteRobot("127.0.0.1", int(sys.argv[1]), Path(sys.argv[2]))
+while True:
+    if robot.status != "armed":
+        robot.arm()  # a machine under load may itself keep silent for too long
+    robot.command(10.0, 0.0)
+    print(robot.proximal_state().inserted_length, flush=True)
+    time.sleep(0.05)
+"""
+
+
+@contextlib.contextmanager
+def running(certificates, *options):
+    """Start a drive on a free port, yield its process and the port, and check that no traceback was printed."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", MAIN, "drive", "--certificates", str(certificates), "--port", "0", *options],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        begun = process.stdout.readline()
+        assert begun.startswith(f"listening on {HOST}:"), process.communicate()
+        yield process, int(begun.rsplit(":", 1)[1])
+    finally:
+        process.kill()
+        _, errors = process.communicate(timeout=20)
+    assert "Traceback" not in errors
+
+
+@pytest.fixture
+def drive(certificates):
+    """Start a drive, and return its process and the port."""
+    with running(certificates) as started:
+        yield started
+
+
+def wait_for(process: subprocess.Popen, text: str) -> None:
+    """Read what the drive reports until a line holds some text."""
+    assert any(text in line for line in iter(process.stdout.readline, ""))
+
+
+def moved(robot: RemoteRobot, seconds: float) -> float:
+    """Return how far the wire goes in some time, mm, as the encoders see it, with noise of 0.02 mm."""
+    readings = [robot.proximal_state()]
+    while readings[-1].time_s < readings[0].time_s + seconds:
+        time.sleep(0.02)
+        readings.append(robot.proximal_state())
+    return float(np.ptp([reading.inserted_length for reading in readings]))
+
+
+def test_it_stops_when_its_client_is_killed(drive, certificates) -> None:
+    process, port = drive
+    client = subprocess.Popen(
+        [sys.executable, "-c", CLIENT, str(port), str(certificates)], stdout=subprocess.PIPE, text=True
+    )
+    while float(client.stdout.readline()) < 2.0:
+        pass
+    client.send_signal(signal.SIGKILL)
+    client.wait()
+    client.stdout.close()
+    wait_for(process, "the client has disconnected")
+    with RemoteRobot(HOST, port, certificates) as robot:
+        time.sleep(0.3)
+        assert moved(robot, 0.7) < 0.2
+
+
+def test_it_stops_when_its_client_falls_silent_and_goes_on_when_armed(drive, certificates, monkeypatch) -> None:
+    process, port = drive
+    monkeypatch.setattr(remote, "REPEAT_S", 1e6)  # the thread that repeats commands hangs
+    with RemoteRobot(HOST, port, certificates) as robot:
+        assert isinstance(robot, Robot)
+        robot.command(10.0, 1.0)
+        wait_for(process, ": silence;")
+        robot.command(10.0, 1.0)
+        assert robot.status == "stopped:silence"
+        robot.arm()
+        robot.command(np.nan, 1.0)
+        assert robot.status in OBEYED  # what is sent is finite: the wire stands still
+        robot.command(1e9, -1e9)
+        assert robot.status in OBEYED
+
+
+def test_a_controller_that_hangs_stops_it(drive, certificates, monkeypatch) -> None:
+    process, port = drive
+    monkeypatch.setattr(remote, "HOLD_S", 0.3)
+    with RemoteRobot(HOST, port, certificates) as robot:
+        robot.command(5.0, 0.0)
+        wait_for(process, ": silence;")  # commands are repeated for a while, and then no more
+
+
+def test_a_drive_that_was_held_up_stops_and_arming_alone_does_not_move_it(drive, certificates) -> None:
+    process, port = drive
+    with RemoteRobot(HOST, port, certificates) as robot:
+        for stopping in (signal.SIGSTOP, None):
+            robot.arm()
+            robot.command(10.0, 0.0)
+            if stopping is not None:
+                process.send_signal(stopping)
+                time.sleep(0.3)
+                process.send_signal(signal.SIGCONT)
+                wait_for(process, ": silence;")
+            else:
+                robot.stop()
+            robot.arm()  # within the time for which the last command is held
+            time.sleep(0.2)
+            assert moved(robot, 0.3) < 0.2
+
+
+def test_any_thread_may_call_it(drive, certificates) -> None:
+    _, port = drive
+    failures: list[Exception] = []
+
+    def call(robot: RemoteRobot, speed: float) -> None:
+        try:
+            for _ in range(50):
+                robot.command(speed, 0.0)
+                assert robot.proximal_state().time_s > 0.0
+        except Exception as error:
+            failures.append(error)
+
+    with RemoteRobot(HOST, port, certificates) as robot:
+        threads = [threading.Thread(target=call, args=(robot, speed)) for speed in (0.0, 1.0, 2.0)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    assert not failures
+    assert not robot._repeater.is_alive()
+    for call_again in (robot.arm, robot.stop, robot.proximal_state, lambda: robot.command(1.0, 0.0), robot.arm):
+        with pytest.raises(InputError, match="it was closed"):
+            call_again()
+    robot.close()
+
+
+@pytest.mark.parametrize(
+    ("ending", "connected"), [(signal.SIGINT, False), (signal.SIGINT, True), (signal.SIGTERM, True)]
+)
+def test_ctrl_c_and_sigterm_end_it_with_one_line(certificates, ending, connected) -> None:
+    with running(certificates) as (process, port), contextlib.ExitStack() as clients:
+        if connected:
+            robot = clients.enter_context(RemoteRobot(HOST, port, certificates))
+            robot.command(10.0, 0.0)
+            clients.enter_context(socket.create_connection((HOST, port)))  # and one that waits
+        process.send_signal(ending)
+        _, errors = process.communicate(timeout=20)
+        word = "interrupted" if ending is signal.SIGINT else "terminated"
+        assert (process.returncode, errors) == (128 + ending, f"endopilot drive: {word}\n")
+        if connected:
+            with pytest.raises(InputError, match="the connection is lost"):
+                robot.command(1.0, 0.0)
+
+
+def test_it_refuses_a_second_client_and_strangers(drive, certificates, make_certificates, tmp_path) -> None:
+    process, port = drive
+    strange = make_certificates(tmp_path / "strange")
+    half = tmp_path / "half"  # knows the drive, which does not know it
+    half.mkdir()
+    for name, folder in (("drive.crt", certificates), ("client.key", strange), ("client.crt", strange)):
+        (half / name).write_bytes((folder / name).read_bytes())
+    (half / "client.key").chmod(0o600)
+    with RemoteRobot(HOST, port, certificates) as robot:
+        with pytest.raises(InputError, match="another client"):
+            RemoteRobot(HOST, port, certificates)
+        with pytest.raises(InputError, match=r"certificates: the drive at .* is not that of .*strange/drive.crt"):
+            RemoteRobot(HOST, port, strange)
+        with pytest.raises(InputError, match=r"certificates: the drive at .* closed .* copy .*half/client.crt"):
+            RemoteRobot(HOST, port, half)
+        with socket.create_connection((HOST, port)) as plain:  # no TLS
+            plain.sendall(b"\x00" * 100_000 + b"\nSTOP\n")
+            robot.arm()
+            robot.command(1.0, 0.0)
+            assert robot.status in OBEYED
+    wait_for(process, f"refused a connection from {HOST}:")
+
+
+def test_it_says_where_no_drive_is(certificates) -> None:
+    with socket.socket() as listener:
+        listener.bind((HOST, 0))
+        port = listener.getsockname()[1]
+        with pytest.raises(InputError, match="no drive at"):
+            RemoteRobot(HOST, port, certificates)
+        listener.listen()
+
+        def greet() -> None:
+            with listener.accept()[0] as connection:
+                connection.sendall(b"endopilot-drive 1 00\n")
+                connection.recv(4096)
+
+        thread = threading.Thread(target=greet)
+        thread.start()
+        with pytest.raises(InputError, match=r"begins no TLS 1\.3"):
+            RemoteRobot(HOST, port, certificates)
+        thread.join()
+    for host, number in (("", 1), ("x" * 80, 1), (HOST, 99999)):
+        with pytest.raises(InputError, match="no drive at"):
+            RemoteRobot(host, number, certificates)
+
+
+def test_certificates_are_checked(make_certificates, tmp_path) -> None:
+    folder = make_certificates(tmp_path / "good")
+    other = make_certificates(tmp_path / "other")
+    tls_context(folder, of_drive=True)
+
+    def refuses(name: str, content: bytes, match: str) -> None:
+        before = (folder / name).read_bytes()
+        (folder / name).write_bytes(content)
+        with pytest.raises(InputError, match=match):
+            tls_context(folder, of_drive=True)
+        (folder / name).write_bytes(before)
+
+    refuses("drive.key", (other / "drive.key").read_bytes(), "certificates: .*drive.crt and .*drive.key are no")
+    refuses("drive.key", b"", "drive.key are no")
+    refuses("drive.crt", b"nothing", "drive.crt and .*drive.key are no")
+    refuses("client.crt", b"", r"certificates: .*client.crt holds no certificate")
+    locked = ["openssl", "rsa", "-aes128", "-passout", "pass:1234", "-in", folder / "drive.key"]
+    key = subprocess.run(locked, check=True, capture_output=True).stdout
+    refuses("drive.key", key, "unencrypted key")
+    (folder / "drive.key").chmod(0o640)
+    with pytest.raises(InputError, match="chmod 600"):
+        tls_context(folder, of_drive=True)
+    (folder / "client.crt").unlink()
+    with pytest.raises(InputError, match=r"client.crt: no such file"):
+        tls_context(folder, of_drive=True)
