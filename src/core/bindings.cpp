@@ -452,8 +452,7 @@ NB_MODULE(ENDOPILOT_MODULE, module) {
         .def_prop_ro("nodes", &Simulations::nodes);
     for (const auto& [name, which] : {std::pair{"time", World::kTime}, {"active", World::kActive}, {"reason", World::kReason}})
         simulation.def(name, [which](Simulations& s) { return of_world(s, which); });
-    for (const auto& [name, which] : {std::pair{"inserted_length", World::kLength}, {"rotation", World::kRotation}, {"base_force", World::kBaseForce},
-                                      {"base_torque", World::kBaseTorque}, {"drive_force", World::kDriveForce}, {"drive_torque", World::kDriveTorque},
-                                      {"slip", World::kSlip}, {"rotation_slip", World::kRotationSlip}})
-        simulation.def(name, [which](Simulations& s) { return of_devices(s, which); });
+#define NUMBER(name, quantity) simulation.def(#name, [](Simulations& s) { return of_devices(s, World::quantity); });
+    ENDOPILOT_DEVICE_NUMBERS(NUMBER)
+#undef NUMBER
 }

@@ -166,7 +166,7 @@ struct ContactPoint {
 // reference frame since the step's start, and the rotation that their sliding along the mesh brings (tubes.hpp).
 template <class V, int T>
 struct Touching {
-    V weight[T], twisted[T], spin;
+    V spin, weight[T], twisted[T];
 };
 
 // The wall's spring at a contact point: it gives way by d to the force k d exp(s d²).

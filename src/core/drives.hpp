@@ -9,7 +9,7 @@
 namespace endopilot {
 
 constexpr double kStopStiffness = 100;  // N/mm, of the stops at both ends of a drive's travel
-constexpr int kMaxReleases = 8;         // times in a step that a drive may let go of its device
+constexpr int kMaxReleases = 8;         // times in a step that a drive may begin to slip
 constexpr double kMobilizingLength = 0.02;   // mm of sliding that turn friction along two devices from one direction to the other by half
 constexpr double kFaster = 1.25, kLeastFeed = 1.0 / 64;   // of the share of its motion that a drive makes after it was at its limit
 constexpr double kBackdrive = 20, kMostBackdrive = 40;   // mm/s by which a drive at twice its limit gives way faster with each step, and at most
@@ -113,7 +113,7 @@ ENDOPILOT_DEVICE double borne_by_others(const Drives& drives, const Lane<T>& lan
         most += drives.push[k];
         least -= drives.pull[k];
     }
-    return T == 0 ? 0.0 : std::clamp(lane.others, least, most);
+    return T == 0 ? 0.0 : std::clamp(lane.others_force, least, most);
 }
 
 // The energy at the trial point of what is lost where drives slip at their limits; the foremost one also moves what the others bear. Or,
@@ -285,7 +285,7 @@ ENDOPILOT_DEVICE void update_drives(const Scene& scene, Lanes<V, T>& lanes, int 
                                        : std::clamp(device.backdrive - kBackdrive * beyond, double{-kMostBackdrive}, double{kMostBackdrive});
         if (std::abs(device.backdrive) < scene.options.stick_velocity) device.backdrive = 0;
     }
-    lane.others = pushed - lane.device[lane.foremost].force;
+    lane.others_force = pushed - lane.device[lane.foremost].force;
 }
 
 }  // namespace endopilot

@@ -134,10 +134,10 @@ ENDOPILOT_LARGE double load(const Run& run, Lanes<V, T>& lanes, int l) {
         device.force = from[World::kBaseForce];
         device.torque = from[World::kBaseTorque];
         pushed += device.force;
-        if (from[World::kLeads] != 0) lane.foremost = k;
+        if (from[World::kForemost] != 0) lane.foremost = k;
         set(lanes.step.friction[k], l, from[World::kFriction]);
     }
-    lane.others = pushed - lane.device[lane.foremost].force;
+    lane.others_force = pushed - lane.device[lane.foremost].force;
     read_control(run, lanes, l);
     const double weight = lane.last_duration > 0 ? run.in.seconds(lane.stride) / lane.last_duration : 0.0;
     lane.advance.last = weight > 0 ? w[World::kLastAdvance] : 0.0;
@@ -202,7 +202,7 @@ ENDOPILOT_LARGE void store(const Run& run, const Lanes<V, T>& lanes, int l) {
         to[World::kFeed] = device.feed;
         to[World::kBackdrive] = device.backdrive;
         to[World::kMobilized] = device.mobilized;
-        to[World::kLeads] = k == lane.foremost;
+        to[World::kForemost] = k == lane.foremost;
         to[World::kBaseForce] = device.force;
         to[World::kBaseTorque] = device.torque;
     }

@@ -36,7 +36,7 @@ ENDOPILOT_DEVICE bool slow(const Options& options, const Lane<T>& lane) {
 template <class V, int T>
 ENDOPILOT_DEVICE double best_share(const Lanes<V, T>& lanes, int l, double energy) {
     const Lane<T>& lane = lanes.lane[l];
-    const double slope = lane.length * lane.slope, excess = slope + energy - lane.energy;
+    const double slope = lane.step_length * lane.slope, excess = slope + energy - lane.energy;
     // without the drives' part of the slope at the end, where they are free
     const double power = lane.drives_free() ? 2.0 : std::clamp((get(lanes.found.end_slope, l) + slope) / excess, 2.0, double{kMostPower});
     const double sliding = std::pow(slope / (power * excess), 1 / (power - 1));
@@ -56,7 +56,7 @@ ENDOPILOT_DEVICE Next shorten(Lanes<V, T>& lanes, int l, double energy) {
         set(lanes.terms.damping, l, std::max(double{kFirstDamping}, 10 * lane.damping));
     }
     set_mask<V>(lanes.accepted, l, false);
-    lane.length *= lane.factor;
+    lane.step_length *= lane.factor;
     return Next::shorten;
 }
 
@@ -172,7 +172,7 @@ ENDOPILOT_DEVICE Next advance(const Run& run, Lanes<V, T>& lanes, int l, double 
     Lane<T>& lane = lanes.lane[l];
     const Options& options = run.scene.options;
     if (!(size < 1e100)) return Next::restart;   // the step is not finite
-    lane.factor = lane.length = std::min(lane.lengthened, options.largest_step / size);
+    lane.factor = lane.step_length = std::min(lane.lengthened, options.largest_step / size);
     const bool last_resort = lane.stride == 1 && lane.iterations > options.max_iterations;
     const bool ends_sample = lane.tick + lane.stride == kTicks * run.in.steps_per_sample;
     // Where a drive is at its limit, a wire may come to rest within the energy's rounding, where steps no longer shrink.

@@ -80,7 +80,7 @@ struct Lane {
     Device device[T + 1];             // from the inside out
     int foremost = 0;                 // which of them
     bool by_force = false;            // what the controls are
-    double others = 0;                // force of the drives of the others at the end of the last step, N
+    double others_force = 0;          // of the other devices' drives at the end of the last step, N
 
     // the time step
     int tick = 0, stride = 0;         // time since the start of the sample, and the step, in time_step / kTicks
@@ -95,7 +95,7 @@ struct Lane {
     int iterations = 0, rejections = 0, releases = 0;   // of the step; in a row, of trials; of drives
     double energy = 0, slope = 0;     // at the accepted point, and along Newton's step there
     double rise = 0;                  // by which the energy may exceed that, N mm
-    double length = 1, factor = 0;    // share of Newton's step that is tried; by which the next move changes that
+    double step_length = 1, factor = 0;   // share of Newton's step that is tried; of it, or of the last move, that the next move takes
     double lengthened = 1;            // damped steps, by so much
     double damping = 0;               // of the Hessian that the last step came of
     bool modified = false, first = true, finite = true;   // that Hessian lacked terms; no trial is accepted yet; the last energy was finite

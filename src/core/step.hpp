@@ -274,7 +274,7 @@ ENDOPILOT_DEVICE int end_steps(const Run& run, Lanes<V, T>& lanes, const Next (&
 
 // Gives an idle lane a world of the queue, if there is one, and begins a step of it.
 template <class V, int T, class Queue>
-ENDOPILOT_DEVICE void take_world(const Run& run, Lanes<V, T>& lanes, int l, Queue& queue) {
+ENDOPILOT_DEVICE void assign_world(const Run& run, Lanes<V, T>& lanes, int l, Queue& queue) {
     double length = 0;
     int others = 0;
     for (const Lane<T>& lane : lanes.lane)
@@ -303,7 +303,7 @@ template <class V, int T, class Queue>
 ENDOPILOT_DEVICE int iterate(const Run& run, Lanes<V, T>& lanes, Queue& queue) {
     bool busy = false;
     for (int l = 0; l < kWidth<V>; ++l) {
-        if (lanes.lane[l].world < 0) take_world(run, lanes, l, queue);
+        if (lanes.lane[l].world < 0) assign_world(run, lanes, l, queue);
         busy = busy || lanes.lane[l].world >= 0;
     }
     if (!busy) return -1;

@@ -36,7 +36,7 @@ struct World {
         kFeed,                         // share of the commanded motion that a drive makes after it was at its limit
         kMobilized,                    // friction along the device around it, as a share of its most
         kBackdrive,                    // mm/s by which a drive beyond its limit gives way
-        kLeads,                        // 1: its tip is the foremost
+        kForemost,                     // 1: its tip is
         kDeviceSize
     };
     // of a node: last increments of position and rotation; the contact points at the node and at the middle of the element behind it
@@ -210,6 +210,13 @@ ENDOPILOT_DEVICE inline bool through_wall(const Scene& scene, const World& w) {
     return false;
 }
 
+// Outputs that are numbers of a world's device as they are: the output and the number. Python can also read them between runs.
+#define ENDOPILOT_DEVICE_NUMBERS(NUMBER)                                                                          \
+    NUMBER(inserted_length, kLength) NUMBER(rotation, kRotation)                                                  \
+    NUMBER(base_force, kBaseForce) NUMBER(base_torque, kBaseTorque)                                               \
+    NUMBER(drive_force, kDriveForce) NUMBER(drive_torque, kDriveTorque)                                           \
+    NUMBER(slip, kSlip) NUMBER(rotation_slip, kRotationSlip)
+
 // Records a world at the end of a sample.
 ENDOPILOT_LARGE inline void record(const Run& run, int world, int sample, double iterations, double node_iterations) {
     const RodModel& rod = run.scene.rod;
@@ -242,14 +249,9 @@ ENDOPILOT_LARGE inline void record(const Run& run, int world, int sample, double
     for (int k = 0; k < w.devices; ++k) {
         const std::size_t here = at * w.devices + k;
         const World::Numbers device = w.device(k);
-        out.inserted_length[here] = device[World::kLength];
-        out.rotation[here] = device[World::kRotation];
-        out.base_force[here] = device[World::kBaseForce];
-        out.base_torque[here] = device[World::kBaseTorque];
-        out.drive_force[here] = device[World::kDriveForce];
-        out.drive_torque[here] = device[World::kDriveTorque];
-        out.slip[here] = device[World::kSlip];
-        out.rotation_slip[here] = device[World::kRotationSlip];
+#define NUMBER(name, quantity) out.name[here] = device[World::quantity];
+        ENDOPILOT_DEVICE_NUMBERS(NUMBER)
+#undef NUMBER
         write(out.tip_position + 3 * here, pose.tip(k));
         write(out.tip_direction + 3 * here, pose.tip_direction(k));
         out.tip_twist[here] = 0;
