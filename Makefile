@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
-.PHONY: demo test test-wheel check cta readme docs roofline core-baseline recipe-laptop recipe-gpu gpu-figures clean
+.PHONY: demo test test-wheel check cta readme docs roofline recipe-laptop recipe-gpu gpu-figures clean
 
 demo: $(INSTALLED)
 	$(BIN)/endopilot demo
@@ -13,7 +13,8 @@ demo: $(INSTALLED)
 test: $(INSTALLED)
 	OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
-# Wheel from sdist, installed into an environment of its own; the tests run against it, with no source of the package near.
+# Wheel from sdist, installed into an environment of its own; the tests and the benchmarks that they call run against it,
+# with no source of the package near.
 CLEAN := build/test-wheel
 test-wheel: $(INSTALLED)
 	rm -rf dist $(CLEAN)
@@ -47,6 +48,7 @@ cta: $(INSTALLED)
 
 readme: $(INSTALLED)
 	$(BIN)/python docs/readme.py
+	$(BIN)/python docs/commands.py
 
 # docs/learning.md's figures: two cores and an evening. What is there already is not made again.
 LEARNING := runs/causal
@@ -92,16 +94,8 @@ gpu-figures: $(INSTALLED)
 roofline:
 	mkdir -p build
 	$(CXX) -std=gnu++20 -O3 -march=native -fno-math-errno -fno-trapping-math -fno-tree-pre -Wno-psabi \
-	  -I src/core benchmarks/roofline.cpp -o build/roofline
+	  -I src/core benchmarks/core/roofline.cpp -o build/roofline
 	build/roofline
-
-# The build that `endopilot bench simulation` compares its speed with, from the repository's history.
-BASELINE := build/core-baseline
-core-baseline: $(INSTALLED)
-	rm -rf $(BASELINE) $(BASELINE)-source
-	mkdir -p $(BASELINE)-source
-	git archive 9941f70 | tar -x -C $(BASELINE)-source
-	$(BIN)/python -m pip install -q --no-deps --target $(BASELINE) $(BASELINE)-source
 
 docs: $(INSTALLED)
 	$(BIN)/pip install -q -c constraints.txt -e '.[docs]'

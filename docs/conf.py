@@ -7,7 +7,8 @@ from pathlib import Path
 from endopilot import __version__
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # torch's threads slow each other down on a busy machine
-sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))  # for the processes that tutorial 4 starts
+ROOT = Path(__file__).parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "examples")]  # `benchmarks`, and for the processes that tutorial 4 starts
 
 project = "endopilot"
 author = "the endopilot authors"

@@ -1,4 +1,4 @@
-"""Write the measured parts of README.md, docs/demo.md and docs/commands.md from what the commands left in `runs/`.
+"""Write the measured parts of README.md and docs/demo.md from what the commands left in `runs/`.
 
 `make readme` runs it, after `make demo` and `make cta`. A part whose run is not there stays as it is.
 """
@@ -8,7 +8,6 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-from endopilot.cli import COMMANDS
 from endopilot.files import read_json
 from endopilot.report.report_text import tip_rows
 
@@ -19,7 +18,6 @@ SPLIT = "test"
 
 def main() -> None:
     """Replace each part of the pages between its markers."""
-    _replace("docs/commands.md", "commands", _commands())
     demo, cta = ROOT / "runs" / "demo", ROOT / "runs" / "cta-thorax"
     if (demo / "manifest.json").exists():
         shutil.copyfile(demo / "scene.png", IMAGES / "demo.png")
@@ -36,11 +34,6 @@ def _replace(page: str, name: str, content: str) -> None:
     path, begin, end = ROOT / page, f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
     head, rest = path.read_text(encoding="utf-8").split(begin)
     path.write_text(f"{head}{begin}\n{content}\n{end}{rest.split(end)[1]}", encoding="utf-8")
-
-
-def _commands() -> str:
-    rows = [f"| `endopilot {name}` | {summary} |" for name, summary in COMMANDS.items()]
-    return "\n".join(["| command | what it does |", "| --- | --- |", *rows])
 
 
 def _demo(metrics: dict, record: dict) -> str:

@@ -46,7 +46,7 @@ def drive_session(number: int, folder: Path) -> Path:
     while world.time_s < 20.0:
         if world.cycle % 20 == 0:
             left_mm = navigation.target.abscissa - float(world.snapshot().tip.abscissa[0])
-            recorder.event(move=world.command(hand(left_mm, world.time_s)))
+            recorder.event(move=world.command((hand(left_mm, world.time_s),))[0])
         world.advance()
         recorder.cycle()
     recorder.close()
@@ -95,7 +95,7 @@ class Clone:
         left_mm, offset_mm = self._target_mm - observation.tip.abscissa, observation.tip.offset
         with torch.no_grad():
             translation, rotation = self._network(features(np.array(left_mm), np.array(offset_mm))).numpy() * SCALE
-        return Decision(float(translation), float(rotation), expose=True)
+        return Decision(((float(translation), float(rotation)),), expose=True)
 
 
 def main() -> None:

@@ -31,21 +31,21 @@ class TurnBack:
         self.turn_to_rad: float | None = None
 
     def decide(self, observation: Observation) -> Decision:
-        tip = observation.tip
+        tip, (inserted_mm, rotation_rad) = observation.tip, observation.devices[0]  # of the wire
         if tip is not None and math.isfinite(fork := float(self.fork_mm[tip.branch])):
             # The wire lies in a wrong branch: this much of it has to come out.
-            self.pull_to_mm = observation.inserted_length - (tip.abscissa - fork) - BEFORE_FORK_MM
-            self.turn_to_rad = observation.rotation + 2 * math.pi / 3
+            self.pull_to_mm = inserted_mm - (tip.abscissa - fork) - BEFORE_FORK_MM
+            self.turn_to_rad = rotation_rad + 2 * math.pi / 3
         if self.pull_to_mm is not None:
-            if observation.inserted_length > max(self.pull_to_mm, 0.0):
-                return Decision(PULL_MM_S, 0.0)
+            if inserted_mm > max(self.pull_to_mm, 0.0):
+                return Decision(((PULL_MM_S, 0.0),))
             self.pull_to_mm = None
         if self.turn_to_rad is not None:
-            if observation.rotation < self.turn_to_rad - 0.1:
-                return Decision(0.0, min(TURN_RAD_S, 2 * (self.turn_to_rad - observation.rotation)))
+            if rotation_rad < self.turn_to_rad - 0.1:
+                return Decision(((0.0, min(TURN_RAD_S, 2 * (self.turn_to_rad - rotation_rad))),))
             self.turn_to_rad = None
         look = observation.time_s % 1.0 == 0.5
-        return Decision(PUSH_MM_S, 0.0, expose=look)
+        return Decision(((PUSH_MM_S, 0.0),), expose=look)
 
 
 def main() -> None:

@@ -32,9 +32,9 @@ def anatomy():
 @pytest.fixture(scope="session")
 def rollout():
     """Return one world whose wire lies on the axis and goes deeper each sample."""
-    from toy_evaluation import make_rollout
+    from toy_evaluation import make_trajectory
 
-    return make_rollout()
+    return make_trajectory()
 
 
 @pytest.fixture(scope="session")

@@ -165,7 +165,7 @@ class Waits:
     def start(self, navigation, seed):
         print("noise")
     def decide(self, observation):
-        return Decision(0.0, 0.0)
+        return Decision()
 
 class Leaves(Waits):
     def __init__(self):

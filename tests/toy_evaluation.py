@@ -5,14 +5,17 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import KDTree
 
+from endopilot.devices.device import read_device
+from endopilot.devices.stack import Stack
 from endopilot.evaluation.results import SplitResult, TipSeries
+from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.trajectory import SetUp, Trajectory
 from endopilot.types import (
     Anatomy,
     Branch,
     Centerline,
     DistanceMap,
     Insertion,
-    Rollout,
     TipProjection,
     VesselTree,
 )
@@ -41,32 +44,35 @@ def make_anatomy(name: str = "tube") -> Anatomy:
     return Anatomy(name, tree, DistanceMap(RADIUS_MM - distance, SPACING_MM, low), insertion, RADIUS_MM)
 
 
-def make_rollout(samples: int = 6) -> Rollout:
+def make_trajectory(samples: int = 6) -> Trajectory:
     """One world whose wire lies on the z axis and goes 4 mm deeper each sample."""
     depth = 8.0 + 4.0 * np.arange(samples)
     nodes = np.arange(30)
     shape = np.zeros((1, samples, 30, 3))
     shape[0, :, :, 2] = -depth[:, None] + 2.0 * nodes
-    flat = np.zeros((1, samples))
-    return Rollout(
-        sample_period_s=0.5,
-        initial_inserted_length=np.array([4.0]),
-        initial_rotation=np.array([0.0]),
-        control=np.tile([8.0, 0.0], (1, samples, 1)),
-        inserted_length=depth[None],
-        rotation=flat,
-        tip_position=shape[:, :, 0],
-        tip_direction=np.tile([0.0, 0.0, -1.0], (1, samples, 1)),
-        tip=TipProjection(depth[None], flat, np.zeros((1, samples), dtype=int), flat + RADIUS_MM),
+    start = np.array([[[4.0, 0.0]]])
+    flat, of_wire = np.zeros((1, samples)), np.zeros((1, samples, 1))
+    inserted = depth[None, :, None]
+    stack, friction = Stack(read_device("workhorse-014")), np.full((1, 1), 0.1)
+    return Trajectory(
+        set_up=SetUp([make_anatomy()], [stack], start, friction, "velocity", None, SimulatorConfig()),
+        period_s=0.5,
+        start=start,
+        command=np.tile([8.0, 0.0], (1, samples, 1, 1)),
+        inserted_length=inserted,
+        rotation=of_wire,
+        tip_position=shape[:, :, :1],
+        tip_direction=np.tile([0.0, 0.0, -1.0], (1, samples, 1, 1)),
+        tip=TipProjection(inserted, of_wire, np.zeros((1, samples, 1), dtype=int), of_wire + RADIUS_MM),
         contact_force_max=flat,
         contact_force_sum=flat,
         wall_force=flat,
-        base_force=flat,
-        base_torque=flat,
-        drive_force=flat,
-        drive_torque=flat,
-        slip=flat,
-        rotation_slip=flat,
+        base_force=of_wire,
+        base_torque=of_wire,
+        drive_force=of_wire,
+        drive_torque=of_wire,
+        slip=of_wire,
+        rotation_slip=of_wire,
         iterations=flat,
         node_iterations=flat,
         valid=np.ones((1, samples), dtype=bool),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from endopilot.benchmarks.analytic_lumens import forked_tree, tree_distance
+from benchmarks.anatomy.analytic_lumens import forked_tree, tree_distance
 from endopilot.types import Anatomy, DistanceMap, Insertion
 
 SPACING_MM = 0.4

@@ -1,7 +1,7 @@
 """Measure extraction, write the figures into docs/anatomy.md and draw its picture.
 
 `python docs/figures/anatomy.py [FOLDER]`, where the folder holds rca_cl.vtp and lca_cl.vtp of a real patient; takes
-some five minutes. With `--from FILE` it takes the figures from what `endopilot bench anatomy --json` printed.
+some five minutes. With `--from FILE` it takes the figures from what `python -m benchmarks anatomy --json` printed.
 """
 
 from __future__ import annotations
@@ -10,9 +10,11 @@ import json
 import sys
 from pathlib import Path
 
+sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
+
+from benchmarks.anatomy.extraction import extraction_errors
 from endopilot.anatomy.anatomy_picture import draw_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.benchmarks.anatomy import bench_anatomy
 
 DOCS = Path(__file__).parents[1]
 PAGE = DOCS / "anatomy.md"
@@ -46,7 +48,7 @@ def main(arguments: list[str]) -> None:
     if arguments[:1] == ["--from"]:
         rows = json.loads(Path(arguments[1]).read_text(encoding="utf-8"))
     else:
-        rows = bench_anatomy(Path(arguments[0]) if arguments else None)
+        rows = extraction_errors(Path(arguments[0]) if arguments else None)
     begin, end = "<!-- bench:begin -->", "<!-- bench:end -->"
     page = PAGE.read_text(encoding="utf-8")
     PAGE.write_text(f"{page.split(begin)[0]}{begin}\n{tables(rows)}\n{end}{page.split(end)[1]}", encoding="utf-8")

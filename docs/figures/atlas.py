@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections import Counter
 from pathlib import Path
@@ -10,9 +11,11 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 
+sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
+
+from benchmarks.anatomy.labels import measure_labels
 from endopilot.atlas import curves as shape
 from endopilot.atlas.atlas import ANATOMIES, AtlasConfig, make_patient, make_patient_tree
-from endopilot.benchmarks.labels import measure_labels
 from endopilot.phantom.phantom import PhantomConfig, make_phantom
 from endopilot.types import VesselTree
 

@@ -11,10 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
+sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
+
+from benchmarks.anatomy.compare import KINDS, Values, anatomy_folders, scaled_distance, together
+from benchmarks.anatomy.vessel_shape import vessel_shape
 from endopilot.anatomy.io import read_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_atlas
-from endopilot.benchmarks.anatomy_compare import KINDS, Values, anatomy_folders, scaled_distance, together
-from endopilot.benchmarks.vessel_shape import vessel_shape
 
 PAGE = Path(__file__).parents[1] / "atlas.md"
 ATLAS = {

@@ -19,8 +19,10 @@ from pathlib import Path
 from PIL import Image
 from playwright.sync_api import Page, ViewportSize, sync_playwright
 
+sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
+
+from benchmarks.cockpit import BROWSER_FLAGS, find_browser, serving, wait_for
 from endopilot.anatomy.io import write_anatomy
-from endopilot.benchmarks.cockpit import BROWSER_FLAGS, find_browser, serving, wait_for
 from endopilot.tasks.task import reference_navigation
 
 IMAGES = Path(__file__).parents[1] / "images"

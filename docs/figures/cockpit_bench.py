@@ -1,7 +1,7 @@
 """Measure the cockpit's speed and write it into docs/cockpit.md: `python docs/figures/cockpit_bench.py [alone] [pair]`.
 
-Runs `endopilot bench cockpit` five times, then three times in turn with a catheter, which takes ten minutes; nothing
-else should run meanwhile. `alone` and `pair` make one of the two tables.
+Runs `python -m benchmarks cockpit` five times, then three times in turn with a catheter, which takes ten minutes;
+nothing else should run meanwhile. `alone` and `pair` make one of the two tables.
 """
 
 from __future__ import annotations
@@ -14,12 +14,14 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from endopilot.benchmarks.cockpit import BARS
+sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
+
+from benchmarks.cockpit import BARS
 from endopilot.files import processor_name
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "cockpit.md"
-COMMAND = (sys.executable, "-m", "endopilot.cli", "bench", "cockpit", "--json")
+COMMAND = (sys.executable, "-m", "benchmarks", "cockpit", "--json")
 RUNS, PAIR_RUNS = 5, 3
 CATHETER = "microcatheter-1.7f"
 QUIET = 2.5
@@ -48,7 +50,7 @@ def alone() -> None:
         met = sum(run["passed"][name] for run in found)
         rows.append(
             f"| `{name}`: {WHAT[name]} | {median(values):.4g} | {min(values):.4g} | {max(values):.4g} | "
-            f"{bar(found[0], name)} | {met} of {RUNS} |"
+            f"{BARS[name]} | {met} of {RUNS} |"
         )
     write("bench", RUNS, rows)
 
@@ -59,18 +61,13 @@ def pair() -> None:
     rows = ["| figure, median | wire alone | wire and catheter | bar |", "|---|---|---|---|"]
     for name in BARS:
         middle = [median(both[which][name] for both in found) for which in (0, 1)]
-        rows.append(f"| `{name}` | {middle[0]:.4g} | {middle[1]:.4g} | {bar(found[0][0], name)} |")
+        rows.append(f"| `{name}` | {middle[0]:.4g} | {middle[1]:.4g} | {BARS[name]} |")
     write("bench-pair", PAIR_RUNS, rows)
 
 
 def measured(*more: str) -> dict[str, Any]:
-    """Return what `endopilot bench cockpit` prints."""
+    """Return what `python -m benchmarks cockpit` prints."""
     return json.loads(subprocess.run([*COMMAND, *more], cwd=ROOT, capture_output=True, text=True).stdout)
-
-
-def bar(run: dict[str, Any], name: str) -> str:
-    """Return the bar of a figure as the table has it."""
-    return run["bars"][name].replace(">=", "≥").replace("<=", "≤")
 
 
 def write(mark: str, runs: int, rows: list[str]) -> None:

@@ -29,7 +29,7 @@ def main() -> None:
     fill("specification", (inspect.getdoc(NavigateVectorEnv) or "").replace("\n## ", "\n### "))
     if "--specification" in sys.argv:
         return
-    command = [sys.executable, "-m", "endopilot.cli", "bench", "env", "--json"]
+    command = [sys.executable, "-m", "benchmarks", "env", "--json"]
     figures = json.loads(subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout)
     rows = [f"| {name} | {value} |" for name, value in figures.items() if name != "processor"]
     fill("bench", "\n".join([f"{figures['processor']}:\n", "| figure | value |", "|---|---|", *rows]))

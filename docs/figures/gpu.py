@@ -26,8 +26,8 @@ SLICE = Path("runs/gpu-slice")
 
 
 def kernel_rows() -> list[dict[str, Any]]:
-    """Return the rows of `endopilot bench simulation --device cuda`, which leaves with 1 if its bar is not met."""
-    command = [sys.executable, "-m", "endopilot.cli", "bench", "simulation", "--device", "cuda", "--json"]
+    """Return the rows of `python -m benchmarks simulation --device cuda`, which leaves with 1 if its bar is not met."""
+    command = [sys.executable, "-m", "benchmarks", "simulation", "--device", "cuda", "--json"]
     ran = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     if ran.returncode > 1:
         sys.exit(ran.stderr)

@@ -1,4 +1,4 @@
-"""Runs `endopilot bench imaging` and writes what it measured into docs/imaging.md.
+"""Runs `python -m benchmarks imaging` and writes what it measured into docs/imaging.md.
 
 Give the number of clean cases, or 50, and that of each difficulty, or 10.
 """
@@ -9,8 +9,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from endopilot.benchmarks.imaging import BARS, ImagingBenchConfig, bench_imaging
-from endopilot.benchmarks.imaging_cases import DIFFICULTIES
+sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
+
+from benchmarks.imaging.cases import DIFFICULTIES
+from benchmarks.imaging.segmentation import BARS, ImagingBenchConfig, bench_imaging
 
 PAGE = Path(__file__).parents[1] / "imaging.md"
 TITLES = {
@@ -29,18 +31,18 @@ def main() -> None:
     cases = int(sys.argv[1]) if len(sys.argv) > 1 else ImagingBenchConfig.cases
     found = bench_imaging(ImagingBenchConfig(cases=cases))
     lines = [
-        f"`endopilot bench imaging --cases {cases} --seed 0`:",
+        f"`python -m benchmarks imaging --cases {cases} --seed 0`:",
         "",
         "| figure | mean ± SD | worst | worst with a result | bar | met |",
         "| --- | --- | --- | --- | --- | --- |",
     ]
     for name, bar in BARS.items():
         row = found[name]
-        limit = f"{row['counts']} {'≥' if bar.at_least else '≤'} {bar.limit:g}"
+        limit = f"{row['counts']} {bar}"
         lines.append(
             f"| {TITLES[name]} | {row['mean']:.3f} ± {row['sd']:.3f} | {_number(row['worst'])} | "
             f"{_number(row['worst_found'])} | {limit} | "
-            f"{'yes' if row['met'] else '**no**'} |"
+            f"{'yes' if row['passed'] else '**no**'} |"
         )
     reasons = "; ".join(f"case {case}: {why}" for case, why in found["failed"].items()) or "none"
     lines += ["", f"Cases without a result: {reasons}."]
@@ -51,7 +53,7 @@ def main() -> None:
 def _difficulties(cases: int) -> list[str]:
     """Measure the same patients with each difficulty, and return the table."""
     lines = [
-        f"`endopilot bench imaging --cases {cases} --seed 0 --difficulty NAME`, means of the cases with a result:",
+        f"`python -m benchmarks imaging --cases {cases} --seed 0 --difficulty NAME`, means of the cases with a result:",
         "",
         "| difficulty | Dice | clDice | overlap OV | ostium error, mm | wrong or none | told | silent | false alarms |",
         "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",

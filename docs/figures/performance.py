@@ -1,7 +1,6 @@
 """Measure the rod core and write the figures into docs/performance.md: `python docs/figures/performance.py`.
 
-Takes some ten minutes; nothing else should run meanwhile. First `make core-baseline`: it builds what the speed is
-compared with.
+Takes some ten minutes; nothing else should run meanwhile.
 """
 
 from __future__ import annotations
@@ -19,7 +18,6 @@ ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "performance.md"
 COMPARED = (
     "realtime_factor_per_core",
-    "speed_over_baseline",
     "node_iterations_per_second",
     "true_tip_error_median_mm",
     "true_tip_error_p95_mm",
@@ -35,7 +33,7 @@ BESIDE = {"catheter": ("--catheter", "microcatheter-2.4f"), "motion": ("--motion
 
 
 def output(*command: str) -> str:
-    """Return what a command prints; `bench` exits with 1 where a bar is missed."""
+    """Return what a command prints; a benchmark exits with 1 where a bar is missed."""
     done = subprocess.run(command, cwd=ROOT, check=False, capture_output=True, text=True)
     if done.returncode > 1:
         sys.exit(f"{' '.join(command)}: {done.stderr}")
@@ -43,8 +41,8 @@ def output(*command: str) -> str:
 
 
 def bench(*subject: str) -> Any:
-    """Return the figures of `endopilot bench`."""
-    return json.loads(output(sys.executable, "-m", "endopilot.cli", "bench", *subject, "--json"))
+    """Return the figures of `python -m benchmarks`."""
+    return json.loads(output(sys.executable, "-m", "benchmarks", *subject, "--json"))
 
 
 def table(rows: list[dict[str, Any]]) -> str:

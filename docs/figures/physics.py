@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
 
-from endopilot.verification import scenes as scenarios
+sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
+
+from benchmarks.verification import scenes as scenarios
 
 mpl.use("Agg")
 import matplotlib.pyplot as plt

@@ -1,4 +1,4 @@
-"""Write the figures of `endopilot bench published --json > FILE` into docs/bench.md.
+"""Write the figures of `python -m benchmarks published --json > FILE` into docs/bench.md.
 
 `python docs/figures/published.py FILE`. The run itself takes ten minutes.
 """

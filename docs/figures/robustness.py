@@ -1,4 +1,4 @@
-"""Write the figures of `endopilot bench robustness --json > FILE` into docs/simulation.md.
+"""Write the figures of `python -m benchmarks robustness --json > FILE` into docs/simulation.md.
 
 `python docs/figures/robustness.py FILE`, or `... FILE catheters` for a run with `--catheters`. Each run takes half
 an hour on two quiet cores.

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
 
-from endopilot.benchmarks.straightening import WIRES_GPA, draw_path, stiff_wire, straighten
+sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
+
+from benchmarks.published.straightening import WIRES_GPA, draw_path, stiff_wire, straighten
 from endopilot.plotting import BLACK, GREEN, GREY, ORANGE, SKY, STYLE, VERMILLION
 
 mpl.use("Agg")
@@ -16,7 +19,7 @@ import matplotlib.pyplot as plt
 
 PICTURE = Path(__file__).parents[1] / "images" / "bench-straightening.png"
 DRAW = 4
-"""Which of the paths of `endopilot bench published` is drawn."""
+"""Which of the paths of `python -m benchmarks published` is drawn."""
 
 
 def main() -> None:

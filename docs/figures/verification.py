@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -9,8 +10,10 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from endopilot.verification.plots import file_name
-from endopilot.verification.verify import run_verification
+sys.path.append(str(Path(__file__).parents[2]))  # where `benchmarks` is
+
+from benchmarks.verification.plots import file_name
+from benchmarks.verification.verification import bench_verification
 
 DOCS = Path(__file__).parents[1]
 BEGIN, END = "<!-- table:begin -->", "<!-- table:end -->"
@@ -28,7 +31,7 @@ COLUMNS = 3
 def main() -> None:
     """Write docs/images/verification.png and the table between its markers in docs/verification.md."""
     with tempfile.TemporaryDirectory() as folder:
-        rows = run_verification(Path(folder))
+        rows = bench_verification(plots=Path(folder))
         pictures = [np.asarray(Image.open(Path(folder) / f"{file_name(name)}.png").convert("RGB")) for name in SHOWN]
     lines = [np.hstack(pictures[start : start + COLUMNS]) for start in range(0, len(pictures), COLUMNS)]
     whole = Image.fromarray(np.vstack(lines)).quantize(64)

@@ -9,7 +9,7 @@ A wire with bending stiffness needs more.
 import matplotlib.pyplot as plt
 import numpy as np
 
-from endopilot.verification.scenes import drag_through_bends
+from benchmarks.verification.scenes import drag_through_bends
 
 friction, bends = 0.2, range(0, 7, 2)
 figure, axes = plt.subplots(figsize=(6.4, 4), layout="constrained")

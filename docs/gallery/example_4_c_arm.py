@@ -26,7 +26,7 @@ medians = {}
 for name, biplane, color in (("two views", True, "C0"), ("one view", False, "C1")):
     c_arm = Fluoroscope(anatomy, device.tip_radius_mm, replace(FluoroscopeConfig(), biplane=biplane))
     random = np.random.default_rng(0)
-    shown = np.array([c_arm.expose(tip, direction, length, random).position for _ in range(400)])
+    shown = np.array([c_arm.measure(tip, direction, length, random).position for _ in range(400)])
     error_mm = np.linalg.norm(shown - tip, axis=1)
     medians[name] = float(np.median(error_mm))
     axes.hist(

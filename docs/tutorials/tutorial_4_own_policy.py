@@ -12,8 +12,8 @@ check.
 # The policy
 # ----------
 # Every 0.5 s a policy gets an :class:`endopilot.Observation`: time, the encoders' readings and, where it
-# asked for X-ray, the measured tip. It answers with a :class:`endopilot.Decision`: translation in mm/s,
-# rotation in rad/s, and whether X-ray is to be on at the next decision.
+# asked for X-ray, the measured tip. It answers with a :class:`endopilot.Decision`: of each device a
+# translation in mm/s and a rotation in rad/s, and whether X-ray is to be on at the next decision.
 #
 # ``examples/my_policy.py`` holds one. It pushes and looks once a second. After a wrong branch it pulls back to before
 # the fork, turns the wire by 120°, and pushes again.
@@ -53,10 +53,11 @@ for branch in navigation.anatomy.tree.branches:
     x, _, z = branch.centerline.points.T
     map_axes.plot(x, z, color="0.85", lw=5, solid_capstyle="round", zorder=0)
 for (name, record), color in zip(records.items(), ("0.4", "C0"), strict=True):
-    map_axes.plot(record.tip_position[:, 0], record.tip_position[:, 2], ".-", color=color, lw=1, ms=3, label=name)
-    time_axes.plot(record.time_s, record.tip.abscissa, color=color, label=name)
+    x, _, z = record.tip_position[:, 0].T  # of the wire
+    map_axes.plot(x, z, ".-", color=color, lw=1, ms=3, label=name)
+    time_axes.plot(record.time_s, record.tip.abscissa[:, 0], color=color, label=name)
     shown = record.exposed
-    time_axes.plot(record.time_s[shown], record.tip.abscissa[shown], "o", color=color, ms=3)
+    time_axes.plot(record.time_s[shown], record.tip.abscissa[shown, 0], "o", color=color, ms=3)
 goal = navigation.target.position(navigation.anatomy)
 map_axes.plot(goal[0], goal[2], "*", color="C3", ms=13, label="target")
 map_axes.set(xlabel="x (to the patient's left), mm", ylabel="z (to the head), mm", title="Tip from the front")

@@ -14,8 +14,11 @@ from .control.plan_config import Plan as Plan
 from .control.plan_config import PlanConfig as PlanConfig
 from .dataset.config import DatasetConfig as DatasetConfig
 from .dataset.generate import generate_dataset as generate_dataset
+from .devices.catheter import Catheter as Catheter
+from .devices.catheter import read_catheter as read_catheter
 from .devices.device import Device as Device
 from .devices.device import read_device as read_device
+from .devices.stack import Stack as Stack
 from .errors import InputError as InputError
 from .evaluation.evaluate import EvaluateConfig as EvaluateConfig
 from .evaluation.evaluate import evaluate as evaluate
@@ -29,6 +32,7 @@ from .navigation.navigate import NavigateConfig as NavigateConfig
 from .navigation.navigate import NavigationLoop as NavigationLoop
 from .navigation.navigate import navigate as navigate
 from .navigation.policy import Decision as Decision
+from .navigation.policy import Hand as Hand
 from .navigation.policy import Observation as Observation
 from .navigation.policy import Policy as Policy
 from .navigation.record import NavigationRecord as NavigationRecord
@@ -36,11 +40,12 @@ from .pipeline.navigation import navigate_into as navigate_into
 from .simulation.config import SimulatorConfig as SimulatorConfig
 from .simulation.simulate import simulate as simulate
 from .simulation.simulator import Simulator as Simulator
+from .simulation.trajectory import Trajectory as Trajectory
+from .simulation.trajectory_file import read_trajectory as read_trajectory
 from .tasks.navigation import Navigation as Navigation
 from .tasks.navigation import Target as Target
 from .types import Anatomy as Anatomy
 from .types import LumenMask as LumenMask
-from .types import Rollout as Rollout
 from .types import Volume as Volume
 from .xray.image import ImageConfig as ImageConfig
 from .xray.image import XrayImager as XrayImager

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 
 class InputError(Exception):
     """Bad input; the message is one line that names the file or field, the value found, and the remedy.
@@ -21,3 +23,8 @@ class Stopped(SystemExit):
 
 class Remark(UserWarning):
     """A warning of endopilot about a result, in one line: the command line shows it, and no library's warnings."""
+
+
+def place_text(point: Iterable[float]) -> str:
+    """Return a position in mm as messages and notes write it."""
+    return "(" + ", ".join(f"{value:.1f}" for value in point) + ") mm"

@@ -71,7 +71,8 @@ def each(title: str, items: Sequence[Path], work: Callable[[Path], None]) -> dic
 class Workers(ProcessPoolExecutor):
     """Processes for work that other processes can import; they end with this one, however it ends.
 
-    Leaving the block by an exception stops them at once; they remove their half-written files.
+    Leaving the block by an exception stops them at once; they remove their half-written files. (joblib's loky kills its
+    workers, which leaves those files, and lets them live on where this process is killed.)
     """
 
     def __init__(self, processes: int) -> None:

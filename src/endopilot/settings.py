@@ -15,16 +15,15 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import inspect
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, cast, dataclass_transform, get_args, get_origin, get_type_hints, overload
+from typing import Annotated, Any, TypeVar, cast, dataclass_transform, get_args, get_origin, overload
 
 import numpy as np
-from pydantic import AfterValidator, ConfigDict, GetCoreSchemaHandler, StringConstraints, TypeAdapter, ValidationError
+from pydantic import AfterValidator, ConfigDict, GetCoreSchemaHandler, StringConstraints, ValidationError
 from pydantic.dataclasses import dataclass
 from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, core_schema
 
@@ -183,29 +182,39 @@ def settings(cls: type[T] | None = None, /, *, eq: bool = True) -> Any:
     return _made(cls, eq)
 
 
-def from_record(cls: type[T], record: Any) -> T:
+def is_settings(cls: Any) -> bool:
+    """Return whether something is a class made by `settings`."""
+    return isinstance(cls, type) and hasattr(cls, "__pydantic_fields__")
+
+
+def from_record(cls: type[T], record: Any, *, onto: T | None = None) -> T:
     """Return settings from the names and values of their fields, as `dataclasses.asdict` or a file gives them.
 
-    All fields must be there but those that are None by default.
+    Args:
+        cls: their class.
+        record: the names and values.
+        onto: settings that hold the fields which are not there; if not given, all must be there but those that are None
+            by default.
 
     Raises:
         InputError: it is no such record; the line names field, value and what to give instead.
     """
     if not isinstance(record, Mapping) or not all(isinstance(name, str) for name in record):
         raise InputError(f"holds no mapping of fields; the fields are {', '.join(_fields(cls))}")
-    read = cls(**record)
+    read = cls(**record) if onto is None else cls(**_onto(onto, record))
     for field in dataclasses.fields(cast(Any, cls)):
-        if field.name not in record and field.default is not None:
+        if onto is None and field.name not in record and field.default is not None:
             raise InputError(f"{field.name}: missing; add it")
     return read
 
 
-def read_settings(path: Path, cls: type[T], *, remedy: str = "") -> T:
+def read_settings(path: Path, cls: type[T], *, onto: T | None = None, remedy: str = "") -> T:
     """Read settings from a JSON file (by its suffix) or a YAML file.
 
     Args:
         path: the file.
         cls: the class of the settings.
+        onto: settings that hold the fields which the file leaves out; all must be there if not given.
         remedy: what else to do about a bad file, such as "run `endopilot advise` again".
 
     Raises:
@@ -213,28 +222,19 @@ def read_settings(path: Path, cls: type[T], *, remedy: str = "") -> T:
     """
     content = read_json(path) if Path(path).suffix == ".json" else read_yaml(path)
     try:
-        return from_record(cls, content)
+        return from_record(cls, content, onto=onto)
     except InputError as error:
         raise InputError(f"{path}: {error}{', or ' if remedy else ''}{remedy}") from None
 
 
-def check_call(function: Callable[..., Any], args: Sequence[Any], kwargs: Mapping[str, Any]) -> None:
-    """Check the arguments of a function whose annotations have a range, such as `count: Count`.
-
-    Raises:
-        InputError: one is out of its range; the line names it, its value and what to give instead.
-    """
-    hints = get_type_hints(function, include_extras=True)
-    for name, value in inspect.signature(function).bind(*args, **kwargs).arguments.items():
-        for kind in (hints[name], *get_args(hints[name])):  # as it is, or in a union
-            limits = next((part for part in getattr(kind, "__metadata__", ()) if isinstance(part, Within)), None)
-            if limits is None or value is None:
-                continue
-            try:
-                TypeAdapter(kind).validate_python(value)
-            except ValidationError:
-                whole = get_args(kind)[0] is int
-                raise InputError(f"{name}: {value}; {limits.mend(whole=whole)}") from None
+def _onto(values: Any, record: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields of settings with those of a record in their place, settings within them likewise."""
+    fields = {name: getattr(values, name) for name in _fields(type(values))} | dict(record)
+    for name in record:
+        old = getattr(values, name, None)
+        if is_settings(type(old)) and isinstance(record[name], Mapping):
+            fields[name] = _onto(old, record[name])
+    return fields
 
 
 def _made(cls: type[T], eq: bool) -> type[T]:

@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Float, Int, Shaped
 
 SAMPLE_PERIOD_S = 0.5
 """Time between two recorded samples, s: the paper records at 2 Hz."""
@@ -157,10 +157,16 @@ class VesselTree:
         """Return the indices of the branches that leave at the end of `branch`."""
         return tuple(i for i, candidate in enumerate(self.branches) if candidate.parent == branch)
 
-    def leaves(self) -> tuple[int, ...]:
-        """Return the indices of the branches that end distally."""
+    def leaves(self, branch: int = 0) -> tuple[int, ...]:
+        """Return the indices of the branches that end distally, of those that a route through `branch` leads to."""
         parents = {branch.parent for branch in self.branches}
-        return tuple(i for i in range(len(self.branches)) if i not in parents)
+        ends = tuple(i for i in range(len(self.branches)) if i not in parents)
+        return ends if branch == 0 else tuple(leaf for leaf in ends if branch in self.route(leaf))
+
+    def longest_leaf(self, branch: int = 0) -> int:
+        """Return the index of the leaf, of those that a route through `branch` leads to, that ends farthest from the
+        ostium along the tree."""
+        return max(self.leaves(branch), key=lambda leaf: self.branches[leaf].centerline.abscissa[-1])
 
     def route(self, branch: int) -> tuple[int, ...]:
         """Return the indices of the branches from the root to `branch`, both included."""
@@ -190,7 +196,7 @@ class VesselTree:
 
     def longest_path(self) -> Centerline:
         """Return the path from the ostium to the farthest distal end."""
-        return self.path(max(self.leaves(), key=lambda leaf: self.branches[leaf].centerline.abscissa[-1]))
+        return self.path(self.longest_leaf())
 
     def rotation_zero(self, insertion: Insertion) -> Float[np.ndarray, "3"]:
         """Return where a tip's bend points at φ = 0: to the side of the catheter's axis on which the vessel lies.
@@ -297,103 +303,9 @@ class TipProjection:
     branch: Int[np.ndarray, "..."]
     radius: Float[np.ndarray, "..."]
 
-
-@dataclass(frozen=True, eq=False)
-class CatheterMotion:
-    """The recorded motion of the catheters around a wire, from the inside out; the fields are those of `Rollout`.
-
-    Attributes:
-        control: dΔ/dt (mm/s) and dφ/dt (rad/s) of each drive.
-        inserted_length: Δ, mm.
-        rotation: φ, rad.
-        tip_position: where each catheter ends, LPS mm.
-        base_force: axial force that each drive must apply, N, positive when it pushes.
-        base_torque: torque, N·mm.
-        drive_force: `base_force` and what the valve that the catheter passes takes, N.
-        drive_torque: torque, N·mm, likewise.
-        slip: advance that was commanded and not made, mm.
-        rotation_slip: rotation that was commanded and not made, rad.
-    """
-
-    control: Float[np.ndarray, "worlds samples catheters 2"]
-    inserted_length: Float[np.ndarray, "worlds samples catheters"]
-    rotation: Float[np.ndarray, "worlds samples catheters"]
-    tip_position: Float[np.ndarray, "worlds samples catheters 3"]
-    base_force: Float[np.ndarray, "worlds samples catheters"]
-    base_torque: Float[np.ndarray, "worlds samples catheters"]
-    drive_force: Float[np.ndarray, "worlds samples catheters"]
-    drive_torque: Float[np.ndarray, "worlds samples catheters"]
-    slip: Float[np.ndarray, "worlds samples catheters"]
-    rotation_slip: Float[np.ndarray, "worlds samples catheters"]
-
-
-@dataclass(frozen=True, eq=False)
-class Rollout:
-    """The recorded motion of simulated worlds, one sample every `sample_period_s`.
-
-    Sample t is the state at the end of period t, and `control[:, t]` is the mean control over that period, so that
-    inserted_length[:, t] = initial_inserted_length + sample_period_s · Σ control[:, :t+1, 0], and likewise for the
-    rotation.
-
-    Attributes:
-        sample_period_s: time between samples, s.
-        initial_inserted_length: Δ before the first period, mm.
-        initial_rotation: φ before the first period, rad.
-        control: π = (dΔ/dt mm/s, dφ/dt rad/s).
-        inserted_length: Δ, mm.
-        rotation: φ, rad.
-        tip_position: LPS mm.
-        tip_direction: unit vector along the wire at its tip.
-        tip: Δtip, γtip, branch and lumen radius at each sample.
-        contact_force_max: largest wall force on one node, N.
-        contact_force_sum: sum of the wall forces' magnitudes, N.
-        wall_force: largest resultant of the wall's forces on any 2 mm of the wire, N. It does not depend on the number
-            of elements, as the force on a node does: neighbouring nodes share one contact.
-        base_force: axial force that the drive must apply to the wire, N, positive when it pushes.
-        base_torque: torque that the drive must apply about the wire's axis, N·mm.
-        drive_force: axial force of the drive, N: `base_force` and what the introducer's valve takes.
-        drive_torque: torque of the drive, N·mm, likewise.
-        slip: advance that was commanded and not made in the period, mm; 0 unless the drive slipped, and
-            negative where it pulled or the wire was out already.
-        rotation_slip: rotation that was commanded and not made in the period, rad.
-        iterations: mean Newton iterations a time step over the period.
-        node_iterations: evaluations of active nodes in the period: for each Newton iteration, also those of attempts
-            that were given up, the nodes ahead of the catheter.
-        valid: false from the sample in which a world failed to converge or left the finite numbers.
-        reason: why a world became invalid: 0 it is valid, 1 it left the finite numbers, 2 it did not converge,
-            3 the wire went through the wall.
-        shape: positions of all nodes from the foremost tip to the base, LPS mm, if they were recorded.
-        catheters: the motion of the catheters; None for a wire alone. With catheters, the fields above are those of the
-            wire, but for the wall's forces, which are those of all devices.
-        vessel_to_laboratory: where the vessel lies at each sample, if it moves: affine maps of its points, as CT shows
-            them, to the laboratory, LPS mm. Positions and directions above are those in the vessel as CT shows it.
-    """
-
-    sample_period_s: float
-    initial_inserted_length: Float[np.ndarray, "worlds"]
-    initial_rotation: Float[np.ndarray, "worlds"]
-    control: Float[np.ndarray, "worlds samples 2"]
-    inserted_length: Float[np.ndarray, "worlds samples"]
-    rotation: Float[np.ndarray, "worlds samples"]
-    tip_position: Float[np.ndarray, "worlds samples 3"]
-    tip_direction: Float[np.ndarray, "worlds samples 3"]
-    tip: TipProjection
-    contact_force_max: Float[np.ndarray, "worlds samples"]
-    contact_force_sum: Float[np.ndarray, "worlds samples"]
-    wall_force: Float[np.ndarray, "worlds samples"]
-    base_force: Float[np.ndarray, "worlds samples"]
-    base_torque: Float[np.ndarray, "worlds samples"]
-    drive_force: Float[np.ndarray, "worlds samples"]
-    drive_torque: Float[np.ndarray, "worlds samples"]
-    slip: Float[np.ndarray, "worlds samples"]
-    rotation_slip: Float[np.ndarray, "worlds samples"]
-    iterations: Float[np.ndarray, "worlds samples"]
-    node_iterations: Float[np.ndarray, "worlds samples"]
-    valid: Bool[np.ndarray, "worlds samples"]
-    reason: Int[np.ndarray, "worlds"]
-    shape: Float[np.ndarray, "worlds samples nodes 3"] | None = None
-    catheters: CatheterMotion | None = None
-    vessel_to_laboratory: Float[np.ndarray, "samples 3 4"] | None = None
+    def __getitem__(self, chosen: Any) -> TipProjection:
+        """Return some of the tips, chosen as of an array: `tip[:, 0]` are those of the wires."""
+        return TipProjection(self.abscissa[chosen], self.offset[chosen], self.branch[chosen], self.radius[chosen])
 
 
 def _add(digest: hashlib._Hash, values: np.ndarray, kind: type[np.generic]) -> None:

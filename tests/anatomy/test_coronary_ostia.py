@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from analytic_shapes import mask_of
 
+from benchmarks.anatomy.analytic_lumens import tree_of
 from endopilot.anatomy.coronary_ends import open_ends, skeleton_of
 from endopilot.anatomy.coronary_inlet import _coarse, coronary_inlet
 from endopilot.anatomy.coronary_ostia import end_score, rank_ostia
@@ -17,7 +18,6 @@ from endopilot.anatomy.distance import distance_map_from_mask, distance_map_from
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.anatomy.inlet import component, entrance, grid_points
 from endopilot.anatomy.surface import surface_from_mask
-from endopilot.benchmarks.analytic_lumens import tree_of
 from endopilot.errors import InputError
 from endopilot.imaging.volume import read_volume
 from endopilot.types import Insertion, LumenMask, Volume

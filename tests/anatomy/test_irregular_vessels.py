@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from analytic_shapes import forked_tree, mask_of, tree_distance
 
+from benchmarks.anatomy.analytic_lumens import tree_of
 from endopilot.anatomy.batch import extract_all
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy
 from endopilot.anatomy.projection import project_tip
-from endopilot.benchmarks.analytic_lumens import tree_of
 from endopilot.errors import InputError
 from endopilot.files import read_json
 from endopilot.imaging.volume import write_mask

@@ -7,9 +7,9 @@ import itertools
 import numpy as np
 from analytic_shapes import forked_tree
 
+from benchmarks.anatomy.analytic_lumens import tree_of
 from endopilot.anatomy.projection import project_tip, safety_ratio
 from endopilot.atlas.atlas import AtlasConfig, make_patient_tree
-from endopilot.benchmarks.analytic_lumens import tree_of
 from endopilot.types import Insertion
 
 INSERTION = Insertion(np.zeros(3), np.array([0.0, 0, 1]))

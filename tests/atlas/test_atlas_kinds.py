@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.anatomy.labels import label_agreement
 from endopilot.anatomy.distance import sample
 from endopilot.anatomy.labels import dominance, label_tree
 from endopilot.atlas import heart_left
 from endopilot.atlas.atlas import AtlasConfig, make_patient, make_patient_tree
-from endopilot.benchmarks.labels import label_agreement
 
 COUNT = 12
 KINDS = ("lca", "arch", "cerebral", "portal")

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.anatomy.vessel_shape import vessel_shape
 from endopilot.anatomy.distance import distance_map_from_spheres, sample
 from endopilot.anatomy.tree import Line, sampled, tree_from_lines
 from endopilot.atlas import curves as shape
@@ -16,7 +17,6 @@ from endopilot.atlas.branching import SidePlan, Vessel, lumens_collide, stenoses
 from endopilot.atlas.population import Population, population_of
 from endopilot.atlas.through_ct import rasterised, visible
 from endopilot.atlas.variation import TIGHTEST, Fork, bent, catheter_direction, drawn_from, ectasia, opened_fork
-from endopilot.benchmarks.vessel_shape import vessel_shape
 
 COUNT = 32
 REAL = {

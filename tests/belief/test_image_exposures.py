@@ -39,7 +39,7 @@ class Arm:
     def forget_wires(self) -> None:
         self._images = 0
 
-    def expose(self, nodes, inserted_length, random, *, refine) -> TipMeasurement | None:
+    def measure(self, nodes, inserted_length, random, *, refine) -> TipMeasurement | None:
         self._images += 1
         self.refined.append(refine)
         tip = nodes[0]

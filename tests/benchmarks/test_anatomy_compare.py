@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.anatomy.compare import compare_with_atlas, compared, scaled_distance, together
+from benchmarks.anatomy.vessel_shape import curvature_and_torsion, vessel_shape
 from endopilot.anatomy.distance import distance_map_from_spheres
 from endopilot.anatomy.io import write_anatomy
 from endopilot.anatomy.labels_tree import LCA_SECTIONS, RCA_SECTIONS
 from endopilot.anatomy.tree import Line, tree_from_lines
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.benchmarks.anatomy_compare import compare_with_atlas, compared, scaled_distance, together
-from endopilot.benchmarks.vessel_shape import curvature_and_torsion, vessel_shape
 from endopilot.errors import InputError
 from endopilot.types import Anatomy, Branch, Insertion, VesselTree
 

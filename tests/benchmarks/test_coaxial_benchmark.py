@@ -1,4 +1,4 @@
-"""`endopilot bench simulation --catheter` on a few short worlds."""
+"""`python -m benchmarks simulation --catheter` on a few short worlds."""
 
 from __future__ import annotations
 
@@ -7,22 +7,23 @@ from functools import partial
 
 import pytest
 
-from endopilot import cli
-from endopilot.benchmarks import beside, coaxial, scenes
+from benchmarks import figures
+from benchmarks.__main__ import main
+from benchmarks.core import coaxial, scenes, simulation
 from endopilot.devices.catheter import read_catheter
 
 
 @pytest.fixture(autouse=True)
 def one_patient(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scenes, "KINDS", {"right": "rca"})
-    monkeypatch.setattr(beside, "REPEATS", 1)
+    monkeypatch.setattr(figures, "REPEATS", 1)
 
 
 def test_the_figures_belong_together(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(coaxial, "LEAST_SHARE", 1e-6)  # how fast it is here says nothing
-    monkeypatch.setattr(coaxial, "bench_coaxial", partial(coaxial.bench_coaxial, worlds=2, samples=4))
+    monkeypatch.setattr(simulation, "bench_coaxial", partial(coaxial.bench_coaxial, worlds=2, samples=4))
     with pytest.raises(SystemExit) as left:
-        cli.main(["bench", "simulation", "--catheter", "microcatheter-1.7f", "--json"])
+        main(["simulation", "--catheter", "microcatheter-1.7f", "--json"])
     assert not left.value.code
     measured = json.loads(capsys.readouterr().out)
     assert measured["catheter"] == "microcatheter-1.7f" and measured["passed"] is True

@@ -1,4 +1,4 @@
-"""`endopilot bench imaging`: its cases, its figures, and that it goes on where it stopped."""
+"""`python -m benchmarks imaging`: its cases, its figures, and that it goes on where it stopped."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
+from benchmarks.imaging import segmentation as imaging_bench
+from benchmarks.imaging.cases import DIFFICULTIES, draw_case
+from benchmarks.imaging.segmentation import BARS, ImagingBenchConfig, bench_imaging
 from endopilot import runs
 from endopilot.atlas.atlas import make_patient
-from endopilot.benchmarks import imaging as imaging_bench
-from endopilot.benchmarks.imaging import BARS, ImagingBenchConfig, bench_imaging
-from endopilot.benchmarks.imaging_cases import DIFFICULTIES, draw_case
 from endopilot.errors import InputError
 from endopilot.imaging.overlap import mask_like
 from endopilot.runs import claim
@@ -43,7 +43,7 @@ DISTURBANCES = {
 
 def write(base, rows) -> None:
     folder = base / "clean"
-    claim(folder, "endopilot bench imaging", **imaging_bench._identity(7))
+    claim(folder, "python -m benchmarks imaging", **imaging_bench._identity(7))
     for index, row in enumerate(rows):
         whole = {"case": index, "failed": None, "warnings": [], "seconds": 2, "processor_seconds": 3}
         (folder / f"{index:04d}.json").write_text(json.dumps(whole | row))
@@ -58,10 +58,10 @@ def test_means_spreads_and_bars(tmp_path):
     found = figures(tmp_path, [GOOD, GOOD | {"dice": 0.83, "ostium_error_mm": 1.2}])
     assert found["dice"] == {
         "mean": 0.88, "sd": 0.0707, "worst": 0.83, "mean_found": 0.88, "worst_found": 0.83,
-        "bar": 0.85, "counts": "mean", "met": True
+        "bar": 0.85, "counts": "mean", "passed": True
     }  # fmt: skip
-    assert found["ostium_error_mm"]["worst"] == 1.2 and not found["ostium_error_mm"]["met"]
-    assert all(found[name]["met"] for name in BARS if name != "ostium_error_mm")
+    assert found["ostium_error_mm"]["worst"] == 1.2 and not found["ostium_error_mm"]["passed"]
+    assert all(found[name]["passed"] for name in BARS if name != "ostium_error_mm")
     assert found["seconds"] == {"mean": 2.0, "worst": 2.0}
 
 
@@ -71,7 +71,7 @@ def test_a_failed_case_counts_against_every_figure(tmp_path):
     assert found["dice"]["worst"] == 0.0 and found["dice"]["worst_found"] == 0.93
     assert found["dice"]["mean_found"] == pytest.approx(0.93)
     assert found["dice"]["mean"] == pytest.approx(0.837)
-    assert not any(found[name]["met"] for name in BARS if name.endswith("_mm"))
+    assert not any(found[name]["passed"] for name in BARS if name.endswith("_mm"))
 
 
 def test_only_missing_cases_are_measured(tmp_path, monkeypatch):

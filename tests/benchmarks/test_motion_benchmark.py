@@ -1,4 +1,4 @@
-"""`endopilot bench simulation --motion` on a few short worlds."""
+"""`python -m benchmarks simulation --motion` on a few short worlds."""
 
 from __future__ import annotations
 
@@ -7,17 +7,18 @@ from functools import partial
 
 import pytest
 
-from endopilot import cli
-from endopilot.benchmarks import beside, motion, scenes
+from benchmarks import figures
+from benchmarks.__main__ import main
+from benchmarks.core import beside, scenes, simulation
 
 
 def test_the_figures_belong_together(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(scenes, "KINDS", {"right": "rca"})
-    monkeypatch.setattr(beside, "REPEATS", 1)
-    monkeypatch.setattr(motion, "LEAST_SHARE", 1e-6)  # how fast it is here says nothing
-    monkeypatch.setattr(motion, "bench_motion", partial(motion.bench_motion, worlds=2, samples=4))
+    monkeypatch.setattr(figures, "REPEATS", 1)
+    monkeypatch.setattr(beside, "LEAST_SHARE_MOVING", 1e-6)  # how fast it is here says nothing
+    monkeypatch.setattr(simulation, "bench_motion", partial(beside.bench_motion, worlds=2, samples=4))
     with pytest.raises(SystemExit) as left:
-        cli.main(["bench", "simulation", "--motion", "heartbeat", "--json"])
+        main(["simulation", "--motion", "heartbeat", "--json"])
     assert not left.value.code
     measured = json.loads(capsys.readouterr().out)
     assert measured["motion"] == "heartbeat" and measured["passed"] is True

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from endopilot.benchmarks.ostia import bench_ostia, judged
+from benchmarks.anatomy.ostia import bench_ostia, judged
 from endopilot.errors import InputError
 from endopilot.imaging.volume import write_volume
 from toy_coronaries import artery, mask_of_arteries
@@ -23,7 +23,7 @@ def test_a_folder_of_masks_is_judged_by_its_truth(tmp_path):
     with pytest.raises(InputError, match=r"two.nii.gz: is missing"):
         bench_ostia(tmp_path)
     write_volume(right.volume, tmp_path / "two.nii.gz")
-    found, absent = bench_ostia(tmp_path)
+    found, absent = bench_ostia(tmp_path)["arteries"]
     assert found["ostium_error_mm"] < 3.0 and found["confidence"] > 0.8 and found["told"] is None
     assert 0.99 < found["coverage"] <= 1.0
     assert absent["ostium_error_mm"] is None and "holds no left coronary artery" in absent["told"]

@@ -1,4 +1,4 @@
-"""`endopilot bench published`: its tests against closed forms, its paths, its verdicts, and a short run."""
+"""`python -m benchmarks published`: its tests against closed forms, its paths, its verdicts, and a short run."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from endopilot import cli
-from endopilot.benchmarks import published, tubing
-from endopilot.benchmarks.published import (
+from benchmarks.__main__ import main
+from benchmarks.published import published, tubing
+from benchmarks.published.published import (
     Comparison,
     PublishedConfig,
     bending,
@@ -21,9 +21,9 @@ from endopilot.benchmarks.published import (
     tip_loads,
     unreinforced,
 )
-from endopilot.benchmarks.straightening import AortoIliac, Straightened
-from endopilot.benchmarks.three_point import flexural_modulus
-from endopilot.benchmarks.tubing import BORE_MM, LENGTH_MM, Push, draw_tubing, push_through
+from benchmarks.published.straightening import AortoIliac, Straightened
+from benchmarks.published.three_point import flexural_modulus
+from benchmarks.published.tubing import BORE_MM, LENGTH_MM, Push, draw_tubing, push_through
 from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import read_device
 from endopilot.simulation.config import PRESETS
@@ -129,7 +129,7 @@ def test_the_command_shows_every_test_and_counts_what_failed(monkeypatch, capsys
     monkeypatch.setattr(published, "draw_tubing", draw)
     monkeypatch.setattr(published, "straightenings", lambda config: [])
     with pytest.raises(SystemExit) as left:
-        cli.main(["bench", "published", "--draws", "2", "--seed", "4", "--json"])
+        main(["published", "--draws", "2", "--seed", "4", "--json"])
     assert not left.value.code
     rows = {row["case"]: row for row in json.loads(capsys.readouterr().out)}
     pushed = {name.rsplit(": ", 1)[1]: row for name, row in rows.items() if "pushed" in name}

@@ -1,4 +1,4 @@
-"""A small version of `endopilot bench robustness`, and that it counts what it says it counts."""
+"""A small version of `python -m benchmarks robustness`, and that it counts what it says it counts."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.core import robustness
+from benchmarks.core.manoeuvres import MANOEUVRES, paired_controls, robust_controls, stacks_of
+from benchmarks.core.robustness import RobustnessConfig, measure_robustness
 from endopilot.anatomy.io import write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.benchmarks import robustness
-from endopilot.benchmarks.manoeuvres import MANOEUVRES, paired_controls, robust_controls, stacks_of
-from endopilot.benchmarks.robustness import RobustnessConfig, measure_robustness
 from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import Device, read_device
 from endopilot.devices.device_files import list_devices

@@ -1,23 +1,20 @@
-"""`endopilot bench simulation` on a few short worlds: its figures, its reference, and what it refuses."""
+"""`python -m benchmarks simulation` on a few short worlds: its figures, its reference, and what it refuses."""
 
 from __future__ import annotations
 
 import json
-import shutil
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-import endopilot
-from endopilot import cli
-from endopilot.benchmarks.errors import error_figures, error_intervals
-from endopilot.benchmarks.reference import REFERENCE_FILE, check_reference, make_reference, read_reference
-from endopilot.benchmarks.scenes import KINDS, Solution, make_scenes
-from endopilot.benchmarks.simulation import bench_simulation
+from benchmarks.__main__ import main
+from benchmarks.core.errors import error_figures, error_intervals
+from benchmarks.core.reference import REFERENCE_FILE, check_reference, make_reference, read_reference
+from benchmarks.core.scenes import KINDS, Solution, make_scenes
+from benchmarks.core.simulation import against_reference
 from endopilot.errors import InputError
 from endopilot.simulation.config import PRESETS, SimulatorConfig
 
@@ -46,8 +43,8 @@ def rewritten(small: Path, to: Path, change: dict[str, Any]) -> Path:
     return to
 
 
-def test_the_figures_of_the_preset_are_those_against_the_reference(small: Path, tmp_path: Path) -> None:
-    measured = bench_simulation("fast", reference=small, baseline=tmp_path / "none")
+def test_the_figures_of_the_preset_are_those_against_the_reference(small: Path) -> None:
+    measured = against_reference("fast", small)
     scenes = make_scenes(WORLDS, SAMPLES)
     rollouts = [scene.run(PRESETS["fast"]) for scene in scenes]
     exact = [scene.run(CONVERGED) for scene in scenes]
@@ -62,25 +59,11 @@ def test_the_figures_of_the_preset_are_those_against_the_reference(small: Path, 
     assert measured["node_iterations_per_second"] == pytest.approx(spent / (len(tip) * SAMPLES * 0.5), abs=0.1)
     # in time alone the error is another, smaller one: the elements are the same
     assert 0 < measured["tip_error_median_mm"] < measured["true_tip_error_median_mm"]
-    assert measured["speed_over_baseline"] is None and measured["realtime_factor_per_core"] > 0
+    assert measured["realtime_factor_per_core"] > 0
     assert measured["worlds"] == len(KINDS) * WORLDS and set(measured["by_anatomy"]) == set(KINDS)
     assert measured["reference_own_error"]["true_tip_error_median_mm"] > 0
     for name, (low, high) in measured["intervals"].items():
         assert (low is None) == (measured[name] is None) and (low is None or low <= high), name
-
-
-def test_the_speed_is_compared_with_another_build_in_a_process_of_its_own(small: Path, tmp_path: Path) -> None:
-    build = tmp_path / "build"
-    shutil.copytree(Path(endopilot.__file__).parent, build / "endopilot", ignore=shutil.ignore_patterns("__pycache__"))
-    for level in ("baseline", "avx2", "avx512"):
-        core = find_spec(f"endopilot._core_{level}")
-        if core is not None and core.origin is not None:
-            shutil.copy(core.origin, build / "endopilot")
-    assert bench_simulation(reference=small, baseline=build)["speed_over_baseline"] > 0
-
-    (build / "endopilot" / "simulation" / "simulate.py").write_text("raise ImportError", encoding="utf-8")
-    with pytest.raises(InputError, match=r"build: does not run; make it anew with `make core-baseline`$"):
-        bench_simulation(reference=small, baseline=build)
 
 
 def test_a_finer_preset_errs_by_less(small: Path) -> None:
@@ -130,7 +113,7 @@ def test_a_reference_of_other_scenes_is_refused(small: Path, tmp_path: Path) -> 
     check_reference(small, make_scenes(WORLDS, SAMPLES))
     with np.load(small) as stored:
         kept = dict(stored)
-    mend = "make it anew with `endopilot bench simulation --make-reference`"
+    mend = "make it anew with `python -m benchmarks simulation --make-reference`"
     for name in ("centerlines_left", "distance_map_cerebral", "initial_states_right", "controls_left"):
         other = kept[name].copy()
         other.flat[-1] += 0.01
@@ -144,14 +127,14 @@ def test_a_reference_of_other_scenes_is_refused(small: Path, tmp_path: Path) -> 
 
 def test_a_file_that_is_no_reference_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     missing = tmp_path / "missing.npz"
-    with pytest.raises(InputError, match=r"missing\.npz: no such file; `endopilot bench simulation --make-ref"):
+    with pytest.raises(InputError, match=r"missing\.npz: no such file; `python -m benchmarks simulation --make-ref"):
         read_reference(missing)
     strange = tmp_path / "strange.npz"
     np.savez(strange, tip_position=np.zeros(3))
     with pytest.raises(InputError, match=r"strange\.npz: no reference \("):
         read_reference(strange)
     with pytest.raises(SystemExit) as left:
-        cli.main(["bench", "simulation", "--reference", str(missing)])
+        main(["simulation", "--reference", str(missing)])
     assert left.value.code == 2
     assert len(capsys.readouterr().err.splitlines()) == 1
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from endopilot.benchmarks import straightening
-from endopilot.benchmarks.straightening import (
+from benchmarks.published import straightening
+from benchmarks.published.straightening import (
     AortoIliac,
     draw_path,
     stiff_wire,

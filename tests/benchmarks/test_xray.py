@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.imaging.xray import BARS, _Exposure, _figures
 from endopilot.anatomy.io import write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.benchmarks.xray import BARS, _Exposure, _figures
 from endopilot.errors import InputError
 from endopilot.xray.scenes import SceneConfig, draw_scenes
 

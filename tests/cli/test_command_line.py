@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import subprocess
 import sys
@@ -10,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from endopilot.cli import COMMANDS, main, module_of
+from endopilot.cli import COMMANDS, main
 from endopilot.cli.arguments import show
 
 
@@ -43,28 +42,11 @@ def test_the_overview_names_every_command(capsys: pytest.CaptureFixture[str]) ->
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_every_command_documents_all_its_options(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_command_has_help(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as leaving:
         main([name, "--help"])
     assert leaving.value.code == 0
-    printed = capsys.readouterr().out
-    assert f"usage: endopilot {name}" in printed
-    undocumented = [
-        line
-        for line in printed.splitlines()
-        if line.strip("│ ").startswith("--") and line.rstrip("│ ").endswith(("INT", "FLOAT", "STR", "PATH"))
-    ]
-    following = printed.splitlines()
-    for line in undocumented:
-        after = following[following.index(line) + 1].strip("│ ")
-        assert after and not after.startswith("-"), f"{name}: no help for {line}"
-
-
-def test_every_command_has_a_module() -> None:
-    for name in COMMANDS:
-        module = importlib.import_module(f"endopilot.cli.{module_of(name)}")
-        functions = getattr(module, "SUBJECTS", None) or {name: module.command}
-        assert functions and all(map(callable, functions.values()))
+    assert f"usage: endopilot {name}" in capsys.readouterr().out
 
 
 def test_an_unknown_command_proposes_a_near_one() -> None:

@@ -33,7 +33,7 @@ class Scripted:
 
     def decide(self, observation):
         self.seen.append(observation)
-        return Decision(10.0, 0.0, expose=len(self.seen) % 3 == 2)
+        return Decision(((10.0, 0.0),), expose=len(self.seen) % 3 == 2)
 
     def watch(self, observation):
         self.watched += 1
@@ -54,7 +54,7 @@ class Broken(Scripted):
 
 class Hopeless(Scripted):
     def decide(self, observation):
-        return Decision(1.0, 0.0, gives_up="at the first fork")
+        return Decision(((1.0, 0.0),), gives_up="at the first fork")
 
 
 class Slow(Scripted):
@@ -118,7 +118,7 @@ def test_a_hand_takes_over_and_hands_back(session):
         session.handle(Drive(type="drive", translation=-5.0, rotation=0.0), number * 0.0125)
         session.cycle(number * 0.0125)
         time.sleep(0.001)
-    assert session.world.robot.velocity[0] == -5.0
+    assert session.world.loop.robot.velocity[0, 0] == -5.0
     assert policy.watched >= 1 and len(policy.seen) == decisions
     start(session, "test_autopilot:Scripted")
     drive(session, until=lambda: len(policy.seen) > decisions)
@@ -147,7 +147,7 @@ def test_a_page_that_falls_silent_pauses_the_policy(session):
     assert session.autopilot.status == "paused"
     for number in range(100):
         session.cycle(100.0 + AUTOPILOT_SILENCE_S + number)
-    assert session.world.robot.velocity[0] == 0.0
+    assert session.world.loop.robot.velocity[0, 0] == 0.0
 
 
 def test_a_page_cannot_name_a_module(session):

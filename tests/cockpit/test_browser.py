@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from browser import hold, opened, says, serving, until, value
 
-from endopilot.benchmarks.cockpit import BROWSER_FLAGS, find_browser
+from benchmarks.cockpit import BROWSER_FLAGS, find_browser
 from endopilot.cockpit.recording import read_recording, replayed
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")

@@ -6,6 +6,7 @@ import time
 
 import numpy as np
 import pytest
+from endopilot.simulation.table import write_rollout
 
 from endopilot.cockpit.film import open_film
 from endopilot.cockpit.frames import decode
@@ -16,7 +17,6 @@ from endopilot.files import write_json
 from endopilot.ladder.attempt import attempt, navigation_seed
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.simulate import simulate
-from endopilot.simulation.table import write_rollout
 from endopilot.tasks.task import find_task
 
 

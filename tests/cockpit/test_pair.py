@@ -8,6 +8,7 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
+from endopilot.simulation.table import write_rollout
 from test_game import Rival, play
 from test_session import run
 
@@ -26,7 +27,6 @@ from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.simulate import simulate
 from endopilot.simulation.simulator import Simulator
-from endopilot.simulation.table import write_rollout
 from endopilot.tasks.task import task_by_hand
 
 NAME = "microcatheter-1.7f"
@@ -51,7 +51,7 @@ def test_each_device_follows_its_own_drive(session):
         {"inserted_mm": round(catheter.inserted_mm, 3), "rotation_deg": round(np.degrees(catheter.rotation), 2)}
     ]
     assert header["catheter_tips_mm"][0] < header["tip_mm"]
-    simulator = session.world.simulator
+    simulator = session.world.loop.simulator
     np.testing.assert_array_equal(arrays["nodes"][0], simulator.tips(0)[0].astype("<f4"))
     np.testing.assert_array_equal(arrays["catheter_1_nodes"][0], simulator.tips(1)[0].astype("<f4"))
     assert len(arrays["catheter_1_force"]) == len(arrays["catheter_1_nodes"]) < len(arrays["nodes"])
@@ -63,7 +63,7 @@ def test_each_device_follows_its_own_drive(session):
 @pytest.mark.parametrize(("wire_mm", "catheter_mm"), [(10.0, 4.0), (4.0, 10.0)])
 def test_the_wall_presses_on_the_outermost_device_alone(world, wire_mm, catheter_mm):
     """A wall that presses everywhere is shown on the wire as far as it leads, and on the catheter."""
-    world.simulator.reset(inserted_length=[wire_mm], rotation=[0.0], catheter_inserted_length=[[catheter_mm]])
+    world.loop.simulator.reset(inserted_length=[wire_mm], rotation=[0.0], catheter_inserted_length=[[catheter_mm]])
     with patch.object(Simulator, "contacts", property(lambda self: np.ones((1, self.nodes)))):
         snapshot = world.snapshot()
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(snapshot.nodes, axis=0), axis=1))])
@@ -74,7 +74,7 @@ def test_the_wall_presses_on_the_outermost_device_alone(world, wire_mm, catheter
 def test_silence_stops_both(session):
     session.handle(both((5.0, 1.0), (4.0, 1.0)), 0.0)
     run(session, SILENCE_S)
-    assert session.world.robot.velocity.tolist() == [5.0, 1.0, 4.0, 1.0]
+    assert session.world.loop.robot.velocity.tolist() == [[5.0, 1.0], [4.0, 1.0]]
     (header, _), _ = run(session, 0.3, start=SILENCE_S + 0.02)
     assert header["stopped"] == "silence" and header["velocity"] == [0.0] * 4
 

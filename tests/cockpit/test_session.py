@@ -38,7 +38,7 @@ def test_the_wire_follows_the_drive_within_its_limits(session):
 def test_silence_stops_the_wire(session):
     session.handle(Drive(type="drive", translation=5.0, rotation=1.0), 0.0)
     run(session, SILENCE_S)
-    moving = session.world.robot.velocity.copy()
+    moving = session.world.loop.robot.velocity[0].copy()
     (header, _), _ = run(session, 0.3, start=SILENCE_S + 0.02)
     assert moving[0] == 5.0
     assert header["stopped"] == "silence" and header["velocity"] == [0.0, 0.0]
@@ -191,7 +191,14 @@ def test_a_recording_that_cannot_be_written_is_told(world, vessel, tmp_path):
         Recorder(tmp_path / "file" / "a.jsonl", world, Where(patient=vessel), 0)
 
 
-@pytest.mark.parametrize("text", ["", "{}\n", "nonsense\n", '{"format": "endopilot cockpit 1"}\n'])
+def test_a_session_of_an_older_version_says_which(tmp_path):
+    path = tmp_path / "x.cockpit.jsonl"
+    path.write_text('{"format": "endopilot cockpit 1", "version": "0.0.9"}\n')
+    with pytest.raises(InputError, match=r"a session of endopilot 0\.0\.9, whose loop differs; replay it with that"):
+        read_recording(path)
+
+
+@pytest.mark.parametrize("text", ["", "{}\n", "nonsense\n", '{"format": "endopilot cockpit 2"}\n'])
 def test_what_is_no_session_is_told(tmp_path, text):
     path = tmp_path / "x.cockpit.jsonl"
     path.write_text(text)

@@ -20,8 +20,10 @@ from endopilot.control.halt import describe_halt
 from endopilot.control.period import drive_period
 from endopilot.control.route import Route
 from endopilot.control.search import Search
+from endopilot.devices.drive_limits import DriveLimits
 from endopilot.navigation.navigate import NavigationLoop, navigate, start_world
-from endopilot.navigation.policy import Decision, Observation, Policy
+from endopilot.navigation.policy import Decision, Hand, Observation, Policy
+from endopilot.robot.robot import DriveMotion, RobotConfig
 from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.simulation.motion import motion_named
 from endopilot.tasks.navigation import Navigation, Target
@@ -37,7 +39,7 @@ class Forward:
         pass
 
     def decide(self, observation: Observation) -> Decision:
-        return Decision(6.0, 0.0)
+        return Decision(((6.0, 0.0),))
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +59,7 @@ def test_the_twin_gets_into_a_side_branch_that_pushing_misses(side_branch) -> No
     assert isinstance(policy, Policy)
     record = navigate(side_branch, policy, seed=1)
     assert record.success and record.safe and record.faults == 0
-    assert record.tip.branch[-1] == 2
+    assert record.tip.branch[-1, 0] == 2
     assert record.exposures == len(record.time_s) - 1  # X-ray is always on
 
 
@@ -157,12 +159,12 @@ def test_a_tip_that_no_wire_explains_is_pulled_back_under_xray(side_branch) -> N
     policy = AgentPolicy(QUICK)
     policy.start(side_branch, 0)
     shown = measured(policy.belief, 0)
-    first = policy.decide(Observation(0.0, 2.0, 0.0, shown))
-    assert first.translation > 0
+    first = policy.decide(Observation(0.0, ((2.0, 0.0),), shown))
+    assert first.devices[0][0] > 0
     far = replace(shown, position=shown.position + np.array([6.0, 0.0, 5.0]))
-    lost = policy.decide(Observation(0.5, 2.0, 0.0, far))
-    assert lost.translation < 0 and lost.expose
-    policy.decide(Observation(1.0, 2.0, 0.0, measured(policy.belief, 0)))
+    lost = policy.decide(Observation(0.5, ((2.0, 0.0),), far))
+    assert lost.devices[0][0] < 0 and lost.expose
+    policy.decide(Observation(1.0, ((2.0, 0.0),), measured(policy.belief, 0)))
     assert policy.plans == 2  # found again, it searches another path
 
 
@@ -170,10 +172,10 @@ def test_a_lost_wire_that_is_back_in_its_catheter_unseen_sets_out_again(side_bra
     policy = AgentPolicy(QUICK)
     policy.start(side_branch, 0)
     far = replace(measured(policy.belief, 0), position=np.full(3, 50.0))
-    assert policy.decide(Observation(0.0, 6.0, 0.0, far)).translation < 0
-    assert policy.decide(Observation(0.5, 4.0, 0.0, None)).translation < 0  # not there yet
-    again = policy.decide(Observation(1.0, 1.9, 0.0, None))
-    assert again.translation > 0 and not again.expose
+    assert policy.decide(Observation(0.0, ((6.0, 0.0),), far)).devices[0][0] < 0
+    assert policy.decide(Observation(0.5, ((4.0, 0.0),), None)).devices[0][0] < 0  # not there yet
+    again = policy.decide(Observation(1.0, ((1.9, 0.0),), None))
+    assert again.devices[0][0] > 0 and not again.expose
 
 
 def test_a_tip_that_is_measured_badly_is_not_lost(side_branch) -> None:
@@ -184,7 +186,7 @@ def test_a_tip_that_is_measured_badly_is_not_lost(side_branch) -> None:
         shown = measured(policy.belief, int(np.argmax(policy.belief.weight)))
         aside = np.cross(side_branch.anatomy.insertion.direction, [1.0, 0.0, 0.0])
         off = replace(shown, position=shown.position + 6.0 * aside / np.linalg.norm(aside), sd_mm=(sd_mm, sd_mm))
-        assert (policy.decide(Observation(0.0, 2.0, 0.0, off)).translation < 0) == lost
+        assert (policy.decide(Observation(0.0, ((2.0, 0.0),), off)).devices[0][0] < 0) == lost
 
 
 def test_with_a_calibration_the_adviser_says_when_to_look(side_branch) -> None:
@@ -195,7 +197,7 @@ def test_with_a_calibration_the_adviser_says_when_to_look(side_branch) -> None:
     )  # fmt: skip
     policy = AgentPolicy(QUICK, calibration=calibration, advice=AdviserConfig(abscissa_mm=1.0, wall_ratio=2.0))
     policy.start(replace(side_branch, target=Target(branch=1, abscissa=39.0)), 0)
-    at = [k for k in range(9) if policy.decide(Observation(0.5 * k, 2.0, 0.0, None)).expose]
+    at = [k for k in range(9) if policy.decide(Observation(0.5 * k, ((2.0, 0.0),), None)).expose]
     assert at == [3, 7]
 
 
@@ -225,7 +227,7 @@ def test_open_loop_plans_once_and_looks_no_more(side_branch) -> None:
     assert record.success and record.exposures == 1 and policy.plans == 1
     policy.start(side_branch, 0)
     far = replace(measured(policy.belief, 0), position=np.full(3, 50.0))
-    assert policy.decide(Observation(0.0, 2.0, 0.0, far)).translation > 0  # whatever the first exposure shows
+    assert policy.decide(Observation(0.0, ((2.0, 0.0),), far)).devices[0][0] > 0  # whatever the first exposure shows
 
 
 NUMBERS = st.floats(allow_nan=True, allow_infinity=True, width=64)
@@ -240,7 +242,7 @@ def started(side_branch) -> AgentPolicy:
 
 @given(control=st.lists(st.tuples(NUMBERS, NUMBERS, NUMBERS, NUMBERS), min_size=1, max_size=4))
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_whatever_the_model_returns_commands_are_finite_and_within_limits(started, shaped, control) -> None:
+def test_whatever_the_model_returns_a_drive_takes_what_is_finite_and_within_limits(started, shaped, control) -> None:
     """The search is made to return any numbers at all."""
     wild = np.array(control)
 
@@ -253,10 +255,10 @@ def test_whatever_the_model_returns_commands_are_finite_and_within_limits(starte
 
     started._search.find, started._course, started._failed = find, None, 0
     for k in range(len(control)):
-        decision = started.decide(Observation(0.5 * k, 2.0, 0.0, None))
-        assert np.isfinite([decision.translation, decision.rotation]).all()
-        assert abs(decision.translation) <= shaped.max_velocity_mm_s
-        assert abs(decision.rotation) <= shaped.max_rotation_rad_s
+        (velocity,) = started.decide(Observation(0.5 * k, ((2.0, 0.0),), None)).devices
+        taken = DriveMotion(DriveLimits.of(shaped), RobotConfig(), (2.0, 0.0)).command(*velocity)
+        assert np.isfinite(taken).all()
+        assert (np.abs(taken) <= [shaped.max_velocity_mm_s, shaped.max_rotation_rad_s]).all()
 
 
 @pytest.mark.timeout(60)
@@ -287,8 +289,10 @@ def test_an_agent_tells_what_it_believes_and_goes_on_after_hands(side_branch) ->
     loop = NavigationLoop(side_branch, AgentPolicy(QUICK), seed=2)
     for _ in range(4):
         loop.step()
-    for _ in range(6):  # away from its course, turned
-        loop.step(by_hand=Decision(-2.0, 1.5, expose=False))
+    loop.hand_over(Hand(((-2.0, 1.5),)))  # away from its course, turned
+    for _ in range(6):
+        loop.step()
+    loop.hand_over(None)
     wires, tip = loop.policy.believed_wires(), loop.policy.belief.tip
     assert wires.shape == (QUICK.belief.members, loop.policy.belief.simulator.nodes, 3)
     likeliest = int(np.argmax(loop.policy.belief.weight))
@@ -299,7 +303,7 @@ def test_an_agent_tells_what_it_believes_and_goes_on_after_hands(side_branch) ->
     record = loop.record()
     assert record.success and record.safe
     assert record.exposed[10], "the policy goes on with an image"
-    ends = np.abs(record.believed[:-1, 0] - record.tip.abscissa[:-1])
+    ends = np.abs(record.believed[:-1, 0] - record.tip.abscissa[:-1, 0])
     assert np.isnan(record.believed[-1]).all() and np.median(ends) < 0.5
     bands = record.half_width[:-1][~np.isnan(record.half_width[:-1, 0])]
     assert len(bands) > 5 and (bands > 0).all()
@@ -372,11 +376,11 @@ def test_a_wire_that_should_have_arrived_goes_by_the_image(side_branch) -> None:
         navigation = replace(side_branch, target=Target(branch=0, abscissa=here + off_mm))
         policy.start(navigation, 0)
         policy._search.find = lambda *_, **__: Log().course(3, 1.0)
-        blind = policy.decide(Observation(0.0, 2.0, 0.0, None))
-        assert blind.expose and blind.translation == 0.0
+        blind = policy.decide(Observation(0.0, ((2.0, 0.0),), None))
+        assert blind.expose and blind.devices[0][0] == 0.0
         assert policy.believed().asks == "the tip should be at the target"
-        seen = policy.decide(Observation(0.5, 2.0, 0.0, shown))
-        assert seen.expose and seen.translation == pytest.approx(translation) and seen.rotation == 0.0
+        seen = policy.decide(Observation(0.5, ((2.0, 0.0),), shown))
+        assert seen.expose and seen.devices[0] == pytest.approx((translation, 0.0))
 
 
 def test_a_course_may_begin_with_a_turn(side_branch) -> None:

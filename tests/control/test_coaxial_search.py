@@ -108,16 +108,16 @@ def test_a_wire_that_no_simulated_one_explains_is_pulled_back_until_one_does(sid
 
     def seen(shift_mm: float, sd_mm: float = 0.0) -> Observation:
         tip = TipMeasurement(believed + np.array([0.0, 0.0, shift_mm]), 10.0 + shift_mm, 0.0, 0, (sd_mm, sd_mm))
-        return Observation(0.0, 10.0, np.pi, tip, ((0.0, 0.0),))
+        return Observation(0.0, ((10.0, np.pi), (0.0, 0.0)), tip)
 
     lost = policy.decide(seen(8.0))
-    assert lost.translation < 0 and lost.catheters[0][0] == 0.0 and lost.expose and policy.plans == 0
-    inside = policy.decide(replace(seen(8.0), catheters=((12.0, 0.0),)))
-    assert inside.translation < 0 and inside.catheters[0][0] < 0
+    assert lost.devices[0][0] < 0 and lost.devices[1][0] == 0.0 and lost.expose and policy.plans == 0
+    inside = policy.decide(replace(seen(8.0), devices=((10.0, np.pi), (12.0, 0.0))))
+    assert inside.devices[0][0] < 0 and inside.devices[1][0] < 0
     policy.start(side_branch, 0)
-    assert policy.decide(seen(0.5)).translation >= 0 and policy.plans == 1
+    assert policy.decide(seen(0.5)).devices[0][0] >= 0 and policy.plans == 1
     policy.start(side_branch, 0)
-    assert policy.decide(seen(8.0, sd_mm=4.0)).translation >= 0 and policy.plans == 1  # a poor image proves little
+    assert policy.decide(seen(8.0, sd_mm=4.0)).devices[0][0] >= 0 and policy.plans == 1  # a poor image proves little
 
 
 def test_a_ladder_counts_the_events_that_the_agent_misses(side_branch) -> None:

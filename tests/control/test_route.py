@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.anatomy.analytic_lumens import tree_of
 from endopilot.anatomy.projection import project_tip
-from endopilot.benchmarks.analytic_lumens import tree_of
 from endopilot.control.route import Route, check_passable, parse_target
 from endopilot.errors import InputError
 from endopilot.tasks.navigation import Target

@@ -9,13 +9,13 @@ from functools import cache
 
 import numpy as np
 
+from benchmarks.verification.contact import bent_tube
 from endopilot import _core
 from endopilot.devices.device import read_device
 from endopilot.simulation.config import FREE_BEHIND_MM, Actuation, SimulatorConfig
 from endopilot.simulation.core import make_lumen, run_core
 from endopilot.simulation.rod import lay_out
 from endopilot.types import Insertion
-from endopilot.verification.contact import bent_tube
 
 WORLDS, SAMPLES = 5, 3
 CONFIG = SimulatorConfig(element_mm=1.0, threads=1)

@@ -17,5 +17,5 @@ def test_the_roofline_compiles_with_the_core() -> None:
     if compiler is None or not (ROOT / "benchmarks").exists():
         pytest.skip("no C++ compiler, or no source of the project, here")
     command = [compiler, "-std=gnu++20", "-fsyntax-only", "-Wno-psabi", "-I", str(ROOT / "src" / "core")]
-    run = subprocess.run([*command, str(ROOT / "benchmarks" / "roofline.cpp")], capture_output=True, text=True)
+    run = subprocess.run([*command, str(ROOT / "benchmarks" / "core" / "roofline.cpp")], capture_output=True, text=True)
     assert run.returncode == 0, run.stderr

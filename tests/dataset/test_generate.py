@@ -25,6 +25,7 @@ from endopilot.dataset.loader import load_dataset
 from endopilot.devices.device_files import device_yaml
 from endopilot.errors import InputError
 from endopilot.files import read_json, sha256
+from endopilot.simulation.config import SimulatorConfig
 from toy_navigation import make_toy_dataset, toy_anatomy, toy_simulate
 
 
@@ -58,18 +59,15 @@ def test_pandas_reads_the_layout_of_lerobot(toy_dataset):
 def test_motion_is_the_integral_of_the_control(toy_dataset):
     data = load_dataset(toy_dataset)
     travel = data.sample_period_s * np.cumsum(data.control.astype(float), axis=1)
-    np.testing.assert_allclose(data.inserted_length, data.initial_inserted_length[:, None] + travel[..., 0], atol=1e-5)
-    np.testing.assert_allclose(data.rotation, data.initial_rotation[:, None] + travel[..., 1], atol=1e-5)
+    np.testing.assert_allclose(data.inserted_length, data.initial[:, None, :, 0] + travel[..., 0], atol=1e-5)
+    np.testing.assert_allclose(data.rotation, data.initial[:, None, :, 1] + travel[..., 1], atol=1e-5)
 
 
 def test_an_episode_repeats_exactly_from_the_disk(toy_dataset):
     data = load_dataset(toy_dataset)
     chosen = data.select(data.anatomy == data.anatomy[0])
-    initial = np.stack([chosen.initial_inserted_length, chosen.initial_rotation], axis=-1)
-    anatomy = toy_anatomy(str(chosen.anatomy[0]))
-    again = toy_simulate(
-        anatomy, None, chosen.control.astype(float), initial=initial, config=None, friction=chosen.friction
-    )
+    options = {"initial": chosen.initial, "config": SimulatorConfig(), "friction": chosen.friction}
+    again = toy_simulate(toy_anatomy(str(chosen.anatomy[0])), data.stack, chosen.control.astype(float), **options)
     assert (again.tip.abscissa.astype(np.float32) == chosen.tip_abscissa).all()
     assert (again.tip.offset.astype(np.float32) == chosen.tip_offset).all()
 
@@ -104,7 +102,7 @@ def test_bits_do_not_depend_on_how_sequences_are_put_into_files(tmp_path, toy_da
     make_toy_dataset(tmp_path / "small-files", patients=6, sequences=24, sequences_per_file=7)
     whole, split = load_dataset(toy_dataset), load_dataset(tmp_path / "small-files")
     assert split.manifest["files"] == 6 * 4
-    for name in ("control", "tip_abscissa", "friction", "initial_rotation", "split", "anatomy"):
+    for name in ("control", "tip_abscissa", "friction", "initial", "split", "anatomy"):
         assert (getattr(whole, name) == getattr(split, name)).all(), name
 
 
@@ -229,11 +227,11 @@ def test_a_full_disk_gives_one_line_and_the_run_can_be_resumed(tmp_path, monkeyp
 
 def test_invalid_worlds_are_listed_and_never_trained_on(tmp_path):
     def failing(*args, **kwargs):
-        rollout = toy_simulate(*args, **kwargs)
-        rollout.valid[3, 50:] = False
-        rollout.reason[3] = 2
-        rollout.tip.abscissa[3, 50:] = np.nan
-        return rollout
+        trajectory = toy_simulate(*args, **kwargs)
+        trajectory.valid[3, 50:] = False
+        trajectory.reason[3] = 2
+        trajectory.tip.abscissa[3, 50:] = np.nan
+        return trajectory
 
     make_toy_dataset(tmp_path / "d", patients=1, sequences=10, simulate=failing)
     record = read_json(tmp_path / "d/meta/manifest.json")["invalid"]

@@ -14,10 +14,10 @@ from toy_navigation import make_toy_dataset, toy_simulate
 
 
 def failing(*args, **kwargs):
-    rollout = toy_simulate(*args, **kwargs)
-    rollout.valid[1, 5:] = False
-    rollout.reason[1] = 2
-    return rollout
+    trajectory = toy_simulate(*args, **kwargs)
+    trajectory.valid[1, 5:] = False
+    trajectory.reason[1] = 2
+    return trajectory
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def test_figures_are_those_of_the_samples(folder):
 
 def test_manoeuvres_are_those_that_were_driven(folder):
     data = load_dataset(folder)
-    velocity = data.control[data.valid]
+    velocity = data.control[data.valid][:, 0]
     shares = describe_dataset(folder).figures["manoeuvres"]
     assert shares["insertion"] == pytest.approx((velocity[:, 0] > 0.1).mean(), abs=1e-4)
     assert shares["retraction"] == pytest.approx((velocity[:, 0] < -0.1).mean(), abs=1e-4)

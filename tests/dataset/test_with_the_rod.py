@@ -17,6 +17,7 @@ from endopilot.dataset.generate import generate_dataset
 from endopilot.dataset.loader import load_dataset
 from endopilot.dataset.navigations import PULL_BACK_MM, STOP_SHORT_MM, simulate_navigations
 from endopilot.devices.device import read_device
+from endopilot.devices.stack import Stack
 from endopilot.evaluation.replay import Recorded
 from endopilot.models.config import WINDOW
 from endopilot.simulation.motion import motion_named
@@ -28,8 +29,6 @@ DEVICE = read_device("workhorse-014")
 @pytest.fixture(scope="module")
 def patient(tmp_path_factory):
     folder = tmp_path_factory.mktemp("anatomies") / "patient"
-    # Where a wire springs back farther than it is driven, as in sharp bends, float32 controls do not give commands back
-    # to the bit: the textbook's vessels bend gently.
     write_anatomy(make_patient(AtlasConfig(count=1, seed=4, population="textbook"), 0), folder)
     return folder
 
@@ -51,7 +50,7 @@ def test_an_episode_simulated_from_the_disk_repeats_to_the_bit(tmp_path, patient
             read_anatomy(data.anatomy_folder(str(data.anatomy[0]))),
             DEVICE.with_tip(bend_rad=tip[0], stiffness_factor=tip[1]),
             one.control.astype(float),
-            initial=np.stack([one.initial_inserted_length, one.initial_rotation], axis=-1),
+            initial=one.initial,
             config=config.simulator,
             friction=one.friction,
         )
@@ -66,12 +65,11 @@ def test_where_the_drive_slipped_its_commands_repeat_the_navigation(tmp_path, pa
     generate_dataset([patient], tmp_path / "dataset", weak, config)
     data = load_dataset(tmp_path / "dataset")
     assert (data.slip != 0).any() and (data.rotation_slip != 0).any()
-    slips = (data.slip != 0).any(axis=1) | (data.rotation_slip != 0).any(axis=1)
-    initial = np.stack([data.initial_inserted_length, data.initial_rotation], axis=-1)
+    slips = ((data.slip != 0) | (data.rotation_slip != 0)).any(axis=(1, 2))
 
     def retraced(control):
         return simulate(
-            read_anatomy(patient), weak, control, initial=initial, config=config.simulator, friction=data.friction
+            read_anatomy(patient), weak, control, initial=data.initial, config=config.simulator, friction=data.friction
         )
 
     again = retraced(data.command)
@@ -86,15 +84,16 @@ def test_wires_stay_inside_the_imaged_vessel_and_repeat_from_the_recorded_contro
     anatomy, config = read_anatomy(patient), DatasetConfig().simulator
     leaves = anatomy.tree.leaves()
     ends = np.array([b.centerline.abscissa[-1] if i in leaves else np.inf for i, b in enumerate(anatomy.tree.branches)])
-    control = np.zeros((6, 24, 2))
-    control[:, :, 0] = 12.0
-    control[:, :, 1] = np.linspace(-2, 2, 6)[:, None]
-    initial = np.column_stack([np.linspace(70.0, 1.5 * ends[np.isfinite(ends)].max(), 6), np.zeros(6)])
-    friction = np.linspace(0.05, 0.2, 6)
-    rollout, started, applied, stopped = simulate_navigations(anatomy, [DEVICE] * 6, initial, control, friction, config)
-    assert rollout.valid.all()
+    control = np.zeros((6, 24, 1, 2))
+    control[..., 0] = 12.0
+    control[..., 1] = np.linspace(-2, 2, 6)[:, None, None]
+    initial = np.column_stack([np.linspace(70.0, 1.5 * ends[np.isfinite(ends)].max(), 6), np.zeros(6)])[:, None]
+    friction = np.linspace(0.05, 0.2, 6)[:, None]
+    driven, stopped = simulate_navigations(anatomy, [Stack(DEVICE)] * 6, initial, control, friction, config)
+    assert driven.valid.all()
     assert stopped.all()
-    assert (rollout.tip.abscissa < ends[rollout.tip.branch] - 0.5 * STOP_SHORT_MM).all()
+    assert (driven.tip.abscissa < ends[driven.tip.branch] - 0.5 * STOP_SHORT_MM).all()
+    applied, started = driven.command[:, :, 0], driven.set_up.initial
     pulled = applied[..., 0] < 0
     assert pulled.any(axis=1).all()  # pushed into a dead end, every wire is pulled back
     longest = max(len(run) for world in pulled for run in "".join("x" if p else " " for p in world).split())
@@ -102,8 +101,8 @@ def test_wires_stay_inside_the_imaged_vessel_and_repeat_from_the_recorded_contro
     free = ~pulled & (applied[..., 0] == 12.0)
     assert free.mean() > 0.3
     again = simulate(anatomy, DEVICE, applied, initial=started, friction=friction, config=config)
-    np.testing.assert_array_equal(again.tip_position, rollout.tip_position)
-    np.testing.assert_array_equal(again.inserted_length, rollout.inserted_length)
+    np.testing.assert_array_equal(again.tip_position, driven.tip_position)
+    np.testing.assert_array_equal(again.inserted_length, driven.inserted_length)
 
 
 def test_a_draw_does_not_depend_on_the_others(patient):
@@ -118,7 +117,7 @@ def test_a_draw_does_not_depend_on_the_others(patient):
             assert np.array_equal(values, vars(everything)[name][9:12]), name
         assert len(set(everything.tip_bend_rad.tolist())) == 40 // TIP_GROUP
         assert 0.5 <= everything.tip_bend_rad.min() / DEVICE.tip_bend_rad < 1.5
-        assert len({id(device) for device in everything.devices(DEVICE)}) == 40 // TIP_GROUP
+        assert len({id(stack) for stack in everything.stacks(Stack(DEVICE))}) == 40 // TIP_GROUP
 
 
 def test_a_dataset_driven_by_force(tmp_path, patient):
@@ -130,17 +129,17 @@ def test_a_dataset_driven_by_force(tmp_path, patient):
     assert 0.05 < np.abs(load[:, 0]).max() < DEVICE.push_limit_n
     data = load_dataset(tmp_path / "dataset")
     one = data.select(np.array([1]))
-    assert np.array_equal(one.control[0], velocity)
+    assert np.array_equal(one.command[0, :, 0], load)
+    assert np.array_equal(one.control[0, :, 0], velocity)
     travel = 0.5 * np.cumsum(one.control.astype(float), axis=1)
-    np.testing.assert_allclose(one.inserted_length, one.initial_inserted_length[:, None] + travel[..., 0], atol=1e-4)
+    np.testing.assert_allclose(one.inserted_length, one.initial[:, None, :, 0] + travel[..., 0], atol=1e-4)
     assert np.ptp(data.inserted_length, axis=1).max() > 5
-    initial = np.stack([one.initial_inserted_length, one.initial_rotation], axis=-1)
     again = simulate(
         read_anatomy(patient),
         DEVICE,
-        load[None].astype(float),
+        load[None],
         actuation="force",
-        initial=initial,
+        initial=one.initial,
         config=config.simulator,
         friction=one.friction,
     )
@@ -155,15 +154,15 @@ def test_vessels_move_as_it_is_drawn_for_each_patient(tmp_path, patient):
     name = str(data.anatomy[0])
     assert data.motion(name) == patient_motion(config, name) != patient_motion(config, "somebody else")
     assert patient_motion(replace(config, motion="still"), name) is None
-    initial = np.stack([data.initial_inserted_length, data.initial_rotation], axis=-1)
+    options = {"initial": data.initial, "config": config.simulator}
     moved, still = (
-        simulate(read_anatomy(patient), DEVICE, data.command, initial=initial, config=config.simulator, motion=motion)
+        simulate(read_anatomy(patient), DEVICE, data.command, motion=motion, **options)
         for motion in (data.motion(name), None)
     )
     np.testing.assert_array_equal(moved.tip.abscissa.astype(np.float32), data.tip_abscissa)
     assert np.abs(still.tip.abscissa - data.tip_abscissa).max() > 0.3
     recorded = Recorded.of(data)
-    ((_, again),) = recorded.simulated({"true_replay": data.command[:, WINDOW:]})
+    ((_, again),) = recorded.simulated({"true_replay": data.command[:, WINDOW:, 0]})
     np.testing.assert_array_equal(again.tip.abscissa.astype(np.float32), data.tip_abscissa)
 
 
@@ -171,13 +170,17 @@ def test_an_episode_names_the_motion_of_its_vessel_and_is_replayed_in_it(tmp_pat
     motion, simulator = motion_named("heartbeat", 7), DatasetConfig().simulator
     drawn = draw_navigations(DatasetConfig(sequences=1, seconds=16.0), DEVICE, read_anatomy(patient), range(1))
     options = {"initial": drawn.initial, "config": simulator, "motion": motion}
-    rollout = simulate(read_anatomy(patient), DEVICE, drawn.control, **options)
-    wire = {"friction": DEVICE.friction, "tip_stiffness_factor": 1.0}
-    told = {"task": "navigate", "seed": 7, "origin": {}, "simulator": simulator}
-    write_episode(rollout, patient, tmp_path / "episode", DEVICE, **wire, **told, motion=motion)
+    trajectory = simulate(read_anatomy(patient), DEVICE, drawn.control, **options)
+    assert (drawn.control != drawn.control.astype(np.float32)).any()
+    told = {"task": "navigate", "seed": 7, "origin": {}, "friction": DEVICE.friction, "tip_stiffness_factor": 1.0}
+    write_episode(trajectory, patient, tmp_path / "episode", Stack(DEVICE), **told)
     data = load_dataset(tmp_path / "episode")
     assert data.motion(str(data.anatomy[0])) == motion
-    ((_, again),) = Recorded.of(data).simulated({"true_replay": data.command[:, WINDOW:]})
-    np.testing.assert_allclose(again.tip.abscissa, data.tip_abscissa, atol=1e-3)
-    write_episode(rollout, patient, tmp_path / "still", DEVICE, **wire, **told)
+    ((_, again),) = Recorded.of(data).simulated({"true_replay": data.command[:, WINDOW:, 0]})
+    for name in ("tip_position", "tip_direction", "drive_force", "drive_torque", "contact_force_sum"):
+        np.testing.assert_array_equal(getattr(again, name).astype(np.float32), getattr(data, name), err_msg=name)
+    np.testing.assert_array_equal(again.slip, data.slip)
+    np.testing.assert_array_equal(again.command, trajectory.command)
+    still = replace(trajectory, set_up=replace(trajectory.set_up, motion=None))
+    write_episode(still, patient, tmp_path / "still", Stack(DEVICE), **told)
     assert load_dataset(tmp_path / "still").motion(str(data.anatomy[0])) is None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,12 @@ import pytest
 from endopilot.cli import main
 
 
-def run(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> dict[str, Any]:
+def run(
+    capsys: pytest.CaptureFixture[str], *arguments: str | Path, command: Callable[[list[str]], None] = main
+) -> dict[str, Any]:
     """Run a command with --json and return its figures."""
     with pytest.raises(SystemExit) as leaving:
-        main([*map(str, arguments), "--json"])
+        command([*map(str, arguments), "--json"])
     captured = capsys.readouterr()
     assert leaving.value.code == 0, captured.err
     return json.loads(captured.out)

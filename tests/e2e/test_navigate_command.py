@@ -164,7 +164,7 @@ def test_the_picture_shows_wire_and_catheter(patient):
     )
     found = navigate_patient(set_up_navigation(patient, "2", config))
     record, motion = found.record, found.rollout.catheters
-    np.testing.assert_allclose(record.catheter_tip_position[1:], motion.tip_position[0], atol=1e-3)
+    np.testing.assert_allclose(record.tip_position[1:, 1:], motion.tip_position[0], atol=1e-3)
     outcome = tell_outcome(found)
     assert "after 6 s the catheter's tip is in section 1 at 0.0 mm" in outcome  # the wire goes first
     assert "it was still on its course; give more --seconds" in outcome
@@ -173,19 +173,20 @@ def test_the_picture_shows_wire_and_catheter(patient):
     assert {"wire's tip", "tip of microcatheter-1.7f"} < set(names[route])
     assert names[tip][:2] == ["wire's tip", "catheter's tip"]
     line = tip.lines[1]
-    np.testing.assert_array_equal(line.get_ydata(), record.catheter_tips[0].abscissa)
+    np.testing.assert_array_equal(line.get_ydata(), record.tip.abscissa[:, 1])
     assert names[pushes] == ["workhorse-014", "microcatheter-1.7f"]
     np.testing.assert_array_equal(pushes.lines[1].get_ydata(), motion.drive_force[0, :, 0])
     for axes, column in ((translation, 0), (rotation, 1)):
-        for line, of_device in zip(axes.lines, record.control[:, column::2].T, strict=False):
+        for line, of_device in zip(axes.lines, record.control[..., column].T, strict=False):
             np.testing.assert_array_equal(line.get_ydata(), of_device)
 
 
 def test_the_replayed_wire_is_the_navigations_to_the_bit(patient):
     found = navigate_patient(set_up_navigation(patient, "2", NavigatePatientConfig(tip="own", seconds=20.0, seed=3)))
     samples = len(found.record.time_s) - 1
-    np.testing.assert_array_equal(found.rollout.tip_position[0], found.record.tip_position[1:])
-    np.testing.assert_array_equal(found.rollout.shape[0, :, 0], found.record.tip_position[1:])
+    np.testing.assert_array_equal(found.rollout.tip_position[0], found.record.tip_position[1:, 0])
+    nodes = found.rollout.shape.shape[2]  # laid out for what is driven
+    np.testing.assert_array_equal(found.rollout.shape[0], found.record.shape[1:, :nodes])
     assert found.rollout.tip_position.shape[1] == samples == len(found.wires) < found.episode.valid.shape[1] == 40
     # the likeliest wire held possible is where the record has it, a decision later
     shown = np.array([wires[0, 0] for wires in found.wires])
@@ -193,7 +194,9 @@ def test_the_replayed_wire_is_the_navigations_to_the_bit(patient):
     assert np.median(errors) < 1.0
     # then the drive rests
     np.testing.assert_array_equal(found.episode.control[0, samples + 1 :], 0.0)
-    np.testing.assert_allclose(found.episode.inserted_length[0, :samples], found.record.inserted_length[1:], atol=1e-9)
+    np.testing.assert_allclose(
+        found.episode.inserted_length[0, :samples], found.record.inserted_length[1:, 0], atol=1e-9
+    )
 
 
 def test_the_episode_trains_beside_simulated_data(driven, patient, capsys, tmp_path):

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from command import refused, run
 
+from benchmarks.anatomy.analytic_lumens import forked_tree, tree_distance
 from endopilot.anatomy.io import write_anatomy
-from endopilot.benchmarks.analytic_lumens import forked_tree, tree_distance
 from endopilot.files import read_json, write_json
 from endopilot.models.config import run_path
 from endopilot.types import Anatomy, Branch, DistanceMap, Insertion, VesselTree

@@ -78,4 +78,4 @@ def test_a_jump_to_another_vessel_is_cut_and_noted():
     trunk = straight([0, 0, 0], [0, 0, 60], 121)
     found = made([np.concatenate([trunk, straight([0, 0, 30], [20, 0, 60])])])
     assert len(found.tree.leaves()) == 2
-    assert any("line 0 jumps by 30.0 mm at [0.0, 0.0, 60.0] mm: cut there" in note for note in found.notes)
+    assert any("line 0 jumps by 30.0 mm at (0.0, 0.0, 60.0) mm: cut there" in note for note in found.notes)

@@ -14,7 +14,7 @@ from endopilot.errors import InputError
 
 TURN = np.linspace(0.0, 2 * np.pi, 300)
 RING = np.column_stack([20 * np.cos(TURN), 20 * np.sin(TURN), 0 * TURN])
-LOOP = r"(two lines meet|two vessels touch) at \[(.*?)\] mm and close a loop of (\d+) mm"
+LOOP = r"(two lines meet|two vessels touch) at \((.*?)\) mm and close a loop of (\d+) mm"
 
 
 def loops(found):
@@ -70,13 +70,13 @@ def test_covered_left_out_and_bridged_are_all_of_the_lines(pieces):
 def test_a_second_line_apart_is_said_with_its_length_and_place():
     found = made([straight([0, 0, 0], [0, 0, 60]), straight([30, 0, 0], [30, 0, 40])])
     assert found.coverage == {"length_mm": 100.0, "reached_mm": 60.0, "left_out_mm": 40.0, "bridged_mm": 0.0}
-    assert any(re.match(r"40\.0 mm of line at \[30\.0, .*\] mm is left out", note) for note in found.notes)
+    assert any(re.match(r"40\.0 mm of line at \(30\.0, .*\) mm is left out", note) for note in found.notes)
 
 
 def test_a_small_gap_between_lines_is_bridged_and_noted():
     found = made([straight([0, 0, 0], [0, 0, 30]), straight([0, 0, 34], [0, 0, 60])])
     assert len(found.tree.branches) == 1 and found.coverage["bridged_mm"] == 4.0
-    assert any("a gap of 4.0 mm between lines at [0.0, 0.0, 30.0] mm is bridged" in note for note in found.notes)
+    assert any("a gap of 4.0 mm between lines at (0.0, 0.0, 30.0) mm is bridged" in note for note in found.notes)
 
 
 def test_the_longer_of_two_pieces_is_taken_though_the_other_is_wider():
@@ -134,7 +134,7 @@ def test_vessels_that_touch_are_said_and_bends_without_a_hole_are_not():
 def test_a_second_inlet_is_said_with_its_place():
     first = np.concatenate([straight([-15, 0, 0], [0, 0, 40]), straight([0, 0, 40.4], [0, 0, 80])])
     found = made([first, straight([15, 0, 0], [0, 0, 40])])
-    assert any("the end at [15.0, 0.0, 0.0] mm could be an inlet too" in note for note in found.notes)
+    assert any("the end at (15.0, 0.0, 0.0) mm could be an inlet too" in note for note in found.notes)
     assert made([straight([0, 0, 0], [0, 0, 80])]).notes == []
 
 

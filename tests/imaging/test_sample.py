@@ -1,40 +1,62 @@
 from __future__ import annotations
 
+import hashlib
 import io
-import subprocess
 import tarfile
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from threading import Thread
 
 import pytest
 
 from endopilot.errors import InputError
-from endopilot.files import sha256
 from endopilot.imaging import sample as samples
 from endopilot.imaging.sample import fetch_sample
 
 
+def _archive(content: bytes) -> bytes:
+    stream = io.BytesIO()
+    with tarfile.open(fileobj=stream, mode="w:gz") as archive:
+        member = tarfile.TarInfo("package-1/tests/ct.nii.gz")
+        member.size = len(content)
+        archive.addfile(member, io.BytesIO(content))
+    return stream.getvalue()
+
+
+def _sha256(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
 @pytest.fixture
 def index(tmp_path, monkeypatch):
-    """Stand in for pip and for the sample's hashes; return what pip was asked, and how the archive is made."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    state = {"asked": [], "files": {"tests/ct.nii.gz": b"the CT", "tests/other.nii.gz": b"no", "setup.py": b"the CT"}}
-    (tmp_path / "ct").write_bytes(b"the CT")
-    wanted = samples._Sample("package==1", "Apache-2.0", "a CT", {"ct.nii.gz": sha256(tmp_path / "ct")})
+    """Stand in for the package index; return what was asked for, and what it answers."""
+    state = {"asked": [], "archive": _archive(b"the CT")}
+
+    class Index(BaseHTTPRequestHandler):
+        def do_GET(self):
+            state["asked"].append(self.path)
+            self.send_response(200 if state["archive"] else 404)
+            self.send_header("Content-Length", str(len(state["archive"])))
+            self.end_headers()
+            self.wfile.write(state["archive"])
+
+        def log_message(self, *_):
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Index)
+    Thread(target=server.serve_forever, daemon=True).start()
+    wanted = samples._Sample(
+        f"http://127.0.0.1:{server.server_port}/package-1.tar.gz",
+        _sha256(state["archive"]),
+        "Apache-2.0",
+        "a CT",
+        {"ct.nii.gz": _sha256(b"the CT")},
+        {"ct.nii.gz": "package-1/tests/ct.nii.gz"},
+    )
     monkeypatch.setattr(samples, "_SAMPLES", {"cta-thorax": wanted})
-
-    def pip(command, **_):
-        state["asked"].append(command)
-        if state["files"] is None:
-            return subprocess.CompletedProcess(command, 1, "", "WARNING: slow\nERROR: no route to host\n")
-        folder = command[command.index("--dest") + 1]
-        with tarfile.open(f"{folder}/package-1.tar.gz", "w:gz") as archive:
-            for name, content in state["files"].items():
-                member = tarfile.TarInfo(f"package-1/{name}")
-                member.size = len(content)
-                archive.addfile(member, io.BytesIO(content))
-        return subprocess.CompletedProcess(command, 0, "", "")
-
-    monkeypatch.setattr(samples.subprocess, "run", pip)
-    return state
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    yield state
+    server.shutdown()
+    server.server_close()
 
 
 def test_the_sample_is_fetched_once_and_its_licence_printed(index, tmp_path, capsys):
@@ -54,17 +76,19 @@ def test_a_damaged_copy_is_fetched_again(index):
 
 
 def test_no_network_is_reported_in_one_line_and_leaves_nothing(index, tmp_path):
-    index["files"] = None
-    with pytest.raises(InputError, match=r"package==1 cannot be fetched with pip \(no route to host\)"):
+    index["archive"] = b""
+    with pytest.raises(
+        InputError, match=r"package-1\.tar\.gz: cannot be fetched into .*cta-thorax \(HTTPError\); check"
+    ):
         fetch_sample()
-    assert not (tmp_path / "cache").exists()
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 
 def test_another_content_is_refused_and_leaves_nothing(index, tmp_path):
-    index["files"] = {"tests/ct.nii.gz": b"something else"}
-    with pytest.raises(InputError, match=r"does not hold ct\.nii\.gz"):
+    index["archive"] = _archive(b"something else")
+    with pytest.raises(InputError, match=r"package-1\.tar\.gz: has another SHA-256 than the sample"):
         fetch_sample()
-    assert not list((tmp_path / "cache" / "endopilot" / "samples").iterdir())
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 
 def test_an_unknown_sample_is_refused():

@@ -30,7 +30,7 @@ class Hurried:
         self.random = np.random.default_rng(seed)
     def decide(self, observation):
         translation, rotation = self.random.normal([9.0, 0.0], [3.0, 2.0])
-        return Decision(translation, rotation, expose=observation.time_s % 2.0 == 0.5)
+        return Decision(((translation, rotation),), expose=observation.time_s % 2.0 == 0.5)
 """
 
 
@@ -83,7 +83,7 @@ def _record(content: dict, change) -> None:
 
 def _at(row: int, column: int, factor: float):
     def change(control, exposed):
-        control[row, column] = control[row, column] * factor + (factor - 1)
+        control[row, 0, column] = control[row, 0, column] * factor + (factor - 1)
         return control, exposed
 
     return change
@@ -253,7 +253,7 @@ def test_the_agent_s_believed_tips_give_its_missed_events_again():
 
 def test_a_recording_is_kept_to_the_bit():
     random = np.random.default_rng(0)
-    recording = Recording(random.normal(size=(180, 2)), np.arange(180) % 7 == 0, random.normal(size=180))
+    recording = Recording(random.normal(size=(180, 1, 2)), np.arange(180) % 7 == 0, random.normal(size=180))
     again = Recording.unpacked(json.loads(json.dumps(recording.packed())))
     for name in ("control", "exposed", "believed_mm"):
         np.testing.assert_array_equal(getattr(again, name), getattr(recording, name))

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 
-from endopilot.benchmarks import training
 from endopilot.errors import InputError
 from endopilot.files import read_json
 from endopilot.models.checkpoint import read_tensors
@@ -70,12 +69,3 @@ def test_a_gpu_that_is_not_there_is_refused(toy_dataset, tmp_path):
     with pytest.raises(InputError, match="torch finds no GPU here"):
         train(toy_dataset, tmp_path / "run", TrainConfig(processor="cuda"))
     assert not (tmp_path / "run").exists()
-
-
-def test_the_training_bench_compares_equal_work(toy_dataset, monkeypatch):
-    monkeypatch.setattr(training, "STEPS", 3)
-    row = training.compare_with_plain_loop(
-        toy_dataset, TrainConfig(size=SMALL, network="ff", batch_size=16), "small", rounds=2
-    )
-    assert row["model"] == "small" and row["samples_per_second"] > 0 and row["plain_samples_per_second"] > 0
-    assert row["ratio"] == pytest.approx(row["samples_per_second"] / row["plain_samples_per_second"], rel=0.5)

@@ -20,7 +20,7 @@ def navigation(fork, wire) -> Navigation:
 
 
 def _sight(inserted: float, rotation: float = 0.0, tip: TipMeasurement | None = None) -> Observation:
-    return Observation(time_s=0.0, inserted_length=inserted, rotation=rotation, tip=tip)
+    return Observation(time_s=0.0, devices=((inserted, rotation),), tip=tip)
 
 
 def _seen(navigation: Navigation, abscissa: float, *, wrong: bool = False) -> TipMeasurement:
@@ -42,36 +42,36 @@ def test_a_policy_is_found_by_its_name(name, navigation):
 def test_forward_and_spin_push_until_the_target_lies_behind_them(policy, rotation, navigation):
     policy.start(navigation, seed=0)
     going, past = policy.decide(_sight(49.0)), policy.decide(_sight(50.1))
-    assert (going.translation, going.rotation, going.expose) == (ADVANCE_MM_S, rotation, False)
-    assert (past.translation, past.rotation, past.expose) == (0.0, 0.0, False)
+    assert (*going.devices, going.expose) == ((ADVANCE_MM_S, rotation), False)
+    assert (*past.devices, past.expose) == ((0.0, 0.0), False)
 
 
 def test_a_missed_branch_is_retracted_from_rotated_at_and_tried_again(navigation):
     policy = RetractRotate()
     policy.start(navigation, seed=0)
-    assert policy.decide(_sight(19.0, tip=_seen(navigation, 18.0))).translation == ADVANCE_MM_S
+    assert policy.decide(_sight(19.0, tip=_seen(navigation, 18.0))).devices[0][0] == ADVANCE_MM_S
     for abscissa in (25.0, 21.0, 16.0):
         decision = policy.decide(_sight(abscissa + 1.0, 0.3, _seen(navigation, abscissa, wrong=True)))
-        assert (decision.translation, decision.rotation) == (-ADVANCE_MM_S, 0.0)
+        assert decision.devices == ((-ADVANCE_MM_S, 0.0),)
     rotation, decisions = 0.3, 0
-    while (decision := policy.decide(_sight(15.0, rotation, _seen(navigation, 14.5)))).translation == 0.0:
-        assert 0 < decision.rotation <= SPIN_RAD_S
-        rotation, decisions = rotation + 0.5 * decision.rotation, decisions + 1
+    while (decision := policy.decide(_sight(15.0, rotation, _seen(navigation, 14.5)))).devices[0][0] == 0.0:
+        assert 0 < decision.devices[0][1] <= SPIN_RAD_S
+        rotation, decisions = rotation + 0.5 * decision.devices[0][1], decisions + 1
         assert decisions < 10
     assert rotation == pytest.approx(0.3 + np.pi, abs=0.06)
-    assert decision.translation == ADVANCE_MM_S
-    assert policy.decide(_sight(26.0, rotation, _seen(navigation, 25.0))).translation == ADVANCE_MM_S
+    assert decision.devices[0][0] == ADVANCE_MM_S
+    assert policy.decide(_sight(26.0, rotation, _seen(navigation, 25.0))).devices[0][0] == ADVANCE_MM_S
 
 
 def test_a_caught_wire_is_freed(navigation):
     policy = RetractRotate()
     policy.start(navigation, seed=0)
-    moves = [policy.decide(_sight(10.0 + i, tip=_seen(navigation, 10.0))).translation for i in range(9)]
+    moves = [policy.decide(_sight(10.0 + i, tip=_seen(navigation, 10.0))).devices[0][0] for i in range(9)]
     assert moves[0] > 0 > moves[-1]
 
 
 def test_every_decision_of_retract_rotate_asks_for_x_ray(navigation):
     policy = RetractRotate()
     policy.start(navigation, seed=0)
-    assert policy.decide(_sight(10.0)).expose and policy.decide(_sight(10.0)).translation == 0.0
+    assert policy.decide(_sight(10.0)).expose and policy.decide(_sight(10.0)).devices[0][0] == 0.0
     assert policy.decide(_sight(10.0, tip=_seen(navigation, 10.0))).expose

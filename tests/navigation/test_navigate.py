@@ -10,7 +10,7 @@ import pytest
 from endopilot.control.navigate_patient import NavigatePatientConfig, set_up_navigation
 from endopilot.errors import InputError
 from endopilot.navigation.navigate import NavigateConfig, NavigationLoop, navigate
-from endopilot.navigation.policy import Decision, Observation, Policy
+from endopilot.navigation.policy import Decision, Hand, Observation, Policy
 from endopilot.robot.robot import CYCLE_S, RobotConfig
 from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.simulation.motion import Motion, motion_named
@@ -40,7 +40,7 @@ class Forward:
 
     def decide(self, observation: Observation) -> Decision:
         self.given.append(observation)
-        return Decision(self.speed, self.rotation, expose=len(self.given) % self.expose_every == 0)
+        return Decision(((self.speed, self.rotation),), expose=len(self.given) % self.expose_every == 0)
 
 
 @pytest.fixture
@@ -53,8 +53,8 @@ def test_a_policy_that_pushes_on_reaches_a_target_straight_ahead(straight) -> No
     assert isinstance(policy, Policy)
     record = navigate(straight, policy, seed=1)
     assert record.reason == "reached" and record.success
-    assert abs(record.tip.abscissa[-1] - 30.0) <= 2.0 and record.tip.branch[-1] == 1
-    assert (np.abs(record.tip.abscissa[:-1] - 30.0) > 2.0).all()  # it ends at once
+    assert abs(record.tip.abscissa[-1, 0] - 30.0) <= 2.0 and record.tip.branch[-1, 0] == 1
+    assert (np.abs(record.tip.abscissa[:-1, 0] - 30.0) > 2.0).all()  # it ends at once
     samples = len(policy.given)
     assert len(record.time_s) == len(record.inserted_length) == len(record.tip.abscissa) == samples + 1
     assert record.seconds == record.time_s[-1] == 0.5 * samples
@@ -64,7 +64,7 @@ def test_a_policy_that_pushes_on_reaches_a_target_straight_ahead(straight) -> No
     assert record.exposures == sum(on)
     for index in np.flatnonzero(record.exposed):
         assert policy.given[index].tip is record.measured[index]
-        error = np.linalg.norm(record.measured[index].position - record.tip_position[index])
+        error = np.linalg.norm(record.measured[index].position - record.tip_position[index, 0])
         assert 0.0 < error < 1.5
     assert record.peak_force_n == record.contact_force_max.max()
     assert record.safe == (record.peak_force_n <= straight.force_limit_n)
@@ -83,9 +83,9 @@ def test_it_ends_in_time_and_the_same_seed_repeats_it(straight) -> None:
 def test_encoders_count_from_where_the_ostium_is_believed_to_be(straight) -> None:
     policy = Forward(4.0)
     record = navigate(straight, policy, config=NavigateConfig(robot=PERFECT), truth=ModelMismatch(ostium_mm=1.5))
-    encoder = np.array([observation.inserted_length for observation in policy.given])
-    np.testing.assert_allclose(record.inserted_length[:-1] - encoder, 1.5, atol=1e-9)
-    np.testing.assert_allclose(np.diff(record.inserted_length), 2.0, atol=1e-6)
+    encoder = np.array([observation.devices[0][0] for observation in policy.given])
+    np.testing.assert_allclose(record.inserted_length[:-1, 0] - encoder, 1.5, atol=1e-9)
+    np.testing.assert_allclose(np.diff(record.inserted_length[:, 0]), 2.0, atol=1e-6)
 
 
 def test_friction_and_stiffness_of_the_truth_change_what_happens(straight) -> None:
@@ -132,11 +132,23 @@ def test_what_a_policy_asks_is_kept_within_the_limits(straight) -> None:
         assert record.reason != "invalid"
 
 
+@pytest.mark.parametrize("devices", [5.0, (5.0, 0.0), ((5.0,),), ((1.0, 2.0, 3.0),), None])
+def test_what_is_no_pair_for_each_device_is_refused_in_a_line(straight, devices) -> None:
+    class Odd(Forward):
+        def decide(self, observation: Observation) -> Decision:
+            decision = Decision()
+            object.__setattr__(decision, "devices", devices)  # tests check types where a user's program does not
+            return decision
+
+    with pytest.raises(InputError, match=r"policy: Odd decided devices = .*; give a pair of velocities for each"):
+        navigate(straight, Odd(1.0))
+
+
 def test_one_view_alone_locates_the_tip_by_the_vessel(straight) -> None:
     config = NavigateConfig(fluoroscope=FluoroscopeConfig(biplane=False))
     record = navigate(straight, Forward(5.0, expose_every=1), config=config)
     shown = [measured for measured in record.measured if measured is not None]
-    error = np.array([tip.abscissa for tip in shown]) - record.tip.abscissa[: len(shown)]
+    error = np.array([tip.abscissa for tip in shown]) - record.tip.abscissa[: len(shown), 0]
     assert np.abs(error).max() < 2.0
 
 
@@ -153,9 +165,10 @@ def test_steps_of_the_loop_are_the_navigation_to_the_bit(straight) -> None:
     assert stepped.reason == whole.reason
     for name in ("tip_position", "contact_force_max", "control", "driven", "exposed"):
         np.testing.assert_array_equal(getattr(stepped, name), getattr(whole, name), err_msg=name)
-    assert whole.driven.shape == (10 * (len(whole.time_s) - 1), 2)
-    moved = whole.inserted_length[0] + 0.05 * np.cumsum(whole.driven[:, 0])[9::10]
-    np.testing.assert_allclose(moved, whole.inserted_length[1:], atol=1e-6)
+    assert whole.driven.shape == (10 * (len(whole.time_s) - 1), 1, 2)
+    moved = whole.inserted_length[0, 0] + 0.05 * np.cumsum(whole.driven[:, 0, 0])[9::10]
+    np.testing.assert_allclose(moved, whole.inserted_length[1:, 0], atol=1e-6)
+    assert np.array_equal(whole.shape[:, 0], whole.tip_position[:, 0]) and len(whole.shape) == len(whole.time_s)
 
 
 def test_a_loop_that_is_over_or_within_a_period_takes_no_decision(straight) -> None:
@@ -173,6 +186,38 @@ def test_a_loop_that_is_over_or_within_a_period_takes_no_decision(straight) -> N
     assert record.reason == "stopped" and not record.success and record.seconds == 0.5
 
 
+def test_a_navigation_that_is_over_goes_on_to_another_target_without_a_limit_of_time(straight) -> None:
+    hand = Hand(((6.0, 0.0),))
+    loop = NavigationLoop(replace(straight, seconds=4.0, target=Target(branch=0, abscissa=12.0)), hand)
+    while loop.reason is None:
+        loop.step()
+    assert loop.reason == "reached" and loop.reached and loop.time_s < 4.0
+    loop.aim(straight.target)
+    loop.go_on()
+    hand.devices = ((2.0, 0.0),)
+    while loop.time_s < 5.0:
+        loop.step()
+    assert loop.reason is None and not loop.reached
+    hand.devices = ((6.0, 0.0),)
+    while loop.reason is None:
+        loop.step()
+    record = loop.record()
+    assert record.success and abs(record.tip.abscissa[-1, 0] - 30.0) <= 2.0 and record.seconds == loop.time_s
+    with pytest.raises(InputError, match="abscissa"):
+        loop.aim(Target(branch=0, abscissa=1e3))
+
+
+def test_a_cycle_of_the_drives_divides_the_time_between_two_decisions(straight) -> None:
+    with pytest.raises(InputError, match=r"cycle_s: 0\.03; give what divides 0\.5 s"):
+        NavigateConfig(cycle_s=0.03)
+    ends = {}
+    for cycle_s in (CYCLE_S, 0.0125):
+        record = navigate(straight, Forward(3.0), config=NavigateConfig(robot=PERFECT, cycle_s=cycle_s), seed=1)
+        assert len(record.driven) == record.seconds / cycle_s
+        ends[cycle_s] = record.tip_position[-1]
+    np.testing.assert_allclose(ends[CYCLE_S], ends[0.0125], atol=0.05)
+
+
 class Watching(Forward):
     """Counts what it sees while somebody else drives."""
 
@@ -184,15 +229,19 @@ def test_hands_take_over_and_hand_back(straight) -> None:
     policy = Watching(4.0)
     loop = NavigationLoop(straight, policy, config=NavigateConfig(robot=PERFECT))
     loop.step()
+    loop.hand_over(Hand(((-1.0, 1.0),)))
     for _ in range(3):
-        loop.step(by_hand=Decision(-1.0, 1.0, expose=False))
+        loop.step()
+    loop.exposed()
     assert len(policy.given) == 1 and len(policy.watched) == 3
+    loop.hand_over(None)
     loop.step()
     assert policy.given[1].tip is not None, "X-ray is on where the policy goes on"
     record = loop.record()
-    np.testing.assert_allclose(record.control[:5, 0], [4.0, -1.0, -1.0, -1.0, 4.0])
-    np.testing.assert_allclose(np.diff(record.inserted_length), [2.0, -0.5, -0.5, -0.5, 2.0], atol=1e-6)
-    assert record.exposed.tolist() == [True, False, False, False, True, False]
+    np.testing.assert_allclose(record.control[:5, 0, 0], [4.0, -1.0, -1.0, -1.0, 4.0])
+    np.testing.assert_allclose(np.diff(record.inserted_length[:, 0]), [2.0, -0.5, -0.5, -0.5, 2.0], atol=1e-6)
+    assert record.exposed.tolist() == [True, False, False, True, True, False]
+    assert record.exposures == 3
     assert record.believed is None and record.half_width is None
 
 
@@ -205,14 +254,14 @@ def test_images_show_the_tip(straight) -> None:
     for sample in np.flatnonzero(record.exposed):
         shown = record.measured[sample]
         assert shown is not None and min(shown.sd_mm) > 0
-        assert abs(shown.abscissa - record.tip.abscissa[sample]) < 1.5
+        assert abs(shown.abscissa - record.tip.abscissa[sample, 0]) < 1.5
 
 
 def test_an_image_without_a_wire_is_taken_again_and_counts(straight, monkeypatch) -> None:
     loop = NavigationLoop(straight, Forward(4.0))
     blind = iter([True, True, False])
-    measure = loop._measure
-    monkeypatch.setattr(loop, "_measure", lambda length: None if next(blind) else measure(length))
+    expose = loop.c_arm.expose
+    monkeypatch.setattr(loop.c_arm, "expose", lambda *all, **named: None if next(blind) else expose(*all, **named))
     for _ in range(5):
         loop.step()
     record = loop.record()
@@ -236,7 +285,7 @@ def test_an_exposure_shows_a_moving_vessel_where_it_is_less_what_the_c_arm_knows
     def errors(known: Motion | None) -> np.ndarray:
         record = navigate(replace(straight, known_motion=known), Forward(3.0, expose_every=1), config=config)
         shown = [tip for tip in record.measured if tip is not None]
-        return np.array([tip.position for tip in shown]) - record.tip_position[: len(shown)]
+        return np.array([tip.position for tip in shown]) - record.tip_position[: len(shown), 0]
 
     unknown, half, exact = (errors(known) for known in (None, breathing(breathing_caudal_mm=3.0), breathing()))
     time_s = 0.5 * np.arange(len(unknown))
@@ -267,7 +316,7 @@ def test_images_show_a_moving_vessel_where_it_is_less_what_is_known(straight) ->
     assert len(at) >= 3
     seen = np.array([record.measured[k].position[2] for k in at])
     shift = -(np.sin(np.pi * 0.5 * at / 4.0) ** 4)
-    np.testing.assert_allclose(seen - record.tip_position[at, 2], shift, atol=0.4)
+    np.testing.assert_allclose(seen - record.tip_position[at, 0, 2], shift, atol=0.4)
     assert np.ptp(shift) > 0.7
 
 
@@ -278,7 +327,7 @@ def test_a_run_of_contrast_before_the_wire_shows_how_the_patient_moves(straight)
     config = NavigateConfig(robot=PERFECT, xray="images", motion=deep, measure_motion=True)
     loop = NavigationLoop(navigation, Forward(6.0, expose_every=2), config=config, seed=2)
     assert loop.navigation.known_motion.breathing_caudal_mm == pytest.approx(7.0, abs=0.3)
-    assert loop._known.placements(np.array([2.0]))[0][0, 2, 3] == pytest.approx(-7.0, abs=0.5)
+    assert loop.c_arm.known_motion == loop.navigation.known_motion
     with pytest.raises(InputError, match="measure_motion: exposures of assumed errors show no contrast"):
         NavigationLoop(navigation, Forward(6.0), config=replace(config, xray="assumed"), seed=2)
 

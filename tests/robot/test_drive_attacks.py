@@ -128,7 +128,7 @@ def after_the_attack(process: subprocess.Popen, port: int, certificates, since: 
     with RemoteRobot(HOST, port, certificates) as robot:
         readings = []
         for _ in range(10):
-            readings.append(robot.proximal_state().inserted_length)
+            readings.append(robot.proximal_state().devices[0][0])
             time.sleep(0.03)
     until_disconnected(process)
     assert np.ptp(readings) < NOISE_MM

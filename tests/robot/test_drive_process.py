@@ -30,8 +30,8 @@ robot = RemoteRobot("127.0.0.1", int(sys.argv[1]), Path(sys.argv[2]))
 while True:
     if robot.status != "armed":
         robot.arm()  # a machine under load may itself keep silent for too long
-    robot.command(10.0, 0.0)
-    print(robot.proximal_state().inserted_length, flush=True)
+    robot.command(((10.0, 0.0),))
+    print(robot.proximal_state().devices[0][0], flush=True)
     time.sleep(0.05)
 """
 
@@ -73,7 +73,7 @@ def moved(robot: RemoteRobot, seconds: float) -> float:
     while readings[-1].time_s < readings[0].time_s + seconds:
         time.sleep(0.02)
         readings.append(robot.proximal_state())
-    return float(np.ptp([reading.inserted_length for reading in readings]))
+    return float(np.ptp([reading.devices[0][0] for reading in readings]))
 
 
 def test_it_stops_when_its_client_is_killed(drive, certificates) -> None:
@@ -97,14 +97,14 @@ def test_it_stops_when_its_client_falls_silent_and_goes_on_when_armed(drive, cer
     monkeypatch.setattr(remote, "REPEAT_S", 1e6)  # the thread that repeats commands hangs
     with RemoteRobot(HOST, port, certificates) as robot:
         assert isinstance(robot, Robot)
-        robot.command(10.0, 1.0)
+        robot.command(((10.0, 1.0),))
         wait_for(process, ": silence;")
-        robot.command(10.0, 1.0)
+        robot.command(((10.0, 1.0),))
         assert robot.status == "stopped:silence"
         robot.arm()
-        robot.command(np.nan, 1.0)
+        robot.command(((np.nan, 1.0),))
         assert robot.status in OBEYED  # what is sent is finite: the wire stands still
-        robot.command(1e9, -1e9)
+        robot.command(((1e9, -1e9),))
         assert robot.status in OBEYED
 
 
@@ -112,7 +112,7 @@ def test_a_controller_that_hangs_stops_it(drive, certificates, monkeypatch) -> N
     process, port = drive
     monkeypatch.setattr(remote, "HOLD_S", 0.3)
     with RemoteRobot(HOST, port, certificates) as robot:
-        robot.command(5.0, 0.0)
+        robot.command(((5.0, 0.0),))
         wait_for(process, ": silence;")  # commands are repeated for a while, and then no more
 
 
@@ -121,7 +121,7 @@ def test_a_drive_that_was_held_up_stops_and_arming_alone_does_not_move_it(drive,
     with RemoteRobot(HOST, port, certificates) as robot:
         for stopping in (signal.SIGSTOP, None):
             robot.arm()
-            robot.command(10.0, 0.0)
+            robot.command(((10.0, 0.0),))
             if stopping is not None:
                 process.send_signal(stopping)
                 time.sleep(0.3)
@@ -141,7 +141,7 @@ def test_any_thread_may_call_it(drive, certificates) -> None:
     def call(robot: RemoteRobot, speed: float) -> None:
         try:
             for _ in range(50):
-                robot.command(speed, 0.0)
+                robot.command(((speed, 0.0),))
                 assert robot.proximal_state().time_s > 0.0
         except Exception as error:
             failures.append(error)
@@ -154,7 +154,7 @@ def test_any_thread_may_call_it(drive, certificates) -> None:
             thread.join()
     assert not failures
     assert not robot._repeater.is_alive()
-    for call_again in (robot.arm, robot.stop, robot.proximal_state, lambda: robot.command(1.0, 0.0), robot.arm):
+    for call_again in (robot.arm, robot.stop, robot.proximal_state, lambda: robot.command(((1.0, 0.0),)), robot.arm):
         with pytest.raises(InputError, match="it was closed"):
             call_again()
     robot.close()
@@ -167,7 +167,7 @@ def test_ctrl_c_and_sigterm_end_it_with_one_line(certificates, ending, connected
     with running(certificates) as (process, port), contextlib.ExitStack() as clients:
         if connected:
             robot = clients.enter_context(RemoteRobot(HOST, port, certificates))
-            robot.command(10.0, 0.0)
+            robot.command(((10.0, 0.0),))
             clients.enter_context(socket.create_connection((HOST, port)))  # and one that waits
         process.send_signal(ending)
         _, errors = process.communicate(timeout=20)
@@ -175,7 +175,7 @@ def test_ctrl_c_and_sigterm_end_it_with_one_line(certificates, ending, connected
         assert (process.returncode, errors) == (128 + ending, f"endopilot drive: {word}\n")
         if connected:
             with pytest.raises(InputError, match="the connection is lost"):
-                robot.command(1.0, 0.0)
+                robot.command(((1.0, 0.0),))
 
 
 def test_it_refuses_a_second_client_and_strangers(drive, certificates, make_certificates, tmp_path) -> None:
@@ -196,7 +196,7 @@ def test_it_refuses_a_second_client_and_strangers(drive, certificates, make_cert
         with socket.create_connection((HOST, port)) as plain:  # no TLS
             plain.sendall(b"\x00" * 100_000 + b"\nSTOP\n")
             robot.arm()
-            robot.command(1.0, 0.0)
+            robot.command(((1.0, 0.0),))
             assert robot.status in OBEYED
     wait_for(process, f"refused a connection from {HOST}:")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -39,7 +40,8 @@ def test_what_is_sent_to_a_drive_is_finite_and_within_its_limits(orders) -> None
     robot._lock, robot._ticket, robot._ticket_time = threading.RLock(), "ticket", np.inf
     robot.limits, robot._ask = LIMITS, lambda verb, ticket, *arguments: sent.append((verb, *arguments))
     for translation, rotation in orders:
-        robot.command(translation, rotation)
+        (taken,) = robot.command(((translation, rotation),))
+        assert taken == LIMITS.safe(translation, rotation)
     assert [verb for verb, *_ in sent] == ["MOVE"] * len(orders)
     numbers = np.array([[float(number) for number in numbers] for _, *numbers in sent])
     assert np.isfinite(numbers).all() and (np.abs(numbers) <= [40.0, 12.0]).all()
@@ -89,18 +91,30 @@ def test_the_encoders_read_the_wire_with_noise(fork, wire) -> None:
     simulator.reset(inserted_length=[10.0], rotation=[0.3])
     robot = SimulatedRobot(simulator, [DriveLimits.of(wire, fork)], RobotConfig(encoder_sd_mm=0.05), seed=3)
     assert isinstance(robot, Robot)
-    robot.command(8.0, 0.0)
+    assert robot.command(((8.0, 0.0),)) == ((8.0, 0.0),)
     robot.run(10 * CYCLE_S)
-    readings = np.array([robot.proximal_state().inserted_length for _ in range(400)])
+    readings = np.array([robot.proximal_state().devices[0][0] for _ in range(400)])
     assert 12.5 < simulator.inserted_length[0] < 14.0  # 4 mm less latency, ramp and gap
     assert abs(readings.mean() - simulator.inserted_length[0]) < 0.01
     assert 0.04 < readings.std() < 0.06
     assert robot.proximal_state().time_s == pytest.approx(0.5)
     # at the far end of the travel the wire stops
-    robot.command(1e6, np.nan)
-    robot.command(40.0, 0.0)
+    assert robot.command(((1e6, np.nan),)) == ((0.0, 0.0),)
+    robot.command(((40.0, 0.0),))
     robot.run(3.0)
     assert simulator.inserted_length[0] <= DriveLimits.of(wire, fork).travel_mm[1] + 1e-6
+
+
+@pytest.mark.parametrize("ostium_mm", [0.0, 1.7, -1.7])
+def test_a_wire_is_not_driven_beyond_its_end_wherever_the_ostium_truly_is(fork, wire, ostium_mm) -> None:
+    limits = replace(DriveLimits.of(wire, fork), travel_mm=(0.0, 15.0))
+    simulator = Simulator(fork, wire, config=SimulatorConfig(element_mm=1.5, threads=1))
+    simulator.reset(inserted_length=[10.0], rotation=[0.0])
+    robot = SimulatedRobot(simulator, [limits], RobotConfig(**IDEAL), ostium_mm=ostium_mm)
+    robot.command(((20.0, 0.0),))
+    robot.run(1.0)
+    # by the encoder it goes no farther than the travel, and in truth no farther than the wire is laid out for
+    assert robot.proximal[0, 0] == pytest.approx(15.0 + min(ostium_mm, 0.0), abs=1e-6)
 
 
 def test_refuses_bad_settings() -> None:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from benchmarks.verification.contact import bent_tube
 from endopilot.types import Anatomy, Branch, Centerline, DistanceMap, Insertion, VesselTree
-from endopilot.verification.contact import bent_tube
 
 RADIUS, BEND, LEAD = 1.5, 20.0, 35.0
 

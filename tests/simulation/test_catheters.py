@@ -8,20 +8,20 @@ from pathlib import Path
 import bend
 import numpy as np
 import pytest
+from endopilot.simulation.table import write_rollout
 
 import endopilot
+from benchmarks.core.manoeuvres import paired_controls, seed_of
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.benchmarks.manoeuvres import paired_controls, seed_of
 from endopilot.devices.catheter import Catheter, list_catheters, read_catheter
 from endopilot.devices.device import read_device
 from endopilot.devices.stack import Stack, lines_from_tips
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import read_controls_csv
-from endopilot.simulation.table import write_rollout
 from endopilot.types import Anatomy, Rollout
 
-SHIPPED = Path(endopilot.__file__).parent / "simulation/catheters"
+SHIPPED = Path(endopilot.__file__).parent / "devices/catheters"
 
 
 @pytest.fixture(scope="module")

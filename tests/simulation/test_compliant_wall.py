@@ -12,6 +12,7 @@ from endopilot.anatomy.distance import sample
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import read_device
+from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.simulation.config import (
     COMPLIANT_WALL_AT_TIP_MM,
@@ -48,7 +49,7 @@ def test_the_tip_takes_more_of_the_wall_along_than_its_own_length() -> None:
     # Head on, the tip alone touches: F = K (l/4 + 6.4 mm) d exp(s d²), with d by which it is beyond the blind end.
     anatomy, wire = vessel(0.01), STIFF.with_tip(bend_rad=0.0, stiffness_factor=1.0)
     pushed = simulate(anatomy, wire, np.tile([0.3, 0.0], (1, 4, 1)), initial=np.array([[34.9, 0.0]]), config=SOFT)
-    depth = wire.tip_radius_mm - sample(anatomy.distance_map, pushed.tip_position[0])
+    depth = wire.tip_radius_mm - sample(anatomy.distance_map, pushed.tip_position[0, :, 0])
     assert 0.02 < depth[0] < depth[-1] < 0.5
     stiffness = 0.01 * (SOFT.element_mm / 4 + COMPLIANT_WALL_AT_TIP_MM)
     force = stiffness * depth * np.exp(COMPLIANT_WALL_STIFFENING_MM2 * depth**2)
@@ -66,9 +67,9 @@ def test_a_simulator_steps_a_compliant_wall_to_the_same_bits_and_shares_no_rigid
 
 def test_a_catheter_straightens_more_than_its_wire() -> None:
     anatomy, wire = vessel(), read_device("workhorse-014")
-    both = np.concatenate([PUSH, PUSH], axis=-1)[:, :18]
-    alone = simulate(anatomy, wire, PUSH[:, :18], config=SOFT)
-    inside = simulate(anatomy, wire, both, catheters=[read_catheter("microcatheter-1.7f")], config=SOFT)
+    stack, push = Stack(wire, (read_catheter("microcatheter-1.7f"),)), PUSH[:, :18]
+    alone = simulate(anatomy, wire, push, config=SOFT)
+    inside = simulate(anatomy, stack, np.stack([push, push], axis=2), config=SOFT)
     assert inside.valid.all()
     assert inside.wall_force.max() > alone.wall_force.max()
 

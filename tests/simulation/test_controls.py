@@ -42,19 +42,20 @@ def test_the_load_of_a_free_wire_moves_it_at_the_drawn_speed() -> None:
         stick_mm_s=config.stick_velocity_mm_s,
     )
     initial = np.tile([2.0, 0.0], (2, 1))
-    rollout = simulate(vessel(), device, load, actuation="force", initial=initial, config=config)
+    trajectory = simulate(vessel(), device, load, actuation="force", initial=initial, config=config)
     # In the first sample the wire starts from rest; in the second the blood's drag is left. 1 % of load is 25 % of
     # speed.
-    np.testing.assert_allclose(rollout.control[:, 1], velocity[:, 1], rtol=0.02)
-    travel = 0.5 * np.cumsum(rollout.control[..., 0], axis=1)
-    np.testing.assert_allclose(rollout.inserted_length, 2.0 + travel, rtol=1e-12)
-    assert np.array_equal(np.stack([rollout.drive_force, rollout.drive_torque], axis=-1), load)
+    np.testing.assert_allclose(trajectory.control[:, 1, 0], velocity[:, 1], rtol=0.02)
+    travel = 0.5 * np.cumsum(trajectory.control[..., 0], axis=1)
+    np.testing.assert_allclose(trajectory.inserted_length, 2.0 + travel, rtol=1e-12)
+    assert np.array_equal(np.stack([trajectory.drive_force, trajectory.drive_torque], axis=-1), trajectory.command)
+    assert np.array_equal(trajectory.command[:, :, 0], load)
 
 
 def test_insertion_stays_in_its_range() -> None:
     config = ControlConfig()
     initial, control = random_controls(config, n_sequences=200, n_samples=120, seed=0, max_inserted_length_mm=80.0)
-    inserted = initial[:, :1] + 0.5 * np.cumsum(control[..., 0], axis=1)
+    inserted = initial[:, None, :, 0] + 0.5 * np.cumsum(control[..., 0], axis=1)
     assert inserted.min() > -1e-9
     assert inserted.max() < 80 + 1e-9
     assert np.abs(control[..., 0]).max() <= config.max_velocity_mm_s
@@ -66,8 +67,8 @@ def test_controls_from_csv(tmp_path: Path) -> None:
     path = tmp_path / "c.csv"
     path.write_text("time_s,translation_mm_s,rotation_rad_s\n0.5,2,0\n1.0,-1,0.5\n")
     script = read_controls_csv(path)
-    np.testing.assert_array_equal(script.initial, [[0, 0]])
-    np.testing.assert_array_equal(script.control, [[[2, 0], [-1, 0.5]]])
+    np.testing.assert_array_equal(script.initial, [[[0, 0]]])
+    np.testing.assert_array_equal(script.control, [[[[2, 0]], [[-1, 0.5]]]])
     assert script.period_s == 0.5
 
 
@@ -77,7 +78,7 @@ def test_controls_from_csv_may_hold_for_another_time(tmp_path: Path) -> None:
     path.write_text(columns + "0.05,2,1,5.1,0.25\n0.1,-1,0.5,5.05,0.275\n")
     script = read_controls_csv(path)
     assert script.period_s == 0.05
-    np.testing.assert_allclose(script.initial, [[5.0, 0.2]], atol=1e-12)
+    np.testing.assert_allclose(script.initial, [[[5.0, 0.2]]], atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -123,31 +123,30 @@ def navigation(worlds: int = 5, samples: int = 24) -> tuple[np.ndarray, np.ndarr
 
 def test_what_slips_in_a_vessel_is_told_and_the_limits_hold(anatomy: Anatomy) -> None:
     initial, control = navigation()
-    rollout = simulate(anatomy, WEAK, control, initial=initial, config=CONFIG)
-    assert rollout.valid.all()
-    assert (rollout.slip > 1e-3).any() and (rollout.slip < -1e-3).any()
-    assert (rollout.rotation_slip > 1e-3).any() and (rollout.rotation_slip < -1e-3).any()
+    trajectory = simulate(anatomy, WEAK, control, initial=initial, config=CONFIG)
+    assert trajectory.valid.all()
+    assert (trajectory.slip > 1e-3).any() and (trajectory.slip < -1e-3).any()
+    assert (trajectory.rotation_slip > 1e-3).any() and (trajectory.rotation_slip < -1e-3).any()
     # Newton's method leaves the force within the sample's tolerance of 1 nm times the wire's stiffness of some kN/mm.
-    assert rollout.base_force.max() == pytest.approx(WEAK.push_limit_n, rel=1e-3)
-    assert rollout.base_force.min() == pytest.approx(-WEAK.pull_limit_n, rel=1e-2)
-    assert np.abs(rollout.base_torque).max() == pytest.approx(WEAK.torque_limit_n_mm, rel=1e-2)
-    slip = np.stack([rollout.slip, rollout.rotation_slip], axis=-1)
-    np.testing.assert_allclose(SAMPLE_PERIOD_S * rollout.control + slip, SAMPLE_PERIOD_S * control, atol=1e-12)
-    state = np.stack([rollout.inserted_length, rollout.rotation], axis=-1)
-    start = np.stack([rollout.initial_inserted_length, rollout.initial_rotation], axis=-1)
-    np.testing.assert_allclose(state, start[:, None] + SAMPLE_PERIOD_S * np.cumsum(rollout.control, axis=1), atol=1e-9)
+    assert trajectory.base_force.max() == pytest.approx(WEAK.push_limit_n, rel=1e-3)
+    assert trajectory.base_force.min() == pytest.approx(-WEAK.pull_limit_n, rel=1e-2)
+    assert np.abs(trajectory.base_torque).max() == pytest.approx(WEAK.torque_limit_n_mm, rel=1e-2)
+    slip = np.stack([trajectory.slip, trajectory.rotation_slip], axis=-1)
+    asked = SAMPLE_PERIOD_S * control[:, :, None]
+    np.testing.assert_allclose(SAMPLE_PERIOD_S * trajectory.control + slip, asked, atol=1e-12)
+    made = trajectory.start[:, None] + SAMPLE_PERIOD_S * np.cumsum(trajectory.control, axis=1)
+    np.testing.assert_allclose(trajectory.proximal, made, atol=1e-9)
 
 
 def test_what_was_made_is_where_the_wire_is(anatomy: Anatomy) -> None:
     initial, control = navigation()
-    rollout = simulate(anatomy, WEAK, control, initial=initial, config=CONFIG)
+    trajectory = simulate(anatomy, WEAK, control, initial=initial, config=CONFIG)
     simulator = Simulator(anatomy, WEAK, worlds=len(control), config=CONFIG)
     simulator.reset(inserted_length=initial[:, 0], rotation=initial[:, 1])
     for sample in np.moveaxis(control, 1, 0):
         simulator.step(sample, SAMPLE_PERIOD_S)
-    np.testing.assert_allclose(simulator.inserted_length, rollout.inserted_length[:, -1], atol=1e-9)
-    np.testing.assert_allclose(simulator.rotation, rollout.rotation[:, -1], atol=1e-9)
-    np.testing.assert_array_equal(simulator.position[:, 0], rollout.tip_position[:, -1])
+    np.testing.assert_array_equal(simulator.proximal, trajectory.proximal[:, -1])
+    np.testing.assert_array_equal(simulator.position[:, :1], trajectory.tip_position[:, -1])
 
 
 def test_a_drive_that_slips_gives_the_same_bits_in_any_company_and_from_any_state(anatomy: Anatomy, tmp_path) -> None:
@@ -176,11 +175,11 @@ def test_a_wire_that_was_not_pulled_back_is_pushed_on_from_there(anatomy: Anatom
     control = np.zeros((1, 60, 2))
     control[0, :40, 0], control[0, 40:, 0] = -1.0, 2.0
     loose = replace(WEAK, pull_limit_n=2e-3, push_limit_n=0.5)
-    rollout = simulate(anatomy, loose, control, initial=np.array([[60.0, 0.0]]), record_shape=True, config=CONFIG)
-    assert rollout.valid.all() and rollout.shape is not None
-    assert rollout.base_force[0, :40] == pytest.approx(-2e-3, abs=1e-6)
-    assert rollout.inserted_length[0, -1] > 70.0  # and 60 mm was commanded
-    behind = anatomy.insertion.position[0] - rollout.shape[0, -1, -1, 0]
+    trajectory = simulate(anatomy, loose, control, initial=np.array([[60.0, 0.0]]), record_shape=True, config=CONFIG)
+    assert trajectory.valid.all() and trajectory.shape is not None
+    assert trajectory.base_force[0, :40, 0] == pytest.approx(-2e-3, abs=1e-6)
+    assert trajectory.inserted_length[0, -1, 0] > 70.0  # and 60 mm was commanded
+    behind = anatomy.insertion.position[0] - trajectory.shape[0, -1, -1, 0]
     assert behind > 3.0  # the recorded wire reaches back into the catheter
 
 
@@ -209,9 +208,9 @@ def test_a_wire_that_has_gone_through_the_wall_is_no_result(anatomy: Anatomy) ->
     control, initial = np.tile([10.0, 0.0], (1, 16, 1)), np.array([[40.0, 0.0]])
     soft = SimulatorConfig(element_mm=1.0, wall_stiffness_n_mm=0.2)
     with pytest.warns(UserWarning, match="went through the wall after"):
-        rollout = simulate(anatomy, DEVICE, control, initial=initial, config=soft)
-    assert rollout.reason[0] == 3 and not rollout.valid[0, -1]
-    before = rollout.contact_force_max[rollout.valid]
+        trajectory = simulate(anatomy, DEVICE, control, initial=initial, config=soft)
+    assert trajectory.reason[0] == 3 and not trajectory.valid[0, -1]
+    before = trajectory.contact_force_max[trajectory.valid]
     assert len(before) and before.max() < 2 * 0.2 * DEVICE.tip_radius_mm  # node and middle together
     simulator = Simulator(anatomy, DEVICE, config=soft)
     simulator.reset(inserted_length=initial[:, 0], rotation=initial[:, 1])

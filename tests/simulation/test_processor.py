@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,8 +13,8 @@ import numpy as np
 import pytest
 from bend import vessel
 
+from benchmarks.core.gpu import bench_gpu
 from endopilot import _core
-from endopilot.benchmarks.gpu import bench_gpu
 from endopilot.devices.device import read_device
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
@@ -22,6 +23,7 @@ from endopilot.simulation.simulate import simulate
 from endopilot.simulation.simulator import Simulator
 from endopilot.types import Anatomy
 
+ROOT = Path(__file__).parents[2]
 DEVICE = read_device("workhorse-014")
 GPU = SimulatorConfig(element_mm=1.5, processor="cuda")
 CPU = SimulatorConfig(element_mm=1.5)
@@ -64,11 +66,11 @@ def test_the_bench_says_in_one_line_that_there_is_no_gpu() -> None:
     code = (
         "import sys\n"
         "sys.modules['endopilot._core_cuda'] = None\n"
-        "sys.argv = ['endopilot', 'bench', 'simulation', '--device', 'cuda']\n"
-        "from endopilot.cli import main\n"
+        "sys.argv = ['benchmarks', 'simulation', '--device', 'cuda']\n"
+        "from benchmarks.__main__ import main\n"
         "main()\n"
     )
-    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
     assert ran.returncode == 2 and ran.stdout == ""
     assert ran.stderr.count("\n") == 1 and "processor: 'cuda': endopilot was built without it" in ran.stderr
 

@@ -51,9 +51,9 @@ def tips(anatomy: Anatomy) -> np.ndarray:
     control = np.zeros((2, 14, 2))
     control[:, :, 0], control[:, 4:, 1] = 4.0, np.array([[0.4], [-0.6]])
     initial, config = np.array([[5.0, 0.0], [5.0, 2.0]]), SimulatorConfig(element_mm=1.0)
-    rollout = simulate(anatomy, read_device("workhorse-014"), control, initial=initial, config=config)
-    assert rollout.valid.all()
-    return rollout.tip_position
+    trajectory = simulate(anatomy, read_device("workhorse-014"), control, initial=initial, config=config)
+    assert trajectory.valid.all()
+    return trajectory.tip_position[:, :, 0]
 
 
 # +z stays, becomes −z about either of the other axes (where the shortest turn from +z is singular), becomes +x, +y;
@@ -86,10 +86,10 @@ def test_the_bend_points_to_the_zero_and_turns_clockwise_as_the_operator_sees_it
     lumen = add_catheter(distance_map_from_spheres(tree, spacing_mm=1.5), insertion, 8.0)
     anatomy = Anatomy("wide", tree, lumen, insertion, 8.0)
     device, start = read_device("workhorse-014"), np.array([[15.0, phi]])
-    rollout = simulate(anatomy, device, np.zeros((1, 1, 2)), initial=start)
+    trajectory = simulate(anatomy, device, np.zeros((1, 1, 2)), initial=start)
     zero = zero_of(anatomy)
     right = np.cross(axis, zero)  # of the operator, who looks along the axis with the zero above
-    across = rollout.tip_direction[0, 0] - (rollout.tip_direction[0, 0] @ axis) * axis
+    across = trajectory.tip_direction[0, 0, 0] - (trajectory.tip_direction[0, 0, 0] @ axis) * axis
     expected = np.cos(phi) * zero + np.sin(phi) * right
     assert across / np.linalg.norm(across) == pytest.approx(expected, abs=1e-3)
 

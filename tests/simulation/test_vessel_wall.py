@@ -7,7 +7,7 @@ import pytest
 
 import endopilot
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.devices.catheter import Catheter, read_catheter
+from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import read_device
 from endopilot.devices.stack import Stack
 from endopilot.simulation.config import SimulatorConfig
@@ -68,10 +68,7 @@ def test_the_wall_stays_as_it_is_for_devices_that_find_room_in_it(vessel: Anatom
 
 def test_a_straight_catheter_that_fills_the_guiding_catheter_does_not_press_it(vessel: Anatomy, wide: Stack) -> None:
     """A straight tube on the axis of a wider one touches it no more than the bent tip of the wire in it does."""
-    catheter: Catheter = wide.catheters[0]
-    control = np.zeros((1, 4, 4))
-    rollout = endopilot.simulate(
-        vessel, wide.wire, control, catheters=[catheter], initial=np.array([[0.0, 0.0, 1.0, 0.0]])
-    )
-    assert rollout.valid.all()
-    assert rollout.contact_force_max.max() < 0.2  # N; 10 N and more where the map is too coarse
+    initial = np.array([[[0.0, 0.0], [1.0, 0.0]]])
+    trajectory = endopilot.simulate(vessel, wide, np.zeros((1, 4, 2, 2)), initial=initial)
+    assert trajectory.valid.all()
+    assert trajectory.contact_force_max.max() < 0.2  # N; 10 N and more where the map is too coarse

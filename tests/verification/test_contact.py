@@ -1,11 +1,11 @@
-"""Contact and friction against closed forms. Equations stand in `endopilot.verification.contact`."""
+"""Contact and friction against closed forms. Equations stand in `benchmarks.verification.contact`."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from endopilot.verification import contact
+from benchmarks.verification import contact
 
 
 def test_capstan() -> None:

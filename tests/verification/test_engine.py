@@ -6,7 +6,7 @@ import importlib.util
 
 import pytest
 
-from endopilot.verification import engine
+from benchmarks.verification import engine
 
 needs_mujoco = pytest.mark.skipif(importlib.util.find_spec("mujoco") is None, reason=engine.MISSING)
 

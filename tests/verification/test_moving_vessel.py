@@ -1,8 +1,8 @@
-"""Vessels that move. Derivations stand in `endopilot.verification.motion`."""
+"""Vessels that move. Derivations stand in `benchmarks.verification.motion`."""
 
 from __future__ import annotations
 
-from endopilot.verification import motion
+from benchmarks.verification import motion
 
 
 def test_a_rigid_motion_leaves_the_wire_where_it_is_in_the_tube() -> None:

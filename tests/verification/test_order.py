@@ -1,8 +1,8 @@
-"""Orders of convergence. What is measured stands in `endopilot.verification.order`."""
+"""Orders of convergence. What is measured stands in `benchmarks.verification.order`."""
 
 from __future__ import annotations
 
-from endopilot.verification import order
+from benchmarks.verification import order
 
 
 def test_second_order_in_element_length() -> None:

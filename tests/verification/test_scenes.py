@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.verification import scenes as scenarios
 from endopilot.devices.device import read_device
-from endopilot.verification import scenes as scenarios
 
 
 def test_a_string_is_dragged_as_the_capstan_equation_says() -> None:

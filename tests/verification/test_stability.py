@@ -1,8 +1,8 @@
-"""Twisted rods that buckle. Derivations stand in `endopilot.verification.stability`."""
+"""Twisted rods that buckle. Derivations stand in `benchmarks.verification.stability`."""
 
 from __future__ import annotations
 
-from endopilot.verification.stability import greenhill, michell_ring
+from benchmarks.verification.stability import greenhill, michell_ring
 
 
 def test_greenhill() -> None:

@@ -1,10 +1,10 @@
-"""Rods in tubes. Derivations stand in `endopilot.verification.tube`."""
+"""Rods in tubes. Derivations stand in `benchmarks.verification.tube`."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from endopilot.verification import tube
+from benchmarks.verification import tube
 
 
 def test_sinusoidal_buckling() -> None:

@@ -1,4 +1,4 @@
-"""Telescoping tubes. Derivations stand in `endopilot.verification.tubes`; the numbers here are others than there."""
+"""Telescoping tubes. Derivations stand in `benchmarks.verification.tubes`; the numbers here are others than there."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from benchmarks.verification import tubes
+from benchmarks.verification.tubes import ELEMENTS, Sliding, Uniform, curvature, drive, lay_out, mesh
 from endopilot.simulation.tubes import TubeLayout
-from endopilot.verification import tubes
 from endopilot.verification.case import Case, Loading
-from endopilot.verification.tubes import ELEMENTS, Sliding, Uniform, curvature, drive, lay_out, mesh
 
 
 @pytest.mark.parametrize("group", tubes.CASES, ids=lambda group: group.__name__)

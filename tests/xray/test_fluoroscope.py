@@ -52,7 +52,7 @@ def test_the_branch_is_observed(fork) -> None:
     arm, random = Fluoroscope(fork, RADIUS), np.random.default_rng(1)
     line = fork.tree.branches[2].centerline
     for index in range(10, len(line.points), 5):
-        tip = arm.expose(line.points[index], np.array([np.sqrt(0.75), 0, 0.5]), float(line.abscissa[index]), random)
+        tip = arm.measure(line.points[index], np.array([np.sqrt(0.75), 0, 0.5]), float(line.abscissa[index]), random)
         assert tip.branch == 2
         assert abs(tip.abscissa - line.abscissa[index]) < 2.0
 

@@ -28,12 +28,12 @@ def test_the_patient_is_registered_by_contrast(arm, fork):
 def test_an_exposure_measures_the_tip_with_its_uncertainty(arm):
     at = np.arange(15.0, -30.0, -0.5)
     nodes = np.stack([0.4 + 0 * at, 0 * at, at], axis=-1)
-    shown = arm.expose(nodes, 15.3, np.random.default_rng(0))
+    shown = arm.measure(nodes, 15.3, np.random.default_rng(0))
     assert shown is not None and shown.branch == 0
     assert np.linalg.norm(shown.position - nodes[0]) < 0.8
     assert shown.abscissa == pytest.approx(15.0, abs=0.6)
     assert all(0.02 < sd < 1.0 for sd in shown.sd_mm)
-    again = arm.expose(nodes, 15.3, np.random.default_rng(0))
+    again = arm.measure(nodes, 15.3, np.random.default_rng(0))
     np.testing.assert_array_equal(shown.position, again.position)
 
 
@@ -47,7 +47,7 @@ def test_exposures_refine_a_pose_that_is_not_sure(arm, fork):
     at, errors = np.arange(15.0, -30.0, -0.5), []
     for index, side in enumerate((0.7, -0.7)):  # on one wall, then on the other
         nodes = np.stack([0 * at, np.where(at > 0, side, 0.0), at], axis=-1)
-        shown = unsure.expose(nodes, 15.3, np.random.default_rng(index))
+        shown = unsure.measure(nodes, 15.3, np.random.default_rng(index))
         errors.append(np.linalg.norm(shown.position - nodes[0]))
     room_mm = 1.0 - 0.18  # of the lumen and of the wire
     assert vessel_error_mm(fork, arm.pose, unsure.refiner.pose) < room_mm and errors[1] < room_mm
@@ -55,7 +55,7 @@ def test_exposures_refine_a_pose_that_is_not_sure(arm, fork):
 
 
 def test_an_image_without_a_wire_measures_nothing(arm):
-    assert arm.expose(np.zeros((0, 3)), 15.0, np.random.default_rng(1)) is None
+    assert arm.measure(np.zeros((0, 3)), 15.0, np.random.default_rng(1)) is None
 
 
 def test_a_vessel_that_is_not_recognised_is_told(fork, wire, monkeypatch):

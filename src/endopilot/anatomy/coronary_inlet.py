@@ -16,7 +16,7 @@ from endopilot.anatomy.distance import distance_map_from_surface
 from endopilot.anatomy.surface import Surface, filled_box, surface_from_mask
 from endopilot.anatomy.topology import parted
 from endopilot.anatomy.units import check_unit
-from endopilot.errors import InputError
+from endopilot.errors import InputError, place_text
 from endopilot.types import DistanceMap, Insertion, LumenMask, Volume
 
 CERTAIN = 0.8
@@ -138,9 +138,11 @@ def _doubt(ranking: OstiumRanking, counterpart: OstiumRanking, side: Side, coord
             f"take --vessel {other}, or say where it begins, perhaps --ostium-mm {first}"
         )
     named = [candidate for candidate in ranking.candidates[:_NAMED] if candidate.probability > _WORTH_NAMING]
-    places = ", ".join(f"{_text(each.position)} {each.probability:.0%}" for each in named or ranking.candidates[:1])
+    places = ", ".join(
+        f"{place_text(each.position)} {each.probability:.0%}" for each in named or ranking.candidates[:1]
+    )
     return (
-        f"it is not certain where the {name} begins: {places} (LPS mm, probability); look, and give the right "
+        f"it is not certain where the {name} begins: {places} (LPS, probability); look, and give the right "
         f"one, such as --ostium-mm {first}"
         + (f"; or, {_in_other_axes(axes, coordinates)}" if turned > _AS_WELL * best.probability else "")
     )
@@ -169,10 +171,6 @@ def _in_other_axes(axes: str, coordinates: str | None) -> str:
 
 def _option(position: Float[np.ndarray, "3"]) -> str:
     return " ".join(f"{value:.1f}" for value in position)
-
-
-def _text(position: Float[np.ndarray, "3"]) -> str:
-    return "(" + ", ".join(f"{value:.1f}" for value in position) + ")"
 
 
 def _lumens(content: Volume | Surface, label: str) -> Iterator[DistanceMap]:

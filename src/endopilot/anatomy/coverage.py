@@ -16,8 +16,8 @@ from endopilot.anatomy.distance import MAXIMUM_GRID_POINTS
 from endopilot.anatomy.medial_lines import MedialLines
 from endopilot.anatomy.repair import MOST_LISTED, NOTED_MM
 from endopilot.anatomy.surface import Surface, blur_voxels, level_function
-from endopilot.anatomy.topology import place_text
 from endopilot.anatomy.tree import sampled
+from endopilot.errors import place_text
 from endopilot.types import VesselTree, Volume
 
 _REACH_VOXELS = 1.5

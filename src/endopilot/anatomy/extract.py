@@ -29,10 +29,9 @@ from endopilot.anatomy.lumen_graph import lumen_graph, trace_branches
 from endopilot.anatomy.medial_lines import MedialLines, traced_lines
 from endopilot.anatomy.sources import AnatomySource, Polylines, read_source, transformed
 from endopilot.anatomy.surface import Surface, surface_from_mask
-from endopilot.anatomy.topology import place_text
 from endopilot.anatomy.tree import tree_from_lines
 from endopilot.anatomy.units import SMALLEST_RADIUS_MM, check_unit
-from endopilot.errors import InputError
+from endopilot.errors import InputError, place_text
 from endopilot.progress import progress
 from endopilot.settings import Finite, Within, settings
 from endopilot.types import Anatomy, DistanceMap, Insertion, LumenMask, VesselTree

@@ -46,7 +46,7 @@ the crux."""
 def label_rca(labeller: Labeller) -> None:
     """Name the sections of a right coronary tree."""
     tree = labeller.tree
-    leaf = max(tree.leaves(), key=lambda index: tree.branches[index].centerline.abscissa[-1])
+    leaf = tree.longest_leaf()
     route = tree.route(leaf)
     passed = None if labeller.crux is None else labeller.crux.abscissa(tree.path(leaf))
     crux = _crux(labeller, route) if labeller.crux is None else _crux_near(labeller, route, passed)
@@ -180,7 +180,7 @@ def label_lca(labeller: Labeller) -> None:
     major = labeller.major(fork, NAMED_MM)
     end = float(tree.branches[fork].centerline.abscissa[-1])
     if len(major) < 2 or end > LONGEST_LEFT_MAIN_MM:
-        line = tree.path(labeller.longest_leaf(0)).points
+        line = tree.path(tree.longest_leaf()).points
         far = line[np.linalg.norm(line - line[0], axis=1).argmax()] - line[0]
         (_label_lad if far[1] < 0 else _label_lcx)(labeller, 0, USUAL_LEFT_MAIN_MM)
         return
@@ -200,7 +200,7 @@ def label_lca(labeller: Labeller) -> None:
 
 def _label_lad(labeller: Labeller, branch: int, end: float) -> None:
     tree = labeller.tree
-    route = labeller.onwards(branch, labeller.longest_leaf(branch))
+    route = labeller.onwards(branch, tree.longest_leaf(branch))
     # Diagonals run to the left over the free wall; septals dive to the right of the vessel's own course.
     diagonals, named = [], []
     for side in labeller.sides(route):
@@ -229,9 +229,9 @@ def _label_lcx(labeller: Labeller, branch: int, end: float) -> None:
     # The circumflex keeps to the groove, round the back; the marginals leave it to the left.
     supplies = labeller.crux is not None and labeller.crux.dominance != "right"
     if supplies:
-        leaf = min(labeller.ends(branch), key=lambda index: _from_crux(labeller, index))
+        leaf = min(tree.leaves(branch), key=lambda index: _from_crux(labeller, index))
     else:
-        leaf = max(labeller.ends(branch), key=lambda index: (tree.path(index).points @ GROOVE).max())
+        leaf = max(tree.leaves(branch), key=lambda index: (tree.path(index).points @ GROOVE).max())
     route = labeller.onwards(branch, leaf)
     crux_mm = _left_crux(labeller, route)
     marginals = []

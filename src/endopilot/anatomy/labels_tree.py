@@ -58,13 +58,9 @@ class Labeller:
             abscissa[0] += 1e-3  # a branch that starts where a section ends belongs to the next one
             self.sections[branch][:] = indices[np.searchsorted([end for _, end in ends], abscissa)]
 
-    def longest_leaf(self, branch: int) -> int:
-        """The end behind a branch that lies farthest along the tree."""
-        return max(self.ends(branch), key=lambda leaf: self.tree.branches[leaf].centerline.abscissa[-1])
-
     def length_behind(self, branch: int) -> float:
         """Length from a branch's start to the farthest tip behind it, mm."""
-        tip = self.tree.branches[self.longest_leaf(branch)].centerline.abscissa[-1]
+        tip = self.tree.branches[self.tree.longest_leaf(branch)].centerline.abscissa[-1]
         return float(tip - self.tree.branches[branch].centerline.abscissa[0])
 
     def reach(self, branch: int, direction: Float[np.ndarray, "3"]) -> float:
@@ -72,13 +68,9 @@ class Labeller:
         behind = [i for i in range(len(self.tree.branches)) if branch in self.tree.route(i)]
         return max(float((self.tree.branches[i].centerline.points @ direction).max()) for i in behind)
 
-    def ends(self, branch: int) -> list[int]:
-        """The distal ends behind a branch."""
-        return [leaf for leaf in self.tree.leaves() if branch in self.tree.route(leaf)]
-
     def own(self, leaf: int) -> int:
         """The first branch on the path to a distal end that leads to no other."""
-        return next(branch for branch in self.tree.route(leaf) if self.ends(branch) == [leaf])
+        return next(branch for branch in self.tree.route(leaf) if self.tree.leaves(branch) == (leaf,))
 
     def leftward(self, leaf: int) -> float:
         """How far to the patient's left an end lies, mm."""
@@ -112,7 +104,7 @@ class Labeller:
 
     def heading(self, branch: int, reach_mm: float) -> Float[np.ndarray, "3"]:
         """Unit vector from a branch's start to where its longest path is after `reach_mm`."""
-        line = self.tree.path(self.longest_leaf(branch))
+        line = self.tree.path(self.tree.longest_leaf(branch))
         start = self.tree.branches[branch].centerline
         last = line.points[min(np.searchsorted(line.abscissa, start.abscissa[0] + reach_mm), len(line.points) - 1)]
         heading = last - start.points[0]

@@ -37,7 +37,7 @@ def label_arch(labeller: Labeller) -> None:
     for side in others:
         labeller.fill(side, "left subclavian" if side == subclavian else "left common carotid")
     labeller.fill(trunk, "brachiocephalic trunk")
-    ordered = sorted(labeller.ends(trunk), key=labeller.leftward)
+    ordered = sorted(tree.leaves(trunk), key=labeller.leftward)
     if len(ordered) > 1:
         labeller.fill(labeller.own(ordered[0]), "right subclavian")
         labeller.fill(labeller.own(ordered[1]), "right common carotid")
@@ -47,8 +47,8 @@ def label_arch(labeller: Labeller) -> None:
 
 def label_cerebral(labeller: Labeller) -> None:
     """Name the sections of one side's anterior cerebral circulation that is entered from the internal carotid."""
-    terminus = labeller.fork(0, _LONG_MM)
-    carotid = labeller.tree.route(terminus)
+    tree, terminus = labeller.tree, labeller.fork(0, _LONG_MM)
+    carotid = tree.route(terminus)
     labeller.along(carotid, [("ICA", np.inf)])
     parted = labeller.major(terminus, _LONG_MM)
     for side in labeller.sides(carotid):
@@ -57,19 +57,19 @@ def label_cerebral(labeller: Labeller) -> None:
     if len(parted) < 2:
         return
     # The carotid has come from the side towards the midline; the anterior cerebral artery continues in that direction.
-    line = labeller.tree.path(terminus)
+    line = tree.path(terminus)
     inwards = np.sign(line.points[-1] - line.points[0]) * LEFT
     anterior = max(parted, key=lambda child: float(labeller.heading(child, 12.0) @ inwards))
     for middle in parted:
         if middle != anterior:
             _label_middle(labeller, middle, inwards)
-    line = labeller.tree.path(labeller.longest_leaf(anterior))
+    line = tree.path(tree.longest_leaf(anterior))
     own = np.flatnonzero(line.abscissa >= labeller.origin(anterior) + _SHORTEST_A1_MM)
     step = np.gradient(line.points[own], axis=0)
     up = step[:, 2] > np.abs(step[:, 0])
     turn = float(line.abscissa[own[up.argmax() if up.any() else -1]]) - _TURN_MM
     labeller.fill(anterior, "A2")
-    labeller.along(labeller.onwards(anterior, labeller.longest_leaf(anterior)), [("A1", turn), ("A2", np.inf)])
+    labeller.along(labeller.onwards(anterior, tree.longest_leaf(anterior)), [("A1", turn), ("A2", np.inf)])
 
 
 def _label_middle(labeller: Labeller, branch: int, inwards: Float[np.ndarray, "3"]) -> None:
@@ -101,7 +101,7 @@ def label_portal(labeller: Labeller) -> None:
     posterior = _right_posterior(labeller, right)
     groups = {"LPV": set(leaves) - right, "RPPV": posterior, "RAPV": right - posterior}
     for branch in range(len(tree.branches)):
-        behind = set(labeller.ends(branch))
+        behind = set(tree.leaves(branch))
         inside = [name for name, group in groups.items() if behind <= group]
         name = inside[0] if inside else "RPV" if behind <= right else "MPV"
         labeller.sections[branch][:] = labeller.names.index(name)
@@ -128,9 +128,9 @@ def _parting(labeller: Labeller, one: int, other: int) -> float:
 def _right_posterior(labeller: Labeller, right: set[int]) -> set[int]:
     """Return the ends of the right posterior branch: of what leads to the right lobe alone, the part at the back."""
     tree = labeller.tree
-    alone = [branch for branch in range(len(tree.branches)) if set(labeller.ends(branch)) <= right]
+    alone = [branch for branch in range(len(tree.branches)) if set(tree.leaves(branch)) <= right]
     first = [branch for branch in alone if tree.branches[branch].parent not in alone]
     while len(first) == 1 and tree.children(first[0]):
         first = list(tree.children(first[0]))
     back = min(first, key=lambda branch: float(labeller.heading(branch, 30.0) @ FRONT))
-    return set(labeller.ends(back)) if len(first) > 1 else set()
+    return set(tree.leaves(back)) if len(first) > 1 else set()

@@ -8,6 +8,7 @@ from scipy.spatial import KDTree
 
 from endopilot.anatomy.line_graph import STEP_MM, LineNodes
 from endopilot.anatomy.sources import Polylines
+from endopilot.errors import place_text
 from endopilot.types import VesselTree
 
 _SHORTEST_MM = 2.0
@@ -53,14 +54,14 @@ def left_out(
     for number in range(stretch.max() + 1):
         part = lost[stretch == number]
         length = _length_once(nodes, part)
-        place = nodes.points[part[gap[part].argmax()]].round(1).tolist()
+        place = place_text(nodes.points[part[gap[part].argmax()]])
         if not kept[part].any():
             why = "it lies in the parent vessel that the lines start in"
         elif own[part].max() != root_piece:
             why = f"no line leads there; the nearest is {gap[part].min():.1f} mm away"
         else:
             why = "it is no longer than the vessel it leaves is wide"
-        (notes if length >= _SHORTEST_MM else short).append((length, f"at {place} mm is left out: {why}"))
+        (notes if length >= _SHORTEST_MM else short).append((length, f"at {place} is left out: {why}"))
     notes.sort(key=lambda note: -note[0])
     short += notes[_MOST_NOTES:]
     texts = [f"{length:.1f} mm of line {rest}" for length, rest in notes[:_MOST_NOTES]]
@@ -68,7 +69,7 @@ def left_out(
         total, longest = sum(length for length, _ in short), max(short)
         texts.append(
             f"{total:.1f} mm of line in {len(short)} short stretches left out; the longest, {longest[0]:.1f} mm, "
-            f"{longest[1].split(' mm is')[0]} mm"
+            f"{longest[1].split(' is')[0]}"
         )
     return texts, covered
 
@@ -133,7 +134,7 @@ def closures(tree: VesselTree) -> list[str]:
         notes.append(
             (
                 float(route[best]),
-                f"{what} at {places[best].round(1).tolist()} mm and close a loop of {route[best]:.0f} mm: the tree is "
+                f"{what} at {place_text(places[best])} and close a loop of {route[best]:.0f} mm: the tree is "
                 "cut there, the lumen is open",
             )
         )
@@ -251,7 +252,7 @@ def further_inlets(source: Polylines, tree: VesselTree) -> list[str]:
         widens = size > _WIDENS * float(line.radius.min())
         if size >= _AS_WIDE * float(root.radius[0]) and (begins or widens):
             notes.append(
-                f"the end at {end.round(1).tolist()} mm could be an inlet too (radius {size:.2f} mm, "
+                f"the end at {place_text(end)} could be an inlet too (radius {size:.2f} mm, "
                 f"{root.radius[0]:.2f} mm at the ostium): the tree has one, and --ostium-mm chooses it"
             )
     return notes

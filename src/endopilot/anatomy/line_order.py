@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
 from endopilot.anatomy.sources import Polylines
-from endopilot.errors import InputError
+from endopilot.errors import InputError, place_text
 
 _NEIGHBOURS = 6
 """Points of a line are compared with this many nearest ones."""
@@ -38,7 +38,7 @@ def in_order(source: Polylines, label: str) -> tuple[Polylines, list[str]]:
         distinct = np.concatenate([[True], np.linalg.norm(np.diff(line, axis=0), axis=1) > 1e-6])
         line, size = line[distinct], size[distinct]
         if len(line) < 2:
-            notes.append(f"line {number}: all its points coincide at {_text(line[0])}: left out")
+            notes.append(f"line {number}: all its points coincide at {place_text(line[0])}: left out")
             continue
         order = _order(line, f"{label}: line {number}")
         if order is not None:
@@ -53,14 +53,14 @@ def in_order(source: Polylines, label: str) -> tuple[Polylines, list[str]]:
         apart = step > reach
         jump = apart & (step > _JUMP_RADII * reach) & (step > _JUMP_STEPS * np.median(step))
         notes += [
-            f"line {number} jumps by {step[i]:.1f} mm at {_text(line[i])}: cut there" for i in np.flatnonzero(jump)
+            f"line {number} jumps by {step[i]:.1f} mm at {place_text(line[i])}: cut there" for i in np.flatnonzero(jump)
         ]
         coarse = np.flatnonzero(apart & ~jump)
         if len(coarse):
             longest = int(coarse[step[coarse].argmax()])
             notes.append(
                 f"line {number}: the spheres of {len(coarse)} neighbouring points do not touch (the longest step, "
-                f"{step[longest]:.1f} mm, is at {_text(line[longest])}): joined by straight pieces of "
+                f"{step[longest]:.1f} mm, is at {place_text(line[longest])}): joined by straight pieces of "
                 f"{step[coarse].sum():.1f} mm in all"
             )
         for part in np.split(np.arange(len(line)), np.flatnonzero(jump) + 1):
@@ -68,7 +68,7 @@ def in_order(source: Polylines, label: str) -> tuple[Polylines, list[str]]:
                 points.append(line[part])
                 radii.append(size[part])
             else:
-                notes.append(f"line {number}: the single point at {_text(line[part[0]])} is left out")
+                notes.append(f"line {number}: the single point at {place_text(line[part[0]])} is left out")
     if not points:
         raise InputError(f"{label}: holds no line of at least two distinct points; export the centerline again")
     return Polylines(tuple(points), tuple(radii)), notes
@@ -117,7 +117,3 @@ def _turns(line: Float[np.ndarray, "n 3"]) -> int:
 
 def _length(line: Float[np.ndarray, "n 3"]) -> float:
     return float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
-
-
-def _text(point: Float[np.ndarray, "3"]) -> str:
-    return f"{point.round(1).tolist()} mm"

@@ -26,7 +26,7 @@ from endopilot.anatomy.line_graph import (
 from endopilot.anatomy.line_order import in_order
 from endopilot.anatomy.sources import Polylines
 from endopilot.anatomy.tree import Line, tree_from_lines
-from endopilot.errors import InputError
+from endopilot.errors import InputError, place_text
 from endopilot.types import Insertion, VesselTree
 
 PARENT_VESSEL_RATIO = 2.5
@@ -88,7 +88,7 @@ def tree_from_polylines(
     gaps = bridges(nodes, edges)
     bridged = np.linalg.norm(nodes.points[gaps[:, 0]] - nodes.points[gaps[:, 1]], axis=1)
     notes += [
-        f"a gap of {gap:.1f} mm between lines at {nodes.points[end].round(1).tolist()} mm is bridged"
+        f"a gap of {gap:.1f} mm between lines at {place_text(nodes.points[end])} is bridged"
         for gap, end in zip(bridged, gaps[:, 0], strict=True)
     ]
     edges = with_bridges(nodes, edges, gaps)
@@ -165,9 +165,9 @@ def _widest_end(nodes: LineNodes, piece: Int[np.ndarray, "n"], vessel: str, labe
     roots = [int(ends[nodes.radius[ends].argmax()]) for ends in widest.values()]
     rival = len(roots) > 1 and length[piece[roots[1]]] > _RIVAL * length[piece[roots[0]]]
     if rival and vessel != "generic":
-        one, two = (nodes.points[root].round(1).tolist() for root in roots)
+        one, two = (place_text(nodes.points[root]) for root in roots)
         raise InputError(
-            f"{label}: holds two trees that are not connected, with their widest ends at {one} and {two} mm (LPS); "
+            f"{label}: holds two trees that are not connected, with their widest ends at {one} and {two} (LPS); "
             "name the ostium of one with --ostium-mm"
         )
     return roots[0]

@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 from endopilot.anatomy.parent_vessel import COMPARABLE, Vessel, piece_on_side
 from endopilot.anatomy.surface import filled_box
 from endopilot.anatomy.topology import parted
-from endopilot.errors import InputError
+from endopilot.errors import InputError, place_text
 from endopilot.types import Insertion, Volume
 
 NEAR_OSTIUM_MM = 5.0
@@ -149,10 +149,9 @@ def _nearest_piece(mask: Volume, labels: np.ndarray, sizes: np.ndarray, given: I
     gap = np.linalg.norm(mask.index_to_world(index[:, ::-1].astype(float)) - given.position, axis=1)
     if gap.min() > max(NEAR_OSTIUM_MM, 2.0 * float(mask.spacing_mm.max())):
         nearest = mask.index_to_world(index[gap.argmin()][::-1].astype(float))
-        place = ", ".join(f"{value:.1f}" for value in nearest)
         raise InputError(
-            f"{label}: the mask touches nothing near the ostium at {position_text(given)}; "
-            f"its nearest voxel is {gap.min():.1f} mm away at ({place})"
+            f"{label}: the mask touches nothing near the ostium at {place_text(given.position)}; "
+            f"its nearest voxel is {gap.min():.1f} mm away at {place_text(nearest)}"
         )
     return int(labels[tuple(index[gap.argmin()])])
 
@@ -220,10 +219,10 @@ def _left_out(
         own = np.argwhere(labels[box] == lost[number]) + corners[number, :, 0]
         place = mask.index_to_world(own[:, ::-1].astype(float))
         gap = np.asarray(reach.query(place)[0])
-        at = ", ".join(f"{value:.0f}" for value in place[gap.argmin()])
         remarks.append(
             f"a piece apart from the lumen left out ({sizes[lost[number]]} voxels): it is {extent[number]:.0f} mm long "
-            f"and begins {gap.min():.1f} mm away at ({at}) mm; close the gap in the mask if it belongs to the vessel"
+            f"and begins {gap.min():.1f} mm away at {place_text(place[gap.argmin()])}; close the gap in the mask if it "
+            "belongs to the vessel"
         )
     rest = order[len(remarks) :]
     if len(rest):
@@ -320,8 +319,3 @@ def other_pieces_text(vessel: Vessel, count: int) -> str:
     )
     pieces = "1 other large piece lies" if count == 1 else f"{count} other large pieces lie"
     return f"{pieces} apart and {choice}; --ostium-mm chooses another"
-
-
-def position_text(given: Insertion) -> str:
-    """Return where an ostium is, LPS mm, for a message."""
-    return "(" + ", ".join(f"{value:.1f}" for value in given.position) + ") mm"

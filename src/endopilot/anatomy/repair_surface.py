@@ -14,16 +14,9 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from endopilot.anatomy.parent_vessel import Vessel, piece_on_side
-from endopilot.anatomy.repair import (
-    MOST_LISTED,
-    MOST_PIECES,
-    NEAR_OSTIUM_MM,
-    NOTED_MM,
-    other_pieces_text,
-    position_text,
-)
+from endopilot.anatomy.repair import MOST_LISTED, MOST_PIECES, NEAR_OSTIUM_MM, NOTED_MM, other_pieces_text
 from endopilot.anatomy.surface import Surface, surface_from_mask
-from endopilot.errors import InputError
+from endopilot.errors import InputError, place_text
 from endopilot.types import Insertion, Volume
 
 
@@ -71,7 +64,8 @@ def closed_surface(
         gap = float(KDTree(mesh.points).query(given.position)[0])
         if gap > max(NEAR_OSTIUM_MM, 0.15 * float(np.ptp(mesh.points, axis=0).max())):
             raise InputError(
-                f"{label}: the surface is {gap:.1f} mm from the ostium at {position_text(given)}; check coordinates"
+                f"{label}: the surface is {gap:.1f} mm from the ostium at {place_text(given.position)}; check "
+                "coordinates"
             )
     open_edges = mesh.n_open_edges
     if open_edges:
@@ -120,10 +114,8 @@ def _regions_left_out(
             found.append((np.inf, f"the {other} coronary artery ({len(place)} vertices) is not part of this one"))
         elif extent >= NOTED_MM:
             gap = np.asarray(own.query(place)[0])
-            at = ", ".join(f"{value:.0f}" for value in place[gap.argmin()])
-            text = (
-                f"a separate piece of the surface left out: {extent:.0f} mm long, {gap.min():.1f} mm away at ({at}) mm"
-            )
+            at = place_text(place[gap.argmin()])
+            text = f"a separate piece of the surface left out: {extent:.0f} mm long, {gap.min():.1f} mm away at {at}"
             found.append((extent, text))
     remarks = [text for _, text in sorted(found, key=lambda item: -item[0])[:MOST_LISTED]]
     rest = len(np.unique(ids)) - 1 - len(remarks)

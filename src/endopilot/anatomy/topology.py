@@ -17,6 +17,7 @@ from scipy.spatial import KDTree
 
 from endopilot.anatomy.medial_lines import MedialLines, thinned_lines, traced_lines
 from endopilot.anatomy.parent_vessel import AORTA_RADIUS_MM
+from endopilot.errors import place_text
 from endopilot.types import Volume
 
 CONTACT = 0.6
@@ -104,11 +105,6 @@ def _porous(cuts: list[_Cut]) -> str:
         f"left open, and the tree takes one way round each; the longest ring has {cuts[0].around_mm:.0f} mm, at "
         f"{place_text(cuts[0].place)}"
     )
-
-
-def place_text(point: Float[np.ndarray, "3"]) -> str:
-    """Return a position as remarks give it."""
-    return "(" + ", ".join(f"{value:.0f}" for value in point) + ") mm"
 
 
 def _remarks(cuts: list[_Cut], holes: list[_Cut]) -> list[str]:

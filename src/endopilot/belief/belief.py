@@ -10,6 +10,7 @@ vessel that moves as it is known to. A measurement of the tip weights them by th
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from typing import Annotated
 
 import numpy as np
@@ -81,26 +82,19 @@ class Belief:
             factor: device.with_tip(bend_rad=device.tip_bend_rad, stiffness_factor=float(factor))
             for factor in np.unique(parameters[:, 1])
         }
-        catheters = len(navigation.catheters)
         self.simulator = Simulator(
             navigation.anatomy,
-            [self.wires[factor] for factor in parameters[:, 1]],
-            catheters=navigation.catheters,
+            [replace(navigation.stack, wire=self.wires[factor]) for factor in parameters[:, 1]],
             motion=navigation.known_motion,
             config=config.core,
         )
         self._ostium = parameters[:, 2]
-        self.simulator.reset(
-            inserted_length=np.maximum(navigation.start_inserted_mm + self._ostium, 0.0),
-            rotation=np.full(len(parameters), navigation.start_rotation),
-            friction=device.friction * parameters[:, 0],
-            catheter_inserted_length=np.tile(
-                np.maximum(navigation.start_catheter_mm + self._ostium, 0.0)[:, None], (1, catheters)
-            ),
-        )
+        start, friction = np.tile(navigation.start, (len(parameters), 1, 1)), self.simulator.set_up.friction.copy()
+        friction[:, 0] = device.friction * parameters[:, 0]
+        self.simulator.reset(inserted_length=self._deeper(start[..., 0]), rotation=start[..., 1], friction=friction)
         self._limits = [DriveLimits.of(each, navigation.anatomy) for each in navigation.devices]
         self._score, self._coaxial = np.zeros(len(parameters)), bool(navigation.catheters)
-        self.tip = self.simulator.project()
+        self.tip = self.simulator.project()[:, 0]
 
     @staticmethod
     def around(given: Float[np.ndarray, "3"], config: BeliefConfig) -> Float[np.ndarray, "members 3"]:
@@ -123,22 +117,26 @@ class Belief:
     def follow(self, inserted_length: float, rotation: float, catheters: Proximals = ()) -> None:
         """Move every member's proximal ends to where the encoders say that they are, in one decision period."""
         simulator = self.simulator
-        inserted = np.column_stack([simulator.inserted_length, simulator.catheter_inserted_length])
-        turned = np.column_stack([simulator.rotation, simulator.catheter_rotation])
-        controls = []
+        inserted, turned = simulator.inserted_length, simulator.rotation
+        control = np.empty((simulator.worlds, simulator.devices, 2))
         for k, (length, turn) in enumerate([(inserted_length, rotation), *catheters]):
-            motion = np.column_stack([np.maximum(length + self._ostium, 0.0) - inserted[:, k], turn - turned[:, k]])
-            controls.append(self._limits[k].clip(motion / DECISION_PERIOD_S, inserted[:, k], DECISION_PERIOD_S))
-        control = np.concatenate(controls, axis=1)
+            motion = np.column_stack(
+                [self._deeper(np.full(len(inserted), length)) - inserted[:, k], turn - turned[:, k]]
+            )
+            control[:, k] = self._limits[k].clip(motion / DECISION_PERIOD_S, inserted[:, k], DECISION_PERIOD_S)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a member that fails has no weight
             simulator.step(control, DECISION_PERIOD_S)
-        self.tip = simulator.project()
+        self.tip = simulator.project()[:, 0]
+
+    def _deeper(self, given_mm: Float[np.ndarray, "members *devices"]) -> Float[np.ndarray, "members *devices"]:
+        """Return inserted lengths from each member's ostium on, mm, of those from the given one on."""
+        return np.maximum(given_mm + self._ostium.reshape(-1, *[1] * (given_mm.ndim - 1)), 0.0)
 
     def errors(self, measured: TipMeasurement) -> Float[np.ndarray, "members 2"]:
         """Return the distances of the members' tips from a measured one, along and across each wire, mm."""
         if self._coaxial:  # the first nodes are the foremost tube's
-            end, along = self.simulator.tips(), self.simulator.tip_direction
+            end, along = self.simulator.tip_position[:, 0], self.simulator.tip_direction[:, 0]
         else:
             nodes = self.simulator.position[:, :2]
             end, along = nodes[:, 0], nodes[:, 0] - nodes[:, 1]
@@ -174,4 +172,4 @@ class Belief:
     def likeliest_tip(self) -> TipProjection:
         """Return where the tip of the likeliest member is, as arrays of one."""
         best = [int(np.argmax(self.weight))]
-        return TipProjection(**{name: getattr(self.tip, name)[best] for name in TipProjection.__dataclass_fields__})
+        return self.tip[best]

@@ -19,12 +19,10 @@ from jaxtyping import Bool, Float, Int
 from endopilot.anatomy.io import read_anatomy
 from endopilot.dataset.again import simulate_again
 from endopilot.dataset.loader import Dataset, load_dataset
-from endopilot.devices.device import Device
 from endopilot.errors import InputError
 from endopilot.files import json_text, writing
 from endopilot.models.config import WINDOW
 from endopilot.parallel import each
-from endopilot.settings import from_record
 from endopilot.simulation.motion import Motion, place
 from endopilot.types import Anatomy
 from endopilot.xray.fluoroscope import FluoroscopeConfig, TipMeasurement
@@ -151,14 +149,14 @@ def expose_navigations(data: Dataset, anatomy: Anatomy, settings: ImageSettings)
     """
     seed, name = settings.seed, anatomy.name
     pose_seed = int(np.random.default_rng([seed, 5, *name.encode()]).integers(2**31))
-    arm = ImageFluoroscope(anatomy, from_record(Device, data.manifest["device"]), settings.fluoroscope, pose_seed)
-    shape = data.inserted_length.shape
+    arm = ImageFluoroscope(anatomy, data.stack.wire, settings.fluoroscope, pose_seed)
+    shape = data.valid.shape
     ostium, samples = np.asarray(anatomy.insertion.position), min(shape[1], settings.samples)
     known, motion = None, data.motion(name)
     if motion is not None:
         known = arm.measure_motion(motion, np.random.default_rng([seed, 6, *name.encode()]))
     shown = seen_in_episodes(motion, known, ostium, shape[1], data.sample_period_s)
-    encoder = data.inserted_length.astype(float) - deeper_ostium_mm(name, settings.ostium_mm, seed)
+    encoder = data.inserted_length[:, :, 0].astype(float) - deeper_ostium_mm(name, settings.ostium_mm, seed)
     measured: list[list[TipMeasurement | None]] = [[] for _ in data.sequence]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # forces on the wall are in the dataset
@@ -172,7 +170,7 @@ def expose_navigations(data: Dataset, anatomy: Anatomy, settings: ImageSettings)
                 there = nodes[sample] if shown is None else place(shown[sample], nodes[sample])
                 random = np.random.default_rng([seed, 3, sequence, sample, *name.encode()])
                 depth, given = float(encoder[index, sample]), sample < WINDOW
-                measured[index].append(arm.expose(there, depth, random, refine=given))
+                measured[index].append(arm.measure(there, depth, random, refine=given))
     return _held(measured, encoder, known)
 
 

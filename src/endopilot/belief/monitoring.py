@@ -174,7 +174,7 @@ def monitor(predictor: Predictor, dataset: Dataset, config: AdviseConfig, *, sam
     episodes = replace(true, initial=true.initial + by_encoder, setup=setup, **measured)
     return Monitored(
         truth=true.tip.astype(float),
-        ratio=safety_ratio(dataset.tip_offset, dataset.lumen_radius, wire_radius).astype(float),
+        ratio=safety_ratio(dataset.tip_offset[:, :, 0], dataset.lumen_radius[:, :, 0], wire_radius).astype(float),
         episodes=episodes,
         found=found,
         unregistered=unregistered,

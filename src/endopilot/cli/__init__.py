@@ -5,20 +5,19 @@ Only the command that is called is imported, so that `endopilot --help` and `end
 
 from __future__ import annotations
 
-import contextlib
 import difflib
 import functools
 import importlib
-import io
-import itertools
-import re
 import sys
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from endopilot import __version__
 from endopilot.cli.process import EXIT_BAD_INPUT, carry_out, leave, own_streams
 from endopilot.errors import InputError
+
+if TYPE_CHECKING:
+    from endopilot.cli.options import Command
 
 COMMANDS = {
     "demo": "six synthetic patients -> everything from the CT angiogram to the report",
@@ -39,8 +38,7 @@ COMMANDS = {
     "drive": "a simulated robotic drive that takes commands over TCP, with a watchdog",
     "cockpit": "a wire in the browser: watched, driven by hand, or left to a policy",
     "ladder": "a policy on twelve tasks in unseen patients -> scores, a page and a submission",
-    "verify": "the rod core compared with closed forms and an independent engine",
-    "bench": "benchmarks: speed, environments, robustness, anatomy, imaging, labels, dataset, training, cockpit, X-ray",
+    "verify": "the rod core compared with closed forms",
     "devices": "the known guidewires and their properties",
     "sample": "download a real CT angiogram to try",
     "info": "versions and machine",
@@ -78,6 +76,15 @@ def module_of(name: str) -> str:
     return name.replace("-", "_")
 
 
+def commands_of(name: str) -> dict[str, Command]:
+    """Return the commands of a name by their subjects, such as those of `bench`; one without subjects is under ""."""
+    from endopilot.cli.options import Command  # tyro and pydantic are slow to import
+
+    module = importlib.import_module(f"endopilot.cli.{module_of(name)}")
+    functions = getattr(module, "SUBJECTS", None) or {"": module.command}
+    return {subject: Command(f"endopilot {name} {subject}".rstrip(), one) for subject, one in functions.items()}
+
+
 def overview() -> str:
     """Return the text of `endopilot --help`."""
     lines = [f"  {name:<12} {summary}" for name, summary in COMMANDS.items()]
@@ -90,49 +97,19 @@ def overview() -> str:
             "",
             *lines,
             "",
-            "`endopilot COMMAND --help` gives each command's options, units and defaults.",
+            "`endopilot COMMAND --help` lists what is set most often, with units and defaults; `--help-all` lists all.",
         ]
     )
 
 
 def _work(name: str, arguments: Sequence[str]) -> None:
     """Read a command's arguments and do its work."""
-    import tyro
-
-    module = importlib.import_module(f"endopilot.cli.{module_of(name)}")
-    subjects: dict[str, Any] | None = getattr(module, "SUBJECTS", None)
-    read: Any = tyro.cli if subjects is None else tyro.extras.subcommand_cli_from_dict
-    said = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(said):
-            work = read(
-                _later(module.command) if subjects is None else {key: _later(one) for key, one in subjects.items()},
-                prog=f"endopilot {name}",
-                args=arguments,
-                config=(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes),
-            )
-    except SystemExit as error:
-        if not error.code:
-            raise
-        raise InputError(f"{_told(said.getvalue())}; `endopilot {name} --help` lists the options") from None
-    work()
-
-
-def _later(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
-    """Return what takes the arguments of a command and returns its work, still to be done."""
-
-    @functools.wraps(command)
-    def bound(*args: Any, **kwargs: Any) -> Callable[[], None]:
-        from endopilot.settings import check_call  # pydantic is slow to import
-
-        check_call(command, args, kwargs)
-        return functools.partial(command, *args, **kwargs)
-
-    return bound
-
-
-def _told(box: str) -> str:
-    """Return what tyro's box of several lines says of bad arguments, in one line: its first part, without the help."""
-    lines = [line.strip("│╭╮╰╯─\n") for line in box.splitlines()[1:]]
-    first = list(itertools.takewhile(lambda line: line.strip(" ─"), lines))
-    return re.sub(r"\.$", "", " ".join(line.strip() for line in first if not line.startswith(" " * 6)))
+    commands = commands_of(name)
+    if "" in commands:
+        commands[""].run(arguments)
+    elif not arguments or arguments[0] in ("-h", "--help"):
+        print(f"usage: endopilot {name} {{{','.join(commands)}}} [OPTIONS]")
+    elif arguments[0] in commands:
+        commands[arguments[0]].run(arguments[1:])
+    else:
+        raise InputError(f"{arguments[0]}: no such subject; choose from {', '.join(commands)}")

@@ -10,7 +10,7 @@ from tyro.conf import Positional
 from endopilot.anatomy.batch import extract_all
 from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy, read_source
 from endopilot.anatomy.io import write_anatomy
-from endopilot.cli.arguments import OutputFolder, existing, show
+from endopilot.cli.arguments import Existing, Figures, OutputFolder, Picture, existing
 from endopilot.errors import InputError
 from endopilot.imaging.volume import read_volume
 from endopilot.types import Anatomy
@@ -23,11 +23,10 @@ def command(
     output: OutputFolder,
     name: str | None = None,
     label: str | None = None,
-    picture: Path | None = None,
-    ct: Path | None = None,
-    json: bool = False,
+    picture: Picture | None = None,
+    ct: Existing | None = None,
     config: AnatomyConfig = AnatomyConfig(),
-) -> None:
+) -> Figures:
     """Make an anatomy: centerline tree with section labels, distance map and ostium.
 
     The folder holds centerline.vtp, lumen.nrrd (distance to the wall, mm, positive inside) and anatomy.json; 3D Slicer
@@ -42,7 +41,6 @@ def command(
         label: number or name of the segment to take, where a mask holds several.
         picture: PNG of the tree by section and by radius, its longest path straightened, and cross-sections.
         ct: CT angiogram in HU, shown behind the walls in the picture.
-        json: print the figures as JSON.
         config: how to extract.
     """
     if not sources:
@@ -52,28 +50,25 @@ def command(
             if value is not None:
                 raise InputError(f"--{option} {value}: serves one patient, and {len(sources)} are given; leave it out")
         made, rejected = extract_all(sources, output, label=label, config=config)
-        show({"anatomies": [str(folder) for folder in made], "rejected": rejected}, as_json=json)
         for reason in rejected.values():
             print(f"endopilot anatomy: rejected: {reason}", file=sys.stderr)
-        return
-    if picture is not None and picture.suffix.lower() != ".png":
-        raise InputError(f"{picture}: a picture is written as PNG; name it with .png")
+        return {"anatomies": made, "rejected": rejected}
     if ct is not None and picture is None:
         raise InputError(f"--ct {ct}: is only shown in a picture; give --picture FILE.png too")
-    volume = None if ct is None else read_volume(existing(ct))
+    volume = None if ct is None else read_volume(ct)
     source = next(iter(sources))
     content = read_source(existing(source), label=label)
     anatomy = extract_anatomy(content, name=name or output.resolve().name, config=config)
     write_anatomy(anatomy, output)
-    figures = {"anatomy": str(output), **describe(anatomy)}
+    figures = {"anatomy": output, **describe(anatomy)}
     if picture is not None:
         from endopilot.anatomy.anatomy_picture import draw_anatomy  # matplotlib is slow to import
 
         draw_anatomy(anatomy, picture, volume=volume)
-        figures["picture"] = str(picture)
+        figures["picture"] = picture
     if volume is not None and volume.notes:
         figures["ct_notes"] = list(volume.notes)
-    show(figures, as_json=json)
+    return figures
 
 
 def describe(anatomy: Anatomy) -> dict[str, object]:

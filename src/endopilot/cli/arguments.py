@@ -1,12 +1,15 @@
-"""Arguments that several commands share, and how commands print."""
+"""What commands take, and how they print what they return."""
 
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
+from pydantic import AfterValidator
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Column, Table
@@ -16,9 +19,8 @@ from endopilot.cli.process import one_line
 from endopilot.errors import InputError
 from endopilot.files import json_text
 
-OutputFolder = Annotated[Path, arg(name="output", aliases=("-o",), metavar="DIR")]
-OutputFile = Annotated[Path, arg(name="output", aliases=("-o",), metavar="FILE")]
-Point = tuple[float, float, float]
+EXIT_FAILED = 1
+Figures = Mapping[str, Any] | Sequence[Mapping[str, Any]]
 
 
 def existing(path: Path) -> Path:
@@ -32,6 +34,52 @@ def existing(path: Path) -> Path:
     except OSError as error:
         raise InputError(f"{path}: {(error.strerror or str(error)).lower()}; check the path") from error
     return path
+
+
+def _named_png(path: Path) -> Path:
+    if path.suffix.lower() != ".png":
+        raise InputError(f"{path}: a picture is written as PNG; name it with .png")
+    return path
+
+
+MUST_EXIST = "must exist"
+Existing = Annotated[Path, MUST_EXIST]
+"""A file or folder that must be there when the command begins."""
+Picture = Annotated[Path, AfterValidator(_named_png)]
+"""A picture to be written."""
+OutputFolder = Annotated[Path, arg(aliases=("-o",), metavar="DIR")]
+OutputFile = Annotated[Path, arg(aliases=("-o",), metavar="FILE")]
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a command returns that shows less, or more, than its figures, or whose figures miss a bar.
+
+    Attributes:
+        figures: all of them, which `--json` prints.
+        shown: what is printed else, one below another: figures, rows or text; `figures` if not given.
+        passed: whether the command leaves with exit code 0, and not 1.
+    """
+
+    figures: Figures
+    shown: Sequence[Figures | str] | None = None
+    passed: bool = True
+
+
+def show_answer(answer: Answer | Figures | None, *, as_json: bool) -> None:
+    """Print what a command returns, as JSON or as text, and leave with exit code 1 if a figure misses its bar."""
+    if answer is None:
+        return
+    full = answer if isinstance(answer, Answer) else Answer(answer)
+    for part in [full.figures] if as_json or full.shown is None else full.shown:
+        if isinstance(part, str):
+            print(part)
+        elif isinstance(part, Mapping):
+            show(part, as_json=as_json)
+        else:
+            show_rows(part, as_json=as_json)
+    if not full.passed:
+        sys.exit(EXIT_FAILED)
 
 
 def show(figures: Mapping[str, Any], *, as_json: bool) -> None:

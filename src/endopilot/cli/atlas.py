@@ -4,21 +4,19 @@ from __future__ import annotations
 
 from endopilot.anatomy.io import write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_atlas
-from endopilot.cli.arguments import OutputFolder, show_rows
+from endopilot.cli.arguments import Figures, OutputFolder
 from endopilot.progress import progress
 
 
 def command(
     *,
     output: OutputFolder,
-    json: bool = False,
     config: AtlasConfig = AtlasConfig(),
-) -> None:
+) -> Figures:
     """Make synthetic patients whose vessels match published statistics: an anatomy folder for each.
 
     Args:
         output: folder that takes an anatomy folder for each patient.
-        json: print the figures as JSON.
         config: the patients to make.
     """
     rows = []
@@ -35,4 +33,4 @@ def command(
                 }
             )
             advance()
-    show_rows(rows, as_json=json)
+    return rows

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from tyro.conf import Positional
 
-from endopilot.cli.arguments import existing
+from endopilot.cli.arguments import Existing
 from endopilot.errors import InputError
 from endopilot.settings import CountOrZero, Text, Within, settings
 
@@ -25,17 +25,17 @@ class ListenConfig:
 
 
 def command(
-    patient: Positional[Path | None] = None,
+    patient: Positional[Existing | None] = None,
     /,
     *,
     device: str = "workhorse-014",
     catheter: tuple[str, ...] = (),
     task: str | None = None,
     world: CountOrZero = 0,
-    replay: Path | None = None,
+    replay: Existing | None = None,
     episode: Path | None = None,
-    resume: Path | None = None,
-    ct: Path | None = None,
+    resume: Existing | None = None,
+    ct: Existing | None = None,
     output: Path = Path("runs/cockpit"),
     browser: bool = True,
     listen: ListenConfig = ListenConfig(),
@@ -65,19 +65,16 @@ def command(
     from endopilot.cockpit.launch import serve
     from endopilot.cockpit.open import open_replay, open_session, open_task, resume_session
 
-    folder, volume = patient and existing(patient), ct and existing(ct)
     if replay is not None:
-        opened = open_replay(
-            existing(replay), folder, device=device, catheters=catheter, world=world, task=task, ct=volume
-        )
+        opened = open_replay(replay, patient, device=device, catheters=catheter, world=world, task=task, ct=ct)
     elif catheter and (task is not None or resume is not None):
         raise InputError("catheter: a task and a session have theirs; leave it out")
     elif task is not None:
         opened = open_task(task, world, output=output)
     elif resume is not None:
-        opened = resume_session(existing(resume), ct=volume)
+        opened = resume_session(resume, ct=ct)
     else:
-        opened = open_session(folder, device=device, catheters=catheter, ct=volume, output=output)
+        opened = open_session(patient, device=device, catheters=catheter, ct=ct, output=output)
 
     def listening(address: str) -> None:
         print(f"page       {address}", flush=True)
@@ -94,5 +91,5 @@ def _write_episode(session: Path | None, output: Path) -> None:
 
     if session is None:
         raise InputError("episode: names no session; give --replay SESSION too")
-    write_session_episode(existing(session), output)
+    write_session_episode(session, output)
     print(f"episode    {output}")

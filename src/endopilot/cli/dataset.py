@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from tyro.conf import Positional
 
-from endopilot.cli.arguments import OutputFolder, existing, show
+from endopilot.cli.arguments import Existing, Figures, OutputFolder
 from endopilot.dataset.config import DatasetConfig
-from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import read_device
+from endopilot.devices.stack import Stack
 from endopilot.files import read_json
 
 
 def command(
-    anatomies: Positional[tuple[Path, ...]],
+    anatomies: Positional[tuple[Existing, ...]],
     /,
     *,
     output: OutputFolder,
     device: str = "workhorse-014",
     catheter: tuple[str, ...] = (),
     scheduler: str | None = None,
-    json: bool = False,
     config: DatasetConfig = DatasetConfig(),
-) -> None:
+) -> Figures:
     """Simulate random navigations of many patients and store them as a LeRobot v3 dataset.
 
     An interrupted run goes on where it stopped when the same command is given again.
@@ -36,21 +33,16 @@ def command(
             driven at random and independently, by velocity.
         scheduler: address of a Dask scheduler (tcp://host:8786) whose workers simulate and share these folders; the
             cores of this machine if not given.
-        json: print the figures as JSON.
         config: how many navigations, how long, and how they are split.
     """
     from endopilot.dataset.generate import generate_dataset  # an extra brings its libraries; --help needs none
 
     generate_dataset(
-        [existing(folder) for folder in anatomies],
+        anatomies,
         output,
-        read_device(device),
+        Stack(read_device(device), tuple(read_catheter(name) for name in catheter)),
         config,
-        catheters=[read_catheter(name) for name in catheter],
         scheduler=scheduler,
     )
     info = read_json(output / "meta" / "info.json")
-    show(
-        {"dataset": str(output), "episodes": info["total_episodes"], "samples": info["total_frames"]},
-        as_json=json,
-    )
+    return {"dataset": output, "episodes": info["total_episodes"], "samples": info["total_frames"]}

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import sys
 from typing import Any
 
 from tyro.conf import Positional
 
-from endopilot.cli.arguments import show_rows
+from endopilot.cli.arguments import Answer
 from endopilot.devices.device import read_device
 from endopilot.devices.device_files import device_file, device_yaml, is_shipped, list_devices, user_devices
 from endopilot.errors import InputError
 from endopilot.simulation.tip_load import tip_load_row
 
-EXIT_FAILED = 1
-
 
 def command(
-    devices: Positional[tuple[str, ...]] = (), /, *, tip_load: bool = False, yaml: bool = False, json: bool = False
-) -> None:
+    devices: Positional[tuple[str, ...]] = (), /, *, tip_load: bool = False, yaml: bool = False
+) -> Answer | None:
     """List devices: diameter, bending stiffness EI and torsional stiffness GJ at tip and shaft, tip load, tip shape.
 
     A device is shipped, or a YAML file in ~/.config/endopilot/devices or in the folder that ENDOPILOT_DEVICES names; it
@@ -28,19 +25,16 @@ def command(
         devices: names of devices or paths of YAML files; all known devices by default.
         tip_load: simulate the tip-load test instead; exit code 1 if a device's error exceeds the bar.
         yaml: print the file of one device instead, to start one of your own from.
-        json: print the rows as JSON.
     """
     if yaml:
         if len(devices) != 1:
             raise InputError(f"--yaml: {len(devices)} devices; name the one to print")
         read_device(devices[0])
         print(device_yaml(devices[0])[1], end="")
-        return
+        return None
     names = devices or (*list_devices(), *user_devices())
     rows = [tip_load_row(read_device(name)) if tip_load else _row(name) for name in names]
-    show_rows(rows, as_json=json)
-    if any(row.get("passed") is False for row in rows):
-        sys.exit(EXIT_FAILED)
+    return Answer(rows, passed=all(row.get("passed") is not False for row in rows))
 
 
 def _row(name: str) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
-from endopilot.cli.arguments import OutputFolder, existing, show, show_rows
+from endopilot.cli.arguments import Answer, Existing, Figures, OutputFolder
 from endopilot.evaluation.evaluate import EvaluateConfig, evaluate
 from endopilot.evaluation.results import FIGURES_FOLDER, METRICS_FILE, REPORT_FILE, RESULTS_FILE
 from endopilot.report.report_text import mean_errors
@@ -17,11 +17,10 @@ def command(
     /,
     *,
     output: OutputFolder,
-    dataset: Path | None = None,
+    dataset: Existing | None = None,
     other_seeds: tuple[Path, ...] = (),
-    json: bool = False,
     config: EvaluateConfig = EvaluateConfig(),
-) -> None:
+) -> Answer:
     """Roll the networks of a run out in open loop (protocols P1 to P4) and measure their errors.
 
     Args:
@@ -30,20 +29,17 @@ def command(
         dataset: dataset to evaluate on; the one that the run was trained on if not given.
         other_seeds: runs of the same training with other seeds; their errors in P1 are reported beside the run's, with
             mean and standard deviation.
-        json: print all of metrics.json.
         config: what to evaluate.
     """
     from endopilot.report.evaluation_report import report_evaluation  # matplotlib and plotly are slow to import
 
-    metrics = evaluate(run, output, config, existing(dataset) if dataset else None, other_seeds)
+    metrics = evaluate(run, output, config, dataset, other_seeds)
     report_evaluation(output)
-    if json:
-        show(metrics, as_json=True)
-        return
+    shown: list[Figures | str] = []
     for split, record in metrics["splits"].items():
         counts = f"{record['episodes']} navigations, patients: {len(record['anatomies'])}"
-        print(f"{record['title']} ({split}; {counts}): mean absolute error, mm, by s after the given states")
-        show_rows(mean_errors(metrics, split), as_json=False)
+        shown.append(f"{record['title']} ({split}; {counts}): mean absolute error, mm, by s after the given states")
+        shown.append(mean_errors(metrics, split))
     names = {"report": REPORT_FILE, "figures": FIGURES_FOLDER, "metrics": METRICS_FILE, "predictions": RESULTS_FILE}
     files = {name: output / file for name, file in names.items()}
-    show({"findings": metrics["findings"], **files}, as_json=False)
+    return Answer(metrics, [*shown, {"findings": metrics["findings"], **files}])

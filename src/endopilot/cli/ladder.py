@@ -2,28 +2,21 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
 
-from tyro.conf import arg
-
-from endopilot.cli.arguments import existing, show, show_rows
+from endopilot.cli.arguments import Answer, Existing, OutputFolder
 from endopilot.ladder.ladder import LadderConfig, climb
-
-EXIT_FAILED = 1
 
 
 def command(
     *,
-    output: Annotated[Path | None, arg(name="output", aliases=("-o",), metavar="DIR")] = None,
+    output: OutputFolder | None = None,
     mismatch: float = 0.0,
-    check: Path | None = None,
+    check: Existing | None = None,
     page: bool = True,
-    json: bool = False,
     config: LadderConfig = LadderConfig(),
-) -> None:
+) -> Answer:
     """Let a policy climb the ladder: twelve tasks, each in twenty synthetic patients. An interrupted run goes on.
 
     The output folder gets the scores, a page with pictures and replays, and submission.json: it holds all that others
@@ -37,12 +30,10 @@ def command(
         check: a submission.json. Its recorded controls are driven again, without the policy, and its scores confirmed
             to the bit; exit code 1 if one differs. Nothing else is done.
         page: write index.html with pictures and replays; --no-page leaves it out.
-        json: print the scores as JSON.
         config: which policy, tasks and patients.
     """
     if check is not None:
-        _check(check, as_json=json)
-        return
+        return _confirmed(check)
     from endopilot.ladder.mismatch import PICTURE_FILE, measure_mismatch
     from endopilot.ladder.submission import SUBMISSION_FILE
     from endopilot.report.ladder_page import write_page
@@ -50,19 +41,16 @@ def command(
     name = config.policy.replace(":", ".")
     folder = output or Path("runs") / ("ladder-mismatch" if mismatch else "ladder") / name
     rows = measure_mismatch(folder, config, mismatch) if mismatch else climb(folder, config)
-    show_rows(rows, as_json=json)
     if mismatch:
         made = {"picture": folder / PICTURE_FILE}
     else:
         made = ({"page": write_page(folder)} if page else {}) | {"submission": folder / SUBMISSION_FILE}
-    if not json:
-        show({name: str(path) for name, path in made.items()}, as_json=False)
+    return Answer(rows, [rows, made])
 
 
-def _check(file: Path, *, as_json: bool) -> None:
+def _confirmed(file: Path) -> Answer:
     from endopilot.ladder.submission import check_submission
 
-    checked = check_submission(existing(file))
-    show({"confirmed": checked.difference is None} | asdict(checked), as_json=as_json)
-    if checked.difference is not None:
-        sys.exit(EXIT_FAILED)
+    checked = check_submission(file)
+    confirmed = checked.difference is None
+    return Answer({"confirmed": confirmed} | asdict(checked), passed=confirmed)

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from tyro.conf import Positional
 
-from endopilot.cli.arguments import OutputFolder, existing, show
+from endopilot.cli.arguments import Existing, Figures, OutputFolder
 from endopilot.control.navigate_patient import NavigatePatientConfig
 from endopilot.pipeline.navigation import navigate_into
 
 
 def command(
-    anatomy: Positional[Path],
+    anatomy: Positional[Existing],
     /,
     *,
     target: str,
     output: OutputFolder,
-    json: bool = False,
     config: NavigatePatientConfig = NavigatePatientConfig(),
-) -> None:
+) -> Figures:
     """Let a policy drive a wire to a place of a patient's vessel: simulated robot, X-ray only when the policy asks.
 
     The folder gets navigation.html (replay and course), navigation.csv, navigation.png, controls.csv and wire.yaml for
@@ -31,7 +28,6 @@ def command(
         target: section label such as 4 or LAD, or point X,Y,Z in LPS mm (--target=-1.5,2,3 where it begins with a
             minus).
         output: folder of the results.
-        json: print the figures as JSON.
         config: policy, wire, limits, and how reality differs from what the policy is given.
     """
-    show(navigate_into(existing(anatomy), target, output, config), as_json=json)
+    return navigate_into(anatomy, target, output, config)

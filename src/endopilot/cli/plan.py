@@ -6,7 +6,7 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
-from endopilot.cli.arguments import OutputFolder, existing, show
+from endopilot.cli.arguments import Existing, Figures, OutputFolder
 from endopilot.control.plan import plan
 from endopilot.control.plan_config import PlanConfig
 from endopilot.control.plan_file import write_plan
@@ -16,7 +16,7 @@ from endopilot.errors import InputError
 
 
 def command(
-    anatomy: Positional[Path],
+    anatomy: Positional[Existing],
     /,
     *,
     target: str,
@@ -25,9 +25,8 @@ def command(
     device: str | None = None,
     catheter: tuple[str, ...] = (),
     xray: bool = False,
-    json: bool = False,
     config: PlanConfig = PlanConfig(),
-) -> None:
+) -> Figures:
     """Plan a navigation to a target.
 
     Args:
@@ -43,13 +42,12 @@ def command(
             YAML file.
         xray: also predict when X-ray will be needed, with the calibration that `endopilot advise` wrote into the run
             (inverse, mppi), or with that of the agent's simulated wires (other methods).
-        json: print the figures as JSON.
         config: method, limits and cost.
     """
     if xray and catheter:
         raise InputError("--xray: takes a wire alone; leave --xray or --catheter out")
     calibration = read_calibration(config, model) if xray else None
     catheters = [read_catheter(name) for name in catheter]
-    found = plan(existing(anatomy), target, config, model=model, device=device, catheters=catheters)
+    found = plan(anatomy, target, config, model=model, device=device, catheters=catheters)
     needed = None if calibration is None else plan_xray(found, calibration)
-    show(write_plan(found, output, needed), as_json=json)
+    return write_plan(found, output, needed)

@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from tyro.conf import Positional
 
-from endopilot.cli.arguments import OutputFolder, existing, show
+from endopilot.cli.arguments import Existing, Figures, OutputFolder
 from endopilot.pipeline.study import RunConfig, run_volume
 
 
 def command(
-    volume: Positional[Path],
+    volume: Positional[Existing],
     /,
     *,
     output: OutputFolder,
     target: str | None = None,
     series: str | None = None,
     phase: str | None = None,
-    json: bool = False,
     config: RunConfig = RunConfig(),
-) -> None:
+) -> Figures:
     """Run every stage on one patient, from the CT angiogram to the report.
 
     With --target the agent drives the wire to a place of the vessel, as `endopilot navigate` does with its defaults;
@@ -35,8 +32,6 @@ def command(
         target: section label such as 4 or LAD, or point X,Y,Z in LPS mm, to which the agent drives the wire.
         series: number or instance UID of the series, where a DICOM folder holds several.
         phase: cardiac phase, such as 75 (per cent), where a DICOM series holds several.
-        json: print the figures as JSON.
         config: segmentation, device and size of the study.
     """
-    figures = run_volume(existing(volume), output, config, series=series, phase=phase, target=target)
-    show(figures, as_json=json)
+    return run_volume(volume, output, config, series=series, phase=phase, target=target)

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from pathlib import Path
 
 from tyro.conf import Positional
 
-from endopilot.cli.arguments import OutputFile, existing, show
-from endopilot.errors import InputError
+from endopilot.cli.arguments import Existing, Figures, OutputFile, Picture
 from endopilot.files import input_hash, manifest
 from endopilot.imaging.overlap import compare_masks
 from endopilot.imaging.segment import SegmentConfig, segment
@@ -16,17 +14,16 @@ from endopilot.imaging.volume import check_output, read_mask, read_volume, write
 
 
 def command(
-    volume: Positional[Path],
+    volume: Positional[Existing],
     /,
     *,
     output: OutputFile,
     series: str | None = None,
     phase: str | None = None,
-    reference: Path | None = None,
-    picture: Path | None = None,
-    json: bool = False,
+    reference: Existing | None = None,
+    picture: Picture | None = None,
     config: SegmentConfig = SegmentConfig(),
-) -> None:
+) -> Figures:
     """Segment the lumen of a vessel tree in a CT angiogram.
 
     A JSON file beside the mask holds the ostium, the method, the manifest, and warnings of what is doubtful.
@@ -38,20 +35,17 @@ def command(
         phase: cardiac phase, such as 75 (per cent), where a DICOM series holds several.
         reference: another mask of the same vessel; the agreement is printed, and its outline is red in the picture.
         picture: PNG of three slices with the mask's outline in green.
-        json: print the figures as JSON.
         config: method, vessel and seeds.
     """
     check_output(output, mask=True)
-    if picture is not None and picture.suffix.lower() != ".png":
-        raise InputError(f"{picture}: a picture is written as PNG; name it with .png")
-    other = read_mask(existing(reference)) if reference is not None else None
-    ct = read_volume(existing(volume), series=series, phase=phase)
+    other = read_mask(reference) if reference is not None else None
+    ct = read_volume(volume, series=series, phase=phase)
     mask = segment(ct, config)
     agreement = compare_masks(mask, other) if other is not None else None
     write_mask(mask, output, manifest=manifest(config=config, inputs=input_hash(volume, ct.files)))
     volume_ml = float(mask.volume.voxels.sum() * mask.volume.spacing_mm.prod() / 1000)
     ostium = mask.ostium.position.round(2).tolist() if mask.ostium is not None else None
-    figures = {"mask": str(output), "method": mask.method, "lumen_ml": round(volume_ml, 3), "ostium_lps_mm": ostium}
+    figures = {"mask": output, "method": mask.method, "lumen_ml": round(volume_ml, 3), "ostium_lps_mm": ostium}
     figures["warnings"] = list(mask.warnings)
     if agreement is not None:
         figures |= {name: round(value, 4) for name, value in asdict(agreement).items()}
@@ -59,5 +53,5 @@ def command(
         from endopilot.imaging.overlay_picture import draw_overlay  # matplotlib is slow to import
 
         draw_overlay(ct, mask, picture, reference=other)
-        figures["picture"] = str(picture)
-    show(figures, as_json=json)
+        figures["picture"] = picture
+    return figures

@@ -11,7 +11,7 @@ import numpy as np
 from tyro.conf import Positional
 
 from endopilot.anatomy.io import read_anatomy
-from endopilot.cli.arguments import OutputFile, existing, show
+from endopilot.cli.arguments import Existing, Figures, OutputFile
 from endopilot.control.plan_file import read_plan
 from endopilot.dataset.navigations import simulate_navigations
 from endopilot.devices.catheter import read_catheter
@@ -23,8 +23,9 @@ from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, random_controls, read_controls_csv
 from endopilot.simulation.motion import Motion, MotionName, motion_named
 from endopilot.simulation.simulate import simulate, wall_force_events
-from endopilot.simulation.table import write_rollout
-from endopilot.types import SAMPLE_PERIOD_S, Anatomy, Rollout
+from endopilot.simulation.trajectory import Trajectory
+from endopilot.simulation.trajectory_file import write_trajectory
+from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
 
 @settings
@@ -43,21 +44,20 @@ class RandomConfig:
 
 
 def command(
-    anatomy: Positional[Path],
+    anatomy: Positional[Existing],
     /,
     *,
     output: OutputFile,
     device: str = "workhorse-014",
     catheter: tuple[str, ...] = (),
-    controls: Path | None = None,
+    controls: Existing | None = None,
     motion: MotionName = "still",
     motion_seed: Seed | None = None,
     shape: bool = False,
     picture: Path | None = None,
-    json: bool = False,
     random: RandomConfig = RandomConfig(),
     config: SimulatorConfig = SimulatorConfig(),
-) -> None:
+) -> Figures:
     """Drive a guidewire through an anatomy and record it at 2 Hz, or at the end of each control of a file.
 
     Args:
@@ -73,77 +73,73 @@ def command(
         motion_seed: draws the patient's amplitudes from the published distributions; their means by default.
         shape: also record the positions of all nodes, mm (.npz only).
         picture: PNG of the vessel with the first navigation's wire and catheters at its end.
-        json: print the figures as JSON.
         random: the random controls, if no others are given.
         config: settings of the rod core.
     """
-    patient = read_anatomy(existing(anatomy))
-    wire, catheters = read_device(device), tuple(read_catheter(name) for name in catheter)
+    patient = read_anatomy(anatomy)
+    stack = Stack(read_device(device), tuple(read_catheter(name) for name in catheter))
     moves, period_s = motion_named(motion, motion_seed), SAMPLE_PERIOD_S
     if controls is not None and controls.is_dir():
-        plan = read_plan(controls, patient, wire, catheters)
-        patient, wire = plan.navigation.anatomy, plan.navigation.device
-        initial, control = plan.navigation.start[None], plan.control[None]
+        plan = read_plan(controls, patient, stack.wire, stack.catheters)
+        patient, stack, start = plan.navigation.anatomy, plan.navigation.stack, plan.navigation.start
+        initial, control = start[None], plan.control.reshape(1, -1, *start.shape)
     elif controls is not None:
-        script = read_controls_csv(existing(controls), catheters=len(catheters))
+        script = read_controls_csv(controls, devices=len(stack))
         initial, control, period_s = script.initial, script.control, script.period_s
     else:
         initial, control = random_controls(
             ControlConfig(),
-            catheters=len(catheters),
+            devices=len(stack),
             n_sequences=random.sequences,
             n_samples=round(random.seconds / SAMPLE_PERIOD_S),
             seed=random.seed,
             max_inserted_length_mm=float(patient.tree.longest_path().abscissa[-1]),
         )
-    rollout, stopped, record_shape = None, None, shape or picture is not None
+    trajectory, stopped, record_shape = None, None, shape or picture is not None
     if controls is None and random.stop_short:
-        rollout, initial, control, stopped = _stopped_short(
-            patient, Stack(wire, catheters), initial, control, moves, config
-        )
-    # The controls that were made give the same navigations again.
-    if rollout is None or record_shape or moves is not None:
-        rollout = simulate(
+        trajectory, stopped = _stopped_short(patient, stack, initial, control, moves, config)
+        initial, control = trajectory.set_up.initial, trajectory.command  # they give the same navigations again
+    if trajectory is None or record_shape:
+        trajectory = simulate(
             patient,
-            wire,
+            stack,
             control,
-            catheters=catheters,
             initial=initial,
             config=config,
             record_shape=record_shape,
             period_s=period_s,
             motion=moves,
         )
-    write_rollout(rollout if shape else replace(rollout, shape=None), output)
-    valid = rollout.valid
+    write_trajectory(trajectory if shape else replace(trajectory, shape=None), output)
+    valid, force, torque = trajectory.valid, np.abs(trajectory.base_force), np.abs(trajectory.base_torque)
     figures = {
-        "rollout": str(output),
+        "rollout": output,
         "worlds": int(valid.shape[0]),
         "samples": int(valid.shape[1]),
         "valid_worlds": int(valid[:, -1].sum()),
         **({} if stopped is None else {"worlds_stopped_short": int(stopped.sum())}),
-        "slipped_worlds": int(((rollout.slip != 0) | (rollout.rotation_slip != 0)).any(axis=1).sum()),
-        "deepest_tip_mm": _largest(rollout.tip.abscissa, valid),
-        "largest_contact_force_n": _largest(rollout.contact_force_max, valid),
-        "largest_wall_force_n": _largest(rollout.wall_force, valid),
-        "wall_force_worlds": len(wall_force_events(rollout)),
-        "largest_base_force_n": _largest(np.abs(rollout.base_force), valid),
-        "largest_base_torque_n_mm": _largest(np.abs(rollout.base_torque), valid),
+        "slipped_worlds": int(((trajectory.slip != 0) | (trajectory.rotation_slip != 0))[..., 0].any(axis=1).sum()),
+        "deepest_tip_mm": _largest(trajectory.tip.abscissa[..., 0], valid),
+        "largest_contact_force_n": _largest(trajectory.contact_force_max, valid),
+        "largest_wall_force_n": _largest(trajectory.wall_force, valid),
+        "wall_force_worlds": len(wall_force_events(trajectory)),
+        "largest_base_force_n": _largest(force[..., 0], valid),
+        "largest_base_torque_n_mm": _largest(torque[..., 0], valid),
     }
-    if rollout.catheters is not None:
-        figures["largest_catheter_force_n"] = _largest(np.abs(rollout.catheters.base_force).max(axis=-1), valid)
-        figures["largest_catheter_torque_n_mm"] = _largest(np.abs(rollout.catheters.base_torque).max(axis=-1), valid)
+    if stack.catheters:
+        figures["largest_catheter_force_n"] = _largest(force[..., 1:].max(axis=-1), valid)
+        figures["largest_catheter_torque_n_mm"] = _largest(torque[..., 1:].max(axis=-1), valid)
     if picture is not None:
         from endopilot.report.scene import visible_devices  # plotly is slow to import
         from endopilot.report.still import render_still
 
-        shown, devices = visible_devices(rollout, 0, -1), Stack(wire, catheters).devices
+        shown, devices = visible_devices(trajectory, 0, -1), stack.devices
         missing = render_still(patient, shown, picture, devices=devices)
         if missing is None:
-            figures["picture"] = str(picture)
+            figures["picture"] = picture
         else:
             print(missing, file=sys.stderr)
-    show(figures, as_json=json)
+    return figures
 
 
 def _stopped_short(
@@ -153,18 +149,17 @@ def _stopped_short(
     control: np.ndarray,
     motion: Motion | None,
     config: SimulatorConfig,
-) -> tuple[Rollout, np.ndarray, np.ndarray, np.ndarray]:
-    """Return random navigations that stop short of the ends, their starts, their controls, and which were stopped."""
+) -> tuple[Trajectory, np.ndarray]:
+    """Return random navigations that stop short of the ends, and which were stopped."""
     worlds, samples = control.shape[:2]
     with progress("Simulating the wire", total=worlds * samples) as advance:
         return simulate_navigations(
             patient,
-            [stack.wire] * worlds,
+            [stack] * worlds,
             initial,
             control,
-            np.full(worlds, stack.wire.friction),
+            np.tile([each.friction for each in stack.devices], (worlds, 1)),
             config,
-            catheters=stack.catheters,
             motion=motion,
             advance=advance,
         )

@@ -2,39 +2,35 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from tyro.conf import Positional
 
 from endopilot.anatomy.io import read_anatomy
-from endopilot.cli.arguments import OutputFile, existing, show
+from endopilot.cli.arguments import Existing, Figures, OutputFile
 from endopilot.imaging.volume import read_volume
 from endopilot.xray.take_image import TakeImageConfig, take_image
 
 
 def command(
-    anatomy: Positional[Path],
+    anatomy: Positional[Existing],
     /,
     *,
     output: OutputFile,
-    ct: Path | None = None,
-    json: bool = False,
+    ct: Existing | None = None,
     config: TakeImageConfig = TakeImageConfig(),
-) -> None:
+) -> Figures:
     """Push a wire, alone or in a catheter, into a vessel, and take an X-ray image: fluoroscopy, contrast, DSA, roadmap.
 
     Args:
         anatomy: folder made by `endopilot anatomy` or `endopilot atlas`.
         output: the image, .png.
         ct: CT angiogram of the patient, HU; a synthetic chest around a coronary artery, else water, if not given.
-        json: print the figures as JSON.
         config: what is shown, from where, at which dose.
     """
-    volume = None if ct is None else read_volume(existing(ct))
-    image = take_image(read_anatomy(existing(anatomy)), config, volume)
+    volume = None if ct is None else read_volume(ct)
+    image = take_image(read_anatomy(anatomy), config, volume)
     image.write(output)
     tip = None if image.tip_pixel is None else [round(float(value), 2) for value in image.tip_pixel]
-    figures = {"image": str(output), "tip_row_column": tip, "mm_per_pixel": round(image.mm_per_pixel, 4)}
+    figures = {"image": output, "tip_row_column": tip, "mm_per_pixel": round(image.mm_per_pixel, 4)}
     if volume is not None and volume.notes:
         figures["ct_notes"] = list(volume.notes)
-    show(figures | {"frames": image.frames, "air_kerma_ugy": round(image.air_kerma_ugy, 3)}, as_json=json)
+    return figures | {"frames": image.frames, "air_kerma_ugy": round(image.air_kerma_ugy, 3)}

@@ -1,6 +1,6 @@
 """A policy at the wheel of the cockpit's world.
 
-Every decision period it observes, decides, and drives until the next. A policy that plans takes its time: it decides
+The world's navigation loop is handed over to it, and back to the hand. A policy that plans takes its time: it decides
 in a thread of its own, and the world's clock stands still meanwhile. While a hand drives, a policy that can be led
 watches.
 """
@@ -16,12 +16,11 @@ import numpy as np
 
 from endopilot.cockpit.frames import encode
 from endopilot.cockpit.world import Snapshot, World
+from endopilot.devices.stack import Proximals, shown_part
 from endopilot.errors import InputError
 from endopilot.navigation.policies import make_policy
 from endopilot.navigation.policy import BelievedTip, Believer, Decision, Led, Observation, Policy
-from endopilot.devices.stack import shown_part
-from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target
-from endopilot.xray.fluoroscope import Fluoroscope, FluoroscopeConfig, TipMeasurement
+from endopilot.tasks.navigation import Navigation, Target
 
 SECONDS = 600.0
 """Time that a policy is given, s."""
@@ -43,15 +42,12 @@ class Autopilot:
         """Take the world; nobody drives yet."""
         self.status, self.policy_name, self.asks, self.failure = "off", "", "", ""
         self._world, self._pool = world, ThreadPoolExecutor(1)
-        self._random = np.random.default_rng([_SEED, 2])
         self._policy: Policy | None = None
         self._target: Target | None = None
         self._pending: Future[Decision | None] | None = None
         self._believed: BelievedTip | None = None
-        self._fluoroscope: Fluoroscope | None = None
-        self._due = self._began = 0
-        self._expose, self._started = True, False
-        self._turned: tuple[float, ...] = ()  # of catheters as the policy began
+        self._began_s, self._started = 0.0, False
+        self._turned: tuple[float, ...] = ()  # each device as the policy began; the wire's turns are told
 
     @property
     def drives(self) -> bool:
@@ -61,10 +57,10 @@ class Autopilot:
     @property
     def waits(self) -> bool:
         """Whether the world must wait for the policy's decision."""
-        return self.drives and (self._pending is not None or self._due <= self._world.cycle)
+        return self.drives and (self._pending is not None or self._world.loop.between_periods)
 
     def start(self, name: str, target: Target) -> None:
-        """Hand the wheel to a policy, or back to it.
+        """Hand the wheel to a policy, or back to it, from the next decision on.
 
         Args:
             name: of the policy.
@@ -73,65 +69,56 @@ class Autopilot:
         """
         if self._policy is None or (name, target) != (self.policy_name, self._target) or not self._led:
             self._policy, self.policy_name, self._target = None, name, target
-            self._began, self._started, self._believed = self._world.cycle, False, None
-        self.status, self.failure, self._expose = "drives", "", True
-        self._due = self._world.cycle
+            self._started, self._believed = False, None
+        self.status, self.failure = "drives", ""
+        self._world.loop.hand_over(None)
 
     def pause(self, paused: bool) -> None:
         """Let the policy wait, or go on."""
         if paused and self.drives:
-            self.status = "paused"
+            self._let_go("paused")
         elif not paused and self.status == "paused":
-            self.status, self._due = "drives", self._world.cycle
+            self.status = "drives"
+            self._world.loop.hand_over(None)
 
     def stop(self) -> None:
         """Take the wheel from the policy; one that can be led goes on watching."""
         if self.status not in ("off", "failed"):
-            self.status = "watches" if self._led else "off"
+            self._let_go("watches" if self._led else "off")
         self.asks = ""
 
-    def think(self, snapshot: Snapshot, expose: Callable[[], None]) -> Decision | None:
-        """Go on with what the policy has to do now; return its decision when there is one.
+    def think(self, expose: Callable[[], None]) -> Proximals | None:
+        """Go on with what the policy has to do now; return what the robot has been commanded, if anything.
 
         Args:
-            snapshot: the world.
             expose: takes an X-ray image for the page, if the policy has one.
         """
         if self._pending is not None:
-            return self._collect(snapshot)
-        if self._due > self._world.cycle or not (self.drives or self.status == "watches"):
+            return self._collect()
+        loop = self._world.loop
+        if not loop.between_periods or not (self.drives or self.status == "watches"):
             return None
-        if self.drives and self._world.reaches(self._target):
-            self.status, self.asks = "reached", ""
-            return Decision(0.0, 0.0)
-        state, tip = self._world.robot.proximal_state(), None
+        if self.drives and loop.reached:
+            return self._end("reached")
         if not self._started:
-            self._turned = tuple(turn for _, turn in state.catheters)
+            self._turned = (0.0, *(turn for _, turn in loop.robot.proximal_state().devices[1:]))
             if crooked := self._turned_catheter():
-                self.status, self.asks = "failed", ""
-                self.failure = f"{self.policy_name}: begins with unturned catheters; turn {crooked} back to 0° first"
-                return Decision(0.0, 0.0)
-        if self.drives and self._expose:
+                return self._end(
+                    "failed", f"{self.policy_name}: begins with unturned catheters; turn {crooked} back to 0° first"
+                )
+        observation = self._world.observe() if self.drives else self._world.begin()
+        if observation.tip is not None:
             expose()
-            tip = self._measure(snapshot, state.inserted_length)
-        time_s = (self._world.cycle - self._began) * self._world.config.cycle_s
-        catheters = tuple((at, turn - began) for (at, turn), began in zip(state.catheters, self._turned, strict=True))
-        observation = Observation(time_s, state.inserted_length, state.rotation, tip, catheters)
         start = None
         if not self._started:
-            start = replace(
-                self._world.navigation_to(self._target),
-                start_inserted_mm=max(state.inserted_length, 0.0),
-                start_rotation=state.rotation,
-                start_catheter_mm=max([0.0, *(at for at, _ in state.catheters)]),
-                seconds=SECONDS,
-            )
-            self._started = True
-        if self.drives:
-            self._pending = self._pool.submit(self._decide, start, observation)
-        else:
-            self._pending = self._pool.submit(self._watch, observation)
-        self._due = self._world.cycle + round(DECISION_PERIOD_S / self._world.config.cycle_s)
+            start, self._began_s, self._started = self._navigation(observation), observation.time_s, True
+        devices = zip(observation.devices, self._turned, strict=True)
+        seen = replace(
+            observation,
+            time_s=observation.time_s - self._began_s,
+            devices=tuple((at, turn - began) for (at, turn), began in devices),
+        )
+        self._pending = self._pool.submit(self._decide if self.drives else self._watch, start, seen)
         if self.drives:
             self.status = "thinking"
         return None
@@ -175,7 +162,7 @@ class Autopilot:
     def _led(self) -> bool:
         return isinstance(self._policy, Led)
 
-    def _collect(self, snapshot: Snapshot) -> Decision | None:
+    def _collect(self) -> Proximals | None:
         """Take the decision that was pending, if it has been made."""
         pending = self._pending
         assert pending is not None
@@ -185,43 +172,57 @@ class Autopilot:
         try:
             decision = pending.result()
         except Exception as error:  # a policy may be anybody's: whatever it raises is told in the page
-            self.status, self.failure, self.asks = "failed", f"{self.policy_name}: {' '.join(str(error).split())}", ""
             self._policy = None
-            return Decision(0.0, 0.0)
+            return self._end("failed", f"{self.policy_name}: {' '.join(str(error).split())}")
         if isinstance(self._policy, Believer):
             self._believed = self._policy.believed()
         if decision is None or self.status != "thinking":
             return None  # taken over or paused meanwhile
         if decision.gives_up:
-            self.status, self.failure, self.asks = "gave up", f"{self.policy_name} gives up: {decision.gives_up}", ""
-            return Decision(0.0, 0.0)
-        self.status, self._expose = "drives", bool(decision.expose)
+            return self._end("gave up", f"{self.policy_name} gives up: {decision.gives_up}")
+        self.status = "drives"
         told = "" if self._believed is None else self._believed.asks
         self.asks = (told or "the policy asks for it") if decision.expose else ""
-        return decision
+        return self._world.loop.take(decision).devices
+
+    def _let_go(self, status: str) -> None:
+        """Let the hand drive from now on."""
+        self.status = status
+        self._world.loop.hand_over(self._world.hand)
+
+    def _end(self, status: str, failure: str = "") -> Proximals:
+        """Let the hand drive from now on, and the devices stand still."""
+        self._let_go(status)
+        self.asks, self.failure = "", failure
+        return self._world.command(())
+
+    def _navigation(self, observation: Observation) -> Navigation:
+        """Return the navigation as it begins for the policy, from where the devices are."""
+        (inserted, turned), *around = observation.devices
+        return replace(
+            self._world.navigation,
+            start_inserted_mm=max(inserted, 0.0),
+            start_rotation=turned,
+            start_catheter_mm=max([0.0, *(at for at, _ in around)]),
+            seconds=SECONDS,
+        )
 
     def _turned_catheter(self) -> str:
         """Return the name of a curved catheter that the policy would take for unturned and is not; empty if none is."""
-        for catheter, turn in zip(self._world.navigation.catheters, self._turned, strict=True):
+        for catheter, turn in zip(self._world.navigation.catheters, self._turned[1:], strict=True):
             if catheter.shape and np.cos(turn) < np.cos(_UNTURNED_RAD):
                 return catheter.name
         return ""
 
-    def _measure(self, snapshot: Snapshot, inserted_mm: float) -> TipMeasurement:
-        navigation = self._world.navigation
-        if self._fluoroscope is None:
-            self._fluoroscope = Fluoroscope(navigation.anatomy, navigation.device.tip_radius_mm, FluoroscopeConfig())
-        return self._fluoroscope.expose(snapshot.nodes[0], snapshot.tip_direction, inserted_mm, self._random)
-
     def _decide(self, start: Navigation | None, observation: Observation) -> Decision:
         """Decide, in a thread of its own; a policy that is new is made and started first."""
         if self._policy is None:
-            self._policy = make_policy(self.policy_name)
+            self._policy = self._world.loop.policy = make_policy(self.policy_name)
         if start is not None:
             self._policy.start(start, _SEED)
-        return self._policy.decide(observation)
+        return self._world.loop.decide(observation)
 
-    def _watch(self, observation: Observation) -> None:
+    def _watch(self, start: Navigation | None, observation: Observation) -> None:
         if isinstance(self._policy, Led):
             self._policy.watch(observation)
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from endopilot.anatomy.io import write_anatomy
 from endopilot.cockpit.recording import read_recording, replayed
-from endopilot.control.navigate_patient import sampled
 from endopilot.dataset.episode import write_episode
+from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.simulation.simulate import simulate
 from endopilot.tasks.navigation import DECISION_PERIOD_S
@@ -36,18 +36,17 @@ def write_session_episode(session: Path, output: Path) -> None:
     if samples == 0:
         raise InputError(f"{session}: lasts less than {DECISION_PERIOD_S:g} s; drive for longer")
     targets = [event["target"] for event in recording.events if "target" in event]
-    navigation, truth = recording.navigation, recording.config.truth
+    navigation, truth = recording.navigation, recording.truth
     *_, (world, _events) = replayed(recording)
     device = navigation.device
     wire = device.with_tip(bend_rad=device.tip_bend_rad, stiffness_factor=truth.stiffness_factor)
-    start = navigation.start
-    start[::2] = np.maximum(start[::2] + truth.ostium_mm, 0.0)
+    start = np.maximum(navigation.start + np.array([truth.ostium_mm, 0.0]), [0.0, -np.inf])
+    commands = np.array(world.loop.robot.driven)[: samples * per_sample].reshape(1, -1, *start.shape)
     friction = device.friction * truth.friction_factor
     cycles = simulate(
         navigation.anatomy,
-        replace(wire, friction=friction),
-        np.array(world.robot.driven)[None, : samples * per_sample],
-        catheters=truth.catheters(navigation.catheters),
+        Stack(replace(wire, friction=friction), truth.catheters(navigation.catheters)),
+        commands,
         initial=start[None],
         config=recording.config.simulator,
         period_s=recording.config.cycle_s,
@@ -58,15 +57,13 @@ def write_session_episode(session: Path, output: Path) -> None:
         write_anatomy(navigation.anatomy, folder)
     target = targets[-1] if targets else [navigation.target.branch, navigation.target.abscissa]
     write_episode(
-        sampled(cycles),
+        cycles.every(per_sample),
         folder,
         output,
-        device,
+        navigation.stack,
         task="navigation by hand",
         friction=friction,
         tip_stiffness_factor=truth.stiffness_factor,
-        simulator=recording.config.simulator,
-        catheters=navigation.catheters,
         seed=recording.seed,
         origin={"session": session.name, "target_branch": int(target[0]), "target_mm": float(target[1])},
     )

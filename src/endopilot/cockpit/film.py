@@ -116,7 +116,9 @@ def open_film(
         around = tuple(read_catheter(name) for name in catheters)
         plan = read_plan(path, read_anatomy(_given(patient, path)), read_device(device), around)
         start = plan.navigation.start
-        return _controls(plan.navigation, start, plan.control, DECISION_PERIOD_S, f"plan {path.name}")
+        return _controls(
+            plan.navigation, start, plan.control.reshape(-1, *start.shape), DECISION_PERIOD_S, f"plan {path.name}"
+        )
     if (path / "navigation.csv").exists():
         vessel, files = read_anatomy(_given(patient, path)), sorted(path.glob("catheter-*.yaml"))
         return _rollout(path / "controls.csv", vessel, str(path / "wire.yaml"), list(map(str, files)), 0)
@@ -155,18 +157,18 @@ def _session(path: Path) -> Film:
 
 def _controls(
     navigation: Navigation,
-    start: Float[np.ndarray, "numbers"],
-    control: Float[np.ndarray, "n numbers"],
+    start: Float[np.ndarray, "devices 2"],
+    control: Float[np.ndarray, "n devices 2"],
     period_s: float,
     title: str,
     config: SimulatorConfig | None = None,
     friction: float | None = None,
 ) -> Film:
-    """Return a film of controls, mm/s and rad/s of the wire, then of each catheter, each held for a period, s.
+    """Return a film of controls, mm/s and rad/s of each device, each held for a period, s.
 
     Args:
         navigation: vessel, wire and catheters.
-        start: inserted length, mm, and rotation, rad, of the wire, then of each catheter.
+        start: inserted length, mm, and rotation, rad, of each device.
         control: a row a period.
         period_s: time that each is held, s.
         title: of the film.
@@ -174,32 +176,29 @@ def _controls(
         friction: of the wire; the device's own if not given.
     """
     parts = max(round(period_s / FRAME_S), 1)
-    lengths = np.maximum(start[::2], 0.0)  # what was computed back from the end of a period may lie below by a rounding
+    lengths = np.maximum(
+        start[:, 0], 0.0
+    )  # what was computed back from the end of a period may lie below by a rounding
 
     def make() -> Iterator[Frame]:
         simulator = Simulator(
             navigation.anatomy,
-            navigation.device,
-            catheters=navigation.catheters,
+            navigation.stack,
             config=replace(config or SimulatorConfig(), threads=1),
         )
-        simulator.reset(
-            inserted_length=lengths[:1],
-            rotation=start[1:2],
-            catheter_inserted_length=lengths[None, 1:],
-            catheter_rotation=start[None, 3::2],
-            friction=[navigation.device.friction if friction is None else friction],
-        )
-        frame = {"cycle": 0, "time_s": 0.0, "force_n": 0.0, "velocity": (0.0,) * control.shape[1]}
+        own = simulator.set_up.friction.copy()
+        own[:, 0] = own[:, 0] if friction is None else friction
+        simulator.reset(inserted_length=lengths[None], rotation=start[None, :, 1], friction=own)
+        frame = {"cycle": 0, "time_s": 0.0, "force_n": 0.0, "velocity": (0.0,) * start.size}
         yield Frame(take_snapshot(simulator, None, **frame))
-        for number, velocity in enumerate(control.tolist()):
+        for number, velocity in enumerate(control):
             for part in range(parts):
                 step = simulator.step([velocity], period_s / parts)
                 frame = {
                     "cycle": number * parts + part + 1,
                     "time_s": (number + (part + 1) / parts) * period_s,
                     "force_n": float(step.contact_force_max[0]),
-                    "velocity": tuple(velocity),
+                    "velocity": tuple(velocity.ravel().tolist()),
                 }
                 yield Frame(take_snapshot(simulator, step, **frame))
 
@@ -208,13 +207,13 @@ def _controls(
 
 def _rollout(path: Path, anatomy: Anatomy, device: str, catheters: Sequence[str], world: int) -> Film:
     """Return a film of a rollout's or script's controls."""
-    script = read_controls_csv(path, catheters=len(catheters))
+    script = read_controls_csv(path, devices=1 + len(catheters))
     worlds = len(script.control)
     if not 0 <= world < worlds:
         raise InputError(f"world: {world}; {path} has worlds 0 to {worlds - 1}")
     start = script.initial[world]
     wire = read_device(device)
-    leaf = max(anatomy.tree.leaves(), key=lambda branch: anatomy.tree.branches[branch].centerline.abscissa[-1])
+    leaf = anatomy.tree.longest_leaf()
     end = float(anatomy.tree.branches[leaf].centerline.abscissa[-1])
     navigation = Navigation(
         anatomy=anatomy,
@@ -235,13 +234,13 @@ def _episode(folder: Path, number: int) -> Film:
     wire = read_device(str(data.device[number])).with_tip(
         bend_rad=float(data.tip_bend[number]), stiffness_factor=float(data.tip_stiffness_factor[number])
     )
-    branch = int(data.branch[number, -1])
+    branch = int(data.branch[number, -1, 0])
     line = anatomy.tree.branches[branch].centerline.abscissa
     navigation = Navigation(
         anatomy=anatomy,
         device=wire,
-        target=Target(branch=branch, abscissa=float(np.clip(data.tip_abscissa[number, -1], line[0], line[-1]))),
-        catheters=data.catheters,
+        target=Target(branch=branch, abscissa=float(np.clip(data.tip_abscissa[number, -1, 0], line[0], line[-1]))),
+        catheters=data.stack.catheters,
     )
     config = SimulatorConfig(**(settings["config"]["simulator"] | {"threads": 1}))
     friction = float(data.friction[number])
@@ -274,7 +273,7 @@ def _ladder(path: Path, name: str | None, place: int) -> Film:
         loop = NavigationLoop(navigation, Repeated(recording), config=config, seed=navigation_seed(task, place))
         yield Frame(_of_loop(loop, 0.0, (0.0, 0.0) * devices))
         while loop.reason is None:
-            velocity = tuple(chain.from_iterable(loop.begin().velocities(devices)))
+            velocity = tuple(chain.from_iterable(loop.begin().devices))
             exposed = loop.observation is not None and loop.observation.tip is not None
             while loop.reason is None and not loop.between_periods:
                 peak = loop.advance(FRAME_S)

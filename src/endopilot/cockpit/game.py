@@ -1,8 +1,8 @@
 """A task of the ladder, driven by hand with X-ray as the only sight, and scored as policies are.
 
 The clock begins when the page says so. The wire in space, the tip and the wall's force are not sent to the page until
-the end. Then the same code as for policies (`ladder.attempt.figures`) makes the score, and the agent drives the same
-patient in a process of its own, so that both scores stand side by side.
+the end. A hand drives the same loop as policies do, and is scored by the same code (`ladder.attempt.scored`); the agent
+drives the same patient in a process of its own, so that both scores stand side by side.
 """
 
 from __future__ import annotations
@@ -12,20 +12,15 @@ from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
 from endopilot.cockpit import messages
 from endopilot.cockpit.fluoroscopy import XrayUnit
 from endopilot.cockpit.frames import encode
 from endopilot.cockpit.recording import Recorder
 from endopilot.cockpit.session import Session
-from endopilot.cockpit.world import Snapshot, World, WorldConfig
+from endopilot.cockpit.world import BY_HAND, Snapshot, World
 from endopilot.errors import InputError
-from endopilot.ladder.attempt import Recording, attempt, figures, navigation_seed
-from endopilot.navigation.record import Track
+from endopilot.ladder.attempt import attempt, navigation_seed, scored
 from endopilot.parallel import Workers
-from endopilot.simulation.simulator import Simulator
-from endopilot.tasks.navigation import DECISION_PERIOD_S
 from endopilot.tasks.task import CORE, Task
 
 RIVALS = ("agent", "coaxial-agent")
@@ -57,7 +52,7 @@ class Attempt:
 
     def world(self) -> World:
         """Return the world at the task's start, with the ladder's rod core."""
-        config = WorldConfig(simulator=replace(CORE, threads=1))
+        config = replace(BY_HAND, simulator=replace(CORE, threads=1))
         return World(self.task.ladder_navigation(self.place), config, seed=self.seed)
 
     def session(self, *parts: Any) -> GameSession:
@@ -94,11 +89,6 @@ class GameSession(Session):
         self.sight, self.phase = False, "waits"
         self.result: dict[str, Any] | None = None
         self._tried = tried
-        self._track = Track(world.simulator)
-        self._commands: list[tuple[float, ...]] = []
-        self._exposed: list[bool] = []
-        self._peak_n, self._counted_before = 0.0, 0
-        self._period = round(DECISION_PERIOD_S / world.config.cycle_s)
         self._rival: Future[dict[str, Any]] | None = None
         self._pool: Workers | None = None
 
@@ -123,11 +113,9 @@ class GameSession(Session):
         """Let one cycle pass, unless the game has not begun."""
         if self.phase == "waits":
             return [("state", self.state(self.world.snapshot()))]
-        if self.phase == "on" and self.world.cycle % self._period == 0:
-            self._commands.append(self._command)
         sent = super().cycle(now_s)
-        if self.phase == "on":
-            sent += self._cycle_is_over()
+        if self.phase == "on" and self.world.loop.reason is not None:
+            sent.append(self._end())
         elif self._rival is not None and self._rival.done():
             sent.append(self._scores())
         return sent
@@ -161,53 +149,22 @@ class GameSession(Session):
             self.phase = "waits"
 
     def _relive(self, events: Sequence[dict[str, Any]]) -> None:
-        """Count a cycle that has passed as `cycle` did; the events after it set the next command."""
-        if self.phase == "on" and (self.world.cycle - 1) % self._period == 0:
-            self._commands.append(self._command)
+        """Take over the events of a cycle that has passed; the world's loop counts as it did."""
         super()._relive(events)
-        if self.phase == "on":
-            self._cycle_is_over()
-        for event in events:
-            if "game" in event:
-                self.phase = "on"
-            elif "move" in event:
-                self._command = tuple(event["move"])
-            elif "stop" in event:
-                self._command = self._rest
+        if self.phase == "on" and self.world.loop.reason is not None:
+            self._end()
+        if any("game" in event for event in events):
+            self.phase = "on"
 
-    def _cycle_is_over(self) -> list[tuple[str, bytes]]:
-        self._peak_n = max(self._peak_n, self.world.force_n)
-        return self._period_is_over() if self.world.cycle % self._period == 0 else []
-
-    def _period_is_over(self) -> list[tuple[str, bytes]]:
-        """Take a sample as `navigate` does, and end the game where it would."""
-        self._exposed.append(self.xray.frames > self._counted_before)
-        self._counted_before = self.xray.frames
-        simulator: Simulator = self.world.simulator
-        command = self._commands[-1]
-        pairs = tuple(zip(command[::2], command[1::2], strict=True))
-        self._track.decided(pairs, None, None, exposed=self._exposed[-1], fault=False)
-        self._track.moved(simulator, self._peak_n)
-        self._peak_n = 0.0
-        if not simulator.valid[0]:
-            return self._end("invalid")
-        if self.world.reaches(self.world.navigation.target):
-            return self._end("reached")
-        if self.world.time_s >= self.world.navigation.seconds - 1e-9:
-            return self._end("time")
-        return []
-
-    def _end(self, reason: str) -> list[tuple[str, bytes]]:
+    def _end(self) -> tuple[str, bytes]:
+        """End the game where the navigation has ended, and return the message with the score."""
+        self.result = scored(self.world.navigation, self.world.loop.record())
         self.halt("the task is over")
         self.phase, self.sight = "over", True
-        record = self._track.record(self.world.navigation, self.world.robot.driven, reason, gives_up="")
-        record = replace(record, exposures=self.xray.frames)
-        recording = Recording(np.array(self._commands), np.array(self._exposed), None)
-        self.result = figures(self.world.navigation, record, recording)
         self._record(score={name: self.result[name] for name in _SHOWN})
         self._pool = Workers(1)
         self._rival = self._pool.submit(_rival, self._tried)
-        return [self._scores()]
+        return self._scores()
 
     def _scores(self) -> tuple[str, bytes]:
         """Return the message with the person's score, and the agent's once it is known."""

@@ -204,7 +204,7 @@ def read_ct(path: Path | None) -> Volume | None:
 def _start_of(anatomy: Anatomy, device: Device, catheters: tuple[Catheter, ...]) -> Navigation:
     """Return a navigation from the ostium to a first target, far down the longest path."""
     tree = anatomy.tree
-    leaf = max(tree.leaves(), key=lambda branch: tree.branches[branch].centerline.abscissa[-1])
+    leaf = tree.longest_leaf()
     line = tree.branches[leaf].centerline.abscissa
     target = Target(branch=leaf, abscissa=float(max(_DEEP * line[-1], line[0])))
     return Navigation(anatomy=anatomy, device=device, target=target, catheters=catheters, start_inserted_mm=_START_MM)

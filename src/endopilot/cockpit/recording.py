@@ -18,15 +18,18 @@ import numpy as np
 
 from endopilot import __version__
 from endopilot.anatomy.io import read_anatomy
-from endopilot.cockpit.world import World, WorldConfig
+from endopilot.cockpit.world import World
 from endopilot.devices.catheter import Catheter
 from endopilot.devices.device import Device
+from endopilot.devices.stack import Proximals
 from endopilot.errors import InputError
 from endopilot.files import json_text, reading
+from endopilot.navigation.navigate import NavigateConfig
 from endopilot.settings import from_record
+from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.tasks.navigation import Navigation, Target
 
-FORMAT = "endopilot cockpit 1"
+FORMAT = "endopilot cockpit 2"
 SUFFIX = ".cockpit.jsonl"
 CHECK_S = 0.25
 """Time from one check to the next, s."""
@@ -94,6 +97,7 @@ class Recording:
         path: of the file.
         navigation: vessel, wire, target and start.
         config: robot, rod core and length of a cycle.
+        truth: how reality differed from the navigation.
         seed: of the encoders' noise.
         where: it took place.
         events: one each, in their order.
@@ -102,7 +106,8 @@ class Recording:
 
     path: Path
     navigation: Navigation
-    config: WorldConfig
+    config: NavigateConfig
+    truth: ModelMismatch
     seed: int
     where: Where
     events: tuple[dict[str, Any], ...]
@@ -117,6 +122,10 @@ def read_recording(path: Path) -> Recording:
     """
     lines = _lines(path)
     header = lines[0] if lines else {}
+    if str(header.get("format")).startswith("endopilot cockpit ") and header["format"] != FORMAT:
+        raise InputError(
+            f"{path}: a session of endopilot {header.get('version')}, whose loop differs; replay it with that version"
+        )
     if header.get("format") != FORMAT:
         raise InputError(f"{path}: no session of the cockpit; give a file that ends in {SUFFIX}")
     with reading(path, "choose another session"):
@@ -130,16 +139,16 @@ def read_recording(path: Path) -> Recording:
         np.random.default_rng(int(header["seed"]))  # which must not be negative
         for event in events:
             _check(event)
-        config = from_record(WorldConfig, header["config"])
+        config, truth = from_record(NavigateConfig, header["config"]), from_record(ModelMismatch, header["truth"])
         at = np.array([0, *(int(event["at"]) for event in events)])
         between = _between_checks(config)
         if (apart := np.diff(np.sort(at)).max(initial=0)) > between:
             raise InputError(f"{apart} cycles without a check, which is due after {between}")
         cycles = int(at.max())
-        return Recording(path, navigation, config, int(header["seed"]), where, events, cycles)
+        return Recording(path, navigation, config, truth, int(header["seed"]), where, events, cycles)
 
 
-def _between_checks(config: WorldConfig) -> int:
+def _between_checks(config: NavigateConfig) -> int:
     """Return the number of cycles from one check to the next."""
     return max(1, round(CHECK_S / config.cycle_s))
 
@@ -150,25 +159,32 @@ def replayed(recording: Recording) -> Iterator[tuple[World, list[dict[str, Any]]
     Raises:
         InputError: the wire is not where it was: another version of endopilot, or another processor.
     """
-    world = World(recording.navigation, recording.config, seed=recording.seed)
+    world = World(recording.navigation, recording.config, seed=recording.seed, truth=recording.truth)
     at: dict[int, list[dict[str, Any]]] = {}
     for event in recording.events:
         at.setdefault(int(event["at"]), []).append(event)
     for cycle in range(recording.cycles + 1):
         events = at.get(cycle, [])
         for event in events:
+            if "exposure" in event:
+                world.loop.exposed()
             if event.get("check", "") not in ("", world.digest()):
                 raise InputError(
                     f"{recording.path}: at {world.time_s:g} s the wire is not where it was; "
                     f"replay it with the version and on the kind of processor that recorded it"
                 )
             if "move" in event:
-                world.command(event["move"])
+                world.command(moved(event))
             elif "stop" in event:
                 world.stop()
         yield world, events
         if cycle < recording.cycles:
             world.advance()
+
+
+def moved(event: dict[str, Any]) -> Proximals:
+    """Return the velocities of a `move`, a pair for each device."""
+    return tuple(zip(event["move"][::2], event["move"][1::2], strict=True))
 
 
 def _check(event: dict[str, Any]) -> None:
@@ -177,7 +193,7 @@ def _check(event: dict[str, Any]) -> None:
         branch, abscissa = event["target"]
         Target(branch=branch, abscissa=abscissa)
     if "move" in event:
-        [float(value) for value in event["move"]]
+        [(float(translation), float(rotation)) for translation, rotation in moved(event)]
     if "exposure" in event:
         float(event["exposure"] + event["seconds"] + event["kerma_ugy"])
 
@@ -197,6 +213,7 @@ def _header(world: World, where: Where, seed: int) -> dict[str, Any]:
         "seconds": navigation.seconds,
         "force_limit_n": navigation.force_limit_n,
         "config": asdict(world.config),
+        "truth": asdict(world.truth),
         "seed": seed,
     }
     if navigation.catheters:

@@ -6,7 +6,6 @@ Everything here runs in one thread, by the world's clock. The only real time in 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from itertools import chain
 from typing import Any
 
@@ -18,6 +17,7 @@ from endopilot.cockpit.fluoroscopy import XrayUnit
 from endopilot.cockpit.frames import device_arrays, encode, motion_values, target_values, tip_values
 from endopilot.cockpit.recording import Recorder
 from endopilot.cockpit.world import Snapshot, World
+from endopilot.devices.stack import Proximals
 from endopilot.errors import InputError
 from endopilot.tasks.navigation import Target
 from endopilot.types import VesselTree
@@ -37,7 +37,6 @@ class Session:
         world: the wire in its vessel.
         xray: C-arm, pedal and contrast.
         autopilot: a policy that may drive.
-        target: where the tip is to go.
         sight: whether the page may show the wire in space.
     """
 
@@ -53,14 +52,19 @@ class Session:
             policies: names of those that a page may choose.
         """
         self.world, self.xray, self._recorder, self._policies = world, xray, recorder, policies
-        self._rest = world.safe(())
+        self._rest = ((0.0, 0.0),) * len(world.navigation.devices)
         self.autopilot = Autopilot(world)
-        self.target: Target = world.navigation.target
         self.sight = True
-        self._command, self._moving, self._heard_s = self._rest, False, -np.inf
+        self._command, self._asked = self._rest, self._rest  # what the robot has taken, and of what
+        self._moving, self._heard_s = False, -np.inf
         self._stopped = ""
         self._held: set[str] = set()  # what silence stopped
         self._locked: set[str] = set()  # what of it must be let go
+
+    @property
+    def target(self) -> Target:
+        """Where the tip is to go."""
+        return self.world.navigation.target
 
     def handle(self, message: messages.Message, now_s: float) -> None:
         """Do what the page of who drives asks for.
@@ -74,7 +78,7 @@ class Session:
         """
         if isinstance(message, messages.Drive):
             self._hear(now_s)
-            self._drive((message.translation, message.rotation, *chain.from_iterable(message.catheters)))
+            self._drive(((message.translation, message.rotation), *message.catheters))
         elif isinstance(message, messages.Pedal):
             self._hear(now_s)
             self._pedal(message.down)
@@ -109,7 +113,7 @@ class Session:
         """Take over the events of a cycle that has passed."""
         for event in events:
             if "target" in event:
-                self.target = Target(branch=event["target"][0], abscissa=event["target"][1])
+                self.world.loop.aim(Target(branch=event["target"][0], abscissa=event["target"][1]))
             elif "exposure" in event:
                 self.xray.frames = event["exposure"]
                 self.xray.seconds, self.xray.kerma_ugy = event["seconds"], event["kerma_ugy"]
@@ -128,7 +132,7 @@ class Session:
         self.xray.pedal = False
         if self._moving:
             self.world.stop()
-            self._command, self._moving = self._rest, False
+            self._command, self._asked, self._moving = self._rest, self._rest, False
             self._record(stop=why)
 
     def cycle(self, now_s: float) -> list[tuple[str, bytes]]:
@@ -148,7 +152,10 @@ class Session:
             if self._recorder is not None:
                 self._recorder.cycle()
         snapshot = self.world.snapshot()
-        sent += _images(self._counted(self.xray.pulse(snapshot)))
+        pulse = self.xray.pulse(snapshot)
+        if pulse is not None:
+            self.world.loop.exposed()
+        sent += _images(self._counted(pulse))
         return [*sent, ("state", self.state(snapshot))]
 
     def state(self, snapshot: Snapshot) -> bytes:
@@ -158,11 +165,11 @@ class Session:
 
     def values(self, snapshot: Snapshot) -> dict[str, Any]:
         """Return the figures that the page shows."""
-        anatomy, ostium_mm = self.world.navigation.anatomy, self.world.config.truth.ostium_mm
+        anatomy, ostium_mm = self.world.navigation.anatomy, self.world.truth.ostium_mm
         shown = {
             "mode": "drive",
             **motion_values(snapshot, ostium_mm),
-            "command": self._command,
+            "command": tuple(chain.from_iterable(self._command)),
             "stopped": self._stopped,
             "peak_force_n": round(self.world.peak_force_n, 4),
             "sight": self.sight,
@@ -196,19 +203,17 @@ class Session:
         if self.xray.pedal and not self._locked and self._stopped == "silence":
             self._stopped = ""
 
-    def _drive(self, velocity: tuple[float, ...]) -> None:
-        command = self.world.safe(velocity)
-        if command == self._rest:
+    def _drive(self, devices: Proximals) -> None:
+        if not np.any(devices):
             self._locked.discard("drive")
         elif "drive" in self._locked:
             return
         if self.autopilot.drives:
-            if command == self._rest:
+            if not np.any(devices):
                 return  # the page only says that it is there
             self._take_over()
-        if command != self._command:
-            self._command = self.world.command(command)
-            self._record(move=command)
+        if devices != self._asked:
+            self._move(devices)
         self._moving = self._command != self._rest
         if self._moving:
             self._stopped = ""
@@ -217,10 +222,9 @@ class Session:
         """Set the target, in the middle of a section or at a place."""
         tree = self.world.navigation.anatomy.tree
         if message.section is not None:
-            self.target = middle_of_section(tree, message.section)
+            self.world.loop.aim(middle_of_section(tree, message.section))
         elif message.branch is not None and message.abscissa is not None:
-            wanted = Target(branch=message.branch, abscissa=message.abscissa)
-            self.target = replace(self.world.navigation, target=wanted).target  # which checks that it is in the tree
+            self.world.loop.aim(Target(branch=message.branch, abscissa=message.abscissa))
         else:
             raise InputError("target: give a section, or a branch and an abscissa")
         self._record(target=[self.target.branch, self.target.abscissa])
@@ -229,21 +233,31 @@ class Session:
         """Hand the wheel to a policy or back, or let it pause."""
         if message.action == "start":
             self.autopilot.start(check_policy(message.policy, self._policies), self.target)
+            if self._moving:
+                self._move(self._rest)
+                self._moving = False
             self._stopped = ""
         elif message.action == "stop":
             self._take_over()
         else:
             self.autopilot.pause(message.action == "pause")
             if message.action == "pause":
-                self._command = self.world.command(self._rest)
-                self._record(move=self._command)
+                self._move(self._rest)
         self._record(autopilot=message.action, policy=message.policy)
 
     def _take_over(self) -> None:
         if self.autopilot.drives:
-            self._command = self.world.command(self._rest)
-            self._record(move=self._command)
+            self._move(self._rest)
         self.autopilot.stop()
+
+    def _move(self, devices: Proximals) -> None:
+        """Command the robot by hand."""
+        self._note(self.world.command(devices), devices)
+
+    def _note(self, taken: Proximals, asked: Proximals) -> None:
+        """Note and write down what the robot has taken, and of what."""
+        self._command, self._asked = taken, asked
+        self._record(move=list(chain.from_iterable(self._command)))
 
     def _think(self) -> list[tuple[str, bytes]]:
         """Let the autopilot go on, and return what the pages are to see of it."""
@@ -251,11 +265,9 @@ class Session:
             return []
         snapshot, images = self.world.snapshot(), []
         before = self.autopilot.values()
-        decision = self.autopilot.think(snapshot, lambda: images.extend(self._counted(self.xray.expose(snapshot))))
-        if decision is not None:
-            asked = decision.velocities(len(self.world.navigation.devices))
-            self._command = self.world.command(tuple(chain.from_iterable(asked)))
-            self._record(move=self._command)
+        taken = self.autopilot.think(lambda: images.extend(self._counted(self.xray.expose(snapshot))))
+        if taken is not None:
+            self._note(taken, taken)
         sent = _images(images)
         if self.sight and self.autopilot.values() != before:
             belief = self.autopilot.belief(snapshot)

@@ -7,39 +7,23 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import Annotated
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.devices.drive_limits import DriveLimits
-from endopilot.devices.stack import lines_from_tips, shown_part
+from endopilot.devices.stack import Proximals, lines_from_tips, shown_part
 from endopilot.errors import InputError
-from endopilot.navigation.navigate import start_world
-from endopilot.robot.robot import RobotConfig, SimulatedRobot
-from endopilot.settings import Within, settings
-from endopilot.simulation.config import SimulatorConfig
+from endopilot.navigation.navigate import NavigateConfig, NavigationLoop
+from endopilot.navigation.policy import Hand, Observation
 from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import Step
-from endopilot.tasks.navigation import Navigation, Target
+from endopilot.tasks.navigation import Navigation
 from endopilot.types import TipProjection
 
-
-@settings
-class WorldConfig:
-    """The simulated reality: rod core, drive, how it differs from what is known, and the length of a cycle."""
-
-    cycle_s: Annotated[float, Within(1e-4, 0.5)] = 0.0125
-    """Time from one command and picture to the next, s."""
-    robot: RobotConfig = field(default_factory=RobotConfig)
-    """The drive."""
-    truth: ModelMismatch = field(default_factory=ModelMismatch)
-    """How reality differs from the navigation."""
-    simulator: SimulatorConfig = field(default_factory=lambda: SimulatorConfig(threads=1))
-    """The rod core."""
+BY_HAND = NavigateConfig(cycle_s=0.0125)
+"""A hand's commands act sooner than a policy's, and pages show as many pictures."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,38 +95,49 @@ class Snapshot:
 
 
 class World:
-    """One wire, alone or in catheters, behind the simulated robot.
+    """A navigation loop that a hand drives in short cycles, and what pages show of it.
 
-    The same commands in the same cycles give the same bits.
+    It goes on after the loop's end. The same commands in the same cycles give the same bits.
 
     Attributes:
-        navigation: vessel, wire, catheters, target and start.
+        loop: wire, catheters, robot and C-arm; the hand drives it until it is handed over.
+        hand: what the hand holds.
         config: robot, rod core and length of a cycle.
-        robot: the drives, whose encoders a policy reads.
+        truth: how reality differs from the navigation.
         cycle: how many cycles have passed.
         force_n: largest wall force on one node in the last cycle, N.
         peak_force_n: the same so far, N.
     """
 
-    def __init__(self, navigation: Navigation, config: WorldConfig | None = None, *, seed: int = 0) -> None:
+    def __init__(
+        self,
+        navigation: Navigation,
+        config: NavigateConfig = BY_HAND,
+        *,
+        seed: int = 0,
+        truth: ModelMismatch | None = None,
+    ) -> None:
         """Bring wire and catheters to the navigation's start.
 
         Args:
             navigation: vessel, wire, catheters and start.
             config: robot, rod core and length of a cycle.
-            seed: of the encoders' noise.
+            seed: of the encoders' noise and of errors of detection.
+            truth: how reality differs; not at all if not given.
 
         Raises:
             InputError: a device does not fit the vessel, or starts deeper than it is long.
         """
-        self.navigation, self.config = navigation, config or WorldConfig()
-        truth = self.config.truth
-        self.simulator = start_world(navigation, truth, self.config.simulator)
-        self._limits = tuple(DriveLimits.of(device, navigation.anatomy) for device in navigation.devices)
-        drive = replace(self.config.robot, latency_s=self.config.robot.latency_s * truth.latency_factor)
-        self.robot = SimulatedRobot(self.simulator, self._limits, drive, seed=seed, ostium_mm=truth.ostium_mm)
+        self.hand, self.config, self.truth = Hand(), config, truth or ModelMismatch()
+        self.loop = NavigationLoop(navigation, self.hand, config=config, seed=seed, truth=truth)
+        self.loop.hand_over(self.hand)
         self.cycle, self.peak_force_n, self.force_n = 0, 0.0, 0.0
-        self._taken_s = self.config.cycle_s / 10
+        self._taken_s = config.cycle_s / 10
+
+    @property
+    def navigation(self) -> Navigation:
+        """Vessel, wire, catheters, target and start."""
+        return self.loop.navigation
 
     @property
     def time_s(self) -> float:
@@ -154,75 +149,61 @@ class World:
         """Simulated time over the time that simulating it takes, lately."""
         return self.config.cycle_s / self._taken_s
 
-    def navigation_to(self, target: Target | None) -> Navigation:
-        """Return the navigation with another target, or as it is.
-
-        Raises:
-            InputError: the vessel has no such place.
-        """
-        return self.navigation if target is None else replace(self.navigation, target=target)
-
-    def reaches(self, target: Target | None) -> bool:
-        """Return whether a target is reached: the navigation's own if none is given."""
-        navigation = self.navigation_to(target)
-        return bool(navigation.reached(*map(self.simulator.project, range(navigation.arriving + 1)))[0])
-
-    def safe(self, velocity: Sequence[float]) -> tuple[float, ...]:
-        """Return what is left of velocities within the drives' limits.
-
-        Args:
-            velocity: mm/s and rad/s of the wire, then of each catheter; catheters that are not given stand still.
+    def command(self, devices: Proximals) -> Proximals:
+        """Let the hand hold velocities, and return what the robot has taken of them, as `Robot` says.
 
         Raises:
             InputError: more catheters are given than there are.
         """
-        around = len(self._limits) - 1
-        if len(velocity) > 2 * len(self._limits):
-            raise InputError(f"catheters: {len(velocity) // 2 - 1}; this wire has {around} around it")
-        padded = [*velocity, *[0.0] * (2 * len(self._limits) - len(velocity))]
-        return tuple(
-            each for k, limits in enumerate(self._limits) for each in limits.safe(padded[2 * k], padded[2 * k + 1])
-        )
-
-    def command(self, velocity: Sequence[float]) -> tuple[float, ...]:
-        """Command the drives, and return what is left of it, as `safe` does.
-
-        Raises:
-            InputError: more catheters are given than there are.
-        """
-        safe = self.safe(velocity)
-        self.robot.command(safe[0], safe[1], *zip(safe[2::2], safe[3::2], strict=True))
-        return safe
+        around = len(self.navigation.catheters)
+        if len(devices) > 1 + around:
+            raise InputError(f"catheters: {len(devices) - 1}; this wire has {around} around it")
+        self.hand.devices = self.loop.robot.command(devices)
+        return self.hand.devices
 
     def stop(self) -> None:
-        """Let the drives brake at once."""
-        self.robot.stop()
+        """Let go, and let the drives brake at once."""
+        self.hand.devices = ()
+        self.loop.robot.stop()
+
+    def observe(self) -> Observation:
+        """Begin a decision period for whoever drives; `loop.take` is to follow."""
+        if self.loop.reason is not None:
+            self.loop.go_on()
+        return self.loop.observe()
+
+    def begin(self) -> Observation:
+        """Begin a decision period by hand, and return what is observed then."""
+        observation = self.observe()
+        self.loop.take(self.hand.decide(observation))
+        return observation
 
     def advance(self) -> None:
-        """Let one cycle pass."""
+        """Let one cycle pass; the hand decides where a decision is due."""
         began = time.perf_counter()
-        self.force_n = self.robot.run(self.config.cycle_s)
+        if self.loop.between_periods:
+            self.begin()
+        self.force_n = self.loop.advance(self.config.cycle_s)
         self._taken_s += 0.02 * (time.perf_counter() - began - self._taken_s)
         self.peak_force_n = max(self.peak_force_n, self.force_n)
         self.cycle += 1
 
     def snapshot(self) -> Snapshot:
         """Return the world as it is now."""
-        velocity, step = self.robot.velocity, self.robot.last_step
         return take_snapshot(
-            self.simulator,
-            step,
+            self.loop.simulator,
+            self.loop.robot.last_step,
             cycle=self.cycle,
             time_s=self.time_s,
             force_n=self.force_n,
-            velocity=tuple(velocity.tolist()),
+            velocity=tuple(self.loop.robot.velocity.ravel().tolist()),
         )
 
     def digest(self) -> str:
         """Return a hash of the state of wire and catheters, to the bit."""
-        simulator = self.simulator
-        parts = [simulator.position, simulator.inserted_length, simulator.rotation, simulator.contacts]
-        parts += [simulator.catheter_inserted_length, simulator.catheter_rotation]  # nothing for a wire alone
+        simulator = self.loop.simulator
+        inserted, turned = simulator.inserted_length, simulator.rotation
+        parts = [simulator.position, inserted[:, 0], turned[:, 0], simulator.contacts, inserted[:, 1:], turned[:, 1:]]
         return hashlib.sha256(b"".join(part.astype("<f8").tobytes() for part in parts)).hexdigest()[:16]
 
 
@@ -245,29 +226,26 @@ def take_snapshot(
         force_n: largest wall force on one node in the cycle, N.
         velocity: of the drives, mm/s and rad/s of the wire, then of each catheter.
     """
-    inserted = np.append(simulator.inserted_length, simulator.catheter_inserted_length)
+    inserted, turned, tip = simulator.inserted_length[0], simulator.rotation[0].tolist(), simulator.project()
     (nodes, force), *around = _lines(simulator, inserted)
-    turned = simulator.catheter_rotation[0].tolist()
     catheters = tuple(
-        ShownCatheter(*line, simulator.project(k + 1), float(inserted[k + 1]), turned[k])
-        for k, line in enumerate(around)
+        ShownCatheter(*line, tip[:, k], float(inserted[k]), turned[k]) for k, line in enumerate(around, start=1)
     )
-    slip = np.zeros((1, 2)) if step is None else np.column_stack([step.slip, step.rotation_slip])
-    catheter_slip = np.zeros((len(around), 2)) if step is None else simulator.catheter_slip[0]
+    slip = np.zeros((len(inserted), 2)) if step is None else simulator.slip[0]
     return Snapshot(
         cycle=cycle,
         time_s=time_s,
         nodes=nodes,
         node_force=force,
-        tip_direction=simulator.tip_direction[0],
-        tip=simulator.project(),
+        tip_direction=simulator.tip_direction[0, 0],
+        tip=tip[:, 0],
         inserted_mm=float(inserted[0]),
-        rotation=float(simulator.rotation[0]),
+        rotation=turned[0],
         velocity=velocity,
         force_n=force_n,
         wall_force_n=0.0 if step is None else float(step.wall_force[0]),
-        drive_load=tuple(np.append(simulator.drive_load, simulator.catheter_drive_load).tolist()),
-        slip=tuple(np.append(slip, catheter_slip).tolist()),
+        drive_load=tuple(simulator.drive_load[0].ravel().tolist()),
+        slip=tuple(slip.ravel().tolist()),
         valid=bool(simulator.valid[0]),
         catheters=catheters,
     )
@@ -286,7 +264,7 @@ def _lines(
         own = force[len(nodes) - len(line) : len(nodes)]
         if len(inserted_mm) > 1:
             along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
-            line[0] = simulator.tips(device)[0]
+            line[0] = simulator.tip_position[0, device]
             own = np.where(inserted_mm[device] - along > covered, own, 0.0)
             covered = max(covered, float(inserted_mm[device]))
         found.append((line, own))

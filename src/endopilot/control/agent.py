@@ -22,7 +22,6 @@ from endopilot.control.course import Course
 from endopilot.control.halt import SPARE_SHARE
 from endopilot.control.route import Route, check_passable
 from endopilot.control.search import Search, SearchConfig
-from endopilot.devices.drive_limits import DriveLimits
 from endopilot.navigation.policy import BelievedTip, Decision, Observation
 from endopilot.progress import Advance
 from endopilot.settings import Positive, Within, settings
@@ -112,7 +111,6 @@ class _PlanningPolicy:
             seed=seed,
             sharing=self.belief.simulator,
         )
-        self._limits = DriveLimits.of(navigation.device, navigation.anatomy)
         self._course: Course | None = None
         self._at, self._lost, self._began, self._led, self._arrived = 0, False, False, False, False
         self.plans, self.planning_s, self._failed, self.halt = 0, 0.0, 0, ""
@@ -120,24 +118,23 @@ class _PlanningPolicy:
     def decide(self, observation: Observation) -> Decision:
         """Follow the course, search another one, or pull back, as the module describes."""
         if self._began:
-            self.belief.follow(observation.inserted_length, observation.rotation)
+            self.belief.follow(*observation.devices[0])
         self._began = True
         if observation.tip is not None:
             self._update(observation.tip)
-        elif observation.inserted_length <= self.navigation.start_inserted_mm:
+        elif observation.devices[0][0] <= self.navigation.start_inserted_mm:
             self._lost = False  # back where it began, the wire lies as it did, unseen in its catheter
         if self._lost:
             translation, rotation = -self.config.search.speed_mm_s, 0.0
         else:
             translation, rotation = self._follow(observation)
-        translation, rotation = self._limits.safe(translation, rotation)
         gives_up = self.halt if self._failed >= self.config.tries and self._course is None and not self._lost else ""
-        return Decision(translation, rotation, expose=self._lost or self.wants_xray(), gives_up=gives_up)
+        return Decision(((translation, rotation),), expose=self._lost or self.wants_xray(), gives_up=gives_up)
 
     def watch(self, observation: Observation) -> None:
         """Follow what somebody else does; a new course is searched at the next decision."""
         if self._began:
-            self.belief.follow(observation.inserted_length, observation.rotation)
+            self.belief.follow(*observation.devices[0])
         self._began, self._led, self._course, self._failed = True, True, None, 0
         if observation.tip is not None:
             self._update(observation.tip)
@@ -174,10 +171,8 @@ class _PlanningPolicy:
             return 0.0, 0.0
         wanted = self._course.inserted[self._at] - self._ostium, self._course.rotation[self._at]
         self._at += 1
-        return (
-            (wanted[0] - observation.inserted_length) / DECISION_PERIOD_S,
-            (wanted[1] - observation.rotation) / DECISION_PERIOD_S,
-        )
+        inserted, turned = observation.devices[0]
+        return (wanted[0] - inserted) / DECISION_PERIOD_S, (wanted[1] - turned) / DECISION_PERIOD_S
 
     def _off_course(self) -> bool:
         """Return whether the likeliest tip is not where the course has it now."""
@@ -293,7 +288,7 @@ class AgentPolicy(_PlanningPolicy):
             config: search and belief.
             calibration: of the bands around what the simulated wires predict, by which `XrayAdviser` asks for
                 X-ray; if not given, the package's own for the navigation's X-ray, which
-                `benchmarks/agent_calibration.py` makes.
+                `python -m benchmarks agent-calibration` makes.
             advice: which events the adviser watches for.
         """
         super().__init__(config)
@@ -325,7 +320,7 @@ class AgentPolicy(_PlanningPolicy):
         """Return what the adviser is given: the likeliest wire, and the spread of all wires."""
         best, tip = int(np.argmax(self.belief.weight)), self.belief.likeliest_tip()
         wires = self.belief.simulator
-        proximal = np.array([[wires.inserted_length[best], wires.rotation[best]]])
+        proximal = wires.proximal[best, :1]
         return proximal, np.array([[tip.abscissa[0], tip.offset[0]]]), self.belief.tip_spread()[None], tip.radius
 
     def wants_xray(self) -> bool:

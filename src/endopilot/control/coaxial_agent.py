@@ -23,7 +23,7 @@ from endopilot.control.coaxial_copies import CoaxialCourse, CoaxialSearchConfig
 from endopilot.control.coaxial_search import CoaxialSearch
 from endopilot.control.route import check_passable
 from endopilot.errors import InputError
-from endopilot.navigation.coaxial_policies import check_catheter
+from endopilot.navigation.baseline_policies import check_catheter
 from endopilot.navigation.policy import BelievedTip, Decision, Observation
 from endopilot.settings import Positive, Within, settings
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
@@ -71,7 +71,7 @@ class CoaxialAgent:
         Args:
             config: search and belief.
             calibration: of the adviser's bands around what the simulated wires predict; if not given, the package's
-                own for wires in catheters, which `benchmarks/agent_calibration.py coaxial` makes.
+                own for wires in catheters, which `python -m benchmarks agent-calibration coaxial` makes.
         """
         self.config = config or CoaxialAgentConfig()
         self._calibration = calibration or Calibration.read(COAXIAL_CALIBRATED)
@@ -104,7 +104,7 @@ class CoaxialAgent:
     def decide(self, observation: Observation) -> Decision:
         """Follow the course, search another one, or pull back, as the module describes."""
         if self._began:
-            self.belief.follow(observation.inserted_length, observation.rotation, observation.catheters)
+            self.belief.follow(*observation.devices[0], observation.devices[1:])
         self._began = True
         if observation.tip is not None:
             self._update(observation.tip)
@@ -119,7 +119,7 @@ class CoaxialAgent:
         if not self._course.reached:
             ends = self._failed >= self.config.tries
             self._course = None
-            return Decision(0.0, 0.0, expose=True, gives_up=self._halt if ends else "")
+            return Decision(expose=True, gives_up=self._halt if ends else "")
         return self._creep()
 
     def believed(self) -> BelievedTip:
@@ -138,7 +138,7 @@ class CoaxialAgent:
     def adviser_input(self) -> AdviserInput:
         """Return what the adviser is given: the likeliest wire, and the spread of all wires."""
         tip, wires = self.belief.likeliest_tip(), self.belief.simulator
-        proximal = np.array([[wires.inserted_length[self._best], wires.rotation[self._best]]])
+        proximal = wires.proximal[self._best, :1]
         ends = np.array([[tip.abscissa[0], tip.offset[0]]])
         return proximal, ends, self.belief.tip_spread()[None], tip.radius
 
@@ -162,8 +162,8 @@ class CoaxialAgent:
 
     def _pull_back(self, observation: Observation) -> Decision:
         """Pull the wire back, and the catheter too once the wire's tip is in it, with X-ray on."""
-        inside = observation.inserted_length <= observation.catheters[0][0]
-        return Decision(-_RETRACT_MM_S, 0.0, expose=True, catheters=((-_RETRACT_MM_S if inside else 0.0, 0.0),))
+        (wire, _), (catheter, _) = observation.devices
+        return Decision(((-_RETRACT_MM_S, 0.0), (-_RETRACT_MM_S if wire <= catheter else 0.0, 0.0)), expose=True)
 
     def _off_course(self) -> bool:
         """Return whether a waypoint was to be passed just now, and the likeliest wire is not where it should be."""
@@ -189,11 +189,10 @@ class CoaxialAgent:
         """Go to the next place of the course; X-ray shows where each waypoint's end has led."""
         course, at = self._course, self._at
         assert course is not None
-        wanted = course.proximal[at] - [self._ostium, 0.0, self._ostium, 0.0]
-        now = np.array([(observation.inserted_length, observation.rotation), *observation.catheters]).ravel()
-        wire, turn, catheter, other = ((wanted - now) / DECISION_PERIOD_S).tolist()
+        wanted = course.proximal[at] - [self._ostium, 0.0]
+        velocity = (wanted - np.array(observation.devices)) / DECISION_PERIOD_S
         self._at += 1
-        return Decision(wire, turn, expose=expose or bool(course.settled[at]), catheters=((catheter, other),))
+        return Decision(tuple((v, w) for v, w in velocity.tolist()), expose=expose or bool(course.settled[at]))
 
     def _creep(self) -> Decision:
         """Move what is to arrive a little ahead and back, with X-ray on; then search again."""
@@ -201,6 +200,4 @@ class CoaxialAgent:
         if step >= 3 * _CREEP_PERIODS:
             self._course = None
         speed = _CREEP_MM_S if step < _CREEP_PERIODS else -_CREEP_MM_S
-        if self.navigation.arriving:
-            return Decision(0.0, 0.0, expose=True, catheters=((speed, 0.0),))
-        return Decision(speed, 0.0, expose=True)
+        return Decision((*[(0.0, 0.0)] * self.navigation.arriving, (speed, 0.0)), expose=True)

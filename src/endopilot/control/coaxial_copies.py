@@ -42,8 +42,8 @@ class CoaxialCourse:
     """Controls of wire and catheter, and where they bring both.
 
     Attributes:
-        control: mm/s and rad/s of the wire, then of the catheter, of each decision period.
-        proximal: inserted length (mm) and rotation (rad) of both, likewise, at the end of each period.
+        control: mm/s and rad/s of wire and catheter, of each decision period.
+        proximal: inserted length (mm) and rotation (rad) of both at the end of each period.
         abscissa: Δtip of the wire at the end of each period, mm.
         off_route: how far the wire's tip is in a wrong branch then, mm.
         settled: whether a waypoint is passed then, and the catheter has followed.
@@ -51,8 +51,8 @@ class CoaxialCourse:
         reached: whether it ends at the target.
     """
 
-    control: Float[np.ndarray, "periods 4"]
-    proximal: Float[np.ndarray, "periods 4"]
+    control: Float[np.ndarray, "periods 2 2"]
+    proximal: Float[np.ndarray, "periods 2 2"]
     abscissa: Float[np.ndarray, "periods"]
     off_route: Float[np.ndarray, "periods"]
     settled: Bool[np.ndarray, "periods"]
@@ -84,11 +84,9 @@ class Copies:
     def __init__(
         self, navigation: Navigation, route: Route, config: CoaxialSearchConfig, worlds: int, like: Simulator | None
     ):
-        catheters = navigation.catheters
         self.simulator = Simulator(
             navigation.anatomy,
-            navigation.device,
-            catheters=catheters,
+            navigation.stack,
             worlds=worlds,
             motion=navigation.known_motion,
             config=config.core,
@@ -112,37 +110,32 @@ class Copies:
     @property
     def wire(self) -> Float[np.ndarray, "worlds"]:
         """Inserted lengths of the wires, mm."""
-        return self.simulator.inserted_length
+        return self.simulator.inserted_length[:, 0]
 
     @property
     def catheter(self) -> Float[np.ndarray, "worlds"]:
         """Inserted lengths of the catheters, mm."""
-        return self.simulator.catheter_inserted_length[:, 0]
+        return self.simulator.inserted_length[:, 1]
 
     def foremost(self) -> TipProjection:
         """Return the foremost tips, those of the wires or of the catheters."""
-        tips = [self.simulator.project(device) for device in range(2)]
-        leads = self.wire >= self.catheter
-        names = TipProjection.__dataclass_fields__
-        return TipProjection(**{name: np.where(leads, *(getattr(tip, name) for tip in tips)) for name in names})
+        worlds = np.arange(self.simulator.worlds)
+        return self.simulator.project()[worlds, np.where(self.wire >= self.catheter, 0, 1)]
 
     def drive(self, wire: np.ndarray | float, catheter: np.ndarray | float, turn: np.ndarray | float = 0.0) -> None:
         """Drive them for a decision period, wire and catheter at mm/s, both turned at rad/s."""
         simulator = self.simulator
-        control = np.zeros((simulator.worlds, 4))
-        control[:, 0], control[:, 2] = wire, catheter
-        control[:, 1] = control[:, 3] = turn
+        control = np.zeros((simulator.worlds, 2, 2))
+        control[:, 0, 0], control[:, 1, 0] = wire, catheter
+        control[:, 0, 1] = control[:, 1, 1] = turn
         control[self.failed] = 0.0
         for k, inserted in enumerate((self.wire, self.catheter)):
-            pair = slice(2 * k, 2 * k + 2)
-            control[:, pair] = self._limits[k].clip(control[:, pair], inserted, DECISION_PERIOD_S)
+            control[:, k] = self._limits[k].clip(control[:, k], inserted, DECISION_PERIOD_S)
         step = drive_period(simulator, control)
         self.peak = np.maximum(self.peak, np.where(step.valid, step.contact_force_max, np.inf))
-        tip = simulator.project()
+        tip = simulator.project()[:, 0]
         off = self.route.off_route(tip)
         self.made.append(control)
-        self.proximal.append(
-            np.column_stack([self.wire, simulator.rotation, self.catheter, simulator.catheter_rotation[:, 0]])
-        )
+        self.proximal.append(simulator.proximal)
         self.tip.append((tip.abscissa, off))
         self.failed |= self.peak > self.most_n

@@ -99,16 +99,15 @@ class CoaxialSearch:
                 self.halted_mm = waypoint
                 break
             settled.append(len(one.made) - 1)
-        tips = [one.simulator.project(device) for device in range(2)]
         abscissa, off = (np.array([tip[k] for tip in one.tip]).reshape(-1) for k in range(2))
         return CoaxialCourse(
-            control=np.array(one.made).reshape(-1, 4),
-            proximal=np.array(one.proximal).reshape(-1, 4),
+            control=np.array(one.made).reshape(-1, 2, 2),
+            proximal=np.array(one.proximal).reshape(-1, 2, 2),
             abscissa=abscissa,
             off_route=off,
             settled=np.isin(np.arange(len(one.made)), settled),
             peak_n=float(one.peak.max()),
-            reached=bool(self._navigation.reached(*tips)[0]),
+            reached=bool(self._navigation.reached(one.simulator.project())[0]),
         )
 
     def _go_on(self, waypoint: float) -> bool:
@@ -189,7 +188,7 @@ class CoaxialSearch:
         self._pressed |= bool((copies.peak > copies.most_n).any())
         for place in chosen:
             for controls in copies.made:
-                wire, turn, catheter, _ = controls[place]
+                (wire, turn), (catheter, _) = controls[place]
                 if wire or turn or catheter:
                     one.drive(wire, catheter, turn)
             if self._there(one, waypoint)[0]:
@@ -201,7 +200,7 @@ class CoaxialSearch:
         """Bring the catheters' tips to some abscissae, mm, and the wires so much deeper than the catheters, mm."""
         speed = 2 * self.config.speed_mm_s
         for _ in range(round(self.config.longest_s / DECISION_PERIOD_S)):
-            error = wanted - copies.simulator.project(1).abscissa
+            error = wanted - copies.simulator.project().abscissa[:, 1]
             moving = np.abs(error) > _AT_MM
             catheter = np.where(moving, np.clip(error / (2 * DECISION_PERIOD_S), -speed, speed), 0.0)
             gap = np.maximum(copies.catheter + catheter * DECISION_PERIOD_S + lead, 0.0) - copies.wire
@@ -261,7 +260,7 @@ class CoaxialSearch:
             return waypoint - route.progress(tip), copies.wire - behind - copies.catheter
         end = float(self._navigation.anatomy.tree.branches[route.target.branch].centerline.abscissa[-1])
         goal = np.clip(waypoint + behind, waypoint, max(end - _REST_MM, waypoint))
-        left = waypoint - copies.simulator.project(1).abscissa
+        left = waypoint - copies.simulator.project().abscissa[:, 1]
         return goal - route.progress(tip), np.minimum(left, copies.wire - copies.catheter)
 
     def _together(
@@ -288,7 +287,7 @@ class CoaxialSearch:
     def _there(self, copies: Copies, waypoint: float) -> Bool[np.ndarray, "worlds"]:
         """Return which copies are past a place, or at the target, and never pressed too hard."""
         if waypoint >= self.route.target.abscissa:
-            return self._navigation.reached(*(copies.simulator.project(k) for k in range(2))) & ~copies.failed
+            return self._navigation.reached(copies.simulator.project()) & ~copies.failed
         tip = copies.foremost()
         if waypoint in self.route.waypoints:
             return (self.route.off_route(tip) == 0) & (tip.abscissa >= waypoint) & ~copies.failed

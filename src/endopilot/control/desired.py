@@ -59,7 +59,7 @@ def last_place(anatomy: Anatomy, tips: pd.DataFrame, target: str) -> Target:
         InputError: it lies outside the tree.
     """
     tree, branch, abscissa = anatomy.tree, int(tips["branch"].iloc[-1]), float(tips["abscissa"].iloc[-1])
-    leaf = max(tree.leaves(), key=lambda one: tree.branches[one].centerline.abscissa[-1])
+    leaf = tree.longest_leaf()
     on_path = [b for b in tree.route(leaf) if tree.branches[b].centerline.abscissa[0] <= abscissa]
     if branch < 0 and on_path:
         branch = on_path[-1]

@@ -7,10 +7,9 @@ as the policy believed it to be.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -22,6 +21,7 @@ from endopilot.control.route import Route, check_passable, parse_target
 from endopilot.control.set_up import TILT_DEG, TipChoice, choose_tip
 from endopilot.devices.catheter import Catheter, read_catheter
 from endopilot.devices.device import Device, read_device
+from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.navigation.navigate import NavigateConfig, NavigationLoop, XrayKind
 from endopilot.navigation.policies import make_policy
@@ -34,11 +34,11 @@ from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.mismatch import ModelMismatch, drawn_sides, mismatch_by
 from endopilot.simulation.motion import Motion, MotionName, motion_named
 from endopilot.simulation.simulate import simulate
+from endopilot.simulation.trajectory import Trajectory
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Arrives, Navigation
-from endopilot.types import Anatomy, CatheterMotion, Rollout, TipProjection
+from endopilot.types import Anatomy
 from endopilot.xray.fluoroscope import Fluoroscope
 
-_Samples = TypeVar("_Samples", bound=Rollout | CatheterMotion | TipProjection)
 MotionKnown = Literal["nothing", "published", "measured", "exact"]
 _Factor = Annotated[float, Within(0.2, 5)]
 
@@ -164,16 +164,16 @@ class PatientNavigation:
 
     set_up: SetUp
     record: NavigationRecord
-    rollout: Rollout
-    cycles: Rollout
+    rollout: Trajectory
+    cycles: Trajectory
     wires: tuple[Float[np.ndarray, "wires nodes 3"], ...] | None
     plans: int | None
     planning_s: float | None
 
     @property
-    def episode(self) -> Rollout:
+    def episode(self) -> Trajectory:
         """The true wire at the end of each decision period, at rest from the end of the navigation until its limit."""
-        return sampled(self.cycles)
+        return _each_period(self.cycles)
 
 
 def set_up_navigation(anatomy: Anatomy | str | Path, target: str, config: NavigatePatientConfig | None = None) -> SetUp:
@@ -234,29 +234,29 @@ def navigate_patient(set_up: SetUp) -> PatientNavigation:
         measure_motion=set_up.config.motion_known == "measured",
     )
     loop = NavigationLoop(navigation, policy, config=config, seed=set_up.config.seed, truth=set_up.truth)
-    began = loop.robot.proximal.ravel()
+    began = loop.robot.proximal
     wires: list[Float[np.ndarray, "wires nodes 3"]] = []
     with progress(f"Navigating, {set_up.config.policy}", total=navigation.seconds) as advance:
         while loop.reason is None:
             loop.step()
             if loop.gives_up:
                 loop.stop()
-            advance(DECISION_PERIOD_S, f"{loop.simulator.inserted_length[0]:.0f} mm inserted")
+            advance(DECISION_PERIOD_S, f"{loop.simulator.inserted_length[0, 0]:.0f} mm inserted")
             if isinstance(policy, Believer) and loop.time_s > DECISION_PERIOD_S:
                 wires.append(policy.believed_wires())  # at the decision, which ended the period before
     if isinstance(policy, Led):
         state = loop.robot.proximal_state()
-        policy.watch(Observation(loop.time_s, state.inserted_length, state.rotation, None, state.catheters))
+        policy.watch(Observation(loop.time_s, state.devices, None))
     if isinstance(policy, Believer):
         wires.append(policy.believed_wires())
     record = loop.record()
     cycles = _driven_again(set_up, record, began)
     whole = len(record.time_s) - 1
-    shown = sampled(cycles)
+    shown = _each_period(cycles)
     return PatientNavigation(
         set_up=set_up,
         record=record,
-        rollout=_each_sample(shown, lambda values: values[:, :whole]),
+        rollout=shown.samples(slice(whole)),
         cycles=replace(cycles, shape=None),
         wires=tuple(wires) if wires else None,
         plans=getattr(policy, "plans", None),
@@ -302,17 +302,16 @@ def _see_catheter(
     return with_axis(vessel, axis), replace(truth, axis_deg=unseen_deg, axis_side_deg=side_deg)
 
 
-def _driven_again(set_up: SetUp, record: NavigationRecord, began: Float[np.ndarray, "numbers"]) -> Rollout:
+def _driven_again(set_up: SetUp, record: NavigationRecord, began: Float[np.ndarray, "devices 2"]) -> Trajectory:
     """Return wire and catheters, driven again as they were, and then held at rest until the navigation's limit."""
     periods = int(np.ceil(set_up.navigation.seconds / DECISION_PERIOD_S - 1e-9))
     per_period = round(DECISION_PERIOD_S / CYCLE_S)
-    control = np.zeros((1, periods * per_period, len(began)))
-    control[0, : len(record.driven)] = record.driven
+    control = np.zeros((1, periods * per_period, *began.shape))
+    control[0, : len(record.driven)] = record.driven.reshape(-1, *began.shape)
     return simulate(
         set_up.true_anatomy,
-        set_up.true_wire,
+        Stack(set_up.true_wire, set_up.true_catheters),
         control,
-        catheters=set_up.true_catheters,
         initial=began[None],
         config=set_up.simulator,
         record_shape=True,
@@ -321,53 +320,6 @@ def _driven_again(set_up: SetUp, record: NavigationRecord, began: Float[np.ndarr
     )
 
 
-def sampled(cycles: Rollout) -> Rollout:
-    """Return a rollout of a drive's cycles, which divide a decision period, as it is recorded at each period's end."""
-    step = round(DECISION_PERIOD_S / cycles.sample_period_s)
-
-    def gathered(motion: Rollout | CatheterMotion) -> dict[str, np.ndarray]:
-        """Return what is a mean or a sum over the cycles of each period."""
-        names = [name for name in _GATHERED if hasattr(motion, name)]
-        parts = {name: getattr(motion, name) for name in names}
-        return {
-            name: _GATHERED[name](part.reshape(part.shape[0], -1, step, *part.shape[2:]), axis=2)
-            for name, part in parts.items()
-        }
-
-    ends = _each_sample(cycles, lambda values: values[:, step - 1 :: step])
-    if cycles.catheters is not None and ends.catheters is not None:
-        ends = replace(ends, catheters=replace(ends.catheters, **gathered(cycles.catheters)))
-    return replace(ends, sample_period_s=DECISION_PERIOD_S, **gathered(cycles))
-
-
-_GATHERED = {
-    "control": np.mean,
-    "slip": np.sum,
-    "rotation_slip": np.sum,
-    "iterations": np.mean,
-    "node_iterations": np.sum,
-}
-"""What a sample tells of its period, not of its end, and how it follows from the cycles."""
-_PER_WORLD = ("sample_period_s", "initial_inserted_length", "initial_rotation", "reason")
-"""What a rollout holds once, or once a world."""
-
-
-def _each_sample(record: _Samples, take: Callable[[np.ndarray], np.ndarray]) -> _Samples:
-    """Return a rollout, or a part of one, with some of its samples.
-
-    Args:
-        record: all of them.
-        take: chooses of an array with a row a world and a column a sample.
-    """
-
-    def chosen(name: str) -> Any:
-        value = getattr(record, name)
-        if value is None or name in _PER_WORLD:
-            return value
-        if isinstance(value, TipProjection | CatheterMotion):
-            return _each_sample(value, take)
-        if name == "vessel_to_laboratory":  # that of all worlds
-            return take(value[None])[0]
-        return take(value)
-
-    return replace(record, **{field.name: chosen(field.name) for field in fields(record)})
+def _each_period(cycles: Trajectory) -> Trajectory:
+    """Return a trajectory of a drive's cycles as it is at the end of each decision period."""
+    return cycles.every(round(DECISION_PERIOD_S / CYCLE_S))

@@ -129,7 +129,7 @@ class RestingStart:
         self._setup = Setup.of_anatomy(navigation.anatomy, navigation.device, config)
         simulator = Simulator(navigation.anatomy, navigation.device, config=SimulatorConfig(threads=1))
         simulator.reset(inserted_length=[navigation.start_inserted_mm], rotation=[navigation.start_rotation])
-        tip = simulator.project()
+        tip = simulator.project()[:, 0]
         self.tip = np.array([tip.abscissa[0], tip.offset[0]])
 
     def episodes(self, tips: Float[np.ndarray, "n s 2"], control: Float[np.ndarray, "n s 2"]) -> Episodes:

@@ -9,8 +9,9 @@ from endopilot.anatomy.projection import safety_ratio
 from endopilot.control.navigate_patient import PatientNavigation, SetUp
 from endopilot.control.route import Route
 from endopilot.robot.robot import CYCLE_S
+from endopilot.simulation.trajectory import Trajectory
 from endopilot.tasks.navigation import DECISION_PERIOD_S, SUCCESS_MM
-from endopilot.types import Rollout, VesselTree
+from endopilot.types import VesselTree
 
 _TIGHT_RATIO = 0.8
 """A wire that fills this share of a lumen is held up by its walls."""
@@ -61,7 +62,7 @@ def why_not(found: PatientNavigation) -> str:
     if record.reason == "invalid":
         return f"the simulation failed after {record.seconds:g} s"
     route = Route.to(navigation.anatomy, navigation.target)
-    tree, tip = navigation.anatomy.tree, record.tips[navigation.arriving]
+    tree, tip = navigation.anatomy.tree, record.tip[:, navigation.arriving]
     branch, at = int(tip.branch[-1]), round(float(tip.abscissa[-1]), 1) + 0.0  # no "-0.0"
     whose = "the catheter's tip" if navigation.arriving else "the tip"
     where = f"after {record.seconds:g} s {whose} is in section {section_at(tree, branch, at)} at {at:.1f} mm"
@@ -78,8 +79,8 @@ def why_not(found: PatientNavigation) -> str:
 def _held_up(found: PatientNavigation, route: Route) -> str:
     """Return what is likeliest to have held up the device that was to arrive, or the wire ahead of it."""
     record, navigation = found.record, found.set_up.navigation
-    wire, device, tip = navigation.device, navigation.devices[navigation.arriving], record.tips[navigation.arriving]
-    refused, wire_came = found.set_up.choice.refused, float(route.progress(record.tip).max())
+    wire, device, tip = navigation.device, navigation.devices[navigation.arriving], record.tip[:, navigation.arriving]
+    refused, wire_came = found.set_up.choice.refused, float(route.progress(record.tip[:, 0]).max())
     if refused is not None and abs(wire_came - refused.abscissa) <= _AT_FORK_MM + wire.tip_bend_length_mm:
         return f"no rotation of the tip enters {refused}"
     narrow = _narrowest(route, float(route.progress(tip).max()), device.tip_radius_mm)
@@ -94,7 +95,7 @@ def _held_up(found: PatientNavigation, route: Route) -> str:
     if route.off_route(tip)[-1] > 0:
         return "it took another branch"
     still = min(round(_STILL_S / DECISION_PERIOD_S), len(record.time_s) - 1)
-    progress = [route.progress(each) for each in record.tips[: navigation.arriving + 1]]
+    progress = [route.progress(record.tip[:, k]) for k in range(navigation.arriving + 1)]
     if any(each[-1] - each[-1 - still] > _STILL_MM for each in progress):
         return "it was still on its course; give more --seconds"
     if found.plans is not None and found.plans > 1:
@@ -116,7 +117,7 @@ def _narrowest(route: Route, came_mm: float, wire_radius_mm: float) -> tuple[flo
 
 def worst_ratio(found: PatientNavigation) -> float:
     """Return the largest safety ratio γ/(r − r_w) of the tip."""
-    tip, radius = found.record.tip, found.set_up.navigation.device.tip_radius_mm
+    tip, radius = found.record.tip[:, 0], found.set_up.navigation.device.tip_radius_mm
     return float(safety_ratio(tip.offset, tip.radius, radius).max())
 
 
@@ -126,10 +127,6 @@ def slipped_s(found: PatientNavigation) -> float:
     return float((slip != 0).any(axis=1).sum()) * CYCLE_S
 
 
-def _slips(rollout: Rollout) -> list[Float[np.ndarray, "samples 2"]]:
+def _slips(rollout: Trajectory) -> list[Float[np.ndarray, "samples 2"]]:
     """Return advance (mm) and rotation (rad) that the drive of each device slipped over in each period."""
-    wire = np.stack([rollout.slip[0], rollout.rotation_slip[0]], axis=-1)
-    if rollout.catheters is None:
-        return [wire]
-    around = np.stack([rollout.catheters.slip[0], rollout.catheters.rotation_slip[0]], axis=-1)
-    return [wire, *np.moveaxis(around, 1, 0)]
+    return list(np.moveaxis(np.stack([rollout.slip[0], rollout.rotation_slip[0]], axis=-1), 1, 0))

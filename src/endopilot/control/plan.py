@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.anatomy.io import read_anatomy
-from endopilot.anatomy.projection import project_tip
 from endopilot.belief.belief import BeliefConfig
 from endopilot.control.agent import AgentConfig, TwinPolicy
 from endopilot.control.course import Course
@@ -33,7 +32,7 @@ from endopilot.settings import from_record
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.simulate import simulate
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
-from endopilot.types import Anatomy, TipProjection
+from endopilot.types import Anatomy
 
 _IDEAL = RobotConfig(
     latency_s=0.0, max_acceleration_mm_s2=1e6, max_acceleration_rad_s2=1e6, backlash_mm=0.0, backlash_rad=0.0,
@@ -253,9 +252,9 @@ def _by_policy(navigation: Navigation, config: PlanConfig) -> tuple[Steps, Steps
     from endopilot.navigation.policies import make_policy
 
     record = navigate(navigation, make_policy(config.method), config=NavigateConfig(robot=_IDEAL), seed=config.seed)
-    proximal = np.column_stack([record.inserted_length, record.rotation])
+    proximal, tip = np.column_stack([record.inserted_length[:, 0], record.rotation[:, 0]]), record.tip[:, 0]
     control = np.diff(proximal, axis=0) / DECISION_PERIOD_S
-    return control, np.column_stack([record.tip.abscissa, record.tip.offset])[1:]
+    return control, np.column_stack([tip.abscissa, tip.offset])[1:]
 
 
 def _checked(
@@ -265,45 +264,37 @@ def _checked(
     """Put the controls within the limits, drive the rod core with them, and return the plan."""
     start = navigation.start
     parts = [
-        within_limits(control[:, 2 * k : 2 * k + 2], DriveLimits.of(device, navigation.anatomy), start[2 * k])
+        within_limits(control[:, 2 * k : 2 * k + 2], DriveLimits.of(device, navigation.anatomy), start[k, 0])
         for k, device in enumerate(navigation.devices)
     ]
-    control = np.concatenate(parts, axis=1)
+    control = np.stack(parts, axis=1)
     rollout = simulate(
         navigation.anatomy,
-        navigation.device,
+        navigation.stack,
         control[None],
-        catheters=navigation.catheters,
         initial=start[None],
         config=SimulatorConfig(threads=1),
     )
-    tip = TipProjection(**{name: getattr(rollout.tip, name)[0] for name in TipProjection.__dataclass_fields__})
-    catheter_position = None if rollout.catheters is None else rollout.catheters.tip_position[0, :, 0]
-    catheter_tip = (
-        None
-        if catheter_position is None
-        else project_tip(navigation.anatomy.tree, navigation.anatomy.insertion, catheter_position)
-    )
-    tips = (tip,) if catheter_tip is None else (tip, catheter_tip)
+    tip, around = rollout.tip[0], bool(navigation.catheters)
     wanted = np.concatenate([desired, np.repeat(desired[-1:], max(len(control) - len(desired), 0), axis=0)])
     return Plan(
         navigation=navigation,
         config=config,
         model=None if model is None else str(model),
-        control=control,
-        proximal=start + DECISION_PERIOD_S * np.cumsum(control, axis=0),
+        control=control.reshape(len(control), -1),
+        proximal=(start + DECISION_PERIOD_S * np.cumsum(control, axis=0)).reshape(len(control), -1),
         desired=wanted[: len(control)],
         predicted=predicted,
-        simulated=tip,
-        position=rollout.tip_position[0],
+        simulated=tip[:, 0],
+        position=rollout.tip_position[0, :, 0],
         force=rollout.contact_force_max[0],
-        reached=bool(navigation.reached(*tips).any()),
+        reached=bool(navigation.reached(tip).any()),
         why=choice.why if choice else "",
         tilt_deg=choice.tilt_deg if choice else 0.0,
         seconds_to_plan=float(spent[0]),
         processor_seconds=float(spent[1]),
-        catheter_tip=catheter_tip,
-        catheter_position=catheter_position,
+        catheter_tip=tip[:, 1] if around else None,
+        catheter_position=rollout.tip_position[0, :, 1] if around else None,
     )
 
 

@@ -92,6 +92,6 @@ def search_pair(navigation: Navigation, config: PlanConfig, trial: int) -> tuple
     tips = []
     for control in course.control:
         drive_period(start, control[None])
-        tip = start.project()
-        tips.append((tip.abscissa[0], tip.offset[0]))
-    return course.control, np.array(tips)
+        tip = start.project()[0, 0]
+        tips.append((tip.abscissa, tip.offset))
+    return course.control.reshape(len(tips), -1), np.array(tips)

@@ -98,7 +98,7 @@ def rotations_that_enter(navigation: Navigation, device: Device) -> Int[np.ndarr
 
     def go_on(waypoint: float) -> int:
         """Sweep up to a waypoint, put all wires where the middle of those is that pass it; return how many do."""
-        here = float(route.progress(simulator.project())[0])
+        here = float(route.progress(simulator.project()[:, 0])[0])
         made = sweep(
             simulator,
             route,
@@ -117,7 +117,7 @@ def rotations_that_enter(navigation: Navigation, device: Device) -> Int[np.ndarr
     for index, fork in enumerate(places):
         radius = float(route.radius(np.array([fork.abscissa]))[0])
         before = fork.abscissa - max(_LEAD_MM, _LEAD_RADII * radius)
-        if before > route.progress(simulator.project())[0] + 1.0 and not go_on(before - ENTERED_MM):
+        if before > route.progress(simulator.project()[:, 0])[0] + 1.0 and not go_on(before - ENTERED_MM):
             return count
         count[index] = go_on(float(route.waypoints[index]))
         if not count[index]:

@@ -137,7 +137,7 @@ class Search:
         for _ in range(min(TURN_PERIODS, periods) if turn else 0):
             self._drive(log, np.array([0.0, turn / (TURN_PERIODS * DECISION_PERIOD_S)]))
         while log.periods < periods:
-            here = float(self.route.progress(self.single.project()) @ self._weight)
+            here = float(self.route.progress(self.single.project()[:, 0]) @ self._weight)
             if advance is not None:
                 advance(max(here - reported, 0.0))
                 reported = max(here, reported)
@@ -229,7 +229,7 @@ class Search:
         """Push straight on past a waypoint; return why not, or None if all wires passed it."""
         begun = log.periods
         while log.periods < periods:
-            tip = self.single.project()
+            tip = self.single.project()[:, 0]
             if self._all(self.route.passed(tip, waypoint)):
                 return None
             if not self._all(self.route.off_route(tip) == 0):
@@ -237,16 +237,16 @@ class Search:
             left = waypoint - float(self.route.progress(tip) @ self._weight)
             last = waypoint >= self.route.target.abscissa
             speed = np.clip(left / DECISION_PERIOD_S, 1.0, self.config.speed_mm_s) if last else self.config.speed_mm_s
-            before = self.single.inserted_length
+            before = self.single.inserted_length[:, 0]
             self._drive(log, np.array([speed, 0.0]))
-            advance = (self.single.inserted_length - before)[self._weight > 0].min()
+            advance = (self.single.inserted_length[:, 0] - before)[self._weight > 0].min()
             if advance < SLIP_SHARE * log.control[0] * DECISION_PERIOD_S:
                 return "slipped"
             if self._pressed(log):
                 return "pressed"
             if log.periods - begun >= STALL_PERIODS and log.stalled(self._weight > 0):
                 return "stalled"
-        return None if self._all(self.route.passed(self.single.project(), waypoint)) else "late"
+        return None if self._all(self.route.passed(self.single.project()[:, 0], waypoint)) else "late"
 
     def _approach(self, log: Log, periods: int, waypoint: float, hard: float) -> None:
         """Push on, or pull back, to where a search for a waypoint begins.
@@ -265,9 +265,9 @@ class Search:
             begin = float(before[-1]) - max(self.config.lead_mm, _LEAD_RADII * radius)
         begin = min(begin, hard - self.config.lead_mm)
         for _ in range(periods - log.periods):
-            tip = self.single.project()
+            tip = self.single.project()[:, 0]
             here, on_route = self.route.progress(tip) @ self._weight, self._all(self.route.off_route(tip) == 0)
-            if not on_route and self.single.inserted_length.min() > 1.0:
+            if not on_route and self.single.inserted_length[:, 0].min() > 1.0:
                 self._drive(log, np.array([-self.config.speed_mm_s, 0.0]))
             elif here < begin - 1.0 and not (log.periods >= STALL_PERIODS and log.stalled(self._weight > 0)):
                 self._drive(log, np.array([min(self.config.speed_mm_s, (begin - here) / DECISION_PERIOD_S), 0.0]))
@@ -277,12 +277,14 @@ class Search:
     def _drive(self, log: Log, control: Float[np.ndarray, "2"]) -> None:
         made = self._possible(control[None], self.single)[0]
         step = drive_period(self.single, np.tile(made, (self.single.worlds, 1)))
-        tip = self.single.project()
-        log.add(made, tip, step.tip_position, step.contact_force_max, step.inserted_length, step.rotation)
+        tip = self.single.project()[:, 0]
+        log.add(
+            made, tip, step.tip_position[:, 0], step.contact_force_max, step.inserted_length[:, 0], step.rotation[:, 0]
+        )
 
     def _possible(self, control: Float[np.ndarray, "n 2"], simulator: Simulator) -> Float[np.ndarray, "n 2"]:
         """Return what the drive can do of controls: neither the shortest nor the longest wire leaves the travel."""
-        inserted = simulator.inserted_length
+        inserted = simulator.inserted_length[:, 0]
         for length in (inserted.min(), inserted.max()):
             control = self._limits.clip(control, length, DECISION_PERIOD_S)
         return control
@@ -300,7 +302,7 @@ class Search:
 
         Every attempt begins from the same state, so that a plan holds no motion of a failed one.
         """
-        progress = float(self.route.progress(self.single.project()) @ self._weight)
+        progress = float(self.route.progress(self.single.project()[:, 0]) @ self._weight)
         lookout = max(_LOOKOUT_MM, _LOOKOUT_RADII * float(self.route.radius(np.array([progress]))[0]))
         waypoint = min(self.route.next_waypoint(progress), progress + lookout)
         rounds = min(self.config.rounds, (periods - log.periods) // self.config.round_periods)
@@ -309,7 +311,7 @@ class Search:
             score, controls, won = self._attempt(waypoint, rounds, attempt)
             if won:
                 self._follow(log, controls)
-                self._leave_behind(self.route.passed(self.single.project(), waypoint))
+                self._leave_behind(self.route.passed(self.single.project()[:, 0], waypoint))
                 return True
             if score < nearest:
                 nearest, best = score, controls
@@ -385,10 +387,10 @@ class Search:
         spent = cost.roughness(before, control, self._limits.fastest)
         for _ in range(self.config.round_periods):
             step = drive_period(self._many, np.tile(control, (wires, 1)))
-            tip = self._many.project()
+            tip = self._many.project()[:, 0]
             self._peak = np.maximum(self._peak, step.contact_force_max)
             running = cost.running(
-                error=self._distance(step.tip_position, waypoint),
+                error=self._distance(step.tip_position[:, 0], waypoint),
                 ratio=safety_ratio(tip.offset, tip.radius, self._wire_radius),
                 force_share=step.contact_force_max / self.navigation.force_limit_n,
             )
@@ -403,7 +405,7 @@ class Search:
         self, waypoint: float, spent: Float[np.ndarray, "candidates"], force_n: float
     ) -> tuple[Float[np.ndarray, "candidates"], Float[np.ndarray, "candidates"]]:
         """Return each candidate's cost so far and to go, and the share of its wires that passed within a force."""
-        tip, wires = self._many.project(), self.single.worlds
+        tip, wires = self._many.project()[:, 0], self.single.worlds
         to_go = self._distance(self._many.position[:, 0], waypoint) + 0.5 * self.route.off_route(tip)
         sound = self._many.valid & (self._peak <= force_n)
         passed = (self.route.passed(tip, waypoint) & sound).reshape(wires, -1)

@@ -91,14 +91,14 @@ def sweep(
         else:
             left = (waypoint - weight @ progress[-1]) / DECISION_PERIOD_S
             control[:, 0] = np.where(going, np.clip(left, 1.0, speed_mm_s) if last else speed_mm_s, 0.0)
-        inserted = simulator.inserted_length.reshape(wires, count)
+        inserted = simulator.inserted_length[:, 0].reshape(wires, count)
         for length in (inserted.min(axis=0), inserted.max(axis=0)):
             control = travel.clip(control, length, DECISION_PERIOD_S)
         step = drive_period(simulator, np.tile(control, (wires, 1)))
         made.append(control)
         took[going] = period + 1
-        tip, shape = simulator.project(), (wires, count)
-        advance = simulator.inserted_length.reshape(shape) - inserted
+        tip, shape = simulator.project()[:, 0], (wires, count)
+        advance = simulator.inserted_length[:, 0].reshape(shape) - inserted
         slipped = advance < SLIP_SHARE * control[:, 0] * DECISION_PERIOD_S
         pressed = step.contact_force_max.reshape(shape)
         force = np.where(going, np.maximum(force, pressed[counted].max(axis=0)), force)
@@ -131,7 +131,7 @@ def middle(passed: Bool[np.ndarray, "rotations"]) -> int:
 
 
 def _progress(simulator: Simulator, route: Route, wires: int) -> Float[np.ndarray, "wires rotations"]:
-    return route.progress(simulator.project()).reshape(wires, -1)
+    return route.progress(simulator.project()[:, 0]).reshape(wires, -1)
 
 
 def _stalled(

@@ -6,7 +6,7 @@ Everything follows from the seed, the anatomy's name and the navigation's index,
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -14,6 +14,7 @@ from jaxtyping import Float
 from endopilot.dataset.config import DatasetConfig
 from endopilot.devices.device import Device
 from endopilot.devices.drive_limits import DriveLimits
+from endopilot.devices.stack import Stack
 from endopilot.simulation.controls import free_wire_load, random_controls
 from endopilot.simulation.motion import Motion, motion_named
 from endopilot.types import Anatomy
@@ -30,31 +31,38 @@ class Draw:
     """The drawn controls, friction and tips of navigations.
 
     Attributes:
-        initial: Δ (mm) and φ (rad) before the first period, of the wire, then of each catheter.
-        control: velocities (mm/s, rad/s) or loads (N, N·mm) of the drive, likewise.
+        initial: Δ (mm) and φ (rad) of each device before the first period.
+        control: velocities (mm/s, rad/s) or loads (N, N·mm) of the drives.
         friction: friction coefficient.
         tip_bend_rad: angle of the unloaded tip.
         tip_stiffness_factor: factor on the stiffness of the distal 10 mm.
     """
 
-    initial: Float[np.ndarray, "n numbers"]
-    control: Float[np.ndarray, "n samples numbers"]
+    initial: Float[np.ndarray, "n devices 2"]
+    control: Float[np.ndarray, "n samples devices 2"]
     friction: Float[np.ndarray, "n"]
     tip_bend_rad: Float[np.ndarray, "n"]
     tip_stiffness_factor: Float[np.ndarray, "n"]
 
-    def devices(self, device: Device) -> list[Device]:
-        """Return each navigation's wire; those of one tip share one object, and `device` itself where nothing is
+    def stacks(self, given: Stack) -> list[Stack]:
+        """Return each navigation's devices; those of one tip share one object, and `given` itself where nothing is
         drawn."""
-        made = {(device.tip_bend_rad, 1.0): device}
-        for tip in zip(self.tip_bend_rad.tolist(), self.tip_stiffness_factor.tolist(), strict=True):
-            if tip not in made:
-                made[tip] = device.with_tip(bend_rad=tip[0], stiffness_factor=tip[1])
-        return [made[tip] for tip in zip(self.tip_bend_rad.tolist(), self.tip_stiffness_factor.tolist(), strict=True)]
+        made = {(given.wire.tip_bend_rad, 1.0): given}
+        tips = list(zip(self.tip_bend_rad.tolist(), self.tip_stiffness_factor.tolist(), strict=True))
+        for bend_rad, factor in tips:
+            if (bend_rad, factor) not in made:
+                wire = given.wire.with_tip(bend_rad=bend_rad, stiffness_factor=factor)
+                made[bend_rad, factor] = replace(given, wire=wire)
+        return [made[tip] for tip in tips]
+
+    def frictions(self, given: Stack) -> Float[np.ndarray, "n devices"]:
+        """Return each device's friction coefficient; that of the catheters is their own."""
+        around = [each.device.friction for each in given.catheters]
+        return np.column_stack([self.friction, *(np.full(len(self.friction), value) for value in around)])
 
 
 def draw_navigations(
-    config: DatasetConfig, device: Device, anatomy: Anatomy, sequences: range, *, catheters: int = 0
+    config: DatasetConfig, device: Device, anatomy: Anatomy, sequences: range, *, devices: int = 1
 ) -> Draw:
     """Draw some navigations of an anatomy; each is the same whatever the number of the others.
 
@@ -63,13 +71,12 @@ def draw_navigations(
         device: the wire.
         anatomy: the vessel.
         sequences: their indices among those of the anatomy.
-        catheters: number of catheters around the wire, each driven independently; the wire's draw is the same with
-            and without them.
+        devices: their number, each driven independently; the wire's draw is the same with and without catheters.
     """
     controls, friction, tip, surplus, _ = _streams(config, anatomy.name)
     initial, control = random_controls(
         config.navigation,
-        catheters=catheters,
+        devices=devices,
         n_sequences=len(sequences),
         n_samples=config.samples,
         seed=int(controls.generate_state(1, np.uint64)[0]),
@@ -80,7 +87,7 @@ def draw_navigations(
     bend, stiffness = np.moveaxis(_uniform(tip, (0.0, 1.0), (sequences.stop // TIP_GROUP + 1, 2))[groups], 1, 0)
     own = config.friction or (device.friction, device.friction)
     if config.control == "force":
-        free = control * _uniform(surplus, SURPLUS, sequences.stop)[sequences.start :, None, None]
+        free = control * _uniform(surplus, SURPLUS, sequences.stop)[sequences.start :, None, None, None]
         control = _loads(config, device, free)
     return Draw(
         initial=initial,
@@ -120,8 +127,8 @@ def _within(bounds: tuple[float, float] | None, share: Float[np.ndarray, "n"]) -
 
 
 def _loads(
-    config: DatasetConfig, device: Device, velocity: Float[np.ndarray, "n samples 2"]
-) -> Float[np.ndarray, "n samples 2"]:
+    config: DatasetConfig, device: Device, velocity: Float[np.ndarray, "n samples 1 2"]
+) -> Float[np.ndarray, "n samples 1 2"]:
     """Return the drive's loads (N, N·mm) that would move a free wire at these velocities, within the drive's limits."""
     fastest = DriveLimits.of(device).fastest
     return free_wire_load(

@@ -20,8 +20,8 @@ from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.layout import Block, Layout, make_layout
 from endopilot.dataset.splits import SPLITS
 from endopilot.dataset.workers import run_locally, run_on_cluster
-from endopilot.devices.catheter import Catheter
 from endopilot.devices.device import Device
+from endopilot.devices.stack import Stack
 from endopilot.files import manifest, read_json, write_json, writing
 from endopilot.progress import progress
 from endopilot.runs import claim, remove_partial_files
@@ -33,10 +33,9 @@ _WORK_PATH = "meta/work.json"
 def generate_dataset(
     anatomy_folders: Sequence[str | Path],
     output: str | Path,
-    device: Device,
+    device: Device | Stack,
     config: DatasetConfig | None = None,
     *,
-    catheters: Sequence[Catheter] = (),
     scheduler: str | None = None,
 ) -> None:
     """Simulate random navigations of every anatomy and store them in the LeRobot v3 layout.
@@ -47,9 +46,8 @@ def generate_dataset(
     Args:
         anatomy_folders: anatomies on disk, with different names.
         output: folder of the dataset.
-        device: the wire.
+        device: the wire, or the wire and its catheters; each is driven at random and independently.
         config: number, length, distribution and split of the navigations; the defaults if not given.
-        catheters: around the wire, from the inside out; each is driven at random and independently.
         scheduler: address of a Dask scheduler whose workers simulate; the cores of this machine if not given.
 
     Raises:
@@ -59,7 +57,7 @@ def generate_dataset(
     """
     config = config or DatasetConfig()
     folders = [Path(folder) for folder in anatomy_folders]
-    layout = make_layout(folders, Path(output), device, config, catheters=catheters)
+    layout = make_layout(folders, Path(output), Stack.of(device), config)
     blocks = layout.blocks()
     claim(layout.context.output, "endopilot dataset", **layout.settings)
     if _is_finished(layout, blocks):
@@ -130,10 +128,10 @@ def describe(layout: Layout, blocks: Sequence[Block]) -> None:
     files = [schema.paths_of_file(context.output, block.number) for block in blocks]
     columns = ("episode_index", "anatomy", "sequence", "split", "stopped_short", "valid", "invalid_reason")
     episodes = [row for _, path in files for row in parquet.read_table(path, context.key).select(columns).to_pylist()]
-    started, count = time.process_time(), len(context.catheters)
+    started, devices = time.process_time(), len(context.stack)
     with progress("Describing the dataset", total=len(files)) as advance:
         stats, shares = parquet.statistics(
-            context.config.control, [path for path, _ in files], context.key, advance, count
+            context.config.control, [path for path, _ in files], context.key, advance, devices
         )
     work = read_work(context.output)
     work["processor_seconds"] += time.process_time() - started
@@ -142,7 +140,7 @@ def describe(layout: Layout, blocks: Sequence[Block]) -> None:
     with writing(context.output / schema.TASKS_PATH) as partial:
         tasks.to_parquet(partial)
     samples = context.config.samples
-    write_json(context.output / schema.INFO_PATH, schema.info(context.config.control, len(episodes), samples, count))
+    write_json(context.output / schema.INFO_PATH, schema.info(context.config.control, len(episodes), samples, devices))
     reported = ("episode_index", "anatomy", "sequence", "invalid_reason")
     invalid = [{name: row[name] for name in reported} for row in episodes if not row["valid"]]
     counts = Counter(row["split"] for row in episodes)
@@ -154,8 +152,8 @@ def describe(layout: Layout, blocks: Sequence[Block]) -> None:
         settings=layout.settings,
         files=len(files),
         samples_per_episode=samples,
-        device=asdict(context.device),
-        **({"catheters": [asdict(catheter) for catheter in context.catheters]} if count else {}),
+        device=asdict(context.stack.wire),
+        catheters=[asdict(catheter) for catheter in context.stack.catheters],
         anatomies=[_anatomy_record(layout, i) for i in range(len(layout.names))],
         splits={name: counts[name] for name in SPLITS if counts[name]},
         manoeuvres=shares,

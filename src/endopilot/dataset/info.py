@@ -145,14 +145,19 @@ def _count(table, wire_mm: float, histograms: dict[str, Histogram], visits: Coun
     """Count one file's valid samples, and the branches that each valid navigation reached."""
     valid = parquet.column_values(table, "valid")
     state = parquet.column_values(table, "observation.state")[valid].astype(float)
-    radius = parquet.column_values(table, "lumen_radius_mm")[valid].astype(float)
+    radius = _of_wire(table, "lumen_radius_mm")[valid].astype(float)
     histograms["insertion"].add(state[:, 0])
     histograms["offset-ratio"].add(state[:, 3] / radius)
     histograms["wall-ratio"].add(safety_ratio(state[:, 3], radius, wire_mm))
     histograms["contact-force"].add(parquet.column_values(table, "contact_force_max_n")[valid].astype(float))
-    branch = np.sort(parquet.column_values(table, "branch").reshape(-1, samples), axis=1)
+    branch = np.sort(_of_wire(table, "branch").reshape(-1, samples), axis=1)
     distinct = 1 + (np.diff(branch, axis=1) != 0).sum(axis=1)
     visits.update(distinct[valid.reshape(-1, samples).all(axis=1)].tolist())
+
+
+def _of_wire(table, name: str) -> np.ndarray:
+    """Return the wire's number in each row of a column that holds one of each device."""
+    return parquet.column_values(table, name).reshape(len(table), -1)[:, 0]
 
 
 def _anatomies(episodes: dict[str, list[Any]]) -> dict[str, int]:

@@ -67,8 +67,8 @@ def _check_alike(first: Dataset, other: Dataset) -> None:
                 f"{other.folder}: its wire is {theirs['name']}, and that of {first.folder} is {ours['name']}, with "
                 f"another {name}; join datasets of one wire"
             )
-    if first.catheters != other.catheters:
-        around = [", ".join(each.name for each in data.catheters) or "no catheter" for data in (other, first)]
+    if first.stack.catheters != other.stack.catheters:
+        around = [", ".join(each.name for each in data.stack.catheters) or "no catheter" for data in (other, first)]
         raise InputError(
             f"{other.folder}: its wire lies in {around[0]}, and that of {first.folder} in {around[1]}; join datasets "
             "of the same devices"

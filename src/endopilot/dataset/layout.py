@@ -18,13 +18,13 @@ from endopilot.dataset import schema
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.draw import patient_motion
 from endopilot.dataset.splits import assign_splits
-from endopilot.devices.catheter import Catheter, check_nested
-from endopilot.devices.device import Device
+from endopilot.devices.catheter import check_nested
+from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.files import json_text, read_json
 from endopilot.simulation.motion import Motion
 
-FORMAT_VERSION = 5
+FORMAT_VERSION = 6
 """Counts changes of the columns or of their meaning."""
 
 
@@ -58,18 +58,16 @@ class BlockContext:
     Attributes:
         output: folder of the dataset.
         config: number, length, distribution and split of the navigations.
-        device: the wire.
+        stack: the wire, and the catheters around it.
         key: marks the files of this dataset; it follows from all settings.
         task: what the navigations do, as LeRobot names it.
-        catheters: around the wire, from the inside out.
     """
 
     output: Path
     config: DatasetConfig
-    device: Device
+    stack: Stack
     key: str
     task: str = schema.TASK
-    catheters: tuple[Catheter, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,10 +106,9 @@ class Layout:
 def make_layout(
     folders: Sequence[Path],
     output: Path,
-    device: Device,
+    stack: Stack,
     config: DatasetConfig,
     *,
-    catheters: Sequence[Catheter] = (),
     task: str = schema.TASK,
     origin: Mapping[str, Any] | None = None,
 ) -> Layout:
@@ -120,9 +117,8 @@ def make_layout(
     Args:
         folders: of the anatomies.
         output: folder of the dataset.
-        device: the wire.
+        stack: the wire, and the catheters around it.
         config: number, length, distribution and split of the navigations.
-        catheters: around the wire, from the inside out.
         task: what they do.
         origin: what else they follow from, where they were not drawn at random.
 
@@ -130,8 +126,8 @@ def make_layout(
         InputError: no anatomy, or a folder that is none; two of one name; too few for the split; catheters that do not
             fit around the wire, or are to be driven by force.
     """
-    check_nested(device, catheters)
-    if catheters and config.control == "force":
+    check_nested(stack.wire, stack.catheters)
+    if stack.catheters and config.control == "force":
         raise InputError("control: 'force' with catheters; give 'velocity'")
     if not folders:
         raise InputError("anatomies: none given; name at least one folder made by `endopilot anatomy`")
@@ -146,15 +142,15 @@ def make_layout(
     del described["simulator"]["threads"]  # no bit depends on it
     settings = {
         "config": described,
-        "device": asdict(device),
+        "device": asdict(stack.wire),
         "anatomies": dict(zip(names, identities, strict=True)),
         "version": version(),
-        **({"catheters": [asdict(catheter) for catheter in catheters]} if catheters else {}),
+        **({"catheters": [asdict(catheter) for catheter in stack.catheters]} if stack.catheters else {}),
         **(origin or {}),
     }
     settings = json.loads(json_text(settings))  # as JSON gives them back, so that they compare equal
     key = hashlib.sha256(json_text(settings).encode()).hexdigest()
-    context = BlockContext(Path(output), config, device, key, task, tuple(catheters))
+    context = BlockContext(Path(output), config, stack, key, task)
     motions = tuple(patient_motion(config, name) for name in names)
     return Layout(context, tuple(map(Path, folders)), names, identities, splits, motions, settings)
 

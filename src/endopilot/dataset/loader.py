@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -15,13 +14,14 @@ from endopilot.dataset.schema import (
     INFO_PATH,
     LEROBOT_VERSION,
     MANIFEST_PATH,
-    OF_CATHETER,
     actuation_of,
-    catheters_of,
+    devices_of,
     paths_of_file,
     signals,
 )
 from endopilot.devices.catheter import Catheter
+from endopilot.devices.device import Device
+from endopilot.devices.stack import Stack, column_prefixes
 from endopilot.errors import InputError
 from endopilot.extras import extra_named
 from endopilot.files import read_json, reading
@@ -36,6 +36,8 @@ _MEND = "make the dataset again"
 class Dataset:
     """Episodes of equal length. Sample t is the state at the end of period t; `control[:, t]` is the mean over it.
 
+    Device 0 is the wire; the catheters around it follow from the inside out.
+
     Attributes:
         folder: where it was read from.
         manifest: how it was made (`meta/manifest.json`).
@@ -47,9 +49,11 @@ class Dataset:
         friction: friction coefficient between wire and wall.
         tip_bend: angle by which the unloaded tip is bent, rad.
         tip_stiffness_factor: factor on the stiffness of the device's distal 10 mm.
-        initial_inserted_length: Δ before the first period, mm.
-        initial_rotation: φ before the first period, rad.
-        control: π = (dΔ/dt mm/s, dφ/dt rad/s): the applied velocity, or that which resulted from force and torque.
+        initial: Δ (mm) and φ (rad) of each device before the first period.
+        command: what the drives were commanded: dΔ/dt (mm/s) and dφ/dt (rad/s), or force (N) and torque (N·mm).
+            Simulated again it gives the same navigation to the bit, which `control` does not: a drive that pushes at
+            one speed until it slips strains the wire otherwise than one that is slower from the start.
+        control: π = (dΔ/dt mm/s, dφ/dt rad/s), what was made of it.
         inserted_length: Δ, mm.
         rotation: φ, rad, unwrapped.
         tip_abscissa: Δtip, mm.
@@ -67,8 +71,6 @@ class Dataset:
         slip: advance that was commanded and not made over the period, mm; nearly always 0.
         rotation_slip: rotation likewise, rad.
         valid: false from the sample in which the simulation of that episode failed.
-        catheter_initial: (Δ mm, φ rad) of each catheter before the first period; the fields of catheters that follow
-            mean what those of the wire do. A wire alone has none: their axis has the length 0.
     """
 
     folder: Path
@@ -81,49 +83,36 @@ class Dataset:
     friction: Float[np.ndarray, "episodes"]
     tip_bend: Float[np.ndarray, "episodes"]
     tip_stiffness_factor: Float[np.ndarray, "episodes"]
-    initial_inserted_length: Float[np.ndarray, "episodes"]
-    initial_rotation: Float[np.ndarray, "episodes"]
-    control: Float[np.ndarray, "episodes samples 2"]
-    inserted_length: Float[np.ndarray, "episodes samples"]
-    rotation: Float[np.ndarray, "episodes samples"]
-    tip_abscissa: Float[np.ndarray, "episodes samples"]
-    tip_offset: Float[np.ndarray, "episodes samples"]
-    tip_position: Float[np.ndarray, "episodes samples 3"]
-    tip_direction: Float[np.ndarray, "episodes samples 3"]
-    branch: Int[np.ndarray, "episodes samples"]
-    lumen_radius: Float[np.ndarray, "episodes samples"]
+    initial: Float[np.ndarray, "episodes devices 2"]
+    command: Float[np.ndarray, "episodes samples devices 2"]
+    control: Float[np.ndarray, "episodes samples devices 2"]
+    inserted_length: Float[np.ndarray, "episodes samples devices"]
+    rotation: Float[np.ndarray, "episodes samples devices"]
+    tip_abscissa: Float[np.ndarray, "episodes samples devices"]
+    tip_offset: Float[np.ndarray, "episodes samples devices"]
+    tip_position: Float[np.ndarray, "episodes samples devices 3"]
+    tip_direction: Float[np.ndarray, "episodes samples devices 3"]
+    branch: Int[np.ndarray, "episodes samples devices"]
+    lumen_radius: Float[np.ndarray, "episodes samples devices"]
+    base_force: Float[np.ndarray, "episodes samples devices"]
+    base_torque: Float[np.ndarray, "episodes samples devices"]
+    drive_force: Float[np.ndarray, "episodes samples devices"]
+    drive_torque: Float[np.ndarray, "episodes samples devices"]
+    slip: Float[np.ndarray, "episodes samples devices"]
+    rotation_slip: Float[np.ndarray, "episodes samples devices"]
     contact_force_max: Float[np.ndarray, "episodes samples"]
     contact_force_sum: Float[np.ndarray, "episodes samples"]
-    base_force: Float[np.ndarray, "episodes samples"]
-    base_torque: Float[np.ndarray, "episodes samples"]
-    drive_force: Float[np.ndarray, "episodes samples"]
-    drive_torque: Float[np.ndarray, "episodes samples"]
-    slip: Float[np.ndarray, "episodes samples"]
-    rotation_slip: Float[np.ndarray, "episodes samples"]
     valid: Bool[np.ndarray, "episodes samples"]
-    catheter_initial: Float[np.ndarray, "episodes catheters 2"]
-    catheter_control: Float[np.ndarray, "episodes samples catheters 2"]
-    catheter_inserted_length: Float[np.ndarray, "episodes samples catheters"]
-    catheter_rotation: Float[np.ndarray, "episodes samples catheters"]
-    catheter_tip_abscissa: Float[np.ndarray, "episodes samples catheters"]
-    catheter_tip_offset: Float[np.ndarray, "episodes samples catheters"]
-    catheter_tip_position: Float[np.ndarray, "episodes samples catheters 3"]
-    catheter_branch: Int[np.ndarray, "episodes samples catheters"]
-    catheter_base_force: Float[np.ndarray, "episodes samples catheters"]
-    catheter_base_torque: Float[np.ndarray, "episodes samples catheters"]
-    catheter_drive_force: Float[np.ndarray, "episodes samples catheters"]
-    catheter_drive_torque: Float[np.ndarray, "episodes samples catheters"]
-    catheter_slip: Float[np.ndarray, "episodes samples catheters"]
-    catheter_rotation_slip: Float[np.ndarray, "episodes samples catheters"]
 
     def __len__(self) -> int:
         """Return the number of episodes."""
         return len(self.anatomy)
 
     @property
-    def catheters(self) -> tuple[Catheter, ...]:
-        """Catheters around the wire, from the inside out; none around a wire alone."""
-        return tuple(from_record(Catheter, record) for record in self.manifest.get("catheters", ()))
+    def stack(self) -> Stack:
+        """The wire as it was given, and the catheters around it."""
+        catheters = tuple(from_record(Catheter, record) for record in self.manifest["catheters"])
+        return Stack(from_record(Device, self.manifest["device"]), catheters)
 
     def check_wire_alone(self, what: str) -> None:
         """Check that the dataset's wire has no catheter around it, for what takes a wire alone.
@@ -134,30 +123,12 @@ class Dataset:
         Raises:
             InputError: it has one.
         """
-        if self.catheters:
-            names = ", ".join(catheter.name for catheter in self.catheters)
+        if self.stack.catheters:
+            names = ", ".join(catheter.name for catheter in self.stack.catheters)
             raise InputError(
                 f"{self.folder}: its wires lie in {names}, and {what} takes a wire alone; "
                 "make a dataset without --catheter"
             )
-
-    @property
-    def initial(self) -> Float[np.ndarray, "episodes numbers"]:
-        """(Δ mm, φ rad) before the first period, of the wire, then of each catheter, as `simulate` takes them."""
-        wire = np.column_stack([self.initial_inserted_length, self.initial_rotation])
-        return np.concatenate([wire, self.catheter_initial.reshape(len(self), -1)], axis=1)
-
-    @property
-    def command(self) -> Float[np.ndarray, "episodes samples numbers"]:
-        """Control that the drives were commanded (mm/s, rad/s): `control` and the slip, of the wire and each catheter.
-
-        Simulated again it gives the same navigation to the bit, which `control` does not: a drive that pushes at one
-        speed until it slips strains the wire otherwise than one that is slower from the start.
-        """
-        wire = commanded(self.control, np.stack([self.slip, self.rotation_slip], axis=-1), self.sample_period_s)
-        slip = np.stack([self.catheter_slip, self.catheter_rotation_slip], axis=-1)
-        others = commanded(self.catheter_control, slip, self.sample_period_s)
-        return np.concatenate([wire, others.reshape(*wire.shape[:2], -1)], axis=-1)
 
     def select(self, episodes: Shaped[np.ndarray, "chosen"]) -> Dataset:
         """Return the chosen episodes, given as a mask or as indices."""
@@ -203,13 +174,6 @@ class Dataset:
         if identify(folder) != (name, record["sha256"]):
             raise InputError(f"{folder}: is not the anatomy that {self.folder} was made in; make the dataset again")
         return folder
-
-
-def commanded(
-    control: Float[np.ndarray, "*n 2"], slip: Float[np.ndarray, "*n 2"], sample_period_s: float
-) -> Float[np.ndarray, "*n 2"]:
-    """Return the control that was commanded (mm/s, rad/s), from the motion of the drive and its slip (mm, rad)."""
-    return (control + slip / sample_period_s).astype(control.dtype).astype(float)
 
 
 def read_manifest(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -259,7 +223,7 @@ def _of_files(folder: Path, manifest: dict[str, Any], info: dict[str, Any]) -> D
     from endopilot.dataset.parquet import column_values, read_table
 
     samples, total = manifest["samples_per_episode"], info["total_episodes"]
-    actuation, catheters = actuation_of(info["features"]), catheters_of(info["features"])
+    actuation, devices = actuation_of(info["features"]), devices_of(info["features"])
     episodes: dict[str, list[np.ndarray]] = {}
     signal: dict[str, np.ndarray] = {}
     filled = 0
@@ -277,7 +241,7 @@ def _of_files(folder: Path, manifest: dict[str, Any], info: dict[str, Any]) -> D
         end = filled + table.num_rows
         if end > total:
             break
-        for name in signals(actuation, catheters):
+        for name in signals(actuation, devices):
             values = column_values(data, name)
             values = values.reshape(table.num_rows, samples, *values.shape[1:])
             if name not in signal:  # in place, so that a large dataset is never held twice
@@ -291,7 +255,20 @@ def _of_files(folder: Path, manifest: dict[str, Any], info: dict[str, Any]) -> D
             f"{folder}: {len(episode['episode_index'])} episodes where {INFO_PATH} counts {total}; "
             "run `endopilot dataset` again"
         )
-    state = signal["observation.state"]
+    shape = (total, samples, devices)
+    vectors = ("action", "velocity", "observation.state", "tip_position_mm", "tip_direction")
+    of_devices = {name: signal[name].reshape(*shape, -1) for name in vectors if name in signal}
+    state = of_devices["observation.state"]
+    if actuation == "force":
+        control = of_devices["velocity"]
+    else:
+        slip = np.stack([signal["slip_mm"], signal["rotation_slip_rad"]], axis=-1).reshape(*shape, 2)
+        control = (of_devices["action"] - slip * info["fps"]).astype(np.float32)
+    starts = [
+        f"{prefix}initial_{name}"
+        for prefix in column_prefixes(devices)
+        for name in ("inserted_length_mm", "rotation_rad")
+    ]
     return Dataset(
         folder=folder,
         manifest=manifest,
@@ -303,54 +280,24 @@ def _of_files(folder: Path, manifest: dict[str, Any], info: dict[str, Any]) -> D
         friction=episode["friction"],
         tip_bend=episode["tip_bend_rad"],
         tip_stiffness_factor=episode["tip_stiffness_factor"],
-        initial_inserted_length=episode["initial_inserted_length_mm"],
-        initial_rotation=episode["initial_rotation_rad"],
-        control=signal["velocity" if actuation == "force" else "action"][..., :2],
+        initial=np.stack([episode[name] for name in starts], axis=-1).reshape(total, devices, 2),
+        command=of_devices["action"],
+        control=control,
         inserted_length=state[..., 0],
         rotation=state[..., 1],
         tip_abscissa=state[..., 2],
         tip_offset=state[..., 3],
-        tip_position=signal["tip_position_mm"],
-        tip_direction=signal["tip_direction"],
-        branch=signal["branch"],
-        lumen_radius=signal["lumen_radius_mm"],
+        tip_position=of_devices["tip_position_mm"],
+        tip_direction=of_devices["tip_direction"],
+        branch=signal["branch"].reshape(shape),
+        lumen_radius=signal["lumen_radius_mm"].reshape(shape),
+        base_force=signal["base_force_n"].reshape(shape),
+        base_torque=signal["base_torque_nmm"].reshape(shape),
+        drive_force=signal["drive_force_n"].reshape(shape),
+        drive_torque=signal["drive_torque_nmm"].reshape(shape),
+        slip=signal["slip_mm"].reshape(shape),
+        rotation_slip=signal["rotation_slip_rad"].reshape(shape),
         contact_force_max=signal["contact_force_max_n"],
         contact_force_sum=signal["contact_force_sum_n"],
-        base_force=signal["base_force_n"],
-        base_torque=signal["base_torque_nmm"],
-        drive_force=signal["drive_force_n"],
-        drive_torque=signal["drive_torque_nmm"],
-        slip=signal["slip_mm"],
-        rotation_slip=signal["rotation_slip_rad"],
         valid=signal["valid"],
-        **_of_catheters(episode, signal, catheters),
     )
-
-
-def _of_catheters(
-    episode: dict[str, np.ndarray], signal: dict[str, np.ndarray], catheters: int
-) -> dict[str, np.ndarray]:
-    """Return the fields of a `Dataset` that tell of its catheters."""
-    prefixes = [f"catheter_{k + 1}_" for k in range(catheters)]
-    names = (f"{prefix}initial_{name}" for prefix in prefixes for name in ("inserted_length_mm", "rotation_rad"))
-    total, samples = signal["valid"].shape
-    first = np.array([episode[name] for name in names]).reshape(2 * catheters, total).T
-    state = signal["observation.state"][..., 4:].reshape(total, samples, catheters, 4)
-    made = {
-        "catheter_initial": first.reshape(total, catheters, 2),
-        "catheter_control": signal["action"][..., 2:].reshape(total, samples, catheters, 2),
-        "catheter_inserted_length": state[..., 0],
-        "catheter_rotation": state[..., 1],
-        "catheter_tip_abscissa": state[..., 2],
-        "catheter_tip_offset": state[..., 3],
-    }
-    for name in OF_CATHETER:
-        like = np.empty((total, samples, 0, *signal[name].shape[2:]), dtype=signal[name].dtype)
-        parts = [like, *(signal[prefix + name][:, :, None] for prefix in prefixes)]
-        made[f"catheter_{_plain(name)}"] = np.concatenate(parts, axis=2)
-    return made
-
-
-def _plain(column: str) -> str:
-    """Return the name of a column without its unit."""
-    return re.sub(r"_(mm|rad|n|nmm)$", "", column)

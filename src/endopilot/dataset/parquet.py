@@ -1,4 +1,4 @@
-"""The Parquet files of a dataset: rollouts to tables, tables to files and back, and statistics over all of them."""
+"""The Parquet files of a dataset: trajectories to tables, tables to files and back, and statistics over all of them."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from endopilot.dataset.schema import INDEX_COLUMNS, MANOEUVRES, OF_CATHETER, manoeuvres, signals
+from endopilot.dataset.schema import INDEX_COLUMNS, MANOEUVRES, manoeuvres, signals
 from endopilot.errors import InputError
 from endopilot.progress import Advance
 from endopilot.simulation.config import Actuation
-from endopilot.types import CatheterMotion, Rollout, TipProjection
+from endopilot.simulation.trajectory import Trajectory
 
 _KEY = b"endopilot_key"
 _LEVEL = 5
@@ -23,91 +23,44 @@ _FEW_VALUES = {"timestamp"}
 """Columns that repeat their values: a dictionary is the smallest."""
 
 
-def sample_table(
-    rollout: Rollout,
-    applied: np.ndarray,
-    actuation: Actuation,
-    first_episode: int,
-    key: str,
-    catheter_tip: TipProjection | None = None,
-) -> pa.Table:
-    """Return the samples of a rollout as rows, one episode after the other.
+def sample_table(trajectory: Trajectory, first_episode: int, key: str) -> pa.Table:
+    """Return the samples of a trajectory as rows, one episode after the other.
 
     Args:
-        rollout: one world for each episode.
-        applied: control of each world and sample, where it is a load (N, N·mm).
-        actuation: what the control is.
-        first_episode: index in the dataset of the rollout's first world.
+        trajectory: one world for each episode.
+        first_episode: index in the dataset of its first world.
         key: marks the dataset that the file belongs to.
-        catheter_tip: where the catheters' tips lie (worlds, samples, catheters), if there are any.
     """
-    worlds, samples = rollout.valid.shape
-    state = (rollout.inserted_length, rollout.rotation, rollout.tip.abscissa, rollout.tip.offset)
+    worlds, samples = trajectory.valid.shape
+    tip = trajectory.tip
     columns = {
         "index": first_episode * samples + np.arange(worlds * samples),
         "episode_index": np.repeat(first_episode + np.arange(worlds), samples),
         "frame_index": np.tile(np.arange(samples), worlds),
         "task_index": np.zeros(worlds * samples, dtype=np.int64),
         # LeRobot's clock starts at 0 with the first recorded sample.
-        "timestamp": np.tile(np.arange(samples) * rollout.sample_period_s, worlds),
-        "action": applied if actuation == "force" else rollout.control,
-        "velocity": rollout.control,
-        "observation.state": np.stack(state, axis=-1),
-        "tip_position_mm": rollout.tip_position,
-        "tip_direction": rollout.tip_direction,
-        "branch": rollout.tip.branch,
-        "lumen_radius_mm": rollout.tip.radius,
-        "contact_force_max_n": rollout.contact_force_max,
-        "contact_force_sum_n": rollout.contact_force_sum,
-        "base_force_n": rollout.base_force,
-        "base_torque_nmm": rollout.base_torque,
-        "drive_force_n": rollout.drive_force,
-        "drive_torque_nmm": rollout.drive_torque,
-        "slip_mm": rollout.slip,
-        "rotation_slip_rad": rollout.rotation_slip,
-        "valid": rollout.valid,
+        "timestamp": np.tile(np.arange(samples) * trajectory.period_s, worlds),
+        "action": trajectory.command,
+        "velocity": trajectory.control,
+        "observation.state": np.concatenate([trajectory.proximal, np.stack([tip.abscissa, tip.offset], -1)], axis=-1),
+        "tip_position_mm": trajectory.tip_position,
+        "tip_direction": trajectory.tip_direction,
+        "branch": tip.branch,
+        "lumen_radius_mm": tip.radius,
+        "contact_force_max_n": trajectory.contact_force_max,
+        "contact_force_sum_n": trajectory.contact_force_sum,
+        "base_force_n": trajectory.base_force,
+        "base_torque_nmm": trajectory.base_torque,
+        "drive_force_n": trajectory.drive_force,
+        "drive_torque_nmm": trajectory.drive_torque,
+        "slip_mm": trajectory.slip,
+        "rotation_slip_rad": trajectory.rotation_slip,
+        "valid": trajectory.valid,
     }
-    count = 0
-    if rollout.catheters is not None and catheter_tip is not None:
-        count = rollout.catheters.rotation.shape[2]
-        for k in range(count):
-            _add_catheter(columns, k, rollout.catheters, catheter_tip)
-        _add_exact_slip(columns, applied, rollout.sample_period_s)
     kinds = dict.fromkeys(INDEX_COLUMNS, ("int64", None)) | {"timestamp": ("float32", None)}
-    kinds |= signals(actuation, count)
+    kinds |= signals(trajectory.set_up.actuation, trajectory.devices)
     arrays = {name: _column(columns[name], *kinds[name]) for name in columns if name in kinds}
     return pa.table(arrays).replace_schema_metadata({_KEY: key.encode()})
-
-
-def _add_catheter(columns: dict[str, np.ndarray], k: int, motion: CatheterMotion, tip: TipProjection) -> None:
-    """Add what catheter k did to the samples' columns."""
-    state = (motion.inserted_length, motion.rotation, tip.abscissa, tip.offset)
-    columns["action"] = np.concatenate([columns["action"], motion.control[:, :, k]], axis=-1)
-    added = np.stack([values[:, :, k] for values in state], axis=-1)
-    columns["observation.state"] = np.concatenate([columns["observation.state"], added], axis=-1)
-    own = (
-        motion.tip_position,
-        tip.branch,
-        motion.base_force,
-        motion.base_torque,
-        motion.drive_force,
-        motion.drive_torque,
-        motion.slip,
-        motion.rotation_slip,
-    )
-    for name, values in zip(OF_CATHETER, own, strict=True):
-        columns[f"catheter_{k + 1}_{name}"] = values[:, :, k]
-
-
-def _add_exact_slip(columns: dict[str, np.ndarray], applied: np.ndarray, sample_period_s: float) -> None:
-    """Put slips in place of the recorded ones that give the commands back to the bit, whatever float32 makes of motion.
-
-    A drive that is asked to rest beside one that moves is often carried along: it then slips more than it is asked.
-    """
-    slip = sample_period_s * (applied - columns["action"].astype(np.float32))
-    for k in range(applied.shape[2] // 2):
-        prefix = f"catheter_{k}_" if k else ""
-        columns[f"{prefix}slip_mm"], columns[f"{prefix}rotation_slip_rad"] = slip[..., 2 * k], slip[..., 2 * k + 1]
 
 
 def episode_table(columns: Mapping[str, Any], key: str) -> pa.Table:
@@ -169,7 +122,7 @@ def column_values(table: pa.Table, name: str) -> np.ndarray:
 
 
 def statistics(
-    actuation: Actuation, paths: Iterable[Path], key: str, advance: Advance, catheters: int = 0
+    actuation: Actuation, paths: Iterable[Path], key: str, advance: Advance, devices: int = 1
 ) -> tuple[dict[str, dict[str, list[float]]], dict[str, float]]:
     """Return the content of `meta/stats.json`, and the share of each manoeuvre in what was driven.
 
@@ -180,7 +133,7 @@ def statistics(
         paths: the data files.
         key: key of the dataset.
         advance: called once for each file that has been read.
-        catheters: their number; the manoeuvres are the wire's.
+        devices: their number; the manoeuvres are the wire's.
     """
     sums: dict[str, list[np.ndarray]] = {}
     count, driven = 0, np.zeros(len(MANOEUVRES))
@@ -190,7 +143,7 @@ def statistics(
         count += int(valid.sum())
         velocity = column_values(table, "velocity" if actuation == "force" else "action")[valid]
         driven += np.bincount(manoeuvres(velocity), minlength=len(driven))
-        for name, (dtype, _) in signals(actuation, catheters).items():
+        for name, (dtype, _) in signals(actuation, devices).items():
             if dtype == "bool" or not valid.any():
                 continue
             values = column_values(table, name)[valid].astype(np.float64).reshape(int(valid.sum()), -1)

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from endopilot.devices.stack import column_prefixes
 from endopilot.simulation.config import Actuation
 from endopilot.types import SAMPLE_PERIOD_S
 
@@ -30,57 +31,52 @@ INDEX_COLUMNS = ("index", "episode_index", "frame_index", "task_index")
 
 VELOCITY = ["translation_mm_s", "rotation_rad_s"]
 LOAD = ["drive_force_n", "drive_torque_nmm"]
-_SIGNALS: dict[str, tuple[str, list[str] | None]] = {
+_OF_DEVICES: dict[str, tuple[str, list[str] | None]] = {
     "observation.state": ("float32", ["inserted_length_mm", "rotation_rad", "tip_abscissa_mm", "tip_offset_mm"]),
     "tip_position_mm": ("float32", ["x", "y", "z"]),
     "tip_direction": ("float32", ["x", "y", "z"]),
     "branch": ("int64", None),
     "lumen_radius_mm": ("float32", None),
-    "contact_force_max_n": ("float32", None),
-    "contact_force_sum_n": ("float32", None),
     "base_force_n": ("float32", None),
     "base_torque_nmm": ("float32", None),
     "drive_force_n": ("float32", None),
     "drive_torque_nmm": ("float32", None),
-    "slip_mm": ("float64", None),  # with all its digits, so that `Dataset.command` is exact; nearly all are 0
+    "slip_mm": ("float64", None),
     "rotation_slip_rad": ("float64", None),
+}
+"""Columns that hold numbers of each device, the wire's first."""
+_OF_ALL: dict[str, tuple[str, list[str] | None]] = {
+    "contact_force_max_n": ("float32", None),
+    "contact_force_sum_n": ("float32", None),
     "valid": ("bool", None),
 }
-OF_CATHETER = (
-    "tip_position_mm",
-    "branch",
-    "base_force_n",
-    "base_torque_nmm",
-    "drive_force_n",
-    "drive_torque_nmm",
-    "slip_mm",
-    "rotation_slip_rad",
-)
-"""Columns that each catheter has of its own; their names begin with `catheter_1_` and `catheter_2_`."""
 MANOEUVRES = ("insertion", "retraction", "spin", "pause")
 _MOVES_MM_S, _TURNS_RAD_S = 0.1, 0.02
 """Below these a drive rests: mm/s, rad/s."""
 
 
-def signals(actuation: Actuation, catheters: int = 0) -> dict[str, tuple[str, list[str] | None]]:
+def signals(actuation: Actuation, devices: int = 1) -> dict[str, tuple[str, list[str] | None]]:
     """Return the name of each simulated column, its type, and the names of its components if it is a vector.
 
-    `action` is the control that was applied. Under force control, `velocity` is the resulting velocity. The load of
-    the drive is always in `drive_force_n` and `drive_torque_nmm`. `action` and `observation.state` have further
-    components for each catheter, and there are columns `catheter_1_...`.
+    `action` is what the drives were commanded, with all its digits: simulated again it gives the same navigation to the
+    bit. Under force control, `velocity` is the resulting velocity. The load of a drive is always in `drive_force_n` and
+    `drive_torque_nmm`. With catheters, a column has components of each device, those of catheter k named
+    `catheter_k_...`.
     """
     velocity = {"velocity": ("float32", VELOCITY)} if actuation == "force" else {}
-    wire = {"action": ("float32", LOAD if actuation == "force" else VELOCITY), **velocity, **_SIGNALS}
-    prefixes = [f"catheter_{k + 1}_" for k in range(catheters)]
-    for name in ("action", "observation.state"):
-        kind, of_wire = wire[name]
-        wire[name] = kind, [prefix + component for prefix in ("", *prefixes) for component in of_wire or ()]
-    return wire | {prefix + name: _SIGNALS[name] for prefix in prefixes for name in OF_CATHETER}
+    own = {"action": ("float64", LOAD if actuation == "force" else VELOCITY), **velocity, **_OF_DEVICES}
+    return {name: (kind, _components(names, devices)) for name, (kind, names) in own.items()} | _OF_ALL
 
 
-def catheters_of(described: Mapping[str, Any]) -> int:
-    """Return how many catheters a dataset has, from the `features` of its `meta/info.json`."""
-    return sum(name.startswith("catheter_") and name.endswith("_rotation_slip_rad") for name in described)
+def _components(names: list[str] | None, devices: int) -> list[str] | None:
+    if names is None:
+        return None if devices == 1 else ["wire", *(prefix[:-1] for prefix in column_prefixes(devices)[1:])]
+    return [prefix + name for prefix in column_prefixes(devices) for name in names]
+
+
+def devices_of(described: Mapping[str, Any]) -> int:
+    """Return how many devices a dataset has, from the `features` of its `meta/info.json`."""
+    return int(described["branch"]["shape"][0])
 
 
 def actuation_of(described: Mapping[str, Any]) -> Actuation:
@@ -97,11 +93,11 @@ def manoeuvres(velocity: np.ndarray) -> np.ndarray:
     return np.select([along > _MOVES_MM_S, along < -_MOVES_MM_S, turn > _TURNS_RAD_S], [0, 1, 2], 3)
 
 
-def features(actuation: Actuation, catheters: int = 0) -> dict[str, dict[str, Any]]:
+def features(actuation: Actuation, devices: int = 1) -> dict[str, dict[str, Any]]:
     """Return the `features` entry of `meta/info.json`: type, shape and component names of every column."""
     described = {"timestamp": {"dtype": "float32", "shape": [1], "names": None}}
     described |= {name: {"dtype": "int64", "shape": [1], "names": None} for name in INDEX_COLUMNS}
-    for name, (dtype, names) in signals(actuation, catheters).items():
+    for name, (dtype, names) in signals(actuation, devices).items():
         described[name] = {"dtype": dtype, "shape": [len(names) if names else 1], "names": names}
     return described
 
@@ -113,7 +109,7 @@ def paths_of_file(folder: Path, number: int) -> tuple[Path, Path]:
     return folder / DATA_PATH.format(**where), folder / EPISODES_PATH.format(**where)
 
 
-def info(actuation: Actuation, episodes: int, samples_per_episode: int, catheters: int = 0) -> dict[str, Any]:
+def info(actuation: Actuation, episodes: int, samples_per_episode: int, devices: int = 1) -> dict[str, Any]:
     """Return the content of `meta/info.json`.
 
     LeRobot's `splits` are ranges of episodes, which ours are not: they are in the episode table, column `split`.
@@ -129,5 +125,5 @@ def info(actuation: Actuation, episodes: int, samples_per_episode: int, catheter
         "splits": {},
         "data_path": DATA_PATH,
         "video_path": None,
-        "features": features(actuation, catheters),
+        "features": features(actuation, devices),
     }

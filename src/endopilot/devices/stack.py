@@ -22,10 +22,19 @@ Proximals = tuple[tuple[float, float], ...]
 
 @dataclass(frozen=True)
 class Stack:
-    """A wire, and the catheters around it from the inside out; none for a wire alone."""
+    """A wire, and the catheters around it from the inside out; a wire alone is a stack of one."""
 
     wire: Device
     catheters: tuple[Catheter, ...] = ()
+
+    @staticmethod
+    def of(device: Device | Stack) -> Stack:
+        """Return a stack as it is, and a wire as a stack of one."""
+        return device if isinstance(device, Stack) else Stack(device)
+
+    def __len__(self) -> int:
+        """Return the number of devices."""
+        return 1 + len(self.catheters)
 
     @property
     def devices(self) -> tuple[Device, ...]:
@@ -48,6 +57,11 @@ class Stack:
         return np.array([[each.push_limit_n, each.pull_limit_n, each.torque_limit_n_mm] for each in self.devices])
 
     @property
+    def fastest(self) -> Float[np.ndarray, "devices 2"]:
+        """Fastest translation (mm/s) and rotation (rad/s) of each drive."""
+        return np.array([[each.max_velocity_mm_s, each.max_rotation_rad_s] for each in self.devices])
+
+    @property
     def constants(self) -> tuple[Any, ...]:
         """All numbers of the devices: stacks with the same constants behave the same."""
         bores = tuple((each.inner_diameter_mm, each.bore_friction, each.shape) for each in self.catheters)
@@ -62,6 +76,11 @@ class Stack:
         check_nested(self.wire, self.catheters)
         for device in self.devices:
             check_fits(device, anatomy)
+
+
+def column_prefixes(devices: int) -> tuple[str, ...]:
+    """Return what names of a table's columns begin with, by device: nothing for the wire, then `catheter_1_`, ..."""
+    return ("", *(f"catheter_{k}_" for k in range(1, devices)))
 
 
 def lines_from_tips(

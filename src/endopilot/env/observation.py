@@ -28,48 +28,46 @@ class Measured:
     """The worlds at one moment; row i belongs to world i.
 
     Attributes:
-        tips: projections to the centerline of the wires' tips, then of each catheter's.
-        position: of the wires' tips, LPS mm.
-        direction: unit vectors along the wires at their tips.
+        tip: projections of the devices' tips to the centerline.
+        position: of the tips, LPS mm.
+        direction: unit vectors along the devices at their tips.
         contact_force: largest force of the wall on one node, N.
-        inserted_length: Δ of the wires, then of each catheter, mm.
-        rotation: φ, rad, likewise.
+        inserted_length: Δ of the devices, mm.
+        rotation: φ, rad.
         valid: false for a world that has failed.
     """
 
-    tips: tuple[TipProjection, ...]
-    position: Float[np.ndarray, "worlds 3"]
-    direction: Float[np.ndarray, "worlds 3"]
+    tip: TipProjection
+    position: Float[np.ndarray, "worlds devices 3"]
+    direction: Float[np.ndarray, "worlds devices 3"]
     contact_force: Float[np.ndarray, "worlds"]
-    inserted_length: tuple[Float[np.ndarray, "worlds"], ...]
-    rotation: tuple[Float[np.ndarray, "worlds"], ...]
+    inserted_length: Float[np.ndarray, "worlds devices"]
+    rotation: Float[np.ndarray, "worlds devices"]
     valid: Bool[np.ndarray, "worlds"]
 
     @classmethod
     def after(cls, step: Step, simulator: Simulator) -> Measured:
         """Return the worlds at the end of a step."""
-        inserted, turned = simulator.catheter_inserted_length.T, simulator.catheter_rotation.T
         return cls(
-            tips=tuple(simulator.project(device) for device in range(1 + len(inserted))),
+            tip=simulator.project(),
             position=step.tip_position,
             direction=step.tip_direction,
             contact_force=step.contact_force_max,
-            inserted_length=(step.inserted_length, *inserted),
-            rotation=(step.rotation, *turned),
+            inserted_length=step.inserted_length,
+            rotation=step.rotation,
             valid=step.valid,
         )
 
     @classmethod
     def current(cls, simulator: Simulator) -> Measured:
         """Return the worlds as they are now."""
-        inserted, turned = simulator.catheter_inserted_length.T, simulator.catheter_rotation.T
         return cls(
-            tips=tuple(simulator.project(device) for device in range(1 + len(inserted))),
-            position=simulator.tips(),
+            tip=simulator.project(),
+            position=simulator.tip_position,
             direction=simulator.tip_direction,
             contact_force=simulator.contacts.max(axis=1),
-            inserted_length=(simulator.inserted_length, *inserted),
-            rotation=(simulator.rotation, *turned),
+            inserted_length=simulator.inserted_length,
+            rotation=simulator.rotation,
             valid=simulator.valid,
         )
 
@@ -77,7 +75,7 @@ class Measured:
 def observe(
     now: Measured,
     routes: RouteTables,
-    distances_mm: tuple[Float[np.ndarray, "worlds"], ...],
+    distances_mm: Float[np.ndarray, "worlds devices"],
     force_limit_n: Float[np.ndarray, "worlds"],
     time_share: Float[np.ndarray, "worlds"],
 ) -> Float[np.ndarray, "worlds features"]:
@@ -86,22 +84,22 @@ def observe(
     Args:
         now: the worlds.
         routes: the paths to their targets.
-        distances_mm: path length to the target of the wires' tips, then of each catheter's.
+        distances_mm: path length to the target of the devices' tips.
         force_limit_n: their force limits.
         time_share: share of the time limit that is used up.
     """
-    tip, inserted, turned = now.tips[0], now.inserted_length[0], now.rotation[0]
+    tip, inserted, turned = now.tip[:, 0], now.inserted_length[:, 0], now.rotation[:, 0]
     place = routes.place(tip)
     outside = np.empty((len(time_share), 3, 2))
-    outside[:, :, 0] = now.direction
-    outside[:, :, 1] = (now.position - place.point) / place.radius[:, None]
+    outside[:, :, 0] = now.direction[:, 0]
+    outside[:, :, 1] = (now.position[:, 0] - place.point) / place.radius[:, None]
     inside = place.frame @ outside
-    out = np.empty((len(time_share), _OF_WIRE + _OF_CATHETER * (len(now.tips) - 1)))
+    out = np.empty((len(time_share), _OF_WIRE + _OF_CATHETER * (now.rotation.shape[1] - 1)))
     out[:, 0] = inserted / 100.0
     out[:, 1], out[:, 2] = np.cos(turned), np.sin(turned)
     out[:, 3] = tip.abscissa / 100.0
     out[:, 4] = tip.offset / tip.radius
-    out[:, 5] = distances_mm[0] / 100.0
+    out[:, 5] = distances_mm[:, 0] / 100.0
     out[:, 6] = place.on_route
     out[:, 7] = now.contact_force / force_limit_n
     out[:, 8] = time_share
@@ -110,14 +108,15 @@ def observe(
     out[:, 14:26] = place.ahead
     out[:, 26:30] = place.radius_ahead / 2.0
     out[:, 30] = (inserted - tip.abscissa) / 10.0
-    for device in range(1, len(now.tips)):
+    on_route = routes.on_route(now.tip)
+    for device in range(1, now.rotation.shape[1]):
         begin = _OF_WIRE + _OF_CATHETER * (device - 1)
-        tip, inserted, turned = now.tips[device], now.inserted_length[device], now.rotation[device]
+        tip, inserted, turned = now.tip[:, device], now.inserted_length[:, device], now.rotation[:, device]
         out[:, begin] = inserted / 100.0
         out[:, begin + 1], out[:, begin + 2] = np.cos(turned), np.sin(turned)
         out[:, begin + 3] = tip.abscissa / 100.0
         out[:, begin + 4] = tip.offset / tip.radius
-        out[:, begin + 5] = distances_mm[device] / 100.0
-        out[:, begin + 6] = routes.on_route(tip)
+        out[:, begin + 5] = distances_mm[:, device] / 100.0
+        out[:, begin + 6] = on_route[:, device]
         out[:, begin + 7] = (inserted - tip.abscissa) / 10.0
     return np.minimum(np.maximum(out, -_BOUND, out=out), _BOUND, out=out).astype(np.float32)

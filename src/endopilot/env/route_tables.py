@@ -71,18 +71,18 @@ class RouteTables:
             target=np.array([navigation.target.abscissa for navigation in navigations]),
         )
 
-    def distance(self, tip: TipProjection) -> Float[np.ndarray, "worlds"]:
+    def distance(self, tip: TipProjection) -> Float[np.ndarray, "worlds devices"]:
         """Return the path length from each tip to its target, mm, back out of a wrong branch first."""
-        leave = self.leave[self.route, tip.branch]
+        leave = self.leave[self.route[:, None], tip.branch]
         fork = np.minimum(leave, tip.abscissa)
-        return (tip.abscissa - fork) + np.abs(self.target - fork)
+        return (tip.abscissa - fork) + np.abs(self.target[:, None] - fork)
 
-    def on_route(self, tip: TipProjection) -> Bool[np.ndarray, "worlds"]:
+    def on_route(self, tip: TipProjection) -> Bool[np.ndarray, "worlds devices"]:
         """Return which tips lie in a branch of the route."""
-        return np.isinf(self.leave[self.route, tip.branch])
+        return np.isinf(self.leave[self.route[:, None], tip.branch])
 
     def place(self, tip: TipProjection) -> Place:
-        """Return the place of each world's route that is nearest to its tip along the tree."""
+        """Return the place of each world's route that is nearest to its wire's tip along the tree."""
         leave = self.leave[self.route, tip.branch]
         along = np.rint(np.minimum(leave, tip.abscissa) / STEP_MM).astype(np.int64)
         row = self.places[self.route, np.minimum(np.maximum(along, 0), self.places.shape[1] - 1)]

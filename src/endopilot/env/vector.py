@@ -15,7 +15,7 @@ from gymnasium.vector.utils import batch_space
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
-from endopilot.devices.drive_limits import far_end_mm, within_travel
+from endopilot.devices.drive_limits import DriveLimits, within_travel
 from endopilot.env.observation import Measured, observe, space
 from endopilot.env.route_tables import RouteTables
 from endopilot.errors import InputError
@@ -23,7 +23,7 @@ from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import SimulatorState
-from endopilot.tasks.navigation import Navigation, reached
+from endopilot.tasks.navigation import Navigation, is_safe, reached
 from endopilot.tasks.task import CORE, in_catheter, reference_navigation, training_navigations
 
 CONTROL_PERIOD_S = 2 / 15
@@ -75,6 +75,10 @@ class NavigateVectorEnv(VectorEnv):
     times a second. Its tip is to reach a place on the centerline of the tree. Friction delays and smooths what the tip
     does; which branch it enters at a fork depends on where the bend points. All worlds are stepped by one `Simulator`;
     `NavigateEnv` is this class with one world. A world's course does not depend on the others, to the last bit.
+
+    It is no `NavigationLoop`: there is no robot with its latency and backlash, no C-arm, and nobody decides every
+    0.5 s. It shares with the loop what a navigation is: start, rule of success, time and force limit (`Navigation`,
+    `reached`, `is_safe`), and how fast and how far a drive goes (`DriveLimits`).
 
     ## Action space
 
@@ -230,11 +234,11 @@ class NavigateVectorEnv(VectorEnv):
         if any((other.catheters, other.arrives) != (first.catheters, first.arrives) for other in navigations):
             raise InputError("navigations: differ in catheters, or in which tip is to arrive; give all the same")
         for device in (device for navigation in navigations for device in navigation.devices):
-            if device.max_velocity_mm_s < TRANSLATION_MM_S or device.max_rotation_rad_s < ROTATION_RAD_S:
+            speed, spin = DriveLimits.of(device).fastest
+            if speed < TRANSLATION_MM_S or spin < ROTATION_RAD_S:
                 raise InputError(
-                    f"device {device.name}: max_velocity_mm_s = {device.max_velocity_mm_s:g}, max_rotation_rad_s = "
-                    f"{device.max_rotation_rad_s:g}; an action of 1 is {TRANSLATION_MM_S:g} mm/s and "
-                    f"{ROTATION_RAD_S:g} rad/s; give a faster device"
+                    f"device {device.name}: max_velocity_mm_s = {speed:g}, max_rotation_rad_s = {spin:g}; "
+                    f"an action of 1 is {TRANSLATION_MM_S:g} mm/s and {ROTATION_RAD_S:g} rad/s; give a faster device"
                 )
         count = len(navigations)
         self.navigations, self._motion, self._config = tuple(navigations), motion, config
@@ -248,24 +252,28 @@ class NavigateVectorEnv(VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, count)
         self._simulator = Simulator(
             [navigation.anatomy for navigation in navigations],
-            [navigation.device for navigation in navigations],
-            catheters=first.catheters,
+            [navigation.stack for navigation in navigations],
             motion=motion,
             config=config,
         )
         self._routes = RouteTables.of(navigations)
-        self._far_ends = np.array([far_end_mm(navigation.anatomy) for navigation in navigations])
+        self._far_ends = np.array(
+            [
+                [DriveLimits.of(device, navigation.anatomy).travel_mm[1] for device in navigation.devices]
+                for navigation in navigations
+            ]
+        )
         targets = [navigation.target for navigation in navigations]
         self._target_branch = np.array([target.branch for target in targets])
         self._target_abscissa = np.array([target.abscissa for target in targets])
-        self._start, start_catheter, self._seconds, self._force_limit = (
-            np.array([getattr(navigation, name) for navigation in navigations])
-            for name in ("start_inserted_mm", "start_catheter_mm", "seconds", "force_limit_n")
+        self._most_steps = np.array([navigation.periods(CONTROL_PERIOD_S) for navigation in navigations])
+        self._start = np.array([navigation.start for navigation in navigations])
+        self._seconds, self._force_limit = (
+            np.array([getattr(navigation, name) for navigation in navigations]) for name in ("seconds", "force_limit_n")
         )
-        self._start_catheters = np.tile(start_catheter[:, None], len(first.catheters))
         self._everyone = np.ones(count, dtype=bool)
         self._generators = [seeding.np_random()[0] for _ in range(count)]
-        self._steps, self._distance = np.zeros(count, dtype=np.int64), np.zeros((self._counted, count))
+        self._steps, self._distance = np.zeros(count, dtype=np.int64), np.zeros((count, self._counted))
         self._safe, self._ended = np.ones(count, dtype=bool), np.zeros(count, dtype=bool)
 
     def reset(
@@ -289,7 +297,7 @@ class NavigateVectorEnv(VectorEnv):
                 self._generators[world] = seeding.np_random(seeds[world])[0]
         self._begin(mask)
         now = Measured.current(self._simulator)
-        distances = self._distances(now)
+        distances = self._routes.distance(now.tip)
         return self._observe(now, distances), self._infos(now)
 
     def step(
@@ -318,12 +326,11 @@ class NavigateVectorEnv(VectorEnv):
         fresh = self._ended & (self.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP)
         control = np.minimum(np.maximum(control, -1.0), 1.0) * self._fastest
         control[fresh] = 0.0
-        travel_mm = (-np.inf, self._far_ends)  # at the ostium the simulator stops the drives by itself
-        simulator = self._simulator
-        for k, inserted in enumerate((simulator.inserted_length, *simulator.catheter_inserted_length.T)):
-            control[:, 2 * k] = within_travel(control[:, 2 * k], inserted, CONTROL_PERIOD_S, travel_mm=travel_mm)
-        step = self._simulator.step(control, CONTROL_PERIOD_S)
-        now = Measured.after(step, self._simulator)
+        travel_mm = (-np.inf, self._far_ends[:, None])  # it stops by itself at the ostium
+        control, simulator = control.reshape(self.num_envs, self._drives, 2), self._simulator
+        inserted = simulator.inserted_length
+        control[..., 0] = within_travel(control[..., 0], inserted, CONTROL_PERIOD_S, travel_mm=travel_mm)
+        now = Measured.after(simulator.step(control, CONTROL_PERIOD_S), simulator)
         if fresh.any():
             self._begin(fresh)
             now = Measured.current(self._simulator)
@@ -333,29 +340,25 @@ class NavigateVectorEnv(VectorEnv):
         """Score what the worlds did in a step, of which those of `fresh` have only begun."""
         going, before = ~fresh, self._distance
         self._steps += going
-        distances = self._distances(now)
-        self._distance = np.array(distances[: self._counted])
-        unsafe = ~(now.contact_force <= self._force_limit) & going
+        distances = self._routes.distance(now.tip)
+        self._distance = distances[:, : self._counted]
+        unsafe = ~is_safe(now.contact_force, self._force_limit) & going
         self._safe &= ~unsafe
         infos = self._infos(now)
         success = infos["success"] & going
-        nearer = (before - self._distance).sum(axis=0)
+        nearer = (before - self._distance).sum(axis=1)
         rewards = PROGRESS_REWARD * nearer + STEP_REWARD + FORCE_REWARD * unsafe + SUCCESS_REWARD * success
         terminations = (success | ~now.valid) & going
-        truncations = (infos["time_s"] > self._seconds - 1e-9) & ~terminations & going
+        truncations = (self._steps >= self._most_steps) & ~terminations & going
         self._ended = terminations | truncations
         observations = self._observe(now, distances)
         return observations, np.where(fresh, 0.0, rewards), terminations, truncations, infos
 
     def _observe(
-        self, now: Measured, distances: tuple[Float[np.ndarray, "worlds"], ...]
+        self, now: Measured, distances: Float[np.ndarray, "worlds devices"]
     ) -> Float[np.ndarray, "worlds features"]:
         time_share = self._steps * CONTROL_PERIOD_S / self._seconds
         return observe(now, self._routes, distances, self._force_limit, time_share)
-
-    def _distances(self, now: Measured) -> tuple[Float[np.ndarray, "worlds"], ...]:
-        """Return the path length from each device's tips to the targets, mm."""
-        return tuple(self._routes.distance(tip) for tip in now.tips)
 
     def draw_from(self, *generators: np.random.Generator) -> None:
         """Let each world draw its starts from a generator that the caller holds."""
@@ -363,29 +366,24 @@ class NavigateVectorEnv(VectorEnv):
 
     def _begin(self, mask: Bool[np.ndarray, "worlds"]) -> None:
         """Start an episode in the worlds of a mask."""
-        turn = np.zeros(self.num_envs)
+        turn = self._start[..., 1].copy()
         worlds = np.flatnonzero(mask)
-        turn[worlds] = [self._generators[world].uniform(0.0, 2 * np.pi) for world in worlds]
-        self._simulator.reset(
-            inserted_length=self._start,
-            rotation=turn,
-            catheter_inserted_length=self._start_catheters,
-            worlds=worlds.tolist(),
-        )
+        turn[worlds, 0] = [self._generators[world].uniform(0.0, 2 * np.pi) for world in worlds]
+        self._simulator.reset(inserted_length=self._start[..., 0], rotation=turn, worlds=worlds.tolist())
         self._steps[mask], self._safe[mask], self._ended[mask] = 0, True, False
-        begun = [self._routes.distance(self._simulator.project(device)) for device in range(self._counted)]
-        self._distance = np.where(mask, np.array(begun), self._distance)
+        begun = self._routes.distance(self._simulator.project())[:, : self._counted]
+        self._distance = np.where(mask[:, None], begun, self._distance)
 
     def _infos(self, now: Measured) -> dict[str, Any]:
-        wire = now.tips[0]
+        wire = now.tip[:, 0]
         infos: dict[str, Any] = {  # the names of `_MASKS`
             "contact_force_max": now.contact_force,
             "valid": now.valid,
-            "success": reached(now.tips[: self._counted], self._target_branch, self._target_abscissa),
+            "success": reached(now.tip[:, : self._counted], self._target_branch, self._target_abscissa),
             "safe": self._safe.copy(),
-            "distance_mm": self._distance[-1],
-            "inserted_length": now.inserted_length[0],
-            "rotation": now.rotation[0],
+            "distance_mm": self._distance[:, -1],
+            "inserted_length": now.inserted_length[:, 0],
+            "rotation": now.rotation[:, 0],
             "tip_abscissa": wire.abscissa,
             "tip_offset": wire.offset,
             "tip_branch": wire.branch,
@@ -393,8 +391,8 @@ class NavigateVectorEnv(VectorEnv):
         }
         infos |= dict.fromkeys(_MASKS, self._everyone)
         for k in range(1, self._drives):
-            tip = now.tips[k]
-            values = (now.inserted_length[k], now.rotation[k], tip.abscissa, tip.offset, tip.branch)
+            tip = now.tip[:, k]
+            values = (now.inserted_length[:, k], now.rotation[:, k], tip.abscissa, tip.offset, tip.branch)
             for name, value in zip(_OF_CATHETER, values, strict=True):
                 infos[f"catheter_{k}_{name}"], infos[f"_catheter_{k}_{name}"] = value, self._everyone
         return infos

@@ -61,24 +61,28 @@ def run_protocols(predictor: Predictor, data: Dataset, training: Dataset | None,
         controls["training_mean"] = baselines.mean_control(training, data, WINDOW)
         predicted_tips["training_mean"] = baselines.mean_tip(training, data, WINDOW)
     trees = [anatomy.tree for anatomy in recorded.anatomies]
-    tips = {name: _series(tip, trees, recorded.anatomy_of, data.branch) for name, tip in predicted_tips.items()}
+    tips = {
+        name: _series(tip, trees, recorded.anatomy_of, data.branch[:, :, 0]) for name, tip in predicted_tips.items()
+    }
     replayed = {"P4": "P3", "P2_replayed": "P2", "hold_control": "hold_control", "follow_slack": "follow_slack"}
     planned = {name: controls[source] for name, source in replayed.items()}
     planned["P4_replanned"] = replanned(predictor, recorded, episodes, predicted["dual"], advance)
     driven = {name: recorded.drivable(control) for name, control in planned.items()}
-    replays = replay(recorded, driven | dict.fromkeys(REPLAYED, data.command[:, WINDOW:]), advance)
+    replays = replay(recorded, driven | dict.fromkeys(REPLAYED, data.command[:, WINDOW:, 0]), advance)
+    true = (data.tip_abscissa, data.tip_offset, data.lumen_radius, data.base_force, data.base_torque)
+    *true_tip, true_force, true_torque = (_after_given(values[:, :, 0]) for values in true)
     return SplitResult(
         sample_period_s=data.sample_period_s,
         anatomies=recorded.names,
         anatomy=recorded.anatomy_of,
         sequence=data.sequence,
         wire_radius_mm=recorded.device.tip_radius_mm,
-        true=TipSeries(*(_after_given(values) for values in (data.tip_abscissa, data.tip_offset, data.lumen_radius))),
-        true_control=data.control[:, WINDOW:].astype(float),
+        true=TipSeries(*true_tip),
+        true_control=data.control[:, WINDOW:, 0].astype(float),
         tips=tips | {name: r.tip for name, r in replays.items()},
         controls=controls,
-        base_force={"true": _after_given(data.base_force)} | {name: r.base_force for name, r in replays.items()},
-        base_torque={"true": _after_given(data.base_torque)} | {name: r.base_torque for name, r in replays.items()},
+        base_force={"true": true_force} | {name: r.base_force for name, r in replays.items()},
+        base_torque={"true": true_torque} | {name: r.base_torque for name, r in replays.items()},
         tip_distance={name: r.distance for name, r in replays.items()},
         events=tip_events(*(signal[:, WINDOW - 1 :] for signal in _moving(data))),
     )
@@ -111,7 +115,7 @@ def _predicted(
 
 
 def _moving(data: Dataset) -> tuple[np.ndarray, ...]:
-    return data.inserted_length, data.rotation, data.tip_abscissa, data.tip_direction
+    return tuple(each[:, :, 0] for each in (data.inserted_length, data.rotation, data.tip_abscissa, data.tip_direction))
 
 
 def _series(

@@ -70,12 +70,12 @@ def _driven(
         ok = rollout.valid[:, now]
         lost[chosen] = ~ok
         kept, moved = chosen[ok], slice(WINDOW, now + 1)
-        made["control"][kept, moved] = rollout.control[ok, moved]
-        made["slip"][kept, moved] = np.stack([rollout.slip, rollout.rotation_slip], axis=-1)[ok, moved]
-        made["proximal"][kept, moved] = np.stack([rollout.inserted_length, rollout.rotation], axis=-1)[ok, moved]
-        made["tip"][kept, now] = np.stack([rollout.tip.abscissa, rollout.tip.offset], axis=-1)[ok, now]
+        made["control"][kept, moved] = rollout.control[ok, moved, 0]
+        made["slip"][kept, moved] = np.stack([rollout.slip, rollout.rotation_slip], axis=-1)[ok, moved, 0]
+        made["proximal"][kept, moved] = rollout.proximal[ok, moved, 0]
+        made["tip"][kept, now] = np.stack([rollout.tip.abscissa, rollout.tip.offset], axis=-1)[ok, now, 0]
         made["branch"][kept, last + 1 : now] = made["branch"][kept, last, None]  # not observed since
-        made["branch"][kept, now] = rollout.tip.branch[ok, now]
+        made["branch"][kept, now] = rollout.tip.branch[ok, now, 0]
     return replace(under_way, **made), lost
 
 

@@ -16,8 +16,8 @@ from endopilot.devices.drive_limits import DriveLimits
 from endopilot.evaluation.results import REPLAYED, TipSeries
 from endopilot.models.config import WINDOW
 from endopilot.progress import Advance
-from endopilot.settings import from_record
-from endopilot.types import Anatomy, Rollout
+from endopilot.simulation.trajectory import Trajectory
+from endopilot.types import Anatomy
 
 Control = Float[np.ndarray, "episodes samples 2"]
 Samples = Float[np.ndarray, "episodes samples"]
@@ -50,15 +50,14 @@ class Recorded:
         """
         names, anatomy_of = np.unique(data.anatomy, return_inverse=True)
         anatomies = tuple(read_anatomy(data.anatomy_folder(str(name))) for name in names)
-        device = from_record(Device, data.manifest["device"])
-        return Recorded(data, tuple(map(str, names)), anatomies, anatomy_of, device)
+        return Recorded(data, tuple(map(str, names)), anatomies, anatomy_of, data.stack.wire)
 
     def drivable(self, control: Control) -> Control:
         """Return what a drive makes of controls: no faster than it can, nor out of the catheter or beyond the vessel.
 
         Controls that are not finite stay so.
         """
-        driven, inserted = np.empty(control.shape), self.data.inserted_length[:, WINDOW - 1].astype(float)
+        driven, inserted = np.empty(control.shape), self.data.inserted_length[:, WINDOW - 1, 0].astype(float)
         for index, anatomy in enumerate(self.anatomies):
             mine, limits = self.anatomy_of == index, DriveLimits.of(self.device, anatomy)
             driven[mine] = limits.clip_sequence(control[mine], inserted[mine], self.data.sample_period_s)
@@ -66,7 +65,7 @@ class Recorded:
 
     def simulated(
         self, controls: Mapping[str, Control], advance: Advance | None = None
-    ) -> Iterator[tuple[Int[np.ndarray, "chosen"], Rollout]]:
+    ) -> Iterator[tuple[Int[np.ndarray, "chosen"], Trajectory]]:
         """Drive episodes as they were driven while states are given, and by each series of controls after.
 
         Series of `REPLAYED` with another friction have it from the start.
@@ -91,7 +90,7 @@ class Recorded:
 
     def _whole(self, control: Control) -> Float[np.ndarray, "episodes all_samples 2"]:
         """Return the recorded commands while states are given, followed by `control`."""
-        return np.concatenate([self.data.command[:, :WINDOW], control], axis=1)
+        return np.concatenate([self.data.command[:, :WINDOW, 0], control], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,15 +114,16 @@ def replay(recorded: Recorded, controls: Mapping[str, Control], advance: Advance
         controls: mm/s and rad/s after the given states, by series.
         advance: called after each anatomy.
     """
-    shape = recorded.data.control[:, WINDOW:].shape[:2]
+    shape = recorded.data.valid[:, WINDOW:].shape
     out = {name: {key: np.full(shape, np.nan) for key in _SIGNALS} for name in controls}
     for chosen, rollout in recorded.simulated(controls, advance):
         commanded = np.concatenate([control[chosen] for control in controls.values()])
         usable = rollout.valid[:, WINDOW:] & np.isfinite(commanded).all(axis=-1).cumprod(axis=1).astype(bool)
         true_tip = recorded.data.tip_position[np.tile(chosen, len(controls))]
-        distance = np.linalg.norm(rollout.tip_position - true_tip, axis=-1)
-        tip = (rollout.tip.abscissa, rollout.tip.offset, rollout.tip.radius)
-        for key, signal in zip(_SIGNALS, (*tip, rollout.base_force, rollout.base_torque, distance), strict=True):
+        distance = np.linalg.norm(rollout.tip_position - true_tip, axis=-1)[:, :, 0]
+        tip, load = rollout.tip, (rollout.base_force, rollout.base_torque)
+        of_wire = [each[:, :, 0] for each in (tip.abscissa, tip.offset, tip.radius, *load)]
+        for key, signal in zip(_SIGNALS, (*of_wire, distance), strict=True):
             values = np.where(usable, signal[:, WINDOW:], np.nan)
             for name, part in zip(controls, values.reshape(len(controls), len(chosen), -1), strict=True):
                 out[name][key][chosen] = part

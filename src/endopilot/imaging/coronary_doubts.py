@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
+from endopilot.errors import place_text
 from endopilot.imaging.contour import CALCIUM
 from endopilot.imaging.grid import connected_components, distance_to_outside
 from endopilot.imaging.openings import box_around, openings
@@ -162,8 +163,8 @@ def _metal(found: FoundTree) -> list[str]:
     if near.min() > _METAL_NEAR_MM:
         return []
     return [
-        f"metal {near.min():.0f} mm from the vessel, at {_place(places[near.argmin()])}: streaks and blooming may hide "
-        "the lumen there or add to it; check the mask there"
+        f"metal {near.min():.0f} mm from the vessel, at {place_text(places[near.argmin()])}: streaks and blooming may "
+        "hide the lumen there or add to it; check the mask there"
     ]
 
 
@@ -180,10 +181,13 @@ def _lost_ends(found: FoundTree) -> list[str]:
             continue
         wide = float(np.median(radius[to_end <= _END_MM]))
         if _goes_on(path, points, numbers, found):
-            told.append(f"a vessel ends at {_place(path[-1])} and seems to go on behind a gap; give a seed beyond it")
+            told.append(
+                f"a vessel ends at {place_text(path[-1])} and seems to go on behind a gap; give a seed beyond it"
+            )
         elif wide >= _WIDE_END_MM:
             told.append(
-                f"a vessel ends at {_place(path[-1])} while it is still {2 * wide:.1f} mm wide; its rest may be missing"
+                f"a vessel ends at {place_text(path[-1])} while it is still {2 * wide:.1f} mm wide; its rest may be "
+                "missing"
             )
     return told
 
@@ -224,8 +228,8 @@ def _filled(found: FoundTree) -> list[str]:
         if not known and beyond > _BEYOND_MM and float(found.volume.voxels[box].max()) > CALCIUM * found.lumen_hu:
             places = np.vstack([places, path[last]])
             told.append(
-                f"calcium or metal fills a vessel at {_place(path[last])}: the mask ends there, and {beyond:.0f} mm of "
-                "the vessel beyond are not in it"
+                f"calcium or metal fills a vessel at {place_text(path[last])}: the mask ends there, and {beyond:.0f} "
+                "mm of the vessel beyond are not in it"
             )
     return told
 
@@ -255,8 +259,9 @@ def _grafts(found: FoundTree, vessel: str) -> list[str]:
     ]
     lowest = min([found.ostium[2], *(place[2] for place, number in places if number in tree)])
     return [
-        f"a vessel leaves the aorta at {_place(place)}, {place[2] - lowest:.0f} mm above the ostium: probably a bypass "
-        f"graft; {'it joins the tree and is part of the mask' if number in tree else 'it is not part of the mask'}"
+        f"a vessel leaves the aorta at {place_text(place)}, {place[2] - lowest:.0f} mm above the ostium: probably a "
+        "bypass graft; "
+        + ("it joins the tree and is part of the mask" if number in tree else "it is not part of the mask")
         for place, number in places
         if place[2] - lowest > (_LEFT_ABOVE_MM if vessel == "rca" and _across_aorta(found, place) else _GRAFT_MM)
     ]
@@ -287,11 +292,7 @@ def _veins(found: FoundTree) -> list[str]:
         if len(inside) and along[inside[-1]] - along[inside[0]] >= _VEIN_MM:
             middle = inside[len(inside) // 2]
             told.append(
-                f"a vessel at {_place(path[middle])} has {np.median(hu[inside]):.0f} HU where the lumen has "
+                f"a vessel at {place_text(path[middle])} has {np.median(hu[inside]):.0f} HU where the lumen has "
                 f"{found.lumen_hu:.0f}: a vein may have been taken for the artery; check the mask there"
             )
     return told
-
-
-def _place(point: np.ndarray) -> str:
-    return "(" + ", ".join(f"{value:.0f}" for value in point) + ") mm"

@@ -1,6 +1,7 @@
 """CT to DICOM: one series of uncompressed slices that names no patient.
 
 The attributes are those that DICOM requires of a CT image (PS3.3 A.3.3); those of type 2 are present and empty.
+highdicom writes no CT images but needs the same header for a mask: pydicom makes it for both.
 """
 
 from __future__ import annotations

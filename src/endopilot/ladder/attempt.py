@@ -35,14 +35,13 @@ class Recording:
     """What was decided during a navigation, in full precision: it is enough to drive the navigation again.
 
     Attributes:
-        control: velocities of each decision within the drives' limits, mm/s and rad/s of the wire, then of each
-            catheter.
+        control: velocities of each device at each decision, within the robot's limits, mm/s and rad/s.
         exposed: whether X-ray was on at each decision.
         believed_mm: where the agent believed the tip to be (Δtip) at each decision, mm; None for other policies.
         gave_up: whether the policy ended the navigation with its last decision.
     """
 
-    control: Float[np.ndarray, "decisions numbers"]
+    control: Float[np.ndarray, "decisions devices 2"]
     exposed: Bool[np.ndarray, "decisions"]
     believed_mm: Float[np.ndarray, "decisions"] | None
     gave_up: bool = False
@@ -79,7 +78,7 @@ class Recording:
                 raise InputError(f"{name}: {size:g} decisions, exposed: {count}; each must have one value a decision")
         if not exposed[0]:
             raise InputError("exposed: X-ray is off at the first decision, where it is always on")
-        return Recording(control.reshape(count, -1), exposed, believed, bool(text.get("gave_up", False)))
+        return Recording(control.reshape(count, devices, 2), exposed, believed, bool(text.get("gave_up", False)))
 
 
 def navigation_seed(task: Task, place: int) -> int:
@@ -101,14 +100,20 @@ def attempt(policy: str, navigation: Navigation, *, seed: int, mismatch: ModelMi
     """
     driver = make_policy(policy)
     record = _drive(navigation, driver, seed, mismatch)
-    told = record.believed if isinstance(driver, AgentPolicy | CoaxialAgent) else None
-    believed = None if told is None else told[:-1, 0]
+    return {"seed": seed} | scored(navigation, record, tells=isinstance(driver, AgentPolicy | CoaxialAgent))
+
+
+def scored(navigation: Navigation, record: NavigationRecord, *, tells: bool = False) -> dict[str, Any]:
+    """Return the figures of a navigation, whoever drove it, its course and its recording.
+
+    Args:
+        navigation: what was to be done.
+        record: how it truly went.
+        tells: whether events count that who drove did not believe.
+    """
+    believed = record.believed[:-1, 0] if tells and record.believed is not None else None
     recording = Recording(record.control[:-1], record.exposed[:-1], believed, record.reason == "gave up")
-    return (
-        {"seed": seed}
-        | figures(navigation, record, recording)
-        | {"course": _course(record), "recording": recording.packed()}
-    )
+    return _figures(navigation, record, recording) | {"course": _course(record), "recording": recording.packed()}
 
 
 def repeat(recording: Recording, navigation: Navigation, *, seed: int) -> dict[str, Any]:
@@ -124,7 +129,7 @@ def repeat(recording: Recording, navigation: Navigation, *, seed: int) -> dict[s
     given, needed = len(recording.control), len(record.control) - 1
     if given != needed:
         raise InputError(f"control: holds {given} decisions, and the navigation ends after {needed}")
-    return figures(navigation, record, recording)
+    return _figures(navigation, record, recording)
 
 
 def _drive(navigation: Navigation, policy: Policy, seed: int, mismatch: ModelMismatch | None) -> NavigationRecord:
@@ -137,7 +142,7 @@ class Repeated:
 
     def __init__(self, recording: Recording) -> None:
         """Take the recording."""
-        self._control = [list(zip(row[::2], row[1::2], strict=True)) for row in recording.control.tolist()]
+        self._control = [tuple((v, w) for v, w in devices) for devices in recording.control.tolist()]
         self._expose_next = [*recording.exposed[1:].tolist(), False]
         self._gave_up = recording.gave_up
         self._at = 0
@@ -154,14 +159,14 @@ class Repeated:
         """
         if self._at == len(self._control):
             raise InputError(f"control: holds {self._at} decisions, and the navigation goes on")
-        (wire, *catheters), expose = self._control[self._at], self._expose_next[self._at]
+        devices, expose = self._control[self._at], self._expose_next[self._at]
         self._at += 1
         last = self._gave_up and self._at == len(self._control)
         gives_up = "as recorded" if last else ""
-        return Decision(*wire, expose=expose, gives_up=gives_up, catheters=tuple(catheters))
+        return Decision(devices, expose=expose, gives_up=gives_up)
 
 
-def figures(navigation: Navigation, record: NavigationRecord, recording: Recording) -> dict[str, Any]:
+def _figures(navigation: Navigation, record: NavigationRecord, recording: Recording) -> dict[str, Any]:
     """Return what a navigation is scored by, and the hash of all that was recorded of it and of how it went.
 
     Args:
@@ -169,7 +174,7 @@ def figures(navigation: Navigation, record: NavigationRecord, recording: Recordi
         record: how it truly went.
         recording: what was decided.
     """
-    length_mm = navigation.target.abscissa - float(record.tip.abscissa[0])
+    length_mm = navigation.target.abscissa - float(record.tip.abscissa[0, 0])
     scored = {
         "success": record.success,
         "safe": record.safe,
@@ -181,7 +186,7 @@ def figures(navigation: Navigation, record: NavigationRecord, recording: Recordi
     }
     if recording.believed_mm is not None:
         radius = navigation.device.tip_radius_mm
-        scored["events"] = list(navigation_events(record.tip, record.exposed, recording.believed_mm, radius))
+        scored["events"] = list(navigation_events(record.tip[:, 0], record.exposed, recording.believed_mm, radius))
     return scored | {"sha256": _digest(record, recording)}
 
 
@@ -209,8 +214,9 @@ def navigation_events(
 def _digest(record: NavigationRecord, recording: Recording) -> str:
     """Return the SHA-256 of the decisions and of the wire's course under them, to the bit."""
     digest = hashlib.sha256(f"{len(record.time_s)}".encode())
-    course = (record.inserted_length, record.rotation, record.tip_position, record.contact_force_max)
-    course += (record.catheter_inserted_length, record.catheter_rotation)
+    inserted, turned = record.inserted_length, record.rotation
+    course = (inserted[:, 0], turned[:, 0], record.tip_position[:, 0], record.contact_force_max)
+    course += (inserted[:, 1:], turned[:, 1:])
     for array in (recording.control, recording.exposed, recording.believed_mm, record.exposed, *course):
         if array is not None:
             digest.update(array.astype(array.dtype.newbyteorder("<")).tobytes())
@@ -221,11 +227,11 @@ def _course(record: NavigationRecord) -> dict[str, list]:
     """Return how a navigation went, for pictures: a value at the start and one after each decision period."""
     return {
         "time_s": record.time_s.tolist(),
-        "inserted_length": record.inserted_length.round(4).tolist(),
-        "rotation": record.rotation.round(4).tolist(),
-        "catheter_inserted_length": record.catheter_inserted_length.round(4).tolist(),
-        "catheter_rotation": record.catheter_rotation.round(4).tolist(),
-        "tip_position": record.tip_position.round(3).tolist(),
+        "inserted_length": record.inserted_length[:, 0].round(4).tolist(),
+        "rotation": record.rotation[:, 0].round(4).tolist(),
+        "catheter_inserted_length": record.inserted_length[:, 1:].round(4).tolist(),
+        "catheter_rotation": record.rotation[:, 1:].round(4).tolist(),
+        "tip_position": record.tip_position[:, 0].round(3).tolist(),
         "contact_force_max": record.contact_force_max.round(5).tolist(),
         "exposed": record.exposed.tolist(),
     }

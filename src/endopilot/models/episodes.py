@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int, Shaped
 
 from endopilot.anatomy.io import read_anatomy
-from endopilot.dataset.loader import Dataset, commanded
+from endopilot.dataset.loader import Dataset
 from endopilot.devices.device import Device
 from endopilot.errors import InputError
 from endopilot.files import reading
@@ -142,13 +142,13 @@ class Episodes:
         return Episodes(
             setup=Setup.of_dataset(dataset),
             anatomy=dataset.anatomy,
-            initial=np.stack([dataset.initial_inserted_length, dataset.initial_rotation], axis=-1),
-            control=dataset.control,
-            slip=np.stack([dataset.slip, dataset.rotation_slip], axis=-1),
-            proximal=np.stack([dataset.inserted_length, dataset.rotation], axis=-1),
-            tip=np.stack([dataset.tip_abscissa, dataset.tip_offset], axis=-1),
-            branch=dataset.branch,
-            tip_sd=np.zeros((*dataset.branch.shape, 2), dtype=np.float32),
+            initial=dataset.initial[:, 0],
+            control=dataset.control[:, :, 0],
+            slip=np.stack([dataset.slip, dataset.rotation_slip], axis=-1)[:, :, 0],
+            proximal=np.stack([dataset.inserted_length, dataset.rotation], axis=-1)[:, :, 0],
+            tip=np.stack([dataset.tip_abscissa, dataset.tip_offset], axis=-1)[:, :, 0],
+            branch=dataset.branch[:, :, 0],
+            tip_sd=np.zeros((*dataset.valid.shape, 2), dtype=np.float32),
         )
 
     @staticmethod
@@ -193,7 +193,7 @@ class Episodes:
     @property
     def command(self) -> Float[np.ndarray, "episodes samples 2"]:
         """Control that the drive was commanded (mm/s, rad/s), see `Dataset.command`."""
-        return commanded(self.control, self.slip, SAMPLE_PERIOD_S)
+        return (self.control + self.slip / SAMPLE_PERIOD_S).astype(self.control.dtype).astype(float)
 
     def select(self, chosen: Shaped[np.ndarray, "chosen"]) -> Episodes:
         """Return the chosen episodes, given as a mask or as indices."""

@@ -91,11 +91,11 @@ def prepare(anatomy: Anatomy, device: Device, config: SimulatorConfig) -> Patien
     pushing, rows = np.ones(WIRES, dtype=bool), []
     idle, before = np.zeros(WIRES, dtype=int), np.zeros(WIRES)
     while True:
-        tip, inserted = simulator.project(), simulator.inserted_length
+        tip, inserted = simulator.project()[:, 0], simulator.inserted_length[:, 0]
         idle, before = np.where(~pushing & (inserted > before - _STILL_MM), idle + 1, 0), inserted.copy()
         rows.append((inserted.copy(), tip.abscissa, tip.offset, tip.branch, pushing))
         room = np.minimum(deepest - inserted, ends[tip.branch] - STOP_SHORT_MM - tip.abscissa)
-        caught = simulator.base_load[:, 0] > CAUGHT * device.push_limit_n
+        caught = simulator.base_load[:, 0, 0] > CAUGHT * device.push_limit_n
         pushing = pushing & (room > 1e-2) & ~caught & simulator.valid
         out = ~pushing & ((inserted <= 1e-6) | (idle >= _PATIENCE) | ~simulator.valid)
         if out.all():

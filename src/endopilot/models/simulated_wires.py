@@ -101,7 +101,7 @@ def _of_one_patient(episodes: Episodes) -> WireTips:
         config=replace(episodes.setup.simulator, threads=1),
         motion=episodes.setup.known_motions.get(str(episodes.anatomy[0])),
     )
-    tip = np.stack([rollout.tip.abscissa, rollout.tip.offset], axis=-1)
+    tip = np.stack([rollout.tip.abscissa, rollout.tip.offset], axis=-1)[:, :, 0]
     tip[~rollout.valid] = np.nan
     return np.moveaxis(tip.reshape(len(episodes), len(factors), *tip.shape[1:]), 1, 2)
 

@@ -58,22 +58,22 @@ def track(
     limits = DriveLimits.of(wires[0], anatomy)
     for sample in np.moveaxis(given, 1, 0):
         command = np.repeat(sample, each, axis=0)
-        simulator.step(limits.clip(command, simulator.inserted_length, SAMPLE_PERIOD_S), SAMPLE_PERIOD_S)
+        simulator.step(limits.clip(command, simulator.inserted_length[:, 0], SAMPLE_PERIOD_S), SAMPLE_PERIOD_S)
     tip, control = np.empty(desired.shape), np.empty(desired.shape)
     for k in range(desired.shape[1]):
-        now = simulator.project().abscissa
+        now = simulator.project().abscissa[:, 0]
         lead = (np.repeat(desired[:, k, 0], each) - now) / SAMPLE_PERIOD_S
         command = np.tile(tries, (episodes, 1))
         command[:, 0] += lead
-        command = limits.clip(command, simulator.inserted_length, SAMPLE_PERIOD_S)
+        command = limits.clip(command, simulator.inserted_length[:, 0], SAMPLE_PERIOD_S)
         step = simulator.step(command, SAMPLE_PERIOD_S)
-        reached = simulator.project()
+        reached = simulator.project()[:, 0]
         error = np.abs(reached.abscissa - np.repeat(desired[:, k, 0], each))
         error += np.abs(reached.offset - np.repeat(desired[:, k, 1], each))
         error[~step.valid] = np.inf
         best = error.reshape(episodes, each).argmin(axis=1) + each * np.arange(episodes)
         tip[:, k] = np.stack([reached.abscissa[best], reached.offset[best]], axis=-1)
-        slip = np.stack([step.slip, step.rotation_slip], axis=-1)[best]
+        slip = np.stack([step.slip, step.rotation_slip], axis=-1)[best, 0]
         control[:, k] = command[best] - slip / SAMPLE_PERIOD_S
         simulator.copy_worlds(np.repeat(best, each))
     return tip, control

@@ -206,7 +206,7 @@ class TwinPredictor:
                     friction=self.device.friction * members[member, episode, 0],
                     motion=data.setup.known_motions.get(anatomy.name),
                 )
-            tip = np.stack([rollout.tip.abscissa, rollout.tip.offset], axis=-1)
+            tip = np.stack([rollout.tip.abscissa, rollout.tip.offset], axis=-1)[:, :, 0]
             paths[member, episode] = np.where(rollout.valid[..., None], tip, np.nan)
         return paths
 

@@ -1,9 +1,10 @@
-"""Policies that need no model: what every planner has to beat."""
+"""Policies that need no model: what every planner has to beat. `CatheterAlone` and `InTurn` drive a catheter, too."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from endopilot.errors import InputError
 from endopilot.navigation.policy import Decision, Observation
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 
@@ -12,11 +13,19 @@ ADVANCE_MM_S = 5.0
 SPIN_RAD_S = 3.0
 """Rotation of `Spin`, rad/s, about half a turn a second."""
 _SLACK_MM = 20.0
-"""A wire that is inserted this much deeper than the target without reaching it is in another branch and waits, mm."""
+"""A device that is inserted this much deeper than the target without reaching it is in another branch, or slack, and
+waits, mm."""
 _RETRACT_MM = 5.0
 """`RetractRotate` pulls its tip back to this far before the fork where it took the wrong branch, mm."""
 _CAUGHT_S, _CAUGHT_MM = 3.0, 1.0
 """A wire whose tip advances by less than this in this time is caught, s and mm."""
+LEAD_MM = 40.0
+"""The wire leads by this much before `InTurn` lets the catheter follow, mm."""
+BEHIND_MM = 10.0
+"""The catheter follows to this far behind the wire's tip, mm, where the wire's tip is to arrive."""
+_STAND = (0.0, 0.0)
+_ADVANCE = (ADVANCE_MM_S, 0.0)
+_RETRACT = (-ADVANCE_MM_S, 0.0)
 
 
 class Forward:
@@ -30,8 +39,8 @@ class Forward:
 
     def decide(self, observation: Observation) -> Decision:
         """Push, or wait."""
-        going = observation.inserted_length < self._deepest
-        return Decision(ADVANCE_MM_S, self._rotation) if going else Decision(0.0, 0.0)
+        going = observation.devices[0][0] < self._deepest
+        return Decision(((ADVANCE_MM_S, self._rotation),) if going else (_STAND,))
 
 
 class Spin(Forward):
@@ -58,23 +67,26 @@ class RetractRotate:
 
     def decide(self, observation: Observation) -> Decision:
         """Push, retract or rotate, depending on what X-ray shows."""
-        tip = observation.tip
+        return Decision((self._velocity(observation),), expose=True)
+
+    def _velocity(self, observation: Observation) -> tuple[float, float]:
+        tip, (inserted, rotation) = observation.tip, observation.devices[0]
         if tip is None:
-            return Decision(0.0, 0.0, expose=True)
+            return _STAND
         if self._back_to is None and self._turn_to is None:
             retract_to = self._retract_to(tip.branch, tip.abscissa)
             if retract_to is None:
-                return Decision(ADVANCE_MM_S, 0.0, expose=True)
+                return _ADVANCE
             self._back_to = retract_to
         if self._back_to is not None:
-            if tip.abscissa > self._back_to and observation.inserted_length > 0:
-                return Decision(-ADVANCE_MM_S, 0.0, expose=True)
-            self._back_to, self._turn_to = None, observation.rotation + np.pi
-        left = (self._turn_to or 0.0) - observation.rotation
+            if tip.abscissa > self._back_to and inserted > 0:
+                return _RETRACT
+            self._back_to, self._turn_to = None, rotation + np.pi
+        left = (self._turn_to or 0.0) - rotation
         if left > 0.05:
-            return Decision(0.0, min(SPIN_RAD_S, left / DECISION_PERIOD_S), expose=True)
+            return 0.0, min(SPIN_RAD_S, left / DECISION_PERIOD_S)
         self._turn_to, self._deepest = None, []
-        return Decision(ADVANCE_MM_S, 0.0, expose=True)
+        return _ADVANCE
 
     def _retract_to(self, branch: int, abscissa: float) -> float | None:
         """Return how far the tip is to be retracted, as an abscissa, or None where it advances on the route."""
@@ -87,3 +99,56 @@ class RetractRotate:
         if len(self._deepest) > before and max(self._deepest) - max(self._deepest[:-before]) < _CAUGHT_MM:
             return abscissa - _RETRACT_MM
         return None
+
+
+class CatheterAlone:
+    """Pushes the catheter at a constant velocity, with the wire's tip at its end; the wire never leads."""
+
+    def start(self, navigation: Navigation, seed: int) -> None:
+        """Take the target's depth.
+
+        Raises:
+            InputError: there is no catheter.
+        """
+        check_catheter(navigation)
+        self._deepest = navigation.target.abscissa + _SLACK_MM
+
+    def decide(self, observation: Observation) -> Decision:
+        """Push the catheter, and the wire in it once both ends meet; or wait."""
+        (wire, _), (catheter, _), *_ = observation.devices
+        push = _ADVANCE if catheter < self._deepest else _STAND
+        return Decision((push if wire <= catheter else _STAND, push))
+
+
+class InTurn:
+    """Advances wire and catheter in turn, without X-ray: the wire leads by `LEAD_MM`, then the catheter follows."""
+
+    def start(self, navigation: Navigation, seed: int) -> None:
+        """Take the target's depth.
+
+        Raises:
+            InputError: there is no catheter.
+        """
+        check_catheter(navigation)
+        self._deepest = navigation.target.abscissa + _SLACK_MM
+        self._behind = BEHIND_MM if navigation.arrives == "wire" else 0.0
+        self._follows = False
+
+    def decide(self, observation: Observation) -> Decision:
+        """Push the one whose turn it is, or wait."""
+        (wire, _), (catheter, _), *_ = observation.devices
+        leads, follows = wire < min(catheter + LEAD_MM, self._deepest), catheter < wire - self._behind
+        self._follows = follows and (self._follows or not leads)
+        if self._follows:
+            return Decision((_STAND, _ADVANCE))
+        return Decision((_ADVANCE if leads else _STAND,))
+
+
+def check_catheter(navigation: Navigation) -> None:
+    """Check that a navigation has a catheter, for policies that drive one.
+
+    Raises:
+        InputError: it has none.
+    """
+    if not navigation.catheters:
+        raise InputError("policy: drives a catheter too, and there is none; give a catheter, or another policy")

@@ -6,27 +6,25 @@
 from __future__ import annotations
 
 from dataclasses import field, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-from jaxtyping import Float
+from pydantic import model_validator
 
 from endopilot.devices.drive_limits import DriveLimits
+from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.navigation.policies import make_policy
 from endopilot.navigation.policy import BelievedTip, Believer, Decision, Led, Observation, Policy
 from endopilot.navigation.record import NavigationRecord, Track
 from endopilot.robot.robot import CYCLE_S, RobotConfig, SimulatedRobot
-from endopilot.settings import settings
+from endopilot.settings import Within, settings
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.mismatch import ModelMismatch
-from endopilot.simulation.motion import Motion, place
+from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulator import Simulator
-from endopilot.tasks.navigation import DECISION_PERIOD_S, SUCCESS_MM, Navigation, XrayKind, check_wire_alone
-from endopilot.xray.fluoroscope import Fluoroscope, FluoroscopeConfig, TipMeasurement
-from endopilot.xray.moving_patient import seen, turned
-
-_CYCLES = round(DECISION_PERIOD_S / CYCLE_S)
+from endopilot.tasks.navigation import DECISION_PERIOD_S, SUCCESS_MM, Navigation, Target, XrayKind
+from endopilot.xray.fluoroscope import FluoroscopeConfig, make_c_arm
 
 
 @settings
@@ -48,32 +46,47 @@ class NavigateConfig:
     measure_motion: bool = False
     """Before the wire goes in, a run of contrast shows how the patient moves, and the navigation knows that instead. It
     takes X-ray images."""
+    cycle_s: Annotated[float, Within(1e-4, CYCLE_S)] = CYCLE_S
+    """Period of the drives' loop, s; it divides the time between two decisions."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> NavigateConfig:
+        if abs(self.cycles * self.cycle_s - DECISION_PERIOD_S) > 1e-9:
+            raise ValueError(f"cycle_s: {self.cycle_s}; give what divides {DECISION_PERIOD_S} s, such as {CYCLE_S}")
+        return self
+
+    @property
+    def cycles(self) -> int:
+        """Number of the drives' cycles between two decisions."""
+        return round(DECISION_PERIOD_S / self.cycle_s)
 
 
 class NavigationLoop:
-    """One navigation in closed loop, a decision period at a time: policy, robot, wire and X-ray.
+    """One navigation in closed loop, a decision period at a time: it owns the world, the robot and the C-arm.
 
-    `navigate` is a plain loop over it. A program that shows the navigation starts, pauses and ends it by calling `step`
-    or not. Whoever takes over gives decisions of their own; the policy watches. It goes on when none is given, with
-    X-ray on at its first decision::
+    `navigate`, the ladder and the cockpit are plain loops over it; a program that shows the navigation starts, pauses
+    and ends it by calling `step` or not. Somebody else may drive, such as a `Hand`: the policy watches then, and goes
+    on with X-ray on once it is handed back to::
 
         loop = NavigationLoop(navigation, "agent", seed=1)
         while loop.reason is None:
             loop.step()                                      # the policy decides
-            loop.step(by_hand=Decision(2.0, 0.5))            # somebody else does
+        loop.hand_over(Hand(((2.0, 0.5),)))
+        loop.step()                                          # somebody else does
         record = loop.record()
 
-    Hands that move faster than twice a second call the parts of a step: `begin`, then `advance` in cycles of `CYCLE_S`
-    until the period is over, with `robot.command` between them.
+    The parts of a step are `observe`, `decide` and `take`, or `begin` for all three, and `advance` until the period is
+    over. Hands that move faster than twice a second call `robot.command` between two cycles.
 
     Attributes:
-        navigation: what is to be done, as the policy is given it.
-        policy: what decides.
+        navigation: what is to be done, as the policy is given it; `aim` gives it another target.
+        config: robot, C-arm and rod core.
+        policy: what decides, or watches while somebody else does.
         simulator: the world as it truly is; its one wire is the real one.
         robot: what moves it, and its catheters.
-        fluoroscope: the C-arm.
-        observation: what was observed at the last decision; None before the first.
-        believed: what the policy believed then; None for a policy that does not tell.
+        c_arm: what shows its tip.
+        observation: what was observed last; None before the first decision.
+        believed: what the policy believed at the last decision; None for a policy that does not tell.
         reason: why the navigation is over, as in `NavigationRecord`; None while it goes on.
         gives_up: where and why the policy gave up at the last decision, in words; empty if it goes on. Somebody else
             may go on then.
@@ -94,35 +107,26 @@ class NavigationLoop:
             InputError: there is no such policy, or the wire does not fit the vessel, or starts deeper than it is long,
                 or the vessel is not recognised in X-ray images.
         """
-        config, truth = config or NavigateConfig(), truth or ModelMismatch()
+        self.config = config = config or NavigateConfig()
+        truth = truth or ModelMismatch()
         self.navigation = navigation = replace(navigation, xray=config.xray)
         self.policy = make_policy(policy) if isinstance(policy, str) else policy
         self.simulator = start_world(navigation, truth, config.simulator, motion=config.motion)
-        ostium = np.asarray(navigation.anatomy.insertion.position)
-        self._moves = config.motion is not None
-        self._limits = tuple(DriveLimits.of(device, navigation.anatomy) for device in navigation.devices)
+        limits = [DriveLimits.of(device, navigation.anatomy) for device in navigation.devices]
         drive = replace(config.robot, latency_s=config.robot.latency_s * truth.latency_factor)
-        self.robot = SimulatedRobot(self.simulator, self._limits, drive, seed=seed, ostium_mm=truth.ostium_mm)
-        anatomy, device = navigation.anatomy, navigation.device
-        if config.xray == "images":
-            from endopilot.xray.image_fluoroscope import ImageFluoroscope  # slow to import
-
-            check_wire_alone(navigation, "xray: images: the detector")
-            self.fluoroscope = ImageFluoroscope(anatomy, device, config.fluoroscope, seed)
-            if config.measure_motion and config.motion is not None:
-                measured = self.fluoroscope.measure_motion(config.motion, np.random.default_rng([seed, 6]))
-                self.navigation = navigation = replace(navigation, known_motion=measured)
-        elif config.measure_motion:
-            raise InputError("measure_motion: exposures of assumed errors show no contrast; give xray: images")
-        else:
-            self.fluoroscope = Fluoroscope(anatomy, device.tip_radius_mm, config.fluoroscope)
-        known = navigation.known_motion
-        self._known = None if known is None else known.core(ostium)
+        self.robot = SimulatedRobot(self.simulator, limits, drive, seed=seed, ostium_mm=truth.ostium_mm)
+        self.c_arm = make_c_arm(navigation, config.fluoroscope, seed=seed)
+        if config.measure_motion:
+            measured = self.c_arm.measure_motion(config.motion, np.random.default_rng([seed, 6]))
+            self.navigation = navigation = replace(navigation, known_motion=measured)
+            self.c_arm.known_motion = measured
         self._random = np.random.default_rng([seed, 2])
-        self._track = Track(self.simulator)
-        self._periods = int(np.ceil(navigation.seconds / DECISION_PERIOD_S - 1e-9))
-        self._period, self._cycles_left, self._peak_n, self._expose = 0, 0, 0.0, True
-        self._by_hand = False
+        self._track = Track()
+        self._track.moved(self.simulator, self.robot.proximal, float(self.simulator.contacts.max()))
+        self._periods = navigation.periods(DECISION_PERIOD_S)
+        self._period, self._cycles_left, self._peak_n = 0, 0, 0.0
+        self._driver: Policy | None = None
+        self._expose, self._exposed = True, False
         self.observation: Observation | None = None
         self.believed: BelievedTip | None = None
         self.reason: str | None = None
@@ -132,31 +136,53 @@ class NavigationLoop:
     @property
     def time_s(self) -> float:
         """Time since the start of the navigation, s."""
-        return DECISION_PERIOD_S * self._period - CYCLE_S * self._cycles_left
+        return DECISION_PERIOD_S * self._period - self.config.cycle_s * self._cycles_left
 
     @property
     def between_periods(self) -> bool:
         """Whether a decision is due: the last period is over."""
         return self._cycles_left == 0
 
-    def step(self, by_hand: Decision | None = None) -> Decision:
-        """Decide, and let the robot move for one period; return the decision.
+    @property
+    def reached(self) -> bool:
+        """Whether the target is reached now; the tip is only projected, which takes time, where it is near."""
+        navigation, simulator = self.navigation, self.simulator
+        line = navigation.anatomy.tree.branches[navigation.target.branch].centerline
+        at, arriving = navigation.target.abscissa, navigation.arriving
+        width = float(line.radius[np.abs(line.abscissa - at) <= SUCCESS_MM + 1.0].max())
+        away = np.linalg.norm(simulator.tip_position[0, arriving] - navigation.target.position(navigation.anatomy))
+        if away > SUCCESS_MM + 3 * width:
+            return False
+        return bool(navigation.reached(simulator.project())[0])
 
-        Args:
-            by_hand: what somebody else decides; the policy does if it is not given.
+    def hand_over(self, to: Policy | None) -> None:
+        """Let somebody else drive from the next decision on, without X-ray; or the policy again (None), with X-ray."""
+        self._driver, self._expose = to, to is None
+
+    def aim(self, target: Target) -> None:
+        """Let the navigation go to another target; a policy that has begun does not learn of it.
+
+        Raises:
+            InputError: the vessel has no such place.
         """
-        decision = self.begin(by_hand)
+        self.navigation = replace(self.navigation, target=target)
+
+    def step(self) -> Decision:
+        """Decide, and let the robot move for one period; return the decision as `take` does."""
+        decision = self.begin()
         self.advance(DECISION_PERIOD_S)
         return decision
 
-    def begin(self, by_hand: Decision | None = None) -> Decision:
+    def begin(self) -> Decision:
         """Begin a period: observe, decide and command the robot. `advance` lets it move.
 
-        Args:
-            by_hand: what somebody else decides; the policy does if it is not given.
+        Raises:
+            ValueError: as `observe`.
+        """
+        return self.take(self.decide(self.observe()))
 
-        Returns:
-            The decision, within the drives' limits.
+    def observe(self) -> Observation:
+        """Read the encoders, and expose where the last decision asked for it.
 
         Raises:
             ValueError: the navigation is over, or the last period is not.
@@ -164,36 +190,62 @@ class NavigationLoop:
         if self.reason is not None or not self.between_periods:
             raise ValueError("the navigation is over" if self.reason else "the period is not over; call advance")
         state, tip = self.robot.proximal_state(), None
-        handed_back, self._by_hand = self._by_hand and by_hand is None, by_hand is not None
-        exposed = self._expose or handed_back
-        if exposed:
-            tip = self._measure(state.inserted_length)
-        observation = Observation(self.time_s, state.inserted_length, state.rotation, tip, state.catheters)
-        decision = self._decide(observation, by_hand)
-        asked = decision.velocities(len(self._limits))
-        control = tuple(limits.safe(*pair) for limits, pair in zip(self._limits, asked, strict=False))
-        # An image in which no wire was found is taken again.
-        self._expose = bool(decision.expose) or (exposed and tip is None)
-        self.observation, self.gives_up = observation, decision.gives_up
+        if self._expose:
+            inserted, _ = state.devices[0]
+            tip = self.c_arm.expose(self.simulator, inserted, self._random, time_s=self.time_s)
+        self._exposed = self._expose
+        self.observation, self.believed = Observation(self.time_s, state.devices, tip), None
+        return self.observation
+
+    def decide(self, observation: Observation) -> Decision:
+        """Return what who drives decides; the policy watches where that is somebody else.
+
+        Raises:
+            InputError: it is no decision.
+        """
+        driver = self._driver or self.policy
+        if driver is not self.policy:
+            if isinstance(self.policy, Led):
+                self.policy.watch(observation)
+            else:
+                self.policy.decide(observation)  # what it answers is not done
+        decision = _checked(driver.decide(observation), type(driver).__name__)
         self.believed = self.policy.believed() if isinstance(self.policy, Believer) else None
-        self._track.decided(control, tip, self.believed, exposed=exposed, fault=control != asked)
-        wire, *catheters = control
-        self.robot.command(*wire, *catheters)
-        self._period, self._cycles_left, self._peak_n = self._period + 1, _CYCLES, 0.0
-        return Decision(*wire, expose=self._expose, gives_up=self.gives_up, catheters=tuple(catheters))
+        return decision
+
+    def take(self, decision: Decision) -> Decision:
+        """Command the robot for a period.
+
+        Returns:
+            The decision as the robot has taken it: within its limits, and with the velocities of all devices.
+        """
+        taken = self.robot.command(decision.devices)
+        tip = None if self.observation is None else self.observation.tip
+        # An image in which no wire was found is taken again.
+        self._expose = bool(decision.expose) or (self._exposed and tip is None)
+        self.gives_up = decision.gives_up
+        fault = taken[: len(decision.devices)] != decision.devices
+        self._track.decided(taken, tip, self.believed, exposed=self._exposed, fault=fault)
+        self._period, self._cycles_left, self._peak_n = self._period + 1, self.config.cycles, 0.0
+        return Decision(taken, expose=self._expose, gives_up=self.gives_up)
+
+    def exposed(self) -> None:
+        """Count an exposure that was taken for whoever drives by hand."""
+        self._track.exposed()
 
     def advance(self, seconds: float) -> float:
         """Let robot and wire move, no farther than to the end of the period.
 
         Args:
-            seconds: a multiple of `CYCLE_S`.
+            seconds: a multiple of the drives' cycle.
 
         Returns:
             The largest wall force on a node, N.
         """
-        cycles, peak_n = min(round(seconds / CYCLE_S), self._cycles_left), 0.0
+        cycle_s = self.config.cycle_s
+        cycles, peak_n = min(round(seconds / cycle_s), self._cycles_left), 0.0
         for _ in range(cycles):  # one by one, so that no rounding depends on how a period is cut
-            peak_n = max(peak_n, self.robot.run(CYCLE_S))
+            peak_n = max(peak_n, self.robot.run(cycle_s))
         self._peak_n, self._cycles_left = max(self._peak_n, peak_n), self._cycles_left - cycles
         if cycles and self._cycles_left == 0:
             self._end_period()
@@ -203,40 +255,19 @@ class NavigationLoop:
         """End the navigation where it is."""
         self.reason = self.reason or ("gave up" if self.gives_up else "stopped")
 
+    def go_on(self) -> None:
+        """Go on after the end, from now on without a limit of time."""
+        self.reason, self._periods = None, -1
+
     def record(self) -> NavigationRecord:
         """Return what has happened up to the end of the last whole period."""
         return self._track.record(self.navigation, self.robot.driven, self.reason or "stopped", self.gives_up)
 
-    def _measure(self, inserted_length: float) -> TipMeasurement | None:
-        if isinstance(self.fluoroscope, Fluoroscope):
-            tip, heading = self.simulator.tips()[0], self.simulator.tip_direction[0]
-            if self._moves:
-                shown = self._seen()
-                tip, heading = place(shown, tip), turned(shown, heading)
-            return self.fluoroscope.expose(tip, heading, inserted_length, self._random)
-        nodes = self.simulator.position[0]
-        if self._moves:
-            nodes = place(self._seen(), nodes)
-        return self.fluoroscope.expose(nodes, inserted_length, self._random)
-
-    def _seen(self) -> Float[np.ndarray, "3 4"]:
-        """Return where the C-arm takes points of the moving vessel to lie in the vessel as CT shows it."""
-        return seen(self.simulator.vessel_to_laboratory[:1], self._known, np.array([self.time_s]))[0]
-
-    def _decide(self, observation: Observation, by_hand: Decision | None) -> Decision:
-        if by_hand is None:
-            return _checked(self.policy.decide(observation), type(self.policy).__name__)
-        if isinstance(self.policy, Led):
-            self.policy.watch(observation)
-        else:
-            self.policy.decide(observation)  # what it answers is not done
-        return by_hand
-
     def _end_period(self) -> None:
-        self._track.moved(self.simulator, self._peak_n)
+        self._track.moved(self.simulator, self.robot.proximal, self._peak_n)
         if not self.simulator.valid[0]:
             self.reason = "invalid"
-        elif _reached(self.navigation, self.simulator):
+        elif self.reached:
             self.reason = "reached"
         elif self._period == self._periods:
             self.reason = "time"
@@ -290,31 +321,26 @@ def start_world(
     """
     device = navigation.device
     wire = device.with_tip(bend_rad=device.tip_bend_rad, stiffness_factor=truth.stiffness_factor)
-    catheters = truth.catheters(navigation.catheters)
-    simulator = Simulator(truth.anatomy(navigation.anatomy), wire, catheters=catheters, motion=motion, config=config)
+    stack = Stack(wire, truth.catheters(navigation.catheters))
+    simulator = Simulator(truth.anatomy(navigation.anatomy), stack, motion=motion, config=config)
+    friction, start = simulator.set_up.friction.copy(), navigation.start
+    friction[:, 0] = device.friction * truth.friction_factor
     simulator.reset(
-        inserted_length=[max(navigation.start_inserted_mm + truth.ostium_mm, 0.0)],
-        rotation=[navigation.start_rotation],
-        friction=[device.friction * truth.friction_factor],
-        catheter_inserted_length=np.full((1, len(catheters)), max(navigation.start_catheter_mm + truth.ostium_mm, 0.0)),
+        inserted_length=np.maximum(start[None, :, 0] + truth.ostium_mm, 0.0),
+        rotation=start[None, :, 1],
+        friction=friction,
     )
     return simulator
 
 
 def _checked(decision: Any, policy: str) -> Decision:
-    """Refuse what a policy of one's own may return in place of a decision; the drives' limits check its numbers."""
+    """Refuse what a policy of one's own may return in place of a decision; the robot checks its numbers."""
     if not isinstance(decision, Decision):
         raise InputError(f"policy: {policy} decided {type(decision).__name__}; return a Decision")
-    return decision
-
-
-def _reached(navigation: Navigation, simulator: Simulator) -> bool:
-    """Return whether the tip has reached the target; it is only projected, which takes time, where it is near."""
-    line = navigation.anatomy.tree.branches[navigation.target.branch].centerline
-    at = navigation.target.abscissa
-    width = float(line.radius[np.abs(line.abscissa - at) <= SUCCESS_MM + 1.0].max())
-    arriving = navigation.arriving
-    away = np.linalg.norm(simulator.tips(arriving)[0] - navigation.target.position(navigation.anatomy))
-    if away > SUCCESS_MM + 3 * width:
-        return False
-    return bool(navigation.reached(*(simulator.project(device) for device in range(arriving + 1)))[0])
+    try:
+        return replace(decision, devices=tuple((v, w) for v, w in decision.devices))
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"policy: {policy} decided devices = {decision.devices!r}; give a pair of velocities for each device, "
+            "such as ((5.0, 0.5),)"
+        ) from error

@@ -22,17 +22,14 @@ class Observation:
 
     Attributes:
         time_s: since the start of the navigation, s.
-        inserted_length: Δ by the robot's encoder, mm.
-        rotation: φ by the robot's encoder, rad.
-        tip: what X-ray shows now, or None where it is off.
-        catheters: inserted length (mm) and rotation (rad) of each catheter by its encoders, from the inside out.
+        devices: inserted length Δ (mm) and rotation φ (rad) of each device by the robot's encoders: of the wire, then
+            of each catheter from the inside out.
+        tip: what X-ray shows of the wire's tip now, or None where it is off.
     """
 
     time_s: float
-    inserted_length: float
-    rotation: float
+    devices: Proximals
     tip: TipMeasurement | None
-    catheters: Proximals = ()
 
 
 @dataclass(frozen=True)
@@ -40,28 +37,15 @@ class Decision:
     """What is done until the next decision.
 
     Attributes:
-        translation: of the wire's proximal end, mm/s.
-        rotation: of the wire's proximal end, rad/s.
+        devices: translation (mm/s) and rotation (rad/s) of each device's proximal end: of the wire, then of each
+            catheter from the inside out. Those that are not given stand still.
         expose: whether X-ray is to be on at the next decision.
         gives_up: where and why the policy ends the navigation with this decision, in words; empty if it goes on.
-        catheters: translation (mm/s) and rotation (rad/s) of each catheter's proximal end, from the inside out; those
-            that are not given stand still.
     """
 
-    translation: float
-    rotation: float
+    devices: Proximals = ()
     expose: bool = False
     gives_up: str = ""
-    catheters: Proximals = ()
-
-    def velocities(self, devices: int) -> Proximals:
-        """Return translation (mm/s) and rotation (rad/s) of the wire, then of each catheter.
-
-        Args:
-            devices: number of wire and catheters.
-        """
-        given = ((self.translation, self.rotation), *self.catheters)
-        return (*given, *[(0.0, 0.0)] * (devices - len(given)))
 
 
 @runtime_checkable
@@ -75,6 +59,25 @@ class Policy(Protocol):
     def decide(self, observation: Observation) -> Decision:
         """Return what to do until the next decision, `DECISION_PERIOD_S` later."""
         ...
+
+
+class Hand:
+    """Whoever drives by hand, as a policy: it decides what the hand holds.
+
+    Attributes:
+        devices: mm/s and rad/s of each device, as in `Decision`.
+    """
+
+    def __init__(self, devices: Proximals = ()) -> None:
+        """Hold some velocities; none to let all devices stand still."""
+        self.devices = devices
+
+    def start(self, navigation: Navigation, seed: int) -> None:
+        """Need nothing."""
+
+    def decide(self, observation: Observation) -> Decision:
+        """Go on as the hand holds it."""
+        return Decision(self.devices)
 
 
 @dataclass(frozen=True)

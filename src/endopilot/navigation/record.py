@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from endopilot.anatomy.projection import project_tip
 from endopilot.navigation.policy import BelievedTip, Proximals
 from endopilot.simulation.simulator import Simulator
-from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
+from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, is_safe
 from endopilot.types import TipProjection
 from endopilot.xray.fluoroscope import TipMeasurement
 
@@ -19,56 +19,51 @@ from endopilot.xray.fluoroscope import TipMeasurement
 class NavigationRecord:
     """A navigation as it truly went: a sample at the start and one after each decision period.
 
+    Where an array has an axis of devices, the wire comes first, then the catheters around it from the inside out.
+
     Attributes:
         time_s: s.
-        inserted_length: Δ, mm.
-        rotation: φ, rad.
+        inserted_length: Δ of each device, mm.
+        rotation: φ of each device, rad.
         tip_position: LPS mm.
-        tip: Δtip, γtip, branch and lumen radius.
+        tip: Δtip, γtip, branch and lumen radius, with a row a sample and a column a device.
+        shape: nodes of the line that the devices share, from the foremost tip on, LPS mm.
         contact_force_max: largest wall force on one node over the period that ends here, N.
-        exposed: whether X-ray was on at this moment.
-        catheter_inserted_length: of each catheter, mm.
-        catheter_rotation: of each catheter, rad.
-        catheter_tip_position: of each catheter, LPS mm.
-        catheter_tips: Δtip, γtip, branch and lumen radius of each catheter.
-        control: what was commanded from this moment on, within the limits, mm/s and rad/s of the wire, then of each
-            catheter; 0 at the end.
+        exposed: whether X-ray was on at this moment, or in the period that follows if a hand drove.
+        control: what was commanded from this moment on, within the limits, mm/s and rad/s; 0 at the end.
         measured: what X-ray showed at this moment; None where it was off, or no wire was found in the images.
         believed: where the policy believed the tip to be when it decided; NaN at the end, and None for a policy that
             does not tell: (Δtip, γtip), mm.
         half_width: of the adviser's bands around it, mm, likewise; NaN where there is none.
         asks: why the policy asked at this moment for X-ray at the next one; empty where it did not, or does not tell.
-        driven: velocity of each device's proximal end that its drive asked for in each cycle of `CYCLE_S`, mm/s and
-            rad/s of the wire, then of each catheter. `endopilot.simulate` makes the same navigation of it, to the bit.
+        driven: velocity of each device's proximal end that its drive asked for in each of its cycles, mm/s and rad/s.
+            `endopilot.simulate` makes the same navigation of it, to the bit.
         success: the tip reached the target in time, at the end of a period.
         safe: the wall force never exceeded the navigation's limit.
         seconds: how long it took, s.
         peak_force_n: largest wall force on one node, N.
         exposures: their number, of both views together as one.
-        path_mm: length of the tip's path, sample to sample, mm.
-        faults: decisions that were not finite or beyond the drive's limits, and were mended.
+        path_mm: length of the wire's tip's path, sample to sample, mm.
+        faults: decisions that were not finite or beyond the robot's limits, and were mended.
         reason: "reached", "time", "invalid" (the simulation failed), "gave up" (the policy did) or "stopped" (somebody
             ended it before).
         gives_up: where and why the policy gave up, in words; empty if it did not.
     """
 
     time_s: Float[np.ndarray, "samples"]
-    inserted_length: Float[np.ndarray, "samples"]
-    rotation: Float[np.ndarray, "samples"]
-    tip_position: Float[np.ndarray, "samples 3"]
+    inserted_length: Float[np.ndarray, "samples devices"]
+    rotation: Float[np.ndarray, "samples devices"]
+    tip_position: Float[np.ndarray, "samples devices 3"]
     tip: TipProjection
+    shape: Float[np.ndarray, "samples nodes 3"]
     contact_force_max: Float[np.ndarray, "samples"]
     exposed: Bool[np.ndarray, "samples"]
-    catheter_inserted_length: Float[np.ndarray, "samples catheters"]
-    catheter_rotation: Float[np.ndarray, "samples catheters"]
-    catheter_tip_position: Float[np.ndarray, "samples catheters 3"]
-    catheter_tips: tuple[TipProjection, ...]
-    control: Float[np.ndarray, "samples numbers"]
+    control: Float[np.ndarray, "samples devices 2"]
     measured: tuple[TipMeasurement | None, ...]
     believed: Float[np.ndarray, "samples 2"] | None
     half_width: Float[np.ndarray, "samples 2"] | None
     asks: tuple[str, ...]
-    driven: Float[np.ndarray, "cycles numbers"]
+    driven: Float[np.ndarray, "cycles devices 2"]
     success: bool
     safe: bool
     seconds: float
@@ -80,16 +75,11 @@ class NavigationRecord:
     gives_up: str
 
     @property
-    def tips(self) -> tuple[TipProjection, ...]:
-        """Those of the wire and of each catheter, as `Navigation.reached` takes them."""
-        return (self.tip, *self.catheter_tips)
-
-    @property
     def in_bands(self) -> Bool[np.ndarray, "decisions"]:
         """Whether the adviser's bands held Δtip and γtip, at each decision that had bands."""
         if self.believed is None or self.half_width is None:
             return np.zeros(0, dtype=bool)
-        true = np.stack([self.tip.abscissa, self.tip.offset], axis=-1)
+        true = np.stack([self.tip.abscissa[:, 0], self.tip.offset[:, 0]], axis=-1)
         held = np.less_equal(np.abs(true - self.believed), self.half_width).all(axis=1)
         return np.asarray(held)[np.isfinite(self.half_width).all(axis=1)]
 
@@ -97,15 +87,17 @@ class NavigationRecord:
 class Track:
     """Gathers what happens in a navigation."""
 
-    def __init__(self, simulator: Simulator) -> None:
-        """Take the start."""
-        self._columns: dict[str, list] = {name: [] for name in ("inserted", "turned", "position", "force")}
-        self._controls: list[Proximals] = []
+    def __init__(self) -> None:
+        """Begin with nothing."""
+        self._proximal: list[Float[np.ndarray, "devices 2"]] = []
+        self._position: list[Float[np.ndarray, "devices 3"]] = []
+        self._shape: list[Float[np.ndarray, "nodes 3"]] = []
+        self._force: list[float] = []
+        self._control: list[Proximals] = []
         self._measured: list[TipMeasurement | None] = []
-        self._exposed: list[bool] = []
+        self._exposures: list[int] = []
         self._believed: list[BelievedTip | None] = []
-        self._faults = 0
-        self.moved(simulator, float(simulator.contacts.max()))
+        self._faults, self._before = 0, 0
 
     def decided(
         self,
@@ -117,64 +109,63 @@ class Track:
         fault: bool,
     ) -> None:
         """Take what was decided, whether X-ray was on and what it showed then, and what the policy believed."""
-        self._controls.append(control)
-        self._exposed.append(exposed)
+        self._control.append(control)
+        self._exposures.append(exposed + self._before)
         self._measured.append(tip)
         self._believed.append(believed)
-        self._faults += fault
+        self._faults, self._before = self._faults + fault, 0
 
-    def moved(self, simulator: Simulator, peak_n: float) -> None:
+    def exposed(self) -> None:
+        """Take an exposure within a period."""
+        if self._exposures:
+            self._exposures[-1] += 1
+        else:
+            self._before += 1
+
+    def moved(self, simulator: Simulator, proximal: Float[np.ndarray, "devices 2"], peak_n: float) -> None:
         """Take where the devices are at the end of a period, and the largest wall force in it, N."""
-        self._columns["inserted"].append(np.append(simulator.inserted_length, simulator.catheter_inserted_length))
-        self._columns["turned"].append(np.append(simulator.rotation, simulator.catheter_rotation))
-        devices = 1 + simulator.catheter_inserted_length.shape[1]
-        self._columns["position"].append([simulator.tips(k)[0] for k in range(devices)])
-        self._columns["force"].append(peak_n)
+        self._proximal.append(proximal)
+        self._position.append(simulator.tip_position[0])
+        self._shape.append(simulator.position[0])
+        self._force.append(peak_n)
 
     def record(self, navigation: Navigation, driven: list[np.ndarray], reason: str, gives_up: str) -> NavigationRecord:
         """Return the record of what was gathered up to the end of the last period.
 
         Args:
             navigation: what was to be done.
-            driven: velocity of each cycle of the drive, mm/s and rad/s.
+            driven: velocity of each device in each cycle of the drives, mm/s and rad/s.
             reason: why it ended.
             gives_up: where and why the policy gave up, in words.
         """
-        anatomy = navigation.anatomy
-        inserted, turned, position, force = (
-            np.array(self._columns[name]) for name in ("inserted", "turned", "position", "force")
-        )
-        tip, *catheter_tips = (
-            project_tip(anatomy.tree, anatomy.insertion, position[:, k]) for k in range(position.shape[1])
-        )
-        numbers = 2 * inserted.shape[1]
-        periods = len(force) - 1  # a decision whose period is not over does not count
-        measured = (*self._measured[:periods], None)
+        anatomy, force = navigation.anatomy, np.array(self._force)
+        proximal, position = np.array(self._proximal), np.array(self._position)
+        samples, devices, _ = proximal.shape
+        flat = project_tip(anatomy.tree, anatomy.insertion, position.reshape(-1, 3))
+        periods = samples - 1  # a decision whose period is not over does not count
+        exposures = np.array([*self._exposures[:periods], 0])
         believed = [_NOTHING if tip is None else tip for tip in self._believed[:periods]] + [_NOTHING]
         tells = any(tip is not None for tip in self._believed)
         return NavigationRecord(
-            time_s=DECISION_PERIOD_S * np.arange(len(force)),
-            inserted_length=inserted[:, 0],
-            rotation=turned[:, 0],
-            tip_position=position[:, 0],
-            tip=tip,
+            time_s=DECISION_PERIOD_S * np.arange(samples),
+            inserted_length=proximal[..., 0],
+            rotation=proximal[..., 1],
+            tip_position=position,
+            tip=TipProjection(*(getattr(flat, name).reshape(samples, devices) for name in _PROJECTED)),
+            shape=np.array(self._shape),
             contact_force_max=force,
-            exposed=np.array([*self._exposed[:periods], False]),
-            catheter_inserted_length=inserted[:, 1:],
-            catheter_rotation=turned[:, 1:],
-            catheter_tip_position=position[:, 1:],
-            catheter_tips=tuple(catheter_tips),
-            control=np.array([*map(np.ravel, self._controls[:periods]), np.zeros(numbers)]),
-            measured=measured,
+            exposed=exposures > 0,
+            control=np.array([*self._control[:periods], np.zeros((devices, 2))]),
+            measured=(*self._measured[:periods], None),
             believed=np.array([(tip.abscissa, tip.offset) for tip in believed]) if tells else None,
             half_width=np.array([tip.half_width for tip in believed]) if tells else None,
             asks=tuple(tip.asks for tip in believed),
-            driven=np.array(driven, dtype=float).reshape(-1, numbers),
+            driven=np.array(driven, dtype=float).reshape(-1, devices, 2),
             success=reason == "reached",
-            safe=bool(force.max() <= navigation.force_limit_n),
+            safe=bool(is_safe(force.max(), navigation.force_limit_n)),
             seconds=DECISION_PERIOD_S * periods,
             peak_force_n=float(force.max()),
-            exposures=sum(self._exposed[:periods]),
+            exposures=int(exposures.sum()),
             path_mm=float(np.linalg.norm(np.diff(position[:, 0], axis=0), axis=1).sum()),
             faults=self._faults,
             reason=reason,
@@ -183,3 +174,4 @@ class Track:
 
 
 _NOTHING = BelievedTip(abscissa=np.nan, offset=np.nan)
+_PROJECTED = ("abscissa", "offset", "branch", "radius")

@@ -52,8 +52,7 @@ def place(tree: VesselTree) -> HeartFit:
         lines = [line.points for line in main_paths(tree)]
         return reference.fit_heart_along(lines, [shape.curve_through(course) for course in (lad, lcx)])
     line = tree.longest_path()
-    leaf = max(tree.leaves(), key=lambda branch: tree.branches[branch].centerline.abscissa[-1])
-    last = tree.section_names[tree.branches[leaf].section[-1]]
+    last = tree.section_names[tree.branches[tree.longest_leaf()].section[-1]]
     return reference.fit_heart(line.points, _crux_abscissa(tree), last)
 
 

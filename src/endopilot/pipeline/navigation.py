@@ -93,15 +93,7 @@ def _write(found: PatientNavigation, folder: Path, target: str, output: Path) ->
         navigation_table(found).to_csv(partial, index=False)
     cycles = found.cycles
     count = len(found.record.driven)
-    motions = [(cycles.inserted_length[0], cycles.rotation[0])]
-    if cycles.catheters is not None:
-        motions += zip(cycles.catheters.inserted_length[0].T, cycles.catheters.rotation[0].T, strict=True)
-    write_controls_csv(
-        output / CONTROLS_FILE,
-        found.record.driven,
-        np.column_stack([column[:count] for motion in motions for column in motion]),
-        cycles.sample_period_s,
-    )
+    write_controls_csv(output / CONTROLS_FILE, cycles.command[0, :count], cycles.proximal[0, :count], cycles.period_s)
     write_device(set_up.true_wire, output / WIRE_FILE)
     for path, catheter in zip(_catheter_files(set_up, output), set_up.true_catheters, strict=True):
         write_catheter(catheter, path)
@@ -118,17 +110,21 @@ def _write(found: PatientNavigation, folder: Path, target: str, output: Path) ->
 def navigation_table(found: PatientNavigation) -> pd.DataFrame:
     """Return a row for the start and for the end of each decision period; docs/navigation.md has the columns."""
     record, navigation = found.record, found.set_up.navigation
-    tip, count = record.tip, len(record.time_s)
+    tip, count = record.tip[:, 0], len(record.time_s)
     tree = navigation.anatomy.tree
     places = zip(tip.branch.tolist(), tip.abscissa.tolist(), strict=True)
     measured = [(np.nan, np.nan) if seen is None else (seen.abscissa, seen.offset) for seen in record.measured]
     nothing = np.full((count, 2), np.nan)
     believed = nothing if record.believed is None else record.believed
     band = nothing if record.half_width is None else record.half_width
-    proximal = np.column_stack([record.inserted_length, record.rotation])
+    proximal = np.stack([record.inserted_length, record.rotation], axis=-1)
+
+    def of_device(k: int) -> dict[str, Any]:
+        return device_columns(k, record.control[:, k], proximal[:, k], record.tip[:, k], record.tip_position[:, k])
+
     columns: dict[str, Any] = {
         "time_s": record.time_s,
-        **device_columns(0, record.control[:, :2], proximal, tip, record.tip_position),
+        **of_device(0),
         "section": [section_at(tree, branch, at) for branch, at in places],
         "safety_ratio": safety_ratio(tip.offset, tip.radius, navigation.device.tip_radius_mm),
         "contact_force_n": record.contact_force_max,
@@ -141,10 +137,8 @@ def navigation_table(found: PatientNavigation) -> pd.DataFrame:
         "band_tip_offset_mm": band[:, 1],
         "asks_for_xray": list(record.asks),
     }
-    for k, catheter_tip in enumerate(record.catheter_tips, start=1):
-        proximal = np.column_stack([record.catheter_inserted_length[:, k - 1], record.catheter_rotation[:, k - 1]])
-        control, position = record.control[:, 2 * k : 2 * k + 2], record.catheter_tip_position[:, k - 1]
-        columns |= device_columns(k, control, proximal, catheter_tip, position)
+    for k in range(1, len(navigation.devices)):
+        columns |= of_device(k)
     return pd.DataFrame(columns)
 
 
@@ -157,13 +151,10 @@ def _write_episode(found: PatientNavigation, anatomy_folder: Path, output: Path)
         found.episode,
         anatomy_folder,
         output,
-        device,
+        set_up.navigation.stack,
         task=f"navigate to {name_target(set_up)}",
         friction=device.friction * truth.friction_factor,
         tip_stiffness_factor=truth.stiffness_factor,
-        simulator=set_up.simulator,
-        catheters=set_up.navigation.catheters,
-        motion=set_up.motion,
         seed=set_up.config.seed,
         origin={
             "target": asdict(set_up.navigation.target),
@@ -191,8 +182,8 @@ def _manifest(found: PatientNavigation, target: str, output: Path) -> dict[str, 
         "exposures": record.exposures,
         "peak_force_n": round(record.peak_force_n, 4),
         "largest_safety_ratio": round(worst_ratio(found), 3),
-        "deepest_tip_mm": round(float(record.tip.abscissa.max()), 2),
-        "end_tip_mm": round(float(record.tip.abscissa[-1]), 2),
+        "deepest_tip_mm": round(float(record.tip.abscissa[:, 0].max()), 2),
+        "end_tip_mm": round(float(record.tip.abscissa[-1, 0]), 2),
         "target_mm": round(navigation.target.abscissa, 2),
         "drive_slipped_s": round(slipped_s(found), 2),
         "courses_searched": found.plans,

@@ -42,7 +42,8 @@ from endopilot.runs import claim
 from endopilot.settings import Seconds, Seed, Within, settings
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.simulate import simulate
-from endopilot.types import Rollout, Volume
+from endopilot.simulation.trajectory import Trajectory
+from endopilot.types import Volume
 
 VOLUME_SUFFIX = ".nii.gz"
 EVALUATED = 48
@@ -301,7 +302,7 @@ def _drive(run: _Run, anatomy: Path) -> None:
     """Let the agent drive to the distal end of the longest path."""
     assert run.navigation is not None
     tree = read_anatomy(anatomy).tree
-    longest = max(tree.leaves(), key=lambda leaf: tree.branches[leaf].centerline.abscissa[-1])
+    longest = tree.longest_leaf()
     target = tree.section_names[tree.branches[longest].section[-1]]
     settings = NavigatePatientConfig(device=run.config.device, seed=run.config.seed)
     navigate_into(anatomy, target, run.navigation, settings)
@@ -399,20 +400,19 @@ def _scores(output: Path, names: Sequence[str]) -> dict[str, dict[str, float]]:
     return scores
 
 
-def _replay(output: Path, device: Device) -> tuple[Path, Rollout]:
+def _replay(output: Path, device: Device) -> tuple[Path, Trajectory]:
     """Simulate one test navigation again with the wire's shape, that in which the tip travelled farthest."""
     dataset = load_dataset(output / "dataset")
     held_out = dataset.of_split("test" if "test" in dataset.split else "seen_test")
-    best = int(np.ptp(held_out.tip_abscissa, axis=1).argmax())
+    best = int(np.ptp(held_out.tip_abscissa[:, :, 0], axis=1).argmax())
     one = held_out.select(np.array([best]))
     folder = dataset.anatomy_folder(str(one.anatomy[0]))
-    initial = np.stack([one.initial_inserted_length, one.initial_rotation], axis=-1)
     anatomy = read_anatomy(folder)
     wire = device.with_tip(bend_rad=float(one.tip_bend[0]), stiffness_factor=float(one.tip_stiffness_factor[0]))
     settings = SimulatorConfig(**dataset.manifest["config"]["simulator"])
-    options = {"initial": initial, "config": settings, "friction": one.friction, "record_shape": True}
+    options = {"initial": one.initial, "config": settings, "friction": one.friction, "record_shape": True}
     options["motion"] = dataset.motion(anatomy.name)
-    return folder, simulate(anatomy, wire, one.control, **options)
+    return folder, simulate(anatomy, wire, one.command, **options)
 
 
 def _finish(run: _Run) -> dict[str, Any]:

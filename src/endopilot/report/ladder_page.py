@@ -23,9 +23,10 @@ from endopilot.plotting import BLACK, BLUE, GREEN, ORANGE, STYLE, VERMILLION, pn
 from endopilot.report.report import image, template_text
 from endopilot.report.scene import mark_target, navigation_scene
 from endopilot.simulation.simulate import simulate
+from endopilot.simulation.trajectory import Trajectory
 from endopilot.tasks.navigation import Navigation
 from endopilot.tasks.task import CORE, Task, find_task, ladder_tasks
-from endopilot.types import SAMPLE_PERIOD_S, Rollout
+from endopilot.types import SAMPLE_PERIOD_S
 
 PAGE_FILE = "index.html"
 SHOWN = 5
@@ -112,19 +113,15 @@ def _outcome(result: dict[str, Any]) -> str:
     return "safe success" if result["safe"] else "success, but too large a force"
 
 
-def _replay(navigation: Navigation, course: dict[str, Any]) -> Rollout:
+def _replay(navigation: Navigation, course: dict[str, Any]) -> Trajectory:
     """Return wire and catheters over a navigation, by driving its proximal end along the same course again."""
-    numbers = [course["inserted_length"], course["rotation"]]
-    for inserted, turned in zip(
-        np.array(course["catheter_inserted_length"]).T, np.array(course["catheter_rotation"]).T, strict=True
-    ):
-        numbers += [inserted, turned]
-    proximal = np.column_stack(numbers)
+    inserted = np.column_stack([course["inserted_length"], course["catheter_inserted_length"]])
+    turned = np.column_stack([course["rotation"], course["catheter_rotation"]])
+    proximal = np.stack([inserted, turned], axis=-1)
     return simulate(
         navigation.anatomy,
-        navigation.device,
+        navigation.stack,
         (np.diff(proximal, axis=0) / SAMPLE_PERIOD_S)[None],
-        catheters=navigation.catheters,
         initial=proximal[:1],
         config=replace(CORE, threads=1),
         record_shape=True,

@@ -30,7 +30,8 @@ def navigation_figure(found: PatientNavigation) -> Figure:
         grid = figure.add_gridspec(len(heights), 2, width_ratios=(1.0, 1.35), height_ratios=heights)
         title = f"{navigation.anatomy.name}, seen from the front"
         left = figure.add_subplot(grid[:, 0])
-        draw_route(left, navigation, record.tip_position, title, list(np.moveaxis(record.catheter_tip_position, 1, 0)))
+        wire, *around = np.moveaxis(record.tip_position, 1, 0)
+        draw_route(left, navigation, wire, title, around)
         _mark_sections(left, found)
         panels = [figure.add_subplot(grid[row, 1]) for row in range(len(heights))]
         _draw_tip(panels[0], found)
@@ -56,30 +57,30 @@ def _mark_sections(axes: Axes, found: PatientNavigation) -> None:
     for name, piece in longest.items():
         x, _, z = piece[len(piece) // 2]
         axes.annotate(name, (x, z), textcoords="offset points", xytext=(5, 4), fontsize=9, color="0.35")
-    shown = found.record.tip_position[found.record.exposed]
+    shown = found.record.tip_position[found.record.exposed, 0]
     axes.plot(shown[:, 0], shown[:, 2], "o", mfc="none", color=BLACK, markersize=6, label="tip under X-ray")
     axes.legend(loc="best", fontsize=9)
 
 
 def _draw_tip(axes: Axes, found: PatientNavigation) -> None:
     record, navigation = found.record, found.set_up.navigation
-    time_s = record.time_s
+    time_s, wire_tip = record.time_s, record.tip[:, 0]
     if record.believed is not None and record.half_width is not None:
         middle, half = record.believed[:, 0], record.half_width[:, 0]
         axes.plot(time_s, middle, color=ORANGE, linestyle="--", label="believed")
         axes.fill_between(time_s, middle - half, middle + half, color=ORANGE, alpha=0.25, linewidth=0, label="band")
     around = found.set_up.navigation.catheters
-    axes.plot(time_s, record.tip.abscissa, color=BLUE, label="wire's tip" if around else "true")
+    axes.plot(time_s, wire_tip.abscissa, color=BLUE, label="wire's tip" if around else "true")
     names = ("catheter's tip", "outer catheter's tip")
-    for name, color, tip in zip(names, CATHETER_COLORS, record.catheter_tips, strict=False):
-        axes.plot(time_s, tip.abscissa, color=color, label=name)
-    off = Route.to(navigation.anatomy, navigation.target).off_route(record.tip) > 0
+    for name, color, abscissa in zip(names, CATHETER_COLORS, record.tip.abscissa[:, 1:].T, strict=False):
+        axes.plot(time_s, abscissa, color=color, label=name)
+    off = Route.to(navigation.anatomy, navigation.target).off_route(wire_tip) > 0
     if off.any():
-        axes.plot(time_s[off], record.tip.abscissa[off], "x", color=VERMILLION, label="in a wrong branch")
+        axes.plot(time_s[off], wire_tip.abscissa[off], "x", color=VERMILLION, label="in a wrong branch")
     seen = [(t, tip.abscissa) for t, tip in zip(time_s, record.measured, strict=True) if tip is not None]
     axes.plot(*np.array(seen).reshape(-1, 2).T, "o", mfc="none", color=BLACK, markersize=5, label="measured by X-ray")
     route, tree = Route.to(navigation.anatomy, navigation.target), navigation.anatomy.tree
-    span, last = float(np.ptp(np.append(record.tip.abscissa, navigation.target.abscissa))), -np.inf
+    span, last = float(np.ptp(np.append(wire_tip.abscissa, navigation.target.abscissa))), -np.inf
     for junction in route.junctions:
         axes.axhline(float(junction), color="0.75", linewidth=0.8, zorder=0)
         section = section_at(tree, int(route.branch(np.array([junction + 1e-3]))[0]), float(junction) + 1.0)
@@ -95,7 +96,7 @@ def _draw_tip(axes: Axes, found: PatientNavigation) -> None:
 
 def _draw_safety(axes: Axes, found: PatientNavigation) -> None:
     record = found.record
-    tip, radius = record.tip, found.set_up.navigation.device.tip_radius_mm
+    tip, radius = record.tip[:, 0], found.set_up.navigation.device.tip_radius_mm
     ratio = safety_ratio(tip.offset, tip.radius, radius)
     axes.plot(record.time_s, ratio, color=PURPLE)
     axes.axhline(1.0, color=GREY, linewidth=1)
@@ -118,9 +119,8 @@ def _draw_force(axes: Axes, found: PatientNavigation) -> None:
 def _draw_pushes(axes: Axes, found: PatientNavigation) -> None:
     """Draw how hard each drive pushes, or pulls below zero."""
     rollout = found.rollout
-    assert rollout.catheters is not None
     time_s = DECISION_PERIOD_S * np.arange(1, rollout.drive_force.shape[1] + 1)
-    pushes = [rollout.drive_force[0], *rollout.catheters.drive_force[0].T]
+    pushes = rollout.drive_force[0].T
     for device, color, push in zip(found.set_up.navigation.devices, _DEVICE_COLORS, pushes, strict=False):
         axes.plot(time_s, push, color=color, label=device.name)
     axes.axhline(0.0, color="0.75", linewidth=0.8, zorder=0)
@@ -134,8 +134,8 @@ def _draw_controls(panels: list[Axes], found: PatientNavigation) -> None:
         (panels[0], 0, BLUE, "translation,\nmm/s"),
         (panels[1], 1, ORANGE, "rotation,\nrad/s"),
     ):
-        axes.step(time_s, control[:, axis], where="post", color=color)
-        for catheter_color, speed in zip(CATHETER_COLORS, control[:, axis + 2 :: 2].T, strict=False):
+        axes.step(time_s, control[:, 0, axis], where="post", color=color)
+        for catheter_color, speed in zip(CATHETER_COLORS, control[:, 1:, axis].T, strict=False):
             axes.step(time_s, speed, where="post", color=catheter_color, linewidth=1.4)
         axes.axhline(0.0, color="0.75", linewidth=0.8, zorder=0)
         axes.set_ylabel(label)

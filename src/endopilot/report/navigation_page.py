@@ -74,7 +74,7 @@ def _tiles(found: PatientNavigation) -> list[tuple[str, str, str]]:
         (f"{worst_ratio(found):.2f}", f"largest safety ratio of the {whose}tip", "1 is the wall"),
     ]  # fmt: skip
     if record.believed is not None:
-        errors = np.abs(record.believed[:-1, 0] - record.tip.abscissa[:-1])
+        errors = np.abs(record.believed[:-1, 0] - record.tip.abscissa[:-1, 0])
         tiles.append(
             (f"{np.median(errors):.2f} mm", "median error of the believed Δtip", f"at most {errors.max():.2f} mm")
         )
@@ -110,7 +110,7 @@ def _scene(found: PatientNavigation) -> str:
     figure = navigation_scene(navigation.anatomy, found.rollout, devices=navigation.devices, believed=found.wires)
     exposed = record.exposed
     place = navigation.target.position(navigation.anatomy)
-    mark_target(figure, place, record.tip_position[exposed], record.time_s[exposed])
+    mark_target(figure, place, record.tip_position[exposed, 0], record.time_s[exposed])
     return figure.to_html(
         full_html=False,
         include_plotlyjs=False,
@@ -131,7 +131,7 @@ def _exposures(found: PatientNavigation) -> list[dict[str, str]]:
                 "time": f"{record.time_s[sample]:g}",
                 "why": why[0].upper() + why[1:],
                 "measured": "no wire found" if tip is None else f"{tip.abscissa:.1f}",
-                "true": f"{record.tip.abscissa[sample]:.1f}",
+                "true": f"{record.tip.abscissa[sample, 0]:.1f}",
             }
         )
     return rows

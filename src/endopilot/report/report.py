@@ -25,7 +25,8 @@ from endopilot.report import figures, report_text
 from endopilot.report.scene import navigation_scene, visible_devices
 from endopilot.report.still import render_still
 from endopilot.report.tables import stage_table
-from endopilot.types import Anatomy, Rollout
+from endopilot.simulation.trajectory import Trajectory
+from endopilot.types import Anatomy
 
 STILL_FILE = "scene.png"
 
@@ -73,7 +74,7 @@ class ReportContent:
     patients: tuple[PatientContent, ...] = ()
     evaluation: Path | None = None
     run: Path | None = None
-    replay: Rollout | None = None
+    replay: Trajectory | None = None
     replay_anatomy: Path | None = None
     navigation: Path | None = None
     stage_seconds: Mapping[str, float] = field(default_factory=dict)
@@ -180,18 +181,18 @@ def _scene(content: ReportContent, still: Path, remarks: list[str]) -> dict[str,
     }
 
 
-def _farthest(replay: Rollout | None) -> list[np.ndarray]:
+def _farthest(replay: Trajectory | None) -> list[np.ndarray]:
     """Return the first world's wire where its tip is deepest in the vessel; nothing without a replay."""
     if replay is None or replay.shape is None or not replay.valid[0].any():
         return []
-    depth = np.where(replay.valid[0], replay.tip.abscissa[0], -np.inf)
+    depth = np.where(replay.valid[0], replay.tip.abscissa[0, :, 0], -np.inf)
     return visible_devices(replay, 0, int(np.argmax(depth)))
 
 
-def _scene_caption(anatomy: Anatomy, replay: Rollout | None) -> str:
+def _scene_caption(anatomy: Anatomy, replay: Trajectory | None) -> str:
     if replay is None:
         return f"The vessel of {anatomy.name}."
-    seconds = replay.valid.shape[1] * replay.sample_period_s
+    seconds = replay.valid.shape[1] * replay.period_s
     return f"{seconds:g} s of navigation in {anatomy.name}, simulated with the Cosserat rod core."
 
 

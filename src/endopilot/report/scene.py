@@ -13,7 +13,8 @@ from endopilot.devices.stack import lines_from_tips, shown_part
 from endopilot.plotting import CATHETER_COLORS
 from endopilot.report.figures import section_color
 from endopilot.report.wall_mesh import wall_mesh
-from endopilot.types import Anatomy, Rollout
+from endopilot.simulation.trajectory import Trajectory
+from endopilot.types import Anatomy
 
 BACKGROUND, INK, FAINT = "#0d1424", "#dfe6f2", "#31405c"
 WALL, WIRE, TIP, BELIEVED = "#d98a8a", "#f6f7fb", "#ffd34d", "#5fb8ff"
@@ -34,7 +35,7 @@ FRAME_MS = 90
 
 def navigation_scene(
     anatomy: Anatomy,
-    rollout: Rollout | None = None,
+    rollout: Trajectory | None = None,
     *,
     world: int = 0,
     devices: Sequence[Device] = (),
@@ -82,7 +83,7 @@ def mark_target(
         figure.add_trace(go.Scatter3d(x=x, y=y, z=z, mode="markers", marker=marker, name=name, **hover))
 
 
-def visible_devices(rollout: Rollout, world: int, sample: int) -> list[Float[np.ndarray, "_ 3"]]:
+def visible_devices(rollout: Trajectory, world: int, sample: int) -> list[Float[np.ndarray, "_ 3"]]:
     """Return the nodes of the wire, then of each catheter, from its tip to a little behind the ostium, LPS mm.
 
     Raises:
@@ -90,14 +91,8 @@ def visible_devices(rollout: Rollout, world: int, sample: int) -> list[Float[np.
     """
     if rollout.shape is None:
         raise ValueError("the rollout holds no wire shapes; simulate with record_shape=True")
-    inserted = _inserted(rollout, world, sample)
+    inserted = rollout.inserted_length[world, sample]
     return lines_from_tips(shown_part(rollout.shape[world, sample], float(inserted.max())), inserted)
-
-
-def _inserted(rollout: Rollout, world: int, sample: int) -> Float[np.ndarray, "devices"]:
-    """Return the inserted length of each device, mm."""
-    around = [] if rollout.catheters is None else rollout.catheters.inserted_length[world, sample]
-    return np.append(rollout.inserted_length[world, sample], around)
 
 
 def _wall(anatomy: Anatomy) -> go.Mesh3d:
@@ -151,7 +146,7 @@ def _centerlines(anatomy: Anatomy) -> list[go.Scatter3d]:
 
 
 def _add_navigation(
-    figure: go.Figure, rollout: Rollout, world: int, devices: Sequence[Device], believed: Sequence[Wires] | None
+    figure: go.Figure, rollout: Trajectory, world: int, devices: Sequence[Device], believed: Sequence[Wires] | None
 ) -> None:
     samples = np.flatnonzero(rollout.valid[world]).tolist()
     if not samples:
@@ -161,13 +156,13 @@ def _add_navigation(
     def moving(sample: int) -> list[go.Scatter3d]:
         behind = []
         if believed is not None:
-            behind = [_possible(believed[sample], float(_inserted(rollout, world, sample).max()))]
+            behind = [_possible(believed[sample], float(rollout.inserted_length[world, sample].max()))]
         return [*behind, *_moving(rollout, world, sample, devices)]
 
     figure.add_traces(moving(samples[0]))
     traces = list(range(first, len(list(figure.data))))
     figure.frames = [go.Frame(name=str(sample), data=moving(sample), traces=traces) for sample in samples]
-    period = rollout.sample_period_s
+    period = rollout.period_s
     animate = {"frame": {"duration": FRAME_MS, "redraw": True}, "transition": {"duration": 0}, "fromcurrent": True}
     stop = {"frame": {"duration": 0, "redraw": True}, "mode": "immediate", "transition": {"duration": 0}}
     figure.update_layout(
@@ -211,25 +206,25 @@ def _add_navigation(
     )
 
 
-def _moving(rollout: Rollout, world: int, sample: int, devices: Sequence[Device]) -> list[go.Scatter3d]:
+def _moving(rollout: Trajectory, world: int, sample: int, devices: Sequence[Device]) -> list[go.Scatter3d]:
     """Return what changes from frame to frame: wire, catheters, the wire's tip and the tip's trail."""
     wire, *around = (np.round(line, 2).astype(np.float32) for line in _uncovered(rollout, world, sample))
-    begin = max(0, sample - round(TRAIL_S / rollout.sample_period_s))
-    trail = np.round(rollout.tip_position[world, begin : sample + 1], 2).astype(np.float32)
+    begin = max(0, sample - round(TRAIL_S / rollout.period_s))
+    trail = np.round(rollout.tip_position[world, begin : sample + 1, 0], 2).astype(np.float32)
     tip = trail[-1:]
-    time = f"<extra>{(sample + 1) * rollout.sample_period_s:g} s</extra>"
+    time = f"<extra>{(sample + 1) * rollout.period_s:g} s</extra>"
     hover = (
-        f"Δ = {rollout.inserted_length[world, sample]:.1f} mm<br>"
-        f"φ = {np.rad2deg(rollout.rotation[world, sample]):.0f}°<br>"
-        f"Δtip = {rollout.tip.abscissa[world, sample]:.1f} mm<br>"
-        f"γtip = {rollout.tip.offset[world, sample]:.2f} mm<br>"
-        f"lumen radius = {rollout.tip.radius[world, sample]:.2f} mm<br>"
+        f"Δ = {rollout.inserted_length[world, sample, 0]:.1f} mm<br>"
+        f"φ = {np.rad2deg(rollout.rotation[world, sample, 0]):.0f}°<br>"
+        f"Δtip = {rollout.tip.abscissa[world, sample, 0]:.1f} mm<br>"
+        f"γtip = {rollout.tip.offset[world, sample, 0]:.2f} mm<br>"
+        f"lumen radius = {rollout.tip.radius[world, sample, 0]:.2f} mm<br>"
         f"largest wall force = {rollout.contact_force_max[world, sample]:.3f} N"
     )
     name = "Guidewire"
     if around:
         name += f" {devices[0].name}"
-        hover += f"<br>push of its drive = {rollout.drive_force[world, sample]:.2f} N"
+        hover += f"<br>push of its drive = {rollout.drive_force[world, sample, 0]:.2f} N"
     hover += time
     tubes = [
         _line(
@@ -237,7 +232,7 @@ def _moving(rollout: Rollout, world: int, sample: int, devices: Sequence[Device]
             color=CATHETER_COLORS[k],
             width=round(_WIRE_WIDTH * devices[k + 1].diameter_mm / devices[0].diameter_mm, 1),
             name=f"Catheter {devices[k + 1].name}",
-            hovertemplate=_catheter_state(rollout, world, sample, k) + time,
+            hovertemplate=_catheter_state(rollout, world, sample, k + 1) + time,
         )
         for k, line in enumerate(around)
     ]
@@ -251,9 +246,9 @@ def _moving(rollout: Rollout, world: int, sample: int, devices: Sequence[Device]
     ]
 
 
-def _uncovered(rollout: Rollout, world: int, sample: int) -> list[Float[np.ndarray, "_ 3"]]:
+def _uncovered(rollout: Trajectory, world: int, sample: int) -> list[Float[np.ndarray, "_ 3"]]:
     """Return the nodes of each device up to where the one around it ends; its tip alone if it lies within."""
-    lines, inserted = visible_devices(rollout, world, sample), _inserted(rollout, world, sample)
+    lines, inserted = visible_devices(rollout, world, sample), rollout.inserted_length[world, sample]
     found = []
     for k, line in enumerate(lines):
         outer = max(range(k + 1, len(lines)), key=lambda j: inserted[j], default=None)
@@ -267,14 +262,12 @@ def _uncovered(rollout: Rollout, world: int, sample: int) -> list[Float[np.ndarr
     return found
 
 
-def _catheter_state(rollout: Rollout, world: int, sample: int, k: int) -> str:
-    """Return how far catheter k is inserted and turned, and how its drive pushes it."""
-    motion = rollout.catheters
-    assert motion is not None
+def _catheter_state(rollout: Trajectory, world: int, sample: int, k: int) -> str:
+    """Return how far device k is inserted and turned, and how its drive pushes it."""
     return (
-        f"Δ = {motion.inserted_length[world, sample, k]:.1f} mm<br>"
-        f"φ = {np.rad2deg(motion.rotation[world, sample, k]):.0f}°<br>"
-        f"push of its drive = {motion.drive_force[world, sample, k]:.2f} N"
+        f"Δ = {rollout.inserted_length[world, sample, k]:.1f} mm<br>"
+        f"φ = {np.rad2deg(rollout.rotation[world, sample, k]):.0f}°<br>"
+        f"push of its drive = {rollout.drive_force[world, sample, k]:.2f} N"
     )
 
 

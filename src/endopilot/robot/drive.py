@@ -3,17 +3,17 @@
 Time and bytes come in as arguments, so that it can be tested without a clock or a socket. A drive that stopped stays so
 until it is armed again.
 
-What moves the drive bears a ticket: a random word that every answer of the drive brings. A ticket lasts for 200 ms less
-the time that braking takes, and a stop makes all of them void. So a command says when its client last heard the drive,
-and 200 ms after that the drive stands still. Whatever waited in a buffer between them is dropped, however much it is,
-and nobody can write a command for later.
+What moves the drive bears a ticket: a random word that the answers of the drive bring, a new one at each instant. A
+ticket lasts for 200 ms less the time that braking takes, and a stop makes all of them void. So a command says when its
+client last heard the drive, and 200 ms after that the drive stands still. Whatever waited in a buffer between them is
+dropped, however much it is, and nobody can write a command for later.
 """
 
 from __future__ import annotations
 
 import math
 import secrets
-from collections import deque
+from collections import OrderedDict, deque
 
 import numpy as np
 
@@ -21,8 +21,6 @@ from endopilot.devices.drive_limits import DriveLimits
 from endopilot.robot.drive_protocol import BRAKING_S, LONGEST_LINE, PROTOCOL, SILENCE_S, number
 from endopilot.robot.robot import DriveMotion, RobotConfig
 
-CYCLE_S = 0.01
-"""Period of the drive's loop, and time for which its answers bring the same ticket, s."""
 LASTS_S = SILENCE_S - BRAKING_S
 """Age at which a ticket is void, s."""
 _MOST_NEWS = 100
@@ -54,7 +52,7 @@ class Drive:
         self._limits, self._motion = limits, DriveMotion(limits, config, (inserted_length, 0.0))
         self._noise, self._random = np.array([config.encoder_sd_mm, config.encoder_sd_rad]), np.random.default_rng()
         self._began = self._now = self._heard = now
-        self._tickets: dict[str, float] = {}
+        self._tickets: OrderedDict[str, float] = OrderedDict()
         self._wanted: tuple[float, float] | None = None
         self._state: str | None = None
         self.stopped: str | None = "start"
@@ -72,11 +70,15 @@ class Drive:
         """Whether the motor stands still."""
         return not self._motion.velocity.any()
 
+    @property
+    def due(self) -> float:
+        """Time by the drive's clock at which the watchdog will stop it, s; infinite while it is stopped."""
+        return self._heard + LASTS_S if self.stopped is None else math.inf
+
     def tick(self, now: float) -> None:
         """Let the time pass up to now, s; the watchdog stops the drive when it is due, even if the call comes late."""
-        due = self._heard + LASTS_S
-        if self.stopped is None and now >= due:
-            self._advance(max(due, self._now))
+        if now >= self.due:
+            self._advance(max(self.due, self._now))
             self.stop("silence")
         self._advance(max(now, self._now))
 
@@ -145,13 +147,12 @@ class Drive:
         self.news.append("the client has disconnected")
 
     def _ticket(self) -> str:
-        """Return a ticket that is at most a cycle old, and forget those that are too old to move anything."""
-        self._tickets = {ticket: given for ticket, given in self._tickets.items() if self._now < given + LASTS_S}
-        newest = next(reversed(self._tickets), None)
-        if newest is None or self._now >= self._tickets[newest] + CYCLE_S:
-            newest = secrets.token_hex(8)
-            self._tickets[newest] = self._now
-        return newest
+        """Return a new ticket, and forget those that are too old to move anything."""
+        while self._tickets and self._now >= next(iter(self._tickets.values())) + LASTS_S:
+            self._tickets.popitem(last=False)
+        ticket = secrets.token_hex(8)
+        self._tickets[ticket] = self._now
+        return ticket
 
     def _given(self, ticket: str) -> float | None:
         """Return when a ticket was given, s, or None if it can move nothing."""

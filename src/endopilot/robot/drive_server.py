@@ -14,8 +14,9 @@ import time
 from collections.abc import Callable
 
 from endopilot.errors import InputError
-from endopilot.robot.drive import CYCLE_S, Drive, Session
+from endopilot.robot.drive import Drive, Session
 from endopilot.robot.drive_protocol import PROTOCOL
+from endopilot.robot.robot import CYCLE_S
 
 AUTHENTICATE_S = 2.0
 """Time in which a client must show its certificate, s."""
@@ -50,7 +51,7 @@ async def serve(drive: Drive, context: ssl.SSLContext, host: str, port: int, say
         say(f"listening on {host}:{listener.getsockname()[1]}")
         door = asyncio.create_task(_Door(drive, context).keep(listener))
         while not (terminated.is_set() or door.done()):
-            await asyncio.sleep(CYCLE_S)
+            await asyncio.sleep(min(CYCLE_S, max(drive.due - time.monotonic(), 0.0)))
             drive.tick(time.monotonic())
             while drive.news:
                 say(drive.news.popleft())

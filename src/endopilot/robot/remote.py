@@ -15,6 +15,7 @@ from pathlib import Path
 from types import TracebackType
 
 from endopilot.devices.drive_limits import DriveLimits
+from endopilot.devices.stack import Proximals
 from endopilot.errors import InputError
 from endopilot.robot.drive_protocol import LONGEST_LINE, PROTOCOL, SILENCE_S, number, tls_context
 from endopilot.robot.robot import ProximalState
@@ -71,15 +72,17 @@ class RemoteRobot:
         """Close the connection."""
         self.close()
 
-    def command(self, translation: float, rotation: float) -> None:
-        """Move on at a velocity, mm/s and rad/s, for `HOLD_S` at most. What is not finite stops the wire.
+    def command(self, devices: Proximals) -> Proximals:
+        """Move on for `HOLD_S` at most, and return what is made of it, as `Robot` says; the drive moves a wire alone.
 
         Raises:
             InputError: the connection is lost.
         """
+        translation, rotation = devices[0] if devices else (0.0, 0.0)
         with self._lock:
             self._wanted, self._until = self.limits.safe(translation, rotation), time.monotonic() + HOLD_S
             self._move()
+            return (self._wanted,)
 
     def proximal_state(self) -> ProximalState:
         """Return what the drive's encoders say now.
@@ -198,7 +201,7 @@ class RemoteRobot:
             if self.status != "armed":
                 self._until = 0.0
             clock, inserted, rotation = values
-            return ProximalState(clock, inserted, rotation)
+            return ProximalState(clock, ((inserted, rotation),))
 
     def _lose(self, reason: str) -> None:
         self._lost = self._lost or reason

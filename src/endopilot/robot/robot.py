@@ -9,44 +9,50 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.devices.drive_limits import DriveLimits, within_travel
+from endopilot.devices.drive_limits import DriveLimits
+from endopilot.devices.stack import Proximals
 from endopilot.settings import NonNegative, Positive, Within, settings
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import Step
 
 CYCLE_S = 0.05
-"""Period of the drive's own loop, s."""
+"""Longest period of a drive's loop, s: in the simulator its motors' mean velocity over it moves the devices. The core's
+time step, a quarter of it, doubles what a navigation costs that plans nothing, and changes none of its figures."""
+_HAIR_MM = 1e-9
+"""What rounding may add to an inserted length, mm."""
 
 
 @dataclass(frozen=True)
 class ProximalState:
-    """A reading of a robot's encoders: the state of the wire's proximal end.
+    """A reading of a robot's encoders.
 
     Attributes:
         time_s: by the robot's clock, s.
-        inserted_length: Δ, mm.
-        rotation: φ, rad, unwrapped.
-        catheters: the same two of each catheter around the wire, from the inside out.
+        devices: inserted length Δ (mm) and rotation φ (rad, unwrapped) of each device: of the wire, then of each
+            catheter from the inside out.
     """
 
     time_s: float
-    inserted_length: float
-    rotation: float
-    catheters: tuple[tuple[float, float], ...] = ()
+    devices: Proximals
 
 
 @runtime_checkable
 class Robot(Protocol):
-    """A robot that drives a wire."""
+    """A robot that drives a wire, and the catheters around it if it has drives for them."""
 
-    def command(self, translation: float, rotation: float) -> None:
-        """Move on at a velocity, mm/s and rad/s, until the next command. What is not finite stops the wire."""
+    def command(self, devices: Proximals) -> Proximals:
+        """Move on until the next command, and return what is made of it: a pair for each device.
+
+        Args:
+            devices: mm/s and rad/s of the wire, then of each catheter. What is not finite stops that device, what is
+                beyond its drive's limits is cut off; a device that is not given stops.
+        """
         ...
 
     def proximal_state(self) -> ProximalState:
@@ -95,9 +101,11 @@ class DriveMotion:
         self._wanted, self._ahead = np.zeros(2), np.zeros(2)
         self.time_s, self.velocity, self.position = 0.0, np.zeros(2), np.array(position, dtype=float)
 
-    def command(self, translation: float, rotation: float) -> None:
-        """Take a velocity, mm/s and rad/s, which acts after the latency."""
-        self._orders.append((self.time_s + self._latency_s, np.array(self._limits.safe(translation, rotation))))
+    def command(self, translation: float, rotation: float) -> tuple[float, float]:
+        """Take a velocity, mm/s and rad/s, which acts after the latency; return it within the limits."""
+        taken = self._limits.safe(translation, rotation)
+        self._orders.append((self.time_s + self._latency_s, np.array(taken)))
+        return taken
 
     def stop(self, *, within_s: float = np.inf) -> None:
         """Brake at once, whatever was commanded before: within a time, s, where the motor's ramp would take longer."""
@@ -135,8 +143,7 @@ class SimulatedRobot:
     command. They count from the assumed position of the ostium.
 
     Attributes:
-        driven: velocity of each device's proximal end that its drive asked for in each cycle so far, mm/s and rad/s of
-            the wire, then of each catheter.
+        driven: velocity of each device's proximal end that its drive asked for in each cycle so far, mm/s and rad/s.
         last_step: what the wire did in the drive's last cycle; None before the first.
     """
 
@@ -163,51 +170,39 @@ class SimulatedRobot:
         self._noise = np.array([config.encoder_sd_mm, config.encoder_sd_rad])
         self._random = np.random.default_rng([seed, 1])
         self._drives = [
-            DriveMotion(limit, config, (at, turned))
+            DriveMotion(_by_encoder(limit, ostium_mm), config, (at, turned))
             for limit, (at, turned) in zip(limits, self._encoders().tolist(), strict=True)
         ]
-        # at the ostium the simulator stops the drives by itself
-        self._travel_mm = [(-np.inf, limit.travel_mm[1]) for limit in limits]
-        self.driven: list[Float[np.ndarray, "numbers"]] = []
+        self.driven: list[Float[np.ndarray, "devices 2"]] = []
         self.last_step: Step | None = None
 
     @property
-    def velocity(self) -> Float[np.ndarray, "numbers"]:
-        """The motors' velocities, mm/s and rad/s of the wire's, then of each catheter's."""
-        return np.concatenate([drive.velocity for drive in self._drives])
+    def velocity(self) -> Float[np.ndarray, "devices 2"]:
+        """The motors' velocities, mm/s and rad/s."""
+        return np.array([drive.velocity for drive in self._drives])
 
     def stop(self) -> None:
         """Brake at once, whatever was commanded before."""
         for drive in self._drives:
             drive.stop()
 
-    def command(self, translation: float, rotation: float, *catheters: tuple[float, float]) -> None:
-        """Move on at a velocity, mm/s and rad/s, until the next command. What is not finite stops a device.
-
-        Args:
-            translation: of the wire.
-            rotation: of the wire.
-            catheters: both of each catheter; one that is not given stops.
-        """
-        orders = [(translation, rotation), *catheters, *[(0.0, 0.0)] * len(self._drives)]
-        for drive, order in zip(self._drives, orders, strict=False):
-            drive.command(*order)
+    def command(self, devices: Proximals) -> Proximals:
+        """Move on until the next command, and return what is made of it, as `Robot` says."""
+        given = [*devices, *[(0.0, 0.0)] * len(self._drives)]
+        return tuple(drive.command(*velocity) for drive, velocity in zip(self._drives, given, strict=False))
 
     def proximal_state(self) -> ProximalState:
         """Return the readings of the encoders; every reading has a noise of its own."""
         places = self._encoders()
-        wire, *catheters = (places + self._noise * self._random.standard_normal(places.shape)).tolist()
-        return ProximalState(self._drives[0].time_s, *wire, catheters=tuple((at, turn) for at, turn in catheters))
+        read = places + self._noise * self._random.standard_normal(places.shape)
+        return ProximalState(self._drives[0].time_s, tuple((at, turn) for at, turn in read.tolist()))
 
     def run(self, duration: float) -> float:
         """Let the robot and its devices run for some time, s, and return the largest wall force on a node, N."""
         cycles = max(1, round(duration / CYCLE_S))
         period, peak = duration / cycles, 0.0
         for _ in range(cycles):
-            control = np.concatenate([drive.advance(period) for drive in self._drives]) / period
-            inserted = self.proximal[:, 0]
-            for k, travel_mm in enumerate(self._travel_mm):
-                control[2 * k] = within_travel(control[2 * k], inserted[k], period, travel_mm=travel_mm)
+            control = np.array([drive.advance(period) for drive in self._drives]) / period
             self.last_step = step = self._simulator.step(control[None], period)
             self.driven.append(control)
             for drive, place in zip(self._drives, self._encoders(), strict=True):
@@ -218,10 +213,14 @@ class SimulatedRobot:
     @property
     def proximal(self) -> Float[np.ndarray, "devices 2"]:
         """Inserted length, mm, and rotation, rad, of each device as they truly are."""
-        simulator = self._simulator
-        inserted = np.append(simulator.inserted_length, simulator.catheter_inserted_length)
-        return np.column_stack([inserted, np.append(simulator.rotation, simulator.catheter_rotation)])
+        return self._simulator.proximal[0]
 
     def _encoders(self) -> Float[np.ndarray, "devices 2"]:
         """Return what the encoders read without noise: they count from where the ostium is assumed."""
         return self.proximal - [self._ostium_mm, 0.0]
+
+
+def _by_encoder(limits: DriveLimits, ostium_mm: float) -> DriveLimits:
+    """Return limits whose far end, by the encoder, is no deeper than where the device truly ends."""
+    low, high = limits.travel_mm
+    return replace(limits, travel_mm=(low, high - max(ostium_mm, 0.0) - _HAIR_MM))

@@ -112,8 +112,8 @@ PRESETS: Mapping[Preset, SimulatorConfig] = MappingProxyType(
         "accurate": SimulatorConfig(element_mm=0.3),
     }
 )
-"""Settings by name: the usual ones, those for many rollouts, and those for measurements. `endopilot bench simulation
---preset NAME` measures speed and error of each."""
+"""Settings by name: the usual ones, those for many rollouts, and those for measurements. `python -m benchmarks
+simulation --preset NAME` measures speed and error of each."""
 
 
 def wall_stiffness(config: SimulatorConfig, push_limit_n: float) -> float:

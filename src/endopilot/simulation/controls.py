@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 from pydantic import model_validator
 
 from endopilot.devices.drive_limits import within_travel
+from endopilot.devices.stack import column_prefixes
 from endopilot.errors import InputError, Remark
 from endopilot.files import writing
 from endopilot.settings import LONGEST_S, Share, Within, settings
@@ -75,8 +76,8 @@ def random_controls(
     seed: int,
     max_inserted_length_mm: float,
     first: int = 0,
-    catheters: int = 0,
-) -> tuple[Float[np.ndarray, "n numbers"], Float[np.ndarray, "n samples numbers"]]:
+    devices: int = 1,
+) -> tuple[Float[np.ndarray, "n devices 2"], Float[np.ndarray, "n samples devices 2"]]:
     """Draw random navigations; sequence i is the same whatever `n_sequences`.
 
     Args:
@@ -86,10 +87,10 @@ def random_controls(
         seed: key of the random streams.
         max_inserted_length_mm: largest inserted length that a navigation reaches, mm; the smallest is 0.
         first: index of the first of them.
-        catheters: number of catheters around the wire; each is driven independently of it, with the same distribution.
+        devices: number of devices; each is driven independently of the others, with the same distribution.
 
     Returns:
-        Initial (Δ mm, φ rad), and controls (mm/s, rad/s), of the wire, then of each catheter.
+        Initial (Δ mm, φ rad), and controls (mm/s, rad/s), of each device.
 
     Raises:
         InputError: a number that is not positive, or a negative seed.
@@ -101,12 +102,12 @@ def random_controls(
     if not 0 < max_inserted_length_mm < np.inf:
         raise InputError(f"max_inserted_length_mm: {max_inserted_length_mm}; give a positive length")
     check_memory(
-        4 * 16 * n_sequences * n_samples * (1 + catheters),  # drawn, smoothed, clipped and simulated
+        4 * 16 * n_sequences * n_samples * devices,  # drawn, smoothed, clipped and simulated
         f"{n_sequences} sequences of {n_samples} samples",
         "draw fewer, or shorter ones",
     )
-    initial, control = np.empty((n_sequences, 1 + catheters, 2)), np.empty((n_sequences, n_samples, 1 + catheters, 2))
-    for index, drive in np.ndindex(n_sequences, 1 + catheters):
+    initial, control = np.empty((n_sequences, devices, 2)), np.empty((n_sequences, n_samples, devices, 2))
+    for index, drive in np.ndindex(n_sequences, devices):
         key = np.array([seed, first + index + drive * _DRIVE], dtype=np.uint64)
         generator = np.random.Generator(np.random.Philox(key=key))
         start, driven = _navigation(config, generator, n_samples, max_inserted_length_mm)
@@ -117,7 +118,7 @@ def random_controls(
             sample[..., 0], inserted, SAMPLE_PERIOD_S, travel_mm=(0.0, max_inserted_length_mm)
         )
         inserted += sample[..., 0] * SAMPLE_PERIOD_S
-    return initial.reshape(n_sequences, -1), control.reshape(n_sequences, n_samples, -1)
+    return initial, control
 
 
 def free_wire_load(
@@ -171,17 +172,17 @@ class ScriptedControls:
     """Controls from a file.
 
     Attributes:
-        initial: (Δ mm, φ rad) of each world before the first period, of the wire and of each catheter.
+        initial: (Δ mm, φ rad) of each world and device before the first period.
         control: mm/s and rad/s, likewise.
         period_s: time that each control holds, s.
     """
 
-    initial: Float[np.ndarray, "worlds numbers"]
-    control: Float[np.ndarray, "worlds samples numbers"]
+    initial: Float[np.ndarray, "worlds devices 2"]
+    control: Float[np.ndarray, "worlds samples devices 2"]
     period_s: float
 
 
-def read_controls_csv(path: Path, *, catheters: int = 0) -> ScriptedControls:
+def read_controls_csv(path: Path, *, devices: int = 1) -> ScriptedControls:
     """Read scripted controls.
 
     The columns are `time_s` (end of each period, all of one length: 0.5, 1.0, ... or 0.05, 0.1, ...),
@@ -192,12 +193,12 @@ def read_controls_csv(path: Path, *, catheters: int = 0) -> ScriptedControls:
 
     Args:
         path: the file.
-        catheters: how many catheters it drives; each adds two numbers to the controls and the initial state.
+        devices: how many devices it drives.
 
     Raises:
         InputError: not such a table; the line names file, column, row and mend.
     """
-    prefixes = ["", *(f"catheter_{k + 1}_" for k in range(catheters))]
+    prefixes = column_prefixes(devices)
     driven = [prefix + name for prefix in prefixes for name in _COLUMNS[1:]]
     state = [prefix + name for prefix in prefixes for name in ("inserted_length_mm", "rotation_rad")]
     table = read_columns(path, [_COLUMNS[0], *driven], ["world", *state])
@@ -205,15 +206,16 @@ def read_controls_csv(path: Path, *, catheters: int = 0) -> ScriptedControls:
     if there and len(there) < len(state):
         absent = next(name for name in state if name not in there)
         raise InputError(f"{path}: column {absent} is missing where {there[0]} is there; give both, or neither")
-    unused = [name for name in table.header if re.fullmatch(r"catheter_\d+_translation_mm_s", name)][catheters:]
+    unused = [name for name in table.header if re.fullmatch(r"catheter_\d+_translation_mm_s", name)][devices - 1 :]
     if unused:
         warnings.warn(f"{path}: column {unused[0]} is not used: no such catheter is simulated", Remark, stacklevel=2)
     worlds = _rows_of_worlds(table)
     period_s = _period(table, worlds)
-    control = np.stack([table.values[name][worlds] for name in driven], axis=-1)
-    initial = np.zeros((len(worlds), len(driven)))
+    control = np.stack([table.values[name][worlds] for name in driven], axis=-1).reshape(*worlds.shape, devices, 2)
+    initial = np.zeros((len(worlds), devices, 2))
     if there:
-        initial = np.stack([table.values[name][worlds[:, 0]] for name in state], axis=-1) - period_s * control[:, 0]
+        first = np.stack([table.values[name][worlds[:, 0]] for name in state], axis=-1)
+        initial = first.reshape(initial.shape) - period_s * control[:, 0]
     return ScriptedControls(initial, control, period_s)
 
 
@@ -256,23 +258,25 @@ def _period(table: Columns, worlds: Int[np.ndarray, "worlds samples"]) -> float:
 
 def write_controls_csv(
     path: Path,
-    control: Float[np.ndarray, "samples numbers"],
-    proximal: Float[np.ndarray, "samples numbers"],
+    control: Float[np.ndarray, "samples devices 2"],
+    proximal: Float[np.ndarray, "samples devices 2"],
     period_s: float,
 ) -> None:
     """Write controls so that `read_controls_csv` reads them.
 
     Args:
         path: where to.
-        control: mm/s and rad/s of the wire, then of each catheter.
+        control: mm/s and rad/s of each device.
         proximal: (Δ mm, φ rad) at the end of each, likewise.
         period_s: time that each holds, s.
     """
     import pandas as pd
 
     time_s = period_s * np.arange(1, len(control) + 1)
-    prefixes = ["", *(f"catheter_{k + 1}_" for k in range(control.shape[1] // 2 - 1))]
+    prefixes = column_prefixes(control.shape[1])
     names = [_COLUMNS[0], *(prefix + name for prefix in prefixes for name in _COLUMNS[1:])]
     names += [prefix + name for prefix in prefixes for name in ("inserted_length_mm", "rotation_rad")]
     with writing(path) as partial:
-        pd.DataFrame(np.column_stack([time_s, control, proximal]), columns=names).to_csv(partial, index=False)
+        pd.DataFrame(
+            np.column_stack([time_s, *(each.reshape(len(time_s), -1) for each in (control, proximal))]), columns=names
+        ).to_csv(partial, index=False)

@@ -19,7 +19,7 @@ from endopilot.simulation.config import (
     SimulatorConfig,
     wall_stiffness,
 )
-from endopilot.simulation.processor import CoreMotion, Lumen, Options, Processor, core_for, gpu_errors
+from endopilot.simulation.processor import CoreMotion, Lumen, Options, Processor, Simulation, core_for, gpu_errors
 from endopilot.simulation.rod import RodLayout
 from endopilot.simulation.tubes import TubeLayout
 from endopilot.types import SAMPLE_PERIOD_S, DistanceMap, Insertion
@@ -54,7 +54,7 @@ def run_core(
     tubes: TubeLayout | None = None,
     motion: CoreMotion | None = None,
 ) -> dict[str, np.ndarray]:
-    """Run the C++ core on checked input. The simulator and the verification both come through here.
+    """Run the C++ core on rods and walls of one's own making, as the verification does.
 
     Devices count from the inside out, with two numbers each where the arrays below have numbers.
 
@@ -89,18 +89,20 @@ def run_core(
     limits = np.array([[push_limit_n, pull_limit_n, torque_limit_n_mm]]) if tubes is None else tubes.limits
     worlds, samples, devices = len(control), control.shape[1], len(limits)
     control = np.ascontiguousarray(control, dtype=float).reshape(worlds, samples, devices, 2)
-    with gpu_errors(config.processor):
-        simulation = core_for(config.processor).Simulation(
-            rod=rod.model(config.processor),
-            lumen=lumen,
-            loads=loads,
-            **insertion_arguments(insertion),
-            options=core_options(config, push_limit_n=push_limit_n, approach=approach, free_behind_mm=free_behind_mm),
-            drives=core_for(config.processor).make_drives(limits),
-            tubes=None if tubes is None else tubes.model(config.processor),
-            motion=motion,
-            worlds=worlds,
-        )
+    simulation = make_simulation(
+        rod,
+        lumen,
+        insertion,
+        limits=limits,
+        push_limit_n=push_limit_n,
+        worlds=worlds,
+        config=config,
+        tubes=tubes,
+        motion=motion,
+        loads=loads,
+        approach=approach,
+        free_behind_mm=free_behind_mm,
+    )
     simulation.reset(
         index=np.arange(worlds),
         initial=np.ascontiguousarray(initial, dtype=float).reshape(worlds, devices, 2),
@@ -132,6 +134,52 @@ def run_core(
             result = run(control, steps, period_s / steps, advance)
             result["approach_slip"] += begun["approach_slip"]
     return {**result, "reason": simulation.reason().astype(int), "contacts": simulation.contacts()}
+
+
+def make_simulation(
+    rod: RodLayout,
+    lumen: Lumen | None,
+    insertion: Insertion,
+    *,
+    limits: Float[np.ndarray, "devices 3"],
+    push_limit_n: float,
+    worlds: int,
+    config: SimulatorConfig,
+    tubes: TubeLayout | None = None,
+    motion: CoreMotion | None = None,
+    loads: _core.Loads | None = None,
+    approach: bool = True,
+    free_behind_mm: float = FREE_BEHIND_MM,
+) -> Simulation:
+    """Return worlds as the core has them; everything that is simulated comes through here.
+
+    Args:
+        rod: nodes and stiffnesses; with tubes, the nodes alone count, and the drag.
+        lumen: the wall, or None for a rod in the open.
+        insertion: the point and the direction along which the base slides.
+        limits: where each drive slips: push (N), pull (N) and torque (N·mm).
+        push_limit_n: what all drives together can push with, N; it sizes the wall's stiffness.
+        worlds: their number.
+        config: settings.
+        tubes: of a wire in catheters.
+        motion: of the vessel and the insertion.
+        loads: dead loads and springs.
+        approach: bring devices to their first inserted length from the ostium; else they start there, straight.
+        free_behind_mm: nodes farther behind the insertion point follow the drive, mm.
+    """
+    core = core_for(config.processor)
+    with gpu_errors(config.processor):
+        return core.Simulation(
+            rod=rod.model(config.processor),
+            lumen=lumen,
+            loads=loads,
+            **insertion_arguments(insertion),
+            options=core_options(config, push_limit_n=push_limit_n, approach=approach, free_behind_mm=free_behind_mm),
+            drives=core.make_drives(limits),
+            tubes=None if tubes is None else tubes.model(config.processor),
+            motion=motion,
+            worlds=worlds,
+        )
 
 
 def of_device(result: Mapping[str, np.ndarray], device: int) -> dict[str, np.ndarray]:

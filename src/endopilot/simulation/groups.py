@@ -14,7 +14,7 @@ from endopilot.devices.drive_limits import far_end_mm
 from endopilot.devices.stack import Stack
 from endopilot.simulation.checks import check_distance_map, check_memory
 from endopilot.simulation.config import FREE_BEHIND_MM, SimulatorConfig
-from endopilot.simulation.core import core_options, insertion_arguments
+from endopilot.simulation.core import make_simulation
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.processor import CoreMotion, Lumen, Simulation, core_for
 from endopilot.simulation.rod import RodLayout, lay_out
@@ -73,6 +73,7 @@ def make_groups(
     motion: Motion | None,
     config: SimulatorConfig,
     sharing: Sequence[Group],
+    reach_mm: float | None,
 ) -> list[Group]:
     """Return the groups of worlds, with their wires laid out and at the ostium.
 
@@ -82,6 +83,7 @@ def make_groups(
         motion: of every vessel about its ostium; None if they lie still.
         config: settings of the rod core.
         sharing: groups whose lumens and projections are taken rather than prepared again.
+        reach_mm: inserted length that devices are laid out for, mm; the far end of each vessel if None.
 
     Raises:
         InputError: a device that does not fit its anatomy or the catheter around it; a distance map that is not finite,
@@ -109,21 +111,20 @@ def make_groups(
         if anatomy.identity not in projectors:
             projectors[anatomy.identity] = TipProjector(anatomy.tree, anatomy.insertion)
         path_mm = float(anatomy.tree.longest_path().abscissa[-1])
-        longest_mm = far_end_mm(anatomy)
+        longest_mm = far_end_mm(anatomy) if reach_mm is None else max(path_mm, reach_mm)
         rod = lay_out(stack.wire, element_mm=config.element_mm, length_mm=longest_mm + FREE_BEHIND_MM)
-        tubes = lay_out_tubes(stack, length_mm=longest_mm + FREE_BEHIND_MM)
         check_memory(8 * len(worlds) * (40 * len(rod.abscissa_mm) + 40), f"worlds: {len(worlds)}", "give fewer")
         moving = None if motion is None else motion.core(np.asarray(anatomy.insertion.position), config.processor)
-        simulation = core.Simulation(
-            rod=rod.model(config.processor),
-            lumen=lumens[key],
-            loads=None,
-            **insertion_arguments(anatomy.insertion),
-            options=core_options(config, push_limit_n=stack.push_limit_n, free_behind_mm=FREE_BEHIND_MM),
-            drives=core.make_drives(stack.limits),
-            tubes=None if tubes is None else tubes.model(config.processor),
-            motion=moving,
+        simulation = make_simulation(
+            rod,
+            lumens[key],
+            anatomy.insertion,
+            limits=stack.limits,
+            push_limit_n=stack.push_limit_n,
             worlds=len(worlds),
+            config=config,
+            tubes=lay_out_tubes(stack, length_mm=longest_mm + FREE_BEHIND_MM),
+            motion=moving,
         )
         index, project = np.array(worlds), projectors[anatomy.identity]
         groups.append(
@@ -142,13 +143,3 @@ def make_groups(
             )
         )
     return groups
-
-
-def merge(groups: Sequence[Group], parts: Sequence[np.ndarray]) -> np.ndarray:
-    """Return one array with a row a world, of one array a group."""
-    if len(groups) == 1:
-        return parts[0]
-    merged = np.empty((sum(len(part) for part in parts), *parts[0].shape[1:]), dtype=parts[0].dtype)
-    for group, part in zip(groups, parts, strict=True):
-        merged[group.index] = part
-    return merged

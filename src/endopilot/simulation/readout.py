@@ -7,50 +7,22 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from endopilot.devices.stack import Stack
-from endopilot.errors import InputError
-from endopilot.simulation.groups import Group, merge
+from endopilot.simulation.groups import Group
+from endopilot.simulation.trajectory import SetUp
 from endopilot.types import TipProjection
 
 
 class Readout:
-    """Wires, loads and tips of worlds as they are now; `Simulator` moves them.
+    """Devices, loads and tips of worlds as they are now; `Simulator` moves them.
 
-    Arrays have a row a world, in the order in which the worlds were given.
+    Arrays have a row a world, in the order in which the worlds were given; where they have an axis of devices, the wire
+    comes first, then the catheters around it from the inside out.
     """
 
     _groups: Sequence[Group]
-    _stacks: Sequence[Stack]
-
-    def project(self, device: int = 0) -> TipProjection:
-        """Project tips to the centerline: Δtip (mm), γtip (mm), branch and lumen radius (mm), a row a world.
-
-        Args:
-            device: whose tips, those of the wires (0) or of a catheter (1, 2), from the inside out.
-
-        Raises:
-            InputError: there is no such device.
-
-        Example:
-            >>> tip = simulator.project()
-            >>> bool((tip.offset < tip.radius).all())
-            True
-        """
-        tips = [group.project(points) for group, points in zip(self._groups, self._tips(device), strict=True)]
-        names = TipProjection.__dataclass_fields__
-        return TipProjection(**{name: self._merge([getattr(tip, name) for tip in tips]) for name in names})
-
-    def tips(self, device: int = 0) -> Float[np.ndarray, "worlds 3"]:
-        """Return where tips are, LPS mm, those of the wires (0) or of a catheter (1, 2), from the inside out.
-
-        Raises:
-            InputError: there is no such device.
-
-        Example:
-            >>> np.array_equal(simulator.tips(), simulator.position[:, 0])  # wires alone
-            True
-        """
-        return self._merge(self._tips(device))
+    _set_up: SetUp
+    _devices: int
+    _rows: Int[np.ndarray, "worlds"]
 
     @property
     def worlds(self) -> int:
@@ -60,7 +32,17 @@ class Readout:
             >>> simulator.worlds
             4
         """
-        return len(self._stacks)
+        return len(self._rows)
+
+    @property
+    def devices(self) -> int:
+        """Number of devices of a world: the wire, and the catheters around it.
+
+        Example:
+            >>> simulator.devices
+            1
+        """
+        return self._devices
 
     @property
     def nodes(self) -> int:
@@ -72,112 +54,105 @@ class Readout:
         """
         return max(group.simulation.nodes for group in self._groups)
 
+    def project(self) -> TipProjection:
+        """Project tips to the centerline: Δtip (mm), γtip (mm), branch and lumen radius (mm) of each world and device.
+
+        Example:
+            >>> tip = simulator.project()
+            >>> bool((tip.offset < tip.radius).all())
+            True
+        """
+        tips = [group.project(np.ascontiguousarray(group.simulation.tips())) for group in self._groups]
+        names = TipProjection.__dataclass_fields__
+        return TipProjection(**{name: self._merge([getattr(tip, name) for tip in tips]) for name in names})
+
     @property
-    def inserted_length(self) -> Float[np.ndarray, "worlds"]:
+    def inserted_length(self) -> Float[np.ndarray, "worlds devices"]:
         """Inserted lengths Δ, mm.
 
         Example:
             >>> simulator.inserted_length.shape
-            (4,)
+            (4, 1)
         """
-        return self._of_devices("inserted_length")[:, 0]
+        return self._gather("inserted_length")
 
     @property
-    def catheter_inserted_length(self) -> Float[np.ndarray, "worlds catheters"]:
-        """Inserted lengths of the catheters, mm.
-
-        Example:
-            >>> simulator.catheter_inserted_length.shape  # a wire alone
-            (4, 0)
-        """
-        return self._of_devices("inserted_length")[:, 1:]
-
-    @property
-    def catheter_rotation(self) -> Float[np.ndarray, "worlds catheters"]:
-        """Rotations of the catheters' drives, rad.
-
-        Example:
-            >>> simulator.catheter_rotation.shape
-            (4, 0)
-        """
-        return self._of_devices("rotation")[:, 1:]
-
-    @property
-    def catheter_drive_load(self) -> Float[np.ndarray, "worlds catheters 2"]:
-        """Force (N) and torque (N·mm) of the catheters' drives.
-
-        Example:
-            >>> simulator.catheter_drive_load.shape
-            (4, 0, 2)
-        """
-        return self._pair_of_devices("drive_force", "drive_torque")[:, 1:]
-
-    @property
-    def catheter_base_load(self) -> Float[np.ndarray, "worlds catheters 2"]:
-        """Axial force (N, positive when it pushes) and torque (N·mm) that hold each catheter where it enters.
-
-        Example:
-            >>> simulator.catheter_base_load.shape
-            (4, 0, 2)
-        """
-        return self._pair_of_devices("base_force", "base_torque")[:, 1:]
-
-    @property
-    def catheter_slip(self) -> Float[np.ndarray, "worlds catheters 2"]:
-        """Advance (mm) and rotation (rad) that the catheters' drives were asked for in the last step and did not make.
-
-        Example:
-            >>> simulator.catheter_slip.shape
-            (4, 0, 2)
-        """
-        return self._pair_of_devices("slip", "rotation_slip")[:, 1:]
-
-    @property
-    def rotation(self) -> Float[np.ndarray, "worlds"]:
-        """Rotations φ of the drive, rad.
+    def rotation(self) -> Float[np.ndarray, "worlds devices"]:
+        """Rotations φ of the drives, rad.
 
         Example:
             >>> simulator.reset(inserted_length=np.full(4, 5.0), rotation=[0.0, 0.5, 1.0, 1.5])
-            >>> simulator.rotation
+            >>> simulator.rotation[:, 0]
             array([0. , 0.5, 1. , 1.5])
         """
-        return self._of_devices("rotation")[:, 0]
+        return self._gather("rotation")
 
     @property
-    def time(self) -> Float[np.ndarray, "worlds"]:
-        """Time since each world was put to its first inserted length, s; it is what the vessel moves with.
+    def proximal(self) -> Float[np.ndarray, "worlds devices 2"]:
+        """Inserted lengths Δ (mm) and rotations φ (rad).
 
         Example:
-            >>> simulator.reset(seed=0)
-            >>> _ = simulator.step(np.zeros((4, 2)), duration=0.25)
-            >>> simulator.time
-            array([0.25, 0.25, 0.25, 0.25])
+            >>> simulator.proximal.shape
+            (4, 1, 2)
         """
-        return self._gather("time")
+        return np.stack([self.inserted_length, self.rotation], axis=-1)
 
     @property
-    def vessel_to_laboratory(self) -> Float[np.ndarray, "worlds 3 4"]:
-        """Where each vessel lies now: affine maps of its points, as CT shows them, to the laboratory, LPS mm.
+    def base_load(self) -> Float[np.ndarray, "worlds devices 2"]:
+        """Axial force (N, positive when it pushes) and torque (N·mm) that hold each device where it enters.
 
         Example:
-            >>> bool((simulator.vessel_to_laboratory[:, :, :3] == np.eye(3)).all())  # a vessel that lies still
+            >>> force_n, torque_n_mm = simulator.base_load[:, 0].T
+            >>> force_n.shape
+            (4,)
+        """
+        return np.stack([self._gather("base_force"), self._gather("base_torque")], axis=-1)
+
+    @property
+    def drive_load(self) -> Float[np.ndarray, "worlds devices 2"]:
+        """Force (N) and torque (N·mm) of the drives: `base_load` and what the introducer's valve takes.
+
+        As controls of a force-driven simulator they make the same motion.
+
+        Example:
+            >>> simulator.drive_load.shape
+            (4, 1, 2)
+        """
+        return np.stack([self._gather("drive_force"), self._gather("drive_torque")], axis=-1)
+
+    @property
+    def slip(self) -> Float[np.ndarray, "worlds devices 2"]:
+        """Advance (mm) and rotation (rad) that the drives were asked for in the last step and did not make.
+
+        Example:
+            >>> simulator.slip.shape
+            (4, 1, 2)
+        """
+        return np.stack([self._gather("slip"), self._gather("rotation_slip")], axis=-1)
+
+    @property
+    def tip_position(self) -> Float[np.ndarray, "worlds devices 3"]:
+        """Where tips are, LPS mm.
+
+        Example:
+            >>> np.array_equal(simulator.tip_position[:, 0], simulator.position[:, 0])  # wires alone
             True
         """
-        still = np.eye(3, 4)
-        return self._merge(
-            [
-                np.tile(still, (len(group.index), 1, 1))
-                if group.motion is None
-                else group.motion.placements(group.simulation.time())[0]
-                for group in self._groups
-            ]
-        )
+        return self._gather("tips")
+
+    @property
+    def tip_direction(self) -> Float[np.ndarray, "worlds devices 3"]:
+        """Unit vectors along the devices at their tips.
+
+        Example:
+            >>> bool(np.allclose(np.linalg.norm(simulator.tip_direction, axis=-1), 1.0))
+            True
+        """
+        return self._gather("tip_directions")
 
     @property
     def position(self) -> Float[np.ndarray, "worlds nodes 3"]:
-        """Positions of the nodes from the tip to the base, LPS mm; NaN beyond the nodes of a shorter wire.
-
-        With catheters the first node is the foremost tip.
+        """Positions of the nodes from the foremost tip to the base, LPS mm; NaN beyond the nodes of a shorter wire.
 
         Example:
             >>> simulator.position.shape == (4, simulator.nodes, 3)
@@ -194,16 +169,6 @@ class Readout:
             True
         """
         return self._per_node("attitudes", np.nan)
-
-    @property
-    def tip_direction(self) -> Float[np.ndarray, "worlds 3"]:
-        """Unit vectors along the wires at their tips.
-
-        Example:
-            >>> bool(np.allclose(np.linalg.norm(simulator.tip_direction, axis=-1), 1.0))
-            True
-        """
-        return self._of_devices("tip_directions")[:, 0]
 
     @property
     def contacts(self) -> Float[np.ndarray, "worlds nodes"]:
@@ -226,37 +191,26 @@ class Readout:
         return self._gather("active")
 
     @property
-    def base_load(self) -> Float[np.ndarray, "worlds 2"]:
-        """Axial force (N, positive when it pushes) and torque (N·mm) that hold the wire in the catheter.
+    def time(self) -> Float[np.ndarray, "worlds"]:
+        """Time since each world was put to its first inserted length, s; it is what the vessel moves with.
 
         Example:
-            >>> force_n, torque_n_mm = simulator.base_load.T
-            >>> force_n.shape
-            (4,)
+            >>> simulator.reset(seed=0)
+            >>> _ = simulator.step(np.zeros((4, 2)), duration=0.25)
+            >>> simulator.time
+            array([0.25, 0.25, 0.25, 0.25])
         """
-        return self._pair_of_devices("base_force", "base_torque")[:, 0]
+        return self._gather("time")
 
     @property
-    def drive_load(self) -> Float[np.ndarray, "worlds 2"]:
-        """Force (N) and torque (N·mm) of the drive: `base_load` and what the introducer's valve takes.
-
-        As controls of a force-driven simulator they make the same motion.
+    def vessel_to_laboratory(self) -> Float[np.ndarray, "worlds 3 4"]:
+        """Where each vessel lies now: affine maps of its points, as CT shows them, to the laboratory, LPS mm.
 
         Example:
-            >>> simulator.drive_load.shape
-            (4, 2)
+            >>> bool((simulator.vessel_to_laboratory[:, :, :3] == np.eye(3)).all())  # a vessel that lies still
+            True
         """
-        return self._pair_of_devices("drive_force", "drive_torque")[:, 0]
-
-    @property
-    def slip(self) -> Float[np.ndarray, "worlds 2"]:
-        """Advance (mm) and rotation (rad) that the drive was asked for in the last step and did not make.
-
-        Example:
-            >>> simulator.slip.shape
-            (4, 2)
-        """
-        return self._pair_of_devices("slip", "rotation_slip")[:, 0]
+        return self._placements(self.time[:, None])[:, 0]
 
     @property
     def valid(self) -> Bool[np.ndarray, "worlds"]:
@@ -279,24 +233,25 @@ class Readout:
         """
         return self._gather("reason").astype(int)
 
-    def _tips(self, device: int) -> list[Float[np.ndarray, "members 3"]]:
-        """Return where tips are, an array a group."""
-        count = len(self._stacks[0].devices)
-        if not 0 <= device < count:
-            raise InputError(f"device: {device}; give 0 for the wire" + (f", to {count - 1}" if count > 1 else ""))
-        return [np.ascontiguousarray(group.simulation.tips()[:, device]) for group in self._groups]
+    def _placements(self, times: Float[np.ndarray, "worlds samples"]) -> Float[np.ndarray, "worlds samples 3 4"]:
+        """Return where each vessel lies at some times, s."""
+        still, parts = np.eye(3, 4), []
+        for group, at in self._of_groups(times):
+            if group.motion is None:
+                parts.append(np.tile(still, (*at.shape, 1, 1)))
+            else:
+                parts.append(group.motion.placements(np.ascontiguousarray(at.ravel()))[0].reshape(*at.shape, 3, 4))
+        return self._merge(parts)
 
-    def _of_devices(self, name: str) -> Float[np.ndarray, "worlds devices *numbers"]:
-        """Return one of the core's numbers of each device, the wire's first."""
-        return self._merge([getattr(group.simulation, name)() for group in self._groups])
-
-    def _pair_of_devices(self, first: str, second: str) -> Float[np.ndarray, "worlds devices 2"]:
-        return np.stack([self._of_devices(first), self._of_devices(second)], axis=-1)
+    def _of_groups(self, values: np.ndarray) -> list[tuple[Group, np.ndarray]]:
+        """Return the rows of each group."""
+        return [(group, values[group.index]) for group in self._groups]
 
     def _merge(self, parts: Sequence[np.ndarray]) -> np.ndarray:
-        return merge(self._groups, parts)
+        """Return one array with a row a world, of one array a group."""
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)[self._rows]
 
-    def _gather(self, name: str) -> Float[np.ndarray, "worlds"]:
+    def _gather(self, name: str) -> np.ndarray:
         return self._merge([getattr(group.simulation, name)() for group in self._groups])
 
     def _per_node(self, name: str, pad: float) -> np.ndarray:

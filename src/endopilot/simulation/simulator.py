@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -16,19 +17,19 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from endopilot.devices.catheter import Catheter
 from endopilot.devices.device import Device
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
-from endopilot.simulation.checks import check_control, check_memory, check_travel
-from endopilot.simulation.config import LANES, Actuation, SimulatorConfig
-from endopilot.simulation.core import of_device
+from endopilot.progress import Advance
+from endopilot.simulation.checks import ROUNDING_MM, check_control, check_memory, check_travel, with_device_axis
+from endopilot.simulation.config import FREE_BEHIND_MM, LANES, Actuation, SimulatorConfig
 from endopilot.simulation.groups import Group, group_key, make_groups
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.processor import gpu_errors
 from endopilot.simulation.readout import Readout
 from endopilot.simulation.state import SimulatorState, Step, SupportsDLPack
-from endopilot.types import SAMPLE_PERIOD_S, Anatomy
+from endopilot.simulation.trajectory import SetUp, Trajectory
+from endopilot.types import SAMPLE_PERIOD_S, Anatomy, TipProjection
 
 _DEEPEST_START = 0.8
 """Share of the longest path that a random start may lie at."""
@@ -37,76 +38,84 @@ _LEAST_BYTES = 4000
 
 
 class Simulator(Readout):
-    """Many worlds at once, each with an anatomy, a device and controls of its own.
+    """Many worlds at once, each with an anatomy, devices and controls of its own.
 
-    A world's result does not depend on the others: neither on their number nor on the threads that step them.
+    A world's result does not depend on the others: neither on their number nor on the threads that step them. Arrays
+    of devices have the wire first, then the catheters around it from the inside out; where a wire is alone, arrays that
+    are given may leave the axis of devices out.
 
     Example:
         >>> simulator = Simulator(anatomy, device, worlds=4)
         >>> simulator.reset(seed=0)
         >>> step = simulator.step(np.tile([5.0, 0.5], (4, 1)), duration=0.1)
         >>> step.tip_position.shape
-        (4, 3)
+        (4, 1, 3)
     """
 
     def __init__(
         self,
         anatomy: Anatomy | Sequence[Anatomy],
-        device: Device | Sequence[Device],
+        device: Device | Stack | Sequence[Device | Stack],
         *,
-        catheters: Sequence[Catheter] = (),
         worlds: int = 1,
         actuation: Actuation = "velocity",
         motion: Motion | None = None,
         config: SimulatorConfig | None = None,
         sharing: Simulator | None = None,
+        reach_mm: float | None = None,
     ) -> None:
-        """Lay the wires out; every world starts with its tip at the ostium.
+        """Lay the devices out; every world starts with the wire's tip at the ostium.
 
         Args:
             anatomy: the vessel of all worlds, or one for each.
-            device: the wire of all worlds, or one for each.
-            catheters: catheters around the wire, from the inside out, of all worlds; they are driven by velocity.
+            device: the wire, or the wire and its catheters, of all worlds, or one for each.
             worlds: their number, where neither of the above says it.
-            actuation: what `step` takes: "velocity" (mm/s, rad/s; the drive makes exactly that motion, except that it
+            actuation: what controls are: "velocity" (mm/s, rad/s; the drive makes exactly that motion, except that it
                 slips rather than push, pull or turn harder than the device's limits) or "force" (axial force N and
                 torque N·mm on the wire; advance and rotation follow, against the friction and drag of the introducer).
             motion: how every vessel moves with time; it lies still if not given. Positions and directions are those in
                 the vessel as CT shows it; `vessel_to_laboratory` says where that lies.
             config: settings of the rod core.
             sharing: a simulator that has prepared the same anatomy, whose lumen is then not prepared again.
+            reach_mm: inserted length that the devices are laid out for, mm; 20 mm beyond the end of each vessel's
+                longest path if not given.
 
         Raises:
             InputError: a device that does not fit its anatomy or the catheter around it; a distance map that is not
-                finite, or negative at the ostium; lists of different lengths; more worlds than the memory holds.
+                finite, or negative at the ostium; lists of different lengths; stacks of different numbers of devices;
+                more worlds than the memory holds.
         """
         if actuation not in ("velocity", "force"):
             raise InputError(f"actuation: {actuation!r}; give 'velocity' or 'force'")
-        self._config = config or SimulatorConfig()
-        if catheters and actuation == "force":
-            raise InputError("actuation: 'force' with catheters; give 'velocity'")
-        self._by_force, self._motion = actuation == "force", motion
+        config = config or SimulatorConfig()
         check_memory(worlds * _LEAST_BYTES, f"worlds: {worlds}", "give fewer")
+        one = isinstance(device, Device | Stack)
         anatomies = [anatomy] * worlds if isinstance(anatomy, Anatomy) else list(anatomy)
-        devices = [device] * len(anatomies) if isinstance(device, Device) else list(device)
-        if isinstance(anatomy, Anatomy) and not isinstance(device, Device):
-            anatomies = [anatomy] * len(devices)
-        if not anatomies or len(anatomies) != len(devices):
+        stacks = [Stack.of(device)] * len(anatomies) if one else [Stack.of(each) for each in device]
+        if isinstance(anatomy, Anatomy) and not one:
+            anatomies = [anatomy] * len(stacks)
+        if not anatomies or len(anatomies) != len(stacks):
             raise InputError(
-                f"anatomy, device: {len(anatomies)} and {len(devices)}; give at least one, and as many of each"
+                f"anatomy, device: {len(anatomies)} and {len(stacks)}; give at least one, and as many of each"
             )
-        self._stacks = [Stack(wire, tuple(catheters)) for wire in devices]
-        with gpu_errors(self._config.processor):
+        counts = {len(stack) for stack in stacks}
+        if len(counts) > 1:
+            raise InputError(f"device: stacks of {min(counts)} and of {max(counts)} devices; give worlds of one number")
+        self._devices = counts.pop()
+        if self._devices > 1 and actuation == "force":
+            raise InputError("actuation: 'force' with catheters; give 'velocity'")
+        with gpu_errors(config.processor):
             self._groups = make_groups(
-                anatomies, self._stacks, motion, self._config, sharing._groups if sharing else ()
+                anatomies, stacks, motion, config, sharing._groups if sharing else (), reach_mm=reach_mm
             )
-        self._device = devices
-        fastest = np.array(
-            [[(each.max_velocity_mm_s, each.max_rotation_rad_s) for each in stack.devices] for stack in self._stacks]
-        ).reshape(len(devices), -1)
-        self._largest = np.full_like(fastest, np.finfo(float).max) if self._by_force else fastest * (1 + 1e-6)
+        self._rows = np.argsort(np.concatenate([group.index for group in self._groups]))
+        fastest = np.array([stack.fastest for stack in stacks])
+        self._largest = np.full_like(fastest, np.finfo(float).max) if actuation == "force" else fastest * (1 + 1e-6)
         self._longest = self._merge([np.full(len(group.index), group.longest_mm) for group in self._groups])
-        self.reset(inserted_length=np.zeros(len(devices)), rotation=np.zeros(len(devices)))
+        own = np.array([[each.friction for each in stack.devices] for stack in stacks])
+        self._set_up = SetUp(anatomies, stacks, np.zeros((*own.shape, 2)), own, actuation, motion, config)
+        self._own_friction = own
+        self.reset(inserted_length=np.zeros(own.shape), rotation=np.zeros(own.shape))
 
     def reset(
         self,
@@ -115,24 +124,21 @@ class Simulator(Readout):
         inserted_length: ArrayLike | None = None,
         rotation: ArrayLike | None = None,
         friction: ArrayLike | None = None,
-        catheter_inserted_length: ArrayLike | None = None,
-        catheter_rotation: ArrayLike | None = None,
         worlds: Sequence[int] | None = None,
     ) -> None:
         """Put worlds back to the ostium and push them to their first inserted length.
 
-        What is not given is drawn from `seed` (which is then needed): inserted lengths evenly up to 0.8 of the longest
-        path, rotations over a full turn; friction is the device's own if not given. A world's draw depends on the seed
-        and its own number alone.
+        The wire is pushed there at `config.approach_velocity_mm_s`, with its catheters along with it, and then rests
+        for 0.5 s. What is not given is drawn from `seed` (which is then needed): the wire's inserted length evenly up
+        to 0.8 of the longest path, its rotation over a full turn; catheters then lie at the ostium. Friction is the
+        devices' own if not given. A world's draw depends on the seed and its own number alone.
 
         Args:
             seed: of the random start.
-            inserted_length: mm, a number for every world.
+            inserted_length: mm, of every world and device.
             rotation: rad, likewise.
-            friction: Coulomb friction coefficient of the wire, likewise.
-            catheter_inserted_length: mm, of each world and catheter; 0 if not given.
-            catheter_rotation: rad, likewise.
-            worlds: the worlds to reset; all if not given. The arrays still hold a number for every world.
+            friction: Coulomb friction coefficient on the wall, likewise.
+            worlds: the worlds to reset; all if not given. The arrays still hold a row for every world.
 
         Raises:
             InputError: a number that is not finite or out of range; neither a seed nor a start.
@@ -140,7 +146,7 @@ class Simulator(Readout):
         Example:
             >>> simulator.reset(inserted_length=[5.0, 10.0, 15.0, 20.0], rotation=np.zeros(4))
             >>> simulator.reset(seed=7, worlds=[2])  # the others stay as they are
-            >>> simulator.inserted_length.round(3)[[0, 1, 3]]
+            >>> simulator.inserted_length[[0, 1, 3], 0].round(3)
             array([ 5., 10., 20.])
         """
         chosen = np.arange(self.worlds) if worlds is None else np.array(worlds, dtype=int)
@@ -149,27 +155,20 @@ class Simulator(Readout):
         if seed is None and (inserted_length is None or rotation is None):
             raise InputError("seed: none given; give one, or inserted_length and rotation of every world")
         start, turn = self._random_start(seed)
-        start = start if inserted_length is None else self._per_world("inserted_length", inserted_length)
-        turn = turn if rotation is None else self._per_world("rotation", rotation)
-        own = np.array([device.friction for device in self._device])
-        coefficient = own if friction is None else self._per_world("friction", friction)
-        each = (self.worlds, len(self._stacks[0].catheters))
-        inner, inner_turn = (
-            np.zeros(each) if given is None else self._of_worlds(name, given, each)
-            for name, given in (
-                ("catheter_inserted_length", catheter_inserted_length),
-                ("catheter_rotation", catheter_rotation),
-            )
-        )
+        start = start if inserted_length is None else self._of_devices_given("inserted_length", inserted_length)
+        turn = turn if rotation is None else self._of_devices_given("rotation", rotation)
+        own = self._own_friction
+        coefficient = own if friction is None else self._of_devices_given("friction", friction)
         if (coefficient < 0).any():
-            raise InputError(f"friction: world {int(np.argmin(coefficient))}: {coefficient.min():g}; give 0 or more")
-        for group in self._groups:
-            for name, given in [("inserted_length", start), *(("catheter_inserted_length", at) for at in inner.T)]:
-                bad = (given[group.index] < 0) | (given[group.index] > group.longest_mm)
-                if bad.any():
-                    world = int(group.index[np.argmax(bad)])
-                    raise InputError(f"{name}: world {world}: {given[world]:g} mm; give 0 to {group.longest_mm:.1f} mm")
-        initial = np.stack([np.column_stack([start, inner]), np.column_stack([turn, inner_turn])], axis=-1)
+            world = int(np.argmin(coefficient.min(axis=1)))
+            raise InputError(f"friction: world {world}: {coefficient.min():g}; give 0 or more")
+        bad = (start < -ROUNDING_MM) | (start > self._longest[:, None])
+        if bad.any():
+            world, device = (int(place) for place in np.argwhere(bad)[0])
+            most = f"{self._longest[world]:.1f} mm"
+            which = f", device {device}" if self._devices > 1 else ""
+            raise InputError(f"inserted_length: world {world}{which}: {start[world, device]:g} mm; give 0 to {most}")
+        initial = np.stack([start, turn], axis=-1)
         for group in self._groups:
             mine = np.isin(group.index, chosen)
             if not mine.any():
@@ -178,55 +177,92 @@ class Simulator(Readout):
             group.simulation.reset(
                 index=np.flatnonzero(mine),
                 initial=initial[index],
-                friction=np.array(
-                    [[coefficient[world], *(each.friction for each in group.stack.devices[1:])] for world in index]
-                ),
+                friction=coefficient[index],
                 sample_period=SAMPLE_PERIOD_S,
             )
-            no_control = np.zeros((len(group.index), 0, 2 * len(group.stack.devices)))
-            self._run(group, no_control, self._config.time_step_s, self._config.steps_per_sample, by_force=False)
+            no_control = np.zeros((len(group.index), 0, self._devices, 2))
+            self._run(group, no_control, self.config.time_step_s, self.config.steps_per_sample, by_force=False)
+        resets = np.isin(np.arange(self.worlds), chosen)
+        self._set_up = replace(
+            self._set_up,
+            initial=np.where(resets[:, None, None], initial, self._set_up.initial),
+            friction=np.where(resets[:, None], coefficient, self._set_up.friction),
+        )
 
     def step(self, control: ArrayLike | SupportsDLPack, duration: float) -> Step:
         """Drive every world for some time with a constant control.
 
         Args:
-            control: a row a world, of translation (mm/s) and rotation (rad/s), or of axial force (N) and torque
-                (N·mm), of the wire, then of each catheter; numpy, or anything that speaks DLPack, such as a torch
-                tensor on the CPU.
+            control: translation (mm/s) and rotation (rad/s), or axial force (N) and torque (N·mm), of each world and
+                device; numpy, or anything that speaks DLPack, such as a torch tensor on the CPU.
             duration: s; it is cut into equal time steps of at most `config.time_step_s`.
 
         Returns:
-            The worlds at the end of the step. The drive stops where the wire is pulled out to the ostium.
+            The worlds at the end of the step. The drive stops where a device is pulled out to the ostium.
 
         Raises:
             InputError: a control of another shape, that is not finite, above the device's velocity limit or beyond
-                the length of the wire; a duration that is not positive. No world is moved then.
+                the length of the device; a duration that is not positive. No world is moved then.
 
         Example:
             >>> before = simulator.inserted_length
             >>> step = simulator.step([[4.0, 0.0]] * 4, duration=0.25)
-            >>> (step.inserted_length - before).round(6)
+            >>> (step.inserted_length - before)[:, 0].round(6)
             array([1., 1., 1., 1.])
         """
-        array: Any = control
-        if not isinstance(array, np.ndarray) and hasattr(array, "__dlpack__"):
-            array = np.from_dlpack(array)
-        array = np.ascontiguousarray(array, dtype=float)
         if not (math.isfinite(duration) and duration > 0):
             raise InputError(f"duration: {duration}; give a positive number of seconds")
-        check_control(array, self._largest, self._stacks)
-        if not self._by_force:
-            ends = [self.inserted_length, *self.catheter_inserted_length.T]
-            for k, inserted in enumerate(ends):
-                check_travel(inserted + array[:, 2 * k] * duration, self._longest)
-        steps = max(1, int(np.ceil(duration / self._config.time_step_s - 1e-9)))
-        results = [
-            self._run(group, array[group.index][:, None], duration / steps, steps, by_force=self._by_force)
-            for group in self._groups
-        ]
-        of_wires = [of_device(result, 0) for result in results]
-        return Step(
-            **{name: self._merge([result[name][:, 0] for result in of_wires]) for name in Step.__dataclass_fields__}
+        array = self._checked(control, duration, sequence=False)
+        steps = self.config.steps_of(duration)
+        result = self._run_all(array, duration / steps, steps)
+        return Step(**{name: result[name][:, 0] for name in Step.__dataclass_fields__})
+
+    def run(
+        self,
+        control: ArrayLike,
+        *,
+        period_s: float = SAMPLE_PERIOD_S,
+        record_shape: bool = False,
+        advance: Advance | None = None,
+    ) -> Trajectory:
+        """Drive every world with a sequence of controls, and record it at the end of each.
+
+        Args:
+            control: mm/s and rad/s, or N and N·mm, of each world, sample and device.
+            period_s: time that each control holds, s.
+            record_shape: record the positions of all nodes too.
+            advance: called with the number of samples of all worlds that were simulated since the last call.
+
+        Raises:
+            InputError: a control of another shape, that is not finite, too fast for its device or that may lead
+                deeper than devices are laid out for; a period that is not positive. No world is moved then.
+
+        Example:
+            >>> simulator.reset(seed=0)
+            >>> trajectory = simulator.run(np.tile([2.0, 0.5], (4, 6, 1)))
+            >>> trajectory.tip_position.shape
+            (4, 6, 1, 3)
+        """
+        if not 0 < period_s < np.inf:
+            raise InputError(f"period_s: {period_s}; give a positive number of seconds")
+        command = self._checked(control, period_s, sequence=True)
+        set_up, start, began_s = self._set_up, self.proximal, self.time
+        steps = self.config.steps_of(period_s)
+        result = self._run_all(command, period_s / steps, steps, record_shape=record_shape, advance=advance)
+        tips = [group.project(each) for group, each in self._of_groups(result["tip_position"])]
+        names = TipProjection.__dataclass_fields__
+        recorded: dict[str, Any] = {name: result[name] for name in Step.__dataclass_fields__}
+        times = began_s[:, None] + period_s * np.arange(1, command.shape[1] + 1)
+        return Trajectory(
+            set_up=set_up,
+            period_s=period_s,
+            start=start,
+            command=command,
+            tip=TipProjection(**{name: self._merge([getattr(tip, name) for tip in tips]) for name in names}),
+            reason=self.reason,
+            shape=result.get("shape"),
+            vessel_to_laboratory=None if self._set_up.motion is None else self._placements(times),
+            **recorded,
         )
 
     @property
@@ -259,6 +295,7 @@ class Simulator(Readout):
             )
         for group, values in zip(self._groups, state.values, strict=True):
             group.simulation.set_state(np.ascontiguousarray(values))
+        self._set_up = replace(self._set_up, initial=np.full_like(self._set_up.initial, np.nan))
 
     def copy_worlds(self, source: ArrayLike, *, of: Simulator | None = None) -> None:
         """Put every world where another one, of the same anatomy and device, is now; friction goes with it.
@@ -280,7 +317,7 @@ class Simulator(Readout):
         chosen = np.asarray(source)
         if chosen.shape != (self.worlds,) or not np.issubdtype(chosen.dtype, np.integer):
             raise InputError(f"source: {source}; give the number of a world for each of the {self.worlds} worlds")
-        if self._setup != of._setup:
+        if self._settings != of._settings:
             raise InputError("of: a simulator with other settings; make both with equal actuation, motion and config")
         originals = {group_key(group.anatomy, group.stack): group for group in of._groups}
         states = []
@@ -298,6 +335,17 @@ class Simulator(Readout):
             states.append(np.ascontiguousarray(original.simulation.state()[rows]))
         for group, state in zip(self._groups, states, strict=True):
             group.simulation.set_state(state)
+        self._set_up = replace(self._set_up, initial=np.full_like(self._set_up.initial, np.nan))
+
+    @property
+    def set_up(self) -> SetUp:
+        """What the worlds are simulated with, and where they started.
+
+        Example:
+            >>> simulator.set_up.initial.shape
+            (4, 1, 2)
+        """
+        return self._set_up
 
     @property
     def config(self) -> SimulatorConfig:
@@ -307,41 +355,92 @@ class Simulator(Readout):
             >>> simulator.config.element_mm
             0.75
         """
-        return self._config
+        return self._set_up.config
 
     def _random_start(self, seed: int | None) -> tuple[np.ndarray, np.ndarray]:
-        if seed is None:
-            return np.zeros(self.worlds), np.zeros(self.worlds)
-        draw = np.array([np.random.default_rng([seed, world]).random(2) for world in range(self.worlds)])
-        deepest = np.empty(self.worlds)
-        for group in self._groups:
-            deepest[group.index] = _DEEPEST_START * group.path_mm
-        return draw[:, 0] * deepest, draw[:, 1] * 2 * np.pi
+        start, turn = np.zeros((2, self.worlds, self._devices))
+        if seed is not None:
+            draw = np.array([np.random.default_rng([seed, world]).random(2) for world in range(self.worlds)])
+            deepest = self._merge([np.full(len(group.index), _DEEPEST_START * group.path_mm) for group in self._groups])
+            start[:, 0], turn[:, 0] = draw[:, 0] * deepest, draw[:, 1] * 2 * np.pi
+        return start, turn
+
+    def _checked(
+        self, control: ArrayLike | SupportsDLPack, period_s: float, *, sequence: bool
+    ) -> Float[np.ndarray, "worlds samples devices 2"]:
+        """Return controls with all their axes, once they are checked."""
+        array: Any = control
+        if not isinstance(array, np.ndarray) and hasattr(array, "__dlpack__"):
+            array = np.from_dlpack(array)
+        array = np.asarray(array, dtype=float)
+        samples = array.shape[1:2] if sequence else ()
+        array = with_device_axis("control", array, (self.worlds, *samples, self._devices, 2))
+        array = np.ascontiguousarray(array if sequence else array[:, None])
+        check_control(array, self._largest, self._set_up.stacks, self._set_up.actuation)
+        if self._set_up.actuation == "velocity":
+            ahead = array[..., 0] * period_s
+            # The approach may have left a loose device a little deeper than it was asked to be.
+            begun = np.fmin(self.inserted_length, self._set_up.initial[..., 0])
+            check_travel(begun + np.maximum(ahead, 0.0).sum(axis=1), self._longest)
+        return array
+
+    def _run_all(
+        self,
+        control: Float[np.ndarray, "worlds samples devices 2"],
+        time_step: float,
+        steps: int,
+        *,
+        record_shape: bool = False,
+        advance: Advance | None = None,
+    ) -> dict[str, np.ndarray]:
+        """Step all worlds; from now on they are on their way."""
+        by_force = self._set_up.actuation == "force"
+        results = [
+            self._run(
+                group, control[group.index], time_step, steps, by_force=by_force, shape=record_shape, advance=advance
+            )
+            for group in self._groups
+        ]
+        if control.size and not np.isnan(self._set_up.initial).all():
+            self._set_up = replace(self._set_up, initial=np.full_like(self._set_up.initial, np.nan))
+        if record_shape:  # of the wires that were needed
+            for group, result in zip(self._groups, results, strict=True):
+                needed = max(group.path_mm, float(result["inserted_length"].max())) + FREE_BEHIND_MM
+                result["shape"] = result["shape"][:, :, : np.searchsorted(group.rod.abscissa_mm, needed) + 3]
+            nodes = max(result["shape"].shape[2] for result in results)
+            for result in results:
+                missing = nodes - result["shape"].shape[2]
+                result["shape"] = np.pad(
+                    result["shape"], ((0, 0), (0, 0), (0, missing), (0, 0)), constant_values=np.nan
+                )
+        return {name: self._merge([result[name] for result in results]) for name in results[0]}
 
     def _run(
-        self, group: Group, control: np.ndarray, time_step: float, steps: int, *, by_force: bool
-    ) -> dict[str, Any]:
-        with gpu_errors(self._config.processor):
+        self,
+        group: Group,
+        control: Float[np.ndarray, "members samples devices 2"],
+        time_step: float,
+        steps: int,
+        *,
+        by_force: bool,
+        shape: bool = False,
+        advance: Advance | None = None,
+    ) -> dict[str, np.ndarray]:
+        with gpu_errors(self.config.processor):
             return group.simulation.run(
-                control=control.reshape(*control.shape[:2], len(group.stack.devices), 2),
+                control=control,
                 force_driven=by_force,
                 time_step=time_step,
                 steps_per_sample=steps,
-                record_shape=False,
+                record_shape=shape,
                 record_attitude=False,
-                threads=self._config.threads_for(len(group.index), LANES),
+                threads=self.config.threads_for(len(group.index), LANES),
                 lanes=LANES,
-                progress=None,
+                progress=advance,
             )
 
-    def _per_world(self, name: str, values: Any) -> Float[np.ndarray, "worlds"]:
-        return self._of_worlds(name, values, (self.worlds,))
-
-    def _of_worlds(self, name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
-        array = np.asarray(values, dtype=float)
-        if array.shape != shape:
-            each = "one number" if len(shape) == 1 else f"{shape[1]} numbers"
-            raise InputError(f"{name}: shape {array.shape}; give {each} for each of the {self.worlds} worlds")
+    def _of_devices_given(self, name: str, values: ArrayLike) -> Float[np.ndarray, "worlds devices"]:
+        array = with_device_axis(name, np.asarray(values, dtype=float), (self.worlds, self._devices))
         if not np.isfinite(array).all():
             world = int(np.argwhere(~np.isfinite(array))[0][0])
             raise InputError(f"{name}: world {world}: not a finite number; correct it")
@@ -351,10 +450,11 @@ class Simulator(Readout):
     def _fingerprint(self) -> str:
         """Hash of all that a state belongs to."""
         groups = [(group.index.tolist(), group_key(group.anatomy, group.stack)) for group in self._groups]
-        return hashlib.sha256(repr((self._setup, groups)).encode()).hexdigest()
+        return hashlib.sha256(repr((self._settings, groups)).encode()).hexdigest()
 
     @property
-    def _setup(self) -> tuple[Any, ...]:
+    def _settings(self) -> tuple[Any, ...]:
         """What a state belongs to besides anatomies and devices: settings, but not where it is stepped."""
         names = (name for name in SimulatorConfig.__dataclass_fields__ if name not in ("processor", "threads"))
-        return self._by_force, self._motion, tuple((name, getattr(self._config, name)) for name in names)
+        made = tuple((name, getattr(self.config, name)) for name in names)
+        return self._set_up.actuation == "force", self._set_up.motion, made

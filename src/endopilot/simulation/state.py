@@ -27,32 +27,21 @@ class SupportsDLPack(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """What all worlds did in one call of `Simulator.step`; row i belongs to world i.
+    """What all worlds did in one call of `Simulator.step`: one sample of a `Trajectory`, which says what each means."""
 
-    Attributes:
-        inserted_length: Δ at the end of the step, mm.
-        rotation: φ at its end, rad.
-        tip_position: LPS mm, in the vessel as CT shows it, wherever it has moved.
-        tip_direction: unit vector along the wire at its tip.
-        contact_force_max: largest wall force on one node, N.
-        contact_force_sum: sum of the wall forces' magnitudes, N.
-        wall_force: largest resultant of the wall's forces on any 2 mm of the wire, N.
-        slip: advance that was asked of the drive and not made, mm; negative where it pulled.
-        rotation_slip: rotation that was asked of the drive and not made, rad.
-        iterations: mean Newton iterations a time step.
-        node_iterations: evaluations of active nodes in the step.
-        valid: false for a world that has failed; it stays as it was.
-    """
-
-    inserted_length: Float[np.ndarray, "worlds"]
-    rotation: Float[np.ndarray, "worlds"]
-    tip_position: Float[np.ndarray, "worlds 3"]
-    tip_direction: Float[np.ndarray, "worlds 3"]
+    inserted_length: Float[np.ndarray, "worlds devices"]
+    rotation: Float[np.ndarray, "worlds devices"]
+    tip_position: Float[np.ndarray, "worlds devices 3"]
+    tip_direction: Float[np.ndarray, "worlds devices 3"]
+    base_force: Float[np.ndarray, "worlds devices"]
+    base_torque: Float[np.ndarray, "worlds devices"]
+    drive_force: Float[np.ndarray, "worlds devices"]
+    drive_torque: Float[np.ndarray, "worlds devices"]
+    slip: Float[np.ndarray, "worlds devices"]
+    rotation_slip: Float[np.ndarray, "worlds devices"]
     contact_force_max: Float[np.ndarray, "worlds"]
     contact_force_sum: Float[np.ndarray, "worlds"]
     wall_force: Float[np.ndarray, "worlds"]
-    slip: Float[np.ndarray, "worlds"]
-    rotation_slip: Float[np.ndarray, "worlds"]
     iterations: Float[np.ndarray, "worlds"]
     node_iterations: Float[np.ndarray, "worlds"]
     valid: Bool[np.ndarray, "worlds"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import numpy as np
@@ -11,6 +10,8 @@ from pydantic import InstanceOf, model_validator
 
 from endopilot.devices.catheter import Catheter, check_nested
 from endopilot.devices.device import Device
+from endopilot.devices.drive_limits import Numbers
+from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.settings import CountOrZero, Finite, NonNegative, Positive, Seconds, Within, settings
 from endopilot.simulation.motion import Motion
@@ -108,22 +109,31 @@ class Navigation:
         return _ARRIVING[self.arrives]
 
     @property
-    def start(self) -> Float[np.ndarray, "numbers"]:
-        """(Δ mm, φ rad) at the start, of the wire, then of each catheter, as `simulate` takes them."""
-        catheters = [self.start_catheter_mm, 0.0] * len(self.catheters)
-        return np.array([self.start_inserted_mm, self.start_rotation, *catheters])
+    def stack(self) -> Stack:
+        """The wire and its catheters."""
+        return Stack(self.device, self.catheters)
 
-    def reached(self, *tips: TipProjection) -> Bool[np.ndarray, "..."]:
+    @property
+    def start(self) -> Float[np.ndarray, "devices 2"]:
+        """(Δ mm, φ rad) of each device at the start."""
+        catheters = [(self.start_catheter_mm, 0.0)] * len(self.catheters)
+        return np.array([(self.start_inserted_mm, self.start_rotation), *catheters])
+
+    def periods(self, period_s: float) -> int:
+        """Return after how many periods of some length, s, the time is over."""
+        return int(np.ceil(self.seconds / period_s - 1e-9))
+
+    def reached(self, tip: TipProjection) -> Bool[np.ndarray, "..."]:
         """Return which worlds have reached the target, see `reached`.
 
         Args:
-            tips: of the wires; where a catheter is to arrive, of the catheters too.
+            tip: of all devices, along the last axis.
         """
-        return reached(tips[: self.arriving + 1], self.target.branch, self.target.abscissa)
+        return reached(tip[..., : self.arriving + 1], self.target.branch, self.target.abscissa)
 
 
 def reached(
-    tips: Sequence[TipProjection], branch: int | Int[np.ndarray, "..."], abscissa: float | Float[np.ndarray, "..."]
+    tip: TipProjection, branch: int | Int[np.ndarray, "..."], abscissa: float | Float[np.ndarray, "..."]
 ) -> Bool[np.ndarray, "..."]:
     """Return which worlds have reached their targets.
 
@@ -131,13 +141,18 @@ def reached(
     wire's tip lies no more than that behind it.
 
     Args:
-        tips: of the wires, and if a catheter's are to arrive, those last.
+        tip: of the wires, and if a catheter's are to arrive, those last, along the last axis.
         branch: of the target of all, or of each.
         abscissa: of the target of all, or of each, mm.
     """
-    wire, arriving = tips[0], tips[-1]
+    wire, arriving = tip[..., 0], tip[..., -1]
     there = (np.abs(arriving.abscissa - abscissa) <= SUCCESS_MM) & (arriving.branch == branch)
     return there & (wire.abscissa >= arriving.abscissa - SUCCESS_MM)
+
+
+def is_safe(force_n: Numbers, limit_n: Numbers) -> Bool[np.ndarray, "..."]:
+    """Return where the largest force of the wall on one node, N, is no larger than the limit, N; NaN is not safe."""
+    return np.asarray(np.less_equal(force_n, limit_n))
 
 
 def check_wire_alone(navigation: Navigation, what: str) -> None:

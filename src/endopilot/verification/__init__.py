@@ -1,1 +1,1 @@
-"""The rod core beside closed forms and an independent engine."""
+"""The rod core against closed forms of rods without a wall, each with its equation and source."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -9,9 +10,11 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot import _core
+from endopilot.progress import progress
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.core import of_device, run_core
 from endopilot.simulation.rod import RodLayout
+from endopilot.simulation.tubes import TubeLayout
 from endopilot.types import Insertion
 
 X_AXIS = Insertion(position=np.zeros(3), direction=np.array([1.0, 0.0, 0.0]))
@@ -78,6 +81,16 @@ class Case:
         }
 
 
+def run(groups: Sequence[Callable[[], list[Case]]]) -> list[Case]:
+    """Run groups of cases under a progress bar."""
+    cases: list[Case] = []
+    with progress("Verifying the rod core", total=len(groups)) as advance:
+        for group in groups:
+            cases += group()
+            advance()
+    return cases
+
+
 def compare(case: str, reference: float, value: float, bar: float, picture: Picture | None = None) -> Case:
     """Return the comparison of a value with its reference, which is not 0."""
     return Case(case, float(reference), float(value), abs(float(value) / float(reference) - 1), bar, picture)
@@ -117,19 +130,47 @@ def straight_rod(
         drag: drag of a node, N·s/mm.
         clamp: nodes behind the wall that the drive holds.
     """
-    size = length_mm / (elements - 0.5)
-    n = elements + clamp
     stiff = 1e5 * bend / length_mm**2
+    return uniform_rod(
+        elements + clamp,
+        length_mm / (elements - 0.5),
+        bend=bend,
+        twist=twist,
+        shear=stiff if shear is None else shear,
+        stretch=stiff if stretch is None else stretch,
+        radius_mm=radius_mm,
+        drag=drag,
+        spin_drag=drag,
+    )
+
+
+def uniform_rod(
+    nodes: int,
+    size_mm: float,
+    *,
+    bend: float,
+    twist: float,
+    shear: float,
+    stretch: float,
+    radius_mm: float,
+    drag: float,
+    spin_drag: float,
+) -> RodLayout:
+    """Return a straight rod with the same section throughout: see `straight_rod`; elements are `size_mm` long."""
+
+    def all_of(value: float) -> Float[np.ndarray, "n"]:
+        return np.full(nodes, value)
+
     return RodLayout(
-        abscissa_mm=size * np.arange(n),
-        shear_n=np.full(n, stiff if shear is None else shear),
-        stretch_n=np.full(n, stiff if stretch is None else stretch),
-        bend_n_mm2=np.full(n, bend),
-        twist_n_mm2=np.full(n, twist),
-        rest_curvature=np.zeros((n, 3)),
-        radius_mm=np.full(n, radius_mm),
-        drag_n_s_mm=np.full(n, drag),
-        spin_drag_n_mm_s=np.full(n, drag),
+        abscissa_mm=size_mm * np.arange(nodes),
+        shear_n=all_of(shear),
+        stretch_n=all_of(stretch),
+        bend_n_mm2=all_of(bend),
+        twist_n_mm2=all_of(twist),
+        rest_curvature=np.zeros((nodes, 3)),
+        radius_mm=all_of(radius_mm),
+        drag_n_s_mm=all_of(drag),
+        spin_drag_n_mm_s=all_of(spin_drag),
     )
 
 
@@ -189,25 +230,75 @@ def equilibrium(
         inserted_mm: free length; the rod's own if not given.
         free_behind_mm: the rod is held this far behind the wall of the clamp.
     """
-    size = float(rod.abscissa_mm[1])
     if inserted_mm is None:
-        inserted_mm = (len(rod.abscissa_mm) - 3 - 0.5) * size
-    control = np.zeros((samples, 2)) if control is None else control
+        inserted_mm = (len(rod.abscissa_mm) - 3 - 0.5) * float(rod.abscissa_mm[1])
+    return driven(
+        rod,
+        np.zeros((samples, 2)) if control is None else control,
+        initial=np.array([inserted_mm, 0.0]),
+        loading=loading,
+        lumen=lumen,
+        friction=friction,
+        config=replace(config, sample_tolerance_mm=1e-8),
+        insertion=insertion,
+        free_behind_mm=free_behind_mm,
+    )
+
+
+def driven(
+    rod: RodLayout,
+    control: Float[np.ndarray, "samples *devices 2"],
+    *,
+    initial: Float[np.ndarray, "*devices 2"],
+    config: SimulatorConfig,
+    tubes: TubeLayout | None = None,
+    loading: Loading | None = None,
+    lumen: _core.Lumen | None = None,
+    friction: float = 0.0,
+    insertion: Insertion = X_AXIS,
+    approach: bool = False,
+    free_behind_mm: float = 0.0,
+    push_limit_n: float = np.inf,
+) -> dict[str, np.ndarray]:
+    """Drive one rod, or tubes in each other, and return the core's arrays, without the axis of worlds.
+
+    The axis of devices is there with tubes alone.
+
+    Args:
+        rod: nodes and stiffnesses.
+        control: mm/s and rad/s, of each tube if there are some.
+        initial: inserted length (mm) and rotation (rad) at the start.
+        config: settings of the core.
+        tubes: from the inside out, in place of the rod's stiffnesses.
+        loading: dead loads and springs.
+        lumen: a wall.
+        friction: Coulomb coefficient of the wall.
+        insertion: where and in which direction the base slides.
+        approach: bring the rod to its first inserted length from the ostium; else it starts there, straight.
+        free_behind_mm: nodes farther behind the insertion follow the drive, mm.
+        push_limit_n: force at which the drive slips, N.
+
+    Raises:
+        RuntimeError: the core did not converge.
+    """
     result = run_core(
         rod,
         lumen,
         insertion,
-        config=replace(config, sample_tolerance_mm=1e-8),
-        initial=np.array([[inserted_mm, 0.0]]),
-        control=control[None],
-        friction=np.array([friction]),
-        loads=loading.core(),
+        config=config,
+        initial=initial.reshape(1, -1),
+        control=control.reshape(1, len(control), -1),
+        friction=np.full((1, initial.size // 2), friction),
+        loads=None if loading is None else loading.core(),
         record_shape=True,
         record_attitude=True,
         lanes=1,
-        approach=False,
+        approach=approach,
         free_behind_mm=free_behind_mm,
+        push_limit_n=push_limit_n,
+        tubes=tubes,
     )
     if not result["valid"].all():
         raise RuntimeError("a verification case did not converge")
-    return {name: values[0] for name, values in of_device(result, 0).items()}
+    result = of_device(result, 0) if tubes is None else result
+    return {name: values[0] for name, values in result.items()}

@@ -9,6 +9,7 @@ catheter is a line in each view. docs/xray.md says where the numbers come from.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -16,11 +17,14 @@ from jaxtyping import Float
 from endopilot.anatomy.projection import project_tip
 from endopilot.anatomy.tree import tangents
 from endopilot.dataset.loader import Dataset
+from endopilot.errors import InputError
 from endopilot.settings import Finite, Positive, settings
-from endopilot.simulation.motion import place, published_mean
+from endopilot.simulation.motion import Motion, place, published_mean
+from endopilot.simulation.simulator import Simulator
+from endopilot.tasks.navigation import Navigation
 from endopilot.types import Anatomy, TipProjection
 from endopilot.xray.carm import CArmGeometry, View, view_at
-from endopilot.xray.moving_patient import seen_in_episodes, turned
+from endopilot.xray.moving_patient import seen_in_episodes, seen_wire, turned
 
 _CATHETER_MM = 20.0
 """Length of the guiding catheter behind the ostium that is straight, in which a tip may be found, mm."""
@@ -51,6 +55,42 @@ class TipMeasurement:
     offset: float
     branch: int
     sd_mm: tuple[float, float] = (0.0, 0.0)
+
+
+@runtime_checkable
+class CArm(Protocol):
+    """A C-arm around one patient.
+
+    Attributes:
+        known_motion: what is known of how the patient moves; an exposure takes it off.
+    """
+
+    known_motion: Motion | None
+
+    def expose(
+        self, simulator: Simulator, inserted_length: float, random: np.random.Generator, *, time_s: float
+    ) -> TipMeasurement | None:
+        """Take one exposure of every view and say where the wire's tip is; None where no wire is found.
+
+        Args:
+            simulator: of one world, the wire as it truly is.
+            inserted_length: Δ by the robot's encoder, mm.
+            random: where the errors are drawn from.
+            time_s: of this moment, s.
+        """
+        ...
+
+    def measure_motion(self, motion: Motion | None, random: np.random.Generator) -> Motion | None:
+        """Inject contrast and return how the patient moves by a run of images; None where that is nothing known.
+
+        Args:
+            motion: how the patient truly moves.
+            random: where the noise is drawn from.
+
+        Raises:
+            InputError: this C-arm's exposures cannot show it.
+        """
+        ...
 
 
 @settings
@@ -87,15 +127,24 @@ class _Detection:
 class Fluoroscope:
     """A C-arm around one patient, whose vessel is known from the CT and registered to it."""
 
-    def __init__(self, anatomy: Anatomy, wire_radius_mm: float, config: FluoroscopeConfig | None = None) -> None:
+    def __init__(
+        self,
+        anatomy: Anatomy,
+        wire_radius_mm: float,
+        config: FluoroscopeConfig | None = None,
+        *,
+        known_motion: Motion | None = None,
+    ) -> None:
         """Bring the middle of the vessel to the isocenter.
 
         Args:
             anatomy: the vessel.
             wire_radius_mm: radius of the wire at its tip, mm.
             config: geometry and errors.
+            known_motion: what is known of how the patient moves.
         """
         self._anatomy, self._config = anatomy, config or FluoroscopeConfig()
+        self.known_motion = known_motion
         lines = [branch.centerline for branch in anatomy.tree.branches]
         insertion = anatomy.insertion
         behind = np.linspace(-_CATHETER_MM, -0.5, 40)
@@ -112,6 +161,21 @@ class Fluoroscope:
         self._abscissa = [behind, *(line.abscissa for line in lines)]
 
     def expose(
+        self, simulator: Simulator, inserted_length: float, random: np.random.Generator, *, time_s: float
+    ) -> TipMeasurement:
+        """Take one exposure of every view and say where the wire's tip is, as `CArm` says."""
+        _, tip, heading = seen_wire(simulator, self.known_motion, self._anatomy.insertion.position, time_s)
+        return self.measure(tip, heading, inserted_length, random)
+
+    def measure_motion(self, motion: Motion | None, random: np.random.Generator) -> Motion | None:
+        """Refuse to: what is assumed of errors says nothing of contrast.
+
+        Raises:
+            InputError: always.
+        """
+        raise InputError("measure_motion: exposures of assumed errors show no contrast; give xray: images")
+
+    def measure(
         self,
         tip_position: Float[np.ndarray, "3"],
         tip_direction: Float[np.ndarray, "3"],
@@ -176,7 +240,7 @@ class Fluoroscope:
             inserted_length: Δ by the robot's encoder, mm, which helps to find the tip.
             seed: of the errors; those of a navigation depend on it, the patient and the sequence alone.
         """
-        tip, heading = episodes.tip_position.astype(float), episodes.tip_direction.astype(float)
+        tip, heading = (each[:, :, 0].astype(float) for each in (episodes.tip_position, episodes.tip_direction))
         position, name = np.zeros_like(tip), self._anatomy.name
         ostium = np.asarray(self._anatomy.insertion.position)
         motion = episodes.motion(name)
@@ -253,3 +317,27 @@ class Fluoroscope:
         lateral = lateral - (lateral @ tangent[nearest]) * tangent[nearest]
         beyond = 1 - np.sqrt(2) * sd[nearest] / max(float(np.linalg.norm(lateral)), 1e-9)
         return place - max(beyond, 0.0) * lateral, cost, nearest  # a tip does not leave the lumen
+
+
+def make_c_arm(navigation: Navigation, config: FluoroscopeConfig | None = None, *, seed: int = 0) -> CArm:
+    """Return the C-arm of a navigation, whose exposures are what `Navigation.xray` says.
+
+    Args:
+        navigation: vessel, wire and what is known of its motion.
+        config: geometry and errors.
+        seed: of the pose that a patient lies in whose images are taken, and of these images' noise.
+
+    Raises:
+        InputError: images of a wire in a catheter, or of a vessel that is not recognised in them.
+    """
+    anatomy, device, known = navigation.anatomy, navigation.device, navigation.known_motion
+    if navigation.xray == "assumed":
+        return Fluoroscope(anatomy, device.tip_radius_mm, config, known_motion=known)
+    from endopilot.xray.image_fluoroscope import ImageFluoroscope  # slow to import
+
+    if navigation.catheters:
+        names = ", ".join(catheter.name for catheter in navigation.catheters)
+        raise InputError(
+            f"xray: images: the detector takes a wire alone, and there is {names} around it; leave the catheter out"
+        )
+    return ImageFluoroscope(anatomy, device, config, seed, known_motion=known)

@@ -14,6 +14,7 @@ from endopilot.anatomy.projection import project_tip
 from endopilot.devices.device import Device
 from endopilot.errors import InputError
 from endopilot.simulation.motion import Motion, published_mean
+from endopilot.simulation.simulator import Simulator
 from endopilot.types import Anatomy
 from endopilot.xray.absorbers import surroundings
 from endopilot.xray.carm import Pose, view_at
@@ -21,6 +22,7 @@ from endopilot.xray.detector import TipDetector
 from endopilot.xray.fluoroscope import FluoroscopeConfig, TipMeasurement
 from endopilot.xray.image import ImageConfig, Plane, XrayImager
 from endopilot.xray.motion_registration import register_motion, take_run
+from endopilot.xray.moving_patient import seen_wire
 from endopilot.xray.pose_refinement import PoseRefiner
 from endopilot.xray.registration import Registration, register, vessel_error_mm
 
@@ -43,7 +45,13 @@ class ImageFluoroscope:
     """
 
     def __init__(
-        self, anatomy: Anatomy, device: Device, config: FluoroscopeConfig | None = None, seed: int = 0
+        self,
+        anatomy: Anatomy,
+        device: Device,
+        config: FluoroscopeConfig | None = None,
+        seed: int = 0,
+        *,
+        known_motion: Motion | None = None,
     ) -> None:
         """Lay the patient on the table, inject contrast and register.
 
@@ -52,6 +60,7 @@ class ImageFluoroscope:
             device: the wire.
             config: geometry and views; its errors of detection are not used.
             seed: of the pose, up to 5 mm and 3° along and about each axis, and of these images' noise.
+            known_motion: what is known of how the patient moves.
 
         Raises:
             NotRegistered: the vessel is not recognised in the images.
@@ -59,7 +68,7 @@ class ImageFluoroscope:
         config = config or FluoroscopeConfig()
         random = np.random.default_rng([seed, 0x706F7365])
         angles = config.view_angles_deg[: 2 if config.biplane else 1]
-        self.pose, self._anatomy = Pose.draw(random), anatomy
+        self.pose, self._anatomy, self.known_motion = Pose.draw(random), anatomy, known_motion
         self._imager = XrayImager(anatomy, device, surroundings(anatomy), ImageConfig(geometry=config.geometry))
         self._angles_deg = angles
         self._planes = [self._imager.plane(angle, pose=self.pose) for angle in angles]
@@ -77,7 +86,7 @@ class ImageFluoroscope:
         """Take the patient's pose to be what contrast showed, whatever the wires since: another navigation begins."""
         self.refiner = PoseRefiner(self._anatomy, self.registration)
 
-    def measure_motion(self, motion: Motion, random: np.random.Generator) -> Motion | None:
+    def measure_motion(self, motion: Motion | None, random: np.random.Generator) -> Motion | None:
         """Inject contrast once more, take a run of images over a breath, and return how the patient moves by them.
 
         Args:
@@ -87,7 +96,7 @@ class ImageFluoroscope:
         Raises:
             NotRegistered: the vessel is not recognised in the images.
         """
-        if (mean := published_mean(motion)) is None:
+        if motion is None or (mean := published_mean(motion)) is None:
             return None
         run = take_run(self._imager, self._angles_deg, self.pose, motion, random)
         views = self.registration.views(self._views, self._imager.isocenter)
@@ -98,6 +107,13 @@ class ImageFluoroscope:
         return found.motion
 
     def expose(
+        self, simulator: Simulator, inserted_length: float, random: np.random.Generator, *, time_s: float
+    ) -> TipMeasurement | None:
+        """Take one exposure of every view and say where the wire's tip is, as `CArm` says."""
+        nodes, _, _ = seen_wire(simulator, self.known_motion, self._anatomy.insertion.position, time_s)
+        return self.measure(nodes, inserted_length, random)
+
+    def measure(
         self,
         nodes: Float[np.ndarray, "n 3"],
         inserted_length: float,

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.simulation.motion import Motion, relative
+from endopilot.simulation.motion import Motion, place, relative
 from endopilot.simulation.processor import CoreMotion
+from endopilot.simulation.simulator import Simulator
 
 
 def seen(
@@ -20,6 +21,28 @@ def seen(
         times_s: of these moments, s.
     """
     return placed if known is None else relative(placed, known.placements(times_s)[0])
+
+
+def seen_wire(
+    simulator: Simulator, known: Motion | None, ostium: Float[np.ndarray, "3"], time_s: float
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Return where a C-arm sees the wire of one world, in the vessel as CT shows it.
+
+    Args:
+        simulator: of one world.
+        known: motion that the C-arm takes off; none if not given.
+        ostium: LPS mm.
+        time_s: of this moment, s.
+
+    Returns:
+        The nodes from the foremost tip on, the wire's tip, LPS mm, and the unit vector along the wire there.
+    """
+    nodes, tip, heading = simulator.position[0], simulator.tip_position[0, 0], simulator.tip_direction[0, 0]
+    if simulator.set_up.motion is None:
+        return nodes, tip, heading
+    known_core = None if known is None else known.core(ostium)
+    (maps,) = seen(simulator.vessel_to_laboratory[:1], known_core, np.array([time_s]))
+    return place(maps, nodes), place(maps, tip), turned(maps, heading)
 
 
 def seen_in_episodes(

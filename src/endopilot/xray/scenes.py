@@ -128,11 +128,11 @@ def _wires(anatomy: Anatomy, device: Device, seed: int) -> tuple[np.ndarray, np.
     )
     rollout = simulate(anatomy, device, control, initial=initial, record_shape=True)
     assert rollout.shape is not None
-    period = rollout.sample_period_s
+    period = rollout.period_s
     velocity = np.gradient(rollout.shape, period, axis=1)
-    used: np.ndarray = rollout.valid & (rollout.inserted_length > 2.0)
+    used: np.ndarray = rollout.valid & (rollout.inserted_length[..., 0] > 2.0)
     used[:, :_FIRST_SAMPLE] = False
     world, sample = np.nonzero(used)
     order = np.random.default_rng(seed).permutation(len(world))
     world, sample = world[order], sample[order]
-    return rollout.shape[world, sample], velocity[world, sample], rollout.inserted_length[world, sample]
+    return rollout.shape[world, sample], velocity[world, sample], rollout.inserted_length[world, sample, 0]

@@ -162,21 +162,16 @@ def _pushed(
     """
     if config.inserted_mm == 0:
         return [np.zeros((0, 3))]
-    around = len(stack.catheters)
-    initial = np.array([[config.inserted_mm, config.rotation_rad, *[config.catheter_inserted_mm, 0.0] * around]])
+    start = [(config.inserted_mm, config.rotation_rad), *[(config.catheter_inserted_mm, 0.0)] * (len(stack) - 1)]
     period_s = max(config.time_s, _SHORTEST_S) if motion is not None else SAMPLE_PERIOD_S
     rollout = simulate(
         anatomy,
-        stack.wire,
-        np.zeros((1, 1, initial.shape[1])),
-        catheters=stack.catheters,
-        initial=initial,
+        stack,
+        np.zeros((1, 1, len(stack), 2)),
+        initial=np.array([start]),
         record_shape=True,
         motion=motion,
         period_s=period_s,
     )
     assert rollout.shape is not None
-    inserted = [rollout.inserted_length[0, -1:]]
-    if rollout.catheters is not None:
-        inserted.append(rollout.catheters.inserted_length[0, -1])
-    return lines_from_tips(rollout.shape[0, -1], np.concatenate(inserted))
+    return lines_from_tips(rollout.shape[0, -1], rollout.inserted_length[0, -1])

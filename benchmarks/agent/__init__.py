@@ -1,0 +1,1 @@
+"""The agent in patients: calibration of its bands, and the choice of the ladder's patients."""

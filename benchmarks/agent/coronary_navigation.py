@@ -1,0 +1,74 @@
+"""Drive the agent into the distal thirds of coronary arteries: `python -m benchmarks coronary-navigation`."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from tyro.conf import Positional
+
+from endopilot.anatomy.io import read_anatomy
+from endopilot.control.navigate_patient import NavigatePatientConfig, navigate_patient, set_up_navigation
+from endopilot.types import Anatomy
+
+ARTERIES = {"LAD": ("6", "7", "8"), "LCx": ("11", "13"), "RCA": ("1", "2", "3")}
+"""Sections of each artery, from its begin to its end."""
+PLACE = 5 / 6
+
+
+def targets(anatomy: Anatomy) -> Iterator[tuple[str, str]]:
+    """Yield the name and the place of each artery's target, as `navigate` takes it."""
+    tree = anatomy.tree
+    for artery, names in ARTERIES.items():
+        labels = [tree.section_names.index(name) for name in names if name in tree.section_names]
+        ends = [
+            (float(branch.centerline.abscissa[of].min()), float(branch.centerline.abscissa[of].max()), index)
+            for index, branch in enumerate(tree.branches)
+            if (of := np.isin(branch.section, labels)).any()
+        ]
+        if not ends:
+            continue
+        _, last, branch = max(ends, key=lambda end: end[1])
+        at = min(first for first, _, _ in ends) * (1 - PLACE) + last * PLACE
+        line = next(
+            tree.branches[index].centerline
+            for index in tree.route(branch)
+            if tree.branches[index].centerline.abscissa[-1] >= at
+        )
+        place = [np.interp(at, line.abscissa, line.points[:, axis]) for axis in range(3)]
+        yield artery, ",".join(f"{value:.3f}" for value in place)
+
+
+def navigate_coronaries(
+    patients: Positional[tuple[Path, ...]],
+    /,
+    *,
+    config: NavigatePatientConfig = NavigatePatientConfig(mismatch=0.2),
+) -> None:
+    """Drive a policy into the distal thirds of coronary arteries; print each navigation, and the share that was safe.
+
+    The targets lie at 5/6 of the anterior descending, the circumflex and the right coronary artery.
+
+    Args:
+        patients: folders that `endopilot anatomy` or `endopilot atlas` made.
+        config: policy, wire, limits, and how reality differs from what the policy is given.
+    """
+    safe = []
+    print("| patient | artery | safe | reached | peak force, N | exposures | seconds | processor, s | outcome |")
+    print("|---" * 9 + "|")
+    for folder in patients:
+        anatomy = read_anatomy(folder)
+        for artery, place in targets(anatomy):
+            began = time.process_time()
+            record = navigate_patient(set_up_navigation(anatomy, place, config)).record
+            spent = time.process_time() - began
+            safe.append(record.success and record.safe)
+            print(
+                f"| {folder.name} | {artery} | {safe[-1]} | {record.success} | {record.peak_force_n:.3f} | "
+                f"{record.exposures} | {record.seconds:g} | {spent:.0f} | "
+                f"{record.reason}{': ' * bool(record.gives_up)}{record.gives_up} |",
+                flush=True,
+            )
+    print(f"\n{sum(safe)} of {len(safe)} safe ({100 * np.mean(safe):.0f} %)")

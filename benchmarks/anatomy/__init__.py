@@ -1,0 +1,1 @@
+"""Errors of centerlines, section names and ostia, and vessels' shapes beside the atlas'."""

@@ -1,0 +1,1 @@
+"""Speed and error of the rod core, alone and in environments, and how seldom it fails."""

@@ -1,0 +1,1 @@
+"""Errors of segmentation in CT angiograms, and of tips and poses in X-ray images."""

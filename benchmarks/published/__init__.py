@@ -1,0 +1,1 @@
+"""Published bench tests of wires and catheters, simulated."""

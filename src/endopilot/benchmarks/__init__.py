@@ -1,1 +1,0 @@
-"""Speed and accuracy of every stage, each figure beside its bar."""

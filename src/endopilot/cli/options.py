@@ -1,0 +1,376 @@
+"""A command's options: its flags, its settings file and its help, all from the signature of its function.
+
+The options are the function's parameters and the fields of its `config`; a parameter that is a settings class is a
+group. A value stands on the command line, else in the file that `--config` names, else it is the default.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import inspect
+import io
+import itertools
+import json
+import re
+import shutil
+import textwrap
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import MISSING, dataclass, field, fields, make_dataclass
+from functools import cache
+from pathlib import Path
+from types import MappingProxyType, NoneType
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+
+import docstring_parser
+import tyro
+from tyro.conf import Positional
+
+from endopilot.cli.arguments import MUST_EXIST, existing, show_answer
+from endopilot.errors import InputError
+from endopilot.settings import Within, is_settings, read_settings, settings
+
+LISTED_AT_MOST = 10
+LISTED: Mapping[str, str] = MappingProxyType(
+    {
+        "run": "output target device method vessel seeds sequences seconds training_seconds json",
+        "anatomy": "output vessel ostium_mm label name scale catheter_radius_mm picture ct json",
+        "phantom": "output seed in_plane_mm slice_mm lumen_hu noise_hu calcium stents motion_mm json",
+        "simulate": "output device catheter controls sequences seconds seed motion picture json",
+        "dataset": "output device catheter sequences seconds seed control friction motion json",
+        "train": "output model epochs batch_size learning_rate max_seconds seed processor precision json",
+        "plan": "target output device catheter model method seconds force_limit_n xray json",
+        "navigate": "target output policy device catheter seconds xray mismatch seed json",
+        "xray": "output show view_deg zoom device inserted_mm catheter catheter_inserted_mm ct json",
+        "advise": "output also_test xray level wall_ratio abscissa_mm missed ostium_mm seed json",
+        "drive": "certificates device host port travel_mm latency_s",
+        "cockpit": "device catheter task world replay resume ct output browser port",
+    }
+)
+"""What `--help` lists of commands that have more than `LISTED_AT_MOST` flags: those that are set most often."""
+_WORDS = {bool: "", int: "INT", float: "FLOAT", str: "TEXT", Path: "PATH"}
+_POSITIONAL = get_args(Positional[Any])[1]
+
+
+@dataclass(frozen=True)
+class Option:
+    """An option of a command, or a group of options.
+
+    Attributes:
+        name: of its field.
+        kind: what it takes, as annotated.
+        value: what it is set to; None where it must be given and is not.
+        meaning: in words, with the unit.
+        required: whether it must be given.
+        group: the options of a group.
+    """
+
+    name: str
+    kind: Any
+    value: Any
+    meaning: str
+    required: bool = False
+    group: tuple[Option, ...] = ()
+
+    @property
+    def positional(self) -> bool:
+        """Whether it is given by its place, without a flag."""
+        return _POSITIONAL in _notes(self.kind)
+
+    @property
+    def flags(self) -> list[str]:
+        """How it is called: `-o` and `--output`; in capitals if it is given by its place."""
+        if self.positional:
+            return [f"[{self.name.upper()} ...]" if _takes(self.kind).endswith("...]") else self.name.upper()]
+        short = [one for note in _notes(self.kind) for one in getattr(note, "aliases", None) or ()]
+        return [*short, f"--{'no-' if self.value is True else ''}{self.name.replace('_', '-')}"]
+
+    @property
+    def takes(self) -> str:
+        """What follows the flag, such as `FLOAT FLOAT`; nothing after a switch."""
+        return "" if self.positional else _takes(self.kind)
+
+    @property
+    def default(self) -> str:
+        """Its value as the command line would have it; "required" if there is none, empty if it may be left out."""
+        return "required" if self.required else "" if isinstance(self.value, bool) else _words(self.value)
+
+    @property
+    def range(self) -> str:
+        """What numbers it takes, in words; empty if it takes any, or no number."""
+        limits = next((note for note in _notes(self.kind) if isinstance(note, Within)), Within())
+        words = limits.mend(whole=False).removeprefix("give a ").removeprefix("number ")
+        return "" if limits == Within() else words
+
+    def leaves(self) -> Iterator[Option]:
+        """Yield the options of a group, or the option itself."""
+        yield from itertools.chain.from_iterable(one.leaves() for one in self.group) if self.group else (self,)
+
+
+class Command:
+    """A command: a function whose parameters and settings are its options.
+
+    Attributes:
+        name: how it is called, such as `endopilot plan`.
+        settings: the settings class of all its options; a file for `--config` holds it.
+        defaults: what its options are set to if nothing is given, an instance of `settings`.
+    """
+
+    def __init__(self, name: str, function: Callable[..., Any]) -> None:
+        """Read the signature of `function`; if it returns something, that is shown and the command has `--json`."""
+        self.name, self._function = name, function
+        self._text = docstring_parser.parse(function.__doc__ or "")
+        self._parameters = dict(inspect.signature(function).parameters)
+        hints = get_type_hints(function, include_extras=True)
+        config = self._parameters.pop("config").default if "config" in self._parameters else None
+        self._config, self._answers = type(config), hints.pop("return") is not NoneType
+        self._required = [one.name for one in self._parameters.values() if one.default is one.empty]
+        own = {one.name: (hints[one.name], one.default) for one in self._parameters.values()}
+        own |= {one: (own[one][0] | None, None) for one in self._required}
+        own |= {"json": (bool, False)} if self._answers else {}
+        self._own = tuple(own)
+        content = {"__annotations__": {one: kind for one, (kind, _) in own.items()}}
+        content |= {one: default for one, (_, default) in own.items()}
+        self.settings = settings(type("Options", () if config is None else (self._config,), content))
+        self.defaults = self.settings(**({} if config is None else _contents(config)))
+
+    @property
+    def summary(self) -> str:
+        """What it does: a sentence, and paragraphs with more."""
+        return "\n\n".join(part for part in (self._text.short_description, self._text.long_description) if part)
+
+    def options(self, values: Any = None) -> list[Option]:
+        """Return its options: its function's in their order, then those of its settings.
+
+        Args:
+            values: what they are set to, an instance of `settings`; the defaults if not given.
+        """
+        meanings = _meanings(self._config) | {"json": "print the figures as JSON."}
+        meanings |= {one.arg_name: _line(one.description) for one in self._text.params}
+        found = _options(self.defaults if values is None else values, meanings, self._required)
+        tree = {one.name: one for one in found}
+        return [tree.pop(name) for name in self._own] + list(tree.values())
+
+    def run(self, arguments: Sequence[str]) -> None:
+        """Do what the arguments ask for, and print what comes of it.
+
+        Raises:
+            InputError: the arguments or the file of `--config` are bad; the line says which, and how to mend it.
+        """
+        values = self._asked(arguments)
+        if values is not None:
+            answer = self._called(values)
+            if self._answers:
+                show_answer(answer, as_json=values.json)
+
+    def answer(self, arguments: Sequence[str]) -> Any:
+        """Do what the arguments ask for, and return what comes of it; None where they ask for help.
+
+        Raises:
+            InputError: as `run`.
+        """
+        values = self._asked(arguments)
+        return None if values is None else self._called(values)
+
+    def _asked(self, arguments: Sequence[str]) -> Any:
+        """Return what the arguments set the options to; None where they ask for a text, which is printed."""
+        if not {"-h", "--help", "--help-all"}.isdisjoint(arguments):
+            print(self.help(everything="--help-all" in arguments), end="")
+            return None
+        values = self.read(arguments)
+        if "--print-config" in arguments:
+            print(self.file(values), end="")
+            return None
+        return values
+
+    def _called(self, values: Any) -> Any:
+        """Return what the function returns."""
+        for one in self.options(values):
+            if MUST_EXIST in _notes(one.kind):
+                for path in one.value if isinstance(one.value, tuple) else (one.value,) if one.value else ():
+                    existing(path)
+        given = {name: getattr(values, name) for name in self._parameters}
+        places = [given.pop(name) for name, one in self._parameters.items() if one.kind is one.POSITIONAL_ONLY]
+        if self._config is not NoneType:
+            given["config"] = self._config(**{one.name: getattr(values, one.name) for one in fields(self._config)})
+        return self._function(*places, **given)
+
+    def read(self, arguments: Sequence[str]) -> Any:
+        """Return what the arguments set the options to, an instance of `settings`.
+
+        Raises:
+            InputError: as `run`.
+        """
+        rest = [word for word in arguments if word != "--print-config"]
+        file = _taken(rest, "--config")
+        start = self.defaults if file is None else read_settings(Path(file), self.settings, onto=self.defaults)
+        leaves = [leaf for option in self.options(start) for leaf in option.leaves()]
+        parts = [_part(leaf, incomplete=len(rest) < len(arguments)) for leaf in leaves]
+        said = io.StringIO()
+        try:
+            with contextlib.redirect_stderr(said):
+                shape = make_dataclass("Arguments", parts, kw_only=True)
+                given = tyro.cli(shape, prog=self.name, args=rest, add_help=False)
+        except SystemExit:
+            raise InputError(f"{_told(said.getvalue())}; `{self.name} --help` lists the options") from None
+        return _with(start, given)
+
+    def help(self, *, everything: bool) -> str:
+        """Return the text of `--help`, or of `--help-all` with `everything`."""
+        options = self.options()
+        leaves = {leaf.name: leaf for one in options for leaf in one.leaves()}
+        places = [leaf for leaf in leaves.values() if leaf.positional]
+        if everything:
+            groups = {"options": [one for one in options if not one.group]}
+            groups |= {one.meaning.rstrip("."): list(one.leaves()) for one in options if one.group}
+        elif listed := LISTED.get(self.name.removeprefix("endopilot ")):
+            groups = {"options": places + [leaves[name] for name in listed.split()]}
+        else:
+            groups = {"options": list(leaves.values())}
+        hidden = len(leaves) - sum(map(len, groups.values()))
+        more = f"`{self.name} --help-all` lists {hidden} more options. " if hidden else ""
+        parser = argparse.ArgumentParser(
+            usage=" ".join([self.name, *(one.flags[0] for one in places), "[OPTIONS]"]),
+            description=_wrapped(self.summary),
+            epilog=_wrapped(
+                f"{more}--config FILE reads options from a YAML file; --print-config writes one to start from. "
+                "Flags win over the file."
+            ),
+            add_help=False,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        for title, group in groups.items():
+            section = parser.add_argument_group(title)
+            for one in group:
+                note = "(required)" if one.required else f"(default: {one.default})" if one.default else ""
+                kind: dict[str, Any] = (
+                    {"metavar": one.takes} if one.takes else {} if one.positional else {"action": "store_true"}
+                )
+                section.add_argument(*one.flags, help=f"{one.meaning} {note}".replace("%", "%%"), **kind)
+        return parser.format_help()
+
+    def file(self, values: Any = None) -> str:
+        """Return the text of a file for `--config`.
+
+        Args:
+            values: what the options are set to, an instance of `settings`; the defaults if not given.
+        """
+        head = f"# Options of `{self.name}` for --config. Flags on the command line win over them."
+        return "\n".join([head, *_yaml(self.options(values), ""), ""])
+
+
+def _options(values: Any, meanings: Mapping[str, str], required: Collection[str]) -> Iterator[Option]:
+    """Yield the options that settings hold, in the order of their fields."""
+    kinds = get_type_hints(type(values), include_extras=True)
+    for name, value in _contents(values).items():
+        kind, meaning = kinds[name], meanings.get(name, "")
+        if is_settings(type(value)):
+            group = tuple(_options(value, _meanings(type(value)), ()))
+            yield Option(name, kind, value, meaning, group=group)
+        elif name in required:
+            yield Option(name, get_args(kind)[0], value, meaning, required=value is None)
+        else:
+            yield Option(name, kind, value, meaning)
+
+
+@cache
+def _meanings(cls: type) -> dict[str, str]:
+    """Return what the fields of a settings class mean, each in one line: their docstrings."""
+    found = (docstring_parser.parse_from_object(kind).params for kind in reversed(cls.__mro__) if is_settings(kind))
+    return {one.arg_name: _line(one.description) for one in itertools.chain.from_iterable(found)}
+
+
+def _contents(values: Any) -> dict[str, Any]:
+    return {one.name: getattr(values, one.name) for one in fields(values)}
+
+
+def _with(values: Any, given: Any) -> Any:
+    """Return settings with the options that an object has as attributes, those of groups without their group."""
+    new = {
+        name: _with(old, given) if is_settings(type(old)) else getattr(given, name)
+        for name, old in _contents(values).items()
+    }
+    return type(values)(**new)
+
+
+def _part(one: Option, *, incomplete: bool) -> tuple[str, Any, Any]:
+    """Return a field of the class that tyro parses; with `incomplete`, nothing need be given."""
+    if one.positional:
+        notes = [_POSITIONAL, tyro.conf.arg(metavar=one.flags[0])]
+    else:
+        notes = [note for note in _notes(one.kind) if getattr(note, "aliases", None)]
+    kind = one.kind | None if one.required and incomplete else one.kind
+    default = MISSING if one.required and not incomplete else one.value
+    return one.name, Annotated[kind, *notes] if notes else kind, field(default=default)
+
+
+def _taken(words: list[str], flag: str) -> str | None:
+    """Take a flag and its value out of words, and return the value; None if the flag is not there.
+
+    Raises:
+        InputError: the flag is the last word.
+    """
+    for i, word in enumerate(words):
+        name, sign, value = word.partition("=")
+        if name == flag:
+            del words[i]
+            if not sign and i == len(words):
+                raise InputError(f"{flag}: names no file; give one")
+            return value if sign else words.pop(i)
+    return None
+
+
+def _told(box: str) -> str:
+    """Return what tyro's box of several lines says of bad arguments, in one line: its first part, without the help."""
+    lines = [line.strip("│╭╮╰╯─\n") for line in box.splitlines()[1:]]
+    first = list(itertools.takewhile(lambda line: line.strip(" ─"), lines))
+    return re.sub(r"\.$", "", " ".join(line.strip() for line in first if not line.startswith(" " * 6)))
+
+
+def _notes(kind: Any) -> list[Any]:
+    """Return the notes of an annotation, and of those within it."""
+    inner = get_args(kind)
+    own, kinds = (inner[1:], inner[:1]) if get_origin(kind) is Annotated else ((), inner)
+    return [*own, *(note for one in kinds for note in _notes(one))]
+
+
+def _takes(kind: Any) -> str:
+    """Return in capitals what a value of some kind is written as on the command line."""
+    inner = get_args(kind)
+    if get_origin(kind) is Annotated:
+        return next((note.metavar for note in inner[1:] if getattr(note, "metavar", None)), _takes(inner[0]))
+    if get_origin(kind) is Literal:
+        return f"{{{','.join(map(str, inner))}}}"
+    if get_origin(kind) is tuple:
+        return f"[{_takes(inner[0])} ...]" if inner[-1] is Ellipsis else " ".join(map(_takes, inner))
+    return _WORDS[kind] if kind in _WORDS else "|".join(_takes(one) for one in inner if one is not NoneType)
+
+
+def _words(value: Any) -> str:
+    """Return a value as the command line has it; nothing for None."""
+    return " ".join(map(_words, value)) if isinstance(value, tuple) else "" if value is None else str(value)
+
+
+def _yaml(options: Sequence[Option], indent: str) -> Iterator[str]:
+    """Yield the lines of options in a YAML file, below what they mean."""
+    note = f"{indent}# "
+    for one in options:
+        yield ""
+        yield from textwrap.wrap(one.meaning, 120, initial_indent=note, subsequent_indent=note)
+        if one.group:
+            yield f"{indent}{one.name}:"
+            yield from _yaml(one.group, f"{indent}  ")
+        elif one.required:
+            yield f"{note}{one.name}: {one.takes or _takes(one.kind)}  (required)"
+        else:
+            yield f"{indent}{one.name}: {json.dumps(one.value, default=str, ensure_ascii=False)}"
+
+
+def _line(text: str | None) -> str:
+    return " ".join((text or "").split())
+
+
+def _wrapped(text: str) -> str:
+    """Return paragraphs as wide as the terminal."""
+    width = min(shutil.get_terminal_size().columns, 120) - 2
+    return "\n\n".join(textwrap.fill(_line(part), width) for part in text.split("\n\n"))

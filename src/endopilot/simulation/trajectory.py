@@ -1,0 +1,187 @@
+"""What simulated devices did, sample by sample, and what they were simulated with: `Trajectory`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, Shaped
+
+from endopilot.devices.stack import Stack
+from endopilot.errors import InputError
+from endopilot.simulation.config import Actuation, SimulatorConfig
+from endopilot.simulation.motion import Motion
+from endopilot.types import Anatomy, TipProjection
+
+_REASONS = {1: "left the finite numbers", 2: "did not converge", 3: "went through the wall"}
+"""Meaning of `Trajectory.reason` for an invalid world."""
+
+
+@dataclass(frozen=True, eq=False)
+class SetUp:
+    """What worlds are simulated with. A `Simulator` made of it and the same commands give the same bits.
+
+    Attributes:
+        anatomies: the vessel of each world.
+        stacks: the devices of each world.
+        initial: Δ (mm) and φ (rad) that the devices are brought to before the first command; NaN in a world that was
+            on its way already.
+        friction: Coulomb coefficient of each device on the wall.
+        actuation: what commands are: "velocity" (mm/s, rad/s) or "force" (N, N·mm).
+        motion: how every vessel moves with time; None where they lie still.
+        config: settings of the rod core.
+    """
+
+    anatomies: Sequence[Anatomy]
+    stacks: Sequence[Stack]
+    initial: Float[np.ndarray, "worlds devices 2"]
+    friction: Float[np.ndarray, "worlds devices"]
+    actuation: Actuation
+    motion: Motion | None
+    config: SimulatorConfig
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """The recorded motion of the devices of simulated worlds, one sample every `period_s`.
+
+    Sample t is the state at the end of period t, and `command[:, t]` held over that period. Device 0 is the wire; the
+    catheters around it follow from the inside out. Positions and directions are those in the vessel as CT shows it.
+
+    Attributes:
+        set_up: what the worlds were simulated with.
+        period_s: time between samples, s.
+        start: Δ (mm) and φ (rad) of each device before the first period, as they truly were.
+        command: what the drives were asked for: dΔ/dt (mm/s) and dφ/dt (rad/s), or force (N) and torque (N·mm).
+        inserted_length: Δ, mm.
+        rotation: φ, rad.
+        tip_position: LPS mm.
+        tip_direction: unit vector along the device at its tip.
+        tip: Δtip, γtip, branch and lumen radius at each sample.
+        base_force: axial force that holds the device where it enters, N, positive when it pushes.
+        base_torque: torque that holds it there, about its axis, N·mm.
+        drive_force: axial force of the drive, N: `base_force` and what the introducer's valve takes.
+        drive_torque: torque of the drive, N·mm, likewise.
+        slip: advance that was commanded and not made in the period, mm; 0 unless the drive slipped, and negative
+            where it pulled or the device was out already.
+        rotation_slip: rotation that was commanded and not made in the period, rad.
+        contact_force_max: largest wall force on one node, N.
+        contact_force_sum: sum of the wall forces' magnitudes, N.
+        wall_force: largest resultant of the wall's forces on any 2 mm of the line that the devices share, N. It does
+            not depend on the number of elements, as the force on a node does: neighbouring nodes share one contact.
+        iterations: mean Newton iterations a time step over the period.
+        node_iterations: evaluations of active nodes in the period: for each Newton iteration, also those of attempts
+            that were given up, the nodes ahead of the guiding catheter.
+        valid: false from the sample in which a world failed to converge or left the finite numbers.
+        reason: why a world became invalid: 0 it is valid, 1 it left the finite numbers, 2 it did not converge,
+            3 the wire went through the wall.
+        shape: positions of all nodes from the foremost tip to the base, LPS mm, if they were recorded; NaN beyond the
+            nodes of a shorter wire.
+        vessel_to_laboratory: where a vessel that moves lies: affine maps of its points, as CT shows them, to the
+            laboratory, LPS mm; None where it lies still.
+        columns: further signals by name.
+        about: what else is to be known, as plain JSON values.
+    """
+
+    set_up: SetUp
+    period_s: float
+    start: Float[np.ndarray, "worlds devices 2"]
+    command: Float[np.ndarray, "worlds samples devices 2"]
+    inserted_length: Float[np.ndarray, "worlds samples devices"]
+    rotation: Float[np.ndarray, "worlds samples devices"]
+    tip_position: Float[np.ndarray, "worlds samples devices 3"]
+    tip_direction: Float[np.ndarray, "worlds samples devices 3"]
+    tip: TipProjection
+    base_force: Float[np.ndarray, "worlds samples devices"]
+    base_torque: Float[np.ndarray, "worlds samples devices"]
+    drive_force: Float[np.ndarray, "worlds samples devices"]
+    drive_torque: Float[np.ndarray, "worlds samples devices"]
+    slip: Float[np.ndarray, "worlds samples devices"]
+    rotation_slip: Float[np.ndarray, "worlds samples devices"]
+    contact_force_max: Float[np.ndarray, "worlds samples"]
+    contact_force_sum: Float[np.ndarray, "worlds samples"]
+    wall_force: Float[np.ndarray, "worlds samples"]
+    iterations: Float[np.ndarray, "worlds samples"]
+    node_iterations: Float[np.ndarray, "worlds samples"]
+    valid: Bool[np.ndarray, "worlds samples"]
+    reason: Int[np.ndarray, "worlds"]
+    shape: Float[np.ndarray, "worlds samples nodes 3"] | None = None
+    vessel_to_laboratory: Float[np.ndarray, "worlds samples 3 4"] | None = None
+    columns: dict[str, Shaped[np.ndarray, "worlds samples ..."]] = field(default_factory=dict)
+    about: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def devices(self) -> int:
+        """Number of devices."""
+        return self.command.shape[2]
+
+    @cached_property
+    def proximal(self) -> Float[np.ndarray, "worlds samples devices 2"]:
+        """Δ (mm) and φ (rad) at each sample."""
+        return np.stack([self.inserted_length, self.rotation], axis=-1)
+
+    @cached_property
+    def control(self) -> Float[np.ndarray, "worlds samples devices 2"]:
+        """π, what was made of the commands: mean dΔ/dt (mm/s) and dφ/dt (rad/s) over each period."""
+        if self.set_up.actuation == "velocity":
+            return self.command - np.stack([self.slip, self.rotation_slip], axis=-1) / self.period_s
+        return np.diff(self.proximal, axis=1, prepend=self.start[:, None]) / self.period_s
+
+    def why_invalid(self, world: int) -> str:
+        """Return why and when a world became invalid, such as "did not converge after 12.5 s"."""
+        seconds = self.period_s * float(np.argmin(self.valid[world]))
+        return f"{_REASONS[int(self.reason[world])]} after {seconds:g} s"
+
+    def replay(self, **changed: Any) -> Trajectory:
+        """Simulate the same commands again from the same start; what nothing changes comes out the same to the bit.
+
+        Args:
+            changed: attributes of `SetUp` that are to be others, such as `config`, `motion` or `friction`.
+
+        Raises:
+            InputError: a world was on its way already when the recording began, or its vessel is not given.
+        """
+        from endopilot.simulation.simulate import run_set_up  # which returns trajectories
+
+        set_up = replace(self.set_up, **changed)
+        if np.isnan(set_up.initial).any():
+            raise InputError("replay: a world was on its way when the recording began; record from its start")
+        if not set_up.anatomies:
+            raise InputError("replay: the vessel is not given; read the trajectory with its anatomy")
+        again = run_set_up(set_up, self.command, period_s=self.period_s, record_shape=self.shape is not None)
+        return replace(again, columns=self.columns, about=self.about)
+
+    def samples(self, chosen: slice) -> Trajectory:
+        """Return the trajectory with some of its samples; the first of them must be kept for it to be replayed."""
+        return self._each(lambda values: values[:, chosen])
+
+    def every(self, count: int) -> Trajectory:
+        """Return the trajectory with every so many-th sample: commands and controls are means over its periods."""
+        ends = self.samples(slice(count - 1, None, count))
+
+        def whole(values: np.ndarray) -> np.ndarray:
+            kept = values[:, : count * (values.shape[1] // count)]
+            return kept.reshape(len(values), -1, count, *values.shape[2:])
+
+        return replace(
+            ends,
+            period_s=count * self.period_s,
+            command=whole(self.command).mean(axis=2),
+            slip=whole(self.slip).sum(axis=2),
+            rotation_slip=whole(self.rotation_slip).sum(axis=2),
+            iterations=whole(self.iterations).mean(axis=2),
+            node_iterations=whole(self.node_iterations).sum(axis=2),
+        )
+
+    def _each(self, take: Callable[[np.ndarray], np.ndarray]) -> Trajectory:
+        """Return the trajectory with every array of samples taken from."""
+        chosen: dict[str, Any] = {
+            each.name: take(value)
+            for each in fields(self)
+            if each.name not in ("start", "reason") and isinstance(value := getattr(self, each.name), np.ndarray)
+        }
+        tip = TipProjection(**{name: take(getattr(self.tip, name)) for name in TipProjection.__dataclass_fields__})
+        return replace(self, tip=tip, columns={name: take(each) for name, each in self.columns.items()}, **chosen)

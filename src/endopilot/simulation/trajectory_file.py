@@ -1,0 +1,231 @@
+"""Trajectories as files and tables.
+
+=======================  ==========================================================================================
+suffix                   content
+=======================  ==========================================================================================
+`.npz`                   everything, to the bit: one array a signal, as `Trajectory` names them, and `about`, JSON text
+                         with each array's axes, unit and meaning, the devices, the settings and the identity of each
+                         vessel. `numpy.load` opens it; `read_trajectory` reads it back, and it is replayed.
+`.csv`, `.parquet`       a row for each world and sample, for people and other programs; columns end in their units
+=======================  ==========================================================================================
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from zipfile import BadZipFile
+
+import numpy as np
+
+from endopilot import _core
+from endopilot.devices.catheter import Catheter
+from endopilot.devices.device import Device
+from endopilot.devices.stack import Stack, column_prefixes
+from endopilot.errors import InputError
+from endopilot.extras import extra_named
+from endopilot.files import json_text, writing
+from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.motion import Motion, place
+from endopilot.simulation.trajectory import SetUp, Trajectory
+from endopilot.types import Anatomy, TipProjection
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+FORMAT_VERSION = 1
+"""Of the .npz file: raised when an array comes to mean something else."""
+_MEANING = {
+    "command": ("worlds samples devices 2", "mm/s and rad/s, or N and N·mm", "what the drives were asked for"),
+    "start": ("worlds devices 2", "mm and rad", "inserted length and rotation before the first period"),
+    "initial": (
+        "worlds devices 2",
+        "mm and rad",
+        "what devices were brought to before; NaN where worlds were on their way",
+    ),
+    "friction": ("worlds devices", "", "Coulomb coefficient on the wall"),
+    "tip_abscissa": ("worlds samples devices", "mm", "of the tip's projection, from the ostium along the centerline"),
+    "tip_offset": ("worlds samples devices", "mm", "of the tip from the centerline"),
+    "tip_branch": ("worlds samples devices", "", "index of the branch that the tip lies in"),
+    "tip_radius": ("worlds samples devices", "mm", "of the lumen at the tip's projection"),
+    "reason": ("worlds", "", "0 valid, 1 left the finite numbers, 2 did not converge, 3 went through the wall"),
+    "shape": ("worlds samples nodes 3", "mm", "of all nodes from the foremost tip on, LPS"),
+    "vessel_to_laboratory": ("worlds samples 3 4", "", "affine map of the moving vessel's points, LPS mm"),
+}
+"""Axes, unit and meaning of the arrays that the core does not record."""
+_AXES = {"device": "worlds samples devices", "sample": "worlds samples"}
+_TABLE = (
+    ("inserted_length", "inserted_length_mm"),
+    ("rotation", "rotation_rad"),
+    ("tip.abscissa", "tip_abscissa_mm"),
+    ("tip.offset", "tip_offset_mm"),
+    ("tip.branch", "branch"),
+    ("tip.radius", "lumen_radius_mm"),
+    ("base_force", "base_force_n"),
+    ("base_torque", "base_torque_nmm"),
+    ("drive_force", "drive_force_n"),
+    ("drive_torque", "drive_torque_nmm"),
+    ("slip", "slip_mm"),
+    ("rotation_slip", "rotation_slip_rad"),
+)
+"""Signals of a device, and their columns in a table."""
+
+
+def trajectory_table(trajectory: Trajectory) -> pd.DataFrame:
+    """Return one row for each world and sample; column names end in their units where they have one.
+
+    Columns of the wire have plain names; those of catheters begin with `catheter_1_` and `catheter_2_`.
+    """
+    import pandas as pd
+
+    worlds, samples = trajectory.valid.shape
+    columns: dict[str, np.ndarray] = {
+        "world": np.repeat(np.arange(worlds), samples),
+        "time_s": np.tile((np.arange(samples) + 1) * trajectory.period_s, worlds),
+    }
+    for k, prefix in enumerate(column_prefixes(trajectory.devices)):
+        columns[f"{prefix}translation_mm_s"] = trajectory.control[:, :, k, 0]
+        columns[f"{prefix}rotation_rad_s"] = trajectory.control[:, :, k, 1]
+        for signal, column in _TABLE:
+            owner, _, name = signal.rpartition(".")
+            columns[prefix + column] = getattr(trajectory.tip if owner else trajectory, name)[:, :, k]
+        for i, axis in enumerate("xyz"):
+            columns[f"{prefix}tip_{axis}_mm"] = trajectory.tip_position[:, :, k, i]
+            columns[f"{prefix}tip_direction_{axis}"] = trajectory.tip_direction[:, :, k, i]
+    columns |= {
+        "contact_force_max_n": trajectory.contact_force_max,
+        "contact_force_sum_n": trajectory.contact_force_sum,
+        "wall_force_n": trajectory.wall_force,
+        "newton_iterations": trajectory.iterations,
+        "valid": trajectory.valid,
+    }
+    if trajectory.vessel_to_laboratory is not None:
+        shown = place(trajectory.vessel_to_laboratory, trajectory.tip_position[:, :, 0])
+        columns |= {f"tip_laboratory_{axis}_mm": shown[..., i] for i, axis in enumerate("xyz")}
+    columns |= {name: values for name, values in trajectory.columns.items() if values.shape == (worlds, samples)}
+    return pd.DataFrame({name: np.asarray(values).reshape(-1) for name, values in columns.items()})
+
+
+def write_trajectory(trajectory: Trajectory, path: Path) -> None:
+    """Write a trajectory as the module describes, whole or not at all.
+
+    Raises:
+        InputError: another suffix, or shapes for a table.
+        ModuleNotFoundError: .parquet without the extra `learn`.
+    """
+    path = Path(path)
+    if path.suffix not in (".parquet", ".csv", ".npz"):
+        raise InputError(f"{path}: a trajectory is written as .parquet, .csv or .npz; choose one of these suffixes")
+    if trajectory.shape is not None and path.suffix != ".npz":
+        raise InputError(f"{path}: wire shapes do not fit a table; write them as .npz")
+    if path.suffix == ".parquet":
+        with extra_named(f"{path}"):
+            pass  # with which pandas writes it
+    with writing(path) as partial:
+        if path.suffix == ".parquet":
+            trajectory_table(trajectory).to_parquet(partial, index=False)
+        elif path.suffix == ".csv":
+            trajectory_table(trajectory).to_csv(partial, index=False)
+        else:
+            arrays = _arrays(trajectory)
+            with partial.open("wb") as stream:
+                np.savez_compressed(stream, about=np.array(_about(trajectory, arrays)), **arrays)  # pyright: ignore[reportArgumentType]
+
+
+def read_trajectory(path: Path | str, anatomy: Anatomy | Sequence[Anatomy] | None = None) -> Trajectory:
+    """Read a trajectory from an .npz file.
+
+    Args:
+        path: the file.
+        anatomy: the vessel of all worlds, or one for each; without it the trajectory is not replayed or plotted.
+
+    Raises:
+        InputError: no such file, or one that is no trajectory, of another version, or of another vessel.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            about = json.loads(str(stored["about"]))
+            arrays = {name: stored[name] for name in stored.files if name != "about"}
+        if about.get("format") != _FORMAT:
+            raise KeyError("format")
+    except (OSError, ValueError, KeyError, BadZipFile, AttributeError) as error:
+        raise InputError(f"{path}: no trajectory ({error}); give a file that Trajectory.write made") from None
+    if about["version"] != FORMAT_VERSION:
+        raise InputError(f"{path}: format version {about['version']}, not {FORMAT_VERSION}; simulate it again")
+    vessels = _vessels(path, about, anatomy)
+    made = [_stack(each) for each in about["stacks"]]
+    set_up = SetUp(
+        anatomies=vessels,
+        stacks=[made[k] for k in about["stack_of_world"]],
+        initial=arrays.pop("initial"),
+        friction=arrays.pop("friction"),
+        actuation=about["actuation"],
+        motion=None if about["motion"] is None else Motion(**about["motion"]),
+        config=SimulatorConfig(**about["config"]),
+    )
+    tip = TipProjection(**{name: arrays.pop(f"tip_{name}") for name in TipProjection.__dataclass_fields__})
+    names = {each.name for each in fields(Trajectory)}
+    own = {name: values for name, values in arrays.items() if name in names}
+    columns = {name.removeprefix("column."): values for name, values in arrays.items() if name.startswith("column.")}
+    return Trajectory(set_up=set_up, period_s=about["period_s"], tip=tip, columns=columns, about=about["about"], **own)
+
+
+_FORMAT = "endopilot trajectory"
+
+
+def _arrays(trajectory: Trajectory) -> dict[str, np.ndarray]:
+    arrays: dict[str, np.ndarray] = {
+        each.name: value
+        for each in fields(trajectory)
+        if isinstance(value := getattr(trajectory, each.name), np.ndarray)
+    }
+    arrays |= {f"tip_{name}": getattr(trajectory.tip, name) for name in TipProjection.__dataclass_fields__}
+    arrays |= {f"column.{name}": values for name, values in trajectory.columns.items()}
+    return arrays | {"initial": trajectory.set_up.initial, "friction": trajectory.set_up.friction}
+
+
+def _about(trajectory: Trajectory, arrays: Mapping[str, np.ndarray]) -> str:
+    """Return what the arrays mean and what they were simulated with, as JSON."""
+    set_up, meaning = trajectory.set_up, dict(_MEANING)
+    for name, of, numbers, unit, words in _core.OUTPUTS:
+        if name in arrays and name not in meaning:
+            meaning[name] = (_AXES[of] + (f" {numbers}" if numbers > 1 else ""), unit, words)
+    stacks = list({id(stack): stack for stack in set_up.stacks}.values())
+    number = {id(stack): k for k, stack in enumerate(stacks)}
+    content = {
+        "format": _FORMAT,
+        "version": FORMAT_VERSION,
+        "period_s": trajectory.period_s,
+        "arrays": {
+            name: dict(zip(("axes", "unit", "meaning"), meaning[name], strict=True))
+            for name in arrays
+            if name in meaning
+        },
+        "actuation": set_up.actuation,
+        "motion": None if set_up.motion is None else asdict(set_up.motion),
+        "config": asdict(set_up.config),
+        "stacks": [asdict(stack) for stack in stacks],
+        "stack_of_world": [number[id(stack)] for stack in set_up.stacks],
+        "anatomies": [{"name": vessel.name, "identity": vessel.identity} for vessel in set_up.anatomies],
+        "about": trajectory.about,
+    }
+    return json_text(content)
+
+
+def _stack(described: Mapping[str, Any]) -> Stack:
+    catheters = [Catheter(**{**each, "device": Device(**each["device"])}) for each in described["catheters"]]
+    return Stack(Device(**described["wire"]), tuple(catheters))
+
+
+def _vessels(path: Path | str, about: Mapping[str, Any], anatomy: Anatomy | Sequence[Anatomy] | None) -> list[Anatomy]:
+    wanted = about["anatomies"]
+    if anatomy is None:
+        return []
+    given = [anatomy] * len(wanted) if isinstance(anatomy, Anatomy) else list(anatomy)
+    for world, each in enumerate(wanted):
+        if world >= len(given) or given[world].identity != each["identity"]:
+            raise InputError(f"{path}: world {world} is of another vessel, {each['name']!r}; give that anatomy")
+    return given

@@ -1,0 +1,161 @@
+"""A wire and a catheter in closed loop: drives of their own, policies that drive both, and what takes a wire alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from endopilot.devices.catheter import Catheter, read_catheter
+from endopilot.devices.drive_limits import DriveLimits
+from endopilot.errors import InputError
+from endopilot.ladder.attempt import Recording, Repeated, attempt, repeat
+from endopilot.navigation.baseline_policies import BEHIND_MM, LEAD_MM, CatheterAlone, InTurn
+from endopilot.navigation.navigate import NavigateConfig, NavigationLoop, navigate, start_world
+from endopilot.navigation.policy import Decision, Hand, Observation
+from endopilot.robot.robot import CYCLE_S, RobotConfig, SimulatedRobot
+from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.mismatch import ModelMismatch
+from endopilot.simulation.simulate import simulate
+from endopilot.tasks.navigation import Navigation, Target
+
+COARSE = NavigateConfig(simulator=SimulatorConfig(element_mm=1.5, time_step_s=0.05, threads=1))
+
+
+@pytest.fixture(scope="module")
+def catheter() -> Catheter:
+    return read_catheter("microcatheter-1.7f")
+
+
+@pytest.fixture
+def over_the_wire(fork, wire, catheter) -> Navigation:
+    """Return a target before the fork to which the catheter's tip is to go."""
+    return Navigation(
+        anatomy=fork,
+        device=wire,
+        target=Target(branch=0, abscissa=17.0),
+        catheters=(catheter,),
+        arrives="catheter",
+        seconds=30.0,
+    )
+
+
+def test_wire_and_catheter_are_driven_by_drives_of_their_own(over_the_wire) -> None:
+    simulator = start_world(over_the_wire, ModelMismatch(), COARSE.simulator)
+    limits = [DriveLimits.of(device, over_the_wire.anatomy) for device in over_the_wire.devices]
+    noiseless = RobotConfig(encoder_sd_mm=0.0, encoder_sd_rad=0.0, backlash_mm=0.0, backlash_rad=0.0)
+    robot = SimulatedRobot(simulator, limits, noiseless)
+    robot.command(((4.0, 0.0), (2.0, 0.5)))
+    robot.run(2.0)
+    state = robot.proximal_state()
+    # v (t - latency) less v²/2a of the ramp
+    assert state.devices[0] == pytest.approx((2.0 + 4.0 * 1.95 - 4.0**2 / 400.0, 0.0), abs=1e-6)
+    assert state.devices[1] == pytest.approx((2.0 * 1.95 - 2.0**2 / 400.0, 0.5 * 1.95 - 0.5**2 / 120.0), abs=1e-6)
+    assert robot.velocity == pytest.approx(np.array([[4.0, 0.0], [2.0, 0.5]]))
+    robot.command(((4.0, 0.0),))  # a catheter that is not named stops
+    robot.run(1.0)
+    assert robot.velocity == pytest.approx(np.array([[4.0, 0.0], [0.0, 0.0]]))
+    robot.stop()
+    robot.run(0.5)
+    before = robot.proximal_state()
+    robot.run(0.5)
+    assert robot.proximal_state().devices[1] == before.devices[1]
+    noisy = SimulatedRobot(simulator, limits, RobotConfig(), seed=1).proximal_state()
+    errors = [now[0] - then[0] for now, then in zip(noisy.devices, before.devices, strict=True)]
+    assert errors[0] != errors[1] and 0 < max(map(abs, errors)) < 0.2
+
+
+def test_the_catheter_follows_in_turn_and_the_same_controls_simulate_the_same(over_the_wire) -> None:
+    record = navigate(over_the_wire, "in-turn", config=COARSE, seed=1)
+    assert record.reason == "reached" and record.faults == 0
+    periods = len(record.time_s) - 1
+    assert record.control.shape == (periods + 1, 2, 2) and record.driven.shape == (10 * periods, 2, 2)
+    assert record.inserted_length.shape == record.rotation.shape == record.tip.abscissa.shape == (periods + 1, 2)
+    inserted, catheter = record.inserted_length.T
+    assert (np.diff(inserted) > -0.1).all()  # the wire is not pulled out
+    assert catheter[-1] > 15.0 and (inserted - catheter).max() < LEAD_MM + 5.0
+    moving = (np.abs(record.control[..., 0]) > 0).sum(axis=1)
+    assert moving.max() == 1  # one at a time
+    again = simulate(
+        over_the_wire.anatomy,
+        over_the_wire.device,
+        record.driven.reshape(1, -1, 4),
+        catheters=over_the_wire.catheters,
+        initial=np.array([[inserted[0], 0.0, 0.0, 0.0]]),
+        config=COARSE.simulator,
+        period_s=CYCLE_S,
+    )
+    np.testing.assert_allclose(again.tip_position[0, 9::10], record.tip_position[1:, 0], atol=1e-5)
+    assert again.catheters is not None
+    np.testing.assert_allclose(again.catheters.inserted_length[0, 9::10, 0], catheter[1:], atol=1e-9)
+
+
+def test_a_catheter_that_a_policy_does_not_name_stands_still(over_the_wire) -> None:
+    wire_first = replace(over_the_wire, arrives="wire")
+    record = navigate(wire_first, "forward", config=COARSE)
+    assert record.reason == "reached" and np.ptp(record.inserted_length[:, 1]) == 0.0
+    assert not record.control[:, 1].any() and record.faults == 0
+    # the wire alone does not bring the catheter's tip there
+    assert navigate(over_the_wire, "forward", config=COARSE).reason == "time"
+
+
+def test_orders_are_kept_within_each_drive_s_limits(over_the_wire, catheter) -> None:
+    class Wild:
+        def start(self, navigation, seed): ...
+
+        def decide(self, observation: Observation) -> Decision:
+            assert len(observation.devices) == 2
+            return Decision(((0.0, 0.0), (1e9, np.nan)))
+
+    loop = NavigationLoop(over_the_wire, Wild(), config=COARSE)
+    assert loop.step().devices == ((0.0, 0.0), (0.0, 0.0))
+    loop.hand_over(Hand(((1.0, 0.0), (1e9, 0.0), (1.0, 1.0))))
+    assert loop.step().devices == ((1.0, 0.0), (catheter.device.max_velocity_mm_s, 0.0))
+    assert loop.record().faults == 2
+
+
+def test_the_turns_depend_on_the_encoders_alone(over_the_wire) -> None:
+    policy = InTurn()
+    policy.start(replace(over_the_wire, arrives="wire"), 0)
+
+    def who(wire: float, catheter: float) -> str:
+        decision = policy.decide(Observation(0.0, ((wire, 0.0), (catheter, 0.0)), None))
+        return next((who for who, (v, _) in zip(("wire", "catheter"), decision.devices, strict=False) if v > 0), "none")
+
+    assert who(5.0, 0.0) == "wire" and who(36.0, 0.0) == "wire"
+    assert who(5.0 + LEAD_MM, 5.0) == "catheter"
+    assert who(36.0, 20.0) == "catheter"  # it goes on to behind the wire's tip
+    assert who(36.0, 36.5 - BEHIND_MM) == "wire"
+    assert who(37.0, 27.5) == "none"  # 20 mm deeper than the target
+    alone = CatheterAlone()
+    alone.start(over_the_wire, 0)
+    decisions = [alone.decide(Observation(0.0, ((5.0, 0.0), (at, 0.0)), None)) for at in (0.0, 5.1, 60.0)]
+    assert [(d.devices[0][0] > 0, d.devices[1][0] > 0) for d in decisions] == [
+        (False, True),
+        (True, True),
+        (False, False),
+    ]
+
+
+def test_a_recording_of_both_is_driven_again_to_the_bit(over_the_wire) -> None:
+    done = attempt("in-turn", over_the_wire, seed=3)
+    recording = Recording.unpacked(done["recording"], 2)
+    figures = repeat(recording, over_the_wire, seed=3)
+    assert figures == {name: done[name] for name in figures}
+    assert len(Repeated(recording).decide(Observation(0.0, (), None)).devices) == 2
+    with pytest.raises(InputError, match="control: "):
+        Recording.unpacked(done["recording"])
+
+
+def test_what_takes_a_wire_alone_says_so(over_the_wire) -> None:
+    line = "takes a wire alone, and there is microcatheter-1.7f around it; leave the catheter out"
+    for policy in ("agent", "twin", "open-loop"):
+        with pytest.raises(InputError, match=line):
+            navigate(over_the_wire, policy, config=COARSE)
+    with pytest.raises(InputError, match=line):
+        navigate(over_the_wire, "in-turn", config=replace(COARSE, xray="images"))
+    alone = replace(over_the_wire, catheters=(), arrives="wire")
+    for policy in ("in-turn", "catheter-alone"):
+        with pytest.raises(InputError, match="policy: drives a catheter too, and there is none"):
+            navigate(alone, policy, config=COARSE)
