@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from endopilot.cli import COMMANDS, commands_of
+from endopilot.cli import COMMANDS, command_of
 from endopilot.cli.options import Command, Option
 
 PAGE = Path(__file__).with_suffix(".md")
@@ -22,11 +22,8 @@ def page() -> str:
 
 
 def _section(name: str) -> str:
-    """Return the section about a command, with a part for each of its subjects if it has some."""
-    parts = [f"## endopilot {name}"]
-    for subject, command in commands_of(name).items():
-        parts += ([f"### endopilot {name} {subject}"] if subject else []) + list(_described(command))
-    return "\n\n".join(parts)
+    """Return the section about a command."""
+    return "\n\n".join([f"## endopilot {name}", *_described(command_of(name))])
 
 
 def _described(command: Command) -> Iterable[str]:

@@ -64,8 +64,8 @@ def clone(sessions: list[Path], folder: Path) -> torch.nn.Module:
         write_session_episode(session, folder / f"episode-{number}")
         data = load_dataset(folder / f"episode-{number}")
         target_mm = data.manifest["settings"]["target_mm"]
-        seen.append(features(target_mm - data.tip_abscissa[0, :-1], data.tip_offset[0, :-1]))
-        done.append(torch.tensor(data.control[0, 1:] / SCALE, dtype=torch.float32))
+        seen.append(features(target_mm - data.tip_abscissa[0, :-1, 0], data.tip_offset[0, :-1, 0]))
+        done.append(torch.tensor(data.control[0, 1:, 0] / SCALE, dtype=torch.float32))
     inputs, wanted = torch.cat(seen), torch.cat(done)
     torch.manual_seed(0)
     network = torch.nn.Sequential(torch.nn.Linear(3, 32), torch.nn.Tanh(), torch.nn.Linear(32, 2))

@@ -17,7 +17,9 @@ from endopilot.anatomy.io import write_anatomy
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.generate import generate_dataset
 from endopilot.devices.device import read_device
+from endopilot.devices.stack import Stack
 from endopilot.files import read_json, write_json
+from endopilot.simulation.trajectory import SetUp, Trajectory
 from endopilot.types import (
     SAMPLE_PERIOD_S,
     Anatomy,
@@ -25,7 +27,6 @@ from endopilot.types import (
     Centerline,
     DistanceMap,
     Insertion,
-    Rollout,
     TipProjection,
     VesselTree,
 )
@@ -51,50 +52,49 @@ def toy_anatomy(name: str) -> Anatomy:
 
 def toy_simulate(
     anatomy: Anatomy, device, control, *, initial, config, friction, motion=None, record_shape=False
-) -> Rollout:
+) -> Trajectory:
     """Return what the toy wire does under the controls; takes what `simulate` takes."""
-    worlds, samples, _ = control.shape
+    worlds, samples = control.shape[:2]
+    control, initial = control.reshape(worlds, samples, 1, 2), initial.reshape(worlds, 1, 2)
+    stack, friction = Stack.of(device), friction.reshape(worlds, 1)
     proximal = initial[:, None] + SAMPLE_PERIOD_S * np.cumsum(control, axis=1)
-    advance = np.diff(proximal[..., 0], axis=1, prepend=initial[:, :1])
+    inserted, rotation = proximal[..., 0], proximal[..., 1]
+    advance = np.diff(inserted, axis=1, prepend=initial[:, None, :, 0])
     curliness = 0.02 + 0.005 * (len(anatomy.name) % 3)
-    slack = np.zeros((worlds, samples))
-    now = curliness * initial[:, 0]
+    slack = np.zeros((worlds, samples, 1))
+    now = curliness * initial[..., 0]
     for t in range(samples):
-        low = curliness * np.maximum(proximal[:, t, 0], 0)
+        low = curliness * np.maximum(inserted[:, t], 0)
         now = np.clip(now + SLACK_RATE * advance[:, t], low, low + 1.5)
         slack[:, t] = now
-    abscissa = proximal[..., 0] - slack
-    offset = 0.8 + 0.5 * np.sin(0.1 * abscissa + proximal[..., 1])
-    force = 0.01 * slack
-    return Rollout(
-        sample_period_s=SAMPLE_PERIOD_S,
-        initial_inserted_length=initial[:, 0],
-        initial_rotation=initial[:, 1],
-        control=control,
-        inserted_length=proximal[..., 0],
-        rotation=proximal[..., 1],
-        tip_position=np.stack([abscissa, offset, np.zeros_like(offset)], axis=-1),
-        tip_direction=np.tile([1.0, 0.0, 0.0], (worlds, samples, 1)),
-        tip=TipProjection(
-            abscissa=abscissa,
-            offset=offset,
-            branch=np.zeros((worlds, samples), dtype=np.int64),
-            radius=np.full((worlds, samples), 1.5),
-        ),
-        contact_force_max=force,
-        contact_force_sum=2 * force,
-        wall_force=force,
+    abscissa = inserted - slack
+    offset = 0.8 + 0.5 * np.sin(0.1 * abscissa + rotation)
+    force, still = 0.01 * slack, np.zeros_like(slack)
+    branch = np.zeros((worlds, samples, 1), dtype=np.int64)
+    return Trajectory(
+        set_up=SetUp([anatomy] * worlds, [stack] * worlds, initial, friction, "velocity", motion, config),
+        period_s=SAMPLE_PERIOD_S,
+        start=initial,
+        command=control,
+        inserted_length=inserted,
+        rotation=rotation,
+        tip_position=np.stack([abscissa, offset, still], axis=-1),
+        tip_direction=np.tile([1.0, 0.0, 0.0], (worlds, samples, 1, 1)),
+        tip=TipProjection(abscissa=abscissa, offset=offset, branch=branch, radius=still + 1.5),
+        contact_force_max=force[..., 0],
+        contact_force_sum=2 * force[..., 0],
+        wall_force=force[..., 0],
         base_force=force.copy(),
         base_torque=0.1 * force,
         drive_force=force + 0.05,
         drive_torque=0.1 * force + 0.01,
-        slip=np.zeros((worlds, samples)),
-        rotation_slip=np.zeros((worlds, samples)),
+        slip=still,
+        rotation_slip=still,
         iterations=np.ones((worlds, samples)),
         node_iterations=np.ones((worlds, samples)),
         valid=np.ones((worlds, samples), dtype=bool),
         reason=np.zeros(worlds, dtype=int),
-        shape=_straight(abscissa, offset) if record_shape else None,
+        shape=_straight(abscissa[..., 0], offset[..., 0]) if record_shape else None,
     )
 
 
@@ -118,13 +118,11 @@ def write_toy_anatomies(folder: Path, patients: int) -> list[Path]:
 def toy_navigate(simulate=toy_simulate):
     """Return a stand-in for `simulate_navigations`: the drawn controls, driven as they are through the toy."""
 
-    def simulate_navigations(
-        anatomy, devices, initial, control, friction, config, *, catheters, actuation, motion, advance
-    ):
+    def simulate_navigations(anatomy, stacks, initial, control, friction, config, *, actuation, motion, advance):
         control = control.astype(np.float32).astype(float)
-        rollout = simulate(anatomy, devices[0], control, initial=initial, config=config, friction=friction)
+        trajectory = simulate(anatomy, stacks[0], control, initial=initial, config=config, friction=friction)
         advance(control.shape[0] * control.shape[1])
-        return rollout, initial, control, np.zeros(len(control), dtype=bool)
+        return trajectory, np.zeros(len(control), dtype=bool)
 
     return simulate_navigations
 

@@ -6,13 +6,12 @@ compared with the truth. In some patients of each task the spread is fitted, and
 that the ladder is scored on test whether the bands hold. With KIND `assumed`, the default, exposures have the assumed
 errors and patients lie at rest. With `images` the tip is found in X-ray images of patients whose pose is registered,
 in the coronary tasks, and heart and breath move each patient by amplitudes of their own, of which the published mean
-is known; the bands of `assumed` are scaled anew. With `coaxial` the coaxial agent drives wire and catheter in the
-coaxial tasks, as in `assumed` otherwise.
+is known; the bands of `assumed` are scaled anew. With `coaxial` the agent drives wire and catheter in the coaxial
+tasks, as in `assumed` otherwise.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -23,8 +22,7 @@ from tyro.conf import Positional
 
 from benchmarks.figures import fill
 from endopilot.belief.bands import Calibration, conformal_scale, fit_spread, narrowest, spread_of
-from endopilot.control.agent import CALIBRATED, CALIBRATIONS, AdviserInput, AgentConfig, AgentPolicy
-from endopilot.control.coaxial_agent import COAXIAL_CALIBRATED, CoaxialAgent, CoaxialAgentConfig
+from endopilot.control.agent import CALIBRATIONS, IN_CATHETER, AgentConfig, AgentPolicy
 from endopilot.files import read_json, write_json
 from endopilot.ladder.ladder import identity
 from endopilot.navigation.navigate import NavigateConfig, navigate
@@ -45,7 +43,6 @@ class Kind:
     """What is calibrated.
 
     Attributes:
-        policy: name of the agent in the ladder.
         config: its settings.
         version: of the ladder; `tasks` are those of it that count.
         roles: places of the patients in a task's lists: in the training list, and for the test in the ladder's.
@@ -54,8 +51,7 @@ class Kind:
         whose: whose patients they are, in words.
     """
 
-    policy: str
-    config: AgentConfig | CoaxialAgentConfig
+    config: AgentConfig
     version: LadderVersion
     tasks: tuple[Task, ...]
     roles: dict[str, range]
@@ -66,42 +62,37 @@ class Kind:
 
 KINDS: dict[KindName, Kind] = {
     "assumed": Kind(
-        policy="agent",
         config=AgentConfig(),
         version=NEWEST,
         tasks=ladder_tasks(),
         roles={"fit": range(4), "calibrate": range(4, 9), "test": range(3)},
-        folder=CALIBRATIONS["assumed"],
+        folder=CALIBRATIONS["assumed", 1],
         mark="agent",
         whose="the ladder's tasks",
     ),
     "images": Kind(
-        policy="agent",
         config=AgentConfig(),
         version=NEWEST,
         tasks=tuple(task for task in ladder_tasks() if task.anatomy in ("rca", "lca")),
         roles={"calibrate": range(2)},
-        folder=CALIBRATIONS["images"],
+        folder=CALIBRATIONS["images", 1],
         mark="agent-images",
         whose="the ladder's coronary tasks",
     ),
     "coaxial": Kind(
-        policy="coaxial-agent",
-        config=CoaxialAgentConfig(),
+        config=IN_CATHETER,
         version="coaxial",
         tasks=ladder_tasks("coaxial"),
         roles={"fit": range(3), "calibrate": range(3, 7), "test": range(3)},
-        folder=COAXIAL_CALIBRATED,
+        folder=CALIBRATIONS["assumed", 2],
         mark="agent-coaxial",
         whose="the ladder's coaxial tasks",
     ),
 }
 
 
-class _Monitored:
-    """A policy with exposures at fixed times; it keeps every prediction."""
-
-    adviser_input: Callable[[], AdviserInput]
+class MonitoredAgent(AgentPolicy):
+    """The agent with exposures at fixed times, and where a manoeuvre has led; it keeps every prediction."""
 
     def start(self, navigation: Navigation, seed: int) -> None:
         """Begin a navigation without predictions."""
@@ -116,16 +107,8 @@ class _Monitored:
         return decision
 
     def wants_xray(self) -> bool:
-        """Ask for X-ray at the fixed times."""
-        return (len(self.kept) + 1) % EXPOSED_EVERY == 0
-
-
-class MonitoredAgent(_Monitored, AgentPolicy):
-    """The agent, monitored."""
-
-
-class MonitoredCoaxialAgent(_Monitored, CoaxialAgent):
-    """The coaxial agent, monitored; besides, it looks where each waypoint's end has led, as it always does."""
+        """Ask for X-ray at the fixed times, and where a manoeuvre is over."""
+        return (len(self.kept) + 1) % EXPOSED_EVERY == 0 or self._shows
 
 
 def truth_of(task: Task, place: int, role: str, kind: Kind) -> ModelMismatch:
@@ -149,8 +132,7 @@ def measure(path: Path, name: KindName) -> None:
     else:
         turn = np.random.default_rng([task.training.seed, number]).uniform(0.0, 2 * np.pi)
         navigation = task.navigation(task.patient(task.training, number), start_rotation=turn)
-    agent = MonitoredCoaxialAgent if name == "coaxial" else partial(MonitoredAgent, AgentConfig(tries=2))
-    policy = agent(calibration=NO_BANDS)
+    policy = MonitoredAgent(replace(kind.config, tries=2), calibration=NO_BANDS)
     seed = 1000 + 100 * task.level + number
     record = navigate(
         replace(navigation, seconds=min(SECONDS, navigation.seconds), known_motion=Motion() if moves else None),
@@ -218,7 +200,7 @@ def calibrate(folder: Path, kind: Kind) -> tuple[Calibration, list[str]]:
         terms = fit_spread(*(np.concatenate(column) for column in zip(*fitted, strict=True)))
         terms = narrowest(terms, worst(fitted, terms), LEVEL)
     else:
-        known = Calibration.read(CALIBRATED)
+        known = Calibration.read(CALIBRATIONS["assumed", 1])
         terms = known.abscissa_terms, known.offset_terms
     rows, owner = gather(folder, "calibrate")
     calibration = Calibration(
@@ -256,7 +238,7 @@ def calibrate_agent(kind: Positional[KindName] = "assumed", /, *, write: bool = 
 
     Args:
         kind: exposures with assumed errors in patients at rest (assumed), X-ray images of patients whom heart and
-            breath move (images), or the coaxial agent in the coaxial tasks (coaxial).
+            breath move (images), or a wire in a catheter in the coaxial tasks (coaxial).
         write: write the calibration into the package, and its figures into docs/xray.md.
 
     Returns:
@@ -273,7 +255,7 @@ def calibrate_agent(kind: Positional[KindName] = "assumed", /, *, write: bool = 
         for place in places
         for task in chosen.tasks
     ]
-    found = identity(chosen.policy, chosen.version)
+    found = identity("agent", chosen.version)
     claim(folder, f"python -m benchmarks agent-calibration {kind}", **found, agent=chosen.config)
     make_missing("Calibrating the agent's adviser", wanted, partial(measure, name=kind))
     calibration, lines = calibrate(folder, chosen)

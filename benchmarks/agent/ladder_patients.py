@@ -26,14 +26,13 @@ from endopilot.atlas.atlas import make_patient_tree
 from endopilot.errors import InputError
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import Navigation, Target
+from endopilot.tasks.targets import find_target, turn_rad
 from endopilot.tasks.task import (
     CORE,
     NEWEST,
     LadderVersion,
     Task,
     ladder_tasks,
-    target_in_section,
-    turn_rad,
     without_catheter,
 )
 from endopilot.types import TipProjection, VesselTree
@@ -52,7 +51,7 @@ def _always(tree: VesselTree, truth: dict[str, Any], target: Target) -> bool:
 
 def _turns(section: str, degrees: float) -> Callable[[VesselTree, dict[str, Any], Target], bool]:
     def eligible(tree: VesselTree, truth: dict[str, Any], target: Target) -> bool:
-        first = target_in_section(tree, section, 0.5).branch
+        first = find_target(tree, section, depth_mm=0.5).branch
         return first > 0 and np.rad2deg(turn_rad(tree, first)) >= degrees
 
     return eligible
@@ -105,13 +104,13 @@ class _Search:
             line = tree.branches[branch].centerline
             fork, radius = float(line.abscissa[-1]), float(line.radius[-1])
             before, beyond = fork - max(5.0, 1.4 * radius), fork + max(7.0, 1.6 * radius)
-            self.drive(PUSH_MM_S, 0.0, 60.0, lambda tip, before=before: tip.abscissa >= before)
-            self.drive(-PUSH_MM_S, 0.0, 5.0, lambda tip, before=before: tip.abscissa <= before)
+            self.drive(PUSH_MM_S, 0.0, 60.0, lambda tip, before=before: tip.abscissa[:, 0] >= before)
+            self.drive(-PUSH_MM_S, 0.0, 5.0, lambda tip, before=before: tip.abscissa[:, 0] <= before)
             if not self.enter(route[place + 1 :], fork + 3.0, beyond):
                 return False
             if self.done().any():
                 return True
-        self.drive(PUSH_MM_S, 0.0, 30.0, lambda tip: tip.abscissa > navigation.target.abscissa + 3.0)
+        self.drive(PUSH_MM_S, 0.0, 30.0, lambda tip: tip.abscissa[:, 0] > navigation.target.abscissa + 3.0)
         return bool(self.done().any())
 
     def enter(self, wanted: tuple[int, ...], inside: float, beyond: float) -> bool:
@@ -125,8 +124,8 @@ class _Search:
             turn = ((np.arange(TRIES) + attempt / 3) / TRIES - 0.5) * 2 * np.pi
             self.drive(0.0, turn / 2.5, 2.5, _never)
             spin = np.linspace(-1.5, 1.5, TRIES) if attempt == 2 else 0.0
-            self.drive(PUSH_MM_S, spin, 4.0 + (beyond - inside) / 2, lambda tip: tip.abscissa > beyond)
-            tip = self.simulator.project()
+            self.drive(PUSH_MM_S, spin, 4.0 + (beyond - inside) / 2, lambda tip: tip.abscissa[:, 0] > beyond)
+            tip = self.simulator.project()[:, 0]
             entered = (np.isin(tip.branch, wanted) & (tip.abscissa > inside)) | self.done()
             entered &= self.peak <= self.navigation.force_limit_n
             if entered.any():
@@ -151,7 +150,8 @@ class _Search:
         for _ in range(round(most_s / PERIOD_S)):
             if still.all():
                 return
-            room = np.array([-self.simulator.inserted_length, self.deepest - self.simulator.inserted_length]) / PERIOD_S
+            inserted = self.simulator.inserted_length[:, 0]
+            room = np.array([-inserted, self.deepest - inserted]) / PERIOD_S
             control = np.column_stack([np.clip(np.full(TRIES, translation), *room), np.full(TRIES, rotation)])
             step = self.simulator.step(np.where(still[:, None], 0.0, control), PERIOD_S)
             self.peak = np.where(still, self.peak, np.maximum(self.peak, step.contact_force_max))
@@ -161,7 +161,7 @@ class _Search:
 
 
 def _never(tip: TipProjection) -> np.ndarray:
-    return np.zeros(tip.abscissa.shape, dtype=bool)
+    return np.zeros(len(tip.abscissa), dtype=bool)
 
 
 def wire_alone_fails(navigation: Navigation) -> bool:
@@ -173,7 +173,7 @@ def wire_alone_fails(navigation: Navigation) -> bool:
     longest = float(navigation.anatomy.tree.longest_path().abscissa[-1]) + 19.0
     deepest, arrived = min(navigation.target.abscissa + 20.0, longest), np.zeros(count, dtype=bool)
     for _ in range(round(deepest / (PUSH_MM_S * PERIOD_S))):
-        speed = np.clip((deepest - simulator.inserted_length) / PERIOD_S, 0.0, PUSH_MM_S)
+        speed = np.clip((deepest - simulator.inserted_length[:, 0]) / PERIOD_S, 0.0, PUSH_MM_S)
         simulator.step(np.column_stack([speed, np.zeros(count)]), PERIOD_S)
         arrived |= navigation.reached(simulator.project())
     return int(arrived.sum()) <= 2
@@ -197,7 +197,7 @@ def choose(task: Task, seed: int, *, search: bool) -> tuple[list[int], int, int]
     for number in range(MOST_EXAMINED):
         tree, truth = make_patient_tree(atlas, number)
         try:
-            target = target_in_section(tree, task.section, task.depth_mm)
+            target = find_target(tree, task.section, depth_mm=task.depth_mm)
         except InputError:
             continue
         if not eligible(tree, truth, target):

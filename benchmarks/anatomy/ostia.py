@@ -17,6 +17,7 @@ from endopilot.anatomy.tree import sampled
 from endopilot.cli.arguments import existing
 from endopilot.errors import InputError
 from endopilot.files import read_json
+from endopilot.imaging.grid import connected_components
 from endopilot.imaging.volume import read_volume
 from endopilot.progress import progress
 from endopilot.types import Anatomy, LumenMask, Volume
@@ -106,9 +107,7 @@ def _measured(file: Path, vessel: str, known: np.ndarray) -> dict[str, Any]:
 
 def _coverage(anatomy: Anatomy, mask: Volume) -> float:
     """Return the share of the voxels of an artery's piece of the mask that its tree covers."""
-    from scipy.ndimage import label
-
-    labels, _ = label(mask.voxels, structure=np.ones((3, 3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
+    labels = connected_components(mask.voxels, corners=True)
     points, radius = sampled(anatomy.tree)
     index = np.argwhere(labels > 0)
     place = mask.index_to_world(index[:, ::-1].astype(float))

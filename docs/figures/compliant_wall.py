@@ -15,7 +15,8 @@ from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, random_controls
 from endopilot.simulation.rod import lay_out
 from endopilot.simulation.simulate import simulate
-from endopilot.types import Anatomy, Rollout
+from endopilot.simulation.trajectory import Trajectory
+from endopilot.types import Anatomy
 
 PAGE = Path(__file__).parents[1] / "physics.md"
 HEAD = "| patient, wire | wall |"
@@ -24,13 +25,13 @@ STIFFNESS_N_MM2 = (None, 0.05, 0.01)
 
 
 def displaced_mm(
-    patient: Anatomy, wire: Device, rollout: Rollout, config: SimulatorConfig
+    patient: Anatomy, wire: Device, rollout: Trajectory, config: SimulatorConfig
 ) -> Float[np.ndarray, "worlds samples"]:
     """Return by how much the wire displaces the wall at most, mm, at each sample."""
     assert rollout.shape is not None
     behind = lay_out(wire, element_mm=config.element_mm, length_mm=400.0).abscissa_mm[: rollout.shape.shape[2]]
     distance = sample(patient.distance_map, rollout.shape.reshape(-1, 3)).reshape(rollout.shape.shape[:3])
-    ahead = behind < rollout.inserted_length[..., None] - 1.0
+    ahead = behind < rollout.inserted_length - 1.0
     return np.where(ahead, np.maximum(wire.tip_radius_mm - distance, 0.0), 0.0).max(axis=-1)
 
 

@@ -16,7 +16,8 @@ import numpy as np
 from endopilot.dataset.loader import load_dataset
 from endopilot.models.episodes import Episodes
 from endopilot.simulation.config import PRESETS, SimulatorConfig
-from endopilot.simulation.simulate import Rollout, simulate
+from endopilot.simulation.simulate import simulate
+from endopilot.simulation.trajectory import Trajectory
 
 PAGE = Path(__file__).parents[1] / "dataset.md"
 BEGIN, END = "<!-- settings:begin -->", "<!-- settings:end -->"
@@ -47,7 +48,7 @@ def main(folders: list[str]) -> None:
     PAGE.write_text(f"{page.split(BEGIN)[0]}{BEGIN}\n{table}\n{END}{page.split(END)[1]}", encoding="utf-8")
 
 
-def _simulated(episodes: Episodes, config: SimulatorConfig) -> tuple[list[Rollout], float]:
+def _simulated(episodes: Episodes, config: SimulatorConfig) -> tuple[list[Trajectory], float]:
     """Return the rollouts of each patient, and simulated seconds per second of one core."""
     rollouts, start = [], time.process_time()
     for name in np.unique(episodes.anatomy):
@@ -59,7 +60,7 @@ def _simulated(episodes: Episodes, config: SimulatorConfig) -> tuple[list[Rollou
     return rollouts, 0.5 * episodes.branch.size / (time.process_time() - start)
 
 
-def _compared(episodes: Episodes, truth: list[Rollout], config: SimulatorConfig) -> list[str]:
+def _compared(episodes: Episodes, truth: list[Trajectory], config: SimulatorConfig) -> list[str]:
     rollouts, speed = _simulated(episodes, config)
     pairs = list(zip(rollouts, truth, strict=True))
     error = np.concatenate([np.linalg.norm(r.tip_position - t.tip_position, axis=-1).ravel() for r, t in pairs])
@@ -68,7 +69,7 @@ def _compared(episodes: Episodes, truth: list[Rollout], config: SimulatorConfig)
     return [*figures, _held(episodes, rollouts), f"{speed:.0f}"]
 
 
-def _held(episodes: Episodes, rollouts: list[Rollout]) -> str:
+def _held(episodes: Episodes, rollouts: list[Trajectory]) -> str:
     limit = HELD * episodes.setup.device.pull_limit_n
     return f"{100 * np.mean(np.concatenate([(r.base_force < -limit).ravel() for r in rollouts])):.2f} %"
 

@@ -58,8 +58,8 @@ def measured(folder: Path) -> Iterator[tuple[str, Dataset]]:
 def headline_rows(folder: Path) -> Iterator[str]:
     """Yield P1 in new patients: every run that is there, the play operator, a simulated wire, the held slack."""
     for patients, data in measured(folder):
-        truth = np.stack([data.tip_abscissa, data.tip_offset], axis=-1)[:, WINDOW:].astype(float)
-        clear = (data.lumen_radius - data.tip_offset)[:, WINDOW:] - RADIUS_MM > OFF_WALL_MM
+        truth = np.stack([data.tip_abscissa, data.tip_offset], axis=-1)[:, WINDOW:, 0].astype(float)
+        clear = (data.lumen_radius - data.tip_offset)[:, WINDOW:, 0] - RADIUS_MM > OFF_WALL_MM
         episodes = Episodes.of_dataset(data)
         vessels, patient = prepare_vessels(episodes), np.unique(data.anatomy, return_inverse=True)[1]
         observed = np.broadcast_to(np.arange(data.valid.shape[1]) < WINDOW, data.valid.shape)

@@ -56,7 +56,7 @@ def guess_rows(data: Dataset) -> Iterator[str]:
     episodes = Episodes.of_dataset(data)
     vessels, patient = prepare_vessels(episodes), np.unique(data.anatomy, return_inverse=True)[1]
     observed = np.broadcast_to(np.arange(data.valid.shape[1]) < WINDOW, data.valid.shape)
-    truth = np.stack([data.tip_abscissa, data.tip_offset], axis=-1).astype(float)
+    truth = np.stack([data.tip_abscissa, data.tip_offset], axis=-1)[:, :, 0].astype(float)
     held = np.abs(hold_slack(data, WINDOW) - truth[:, WINDOW:])
     yield row("hold slack and offset", np.pad(held, ((0, 0), (WINDOW, 0), (0, 0))))
     guess = unfold("forward", vessels, patient, episodes, observed).guess

@@ -1,6 +1,6 @@
 """Write the pictures and tables of docs/navigation.md.
 
-The first part drives the agent in a synthetic patient, and the coaxial agent with a catheter too. The second needs what
+The first part drives the agent in a synthetic patient, with a catheter too. The second needs what
 `make cta` leaves in `runs/cta-thorax`; it pushes the J wire without a policy, at first rotations all around, to see
 where it goes.
 """
@@ -32,7 +32,7 @@ def main() -> None:
     if not (patients / "lca-41-0000").exists():
         subprocess.run([*command, "atlas", "-o", patients, "--anatomy", "lca", "--seed", "41"], check=True)
     navigate = [*command, "navigate", patients / "lca-41-0000", "--target", "12", "--mismatch", "0.2"]
-    pair = ("--catheter", "microcatheter-2.4f", "--arrives", "catheter", "--policy", "coaxial-agent")
+    pair = ("--catheter", "microcatheter-2.4f", "--arrives", "catheter")
     for options, folder, picture, part in (
         ((), "navigation", "navigation.png", "outcome"),
         (pair, "pair", "navigation-pair.png", "pair"),
@@ -59,7 +59,7 @@ def _dissection() -> str:
     for rate in (0.0, 1.0):
         control = np.tile([SPEED_MM_S, rate], (ROTATIONS, round(SECONDS / 0.5), 1))
         initial = np.column_stack([np.zeros(ROTATIONS), 2 * np.pi * np.arange(ROTATIONS) / ROTATIONS])
-        depth = endopilot.simulate(aorta, wire, control, initial=initial).tip.abscissa.max(axis=1)
+        depth = endopilot.simulate(aorta, wire, control, initial=initial).tip.abscissa.max(axis=(1, 2))
         over = depth > BLIND_END_MM
         turned = "without rotation" if rate == 0 else f"and turned at {rate:g} rad/s"
         lines.append(

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.control.agent import AgentPolicy, TwinPolicy
+from endopilot.control.agent import AgentPolicy, OraclePolicy
 from endopilot.devices.device import Device, read_device
 from endopilot.navigation.navigate import navigate
 from endopilot.navigation.policies import make_policy
@@ -25,7 +25,7 @@ from endopilot.types import Anatomy
 PAGE = Path(__file__).parents[1] / "planning.md"
 SEED, PATIENTS, DEEP_MM, SECONDS, FORCE_N = 900, (("rca", 0), ("lca", 0)), 15.0, 60.0, 0.3
 TIPS = ((90.0, 8.0), (45.0, 3.0))
-POLICIES = ("forward", "spin", "twin", "agent")
+POLICIES = ("forward", "spin", "oracle", "agent")
 
 
 def side_branches(anatomy: Anatomy) -> Iterator[Target]:
@@ -48,7 +48,7 @@ def shaped(angle_deg: float, length_mm: float) -> Device:
 
 def drive(name: str, navigation: Navigation, truth: ModelMismatch) -> tuple[bool, int, float]:
     """Return safe success, exposures and processor seconds of one navigation."""
-    kinds: dict[str, Policy] = {"twin": TwinPolicy(truth), "agent": AgentPolicy()}
+    kinds: dict[str, Policy] = {"oracle": OraclePolicy(truth), "agent": AgentPolicy()}
     policy, began = kinds.get(name) or make_policy(name), time.process_time()
     record = navigate(navigation, policy, seed=1, truth=truth)
     return record.success and record.safe, record.exposures, time.process_time() - began

@@ -43,11 +43,11 @@ def rows(episodes: Dataset, sequences: int, deeper_mm: float) -> Iterator[str]:
     along, off, found = [], [], []
     for index, name in enumerate(np.unique(episodes.anatomy)):
         one = episodes.select(np.flatnonzero(episodes.anatomy == name)[:sequences])
-        given = Episodes.of_dataset(replace(one, initial_inserted_length=one.initial_inserted_length - deeper_mm))
+        given = Episodes.of_dataset(replace(one, initial=one.initial - np.array([deeper_mm, 0.0])))
         twin = believed(one, index)
         predicted = twin.predict(given, np.arange(one.valid.shape[1]) < WINDOW)
-        along.append(np.abs(predicted.tip[..., 0] - one.tip_abscissa))
-        off.append(np.abs(predicted.tip[..., 1] - one.tip_offset))
+        along.append(np.abs(predicted.tip[..., 0] - one.tip_abscissa[:, :, 0]))
+        off.append(np.abs(predicted.tip[..., 1] - one.tip_offset[:, :, 0]))
         found.append(np.abs(predicted.parameters[:, 0] * twin.device.friction / one.friction - 1))
         print(f"{name}: {along[-1][:, WINDOW:].mean():.4f} mm, {off[-1][:, WINDOW:].mean():.4f} mm", file=sys.stderr)
     delta, gamma = np.concatenate(along), np.concatenate(off)

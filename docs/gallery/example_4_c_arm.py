@@ -18,8 +18,8 @@ anatomy = next(endopilot.make_atlas(endopilot.AtlasConfig(anatomy="rca", seed=0,
 device = endopilot.read_device("workhorse-014")
 push = np.tile([5.0, 0.0], (1, 16, 1))
 rollout = endopilot.simulate(anatomy, device, push)
-tip, direction = rollout.tip_position[0, -1], rollout.tip_direction[0, -1]
-length = float(rollout.inserted_length[0, -1])
+tip, direction = rollout.tip_position[0, -1, 0], rollout.tip_direction[0, -1, 0]
+length = float(rollout.inserted_length[0, -1, 0])
 
 figure, axes = plt.subplots(figsize=(6.4, 3.8), layout="constrained")
 medians = {}

@@ -73,8 +73,9 @@ plt.show()
 # Drive both wires
 # ----------------
 # :func:`endopilot.simulate` takes controls of shape (worlds, samples, 2): translation in mm/s and
-# rotation in rad/s, one row every 0.5 s. Twelve worlds start with the tip bend turned to a side each, then push on at
-# 5 mm/s for 12 s. All worlds run side by side, and no result depends on another world.
+# rotation in rad/s, one row every 0.5 s. Its results have an axis of devices, and the wire is the first. Twelve worlds
+# start with the tip bend turned to a side each, then push on at 5 mm/s for 12 s. All worlds run side by side, and no
+# result depends on another world.
 
 anatomy = next(endopilot.make_atlas(endopilot.AtlasConfig(anatomy="lca", seed=41, population="textbook")))
 worlds, samples = 12, 24
@@ -97,12 +98,12 @@ for axes, (name, rollout), color in zip(panels[:2], rollouts.items(), ("C0", "C1
     for nodes in rollout.shape[:, -1]:
         axes.plot(nodes[:, 0], nodes[:, 2], color=color, lw=1)
         axes.plot(nodes[0, 0], nodes[0, 2], "o", color=color, ms=4)
-    axes.set(title=f"{name}: tips in {len(set(rollout.tip.branch[:, -1]))} branches")
+    axes.set(title=f"{name}: tips in {len(set(rollout.tip.branch[:, -1, 0]))} branches")
     axes.set(xlabel="x (to the patient's left), mm", ylabel="z (to the head), mm")
     axes.set(xlim=(0, 80), ylim=(-75, 25))
     axes.set_aspect("equal")
 for (name, rollout), color in zip(rollouts.items(), ("C0", "C1"), strict=True):
-    length, push = rollout.inserted_length[0], rollout.base_force
+    length, push = rollout.inserted_length[0, :, 0], rollout.base_force[:, :, 0]
     panels[2].plot(length, 1e3 * np.median(push, axis=0), color=color, label=f"{name}, median")
     panels[2].fill_between(length, 1e3 * push.min(axis=0), 1e3 * push.max(axis=0), color=color, alpha=0.15, lw=0)
 panels[2].set(title="Push at the ostium", xlabel="inserted length, mm", ylabel="force, mN", ylim=(0, None))
@@ -115,7 +116,7 @@ plt.show()
 # A device is data: no code changes. ``simulate``, ``dataset``, ``plan`` and ``run`` take the path of your file as
 # ``--device``. The tasks of the ladder state their own wires.
 
-branches = {name: set(rollout.tip.branch[:, -1].tolist()) for name, rollout in rollouts.items()}
+branches = {name: set(rollout.tip.branch[:, -1, 0].tolist()) for name, rollout in rollouts.items()}
 push = {name: float(np.median(rollout.base_force[:, -1])) for name, rollout in rollouts.items()}
 print(f"branches entered: {branches}")
 assert all(rollout.valid.all() for rollout in rollouts.values())

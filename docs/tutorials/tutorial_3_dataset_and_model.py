@@ -50,14 +50,15 @@ for split in ("train", "seen_test", "calibrate", "test"):
 # depends on the history, which is what a model has to learn.
 
 test = dataset.of_split("test")
+length, tip = test.inserted_length[:, :, 0], test.tip_abscissa[:, :, 0]  # device 0 is the wire, and here the only one
 time_s = test.sample_period_s * np.arange(1, test.valid.shape[1] + 1)
-one = int(np.argmax(np.ptp(test.inserted_length, axis=1)))
+one = int(np.argmax(np.ptp(length, axis=1)))
 figure, (length_axes, slack_axes) = plt.subplots(2, 1, figsize=(8, 4.6), sharex=True, layout="constrained")
-length_axes.plot(time_s, test.inserted_length[one], color="0.5", label="Δ, inserted length")
-length_axes.plot(time_s, test.tip_abscissa[one], color="C0", label="Δtip, tip along the vessel")
+length_axes.plot(time_s, length[one], color="0.5", label="Δ, inserted length")
+length_axes.plot(time_s, tip[one], color="C0", label="Δtip, tip along the vessel")
 length_axes.set(ylabel="mm")
 length_axes.legend()
-slack_axes.plot(time_s, test.inserted_length[one] - test.tip_abscissa[one], color="C1")
+slack_axes.plot(time_s, length[one] - tip[one], color="C1")
 slack_axes.set(xlabel="time, s", ylabel="slack Δ − Δtip, mm")
 plt.show()
 

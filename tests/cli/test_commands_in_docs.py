@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import endopilot
-from endopilot.cli import commands_of, main
+from endopilot.cli import command_of, main
 from endopilot.errors import InputError
 
 ROOT = Path(__file__).parents[2]
@@ -62,8 +62,7 @@ def understood(arguments: list[str]) -> None:
     """Have a command's arguments parsed, and do nothing with them."""
     name, *rest = arguments
     if {"-h", "--help", "--help-all"}.isdisjoint(rest) and not name.startswith("-"):
-        commands = commands_of(name)
-        commands["" if "" in commands else rest.pop(0)].read(rest)
+        command_of(name).read(rest)
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if page.endswith(".md")])

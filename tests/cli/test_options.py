@@ -8,14 +8,14 @@ from pathlib import Path
 import pytest
 from tyro.conf import Positional
 
-from endopilot.cli import COMMANDS, commands_of, main
+from endopilot.cli import COMMANDS, command_of, main
 from endopilot.cli.arguments import OutputFolder
 from endopilot.cli.options import LISTED, LISTED_AT_MOST, Command, Option
 from endopilot.errors import InputError
 from endopilot.files import read_yaml
 from endopilot.settings import Count, Positive, Seed, read_settings, settings
 
-EVERY = [command for name in COMMANDS for command in commands_of(name).values()]
+EVERY = [command_of(name) for name in COMMANDS]
 ROOT = Path(__file__).parents[2]
 
 
@@ -87,7 +87,7 @@ def test_help_fits_a_head(command: Command) -> None:
 
 def test_what_is_listed_are_options_of_commands_that_have_more() -> None:
     for name, listed in LISTED.items():
-        [command] = commands_of(name).values()
+        command = command_of(name)
         names = [leaf.name for one in command.options() for leaf in one.leaves() if not leaf.positional]
         assert set(listed.split()) <= set(names) and len(names) > LISTED_AT_MOST
 
@@ -179,7 +179,7 @@ def test_a_file_can_be_started_from_flags(tmp_path, capsys, monkeypatch) -> None
         "# Tip error before the end, 1/s.\n  tip_weight: 0.3\n" in printed and "# target: TEXT  (required)" in printed
     )
     Path("plan.yaml").write_text(printed)
-    again = commands_of("plan")[""].read(["patient", "--target", "4", "-o", "o", "--config", "plan.yaml"])
+    again = command_of("plan").read(["patient", "--target", "4", "-o", "o", "--config", "plan.yaml"])
     assert again.cost.tip_weight == 0.3 and again.target == "4"
 
 

@@ -6,7 +6,6 @@ import time
 
 import numpy as np
 import pytest
-from endopilot.simulation.table import write_rollout
 
 from endopilot.cockpit.film import open_film
 from endopilot.cockpit.frames import decode
@@ -17,6 +16,7 @@ from endopilot.files import write_json
 from endopilot.ladder.attempt import attempt, navigation_seed
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.simulate import simulate
+from endopilot.simulation.trajectory_file import write_trajectory
 from endopilot.tasks.task import find_task
 
 
@@ -55,12 +55,12 @@ def test_a_rollout_is_driven_again(fork, wire, vessel, tmp_path):
     rollout = simulate(
         fork, wire, control, initial=np.array([[2.0, 0.1], [2.0, 0.1]]), config=SimulatorConfig(threads=1)
     )
-    write_rollout(rollout, tmp_path / "r.csv")
+    write_trajectory(rollout, tmp_path / "r.csv")
     film = driven(open_film(tmp_path / "r.csv", vessel, world=1))
     assert len(film.frames) == 31
     last = film.frames[-1].snapshot
-    assert last.inserted_mm == pytest.approx(rollout.inserted_length[1, -1], abs=1e-9)
-    np.testing.assert_allclose(last.nodes[0], rollout.tip_position[1, -1], atol=0.02)
+    assert last.inserted_mm == pytest.approx(rollout.inserted_length[1, -1, 0], abs=1e-9)
+    np.testing.assert_allclose(last.nodes[0], rollout.tip_position[1, -1, 0], atol=0.02)
     with pytest.raises(InputError, match="worlds 0 to 1"):
         open_film(tmp_path / "r.csv", vessel, world=2)
     with pytest.raises(InputError, match="patient's folder"):
@@ -98,7 +98,7 @@ def test_an_episode_of_a_data_set_is_shown(fork, wire, vessel, tmp_path):
     generate_dataset([vessel], tmp_path / "data", wire, config)
     data = load_dataset(tmp_path / "data")
     film = driven(open_film(tmp_path / "data", world=1))
-    np.testing.assert_allclose(film.frames[-1].snapshot.nodes[0], data.tip_position[1, -1], atol=0.05)
+    np.testing.assert_allclose(film.frames[-1].snapshot.nodes[0], data.tip_position[1, -1, 0], atol=0.05)
 
 
 def test_other_files_are_refused(tmp_path):

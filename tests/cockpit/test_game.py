@@ -72,7 +72,7 @@ def test_only_x_ray_shows_the_wire(played):
     assert last["image0"][1]["grey"].shape == (512, 512)
     for message in (
         Target(type="target", branch=0, abscissa=1.0),
-        Autopilot(type="autopilot", action="start", policy="twin"),
+        Autopilot(type="autopilot", action="start", policy="oracle"),
     ):
         with pytest.raises(InputError, match="not before the end"):
             played.handle(message, 0.0)

@@ -8,7 +8,6 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-from endopilot.simulation.table import write_rollout
 from test_game import Rival, play
 from test_session import run
 
@@ -27,6 +26,7 @@ from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.simulate import simulate
 from endopilot.simulation.simulator import Simulator
+from endopilot.simulation.trajectory_file import write_trajectory
 from endopilot.tasks.task import task_by_hand
 
 NAME = "microcatheter-1.7f"
@@ -52,8 +52,8 @@ def test_each_device_follows_its_own_drive(session):
     ]
     assert header["catheter_tips_mm"][0] < header["tip_mm"]
     simulator = session.world.loop.simulator
-    np.testing.assert_array_equal(arrays["nodes"][0], simulator.tips(0)[0].astype("<f4"))
-    np.testing.assert_array_equal(arrays["catheter_1_nodes"][0], simulator.tips(1)[0].astype("<f4"))
+    np.testing.assert_array_equal(arrays["nodes"][0], simulator.tip_position[0, 0].astype("<f4"))
+    np.testing.assert_array_equal(arrays["catheter_1_nodes"][0], simulator.tip_position[0, 1].astype("<f4"))
     assert len(arrays["catheter_1_force"]) == len(arrays["catheter_1_nodes"]) < len(arrays["nodes"])
     # A catheter that is not named stands still.
     (header, _), _ = run(session, 0.3, message=Drive(type="drive", translation=-3.0, rotation=0.0))
@@ -63,7 +63,7 @@ def test_each_device_follows_its_own_drive(session):
 @pytest.mark.parametrize(("wire_mm", "catheter_mm"), [(10.0, 4.0), (4.0, 10.0)])
 def test_the_wall_presses_on_the_outermost_device_alone(world, wire_mm, catheter_mm):
     """A wall that presses everywhere is shown on the wire as far as it leads, and on the catheter."""
-    world.loop.simulator.reset(inserted_length=[wire_mm], rotation=[0.0], catheter_inserted_length=[[catheter_mm]])
+    world.loop.simulator.reset(inserted_length=[[wire_mm, catheter_mm]], rotation=[[0.0, 0.0]])
     with patch.object(Simulator, "contacts", property(lambda self: np.ones((1, self.nodes)))):
         snapshot = world.snapshot()
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(snapshot.nodes, axis=0), axis=1))])
@@ -143,11 +143,11 @@ def test_a_session_becomes_an_episode_of_both(session, tmp_path):
     session.close()
     write_session_episode(tmp_path / "a.cockpit.jsonl", tmp_path / "episode")
     data = load_dataset(tmp_path / "episode")
-    assert [catheter.name for catheter in data.catheters] == [NAME]
-    assert data.catheter_inserted_length[0, -1, 0] == pytest.approx(snapshot.catheters[0].inserted_mm, abs=1e-4)
-    np.testing.assert_allclose(data.tip_position[0, -1], snapshot.nodes[0], atol=1e-4)
-    made = np.diff([data.catheter_initial[0, 0, 0], *data.catheter_inserted_length[0, :, 0]])
-    asked = 0.5 * data.catheter_control[0, :, 0, 0]
+    assert [catheter.name for catheter in data.stack.catheters] == [NAME]
+    assert data.inserted_length[0, -1, 1] == pytest.approx(snapshot.catheters[0].inserted_mm, abs=1e-4)
+    np.testing.assert_allclose(data.tip_position[0, -1, 0], snapshot.nodes[0], atol=1e-4)
+    made = np.diff([data.initial[0, 1, 0], *data.inserted_length[0, :, 1]])
+    asked = 0.5 * data.control[0, :, 1, 0]
     np.testing.assert_allclose(made, asked, atol=1e-4)
 
 
@@ -192,9 +192,8 @@ def test_a_curved_catheter_is_turned_back_before_a_policy_begins(navigation, xra
 
 
 def test_a_task_of_wire_and_catheter_is_scored(navigation, xray):
-    """The catheter is to arrive: the wire at the target is not enough. The coaxial agent's score stands beside."""
+    """The catheter is to arrive: the wire at the target is not enough. The agent's score stands beside."""
     tried = Attempt(task_by_hand("follow"), 0)
-    assert tried.rival == "coaxial-agent"
     wanted = replace(navigation.target, abscissa=10.0)
     world = World(replace(navigation, arrives="catheter", target=wanted, seconds=6.0, force_limit_n=0.3))
     with patch.object(game, "Workers", Rival):
@@ -206,22 +205,28 @@ def test_a_task_of_wire_and_catheter_is_scored(navigation, xray):
         played.close()
     scores = last["result"][0]["scores"]
     assert played.phase == "over" and scores["you"]["reason"] == "reached"
-    assert scores["rival"] == "coaxial-agent" and scores["agent"] == {"success": True}
+    assert scores["rival"] == "agent" and scores["agent"] == {"success": True}
 
 
 def test_a_rollout_of_a_pair_is_driven_again(fork, vessel, navigation, tmp_path):
-    control = np.array([[[8.0, 1.0, 6.0, 0.0], [4.0, -2.0, 0.0, 2.0], [-6.0, 1.0, 8.0, 0.0]]])
-    initial = np.array([[2.0, 0.1, 1.0, 0.0]])
+    control = np.array([[[[8.0, 1.0], [6.0, 0.0]], [[4.0, -2.0], [0.0, 2.0]], [[-6.0, 1.0], [8.0, 0.0]]]])
+    initial = np.array([[[2.0, 0.1], [1.0, 0.0]]])
     config = SimulatorConfig(threads=1)
-    rollout = simulate(fork, navigation.device, control, catheters=navigation.catheters, initial=initial, config=config)
-    write_rollout(rollout, tmp_path / "r.csv")
+    rollout = simulate(
+        fork,
+        navigation.stack,
+        control.reshape(*control.shape[:2], 2, 2),
+        initial=initial.reshape(1, 2, 2),
+        config=config,
+    )
+    write_trajectory(rollout, tmp_path / "r.csv")
     film = open_film(tmp_path / "r.csv", vessel, catheters=(NAME,))
     film._drive()
     last = film.frames[-1].snapshot
-    assert not film.failure and rollout.catheters is not None
-    assert last.inserted_mm == pytest.approx(rollout.inserted_length[0, -1], abs=1e-9)
-    assert last.catheters[0].inserted_mm == pytest.approx(rollout.catheters.inserted_length[0, -1, 0], abs=1e-9)
-    np.testing.assert_allclose(last.catheters[0].nodes[0], rollout.catheters.tip_position[0, -1, 0], atol=0.02)
+    assert not film.failure
+    assert last.inserted_mm == pytest.approx(rollout.inserted_length[0, -1, 0], abs=1e-9)
+    assert last.catheters[0].inserted_mm == pytest.approx(rollout.inserted_length[0, -1, 1], abs=1e-9)
+    np.testing.assert_allclose(last.catheters[0].nodes[0], rollout.tip_position[0, -1, 1], atol=0.02)
 
 
 def test_a_navigation_of_a_pair_is_shown(vessel, tmp_path):
@@ -247,14 +252,14 @@ def test_an_episode_of_pairs_is_shown(navigation, vessel, tmp_path):
 
     # With this seed no device jumps within a sample: then the replay is exact.
     config = DatasetConfig(sequences=1, seconds=3.0, anatomy_shares=(1.0, 0.0, 0.0), seen_test_share=0.0, seed=1)
-    generate_dataset([vessel], tmp_path / "data", navigation.device, config, catheters=navigation.catheters)
+    generate_dataset([vessel], tmp_path / "data", navigation.stack, config)
     data = load_dataset(tmp_path / "data")
     film = open_film(tmp_path / "data")
     film._drive()
     assert not film.failure
     last = film.frames[-1].snapshot
-    np.testing.assert_allclose(last.nodes[0], data.tip_position[0, -1], atol=1e-4)
-    np.testing.assert_allclose(last.catheters[0].nodes[0], data.catheter_tip_position[0, -1, 0], atol=1e-4)
+    np.testing.assert_allclose(last.nodes[0], data.tip_position[0, -1, 0], atol=1e-4)
+    np.testing.assert_allclose(last.catheters[0].nodes[0], data.tip_position[0, -1, 1], atol=1e-4)
 
 
 def test_a_plan_of_a_pair_is_shown(vessel, tmp_path):
@@ -267,8 +272,8 @@ def test_a_plan_of_a_pair_is_shown(vessel, tmp_path):
     film = open_film(tmp_path / "plan", vessel, catheters=(NAME,))
     film._drive()
     last = film.frames[-1].snapshot
-    assert not film.failure and made.catheter_position is not None
+    assert not film.failure and made.position.shape[1] == 2
     np.testing.assert_allclose(last.nodes[0], made.position[-1], atol=0.05)
-    np.testing.assert_allclose(last.catheters[0].nodes[0], made.catheter_position[-1], atol=0.05)
+    np.testing.assert_allclose(last.catheters[0].nodes[0], made.position[-1, 1], atol=0.05)
     with pytest.raises(InputError, match=f"for another device .workhorse-014 in {NAME}., not for workhorse-014"):
         open_film(tmp_path / "plan", vessel)

@@ -13,13 +13,12 @@ from hypothesis import strategies as st
 from endopilot.belief.adviser import AdviserConfig
 from endopilot.belief.bands import Calibration
 from endopilot.belief.belief import Belief, BeliefConfig
-from endopilot.control import search
-from endopilot.control.agent import CALIBRATIONS, AgentConfig, AgentPolicy, OpenLoopPolicy, TwinPolicy
-from endopilot.control.course import Course, Log
+from endopilot.control import wire_search
+from endopilot.control.agent import CALIBRATIONS, AgentConfig, AgentPolicy, OpenLoopPolicy, OraclePolicy
+from endopilot.control.course import Course, Log, Period
 from endopilot.control.halt import describe_halt
 from endopilot.control.period import drive_period
-from endopilot.control.route import Route
-from endopilot.control.search import Search
+from endopilot.control.wire_search import WireSearch
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.navigation.navigate import NavigationLoop, navigate, start_world
 from endopilot.navigation.policy import Decision, Hand, Observation, Policy
@@ -27,6 +26,8 @@ from endopilot.robot.robot import DriveMotion, RobotConfig
 from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.simulation.motion import motion_named
 from endopilot.tasks.navigation import Navigation, Target
+from endopilot.tasks.route import Route
+from endopilot.types import TipProjection
 from endopilot.xray.fluoroscope import TipMeasurement
 
 QUICK = AgentConfig(belief=BeliefConfig(members=6, time_step_s=0.05))
@@ -52,10 +53,10 @@ def side_branch(fork, shaped) -> Navigation:
     return Navigation(anatomy=fork, device=shaped, target=Target(branch=2, abscissa=33.0), seconds=40.0)
 
 
-def test_the_twin_gets_into_a_side_branch_that_pushing_misses(side_branch) -> None:
+def test_the_oracle_gets_into_a_side_branch_that_pushing_misses(side_branch) -> None:
     failed = navigate(replace(side_branch, seconds=8.0), Forward(), seed=1)
     assert not failed.success
-    policy = TwinPolicy(config=QUICK)
+    policy = OraclePolicy(config=QUICK)
     assert isinstance(policy, Policy)
     record = navigate(side_branch, policy, seed=1)
     assert record.success and record.safe and record.faults == 0
@@ -63,9 +64,9 @@ def test_the_twin_gets_into_a_side_branch_that_pushing_misses(side_branch) -> No
     assert record.exposures == len(record.time_s) - 1  # X-ray is always on
 
 
-def test_the_twin_knows_a_catheter_that_leans(side_branch) -> None:
+def test_the_oracle_knows_a_catheter_that_leans(side_branch) -> None:
     truth = ModelMismatch(axis_deg=20.0, axis_side_deg=90.0)
-    policy = TwinPolicy(truth, config=QUICK)
+    policy = OraclePolicy(truth, config=QUICK)
     policy.start(side_branch, seed=1)
     nodes = policy.belief.simulator.position[0]
     along = nodes[-1] - nodes[-2]  # the base lies in the catheter
@@ -76,16 +77,16 @@ def test_the_twin_knows_a_catheter_that_leans(side_branch) -> None:
 @pytest.mark.parametrize("known", ["still", "both"])
 def test_a_course_is_what_the_simulator_does_under_its_controls(side_branch, known) -> None:
     side_branch = replace(side_branch, known_motion=motion_named(known))
-    policy = TwinPolicy(config=QUICK)
+    policy = OraclePolicy(config=QUICK)
     policy.start(side_branch, 0)
     course = policy.find_course(side_branch.seconds)
     assert course.reached == 1.0
-    moved = side_branch.start_inserted_mm + 0.5 * np.cumsum(course.control[:, 0])
-    assert np.allclose(course.inserted, moved, atol=1e-9)
+    moved = side_branch.start_inserted_mm + 0.5 * np.cumsum(course.control[:, 0, 0])
+    assert np.allclose(course.proximal[:, 0, 0], moved, atol=1e-9)
     simulator = Belief(side_branch, np.array([[1.0, 1.0, 0.0]]), QUICK.belief).simulator
     for k in range(len(course.control)):
-        looks = [simulator.step(course.control[k : k + 1], 0.1) for _ in range(5)]
-        assert np.array_equal(looks[-1].tip_position[0], course.position[k, 0])
+        looks = [simulator.step(course.control[k], 0.1) for _ in range(5)]
+        assert simulator.project().abscissa[0, 0] == course.tip.abscissa[k, 0]
         assert course.force[k, 0] == max(look.contact_force_max[0] for look in looks)
     assert side_branch.reached(simulator.project())[0]
 
@@ -122,8 +123,8 @@ def test_measurements_weigh_the_member_that_they_are_of(side_branch) -> None:
     assert np.allclose(belief.weight, 1 / 6)
     wide = belief.tip_spread()
     for k in range(4):
-        belief.follow(4.0 + 2.0 * k, 0.0)
-        assert np.allclose(belief.simulator.inserted_length - belief.parameters[:, 2], 4.0 + 2.0 * k)
+        belief.follow(((4.0 + 2.0 * k, 0.0),))
+        assert np.allclose(belief.simulator.inserted_length[:, 0] - belief.parameters[:, 2], 4.0 + 2.0 * k)
         belief.weigh(measured(belief, 4))
     assert belief.weight.argmax() == 4 and belief.weight[4] > 0.5
     assert belief.tip_spread()[0] < 0.8 * wide[0]
@@ -140,8 +141,10 @@ def test_simulated_wires_slide_in_a_vessel_that_beats_as_far_as_that_is_known(si
     for _ in range(8):
         true.step([[6.0, 0.0]], 0.5)
         for belief in (knows, knows_not):
-            belief.follow(float(true.inserted_length[0]), 0.0)
-        errors.append([float(abs(belief.tip.abscissa - true.project().abscissa)[0]) for belief in (knows, knows_not)])
+            belief.follow(((float(true.inserted_length[0, 0]), 0.0),))
+        errors.append(
+            [float(abs(belief.tip.abscissa - true.project().abscissa[:, 0])[0]) for belief in (knows, knows_not)]
+        )
     assert np.max(errors, axis=0)[0] < 0.01
     assert np.max(errors, axis=0)[1] > 0.3
 
@@ -217,7 +220,7 @@ def test_images_have_a_calibration_of_their_own(side_branch) -> None:
         policy = AgentPolicy(QUICK)
         policy.start(replace(side_branch, xray=xray), 0)
         found[xray] = policy._calibration
-        assert found[xray] == Calibration.read(CALIBRATIONS[xray]) and found[xray].anatomies >= 9
+        assert found[xray] == Calibration.read(CALIBRATIONS[xray, 1]) and found[xray].anatomies >= 9
     assert found["images"] != found["assumed"]
 
 
@@ -248,9 +251,11 @@ def test_whatever_the_model_returns_a_drive_takes_what_is_finite_and_within_limi
 
     def find(*_, **__) -> Course:
         tip = np.repeat(wild[:, 2:3], 3, axis=1)
+        tips = TipProjection(abscissa=tip, offset=tip, branch=np.zeros(tip.shape, dtype=int), radius=tip)
+        yes = np.ones(len(wild), dtype=bool)
         return Course(
-            control=wild[:, :2], abscissa=tip, offset=tip, branch=np.zeros(tip.shape, dtype=int), radius=tip,
-            position=np.zeros((*tip.shape, 3)), force=tip, inserted=wild[:, 2], rotation=wild[:, 3], reached=0.0,
+            control=wild[:, None, :2], proximal=wild[:, None, 2:], tip=tips, force=tip, checked=yes, exposed=~yes,
+            reached=0.0,
         )  # fmt: skip
 
     started._search.find, started._course, started._failed = find, None, 0
@@ -263,8 +268,8 @@ def test_whatever_the_model_returns_a_drive_takes_what_is_finite_and_within_limi
 
 @pytest.mark.timeout(60)
 def test_a_search_ends_though_pushing_seems_to_arrive_and_the_target_is_not_reached(side_branch, monkeypatch) -> None:
-    monkeypatch.setattr(Search, "_push_on", lambda *_: None)
-    policy = TwinPolicy(config=QUICK)
+    monkeypatch.setattr(WireSearch, "_push_on", lambda *_: None)
+    policy = OraclePolicy(config=QUICK)
     policy.start(side_branch, 0)
     course = policy.find_course(5.0)
     assert course.reached == 0.0 and len(course.control) == 10
@@ -274,14 +279,14 @@ def test_a_search_begins_farther_before_a_wide_junction(side_branch, monkeypatch
     """The junction is at 20 mm in a vessel of 1 mm: 4 mm before it, or as many radii as a mouth needs."""
     begun = []
     for radii in (1.4, 8.0):
-        monkeypatch.setattr(search, "_LEAD_RADII", radii)
-        policy = TwinPolicy(config=QUICK)
+        monkeypatch.setattr(wire_search, "_LEAD_RADII", radii)
+        policy = OraclePolicy(config=QUICK)
         policy.start(side_branch, 0)
         one = policy._search
-        one.single.copy_worlds(np.zeros(1, dtype=int), of=policy.belief.simulator)
+        one._single.put(np.zeros(1, dtype=int), policy.belief.simulator)
         one._weight = np.ones(1)
-        one._approach(search.Log(), 20, 22.5, np.inf)
-        begun.append(float(one.single.project().abscissa[0]))
+        one._approach(20, 22.5, np.inf)
+        begun.append(float(one._tip.abscissa[0]))
     assert begun == pytest.approx([16.0, 12.0], abs=1.1)
 
 
@@ -311,11 +316,11 @@ def test_an_agent_tells_what_it_believes_and_goes_on_after_hands(side_branch) ->
 
 def test_no_attempt_wins_without_a_wire_that_arrives(side_branch) -> None:
     """However many attempts were made, a path that no wire follows into the branch is none."""
-    policy = TwinPolicy(config=QUICK)
+    policy = OraclePolicy(config=QUICK)
     straight = replace(side_branch.device, tip_bend_rad=0.0, tip_bend_length_mm=0.0)
     policy.start(replace(side_branch, device=straight), 0)
     one = policy._search
-    one.single.copy_worlds(np.zeros(1, dtype=int), of=policy.belief.simulator)
+    one._single.put(np.zeros(1, dtype=int), policy.belief.simulator)
     one._weight = np.ones(1)
     for attempt in (0, 5, 9):
         _, _, won = one._attempt(22.5, 2, attempt)
@@ -345,7 +350,7 @@ def test_advice_names_a_tip_at_forks_alone(side_branch) -> None:
 
 def test_a_search_takes_no_path_that_presses_harder_than_the_limit(side_branch) -> None:
     """Under a limit below what the branch takes there is no path, and no part of one that breaks the limit."""
-    policy = TwinPolicy(config=QUICK)
+    policy = OraclePolicy(config=QUICK)
     policy.start(side_branch, 0)
     needed = float(policy.find_course(20.0).force.max())
     tight = replace(side_branch, force_limit_n=0.25 * needed)
@@ -357,7 +362,7 @@ def test_a_search_takes_no_path_that_presses_harder_than_the_limit(side_branch) 
 
 def test_a_force_that_a_snap_ends_within_a_period_counts(side_branch) -> None:
     """Where the tip slips, the wall bears more before than at the end of the period."""
-    policy = TwinPolicy(config=QUICK)
+    policy = OraclePolicy(config=QUICK)
     policy.start(side_branch, 0)
     simulator, ends = policy.belief.simulator, []
     for _ in range(10):
@@ -375,7 +380,7 @@ def test_a_wire_that_should_have_arrived_goes_by_the_image(side_branch) -> None:
     for off_mm, translation in ((0.4, 0.8), (-0.4, -0.8), (1.9, 2.0)):  # at most 2 mm/s
         navigation = replace(side_branch, target=Target(branch=0, abscissa=here + off_mm))
         policy.start(navigation, 0)
-        policy._search.find = lambda *_, **__: Log().course(3, 1.0)
+        policy._search.find = lambda *_, **__: Log().course((3, 1), reached=1.0)
         blind = policy.decide(Observation(0.0, ((2.0, 0.0),), None))
         assert blind.expose and blind.devices[0][0] == 0.0
         assert policy.believed().asks == "the tip should be at the target"
@@ -384,21 +389,20 @@ def test_a_wire_that_should_have_arrived_goes_by_the_image(side_branch) -> None:
 
 
 def test_a_course_may_begin_with_a_turn(side_branch) -> None:
-    policy = TwinPolicy(config=QUICK)
+    policy = OraclePolicy(config=QUICK)
     policy.start(side_branch, 0)
-    source, weight = policy.belief.likeliest()
-    course = policy._search.find(policy.belief.simulator, source, weight, seconds=20.0, turn=np.pi)
-    assert course.rotation[1] - side_branch.start_rotation == pytest.approx(np.pi)
-    assert (course.control[:2, 0] == 0.0).all() and course.reached == 1.0
+    course = policy._search.find_turned(policy.belief, np.pi, seconds=20.0)
+    assert course.proximal[1, 0, 1] - side_branch.start_rotation == pytest.approx(np.pi)
+    assert (course.control[:2, 0, 0] == 0.0).all() and course.reached == 1.0
 
 
 def test_a_path_that_does_not_arrive_ends_before_it_presses_too_hard(side_branch) -> None:
-    policy = TwinPolicy(config=QUICK)
+    policy = OraclePolicy(config=QUICK)
     policy.start(side_branch, 0)
-    one, log, tip = policy._search, search.Log(), policy.belief.tip
+    one, log, tip = policy._search, policy._search._single.log, policy.belief.tip
     one._weight = np.ones(1)
     for share in (0.5, 1.0, 1.5, 0.5):
         force = np.array([share * side_branch.force_limit_n])
-        log.add(np.zeros(2), tip, np.zeros((1, 3)), force, np.ones(1), np.zeros(1))
-    one._cut_hard(log)
+        log.rows.append(Period(np.zeros((1, 1, 2)), np.zeros((1, 1, 2)), tip, force))
+    one._cut_hard()
     assert log.periods == 2

@@ -32,12 +32,12 @@ SLACK = 0.9
 
 
 def test_a_plan_reaches_its_target_and_counts_its_cost(found):
-    assert found.reached and found.config.method == "twin"
-    assert abs(found.simulated.abscissa[-1] - 33.0) <= 2.0
-    assert np.allclose(found.proximal[-1, 0], 2.0 + 0.5 * found.control[:, 0].sum())
+    assert found.reached and found.config.method == "search"
+    assert abs(found.arriving_tip.abscissa[-1] - 33.0) <= 2.0
+    assert np.allclose(found.proximal[-1, 0, 0], 2.0 + 0.5 * found.control[:, 0, 0].sum())
     terms, cost = found.cost_terms(), found.config.cost
     assert terms["time"] == pytest.approx(0.5 * len(found.control) * cost.time_weight)
-    assert terms["end"] == pytest.approx(abs(found.simulated.abscissa[-1] - 33.0))
+    assert terms["end"] == pytest.approx(abs(found.arriving_tip.abscissa[-1] - 33.0))
     # each weight scales its own term and no other
     twice = replace(found.config, cost=replace(cost, tip_weight=2 * cost.tip_weight))
     dearer = replace(found, config=twice).cost_terms()
@@ -62,7 +62,7 @@ def test_a_written_plan_is_read_back_and_drives_the_simulator(found, vessel, tmp
     back = read_plan(tmp_path / "plan", anatomy, device)
     for name in ("control", "proximal", "desired", "predicted", "position", "force"):
         assert np.allclose(getattr(back, name), getattr(found, name), atol=1e-12), name
-    assert np.array_equal(back.simulated.branch, found.simulated.branch)
+    assert np.array_equal(back.tip.branch, found.tip.branch)
     assert back.navigation.target == found.navigation.target and back.config == found.config
     script = read_controls_csv(tmp_path / "plan" / "plan.csv")
     rollout = simulate(anatomy, device, script.control, initial=script.initial, config=SimulatorConfig(threads=1))
@@ -147,7 +147,7 @@ def run(found, tmp_path, monkeypatch):
 def test_the_inverse_network_is_asked_for_the_desired_tips(vessel, run):
     made = plan(vessel, "0,0,33", PlanConfig(method="inverse", seconds=30.0), model=run)
     assert np.allclose(made.predicted[:, 0], made.desired[:, 0])
-    assert made.proximal[-1, 0] == pytest.approx(made.desired[-1, 0] / SLACK, abs=1e-6)
+    assert made.proximal[-1, 0, 0] == pytest.approx(made.desired[-1, 0] / SLACK, abs=1e-6)
 
 
 def test_sampling_brings_the_predicted_tip_nearer_to_the_desired_one(vessel, run):
@@ -167,7 +167,7 @@ def test_the_model_of_the_package_plans_to_a_target_and_leaves_the_patients_fold
     before = sorted(vessel.parent.rglob("*"))
     made = plan(vessel, "0,0,33", PlanConfig(method="inverse", seconds=30.0), model=Path("pretrained"))
     assert made.reached and made.model == "pretrained"
-    assert np.abs(made.predicted[:, 0] - made.simulated.abscissa).max() < 0.5
+    assert np.abs(made.predicted[:, 0] - made.tip.abscissa[:, 0]).max() < 0.5
     assert sorted(vessel.parent.rglob("*")) == before
 
 
@@ -184,7 +184,7 @@ def test_desired_tips_are_followed(vessel, tmp_path):
     path.write_text("time_s,tip_abscissa_mm,tip_offset_mm,branch\n" + "\n".join(rows) + "\n")
     made = plan(vessel, str(path))
     assert len(made.control) == 14 and made.navigation.target.branch == 1
-    assert np.abs(made.simulated.abscissa - made.desired[:, 0]).max() < 0.5
+    assert np.abs(made.tip.abscissa[:, 0] - made.desired[:, 0]).max() < 0.5
     path.write_text("time_s,tip_abscissa_mm,tip_offset_mm\n0.5,5,0.1\n1.5,6,0.1\n")
     with pytest.raises(InputError, match=r"row 3: time_s = 1\.5"):
         read_tips(path, 40.0, 2.0)

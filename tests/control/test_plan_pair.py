@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 
 from endopilot.anatomy.io import read_anatomy
+from endopilot.belief.bands import Calibration
 from endopilot.cli import main
+from endopilot.control.agent import CALIBRATIONS
 from endopilot.control.plan import plan
 from endopilot.control.plan_config import Plan, PlanConfig
 from endopilot.control.plan_file import read_plan, write_plan
+from endopilot.control.plan_xray import plan_xray, read_calibration
 from endopilot.devices.catheter import read_catheter
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
@@ -31,13 +34,13 @@ def pair(vessel) -> Plan:
 
 def test_the_catheter_s_tip_arrives_with_the_wire_no_deeper_in_it_than_allowed(pair):
     assert pair.reached and pair.within_force_limit
-    assert pair.control.shape == (len(pair.position), 4)
-    assert pair.catheter_tip is not None and pair.arriving_tip is pair.catheter_tip
-    assert abs(pair.catheter_tip.abscissa[-1] - 25.0) <= 2.0
-    assert pair.simulated.abscissa[-1] >= pair.catheter_tip.abscissa[-1] - 2.0
-    assert pair.cost_terms()["end"] == pytest.approx(abs(pair.catheter_tip.abscissa[-1] - 25.0))
-    assert np.abs(pair.predicted[:, 0] - pair.simulated.abscissa).mean() < 0.5
-    assert pair.proximal[-1] == pytest.approx([2.0, 0.0, 0.0, 0.0] + 0.5 * pair.control.sum(axis=0))
+    assert pair.control.shape == (len(pair.position), 2, 2)
+    wire, catheter = pair.tip.abscissa.T
+    assert np.array_equal(pair.arriving_tip.abscissa, catheter)
+    assert abs(catheter[-1] - 25.0) <= 2.0 and wire[-1] >= catheter[-1] - 2.0
+    assert pair.cost_terms()["end"] == pytest.approx(abs(catheter[-1] - 25.0))
+    assert np.abs(pair.predicted[:, 0] - wire).mean() < 0.5
+    assert pair.proximal[-1] == pytest.approx([[2.0, 0.0], [0.0, 0.0]] + 0.5 * pair.control.sum(axis=0))
 
 
 def test_a_written_plan_is_read_back_and_drives_both_devices(pair, vessel, tmp_path):
@@ -45,26 +48,25 @@ def test_a_written_plan_is_read_back_and_drives_both_devices(pair, vessel, tmp_p
     assert figures["tip_error_mm"] == pytest.approx(pair.cost_terms()["end"], abs=1e-3)
     anatomy, wire = read_anatomy(vessel), pair.navigation.device
     back = read_plan(tmp_path / "plan", anatomy, wire, [CATHETER])
-    for name in ("control", "proximal", "position", "catheter_position", "force"):
+    for name in ("control", "proximal", "position", "force"):
         assert np.allclose(getattr(back, name), getattr(pair, name), atol=1e-12), name
-    assert back.catheter_tip is not None and pair.catheter_tip is not None
-    assert np.allclose(back.catheter_tip.abscissa, pair.catheter_tip.abscissa)
+    assert np.allclose(back.tip.abscissa, pair.tip.abscissa)
     assert back.navigation.arrives == "catheter" and back.navigation.catheters == (CATHETER,)
-    script = read_controls_csv(tmp_path / "plan" / "plan.csv", catheters=1)
-    again = simulate(
-        anatomy,
-        wire,
-        script.control,
-        catheters=[CATHETER],
-        initial=script.initial,
-        config=SimulatorConfig(threads=1),
-    )
-    assert again.catheters is not None
-    assert np.allclose(again.catheters.tip_position[0, :, 0], pair.catheter_position, atol=1e-3)
+    script = read_controls_csv(tmp_path / "plan" / "plan.csv", devices=2)
+    stack = pair.navigation.stack
+    again = simulate(anatomy, stack, script.control, initial=script.initial, config=SimulatorConfig(threads=1))
+    assert np.allclose(again.tip_position[0], pair.position, atol=1e-3)
     stiffer = replace(CATHETER, bore_friction=2 * CATHETER.bore_friction)
     for others in ([], [stiffer]):
         with pytest.raises(InputError, match=r"\(workhorse-014 in microcatheter-1\.7f\), not for workhorse-014"):
             read_plan(tmp_path / "plan", anatomy, wire, others)
+
+
+def test_the_agent_s_ensemble_forecasts_the_x_ray_of_both(pair):
+    own = read_calibration(pair.config, None, devices=2)
+    assert own == Calibration.read(CALIBRATIONS["assumed", 2]) != read_calibration(pair.config, None)
+    xray = plan_xray(pair, own)
+    assert (xray.half_width > 0).all() and xray.exposure.sum() < len(pair.control) / 2
 
 
 def test_the_commands_plan_and_simulate_take_a_catheter(vessel, tmp_path, capsys):
@@ -79,21 +81,18 @@ def test_the_commands_plan_and_simulate_take_a_catheter(vessel, tmp_path, capsys
             main(list(command))
         assert leaving.value.code == 0, capsys.readouterr().err
     assert "catheter_1_translation_mm_s" in Path(table).read_text(encoding="utf-8").splitlines()[0]
-    with pytest.raises(SystemExit) as leaving:
-        main(["plan", str(vessel), *options, *both, "--xray", "-o", str(tmp_path / "no")])
-    assert leaving.value.code == 2 and "--xray: takes a wire alone" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     ("change", "others", "line"),
     [
-        ({"config": replace(CONFIG, method="spin")}, {}, "method: spin; a wire in a catheter is planned by twin"),
+        ({"config": replace(CONFIG, method="spin")}, {}, "method: spin; a wire in a catheter is planned by search"),
         ({"target": "tips.csv"}, {}, "desired tips are followed by a wire alone"),
         ({}, {"model": "pretrained"}, "--model pretrained: models are of a wire alone"),
-        ({}, {"catheters": [CATHETER, read_catheter("straight-5f")]}, "catheter: 2; a plan drives one catheter"),
+        ({}, {"catheters": [CATHETER, read_catheter("straight-5f")]}, "catheter: 2; the search drives one"),
         ({}, {"catheters": []}, "arrives: catheter; there is none"),
         ({"config": replace(CONFIG, seconds=4.0)}, {}, r"seconds: 4 s are too few .* in microcatheter-1\.7f; give \d"),
-        ({"config": replace(CONFIG, force_limit_n=1e-6)}, {}, "no course found to branch"),
+        ({"config": replace(CONFIG, force_limit_n=1e-6)}, {}, "no path found to branch"),
     ],
 )
 def test_what_cannot_be_planned_is_refused(vessel, change, others, line):

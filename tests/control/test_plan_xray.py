@@ -10,16 +10,16 @@ import pytest
 
 from endopilot.belief.bands import Calibration
 from endopilot.belief.belief import Belief
-from endopilot.control.agent import CALIBRATED
+from endopilot.control.agent import CALIBRATIONS
 from endopilot.control.plan_config import PlanConfig
 from endopilot.control.plan_file import read_plan, write_plan
 from endopilot.control.plan_xray import PlannedXray, plan_xray, read_calibration
-from endopilot.control.route import Route
 from endopilot.errors import InputError
 from endopilot.files import write_json
 from endopilot.models.config import WINDOW
 from endopilot.models.episodes import Episodes
 from endopilot.models.open_loop import OpenLoop, Prediction
+from endopilot.tasks.route import Route
 
 STILL = (0.0, 0.0, 0.0, 0.0)
 
@@ -66,17 +66,17 @@ def by_network(found, tmp_path, monkeypatch):
     def made(predictor):
         monkeypatch.setattr("endopilot.models.rollout.load_model", lambda _: predictor)
         write_json(tmp_path / "run" / "manifest.json", {"config": {}, "networks": {}, "device": {}})
-        tip, proximal = found.simulated, np.column_stack([2.0 + 2.0 * np.arange(1, 21), np.zeros(20)])
+        tip, proximal = found.tip, np.column_stack([2.0 + 2.0 * np.arange(1, 21), np.zeros(20)])
         return replace(
             found,
             config=PlanConfig(method="mppi"),
             model=str(tmp_path / "run"),
-            control=np.tile([4.0, 0.0], (20, 1)),
-            proximal=proximal,
+            control=np.tile([4.0, 0.0], (20, 1, 1)),
+            proximal=proximal[:, None],
             desired=np.resize(found.desired, (20, 2)),
             predicted=np.column_stack([0.8 * proximal[:, 0], np.full(20, 0.1)]),
-            simulated=replace(tip, **{name: np.resize(getattr(tip, name), 20) for name in tip.__dataclass_fields__}),
-            position=np.resize(found.position, (20, 3)),
+            tip=replace(tip, **{name: np.resize(getattr(tip, name), (20, 1)) for name in tip.__dataclass_fields__}),
+            position=np.resize(found.position, (20, 1, 3)),
             force=np.resize(found.force, 20),
         )
 
@@ -138,21 +138,21 @@ def test_the_agents_wires_follow_the_plan_and_observe_its_tip(found, monkeypatch
         observed.append(measured.position)
         weigh(self, measured)
 
-    def watched_follow(self, inserted, rotation):
-        followed.append((inserted, rotation))
-        follow(self, inserted, rotation)
+    def watched_follow(self, devices):
+        followed.append(devices)
+        follow(self, devices)
 
     monkeypatch.setattr(Belief, "weigh", watched_weigh)
     monkeypatch.setattr(Belief, "follow", watched_follow)
     xray = plan_xray(found, calibration(abscissa=(5.0, 0.0, 0.0, 0.0)))  # wider than 2 mm from the start
     assert due(xray) == list(range(3, 1 + len(found.control), 3))  # not sooner than 1.5 s after the last
-    np.testing.assert_array_equal(observed, found.position[xray.exposure])
+    np.testing.assert_array_equal(observed, found.position[xray.exposure, 0])
     np.testing.assert_allclose(followed, found.proximal)
 
 
 def test_the_agents_own_calibration_asks_seldom_along_a_straight_vessel(found):
     own = read_calibration(found.config, None)
-    assert own == Calibration.read(CALIBRATED)
+    assert own == Calibration.read(CALIBRATIONS["assumed", 1])
     xray = plan_xray(found, own)
     assert (xray.half_width > 0).all()
     assert xray.exposure.sum() < len(found.control) / 3
@@ -181,6 +181,6 @@ def test_a_model_without_calibration_is_refused(tmp_path):
     (tmp_path / "run").mkdir()
     with pytest.raises(InputError, match=r"run: the model has no calibration.*endopilot advise"):
         read_calibration(PlanConfig(method="inverse"), tmp_path / "run")
-    assert read_calibration(PlanConfig(method="twin"), tmp_path / "run") == read_calibration(PlanConfig(), None)
+    assert read_calibration(PlanConfig(method="search"), tmp_path / "run") == read_calibration(PlanConfig(), None)
     with pytest.raises(InputError, match="no such run"):
         read_calibration(PlanConfig(method="mppi"), Path("nowhere"))

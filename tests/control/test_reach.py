@@ -9,13 +9,13 @@ import pytest
 
 from endopilot.anatomy.catheter_axis import with_axis
 from endopilot.control.reach import ROTATIONS, forks, lateral_reach, rotations_that_enter
-from endopilot.control.route import Route
 from endopilot.control.set_up import choose_tip
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.core import run_core
 from endopilot.simulation.rod import lay_out
 from endopilot.tasks.navigation import Navigation, Target
+from endopilot.tasks.route import Route
 from endopilot.types import Insertion
 from toy_fork import make_fork
 

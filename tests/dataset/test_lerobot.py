@@ -39,6 +39,8 @@ def test_lerobot_reads_a_dataset(toy_dataset):
     assert read["task"] == "random navigation"
     assert read["names"] == ["translation_mm_s", "rotation_rad_s"]
     assert read["episode"] == 2
-    np.testing.assert_array_equal(np.float32(read["action"]), data.control[2, 10])
-    np.testing.assert_array_equal(np.float32(read["state"][2:]), [data.tip_abscissa[2, 10], data.tip_offset[2, 10]])
+    np.testing.assert_array_equal(np.float32(read["action"]), data.control[2, 10, 0])
+    np.testing.assert_array_equal(
+        np.float32(read["state"][2:]), [data.tip_abscissa[2, 10, 0], data.tip_offset[2, 10, 0]]
+    )
     np.testing.assert_allclose(read["mean"], data.control.reshape(-1, 2).mean(axis=0), rtol=1e-3, atol=1e-5)

@@ -132,11 +132,11 @@ def test_a_catheter_follows_its_wire_and_both_are_written(patient, capsys, tmp_p
     assert abs(table["catheter_1_tip_abscissa_mm"].iloc[-1] - figures["target_mm"]) <= 2.0
     given, true = read_catheter("microcatheter-1.7f"), read_catheter(folder / "catheter-1.yaml")
     episode = load_dataset(folder / "episode")
-    lengths = episode.catheter_inserted_length[0, : len(table) - 1, 0]
+    lengths = episode.inserted_length[0, : len(table) - 1, 1]
     np.testing.assert_allclose(lengths, table["catheter_1_inserted_length_mm"][1:], atol=1e-4)
     assert true.device.friction == 1.1 * given.device.friction
     assert true == replace(given, device=replace(given.device, friction=true.device.friction))
-    assert episode.catheters == (given,) and episode.catheter_initial[0, 0].tolist() == [0.0, 0.0]
+    assert episode.stack.catheters == (given,) and episode.initial[0, 1].tolist() == [0.0, 0.0]
     again = run(
         *(capsys, "simulate", patient, "--device", folder / "wire.yaml", "--catheter", folder / "catheter-1.yaml"),
         *("--controls", folder / "controls.csv", "-o", tmp_path / "again.csv"),
@@ -163,8 +163,8 @@ def test_the_picture_shows_wire_and_catheter(patient):
         tip="own", seconds=6.0, policy="in-turn", catheter=("microcatheter-1.7f",), arrives="catheter"
     )
     found = navigate_patient(set_up_navigation(patient, "2", config))
-    record, motion = found.record, found.rollout.catheters
-    np.testing.assert_allclose(record.tip_position[1:, 1:], motion.tip_position[0], atol=1e-3)
+    record, motion = found.record, found.record.trajectory
+    np.testing.assert_array_equal(record.tip_position[1:], motion.tip_position[0])
     outcome = tell_outcome(found)
     assert "after 6 s the catheter's tip is in section 1 at 0.0 mm" in outcome  # the wire goes first
     assert "it was still on its course; give more --seconds" in outcome
@@ -175,7 +175,7 @@ def test_the_picture_shows_wire_and_catheter(patient):
     line = tip.lines[1]
     np.testing.assert_array_equal(line.get_ydata(), record.tip.abscissa[:, 1])
     assert names[pushes] == ["workhorse-014", "microcatheter-1.7f"]
-    np.testing.assert_array_equal(pushes.lines[1].get_ydata(), motion.drive_force[0, :, 0])
+    np.testing.assert_array_equal(pushes.lines[1].get_ydata(), motion.drive_force[0, :, 1])
     for axes, column in ((translation, 0), (rotation, 1)):
         for line, of_device in zip(axes.lines, record.control[..., column].T, strict=False):
             np.testing.assert_array_equal(line.get_ydata(), of_device)
@@ -184,18 +184,19 @@ def test_the_picture_shows_wire_and_catheter(patient):
 def test_the_replayed_wire_is_the_navigations_to_the_bit(patient):
     found = navigate_patient(set_up_navigation(patient, "2", NavigatePatientConfig(tip="own", seconds=20.0, seed=3)))
     samples = len(found.record.time_s) - 1
-    np.testing.assert_array_equal(found.rollout.tip_position[0], found.record.tip_position[1:, 0])
-    nodes = found.rollout.shape.shape[2]  # laid out for what is driven
-    np.testing.assert_array_equal(found.rollout.shape[0], found.record.shape[1:, :nodes])
-    assert found.rollout.tip_position.shape[1] == samples == len(found.wires) < found.episode.valid.shape[1] == 40
+    motion, again = found.record.trajectory, found.record.cycles.replay()
+    np.testing.assert_array_equal(motion.tip_position[0], found.record.tip_position[1:])
+    np.testing.assert_array_equal(again.tip_position[0, 9::10], found.record.tip_position[1:])
+    np.testing.assert_array_equal(motion.shape[0, :, 0], found.record.tip_position[1:, 0])
+    assert motion.tip_position.shape[1] == samples == len(found.wires) < found.episode.valid.shape[1] == 40
     # the likeliest wire held possible is where the record has it, a decision later
     shown = np.array([wires[0, 0] for wires in found.wires])
-    errors = np.linalg.norm(shown - found.rollout.tip_position[0], axis=1)
+    errors = np.linalg.norm(shown - motion.tip_position[0, :, 0], axis=1)
     assert np.median(errors) < 1.0
     # then the drive rests
     np.testing.assert_array_equal(found.episode.control[0, samples + 1 :], 0.0)
     np.testing.assert_allclose(
-        found.episode.inserted_length[0, :samples], found.record.inserted_length[1:, 0], atol=1e-9
+        found.episode.inserted_length[0, :samples], found.record.inserted_length[1:], atol=1e-9
     )
 
 
@@ -204,7 +205,7 @@ def test_the_episode_trains_beside_simulated_data(driven, patient, capsys, tmp_p
     episode = load_dataset(folder / "episode")
     assert len(episode) == 1 and episode.valid.all() and episode.split.tolist() == ["train"]
     table = pd.read_csv(folder / "navigation.csv")
-    np.testing.assert_allclose(episode.tip_abscissa[0, : len(table) - 1], table["tip_abscissa_mm"][1:], atol=1e-4)
+    np.testing.assert_allclose(episode.tip_abscissa[0, : len(table) - 1, 0], table["tip_abscissa_mm"][1:], atol=1e-4)
     assert episode.friction[0] == pytest.approx(0.12) and episode.tip_stiffness_factor[0] == 0.8
     sizes = ("--sequences", "4", "--seconds", "20")
     run(capsys, "dataset", patient, "-o", tmp_path / "data", *sizes)
@@ -276,7 +277,9 @@ def test_a_point_is_moved_to_the_vessel_and_told(patient, capsys, tmp_path):
     at = len(line.points) // 3
     point = line.points[at] + 0.7 * line.normals[at]
     target = ",".join(f"{value:.4f}" for value in point)
-    figures = run(capsys, "navigate", patient, f"--target={target}", "-o", tmp_path / "out", "--policy", "twin", *SHORT)
+    figures = run(
+        capsys, "navigate", patient, f"--target={target}", "-o", tmp_path / "out", "--policy", "oracle", *SHORT
+    )
     assert figures["snapped_mm"] == pytest.approx(0.7, abs=0.02)
     assert figures["target_mm"] == pytest.approx(line.abscissa[at], abs=0.5)
     assert f"{figures['snapped_mm']:.1f} mm from the given point" in figures["outcome"]

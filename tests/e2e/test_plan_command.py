@@ -93,7 +93,7 @@ def test_desired_tips_that_no_drive_can_keep_up_with(patient, tmp_path, capsys):
         (("--target", "PDA"), ("PDA", "no such section")),
         (("--target", "80,0,0"), ("80,0,0", "LPS")),
         (("--target", "0,0"), ("0,0", "no such section")),
-        (("--target", ""), ("--target: is empty", "X,Y,Z")),
+        (("--target", ""), ("target: is empty", "X,Y,Z")),
         (("--target", "nothing.csv"), ("nothing.csv",)),
         (("--target", "0,0,33", "--seconds", "2"), ("seconds: 2", "31 mm", "speed_mm_s")),
         (("--target", "0,0,33", "--method", "inverse"), ("--model",)),

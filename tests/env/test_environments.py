@@ -267,10 +267,12 @@ def test_a_wrong_branch_lengthens_the_route():
     route = tree.route(navigation.target.branch)
     side = next(i for i in range(len(tree.branches)) if i not in route and tree.branches[i].parent == 0)
     fork = tree.branches[0].centerline.abscissa[-1]
-    tip = replace(env.simulator.project(), abscissa=np.array([fork + 7.0]), branch=np.array([side]), offset=np.zeros(1))
+    tip = replace(
+        env.simulator.project(), abscissa=np.array([[fork + 7.0]]), branch=np.array([[side]]), offset=np.zeros((1, 1))
+    )
     length = env._worlds._routes.distance(tip)
     assert length == pytest.approx(7.0 + navigation.target.abscissa - fork)
-    assert not env._worlds._routes.place(tip).on_route.any()
+    assert not env._worlds._routes.place(tip[:, 0]).on_route.any()
 
 
 @pytest.mark.parametrize("action", [np.full((WORLDS, 2), np.nan), np.zeros((WORLDS, 3)), np.zeros(2)])

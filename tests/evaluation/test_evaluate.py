@@ -184,7 +184,7 @@ def test_known_patients_among_new_ones_stay_known(elsewhere, trained_on, tmp_pat
     trained = dataset.select(known & training)
     assert metrics["training_mean"] == {"navigations": len(trained), "patients": 1}
     for result in results.values():
-        mean = trained.control.mean(axis=(0, 1), dtype=float)
+        mean = trained.control.mean(axis=(0, 1, 2), dtype=float)
         np.testing.assert_allclose(result.controls["training_mean"][0, 0], mean)
         np.testing.assert_allclose(result.tips["training_mean"].offset, trained.tip_offset.mean(dtype=float))
 
@@ -235,8 +235,8 @@ def test_replayed_controls_are_simulated_from_the_start_of_the_episode(evaluated
     data = load_dataset(toy_dataset)
     name, sequence = result.anatomies[result.anatomy[0]], result.sequence[0]
     episode = data.select(np.flatnonzero((data.anatomy == name) & (data.sequence == sequence)))
-    held = np.repeat(episode.control[:, 29:30], 90, axis=1)
-    inserted = episode.inserted_length[:, 29, None] + 0.5 * np.cumsum(held[..., 0], axis=1)
+    held = np.repeat(episode.control[:, 29:30, 0], 90, axis=1)
+    inserted = episode.inserted_length[:, 29] + 0.5 * np.cumsum(held[..., 0], axis=1)
     inserted = np.minimum(np.maximum(inserted, 0.0), LENGTH_MM + SPARE_MM)
     slack = inserted - result.tips["hold_control"].abscissa[:1]
     curliness = 0.02 + 0.005 * (len(name) % 3)

@@ -75,7 +75,7 @@ def test_each_plan_is_given_the_drive_and_what_was_exposed_and_nothing_else(reco
         # the drive's motion, as it was made
         driven = recorded.drivable(control)[:, : now + 1 - GIVEN]
         np.testing.assert_allclose(episodes.control[:, GIVEN : now + 1], driven, atol=1e-4)
-        inserted = data.inserted_length[:, 29, None] + 0.5 * np.cumsum(driven[..., 0], axis=1)
+        inserted = data.inserted_length[:, 29] + 0.5 * np.cumsum(driven[..., 0], axis=1)
         np.testing.assert_allclose(episodes.proximal[:, GIVEN : now + 1, 0], inserted, atol=1e-3)
 
 
@@ -85,7 +85,7 @@ def test_x_ray_brings_the_tip_back_to_its_desired_path(recorded) -> None:
         first, control = planned(recorded, predictor)
         series = {"P4": recorded.drivable(first.control), "P4_replanned": recorded.drivable(control)}
         done = replay(recorded, series, lambda *_: None)
-    error = {name: np.abs(r.tip.abscissa - data.tip_abscissa[:, GIVEN:]) for name, r in done.items()}
+    error = {name: np.abs(r.tip.abscissa - data.tip_abscissa[:, GIVEN:, 0]) for name, r in done.items()}
     until = round(EXPOSURE_PERIOD_S / 0.5)
     np.testing.assert_array_equal(error["P4"][:, :until], error["P4_replanned"][:, :until])
     assert error["P4_replanned"][:, until:].mean() < 0.7 * error["P4"][:, until:].mean()

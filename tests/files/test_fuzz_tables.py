@@ -26,13 +26,13 @@ ODD = ["0.5", "1.0", "1.5", "0", "", "nan", "1e400", "0,5", '"', "x", " 2 ", "1_
 CELLS = st.sampled_from(ODD) | NUMBERS.map(str)
 
 
-def outcome(path: Path, content: str | bytes, catheters: int = 0) -> ScriptedControls | None:
+def outcome(path: Path, content: str | bytes, devices: int = 1) -> ScriptedControls | None:
     """Return what a file is read as; None where one line refuses it."""
     path.write_bytes(content if isinstance(content, bytes) else content.encode("utf-8", "surrogatepass"))
     found = None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        for read in (lambda: read_controls_csv(path, catheters=catheters), lambda: read_tips(path, 40.0, 2.0)):
+        for read in (lambda: read_controls_csv(path, devices=devices), lambda: read_tips(path, 40.0, 2.0)):
             try:
                 found = read() if found is None else found
             except InputError as error:
@@ -51,10 +51,10 @@ def outcome(path: Path, content: str | bytes, catheters: int = 0) -> ScriptedCon
     rows=st.lists(st.lists(CELLS, max_size=7), max_size=5),
     separator=st.sampled_from(",;\t|"),
     end=st.sampled_from(["\n", "\r\n", "\r"]),
-    catheters=st.integers(0, 2),
+    devices=st.integers(1, 3),
 )
-def test_any_cells(tmp_path, header, rows, separator, end, catheters) -> None:
-    outcome(tmp_path / "c.csv", end.join(separator.join(row) for row in (header, *rows)), catheters)
+def test_any_cells(tmp_path, header, rows, separator, end, devices) -> None:
+    outcome(tmp_path / "c.csv", end.join(separator.join(row) for row in (header, *rows)), devices)
 
 
 @BOUNDED
@@ -81,4 +81,4 @@ def test_a_table_is_read_the_same_however_it_is_written(
         text = text.replace(".", ",")
     found = outcome(tmp_path / "c.csv", text.encode(encoding))
     assert found is not None and abs(found.period_s - period) < 1e-12
-    np.testing.assert_array_equal(found.control[0], rows)
+    np.testing.assert_array_equal(found.control[0, :, 0], rows)

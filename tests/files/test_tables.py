@@ -57,7 +57,7 @@ def refused(tmp_path: Path, content: str | bytes, **options: int) -> str:
 )  # fmt: skip
 def test_what_spreadsheets_add_changes_nothing(tmp_path, content) -> None:
     script, remarks = read(tmp_path, content)
-    np.testing.assert_array_equal(script.control, [[[2, 0], [-1, 0.5], [0, -0.25]]])
+    np.testing.assert_array_equal(script.control, [[[[2, 0]], [[-1, 0.5]], [[0, -0.25]]]])
     assert script.period_s == 0.5 and remarks == []
 
 
@@ -75,7 +75,7 @@ def test_what_spreadsheets_add_changes_nothing(tmp_path, content) -> None:
 )
 def test_other_separators_are_read_and_said(tmp_path, content, said) -> None:
     script, remarks = read(tmp_path, content)
-    np.testing.assert_array_equal(script.control, [[[2, 0], [-1, 0.5], [0, -0.25]]])
+    np.testing.assert_array_equal(script.control, [[[[2, 0]], [[-1, 0.5]], [[0, -0.25]]]])
     assert len(remarks) == len(said) and all(word in remark for word, remark in zip(said, remarks, strict=True))
     assert all(remark.startswith(str(tmp_path)) for remark in remarks)
 
@@ -142,7 +142,7 @@ def test_worlds_are_whole_numbers_and_each_row_has_one(tmp_path) -> None:
         return "\n".join([f"{HEADER},world", *rows]) + "\n"
 
     script, _ = read(tmp_path, table("7", "7", "3.0", "3.0"))
-    assert script.control.shape == (2, 2, 2)
+    assert script.control.shape == (2, 2, 1, 2)
     assert "row 3: world is empty" in refused(tmp_path, table("0", "", "1", "1"))
     assert "row 2: world is empty" in refused(tmp_path, table("", "", "", ""))
     assert "row 2: world = 0.5; give a whole number" in refused(tmp_path, table("0.5", "0", "1", "1"))
@@ -156,13 +156,13 @@ def test_a_state_is_whole_or_absent(tmp_path) -> None:
         return "\n".join([",".join([HEADER, *names]), ",".join(["0.5,2,0.5", *["6"] * len(names)])]) + "\n"
 
     script, _ = read(tmp_path, table("inserted_length_mm", "rotation_rad"))
-    np.testing.assert_allclose(script.initial, [[5, 5.75]])
+    np.testing.assert_allclose(script.initial, [[[5, 5.75]]])
     assert "column rotation_rad is missing where inserted_length_mm is there" in refused(
         tmp_path, table("inserted_length_mm")
     )
     assert "column inserted_length_mm is missing where rotation_rad is" in refused(tmp_path, table("rotation_rad"))
     pair = table("catheter_1_translation_mm_s", "catheter_1_rotation_rad_s", "inserted_length_mm", "rotation_rad")
-    assert "column catheter_1_inserted_length_mm is missing" in refused(tmp_path, pair, catheters=1)
+    assert "column catheter_1_inserted_length_mm is missing" in refused(tmp_path, pair, devices=2)
 
 
 def test_controls_of_a_catheter_that_is_not_there_are_said(tmp_path) -> None:
@@ -171,8 +171,8 @@ def test_controls_of_a_catheter_that_is_not_there_are_said(tmp_path) -> None:
     )
     _, remarks = read(tmp_path, content)
     assert len(remarks) == 1 and "column catheter_1_translation_mm_s is not used" in remarks[0]
-    script, remarks = read(tmp_path, content, catheters=1)
-    assert script.control.shape == (1, 3, 4) and remarks == []
+    script, remarks = read(tmp_path, content, devices=2)
+    assert script.control.shape == (1, 3, 2, 2) and remarks == []
 
 
 def test_desired_tips_are_read_by_the_same_rules(tmp_path) -> None:

@@ -10,6 +10,7 @@ from scipy.spatial import KDTree
 from shapes import BLOOD_HU, FAT_HU, dice, empty_grid, inside_tube, positions, scan
 
 from endopilot.atlas.atlas import AtlasConfig, make_patient
+from endopilot.cli import main
 from endopilot.cli import segment as segment_command
 from endopilot.errors import InputError
 from endopilot.imaging.segment import SegmentConfig, segment
@@ -227,6 +228,8 @@ def test_warnings_stand_beside_the_mask_and_on_the_command_line(heart, right_tre
     assert any("ends" in told and "main vessels are longer" in told for told in right_tree.warnings)
     write_volume(heart[0], tmp_path / "ct.nrrd")
     monkeypatch.setattr(segment_command, "segment", lambda volume, config: right_tree)
-    segment_command.command(tmp_path / "ct.nrrd", output=tmp_path / "mask.nrrd")
+    with pytest.raises(SystemExit) as leaving:
+        main(["segment", str(tmp_path / "ct.nrrd"), "-o", str(tmp_path / "mask.nrrd")])
+    assert leaving.value.code == 0
     assert right_tree.warnings[0] in capsys.readouterr().out
     assert json.loads((tmp_path / "mask.json").read_text())["warnings"] == list(right_tree.warnings)

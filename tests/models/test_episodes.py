@@ -24,15 +24,17 @@ def dataset(toy_dataset):
 
 
 def test_a_dataset_gives_its_navigations_to_the_bit(dataset):
-    slipped = replace(dataset, slip=np.random.default_rng(1).uniform(0, 1, dataset.slip.shape).astype(np.float32))
+    slip = np.random.default_rng(1).uniform(0, 1, dataset.slip.shape).astype(np.float32)
+    asked = dataset.control + np.stack([slip, np.zeros_like(slip)], axis=-1) / dataset.sample_period_s
+    slipped = replace(dataset, slip=slip, command=asked.astype(np.float32).astype(float))
     episodes = Episodes.of_dataset(slipped)
     assert len(episodes) == len(dataset) and episodes.samples == 120
-    np.testing.assert_array_equal(episodes.proximal[..., 0], dataset.inserted_length)
-    np.testing.assert_array_equal(episodes.proximal[..., 1], dataset.rotation)
-    np.testing.assert_array_equal(episodes.tip[..., 0], dataset.tip_abscissa)
-    np.testing.assert_array_equal(episodes.tip[..., 1], dataset.tip_offset)
-    np.testing.assert_array_equal(episodes.initial[:, 0], dataset.initial_inserted_length)
-    np.testing.assert_array_equal(episodes.command, slipped.command)
+    np.testing.assert_array_equal(episodes.proximal[..., 0], dataset.inserted_length[:, :, 0])
+    np.testing.assert_array_equal(episodes.proximal[..., 1], dataset.rotation[:, :, 0])
+    np.testing.assert_array_equal(episodes.tip[..., 0], dataset.tip_abscissa[:, :, 0])
+    np.testing.assert_array_equal(episodes.tip[..., 1], dataset.tip_offset[:, :, 0])
+    np.testing.assert_array_equal(episodes.initial, dataset.initial[:, 0])
+    np.testing.assert_array_equal(episodes.command, slipped.command[:, :, 0])
     assert np.abs(episodes.command - episodes.control).max() > 1.0
     names = set(dataset.anatomy.tolist())
     assert names == set(episodes.setup.anatomies) == set(episodes.setup.identities)

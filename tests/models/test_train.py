@@ -45,11 +45,11 @@ def test_windows_hold_what_the_paper_says(toy_dataset, name):
         name, torch.tensor([[2, 30], [5, 119]])
     )
     first = slice(0, 30) if name == "ff" else slice(1, 31)
-    np.testing.assert_array_equal(tip[0, :, 0], data.tip_abscissa[2, first])
+    np.testing.assert_array_equal(tip[0, :, 0], data.tip_abscissa[2, first, 0])
     first = slice(1, 31) if name == "ff" else slice(0, 30)
-    np.testing.assert_array_equal(proximal[0, :, 1], data.rotation[2, first])
-    np.testing.assert_array_equal(control[0], data.control[2, first])
-    expected = (data.tip_abscissa[5, 119], data.tip_offset[5, 119]) if name == "ff" else data.control[5, 119]
+    np.testing.assert_array_equal(proximal[0, :, 1], data.rotation[2, first, 0])
+    np.testing.assert_array_equal(control[0], data.control[2, first, 0])
+    expected = (data.tip_abscissa[5, 119, 0], data.tip_offset[5, 119, 0]) if name == "ff" else data.control[5, 119, 0]
     np.testing.assert_array_equal(truth[1], expected)
 
 

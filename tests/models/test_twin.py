@@ -16,6 +16,7 @@ from endopilot.devices.device import read_device
 from endopilot.errors import InputError
 from endopilot.models import twin as twin_module
 from endopilot.models.config import TrainConfig, TwinConfig
+from endopilot.models.ensemble import Ensemble
 from endopilot.models.episodes import Episodes
 from endopilot.models.rollout import load_model
 from endopilot.models.simulated_wires import simulated_tips
@@ -55,7 +56,7 @@ def test_identified_from_the_given_tips_it_predicts_the_others(folder, episodes)
     control = episodes.control.astype(float)
     drawn_out = -0.5 * np.cumsum(control[..., 0], axis=1).min(axis=1)
     start = np.column_stack([np.maximum(episodes.initial[:, 0], drawn_out), episodes.initial[:, 1]])
-    nominal = simulate(anatomy, twin.device, control, initial=start).tip.abscissa[:, later]
+    nominal = simulate(anatomy, twin.device, control, initial=start).tip.abscissa[:, later, 0]
     nominal_error = np.abs(nominal - episodes.tip[:, later, 0])
     # of the middle navigation: where a snap falls on the other side of its edge, one of four errs by a millimetre
     assert np.median(error[..., 0].mean(axis=1)) < 0.1  # mm
@@ -84,11 +85,12 @@ def test_a_wire_that_is_held_while_it_is_pulled_starts_where_it_lies(folder, epi
     """What a drive was commanded and did not make moves no wire: the sum of commands says nothing of where it began."""
     starts = []
 
-    def kept(*args, initial, **kwargs):
-        starts.append(initial[:, 0])
-        return simulate(*args, initial=initial, **kwargs)
+    class Kept(Ensemble):
+        def __init__(self, *args, **kwargs):
+            super().__init__(*args, **kwargs)
+            starts.append(self.set_up.initial[:, 0, 0])
 
-    monkeypatch.setattr(twin_module, "simulate", kept)
+    monkeypatch.setattr(twin_module, "Ensemble", Kept)
     held = replace(episodes, slip=episodes.slip - np.array([5.0, 0.0], dtype=episodes.slip.dtype))
     twin = load_model(folder / "run")
     twin.predict(held.select(np.array([0])), GIVEN)
@@ -136,7 +138,7 @@ def test_under_way_it_drives_on_from_what_was_driven(folder, episodes) -> None:
 
 
 def test_all_protocols_share_one_ensemble_and_one_search(folder, episodes, monkeypatch) -> None:
-    calls = {"simulate": 0, "track": 0}
+    calls = {"Ensemble": 0, "track": 0}
 
     def counted(name):
         real = getattr(twin_module, name)
@@ -152,9 +154,9 @@ def test_all_protocols_share_one_ensemble_and_one_search(folder, episodes, monke
     few = episodes.select(np.array([0]))
     twin = load_model(folder / "run")
     forward = twin.rollout_forward(few)
-    simulated = calls["simulate"]
+    simulated = calls["Ensemble"]
     inverse, dual = twin.rollout_inverse(few), twin.rollout_dual(few)
-    assert simulated > 0 and calls == {"simulate": simulated, "track": 1}
+    assert simulated > 0 and calls == {"Ensemble": simulated, "track": 1}
     np.testing.assert_array_equal(inverse.control, dual.control)
     # other episodes are not taken for these
     other = twin.rollout_forward(episodes.select(np.array([1])))

@@ -163,10 +163,11 @@ def test_steps_of_the_loop_are_the_navigation_to_the_bit(straight) -> None:
         loop.advance(2.0)
     stepped = loop.record()
     assert stepped.reason == whole.reason
-    for name in ("tip_position", "contact_force_max", "control", "driven", "exposed"):
+    for name in ("tip_position", "contact_force_max", "control", "exposed"):
         np.testing.assert_array_equal(getattr(stepped, name), getattr(whole, name), err_msg=name)
-    assert whole.driven.shape == (10 * (len(whole.time_s) - 1), 1, 2)
-    moved = whole.inserted_length[0, 0] + 0.05 * np.cumsum(whole.driven[:, 0, 0])[9::10]
+    np.testing.assert_array_equal(stepped.cycles.command, whole.cycles.command)
+    assert whole.cycles.command.shape == (1, 10 * (len(whole.time_s) - 1), 1, 2)
+    moved = whole.inserted_length[0, 0] + 0.05 * np.cumsum(whole.cycles.command[0, :, 0, 0])[9::10]
     np.testing.assert_allclose(moved, whole.inserted_length[1:, 0], atol=1e-6)
     assert np.array_equal(whole.shape[:, 0], whole.tip_position[:, 0]) and len(whole.shape) == len(whole.time_s)
 
@@ -213,7 +214,7 @@ def test_a_cycle_of_the_drives_divides_the_time_between_two_decisions(straight) 
     ends = {}
     for cycle_s in (CYCLE_S, 0.0125):
         record = navigate(straight, Forward(3.0), config=NavigateConfig(robot=PERFECT, cycle_s=cycle_s), seed=1)
-        assert len(record.driven) == record.seconds / cycle_s
+        assert record.cycles.command.shape[1] == record.seconds / cycle_s
         ends[cycle_s] = record.tip_position[-1]
     np.testing.assert_allclose(ends[CYCLE_S], ends[0.0125], atol=0.05)
 

@@ -14,7 +14,8 @@ from endopilot.errors import InputError
 from endopilot.ladder.scores import COAXIAL
 from endopilot.settings import read_settings
 from endopilot.tasks import task
-from endopilot.tasks.task import Task, find_task, ladder_tasks, target_in_section, turn_rad, without_catheter
+from endopilot.tasks.targets import find_target, turn_rad
+from endopilot.tasks.task import Task, find_task, ladder_tasks, without_catheter
 
 FOLDER = Path(task.__file__).parent
 FILES = sorted(FOLDER.glob("ladder_*/*.yaml"))
@@ -46,7 +47,7 @@ def test_coaxial_tasks_are_done_by_the_tip_of_a_catheter():
     assert [each.level for each in tasks] == list(COAXIAL)
     for each in tasks:
         tree, _ = make_patient_tree(each.atlas(each.ladder.seed), each.ladder.numbers[0])
-        target = target_in_section(tree, each.section, each.depth_mm)
+        target = find_target(tree, each.section, depth_mm=each.depth_mm)
         assert each.start_catheter_mm < each.start_inserted_mm < target.abscissa
     navigation = find_task("follow", "coaxial").ladder_navigation(0)
     assert navigation.arrives == "catheter" and [c.name for c in navigation.catheters] == ["microcatheter-1.7f"]
@@ -59,14 +60,14 @@ def test_the_side_branch_leaves_at_ninety_degrees_or_more():
     steep = find_task("side-branch", "coaxial")
     for place in (0, 7):
         tree, _ = make_patient_tree(steep.atlas(steep.ladder.seed), steep.ladder.numbers[place])
-        assert turn_rad(tree, target_in_section(tree, steep.section, 0.5).branch) >= np.pi / 2
+        assert turn_rad(tree, find_target(tree, steep.section, depth_mm=0.5).branch) >= np.pi / 2
 
 
 @pytest.mark.parametrize("name", ["straight", "crux", "carotid"])
 def test_the_target_lies_in_its_section(name):
     task = find_task(name)
     tree, _ = make_patient_tree(task.atlas(task.ladder.seed), task.ladder.numbers[0])
-    target = target_in_section(tree, task.section, task.depth_mm)
+    target = find_target(tree, task.section, depth_mm=task.depth_mm)
     branch = tree.branches[target.branch]
     at = int(np.searchsorted(branch.centerline.abscissa, target.abscissa))
     assert tree.section_names[branch.section[at]] == task.section
@@ -104,9 +105,9 @@ def test_what_is_wrong_in_a_file_is_named(tmp_path, old, new, line):
 
 def test_a_target_outside_the_tree_is_refused():
     tree, _ = make_patient_tree(AtlasConfig(population="textbook"), 0)
-    with pytest.raises(InputError, match="section: 'LAD'"):
-        target_in_section(tree, "LAD", 5.0)
+    with pytest.raises(InputError, match="target: 'LAD'"):
+        find_target(tree, "LAD", depth_mm=5.0)
     with pytest.raises(InputError, match="depth_mm: 500"):
-        target_in_section(tree, "4", 500.0)
+        find_target(tree, "4", depth_mm=500.0)
     with pytest.raises(InputError, match="patient: 20"):
         find_task("crux").patient(find_task("crux").ladder, 20)

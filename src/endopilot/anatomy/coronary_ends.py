@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import KDTree
 from scipy.stats import rankdata
 
@@ -87,8 +89,6 @@ class OpenEnd:
 
 def skeleton_of(points: Float[np.ndarray, "n 3"], clearance: Float[np.ndarray, "n"], spacing_mm: float) -> Skeleton:
     """Return the skeleton of one connected lumen, given as grid points with their distances to the wall, mm."""
-    from scipy.sparse import csr_matrix
-
     graph = lumen_graph(points, clearance, spacing_mm, int(clearance.argmax()))
     graph = lumen_graph(graph.points, graph.clearance, spacing_mm, int(graph.length.argmax()))
     paths = trace_branches(graph, minimum_length_mm=STUB_MM, coverage=STUB_COVERAGE, slenderness=STUB_SLENDERNESS)
@@ -107,8 +107,6 @@ def skeleton_of(points: Float[np.ndarray, "n 3"], clearance: Float[np.ndarray, "
 
 def open_ends(skeleton: Skeleton) -> list[OpenEnd]:
     """Return every end of a skeleton, described as the root of its tree."""
-    from scipy.sparse.csgraph import dijkstra
-
     length, before = dijkstra(skeleton.edges, directed=False, indices=skeleton.tips, return_predecessors=True)
     trees = zip(skeleton.tips, length, before, strict=True)
     return [_described(skeleton, int(tip), own, back) for tip, own, back in trees]

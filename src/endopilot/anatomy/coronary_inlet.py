@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
+from scipy.ndimage import distance_transform_edt, find_objects, minimum_filter
 
 from endopilot.anatomy import parent_vessel, repair, repair_surface
 from endopilot.anatomy.coronary_crux import Crux, find_crux
@@ -17,6 +18,7 @@ from endopilot.anatomy.surface import Surface, filled_box, surface_from_mask
 from endopilot.anatomy.topology import parted
 from endopilot.anatomy.units import check_unit
 from endopilot.errors import InputError, place_text
+from endopilot.imaging.grid import connected_components
 from endopilot.types import DistanceMap, Insertion, LumenMask, Volume
 
 CERTAIN = 0.8
@@ -187,10 +189,7 @@ def _lumens(content: Volume | Surface, label: str) -> Iterator[DistanceMap]:
 
 
 def _parts(lumen: DistanceMap, inside: np.ndarray) -> Iterator[tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]]:
-    from scipy.ndimage import find_objects
-    from scipy.ndimage import label as components
-
-    labels, _ = components(inside, structure=np.ones((3, 3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
+    labels = connected_components(inside, corners=True)
     for number, box in enumerate(find_objects(labels), start=1):
         own = labels[box] == number
         corner = np.array([part.start for part in box])
@@ -201,8 +200,6 @@ def _parts(lumen: DistanceMap, inside: np.ndarray) -> Iterator[tuple[Float[np.nd
 
 def _holds_aorta(coarse: Volume) -> bool:
     """Return whether a mask is somewhere too thick for a coronary artery, at a fraction of its wall's cost."""
-    from scipy.ndimage import distance_transform_edt, minimum_filter
-
     # A ball holds a cube of its radius over √3; without such a cube the costly distance need not be asked.
     cube = 2 * np.floor(parent_vessel.AORTA_RADIUS_MM / np.sqrt(3.0) / coarse.spacing_mm[::-1]).astype(int) - 1
     if not minimum_filter(coarse.voxels, size=np.maximum(cube, 1), mode="constant").any():

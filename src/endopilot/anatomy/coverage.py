@@ -13,11 +13,13 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
 from endopilot.anatomy.distance import MAXIMUM_GRID_POINTS
+from endopilot.anatomy.lumen_graph import pieces
 from endopilot.anatomy.medial_lines import MedialLines
 from endopilot.anatomy.repair import MOST_LISTED, NOTED_MM
 from endopilot.anatomy.surface import Surface, blur_voxels, level_function
 from endopilot.anatomy.tree import sampled
 from endopilot.errors import place_text
+from endopilot.imaging.grid import connected_components
 from endopilot.types import VesselTree, Volume
 
 _REACH_VOXELS = 1.5
@@ -126,10 +128,8 @@ def stretches(
         chosen: which points.
         order: a part begins at its point of the lowest value; by default at that nearest to the widest place.
     """
-    from scipy.sparse.csgraph import connected_components
-
     inner = chosen[lines.edges].all(axis=1)
-    _, part = connected_components(lines.matrix(lines.edges[inner]), directed=False)
+    part = pieces(lines.edges[inner], len(lines.points))
     length, behind = lines.from_widest
     order = length if order is None else order
     found = []
@@ -204,10 +204,8 @@ def _thin(mask: Volume, lines: MedialLines, enough: float) -> Bool[np.ndarray, "
 
     Voxel centres lie up to half a diagonal off the axis, so that the deepest one around a point stands for it.
     """
-    from scipy.ndimage import label
-
     level = level_function(np.pad(mask.voxels, 4), mask.spacing_mm[::-1])[3:-3, 3:-3, 3:-3]
-    core, _ = label(level > enough, structure=np.ones((3, 3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
+    core = connected_components(level > enough, corners=True)
     around = (lines.index[:, None, :] + np.array(list(np.ndindex(3, 3, 3)))).reshape(-1, 3)
     depth = level[tuple(around.T)].reshape(-1, 27)
     part = core[tuple(around.T)].reshape(-1, 27)[np.arange(len(depth)), depth.argmax(axis=1)]

@@ -32,6 +32,7 @@ from endopilot.anatomy.surface import Surface, surface_from_mask
 from endopilot.anatomy.tree import tree_from_lines
 from endopilot.anatomy.units import SMALLEST_RADIUS_MM, check_unit
 from endopilot.errors import InputError, place_text
+from endopilot.imaging.grid import connected_components
 from endopilot.progress import progress
 from endopilot.settings import Finite, Within, settings
 from endopilot.types import Anatomy, DistanceMap, Insertion, LumenMask, VesselTree
@@ -312,14 +313,12 @@ def _tree(
 
 def _final_map(surface: Surface, tree: VesselTree, config: AnatomyConfig) -> DistanceMap:
     """Return the distance map at its final spacing, without lumens that the tree does not reach."""
-    from scipy.ndimage import label
-
     radius = np.concatenate([branch.centerline.radius for branch in tree.branches])
     points = np.concatenate([branch.centerline.points for branch in tree.branches])
     spacing = config.spacing_mm or automatic_spacing(radius, np.ptp(surface.vertices, axis=0) + 5.0)
     result = distance_map_from_surface(surface, spacing_mm=spacing)
-    labels, count = label(result.values > 0, structure=np.ones((3, 3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
-    if count > 1:
+    labels = connected_components(result.values > 0, corners=True)
+    if labels.max() > 1:
         index = np.rint((points - result.origin_mm) / spacing).astype(int)[:, ::-1]
         index = np.clip(index, 0, np.array(result.values.shape) - 1)
         reached = np.unique(labels[tuple(index.T)])

@@ -13,6 +13,7 @@ from endopilot.anatomy.distance import distance_map_from_surface
 from endopilot.anatomy.line_ends import end_score as inlet_score
 from endopilot.anatomy.lumen_graph import lumen_graph, trace_branches
 from endopilot.anatomy.surface import Surface
+from endopilot.imaging.grid import connected_components
 from endopilot.types import DistanceMap, Insertion
 
 ENTRANCE_RADII = 3.0
@@ -29,10 +30,8 @@ _BRANCH_MM = 4.0
 
 def component(distance_map: DistanceMap, given: Insertion | None) -> Bool[np.ndarray, "nz ny nx"]:
     """Return the connected inside at the ostium, or the largest one."""
-    from scipy.ndimage import label
-
-    labels, count = label(distance_map.values > 0, structure=np.ones((3, 3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
-    if count <= 1 or given is None:
+    labels = connected_components(distance_map.values > 0, corners=True)
+    if labels.max() <= 1 or given is None:
         sizes = np.bincount(labels.ravel())
         sizes[0] = 0
         return labels == sizes.argmax()
@@ -65,8 +64,6 @@ def beyond_parent(
         side: which coronary artery is wanted.
         inlet: where the artery begins, LPS mm, if the lumen holds no aorta; a stub of the aorta may bulge there.
     """
-    from scipy.ndimage import label
-
     if distance_map.values[inside].max(initial=0.0) < parent_vessel.PARENT_RADIUS_MM[0]:
         return None, inside
     coarse = distance_map
@@ -92,7 +89,7 @@ def beyond_parent(
     nearest = np.clip(nearest, 0, np.array(parent.shape) - 1)
     beyond = inside.copy()
     beyond[tuple(index.T)] = ~parent[tuple(nearest.T)]
-    labels, _ = label(beyond, structure=np.ones((3, 3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
+    labels = connected_components(beyond, corners=True)
     return ostium, part_at(distance_map, labels, ostium)
 
 

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from endopilot.anatomy.labels_tree import Labeller
 
-LEFT, FRONT, HEAD = np.array([1.0, 0.0, 0.0]), np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, 1.0])
+LEFT, FRONT = np.array([1.0, 0.0, 0.0]), np.array([0.0, -1.0, 0.0])
 
 _LONG_MM = 35.0
 """Where two branches with this much behind them part, the internal carotid ends."""

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
 from endopilot.anatomy.line_graph import STEP_MM, LineNodes
+from endopilot.anatomy.lumen_graph import groups, pieces
 from endopilot.anatomy.sources import Polylines
 from endopilot.errors import place_text
 from endopilot.types import VesselTree
@@ -76,17 +77,12 @@ def left_out(
 
 def _stretches(nodes: LineNodes, lost: Int[np.ndarray, "l"], kept: Bool[np.ndarray, "n"]) -> Int[np.ndarray, "l"]:
     """Return which stretch each lost node belongs to: those joined along lines, or lying on one another."""
-    from scipy.sparse import csr_matrix
-    from scipy.sparse.csgraph import connected_components
-
     follows = (np.diff(lost) == 1) & (nodes.owner[lost[1:]] == nodes.owner[lost[:-1]])
     follows &= kept[lost[1:]] == kept[lost[:-1]]
     along = np.flatnonzero(follows)
     near = KDTree(nodes.points[lost]).query_pairs(2 * STEP_MM, output_type="ndarray")
     near = near[kept[lost[near[:, 0]]] == kept[lost[near[:, 1]]]]
-    rows, columns = np.concatenate([along, near[:, 0]]), np.concatenate([along + 1, near[:, 1]])
-    matrix = csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(len(lost), len(lost)))
-    return connected_components(matrix, directed=False)[1]
+    return pieces(np.concatenate([np.stack([along, along + 1], axis=1), near]), len(lost))
 
 
 def _length_once(nodes: LineNodes, part: Int[np.ndarray, "p"]) -> float:
@@ -121,7 +117,7 @@ def closures(tree: VesselTree) -> list[str]:
         return []
     one, two, overlap, route = one[found], two[found], overlap[found], route[found]
     places = 0.5 * (points[one] + points[two])
-    cluster = _clusters(places, float(np.median(radius[one])) + STEP_MM)
+    cluster = groups(places, float(np.median(radius[one])) + STEP_MM)
     notes = []
     for number in range(cluster.max() + 1):
         mine = np.flatnonzero(cluster == number)
@@ -223,17 +219,7 @@ def _ends_near(
     """Return whether a point lies within two radii of the end of its branch, and the branch ends blind there."""
     number = int(branch[index])
     end = float(tree.branches[number].centerline.abscissa[-1])
-    leaf = all(other.parent != number for other in tree.branches)
-    return leaf and end - float(abscissa[index]) < 2 * float(radius[index]) + STEP_MM
-
-
-def _clusters(places: Float[np.ndarray, "n 3"], apart_mm: float) -> Int[np.ndarray, "n"]:
-    from scipy.sparse import csr_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    near = KDTree(places).query_pairs(apart_mm, output_type="ndarray")
-    matrix = csr_matrix((np.ones(len(near)), (near[:, 0], near[:, 1])), shape=(len(places), len(places)))
-    return connected_components(matrix, directed=False)[1]
+    return number in tree.leaves() and end - float(abscissa[index]) < 2 * float(radius[index]) + STEP_MM
 
 
 def further_inlets(source: Polylines, tree: VesselTree) -> list[str]:

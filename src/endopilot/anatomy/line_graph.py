@@ -7,8 +7,10 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.sparse import csr_matrix
 from scipy.spatial import KDTree
 
+from endopilot.anatomy.lumen_graph import pieces
 from endopilot.anatomy.sources import Polylines
 
 STEP_MM = 0.5
@@ -86,8 +88,6 @@ class Edges:
     @cached_property
     def matrix(self):
         """Return the sparse matrix of the costs between nodes; of edges that repeat, the cheapest counts."""
-        from scipy.sparse import csr_matrix
-
         key = np.minimum(*self.nodes.T) * self.count + np.maximum(*self.nodes.T)
         order = np.lexsort((self.cost, key))
         first = order[np.concatenate([[True], np.diff(key[order]) != 0])] if len(key) else order
@@ -97,9 +97,7 @@ class Edges:
     @cached_property
     def pieces(self) -> Int[np.ndarray, "n"]:
         """Return for each node the number of the connected piece that it belongs to."""
-        from scipy.sparse.csgraph import connected_components
-
-        return connected_components(self.matrix, directed=False)[1]
+        return pieces(self.nodes, self.count)
 
 
 def dense_nodes(source: Polylines) -> LineNodes:

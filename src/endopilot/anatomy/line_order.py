@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.spatial import KDTree
 
 from endopilot.anatomy.sources import Polylines
@@ -79,9 +81,6 @@ def _order(line: Float[np.ndarray, "n 3"], label: str) -> Int[np.ndarray, "n"] |
 
     The shortest tree through the points, where it has no fork, is the order along a vessel.
     """
-    from scipy.sparse import csr_matrix
-    from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
-
     count = len(line)
     if count < 4:
         return None

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import KDTree
 
 COVERAGE = 1.6
@@ -45,6 +47,17 @@ class LumenGraph:
     spacing_mm: float
 
 
+def pieces(pairs: Int[np.ndarray, "m 2"], count: int) -> Int[np.ndarray, "count"]:
+    """Return for each of `count` nodes, of which pairs are joined, the number of its connected piece, from 0 on."""
+    joined = csr_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    return connected_components(joined, directed=False)[1]
+
+
+def groups(points: Float[np.ndarray, "n 3"], apart_mm: float) -> Int[np.ndarray, "n"]:
+    """Return for each point the number of its group: points as near each other as this, mm, are of one."""
+    return pieces(KDTree(points).query_pairs(apart_mm, output_type="ndarray"), len(points))
+
+
 def lumen_graph(
     points: Float[np.ndarray, "n 3"],
     clearance: Float[np.ndarray, "n"],
@@ -59,9 +72,6 @@ def lumen_graph(
         spacing_mm: spacing of the grid, one or along each axis, mm; the graph keeps the largest.
         root: index of the point that all paths lead to.
     """
-    from scipy.sparse import csr_matrix
-    from scipy.sparse.csgraph import dijkstra
-
     edges = np.broadcast_to(np.asarray(spacing_mm, dtype=float), 3)
     index = np.rint((points - points.min(axis=0)) / edges).astype(np.int64) + 1
     shape = index.max(axis=0) + 2

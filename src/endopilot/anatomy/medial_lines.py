@@ -12,9 +12,13 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.ndimage import find_objects
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import dijkstra, minimum_spanning_tree
 from scipy.spatial import KDTree
 
-from endopilot.anatomy.lumen_graph import lumen_graph, trace_branches
+from endopilot.anatomy.lumen_graph import lumen_graph, pieces, trace_branches
+from endopilot.imaging.grid import connected_components
 from endopilot.types import Volume
 
 _NEIGHBOURS_APART = 1.8
@@ -57,11 +61,11 @@ class MedialLines:
     @cached_property
     def from_widest(self) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
         """Length of the path from each piece's widest place to each point, and of all at and beyond that point, mm."""
-        from scipy.sparse.csgraph import connected_components, dijkstra
-
         length, behind = np.zeros(len(self.points)), self.share_mm.copy()
-        count, piece = connected_components(self.forest, directed=False)
-        roots = [np.flatnonzero(piece == i)[self.clearance[piece == i].argmax()] for i in range(count)]
+        piece = pieces(self.edges, len(self.points))
+        roots = [
+            np.flatnonzero(piece == i)[self.clearance[piece == i].argmax()] for i in range(piece.max(initial=-1) + 1)
+        ]
         length, before, _ = dijkstra(
             self.forest, directed=False, indices=roots, return_predecessors=True, min_only=True
         )  # pyright: ignore[reportAssignmentType]
@@ -76,8 +80,6 @@ class MedialLines:
 
     def matrix(self, edges: Int[np.ndarray, "m 2"]) -> Any:
         """Return edges as a sparse matrix of lengths, mm, both ways."""
-        from scipy.sparse import coo_matrix
-
         both = np.concatenate([edges, edges[:, ::-1]])
         size = (len(self.points),) * 2
         return coo_matrix((np.tile(self.lengths(edges), 2), (both[:, 0], both[:, 1])), shape=size).tocsr()
@@ -97,9 +99,7 @@ def thinned_lines(mask: Volume) -> MedialLines:
 
 def traced_lines(mask: Volume) -> MedialLines:
     """Return the middle of a mask as paths between the ends of each piece: every end, but no tunnel."""
-    from scipy.ndimage import find_objects, label
-
-    labels, _ = label(mask.voxels, structure=np.ones((3, 3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
+    labels = connected_components(mask.voxels, corners=True)
     index, clearance, edges = [np.empty((0, 3), int)], [np.empty(0)], [np.empty((0, 2), int)]
     for number, box in enumerate(find_objects(labels), start=1):
         own = np.pad(labels[box] == number, 1)
@@ -169,9 +169,6 @@ def _widest_forest(
     pairs: Int[np.ndarray, "m 2"], clearance: Float[np.ndarray, "n"], apart: Float[np.ndarray, "m"]
 ) -> tuple[Int[np.ndarray, "e 2"], Int[np.ndarray, "k 2"]]:
     """Return the forest whose paths are as wide as they can be, and the edges that would close a loop."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import minimum_spanning_tree
-
     # Of equally wide edges the shorter is kept, so that the corners of the voxels' steps are not cut.
     cost = 1.0 + clearance.max(initial=0.0) - clearance[pairs].min(axis=1) + 1e-3 * apart
     size = (len(clearance),) * 2

@@ -6,8 +6,10 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.ndimage import center_of_mass, distance_transform_edt
 
 from endopilot.anatomy.lumen_graph import LumenGraph
+from endopilot.imaging.grid import connected_components
 from endopilot.types import DistanceMap, Insertion
 
 Vessel = Literal["rca", "lca", "generic"]
@@ -64,8 +66,6 @@ def parent_region(
         graph: that lumen, with the paths to the inlet as root.
         usual_mm: median radius along the tree, mm.
     """
-    from scipy.ndimage import distance_transform_edt, label
-
     spacing = distance_map.spacing_mm
     wide = float(np.clip(PARENT_RATIO * usual_mm, *PARENT_RADIUS_MM))
     core = inside & (distance_map.values > wide)
@@ -80,7 +80,7 @@ def parent_region(
     touching = np.flatnonzero(gap < reach)
     if len(touching) == 0:
         return None
-    labels, _ = label(core, structure=np.ones((3, 3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
+    labels = connected_components(core, corners=True)
     own = labels == labels[tuple(index[touching[gap[touching].argmin()]])]
     return inside & (np.asarray(distance_transform_edt(~own)) * spacing < wide + spacing)
 
@@ -101,11 +101,9 @@ def ostium_beyond(
         graph: the lumen with the paths to the inlet as root.
         vessel: which vessel is wanted.
     """
-    from scipy.ndimage import center_of_mass, label
-
     origin, spacing = distance_map.origin_mm, distance_map.spacing_mm
-    labels, count = label(inside & ~parent, structure=np.ones((3, 3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
-    if count == 0:
+    labels = connected_components(inside & ~parent, corners=True)
+    if (count := int(labels.max())) == 0:
         return None
     places = np.rint((graph.points - origin) / spacing).astype(int)[:, ::-1]
     piece = labels[tuple(places.T)]

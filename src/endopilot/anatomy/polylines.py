@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import KDTree
 
 from endopilot.anatomy.line_checks import closures, further_inlets, left_out
@@ -175,8 +176,6 @@ def _widest_end(nodes: LineNodes, piece: Int[np.ndarray, "n"], vessel: str, labe
 
 def _trace(nodes: LineNodes, edges: Edges, root: int) -> list[Int[np.ndarray, "_"]]:
     """Return the tree as paths of nodes, the first from the root, each other from a node of an earlier one."""
-    from scipy.sparse.csgraph import dijkstra
-
     points, radius = nodes.points, nodes.radius
     places = KDTree(points)
     distance, before = dijkstra(edges.matrix, directed=False, indices=root, return_predecessors=True)

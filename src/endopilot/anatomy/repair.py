@@ -9,12 +9,14 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.ndimage import binary_fill_holes, center_of_mass, distance_transform_edt, find_objects
 from scipy.spatial import KDTree
 
 from endopilot.anatomy.parent_vessel import COMPARABLE, Vessel, piece_on_side
 from endopilot.anatomy.surface import filled_box
 from endopilot.anatomy.topology import parted
 from endopilot.errors import InputError, place_text
+from endopilot.imaging.grid import connected_components
 from endopilot.types import Insertion, Volume
 
 NEAR_OSTIUM_MM = 5.0
@@ -64,8 +66,6 @@ def connected_mask(
     Raises:
         InputError: the mask is empty, full, a solid block, noise, or touches nothing near the given ostium.
     """
-    from scipy.ndimage import binary_fill_holes
-
     box = filled_box(mask.voxels)
     if box[0].stop == 0:
         raise InputError(f"{label}: the mask is empty; check the label or segment again")
@@ -113,10 +113,8 @@ def connected_mask(
 
 def joined_mask(mask: Volume) -> Volume:
     """Return a mask in which each of the largest pieces is joined to what carries it on; specks are left out."""
-    from scipy.ndimage import label as components
-
     voxels = np.asarray(mask.voxels, dtype=bool)
-    labels, _ = components(voxels, structure=np.ones((3, 3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
+    labels = connected_components(voxels, corners=True)
     sizes = np.bincount(labels.ravel())
     sizes[0] = 0
     pieces = [int(piece) for piece in np.argsort(-sizes)[:MOST_PIECES] if sizes[piece] >= SMALLEST_PIECE]
@@ -160,10 +158,8 @@ def _pieces(
     mask: Volume, given: Insertion | None, label: str, vessel: Vessel
 ) -> tuple[np.ndarray, np.ndarray, int, list[int]]:
     """Return the connected pieces' labels and sizes, the wanted one, and others that are nearly as large."""
-    from scipy.ndimage import label as components
-
-    labels, count = components(mask.voxels, structure=np.ones((3, 3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
-    sizes = np.bincount(labels.ravel(), minlength=count + 1)
+    labels = connected_components(mask.voxels, corners=True)
+    sizes = np.bincount(labels.ravel())
     sizes[0] = 0
     if given is None:
         return labels, sizes, *_piece_on_side(mask, labels, sizes, vessel)
@@ -199,8 +195,6 @@ def _left_out(
         sizes: their voxels, by number.
         foreign: number of a piece that belongs to another vessel, 0 if there is none.
     """
-    from scipy.ndimage import find_objects
-
     kept = np.isin(np.arange(len(sizes)), labels[result])
     kept[[0, foreign]] = True
     lost = np.flatnonzero(~kept)
@@ -240,8 +234,6 @@ def _bridged(
     Returns the lumen, how many pieces were joined, and how many are near enough but run alongside it: two vessels that
     pass each other are not one.
     """
-    from scipy.ndimage import distance_transform_edt
-
     if not pieces:
         return result, 0, 0
     result, joined, beside = result.copy(), 0, 0
@@ -302,8 +294,6 @@ def _draw_tube(voxels: np.ndarray, start: np.ndarray, end: np.ndarray, width: fl
 
 def _piece_on_side(mask: Volume, labels: np.ndarray, sizes: np.ndarray, vessel: Vessel) -> tuple[int, list[int]]:
     """Return the label of the wanted piece of a mask, and those of the others that are nearly as large."""
-    from scipy.ndimage import center_of_mass
-
     large = np.flatnonzero(sizes >= COMPARABLE * sizes.max())
     index = np.array(center_of_mass(labels > 0, labels, large))[:, ::-1]
     chosen, others = piece_on_side(sizes[large].astype(float), mask.index_to_world(index), vessel)

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
+from scipy.ndimage import binary_closing, binary_fill_holes, binary_opening
 from scipy.spatial import KDTree
 
+from endopilot.anatomy.lumen_graph import pieces
 from endopilot.anatomy.parent_vessel import Vessel, piece_on_side
 from endopilot.anatomy.repair import MOST_LISTED, MOST_PIECES, NEAR_OSTIUM_MM, NOTED_MM, other_pieces_text
 from endopilot.anatomy.surface import Surface, surface_from_mask
@@ -148,15 +148,14 @@ def _capped(mesh):
     """Close every hole by a fan of triangles from the centre of its rim to the rim's edges."""
     import pyvista
 
-    points, faces = np.asarray(mesh.points, dtype=float), np.asarray(mesh.faces.reshape(-1, 4)[:, 1:])
+    points, faces = np.asarray(mesh.points, dtype=float), np.asarray(mesh.faces.reshape(-1, 4)[:, 1:], dtype=np.int64)
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     _, inverse, uses = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
     rim = edges[uses[inverse.reshape(-1)] == 1]
     if len(rim) == 0:  # edges that more than two triangles share: no hole, but nothing that a cap closes
         return mesh
     size = len(points)
-    _, hole = connected_components(coo_matrix((np.ones(len(rim)), (rim[:, 0], rim[:, 1])), shape=(size, size)))
-    numbers, own = np.unique(hole[rim[:, 0]], return_inverse=True)
+    numbers, own = np.unique(pieces(rim, size)[rim[:, 0]], return_inverse=True)
     centres = np.stack([points[np.unique(rim[own == i])].mean(axis=0) for i in range(len(numbers))])
     fans = np.column_stack([rim[:, 1], rim[:, 0], size + own.reshape(-1)])
     closed = np.concatenate([faces, fans])
@@ -165,8 +164,6 @@ def _capped(mesh):
 
 def _from_shell(surface: Surface, label: str) -> Surface:
     """Close a surface that no cap closes: voxels that the wall shuts off from outside are inside."""
-    from scipy.ndimage import binary_closing, binary_fill_holes, binary_opening
-
     extent = np.ptp(surface.vertices, axis=0)
     spacing = max(float(np.prod(extent) / 3e6) ** (1 / 3), float(extent.max()) / 600)
     fine = surface.refined(0.7 * spacing)

@@ -13,6 +13,8 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
+from scipy.ndimage import binary_dilation
+from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import KDTree
 
 from endopilot.anatomy.medial_lines import MedialLines, thinned_lines, traced_lines
@@ -131,8 +133,6 @@ def _remarks(cuts: list[_Cut], holes: list[_Cut]) -> list[str]:
 
 def _loops(lines: MedialLines, mask: Volume) -> list[_Cut]:
     """Return a cut for every loop of the vessel's middle."""
-    from scipy.sparse.csgraph import dijkstra
-
     cuts = []
     for start, end in lines.closing:
         length, before = dijkstra(lines.forest, indices=start, return_predecessors=True)
@@ -184,8 +184,6 @@ def _without_sides(mask: Volume, lines: MedialLines) -> tuple[Volume, list[str]]
 
     Each voxel belongs to the nearest point of the middle; neighbours that belong to distant points are emptied.
     """
-    from scipy.sparse.csgraph import dijkstra
-
     if lines.clearance.max(initial=0.0) > AORTA_RADIUS_MM:  # a branch's first part lies inside the aorta's own middle
         return mask, []
     voxel = float(mask.spacing_mm.max())
@@ -258,9 +256,6 @@ def _runs_past(lines: MedialLines, ways: list[list[int]], fork: int, bridge: lis
 
 def _sever(voxels: np.ndarray, lines: MedialLines, ends: tuple[int, int]) -> None:
     """Empty the voxels between the two sides of a cut, two layers of them, so that their walls do not run together."""
-    from scipy.ndimage import binary_dilation
-    from scipy.sparse.csgraph import dijkstra
-
     one, two = ends
     others = ~np.isin(lines.edges, ends).all(axis=1)
     forest = lines.matrix(lines.edges[others])

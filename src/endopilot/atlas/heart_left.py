@@ -37,8 +37,6 @@ def place_from_ostium(distance_cm: float, azimuth_deg: float, elevation_deg: flo
 FORK = np.array([13.0, -3.0, -1.2])
 """End of the left main artery: halfway between the first points of LAD (L1p) and circumflex (C1p), mm."""
 
-LEFT_MAIN = np.array([[0.0, 0.0, 0.0], place_from_ostium(0.7, 80.0, 4.0), FORK])
-
 LAD = np.array(
     [
         FORK,

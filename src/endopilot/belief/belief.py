@@ -1,16 +1,12 @@
 """The belief about the wire between X-ray exposures: an ensemble of simulated wires, driven like the real one.
 
-Catheters around the real wire are around each simulated one too, and driven like the real ones.
-
-Its members differ in what is uncertain: friction, the stiffness of the tip, and how deep the ostium lies (as
-`models/twin.py` has it). Each follows the robot's encoders, in a
-vessel that moves as it is known to. A measurement of the tip weights them by their errors.
+Each follows the robot's encoders, in a vessel that moves as it is known to. Catheters around the real wire are around
+each simulated one too, and driven like the real ones. A measurement of the tip weights the members by their errors.
 """
 
 from __future__ import annotations
 
 import warnings
-from dataclasses import replace
 from typing import Annotated
 
 import numpy as np
@@ -19,9 +15,9 @@ from scipy.stats import qmc
 
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.stack import Proximals
+from endopilot.models.ensemble import Ensemble, likelihoods
 from endopilot.settings import NonNegative, Positive, ShareBelowOne, Within, settings
 from endopilot.simulation.config import PRESETS, SimulatorConfig
-from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
 from endopilot.types import TipProjection
 from endopilot.xray.fluoroscope import TipMeasurement
@@ -63,35 +59,26 @@ class BeliefConfig:
         )
 
 
-class Belief:
-    """An ensemble of simulated wires, and how likely each is.
+class Belief(Ensemble):
+    """An ensemble of simulated wires that follow a navigation, and how likely each is.
 
     Attributes:
-        parameters: friction factor, tip stiffness factor and depth of the ostium (mm) of each member.
-        simulator: their worlds.
-        weight: their likelihoods; the sum is 1.
+        tip: of each member's wire.
     """
 
     def __init__(
         self, navigation: Navigation, parameters: Float[np.ndarray, "members 3"], config: BeliefConfig
     ) -> None:
         """Bring every member's wire to the start of the navigation."""
-        self.parameters, self._config = parameters, config
-        device = navigation.device
-        self.wires = {
-            factor: device.with_tip(bend_rad=device.tip_bend_rad, stiffness_factor=float(factor))
-            for factor in np.unique(parameters[:, 1])
-        }
-        self.simulator = Simulator(
+        super().__init__(
             navigation.anatomy,
-            [replace(navigation.stack, wire=self.wires[factor]) for factor in parameters[:, 1]],
-            motion=navigation.known_motion,
+            navigation.stack,
+            parameters,
+            start=np.tile(navigation.start, (len(parameters), 1, 1)),
             config=config.core,
+            motion=navigation.known_motion,
         )
-        self._ostium = parameters[:, 2]
-        start, friction = np.tile(navigation.start, (len(parameters), 1, 1)), self.simulator.set_up.friction.copy()
-        friction[:, 0] = device.friction * parameters[:, 0]
-        self.simulator.reset(inserted_length=self._deeper(start[..., 0]), rotation=start[..., 1], friction=friction)
+        self._accuracy_mm = config.along_sd_mm, config.across_sd_mm
         self._limits = [DriveLimits.of(each, navigation.anatomy) for each in navigation.devices]
         self._score, self._coaxial = np.zeros(len(parameters)), bool(navigation.catheters)
         self.tip = self.simulator.project()[:, 0]
@@ -111,27 +98,24 @@ class Belief:
     def weight(self) -> Float[np.ndarray, "members"]:
         """Likelihoods of the members; a member whose simulation failed has none."""
         score = np.where(self.simulator.valid, self._score, -1e6)
-        weight = np.exp(score - score.max())
-        return weight / weight.sum()
+        return likelihoods(score)
 
-    def follow(self, inserted_length: float, rotation: float, catheters: Proximals = ()) -> None:
-        """Move every member's proximal ends to where the encoders say that they are, in one decision period."""
+    def follow(self, devices: Proximals) -> None:
+        """Move every member's proximal ends to where the encoders say that they are, in one decision period.
+
+        Args:
+            devices: inserted length (mm) and rotation (rad) of the wire, then of each catheter.
+        """
         simulator = self.simulator
-        inserted, turned = simulator.inserted_length, simulator.rotation
-        control = np.empty((simulator.worlds, simulator.devices, 2))
-        for k, (length, turn) in enumerate([(inserted_length, rotation), *catheters]):
-            motion = np.column_stack(
-                [self._deeper(np.full(len(inserted), length)) - inserted[:, k], turn - turned[:, k]]
-            )
-            control[:, k] = self._limits[k].clip(motion / DECISION_PERIOD_S, inserted[:, k], DECISION_PERIOD_S)
+        now, control = simulator.proximal, np.empty((simulator.worlds, simulator.devices, 2))
+        for k, (length, turn) in enumerate(devices):
+            ahead = self._deeper(np.full(len(now), length)) - now[:, k, 0]
+            motion = np.column_stack([ahead, turn - now[:, k, 1]])
+            control[:, k] = self._limits[k].clip(motion / DECISION_PERIOD_S, now[:, k, 0], DECISION_PERIOD_S)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a member that fails has no weight
             simulator.step(control, DECISION_PERIOD_S)
         self.tip = simulator.project()[:, 0]
-
-    def _deeper(self, given_mm: Float[np.ndarray, "members *devices"]) -> Float[np.ndarray, "members *devices"]:
-        """Return inserted lengths from each member's ostium on, mm, of those from the given one on."""
-        return np.maximum(given_mm + self._ostium.reshape(-1, *[1] * (given_mm.ndim - 1)), 0.0)
 
     def errors(self, measured: TipMeasurement) -> Float[np.ndarray, "members 2"]:
         """Return the distances of the members' tips from a measured one, along and across each wire, mm."""
@@ -151,9 +135,7 @@ class Belief:
         The density is a Cauchy density. Its tails are heavy: a tip that snapped a moment too early says little about
         friction. Its scales are no smaller than the measurement's own standard deviations.
         """
-        scaled = self.errors(measured) / np.maximum(
-            [self._config.along_sd_mm, self._config.across_sd_mm], measured.sd_mm
-        )
+        scaled = self.errors(measured) / np.maximum(self._accuracy_mm, measured.sd_mm)
         self._score = self._score - np.log1p((scaled**2).sum(axis=1))
 
     def likeliest(self) -> tuple[Int[np.ndarray, "levels"], Float[np.ndarray, "levels"]]:

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 
 from endopilot import __version__
 from endopilot.cli.process import EXIT_BAD_INPUT, carry_out, leave, own_streams
-from endopilot.errors import InputError
 
 if TYPE_CHECKING:
     from endopilot.cli.options import Command
@@ -76,13 +75,11 @@ def module_of(name: str) -> str:
     return name.replace("-", "_")
 
 
-def commands_of(name: str) -> dict[str, Command]:
-    """Return the commands of a name by their subjects, such as those of `bench`; one without subjects is under ""."""
+def command_of(name: str) -> Command:
+    """Return a command by its name."""
     from endopilot.cli.options import Command  # tyro and pydantic are slow to import
 
-    module = importlib.import_module(f"endopilot.cli.{module_of(name)}")
-    functions = getattr(module, "SUBJECTS", None) or {"": module.command}
-    return {subject: Command(f"endopilot {name} {subject}".rstrip(), one) for subject, one in functions.items()}
+    return Command(f"endopilot {name}", importlib.import_module(f"endopilot.cli.{module_of(name)}").command)
 
 
 def overview() -> str:
@@ -104,12 +101,4 @@ def overview() -> str:
 
 def _work(name: str, arguments: Sequence[str]) -> None:
     """Read a command's arguments and do its work."""
-    commands = commands_of(name)
-    if "" in commands:
-        commands[""].run(arguments)
-    elif not arguments or arguments[0] in ("-h", "--help"):
-        print(f"usage: endopilot {name} {{{','.join(commands)}}} [OPTIONS]")
-    elif arguments[0] in commands:
-        commands[arguments[0]].run(arguments[1:])
-    else:
-        raise InputError(f"{arguments[0]}: no such subject; choose from {', '.join(commands)}")
+    command_of(name).run(arguments)

@@ -18,6 +18,7 @@ from tyro.conf import arg
 from endopilot.cli.process import one_line
 from endopilot.errors import InputError
 from endopilot.files import json_text
+from endopilot.settings import Text, Within, settings
 
 EXIT_FAILED = 1
 Figures = Mapping[str, Any] | Sequence[Mapping[str, Any]]
@@ -40,6 +41,17 @@ def _named_png(path: Path) -> Path:
     if path.suffix.lower() != ".png":
         raise InputError(f"{path}: a picture is written as PNG; name it with .png")
     return path
+
+
+@settings
+class ListenConfig:
+    """Where a server listens."""
+
+    host: Text = "127.0.0.1"
+    """Address to listen on; by default only this machine can connect. 0.0.0.0 or :: for all addresses of this
+    machine."""
+    port: Annotated[int, Within(0, 65535)] = 0
+    """TCP port; 0 for a free one."""
 
 
 MUST_EXIST = "must exist"

@@ -4,24 +4,12 @@ from __future__ import annotations
 
 import webbrowser
 from pathlib import Path
-from typing import Annotated
 
 from tyro.conf import Positional
 
-from endopilot.cli.arguments import Existing
+from endopilot.cli.arguments import Existing, ListenConfig
 from endopilot.errors import InputError
-from endopilot.settings import CountOrZero, Text, Within, settings
-
-
-@settings
-class ListenConfig:
-    """The page's address."""
-
-    host: Text = "127.0.0.1"
-    """Address to listen on; by default only this machine can connect. 0.0.0.0 or :: for all addresses of this machine:
-    whoever is given the page's address, token included, can then drive."""
-    port: Annotated[int, Within(0, 65535)] = 0
-    """TCP port; 0 for a free one."""
+from endopilot.settings import CountOrZero
 
 
 def command(
@@ -57,7 +45,7 @@ def command(
         ct: CT angiogram of the patient, for the X-ray's background; a phantom's if not given.
         output: folder of the sessions' recordings.
         browser: open the page in a browser; --no-browser only prints its address.
-        listen: the page's address.
+        listen: the page's address; whoever is given it, token included, can then drive.
     """
     if episode is not None:
         _write_episode(replay, episode)

@@ -7,34 +7,23 @@ import signal
 import sys
 import time
 from pathlib import Path
-from typing import Annotated
 
+from endopilot.cli.arguments import ListenConfig
 from endopilot.devices.device import read_device
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.robot.drive import Drive
 from endopilot.robot.drive_protocol import tls_context
 from endopilot.robot.drive_server import serve
 from endopilot.robot.robot import RobotConfig
-from endopilot.settings import Finite, Within, settings
-
-
-@settings
-class ListenConfig:
-    """The drive's address and travel."""
-
-    host: str = "127.0.0.1"
-    """Address to listen on; by default only this machine can connect."""
-    port: Annotated[int, Within(0, 65535)] = 7345
-    """TCP port; 0 for a free one."""
-    travel_mm: tuple[Finite, Finite] = (0.0, 300.0)
-    """Least and largest inserted length, mm."""
+from endopilot.settings import Finite
 
 
 def command(
     *,
     certificates: Path,
     device: str = "workhorse-014",
-    listen: ListenConfig = ListenConfig(),
+    travel_mm: tuple[Finite, Finite] = (0.0, 300.0),
+    listen: ListenConfig = ListenConfig(port=7345),
     config: RobotConfig = RobotConfig(),
 ) -> None:
     """Run a simulated robotic drive until Ctrl-C; one client commands it over TLS (docs/robot.md). No medical device.
@@ -42,17 +31,18 @@ def command(
     Args:
         certificates: folder with drive.key, drive.crt and client.crt; docs/robot.md makes them.
         device: name of a device (`endopilot devices`) or a YAML file; it sets the speed limits.
-        listen: address and travel.
+        travel_mm: least and largest inserted length, mm.
+        listen: the drive's address.
         config: latency, accelerations, backlash and encoder noise.
     """
     wire = read_device(device)
     limits = DriveLimits(
         max_velocity_mm_s=wire.max_velocity_mm_s,
         max_rotation_rad_s=wire.max_rotation_rad_s,
-        travel_mm=listen.travel_mm,
+        travel_mm=travel_mm,
     )
     context = tls_context(certificates, of_drive=True)
-    low, high = listen.travel_mm
+    low, high = travel_mm
     drive = Drive(limits, now=time.monotonic(), config=config, inserted_length=min(max(low, 0.0), high))
     asyncio.run(serve(drive, context, listen.host, listen.port, lambda line: print(line, flush=True)))
     print("endopilot drive: terminated", file=sys.stderr)

@@ -12,7 +12,6 @@ from endopilot.control.plan_config import PlanConfig
 from endopilot.control.plan_file import write_plan
 from endopilot.control.plan_xray import plan_xray, read_calibration
 from endopilot.devices.catheter import read_catheter
-from endopilot.errors import InputError
 
 
 def command(
@@ -38,15 +37,13 @@ def command(
             the methods inverse and mppi.
         device: name of a device (`endopilot devices`) or a YAML file; by default the model's device, or workhorse-014
             without a model.
-        catheter: one around the wire, which is planned for too (method twin): a name such as microcatheter-1.7f, or a
+        catheter: one around the wire, which is planned for too (method search): a name such as microcatheter-1.7f, or a
             YAML file.
         xray: also predict when X-ray will be needed, with the calibration that `endopilot advise` wrote into the run
             (inverse, mppi), or with that of the agent's simulated wires (other methods).
         config: method, limits and cost.
     """
-    if xray and catheter:
-        raise InputError("--xray: takes a wire alone; leave --xray or --catheter out")
-    calibration = read_calibration(config, model) if xray else None
+    calibration = read_calibration(config, model, devices=1 + len(catheter)) if xray else None
     catheters = [read_catheter(name) for name in catheter]
     found = plan(anatomy, target, config, model=model, device=device, catheters=catheters)
     needed = None if calibration is None else plan_xray(found, calibration)

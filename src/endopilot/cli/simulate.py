@@ -81,8 +81,8 @@ def command(
     moves, period_s = motion_named(motion, motion_seed), SAMPLE_PERIOD_S
     if controls is not None and controls.is_dir():
         plan = read_plan(controls, patient, stack.wire, stack.catheters)
-        patient, stack, start = plan.navigation.anatomy, plan.navigation.stack, plan.navigation.start
-        initial, control = start[None], plan.control.reshape(1, -1, *start.shape)
+        patient, stack = plan.navigation.anatomy, plan.navigation.stack
+        initial, control = plan.navigation.start[None], plan.control[None]
     elif controls is not None:
         script = read_controls_csv(controls, devices=len(stack))
         initial, control, period_s = script.initial, script.control, script.period_s

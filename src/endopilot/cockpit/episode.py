@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
-
-import numpy as np
 
 from endopilot.anatomy.io import write_anatomy
 from endopilot.cockpit.recording import read_recording, replayed
 from endopilot.dataset.episode import write_episode
-from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
-from endopilot.simulation.simulate import simulate
 from endopilot.tasks.navigation import DECISION_PERIOD_S
 
 
@@ -38,19 +33,8 @@ def write_session_episode(session: Path, output: Path) -> None:
     targets = [event["target"] for event in recording.events if "target" in event]
     navigation, truth = recording.navigation, recording.truth
     *_, (world, _events) = replayed(recording)
-    device = navigation.device
-    wire = device.with_tip(bend_rad=device.tip_bend_rad, stiffness_factor=truth.stiffness_factor)
-    start = np.maximum(navigation.start + np.array([truth.ostium_mm, 0.0]), [0.0, -np.inf])
-    commands = np.array(world.loop.robot.driven)[: samples * per_sample].reshape(1, -1, *start.shape)
-    friction = device.friction * truth.friction_factor
-    cycles = simulate(
-        navigation.anatomy,
-        Stack(replace(wire, friction=friction), truth.catheters(navigation.catheters)),
-        commands,
-        initial=start[None],
-        config=recording.config.simulator,
-        period_s=recording.config.cycle_s,
-    )
+    cycles = world.loop.robot.recorder.trajectory().samples(slice(samples * per_sample))
+    friction = navigation.device.friction * truth.friction_factor
     folder = recording.where.patient
     if folder is None:
         folder = output.with_name(f"{output.name}-anatomy")

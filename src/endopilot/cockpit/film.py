@@ -116,9 +116,7 @@ def open_film(
         around = tuple(read_catheter(name) for name in catheters)
         plan = read_plan(path, read_anatomy(_given(patient, path)), read_device(device), around)
         start = plan.navigation.start
-        return _controls(
-            plan.navigation, start, plan.control.reshape(-1, *start.shape), DECISION_PERIOD_S, f"plan {path.name}"
-        )
+        return _controls(plan.navigation, start, plan.control, DECISION_PERIOD_S, f"plan {path.name}")
     if (path / "navigation.csv").exists():
         vessel, files = read_anatomy(_given(patient, path)), sorted(path.glob("catheter-*.yaml"))
         return _rollout(path / "controls.csv", vessel, str(path / "wire.yaml"), list(map(str, files)), 0)

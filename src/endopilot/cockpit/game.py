@@ -23,8 +23,8 @@ from endopilot.ladder.attempt import attempt, navigation_seed, scored
 from endopilot.parallel import Workers
 from endopilot.tasks.task import CORE, Task
 
-RIVALS = ("agent", "coaxial-agent")
-"""The policies whose score stands beside a person's: of a wire alone, and of a wire in a catheter."""
+RIVAL = "agent"
+"""The policy whose score stands beside a person's."""
 _SHOWN = ("success", "safe", "seconds", "exposures", "peak_force_n", "path_ratio", "reason")
 
 
@@ -44,11 +44,6 @@ class Attempt:
     def seed(self) -> int:
         """Of the navigation, the same for policies."""
         return navigation_seed(self.task, self.place)
-
-    @property
-    def rival(self) -> str:
-        """Name of the policy that drives the same task."""
-        return RIVALS[self.task.catheter is not None]
 
     def world(self) -> World:
         """Return the world at the task's start, with the ladder's rod core."""
@@ -172,16 +167,16 @@ class GameSession(Session):
         if self._rival is not None and self._rival.done():
             error = self._rival.exception()
             rival = None if error else self._rival.result()
-            failure = f"{self._tried.rival} could not drive: {error}" if error else ""
+            failure = f"{RIVAL} could not drive: {error}" if error else ""
             self._rival = None
         assert self.result is not None
         you = {name: self.result[name] for name in _SHOWN}
-        scores = {"you": you, "rival": self._tried.rival, "agent": rival, "failure": failure}
+        scores = {"you": you, "rival": RIVAL, "agent": rival, "failure": failure}
         return "result", encode("result", {"scores": scores})
 
 
 def _rival(tried: Attempt) -> dict[str, Any]:
     """Let the agent drive the same task in the same patient."""
     navigation = tried.task.ladder_navigation(tried.place)
-    scored = attempt(tried.rival, navigation, seed=tried.seed)
+    scored = attempt(RIVAL, navigation, seed=tried.seed)
     return {name: scored[name] for name in _SHOWN}

@@ -20,7 +20,7 @@ from endopilot.cockpit.world import Snapshot, World
 from endopilot.devices.stack import Proximals
 from endopilot.errors import InputError
 from endopilot.tasks.navigation import Target
-from endopilot.types import VesselTree
+from endopilot.tasks.targets import find_target
 
 SILENCE_S = 0.2
 """The drive stops after this time without a message from whose hand drives, s."""
@@ -222,9 +222,9 @@ class Session:
         """Set the target, in the middle of a section or at a place."""
         tree = self.world.navigation.anatomy.tree
         if message.section is not None:
-            self.world.loop.aim(middle_of_section(tree, message.section))
+            self.world.loop.aim(find_target(tree, message.section))
         elif message.branch is not None and message.abscissa is not None:
-            self.world.loop.aim(Target(branch=message.branch, abscissa=message.abscissa))
+            self.world.loop.aim(find_target(tree, Target(branch=message.branch, abscissa=message.abscissa)))
         else:
             raise InputError("target: give a section, or a branch and an abscissa")
         self._record(target=[self.target.branch, self.target.abscissa])
@@ -289,17 +289,3 @@ class Session:
 
 def _images(images: list[bytes]) -> list[tuple[str, bytes]]:
     return [(f"image{number}", image) for number, image in enumerate(images)]
-
-
-def middle_of_section(tree: VesselTree, section: str) -> Target:
-    """Return the place half along a section, in the branch that holds most of it.
-
-    Raises:
-        InputError: the tree has no such section.
-    """
-    if section not in tree.sections_present:
-        raise InputError(f"section: {section!r}; this vessel has {', '.join(tree.sections_present)}")
-    label = tree.section_names.index(section)
-    branch = max(range(len(tree.branches)), key=lambda index: int((tree.branches[index].section == label).sum()))
-    inside = tree.branches[branch].centerline.abscissa[tree.branches[branch].section == label]
-    return Target(branch=branch, abscissa=float((inside[0] + inside[-1]) / 2))

@@ -8,10 +8,11 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from endopilot.control.route import Route
 from endopilot.errors import InputError
 from endopilot.simulation.csv_file import read_columns
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Target
+from endopilot.tasks.route import Route
+from endopilot.tasks.targets import find_target
 from endopilot.types import Anatomy
 
 _MARGIN_S = 5.0
@@ -59,16 +60,12 @@ def last_place(anatomy: Anatomy, tips: pd.DataFrame, target: str) -> Target:
         InputError: it lies outside the tree.
     """
     tree, branch, abscissa = anatomy.tree, int(tips["branch"].iloc[-1]), float(tips["abscissa"].iloc[-1])
-    leaf = tree.longest_leaf()
-    on_path = [b for b in tree.route(leaf) if tree.branches[b].centerline.abscissa[0] <= abscissa]
-    if branch < 0 and on_path:
-        branch = on_path[-1]
-    if not 0 <= branch < len(tree.branches) or abscissa > tree.branches[branch].centerline.abscissa[-1]:
-        raise InputError(
-            f"{target}: the last tip, at {abscissa:g} mm in branch {branch}, lies outside the tree of {anatomy.name}, "
-            f"which has branches 0 to {len(tree.branches) - 1}; correct tip_abscissa_mm or branch"
-        )
-    return Target(branch=branch, abscissa=abscissa)
+    if branch < 0:
+        branch = [b for b in tree.route(tree.longest_leaf()) if tree.branches[b].centerline.abscissa[0] <= abscissa][-1]
+    try:
+        return find_target(tree, Target(branch=branch, abscissa=abscissa))
+    except InputError as error:
+        raise InputError(f"{target}: the last tip: {error}; correct tip_abscissa_mm or branch") from None
 
 
 def tips_along(

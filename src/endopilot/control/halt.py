@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Literal
 
 from endopilot.control.reach import Fork, forks
-from endopilot.control.route import BEYOND_MM, Route
 from endopilot.control.set_up import tip_name
 from endopilot.tasks.navigation import Navigation
+from endopilot.tasks.route import BEYOND_MM, Route
 
 Halt = Literal["off", "stalled", "slipped", "pressed", "late"]
 """A wire leaves the route, does not come forward though it is pushed, cannot be pushed without the drive's slipping,

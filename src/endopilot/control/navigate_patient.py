@@ -16,26 +16,24 @@ from jaxtyping import Float
 
 from endopilot.anatomy.catheter_axis import lean_between, with_axis
 from endopilot.anatomy.io import read_anatomy
-from endopilot.control.agent import TwinPolicy
-from endopilot.control.route import Route, check_passable, parse_target
+from endopilot.control.agent import OraclePolicy
 from endopilot.control.set_up import TILT_DEG, TipChoice, choose_tip
 from endopilot.devices.catheter import Catheter, read_catheter
 from endopilot.devices.device import Device, read_device
-from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.navigation.navigate import NavigateConfig, NavigationLoop, XrayKind
 from endopilot.navigation.policies import make_policy
 from endopilot.navigation.policy import Believer, Led, Observation, Policy
 from endopilot.navigation.record import NavigationRecord
 from endopilot.progress import progress
-from endopilot.robot.robot import CYCLE_S
 from endopilot.settings import Finite, Positive, Seconds, Seed, ShareBelowOne, Text, Within, settings
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.mismatch import ModelMismatch, drawn_sides, mismatch_by
 from endopilot.simulation.motion import Motion, MotionName, motion_named
-from endopilot.simulation.simulate import simulate
 from endopilot.simulation.trajectory import Trajectory
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Arrives, Navigation
+from endopilot.tasks.route import Route, check_passable
+from endopilot.tasks.targets import find_target
 from endopilot.types import Anatomy
 from endopilot.xray.fluoroscope import Fluoroscope
 
@@ -48,8 +46,8 @@ class NavigatePatientConfig:
     """Policy, wire, limits, and how reality differs from what the policy is given."""
 
     policy: Text = "agent"
-    """What decides: agent, twin, open-loop, forward, spin, retract-rotate, with a catheter coaxial-agent, in-turn or
-    catheter-alone, or MODULE:OBJECT of your own."""
+    """What decides: agent, oracle (which is given the truth), open-loop, forward, spin, retract-rotate, with a catheter
+    in-turn or catheter-alone, or MODULE:OBJECT of your own."""
     device: Text = "workhorse-014"
     """Name of a device (`endopilot devices`) or a YAML file."""
     catheter: tuple[Text, ...] = ()
@@ -153,9 +151,8 @@ class PatientNavigation:
     Attributes:
         set_up: what it began with.
         record: what happened, at the start and after each decision period.
-        rollout: the true wire with its shape at the end of each decision period, one world.
-        cycles: the same at the end of each of the drive's cycles, with a wire at rest until the time is over; without
-            shapes.
+        episode: the true motion at the end of each decision period, at rest from the end of the navigation until its
+            limit, so that all episodes of a task are of one length.
         wires: the wires that the policy held possible at the end of each period, the likeliest first: nodes from the
             tip on, LPS mm; None for a policy that does not tell.
         plans: how often the policy searched a course; None for one that does not count.
@@ -164,16 +161,10 @@ class PatientNavigation:
 
     set_up: SetUp
     record: NavigationRecord
-    rollout: Trajectory
-    cycles: Trajectory
+    episode: Trajectory
     wires: tuple[Float[np.ndarray, "wires nodes 3"], ...] | None
     plans: int | None
     planning_s: float | None
-
-    @property
-    def episode(self) -> Trajectory:
-        """The true wire at the end of each decision period, at rest from the end of the navigation until its limit."""
-        return _each_period(self.cycles)
 
 
 def set_up_navigation(anatomy: Anatomy | str | Path, target: str, config: NavigatePatientConfig | None = None) -> SetUp:
@@ -192,11 +183,11 @@ def set_up_navigation(anatomy: Anatomy | str | Path, target: str, config: Naviga
     if config.motion_known == "measured" and config.xray != "images":
         raise InputError("motion_known: measured; only X-ray images measure it: give xray: images, or published")
     vessel = anatomy if isinstance(anatomy, Anatomy) else read_anatomy(anatomy)
-    device, goal = read_device(config.device), parse_target(vessel, target)
+    device, goal = read_device(config.device), find_target(vessel.tree, target)
     catheters = tuple(read_catheter(name) for name in config.catheter)
     truth = _truth(config, vessel)
     seen, truth = _see_catheter(vessel, device, truth, config)
-    policy = TwinPolicy(truth) if config.policy == "twin" else make_policy(config.policy)
+    policy = OraclePolicy(truth) if config.policy == "oracle" else make_policy(config.policy)
     given = Navigation(
         anatomy=seen,
         device=device,
@@ -234,7 +225,6 @@ def navigate_patient(set_up: SetUp) -> PatientNavigation:
         measure_motion=set_up.config.motion_known == "measured",
     )
     loop = NavigationLoop(navigation, policy, config=config, seed=set_up.config.seed, truth=set_up.truth)
-    began = loop.robot.proximal
     wires: list[Float[np.ndarray, "wires nodes 3"]] = []
     with progress(f"Navigating, {set_up.config.policy}", total=navigation.seconds) as advance:
         while loop.reason is None:
@@ -250,14 +240,13 @@ def navigate_patient(set_up: SetUp) -> PatientNavigation:
     if isinstance(policy, Believer):
         wires.append(policy.believed_wires())
     record = loop.record()
-    cycles = _driven_again(set_up, record, began)
-    whole = len(record.time_s) - 1
-    shown = _each_period(cycles)
+    if record.seconds < navigation.seconds:
+        loop.robot.stop()
+        loop.robot.run(navigation.seconds - record.seconds)
     return PatientNavigation(
         set_up=set_up,
         record=record,
-        rollout=shown.samples(slice(whole)),
-        cycles=replace(cycles, shape=None),
+        episode=loop.robot.recorder.trajectory().every(loop.config.cycles),
         wires=tuple(wires) if wires else None,
         plans=getattr(policy, "plans", None),
         planning_s=getattr(policy, "planning_s", None),
@@ -300,26 +289,3 @@ def _see_catheter(
     axis = c_arm.catheter_axis(real, np.random.default_rng([config.seed, 4]))
     unseen_deg, side_deg = lean_between(axis, real)
     return with_axis(vessel, axis), replace(truth, axis_deg=unseen_deg, axis_side_deg=side_deg)
-
-
-def _driven_again(set_up: SetUp, record: NavigationRecord, began: Float[np.ndarray, "devices 2"]) -> Trajectory:
-    """Return wire and catheters, driven again as they were, and then held at rest until the navigation's limit."""
-    periods = int(np.ceil(set_up.navigation.seconds / DECISION_PERIOD_S - 1e-9))
-    per_period = round(DECISION_PERIOD_S / CYCLE_S)
-    control = np.zeros((1, periods * per_period, *began.shape))
-    control[0, : len(record.driven)] = record.driven.reshape(-1, *began.shape)
-    return simulate(
-        set_up.true_anatomy,
-        Stack(set_up.true_wire, set_up.true_catheters),
-        control,
-        initial=began[None],
-        config=set_up.simulator,
-        record_shape=True,
-        period_s=CYCLE_S,
-        motion=set_up.motion,
-    )
-
-
-def _each_period(cycles: Trajectory) -> Trajectory:
-    """Return a trajectory of a drive's cycles as it is at the end of each decision period."""
-    return cycles.every(round(DECISION_PERIOD_S / CYCLE_S))

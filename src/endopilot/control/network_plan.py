@@ -15,7 +15,6 @@ from scipy.ndimage import convolve1d
 
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.control.plan_config import PlanConfig, Steps
-from endopilot.control.route import Route
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.models.config import WINDOW, read_run
 from endopilot.models.episodes import Episodes, Setup
@@ -25,6 +24,7 @@ from endopilot.progress import progress
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import Navigation
+from endopilot.tasks.route import Route
 from endopilot.types import SAMPLE_PERIOD_S
 
 _SMOOTH = np.array([0.25, 0.5, 0.25])

@@ -7,11 +7,11 @@ from jaxtyping import Float
 
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.control.navigate_patient import PatientNavigation, SetUp
-from endopilot.control.route import Route
 from endopilot.robot.robot import CYCLE_S
 from endopilot.simulation.trajectory import Trajectory
 from endopilot.tasks.navigation import DECISION_PERIOD_S, SUCCESS_MM
-from endopilot.types import VesselTree
+from endopilot.tasks.route import Route
+from endopilot.tasks.targets import section_at
 
 _TIGHT_RATIO = 0.8
 """A wire that fills this share of a lumen is held up by its walls."""
@@ -19,19 +19,6 @@ _AT_FORK_MM = 4.0
 """A tip that came this near to a fork, and the length of its bend, was held up by it, mm."""
 _STILL_S, _STILL_MM = 5.0, 1.0
 """A tip that comes no farther than this in this time has stopped, s and mm."""
-
-
-def section_at(tree: VesselTree, branch: int, abscissa: float) -> str:
-    """Return the name of the section that a place of the tree lies in.
-
-    Args:
-        tree: centerlines.
-        branch: index of the branch.
-        abscissa: of the place, mm.
-    """
-    line = tree.branches[branch].centerline
-    at = int(np.argmin(np.abs(line.abscissa - abscissa)))
-    return tree.section_names[int(tree.branches[branch].section[at])]
 
 
 def name_target(set_up: SetUp) -> str:
@@ -66,7 +53,7 @@ def why_not(found: PatientNavigation) -> str:
     branch, at = int(tip.branch[-1]), round(float(tip.abscissa[-1]), 1) + 0.0  # no "-0.0"
     whose = "the catheter's tip" if navigation.arriving else "the tip"
     where = f"after {record.seconds:g} s {whose} is in section {section_at(tree, branch, at)} at {at:.1f} mm"
-    departs = tree.departures(navigation.target.branch)[branch]
+    departs = route.leaves_at[branch]
     if np.isfinite(departs):
         where += f", off the route, which it left at the fork at {departs:.1f} mm"
     else:
@@ -88,7 +75,7 @@ def _held_up(found: PatientNavigation, route: Route) -> str:
         at, width = narrow
         what = "catheter" if navigation.arriving else "wire"
         return f"at {at:.1f} mm the lumen is {width:.2f} mm wide, and the {what} {device.diameter_mm:g} mm"
-    for k, (each, slip) in enumerate(zip(navigation.devices, _slips(found.rollout), strict=True)):
+    for k, (each, slip) in enumerate(zip(navigation.devices, _slips(found.record.trajectory), strict=True)):
         slipped, caught = int((slip[:, 0] > 0).sum()), "catheter" if k else "wire"
         if slipped:
             return f"the {caught} is caught; the drive slipped at its limit of {each.push_limit_n:g} N {slipped} times"
@@ -123,7 +110,8 @@ def worst_ratio(found: PatientNavigation) -> float:
 
 def slipped_s(found: PatientNavigation) -> float:
     """Return for how long a drive slipped, s."""
-    slip = np.hstack(_slips(found.cycles))[: len(found.record.driven)]
+    cycles = found.record.cycles
+    slip = np.zeros((0, 1)) if cycles is None else np.hstack(_slips(cycles))
     return float((slip != 0).any(axis=1).sum()) * CYCLE_S
 
 

@@ -17,7 +17,7 @@ _LOOKS = 5
 of a second."""
 
 
-def drive_period(simulator: Simulator, control: Float[np.ndarray, "worlds numbers"]) -> Step:
+def drive_period(simulator: Simulator, control: Float[np.ndarray, "worlds *devices 2"]) -> Step:
     """Drive all worlds for a decision period; a world that fails stays where it was.
 
     Args:

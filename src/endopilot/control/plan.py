@@ -1,23 +1,20 @@
-"""`plan`: the controls that bring a wire's tip along the vessel to a target, found before the wire moves."""
+"""`plan`: the controls that bring a tip along the vessel to a target, found before wire and catheter move."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
 from endopilot.anatomy.io import read_anatomy
-from endopilot.belief.belief import BeliefConfig
-from endopilot.control.agent import AgentConfig, TwinPolicy
-from endopilot.control.course import Course
+from endopilot.control.agent import AgentConfig, OraclePolicy
+from endopilot.control.course import Controls
 from endopilot.control.desired import last_place, read_tips, tips_along
-from endopilot.control.plan_config import NETWORK_METHODS, Controls, Plan, PlanConfig, Steps
-from endopilot.control.plan_pair import check_pair, search_pair
-from endopilot.control.route import Route, check_passable, parse_target
-from endopilot.control.search import SearchConfig
+from endopilot.control.plan_config import NETWORK_METHODS, Plan, PlanConfig, Steps
 from endopilot.control.set_up import TipChoice, choose_tip
 from endopilot.devices.catheter import Catheter
 from endopilot.devices.device import Device, read_device
@@ -32,6 +29,8 @@ from endopilot.settings import from_record
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.simulate import simulate
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
+from endopilot.tasks.route import Route, check_passable
+from endopilot.tasks.targets import find_target
 from endopilot.types import Anatomy
 
 _IDEAL = RobotConfig(
@@ -61,23 +60,24 @@ def plan(
         model: run made by `endopilot train`, or "pretrained", the model of the package; needed for the methods inverse
             and mppi.
         device: the wire, its name or its YAML file; the model's if not given, the workhorse if there is none.
-        catheters: one around the wire, which is then planned for too, by the method twin.
+        catheters: one around the wire, which is then planned for too, by the method search.
 
     Raises:
         InputError: a target outside the tree, behind an occlusion or too far for the time; a model of another device or
-            without the network that the method needs; with the method twin, no path found, or one that in the rod core
-            at its own settings breaks the force limit or does not reach the target; more than one catheter, or what
-            is for a wire alone with one.
+            without the network that the method needs; with the method search, no path found, or one that in the rod
+            core at its own settings breaks the force limit or does not reach the target; more than one catheter, or
+            what is for a wire alone with one.
     """
     config = config or PlanConfig()
     vessel = anatomy if isinstance(anatomy, Anatomy) else read_anatomy(anatomy)
     model = None if model is None else Path(model)
-    check_pair(catheters, config, target, model)
+    if catheters:
+        _check_for_stack(config, target, model)
     wire = _wire(model, device, config.method)
     tips = (
         read_tips(Path(target), wire.max_velocity_mm_s, config.start_inserted_mm) if target.endswith(".csv") else None
     )
-    goal = parse_target(vessel, target) if tips is None else last_place(vessel, tips, target)
+    goal = find_target(vessel.tree, target) if tips is None else last_place(vessel, tips, target)
     navigation = Navigation(
         anatomy=vessel,
         device=wire,
@@ -114,18 +114,19 @@ def plan(
         )
     else:
         desired = tips[["abscissa", "offset"]].to_numpy(float)
-    made, trials = None, _TRIALS if config.method == "twin" and tips is None else 1
+    made, trials = None, _TRIALS if config.method == "search" and tips is None else 1
     trials = min(trials, 2) if catheters else trials  # nothing of theirs is drawn at random
     for trial in range(trials):
         find = _method(navigation, config, model, desired, route, follow=tips is not None, trial=trial)
         began = _clock()
         control, predicted = find()
+        control = control.reshape(len(control), -1, 2)
         spent += _clock() - began
         made = _checked(navigation, config, model, choice, desired, control, predicted, spent)
         if made.reached and made.within_force_limit:
             break
     assert made is not None
-    if config.method == "twin":
+    if config.method == "search":
         _check_kept(made)
     return made
 
@@ -138,7 +139,7 @@ def _clock() -> Float[np.ndarray, "2"]:
 def _method(
     navigation: Navigation, config: PlanConfig, model: Path | None, desired: Steps, route: Route, *,
     follow: bool, trial: int,
-) -> Callable[[], tuple[Controls, Steps]]:  # fmt: skip
+) -> Callable[[], tuple[Controls | Steps, Steps]]:  # fmt: skip
     """Return a function that finds controls and predicts their tips; loading a model is done before it is called."""
     if config.method in NETWORK_METHODS:
         with extra_named(f"plan by {config.method}"):
@@ -146,11 +147,25 @@ def _method(
 
         assert model is not None
         return network_planner(navigation, model, desired, route, config)
-    if navigation.catheters:
-        return lambda: search_pair(navigation, config, trial)
-    if config.method != "twin":
+    if config.method != "search":
         return lambda: _by_policy(navigation, config)
     return lambda: _track(navigation, desired) if follow else _search(navigation, config, trial)
+
+
+def _check_for_stack(config: PlanConfig, target: str, model: Path | None) -> None:
+    """Check that a plan with a catheter asks for nothing that a wire alone can do.
+
+    Raises:
+        InputError: a trained model, another method than search, or desired tips.
+    """
+    if model is not None:
+        raise InputError(f"--model {model}: models are of a wire alone; leave --model or --catheter out")
+    if config.method != "search":
+        raise InputError(f"method: {config.method}; a wire in a catheter is planned by search: give search")
+    if target.endswith(".csv"):
+        raise InputError(
+            f"target: {target}; desired tips are followed by a wire alone: give a section or a point X,Y,Z"
+        )
 
 
 def _wire(model: Path | None, device: Device | str | Path | None, method: str) -> Device:
@@ -181,28 +196,31 @@ def _check_time(navigation: Navigation, config: PlanConfig) -> None:
         )
 
 
-def _search(navigation: Navigation, config: PlanConfig, trial: int) -> tuple[Steps, Steps]:
-    """Search a path in the rod core: with the settings of a belief, then with those that a plan is checked with."""
-    own = SimulatorConfig()
-    belief = BeliefConfig(element_mm=own.element_mm, time_step_s=own.time_step_s) if trial else BeliefConfig()
-    search = SearchConfig(speed_mm_s=config.speed_mm_s, cost=config.cost)
-    policy = TwinPolicy(config=AgentConfig(search=search, belief=belief))
+def _search(navigation: Navigation, config: PlanConfig, trial: int) -> tuple[Controls, Steps]:
+    """Search a course in the rod core: with the settings of the agent, then with those that a plan is checked with."""
+    fine, agent = SimulatorConfig(), AgentConfig.of(navigation)
+    speed_mm_s = min(agent.search.speed_mm_s, config.speed_mm_s) if navigation.catheters else config.speed_mm_s
+    search = replace(agent.search, speed_mm_s=speed_mm_s, cost=config.cost)
+    fine_belief = replace(agent.belief, element_mm=fine.element_mm, time_step_s=fine.time_step_s)
+    policy = OraclePolicy(config=replace(agent, search=search, belief=fine_belief if trial else agent.belief))
     policy.start(navigation, config.seed + trial)
     with progress("plan: searching in the rod core", total=navigation.target.abscissa) as advance:
         course = policy.find_course(navigation.seconds, advance)
+    names = " in ".join(device.name for device in navigation.devices)
     if course.reached < 0.5:
-        raise InputError(_no_path(navigation, course, policy.halt))
-    return course.control, np.column_stack([course.abscissa[:, 0], course.offset[:, 0]])
-
-
-def _no_path(navigation: Navigation, course: Course, halt: str) -> str:
-    """Return how far a search came, and what it met there, as one line."""
-    came = float(course.abscissa[-1, 0]) if len(course.abscissa) else navigation.start_inserted_mm
-    return (
-        f"target: no path found to branch {navigation.target.branch} of {navigation.anatomy.name} in "
-        f"{navigation.seconds:g} s under {navigation.force_limit_n:g} N with {navigation.device.name}; the tip came to "
-        f"{came:.0f} of {navigation.target.abscissa:.0f} mm; {halt}"
-    )
+        came = float(course.tip.abscissa[-1, 0]) if len(course.control) else navigation.start_inserted_mm
+        raise InputError(
+            f"target: no path found to branch {navigation.target.branch} of {navigation.anatomy.name} in "
+            f"{navigation.seconds:g} s under {navigation.force_limit_n:g} N with {names}; the tip came to "
+            f"{came:.0f} of {navigation.target.abscissa:.0f} mm; {policy.halt}"
+        )
+    needed_s = DECISION_PERIOD_S * len(course.control)
+    if needed_s > navigation.seconds:
+        raise InputError(
+            f"seconds: {navigation.seconds:g} s are too few for the course found to branch "
+            f"{navigation.target.branch} of {navigation.anatomy.name} with {names}; give {needed_s:g} s or more"
+        )
+    return course.control, np.column_stack([course.tip.abscissa[:, 0], course.tip.offset[:, 0]])
 
 
 def _check_kept(made: Plan) -> None:
@@ -263,38 +281,29 @@ def _checked(
 ) -> Plan:  # fmt: skip
     """Put the controls within the limits, drive the rod core with them, and return the plan."""
     start = navigation.start
-    parts = [
-        within_limits(control[:, 2 * k : 2 * k + 2], DriveLimits.of(device, navigation.anatomy), start[k, 0])
-        for k, device in enumerate(navigation.devices)
-    ]
+    limits = [DriveLimits.of(device, navigation.anatomy) for device in navigation.devices]
+    parts = [within_limits(control[:, k], each, start[k, 0]) for k, each in enumerate(limits)]
     control = np.stack(parts, axis=1)
     rollout = simulate(
-        navigation.anatomy,
-        navigation.stack,
-        control[None],
-        initial=start[None],
-        config=SimulatorConfig(threads=1),
+        navigation.anatomy, navigation.stack, control[None], initial=start[None], config=SimulatorConfig(threads=1)
     )
-    tip, around = rollout.tip[0], bool(navigation.catheters)
     wanted = np.concatenate([desired, np.repeat(desired[-1:], max(len(control) - len(desired), 0), axis=0)])
     return Plan(
         navigation=navigation,
         config=config,
         model=None if model is None else str(model),
-        control=control.reshape(len(control), -1),
-        proximal=(start + DECISION_PERIOD_S * np.cumsum(control, axis=0)).reshape(len(control), -1),
+        control=control,
+        proximal=start + DECISION_PERIOD_S * np.cumsum(control, axis=0),
         desired=wanted[: len(control)],
         predicted=predicted,
-        simulated=tip[:, 0],
-        position=rollout.tip_position[0, :, 0],
+        tip=rollout.tip[0],
+        position=rollout.tip_position[0],
         force=rollout.contact_force_max[0],
-        reached=bool(navigation.reached(tip).any()),
+        reached=bool(navigation.reached(rollout.tip[0]).any()),
         why=choice.why if choice else "",
         tilt_deg=choice.tilt_deg if choice else 0.0,
         seconds_to_plan=float(spent[0]),
         processor_seconds=float(spent[1]),
-        catheter_tip=tip[:, 1] if around else None,
-        catheter_position=rollout.tip_position[0, :, 1] if around else None,
     )
 
 

@@ -16,11 +16,11 @@ from endopilot.settings import Finite, Positive, Seconds, Seed, Text, Within, se
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Arrives, Navigation
 from endopilot.types import TipProjection
 
-Method = Literal["twin", "inverse", "mppi", "forward", "spin", "retract-rotate"]
+Method = Literal["search", "inverse", "mppi", "forward", "spin", "retract-rotate"]
 NETWORK_METHODS = ("inverse", "mppi")
 """Methods that ask a trained network."""
 Steps = Float[np.ndarray, "samples 2"]
-Controls = Float[np.ndarray, "samples numbers"]
+Controls = Float[np.ndarray, "samples devices 2"]
 
 
 @settings
@@ -43,8 +43,8 @@ class SampleConfig:
 class PlanConfig:
     """Method, limits and cost of a plan."""
 
-    method: Method = "twin"
-    """How the controls are found: twin (searched in the rod core), inverse (the inverse network of --model), mppi
+    method: Method = "search"
+    """How the controls are found: search (searched in the rod core), inverse (the inverse network of --model), mppi
     (sampled through its forward network), or a baseline: forward, spin, retract-rotate."""
     seconds: Seconds = 60.0
     """Time in which the target is to be reached, s."""
@@ -79,14 +79,12 @@ class Plan:
         navigation: what is to be done.
         config: its settings.
         model: the trained run that it was found with, if any.
-        control: π, mm/s and rad/s, of the wire, then of a catheter.
-        proximal: (Δ mm, φ rad), its integral, likewise.
+        control: π, mm/s and rad/s, of each device.
+        proximal: (Δ mm, φ rad), its integral.
         desired: desired tip states (Δtip, γtip), mm.
         predicted: tip states that the model predicts, mm.
-        simulated: where the rod core, at its own settings, has the tip under these controls.
-        position: of that tip, LPS mm.
-        catheter_tip: where the catheter's tip lies then; None for a wire alone.
-        catheter_position: of that tip, LPS mm; None likewise.
+        tip: where the rod core, at its own settings, has the tips under these controls, a column a device.
+        position: of these tips, LPS mm.
         force: largest wall force on one node in the rod core, N.
         reached: whether the target is reached at the end of a period in the rod core.
         why: why the tip has its shape and the catheter its axis; empty where both are the given ones.
@@ -102,16 +100,14 @@ class Plan:
     proximal: Controls
     desired: Steps
     predicted: Steps
-    simulated: TipProjection
-    position: Float[np.ndarray, "samples 3"]
+    tip: TipProjection
+    position: Float[np.ndarray, "samples devices 3"]
     force: Float[np.ndarray, "samples"]
     reached: bool
     why: str
     tilt_deg: float
     seconds_to_plan: float
     processor_seconds: float
-    catheter_tip: TipProjection | None = None
-    catheter_position: Float[np.ndarray, "samples 3"] | None = None
 
     @property
     def seconds(self) -> float:
@@ -120,14 +116,14 @@ class Plan:
 
     @property
     def ratio(self) -> Float[np.ndarray, "samples"]:
-        """Safety ratio γ/(r − r_w) in the rod core."""
-        tip = self.simulated
+        """Safety ratio γ/(r − r_w) of the wire in the rod core."""
+        tip = self.tip[:, 0]
         return safety_ratio(tip.offset, tip.radius, self.navigation.device.tip_radius_mm)
 
     @property
     def arriving_tip(self) -> TipProjection:
         """Where the tip that is to go to the target lies in the rod core."""
-        return self.catheter_tip if self.navigation.arriving and self.catheter_tip is not None else self.simulated
+        return self.tip[:, self.navigation.arriving]
 
     @property
     def within_force_limit(self) -> bool:
@@ -137,7 +133,7 @@ class Plan:
     def cost_terms(self) -> dict[str, float]:
         """Return what each term of the cost comes to in the rod core, mm; all but `end` are the wire's."""
         device, weights = self.navigation.device, self.config.cost
-        error = np.abs(self.simulated.abscissa - self.desired[:, 0])
+        error = np.abs(self.tip.abscissa[:, 0] - self.desired[:, 0])
         share = self.force / self.navigation.force_limit_n
         fastest = DriveLimits.of(device).fastest
         h = DECISION_PERIOD_S
@@ -147,5 +143,5 @@ class Plan:
             "ratio": float(weights.ratio_weight * (np.maximum(self.ratio - weights.safe_ratio, 0) ** 2).sum() * h),
             "force": float(weights.force_weight * (share**2).sum() * h),
             "time": float(weights.time_weight * len(error) * h),
-            "smooth": float(weights.roughness(self.control[:-1, :2], self.control[1:, :2], fastest).sum()),
+            "smooth": float(weights.roughness(self.control[:-1, 0], self.control[1:, 0], fastest).sum()),
         }

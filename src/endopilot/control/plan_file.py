@@ -48,7 +48,6 @@ from endopilot.settings import from_record
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target
 from endopilot.types import Anatomy, TipProjection
 
-_CATHETER = "catheter_1_"
 _TABLE, _RECORD, PICTURE = "plan.csv", "manifest.json", "plan.png"
 
 
@@ -68,7 +67,7 @@ def write_plan(plan: Plan, folder: Path, xray: PlannedXray | None = None) -> dic
     folder = Path(folder)
     if folder.exists() and not (folder.is_dir() and ((folder / _TABLE).exists() or not any(folder.iterdir()))):
         raise InputError(f"{folder}: exists and is not a plan; choose another output folder")
-    navigation, tip = plan.navigation, plan.simulated
+    navigation = plan.navigation
     figures = {
         "method": plan.config.method,
         "tip": tip_name(navigation.device),
@@ -79,7 +78,7 @@ def write_plan(plan: Plan, folder: Path, xray: PlannedXray | None = None) -> dic
         "seconds": plan.seconds,
         "target_mm": round(navigation.target.abscissa, 2),
         "tip_error_mm": round(float(np.abs(plan.arriving_tip.abscissa[-1] - navigation.target.abscissa)), 3),
-        "model_error_mm": round(float(np.abs(plan.predicted[:, 0] - tip.abscissa).mean()), 3),
+        "model_error_mm": round(float(np.abs(plan.predicted[:, 0] - plan.tip.abscissa[:, 0]).mean()), 3),
         "peak_force_n": round(float(plan.force.max()), 4),
         "largest_safety_ratio": round(float(plan.ratio.max()), 3),
         "cost": {name: round(value, 3) for name, value in plan.cost_terms().items()},
@@ -117,7 +116,7 @@ def _table(plan: Plan, xray: PlannedXray | None) -> pd.DataFrame:
     """Return a row for the end of each sample period."""
     columns: dict[str, Any] = {
         "time_s": DECISION_PERIOD_S * np.arange(1, len(plan.control) + 1),
-        **device_columns(0, plan.control[:, :2], plan.proximal[:, :2], plan.simulated, plan.position),
+        **_device(plan, 0),
         "desired_tip_abscissa_mm": plan.desired[:, 0],
         "desired_tip_offset_mm": plan.desired[:, 1],
         "predicted_tip_abscissa_mm": plan.predicted[:, 0],
@@ -125,13 +124,17 @@ def _table(plan: Plan, xray: PlannedXray | None) -> pd.DataFrame:
         "safety_ratio": plan.ratio,
         "contact_force_n": plan.force,
     }
-    if plan.catheter_tip is not None and plan.catheter_position is not None:
-        moved = plan.control[:, 2:], plan.proximal[:, 2:], plan.catheter_tip, plan.catheter_position
-        columns |= device_columns(1, *moved)
+    for device in range(1, plan.control.shape[1]):
+        columns |= _device(plan, device)
     if xray is not None:
         columns["xray"] = xray.exposure.astype(int)
         columns["band_tip_abscissa_mm"], columns["band_tip_offset_mm"] = xray.half_width.T
     return pd.DataFrame(columns)
+
+
+def _device(plan: Plan, device: int) -> dict[str, np.ndarray]:
+    moved = plan.control[:, device], plan.proximal[:, device]
+    return device_columns(device, *moved, plan.tip[:, device], plan.position[:, device])
 
 
 def read_plan(folder: Path, anatomy: Anatomy, device: Device, catheters: Sequence[Catheter] = ()) -> Plan:
@@ -177,21 +180,14 @@ def _plan_in(folder: Path, anatomy: Anatomy, device: Device, catheters: Sequence
         raise InputError(f"{folder / _TABLE}: is missing or differs from what {_RECORD} records; plan anew")
     table = pd.read_csv(folder / _TABLE)
     column = {str(name): table[name].to_numpy() for name in table.columns}
-    prefixes = ["", *(_CATHETER for _ in around)]
+    prefixes = ["", *(f"catheter_{number}_" for number in range(1, len(around) + 1))]
 
-    def pair(first: str, second: str) -> np.ndarray:
-        return np.column_stack([column[first], column[second]])
+    def each(*names: str) -> np.ndarray:
+        """Return columns of all devices: (samples, devices, names)."""
+        return np.stack([np.column_stack([column[before + name] for name in names]) for before in prefixes], axis=1)
 
-    def tip_of(prefix: str) -> TipProjection:
-        return TipProjection(
-            abscissa=column[f"{prefix}tip_abscissa_mm"],
-            offset=column[f"{prefix}tip_offset_mm"],
-            branch=column[f"{prefix}branch"],
-            radius=column[f"{prefix}lumen_radius_mm"],
-        )
-
-    def position_of(prefix: str) -> np.ndarray:
-        return np.column_stack([column[f"{prefix}tip_{axis}_mm"] for axis in "xyz"])
+    def wire(*names: str) -> np.ndarray:
+        return np.column_stack([column[name] for name in names])
 
     return Plan(
         navigation=Navigation(
@@ -207,18 +203,21 @@ def _plan_in(folder: Path, anatomy: Anatomy, device: Device, catheters: Sequence
         ),
         config=config,
         model=record["model"],
-        control=np.hstack([pair(f"{each}translation_mm_s", f"{each}rotation_rad_s") for each in prefixes]),
-        proximal=np.hstack([pair(f"{each}inserted_length_mm", f"{each}rotation_rad") for each in prefixes]),
-        desired=pair("desired_tip_abscissa_mm", "desired_tip_offset_mm"),
-        predicted=pair("predicted_tip_abscissa_mm", "predicted_tip_offset_mm"),
-        simulated=tip_of(""),
-        position=position_of(""),
+        control=each("translation_mm_s", "rotation_rad_s"),
+        proximal=each("inserted_length_mm", "rotation_rad"),
+        desired=wire("desired_tip_abscissa_mm", "desired_tip_offset_mm"),
+        predicted=wire("predicted_tip_abscissa_mm", "predicted_tip_offset_mm"),
+        tip=TipProjection(
+            abscissa=each("tip_abscissa_mm")[..., 0],
+            offset=each("tip_offset_mm")[..., 0],
+            branch=each("branch")[..., 0],
+            radius=each("lumen_radius_mm")[..., 0],
+        ),
+        position=each("tip_x_mm", "tip_y_mm", "tip_z_mm"),
         force=column["contact_force_n"],
         reached=record["reached"],
         why=record["why"],
         tilt_deg=record["catheter_tilt_deg"],
         seconds_to_plan=record["seconds_to_plan"],
         processor_seconds=record["processor_seconds"],
-        catheter_tip=tip_of(_CATHETER) if around else None,
-        catheter_position=position_of(_CATHETER) if around else None,
     )

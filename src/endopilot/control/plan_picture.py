@@ -15,10 +15,13 @@ from matplotlib.axes import Axes
 
 from endopilot.control.plan_config import Plan
 from endopilot.control.plan_xray import PlannedXray
-from endopilot.control.route import Route
 from endopilot.files import writing
 from endopilot.plotting import CATHETER_COLORS
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
+from endopilot.tasks.route import Route
+
+_CONTROL_COLORS = (("tab:blue", "tab:orange"), (CATHETER_COLORS[0], "tab:red"))
+"""Colours of translation and rotation of the wire and of a catheter."""
 
 
 def draw_plan(plan: Plan, path: Path, xray: PlannedXray | None = None) -> None:
@@ -27,8 +30,8 @@ def draw_plan(plan: Plan, path: Path, xray: PlannedXray | None = None) -> None:
     grid = figure.add_gridspec(4, 2, width_ratios=(1.0, 1.25))
     names = " in ".join(device.name for device in plan.navigation.devices)
     title = f"{plan.navigation.anatomy.name}, {names}: {plan.config.method}"
-    around = [] if plan.catheter_position is None else [plan.catheter_position]
-    draw_route(figure.add_subplot(grid[:, 0]), plan.navigation, plan.position, title, around)
+    wire, *around = np.moveaxis(plan.position, 1, 0)
+    draw_route(figure.add_subplot(grid[:, 0]), plan.navigation, wire, title, around)
     time_s = DECISION_PERIOD_S * np.arange(1, len(plan.control) + 1)
     panels = [figure.add_subplot(grid[row, 1]) for row in range(4)]
     _draw_tip(plan, time_s, panels[0])
@@ -38,11 +41,13 @@ def draw_plan(plan: Plan, path: Path, xray: PlannedXray | None = None) -> None:
     panels[2].set_ylabel("wall force, N")
     panels[2].set_ylim(0, 1.1 * max(plan.navigation.force_limit_n, float(plan.force.max())))
     edges = np.append(0.0, time_s)
-    for axis, color, label in ((0, "tab:blue", "translation, mm/s"), (1, "tab:orange", "rotation, rad/s")):
-        panels[3].stairs(plan.control[:, axis], edges, baseline=None, color=color, linewidth=1.5, label=label)
-    for axis, color, label in ((2, CATHETER_COLORS[0], "catheter, mm/s"), (3, "tab:red", "catheter, rad/s")):
-        if axis < plan.control.shape[1]:
-            panels[3].stairs(plan.control[:, axis], edges, baseline=None, color=color, linestyle="--", label=label)
+    for k, (colors, style, whose) in enumerate(zip(_CONTROL_COLORS, ("-", "--"), ("", "catheter's "), strict=True)):
+        for axis, unit in enumerate(("translation, mm/s", "rotation, rad/s")):
+            if k < plan.control.shape[1]:
+                panels[3].stairs(
+                    plan.control[:, k, axis], edges, baseline=None, color=colors[axis], linestyle=style,
+                    linewidth=1.5 - 0.5 * k, label=f"{whose}{unit}",
+                )  # fmt: skip
     legend_above(panels[3])
     panels[3].set_ylabel("control")
     panels[3].set_xlabel("time, s")
@@ -95,14 +100,14 @@ def draw_route(
 
 
 def _draw_tip(plan: Plan, time_s: np.ndarray, axes: Axes) -> None:
-    tip = plan.simulated
+    tip = plan.tip[:, 0]
     route = Route.to(plan.navigation.anatomy, plan.navigation.target)
     off_route = route.off_route(tip) > 0
     axes.plot(time_s, plan.desired[:, 0], color="tab:green", label="desired")
     axes.plot(time_s, plan.predicted[:, 0], color="tab:orange", linestyle="--", label="predicted by the model")
     axes.plot(time_s, tip.abscissa, color="tab:blue", linewidth=1, label="in the rod core")
-    if plan.catheter_tip is not None:
-        axes.plot(time_s, plan.catheter_tip.abscissa, color=CATHETER_COLORS[0], linewidth=1, label="the catheter's")
+    for k, color in enumerate(CATHETER_COLORS[: plan.control.shape[1] - 1], start=1):
+        axes.plot(time_s, plan.tip.abscissa[:, k], color=color, linewidth=1, label="the catheter's")
     if off_route.any():
         axes.plot(time_s[off_route], tip.abscissa[off_route], "x", color="tab:red", label="in a wrong branch")
     for junction in route.junctions:

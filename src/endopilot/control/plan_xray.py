@@ -18,10 +18,10 @@ from jaxtyping import Bool, Float
 from endopilot.belief.adviser import AdviserConfig, XrayAdviser
 from endopilot.belief.bands import Calibration
 from endopilot.belief.online_predictors import online_predictor
-from endopilot.control.agent import CALIBRATED, AdviserInput, AgentPolicy
+from endopilot.control.agent import AdviserInput, AgentPolicy, read_agent_calibration
 from endopilot.control.plan_config import NETWORK_METHODS, Plan, PlanConfig
-from endopilot.control.route import Route
 from endopilot.models.config import WINDOW, run_path
+from endopilot.tasks.route import Route
 from endopilot.xray.fluoroscope import TipMeasurement
 
 
@@ -38,19 +38,20 @@ class PlannedXray:
     half_width: Float[np.ndarray, "samples 2"]
 
 
-def read_calibration(config: PlanConfig, model: Path | None) -> Calibration:
+def read_calibration(config: PlanConfig, model: Path | None, *, devices: int = 1) -> Calibration:
     """Return the calibration of the model that predicts a plan's tip: the run that makes it, or else the agent's wires.
 
     Args:
         config: of the plan; its method says whether a network makes it.
         model: the trained run, or "pretrained".
+        devices: 1 for a wire alone, 2 with a catheter.
 
     Raises:
         InputError: the run has no calibration, or a damaged one.
     """
     if config.method in NETWORK_METHODS and model is not None:
         return Calibration.read(run_path(model))
-    return Calibration.read(CALIBRATED)
+    return read_agent_calibration("assumed", devices)
 
 
 def plan_xray(plan: Plan, calibration: Calibration) -> PlannedXray:
@@ -98,15 +99,14 @@ class _Wires:
         return self._agent.adviser_input()
 
     def move(self, period: int) -> AdviserInput:
-        inserted, rotation = self._plan.proximal[period]
-        self._agent.belief.follow(inserted, rotation)
+        self._agent.belief.follow(tuple((inserted, turn) for inserted, turn in self._plan.proximal[period].tolist()))
         return self._agent.adviser_input()
 
     def observe(self, period: int) -> None:
-        tip = self._plan.simulated
+        tip = self._plan.tip[:, 0]
         self._agent.belief.weigh(
             TipMeasurement(
-                position=self._plan.position[period],
+                position=self._plan.position[period, 0],
                 abscissa=float(tip.abscissa[period]),
                 offset=float(tip.offset[period]),
                 branch=int(tip.branch[period]),
@@ -121,7 +121,7 @@ class _Networks:
 
         assert plan.model is not None
         run, navigation = Path(plan.model), plan.navigation
-        episodes = RestingStart(navigation, run).episodes(plan.predicted[None], plan.control[None])
+        episodes = RestingStart(navigation, run).episodes(plan.predicted[None], plan.control[None, :, 0])
         self._model = online_predictor(load_model(run), episodes)
         self._route = Route.to(navigation.anatomy, navigation.target)
         self._proximal = episodes.proximal[0]

@@ -13,13 +13,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Int
 
-from endopilot.control.route import ENTERED_MM, Route
 from endopilot.control.sweep import middle, sweep
 from endopilot.devices.device import Device
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.simulation.config import PRESETS
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
+from endopilot.tasks.route import ENTERED_MM, Route
 
 ROTATIONS = 24
 """Rotations of the wire that are tried at a fork, evenly over a full turn."""

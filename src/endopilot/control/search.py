@@ -1,55 +1,35 @@
-"""Search for a path to a target in the rod core: `Search`.
-
-One wire, or several that differ in what is uncertain, is driven from its present state. It is pushed straight on as
-long as the tip advances along the route. Where the tip enters a wrong branch, or stops, the wires go back to where they
-were before, and a population of candidates tries other motions. Every round each candidate draws a constant control for
-a second. Those nearest to the waypoint, in the mean over the wires and with the cost of their motion, are kept and
-copied over the others, until one of them has entered the wanted branch.
-"""
+"""What searches of courses have in common: `Search`, and its settings, `SearchConfig`."""
 
 from __future__ import annotations
 
-from dataclasses import field, replace
-from itertools import product
-from typing import Annotated
+from dataclasses import field
+from typing import Annotated, Protocol
 
-import numpy as np
-from jaxtyping import Bool, Float, Int
-
-from endopilot.anatomy.projection import safety_ratio
+from endopilot.belief.belief import Belief
 from endopilot.control.cost import Cost
-from endopilot.control.course import SLIP_SHARE, STALL_PERIODS, Controls, Course, Log
-from endopilot.control.halt import SPARE_SHARE, Halt, describe_halt, near_fork
-from endopilot.control.period import drive_period
-from endopilot.control.route import Route
-from endopilot.control.sweep import TURN_PERIODS, Sweep, middle, sweep
-from endopilot.devices.device import Device
-from endopilot.devices.drive_limits import DriveLimits
+from endopilot.control.course import Course
 from endopilot.progress import Advance
-from endopilot.settings import OpenShare, Positive, Within, settings
-from endopilot.simulation.simulator import Simulator
-from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
-from endopilot.types import TipProjection
+from endopilot.settings import OpenShare, Positive, Seconds, Within, settings
 
-_BACK_MM_S = 2.0
-"""Speed at which a wire that has gone past its target is pulled back, mm/s."""
-_SHORT_MM = 1.0
-"""A path leaves this much of the travel unused, mm: encoders err."""
-_LEFT_BEHIND = 0.2
-"""Each further attempt accepts a path that this much more of the wires, by weight, do not follow."""
-_LEAST_SHARE = 0.5
-"""No attempt accepts a path that fewer of the wires follow, by weight."""
-_LOOKOUT_MM, _LOOKOUT_RADII = 12.0, 3.0
-"""A waypoint that is searched for lies no farther ahead than this, mm, or lumen radii where that is more: beyond, a
-chord says little."""
-_LEAD_RADII = 1.4
-"""In a wide vessel a search begins this many lumen radii before the junction: a branch's mouth is about as wide."""
+
+@settings
+class ManoeuvreConfig:
+    """Settings of the manoeuvres of a wire in a catheter."""
+
+    turns: Annotated[int, Within(1, 1000)] = 12
+    """Rotations that are tried at each place."""
+    behind_mm: Positive = 10.0
+    """The catheter follows to this far behind the wire's tip, mm, except to the target if its own tip is to arrive."""
+    longest_s: Seconds = 30.0
+    """A catheter is brought to its place in this time at most, s, and a wire past a fork."""
 
 
 @settings
 class SearchConfig:
-    """Settings of the search."""
+    """Settings of the search; those of candidates are of a wire alone."""
 
+    speed_mm_s: Annotated[float, Within(0.1, 1000)] = 10.0
+    """Translation of a device that is pushed straight on, mm/s."""
     candidates: Annotated[int, Within(1, 4096)] = 32
     """Candidates that are tried side by side where pushing straight on fails."""
     rounds: Annotated[int, Within(1, 1000)] = 6
@@ -60,364 +40,34 @@ class SearchConfig:
     """Decision periods of 0.5 s in a round."""
     keep_share: OpenShare = 0.25
     """Share of the candidates that a round keeps."""
-    speed_mm_s: Annotated[float, Within(0.1, 1000)] = 10.0
-    """Translation while it is pushed straight on, mm/s."""
     turn_rad_s: Annotated[float, Within(0.01, 1000)] = 7.0
     """Fastest rotation that is tried, rad/s."""
     lead_mm: Positive = 4.0
     """A search begins this far before a junction, mm, or 1.4 lumen radii where that is more."""
     cost: Cost = field(default_factory=Cost)
     """What the candidates are compared by."""
+    manoeuvres: ManoeuvreConfig = field(default_factory=ManoeuvreConfig)
+    """What is tried where there is a catheter."""
 
 
-class Search:
-    """Searches paths for a navigation, from any state of its wires.
+class Search(Protocol):
+    """Searches courses for a navigation, from whatever is believed of its devices.
 
     Attributes:
         halt: where and why the last search ended before the target, in words; empty if it arrived.
-        at_fork: whether that was at a fork which the tip does not enter.
+        draws: whether it draws at random, so that another search from the same belief may find another course.
     """
 
-    def __init__(
-        self,
-        navigation: Navigation,
-        route: Route,
-        wires: list[Device],
-        *,
-        config: SearchConfig,
-        seed: int,
-        sharing: Simulator,
-    ) -> None:
-        """Lay out the wires, and the candidates of each.
+    halt: str
+    draws: bool
+
+    def find(self, belief: Belief, *, seconds: float, first: bool = False, advance: Advance | None = None) -> Course:
+        """Find a course from where the likeliest devices are to the target.
 
         Args:
-            navigation: where, and how hard the wall may be pressed.
-            route: to its target.
-            wires: as they may be.
-            config: settings of the search.
-            seed: of the random candidates.
-            sharing: the simulator that paths are searched from; its wires are among `wires`, its settings are taken.
-        """
-        self.navigation, self.route, self.config = navigation, route, config
-        self._random = np.random.default_rng([seed, 0x5EA])
-        candidates = [wire for wire in wires for _ in range(config.candidates)]
-        anatomy, motion, core = navigation.anatomy, navigation.known_motion, sharing.config
-        self.single, self._kept, self._many = (
-            Simulator(anatomy, some, motion=motion, config=core, sharing=sharing) for some in (wires, wires, candidates)
-        )
-        limits = DriveLimits.of(wires[0], anatomy)
-        self._limits = replace(limits, travel_mm=(limits.travel_mm[0], limits.travel_mm[1] - _SHORT_MM))
-        self._wire_radius = wires[0].tip_radius_mm
-        self.halt, self.at_fork = "", False
-
-    def find(
-        self,
-        start: Simulator,
-        source: Int[np.ndarray, "wires"],
-        weight: Float[np.ndarray, "wires"],
-        *,
-        seconds: float,
-        turn: float = 0.0,
-        advance: Advance | None = None,
-    ) -> Course:
-        """Find a path from a state of the wires to the target.
-
-        Args:
-            start: a simulator of the same wires.
-            source: which of its worlds each wire is.
-            weight: how much each wire counts; their sum is 1.
+            belief: of the devices; nothing of it is changed.
             seconds: time that is left, s.
-            turn: angle by which the wire is turned before all else, rad.
+            first: whether it is the first of the navigation, which may turn the devices before all else.
             advance: called with every millimetre along the route.
         """
-        self.single.copy_worlds(source, of=start)
-        self._weight, same = weight, np.arange(len(weight))
-        log, reported, self.halt, self.at_fork = Log(), 0.0, "", False
-        periods = max(1, int(seconds / DECISION_PERIOD_S))
-        for _ in range(min(TURN_PERIODS, periods) if turn else 0):
-            self._drive(log, np.array([0.0, turn / (TURN_PERIODS * DECISION_PERIOD_S)]))
-        while log.periods < periods:
-            here = float(self.route.progress(self.single.project()[:, 0]) @ self._weight)
-            if advance is not None:
-                advance(max(here - reported, 0.0))
-                reported = max(here, reported)
-            waypoint, before = self.route.next_waypoint(here), log.periods
-            self._kept.copy_worlds(same, of=self.single)
-            halt = self._push_on(log, periods, waypoint)
-            if halt is None:
-                if self._reached() > 0.5:
-                    break
-                if log.periods == before:  # past the waypoint and not at the target: some wire lies beyond it
-                    self._drive(log, np.array([-_BACK_MM_S, 0.0]))
-                continue
-            hard = self._farthest(log, before, here)
-            if self._sweep(log, periods, before, waypoint, hard):
-                continue
-            self._go_back(log, before)
-            self._approach(log, periods, waypoint, hard)
-            if not self._search_candidates(log, periods) or log.periods == before:
-                self.halt = describe_halt(halt, hard, self.route, self.navigation)
-                self.at_fork = halt in ("off", "stalled") and near_fork(hard, self.route, self.navigation) is not None
-                break
-        else:
-            self.halt = describe_halt("late", 0.0, self.route, self.navigation)
-        reached = self._reached()
-        if reached <= 0.5:
-            self._cut_hard(log)
-        return log.course(len(weight), reached)
-
-    def _cut_hard(self, log: Log) -> None:
-        """Forget what a path that does not arrive does from where a wire presses too hard."""
-        hard = [bool((force[self._weight > 0] > self.navigation.force_limit_n).any()) for force in log.force]
-        if any(hard):
-            log.cut(hard.index(True))
-
-    def _go_back(self, log: Log, periods: int) -> None:
-        """Put the wires back to where they were kept, and forget what they have done since."""
-        self.single.copy_worlds(np.arange(self.single.worlds), of=self._kept)
-        log.cut(periods)
-
-    def _farthest(self, log: Log, begun: int, here: float) -> float:
-        """Return how far along the route the wires have come since a period, in the mean, mm."""
-        tips = [TipProjection(abscissa=row[1], offset=row[2], branch=row[3], radius=row[4]) for row in log.rows[begun:]]
-        return max([here, *(float(self.route.progress(tip) @ self._weight) for tip in tips)])
-
-    def _sweep(self, log: Log, periods: int, before: int, waypoint: float, hard: float) -> bool:
-        """Turn the wires to all sides and push them on; follow the middle of the rotations that pass the waypoint.
-
-        That is tried before the place that a straight push came to, and from where the wires were kept: in a tortuous
-        vessel the side that a tip looks to decides early. What stays within the share of the force limit that costs
-        nothing is taken first, then what leaves something for the uncertain.
-
-        Args:
-            log: what is done is added to it; nothing remains of it where no rotation passes.
-            periods: its length at most.
-            before: its length when the wires were kept.
-            waypoint: that is to be passed, mm.
-            hard: abscissa that a straight push came to, mm.
-        """
-        wires, limit = self.single.worlds, self.navigation.force_limit_n
-        made: dict[bool, Sweep] = {}
-        for share, near in product((self.config.cost.forbidden_share, SPARE_SHARE), (True, False)):
-            if near in made and not made[near].within(share * limit).any():
-                continue
-            self._go_back(log, before)
-            if near:
-                self._approach(log, periods, waypoint, hard)
-            if near not in made:
-                self._many.copy_worlds(np.repeat(np.arange(wires), self.config.candidates), of=self.single)
-                made[near] = sweep(
-                    self._many,
-                    self.route,
-                    waypoint,
-                    weight=self._weight,
-                    travel=self._limits,
-                    force_limit_n=limit,
-                    speed_mm_s=self.config.speed_mm_s,
-                    periods=periods - log.periods,
-                )
-            within = made[near].within(share * limit)
-            if within.any():
-                self._follow(log, made[near].controls(middle(within)))
-                return True
-        return False
-
-    def _reached(self) -> float:
-        return float(self.navigation.reached(self.single.project()) @ self._weight)
-
-    def _push_on(self, log: Log, periods: int, waypoint: float) -> Halt | None:
-        """Push straight on past a waypoint; return why not, or None if all wires passed it."""
-        begun = log.periods
-        while log.periods < periods:
-            tip = self.single.project()[:, 0]
-            if self._all(self.route.passed(tip, waypoint)):
-                return None
-            if not self._all(self.route.off_route(tip) == 0):
-                return "off"
-            left = waypoint - float(self.route.progress(tip) @ self._weight)
-            last = waypoint >= self.route.target.abscissa
-            speed = np.clip(left / DECISION_PERIOD_S, 1.0, self.config.speed_mm_s) if last else self.config.speed_mm_s
-            before = self.single.inserted_length[:, 0]
-            self._drive(log, np.array([speed, 0.0]))
-            advance = (self.single.inserted_length[:, 0] - before)[self._weight > 0].min()
-            if advance < SLIP_SHARE * log.control[0] * DECISION_PERIOD_S:
-                return "slipped"
-            if self._pressed(log):
-                return "pressed"
-            if log.periods - begun >= STALL_PERIODS and log.stalled(self._weight > 0):
-                return "stalled"
-        return None if self._all(self.route.passed(self.single.project()[:, 0], waypoint)) else "late"
-
-    def _approach(self, log: Log, periods: int, waypoint: float, hard: float) -> None:
-        """Push on, or pull back, to where a search for a waypoint begins.
-
-        Args:
-            log: what is done is added to it.
-            periods: its length at most.
-            waypoint: that is searched for, mm.
-            hard: abscissa that a straight push came to, mm; a bend that turns a wire back may lie before the junction.
-        """
-        before = self.route.junctions[self.route.junctions < waypoint]
-        last = waypoint >= self.route.target.abscissa
-        begin = waypoint - _LOOKOUT_MM
-        if len(before) and not last:
-            radius = float(self.route.radius(before[-1:])[0])
-            begin = float(before[-1]) - max(self.config.lead_mm, _LEAD_RADII * radius)
-        begin = min(begin, hard - self.config.lead_mm)
-        for _ in range(periods - log.periods):
-            tip = self.single.project()[:, 0]
-            here, on_route = self.route.progress(tip) @ self._weight, self._all(self.route.off_route(tip) == 0)
-            if not on_route and self.single.inserted_length[:, 0].min() > 1.0:
-                self._drive(log, np.array([-self.config.speed_mm_s, 0.0]))
-            elif here < begin - 1.0 and not (log.periods >= STALL_PERIODS and log.stalled(self._weight > 0)):
-                self._drive(log, np.array([min(self.config.speed_mm_s, (begin - here) / DECISION_PERIOD_S), 0.0]))
-            else:
-                return
-
-    def _drive(self, log: Log, control: Float[np.ndarray, "2"]) -> None:
-        made = self._possible(control[None], self.single)[0]
-        step = drive_period(self.single, np.tile(made, (self.single.worlds, 1)))
-        tip = self.single.project()[:, 0]
-        log.add(
-            made, tip, step.tip_position[:, 0], step.contact_force_max, step.inserted_length[:, 0], step.rotation[:, 0]
-        )
-
-    def _possible(self, control: Float[np.ndarray, "n 2"], simulator: Simulator) -> Float[np.ndarray, "n 2"]:
-        """Return what the drive can do of controls: neither the shortest nor the longest wire leaves the travel."""
-        inserted = simulator.inserted_length[:, 0]
-        for length in (inserted.min(), inserted.max()):
-            control = self._limits.clip(control, length, DECISION_PERIOD_S)
-        return control
-
-    def _pressed(self, log: Log) -> bool:
-        limit = self.config.cost.forbidden_share * self.navigation.force_limit_n
-        return not self._all((log.force[-1] <= limit) & self.single.valid)
-
-    def _all(self, holds: Bool[np.ndarray, "wires"]) -> bool:
-        """Return whether something holds for all wires that have not been left behind."""
-        return bool(holds[self._weight > 0].all())
-
-    def _search_candidates(self, log: Log, periods: int) -> bool:
-        """Search with the whole population for a path past the next waypoint; append the best to the log.
-
-        Every attempt begins from the same state, so that a plan holds no motion of a failed one.
-        """
-        progress = float(self.route.progress(self.single.project()[:, 0]) @ self._weight)
-        lookout = max(_LOOKOUT_MM, _LOOKOUT_RADII * float(self.route.radius(np.array([progress]))[0]))
-        waypoint = min(self.route.next_waypoint(progress), progress + lookout)
-        rounds = min(self.config.rounds, (periods - log.periods) // self.config.round_periods)
-        nearest, best = np.inf, np.zeros((0, 2))
-        for attempt in range(self.config.attempts):
-            score, controls, won = self._attempt(waypoint, rounds, attempt)
-            if won:
-                self._follow(log, controls)
-                self._leave_behind(self.route.passed(self.single.project()[:, 0], waypoint))
-                return True
-            if score < nearest:
-                nearest, best = score, controls
-        self._follow(log, best)
-        return False
-
-    def _leave_behind(self, passed: Bool[np.ndarray, "wires"]) -> None:
-        """Go on without the wires that a path does not bring past a waypoint."""
-        left = np.where(passed, self._weight, 0.0)
-        if left.sum() > 0:
-            self._weight = left / left.sum()
-
-    def _attempt(self, waypoint: float, rounds: int, attempt: int) -> tuple[float, Controls, bool]:
-        """Search once; return the least cost so far and to go, its controls, and whether they pass the waypoint."""
-        count, wires = self.config.candidates, self.single.worlds
-        self._many.copy_worlds(np.repeat(np.arange(wires), count), of=self.single)
-        history, spent = np.zeros((0, count, 2)), np.zeros(count)
-        self._peak = np.zeros(wires * count)
-        spare = SPARE_SHARE if 2 * attempt < self.config.attempts else 1.0  # the last attempts leave nothing to spare
-        most_n = spare * self.navigation.force_limit_n
-        nearest, best = np.inf, np.zeros((0, 2))
-        for number in range(rounds):
-            before = history[-1] if number else np.zeros((count, 2))
-            drawn = self._possible(self._draw(before, number, attempt), self._many)
-            spent += self._run_round(drawn, before, waypoint)
-            history = np.concatenate([history, np.repeat(drawn[None], self.config.round_periods, axis=0)])
-            score, share = self._judge(waypoint, spent, most_n)
-            won = share >= max(1 - _LEFT_BEHIND * attempt, _LEAST_SHARE) - 1e-9
-            if won.any():
-                return 0.0, history[:, np.argmin(np.where(won, score, np.inf))], True
-            if number == 0:
-                continue  # what has only turned has not shown yet where it leads
-            if score.min() < nearest:
-                nearest, best = float(score.min()), history[:, np.argmin(score)]
-            chosen = self._select(score)
-            source = (np.arange(wires)[:, None] * count + chosen).ravel()
-            self._many.copy_worlds(source)
-            self._peak = self._peak[source]
-            history, spent = history[:, chosen], spent[chosen]
-        return nearest, best, False
-
-    def _draw(
-        self, last: Float[np.ndarray, "candidates 2"], number: int, attempt: int
-    ) -> Float[np.ndarray, "candidates 2"]:
-        """Draw a control for each candidate.
-
-        In the first round they turn the tip to all sides, and pull back, in later attempts farther; in the second most
-        go straight on; then they move at random, and a few go on with what they did.
-        """
-        count, config, random = self.config.candidates, self.config, self._random
-        turn = np.where(random.random(count) < 0.25, 0.0, random.uniform(-1.0, 1.0, count)) * config.turn_rad_s
-        if number == 0:
-            sides = (np.arange(count) + random.random(count)) / count
-            turn = (2 * sides - 1) * np.pi / (config.round_periods * DECISION_PERIOD_S)
-            speed = random.uniform(-0.3 * (1 + attempt), 0.3, count)
-        elif number == 1:
-            turn = np.where(random.random(count) < 0.6, 0.0, turn)
-            speed = random.uniform(0.2, 1.0, count)
-        else:
-            back = random.random(count) < 0.45
-            speed = np.where(back, random.uniform(-0.8, 0.0, count), random.uniform(0.1, 0.8, count))
-        drawn = np.column_stack([np.clip(speed, -1.0, 1.0) * config.speed_mm_s, turn])
-        same = (random.random(count) < 0.2) & (number > 1)
-        drawn[same] = last[same]
-        return drawn
-
-    def _run_round(
-        self, control: Float[np.ndarray, "candidates 2"], before: Float[np.ndarray, "candidates 2"],
-        waypoint: float,
-    ) -> Float[np.ndarray, "candidates"]:  # fmt: skip
-        """Drive all candidates for a round; return what it cost each, in the mean over its wires."""
-        cost, wires = self.config.cost, self.single.worlds
-        spent = cost.roughness(before, control, self._limits.fastest)
-        for _ in range(self.config.round_periods):
-            step = drive_period(self._many, np.tile(control, (wires, 1)))
-            tip = self._many.project()[:, 0]
-            self._peak = np.maximum(self._peak, step.contact_force_max)
-            running = cost.running(
-                error=self._distance(step.tip_position[:, 0], waypoint),
-                ratio=safety_ratio(tip.offset, tip.radius, self._wire_radius),
-                force_share=step.contact_force_max / self.navigation.force_limit_n,
-            )
-            running = np.where(step.valid, running, 1e3)
-            spent += DECISION_PERIOD_S * (self._weight @ running.reshape(wires, -1))
-        return spent
-
-    def _distance(self, position: Float[np.ndarray, "n 3"], waypoint: float) -> Float[np.ndarray, "n"]:
-        return np.linalg.norm(position - self.route.position(waypoint), axis=-1)
-
-    def _judge(
-        self, waypoint: float, spent: Float[np.ndarray, "candidates"], force_n: float
-    ) -> tuple[Float[np.ndarray, "candidates"], Float[np.ndarray, "candidates"]]:
-        """Return each candidate's cost so far and to go, and the share of its wires that passed within a force."""
-        tip, wires = self._many.project()[:, 0], self.single.worlds
-        to_go = self._distance(self._many.position[:, 0], waypoint) + 0.5 * self.route.off_route(tip)
-        sound = self._many.valid & (self._peak <= force_n)
-        passed = (self.route.passed(tip, waypoint) & sound).reshape(wires, -1)
-        score = self._weight @ to_go.reshape(wires, -1) + spent
-        return score, self._weight @ passed
-
-    def _select(self, score: Float[np.ndarray, "candidates"]) -> Int[np.ndarray, "candidates"]:
-        """Return whose copy each candidate becomes: the best stay and are copied over the others."""
-        best = np.argsort(score)[: max(1, round(self.config.keep_share * len(score)))]
-        others = self._random.choice(best, len(score) - len(best))
-        return np.concatenate([best, others])
-
-    def _follow(self, log: Log, controls: Controls) -> None:
-        for control in controls:
-            self._drive(log, control)
+        ...

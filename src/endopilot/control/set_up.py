@@ -14,10 +14,10 @@ from jaxtyping import Float, Int
 
 from endopilot.anatomy.catheter_axis import turned_axis, with_axis
 from endopilot.control.reach import ROTATIONS, Fork, forks, lateral_reach, rotations_that_enter
-from endopilot.control.route import Route
 from endopilot.devices.device import Device
 from endopilot.errors import InputError
 from endopilot.tasks.navigation import Navigation
+from endopilot.tasks.route import Route
 
 SHAPES = ((45.0, 3.0), (60.0, 4.0), (75.0, 5.0), (90.0, 6.5), (90.0, 8.0), (90.0, 10.0))
 """Tips that are tried, angle in degrees and length in mm: from the usual one to the largest that a hand bends."""

@@ -7,13 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from endopilot.control.course import SLIP_SHARE, STALL_PERIODS, STALL_SHARE, Controls
+from endopilot.control.course import SLIP_SHARE, STALL_PERIODS, STALL_SHARE
 from endopilot.control.period import drive_period
-from endopilot.control.route import Route
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.simulation.simulator import Simulator
 from endopilot.tasks.navigation import DECISION_PERIOD_S
+from endopilot.tasks.route import Route
 
+Motion = Float[np.ndarray, "periods 2"]
+"""(mm/s, rad/s) of a wire in each decision period."""
 TURN_PERIODS = 2
 """Decision periods in which the wire is turned, half a turn at most."""
 _OFF_MM = 4.0
@@ -45,7 +47,7 @@ class Sweep:
         """Return which rotations pass without pressing on the wall with more than some force, N."""
         return self.passed & (self.force <= force_n)
 
-    def controls(self, rotation: int) -> Controls:
+    def controls(self, rotation: int) -> Motion:
         """Return the controls of one rotation."""
         return self.control[: self.periods[rotation], rotation]
 

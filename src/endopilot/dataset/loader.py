@@ -189,8 +189,9 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     manifest = read_json(folder / MANIFEST_PATH, keys=("key", "settings"), mend=_MEND)
     with reading(folder / MANIFEST_PATH, _MEND):
         made = manifest["settings"].get("version")
-        manifest["key"].encode()
-        {record["name"]: record["sha256"] + record["folder"] for record in manifest["anatomies"]}
+        parts = (record[part] for record in manifest["anatomies"] for part in ("name", "sha256", "folder"))
+        if not all(isinstance(text, str) for text in (manifest["key"], *parts)):
+            raise ValueError("key or anatomies: no text")
     if made != version():
         raise InputError(f"{folder}: made by {made}, which {version()} cannot read; make the dataset again")
     if not (folder / INFO_PATH).exists():

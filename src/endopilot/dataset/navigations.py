@@ -72,7 +72,7 @@ def simulate_navigations(
         caught = (slip > 0) | (simulator.base_load[..., 0] > watch.caught_n)
         # How far a load moves the wire is not known: about as far as the last one did.
         needed = last if actuation == "force" else np.zeros_like(last)
-        room = watch.room(recorder.tip, inserted, needed, caught)
+        room = watch.room(simulator.project(), inserted, needed, caught)
         held = np.where(room > 0, drawn, -np.abs(drawn))
         if actuation == "velocity":
             held = within_travel(np.minimum(held, room / SAMPLE_PERIOD_S), inserted, SAMPLE_PERIOD_S)

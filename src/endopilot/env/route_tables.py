@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from endopilot.anatomy.tree import parallel_transport, tangents
 from endopilot.tasks.navigation import Navigation
+from endopilot.tasks.route import Route
 from endopilot.types import TipProjection
 
 STEP_MM = 0.5
@@ -62,7 +63,8 @@ class RouteTables:
         """Make the tables, once for worlds that have the same navigation."""
         numbers = {key: number for number, key in enumerate(dict.fromkeys(map(id, navigations)))}
         route = np.array([numbers[id(navigation)] for navigation in navigations])
-        made = [_tables(navigations[world]) for world in np.unique(route, return_index=True)[1]]
+        ends = (navigations[world] for world in np.unique(route, return_index=True)[1])
+        made = [_tables(Route.to(navigation.anatomy, navigation.target)) for navigation in ends]
         places, branches = max(len(row[0]) for row in made), max(len(row[1]) for row in made)
         return cls(
             places=np.stack([_padded(row[0], places) for row in made]),
@@ -96,9 +98,8 @@ class RouteTables:
         )
 
 
-def _tables(navigation: Navigation) -> tuple[np.ndarray, np.ndarray]:
-    tree = navigation.anatomy.tree
-    line = tree.path(navigation.target.branch)
+def _tables(route: Route) -> tuple[np.ndarray, np.ndarray]:
+    line = route.line
     along = np.arange(0.0, line.abscissa[-1], STEP_MM)
     point = np.column_stack([np.interp(along, line.abscissa, axis) for axis in line.points.T])
     radius = np.interp(along, line.abscissa, line.radius)
@@ -108,7 +109,7 @@ def _tables(navigation: Navigation) -> tuple[np.ndarray, np.ndarray]:
     index = np.minimum(index, len(along) - 1)
     away = np.einsum("pij,pkj->pki", frame, (point[index] - point[:, None]) / AHEAD_MM[:, None])
     table = [point, frame.reshape(-1, 9), radius, away.reshape(len(along), -1), radius[index]]
-    return np.column_stack(table), tree.departures(navigation.target.branch)
+    return np.column_stack(table), route.leaves_at
 
 
 def _padded(rows: np.ndarray, count: int, value: float | None = None) -> np.ndarray:

@@ -8,10 +8,9 @@ import numpy as np
 import SimpleITK as sitk
 from jaxtyping import Bool, Float
 from scipy import ndimage
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
+from endopilot.anatomy.lumen_graph import groups
 from endopilot.anatomy.projection import project_tip
 from endopilot.anatomy.tree import SAMPLE_STEP_MM, sampled
 from endopilot.types import Anatomy, DistanceMap, LumenMask, VesselTree, Volume
@@ -128,10 +127,7 @@ def _longest_piece(points: Float[np.ndarray, "n 3"]) -> float:
     """Return the length of the largest group of samples that hang together, mm."""
     if len(points) == 0:
         return 0.0
-    pairs = KDTree(points).query_pairs(2.5 * SAMPLE_STEP_MM, output_type="ndarray")
-    links = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(points), len(points)))
-    _, piece = connected_components(links, directed=False)
-    return float(np.bincount(piece).max() * SAMPLE_STEP_MM)
+    return float(np.bincount(groups(points, 2.5 * SAMPLE_STEP_MM)).max() * SAMPLE_STEP_MM)
 
 
 def _mask_scores(mask: LumenMask, truth: Anatomy) -> tuple[float, float]:

@@ -15,7 +15,6 @@ from jaxtyping import Bool, Float
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.belief.adviser import AdviserConfig, count_events, near_exposures
 from endopilot.control.agent import AgentPolicy
-from endopilot.control.coaxial_agent import CoaxialAgent
 from endopilot.errors import InputError
 from endopilot.navigation.navigate import NavigateConfig, navigate
 from endopilot.navigation.policies import make_policy
@@ -100,7 +99,7 @@ def attempt(policy: str, navigation: Navigation, *, seed: int, mismatch: ModelMi
     """
     driver = make_policy(policy)
     record = _drive(navigation, driver, seed, mismatch)
-    return {"seed": seed} | scored(navigation, record, tells=isinstance(driver, AgentPolicy | CoaxialAgent))
+    return {"seed": seed} | scored(navigation, record, tells=isinstance(driver, AgentPolicy))
 
 
 def scored(navigation: Navigation, record: NavigationRecord, *, tells: bool = False) -> dict[str, Any]:

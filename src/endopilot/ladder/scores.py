@@ -23,7 +23,7 @@ def score(tasks: Sequence[Task], results: Mapping[str, Sequence[Mapping[str, Any
     Each row has `level`; `task`; `safe_success`, the share of navigations that reached the target with a wall force
     that never exceeded the task's limit; `success`, the share that reached it; of those that did, the medians of
     `seconds` and `path_ratio` (length of the tip's path over that of the centerline); and of all the median of
-    `peak_force_n` (N) and the mean of `exposures`. Rows of `agent` and `coaxial-agent` have `missed_events`, the share
+    `peak_force_n` (N) and the mean of `exposures`. Rows of `agent` have `missed_events`, the share
     of the events of all their navigations that X-ray did not show (docs/xray.md).
     """
     rows = [{"level": task.level, "task": task.name} | score_navigations(results[task.name]) for task in tasks]

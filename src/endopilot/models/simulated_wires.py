@@ -20,10 +20,10 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.files import json_text, writing
+from endopilot.models.ensemble import NOMINAL, Ensemble
 from endopilot.models.episodes import Episodes, Setup
 from endopilot.parallel import CORES
 from endopilot.progress import progress
-from endopilot.simulation.simulate import simulate
 
 FRICTION_FACTORS = (0.8, 1.0, 1.25)
 """Friction of the simulated wires, as factors of the device's."""
@@ -78,7 +78,7 @@ def simulated_tips(episodes: Episodes) -> WireTips:
     names = np.unique(episodes.anatomy)
     with (
         progress("Simulated wires", total=len(names)) as advance,
-        warnings.catch_warnings(),
+        warnings.catch_warnings(),  # around the threads, which change what all of them see
         ThreadPoolExecutor(CORES) as pool,  # few wires leave threads of one simulation idle
     ):
         warnings.simplefilter("ignore")  # a wire that fails is left out
@@ -90,20 +90,20 @@ def simulated_tips(episodes: Episodes) -> WireTips:
 
 
 def _of_one_patient(episodes: Episodes) -> WireTips:
-    device, factors = episodes.setup.device, np.array(FRICTION_FACTORS)
-    data = episodes.select(np.repeat(np.arange(len(episodes)), len(factors)))
-    rollout = simulate(
-        episodes.setup.anatomies[str(episodes.anatomy[0])](),
-        device,
-        data.command,
-        initial=data.initial,
-        friction=device.friction * np.tile(factors, len(episodes)),
-        config=replace(episodes.setup.simulator, threads=1),
-        motion=episodes.setup.known_motions.get(str(episodes.anatomy[0])),
+    setup, name, count = episodes.setup, str(episodes.anatomy[0]), len(FRICTION_FACTORS)
+    parameters = np.tile(NOMINAL, (count * len(episodes), 1))
+    parameters[:, 0] = np.tile(FRICTION_FACTORS, len(episodes))
+    data = episodes.select(np.repeat(np.arange(len(episodes)), count))
+    ensemble = Ensemble(
+        setup.anatomies[name](),
+        setup.device,
+        parameters,
+        start=data.initial[:, None],
+        config=replace(setup.simulator, threads=1),
+        motion=setup.known_motions.get(name),
     )
-    tip = np.stack([rollout.tip.abscissa, rollout.tip.offset], axis=-1)[:, :, 0]
-    tip[~rollout.valid] = np.nan
-    return np.moveaxis(tip.reshape(len(episodes), len(factors), *tip.shape[1:]), 1, 2)
+    tip = ensemble.replay(data.command)
+    return np.moveaxis(tip.reshape(len(episodes), count, *tip.shape[1:]), 1, 2)
 
 
 def read_or_simulate(folder: Path | None, episodes: Episodes) -> WireTips:

@@ -9,7 +9,6 @@ that moves as far as that is known.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from weakref import WeakKeyDictionary
@@ -20,11 +19,11 @@ from scipy.stats import qmc
 
 from endopilot.devices.device import Device
 from endopilot.models.config import WINDOW, TwinConfig
+from endopilot.models.ensemble import NOMINAL, Ensemble, likelihoods
 from endopilot.models.episodes import Episodes
 from endopilot.models.open_loop import EachObserved, Observed, OpenLoop, Prediction, begin_after, given_states, jumps
 from endopilot.models.tip_tracking import track
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.simulate import simulate
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
 LEVELS = 7
@@ -37,7 +36,6 @@ _PERSISTENT = 3
 """Observations in a row that the predicted tip must have differed from before the spread is widened."""
 Members = Float[np.ndarray, "members episodes 3"]
 """Friction factor, tip stiffness factor and depth of the ostium (mm) of each member, for each episode."""
-_NOMINAL = np.array([1.0, 1.0, 0.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +112,7 @@ class TwinPredictor:
         self, anatomy: Anatomy, data: Episodes, observed: EachObserved
     ) -> tuple[Members, Float[np.ndarray, "members episodes s 2"]]:
         """Return the second ensemble of the episodes of one anatomy, and its tips."""
-        members = self._members(np.tile(_NOMINAL, (len(data), 1)), np.tile(self._spread, (len(data), 1)))
+        members = self._members(np.tile(NOMINAL, (len(data), 1)), np.tile(self._spread, (len(data), 1)))
         paths = self._simulate(anatomy, data, members, int(np.nonzero(observed)[1].max(initial=0)) + 1)
         weight = _weights(paths, data.tip.astype(float), observed, _scales(data.tip_sd, self.config))
         members = self._members(*_narrowed(members, weight, self._spread))
@@ -178,7 +176,7 @@ class TwinPredictor:
         count = self.config.members  # the point after 0 is the middle
         unit = qmc.Sobol(3, scramble=False).random_base2(count.bit_length())[1 : count + 1]
         members = center + (2 * unit[:, None] - 1) * spread
-        members = np.clip(members, _NOMINAL - self._spread, _NOMINAL + self._spread)
+        members = np.clip(members, NOMINAL - self._spread, NOMINAL + self._spread)
         level = np.linspace(1 - self.config.stiffness_spread, 1 + self.config.stiffness_spread, LEVELS)
         members[..., 1] = level[np.abs(members[..., 1, None] - level).argmin(axis=-1)]
         return members
@@ -190,25 +188,16 @@ class TwinPredictor:
         self, anatomy: Anatomy, data: Episodes, members: Members, samples: int
     ) -> Float[np.ndarray, "members episodes s 2"]:
         """Return (Δtip, γtip) of every member over the first samples, mm; NaN from where a simulation fails."""
-        paths = np.full((*members.shape[:2], samples, 2), np.nan)
-        for stiffness in np.unique(members[..., 1]):
-            member, episode = np.nonzero(members[..., 1] == stiffness)
-            control = data.command[episode, :samples]
-            start = np.maximum(data.initial[episode, 0] + members[member, episode, 2], 0.0)
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # a member that fails has no weight
-                rollout = simulate(
-                    anatomy,
-                    self._wire(stiffness),
-                    control,
-                    initial=np.column_stack([start, data.initial[episode, 1]]),
-                    config=self.simulator,
-                    friction=self.device.friction * members[member, episode, 0],
-                    motion=data.setup.known_motions.get(anatomy.name),
-                )
-            tip = np.stack([rollout.tip.abscissa, rollout.tip.offset], axis=-1)[:, :, 0]
-            paths[member, episode] = np.where(rollout.valid[..., None], tip, np.nan)
-        return paths
+        count = len(members)
+        ensemble = Ensemble(
+            anatomy,
+            self.device,
+            members.reshape(-1, 3),
+            start=np.tile(data.initial[:, None], (count, 1, 1)),
+            config=self.simulator,
+            motion=data.setup.known_motions.get(anatomy.name),
+        )
+        return ensemble.replay(np.tile(data.command[:, :samples], (count, 1, 1))).reshape(count, len(data), samples, 2)
 
 
 def weigh(
@@ -272,8 +261,7 @@ def _weights(
     at = at[at < paths.shape[2]]
     error = (paths[:, :, at] - tips[:, at]) / scale[:, at]
     score = np.where(observed[..., at, None], np.nan_to_num(-np.log1p(error**2), nan=-1e3), 0.0).sum(axis=(2, 3))
-    weight = np.exp(score - score.max(axis=0))
-    return weight / weight.sum(axis=0)
+    return likelihoods(score)
 
 
 def _narrowed(

@@ -114,7 +114,9 @@ class NavigationLoop:
         self.simulator = start_world(navigation, truth, config.simulator, motion=config.motion)
         limits = [DriveLimits.of(device, navigation.anatomy) for device in navigation.devices]
         drive = replace(config.robot, latency_s=config.robot.latency_s * truth.latency_factor)
-        self.robot = SimulatedRobot(self.simulator, limits, drive, seed=seed, ostium_mm=truth.ostium_mm)
+        self.robot = SimulatedRobot(
+            self.simulator, limits, drive, seed=seed, ostium_mm=truth.ostium_mm, cycle_s=config.cycle_s
+        )
         self.c_arm = make_c_arm(navigation, config.fluoroscope, seed=seed)
         if config.measure_motion:
             measured = self.c_arm.measure_motion(config.motion, np.random.default_rng([seed, 6]))
@@ -261,7 +263,7 @@ class NavigationLoop:
 
     def record(self) -> NavigationRecord:
         """Return what has happened up to the end of the last whole period."""
-        return self._track.record(self.navigation, self.robot.driven, self.reason or "stopped", self.gives_up)
+        return self._track.record(self.navigation, self.robot.recorder, self.reason or "stopped", self.gives_up)
 
     def _end_period(self) -> None:
         self._track.moved(self.simulator, self.robot.proximal, self._peak_n)

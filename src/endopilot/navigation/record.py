@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from endopilot.anatomy.projection import project_tip
 from endopilot.navigation.policy import BelievedTip, Proximals
+from endopilot.simulation.recorder import Recorder
 from endopilot.simulation.simulator import Simulator
+from endopilot.simulation.trajectory import Trajectory
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, is_safe
 from endopilot.types import TipProjection
 from endopilot.xray.fluoroscope import TipMeasurement
@@ -36,8 +38,8 @@ class NavigationRecord:
             does not tell: (Δtip, γtip), mm.
         half_width: of the adviser's bands around it, mm, likewise; NaN where there is none.
         asks: why the policy asked at this moment for X-ray at the next one; empty where it did not, or does not tell.
-        driven: velocity of each device's proximal end that its drive asked for in each of its cycles, mm/s and rad/s.
-            `endopilot.simulate` makes the same navigation of it, to the bit.
+        cycles: what the drives asked for in each of their cycles and what the devices did, without shapes; replayed it
+            gives the same navigation to the bit. None where no period is over.
         success: the tip reached the target in time, at the end of a period.
         safe: the wall force never exceeded the navigation's limit.
         seconds: how long it took, s.
@@ -63,7 +65,7 @@ class NavigationRecord:
     believed: Float[np.ndarray, "samples 2"] | None
     half_width: Float[np.ndarray, "samples 2"] | None
     asks: tuple[str, ...]
-    driven: Float[np.ndarray, "cycles devices 2"]
+    cycles: Trajectory | None
     success: bool
     safe: bool
     seconds: float
@@ -73,6 +75,17 @@ class NavigationRecord:
     faults: int
     reason: str
     gives_up: str
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The true motion at the end of each decision period, with the shape of the line that the devices share.
+
+        Raises:
+            ValueError: no period is over.
+        """
+        if self.cycles is None:
+            raise ValueError("nothing was driven yet")
+        return replace(self.cycles.every(round(DECISION_PERIOD_S / self.cycles.period_s)), shape=self.shape[None, 1:])
 
     @property
     def in_bands(self) -> Bool[np.ndarray, "decisions"]:
@@ -129,12 +142,12 @@ class Track:
         self._shape.append(simulator.position[0])
         self._force.append(peak_n)
 
-    def record(self, navigation: Navigation, driven: list[np.ndarray], reason: str, gives_up: str) -> NavigationRecord:
+    def record(self, navigation: Navigation, recorder: Recorder, reason: str, gives_up: str) -> NavigationRecord:
         """Return the record of what was gathered up to the end of the last period.
 
         Args:
             navigation: what was to be done.
-            driven: velocity of each device in each cycle of the drives, mm/s and rad/s.
+            recorder: of the drives' cycles.
             reason: why it ended.
             gives_up: where and why the policy gave up, in words.
         """
@@ -143,6 +156,7 @@ class Track:
         samples, devices, _ = proximal.shape
         flat = project_tip(anatomy.tree, anatomy.insertion, position.reshape(-1, 3))
         periods = samples - 1  # a decision whose period is not over does not count
+        cycles = periods * round(DECISION_PERIOD_S / recorder.period_s)
         exposures = np.array([*self._exposures[:periods], 0])
         believed = [_NOTHING if tip is None else tip for tip in self._believed[:periods]] + [_NOTHING]
         tells = any(tip is not None for tip in self._believed)
@@ -160,7 +174,7 @@ class Track:
             believed=np.array([(tip.abscissa, tip.offset) for tip in believed]) if tells else None,
             half_width=np.array([tip.half_width for tip in believed]) if tells else None,
             asks=tuple(tip.asks for tip in believed),
-            driven=np.array(driven, dtype=float).reshape(-1, devices, 2),
+            cycles=recorder.trajectory().samples(slice(cycles)) if cycles else None,
             success=reason == "reached",
             safe=bool(is_safe(force.max(), navigation.force_limit_n)),
             seconds=DECISION_PERIOD_S * periods,

@@ -22,7 +22,7 @@ from endopilot.control.navigate_patient import (
     navigate_patient,
     set_up_navigation,
 )
-from endopilot.control.outcome import name_target, section_at, slipped_s, tell_outcome, worst_ratio
+from endopilot.control.outcome import name_target, slipped_s, tell_outcome, worst_ratio
 from endopilot.control.set_up import tip_name
 from endopilot.devices.catheter import write_catheter
 from endopilot.devices.device import write_device
@@ -31,6 +31,7 @@ from endopilot.files import manifest, read_json, write_json, writing
 from endopilot.navigation.policies import POLICIES
 from endopilot.runs import claim
 from endopilot.simulation.controls import write_controls_csv
+from endopilot.tasks.targets import section_at
 
 PAGE_FILE, PICTURE_FILE, TABLE_FILE = "navigation.html", "navigation.png", "navigation.csv"
 CONTROLS_FILE, WIRE_FILE, EPISODE_FOLDER, ANATOMY_FOLDER = "controls.csv", "wire.yaml", "episode", "anatomy"
@@ -91,9 +92,9 @@ def _write(found: PatientNavigation, folder: Path, target: str, output: Path) ->
             write_anatomy(real, driven_in)
     with writing(output / TABLE_FILE) as partial:
         navigation_table(found).to_csv(partial, index=False)
-    cycles = found.cycles
-    count = len(found.record.driven)
-    write_controls_csv(output / CONTROLS_FILE, cycles.command[0, :count], cycles.proximal[0, :count], cycles.period_s)
+    cycles = found.record.cycles
+    assert cycles is not None  # a navigation has a period at least
+    write_controls_csv(output / CONTROLS_FILE, cycles.command[0], cycles.proximal[0], cycles.period_s)
     write_device(set_up.true_wire, output / WIRE_FILE)
     for path, catheter in zip(_catheter_files(set_up, output), set_up.true_catheters, strict=True):
         write_catheter(catheter, path)

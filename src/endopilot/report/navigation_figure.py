@@ -10,11 +10,11 @@ from matplotlib.figure import Figure
 from endopilot.anatomy.projection import safety_ratio
 from endopilot.belief.adviser import AdviserConfig
 from endopilot.control.navigate_patient import PatientNavigation
-from endopilot.control.outcome import section_at
 from endopilot.control.plan_picture import draw_route, legend_above
-from endopilot.control.route import Route
 from endopilot.plotting import BLACK, BLUE, CATHETER_COLORS, GREY, ORANGE, PURPLE, STYLE, VERMILLION
 from endopilot.tasks.navigation import DECISION_PERIOD_S
+from endopilot.tasks.route import Route
+from endopilot.tasks.targets import section_at
 
 _DEVICE_COLORS = (BLUE, *CATHETER_COLORS)
 _LABEL_SHARE = 0.06
@@ -118,7 +118,7 @@ def _draw_force(axes: Axes, found: PatientNavigation) -> None:
 
 def _draw_pushes(axes: Axes, found: PatientNavigation) -> None:
     """Draw how hard each drive pushes, or pulls below zero."""
-    rollout = found.rollout
+    rollout = found.record.trajectory
     time_s = DECISION_PERIOD_S * np.arange(1, rollout.drive_force.shape[1] + 1)
     pushes = rollout.drive_force[0].T
     for device, color, push in zip(found.set_up.navigation.devices, _DEVICE_COLORS, pushes, strict=False):

@@ -107,7 +107,9 @@ def _facts(found: PatientNavigation) -> list[tuple[str, str]]:
 def _scene(found: PatientNavigation) -> str:
     """Return the replay in space as HTML."""
     record, navigation = found.record, found.set_up.navigation
-    figure = navigation_scene(navigation.anatomy, found.rollout, devices=navigation.devices, believed=found.wires)
+    figure = navigation_scene(
+        navigation.anatomy, found.record.trajectory, devices=navigation.devices, believed=found.wires
+    )
     exposed = record.exposed
     place = navigation.target.position(navigation.anatomy)
     mark_target(figure, place, record.tip_position[exposed, 0], record.time_s[exposed])

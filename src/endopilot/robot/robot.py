@@ -18,6 +18,7 @@ from jaxtyping import Float
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.stack import Proximals
 from endopilot.settings import NonNegative, Positive, Within, settings
+from endopilot.simulation.recorder import Recorder
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import Step
 
@@ -143,7 +144,7 @@ class SimulatedRobot:
     command. They count from the assumed position of the ostium.
 
     Attributes:
-        driven: velocity of each device's proximal end that its drive asked for in each cycle so far, mm/s and rad/s.
+        recorder: what the devices were asked for and did in each cycle so far.
         last_step: what the wire did in the drive's last cycle; None before the first.
     """
 
@@ -155,6 +156,7 @@ class SimulatedRobot:
         *,
         seed: int = 0,
         ostium_mm: float = 0.0,
+        cycle_s: float = CYCLE_S,
     ) -> None:
         """Grasp the devices where they are.
 
@@ -164,6 +166,7 @@ class SimulatedRobot:
             config: latency, backlash, accelerations and encoder noise.
             seed: of the encoder noise.
             ostium_mm: the true inserted lengths are this much more than the encoders', mm.
+            cycle_s: period of the drives' loop, s.
         """
         self._simulator, self._ostium_mm = simulator, ostium_mm
         config = config or RobotConfig()
@@ -173,7 +176,7 @@ class SimulatedRobot:
             DriveMotion(_by_encoder(limit, ostium_mm), config, (at, turned))
             for limit, (at, turned) in zip(limits, self._encoders().tolist(), strict=True)
         ]
-        self.driven: list[Float[np.ndarray, "devices 2"]] = []
+        self.recorder = Recorder(simulator, cycle_s)
         self.last_step: Step | None = None
 
     @property
@@ -198,13 +201,11 @@ class SimulatedRobot:
         return ProximalState(self._drives[0].time_s, tuple((at, turn) for at, turn in read.tolist()))
 
     def run(self, duration: float) -> float:
-        """Let the robot and its devices run for some time, s, and return the largest wall force on a node, N."""
-        cycles = max(1, round(duration / CYCLE_S))
-        period, peak = duration / cycles, 0.0
-        for _ in range(cycles):
+        """Let the robot and its devices run for whole cycles, s, and return the largest wall force on a node, N."""
+        period, peak = self.recorder.period_s, 0.0
+        for _ in range(max(1, round(duration / period))):
             control = np.array([drive.advance(period) for drive in self._drives]) / period
-            self.last_step = step = self._simulator.step(control[None], period)
-            self.driven.append(control)
+            self.last_step = step = self.recorder.step(control[None])
             for drive, place in zip(self._drives, self._encoders(), strict=True):
                 drive.position = place
             peak = max(peak, float(step.contact_force_max[0]))

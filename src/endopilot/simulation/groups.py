@@ -73,7 +73,7 @@ def make_groups(
     motion: Motion | None,
     config: SimulatorConfig,
     sharing: Sequence[Group],
-    reach_mm: float | None,
+    reach_mm: float,
 ) -> list[Group]:
     """Return the groups of worlds, with their wires laid out and at the ostium.
 
@@ -83,7 +83,7 @@ def make_groups(
         motion: of every vessel about its ostium; None if they lie still.
         config: settings of the rod core.
         sharing: groups whose lumens and projections are taken rather than prepared again.
-        reach_mm: inserted length that devices are laid out for, mm; the far end of each vessel if None.
+        reach_mm: inserted length that devices are laid out for, mm; the far end of each vessel if that is more.
 
     Raises:
         InputError: a device that does not fit its anatomy or the catheter around it; a distance map that is not finite,
@@ -111,7 +111,7 @@ def make_groups(
         if anatomy.identity not in projectors:
             projectors[anatomy.identity] = TipProjector(anatomy.tree, anatomy.insertion)
         path_mm = float(anatomy.tree.longest_path().abscissa[-1])
-        longest_mm = far_end_mm(anatomy) if reach_mm is None else max(path_mm, reach_mm)
+        longest_mm = max(far_end_mm(anatomy), reach_mm)
         rod = lay_out(stack.wire, element_mm=config.element_mm, length_mm=longest_mm + FREE_BEHIND_MM)
         check_memory(8 * len(worlds) * (40 * len(rod.abscissa_mm) + 40), f"worlds: {len(worlds)}", "give fewer")
         moving = None if motion is None else motion.core(np.asarray(anatomy.insertion.position), config.processor)

@@ -124,7 +124,7 @@ def run_set_up(
     worlds, samples = command.shape[:2]
     check_memory(8 * worlds * samples * 20, f"control: {worlds} worlds of {samples} samples", "simulate fewer at once")
     start = set_up.initial[..., 0]
-    reach_mm = None
+    reach_mm = 0.0
     if set_up.actuation == "velocity" and 0 < period_s < np.inf:
         # A drive that slips leaves in the vessel what it did not pull back, and pushes on from there.
         ahead = np.maximum(command[..., 0], 0.0).sum(axis=1) * period_s

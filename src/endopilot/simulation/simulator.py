@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -62,7 +62,7 @@ class Simulator(Readout):
         motion: Motion | None = None,
         config: SimulatorConfig | None = None,
         sharing: Simulator | None = None,
-        reach_mm: float | None = None,
+        reach_mm: float = 0.0,
     ) -> None:
         """Lay the devices out; every world starts with the wire's tip at the ostium.
 
@@ -77,8 +77,8 @@ class Simulator(Readout):
                 the vessel as CT shows it; `vessel_to_laboratory` says where that lies.
             config: settings of the rod core.
             sharing: a simulator that has prepared the same anatomy, whose lumen is then not prepared again.
-            reach_mm: inserted length that the devices are laid out for, mm; 20 mm beyond the end of each vessel's
-                longest path if not given.
+            reach_mm: inserted length that the devices are laid out for, mm; at least 20 mm beyond the end of each
+                vessel's longest path.
 
         Raises:
             InputError: a device that does not fit its anatomy or the catheter around it; a distance map that is not
@@ -249,6 +249,27 @@ class Simulator(Readout):
         set_up, start, began_s = self._set_up, self.proximal, self.time
         steps = self.config.steps_of(period_s)
         result = self._run_all(command, period_s / steps, steps, record_shape=record_shape, advance=advance)
+        return self.made(set_up, start, command, period_s, began_s, result)
+
+    def made(
+        self,
+        set_up: SetUp,
+        start: Float[np.ndarray, "worlds devices 2"],
+        command: Float[np.ndarray, "worlds samples devices 2"],
+        period_s: float,
+        began_s: Float[np.ndarray, "worlds"],
+        result: Mapping[str, np.ndarray],
+    ) -> Trajectory:
+        """Return what was recorded of these worlds as a trajectory; `run` and `Recorder` do.
+
+        Args:
+            set_up: what they were simulated with.
+            start: Δ (mm) and φ (rad) before the first sample.
+            command: of each sample.
+            period_s: time between samples, s.
+            began_s: `time` before the first sample, s.
+            result: the arrays of `Step`, with an axis of samples, and of `shape` if it was recorded.
+        """
         tips = [group.project(each) for group, each in self._of_groups(result["tip_position"])]
         names = TipProjection.__dataclass_fields__
         recorded: dict[str, Any] = {name: result[name] for name in Step.__dataclass_fields__}
@@ -261,7 +282,7 @@ class Simulator(Readout):
             tip=TipProjection(**{name: self._merge([getattr(tip, name) for tip in tips]) for name in names}),
             reason=self.reason,
             shape=result.get("shape"),
-            vessel_to_laboratory=None if self._set_up.motion is None else self._placements(times),
+            vessel_to_laboratory=None if set_up.motion is None else self._placements(times),
             **recorded,
         )
 

@@ -15,7 +15,7 @@ from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.settings import CountOrZero, Finite, NonNegative, Positive, Seconds, Within, settings
 from endopilot.simulation.motion import Motion
-from endopilot.types import Anatomy, TipProjection
+from endopilot.types import Anatomy, TipProjection, VesselTree
 
 DECISION_PERIOD_S = 0.5
 """Time between two decisions, s: the paper's sample period, at which its models speak."""
@@ -44,6 +44,22 @@ class Target:
         """Return the target's place on the centerline, LPS mm."""
         line = anatomy.tree.branches[self.branch].centerline
         return np.array([np.interp(self.abscissa, line.abscissa, axis) for axis in line.points.T])
+
+    def check(self, tree: VesselTree) -> None:
+        """Check that the place lies in a vessel.
+
+        Raises:
+            ValueError: no such branch, or it does not run there.
+        """
+        branches = tree.branches
+        if not 0 <= self.branch < len(branches):
+            raise ValueError(f"target.branch: {self.branch}; the vessel has branches 0 to {len(branches) - 1}")
+        line = branches[self.branch].centerline.abscissa
+        if not line[0] <= self.abscissa <= line[-1]:
+            raise ValueError(
+                f"target.abscissa: {self.abscissa:g} mm; branch {self.branch} of the vessel runs from "
+                f"{line[0]:.1f} to {line[-1]:.1f} mm"
+            )
 
 
 @settings(eq=False)
@@ -82,17 +98,7 @@ class Navigation:
 
     @model_validator(mode="after")
     def _consistent(self) -> Navigation:
-        branches = self.anatomy.tree.branches
-        if not 0 <= self.target.branch < len(branches):
-            raise ValueError(
-                f"target.branch: {self.target.branch}; {self.anatomy.name} has branches 0 to {len(branches) - 1}"
-            )
-        line = branches[self.target.branch].centerline.abscissa
-        if not line[0] <= self.target.abscissa <= line[-1]:
-            raise ValueError(
-                f"target.abscissa: {self.target.abscissa:g} mm; branch {self.target.branch} of {self.anatomy.name} "
-                f"runs from {line[0]:.1f} to {line[-1]:.1f} mm"
-            )
+        self.target.check(self.anatomy.tree)
         if len(self.catheters) < self.arriving:
             raise ValueError("arrives: catheter; there is none; give catheters, or arrives: wire")
         check_nested(self.device, self.catheters)

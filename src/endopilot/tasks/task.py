@@ -19,8 +19,9 @@ from endopilot.devices.device_files import list_devices
 from endopilot.errors import InputError
 from endopilot.settings import CountOrZero, NonNegative, Positive, Seconds, Seed, Share, Within, read_settings, settings
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.tasks.navigation import Arrives, Navigation, Target
-from endopilot.types import Anatomy, VesselTree
+from endopilot.tasks.navigation import Arrives, Navigation
+from endopilot.tasks.targets import find_target
+from endopilot.types import Anatomy
 
 CORE = SimulatorConfig(element_mm=1.25, time_step_s=1 / 14, sample_tolerance_mm=1e-4)
 """Settings of the rod core on the ladder and in the environments: longer elements, two time steps a control period,
@@ -134,7 +135,7 @@ class Task:
         return Navigation(
             anatomy=anatomy,
             device=replace(read_device(self.device), **bend),
-            target=target_in_section(anatomy.tree, self.section, self.depth_mm),
+            target=find_target(anatomy.tree, self.section, depth_mm=self.depth_mm),
             start_inserted_mm=self.start_inserted_mm,
             start_rotation=start_rotation,
             seconds=self.seconds,
@@ -143,45 +144,6 @@ class Task:
             arrives=self.arrives or "wire",
             start_catheter_mm=self.start_catheter_mm or 0.0,
         )
-
-
-def target_in_section(tree: VesselTree, section: str, depth_mm: float) -> Target:
-    """Return the place that lies `depth_mm` beyond the begin of a section, in the branch where it begins.
-
-    Where several branches begin the section, it is the one that begins nearest to the ostium. If the section goes on in
-    several branches, the target lies in the straightest one.
-
-    Raises:
-        InputError: the tree lacks the section, or the section ends before.
-    """
-    if section not in tree.section_names:
-        raise InputError(f"section: {section!r}; the tree has {', '.join(tree.section_names)}")
-    label = tree.section_names.index(section)
-    begins = {
-        index: float(branch.centerline.abscissa[max(int(np.argmax(branch.section == label)) - 1, 0)])
-        for index, branch in enumerate(tree.branches)
-        if (branch.section == label).any()
-    }
-    if not begins:
-        raise InputError(f"section: {section!r} has no branch in this tree; choose another patient")
-    branch = min(begins, key=lambda index: begins[index])
-    abscissa = begins[branch] + depth_mm
-    while abscissa > tree.branches[branch].centerline.abscissa[-1]:
-        onwards = [child for child in tree.children(branch) if child in begins]
-        if not onwards:
-            raise InputError(f"depth_mm: {depth_mm:g}; section {section} of this tree is shorter")
-        branch = min(onwards, key=lambda child: turn_rad(tree, child))
-    return Target(branch=branch, abscissa=abscissa)
-
-
-def turn_rad(tree: VesselTree, branch: int) -> float:
-    """Return the angle between a branch's first direction and its parent's last, rad, over some millimetres."""
-    line, before = tree.branches[branch].centerline, tree.branches[tree.branches[branch].parent].centerline
-    clear = float(line.radius[0]) + float(line.radius[-1])
-    out = line.points[min(int(np.searchsorted(line.abscissa, line.abscissa[0] + clear)), len(line.points) - 1)]
-    back = before.points[max(int(np.searchsorted(before.abscissa, before.abscissa[-1] - clear)) - 1, 0)]
-    into, onto = line.points[0] - back, out - line.points[0]
-    return float(np.arccos(np.clip(into @ onto / (np.linalg.norm(into) * np.linalg.norm(onto)), -1.0, 1.0)))
 
 
 @cache
@@ -254,7 +216,7 @@ def reference_navigation() -> Navigation:
     return Navigation(
         anatomy=anatomy,
         device=read_device("workhorse-014"),
-        target=target_in_section(anatomy.tree, "4", 15.0),
+        target=find_target(anatomy.tree, "4", depth_mm=15.0),
         start_inserted_mm=5.0,
         seconds=60.0,
     )

@@ -11,7 +11,7 @@ export class AutopilotBar {
   constructor(connection, scene) {
     this.connection = connection;
     this.bar = document.getElementById("autopilot");
-    this.policy = this.select("policy", scene.policies, scene.catheters ? "coaxial-agent" : "agent");
+    this.policy = this.select("policy", scene.policies, "agent");
     this.target = this.select("target", ["…", ...scene.sections.map((section) => section.name)]);
     this.target.onchange = () => this.target.value !== "…" && connection.send("target", { section: this.target.value });
     this.go = this.button("Start", () => this.act());

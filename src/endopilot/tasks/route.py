@@ -19,8 +19,6 @@ ENTERED_MM = 1.0
 """A tip this far beyond a waypoint has entered the branch, mm."""
 NEAR_MM = 1.5
 """A tip this near to the target, in its branch, has arrived, mm: half a millimetre before it counts as reached."""
-OUTSIDE_MM = 2.0
-"""A point this far outside the lumen is no target, mm."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,17 +62,17 @@ class Route:
         )
 
     @cached_property
-    def _leaves_at(self) -> Float[np.ndarray, "branches"]:
+    def leaves_at(self) -> Float[np.ndarray, "branches"]:
         """Abscissa at which the path to each branch of the tree leaves the route; infinite for those on it."""
         return self.anatomy.tree.departures(self.target.branch)
 
     def off_route(self, tip: TipProjection) -> Float[np.ndarray, "..."]:
         """Return how far tips are in branches that do not lie on the route, mm; 0 for those on it."""
-        return np.maximum(tip.abscissa - self._leaves_at[tip.branch], 0.0)
+        return np.maximum(tip.abscissa - self.leaves_at[tip.branch], 0.0)
 
     def progress(self, tip: TipProjection) -> Float[np.ndarray, "..."]:
         """Return how far along the route tips have come, mm; for tips off the route, as far as where they left it."""
-        return np.minimum(tip.abscissa, self._leaves_at[tip.branch])
+        return np.minimum(tip.abscissa, self.leaves_at[tip.branch])
 
     def passed(self, tip: TipProjection, waypoint: float) -> Bool[np.ndarray, "..."]:
         """Return which tips have entered the branch of a waypoint, or reached the target if it is the last."""
@@ -117,64 +115,3 @@ def check_passable(route: Route, device: Device) -> None:
             f"{2 * radius[at]:.2f} mm wide and {device.name} is {device.diameter_mm:g} mm; "
             "choose a target before it or a thinner device"
         )
-
-
-def parse_target(anatomy: Anatomy, text: str) -> Target:
-    """Return the target that a text names: a section such as "4" or "PDA", or a point "X,Y,Z" in LPS mm.
-
-    A section's target is the middle of it, on the branch that holds most of it; the PDA of a coronary tree is its
-    segment 4 (15 where it comes from the left).
-
-    Raises:
-        InputError: nothing is named, no such section, a point that is not three numbers, or one outside the lumen.
-    """
-    if not text.strip():
-        raise InputError("--target: is empty; give a section such as 4, or a point X,Y,Z in LPS mm")
-    parts = text.split(",")
-    if len(parts) == 3:
-        return _nearest(anatomy, text, parts)
-    tree = anatomy.tree
-    names = {name.lower(): index for index, name in enumerate(tree.section_names)}
-    wanted = [name for name in _ALIASES.get(text.lower(), (text.lower(),)) if name in names]
-    section = names[wanted[0]] if wanted else -1
-    length = [_length(branch.centerline, branch.section == section) for branch in tree.branches]
-    if not any(length):
-        raise InputError(
-            f"--target {text}: {anatomy.name} has no such section (it has {', '.join(tree.sections_present)}); "
-            "give one of them, or a point X,Y,Z in LPS mm"
-        )
-    branch = int(np.argmax(length))
-    own = tree.branches[branch].centerline.abscissa[tree.branches[branch].section == section]
-    return Target(branch=branch, abscissa=float((own[0] + own[-1]) / 2))
-
-
-_ALIASES = {"pda": ("4", "15"), "lad": ("7",), "lcx": ("13", "11"), "rca": ("3",), "pl": ("16", "14"), "lm": ("5",)}
-"""Other names of AHA/SCCT segments."""
-
-
-def _length(line: Centerline, own: Bool[np.ndarray, "n"]) -> float:
-    at = line.abscissa[own]
-    return float(at[-1] - at[0]) if len(at) else 0.0
-
-
-def _nearest(anatomy: Anatomy, text: str, parts: list[str]) -> Target:
-    try:
-        point = np.array([float(part) for part in parts])
-    except ValueError:
-        point = np.full(3, np.nan)
-    if not np.isfinite(point).all():
-        raise InputError(f"--target {text}: not three finite numbers; give a point as X,Y,Z in LPS mm")
-    best: tuple[float, int, Int[np.ndarray, ""] | int, float] | None = None
-    for index, branch in enumerate(anatomy.tree.branches):
-        distance = np.linalg.norm(branch.centerline.points - point, axis=1)
-        at = int(np.argmin(distance))
-        if best is None or distance[at] < best[0]:
-            best = (float(distance[at]), index, at, float(branch.centerline.radius[at]))
-    assert best is not None
-    distance, index, at, radius = best
-    if distance > radius + OUTSIDE_MM:
-        raise InputError(
-            f"--target {text}: {distance:.1f} mm from the nearest centerline of {anatomy.name}, whose lumen is "
-            f"{radius:.1f} mm in radius there; give a point in the vessel, in LPS mm"
-        )
-    return Target(branch=index, abscissa=float(anatomy.tree.branches[index].centerline.abscissa[at]))

@@ -1,4 +1,4 @@
-"""The route to a target: progress along it, leaving it, and targets that do not lie in the vessel."""
+"""The route to a target: progress along it, leaving it, and targets by name, place and depth."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ import pytest
 
 from benchmarks.anatomy.analytic_lumens import tree_of
 from endopilot.anatomy.projection import project_tip
-from endopilot.control.route import Route, check_passable, parse_target
 from endopilot.errors import InputError
 from endopilot.tasks.navigation import Target
+from endopilot.tasks.route import Route, check_passable
+from endopilot.tasks.targets import find_target
 from endopilot.types import Branch, VesselTree
 
 
@@ -66,20 +67,30 @@ def named(fork):
 
 def test_targets_by_name_and_by_place(fork):
     anatomy = named(fork)
-    assert parse_target(anatomy, "PDA") == parse_target(anatomy, "4")
-    target = parse_target(anatomy, "4")
+    assert find_target(anatomy.tree, "PDA") == find_target(anatomy.tree, "4")
+    target = find_target(anatomy.tree, "4")
     assert target.branch == 2 and target.abscissa == pytest.approx(30.0, abs=0.5)
-    point = parse_target(anatomy, "0.3, 0, 31.9")
+    point = find_target(anatomy.tree, "0.3, 0, 31.9")
     assert point.branch == 1 and point.abscissa == pytest.approx(32.0, abs=0.3)
+    assert find_target(anatomy.tree, [0.3, 0.0, 31.9]) == find_target(anatomy.tree, point) == point
+    beyond = find_target(anatomy.tree, "PDA", depth_mm=4.0)
+    assert (beyond.branch, beyond.abscissa) == (2, pytest.approx(24.0))
 
 
 @pytest.mark.parametrize(
     ("text", "part"),
-    [("LAD", "no such section"), ("50,0,0", "nearest centerline"), ("1,nan,2", "finite"), ("1,x,2", "finite")],
+    [
+        ("LAD", "no such section"),
+        ("50,0,0", "nearest centerline"),
+        ("1,nan,2", "finite"),
+        ("1,x,2", "finite"),
+        (Target(branch=3, abscissa=1.0), "branches 0 to 2"),
+        (Target(branch=2, abscissa=1.0), "runs from 20.0"),
+    ],
 )
 def test_targets_outside_the_tree_are_refused(fork, text, part):
     with pytest.raises(InputError, match=part):
-        parse_target(named(fork), text)
+        find_target(named(fork).tree, text)
 
 
 def test_a_lumen_narrower_than_the_wire_hides_what_lies_behind_it(fork, wire):

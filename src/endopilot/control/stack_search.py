@@ -1,4 +1,4 @@
-"""Search for a course of a wire in a catheter, fork by fork: `CoaxialSearch`.
+"""Search for a course of a wire in a catheter, fork by fork: `StackSearch`.
 
 Up to the next fork and past it, copies of wire and catheter are pushed straight on, each with another lead of the wire
 before the catheter follows. Where none passes, more copies try a grid of manoeuvres at the fork: the catheter is placed
@@ -9,17 +9,25 @@ it bears errors best.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from endopilot.control.coaxial_copies import CoaxialCourse, CoaxialSearchConfig, Copies, Kept
+from endopilot.belief.belief import Belief
+from endopilot.control.course import Copies, Course
 from endopilot.control.halt import SPARE_SHARE
-from endopilot.control.route import Route
+from endopilot.control.search import SearchConfig
 from endopilot.control.sweep import TURN_PERIODS, middle
+from endopilot.devices.device import Device
+from endopilot.devices.drive_limits import SPARE_MM, DriveLimits
+from endopilot.errors import InputError
+from endopilot.progress import Advance
 from endopilot.simulation.simulator import Simulator
+from endopilot.simulation.state import Step
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
+from endopilot.tasks.route import Route
 from endopilot.types import TipProjection
 
 _ALL_ALONG_MM = 1000.0
@@ -56,59 +64,115 @@ _CANDIDATES = 3
 """Manoeuvres that are driven again alone before a fork counts as refusing."""
 
 
-class CoaxialSearch:
+class Stacks(Copies):
+    """Copies of a wire in a catheter, and which of them stand still.
+
+    Attributes:
+        most_n: force on the wall that is too hard, N.
+        failed: which have left the route, pressed too hard or folded.
+        farthest: how far along the route each wire came in the last push, mm.
+    """
+
+    def __init__(self, navigation: Navigation, wires: list[Device], like: Simulator) -> None:
+        """Lay them out; the arguments are those of `Copies`."""
+        super().__init__(navigation, wires, like)
+        limits = [DriveLimits.of(device, navigation.anatomy) for device in navigation.devices]
+        deepest = limits[0].travel_mm[1] - SPARE_MM / 10
+        self._limits = [replace(each, travel_mm=(0.0, deepest)) for each in limits]
+        self.most_n = SPARE_SHARE * navigation.force_limit_n
+        self.failed, self.farthest = np.zeros(len(wires), dtype=bool), np.zeros(len(wires))
+
+    def put(self, source: Int[np.ndarray, "worlds"], of: Simulator) -> None:
+        """Put each where a world of a simulator of equal stacks is, and forget what it has done."""
+        super().put(source, of)
+        self.failed, self.farthest = np.zeros(len(source), dtype=bool), np.zeros(len(source))
+
+    @property
+    def wire(self) -> Float[np.ndarray, "worlds"]:
+        """Inserted lengths of the wires, mm."""
+        return self.simulator.inserted_length[:, 0]
+
+    @property
+    def catheter(self) -> Float[np.ndarray, "worlds"]:
+        """Inserted lengths of the catheters, mm."""
+        return self.simulator.inserted_length[:, 1]
+
+    def foremost(self) -> TipProjection:
+        """Return the foremost tips, those of the wires or of the catheters."""
+        worlds = np.arange(self.simulator.worlds)
+        return self.simulator.project()[worlds, np.where(self.wire >= self.catheter, 0, 1)]
+
+    def move(self, wire: np.ndarray | float, catheter: np.ndarray | float, turn: np.ndarray | float = 0.0) -> Step:
+        """Drive those that go on for a decision period, wire and catheter at mm/s, both turned at rad/s."""
+        control = np.zeros((self.simulator.worlds, 2, 2))
+        control[:, 0, 0], control[:, 1, 0] = wire, catheter
+        control[..., 1] = np.broadcast_to(turn, len(control))[:, None]
+        control[self.failed] = 0.0
+        for k, inserted in enumerate((self.wire, self.catheter)):
+            control[:, k] = self._limits[k].clip(control[:, k], inserted, DECISION_PERIOD_S)
+        step = self.drive(control)
+        self.failed |= self.peak > self.most_n
+        return step
+
+
+class StackSearch:
     """Searches courses for a navigation of wire and catheter.
 
     Attributes:
-        config: settings.
-        route: to the target.
-        halted_mm: abscissa of the waypoint that the last search found no course past, mm; None if it arrived.
+        halt: where and why the last search ended before the target, in words; empty if it arrived.
+        draws: it draws nothing at random.
     """
 
-    def __init__(
-        self, navigation: Navigation, config: CoaxialSearchConfig | None = None, *, sharing: Simulator | None = None
-    ) -> None:
+    draws = False
+
+    def __init__(self, navigation: Navigation, route: Route, belief: Belief, *, config: SearchConfig) -> None:
         """Lay wire and catheter out.
 
         Args:
             navigation: what is to be done.
-            config: settings.
-            sharing: a simulator that has prepared the same anatomy, whose lumen is then not prepared again.
+            route: to its target.
+            belief: whose wire of the middle stiffness and whose settings of the rod core are taken.
+            config: settings of the search.
+
+        Raises:
+            InputError: there is more than one catheter.
         """
-        self._navigation, self.config = navigation, config or CoaxialSearchConfig()
-        self.route = Route.to(navigation.anatomy, navigation.target)
-        shaped = bool(navigation.catheters[0].shape)
+        catheter, *others = navigation.catheters
+        if others:
+            raise InputError(f"catheter: {len(navigation.catheters)}; the search drives one: give one")
+        self._navigation, self.route, self.config = navigation, route, config
+        shaped = bool(catheter.shape)
         self._leads = np.array(_LEADS_SHAPED_MM if shaped else _LEADS_MM)
         self._grids = [_PLACES, *(_SHAPED if shaped else _UNSHAPED)]
-        worlds = (1, len(self._leads), len(_PLACES) * self.config.turns)
+        wires = list(belief.wires.values())
+        self._stiffness = len(wires) // 2
         self._one, self._few, self._many = (
-            Copies(navigation, self.route, self.config, count, sharing) for count in worlds
+            Stacks(navigation, [wires[self._stiffness]] * count, belief.simulator)
+            for count in (1, len(self._leads), len(_PLACES) * config.manoeuvres.turns)
         )
-        self.halted_mm: float | None = None
+        self.halt = ""
 
-    def find(self, start: Simulator, world: int = 0) -> CoaxialCourse:
-        """Search a course from the state of a world of a simulator that has the settings of this search."""
+    def find(self, belief: Belief, *, seconds: float, first: bool = False, advance: Advance | None = None) -> Course:
+        """Find a course from where the likeliest devices are, as `Search` has it; it may take longer than is left."""
         one, route = self._one, self.route
-        one.simulator.copy_worlds([world], of=start)
-        one.begin()
-        self.halted_mm = None
-        begun = float(route.progress(one.foremost())[0])
+        source = int(belief.likeliest()[0][self._stiffness])
+        one.put(np.array([source]), belief.simulator)
+        begun = reported = float(route.progress(one.foremost())[0])
         settled: list[int] = []
-        for waypoint in _stretches(begun, route):
+        self.halt = ""
+        for waypoint in [] if self._reached() else _stretches(begun, route):
             if not self._go_on(waypoint):
-                self.halted_mm = waypoint
+                self.halt = f"no manoeuvre leads past {waypoint:.0f} mm; give another catheter, wire or tip"
                 break
-            settled.append(len(one.made) - 1)
-        abscissa, off = (np.array([tip[k] for tip in one.tip]).reshape(-1) for k in range(2))
-        return CoaxialCourse(
-            control=np.array(one.made).reshape(-1, 2, 2),
-            proximal=np.array(one.proximal).reshape(-1, 2, 2),
-            abscissa=abscissa,
-            off_route=off,
-            settled=np.isin(np.arange(len(one.made)), settled),
-            peak_n=float(one.peak.max()),
-            reached=bool(self._navigation.reached(one.simulator.project())[0]),
-        )
+            settled.append(one.log.periods - 1)
+            if advance is not None:
+                advance(max(waypoint - reported, 0.0))
+                reported = max(waypoint, reported)
+        ostium_mm = float(belief.parameters[source, 2])
+        return one.log.course((1, one.devices), reached=float(self._reached()), ostium_mm=ostium_mm, settled=settled)
+
+    def _reached(self) -> bool:
+        return bool(self._navigation.reached(self._one.simulator.project())[0])
 
     def _go_on(self, waypoint: float) -> bool:
         """Go past a place, straight or by a manoeuvre; return whether any passes within the force limit."""
@@ -122,17 +186,6 @@ class CoaxialSearch:
                 break
         return False
 
-    def _kept(self) -> Kept:
-        return Kept(self._one.simulator.state, self._one.peak.copy(), len(self._one.made))
-
-    def _restore(self, kept: Kept) -> None:
-        """Bring the course back to where it was."""
-        one = self._one
-        one.simulator.set_state(kept.state)
-        one.peak, one.failed[:] = kept.peak.copy(), False
-        for log in (one.made, one.proximal, one.tip):
-            del log[kept.periods :]
-
     def _straight(self, waypoint: float) -> bool:
         """Push copies straight on past a waypoint, each with its own lead; follow the gentlest that passes."""
         few = self._copied(self._few)
@@ -143,13 +196,13 @@ class CoaxialSearch:
 
     def _manoeuvre(self, waypoint: float, grid: list[tuple[float, float, float]]) -> bool:
         """Try a grid before a waypoint, and follow the best of it; return whether any passes."""
-        many, turns = self._copied(self._many), self.config.turns
+        many, turns = self._copied(self._many), self.config.manoeuvres.turns
         where, lead, pull = (np.repeat([place[k] for place in grid], turns) for k in range(3))
         side = np.tile(2 * np.pi * (np.arange(turns) / turns - 0.5), len(grid))
         obstacle, step = self._obstacle(waypoint)
         self._place(many, np.maximum(obstacle + where * step, 0.0), lead)
         for _ in range(TURN_PERIODS):
-            many.drive(0.0, 0.0, side / (TURN_PERIODS * DECISION_PERIOD_S))
+            many.move(0.0, 0.0, side / (TURN_PERIODS * DECISION_PERIOD_S))
         self._pull(many, -pull * step)
         leads = np.where(lead < _WITHDRAWN_MM, lead, _ALL_ALONG_MM)
         rows = self._push(many, waypoint, leads).reshape(len(grid), turns)
@@ -169,37 +222,37 @@ class CoaxialSearch:
         radius = float(self.route.radius(np.array([obstacle]))[0])
         return obstacle, max(_PLACE_RADII * radius, _PLACE_MM)
 
-    def _pull(self, copies: Copies, length: Float[np.ndarray, "worlds"]) -> None:
+    def _pull(self, copies: Stacks, length: Float[np.ndarray, "worlds"]) -> None:
         """Pull wires and catheters back, mm."""
         period_mm = 2 * self.config.speed_mm_s * DECISION_PERIOD_S
         for k in range(int(np.ceil(length.max() / period_mm))):
             speed = -np.clip(length - k * period_mm, 0.0, period_mm) / DECISION_PERIOD_S
-            copies.drive(speed, speed)
+            copies.move(speed, speed)
 
-    def _copied(self, copies: Copies) -> Copies:
+    def _copied(self, copies: Stacks) -> Stacks:
         """Return copies that are put where the course has come to."""
-        copies.simulator.copy_worlds(np.zeros(copies.simulator.worlds, dtype=int), of=self._one.simulator)
-        copies.begin()
+        copies.put(np.zeros(copies.simulator.worlds, dtype=int), self._one.simulator)
         return copies
 
-    def _repeat(self, copies: Copies, chosen: Int[np.ndarray, "n"], waypoint: float) -> bool:
+    def _repeat(self, copies: Stacks, chosen: Int[np.ndarray, "n"], waypoint: float) -> bool:
         """Add to the course what the first of some copies did that passes again without its pauses."""
-        one, kept = self._one, self._kept()
+        one, kept = self._one, self._one.kept()
         self._pressed |= bool((copies.peak > copies.most_n).any())
         for place in chosen:
-            for controls in copies.made:
-                (wire, turn), (catheter, _) = controls[place]
+            for period in copies.log.rows:
+                (wire, turn), (catheter, _) = period.control[place]
                 if wire or turn or catheter:
-                    one.drive(wire, catheter, turn)
+                    one.move(wire, catheter, turn)
             if self._there(one, waypoint)[0]:
                 return True
-            self._restore(kept)
+            one.restore(kept)
+            one.failed[:] = False
         return False
 
-    def _place(self, copies: Copies, wanted: Float[np.ndarray, "worlds"], lead: Float[np.ndarray, "worlds"]) -> None:
+    def _place(self, copies: Stacks, wanted: Float[np.ndarray, "worlds"], lead: Float[np.ndarray, "worlds"]) -> None:
         """Bring the catheters' tips to some abscissae, mm, and the wires so much deeper than the catheters, mm."""
         speed = 2 * self.config.speed_mm_s
-        for _ in range(round(self.config.longest_s / DECISION_PERIOD_S)):
+        for _ in range(round(self.config.manoeuvres.longest_s / DECISION_PERIOD_S)):
             error = wanted - copies.simulator.project().abscissa[:, 1]
             moving = np.abs(error) > _AT_MM
             catheter = np.where(moving, np.clip(error / (2 * DECISION_PERIOD_S), -speed, speed), 0.0)
@@ -207,9 +260,9 @@ class CoaxialSearch:
             gap = np.where(np.abs(gap) > _REST_MM, gap, 0.0)
             if not ((moving | (gap != 0)) & ~copies.failed).any():
                 return
-            copies.drive(np.clip(gap / DECISION_PERIOD_S, -2 * speed, 2 * speed), catheter)
+            copies.move(np.clip(gap / DECISION_PERIOD_S, -2 * speed, 2 * speed), catheter)
 
-    def _push(self, copies: Copies, waypoint: float, lead: Float[np.ndarray, "worlds"]) -> Bool[np.ndarray, "worlds"]:
+    def _push(self, copies: Stacks, waypoint: float, lead: Float[np.ndarray, "worlds"]) -> Bool[np.ndarray, "worlds"]:
         """Push wires past a waypoint, and let their catheters follow; return which arrive.
 
         Args:
@@ -223,12 +276,12 @@ class CoaxialSearch:
         off_mm = _OFF_MM + _OFF_RADII * float(route.radius(np.array([waypoint - far, waypoint])).max())
         follows, together = np.zeros(len(lead), dtype=bool), lead < 0
         best, at_best = np.full(len(lead), -np.inf), np.maximum(copies.wire, copies.catheter)
-        for _ in range(round((2 * max(far, 0.0) / speed + self.config.longest_s) / DECISION_PERIOD_S)):
+        for _ in range(round((2 * max(far, 0.0) / speed + self.config.manoeuvres.longest_s) / DECISION_PERIOD_S)):
             progress, inserted = route.progress(tip), np.maximum(copies.wire, copies.catheter)
             at_best = np.where(progress > best + _REST_MM, inserted, at_best)
             best = np.maximum(best, progress)
             copies.failed |= (route.off_route(tip) > off_mm) | (inserted - at_best > _SLACK_MM)
-            wire, catheter = self._left(copies, tip, waypoint, np.minimum(lead, self.config.behind_mm))
+            wire, catheter = self._left(copies, tip, waypoint, np.minimum(lead, self.config.manoeuvres.behind_mm))
             there = np.abs(wire) <= _REST_MM
             behind = catheter > _REST_MM
             follows = behind & (follows | there | (copies.wire - copies.catheter >= lead))
@@ -239,13 +292,13 @@ class CoaxialSearch:
                 wire, catheter = np.where(together, ahead, wire), np.where(together, beside, catheter)
             if not (((wire != 0) | (catheter != 0)) & ~copies.failed).any():
                 break
-            copies.drive(wire, catheter)
+            copies.move(wire, catheter)
             tip = copies.foremost()
         copies.farthest = np.maximum(best, route.progress(tip))
         return self._there(copies, waypoint)
 
     def _left(
-        self, copies: Copies, tip: TipProjection, waypoint: float, behind: Float[np.ndarray, "worlds"]
+        self, copies: Stacks, tip: TipProjection, waypoint: float, behind: Float[np.ndarray, "worlds"]
     ) -> tuple[Float[np.ndarray, "worlds"], Float[np.ndarray, "worlds"]]:
         """Return how far wires and catheters that follow them have still to go for a waypoint, mm.
 
@@ -264,7 +317,7 @@ class CoaxialSearch:
         return goal - route.progress(tip), np.minimum(left, copies.wire - copies.catheter)
 
     def _together(
-        self, copies: Copies, tip: TipProjection, waypoint: float, lead: Float[np.ndarray, "worlds"]
+        self, copies: Stacks, tip: TipProjection, waypoint: float, lead: Float[np.ndarray, "worlds"]
     ) -> tuple[Float[np.ndarray, "worlds"], Float[np.ndarray, "worlds"]]:
         """Return the speeds, mm/s, of wires that stay in catheters until these are past a waypoint, and of these."""
         speed = self.config.speed_mm_s
@@ -284,7 +337,7 @@ class CoaxialSearch:
             return self.route.passed(tip, waypoint)
         return self.route.progress(tip) >= waypoint
 
-    def _there(self, copies: Copies, waypoint: float) -> Bool[np.ndarray, "worlds"]:
+    def _there(self, copies: Stacks, waypoint: float) -> Bool[np.ndarray, "worlds"]:
         """Return which copies are past a place, or at the target, and never pressed too hard."""
         if waypoint >= self.route.target.abscissa:
             return self._navigation.reached(copies.simulator.project()) & ~copies.failed

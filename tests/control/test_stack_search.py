@@ -1,0 +1,178 @@
+"""The search for wire and catheter, straight on where that goes, else a manoeuvre at the fork; and its agent."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from endopilot.belief.belief import Belief, BeliefConfig
+from endopilot.control.agent import AgentConfig, AgentPolicy, OpenLoopPolicy, OraclePolicy
+from endopilot.control.course import Course
+from endopilot.control.search import ManoeuvreConfig
+from endopilot.control.stack_search import StackSearch
+from endopilot.devices.catheter import read_catheter
+from endopilot.errors import InputError
+from endopilot.ladder.attempt import Recording, attempt, repeat
+from endopilot.navigation.navigate import NavigateConfig, NavigationLoop, navigate
+from endopilot.navigation.policy import Hand, Observation
+from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.mismatch import ModelMismatch
+from endopilot.simulation.simulator import Simulator
+from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target
+from endopilot.tasks.route import Route
+from endopilot.xray.fluoroscope import TipMeasurement
+
+CORE = SimulatorConfig(element_mm=2.0, time_step_s=0.1, threads=1)
+BELIEF = BeliefConfig(members=2, stiffness_levels=1, element_mm=2.0, time_step_s=0.1)
+
+
+@pytest.fixture(scope="module")
+def side_branch(fork, wire) -> Navigation:
+    """Return a target in the side branch of a vessel, to which the catheter's tip is to go."""
+    side = min(fork.tree.leaves(), key=lambda leaf: fork.tree.branches[leaf].centerline.radius[-1])
+    return Navigation(
+        anatomy=fork,
+        device=wire,
+        target=Target(branch=side, abscissa=28.0),
+        catheters=(read_catheter("microcatheter-1.7f"),),
+        arrives="catheter",
+        start_inserted_mm=10.0,
+        start_rotation=np.pi,
+        seconds=60.0,
+        force_limit_n=0.3,
+    )
+
+
+def agent_config(navigation: Navigation, turns: int = 4) -> AgentConfig:
+    own = AgentConfig.of(navigation)
+    return replace(own, search=replace(own.search, manoeuvres=ManoeuvreConfig(turns=turns)), belief=BELIEF)
+
+
+def search(navigation: Navigation, turns: int = 4) -> tuple[StackSearch, Belief, Course]:
+    """Return a search, the belief that it began with, and what it found."""
+    belief = Belief(navigation, np.array([[1.0, 1.0, 0.0]]), BELIEF)
+    route = Route.to(navigation.anatomy, navigation.target)
+    one = StackSearch(navigation, route, belief, config=agent_config(navigation, turns).search)
+    return one, belief, one.find(belief, seconds=navigation.seconds)
+
+
+@pytest.fixture(scope="module")
+def found(side_branch) -> tuple[Belief, Course]:
+    """Return a start that looks away from the branch, and a course from there."""
+    return search(side_branch)[1:]
+
+
+def test_a_course_into_a_side_branch_brings_wire_and_catheter_there(side_branch, found) -> None:
+    belief, course = found
+    assert course.reached == 1.0 and 0 < course.force.max() <= 0.9 * 0.3
+    assert belief.simulator.inserted_length[0, 0] == pytest.approx(10.0)  # the start stays as it is
+    assert np.abs(course.control[:, 0, 1]).sum() * DECISION_PERIOD_S > 0.5  # it has to turn
+    ends = np.flatnonzero(course.exposed)
+    assert len(ends) == 2 and ends[-1] == len(course.control) - 1 and np.array_equal(course.checked, course.exposed)
+    route = Route.to(side_branch.anatomy, side_branch.target)
+    assert not any(route.off_route(course.tip[int(end)]).any() for end in ends)
+    assert len(course.control) == len(course.proximal) == len(course.tip.abscissa) == len(course.force)
+    assert (np.abs(course.control).sum(axis=(1, 2)) > 0).all()  # without pauses
+
+
+def test_the_controls_of_a_course_lead_where_it_says(side_branch, found) -> None:
+    belief, course = found
+    like = belief.simulator
+    again = Simulator(side_branch.anatomy, side_branch.stack, config=like.config, sharing=like)
+    again.copy_worlds([0], of=like)
+    for k, control in enumerate(course.control):
+        for _ in range(5):  # as `drive_period` does
+            again.step(control[None], DECISION_PERIOD_S / 5)
+        assert np.array_equal(again.proximal[0], course.proximal[k])
+        assert again.project().abscissa[0, 0] == course.tip.abscissa[k, 0]
+    assert side_branch.reached(again.project())[0]
+
+
+def test_a_wire_that_leads_by_little_ends_little_beyond_the_target(side_branch, monkeypatch) -> None:
+    monkeypatch.setattr("endopilot.control.stack_search._LEADS_MM", (3.0,))
+    _, _, course = search(side_branch)
+    assert course.reached == 1.0
+    assert course.tip.abscissa[-1, 0] - side_branch.target.abscissa == pytest.approx(3.0, abs=2.0)
+
+
+def test_where_no_manoeuvre_passes_the_search_says_where(side_branch, found) -> None:
+    weak = replace(side_branch, force_limit_n=1e-6)
+    one, _, course = search(weak, turns=1)
+    assert course.reached == 0.0 and len(course.control) == 0
+    assert f"past {one.route.waypoints[0]:.0f} mm" in one.halt
+
+
+def test_from_the_target_there_is_nowhere_to_go(side_branch) -> None:
+    there = replace(side_branch, target=Target(branch=0, abscissa=10.0), arrives="wire")
+    one, _, course = search(there)
+    assert course.reached == 1.0 and len(course.control) == 0 and one.halt == ""
+
+
+def test_the_agent_arrives_with_little_xray(side_branch) -> None:
+    policy = AgentPolicy(agent_config(side_branch))
+    record = navigate(side_branch, policy, config=NavigateConfig(simulator=CORE), seed=2)
+    assert record.reason == "reached" and record.safe
+    assert policy.plans >= 1 and record.exposures < len(record.time_s) / 2
+    along, across = policy.believed().half_width
+    assert along > 0 and across > 0
+
+
+def test_a_wire_that_no_simulated_one_explains_is_pulled_back_until_one_does(side_branch) -> None:
+    policy = AgentPolicy(agent_config(side_branch))
+    policy.start(side_branch, 0)
+    believed = policy.belief.simulator.tip_position[0, 0]
+
+    def seen(shift_mm: float, sd_mm: float = 0.0) -> Observation:
+        tip = TipMeasurement(believed + np.array([0.0, 0.0, shift_mm]), 10.0 + shift_mm, 0.0, 0, (sd_mm, sd_mm))
+        return Observation(0.0, ((10.0, np.pi), (0.0, 0.0)), tip)
+
+    lost = policy.decide(seen(8.0))
+    assert lost.devices[0][0] < 0 and lost.devices[1][0] == 0.0 and lost.expose and policy.plans == 0
+    inside = policy.decide(replace(seen(8.0), devices=((10.0, np.pi), (12.0, 0.0))))
+    assert inside.devices[0][0] < 0 and inside.devices[1][0] < 0
+    policy.start(side_branch, 0)
+    assert policy.decide(seen(0.5)).devices[0][0] >= 0 and policy.plans == 1
+    policy.start(side_branch, 0)
+    assert policy.decide(seen(8.0, sd_mm=4.0)).devices[0][0] >= 0 and policy.plans == 1  # a poor image proves little
+
+
+def test_the_oracle_looks_always_and_a_plan_is_followed_without_a_look(side_branch) -> None:
+    truth, config = ModelMismatch(friction_factor=1.2, ostium_mm=0.5), agent_config(side_branch)
+    record = navigate(side_branch, OraclePolicy(truth, config), config=NavigateConfig(simulator=CORE), truth=truth)
+    assert record.reason == "reached" and record.safe and record.exposures == len(record.time_s) - 1
+    near = replace(side_branch, target=Target(branch=0, abscissa=16.0))
+    record = navigate(near, OpenLoopPolicy(config=config), config=NavigateConfig(simulator=CORE))
+    assert record.reason == "reached" and record.exposures == 1
+
+
+def test_the_agent_goes_on_after_hands_that_drove_both(side_branch) -> None:
+    policy = AgentPolicy(agent_config(side_branch))
+    loop = NavigationLoop(side_branch, policy, config=NavigateConfig(simulator=CORE), seed=2)
+    loop.step()
+    loop.hand_over(Hand(((2.0, 1.5), (4.0, 0.0))))
+    for _ in range(4):
+        loop.step()
+    loop.hand_over(None)
+    followed = policy.belief.simulator.inserted_length[:, 1] - policy.belief.parameters[:, 2]
+    assert loop.observation is not None and followed == pytest.approx(loop.observation.devices[1][0])
+    while loop.reason is None:
+        loop.step()
+    record = loop.record()
+    assert record.reason == "reached" and record.safe and record.exposed[5]
+
+
+def test_a_ladder_counts_the_events_that_the_agent_misses(side_branch) -> None:
+    beside = replace(side_branch, target=Target(branch=0, abscissa=16.0), start_inserted_mm=14.0)
+    result = attempt("agent", beside, seed=1)
+    events, missed = result["events"]
+    assert result["success"] and 0 <= missed <= events
+    assert repeat(Recording.unpacked(result["recording"], devices=2), beside, seed=1)["events"] == result["events"]
+
+
+def test_the_agent_drives_one_catheter(side_branch) -> None:
+    outer = read_catheter("straight-5f")
+    wide = replace(outer, device=replace(outer.device, diameter_mm=1.25))
+    with pytest.raises(InputError, match="catheter: 2; the search drives one"):
+        navigate(replace(side_branch, catheters=(*side_branch.catheters, wide)), "agent")
