@@ -12,7 +12,6 @@ from endopilot.devices.catheter import Catheter, check_nested
 from endopilot.devices.device import Device
 from endopilot.devices.drive_limits import Numbers
 from endopilot.devices.stack import Stack
-from endopilot.errors import InputError
 from endopilot.settings import CountOrZero, Finite, NonNegative, Positive, Seconds, Within, settings
 from endopilot.simulation.motion import Motion
 from endopilot.types import Anatomy, TipProjection, VesselTree
@@ -159,18 +158,3 @@ def reached(
 def is_safe(force_n: Numbers, limit_n: Numbers) -> Bool[np.ndarray, "..."]:
     """Return where the largest force of the wall on one node, N, is no larger than the limit, N; NaN is not safe."""
     return np.asarray(np.less_equal(force_n, limit_n))
-
-
-def check_wire_alone(navigation: Navigation, what: str) -> None:
-    """Check that a navigation has no catheter, for what takes a wire alone.
-
-    Args:
-        navigation: what is to be done.
-        what: what takes a wire alone, as the line begins.
-
-    Raises:
-        InputError: it has one.
-    """
-    if navigation.catheters:
-        names = ", ".join(catheter.name for catheter in navigation.catheters)
-        raise InputError(f"{what} takes a wire alone, and there is {names} around it; leave the catheter out")
