@@ -46,8 +46,8 @@ def random_drives(worlds: int, samples: int, seed: int) -> tuple[np.ndarray, np.
 def test_shipped_catheters_are_whole(name: str) -> None:
     catheter = read_catheter(name)
     assert catheter.name == name
-    assert 0 < catheter.inner_diameter_mm < catheter.device.diameter_mm
-    assert all(len(source) > 7 for source in catheter.device.sources.values())
+    assert 0 < catheter.inner_diameter_mm < catheter.diameter_mm
+    assert all(len(source) > 7 for source in catheter.sources.values())
     assert catheter.turned(np.array([0.0, 1e3]))[1] == pytest.approx(sum(angle for _, angle in catheter.shape))
 
 
@@ -77,7 +77,7 @@ def test_what_is_too_wide_is_refused(vessel: Anatomy, catheter: Catheter) -> Non
         InputError, match=r"diameter_mm = 0\.89 is too wide for the bore of catheter microcatheter-1\.7f"
     ):
         endopilot.simulate(vessel, read_device("j-035"), control, catheters=[catheter])
-    wide = replace(catheter, device=replace(catheter.device, diameter_mm=9.0))
+    wide = replace(catheter, diameter_mm=9.0)
     with pytest.raises(InputError, match="wider than the"):
         endopilot.simulate(vessel, read_device("workhorse-014"), control, catheters=[wide])
     with pytest.raises(InputError, match="catheter 'none'"):
@@ -139,7 +139,7 @@ def test_a_catheter_that_snaps_while_its_drive_pushes_with_all_its_force_goes_on
     assert rollout.valid.all()
     pushed = rollout.catheters
     assert pushed is not None
-    at_limit = pushed.base_force[0, :, 0] > 0.99 * stack.catheters[0].device.push_limit_n
+    at_limit = pushed.base_force[0, :, 0] > 0.99 * stack.catheters[0].push_limit_n
     crept = np.diff(pushed.inserted_length[0, 26:, 0])  # mm in half a second, of some 4 that are asked for
     assert at_limit.sum() > 5
     assert crept.min() < 0.1  # it is held, then snaps
@@ -284,14 +284,14 @@ def test_a_force_beyond_a_follower_s_limit_does_not_stay() -> None:
     pull = sum(device.pull_limit_n for device in stack.devices)
     assert (forces.sum(axis=-1) < -0.9 * pull).any()  # both pull in vain
     assert forces.sum(axis=-1).min() > -1.05 * pull
-    assert forces.min() > -1.5 * stack.catheters[0].device.pull_limit_n
+    assert forces.min() > -1.5 * stack.catheters[0].pull_limit_n
 
 
 def test_tubes_that_rest_at_a_drive_limit_end_their_steps() -> None:
     """A catheter that is pushed at its limit rests where Newton's steps do not shrink below the energy's rounding."""
     stack, rollout = robust_world(5, "jl4-5f", 3, samples=8, rollouts=4)
     assert rollout.catheters is not None
-    assert np.abs(rollout.catheters.base_force).max() > 0.99 * stack.catheters[0].device.push_limit_n
+    assert np.abs(rollout.catheters.base_force).max() > 0.99 * stack.catheters[0].push_limit_n
     assert rollout.valid.all()
 
 
