@@ -134,8 +134,8 @@ def test_a_catheter_follows_its_wire_and_both_are_written(patient, capsys, tmp_p
     episode = load_dataset(folder / "episode")
     lengths = episode.inserted_length[0, : len(table) - 1, 1]
     np.testing.assert_allclose(lengths, table["catheter_1_inserted_length_mm"][1:], atol=1e-4)
-    assert true.device.friction == 1.1 * given.device.friction
-    assert true == replace(given, device=replace(given.device, friction=true.device.friction))
+    assert true.friction == 1.1 * given.friction
+    assert true == replace(given, device=replace(given.device, friction=true.friction))
     assert episode.stack.catheters == (given,) and episode.initial[0, 1].tolist() == [0.0, 0.0]
     again = run(
         *(capsys, "simulate", patient, "--device", folder / "wire.yaml", "--catheter", folder / "catheter-1.yaml"),
@@ -195,9 +195,7 @@ def test_the_replayed_wire_is_the_navigations_to_the_bit(patient):
     assert np.median(errors) < 1.0
     # then the drive rests
     np.testing.assert_array_equal(found.episode.control[0, samples + 1 :], 0.0)
-    np.testing.assert_allclose(
-        found.episode.inserted_length[0, :samples], found.record.inserted_length[1:], atol=1e-9
-    )
+    np.testing.assert_allclose(found.episode.inserted_length[0, :samples], found.record.inserted_length[1:], atol=1e-9)
 
 
 def test_the_episode_trains_beside_simulated_data(driven, patient, capsys, tmp_path):

@@ -47,8 +47,8 @@ def random_drives(worlds: int, samples: int, seed: int) -> tuple[np.ndarray, np.
 def test_shipped_catheters_are_whole(name: str) -> None:
     catheter = read_catheter(name)
     assert catheter.name == name
-    assert 0 < catheter.inner_diameter_mm < catheter.device.diameter_mm
-    assert all(len(source) > 7 for source in catheter.device.sources.values())
+    assert 0 < catheter.inner_diameter_mm < catheter.diameter_mm
+    assert all(len(source) > 7 for source in catheter.sources.values())
     assert catheter.turned(np.array([0.0, 1e3]))[1] == pytest.approx(sum(angle for _, angle in catheter.shape))
 
 
@@ -78,7 +78,7 @@ def test_what_is_too_wide_is_refused(vessel: Anatomy, catheter: Catheter) -> Non
         InputError, match=r"diameter_mm = 0\.89 is too wide for the bore of catheter microcatheter-1\.7f"
     ):
         endopilot.simulate(vessel, Stack(read_device("j-035"), (catheter,)), control)
-    wide = replace(catheter, device=replace(catheter.device, diameter_mm=9.0))
+    wide = replace(catheter, diameter_mm=9.0)
     with pytest.raises(InputError, match="wider than the"):
         endopilot.simulate(vessel, Stack(read_device("workhorse-014"), (wide,)), control)
     with pytest.raises(InputError, match="catheter 'none'"):
@@ -127,7 +127,7 @@ def test_a_catheter_that_snaps_while_its_drive_pushes_with_all_its_force_goes_on
     artery, stack, start, control = tight
     trajectory = endopilot.simulate(artery, stack, control[[4], :42], initial=start[[4]])
     assert trajectory.valid.all()
-    at_limit = trajectory.base_force[0, :, 1] > 0.99 * stack.catheters[0].device.push_limit_n
+    at_limit = trajectory.base_force[0, :, 1] > 0.99 * stack.catheters[0].push_limit_n
     crept = np.diff(trajectory.inserted_length[0, 26:, 1])  # mm in half a second, of some 4 that are asked for
     assert at_limit.sum() > 5
     assert crept.min() < 0.1  # it is held, then snaps
@@ -192,7 +192,7 @@ def robust_world(index: int, catheter: str, world: int, *, samples: int, rollout
 
 def test_drives_keep_their_limits(vessel: Anatomy, catheter: Catheter) -> None:
     weak = replace(
-        catheter, device=replace(catheter.device, push_limit_n=0.02, pull_limit_n=0.02, torque_limit_n_mm=2e-4)
+        catheter, push_limit_n=0.02, pull_limit_n=0.02, torque_limit_n_mm=2e-4
     )
     start = np.array([[[60.0, 0.0], [20.0, 0.0]]])
     control = np.zeros((1, 16, 2, 2))
@@ -214,7 +214,7 @@ def test_neither_drive_passes_its_limit_where_both_meet_an_obstacle() -> None:
     limit = {"push_limit_n": 0.3, "pull_limit_n": 0.3}
     wire = replace(read_device("workhorse-014"), friction=0.3, **limit)
     catheter = read_catheter("microcatheter-1.7f")
-    catheter = replace(catheter, bore_friction=0.3, device=replace(catheter.device, friction=0.3, **limit))
+    catheter = replace(catheter, bore_friction=0.3, friction=0.3, **limit)
     control = np.zeros((4, 43, 2, 2))
     phases = (
         ((20, 6, 6), (8, 0, 0), (12, -8, -8)),
@@ -256,13 +256,13 @@ def test_a_force_beyond_a_follower_s_limit_does_not_stay() -> None:
     pull = sum(device.pull_limit_n for device in stack.devices)
     assert (forces.sum(axis=-1) < -0.9 * pull).any()  # both pull in vain
     assert forces.sum(axis=-1).min() > -1.05 * pull
-    assert forces.min() > -1.5 * stack.catheters[0].device.pull_limit_n
+    assert forces.min() > -1.5 * stack.catheters[0].pull_limit_n
 
 
 def test_tubes_that_rest_at_a_drive_limit_end_their_steps() -> None:
     """A catheter that is pushed at its limit rests where Newton's steps do not shrink below the energy's rounding."""
     stack, trajectory = robust_world(5, "jl4-5f", 3, samples=8, rollouts=4)
-    assert np.abs(trajectory.base_force[..., 1]).max() > 0.99 * stack.catheters[0].device.push_limit_n
+    assert np.abs(trajectory.base_force[..., 1]).max() > 0.99 * stack.catheters[0].push_limit_n
     assert trajectory.valid.all()
 
 

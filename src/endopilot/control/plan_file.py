@@ -40,7 +40,7 @@ from endopilot.control.plan_config import Plan, PlanConfig
 from endopilot.control.plan_xray import PlannedXray
 from endopilot.control.set_up import tip_name
 from endopilot.devices.catheter import Catheter
-from endopilot.devices.device import Device
+from endopilot.devices.device import Wire
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.files import json_text, manifest, read_json, reading, sha256, writing
@@ -137,7 +137,7 @@ def _device(plan: Plan, device: int) -> dict[str, np.ndarray]:
     return device_columns(device, *moved, plan.tip[:, device], plan.position[:, device])
 
 
-def read_plan(folder: Path, anatomy: Anatomy, device: Device, catheters: Sequence[Catheter] = ()) -> Plan:
+def read_plan(folder: Path, anatomy: Anatomy, device: Wire, catheters: Sequence[Catheter] = ()) -> Plan:
     """Read a plan that `write_plan` wrote, for the anatomy and the devices that it was made for.
 
     The plan's own wire has the tip, and its anatomy the catheter's axis, that were chosen for it.
@@ -150,7 +150,7 @@ def read_plan(folder: Path, anatomy: Anatomy, device: Device, catheters: Sequenc
         return _plan_in(folder, anatomy, device, catheters)
 
 
-def _plan_in(folder: Path, anatomy: Anatomy, device: Device, catheters: Sequence[Catheter]) -> Plan:
+def _plan_in(folder: Path, anatomy: Anatomy, device: Wire, catheters: Sequence[Catheter]) -> Plan:
     record = read_json(folder / _RECORD)
     if not isinstance(record, dict) or "table_sha256" not in record:
         raise InputError(f"{folder / _RECORD}: is not the manifest of a plan; make one with `endopilot plan`")
@@ -165,7 +165,7 @@ def _plan_in(folder: Path, anatomy: Anatomy, device: Device, catheters: Sequence
         raise InputError(
             f"{folder}: the plan is for another anatomy ({made['name']}), not for this {anatomy.name}; plan anew"
         )
-    planned = from_record(Device, record["device"])
+    planned = from_record(Wire, record["device"])
     tip = {"tip_bend_rad": planned.tip_bend_rad, "tip_bend_length_mm": planned.tip_bend_length_mm}
     around = tuple(from_record(Catheter, catheter) for catheter in record.get("catheters", ()))
     if Stack(planned, around).constants != Stack(replace(device, **tip), tuple(catheters)).constants:

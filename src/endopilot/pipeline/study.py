@@ -26,7 +26,7 @@ from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.control.navigate_patient import NavigatePatientConfig
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.loader import load_dataset
-from endopilot.devices.device import Device, read_device
+from endopilot.devices.device import Wire, read_device
 from endopilot.evaluation.anatomy_score import score_anatomy
 from endopilot.evaluation.results import REPORT_FILE
 from endopilot.extras import require_extras
@@ -125,7 +125,7 @@ class _Run:
     output: Path
     config: StudyConfig
     segmentation: SegmentConfig
-    device: Device
+    device: Wire
     stages: Stages
     origin: str
     command: str
@@ -400,7 +400,7 @@ def _scores(output: Path, names: Sequence[str]) -> dict[str, dict[str, float]]:
     return scores
 
 
-def _replay(output: Path, device: Device) -> tuple[Path, Trajectory]:
+def _replay(output: Path, device: Wire) -> tuple[Path, Trajectory]:
     """Simulate one test navigation again with the wire's shape, that in which the tip travelled farthest."""
     dataset = load_dataset(output / "dataset")
     held_out = dataset.of_split("test" if "test" in dataset.split else "seen_test")
