@@ -191,9 +191,7 @@ def robust_world(index: int, catheter: str, world: int, *, samples: int, rollout
 
 
 def test_drives_keep_their_limits(vessel: Anatomy, catheter: Catheter) -> None:
-    weak = replace(
-        catheter, push_limit_n=0.02, pull_limit_n=0.02, torque_limit_n_mm=2e-4
-    )
+    weak = replace(catheter, push_limit_n=0.02, pull_limit_n=0.02, torque_limit_n_mm=2e-4)
     start = np.array([[[60.0, 0.0], [20.0, 0.0]]])
     control = np.zeros((1, 16, 2, 2))
     control[0, :, 1] = 8.0, 2.0
