@@ -195,9 +195,7 @@ def test_the_replayed_wire_is_the_navigations_to_the_bit(patient):
     assert np.median(errors) < 1.0
     # then the drive rests
     np.testing.assert_array_equal(found.episode.control[0, samples + 1 :], 0.0)
-    np.testing.assert_allclose(
-        found.episode.inserted_length[0, :samples], found.record.inserted_length[1:], atol=1e-9
-    )
+    np.testing.assert_allclose(found.episode.inserted_length[0, :samples], found.record.inserted_length[1:], atol=1e-9)
 
 
 def test_the_episode_trains_beside_simulated_data(driven, patient, capsys, tmp_path):
