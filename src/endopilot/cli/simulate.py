@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -17,6 +18,7 @@ from endopilot.dataset.navigations import simulate_navigations
 from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import read_device
 from endopilot.devices.stack import Stack
+from endopilot.errors import InputError
 from endopilot.progress import progress
 from endopilot.settings import LONGEST_S, Seed, Within, settings
 from endopilot.simulation.config import SimulatorConfig
@@ -24,7 +26,7 @@ from endopilot.simulation.controls import ControlConfig, random_controls, read_c
 from endopilot.simulation.motion import Motion, MotionName, motion_named
 from endopilot.simulation.simulate import simulate, wall_force_events
 from endopilot.simulation.trajectory import Trajectory
-from endopilot.simulation.trajectory_file import write_trajectory
+from endopilot.simulation.trajectory_file import read_trajectory, write_trajectory
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
 
@@ -48,7 +50,7 @@ def command(
     /,
     *,
     output: OutputFile,
-    device: str = "workhorse-014",
+    device: str | None = None,
     catheter: tuple[str, ...] = (),
     controls: Existing | None = None,
     motion: MotionName = "still",
@@ -63,12 +65,13 @@ def command(
     Args:
         anatomy: folder made by `endopilot anatomy` or `endopilot atlas`.
         output: .parquet or .csv with a row for each sample, or .npz with all arrays.
-        device: name of a device (`endopilot devices`) or a YAML file.
+        device: name of a device (`endopilot devices`) or a YAML file; workhorse-014 if not given.
         catheter: up to two catheters around it, from the inside out: names (`microcatheter-1.7f`, `microcatheter-2.4f`,
             `straight-5f`, `multipurpose-5f`, `vertebral-5f`, `jr4-5f`, `jl4-5f`, `simmons-2-5f`) or YAML files.
         controls: CSV of scripted proximal velocities (time_s, translation_mm_s, rotation_rad_s, those of catheters as
-            catheter_1_translation_mm_s, ...), or folder made by `endopilot plan` for this anatomy and device; random
-            ones by default.
+            catheter_1_translation_mm_s, ...), or folder made by `endopilot plan` for this anatomy and device, or
+            trajectory (.npz), such as `endopilot navigate` writes, which holds devices, start, motion and settings, and
+            is the same again to the bit; random ones by default.
         motion: how heart and breath move the vessel and the guiding catheter: still, breathing, heartbeat or both.
         motion_seed: draws the patient's amplitudes from the published distributions; their means by default.
         shape: also record the positions of all nodes, mm (.npz only).
@@ -77,9 +80,15 @@ def command(
         config: settings of the rod core.
     """
     patient = read_anatomy(anatomy)
-    stack = Stack(read_device(device), tuple(read_catheter(name) for name in catheter))
+    stack = Stack(read_device(device or "workhorse-014"), tuple(read_catheter(name) for name in catheter))
     moves, period_s = motion_named(motion, motion_seed), SAMPLE_PERIOD_S
-    if controls is not None and controls.is_dir():
+    recorded = None
+    if controls is not None and controls.suffix == ".npz":
+        given = {"device": device is not None, "catheter": catheter != (), "motion": moves is not None}
+        _refuse(given | {"config": config != SimulatorConfig()}, controls)
+        recorded = read_trajectory(controls, patient)
+        stack, initial, control = recorded.set_up.stacks[0], recorded.set_up.initial, recorded.command
+    elif controls is not None and controls.is_dir():
         plan = read_plan(controls, patient, stack.wire, stack.catheters)
         patient, stack = plan.navigation.anatomy, plan.navigation.stack
         initial, control = plan.navigation.start[None], plan.control[None]
@@ -99,7 +108,9 @@ def command(
     if controls is None and random.stop_short:
         trajectory, stopped = _stopped_short(patient, stack, initial, control, moves, config)
         initial, control = trajectory.set_up.initial, trajectory.command  # they give the same navigations again
-    if trajectory is None or record_shape:
+    if recorded is not None:
+        trajectory = recorded.replay(record_shape=record_shape)
+    elif trajectory is None or record_shape:
         trajectory = simulate(
             patient,
             stack,
@@ -140,6 +151,12 @@ def command(
         else:
             print(missing, file=sys.stderr)
     return figures
+
+
+def _refuse(given: Mapping[str, bool], path: Path) -> None:
+    name = next((name for name, is_given in given.items() if is_given), None)
+    if name is not None:
+        raise InputError(f"{name}: {path} holds devices, motion and settings that it was made with; leave it out")
 
 
 def _stopped_short(
