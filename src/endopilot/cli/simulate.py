@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -69,9 +68,9 @@ def command(
         catheter: up to two catheters around it, from the inside out: names (`microcatheter-1.7f`, `microcatheter-2.4f`,
             `straight-5f`, `multipurpose-5f`, `vertebral-5f`, `jr4-5f`, `jl4-5f`, `simmons-2-5f`) or YAML files.
         controls: CSV of scripted proximal velocities (time_s, translation_mm_s, rotation_rad_s, those of catheters as
-            catheter_1_translation_mm_s, ...), or folder made by `endopilot plan` for this anatomy and device, or
-            trajectory (.npz), such as `endopilot navigate` writes, which holds devices, start, motion and settings, and
-            is the same again to the bit; random ones by default.
+            catheter_1_translation_mm_s, ...), or what is driven again to the bit with its own devices, motion and
+            settings: a trajectory (.npz), such as `endopilot navigate` writes, or a folder made by `endopilot plan`;
+            random ones by default.
         motion: how heart and breath move the vessel and the guiding catheter: still, breathing, heartbeat or both.
         motion_seed: draws the patient's amplitudes from the published distributions; their means by default.
         shape: also record the positions of all nodes, mm (.npz only).
@@ -83,15 +82,12 @@ def command(
     stack = Stack(read_device(device or "workhorse-014"), tuple(read_catheter(name) for name in catheter))
     moves, period_s = motion_named(motion, motion_seed), SAMPLE_PERIOD_S
     recorded = None
-    if controls is not None and controls.suffix == ".npz":
-        given = {"device": device is not None, "catheter": catheter != (), "motion": moves is not None}
-        _refuse(given | {"config": config != SimulatorConfig()}, controls)
-        recorded = read_trajectory(controls, patient)
-        stack, initial, control = recorded.set_up.stacks[0], recorded.set_up.initial, recorded.command
-    elif controls is not None and controls.is_dir():
-        plan = read_plan(controls, patient, stack.wire, stack.catheters)
-        patient, stack = plan.navigation.anatomy, plan.navigation.stack
-        initial, control = plan.navigation.start[None], plan.control[None]
+    if controls is not None and (controls.is_dir() or controls.suffix == ".npz"):
+        if device is not None or catheter:
+            raise InputError(f"{'catheter' if catheter else 'device'}: {controls} holds its devices; leave it out")
+        recorded = read_plan(controls, patient).trajectory if controls.is_dir() else read_trajectory(controls, patient)
+        patient, stack = recorded.set_up.anatomies[0], recorded.set_up.stacks[0]
+        initial, control = recorded.set_up.initial, recorded.command
     elif controls is not None:
         script = read_controls_csv(controls, devices=len(stack))
         initial, control, period_s = script.initial, script.control, script.period_s
@@ -109,7 +105,9 @@ def command(
         trajectory, stopped = _stopped_short(patient, stack, initial, control, moves, config)
         initial, control = trajectory.set_up.initial, trajectory.command  # they give the same navigations again
     if recorded is not None:
-        trajectory = recorded.replay(record_shape=record_shape)
+        others = {"motion": moves, "config": None if config == SimulatorConfig() else config}
+        others = {name: value for name, value in others.items() if value is not None}
+        trajectory = recorded.replay(record_shape=record_shape, **others)
     elif trajectory is None or record_shape:
         trajectory = simulate(
             patient,
@@ -151,12 +149,6 @@ def command(
         else:
             print(missing, file=sys.stderr)
     return figures
-
-
-def _refuse(given: Mapping[str, bool], path: Path) -> None:
-    name = next((name for name, is_given in given.items() if is_given), None)
-    if name is not None:
-        raise InputError(f"{name}: {path} holds devices, motion and settings that it was made with; leave it out")
 
 
 def _stopped_short(

@@ -30,11 +30,11 @@ from endopilot.extras import require_extras
 from endopilot.files import manifest, read_json, write_json, writing
 from endopilot.navigation.policies import POLICIES
 from endopilot.runs import claim
-from endopilot.simulation.trajectory_file import write_trajectory
+from endopilot.simulation.trajectory_file import TRAJECTORY, write_trajectory
 from endopilot.tasks.targets import section_at
 
 PAGE_FILE, PICTURE_FILE, TABLE_FILE = "navigation.html", "navigation.png", "navigation.csv"
-TRAJECTORY_FILE, WIRE_FILE, EPISODE_FOLDER, ANATOMY_FOLDER = "trajectory.npz", "wire.yaml", "episode", "anatomy"
+WIRE_FILE, EPISODE_FOLDER, ANATOMY_FOLDER = "wire.yaml", "episode", "anatomy"
 CATHETER_FILE, MANIFEST_FILE = "catheter-{}.yaml", "manifest.json"
 
 
@@ -95,7 +95,7 @@ def _write(found: PatientNavigation, folder: Path, target: str, output: Path) ->
     cycles = found.record.cycles
     assert cycles is not None  # a navigation has a period at least
     about = {"policy": set_up.config.policy, "seed": set_up.config.seed, "truth": asdict(set_up.truth)}
-    write_trajectory(replace(cycles, about=cycles.about | about), output / TRAJECTORY_FILE)
+    write_trajectory(replace(cycles, about=cycles.about | about), output / TRAJECTORY)
     write_device(set_up.true_wire, output / WIRE_FILE)
     for number, catheter in enumerate(set_up.true_catheters, start=1):
         write_catheter(catheter, output / CATHETER_FILE.format(number))
@@ -210,7 +210,7 @@ def _manifest(found: PatientNavigation, target: str, output: Path) -> dict[str, 
 def _commands(found: PatientNavigation, folder: Path, driven_in: Path, target: str, output: Path) -> Mapping[str, str]:
     changed = _changed(found.set_up)
     line = ["endopilot", "navigate", str(folder), f"--target={target}", "-o", str(output), *changed]
-    again = ["endopilot", "simulate", str(driven_in), "--controls", str(output / TRAJECTORY_FILE), "-o", "again.csv"]
+    again = ["endopilot", "simulate", str(driven_in), "--controls", str(output / TRAJECTORY), "-o", "again.csv"]
     alone = not found.set_up.navigation.catheters
     beside = ["endopilot", "train", "runs/dataset", str(output / EPISODE_FOLDER), "-o", "runs/training"]
     return {
