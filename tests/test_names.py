@@ -18,7 +18,7 @@ LARGE = {
     "pyvista", "scipy", "skimage", "torch", "tyro", "vtk", "vtkmodules", "yaml",
 }  # fmt: skip
 ASKED = {
-    "Anatomy", "read_anatomy", "extract_anatomy", "segment", "Device", "read_device", "Simulator", "simulate", "plan",
+    "Anatomy", "read_anatomy", "extract_anatomy", "segment", "Wire", "read_device", "Simulator", "simulate", "plan",
     "make_atlas", "generate_dataset", "train", "load_model", "navigate", "evaluate", "InputError", "read_volume",
 }  # fmt: skip
 

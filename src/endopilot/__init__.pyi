@@ -16,7 +16,7 @@ from .dataset.config import DatasetConfig as DatasetConfig
 from .dataset.generate import generate_dataset as generate_dataset
 from .devices.catheter import Catheter as Catheter
 from .devices.catheter import read_catheter as read_catheter
-from .devices.device import Device as Device
+from .devices.device import Wire as Wire
 from .devices.device import read_device as read_device
 from .devices.stack import Stack as Stack
 from .errors import InputError as InputError

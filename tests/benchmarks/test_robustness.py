@@ -15,7 +15,7 @@ from benchmarks.core.robustness import RobustnessConfig, measure_robustness
 from endopilot.anatomy.io import write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.devices.catheter import read_catheter
-from endopilot.devices.device import Device, read_device
+from endopilot.devices.device import Wire, read_device
 from endopilot.devices.device_files import list_devices
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
@@ -140,14 +140,14 @@ def test_a_device_wider_than_a_lumen_that_it_has_passed_is_wedged(patient) -> No
     assert not robustness._wedged(patient, stack, rollout).any()
 
 
-class Fatal(Device):
+class Fatal(Wire):
     """Ends the process that unpickles it."""
 
     def __reduce__(self):
         return os._exit, (3,)
 
 
-class Hungry(Device):
+class Hungry(Wire):
     """Needs more memory than there is."""
 
     def bend_stiffness(self, abscissa_mm):

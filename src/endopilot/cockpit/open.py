@@ -19,7 +19,7 @@ from endopilot.cockpit.recording import SUFFIX, Recorder, Where, read_recording,
 from endopilot.cockpit.session import Session
 from endopilot.cockpit.world import World
 from endopilot.devices.catheter import Catheter, read_catheter
-from endopilot.devices.device import Device, read_device
+from endopilot.devices.device import Wire, read_device
 from endopilot.navigation.policies import POLICIES
 from endopilot.tasks.navigation import Navigation, Target
 from endopilot.types import Anatomy, Volume
@@ -197,7 +197,7 @@ def read_ct(path: Path | None) -> Volume | None:
     return volume
 
 
-def _start_of(anatomy: Anatomy, device: Device, catheters: tuple[Catheter, ...]) -> Navigation:
+def _start_of(anatomy: Anatomy, device: Wire, catheters: tuple[Catheter, ...]) -> Navigation:
     """Return a navigation from the ostium to a first target, far down the longest path."""
     tree = anatomy.tree
     leaf = tree.longest_leaf()

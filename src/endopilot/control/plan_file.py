@@ -40,7 +40,7 @@ from endopilot.control.plan_config import Plan, PlanConfig
 from endopilot.control.plan_xray import PlannedXray
 from endopilot.control.set_up import tip_name
 from endopilot.devices.catheter import Catheter
-from endopilot.devices.device import Device
+from endopilot.devices.device import Wire
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.files import json_text, manifest, read_json, reading, sha256, writing
@@ -176,7 +176,7 @@ def _plan_in(folder: Path, anatomy: Anatomy, stack: Stack | None) -> Plan:
         raise InputError(
             f"{folder}: the plan is for another anatomy ({made['name']}), not for this {anatomy.name}; plan anew"
         )
-    planned = from_record(Device, record["device"])
+    planned = from_record(Wire, record["device"])
     tip = {"tip_bend_rad": planned.tip_bend_rad, "tip_bend_length_mm": planned.tip_bend_length_mm}
     around = tuple(from_record(Catheter, catheter) for catheter in record.get("catheters", ()))
     made_for = Stack(planned, around)

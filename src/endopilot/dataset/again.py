@@ -64,7 +64,7 @@ def simulate_again(
     for kind, (bend, factor) in enumerate(tips.astype(float)):
         chosen = np.flatnonzero(tip_of.ravel() == kind)
         wire = stack.wire.with_tip(bend_rad=float(bend), stiffness_factor=float(factor))
-        around = [np.full(len(chosen), each.device.friction) for each in stack.catheters]
+        around = [np.full(len(chosen), each.friction) for each in stack.catheters]
         yield (
             chosen,
             simulate(

@@ -137,7 +137,7 @@ def driven(recording: Recording, navigation: Navigation, *, seed: int) -> Naviga
     Raises:
         InputError: the recording is shorter than the navigation.
     """
-    return _drive(navigation, _Repeated(recording), seed, None)
+    return _drive(navigation, Repeated(recording), seed, None)
 
 
 def _drive(navigation: Navigation, policy: Policy, seed: int, mismatch: ModelMismatch | None) -> NavigationRecord:
@@ -145,7 +145,7 @@ def _drive(navigation: Navigation, policy: Policy, seed: int, mismatch: ModelMis
     return navigate(navigation, policy, config=config, seed=seed, truth=mismatch)
 
 
-class _Repeated:
+class Repeated:
     """A policy that decides what was recorded."""
 
     def __init__(self, recording: Recording) -> None:

@@ -24,10 +24,10 @@ from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy, read_sourc
 from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.control.navigate_patient import NavigatePatientConfig
-from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.again import episode_trajectory
+from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.loader import load_dataset
-from endopilot.devices.device import Device, read_device
+from endopilot.devices.device import Wire, read_device
 from endopilot.evaluation.anatomy_score import score_anatomy
 from endopilot.evaluation.results import REPORT_FILE
 from endopilot.extras import require_extras
@@ -124,7 +124,7 @@ class _Run:
     output: Path
     config: StudyConfig
     segmentation: SegmentConfig
-    device: Device
+    device: Wire
     stages: Stages
     origin: str
     command: str

@@ -23,7 +23,7 @@ import numpy as np
 
 from endopilot import _core
 from endopilot.devices.catheter import Catheter
-from endopilot.devices.device import Device
+from endopilot.devices.device import Wire
 from endopilot.devices.stack import Stack, column_prefixes
 from endopilot.errors import InputError
 from endopilot.extras import extra_named
@@ -218,8 +218,7 @@ def _about(trajectory: Trajectory, arrays: Mapping[str, np.ndarray]) -> str:
 
 
 def _stack(described: Mapping[str, Any]) -> Stack:
-    catheters = [Catheter(**{**each, "device": Device(**each["device"])}) for each in described["catheters"]]
-    return Stack(Device(**described["wire"]), tuple(catheters))
+    return Stack(Wire(**described["wire"]), tuple(Catheter(**each) for each in described["catheters"]))
 
 
 def _vessels(path: Path | str, about: Mapping[str, Any], anatomy: Anatomy | Sequence[Anatomy] | None) -> list[Anatomy]:
