@@ -105,10 +105,10 @@ def test_recorded_controls_make_the_same_wire(driven, patient, capsys, tmp_path)
     places = table[[f"tip_{axis}_mm" for axis in "xyz"]].to_numpy()
     np.testing.assert_array_equal(recorded.tip_position[0, 9::10, 0], places[1:])
     line = refused(
-        *(capsys, "simulate", patient, "--controls", folder / "trajectory.npz", "--device", "workhorse-014"),
+        *(capsys, "simulate", patient, "--controls", folder / "trajectory.npz", "--device", "wire-018"),
         *("-o", tmp_path / "no.npz"),
     )
-    assert "device: " in line and "holds devices, motion and settings" in line
+    assert "device: " in line and "was made with another (workhorse-014), not with this wire-018" in line
 
 
 def test_the_trajectory_holds_what_was_decided(driven):

@@ -83,9 +83,7 @@ def command(
     moves, period_s = motion_named(motion, motion_seed), SAMPLE_PERIOD_S
     recorded = None
     if controls is not None and (controls.is_dir() or controls.suffix == ".npz"):
-        if device is not None or catheter:
-            raise InputError(f"{'catheter' if catheter else 'device'}: {controls} holds its devices; leave it out")
-        recorded = read_plan(controls, patient).trajectory if controls.is_dir() else read_trajectory(controls, patient)
+        recorded = _recorded(controls, patient, stack if device is not None or catheter else None)
         patient, stack = recorded.set_up.anatomies[0], recorded.set_up.stacks[0]
         initial, control = recorded.set_up.initial, recorded.command
     elif controls is not None:
@@ -149,6 +147,17 @@ def command(
         else:
             print(missing, file=sys.stderr)
     return figures
+
+
+def _recorded(path: Path, patient: Anatomy, asked: Stack | None) -> Trajectory:
+    """Return what a plan's folder or a file holds; devices that are asked for must be its own."""
+    if path.is_dir():
+        return read_plan(path, patient, asked).trajectory
+    recorded = read_trajectory(path, patient)
+    if asked is not None and any(stack.constants != asked.constants for stack in recorded.set_up.stacks):
+        names = [" in ".join(each.name for each in stack.devices) for stack in (recorded.set_up.stacks[0], asked)]
+        raise InputError(f"device: {path} was made with another ({names[0]}), not with this {names[1]}; leave it out")
+    return recorded
 
 
 def _stopped_short(
