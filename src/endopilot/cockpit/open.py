@@ -96,8 +96,6 @@ def open_replay(
     path: Path,
     patient: Path | None = None,
     *,
-    device: str = "workhorse-014",
-    catheters: Sequence[str] = (),
     world: int = 0,
     task: str | None = None,
     ct: Path | None = None,
@@ -106,10 +104,8 @@ def open_replay(
 
     Args:
         path: as for `open_film`.
-        patient: folder of the anatomy, for rollouts and plans.
-        device: wire of a rollout or plan.
-        catheters: around it, from the inside out.
-        world: which of a rollout's worlds, a data set's episodes, or a task's patients.
+        patient: folder of the anatomy, for trajectories and plans.
+        world: which of a trajectory's worlds, a data set's episodes, or a task's patients.
         task: of the ladder's files.
         ct: CT angiogram of the patient, for the X-ray's background.
 
@@ -119,7 +115,7 @@ def open_replay(
     from endopilot.cockpit.film import FRAME_S, open_film  # slow to import, and needed for replays alone
     from endopilot.cockpit.replay import ReplayStage
 
-    film = open_film(path, patient, device=device, catheters=catheters, world=world, task=task)
+    film = open_film(path, patient, world=world, task=task)
     navigation = film.navigation
     stage = ReplayStage(film, xray_unit(navigation, read_ct(ct)))
     return Opened(stage, scene_of(navigation, {}), FRAME_S, None)

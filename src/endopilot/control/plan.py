@@ -284,7 +284,7 @@ def _checked(
     limits = [DriveLimits.of(device, navigation.anatomy) for device in navigation.devices]
     parts = [within_limits(control[:, k], each, start[k, 0]) for k, each in enumerate(limits)]
     control = np.stack(parts, axis=1)
-    rollout = simulate(
+    trajectory = simulate(
         navigation.anatomy, navigation.stack, control[None], initial=start[None], config=SimulatorConfig(threads=1)
     )
     wanted = np.concatenate([desired, np.repeat(desired[-1:], max(len(control) - len(desired), 0), axis=0)])
@@ -292,14 +292,10 @@ def _checked(
         navigation=navigation,
         config=config,
         model=None if model is None else str(model),
-        control=control,
-        proximal=start + DECISION_PERIOD_S * np.cumsum(control, axis=0),
+        trajectory=trajectory,
         desired=wanted[: len(control)],
         predicted=predicted,
-        tip=rollout.tip[0],
-        position=rollout.tip_position[0],
-        force=rollout.contact_force_max[0],
-        reached=bool(navigation.reached(rollout.tip[0]).any()),
+        reached=bool(navigation.reached(trajectory.tip[0]).any()),
         why=choice.why if choice else "",
         tilt_deg=choice.tilt_deg if choice else 0.0,
         seconds_to_plan=float(spent[0]),

@@ -36,6 +36,8 @@ from endopilot.types import Anatomy, TipProjection
 if TYPE_CHECKING:
     import pandas as pd
 
+TRAJECTORY = "trajectory.npz"
+"""Name of the file in a folder that holds one navigation or plan."""
 FORMAT_VERSION = 1
 """Of the .npz file: raised when an array comes to mean something else."""
 _MEANING = {
