@@ -21,7 +21,7 @@ _REASONS = {1: "left the finite numbers", 2: "did not converge", 3: "went throug
 
 
 @dataclass(frozen=True, eq=False)
-class SetUp:
+class SimulationSetUp:
     """What worlds are simulated with. A `Simulator` made of it and the same commands give the same bits.
 
     Attributes:
@@ -86,7 +86,7 @@ class Trajectory:
         about: what else is to be known, as plain JSON values.
     """
 
-    set_up: SetUp
+    set_up: SimulationSetUp
     period_s: float
     start: Float[np.ndarray, "worlds devices 2"]
     command: Float[np.ndarray, "worlds samples devices 2"]
@@ -139,7 +139,7 @@ class Trajectory:
         """Simulate the same commands again from the same start; what nothing changes comes out the same to the bit.
 
         Args:
-            changed: attributes of `SetUp` that are to be others, such as `config`, `motion` or `friction`.
+            changed: attributes of `SimulationSetUp` that are to be others, such as `config`, `motion` or `friction`.
 
         Raises:
             InputError: a world was on its way already when the recording began, or its vessel is not given.
