@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 import endopilot
 
@@ -21,6 +23,8 @@ LARGE = {
     "SimpleITK", "gymnasium", "jinja2", "matplotlib", "numpy", "pandas", "plotly", "pyarrow", "pydantic", "pydicom",
     "pyvista", "scipy", "skimage", "torch", "tyro", "vtk", "vtkmodules", "yaml",
 }  # fmt: skip
+SLOW = {"Axes": Axes, "Figure": Figure}
+"""Of other libraries, which a module imports only to be type-checked."""
 ASKED = {
     "Anatomy", "read_anatomy", "extract_anatomy", "segment", "Device", "read_device", "Simulator", "simulate", "plan",
     "make_atlas", "generate_dataset", "train", "load_model", "navigate", "evaluate", "InputError", "read_volume",
@@ -70,8 +74,12 @@ def types_of(annotation: object) -> Iterator[type]:
 
 def annotations_of(thing: Any, name: str) -> Iterator[tuple[str, object]]:
     """Yield what a function takes and returns, or what a class's public attributes and methods are, by name."""
-    own = {field: each for field, each in inspect.get_annotations(thing, eval_str=True).items() if field[0] != "_"}
-    yield from ((f"{name}.{field}", each) for field, each in own.items())
+    own = {
+        field: each
+        for field, each in inspect.get_annotations(thing, locals=SLOW, eval_str=True).items()
+        if field[0] != "_"
+    }
+    yield from ((f"{name}.{field}", each) for field, each in own.items() if field[0] != "_")
     for field, member in vars(thing).items() if inspect.isclass(thing) else ():
         if field.startswith("_") and field not in ("__init__", "__call__"):
             continue
