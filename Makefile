@@ -43,8 +43,8 @@ cta: $(INSTALLED)
 	  --reference $$(dirname $$volume)/seg_aorta.nii.gz --picture $(CTA)/mask.png --json > $(CTA)/segment.json
 	$(BIN)/endopilot anatomy $(CTA)/mask.nii.gz --vessel generic -o $(CTA)/anatomy
 	$(BIN)/endopilot navigate $(CTA)/anatomy --target G6.1 --device j-035 --force-limit-n 0.7 -o $(CTA)/navigation
-	$(BIN)/endopilot simulate $(CTA)/anatomy --device $(CTA)/navigation/wire.yaml \
-	  --controls $(CTA)/navigation/controls.csv -o $(CTA)/rollout.csv --picture $(CTA)/wire.png --json > $(CTA)/simulate.json
+	$(BIN)/endopilot simulate $(CTA)/anatomy --controls $(CTA)/navigation/trajectory.npz \
+	  -o $(CTA)/rollout.csv --picture $(CTA)/wire.png --json > $(CTA)/simulate.json
 
 readme: $(INSTALLED)
 	$(BIN)/python docs/readme.py

@@ -26,7 +26,7 @@ LARGE = {
 SLOW = {"Axes": Axes, "Figure": Figure}
 """Of other libraries, which a module imports only to be type-checked."""
 ASKED = {
-    "Anatomy", "read_anatomy", "extract_anatomy", "segment", "Device", "read_device", "Simulator", "simulate", "plan",
+    "Anatomy", "read_anatomy", "extract_anatomy", "segment", "Wire", "read_device", "Simulator", "simulate", "plan",
     "make_atlas", "generate_dataset", "train", "load_model", "navigate", "evaluate", "InputError", "read_volume",
 }  # fmt: skip
 

@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from pydantic import TypeAdapter, ValidationError, model_validator
 
 import endopilot
-from endopilot.devices.device import Device, read_device
+from endopilot.devices.device import Wire, read_device
 from endopilot.errors import InputError
 from endopilot.files import json_text
 from endopilot.settings import Ascending, Count, Finite, NonNegative, Positive, Within, from_record, read_settings
@@ -114,7 +114,7 @@ def range_of(hint: Any) -> Within:
     return next(part for part in get_args(hint)[1:] if isinstance(part, Within))
 
 
-UNBOUNDED = {"Device", "Catheter", "DriveLimits"}
+UNBOUNDED = {"Wire", "Catheter", "DriveLimits"}
 """What code gives in the units that it likes; files hold them within `device_ranges`."""
 
 
@@ -154,7 +154,7 @@ def valid(hint: Any) -> Any:
         return arguments[0]
     if origin is not None and issubclass(origin, Mapping):
         return {}
-    if hint is Device:
+    if hint is Wire:
         return read_device("workhorse-014")
     if is_settings(hint):
         return hint(**{name: valid(hints_of(hint)[name]) for name in required(hint)})

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from jaxtyping import Float
 from benchmarks.core.beside import bench_beside, error_in_time, fine_steps, node_iterations_per_second
 from benchmarks.core.scenes import SAMPLES, SEED, WORLDS, Scene, make_scenes
 from endopilot.devices.catheter import Catheter
+from endopilot.devices.device import Device, Wire
 from endopilot.devices.stack import Stack
 from endopilot.simulation.config import PRESETS, Preset, SimulatorConfig, wall_stiffness
 from endopilot.simulation.controls import ControlConfig, random_controls
@@ -60,7 +61,7 @@ def bench_coaxial(
     pair_wall = wall_stiffness(PRESETS[preset], Stack(scenes[0].device, (catheter,)).push_limit_n)
     config = replace(PRESETS[preset], threads=1, wall_stiffness_n_mm=pair_wall)
     alone = [
-        simulate(scene.anatomy, catheter.device, control, initial=start, config=config)
+        simulate(scene.anatomy, _alone(catheter), control, initial=start, config=config)
         for scene, start, control in zip(scenes, starts, controls, strict=True)
     ]
     return {
@@ -70,6 +71,12 @@ def bench_coaxial(
         **error_in_time("wire_tip_error", rollouts, fine),
         **error_in_time("catheter_tip_error", rollouts, fine, _catheter_tip),
     }
+
+
+def _alone(catheter: Catheter) -> Wire:
+    """Return a wire as thick and as stiff as a catheter."""
+    common = {each.name: getattr(catheter, each.name) for each in fields(Device)}
+    return Wire(**common, tip_bend_rad=0.0, tip_bend_length_mm=0.0, tip_load_n=None)
 
 
 def _catheter_drive(scene: Scene, place: int) -> tuple[np.ndarray, np.ndarray]:

@@ -87,7 +87,8 @@ def robust_controls(
         for length in (longest, BEYOND * longest)
     ]
     kind = np.arange(rollouts) % len(MANOEUVRES)
-    initial, control = (np.where(_rows(kind == 0, near), near, far) for near, far in zip(*drawn, strict=True))
+    pair = ((near[..., 0, :], far[..., 0, :]) for near, far in zip(*drawn, strict=True))
+    initial, control = (np.where(_rows(kind == 0, near), near, far) for near, far in pair)
     turn = control[..., 1].copy()
     pull = round(_PULL_AT * samples)
     for rollout in np.flatnonzero(kind >= 2):

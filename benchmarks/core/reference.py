@@ -18,7 +18,7 @@ import numpy as np
 
 from benchmarks.core.errors import error_figures
 from benchmarks.core.scenes import DEVICE, SAMPLES, SEED, WORLDS, Scene, Solution, make_scenes
-from endopilot.devices.device import Device
+from endopilot.devices.device import Wire
 from endopilot.errors import InputError
 from endopilot.files import json_text, manifest, writing
 from endopilot.simulation.config import SimulatorConfig
@@ -146,7 +146,7 @@ def _settings(config: SimulatorConfig) -> dict[str, Any]:
     return {name: value for name, value in asdict(config).items() if name != "threads"}
 
 
-def _constants(device: Device) -> dict[str, Any]:
+def _constants(device: Wire) -> dict[str, Any]:
     """Return the numbers of a device as JSON has them."""
     constants = {name: value for name, value in asdict(device).items() if name not in ("name", "sources")}
     return json.loads(json_text(constants))
@@ -168,7 +168,7 @@ def _marks(scenes: Iterable[Scene]) -> dict[str, Any]:
                 [np.column_stack([line.points, line.radius]) for line in lines]
             ),
             f"distance_map_{scene.name}": scene.anatomy.distance_map.values[step, step, step],
-            f"initial_states_{scene.name}": scene.initial,
-            f"controls_{scene.name}": scene.control,
+            f"initial_states_{scene.name}": scene.initial[:, 0],
+            f"controls_{scene.name}": scene.control[:, :, 0],
         }
     return {name: values.astype(np.float32) for name, values in marks.items()}

@@ -120,7 +120,8 @@ struct Sweeps {
     }
     void friction() {
         const FrictionState<V> friction{0.01 * one, {one, 0.0 * one, 0.0 * one}, {0.0 * one, 0.18 * one, 0.0 * one}};
-        for (int i = 0; i < kNodes; ++i) sink += add_friction<V, 0>(friction, 1e-3 * one, full, x[i] - x[0], q[i], {}, diagonal[i]);
+        Touching<V, 0> alone;
+        for (int i = 0; i < kNodes; ++i) sink += add_friction<V, 0>(friction, 1e-3 * one, full, x[i] - x[0], q[i], alone, diagonal[i]);
     }
     void elimination() {
         Carried<V> carried{};

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from endopilot.anatomy.catheter_axis import with_world_zero
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.devices.device import Device, read_device
+from endopilot.devices.device import Wire, read_device
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, random_controls
 from endopilot.simulation.motion import Motion
@@ -44,7 +44,7 @@ class Scene:
 
     name: str
     anatomy: Anatomy
-    device: Device
+    device: Wire
     initial: Float[np.ndarray, "worlds 1 2"]
     control: Float[np.ndarray, "worlds samples 1 2"]
 

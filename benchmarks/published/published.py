@@ -27,7 +27,7 @@ from benchmarks.published.straightening import (
 from benchmarks.published.three_point import SPAN_MM, flexural_modulus
 from benchmarks.published.tubing import BORE_MM, LENGTH_MM, draw_tubing, push_through
 from endopilot.devices.catheter import Catheter, read_catheter
-from endopilot.devices.device import Device, read_device
+from endopilot.devices.device import Wire, read_device
 from endopilot.devices.device_files import list_devices
 from endopilot.progress import progress
 from endopilot.settings import Within, settings
@@ -183,7 +183,7 @@ class _Test:
     """A push through tubing: the devices, what was published, and which of our assumptions is another."""
 
     name: str
-    wire: Device
+    wire: Wire
     catheters: tuple[Catheter, ...] = ()
     published: tuple[float, float] | None = None
     kind: Kind = "prediction"
@@ -264,11 +264,11 @@ class _Drawn:
             *(random.uniform(*limits) for limits in (WALL_FRICTION, COATED_FRICTION, BORE_FRICTION, TIP_BEND_DEG))
         )
 
-    def wire(self, device: Device) -> Device:
+    def wire(self, device: Wire) -> Wire:
         return replace(device, friction=self.wall).shaped(self.tip_deg, device.tip_bend_length_mm)
 
     def catheter(self, catheter: Catheter) -> Catheter:
-        return replace(catheter, device=replace(catheter.device, friction=self.coated), bore_friction=self.bore)
+        return replace(catheter, friction=self.coated, bore_friction=self.bore)
 
 
 def straightenings(config: PublishedConfig) -> list[Comparison]:
@@ -354,13 +354,11 @@ def _measured(case: str, quantity: str, unit: str, tests: list[Straightened], ki
 
 def unreinforced(catheter: Catheter) -> Catheter:
     """Return a catheter whose whole wall is plain polymer (`POLYMER_MPA`)."""
-    device = catheter.device
-    bend = POLYMER_MPA * np.pi * (device.diameter_mm**4 - catheter.inner_diameter_mm**4) / 64
-    ratio = device.twist_stiffness_n_mm2[0] / device.bend_stiffness_n_mm2[0]
-    plain = replace(
-        device, abscissa_mm=(0.0,), bend_stiffness_n_mm2=(float(bend),), twist_stiffness_n_mm2=(float(ratio * bend),)
+    bend = POLYMER_MPA * np.pi * (catheter.diameter_mm**4 - catheter.inner_diameter_mm**4) / 64
+    ratio = catheter.twist_stiffness_n_mm2[0] / catheter.bend_stiffness_n_mm2[0]
+    return replace(
+        catheter, abscissa_mm=(0.0,), bend_stiffness_n_mm2=(float(bend),), twist_stiffness_n_mm2=(float(ratio * bend),)
     )
-    return replace(catheter, device=plain)
 
 
 def _note(stuck: int, failed: int) -> str:

@@ -20,7 +20,7 @@ from scipy.spatial import KDTree
 
 from endopilot.anatomy.distance import add_catheter, distance_map_from_spheres, sample
 from endopilot.anatomy.tree import make_centerline
-from endopilot.devices.device import Device
+from endopilot.devices.device import Wire
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.rod import POISSON_RATIO
 from endopilot.simulation.simulate import simulate
@@ -202,11 +202,11 @@ def tortuosity_index(axis: Float[np.ndarray, "n 3"]) -> float:
     return float(np.linalg.norm(np.diff(axis, axis=0), axis=1).sum() / np.linalg.norm(axis[-1] - axis[0]))
 
 
-def stiff_wire(modulus_gpa: float, *, friction: float) -> Device:
+def stiff_wire(modulus_gpa: float, *, friction: float) -> Wire:
     """Return a wire of 0.035 inch and some flexural modulus (GPa) behind its floppy tip, EI = E π d⁴/64."""
     shaft = 1000 * modulus_gpa * math.pi * WIRE_MM**4 / 64
     bend = (FLOPPY_N_MM2, FLOPPY_N_MM2, shaft)
-    return Device(
+    return Wire(
         name=f"{modulus_gpa:g} GPa",
         diameter_mm=WIRE_MM,
         abscissa_mm=(0.0, FLOPPY_MM, FLOPPY_MM + TAPER_MM),
@@ -225,7 +225,7 @@ def stiff_wire(modulus_gpa: float, *, friction: float) -> Device:
     )
 
 
-def scaled(device: Device, unit_mm: float) -> Device:
+def scaled(device: Wire, unit_mm: float) -> Wire:
     """Return a device with lengths in units of some mm; forces stay in N."""
     return replace(
         device,
@@ -281,7 +281,7 @@ class Straightened:
 
 
 def straighten(
-    path: AortoIliac, anatomy: Anatomy, wire: Device, *, rigid: bool = False, config: SimulatorConfig | None = None
+    path: AortoIliac, anatomy: Anatomy, wire: Wire, *, rigid: bool = False, config: SimulatorConfig | None = None
 ) -> Straightened:
     """Push a wire from the groin into the aorta and let it rest for a second.
 

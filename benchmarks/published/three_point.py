@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from endopilot.devices.device import Device
+from endopilot.devices.device import Wire
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.rod import POISSON_RATIO, SHEAR_CORRECTION
 from endopilot.verification.case import Loading, driven, straight_rod
@@ -15,7 +15,7 @@ _ELEMENTS = 40
 _STATIC = SimulatorConfig(time_step_s=0.5, tolerance_mm=1e-7, threads=1)
 
 
-def flexural_modulus(device: Device, *, at_mm: float, deflection_mm: float, diameter_mm: float) -> float:
+def flexural_modulus(device: Wire, *, at_mm: float, deflection_mm: float, diameter_mm: float) -> float:
     """Bend a wire between two supports, and return the modulus that the test finds, GPa.
 
     The test takes the section as full and round: E = F L³ / (48 δ I), I = π d⁴ / 64. Half the span is simulated,

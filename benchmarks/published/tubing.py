@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from benchmarks.anatomy.analytic_lumens import tree_of
 from endopilot.devices.catheter import Catheter
-from endopilot.devices.device import Device
+from endopilot.devices.device import Wire
 from endopilot.devices.stack import Stack
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.simulate import simulate
@@ -160,7 +160,7 @@ class Push:
 
 
 def push_through(
-    anatomy: Anatomy, wire: Device, catheters: Sequence[Catheter] = (), *, config: SimulatorConfig | None = None
+    anatomy: Anatomy, wire: Wire, catheters: Sequence[Catheter] = (), *, config: SimulatorConfig | None = None
 ) -> Push:
     """Push a wire, or a wire and the catheters around it together, from the path's entrance to its end.
 

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from endopilot.anatomy.distance import sample
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.devices.device import Device, read_device
+from endopilot.devices.device import Wire, read_device
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import ControlConfig, random_controls
 from endopilot.simulation.rod import lay_out
@@ -25,7 +25,7 @@ STIFFNESS_N_MM2 = (None, 0.05, 0.01)
 
 
 def displaced_mm(
-    patient: Anatomy, wire: Device, rollout: Trajectory, config: SimulatorConfig
+    patient: Anatomy, wire: Wire, rollout: Trajectory, config: SimulatorConfig
 ) -> Float[np.ndarray, "worlds samples"]:
     """Return by how much the wire displaces the wall at most, mm, at each sample."""
     assert rollout.shape is not None

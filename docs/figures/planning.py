@@ -14,7 +14,7 @@ import numpy as np
 
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.control.agent import AgentPolicy, OraclePolicy
-from endopilot.devices.device import Device, read_device
+from endopilot.devices.device import Wire, read_device
 from endopilot.navigation.navigate import navigate
 from endopilot.navigation.policies import make_policy
 from endopilot.navigation.policy import Policy
@@ -40,7 +40,7 @@ def side_branches(anatomy: Anatomy) -> Iterator[Target]:
             yield Target(branch=index, abscissa=float(line.abscissa[0]) + DEEP_MM)
 
 
-def shaped(angle_deg: float, length_mm: float) -> Device:
+def shaped(angle_deg: float, length_mm: float) -> Wire:
     """Return the workhorse with its tip shaped."""
     wire = read_device("workhorse-014").with_tip(bend_rad=float(np.deg2rad(angle_deg)), stiffness_factor=1.0)
     return replace(wire, tip_bend_length_mm=length_mm)

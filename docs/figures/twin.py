@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from endopilot.dataset.loader import Dataset, load_dataset
-from endopilot.devices.device import Device
+from endopilot.devices.device import Wire
 from endopilot.models.config import WINDOW, TwinConfig
 from endopilot.models.episodes import Episodes
 from endopilot.models.twin import TwinPredictor
@@ -28,7 +28,7 @@ SPANS = (("0-10 s", 30, 50), ("10-30 s", 50, 90), ("30-45 s", 90, 120))
 
 def believed(episodes: Dataset, index: int) -> TwinPredictor:
     """Return a twin whose friction and tip stiffness are so far from the truth as the index of a patient says."""
-    device = from_record(Device, episodes.manifest["device"])
+    device = from_record(Wire, episodes.manifest["device"])
     friction, stiffness = np.random.Generator(np.random.Philox([SEED, index])).uniform(1 - OFF, 1 + OFF, 2)
     nominal = replace(device, friction=device.friction / friction)
     return TwinPredictor(

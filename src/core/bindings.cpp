@@ -1,29 +1,81 @@
-// Python bindings: numpy in, numpy out.
+// The Python module: numpy in, numpy out. Nothing else of the core knows of Python.
 #include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
 #include <nanobind/stl/shared_ptr.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
 #include <memory>
+#include <stdexcept>
 
-#include "arrays.hpp"
-#include "levels.hpp"
+#include "contact.hpp"
 #include "projection.hpp"
 #include "refined.hpp"
 #include "simulation.hpp"
 #include "spline.hpp"
 #ifdef ENDOPILOT_CUDA
-#include "gpu.hpp"
-using Processor = endopilot::Gpu;
+#include "cuda.hpp"
+using Processor = endopilot::CudaStepper;
 #else
 #include "cpu.hpp"
 using Processor = endopilot::Cpu;
 #endif
 
+namespace nb = nanobind;
 using namespace endopilot;
 using Simulations = Simulation<Processor>;
 
 namespace {
+
+template <int Dims>
+using Array = nb::ndarray<const double, nb::ndim<Dims>, nb::c_contig, nb::device::cpu>;
+template <int Dims>
+using Indices = nb::ndarray<const std::int64_t, nb::ndim<Dims>, nb::c_contig, nb::device::cpu>;
+using Image = nb::ndarray<const float, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
+
+std::vector<double> values(const Array<1>& a) { return {a.data(), a.data() + a.size()}; }
+
+Vec3<double> vec3(const double* p) { return {p[0], p[1], p[2]}; }
+
+std::vector<Vec3<double>> vectors(const Array<2>& a) {
+    std::vector<Vec3<double>> out;
+    for (std::size_t i = 0; i < a.shape(0); ++i) out.push_back(vec3(a.data() + 3 * i));
+    return out;
+}
+
+Quaternion<double> quaternion(const double* p) { return {p[0], {p[1], p[2], p[3]}}; }
+
+void require(bool fine, const char* what) {
+    if (!fine) throw std::invalid_argument(what);
+}
+
+// An array that belongs to Python.
+template <class T>
+struct OutputArray {
+    T* data;
+    nb::object array;
+    explicit OutputArray(const std::vector<std::size_t>& shape) {
+        std::size_t size = 1;
+        for (std::size_t n : shape) size *= n;
+        data = new T[size]();
+        const nb::capsule owner(data, [](void* p) noexcept { delete[] static_cast<T*>(p); });
+        array = nb::cast(nb::ndarray<nb::numpy, T>(data, shape.size(), shape.data(), owner));
+    }
+};
+
+// The levels that are built and that this processor runs, slowest first. Ask the baseline module, which runs everywhere.
+std::vector<std::string> supported_levels() {
+    std::vector<std::string> levels{"baseline"};
+#ifdef __x86_64__
+    __builtin_cpu_init();
+    const bool avx2 = __builtin_cpu_supports("avx2");
+    if (avx2) levels.push_back("avx2");
+    if (avx2 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512cd") &&
+        __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl"))
+        levels.push_back("avx512");
+#endif
+    return levels;
+}
 
 // All arrays have one entry a node; entries without a meaning (the last element, the first joint) are ignored.
 Rod make_rod(const Array<1>& abscissa, const Array<1>& shear, const Array<1>& stretch, const Array<1>& bend,
@@ -73,10 +125,10 @@ LumenMap make_lumen(const Image& values, const Array<1>& origin, double spacing,
 nb::object distance(const LumenMap& map, const Array<2>& points) {
     require(points.shape(1) == 3, "points need three coordinates");
     const std::size_t n = points.shape(0);
-    OutputArray<double> found(n);
+    const OutputArray<double> found({n});
     const Lumen lumen = view(map, InPlace{});
     for (std::size_t i = 0; i < n; ++i) found.data[i] = distance_to_wall<double>(lumen, vec3(points.data() + 3 * i)).value;
-    return found.array(n);
+    return found.array;
 }
 
 OwnedLoads make_loads(const Array<2>& force, const Array<2>& moment, const Array<2>& spring, const Array<2>& anchor,
@@ -131,15 +183,6 @@ Drives make_drives(const Array<2>& limits) {
     return drives;
 }
 
-// What a run records: (name, what it has an entry of, numbers of an entry, unit, meaning).
-nb::list outputs() {
-    nb::list all;
-#define OUTPUT(Type, name, of, numbers, unit, meaning) all.append(nb::make_tuple(#name, #of, numbers, unit, meaning));
-    ENDOPILOT_OUTPUTS(OUTPUT)
-#undef OUTPUT
-    return all;
-}
-
 // `coefficients`: cycles × knots × numbers.
 OwnedMotion make_motion(const Array<1>& ostium, const Array<1>& period, const Array<3>& coefficients) {
     const std::size_t cycles = period.size();
@@ -159,8 +202,7 @@ OwnedMotion make_motion(const Array<1>& ostium, const Array<1>& period, const Ar
 // The maps of points of the vessel to the laboratory, a row of three by four numbers a time, and the rotations in them.
 nb::tuple placements(const OwnedMotion& motion, const Array<1>& times) {
     const std::size_t n = times.size();
-    OutputArray<double> maps(12 * n), rotations(4 * n);
-    const nb::tuple result = nb::make_tuple(maps.array(n, 3, 4), rotations.array(n, 4));
+    const OutputArray<double> maps({n, 3, 4}), rotations({n, 4});
     for (std::size_t k = 0; k < n; ++k) {
         const Placement vessel = placement(motion, times.data()[k]);
         const Vec3<double> at = vessel.to_laboratory({0, 0, 0});
@@ -171,11 +213,9 @@ nb::tuple placements(const OwnedMotion& motion, const Array<1>& times) {
             maps.data[12 * k + 4 + c] = column[c].y;
             maps.data[12 * k + 8 + c] = column[c].z;
         }
-        const Quaternion<double>& q = vessel.rotation;
-        const double numbers[4] = {q.w, q.v.x, q.v.y, q.v.z};
-        std::copy_n(numbers, 4, rotations.data + 4 * k);
+        write(rotations.data + 4 * k, vessel.rotation);
     }
-    return result;
+    return nb::make_tuple(maps.array, rotations.array);
 }
 
 // All arrays but those of the catheter have a row a vertex; `rival` and `entry` a column a branch.
@@ -206,16 +246,148 @@ Projector make_projector(const Array<2>& point, const Array<2>& tangent, const A
 nb::tuple project(const Projector& projector, const Array<2>& points, const Indices<1>& nearest, const Array<1>& distance) {
     const std::size_t n = points.shape(0);
     require(points.shape(1) == 3 && nearest.size() == n && distance.size() == n, "project needs one row a point");
-    OutputArray<double> abscissa(n), offset(n), radius(n);
-    OutputArray<std::int64_t> branch(n);
-    const nb::tuple result = nb::make_tuple(abscissa.array(n), offset.array(n), branch.array(n), radius.array(n));
+    const OutputArray<double> abscissa({n}), offset({n}), radius({n});
+    const OutputArray<std::int64_t> branch({n});
     for (std::size_t i = 0; i < n; ++i) {
         const std::int64_t at = nearest.data()[i];
         require(at >= 0 && std::size_t(at) < projector.vertices(), "project names no such vertex");
         const Projected p = projector(vec3(points.data() + 3 * i), at, distance.data()[i]);
         abscissa.data[i] = p.abscissa, offset.data[i] = p.offset, branch.data[i] = p.branch, radius.data[i] = p.radius;
     }
+    return nb::make_tuple(abscissa.array, offset.array, branch.array, radius.array);
+}
+
+// What a run records: (name, what it has an entry of, numbers of an entry, unit, meaning).
+nb::list outputs() {
+    nb::list all;
+#define OUTPUT(Type, name, of, numbers, unit, meaning) all.append(nb::make_tuple(#name, #of, numbers, unit, meaning));
+    ENDOPILOT_OUTPUTS(OUTPUT)
+#undef OUTPUT
+    return all;
+}
+
+// The settings: (name, type, unit, meaning).
+nb::list options() {
+    nb::list all;
+#define OPTION(Type, name, unit, meaning) all.append(nb::make_tuple(#name, std::is_same_v<Type, int> ? "int" : "float", unit, meaning));
+    ENDOPILOT_OPTIONS(OPTION)
+#undef OPTION
+    return all;
+}
+
+OwnedScene make_scene(Rod rod, std::shared_ptr<LumenMap> lumen, std::shared_ptr<OwnedLoads> loads, const Array<1>& origin,
+                      const Array<1>& orientation, const Options& options, const Drives& drives, std::shared_ptr<OwnedTubes> tubes,
+                      std::shared_ptr<OwnedMotion> motion) {
+    require(origin.size() == 3 && orientation.size() == 4, "the base needs a position and a quaternion");
+    require(!loads || int(loads->force.size()) == rod.nodes, "loads need one entry a node of the rod");
+    require(drives.count == (tubes ? tubes->tubes : 1), "every device needs the limits of its drive");
+    const Base base{.origin = vec3(origin.data()), .orientation = quaternion(orientation.data())};
+    return {std::move(rod), std::move(lumen), std::move(loads), base, options, drives, std::move(tubes), std::move(motion)};
+}
+
+// Puts worlds at the ostium, ready to be pushed to their first inserted length by the next run. `initial` and `friction` have a row a
+// world and a column a device.
+void reset(Simulations& s, const Indices<1>& index, const Array<3>& initial, const Array<2>& friction, double sample_period) {
+    const std::size_t n = index.size(), devices = s.devices();
+    require(initial.shape(0) == n && initial.shape(1) == devices && initial.shape(2) == 2 && friction.shape(0) == n && friction.shape(1) == devices,
+            "reset needs one row a world and one entry a device");
+    for (std::size_t k = 0; k < n; ++k) {
+        const std::int64_t world = index.data()[k];
+        require(world >= 0 && std::size_t(world) < s.count(), "reset names no such world");
+        start_world(s.scene(), s.worlds()[std::size_t(world)], initial.data() + 2 * k * devices, friction.data() + k * devices, sample_period);
+    }
+}
+
+// Steps all worlds, with the interpreter's lock released, and returns what `OUTPUTS` lists.
+nb::dict run(Simulations& s, const Array<4>& control, bool force_driven, double time_step, int steps_per_sample, bool record_shape,
+             bool record_attitude, int threads, int lanes, const nb::object& progress) {
+    const std::size_t samples = control.shape(1);
+    require(control.shape(0) == s.count() && control.shape(2) == s.devices() && control.shape(3) == 2, "control needs two numbers a world, sample and device");
+    require(s.devices() == 1 || !force_driven, "devices with catheters are not driven by force");
+    require(steps_per_sample >= 1 && time_step > 0, "time step and steps per sample must be positive");
+    const Inputs in{.samples = int(samples),
+                    .steps_per_sample = steps_per_sample,
+                    .time_step = time_step,
+                    .force_driven = force_driven,
+                    .control = control.data()};
+    Outputs out;
+    nb::dict result;
+    each_output(out, [&]<class T>(const char* name, T*& array, Of of, int numbers) {
+        if ((of == Of::node && !record_shape) || (of == Of::element && !record_attitude)) return;
+        std::vector<std::size_t> shape{s.count()};
+        if (of != Of::start) shape.push_back(samples);
+        if (of == Of::device || of == Of::start) shape.push_back(s.devices());
+        if (of == Of::node || of == Of::element) shape.push_back(s.nodes());
+        if (numbers > 1) shape.push_back(std::size_t(numbers));
+        const OutputArray<T> made(shape);
+        array = made.data;
+        result[name] = made.array;
+    });
+    const nb::gil_scoped_release release;
+    s.step(in, out, threads, lanes, [&](long ended) {
+        const nb::gil_scoped_acquire acquire;
+        if (PyErr_CheckSignals() != 0) throw nb::python_error();
+        if (!progress.is_none() && ended > 0) progress(ended);
+    });
     return result;
+}
+
+// All that the worlds' future depends on, bit by bit: a row a world.
+nb::object state(Simulations& s) {
+    const OutputArray<double> all({s.count(), s.width()});
+    std::copy(s.values().begin(), s.values().end(), all.data);
+    return all.array;
+}
+
+void set_state(Simulations& s, const Array<2>& all) {
+    require(all.shape(0) == s.count() && all.shape(1) == s.width(), "the state has another shape");
+    std::copy_n(all.data(), s.values().size(), s.values().begin());
+}
+
+// Of each world, `entries` entries of `numbers` numbers, which `write(world, its pose, entry, to)` writes.
+template <class Write>
+nb::object readout(Simulations& s, std::size_t entries, std::size_t numbers, const Write& write) {
+    std::vector<std::size_t> shape{s.count(), entries, numbers};
+    if (numbers == 1) shape.pop_back();
+    const OutputArray<double> out(shape);
+    double* to = out.data;
+    for (std::size_t w = 0; w < s.count(); ++w) {
+        const World world = s.worlds()[w];
+        const Pose pose(s.scene(), world);
+        for (std::size_t k = 0; k < entries; ++k, to += numbers) write(world, pose, int(k), to);
+    }
+    return out.array;
+}
+
+nb::object of_world(Simulations& s, World::Scalar which) {
+    const OutputArray<double> out({s.count()});
+    for (std::size_t w = 0; w < s.count(); ++w) out.data[w] = s.worlds()[w][which];
+    return out.array;
+}
+
+nb::object of_devices(Simulations& s, World::DeviceQuantity which) {
+    return readout(s, s.devices(), 1, [which](const World& w, const Pose&, int k, double* to) { *to = w.device(k)[which]; });
+}
+
+nb::object tips(Simulations& s) {
+    return readout(s, s.devices(), 3, [](const World&, const Pose& pose, int k, double* to) { write(to, pose.tip(k)); });
+}
+
+nb::object tip_directions(Simulations& s) {
+    return readout(s, s.devices(), 3, [](const World&, const Pose& pose, int k, double* to) { write(to, pose.tip_direction(k)); });
+}
+
+nb::object positions(Simulations& s) {
+    return readout(s, s.nodes(), 3, [](const World&, const Pose& pose, int i, double* to) { write(to, pose.position(i)); });
+}
+
+nb::object attitudes(Simulations& s) {
+    return readout(s, s.nodes(), 4, [](const World&, const Pose& pose, int i, double* to) { write(to, pose.attitude(i)); });
+}
+
+// Forces of the wall at each node and at the middle of the element behind it, added up.
+nb::object contacts(Simulations& s) {
+    return readout(s, s.nodes(), 1, [](const World& w, const Pose&, int i, double* to) { *to = i < w.active() ? w.force(i) : 0.0; });
 }
 
 }  // namespace
@@ -225,6 +397,7 @@ NB_MODULE(ENDOPILOT_MODULE, module) {
     module.attr("LEVEL") = ENDOPILOT_LEVEL;
     module.attr("LANES") = kLanes;
     module.attr("OUTPUTS") = outputs();
+    module.attr("OPTIONS") = options();
     module.def("supported_levels", &supported_levels);
 #ifdef ENDOPILOT_CUDA
     module.def("why_no_gpu", &why_no_gpu);
@@ -253,35 +426,33 @@ NB_MODULE(ENDOPILOT_MODULE, module) {
     module.def("make_motion", &make_motion, nb::kw_only(), nb::arg("ostium"), nb::arg("period"), nb::arg("coefficients"));
     nb::class_<Options>(module, "Options")
         .def(nb::init<>())
-#define OPTION(Type, name, meaning) .def_rw(#name, &Options::name, meaning)
+#define OPTION(Type, name, unit, meaning) .def_rw(#name, &Options::name, meaning)
         ENDOPILOT_OPTIONS(OPTION);
 #undef OPTION
-    nb::class_<Simulations>(module, "Simulation")
-        .def(nb::init<Rod, std::shared_ptr<LumenMap>, std::shared_ptr<OwnedLoads>, const Array<1>&, const Array<1>&, const Options&,
-                      const Drives&, std::shared_ptr<OwnedTubes>, std::shared_ptr<OwnedMotion>, int>(),
-             nb::kw_only(), nb::arg("rod"), nb::arg("lumen").none(), nb::arg("loads").none(), nb::arg("origin"),
-             nb::arg("orientation"), nb::arg("options"), nb::arg("drives"), nb::arg("tubes").none() = nb::none(), nb::arg("motion").none() = nb::none(), nb::arg("worlds"))
-        .def("reset", &Simulations::reset, nb::kw_only(), nb::arg("index"), nb::arg("initial"), nb::arg("friction"), nb::arg("sample_period"))
-        .def("run", &Simulations::run, nb::kw_only(), nb::arg("control"), nb::arg("force_driven"), nb::arg("time_step"),
-             nb::arg("steps_per_sample"), nb::arg("record_shape"), nb::arg("record_attitude"), nb::arg("threads"),
-             nb::arg("lanes"), nb::arg("progress").none())
-        .def("state", &Simulations::state)
-        .def("set_state", &Simulations::set_state, nb::arg("all"))
-        .def("tips", &Simulations::tips)
-        .def("tip_directions", &Simulations::tip_directions)
-        .def("positions", &Simulations::positions)
-        .def("attitudes", &Simulations::attitudes)
-        .def("contacts", &Simulations::contacts)
-        .def_prop_ro("nodes", &Simulations::nodes)
-        .def("time", [](Simulations& s) { return s.scalar(World::kTime); })
-        .def("active", [](Simulations& s) { return s.scalar(World::kActive); })
-        .def("reason", [](Simulations& s) { return s.scalar(World::kReason); })
-        .def("inserted_length", [](Simulations& s) { return s.per_device(World::kLength); })
-        .def("rotation", [](Simulations& s) { return s.per_device(World::kRotation); })
-        .def("base_force", [](Simulations& s) { return s.per_device(World::kBaseForce); })
-        .def("base_torque", [](Simulations& s) { return s.per_device(World::kBaseTorque); })
-        .def("drive_force", [](Simulations& s) { return s.per_device(World::kDriveForce); })
-        .def("drive_torque", [](Simulations& s) { return s.per_device(World::kDriveTorque); })
-        .def("slip", [](Simulations& s) { return s.per_device(World::kSlip); })
-        .def("rotation_slip", [](Simulations& s) { return s.per_device(World::kRotationSlip); });
+    nb::class_<Simulations> simulation(module, "Simulation");
+    simulation
+        .def("__init__", [](Simulations* self, Rod rod, std::shared_ptr<LumenMap> lumen, std::shared_ptr<OwnedLoads> loads, const Array<1>& origin,
+                            const Array<1>& orientation, const Options& options, const Drives& drives, std::shared_ptr<OwnedTubes> tubes,
+                            std::shared_ptr<OwnedMotion> motion, int worlds) {
+                 require(worlds >= 1, "a simulation needs at least one world");
+                 new (self) Simulations(make_scene(std::move(rod), lumen, loads, origin, orientation, options, drives, tubes, motion), std::size_t(worlds));
+             },
+             nb::kw_only(), nb::arg("rod"), nb::arg("lumen").none(), nb::arg("loads").none(), nb::arg("origin"), nb::arg("orientation"), nb::arg("options"),
+             nb::arg("drives"), nb::arg("tubes").none() = nb::none(), nb::arg("motion").none() = nb::none(), nb::arg("worlds"))
+        .def("reset", &reset, nb::kw_only(), nb::arg("index"), nb::arg("initial"), nb::arg("friction"), nb::arg("sample_period"))
+        .def("run", &run, nb::kw_only(), nb::arg("control"), nb::arg("force_driven"), nb::arg("time_step"), nb::arg("steps_per_sample"),
+             nb::arg("record_shape"), nb::arg("record_attitude"), nb::arg("threads"), nb::arg("lanes"), nb::arg("progress").none())
+        .def("state", &state)
+        .def("set_state", &set_state, nb::arg("all"))
+        .def("tips", &tips)
+        .def("tip_directions", &tip_directions)
+        .def("positions", &positions)
+        .def("attitudes", &attitudes)
+        .def("contacts", &contacts)
+        .def_prop_ro("nodes", &Simulations::nodes);
+    for (const auto& [name, which] : {std::pair{"time", World::kTime}, {"active", World::kActive}, {"reason", World::kReason}})
+        simulation.def(name, [which](Simulations& s) { return of_world(s, which); });
+#define NUMBER(name, quantity) simulation.def(#name, [](Simulations& s) { return of_devices(s, World::quantity); });
+    ENDOPILOT_DEVICE_NUMBERS(NUMBER)
+#undef NUMBER
 }

@@ -166,12 +166,10 @@ struct ContactPoint {
 // reference frame since the step's start, and the rotation that their sliding along the mesh brings (tubes.hpp).
 template <class V, int T>
 struct Touching {
-    V weight[T], twisted[T], spin;
+    V spin, weight[T], twisted[T];
 };
-template <class V>
-struct Touching<V, 0> {};
 
-// The wall's spring at a contact point: it yields by d to the force k d exp(s d²).
+// The wall's spring at a contact point: it gives way by d to the force k d exp(s d²).
 struct WallSpring {
     double stiffness;    // k, N/mm
     double stiffening;   // s, 1/mm²; 0 for a spring that does not stiffen
@@ -225,18 +223,15 @@ ENDOPILOT_DEVICE inline V add_friction(const FrictionState<V>& friction, const V
                                        const Vec3<V>& moved, const Quaternion<V>& p, const Touching<V, T>& touching, Diagonal<V, T>& own) {
     using S = Single<V>;
     V twist = 2.0 * p.v.z;
-    if constexpr (T > 0) {
-        twist += touching.spin;
-        for (int k = 0; k < T; ++k) twist += touching.weight[k] * touching.twisted[k];
-    }
+    if constexpr (T > 0) twist += touching.spin;
+    for (int k = 0; k < T; ++k) twist += touching.weight[k] * touching.twisted[k];
     const Vec3<V> slip = moved - dot(moved, friction.normal) * friction.normal + twist * friction.spin_arm;
     const V size = square_root(dot(slip, slip) + eps * eps);
     const V inverse = 1.0 / size;
     const V stiffness = friction.limit * inverse;  // N/mm; the force of friction on the wire is -stiffness times slip
     const Vec3<V> gradient = stiffness * slip;
     Vec3<V> turn{-p.v.y, p.v.x, p.w};  // d twist / d theta
-    if constexpr (T > 0)
-        for (int k = 0; k < T; ++k) turn.z -= touching.weight[k];   // a tube's twist is its turn less theta_3
+    for (int k = 0; k < T; ++k) turn.z -= touching.weight[k];   // a tube's twist is its turn less theta_3
     own.gradient_x += gradient;
     const V gradient_twist = dot(gradient, friction.spin_arm);
     own.gradient_theta += gradient_twist * turn;
@@ -265,16 +260,14 @@ ENDOPILOT_DEVICE inline V add_friction(const FrictionState<V>& friction, const V
     own.tt.xy += rb.x * b.y;
     own.tt.xz += rb.x * b.z;
     own.tt.yz += rb.y * b.z;
-    if constexpr (T > 0) {
-        for (int k = 0; k < T; ++k) {
-            own.twists.gradient[k] += gradient_twist * touching.weight[k];
-            const S w = narrow(touching.weight[k]);
-            own.twists.px[k][0] += w * mixed.x;
-            own.twists.px[k][1] += w * mixed.y;
-            own.twists.px[k][2] += w * mixed.z;
-            for (int r = 0; r < 3; ++r) own.twists.pt[k][r] += w * (rotary * t[r]);
-            for (int c = 0; c <= k; ++c) own.twists.pp[k][c] += w * (rotary * narrow(touching.weight[c]));
-        }
+    for (int k = 0; k < T; ++k) {
+        own.twists.gradient[k] += gradient_twist * touching.weight[k];
+        const S w = narrow(touching.weight[k]);
+        own.twists.px[k][0] += w * mixed.x;
+        own.twists.px[k][1] += w * mixed.y;
+        own.twists.px[k][2] += w * mixed.z;
+        for (int r = 0; r < 3; ++r) own.twists.pt[k][r] += w * (rotary * t[r]);
+        for (int c = 0; c <= k; ++c) own.twists.pp[k][c] += w * (rotary * narrow(touching.weight[c]));
     }
     return friction.limit * (size - eps);
 }
@@ -298,16 +291,14 @@ ENDOPILOT_DEVICE inline void add_middle(const Diagonal<V, T>& middle, Diagonal<V
             own.tx[r][c] += middle.tx[r][c];
             link.tu[r][c] -= 0.5f * middle.tx[r][c];
         }
-    if constexpr (T > 0) {
-        for (int k = 0; k < T; ++k) {
-            own.twists.gradient[k] += middle.twists.gradient[k];
-            for (int c = 0; c < 3; ++c) {
-                own.twists.px[k][c] += middle.twists.px[k][c];
-                link.twists.pu[k][c] -= 0.5f * middle.twists.px[k][c];
-                own.twists.pt[k][c] += middle.twists.pt[k][c];
-            }
-            for (int c = 0; c <= k; ++c) own.twists.pp[k][c] += middle.twists.pp[k][c];
+    for (int k = 0; k < T; ++k) {
+        own.twists.gradient[k] += middle.twists.gradient[k];
+        for (int c = 0; c < 3; ++c) {
+            own.twists.px[k][c] += middle.twists.px[k][c];
+            link.twists.pu[k][c] -= 0.5f * middle.twists.px[k][c];
+            own.twists.pt[k][c] += middle.twists.pt[k][c];
         }
+        for (int c = 0; c <= k; ++c) own.twists.pp[k][c] += middle.twists.pp[k][c];
     }
 }
 

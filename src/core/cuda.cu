@@ -90,15 +90,12 @@ CudaStepper::CudaStepper(const OwnedScene& scene)
 
 CudaStepper::~CudaStepper() = default;
 
-void CudaStepper::step(const Worlds& worlds, const Inputs& in, const Outputs& out, const std::vector<int>& order,
-                       const std::function<void(long)>& progress) {
+void CudaStepper::step(const Worlds& worlds, const Inputs& in, const Outputs& out, const std::vector<int>& order, int, int,
+                       const Progress& progress) {
     const std::size_t count = order.size(), samples = std::size_t(in.samples), devices = std::size_t(scene_.drives.count);
     const std::size_t width = World::size(scene_.rod.nodes, scene_.drives.count);
     Memory memory;
-    Launch launch{.scene = scene_,
-                  .worlds = {},
-                  .in = in,
-                  .out = out,
+    Launch launch{.run = {scene_, {}, in, out},
                   .count = int(count),
                   .order = memory(order),
                   .next = memory(std::vector<int>(count, 0)),
@@ -112,8 +109,8 @@ void CudaStepper::step(const Worlds& worlds, const Inputs& in, const Outputs& ou
         most = std::max(most, world[World::kApproach]);
         for (std::size_t k = 0; k < width; ++k) values[k * count + w] = world.values[std::ptrdiff_t(k) * world.stride];
     }
-    launch.worlds = {memory(values), 1, std::ptrdiff_t(count), scene_.drives.count};
-    launch.in.control = memory(std::vector<double>(in.control, in.control + 2 * devices * count * samples));
+    launch.run.worlds = {memory(values), 1, std::ptrdiff_t(count), scene_.drives.count};
+    launch.run.in.control = memory(std::vector<double>(in.control, in.control + 2 * devices * count * samples));
 
     struct Copy {
         void* to;
@@ -121,7 +118,7 @@ void CudaStepper::step(const Worlds& worlds, const Inputs& in, const Outputs& ou
         std::size_t bytes;
     };
     std::vector<Copy> copies;
-    each_output(launch.out, [&]<class Number>(const char*, Number*& array, Of of, int numbers) {
+    each_output(launch.run.out, [&]<class Number>(const char*, Number*& array, Of of, int numbers) {
         if (!array) return;   // not recorded
         Number* const host = array;
         const std::size_t size = count * entries(of, samples, devices, std::size_t(scene_.rod.nodes)) * std::size_t(numbers);
@@ -143,7 +140,7 @@ void CudaStepper::step(const Worlds& worlds, const Inputs& in, const Outputs& ou
         done = now;
     }
 
-    check(cudaMemcpy(values.data(), launch.worlds.values, values.size() * sizeof(double), cudaMemcpyDeviceToHost));
+    check(cudaMemcpy(values.data(), launch.run.worlds.values, values.size() * sizeof(double), cudaMemcpyDeviceToHost));
     for (std::size_t w = 0; w < count; ++w) {
         const World world = worlds[w];
         for (std::size_t k = 0; k < width; ++k) world.values[std::ptrdiff_t(k) * world.stride] = values[k * count + w];

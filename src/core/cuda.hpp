@@ -1,7 +1,6 @@
 // A CUDA GPU that steps worlds, seen from the host and without Python; cuda.cu implements it.
 #pragma once
 
-#include <functional>
 #include <memory>
 #include <string>
 #include <vector>
@@ -19,10 +18,10 @@ public:
     explicit CudaStepper(const OwnedScene& scene);
     ~CudaStepper();
 
-    // Steps all worlds to the end of the inputs; `order` names those of similar length next to each other. Calls `progress`
-    // with the samples that ended since it was last called; if it throws, the worlds stay as they were before.
-    void step(const Worlds& worlds, const Inputs& in, const Outputs& out, const std::vector<int>& order,
-              const std::function<void(long)>& progress);
+    // Steps all worlds to the end of the inputs, each on a thread of the GPU: the processor's threads and lanes do not matter. `order`
+    // names those of similar length next to each other. If `progress` throws, the worlds stay as they were before.
+    void step(const Worlds& worlds, const Inputs& in, const Outputs& out, const std::vector<int>& order, int threads, int lanes,
+              const Progress& progress);
 
 private:
     struct Memory;

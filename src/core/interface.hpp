@@ -5,6 +5,7 @@
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
+#include <functional>
 #include <memory>
 
 #include "lumen.hpp"
@@ -14,25 +15,25 @@
 
 namespace endopilot {
 
-// Every option, once: its type, its name, and what it is. The struct and the Python class are made of this table.
-#define ENDOPILOT_OPTIONS(OPTION)                                                                                             \
-    OPTION(double, stick_velocity, "slip velocity below which friction falls off, mm/s")                                      \
-    OPTION(double, wall_stiffness, "of a contact point, N/mm")                                                                \
-    OPTION(double, foundation, "of a compliant wall, for each mm of wire, N/mm²: in place of wall_stiffness where not 0")     \
-    OPTION(double, foundation_stiffening, "a compliant wall yields by d to foundation × d exp(stiffening × d²), 1/mm²")      \
-    OPTION(double, tip_takes_along, "length of the compliant wall that the tip displaces beyond its own, mm")                 \
-    OPTION(double, tolerance, "a step has converged when Newton's step moves no node farther, mm (rotations: rad)")           \
-    OPTION(double, sample_tolerance, "the same for the step that ends a sample: its forces are recorded")                     \
-    OPTION(double, largest_step, "displacement that one Newton step is clamped to, mm (rotations: rad)")                      \
-    OPTION(double, largest_jump, "motion of a node in a step beyond the drive's, mm (rad), above which it is shortened")      \
-    OPTION(int, max_iterations, "of one step; then the step is halved (the shortest may take kSnapIterations times as many)") \
-    OPTION(double, free_behind, "nodes farther than this behind the ostium follow the drive, mm")                             \
-    OPTION(double, approach_velocity, "of a device on its way to its first inserted length, mm/s; 0: it starts there")        \
-    OPTION(double, introducer_friction, "Coulomb friction of the introducer's valve, N")                                      \
-    OPTION(double, introducer_drag, "viscous drag of the introducer's valve, N s/mm")
+// Every option, once: its type, name and unit, and what it is. The struct, the Python class and `_core.OPTIONS` are made of this table.
+#define ENDOPILOT_OPTIONS(OPTION)                                                                                                      \
+    OPTION(double, stick_velocity, "mm/s", "slip velocity below which friction falls off")                                             \
+    OPTION(double, wall_stiffness, "N/mm", "of the wall at a contact point")                                                           \
+    OPTION(double, foundation, "N/mm²", "of a compliant wall, for each mm of wire; 0: the wall has wall_stiffness")                    \
+    OPTION(double, foundation_stiffening, "1/mm²", "a compliant wall gives way by d to foundation × d exp(stiffening × d²)")           \
+    OPTION(double, foundation_at_tip, "mm", "length of the compliant wall that the tip displaces beyond its own")                      \
+    OPTION(double, tolerance, "mm, rad", "a step has converged when Newton's step moves and turns no node farther")                    \
+    OPTION(double, sample_tolerance, "mm, rad", "the same for the step that ends a sample: its forces are recorded")                   \
+    OPTION(double, largest_step, "mm, rad", "motion of a node that one Newton step is clamped to")                                     \
+    OPTION(double, largest_jump, "mm, rad", "motion of a node in a step beyond the drive's, above which the step is shortened")        \
+    OPTION(int, max_iterations, "", "of one step; then it is halved (the shortest may take kSnapIterations times as many)")            \
+    OPTION(double, free_behind, "mm", "nodes farther than this behind the ostium follow the drive")                                    \
+    OPTION(double, approach_velocity, "mm/s", "of a device on its way to its first inserted length; 0: it starts there")               \
+    OPTION(double, introducer_friction, "N", "Coulomb friction of the introducer's valve")                                             \
+    OPTION(double, introducer_drag, "N s/mm", "viscous drag of the introducer's valve")
 
 struct Options {
-#define OPTION(Type, name, meaning) Type name;
+#define OPTION(Type, name, unit, meaning) Type name;
     ENDOPILOT_OPTIONS(OPTION)
 #undef OPTION
 };
@@ -146,13 +147,21 @@ Scene view(const OwnedScene& scene, const Place& place) {
             .motion = scene.motion ? view(*scene.motion, place) : Motion{}};
 }
 
+constexpr int kTicks = 64;   // of a time step, which may be halved down to one
+
 // The inputs of one run: samples of equal length, each with one control for each world.
 struct Inputs {
     int samples, steps_per_sample;
     double time_step;         // s
     bool force_driven;        // controls are an axial force and a torque on the wire, not velocities
     const double* control;    // worlds × samples × devices × 2: mm/s and rad/s, or N and N mm
+
+    ENDOPILOT_DEVICE double seconds(int ticks) const { return time_step * ticks / kTicks; }
+    ENDOPILOT_DEVICE double sample_period() const { return time_step * steps_per_sample; }
 };
+
+// Is told while a run goes on how many samples have ended since it was last called. Where it throws, the run ends.
+using Progress = std::function<void(long)>;
 
 enum Reason : std::uint8_t { kFine = 0, kNotFinite = 1, kNotConverged = 2, kThroughWall = 3 };
 

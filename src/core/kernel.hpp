@@ -1,18 +1,15 @@
-// The stepper as a kernel: one world a thread, in scalar lanes.
+// A run as a kernel: one world a thread, in scalar lanes.
 #pragma once
 
 #include <limits>
 
-#include "stepper.hpp"
+#include "step.hpp"
 
 namespace endopilot {
 
 // What the threads of one launch have in common, in memory that they see.
 struct Launch {
-    Scene scene;
-    Worlds worlds;
-    Inputs in;
-    Outputs out;
+    Run run;
     int count;          // worlds
     const int* order;   // worlds, those of similar length next to each other: threads of a warp step them together
     int* next;          // the sample that comes next, of each world
@@ -46,9 +43,8 @@ ENDOPILOT_DEVICE void step_worlds(const Launch& launch, int thread, Node<double,
     if (thread >= launch.count) return;
     const int world = launch.order[thread];
     OneWorld queue(world, launch.next + world, launch.samples);
-    Stepper<double, T> stepper(launch.scene, launch.worlds, node, factor);
-    stepper.prepare(launch.in, launch.out);
-    while (stepper.turn(queue) >= 0) {
+    Lanes<double, T> lanes(node, factor);
+    while (iterate(launch.run, lanes, queue) >= 0) {
     }
 }
 

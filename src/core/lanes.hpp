@@ -262,6 +262,18 @@ ENDOPILOT_DEVICE inline Vec3<V> widen(const Vec3<Single<V>>& a) {
     return {widen<V>(a.x), widen<V>(a.y), widen<V>(a.z)};
 }
 
+template <class V>
+ENDOPILOT_DEVICE inline Vec3<double> get(const Vec3<V>& v, int lane) {
+    return {get(v.x, lane), get(v.y, lane), get(v.z, lane)};
+}
+
+template <class V>
+ENDOPILOT_DEVICE inline void set(Vec3<V>& to, int lane, const Vec3<double>& v) {
+    set(to.x, lane, v.x);
+    set(to.y, lane, v.y);
+    set(to.z, lane, v.z);
+}
+
 // Symmetric 3×3 matrix.
 template <class V>
 struct Sym3 {
@@ -306,6 +318,17 @@ ENDOPILOT_DEVICE inline Quaternion<V> relative(const Quaternion<V>& a, const Qua
 template <class V>
 ENDOPILOT_DEVICE inline Quaternion<V> select(Mask<V> mask, const Quaternion<V>& yes, const Quaternion<V>& no) {
     return {select<V>(mask, yes.w, no.w), select(mask, yes.v, no.v)};
+}
+
+template <class V>
+ENDOPILOT_DEVICE inline Quaternion<double> get(const Quaternion<V>& q, int lane) {
+    return {get(q.w, lane), get(q.v, lane)};
+}
+
+template <class V>
+ENDOPILOT_DEVICE inline void set(Quaternion<V>& to, int lane, const Quaternion<double>& q) {
+    set(to.w, lane, q.w);
+    set(to.v, lane, q.v);
 }
 
 // q rotated by the rotation vector `angle` (rad, in the frame of q). (1, angle/2) normalised agrees with the

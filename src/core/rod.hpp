@@ -59,21 +59,18 @@ RodModel view(const Rod& rod, const Place& place) {
             .spin_drag = place(rod.spin_drag)};
 }
 
-// What a block has besides for the turns of T further tubes (tubes.hpp): rows are turns.
+// What a block has besides for the turns of T further tubes (tubes.hpp): rows are turns. Arrays of no entries, a GNU extension, take no
+// room: a wire alone runs the same code.
 template <class V, int T>
 struct TwistDiagonal {
     V gradient[T];                          // dE/dturn, N mm
     Single<V> px[T][3], pt[T][3], pp[T][T];  // pp: the lower triangle
 };
-template <class V>
-struct TwistDiagonal<V, 0> {};
 
 template <class V, int T>
 struct TwistLink {
     Single<V> pu[T][3], pt[T][3], tp[3][T], pp[T][T];   // p, t: rows (this block); columns u, or of the next block
 };
-template <class V>
-struct TwistLink<V, 0> {};
 
 // One block row of the system: gradient, and the lower triangular Hessian of all but element i.
 // Order of the unknowns: x, y, z, theta1, theta2, theta3, and the turns of T further tubes.
@@ -133,10 +130,8 @@ ENDOPILOT_DEVICE inline V add_element(double length, const Stiffness& shear, con
         link.tu[r][2] = row[r].z;
         next.tx[r][0] = next.tx[r][1] = next.tx[r][2] = S{};
     }
-    if constexpr (T > 0) {
-        for (int k = 0; k < T; ++k)
-            for (int r = 0; r < 3; ++r) next.twists.px[k][r] = link.twists.pu[k][r] = S{};
-    }
+    for (int k = 0; k < T; ++k)
+        for (int r = 0; r < 3; ++r) next.twists.px[k][r] = link.twists.pu[k][r] = S{};
 
     // d2E/dtheta2 = l [y]x^T S [y]x + geometric l ((n y^T + y n^T)/2 - n.y)
     const S along = dot(p, y), zz = ay.z * y.z - along;

@@ -29,20 +29,15 @@ struct Factor {
 };
 
 // What the elimination of a block adds to the next: gradient and lower triangular Hessian.
-template <class V, int T>
-struct TwistCarried {
-    Single<V> gradient[T], px[T][3], pt[T][3], pp[T][T];
-};
-template <class V>
-struct TwistCarried<V, 0> {};
-
 template <class V, int T = 0>
 struct Carried {
     Vec3<Single<V>> gradient_x, gradient_theta;
     Sym3<Single<V>> xx;
     Single<V> tx[3][3];
     Sym3<Single<V>> tt;
-    [[no_unique_address]] TwistCarried<V, T> twists;
+    struct {
+        Single<V> gradient[T], px[T][3], pt[T][3], pp[T][T];
+    } twists;
 };
 
 // A block is positive definite if its smallest pivot is positive; `descent` is its share of gradient · Hessian^-1 gradient.
@@ -85,22 +80,19 @@ template <class V, int T>
                         {tx[1][0], tx[1][1], tx[1][2]},
                         {tx[2][0], tx[2][1], tx[2][2]}};
     S g[B] = {gx.x, gx.y, gx.z, gt.x, gt.y, gt.z};
-    if constexpr (T > 0) {
-        for (int k = 0; k < T; ++k) {
-            for (int c = 0; c < 3; ++c) {
-                cx[6 + k][c] = own.twists.px[k][c] + carried.twists.px[k][c];
-                d[6 + k][c] = cx[6 + k][c] + link.twists.pu[k][c];
-                d[6 + k][3 + c] = own.twists.pt[k][c] + carried.twists.pt[k][c];
-            }
-            for (int c = 0; c <= k; ++c) d[6 + k][6 + c] = own.twists.pp[k][c] + carried.twists.pp[k][c];
-            g[6 + k] = narrow(own.twists.gradient[k]) + carried.twists.gradient[k];
+    for (int k = 0; k < T; ++k) {
+        for (int c = 0; c < 3; ++c) {
+            cx[6 + k][c] = own.twists.px[k][c] + carried.twists.px[k][c];
+            d[6 + k][c] = cx[6 + k][c] + link.twists.pu[k][c];
+            d[6 + k][3 + c] = own.twists.pt[k][c] + carried.twists.pt[k][c];
         }
+        for (int c = 0; c <= k; ++c) d[6 + k][6 + c] = own.twists.pp[k][c] + carried.twists.pp[k][c];
+        g[6 + k] = narrow(own.twists.gradient[k]) + carried.twists.gradient[k];
     }
     // the coupling of theta and twists to those of the next block
     const auto coupling = [&](auto r_, auto c_) {
         constexpr int r = decltype(r_)::value, c = decltype(c_)::value;
-        if constexpr (T == 0) return link.tt[r][c];
-        else if constexpr (r < 3 && c < 3) return link.tt[r][c];
+        if constexpr (r < 3 && c < 3) return link.tt[r][c];
         else if constexpr (r < 3) return link.twists.tp[r][c - 3];
         else if constexpr (c < 3) return link.twists.pt[r - 3][c];
         else return link.twists.pp[r - 3][c - 3];
@@ -202,15 +194,13 @@ template <class V, int T>
     });
     carried.gradient_x = gx + Vec3<S>{zwx(X), zwx(Y), zwx(Z)};
     carried.gradient_theta = {zwt(0), zwt(1), zwt(2)};
-    if constexpr (T > 0) {
-        for (int k = 0; k < T; ++k) {
-            carried.twists.gradient[k] = zwt(3 + k);
-            for (int c = 0; c < 3; ++c) {
-                carried.twists.px[k][c] = -twx(3 + k, c);
-                carried.twists.pt[k][c] = -twt(3 + k, c);
-            }
-            for (int c = 0; c <= k; ++c) carried.twists.pp[k][c] = -twt(3 + k, 3 + c);
+    for (int k = 0; k < T; ++k) {
+        carried.twists.gradient[k] = zwt(3 + k);
+        for (int c = 0; c < 3; ++c) {
+            carried.twists.px[k][c] = -twx(3 + k, c);
+            carried.twists.pt[k][c] = -twt(3 + k, c);
         }
+        for (int c = 0; c <= k; ++c) carried.twists.pp[k][c] = -twt(3 + k, 3 + c);
     }
     S descent = z[0] * f.z[0];
     for (int r = 1; r < B; ++r) descent += z[r] * f.z[r];

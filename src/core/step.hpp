@@ -1,226 +1,316 @@
-// One step of a lane: its begin, what is decided at a trial point, and its end.
+// A time step of a lane: its begin, and its end once Newton's method has converged. `iterate` is where it all comes together.
 #pragma once
 
-#include "stepper.hpp"
+#include "coaxial_limits.hpp"
+#include "newton.hpp"
 
 namespace endopilot {
 
-constexpr int kMaxRejections = 12;
-constexpr int kTurnabout = 10;         // iterations after which friction's tangent and its secant take turns
-constexpr int kSnapIterations = 25;   // times max_iterations that the shortest step may take: a snap takes many at any step
-constexpr double kAllowedRise = 0.85;    // of what the energy has fallen lately: by so much it may rise in a step that struggles
-constexpr double kBackInside = 0.02;    // of a move that left the map, that is tried next
-constexpr double kLeastOfMove = 1e-4, kMostOfMove = 0.7;   // of a move that raised the energy, that is tried next
-constexpr double kMostPower = 8;         // of the share, that the energy is taken to grow with beyond its slope
-constexpr double kFirstDamping = 1e-3;   // N/mm (rotations: N mm/rad), where the Hessian is indefinite even without geometric terms
-constexpr double kMaxDamping = 1e3;
-constexpr double kMaxBoost = 64;
-constexpr double kMaxImbalance = 1e-5;   // N that a damped solution may be out of balance
-constexpr double kLooseImbalance = 1e-4;   // the same, in a step that struggles
 constexpr double kDriveMotion = 1.2;     // times the drive's own motion that a node may move in a step before it counts as a jump
 
-// Begins a step of lane.stride ticks from the lane's start state; nodes ahead of the base already hold a trial.
+// Carries the start of the coming step with the vessel to where that is at the step's end: what a step moves is then its motion
+// relative to the wall, and so is what friction and drag resist.
 template <class V, int T>
-void Stepper<V, T>::begin(int l, bool fresh) {
-    Lane& lane = lane_[l];
+ENDOPILOT_LARGE void carry(const Run& run, Lanes<V, T>& lanes, int l) {
+    Lane<T>& lane = lanes.lane[l];
+    const Motion& motion = run.scene.motion;
+    const bool approaches = lane.sample < 0;   // the vessel then stands still
+    const double begins = approaches ? lane.time : lane.time + run.in.seconds(lane.tick);
+    const double ends = approaches ? lane.time : lane.time + run.in.seconds(lane.tick + lane.stride);
+    const Carriage carriage(placement(motion, lane.carried), placement(motion, ends));
+    const Placement& vessel = carriage.to;
+    lane.carried = ends;
+    lane.strain = strain(placement(motion, begins), vessel);
+    lane.base = run.scene.base.moved(vessel);
+    set(lanes.step.axis, l, frame(lane.base.orientation).d3);
+    const Frame<double> r = frame(vessel.rotation);
+    const Vec3<double> x{r.d1.x, r.d2.x, r.d3.x}, y{r.d1.y, r.d2.y, r.d3.y}, z{r.d1.z, r.d2.z, r.d3.z};   // columns of its transpose
+    const Vec3<double> a = vessel.shrink * x, b = vessel.shrink * y, c = vessel.shrink * z;
+    WallPlace<V>& place = lanes.step.vessel;
+    set(place.row[0], l, {a.x, b.x, c.x});
+    set(place.row[1], l, {a.y, b.y, c.y});
+    set(place.row[2], l, {a.z, b.z, c.z});
+    set(place.at, l, vessel.to_vessel({0, 0, 0}));
+    const auto turn_point = [&](ContactPoint<V>& point) {
+        set(point.offset, l, carriage.direction(get(point.offset, l)));
+        set(point.friction.normal, l, carriage.direction(get(point.friction.normal, l)));
+        set(point.friction.spin_arm, l, carriage.direction(get(point.friction.spin_arm, l)));
+    };
+    for (int i = 0; i < lane.active; ++i) {
+        Node<V, T>& n = lanes.node[i];
+        const Vec3<double> start = get(n.start, l), carried = carriage.point(start);
+        set(n.x, l, carried + carriage.direction(get(n.x, l) - start));
+        set(n.start, l, carried);
+        set(n.q, l, carriage.attitude(get(n.q, l)));
+        set(n.start_q, l, carriage.attitude(get(n.start_q, l)));
+        turn_point(n.at_node);
+        turn_point(n.at_middle);
+    }
+}
+
+// Begins a step of lane.stride ticks from the lane's start state; nodes ahead of the base already hold a trial, which extrapolates the
+// last step by `weight`.
+template <class V, int T>
+ENDOPILOT_LARGE void begin_step(const Run& run, Lanes<V, T>& lanes, int l, double weight) {
+    Lane<T>& lane = lanes.lane[l];
+    TimeStep<V, T>& step = lanes.step;
+    const RodModel& rod = run.scene.rod;
+    const Options& options = run.scene.options;
+    const bool moves = run.scene.motion.cycles > 0;
     const int before = lane.active;
-    if (motion_.cycles > 0) carry(l);
-    const double weight = fresh ? 0.0 : duration(lane) / lane.last_duration;
-    aim(l, weight);
-    lane.active = Base::count_active(rod_, lane.advance.start, options_.free_behind);
+    if (moves) carry(run, lanes, l);
+    command_drives(run.in, lanes, l, weight);
+    lane.active = Base::count_active(rod, lane.advance.start, options.free_behind);
     for (int i = std::min(before, lane.active); i <= std::max(before, lane.active); ++i)
-        if (i >= before || i >= lane.active) place(l, i);
-    if (lane.active < before) clear(node_[lane.active - 1].at_middle, l);
-    if constexpr (T > 0) prepare_tubes(l);
+        if (i >= before || i >= lane.active) place(rod, lanes, l, i);
+    if (lane.active < before) clear(lanes.node[lane.active - 1].at_middle, l);
+    if constexpr (T > 0) prepare_tubes(run.scene, lanes, l);
     lane.iterations = lane.rejections = lane.releases = 0;
-    lane.boost = 1;
+    lane.lengthened = 1;
     lane.first = lane.finite = true;
-    lane.extrapolated = !fresh;
+    lane.extrapolated = weight != 0;
     const auto planned = [&lane](const Coordinate& c) { return std::abs((lane.by_force ? c.end : c.commanded) - c.start); };
     double slides = planned(lane.advance), turns = 0;
-    if (motion_.cycles > 0) slides += lane.strain * std::max(0.0, lane.advance.start);   // a vessel that stretches slides along the wire
+    if (moves) slides += lane.strain * std::max(0.0, lane.advance.start);   // a vessel that stretches slides along the wire
     for (const Device& device : lane.device) turns += planned(device.turn);
-    const double most_x = options_.largest_jump + kDriveMotion * slides, most_theta = options_.largest_jump + kDriveMotion * turns;
-    set(active_, l, lane.active);
-    set(share_, l, Base::share_of_last_joint(rod_, lane.advance.start, options_.free_behind, lane.active));
-    set(geometric_, l, 0.0);
-    set(first_, l, 1.0);
-    set_mask<V>(accepted_, l, false);
-    set(damping_, l, 0.0);
-    set(tangent_, l, 1.0);
-    set(inverse_dt_, l, 1.0 / duration(lane));
-    set(eps_, l, options_.stick_velocity * in_.time_step);
-    set(jump_scale_x_, l, 1.0 / (most_x * most_x));
-    set(jump_scale_theta_, l, 4.0 / (most_theta * most_theta));  // of twice the imaginary part of a quaternion
+    const double most_x = options.largest_jump + kDriveMotion * slides, most_theta = options.largest_jump + kDriveMotion * turns;
+    set(step.active, l, lane.active);
+    set(step.last_joint, l, Base::share_of_last_joint(rod, lane.advance.start, options.free_behind, lane.active));
+    set(step.inverse_dt, l, 1.0 / run.in.seconds(lane.stride));
+    set(step.eps, l, options.stick_velocity * run.in.time_step);
+    set(step.jump_scale_x, l, 1.0 / (most_x * most_x));
+    set(step.jump_scale_theta, l, 4.0 / (most_theta * most_theta));  // of twice the imaginary part of a quaternion
+    set_mask<V>(lanes.accepted, l, false);
+    set(lanes.terms.first, l, 1.0);
+    set(lanes.terms.geometric, l, 0.0);
+    set(lanes.terms.tangent, l, 1.0);
+    set(lanes.terms.damping, l, 0.0);
 }
 
-// One evaluation, decision and update of all lanes. Returns the number of samples that ended.
+// Freezes the wall at a contact point that has come to rest after the move `step`: friction in the coming step, `weight` times as long,
+// then has a potential.
 template <class V, int T>
-template <class Queue>
-int Stepper<V, T>::pass(Queue& queue) {
-    const int n = most_active();
-    evaluate(n);
-    Decision decision[W];
-    for (V& step : drive_step_) step = V{};
-    for (int l = 0; l < W; ++l) decision[l] = decide(l);
-    const V largest = solve(n);
-    V factor{};
-    for (int l = 0; l < W; ++l)
-        if (decision[l] == Decision::shorten) set(factor, l, lane_[l].shorten);
-    for (int l = 0; l < W; ++l) {
-        Lane& lane = lane_[l];
-        if (decision[l] != Decision::accept) continue;
-        const double size = get(largest, l);
-        if (!(size < 1e100)) {  // the direction is not finite
-            decision[l] = Decision::restart;
-            continue;
-        }
-        const bool ends_sample = lane.tick + lane.stride == kTicks * in_.steps_per_sample;
-        lane.scale = std::min(lane.boost, options_.largest_step / size);
-        set(factor, l, lane.scale);
-        // Where a drive is at its limit, a wire may come to rest within the energy's rounding, where steps no longer shrink.
-        const double tolerance = ends_sample && !last_resort(lane) ? options_.sample_tolerance : options_.tolerance;
-        const bool at_rest = size <= options_.tolerance && lane.damping * size <= (struggles(lane) ? kLooseImbalance : kMaxImbalance);
-        if (lane.reduced || lane.damping > 0 ? at_rest : size <= tolerance) {
-            decision[l] = release(l) ? Decision::repeat : Decision::converged;
-            set(factor, l, 1.0);
-        } else if (lane.iterations > options_.max_iterations * kSnapIterations) {   // a large snap goes on in the next step
-            decision[l] = Decision::converged;
-            set(factor, l, 0.0);
-        }
-    }
-    update(n, decision, factor);
-    if constexpr (T > 0) refuse_leaps(decision);
-    return advance(n, decision, queue);
+ENDOPILOT_DEVICE void freeze(ContactPoint<V>& point, const Vec3<V>& step, const Vec3<V>& axis, const WallSpring& spring,
+                             const Surface<V, T>& surface, Mask<V> on, const V& weight) {
+    const V zero{}, one = broadcast<V>(1.0);
+    const Vec3<V>& gradient = point.wall.gradient;
+    const V distance = point.wall.distance + dot(gradient, step);
+    const V norm = square_root(dot(gradient, gradient));
+    const Mask<V> touches = (distance < surface.radius) & (norm > 1e-3);
+    const V push = select<V>(touches, spring.force<V>(surface.radius - distance) * norm, zero);
+    // friction in the coming step acts with the normal force at its middle, extrapolated
+    V ahead = push + select<V>(point.normal_force > zero, 0.5 * weight * (push - point.normal_force), zero);
+    ahead = select<V>(ahead > 2.0 * push, 2.0 * push, ahead);
+    ahead = select<V>(ahead > zero, ahead, zero);
+    point.normal_force = select<V>(on, push, point.normal_force);
+    const V inverse = select<V>(touches, one / norm, zero);
+    const Vec3<V> normal = inverse * gradient;
+    point.friction.limit = select<V>(on, surface.friction * ahead, point.friction.limit);
+    point.friction.normal = select(on, normal, point.friction.normal);
+    point.friction.spin_arm = select(on, (V{} + surface.radius) * cross(normal, axis), point.friction.spin_arm);
 }
 
+// Freezes the walls that friction acts on and the curve's offsets from the polygon, for the converged lanes in `mask`.
 template <class V, int T>
-typename Stepper<V, T>::Decision Stepper<V, T>::decide(int l) {
-    Lane& lane = lane_[l];
-    if (lane.world < 0) return Decision::idle;
-    ++lane.iterations;
-    ++lane.total_iterations;
-    lane.node_iterations += lane.active;
-    const double energy = get(energy_, l) + drive_load(lane, l).energy;
-    lane.finite = std::isfinite(energy);
-    const bool patient = lane.stride == 1 && !lane.extrapolated;   // ends at the first point accepted after its last iteration
-    if (lane.iterations > options_.max_iterations * (patient ? kSnapIterations : 1) + (patient ? 2 * kMaxRejections : 0)) return Decision::restart;
-    if (!lane.first && lane.stride > 1 && get(jump_, l) > 1.0) {  // a snap: follow it in shorter steps
-        lane.extrapolated = false;
-        return Decision::restart;
+ENDOPILOT_LARGE void freeze_contacts(const Scene& scene, Lanes<V, T>& lanes, int n, Mask<V> mask, const V& weight) {
+    const RodModel& rod = scene.rod;
+    Node<V, T>* const nodes = lanes.node;
+    const V& active = lanes.step.active;
+    const auto direction = [&](int i) { return broadcast<V>(1.0 / rod.length[i]) * (nodes[i].x - nodes[i + 1].x); };
+    Vec3<V> ahead = direction(0), behind = direction(1);   // of the elements ahead of a joint and behind it
+    Vec3<V> bent = broadcast<V>(1.0 / rod.joint_length[1]) * (ahead - behind);   // curvature vector at the node: at the tip, of the first joint
+    for (int i = 0; i < n; ++i) {
+        Node<V, T>& node = nodes[i];
+        const Mask<V> on = mask & (active > broadcast<V>(i)), middle = mask & (active > broadcast<V>(i + 1));
+        const Vec3<V> axis = frame(node.q).d3;
+        const Vec3<V> middle_step = broadcast<V>(0.5) * (node.step + nodes[i + 1].step);
+        freeze(node.at_node, node.step, axis, spring_at_node(scene, i), surface_at_node(rod, lanes, i), on, weight);
+        freeze(node.at_middle, middle_step, axis, spring_at_middle(scene, i), surface_at_middle(rod, lanes, i), middle, weight);
+        const Vec3<V> bent_behind = broadcast<V>(1.0 / rod.joint_length[i + 1]) * (ahead - behind);
+        const double l = rod.length[i], around = i > 0 ? rod.length[i - 1] * l / 24 : l * l / 8;
+        node.at_node.offset = select(on, broadcast<V>(around) * bent, node.at_node.offset);
+        node.at_middle.offset = select(middle, broadcast<V>(-l * l / 24) * (bent + bent_behind), node.at_middle.offset);
+        bent = bent_behind;
+        ahead = behind;
+        behind = direction(std::min(i + 2, rod.nodes - 2));
     }
-    const double slack = 1e-11 * (std::abs(lane.energy) + 1e-3);
-    if (!lane.finite || !(lane.first || energy <= lane.energy + lane.allowed + slack)) {
-        if (lane.first) return Decision::restart;
-        lane.shorten = lane.finite ? best_share(energy, l) : kBackInside;
-        if (++lane.rejections > kMaxRejections) {   // the direction is not downhill, for rounding; a damped one is
-            if (lane.stride > 1 || lane.damping >= kMaxDamping) return Decision::restart;
-            lane.shorten = 0;
-            set(damping_, l, std::max(double{kFirstDamping}, 10 * lane.damping));
+}
+
+// For the lanes in `mask`, makes the converged trial the start of the next step and sets a new trial by extrapolation; for
+// those in `restart`, goes back to the start of the step.
+template <class V, int T>
+ENDOPILOT_LARGE void finish_step(const Scene& scene, Lanes<V, T>& lanes, int n, Mask<V> mask, Mask<V> restart, const V& weight) {
+    const V zero{};
+    if (scene.lumen.pool) freeze_contacts(scene, lanes, n, mask, weight);
+    if constexpr (T > 0)
+        for (int l = 0; l < kWidth<V>; ++l)
+            if (holds<V>(mask, l)) freeze_tubes(scene, lanes, l, true);
+    for (int i = 0; i < n; ++i) {
+        Node<V, T>& node = lanes.node[i];
+        const Mask<V> active = lanes.step.active > broadcast<V>(i), on = mask & active, back = restart & active;
+        const Quaternion<V> turned_by = relative(node.start_q, node.q);
+        node.last = select(on, node.x - node.start, node.last);
+        node.last_turn = select(on, broadcast<V>(2.0) * turned_by.v, node.last_turn);
+        node.start = select(on, node.x, node.start);
+        node.start_q = select(on, node.q, node.start_q);
+        node.x = select(on, node.start + weight * node.last, select(back, node.start, node.x));
+        node.q = select(on, rotated(node.start_q, weight * node.last_turn), select(back, node.start_q, node.q));
+        node.step = select(on, {zero, zero, zero}, node.step);
+        node.turn = select(on, {zero, zero, zero}, node.turn);
+        TubeNode<V, T>& tubes = node.tubes;
+        for (int k = 0; k < T; ++k) {
+            tubes.last[k] = select<V>(on, tubes.twist[k] - tubes.start[k], tubes.last[k]);
+            tubes.start[k] = select<V>(on, tubes.twist[k], tubes.start[k]);
+            tubes.twist[k] = select<V>(on, tubes.start[k] + weight * tubes.last[k], select<V>(back, tubes.start[k], tubes.twist[k]));
+            tubes.step[k] = select<V>(on, zero, tubes.step[k]);
         }
-        set_mask<V>(accepted_, l, false);
-        lane.scale *= lane.shorten;
-        return Decision::shorten;
     }
-    lane.allowed = struggles(lane) ? kAllowedRise * (lane.allowed + lane.energy - energy) : 0.0;
-    if (!(get(pivot_, l) > 0) || !solve_drives(l)) {  // not positive definite: less of the geometric terms
-        const double g = get(geometric_, l), damping = get(damping_, l);
-        lane.energy = energy;
-        if (g > 0) {
-            set(geometric_, l, g > 0.05 ? 0.5 * g : 0.0);
-            return Decision::repeat;
+}
+
+// Stores and records the lane's world at the end of a sample and puts it back into the queue.
+template <class V, int T, class Queue>
+ENDOPILOT_DEVICE void end_sample(const Run& run, Lanes<V, T>& lanes, int l, Queue& queue) {
+    Lane<T>& lane = lanes.lane[l];
+    const World w = run.worlds[lane.world];
+    const double period = run.in.sample_period();
+    for (int k = 0; k <= T; ++k) {
+        Device& device = lane.device[k];
+        const World::Numbers to = w.device(k);
+        device.inserted = lane.by_force ? lane.advance.end : device.inserted + (device.control[0] * period - device.slipped);
+        device.rotation = lane.by_force ? device.turn.end : device.rotation + (device.control[1] * period - device.rotation_slipped);
+        if (lane.sample < 0) {
+            double* slip = run.out.approach_slip + 2 * ((T + 1) * std::size_t(lane.world) + k);
+            slip[0] += device.slipped;
+            slip[1] += device.rotation_slipped;
+            device.depth -= device.slipped;
+            if (lane.sample == -1) device.inserted = device.depth;  // exactly
         }
-        if (damping >= kMaxDamping) return Decision::restart;
-        set(damping_, l, std::max(double{kFirstDamping}, 10 * damping));
-        return Decision::repeat;
+        const double radius = device_radius(run.scene, lane, k);
+        const DriveLoad<T> valve = introducer(run.scene.options, lanes, l, device.end - device.start, device.turn.last, radius);
+        to[World::kDriveForce] = lane.by_force ? device.control[0] : device.force + valve.gradient[0];
+        to[World::kDriveTorque] = lane.by_force ? device.control[1] : device.torque + valve.gradient[1];
+        to[World::kSlip] = device.slipped + device.refused;
+        to[World::kRotationSlip] = device.rotation_slipped;
     }
-    lane.energy = energy;
-    lane.slope = get(descent_, l);
-    // Where friction turns, a step with its tangent overshoots, and one with its secant creeps: they take turns.
-    set(tangent_, l, lane.iterations > kTurnabout && lane.iterations / kTurnabout % 2 == 1 ? 0.0 : 1.0);
-    set_mask<V>(accepted_, l, true);
-    // Where the energy is not convex the damped steps are short: lengthen them as long as they succeed.
-    const double damping = lane.damping = get(damping_, l);
-    lane.boost = damping > 0 && lane.rejections == 0 ? std::min(2 * lane.boost, double{kMaxBoost}) : 1.0;
-    if (struggles(lane) && lane.rejections > 0)   // a curved valley: shorter along it, but all the way across
-        set(damping_, l, std::clamp(4 * damping, double{kFirstDamping}, double{kMaxDamping}));
+    if (lane.sample < 0) w[World::kApproach] = -lane.sample - 1;
+    store(run, lanes, l);
+    if (T == 0 && through_wall(run.scene, w)) w[World::kReason] = kThroughWall;
+    if (lane.sample >= 0) record(run, lane.world, lane.sample, double(lane.total_iterations) / lane.steps, double(lane.node_iterations));
+    if (lane.sample + 1 < run.in.samples)
+        queue.put_back(lane.world, lane.sample + 1, lane.active);
     else
-        set(damping_, l, damping > kFirstDamping ? 0.25 * damping : 0.0);
-    lane.rejections = 0;
-    set(first_, l, 0.0);
-    lane.reduced = get(geometric_, l) < 1.0 && !lane.first;
-    set(geometric_, l, lane.first ? 1.0 : std::min(1.0, std::max(0.25, 2 * get(geometric_, l))));
-    lane.first = false;
-    return Decision::accept;
+        queue.finish();
+    lane.world = -1;
 }
 
-// The share of the last move, which raised the energy, at which the energy is least along it. What raises it are contacts that
-// Newton's step did not foresee. If the wire bends into a wall as it slides along it, the energy is C s^p - slope s at the share
-// s, with p from the slopes at both ends. If it hits a wall head on at a share s0, it is k (s - s0)² / 2 - slope s from there on.
+// Marks the lane's world invalid from this sample on and frees the lane; its pose stays as last converged.
 template <class V, int T>
-double Stepper<V, T>::best_share(double energy, int l) const {
-    const Lane& lane = lane_[l];
-    const double slope = lane.scale * lane.slope, excess = slope + energy - lane.energy;
-    const double power = lane.drives_free() ? 2.0 : std::clamp((get(rise_, l) + slope) / excess, 2.0, double{kMostPower});   // else `rise_` lacks the drives' part
-    const double sliding = std::pow(slope / (power * excess), 1 / (power - 1));
-    const double free = get(hit_, l), rest = 1 - free;
-    const double head_on = rest > 0 ? free + rest * rest * slope / (2 * excess) : 0.0;
-    return std::clamp(std::max(sliding, head_on), double{kLeastOfMove}, double{kMostOfMove});
+ENDOPILOT_DEVICE void fail(const Run& run, Lanes<V, T>& lanes, int l) {
+    Lane<T>& lane = lanes.lane[l];
+    const World w = run.worlds[lane.world];
+    for (int k = 0; k <= T; ++k) {
+        Device& device = lane.device[k];
+        const World::Numbers of_world = w.device(k);
+        device.inserted = device.start;
+        device.rotation = device.turn.start;
+        device.force = of_world[World::kBaseForce];
+        device.torque = of_world[World::kBaseTorque];
+        of_world[World::kSlip] = of_world[World::kRotationSlip] = 0.0;
+    }
+    store(run, lanes, l);
+    w[World::kReason] = lane.finite ? kNotConverged : kNotFinite;
+    for (int sample = std::max(0, lane.sample); sample < run.in.samples; ++sample)
+        record(run, lane.world, sample, 0.0, sample == lane.sample ? double(lane.node_iterations) : 0.0);
+    lane.world = -1;
 }
 
-// Ends the steps that converged, restarts those that failed with half the step. Returns the samples that ended.
-template <class V, int T>
-template <class Queue>
-int Stepper<V, T>::advance(int n, const Decision (&decision)[W], Queue& queue) {
-    Mask<V> finished{}, restarted{};
+// Ends the steps that converged, and begins those again that failed. Returns the samples that ended.
+template <class V, int T, class Queue>
+ENDOPILOT_DEVICE int end_steps(const Run& run, Lanes<V, T>& lanes, const Next (&next)[kWidth<V>], Queue& queue) {
+    constexpr int W = kWidth<V>;
+    const int n = lanes.most_active();
+    Mask<V> converged{}, restarted{};
     V weight{};
-    bool any_finished = false, failed[W] = {}, ended[W] = {};
+    bool any = false, failed[W] = {}, ended[W] = {};
     for (int l = 0; l < W; ++l) {
-        Lane& lane = lane_[l];
-        if (decision[l] == Decision::converged) {
-            set_mask<V>(finished, l, true);
-            any_finished = true;
-            const double took = duration(lane);
+        Lane<T>& lane = lanes.lane[l];
+        any = any || next[l] == Next::converge || next[l] == Next::restart;
+        if (next[l] == Next::converge) {
+            set_mask<V>(converged, l, true);
+            lane.last_duration = run.in.seconds(lane.stride);
             lane.tick += lane.stride;
             ++lane.steps;
-            lane.last_duration = took;
-            settle(l);
-            for (int r = 0; r < N; ++r) lane.coordinate(r).start = lane.coordinate(r).end;
-            ended[l] = lane.tick == kTicks * in_.steps_per_sample;
+            settle_drives(lanes, l);
+            for (int r = 0; r < 2 + T; ++r) lane.coordinate(r).start = lane.coordinate(r).end;
+            ended[l] = lane.tick == kTicks * run.in.steps_per_sample;
             if (lane.stride < kTicks && lane.tick % (2 * lane.stride) == 0) lane.stride *= 2;
-            if (ended[l]) continue;
-            set(weight, l, lane.last_duration > 0 ? duration(lane) / lane.last_duration : 0.0);
-        } else if (decision[l] == Decision::restart) {
+            if (!ended[l]) set(weight, l, lane.last_duration > 0 ? run.in.seconds(lane.stride) / lane.last_duration : 0.0);
+        } else if (next[l] == Next::restart) {
             set_mask<V>(restarted, l, true);
-            any_finished = true;
             if (lane.extrapolated) continue;  // perhaps only the extrapolation was bad
-            if (lane.stride == 1) {
-                failed[l] = true;
-            } else {
-                lane.stride /= 2;
-            }
+            failed[l] = lane.stride == 1;
+            if (lane.stride > 1) lane.stride /= 2;
         }
     }
-    if (!any_finished) return 0;
-    finish_step(n, finished, restarted, weight);
+    if (!any) return 0;
+    finish_step(run.scene, lanes, n, converged, restarted, weight);
     int samples = 0;
     for (int l = 0; l < W; ++l) {
-        Lane& lane = lane_[l];
-        if (decision[l] == Decision::converged) note_forces(l);
+        Lane<T>& lane = lanes.lane[l];
+        if (next[l] == Next::converge) update_drives(run.scene, lanes, l);
         if (failed[l]) {
-            samples += std::max(0, in_.samples - std::max(0, lane.sample));
-            fail(l);
+            samples += std::max(0, run.in.samples - std::max(0, lane.sample));
+            fail(run, lanes, l);
             queue.finish();
         } else if (ended[l]) {
             samples += lane.sample >= 0;
-            end_sample(l, queue);
-        } else if (decision[l] == Decision::converged) {
-            begin(l, get(weight, l) == 0.0);
-        } else if (decision[l] == Decision::restart) {
-            begin(l, true);
+            end_sample(run, lanes, l, queue);
+        } else if (next[l] == Next::converge || next[l] == Next::restart) {
+            begin_step(run, lanes, l, get(weight, l));
         }
     }
     return samples;
+}
+
+// Gives an idle lane a world of the queue, if there is one, and begins a step of it.
+template <class V, int T, class Queue>
+ENDOPILOT_DEVICE void assign_world(const Run& run, Lanes<V, T>& lanes, int l, Queue& queue) {
+    double length = 0;
+    int others = 0;
+    for (const Lane<T>& lane : lanes.lane)
+        if (lane.world >= 0) length += lane.active, ++others;
+    for (;;) {
+        int sample = 0;
+        const int world = queue.next(others > 0 ? length / others : -1.0, sample);
+        if (world < 0) return;
+        const World w = run.worlds[world];
+        if (w[World::kApproach] > 0) sample = -int(w[World::kApproach]);
+        if (w.valid() && sample < run.in.samples) {
+            lanes.lane[l] = Lane<T>{};
+            lanes.lane[l].world = world;
+            lanes.lane[l].sample = sample;
+            begin_step(run, lanes, l, load(run, lanes, l));
+            return;
+        }
+        for (sample = std::max(0, sample); sample < run.in.samples; ++sample) record(run, world, sample, 0.0, 0.0);
+        queue.finish();
+    }
+}
+
+// Gives idle lanes a world of the queue and makes one iteration of Newton's method. Returns the number of samples that ended, -1 if no
+// lane has a world. A queue has `next`, `put_back` and `finish` as WorkQueue has.
+template <class V, int T, class Queue>
+ENDOPILOT_DEVICE int iterate(const Run& run, Lanes<V, T>& lanes, Queue& queue) {
+    bool busy = false;
+    for (int l = 0; l < kWidth<V>; ++l) {
+        if (lanes.lane[l].world < 0) assign_world(run, lanes, l, queue);
+        busy = busy || lanes.lane[l].world >= 0;
+    }
+    if (!busy) return -1;
+    Next next[kWidth<V>];
+    newton(run, lanes, next);
+    if constexpr (T > 0) refuse_leaps(run.scene, lanes, next);
+    return end_steps(run, lanes, next, queue);
 }
 
 }  // namespace endopilot

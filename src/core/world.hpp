@@ -1,4 +1,4 @@
-// Worlds at rest between samples.
+// Worlds at rest between samples: their numbers, their pose, how they start and what is recorded of them.
 #pragma once
 
 #include <cmath>
@@ -7,6 +7,8 @@
 #include "interface.hpp"
 
 namespace endopilot {
+
+constexpr double kResultantLength = 2.0;  // mm of wire whose forces of the wall are added up: nodes may share one contact
 
 // A view of all that a world's future depends on, as plain numbers: saved and restored bit by bit. Positions and attitudes are
 // those at the end of the last step; node quantities are meaningful for the `active` nodes ahead of the base.
@@ -34,13 +36,13 @@ struct World {
         kFeed,                         // share of the commanded motion that a drive makes after it was at its limit
         kMobilized,                    // friction along the device around it, as a share of its most
         kBackdrive,                    // mm/s by which a drive beyond its limit gives way
-        kLeads,                        // 1: its tip is the foremost
+        kForemost,                     // 1: its tip is
         kDeviceSize
     };
-    // last increments of position and rotation; the contact points at the node and at the middle of the element behind it
-    enum NodeQuantity { kX = 0, kQ = 3, kLast = 7, kLastTurn = 10, kAtNode = 13, kAtMiddle = 24, kNodeSize = 35 };
+    // of a node: last increments of position and rotation; the contact points at the node and at the middle of the element behind it
+    static constexpr int kX = 0, kQ = 3, kLast = 7, kLastTurn = 10, kAtNode = 13, kAtMiddle = 24, kNodeSize = 35;
     // of a contact point: friction limit, wall normal, spin arm; normal force, N; offset of the curve from the polygon, mm
-    enum PointQuantity { kLimit = 0, kNormal = 1, kSpinArm = 4, kNormalForce = 7, kOffset = 8 };
+    static constexpr int kLimit = 0, kNormal = 1, kSpinArm = 4, kNormalForce = 7, kOffset = 8;
 
     // Numbers `stride` apart.
     struct Numbers {
@@ -76,6 +78,8 @@ ENDOPILOT_DEVICE inline Vec3<double> vec3(const World::Numbers& p) { return {p[0
 ENDOPILOT_DEVICE inline Quaternion<double> quaternion(const World::Numbers& p) { return {p[0], vec3(p + 1)}; }
 ENDOPILOT_DEVICE inline void write(const World::Numbers& to, const Vec3<double>& v) { to[0] = v.x, to[1] = v.y, to[2] = v.z; }
 ENDOPILOT_DEVICE inline void write(const World::Numbers& to, const Quaternion<double>& q) { to[0] = q.w, write(to + 1, q.v); }
+ENDOPILOT_DEVICE inline void write(double* to, const Vec3<double>& v) { write(World::Numbers{to, 1}, v); }
+ENDOPILOT_DEVICE inline void write(double* to, const Quaternion<double>& q) { write(World::Numbers{to, 1}, q); }
 
 // Where device k ends: in element `element`, at `share` of its length from its distal node.
 struct DeviceEnd {
@@ -157,5 +161,108 @@ struct Worlds {
         return {values + std::ptrdiff_t(world) * between_worlds, between_numbers, devices};
     }
 };
+
+// A run: what all its worlds have in common, the worlds, and what goes in and out.
+struct Run {
+    Scene scene;
+    Worlds worlds;
+    Inputs in;
+    Outputs out;
+};
+
+// Puts a world at the ostium, straight, ready to be pushed in before its first sample. `initial` holds inserted length (mm) and rotation
+// (rad) of each device then, `friction` the coefficient of each. The foremost is pushed at the approach velocity, the others arrive with it.
+inline void start_world(const Scene& scene, const World& w, const double* initial, const double* friction, double sample_period) {
+    const double speed = scene.options.approach_velocity;
+    double depth = initial[0];
+    for (int k = 1; k < w.devices; ++k) depth = std::max(depth, initial[2 * k]);
+    const double inserted = speed > 0 ? 0.0 : depth;
+    for (std::size_t k = 0; k < World::size(scene.rod.nodes, w.devices); ++k) w.values[std::ptrdiff_t(k) * w.stride] = 0.0;
+    w[World::kInserted] = inserted;
+    w[World::kApproach] = speed > 0 ? std::ceil(depth / (speed * sample_period)) + 1 : 0.0;
+    w[World::kStride] = kTicks;
+    w[World::kActive] = Base::count_active(scene.rod, inserted, scene.options.free_behind);
+    for (int k = 0; k < w.devices; ++k) {
+        const World::Numbers device = w.device(k);
+        device[World::kLength] = speed > 0 ? 0.0 : initial[2 * k];
+        device[World::kDepth] = initial[2 * k];
+        device[World::kRotation] = initial[2 * k + 1];
+        device[World::kFriction] = friction[k];
+        device[World::kFeed] = 1.0;
+    }
+    const Base base = scene.motion.cycles > 0 ? scene.base.moved(placement(scene.motion, w[World::kTime])) : scene.base;
+    for (int i = 0; i < w.active(); ++i) {
+        write(w.node(i) + World::kX, base.position(scene.rod, i, inserted));
+        write(w.node(i) + World::kQ, base.attitude(initial[1]));
+        for (int k = 1; k < w.devices; ++k) w.twists(scene.rod.nodes, i)[k - 1] = initial[2 * k + 1] - initial[1];
+    }
+}
+
+// Whether a wire's middle has left the lumen of a vessel that does not give way. The wall then holds it on both sides of a septum, and
+// pushes itself apart through the wire, whatever the drive does.
+ENDOPILOT_DEVICE inline bool through_wall(const Scene& scene, const World& w) {
+    if (scene.options.foundation != 0) return false;
+    for (int i = 0; i < w.active(); ++i) {
+        const double most = scene.options.wall_stiffness * scene.rod.radius[i];
+        const World::Numbers node = w.node(i);
+        if (node[World::kAtNode + World::kNormalForce] > most || node[World::kAtMiddle + World::kNormalForce] > most) return true;
+    }
+    return false;
+}
+
+// Outputs that are numbers of a world's device as they are: the output and the number. Python can also read them between runs.
+#define ENDOPILOT_DEVICE_NUMBERS(NUMBER)                                                                          \
+    NUMBER(inserted_length, kLength) NUMBER(rotation, kRotation)                                                  \
+    NUMBER(base_force, kBaseForce) NUMBER(base_torque, kBaseTorque)                                               \
+    NUMBER(drive_force, kDriveForce) NUMBER(drive_torque, kDriveTorque)                                           \
+    NUMBER(slip, kSlip) NUMBER(rotation_slip, kRotationSlip)
+
+// Records a world at the end of a sample.
+ENDOPILOT_LARGE inline void record(const Run& run, int world, int sample, double iterations, double node_iterations) {
+    const RodModel& rod = run.scene.rod;
+    const Outputs& out = run.out;
+    const World w = run.worlds[std::size_t(world)];
+    const std::size_t at = std::size_t(world) * run.in.samples + sample;
+    const int active = w.active();
+    double largest = 0, sum = 0, resultant = 0;
+    // Contact points from tip to base: 2 i is node i, 2 i + 1 the middle of the element behind it.
+    const auto point = [&](int p) { return w.node(p / 2) + (p % 2 ? World::kAtMiddle : World::kAtNode); };
+    const auto abscissa = [&](int p) { return p % 2 ? Base::middle(rod, p / 2) : rod.abscissa[p / 2]; };
+    for (int i = 0; i < active; ++i) {
+        largest = std::max(largest, w.force(i));
+        sum += w.force(i);
+    }
+    for (int p = 0; p < 2 * active; ++p) {
+        if (point(p)[World::kNormalForce] == 0) continue;
+        Vec3<double> all{0, 0, 0};
+        for (int o = p; o < 2 * active && abscissa(o) <= abscissa(p) + kResultantLength; ++o)
+            all += point(o)[World::kNormalForce] * vec3(point(o) + World::kNormal);
+        resultant = std::max(resultant, dot(all, all));
+    }
+    out.contact_force_max[at] = largest;
+    out.contact_force_sum[at] = sum;
+    out.wall_force[at] = std::sqrt(resultant);
+    out.iterations[at] = iterations;
+    out.node_iterations[at] = node_iterations;
+    out.valid[at] = w.valid();
+    const Pose pose(run.scene, w);
+    for (int k = 0; k < w.devices; ++k) {
+        const std::size_t here = at * w.devices + k;
+        const World::Numbers device = w.device(k);
+#define NUMBER(name, quantity) out.name[here] = device[World::quantity];
+        ENDOPILOT_DEVICE_NUMBERS(NUMBER)
+#undef NUMBER
+        write(out.tip_position + 3 * here, pose.tip(k));
+        write(out.tip_direction + 3 * here, pose.tip_direction(k));
+        out.tip_twist[here] = 0;
+        if (k == 0) continue;
+        const int i = device_end(rod, w, k).element;
+        out.tip_twist[here] = i < active ? w.twists(rod.nodes, i)[k - 1] : device[World::kRotation] - w.device(0)[World::kRotation];
+    }
+    for (int i = 0; i < rod.nodes && (out.shape || out.attitude); ++i) {
+        if (out.shape) write(out.shape + 3 * (at * rod.nodes + i), pose.position(i));
+        if (out.attitude) write(out.attitude + 4 * (at * rod.nodes + i), pose.attitude(i));
+    }
+}
 
 }  // namespace endopilot

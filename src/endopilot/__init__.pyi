@@ -32,6 +32,7 @@ from .devices.catheter import Catheter as Catheter
 from .devices.catheter import read_catheter as read_catheter
 from .devices.device import Device as Device
 from .devices.device import TipShaping as TipShaping
+from .devices.device import Wire as Wire
 from .devices.device import read_device as read_device
 from .devices.device_files import device_yaml as device_yaml
 from .devices.device_files import list_devices as list_devices

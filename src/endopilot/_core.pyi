@@ -26,7 +26,7 @@ class Motion:
 class Drives: ...
 
 class Options:
-    """Settings; `ENDOPILOT_OPTIONS` in `src/core/interface.hpp` says what each is."""
+    """Settings; `OPTIONS` says what each is."""
 
     def __setattr__(self, name: str, value: float) -> None: ...
 
@@ -34,6 +34,8 @@ LEVEL: str
 LANES: int
 OUTPUTS: list[tuple[str, str, int, str, str]]
 """What a run records: name, what it has an entry of, numbers of an entry, unit, meaning."""
+OPTIONS: list[tuple[str, str, str, str]]
+"""The settings: name, type ("float" or "int"), unit, meaning."""
 
 def supported_levels() -> list[str]: ...
 def make_rod(

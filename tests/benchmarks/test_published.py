@@ -105,17 +105,17 @@ def test_what_calibrates_a_device_is_no_prediction() -> None:
 
 def test_an_unreinforced_catheter_is_plain_polymer_throughout() -> None:
     catheter = read_catheter("microcatheter-2.4f")
-    plain = unreinforced(catheter).device
+    plain = unreinforced(catheter)
     section = np.pi * (0.8**4 - 0.53**4) / 64
     np.testing.assert_allclose(plain.bend_stiffness(np.array([0.0, 50.0, 1000.0])), 100.0 * section)
-    assert plain.bend_stiffness_n_mm2[0] == pytest.approx(catheter.device.bend_stiffness_n_mm2[0], rel=1e-3)
+    assert plain.bend_stiffness_n_mm2[0] == pytest.approx(catheter.bend_stiffness_n_mm2[0], rel=1e-3)
 
 
 def test_the_command_shows_every_test_and_counts_what_failed(monkeypatch, capsys) -> None:
     pushes = iter(range(10**6))
 
     def push(anatomy, wire, catheters) -> Push:
-        seen.append((wire.friction, [each.device.friction for each in catheters]))
+        seen.append((wire.friction, [each.friction for each in catheters]))
         return Push(force_n=0.05 + 0.01 * len(catheters), through=next(pushes) != 0, valid=True)
 
     seen: list[tuple[float, list[float]]] = []

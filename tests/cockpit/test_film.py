@@ -55,16 +55,16 @@ def test_a_rollout_is_driven_again(fork, wire, vessel, tmp_path):
     rollout = simulate(
         fork, wire, control, initial=np.array([[2.0, 0.1], [2.0, 0.1]]), config=SimulatorConfig(threads=1)
     )
-    write_trajectory(rollout, tmp_path / "r.csv")
-    film = driven(open_film(tmp_path / "r.csv", vessel, world=1))
+    write_trajectory(rollout, tmp_path / "r.npz")
+    film = driven(open_film(tmp_path / "r.npz", vessel, world=1))
     assert len(film.frames) == 31
     last = film.frames[-1].snapshot
     assert last.inserted_mm == pytest.approx(rollout.inserted_length[1, -1, 0], abs=1e-9)
     np.testing.assert_allclose(last.nodes[0], rollout.tip_position[1, -1, 0], atol=0.02)
     with pytest.raises(InputError, match="worlds 0 to 1"):
-        open_film(tmp_path / "r.csv", vessel, world=2)
+        open_film(tmp_path / "r.npz", vessel, world=2)
     with pytest.raises(InputError, match="patient's folder"):
-        open_film(tmp_path / "r.csv")
+        open_film(tmp_path / "r.npz")
 
 
 def test_a_plan_is_shown(found, vessel, tmp_path):
@@ -72,7 +72,7 @@ def test_a_plan_is_shown(found, vessel, tmp_path):
 
     write_plan(found, tmp_path / "plan")
     film = driven(open_film(tmp_path / "plan", vessel))
-    np.testing.assert_allclose(film.frames[-1].snapshot.nodes[0], found.position[-1], atol=0.05)
+    np.testing.assert_allclose(film.frames[-1].snapshot.nodes[0], found.trajectory.tip_position[0, -1, 0], atol=0.05)
 
 
 @pytest.mark.parametrize("version", [1, 2])

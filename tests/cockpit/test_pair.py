@@ -219,8 +219,8 @@ def test_a_rollout_of_a_pair_is_driven_again(fork, vessel, navigation, tmp_path)
         initial=initial.reshape(1, 2, 2),
         config=config,
     )
-    write_trajectory(rollout, tmp_path / "r.csv")
-    film = open_film(tmp_path / "r.csv", vessel, catheters=(NAME,))
+    write_trajectory(rollout, tmp_path / "r.npz")
+    film = open_film(tmp_path / "r.npz", vessel)
     film._drive()
     last = film.frames[-1].snapshot
     assert not film.failure
@@ -240,8 +240,10 @@ def test_a_navigation_of_a_pair_is_shown(vessel, tmp_path):
     assert not film.failure
     last = film.frames[-1].snapshot
     table = np.genfromtxt(tmp_path / "navigation" / "navigation.csv", delimiter=",", names=True)
-    assert last.inserted_mm == pytest.approx(table["inserted_length_mm"][-1], abs=0.05)
-    assert last.catheters[0].inserted_mm == pytest.approx(table["catheter_1_inserted_length_mm"][-1], abs=0.05)
+    assert last.inserted_mm == table["inserted_length_mm"][-1]
+    assert last.catheters[0].inserted_mm == table["catheter_1_inserted_length_mm"][-1]
+    assert [frame.snapshot.time_s for frame in film.frames if frame.exposed] == table["time_s"][table["xray"] == 1]
+    assert film.navigation.target.abscissa == pytest.approx(15.0, abs=1.0)
 
 
 def test_an_episode_of_pairs_is_shown(navigation, vessel, tmp_path):
@@ -269,11 +271,9 @@ def test_a_plan_of_a_pair_is_shown(vessel, tmp_path):
 
     made = plan(vessel, "0,0,9", PlanConfig(seconds=20.0, tip="own"), catheters=[read_catheter(NAME)])
     write_plan(made, tmp_path / "plan")
-    film = open_film(tmp_path / "plan", vessel, catheters=(NAME,))
+    film = open_film(tmp_path / "plan", vessel)
     film._drive()
     last = film.frames[-1].snapshot
-    assert not film.failure and made.position.shape[1] == 2
-    np.testing.assert_allclose(last.nodes[0], made.position[-1], atol=0.05)
-    np.testing.assert_allclose(last.catheters[0].nodes[0], made.position[-1, 1], atol=0.05)
-    with pytest.raises(InputError, match=f"for another device .workhorse-014 in {NAME}., not for workhorse-014"):
-        open_film(tmp_path / "plan", vessel)
+    assert not film.failure and film.navigation.catheters[0].name == NAME
+    np.testing.assert_allclose(last.nodes[0], made.trajectory.tip_position[0, -1, 0], atol=0.05)
+    np.testing.assert_allclose(last.catheters[0].nodes[0], made.trajectory.tip_position[0, -1, 1], atol=0.05)

@@ -19,6 +19,7 @@ from endopilot.control.plan import plan, within_limits
 from endopilot.control.plan_config import PlanConfig
 from endopilot.control.plan_file import read_plan, write_plan
 from endopilot.devices.drive_limits import DriveLimits
+from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.files import read_json, write_json
 from endopilot.models.config import WINDOW
@@ -27,6 +28,7 @@ from endopilot.models.open_loop import Observed, OpenLoop
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import read_controls_csv
 from endopilot.simulation.simulate import simulate
+from endopilot.simulation.trajectory_file import write_trajectory
 
 SLACK = 0.9
 
@@ -34,7 +36,7 @@ SLACK = 0.9
 def test_a_plan_reaches_its_target_and_counts_its_cost(found):
     assert found.reached and found.config.method == "search"
     assert abs(found.arriving_tip.abscissa[-1] - 33.0) <= 2.0
-    assert np.allclose(found.proximal[-1, 0, 0], 2.0 + 0.5 * found.control[:, 0, 0].sum())
+    assert np.allclose(found.trajectory.proximal[0, -1, 0, 0], 2.0 + 0.5 * found.control[:, 0, 0].sum())
     terms, cost = found.cost_terms(), found.config.cost
     assert terms["time"] == pytest.approx(0.5 * len(found.control) * cost.time_weight)
     assert terms["end"] == pytest.approx(abs(found.arriving_tip.abscissa[-1] - 33.0))
@@ -57,16 +59,24 @@ def test_cost_charges_what_is_unsafe():
 def test_a_written_plan_is_read_back_and_drives_the_simulator(found, vessel, tmp_path):
     figures = write_plan(found, tmp_path / "plan")
     assert figures["reached"] is True
-    assert {path.name for path in (tmp_path / "plan").iterdir()} == {"plan.csv", "plan.png", "manifest.json"}
+    assert {path.name for path in (tmp_path / "plan").iterdir()} == {
+        "plan.csv",
+        "plan.png",
+        "trajectory.npz",
+        "manifest.json",
+    }
     anatomy, device = read_anatomy(vessel), found.navigation.device
-    back = read_plan(tmp_path / "plan", anatomy, device)
-    for name in ("control", "proximal", "desired", "predicted", "position", "force"):
-        assert np.allclose(getattr(back, name), getattr(found, name), atol=1e-12), name
+    back = read_plan(tmp_path / "plan", anatomy, Stack(device))
+    for name in ("control", "desired", "predicted", "force"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(found, name), err_msg=name)
     assert np.array_equal(back.tip.branch, found.tip.branch)
     assert back.navigation.target == found.navigation.target and back.config == found.config
+    again = back.trajectory.replay()
+    for name in ("tip_position", "proximal", "base_force"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(found.trajectory, name), err_msg=name)
     script = read_controls_csv(tmp_path / "plan" / "plan.csv")
     rollout = simulate(anatomy, device, script.control, initial=script.initial, config=SimulatorConfig(threads=1))
-    assert np.allclose(rollout.tip_position[0], found.position, atol=1e-3)
+    assert np.allclose(rollout.tip_position, found.trajectory.tip_position, atol=1e-3)
 
 
 def test_a_plan_whose_manifest_lacks_what_was_asked_is_refused(found, vessel, tmp_path):
@@ -76,7 +86,7 @@ def test_a_plan_whose_manifest_lacks_what_was_asked_is_refused(found, vessel, tm
     assert record["seed"] == 4 and record["config"]["seconds"] == 30.0
     write_json(path, record | {"config": {"cost": record["config"]["cost"]}})
     with pytest.raises(InputError, match=r"manifest\.json: config: method: missing; .* plan anew"):
-        read_plan(tmp_path / "plan", read_anatomy(vessel), found.navigation.device)
+        read_plan(tmp_path / "plan", read_anatomy(vessel))
 
 
 def test_a_path_that_does_not_arrive_in_the_rod_core_is_no_plan(vessel, monkeypatch):
@@ -102,14 +112,17 @@ def test_a_plan_for_another_vessel_or_wire_is_refused(found, vessel, tmp_path):
     values[40, 10, 10] += 0.5
     other = replace(anatomy, distance_map=replace(anatomy.distance_map, values=values))
     with pytest.raises(InputError, match="another anatomy"):
-        read_plan(folder, other, device)
+        read_plan(folder, other)
     with pytest.raises(InputError, match="another device"):
-        read_plan(folder, anatomy, replace(device, friction=0.2))
-    read_plan(folder, anatomy, replace(device, sources={}))  # the same wire with other sources
-    table = folder / "plan.csv"
-    table.write_text(table.read_text().replace("10.0,", "11.0,", 1))
-    with pytest.raises(InputError, match=r"plan\.csv.* differs"):
-        read_plan(folder, anatomy, device)
+        read_plan(folder, anatomy, Stack(replace(device, friction=0.2)))
+    read_plan(folder, anatomy, Stack(replace(device, sources={})))  # the same wire with other sources
+    path = folder / "trajectory.npz"
+    write_trajectory(replace(found.trajectory, period_s=0.4), path)
+    with pytest.raises(InputError, match=r"trajectory\.npz.* differs"):
+        read_plan(folder, anatomy)
+    path.unlink()
+    with pytest.raises(InputError, match=r"trajectory\.npz: is missing"):
+        read_plan(folder, anatomy)
 
 
 @dataclass
@@ -147,7 +160,7 @@ def run(found, tmp_path, monkeypatch):
 def test_the_inverse_network_is_asked_for_the_desired_tips(vessel, run):
     made = plan(vessel, "0,0,33", PlanConfig(method="inverse", seconds=30.0), model=run)
     assert np.allclose(made.predicted[:, 0], made.desired[:, 0])
-    assert made.proximal[-1, 0, 0] == pytest.approx(made.desired[-1, 0] / SLACK, abs=1e-6)
+    assert made.trajectory.proximal[0, -1, 0, 0] == pytest.approx(made.desired[-1, 0] / SLACK, abs=1e-6)
 
 
 def test_sampling_brings_the_predicted_tip_nearer_to_the_desired_one(vessel, run):

@@ -17,6 +17,7 @@ from endopilot.control.plan_config import Plan, PlanConfig
 from endopilot.control.plan_file import read_plan, write_plan
 from endopilot.control.plan_xray import plan_xray, read_calibration
 from endopilot.devices.catheter import read_catheter
+from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import read_controls_csv
@@ -34,32 +35,32 @@ def pair(vessel) -> Plan:
 
 def test_the_catheter_s_tip_arrives_with_the_wire_no_deeper_in_it_than_allowed(pair):
     assert pair.reached and pair.within_force_limit
-    assert pair.control.shape == (len(pair.position), 2, 2)
+    assert pair.control.shape == (len(pair.force), 2, 2)
     wire, catheter = pair.tip.abscissa.T
     assert np.array_equal(pair.arriving_tip.abscissa, catheter)
     assert abs(catheter[-1] - 25.0) <= 2.0 and wire[-1] >= catheter[-1] - 2.0
     assert pair.cost_terms()["end"] == pytest.approx(abs(catheter[-1] - 25.0))
     assert np.abs(pair.predicted[:, 0] - wire).mean() < 0.5
-    assert pair.proximal[-1] == pytest.approx([[2.0, 0.0], [0.0, 0.0]] + 0.5 * pair.control.sum(axis=0))
+    assert pair.trajectory.proximal[0, -1] == pytest.approx([[2.0, 0.0], [0.0, 0.0]] + 0.5 * pair.control.sum(axis=0))
 
 
 def test_a_written_plan_is_read_back_and_drives_both_devices(pair, vessel, tmp_path):
     figures = write_plan(pair, tmp_path / "plan")
     assert figures["tip_error_mm"] == pytest.approx(pair.cost_terms()["end"], abs=1e-3)
     anatomy, wire = read_anatomy(vessel), pair.navigation.device
-    back = read_plan(tmp_path / "plan", anatomy, wire, [CATHETER])
-    for name in ("control", "proximal", "position", "force"):
-        assert np.allclose(getattr(back, name), getattr(pair, name), atol=1e-12), name
+    back = read_plan(tmp_path / "plan", anatomy, pair.navigation.stack)
+    for name in ("command", "proximal", "tip_position", "contact_force_max"):
+        np.testing.assert_array_equal(getattr(back.trajectory, name), getattr(pair.trajectory, name), err_msg=name)
     assert np.allclose(back.tip.abscissa, pair.tip.abscissa)
     assert back.navigation.arrives == "catheter" and back.navigation.catheters == (CATHETER,)
     script = read_controls_csv(tmp_path / "plan" / "plan.csv", devices=2)
     stack = pair.navigation.stack
     again = simulate(anatomy, stack, script.control, initial=script.initial, config=SimulatorConfig(threads=1))
-    assert np.allclose(again.tip_position[0], pair.position, atol=1e-3)
+    assert np.allclose(again.tip_position, pair.trajectory.tip_position, atol=1e-3)
     stiffer = replace(CATHETER, bore_friction=2 * CATHETER.bore_friction)
-    for others in ([], [stiffer]):
+    for others in ((), (stiffer,)):
         with pytest.raises(InputError, match=r"\(workhorse-014 in microcatheter-1\.7f\), not for workhorse-014"):
-            read_plan(tmp_path / "plan", anatomy, wire, others)
+            read_plan(tmp_path / "plan", anatomy, Stack(wire, others))
 
 
 def test_the_agent_s_ensemble_forecasts_the_x_ray_of_both(pair):

@@ -66,18 +66,20 @@ def by_network(found, tmp_path, monkeypatch):
     def made(predictor):
         monkeypatch.setattr("endopilot.models.rollout.load_model", lambda _: predictor)
         write_json(tmp_path / "run" / "manifest.json", {"config": {}, "networks": {}, "device": {}})
-        tip, proximal = found.tip, np.column_stack([2.0 + 2.0 * np.arange(1, 21), np.zeros(20)])
+        inserted = 2.0 + 2.0 * np.arange(1, 21)
+        longer = found.trajectory._each(lambda values: np.resize(values, (1, 20, *values.shape[2:])))
         return replace(
             found,
             config=PlanConfig(method="mppi"),
             model=str(tmp_path / "run"),
-            control=np.tile([4.0, 0.0], (20, 1, 1)),
-            proximal=proximal[:, None],
+            trajectory=replace(
+                longer,
+                command=np.tile([4.0, 0.0], (1, 20, 1, 1)),
+                inserted_length=inserted[None, :, None],
+                rotation=np.zeros((1, 20, 1)),
+            ),
             desired=np.resize(found.desired, (20, 2)),
-            predicted=np.column_stack([0.8 * proximal[:, 0], np.full(20, 0.1)]),
-            tip=replace(tip, **{name: np.resize(getattr(tip, name), (20, 1)) for name in tip.__dataclass_fields__}),
-            position=np.resize(found.position, (20, 1, 3)),
-            force=np.resize(found.force, 20),
+            predicted=np.column_stack([0.8 * inserted, np.full(20, 0.1)]),
         )
 
     return made
@@ -146,8 +148,8 @@ def test_the_agents_wires_follow_the_plan_and_observe_its_tip(found, monkeypatch
     monkeypatch.setattr(Belief, "follow", watched_follow)
     xray = plan_xray(found, calibration(abscissa=(5.0, 0.0, 0.0, 0.0)))  # wider than 2 mm from the start
     assert due(xray) == list(range(3, 1 + len(found.control), 3))  # not sooner than 1.5 s after the last
-    np.testing.assert_array_equal(observed, found.position[xray.exposure, 0])
-    np.testing.assert_allclose(followed, found.proximal)
+    np.testing.assert_array_equal(observed, found.trajectory.tip_position[0, xray.exposure, 0])
+    np.testing.assert_array_equal(followed, found.trajectory.proximal[0])
 
 
 def test_the_agents_own_calibration_asks_seldom_along_a_straight_vessel(found):
@@ -173,7 +175,7 @@ def test_it_is_written_beside_the_plan(found, vessel, tmp_path):
     )
     assert figures["xray_due_s"]
     np.testing.assert_allclose(table[["band_tip_abscissa_mm", "band_tip_offset_mm"]], xray.half_width)
-    read_plan(tmp_path / "plan", read_anatomy(vessel), found.navigation.device)
+    read_plan(tmp_path / "plan", read_anatomy(vessel))
     assert "xray_due_s" not in write_plan(found, tmp_path / "plan")
 
 

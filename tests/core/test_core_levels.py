@@ -23,6 +23,7 @@ HERE = Path(__file__).parent
 def python(*arguments: str | Path, level: str | None = None) -> subprocess.CompletedProcess[str]:
     """Run Python in a fresh process, with the level asked for in its environment."""
     environment = {name: value for name, value in os.environ.items() if name != "ENDOPILOT_CORE"}
+    environment["PYTHONPATH"] = str(HERE.parents[1])  # navigations.py takes a scene from the benchmarks
     if level is not None:
         environment["ENDOPILOT_CORE"] = level
     return subprocess.run([sys.executable, *map(str, arguments)], env=environment, capture_output=True, text=True)

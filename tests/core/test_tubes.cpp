@@ -287,7 +287,7 @@ void test_bounded_minimum() {
             for (int c = 0; c < N; ++c) q += h[r][c] * s[c], scale += std::abs(h[r][c] * s[c]);
             const double beyond = side[r] * (off[r] + s[r]);
             if (side[r] == 0) {
-                expect(s[r] == -off[r], "a drive that grips");
+                expect(s[r] == -off[r], "a drive that holds");
             } else if (beyond == 0) {
                 expect(side[r] * q <= 1e-9 * scale, "a bound holds what would pass it");
                 ++held_by_bounds;

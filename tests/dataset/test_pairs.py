@@ -32,7 +32,7 @@ from endopilot.simulation.simulate import simulate
 from endopilot.simulation.trajectory import Trajectory
 
 WIRE, CATHETER = read_device("workhorse-014"), read_catheter("microcatheter-1.7f")
-WEAK = replace(CATHETER, device=replace(CATHETER.device, push_limit_n=0.03, pull_limit_n=0.021))
+WEAK = replace(CATHETER, push_limit_n=0.03, pull_limit_n=0.021)
 CONFIG = DatasetConfig(sequences=3, seconds=10.0, seed=7)
 OF_EPISODES = ("folder", "manifest", "sample_period_s", "anatomy", "sequence", "split", "device", "friction")
 OF_EPISODES += ("tip_bend", "tip_stiffness_factor", "initial")
@@ -102,7 +102,7 @@ def _assert_same(data: Dataset, trajectory: Trajectory) -> None:
 def test_devices_and_columns_are_named(pairs):
     data, info = load_dataset(pairs), read_json(pairs / "meta/info.json")
     assert [catheter.name for catheter in data.stack.catheters] == ["microcatheter-1.7f"]
-    assert data.stack.catheters[0].device.push_limit_n == 0.03
+    assert data.stack.catheters[0].push_limit_n == 0.03
     assert describe_dataset(pairs).figures["catheters"] == ["microcatheter-1.7f"]
     drives = ["translation_mm_s", "rotation_rad_s"]
     assert info["features"]["action"]["names"] == drives + [f"catheter_1_{name}" for name in drives]
@@ -135,7 +135,7 @@ def test_a_catheter_stops_short_of_the_end_of_the_vessel(patient):
     ends = np.array([b.centerline.abscissa[-1] if i in leaves else np.inf for i, b in enumerate(vessel.tree.branches)])
     initial = np.array([[[5.0, 0.0], [90.0, 0.0]], [[5.0, 0.0], [1.5 * ends[np.isfinite(ends)].max(), 1.0]]])
     control = np.tile([[0.0, 0.0], [12.0, 0.5]], (2, 16, 1, 1))
-    friction = np.tile([0.1, CATHETER.device.friction], (2, 1))
+    friction = np.tile([0.1, CATHETER.friction], (2, 1))
     stacks = [Stack(WIRE, (CATHETER,))] * 2
     driven, stopped = simulate_navigations(vessel, stacks, initial, control, friction, CONFIG.simulator)
     assert driven.valid.all()

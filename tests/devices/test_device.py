@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import endopilot
-from endopilot.devices.device import Device, read_device, write_device
+from endopilot.devices.device import Wire, read_device, write_device
 from endopilot.devices.device_files import list_devices
 from endopilot.errors import InputError
 
@@ -19,7 +19,7 @@ def test_shipped_devices_are_whole(name: str) -> None:
     device = read_device(name)
     assert device.name == name
     assert all(len(source) > 10 for source in device.sources.values())
-    assert Device(**asdict(device)) == device
+    assert Wire(**asdict(device)) == device
     summary = device.summary()
     assert summary["ei_tip_n_mm2"] == device.bend_stiffness(np.array([0.0]))[0]
     assert summary["ei_shaft_n_mm2"] == device.bend_stiffness(np.array([1e3]))[0]

@@ -20,10 +20,11 @@ from endopilot.files import read_json
 from endopilot.pipeline import navigation
 from endopilot.report.navigation_figure import navigation_figure
 from endopilot.simulation.motion import motion_named
+from endopilot.simulation.trajectory_file import read_trajectory
 
 SHORT = ("--tip", "own", "--seconds", "20")
-FILES = ["controls.csv", "episode", "manifest.json", "navigation.csv", "navigation.html", "navigation.png", "run.json",
-         "wire.yaml"]  # fmt: skip
+FILES = ["episode", "manifest.json", "navigation.csv", "navigation.html", "navigation.png", "run.json",
+         "trajectory.npz", "wire.yaml"]  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -93,14 +94,40 @@ def test_the_page_needs_nothing_beside_it(driven):
 def test_recorded_controls_make_the_same_wire(driven, patient, capsys, tmp_path):
     folder, _ = driven
     again = run(
-        *(capsys, "simulate", patient, "--device", folder / "wire.yaml", "--controls", folder / "controls.csv"),
-        *("-o", tmp_path / "again.csv"),
+        capsys, "simulate", patient, "--controls", folder / "trajectory.npz", "--shape", "-o", tmp_path / "again.npz"
     )
     assert again["valid_worlds"] == 1
-    table, wire = pd.read_csv(folder / "navigation.csv"), pd.read_csv(tmp_path / "again.csv")
-    places = [f"tip_{axis}_mm" for axis in "xyz"]
-    np.testing.assert_allclose(wire[places].to_numpy()[9::10], table[places].to_numpy()[1:], atol=1e-9)
-    np.testing.assert_allclose(wire["inserted_length_mm"][9::10], table["inserted_length_mm"][1:], atol=1e-9)
+    recorded, wire = read_trajectory(folder / "trajectory.npz"), read_trajectory(tmp_path / "again.npz")
+    assert recorded.shape is None and wire.shape is not None
+    for name in ("tip_position", "inserted_length", "base_force", "command", "contact_force_max"):
+        np.testing.assert_array_equal(getattr(wire, name), getattr(recorded, name))
+    table = pd.read_csv(folder / "navigation.csv")
+    places = table[[f"tip_{axis}_mm" for axis in "xyz"]].to_numpy()
+    np.testing.assert_array_equal(recorded.tip_position[0, 9::10, 0], places[1:])
+    line = refused(
+        *(capsys, "simulate", patient, "--controls", folder / "trajectory.npz", "--device", "wire-018"),
+        *("-o", tmp_path / "no.npz"),
+    )
+    assert "device: " in line and "was made with another (workhorse-014), not with this wire-018" in line
+
+
+def test_the_trajectory_holds_what_was_decided(driven):
+    folder, figures = driven
+    recorded, table = read_trajectory(folder / "trajectory.npz"), pd.read_csv(folder / "navigation.csv")
+    assert len(recorded.about["exposures_s"]) == figures["exposures"]
+    assert recorded.about["exposures_s"] == table["time_s"][table["xray"] == 1].tolist()
+    assert recorded.about["reason"] == "reached" and recorded.about["policy"] == "agent"
+    assert recorded.about["target"]["abscissa"] == pytest.approx(figures["target_mm"], abs=0.01)
+    assert recorded.about["asks_for_xray"] == table["asks_for_xray"].fillna("").tolist()[:-1]
+    for name, column in (
+        ("decided", ["translation_mm_s", "rotation_rad_s"]),
+        ("measured", ["measured_tip_abscissa_mm", "measured_tip_offset_mm"]),
+        ("believed", ["believed_tip_abscissa_mm", "believed_tip_offset_mm"]),
+        ("half_width", ["band_tip_abscissa_mm", "band_tip_offset_mm"]),
+    ):
+        values = recorded.columns[name].reshape(len(table) - 1, 10, 2)
+        np.testing.assert_array_equal(values[:, 0], table[column].to_numpy()[:-1], err_msg=name)
+        np.testing.assert_array_equal(values[:, 9], values[:, 0])
 
 
 def test_a_guiding_catheter_that_leans_is_seen_and_written(patient, capsys, tmp_path):
@@ -113,10 +140,9 @@ def test_a_guiding_catheter_that_leans_is_seen_and_written(patient, capsys, tmp_
     off_deg = np.degrees(np.arccos([given @ real, seen @ real]))
     assert off_deg == pytest.approx([15.0, unseen_deg], abs=1e-3) and 0.0 < unseen_deg < 2.0
     assert f"15° off its given axis; X-ray shows it to {unseen_deg:.1f}°" in page
-    run(
-        *(capsys, "simulate", folder / "anatomy", "--device", folder / "wire.yaml"),
-        *("--controls", folder / "controls.csv", "-o", tmp_path / "again.csv"),
-    )
+    again = ("--controls", folder / "trajectory.npz", "-o", tmp_path / "again.csv")
+    run(capsys, "simulate", folder / "anatomy", *again)
+    assert "of another vessel" in refused(capsys, "simulate", patient, *again)
     table, wire = pd.read_csv(folder / "navigation.csv"), pd.read_csv(tmp_path / "again.csv")
     np.testing.assert_allclose(wire["tip_z_mm"].to_numpy()[9::10], table["tip_z_mm"].to_numpy()[1:], atol=1e-9)
 
@@ -134,26 +160,18 @@ def test_a_catheter_follows_its_wire_and_both_are_written(patient, capsys, tmp_p
     episode = load_dataset(folder / "episode")
     lengths = episode.inserted_length[0, : len(table) - 1, 1]
     np.testing.assert_allclose(lengths, table["catheter_1_inserted_length_mm"][1:], atol=1e-4)
-    assert true.device.friction == 1.1 * given.device.friction
-    assert true == replace(given, device=replace(given.device, friction=true.device.friction))
+    assert true.friction == 1.1 * given.friction
+    assert true == replace(given, friction=true.friction)
     assert episode.stack.catheters == (given,) and episode.initial[0, 1].tolist() == [0.0, 0.0]
-    again = run(
-        *(capsys, "simulate", patient, "--device", folder / "wire.yaml", "--catheter", folder / "catheter-1.yaml"),
-        *("--controls", folder / "controls.csv", "-o", tmp_path / "again.csv"),
-    )
+    again = run(capsys, "simulate", patient, "--controls", folder / "trajectory.npz", "-o", tmp_path / "again.csv")
     assert again["valid_worlds"] == 1
     motion = pd.read_csv(tmp_path / "again.csv")
     for name in ("tip_z_mm", "inserted_length_mm", "catheter_1_inserted_length_mm", "catheter_1_tip_z_mm"):
-        count = len(table) - 1
-        np.testing.assert_allclose(motion[name][9::10][:count], table[name][1:], atol=1e-4, err_msg=name)
+        np.testing.assert_array_equal(motion[name][9::10], table[name][1:], err_msg=name)
     page = (folder / "navigation.html").read_text(encoding="utf-8")
     for part in ("--catheter microcatheter-1.7f", "Guidewire workhorse-014", "Catheter microcatheter-1.7f"):
         assert part in page
     assert "The catheter is turquoise, and covers what lies in it." in page
-    line = refused(
-        capsys, "navigate", patient, "--target", "1", "--catheter", "microcatheter-1.7f", "-o", tmp_path / "n"
-    )
-    assert "policy: it takes a wire alone, and there is microcatheter-1.7f around it; leave the catheter out" in line
     line = refused(capsys, *command, "-o", tmp_path / "n")
     assert "arrives: catheter; there is none" in line
 
@@ -195,9 +213,7 @@ def test_the_replayed_wire_is_the_navigations_to_the_bit(patient):
     assert np.median(errors) < 1.0
     # then the drive rests
     np.testing.assert_array_equal(found.episode.control[0, samples + 1 :], 0.0)
-    np.testing.assert_allclose(
-        found.episode.inserted_length[0, :samples], found.record.inserted_length[1:], atol=1e-9
-    )
+    np.testing.assert_allclose(found.episode.inserted_length[0, :samples], found.record.inserted_length[1:], atol=1e-9)
 
 
 def test_the_episode_trains_beside_simulated_data(driven, patient, capsys, tmp_path):

@@ -166,7 +166,7 @@ def test_a_profile_of_a_million_values_is_refused(tmp_path) -> None:
 )  # fmt: skip
 def test_extreme_devices_are_read(tmp_path, content) -> None:
     path = write(tmp_path / "device.yaml", content)
-    device = read_catheter(path).device if "inner_diameter_mm" in content else read_device(path)
+    device = read_catheter(path) if "inner_diameter_mm" in content else read_device(path)
     assert device.diameter_mm == content["diameter_mm"]["value"]
     assert list(device.bend_stiffness_n_mm2) == content["bend_stiffness_n_mm2"]["value"]
 

@@ -101,7 +101,7 @@ def test_orders_are_kept_within_each_drive_s_limits(over_the_wire, catheter) -> 
     loop = NavigationLoop(over_the_wire, Wild(), config=COARSE)
     assert loop.step().devices == ((0.0, 0.0), (0.0, 0.0))
     loop.hand_over(Hand(((1.0, 0.0), (1e9, 0.0), (1.0, 1.0))))
-    assert loop.step().devices == ((1.0, 0.0), (catheter.device.max_velocity_mm_s, 0.0))
+    assert loop.step().devices == ((1.0, 0.0), (catheter.max_velocity_mm_s, 0.0))
     assert loop.record().faults == 2
 
 

@@ -11,7 +11,8 @@ from endopilot.report import still
 from endopilot.report.scene import navigation_scene, visible_devices
 from endopilot.report.still import LIBRARIES_MISSING, render_still
 from endopilot.report.wall_mesh import wall_mesh
-from endopilot.types import CatheterMotion, DistanceMap, Rollout
+from endopilot.simulation.trajectory import Trajectory
+from endopilot.types import DistanceMap, TipProjection
 
 CENTRE, SQUEEZE = np.array([1.0, 2.0, 3.0]), np.array([1.0, 2.0, 1.5])
 
@@ -41,12 +42,12 @@ def test_a_lumen_that_reaches_the_edge_of_its_map_is_closed_there():
 
 def test_the_wire_is_shown_from_its_tip_to_just_behind_the_ostium(rollout):
     (wire,) = visible_devices(rollout, 0, 3)
-    np.testing.assert_array_equal(wire[0], rollout.tip_position[0, 3])
+    np.testing.assert_array_equal(wire[0], rollout.tip_position[0, 3, 0])
     length = np.linalg.norm(np.diff(wire, axis=0), axis=1).sum()
     assert (
-        rollout.inserted_length[0, 3] + SHOWN_BEHIND_MM - 2.0
+        rollout.inserted_length[0, 3, 0] + SHOWN_BEHIND_MM - 2.0
         < length
-        <= rollout.inserted_length[0, 3] + SHOWN_BEHIND_MM
+        <= rollout.inserted_length[0, 3, 0] + SHOWN_BEHIND_MM
     )
 
 
@@ -61,34 +62,31 @@ def test_every_sample_is_a_frame_and_a_step_of_the_slider(anatomy, rollout):
     assert [frame.name for frame in frames] == [str(sample) for sample in range(6)]
     steps = figure.layout.sliders[0].steps
     assert [step.label for step in steps] == ["0.5", "1", "1.5", "2", "2.5", "3"]
-    np.testing.assert_allclose(np.array(frames[4].data[0].z)[0], rollout.tip_position[0, 4, 2])
+    np.testing.assert_allclose(np.array(frames[4].data[0].z)[0], rollout.tip_position[0, 4, 0, 2])
     assert "Δtip = 24.0 mm" in frames[4].data[0].hovertemplate
     # The frames replace the wire, its trail and its tip, not the vessel.
     assert [figure.data[index].name for index in frames[4].traces] == ["Guidewire", "Tip, last 20 s", "Tip"]
 
 
 @pytest.fixture
-def pair(rollout) -> Rollout:
+def pair(rollout) -> Trajectory:
     """Return the wire with a catheter that stays behind it until the last sample, in which it leads by 2 mm."""
     inserted = np.array([0.0, 3.0, 7.0, 9.0, 12.0, 30.0])[None, :, None]
-    deepest = np.maximum(rollout.inserted_length[..., None], inserted)
+    deepest = np.maximum(rollout.inserted_length, inserted)
     shape = rollout.shape.copy()
     shape[..., 2] = -deepest + 2.0 * np.arange(shape.shape[2])
-    none, pushed = np.zeros_like(inserted), np.full_like(inserted, 0.25)
-    at = np.concatenate([none, none, -inserted], axis=-1)[:, :, None]
-    motion = CatheterMotion(
-        control=np.zeros((1, 6, 1, 2)),
-        inserted_length=inserted,
-        rotation=none + np.pi,
-        tip_position=at,
-        base_force=none,
-        base_torque=none,
-        drive_force=pushed,
-        drive_torque=none,
-        slip=none,
-        rotation_slip=none,
-    )
-    return dataclasses.replace(rollout, shape=shape, catheters=motion, drive_force=np.full((1, 6), 0.5))
+    both = {
+        each.name: np.repeat(value, 2, axis=2)
+        for each in dataclasses.fields(rollout)
+        if each.name != "shape" and np.ndim(value := getattr(rollout, each.name)) > 2 and value.shape[1] == 6
+    }
+    both["inserted_length"][:, :, 1:] = inserted
+    both["rotation"][:, :, 1] = np.pi
+    both["tip_position"][:, :, 1, 2] = -inserted[..., 0]
+    both["drive_force"][:] = 0.5, 0.25
+    tip = TipProjection(**{name: np.repeat(value, 2, axis=2) for name, value in vars(rollout.tip).items()})
+    start = np.repeat(rollout.start, 2, axis=1)
+    return dataclasses.replace(rollout, shape=shape, tip=tip, start=start, **both)
 
 
 @pytest.fixture

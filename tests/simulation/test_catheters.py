@@ -8,7 +8,6 @@ from pathlib import Path
 import bend
 import numpy as np
 import pytest
-from endopilot.simulation.table import write_rollout
 
 import endopilot
 from benchmarks.core.manoeuvres import paired_controls, seed_of
@@ -19,7 +18,9 @@ from endopilot.devices.stack import Stack, lines_from_tips
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.controls import read_controls_csv
-from endopilot.types import Anatomy, Rollout
+from endopilot.simulation.trajectory import Trajectory
+from endopilot.simulation.trajectory_file import write_trajectory
+from endopilot.types import Anatomy
 
 SHIPPED = Path(endopilot.__file__).parent / "devices/catheters"
 
@@ -39,15 +40,15 @@ def random_drives(worlds: int, samples: int, seed: int) -> tuple[np.ndarray, np.
     start = np.column_stack([draw.uniform(0, 40, worlds), draw.uniform(-3, 3, worlds)])
     start = np.column_stack([start, draw.uniform(0, 40, worlds), draw.uniform(-3, 3, worlds)])
     control = draw.uniform(-1, 1, (worlds, samples, 4)) * [15.0, 3.0, 15.0, 3.0]
-    return start, control
+    return start.reshape(worlds, 2, 2), control.reshape(worlds, samples, 2, 2)
 
 
 @pytest.mark.parametrize("name", list_catheters())
 def test_shipped_catheters_are_whole(name: str) -> None:
     catheter = read_catheter(name)
     assert catheter.name == name
-    assert 0 < catheter.inner_diameter_mm < catheter.device.diameter_mm
-    assert all(len(source) > 7 for source in catheter.device.sources.values())
+    assert 0 < catheter.inner_diameter_mm < catheter.diameter_mm
+    assert all(len(source) > 7 for source in catheter.sources.values())
     assert catheter.turned(np.array([0.0, 1e3]))[1] == pytest.approx(sum(angle for _, angle in catheter.shape))
 
 
@@ -72,37 +73,29 @@ def test_a_bad_file_is_refused(tmp_path: Path, old: str, new: str, message: str)
 
 
 def test_what_is_too_wide_is_refused(vessel: Anatomy, catheter: Catheter) -> None:
-    control = np.zeros((1, 1, 4))
+    control = np.zeros((1, 1, 2, 2))
     with pytest.raises(
         InputError, match=r"diameter_mm = 0\.89 is too wide for the bore of catheter microcatheter-1\.7f"
     ):
-        endopilot.simulate(vessel, read_device("j-035"), control, catheters=[catheter])
-    wide = replace(catheter, device=replace(catheter.device, diameter_mm=9.0))
+        endopilot.simulate(vessel, Stack(read_device("j-035"), (catheter,)), control)
+    wide = replace(catheter, diameter_mm=9.0)
     with pytest.raises(InputError, match="wider than the"):
-        endopilot.simulate(vessel, read_device("workhorse-014"), control, catheters=[wide])
+        endopilot.simulate(vessel, Stack(read_device("workhorse-014"), (wide,)), control)
     with pytest.raises(InputError, match="catheter 'none'"):
         read_catheter("none")
     with pytest.raises(InputError, match="'force' with catheters"):
-        endopilot.simulate(vessel, read_device("workhorse-014"), control, catheters=[catheter], actuation="force")
+        endopilot.simulate(vessel, Stack(read_device("workhorse-014"), (catheter,)), control, actuation="force")
 
 
 def test_worlds_do_not_notice_each_other(vessel: Anatomy, catheter: Catheter) -> None:
-    wire = read_device("workhorse-014")
+    stack = Stack(read_device("workhorse-014"), (catheter,))
     start, control = random_drives(9, 6, 5)
-    together = endopilot.simulate(vessel, wire, control, catheters=[catheter], initial=start)
-    assert together.catheters is not None and together.valid.all()
-    crossed = together.inserted_length > together.catheters.inserted_length[..., 0]
+    together = endopilot.simulate(vessel, stack, control, initial=start)
+    assert together.valid.all()
+    crossed = together.inserted_length[..., 0] > together.inserted_length[..., 1]
     assert crossed.any() and not crossed.all()  # wire and catheter overtake each other
-    few = endopilot.simulate(
-        vessel, wire, control[3:5], catheters=[catheter], initial=start[3:5], config=SimulatorConfig(threads=1)
-    )
-    assert few.catheters is not None
-    for all_worlds, two in (
-        (together.tip_position, few.tip_position),
-        (together.base_force, few.base_force),
-        (together.catheters.base_force, few.catheters.base_force),
-        (together.catheters.tip_position, few.catheters.tip_position),
-    ):
+    few = endopilot.simulate(vessel, stack, control[3:5], initial=start[3:5], config=SimulatorConfig(threads=1))
+    for all_worlds, two in ((together.tip_position, few.tip_position), (together.base_force, few.base_force)):
         assert np.array_equal(all_worlds[3:5], two)
 
 
@@ -122,11 +115,8 @@ def test_a_drive_that_slips_as_it_is_brought_in_does_not_notice_a_longer_neighbo
 ) -> None:
     artery, stack, start, control = tight
     start, control = start[[17, 17]], control[[17, 17], :2]
-    start[1, 2] = 60.0
-    alone, both = (
-        endopilot.simulate(artery, stack.wire, control[:count], catheters=stack.catheters, initial=start[:count])
-        for count in (1, 2)
-    )
+    start[1, 1, 0] = 60.0
+    alone, both = (endopilot.simulate(artery, stack, control[:count], initial=start[:count]) for count in (1, 2))
     assert np.array_equal(alone.tip_position[0], both.tip_position[0])
 
 
@@ -135,12 +125,10 @@ def test_a_catheter_that_snaps_while_its_drive_pushes_with_all_its_force_goes_on
     tight: tuple[Anatomy, Stack, np.ndarray, np.ndarray],
 ) -> None:
     artery, stack, start, control = tight
-    rollout = endopilot.simulate(artery, stack.wire, control[[4], :42], catheters=stack.catheters, initial=start[[4]])
-    assert rollout.valid.all()
-    pushed = rollout.catheters
-    assert pushed is not None
-    at_limit = pushed.base_force[0, :, 0] > 0.99 * stack.catheters[0].device.push_limit_n
-    crept = np.diff(pushed.inserted_length[0, 26:, 0])  # mm in half a second, of some 4 that are asked for
+    trajectory = endopilot.simulate(artery, stack, control[[4], :42], initial=start[[4]])
+    assert trajectory.valid.all()
+    at_limit = trajectory.base_force[0, :, 1] > 0.99 * stack.catheters[0].push_limit_n
+    crept = np.diff(trajectory.inserted_length[0, 26:, 1])  # mm in half a second, of some 4 that are asked for
     assert at_limit.sum() > 5
     assert crept.min() < 0.1  # it is held, then snaps
     assert crept.max() > 1.0
@@ -149,87 +137,73 @@ def test_a_catheter_that_snaps_while_its_drive_pushes_with_all_its_force_goes_on
 def test_step_by_step_and_from_a_saved_state_the_bits_are_the_same(
     vessel: Anatomy, catheter: Catheter, tmp_path: Path
 ) -> None:
-    wire = read_device("workhorse-014")
+    stack = Stack(read_device("workhorse-014"), (catheter,))
     start, control = random_drives(3, 5, 6)
-    whole = endopilot.simulate(vessel, wire, control, catheters=[catheter], initial=start)
-    assert whole.catheters is not None
-    simulator = endopilot.Simulator(vessel, wire, catheters=[catheter], worlds=3)
-    simulator.reset(
-        inserted_length=start[:, 0],
-        rotation=start[:, 1],
-        catheter_inserted_length=start[:, 2:3],
-        catheter_rotation=start[:, 3:],
-    )
+    whole = endopilot.simulate(vessel, stack, control, initial=start)
+    simulator = endopilot.Simulator(vessel, stack, worlds=3)
+    simulator.reset(inserted_length=start[..., 0], rotation=start[..., 1])
     for sample in range(3):
         simulator.step(control[:, sample], 0.5)
     simulator.state.save(tmp_path / "state.npz")
-    again = endopilot.Simulator(vessel, wire, catheters=[catheter], worlds=3)
+    again = endopilot.Simulator(vessel, stack, worlds=3)
     again.set_state(type(simulator.state).load(tmp_path / "state.npz"))
     again.step(control[:, 3], 0.5)
     step = again.step(control[:, 4], 0.5)
     assert np.array_equal(step.tip_position, whole.tip_position[:, -1])
-    assert np.array_equal(again.tips(), whole.tip_position[:, -1])
-    assert np.array_equal(again.tips(1), whole.catheters.tip_position[:, -1, 0])
+    assert np.array_equal(again.tip_position, whole.tip_position[:, -1])
     assert np.array_equal(again.project().abscissa, whole.tip.abscissa[:, -1])
-    ahead = again.inserted_length > again.catheter_inserted_length[:, 0]
-    assert np.array_equal((again.tips() == again.position[:, 0]).all(axis=1), ahead) and 0 < ahead.sum() < 3
-    assert again.project(1).abscissa == pytest.approx(again.catheter_inserted_length[:, 0], abs=12.0)
-    assert np.linalg.norm(again.tip_direction, axis=1) == pytest.approx(np.ones(3))
+    ahead = again.inserted_length[:, 0] > again.inserted_length[:, 1]
+    assert np.array_equal((again.tip_position[:, 0] == again.position[:, 0]).all(axis=1), ahead) and 0 < ahead.sum() < 3
+    assert again.project().abscissa[:, 1] == pytest.approx(again.inserted_length[:, 1], abs=12.0)
+    assert np.linalg.norm(again.tip_direction, axis=-1) == pytest.approx(np.ones((3, 2)))
     assert np.array_equal(step.tip_direction, again.tip_direction)
-    with pytest.raises(InputError, match="device: 2; give 0 for the wire, to 1"):
-        again.tips(2)
-    assert np.array_equal(again.catheter_inserted_length, whole.catheters.inserted_length[:, -1])
-    assert np.array_equal(again.catheter_drive_load[:, 0, 0], whole.catheters.drive_force[:, -1, 0])
-    alone = endopilot.Simulator(vessel, wire, worlds=3)
+    assert np.array_equal(again.inserted_length, whole.inserted_length[:, -1])
+    assert np.array_equal(again.drive_load[..., 0], whole.drive_force[:, -1])
+    alone = endopilot.Simulator(vessel, stack.wire, worlds=3)
     with pytest.raises(InputError, match="other anatomies, devices or settings"):
         alone.set_state(simulator.state)
-    too_fast = np.array([[1.0, 0.0, 1e3, 0.0]] * 3)
-    with pytest.raises(InputError, match=r"the limits of microcatheter-1\.7f"):
+    too_fast = np.tile([[1.0, 0.0], [1e3, 0.0]], (3, 1, 1))
+    with pytest.raises(InputError, match=r"exceeds microcatheter-1\.7f's limit"):
         again.step(too_fast, 0.1)
 
 
 def test_a_withdrawn_wire_leaves_the_catheter_where_it_is(vessel: Anatomy, catheter: Catheter) -> None:
     # and the foremost tip is then the catheter's
-    start = np.array([[40.0, 0.0, 30.0, 0.0]])
-    control = np.zeros((1, 10, 4))
-    control[0, :8, 0] = -10.0
-    rollout = endopilot.simulate(vessel, read_device("workhorse-014"), control, catheters=[catheter], initial=start)
-    motion = rollout.catheters
-    assert rollout.valid.all() and motion is not None
-    assert rollout.inserted_length[0, -1] == pytest.approx(0.0, abs=1e-9)
-    assert motion.inserted_length[0, :, 0] == pytest.approx(np.full(10, 30.0))
-    moved = np.linalg.norm(motion.tip_position[0, -1, 0] - motion.tip_position[0, 0, 0])
+    start = np.array([[[40.0, 0.0], [30.0, 0.0]]])
+    control = np.zeros((1, 10, 2, 2))
+    control[0, :8, 0, 0] = -10.0
+    stack = Stack(read_device("workhorse-014"), (catheter,))
+    trajectory = endopilot.simulate(vessel, stack, control, initial=start)
+    assert trajectory.valid.all()
+    assert trajectory.inserted_length[0, -1, 0] == pytest.approx(0.0, abs=1e-9)
+    assert trajectory.inserted_length[0, :, 1] == pytest.approx(np.full(10, 30.0))
+    moved = np.linalg.norm(trajectory.tip_position[0, -1, 1] - trajectory.tip_position[0, 0, 1])
     assert moved < 1.5  # it leans on the wall as its own stiffness has it
 
 
-def robust_world(index: int, catheter: str, world: int, *, samples: int, rollouts: int) -> tuple[Stack, Rollout]:
+def robust_world(index: int, catheter: str, world: int, *, samples: int, rollouts: int) -> tuple[Stack, Trajectory]:
     """Simulate the first samples of a world of `bench robustness --catheters`: the workhorse wire in a catheter."""
     vessel, stack = make_patient(AtlasConfig(), index), Stack(read_device("workhorse-014"), (read_catheter(catheter),))
     seed, one = seed_of(index, seed=0), slice(world, world + 1)
     initial, control = paired_controls(vessel, stack, rollouts=rollouts, samples=120, seed=seed)
     config = SimulatorConfig(threads=1)
-    return stack, endopilot.simulate(
-        vessel, stack.wire, control[one, :samples], catheters=stack.catheters, initial=initial[one], config=config
-    )
+    return stack, endopilot.simulate(vessel, stack, control[one, :samples], initial=initial[one], config=config)
 
 
 def test_drives_keep_their_limits(vessel: Anatomy, catheter: Catheter) -> None:
-    weak = replace(
-        catheter, device=replace(catheter.device, push_limit_n=0.02, pull_limit_n=0.02, torque_limit_n_mm=2e-4)
-    )
-    start = np.array([[60.0, 0.0, 20.0, 0.0]])
-    control = np.zeros((1, 16, 4))
-    control[0, :, 2], control[0, :, 3] = 8.0, 2.0
+    weak = replace(catheter, push_limit_n=0.02, pull_limit_n=0.02, torque_limit_n_mm=2e-4)
+    start = np.array([[[60.0, 0.0], [20.0, 0.0]]])
+    control = np.zeros((1, 16, 2, 2))
+    control[0, :, 1] = 8.0, 2.0
     wire = read_device("workhorse-014")
-    free = endopilot.simulate(vessel, wire, control, catheters=[catheter], initial=start)
-    held = endopilot.simulate(vessel, wire, control, catheters=[weak], initial=start)
-    assert free.catheters is not None and held.catheters is not None
-    assert free.catheters.base_force.max() > 0.03 and np.abs(free.catheters.base_torque).max() > 3e-4
-    assert np.abs(free.catheters.slip).max() == 0
-    assert held.catheters.base_force.max() < 0.025  # a drive behind the lead is slowed down after it met its limit
-    assert np.abs(held.catheters.base_torque).max() <= 2e-4 * (1 + 1e-3)
-    made = start[0, 2] + 8.0 * 8.0 - held.catheters.slip[0, :, 0].sum()
-    assert held.catheters.inserted_length[0, -1, 0] == pytest.approx(made) and held.catheters.slip.sum() > 1.0
+    free = endopilot.simulate(vessel, Stack(wire, (catheter,)), control, initial=start)
+    held = endopilot.simulate(vessel, Stack(wire, (weak,)), control, initial=start)
+    assert free.base_force[..., 1].max() > 0.03 and np.abs(free.base_torque[..., 1]).max() > 3e-4
+    assert np.abs(free.slip[..., 1]).max() == 0
+    assert held.base_force[..., 1].max() < 0.025  # a drive behind the lead is slowed down after it met its limit
+    assert np.abs(held.base_torque[..., 1]).max() <= 2e-4 * (1 + 1e-3)
+    made = start[0, 1, 0] + 8.0 * 8.0 - held.slip[0, :, 1].sum()
+    assert held.inserted_length[0, -1, 1] == pytest.approx(made) and held.slip[..., 1].sum() > 1.0
 
 
 def test_neither_drive_passes_its_limit_where_both_meet_an_obstacle() -> None:
@@ -238,8 +212,8 @@ def test_neither_drive_passes_its_limit_where_both_meet_an_obstacle() -> None:
     limit = {"push_limit_n": 0.3, "pull_limit_n": 0.3}
     wire = replace(read_device("workhorse-014"), friction=0.3, **limit)
     catheter = read_catheter("microcatheter-1.7f")
-    catheter = replace(catheter, bore_friction=0.3, device=replace(catheter.device, friction=0.3, **limit))
-    control = np.zeros((4, 43, 4))
+    catheter = replace(catheter, bore_friction=0.3, friction=0.3, **limit)
+    control = np.zeros((4, 43, 2, 2))
     phases = (
         ((20, 6, 6), (8, 0, 0), (12, -8, -8)),
         ((14, 6, 0), (14, 0, 6), (8, 0, -8), (7, -8, 8)),
@@ -248,14 +222,13 @@ def test_neither_drive_passes_its_limit_where_both_meet_an_obstacle() -> None:
     )
     for world, made in enumerate(phases):
         speeds = np.concatenate([np.tile([a, b], (count, 1)) for count, a, b in made])
-        control[world, : len(speeds), ::2] = speeds
-    start = np.tile([40.0, 0.0, 20.0, 0.0], (4, 1))
-    rollout = endopilot.simulate(bend.vessel(), wire, control, catheters=[catheter], initial=start)
-    motion = rollout.catheters
-    assert rollout.valid.all() and motion is not None
-    assert (np.abs(rollout.slip).sum(axis=1) > 5).any() and (np.abs(motion.slip).sum(axis=1) > 5).any()
-    for force in (rollout.base_force, motion.base_force[..., 0]):
-        assert 0.9 * 0.3 < np.abs(force).max() < 1.1 * 0.3
+        control[world, : len(speeds), :, 0] = speeds
+    start = np.tile([[40.0, 0.0], [20.0, 0.0]], (4, 1, 1))
+    trajectory = endopilot.simulate(bend.vessel(), Stack(wire, (catheter,)), control, initial=start)
+    assert trajectory.valid.all()
+    assert (np.abs(trajectory.slip).sum(axis=1) > 5).any(axis=0).all()
+    for device in range(2):
+        assert 0.9 * 0.3 < np.abs(trajectory.base_force[..., device]).max() < 1.1 * 0.3
 
 
 def test_drives_of_random_pairs_keep_their_limits() -> None:
@@ -265,58 +238,50 @@ def test_drives_of_random_pairs_keep_their_limits() -> None:
     initial, control = paired_controls(vessel, stack, rollouts=16, samples=240, seed=11)
     worlds = [10, 15]  # those in which it would leap to 1.07 and 1.14 times its limit
     config = SimulatorConfig(threads=1)
-    rollout = endopilot.simulate(
-        vessel, stack.wire, control[worlds, :30], catheters=stack.catheters, initial=initial[worlds], config=config
-    )
-    assert rollout.catheters is not None and rollout.valid.all()
-    forces = np.stack([rollout.base_force, rollout.catheters.base_force[..., 0]], axis=-1)
+    trajectory = endopilot.simulate(vessel, stack, control[worlds, :30], initial=initial[worlds], config=config)
+    assert trajectory.valid.all()
     limits = np.array([[device.push_limit_n, -device.pull_limit_n] for device in stack.devices])
-    share = (forces[..., None] / limits).max(axis=-1)
+    share = (trajectory.base_force[..., None] / limits).max(axis=-1)
     assert (share > 0.99).mean() > 0.01
     assert share.max() < 1.055
 
 
 def test_a_force_beyond_a_follower_s_limit_does_not_stay() -> None:
     """Where the lead slips, the force of all tubes is at most the sum of the limits; it stayed at 5.1 N, not 1 N."""
-    stack, rollout = robust_world(46, "microcatheter-1.7f", 15, samples=76, rollouts=20)
-    assert rollout.catheters is not None and rollout.valid.all()
-    forces = np.stack([rollout.base_force, rollout.catheters.base_force[..., 0]], axis=-1)[0, 72:]
+    stack, trajectory = robust_world(46, "microcatheter-1.7f", 15, samples=76, rollouts=20)
+    assert trajectory.valid.all()
+    forces = trajectory.base_force[0, 72:]
     pull = sum(device.pull_limit_n for device in stack.devices)
     assert (forces.sum(axis=-1) < -0.9 * pull).any()  # both pull in vain
     assert forces.sum(axis=-1).min() > -1.05 * pull
-    assert forces.min() > -1.5 * stack.catheters[0].device.pull_limit_n
+    assert forces.min() > -1.5 * stack.catheters[0].pull_limit_n
 
 
 def test_tubes_that_rest_at_a_drive_limit_end_their_steps() -> None:
     """A catheter that is pushed at its limit rests where Newton's steps do not shrink below the energy's rounding."""
-    stack, rollout = robust_world(5, "jl4-5f", 3, samples=8, rollouts=4)
-    assert rollout.catheters is not None
-    assert np.abs(rollout.catheters.base_force).max() > 0.99 * stack.catheters[0].device.push_limit_n
-    assert rollout.valid.all()
+    stack, trajectory = robust_world(5, "jl4-5f", 3, samples=8, rollouts=4)
+    assert np.abs(trajectory.base_force[..., 1]).max() > 0.99 * stack.catheters[0].push_limit_n
+    assert trajectory.valid.all()
 
 
-def test_a_rollout_written_as_csv_is_simulated_again(vessel: Anatomy, catheter: Catheter, tmp_path: Path) -> None:
+def test_a_trajectory_written_as_csv_is_simulated_again(vessel: Anatomy, catheter: Catheter, tmp_path: Path) -> None:
     start, control = random_drives(2, 4, 8)
-    wire = read_device("workhorse-014")
-    first = endopilot.simulate(vessel, wire, control, catheters=[catheter], initial=start)
-    write_rollout(first, tmp_path / "rollout.csv")
-    script = read_controls_csv(tmp_path / "rollout.csv", catheters=1)
-    second = endopilot.simulate(
-        vessel, wire, script.control, catheters=[catheter], initial=script.initial, period_s=script.period_s
-    )
-    assert second.catheters is not None and first.catheters is not None
-    assert second.catheters.tip_position == pytest.approx(first.catheters.tip_position, abs=1e-3)
+    stack = Stack(read_device("workhorse-014"), (catheter,))
+    first = endopilot.simulate(vessel, stack, control, initial=start)
+    write_trajectory(first, tmp_path / "trajectory.csv")
+    script = read_controls_csv(tmp_path / "trajectory.csv", devices=2)
+    second = endopilot.simulate(vessel, stack, script.control, initial=script.initial, period_s=script.period_s)
+    assert second.tip_position[:, :, 1] == pytest.approx(first.tip_position[:, :, 1], abs=1e-3)
     with pytest.raises(InputError, match="column catheter_2_translation_mm_s is missing"):
-        read_controls_csv(tmp_path / "rollout.csv", catheters=2)
+        read_controls_csv(tmp_path / "trajectory.csv", devices=3)
 
 
 @pytest.mark.parametrize(("wire_mm", "catheter_mm"), [(30.0, 12.3), (12.3, 30.0), (20.0, 20.0)])
 def test_the_line_that_devices_share_is_cut_at_each_tip(vessel, catheter, wire_mm, catheter_mm) -> None:
-    simulator = endopilot.Simulator(vessel, read_device("workhorse-014"), catheters=[catheter])
-    simulator.reset(inserted_length=[wire_mm], rotation=[0.0], catheter_inserted_length=[[catheter_mm]])
-    inserted = np.append(simulator.inserted_length, simulator.catheter_inserted_length)
-    lines = lines_from_tips(simulator.position[0], inserted)
+    simulator = endopilot.Simulator(vessel, Stack(read_device("workhorse-014"), (catheter,)))
+    simulator.reset(inserted_length=[[wire_mm, catheter_mm]], rotation=[[0.0, 0.0]])
+    lines = lines_from_tips(simulator.position[0], simulator.inserted_length[0])
     for device, line in enumerate(lines):
-        np.testing.assert_allclose(line[0], simulator.tips(device)[0], atol=0.01)
+        np.testing.assert_allclose(line[0], simulator.tip_position[0, device], atol=0.01)
         np.testing.assert_array_equal(line[-1], simulator.position[0, -1])
         assert np.linalg.norm(np.diff(line, axis=0), axis=1).min() > 0

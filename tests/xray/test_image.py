@@ -56,7 +56,7 @@ def test_a_driven_catheter_takes_away_what_its_wall_and_marker_do(fork, wire, na
     side = imager.config.geometry.pixel_mm / magnification(imager)
     nodes = imager.isocenter + np.linspace(-15, 15, 9)[:, None] * np.array([0.6, 0.0, 0.8])
     drawn = imager.catheter(plane, nodes)
-    outer, inner = catheter.device.diameter_mm / 2, catheter.inner_diameter_mm / 2
+    outer, inner = catheter.diameter_mm / 2, catheter.inner_diameter_mm / 2
     wall = CATHETER_MM * np.pi * (outer**2 - inner**2) * 30.0
     ring = 2 * np.pi * (outer + inner) / 2 * MARKER_WALL_MM * MARKER_LENGTH_MM * MARKER_MM
     marked = name.startswith("micro")  # a diagnostic catheter has none

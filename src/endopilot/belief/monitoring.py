@@ -15,7 +15,7 @@ from endopilot.belief.bands import Calibration, conformal_scale, fit_spread, nar
 from endopilot.belief.image_exposures import Exposures, ImageSettings, deeper_ostium_mm, image_exposures
 from endopilot.belief.online_predictors import OnlinePredictor, online_predictor
 from endopilot.dataset.loader import Dataset
-from endopilot.devices.device import Device
+from endopilot.devices.device import Wire
 from endopilot.models.config import WINDOW
 from endopilot.models.episodes import Episodes
 from endopilot.models.open_loop import Predictor
@@ -145,7 +145,7 @@ def monitor(predictor: Predictor, dataset: Dataset, config: AdviseConfig, *, sam
         images, unregistered = image_exposures(dataset, settings)
         dataset = dataset.select(~np.isin(dataset.anatomy, unregistered))
     names, owner = np.unique(dataset.anatomy, return_inverse=True)
-    wire_radius = from_record(Device, dataset.manifest["device"]).tip_radius_mm
+    wire_radius = from_record(Wire, dataset.manifest["device"]).tip_radius_mm
     deeper = np.array([deeper_ostium_mm(str(name), config.ostium_mm, config.seed) for name in names])
     by_encoder = np.zeros((len(dataset), 2))
     by_encoder[:, 0] = -deeper[owner]

@@ -37,8 +37,9 @@ def command(
         device: name of a device (`endopilot devices`) or a YAML file.
         catheter: up to two catheters around it, from the inside out: names such as microcatheter-1.7f, or YAML files.
         task: task of the ladder to drive by hand, with X-ray as the only sight until the end.
-        world: which patient of the task, world of the rollout, or episode of the data set.
-        replay: session, rollout, plan, data set or file of the ladder to look at instead.
+        world: which patient of the task, world of the trajectory, or episode of the data set.
+        replay: session, trajectory (.npz), folder of a plan, navigation or data set, or file of the ladder to look at
+            instead.
         episode: with --replay SESSION: write the session into this folder as a data set of one episode to train on, and
             leave.
         resume: go on with the session in this file, which a killed server left.
@@ -53,10 +54,10 @@ def command(
     from endopilot.cockpit.launch import serve
     from endopilot.cockpit.open import open_replay, open_session, open_task, resume_session
 
+    if catheter and (replay is not None or task is not None or resume is not None):
+        raise InputError("catheter: a replay, a task and a session have theirs; leave it out")
     if replay is not None:
-        opened = open_replay(replay, patient, device=device, catheters=catheter, world=world, task=task, ct=ct)
-    elif catheter and (task is not None or resume is not None):
-        raise InputError("catheter: a task and a session have theirs; leave it out")
+        opened = open_replay(replay, patient, world=world, task=task, ct=ct)
     elif task is not None:
         opened = open_task(task, world, output=output)
     elif resume is not None:

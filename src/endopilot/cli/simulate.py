@@ -17,6 +17,7 @@ from endopilot.dataset.navigations import simulate_navigations
 from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import read_device
 from endopilot.devices.stack import Stack
+from endopilot.errors import InputError
 from endopilot.progress import progress
 from endopilot.settings import LONGEST_S, Seed, Within, settings
 from endopilot.simulation.config import SimulatorConfig
@@ -24,7 +25,7 @@ from endopilot.simulation.controls import ControlConfig, random_controls, read_c
 from endopilot.simulation.motion import Motion, MotionName, motion_named
 from endopilot.simulation.simulate import simulate, wall_force_events
 from endopilot.simulation.trajectory import Trajectory
-from endopilot.simulation.trajectory_file import write_trajectory
+from endopilot.simulation.trajectory_file import read_trajectory, write_trajectory
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
 
@@ -48,7 +49,7 @@ def command(
     /,
     *,
     output: OutputFile,
-    device: str = "workhorse-014",
+    device: str | None = None,
     catheter: tuple[str, ...] = (),
     controls: Existing | None = None,
     motion: MotionName = "still",
@@ -63,12 +64,13 @@ def command(
     Args:
         anatomy: folder made by `endopilot anatomy` or `endopilot atlas`.
         output: .parquet or .csv with a row for each sample, or .npz with all arrays.
-        device: name of a device (`endopilot devices`) or a YAML file.
+        device: name of a device (`endopilot devices`) or a YAML file; workhorse-014 if not given.
         catheter: up to two catheters around it, from the inside out: names (`microcatheter-1.7f`, `microcatheter-2.4f`,
             `straight-5f`, `multipurpose-5f`, `vertebral-5f`, `jr4-5f`, `jl4-5f`, `simmons-2-5f`) or YAML files.
         controls: CSV of scripted proximal velocities (time_s, translation_mm_s, rotation_rad_s, those of catheters as
-            catheter_1_translation_mm_s, ...), or folder made by `endopilot plan` for this anatomy and device; random
-            ones by default.
+            catheter_1_translation_mm_s, ...), or what is driven again to the bit with its own devices, motion and
+            settings: a trajectory (.npz), such as `endopilot navigate` writes, or a folder made by `endopilot plan`;
+            random ones by default.
         motion: how heart and breath move the vessel and the guiding catheter: still, breathing, heartbeat or both.
         motion_seed: draws the patient's amplitudes from the published distributions; their means by default.
         shape: also record the positions of all nodes, mm (.npz only).
@@ -77,12 +79,13 @@ def command(
         config: settings of the rod core.
     """
     patient = read_anatomy(anatomy)
-    stack = Stack(read_device(device), tuple(read_catheter(name) for name in catheter))
+    stack = Stack(read_device(device or "workhorse-014"), tuple(read_catheter(name) for name in catheter))
     moves, period_s = motion_named(motion, motion_seed), SAMPLE_PERIOD_S
-    if controls is not None and controls.is_dir():
-        plan = read_plan(controls, patient, stack.wire, stack.catheters)
-        patient, stack = plan.navigation.anatomy, plan.navigation.stack
-        initial, control = plan.navigation.start[None], plan.control[None]
+    recorded = None
+    if controls is not None and (controls.is_dir() or controls.suffix == ".npz"):
+        recorded = _recorded(controls, patient, stack if device is not None or catheter else None)
+        patient, stack = recorded.set_up.anatomies[0], recorded.set_up.stacks[0]
+        initial, control = recorded.set_up.initial, recorded.command
     elif controls is not None:
         script = read_controls_csv(controls, devices=len(stack))
         initial, control, period_s = script.initial, script.control, script.period_s
@@ -99,7 +102,11 @@ def command(
     if controls is None and random.stop_short:
         trajectory, stopped = _stopped_short(patient, stack, initial, control, moves, config)
         initial, control = trajectory.set_up.initial, trajectory.command  # they give the same navigations again
-    if trajectory is None or record_shape:
+    if recorded is not None:
+        others = {"motion": moves, "config": None if config == SimulatorConfig() else config}
+        others = {name: value for name, value in others.items() if value is not None}
+        trajectory = recorded.replay(record_shape=record_shape, **others)
+    elif trajectory is None or record_shape:
         trajectory = simulate(
             patient,
             stack,
@@ -140,6 +147,17 @@ def command(
         else:
             print(missing, file=sys.stderr)
     return figures
+
+
+def _recorded(path: Path, patient: Anatomy, asked: Stack | None) -> Trajectory:
+    """Return what a plan's folder or a file holds; devices that are asked for must be its own."""
+    if path.is_dir():
+        return read_plan(path, patient, asked).trajectory
+    recorded = read_trajectory(path, patient)
+    if asked is not None and any(stack.constants != asked.constants for stack in recorded.set_up.stacks):
+        names = [" in ".join(each.name for each in stack.devices) for stack in (recorded.set_up.stacks[0], asked)]
+        raise InputError(f"device: {path} was made with another ({names[0]}), not with this {names[1]}; leave it out")
+    return recorded
 
 
 def _stopped_short(

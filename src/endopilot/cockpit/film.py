@@ -1,36 +1,30 @@
-"""What can be replayed: a session, a rollout, a plan, an episode of a data set, a navigation of the ladder.
+"""What can be replayed: a session, or a trajectory: a simulated or planned one, an episode, a navigation of the ladder.
 
-Each becomes a `Film`: the wire every 50 ms, driven again by its recorded controls while the page shows its begin.
+Each becomes a `Film`: the wire every 50 ms, driven again by its recorded commands while the page shows its begin.
 """
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from itertools import chain
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 
 from endopilot.anatomy.io import read_anatomy
 from endopilot.cockpit.recording import SUFFIX, read_recording, replayed
 from endopilot.cockpit.world import Snapshot, take_snapshot
 from endopilot.control.plan_file import read_plan
+from endopilot.dataset.again import episode_trajectory
 from endopilot.dataset.loader import load_dataset
-from endopilot.devices.catheter import read_catheter
-from endopilot.devices.device import read_device
 from endopilot.errors import InputError
-from endopilot.files import read_json, reading
-from endopilot.ladder.attempt import Recording, Repeated, navigation_seed
-from endopilot.navigation.navigate import NavigateConfig, NavigationLoop
-from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.controls import read_controls_csv
+from endopilot.files import reading
+from endopilot.ladder.submission import read_navigation
 from endopilot.simulation.simulator import Simulator
-from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target
-from endopilot.tasks.task import CORE, find_task
-from endopilot.types import Anatomy
+from endopilot.simulation.trajectory import Trajectory
+from endopilot.simulation.trajectory_file import TRAJECTORY, read_trajectory
+from endopilot.tasks.navigation import Navigation, Target
 
 FRAME_S = 0.05
 """Time from one frame of a film to the next, s."""
@@ -87,24 +81,14 @@ class Film:
         self.done = True
 
 
-def open_film(
-    path: Path,
-    patient: Path | None = None,
-    *,
-    device: str = "workhorse-014",
-    catheters: Sequence[str] = (),
-    world: int = 0,
-    task: str | None = None,
-) -> Film:
+def open_film(path: Path, patient: Path | None = None, *, world: int = 0, task: str | None = None) -> Film:
     """Open what is to be replayed.
 
     Args:
-        path: a session (.cockpit.jsonl); a rollout or controls (.csv); a folder of a plan, of `endopilot navigate` or
-            of a data set; a submission.json, or a navigation's result of the ladder.
-        patient: folder of the anatomy, for rollouts and plans.
-        device: wire of a rollout or plan.
-        catheters: around it, from the inside out.
-        world: which of a rollout's worlds, a data set's episodes, or a task's patients.
+        path: a session (.cockpit.jsonl); a trajectory (.npz); a folder of a plan, of `endopilot navigate` or of a data
+            set; a submission.json, or a navigation's result of the ladder.
+        patient: folder of the anatomy, for trajectories and plans.
+        world: which of a trajectory's worlds, a data set's episodes, or a task's patients.
         task: of the ladder's files.
 
     Raises:
@@ -112,26 +96,29 @@ def open_film(
     """
     if path.name.endswith(SUFFIX):
         return _session(path)
-    if (path / "plan.csv").exists():
-        around = tuple(read_catheter(name) for name in catheters)
-        plan = read_plan(path, read_anatomy(_given(patient, path)), read_device(device), around)
-        start = plan.navigation.start
-        return _controls(plan.navigation, start, plan.control, DECISION_PERIOD_S, f"plan {path.name}")
-    if (path / "navigation.csv").exists():
-        vessel, files = read_anatomy(_given(patient, path)), sorted(path.glob("catheter-*.yaml"))
-        return _rollout(path / "controls.csv", vessel, str(path / "wire.yaml"), list(map(str, files)), 0)
     if (path / "meta").is_dir():
         with reading(path, "make the data set again"):
-            return _episode(path, world)
+            return _film(episode_trajectory(load_dataset(path), world), 0, f"episode {world} of {path.name}")
     if path.suffix == ".json":
         with reading(path, "give a file of the ladder as it was written"):
-            return _ladder(path, task, world)
-    if path.suffix == ".csv":
-        return _rollout(path, read_anatomy(_given(patient, path)), device, catheters, world)
-    raise InputError(
-        f"{path}: cannot be replayed; give a session ({SUFFIX}), a rollout (.csv), a folder of a plan, a navigation "
-        "or a data set, or a file of the ladder (.json)"
-    )
+            of, place, record = read_navigation(path, task, world)
+            return _film(record.cycles, 0, f"{of.title}, patient {place}")
+    recorded = path / TRAJECTORY if path.is_dir() else path
+    if recorded.suffix != ".npz" or not recorded.exists():
+        raise InputError(
+            f"{path}: cannot be replayed; give a session ({SUFFIX}), a trajectory (.npz), a folder of a plan, a "
+            "navigation or a data set, or a file of the ladder (.json)"
+        )
+    if patient is None:
+        raise InputError(f"{path}: give the patient's folder too: endopilot cockpit PATIENT --replay {path}")
+    vessel = read_anatomy(patient)
+    if (path / "plan.csv").exists():
+        return _film(read_plan(path, vessel).trajectory, world, f"plan {path.name}")
+    trajectory = read_trajectory(recorded, vessel)
+    worlds = len(trajectory.valid)
+    if not 0 <= world < worlds:
+        raise InputError(f"world: {world}; {path} has worlds 0 to {worlds - 1}")
+    return _film(trajectory, world, f"{path.name}, world {world}")
 
 
 def _session(path: Path) -> Film:
@@ -153,146 +140,45 @@ def _session(path: Path) -> Film:
     return Film(navigation, recording.cycles * recording.config.cycle_s, f"session {path.name}", make)
 
 
-def _controls(
-    navigation: Navigation,
-    start: Float[np.ndarray, "devices 2"],
-    control: Float[np.ndarray, "n devices 2"],
-    period_s: float,
-    title: str,
-    config: SimulatorConfig | None = None,
-    friction: float | None = None,
-) -> Film:
-    """Return a film of controls, mm/s and rad/s of each device, each held for a period, s.
-
-    Args:
-        navigation: vessel, wire and catheters.
-        start: inserted length, mm, and rotation, rad, of each device.
-        control: a row a period.
-        period_s: time that each is held, s.
-        title: of the film.
-        config: settings of the rod core.
-        friction: of the wire; the device's own if not given.
-    """
-    parts = max(round(period_s / FRAME_S), 1)
-    lengths = np.maximum(
-        start[:, 0], 0.0
-    )  # what was computed back from the end of a period may lie below by a rounding
+def _film(trajectory: Trajectory, world: int, title: str) -> Film:
+    """Return a film of a world of a trajectory, which is driven again by its commands."""
+    set_up, about, period_s = trajectory.set_up, trajectory.about, trajectory.period_s
+    anatomy, stack, start = set_up.anatomies[world], set_up.stacks[world], set_up.initial[world]
+    if np.isnan(start).any():
+        raise InputError(f"{title}: was on its way when the recording began; record from its start")
+    leaf = anatomy.tree.longest_leaf()
+    end = Target(branch=leaf, abscissa=float(anatomy.tree.branches[leaf].centerline.abscissa[-1]))
+    navigation = Navigation(
+        anatomy=anatomy,
+        device=stack.wire,
+        target=Target(**about["target"]) if "target" in about else end,
+        catheters=stack.catheters,
+    )
+    parts, every = max(round(period_s / FRAME_S), 1), max(round(FRAME_S / period_s), 1)
+    exposed = {round(time_s / FRAME_S) for time_s in about.get("exposures_s", ())}
 
     def make() -> Iterator[Frame]:
         simulator = Simulator(
-            navigation.anatomy,
-            navigation.stack,
-            config=replace(config or SimulatorConfig(), threads=1),
+            anatomy, stack, actuation=set_up.actuation, motion=set_up.motion, config=replace(set_up.config, threads=1)
         )
-        own = simulator.set_up.friction.copy()
-        own[:, 0] = own[:, 0] if friction is None else friction
-        simulator.reset(inserted_length=lengths[None], rotation=start[None, :, 1], friction=own)
+        simulator.reset(
+            inserted_length=start[None, :, 0], rotation=start[None, :, 1], friction=set_up.friction[world : world + 1]
+        )
         frame = {"cycle": 0, "time_s": 0.0, "force_n": 0.0, "velocity": (0.0,) * start.size}
-        yield Frame(take_snapshot(simulator, None, **frame))
-        for number, velocity in enumerate(control):
-            for part in range(parts):
-                step = simulator.step([velocity], period_s / parts)
+        yield Frame(take_snapshot(simulator, None, **frame), 0 in exposed)
+        force_n = 0.0
+        for number, command in enumerate(np.repeat(trajectory.command[world], parts, axis=0), start=1):
+            before = simulator.proximal[0]
+            step = simulator.step([command], period_s / parts)
+            force_n = max(force_n, float(step.contact_force_max[0]))
+            if number % every == 0:
                 frame = {
-                    "cycle": number * parts + part + 1,
-                    "time_s": (number + (part + 1) / parts) * period_s,
-                    "force_n": float(step.contact_force_max[0]),
-                    "velocity": tuple(velocity.ravel().tolist()),
+                    "cycle": number // every,
+                    "time_s": number * period_s / parts,
+                    "force_n": force_n,
+                    "velocity": tuple(((simulator.proximal[0] - before) * parts / period_s).ravel().tolist()),
                 }
-                yield Frame(take_snapshot(simulator, step, **frame))
+                yield Frame(take_snapshot(simulator, step, **frame), number // every in exposed)
+                force_n = 0.0
 
-    return Film(navigation, len(control) * period_s, title, make)
-
-
-def _rollout(path: Path, anatomy: Anatomy, device: str, catheters: Sequence[str], world: int) -> Film:
-    """Return a film of a rollout's or script's controls."""
-    script = read_controls_csv(path, devices=1 + len(catheters))
-    worlds = len(script.control)
-    if not 0 <= world < worlds:
-        raise InputError(f"world: {world}; {path} has worlds 0 to {worlds - 1}")
-    start = script.initial[world]
-    wire = read_device(device)
-    leaf = anatomy.tree.longest_leaf()
-    end = float(anatomy.tree.branches[leaf].centerline.abscissa[-1])
-    navigation = Navigation(
-        anatomy=anatomy,
-        device=wire,
-        target=Target(branch=leaf, abscissa=end),
-        catheters=tuple(read_catheter(name) for name in catheters),
-    )
-    return _controls(navigation, start, script.control[world], script.period_s, f"rollout {path.name}, world {world}")
-
-
-def _episode(folder: Path, number: int) -> Film:
-    """Return a film of an episode of a data set, driven again by what the drive was commanded."""
-    data = load_dataset(folder)
-    if not 0 <= number < len(data):
-        raise InputError(f"world: {number}; {folder} has episodes 0 to {len(data) - 1}")
-    settings = data.manifest["settings"]
-    anatomy = read_anatomy(data.anatomy_folder(str(data.anatomy[number])))
-    wire = read_device(str(data.device[number])).with_tip(
-        bend_rad=float(data.tip_bend[number]), stiffness_factor=float(data.tip_stiffness_factor[number])
-    )
-    branch = int(data.branch[number, -1, 0])
-    line = anatomy.tree.branches[branch].centerline.abscissa
-    navigation = Navigation(
-        anatomy=anatomy,
-        device=wire,
-        target=Target(branch=branch, abscissa=float(np.clip(data.tip_abscissa[number, -1, 0], line[0], line[-1]))),
-        catheters=data.stack.catheters,
-    )
-    config = SimulatorConfig(**(settings["config"]["simulator"] | {"threads": 1}))
-    friction = float(data.friction[number])
-    title = f"episode {number} of {folder.name}"
-    start = data.initial[number]
-    return _controls(navigation, start, data.command[number], data.sample_period_s, title, config, friction)
-
-
-def _ladder(path: Path, name: str | None, place: int) -> Film:
-    """Return a film of a navigation in a submission, or in a result file of a ladder's folder."""
-    content = read_json(path)
-    if isinstance(content, dict) and "navigations" in content:
-        if name is None or name not in content["navigations"]:
-            raise InputError(f"task: {name!r}; {path} has {', '.join(content['navigations'])}")
-        entries = content["navigations"][name]
-        if not 0 <= place < len(entries):
-            raise InputError(f"world: {place}; {path} has patients 0 to {len(entries) - 1} of this task")
-        entry = entries[place]
-    elif isinstance(content, dict) and "recording" in content and path.stem.isdecimal():
-        name, place, entry = path.parent.name, int(path.stem), content
-    else:
-        raise InputError(f"{path}: is no file of the ladder; give a submission.json or TASK/NUMBER.json")
-    task = find_task(name, content.get("ladder") or 1)
-    navigation = task.ladder_navigation(place)
-    devices = len(navigation.devices)
-    recording = Recording.unpacked(entry["recording"], devices)
-
-    def make() -> Iterator[Frame]:
-        config = NavigateConfig(simulator=replace(CORE, threads=1))
-        loop = NavigationLoop(navigation, Repeated(recording), config=config, seed=navigation_seed(task, place))
-        yield Frame(_of_loop(loop, 0.0, (0.0, 0.0) * devices))
-        while loop.reason is None:
-            velocity = tuple(chain.from_iterable(loop.begin().devices))
-            exposed = loop.observation is not None and loop.observation.tip is not None
-            while loop.reason is None and not loop.between_periods:
-                peak = loop.advance(FRAME_S)
-                yield Frame(_of_loop(loop, peak, velocity), exposed)
-                exposed = False
-
-    return Film(navigation, len(recording.control) * DECISION_PERIOD_S, f"{task.title}, patient {place}", make)
-
-
-def _of_loop(loop: NavigationLoop, force_n: float, velocity: tuple[float, ...]) -> Snapshot:
-    return take_snapshot(
-        loop.simulator,
-        loop.robot.last_step,
-        cycle=round(loop.time_s / FRAME_S),
-        time_s=loop.time_s,
-        force_n=force_n,
-        velocity=velocity,
-    )
-
-
-def _given(patient: Path | None, path: Path) -> Path:
-    if patient is None:
-        raise InputError(f"{path}: give the patient's folder too: endopilot cockpit PATIENT --replay {path}")
-    return patient
+    return Film(navigation, len(trajectory.command[world]) * period_s, title, make)

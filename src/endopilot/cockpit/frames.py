@@ -145,7 +145,7 @@ def scene(navigation: Navigation, about: dict[str, Any]) -> bytes:
     }
     if navigation.catheters:
         header["catheters"] = [
-            {"name": each.name, "diameter_mm": each.device.diameter_mm, "push_limit_n": each.device.push_limit_n}
+            {"name": each.name, "diameter_mm": each.diameter_mm, "push_limit_n": each.push_limit_n}
             for each in navigation.catheters
         ]
     return encode(

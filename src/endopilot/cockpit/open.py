@@ -19,7 +19,7 @@ from endopilot.cockpit.recording import SUFFIX, Recorder, Where, read_recording,
 from endopilot.cockpit.session import Session
 from endopilot.cockpit.world import World
 from endopilot.devices.catheter import Catheter, read_catheter
-from endopilot.devices.device import Device, read_device
+from endopilot.devices.device import Wire, read_device
 from endopilot.navigation.policies import POLICIES
 from endopilot.tasks.navigation import Navigation, Target
 from endopilot.types import Anatomy, Volume
@@ -96,8 +96,6 @@ def open_replay(
     path: Path,
     patient: Path | None = None,
     *,
-    device: str = "workhorse-014",
-    catheters: Sequence[str] = (),
     world: int = 0,
     task: str | None = None,
     ct: Path | None = None,
@@ -106,10 +104,8 @@ def open_replay(
 
     Args:
         path: as for `open_film`.
-        patient: folder of the anatomy, for rollouts and plans.
-        device: wire of a rollout or plan.
-        catheters: around it, from the inside out.
-        world: which of a rollout's worlds, a data set's episodes, or a task's patients.
+        patient: folder of the anatomy, for trajectories and plans.
+        world: which of a trajectory's worlds, a data set's episodes, or a task's patients.
         task: of the ladder's files.
         ct: CT angiogram of the patient, for the X-ray's background.
 
@@ -119,7 +115,7 @@ def open_replay(
     from endopilot.cockpit.film import FRAME_S, open_film  # slow to import, and needed for replays alone
     from endopilot.cockpit.replay import ReplayStage
 
-    film = open_film(path, patient, device=device, catheters=catheters, world=world, task=task)
+    film = open_film(path, patient, world=world, task=task)
     navigation = film.navigation
     stage = ReplayStage(film, xray_unit(navigation, read_ct(ct)))
     return Opened(stage, scene_of(navigation, {}), FRAME_S, None)
@@ -201,7 +197,7 @@ def read_ct(path: Path | None) -> Volume | None:
     return volume
 
 
-def _start_of(anatomy: Anatomy, device: Device, catheters: tuple[Catheter, ...]) -> Navigation:
+def _start_of(anatomy: Anatomy, device: Wire, catheters: tuple[Catheter, ...]) -> Navigation:
     """Return a navigation from the ostium to a first target, far down the longest path."""
     tree = anatomy.tree
     leaf = tree.longest_leaf()

@@ -20,7 +20,7 @@ from endopilot import __version__
 from endopilot.anatomy.io import read_anatomy
 from endopilot.cockpit.world import World
 from endopilot.devices.catheter import Catheter
-from endopilot.devices.device import Device
+from endopilot.devices.device import Wire
 from endopilot.devices.stack import Proximals
 from endopilot.errors import InputError
 from endopilot.files import json_text, reading
@@ -235,7 +235,7 @@ def _navigation(path: Path, header: dict[str, Any], where: Where) -> Navigation:
         raise InputError(f"{path}: {anatomy.name} is another vessel now; bring the one back that it was recorded in")
     return Navigation(
         anatomy=anatomy,
-        device=from_record(Device, header["device"]),
+        device=from_record(Wire, header["device"]),
         target=from_record(Target, header["target"]),
         start_inserted_mm=header["start"][0],
         start_rotation=header["start"][1],

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from endopilot.control.period import drive_period
-from endopilot.devices.device import Device
+from endopilot.devices.device import Wire
 from endopilot.simulation.simulator import Simulator
 from endopilot.simulation.state import SimulatorState, Step
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation
@@ -124,7 +124,7 @@ class Copies:
         peak: largest wall force on a node of each since `put`, N; infinite where the simulation has failed.
     """
 
-    def __init__(self, navigation: Navigation, wires: list[Device], like: Simulator) -> None:
+    def __init__(self, navigation: Navigation, wires: list[Wire], like: Simulator) -> None:
         """Lay them out.
 
         Args:

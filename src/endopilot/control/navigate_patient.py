@@ -19,7 +19,7 @@ from endopilot.anatomy.io import read_anatomy
 from endopilot.control.agent import OraclePolicy
 from endopilot.control.set_up import TILT_DEG, TipChoice, choose_tip
 from endopilot.devices.catheter import Catheter, read_catheter
-from endopilot.devices.device import Device, read_device
+from endopilot.devices.device import Wire, read_device
 from endopilot.errors import InputError
 from endopilot.navigation.navigate import NavigateConfig, NavigationLoop, XrayKind
 from endopilot.navigation.policies import make_policy
@@ -127,7 +127,7 @@ class SetUp:
         return self.truth.anatomy(self.navigation.anatomy)
 
     @property
-    def true_wire(self) -> Device:
+    def true_wire(self) -> Wire:
         """The wire as it truly is."""
         device = self.navigation.device
         wire = device.with_tip(bend_rad=device.tip_bend_rad, stiffness_factor=self.truth.stiffness_factor)
@@ -276,7 +276,7 @@ def _truth(config: NavigatePatientConfig, vessel: Anatomy) -> ModelMismatch:
 
 
 def _see_catheter(
-    vessel: Anatomy, device: Device, truth: ModelMismatch, config: NavigatePatientConfig
+    vessel: Anatomy, device: Wire, truth: ModelMismatch, config: NavigatePatientConfig
 ) -> tuple[Anatomy, ModelMismatch]:
     """Return the vessel with its guiding catheter as an exposure shows it, and how reality differs from that.
 

@@ -17,7 +17,7 @@ from endopilot.control.desired import last_place, read_tips, tips_along
 from endopilot.control.plan_config import NETWORK_METHODS, Plan, PlanConfig, Steps
 from endopilot.control.set_up import TipChoice, choose_tip
 from endopilot.devices.catheter import Catheter
-from endopilot.devices.device import Device, read_device
+from endopilot.devices.device import Wire, read_device
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.errors import InputError
 from endopilot.extras import extra_named
@@ -48,7 +48,7 @@ def plan(
     config: PlanConfig | None = None,
     *,
     model: str | Path | None = None,
-    device: Device | str | Path | None = None,
+    device: Wire | str | Path | None = None,
     catheters: Sequence[Catheter] = (),
 ) -> Plan:
     """Plan a navigation.
@@ -168,16 +168,16 @@ def _check_for_stack(config: PlanConfig, target: str, model: Path | None) -> Non
         )
 
 
-def _wire(model: Path | None, device: Device | str | Path | None, method: str) -> Device:
+def _wire(model: Path | None, device: Wire | str | Path | None, method: str) -> Wire:
     """Return the wire: the one that is asked for, else the model's; both must be the same."""
-    asked = device if isinstance(device, Device | None) else read_device(device)
+    asked = device if isinstance(device, Wire | None) else read_device(device)
     if model is None:
         if method in NETWORK_METHODS:
             raise InputError(
                 f"--model: none given, and method {method} needs one; give a run of `endopilot train`, or pretrained"
             )
         return asked or read_device("workhorse-014")
-    trained = from_record(Device, read_run(model)["device"])
+    trained = from_record(Wire, read_run(model)["device"])
     if asked is not None and asked.constants != trained.constants:
         raise InputError(
             f"--device {asked.name}: {model} was trained with {trained.name}; leave --device out or train anew"
@@ -284,7 +284,7 @@ def _checked(
     limits = [DriveLimits.of(device, navigation.anatomy) for device in navigation.devices]
     parts = [within_limits(control[:, k], each, start[k, 0]) for k, each in enumerate(limits)]
     control = np.stack(parts, axis=1)
-    rollout = simulate(
+    trajectory = simulate(
         navigation.anatomy, navigation.stack, control[None], initial=start[None], config=SimulatorConfig(threads=1)
     )
     wanted = np.concatenate([desired, np.repeat(desired[-1:], max(len(control) - len(desired), 0), axis=0)])
@@ -292,14 +292,10 @@ def _checked(
         navigation=navigation,
         config=config,
         model=None if model is None else str(model),
-        control=control,
-        proximal=start + DECISION_PERIOD_S * np.cumsum(control, axis=0),
+        trajectory=trajectory,
         desired=wanted[: len(control)],
         predicted=predicted,
-        tip=rollout.tip[0],
-        position=rollout.tip_position[0],
-        force=rollout.contact_force_max[0],
-        reached=bool(navigation.reached(rollout.tip[0]).any()),
+        reached=bool(navigation.reached(trajectory.tip[0]).any()),
         why=choice.why if choice else "",
         tilt_deg=choice.tilt_deg if choice else 0.0,
         seconds_to_plan=float(spent[0]),

@@ -13,6 +13,7 @@ from endopilot.control.cost import Cost
 from endopilot.control.set_up import TILT_DEG
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.settings import Finite, Positive, Seconds, Seed, Text, Within, settings
+from endopilot.simulation.trajectory import Trajectory
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Arrives, Navigation
 from endopilot.types import TipProjection
 
@@ -79,13 +80,9 @@ class Plan:
         navigation: what is to be done.
         config: its settings.
         model: the trained run that it was found with, if any.
-        control: π, mm/s and rad/s, of each device.
-        proximal: (Δ mm, φ rad), its integral.
+        trajectory: what the rod core, at its own settings, makes of the plan's controls.
         desired: desired tip states (Δtip, γtip), mm.
         predicted: tip states that the model predicts, mm.
-        tip: where the rod core, at its own settings, has the tips under these controls, a column a device.
-        position: of these tips, LPS mm.
-        force: largest wall force on one node in the rod core, N.
         reached: whether the target is reached at the end of a period in the rod core.
         why: why the tip has its shape and the catheter its axis; empty where both are the given ones.
         tilt_deg: angle by which the catheter was turned from the anatomy's axis, degrees.
@@ -96,18 +93,29 @@ class Plan:
     navigation: Navigation
     config: PlanConfig
     model: str | None
-    control: Controls
-    proximal: Controls
+    trajectory: Trajectory
     desired: Steps
     predicted: Steps
-    tip: TipProjection
-    position: Float[np.ndarray, "samples devices 3"]
-    force: Float[np.ndarray, "samples"]
     reached: bool
     why: str
     tilt_deg: float
     seconds_to_plan: float
     processor_seconds: float
+
+    @property
+    def control(self) -> Controls:
+        """π, mm/s and rad/s, of each device."""
+        return self.trajectory.command[0]
+
+    @property
+    def tip(self) -> TipProjection:
+        """Where the rod core has the tips, a column a device."""
+        return self.trajectory.tip[0]
+
+    @property
+    def force(self) -> Float[np.ndarray, "samples"]:
+        """Largest wall force on one node in the rod core, N."""
+        return self.trajectory.contact_force_max[0]
 
     @property
     def seconds(self) -> float:

@@ -1,7 +1,8 @@
-"""A plan on disk: a folder of `plan.csv`, `manifest.json` and `plan.png`.
+"""A plan on disk: a folder of `trajectory.npz`, `manifest.json`, `plan.csv` and `plan.png`.
 
-`plan.csv` holds a row for the end of each sample period of 0.5 s. Its first columns are those that `endopilot simulate
---controls` takes, so that a plan can be driven again.
+`trajectory.npz` is what is read back and driven again, to the bit: the plan's controls and what the rod core makes of
+them, with the columns `desired` and `predicted`. `plan.csv` is for people and other programs: a row for the end of each
+sample period of 0.5 s.
 
 ================================================  ====================================================================
 column                                            meaning
@@ -26,7 +27,6 @@ those from the translation to the tip in space, of the catheter.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -40,13 +40,14 @@ from endopilot.control.plan_config import Plan, PlanConfig
 from endopilot.control.plan_xray import PlannedXray
 from endopilot.control.set_up import tip_name
 from endopilot.devices.catheter import Catheter
-from endopilot.devices.device import Device
+from endopilot.devices.device import Wire
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.files import json_text, manifest, read_json, reading, sha256, writing
 from endopilot.settings import from_record
+from endopilot.simulation.trajectory_file import TRAJECTORY, read_trajectory, write_trajectory
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target
-from endopilot.types import Anatomy, TipProjection
+from endopilot.types import Anatomy
 
 _TABLE, _RECORD, PICTURE = "plan.csv", "manifest.json", "plan.png"
 
@@ -90,6 +91,10 @@ def write_plan(plan: Plan, folder: Path, xray: PlannedXray | None = None) -> dic
     with writing(folder) as partial:
         partial.mkdir()
         _table(plan, xray).to_csv(partial / _TABLE, index=False)
+        columns = {"desired": plan.desired[None], "predicted": plan.predicted[None]}
+        about = {"target": asdict(navigation.target), "method": plan.config.method}
+        about |= {"exposures_s": figures["xray_due_s"]} if xray is not None else {}
+        write_trajectory(replace(plan.trajectory, columns=columns, about=about), partial / TRAJECTORY)
         draw_plan(plan, partial / PICTURE, xray)
         record = manifest(
             config=plan.config,
@@ -103,7 +108,7 @@ def write_plan(plan: Plan, folder: Path, xray: PlannedXray | None = None) -> dic
             target=asdict(navigation.target),
             start={"inserted_length_mm": navigation.start_inserted_mm, "rotation_rad": navigation.start_rotation},
             limits={"seconds": navigation.seconds, "force_n": navigation.force_limit_n},
-            table_sha256=sha256(partial / _TABLE),
+            trajectory_sha256=sha256(partial / TRAJECTORY),
             **figures,
         )
         (partial / _RECORD).write_text(json_text(record) + "\n", encoding="utf-8")
@@ -133,26 +138,32 @@ def _table(plan: Plan, xray: PlannedXray | None) -> pd.DataFrame:
 
 
 def _device(plan: Plan, device: int) -> dict[str, np.ndarray]:
-    moved = plan.control[:, device], plan.proximal[:, device]
-    return device_columns(device, *moved, plan.tip[:, device], plan.position[:, device])
+    made = plan.trajectory
+    moved = plan.control[:, device], made.proximal[0, :, device]
+    return device_columns(device, *moved, plan.tip[:, device], made.tip_position[0, :, device])
 
 
-def read_plan(folder: Path, anatomy: Anatomy, device: Device, catheters: Sequence[Catheter] = ()) -> Plan:
-    """Read a plan that `write_plan` wrote, for the anatomy and the devices that it was made for.
+def read_plan(folder: Path, anatomy: Anatomy, stack: Stack | None = None) -> Plan:
+    """Read a plan that `write_plan` wrote, for the anatomy that it was made for.
 
     The plan's own wire has the tip, and its anatomy the catheter's axis, that were chosen for it.
+
+    Args:
+        folder: of the plan.
+        anatomy: the vessel.
+        stack: devices that are to be those of the plan, but for the shape of the wire's tip; any will do if not given.
 
     Raises:
         InputError: a file is missing or damaged, or the plan is for another anatomy or device.
     """
     folder = Path(folder)
     with reading(folder, "plan anew"):
-        return _plan_in(folder, anatomy, device, catheters)
+        return _plan_in(folder, anatomy, stack)
 
 
-def _plan_in(folder: Path, anatomy: Anatomy, device: Device, catheters: Sequence[Catheter]) -> Plan:
+def _plan_in(folder: Path, anatomy: Anatomy, stack: Stack | None) -> Plan:
     record = read_json(folder / _RECORD)
-    if not isinstance(record, dict) or "table_sha256" not in record:
+    if not isinstance(record, dict) or "trajectory_sha256" not in record:
         raise InputError(f"{folder / _RECORD}: is not the manifest of a plan; make one with `endopilot plan`")
     try:
         config = from_record(PlanConfig, record["config"])
@@ -165,30 +176,20 @@ def _plan_in(folder: Path, anatomy: Anatomy, device: Device, catheters: Sequence
         raise InputError(
             f"{folder}: the plan is for another anatomy ({made['name']}), not for this {anatomy.name}; plan anew"
         )
-    planned = from_record(Device, record["device"])
+    planned = from_record(Wire, record["device"])
     tip = {"tip_bend_rad": planned.tip_bend_rad, "tip_bend_length_mm": planned.tip_bend_length_mm}
     around = tuple(from_record(Catheter, catheter) for catheter in record.get("catheters", ()))
-    if Stack(planned, around).constants != Stack(replace(device, **tip), tuple(catheters)).constants:
-        names = [
-            " in ".join([wire.name, *(each.name for each in others)])
-            for wire, others in ((planned, around), (device, catheters))
-        ]
+    made_for = Stack(planned, around)
+    given = made_for if stack is None else replace(stack, wire=replace(stack.wire, **tip))
+    if made_for.constants != given.constants:
+        names = [" in ".join(device.name for device in each.devices) for each in (made_for, given)]
         raise InputError(
             f"{folder}: the plan is for another device ({names[0]}), not for {names[1]}; plan anew, or give the plan's"
         )
-    if not (folder / _TABLE).exists() or sha256(folder / _TABLE) != record["table_sha256"]:
-        raise InputError(f"{folder / _TABLE}: is missing or differs from what {_RECORD} records; plan anew")
-    table = pd.read_csv(folder / _TABLE)
-    column = {str(name): table[name].to_numpy() for name in table.columns}
-    prefixes = ["", *(f"catheter_{number}_" for number in range(1, len(around) + 1))]
-
-    def each(*names: str) -> np.ndarray:
-        """Return columns of all devices: (samples, devices, names)."""
-        return np.stack([np.column_stack([column[before + name] for name in names]) for before in prefixes], axis=1)
-
-    def wire(*names: str) -> np.ndarray:
-        return np.column_stack([column[name] for name in names])
-
+    path = folder / TRAJECTORY
+    if not path.exists() or sha256(path) != record["trajectory_sha256"]:
+        raise InputError(f"{path}: is missing or differs from what {_RECORD} records; plan anew")
+    trajectory = read_trajectory(path, anatomy)
     return Plan(
         navigation=Navigation(
             anatomy=anatomy,
@@ -203,18 +204,9 @@ def _plan_in(folder: Path, anatomy: Anatomy, device: Device, catheters: Sequence
         ),
         config=config,
         model=record["model"],
-        control=each("translation_mm_s", "rotation_rad_s"),
-        proximal=each("inserted_length_mm", "rotation_rad"),
-        desired=wire("desired_tip_abscissa_mm", "desired_tip_offset_mm"),
-        predicted=wire("predicted_tip_abscissa_mm", "predicted_tip_offset_mm"),
-        tip=TipProjection(
-            abscissa=each("tip_abscissa_mm")[..., 0],
-            offset=each("tip_offset_mm")[..., 0],
-            branch=each("branch")[..., 0],
-            radius=each("lumen_radius_mm")[..., 0],
-        ),
-        position=each("tip_x_mm", "tip_y_mm", "tip_z_mm"),
-        force=column["contact_force_n"],
+        trajectory=trajectory,
+        desired=trajectory.columns["desired"][0],
+        predicted=trajectory.columns["predicted"][0],
         reached=record["reached"],
         why=record["why"],
         tilt_deg=record["catheter_tilt_deg"],

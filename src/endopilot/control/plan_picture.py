@@ -30,7 +30,7 @@ def draw_plan(plan: Plan, path: Path, xray: PlannedXray | None = None) -> None:
     grid = figure.add_gridspec(4, 2, width_ratios=(1.0, 1.25))
     names = " in ".join(device.name for device in plan.navigation.devices)
     title = f"{plan.navigation.anatomy.name}, {names}: {plan.config.method}"
-    wire, *around = np.moveaxis(plan.position, 1, 0)
+    wire, *around = np.moveaxis(plan.trajectory.tip_position[0], 1, 0)
     draw_route(figure.add_subplot(grid[:, 0]), plan.navigation, wire, title, around)
     time_s = DECISION_PERIOD_S * np.arange(1, len(plan.control) + 1)
     panels = [figure.add_subplot(grid[row, 1]) for row in range(4)]

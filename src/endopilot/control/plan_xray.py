@@ -99,14 +99,16 @@ class _Wires:
         return self._agent.adviser_input()
 
     def move(self, period: int) -> AdviserInput:
-        self._agent.belief.follow(tuple((inserted, turn) for inserted, turn in self._plan.proximal[period].tolist()))
+        self._agent.belief.follow(
+            tuple((inserted, turn) for inserted, turn in self._plan.trajectory.proximal[0, period].tolist())
+        )
         return self._agent.adviser_input()
 
     def observe(self, period: int) -> None:
         tip = self._plan.tip[:, 0]
         self._agent.belief.weigh(
             TipMeasurement(
-                position=self._plan.position[period, 0],
+                position=self._plan.trajectory.tip_position[0, period, 0],
                 abscissa=float(tip.abscissa[period]),
                 offset=float(tip.offset[period]),
                 branch=int(tip.branch[period]),

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Int
 
 from endopilot.control.sweep import middle, sweep
-from endopilot.devices.device import Device
+from endopilot.devices.device import Wire
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.simulation.config import PRESETS
 from endopilot.simulation.simulator import Simulator
@@ -63,7 +63,7 @@ def lateral_reach(bend_rad: float, length_mm: float) -> float:
     return float(length_mm * (1 - np.cos(min(angle, np.pi))) / angle) if angle > 0 else 0.0
 
 
-def forks(route: Route, device: Device) -> tuple[Fork, ...]:
+def forks(route: Route, device: Wire) -> tuple[Fork, ...]:
     """Return the forks of a route, the nearest to the ostium first."""
     tree = route.anatomy.tree
     found = []
@@ -75,7 +75,7 @@ def forks(route: Route, device: Device) -> tuple[Fork, ...]:
     return tuple(found)
 
 
-def rotations_that_enter(navigation: Navigation, device: Device) -> Int[np.ndarray, "forks"]:
+def rotations_that_enter(navigation: Navigation, device: Wire) -> Int[np.ndarray, "forks"]:
     """Return with how many of `ROTATIONS` rotations a wire enters the right branch at each fork of the route.
 
     A wire is brought up to each fork of the route, turned to all sides and pushed on straight (`sweep`). It goes on

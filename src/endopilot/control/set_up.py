@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 
 from endopilot.anatomy.catheter_axis import turned_axis, with_axis
 from endopilot.control.reach import ROTATIONS, Fork, forks, lateral_reach, rotations_that_enter
-from endopilot.devices.device import Device
+from endopilot.devices.device import Wire
 from endopilot.errors import InputError
 from endopilot.tasks.navigation import Navigation
 from endopilot.tasks.route import Route
@@ -101,12 +101,12 @@ def choose_tip(navigation: Navigation, tip: str = "auto", *, catheter_tilt_deg: 
     return TipChoice(made, tilt_deg, places, counts[best], why)
 
 
-def tip_name(device: Device) -> str:
+def tip_name(device: Wire) -> str:
     """Return the shape of a wire's tip as `--tip` takes it, such as "75/5": degrees and mm."""
     return f"{np.degrees(device.tip_bend_rad):.4g}/{device.tip_bend_length_mm:.4g}"
 
 
-def _tips(device: Device, tip: str) -> list[Device]:
+def _tips(device: Wire, tip: str) -> list[Wire]:
     """Return the wire with each tip that may be chosen, its own one first."""
     shaping = device.tip_shaping
     if tip == "own" or (tip == "auto" and shaping is None):
@@ -124,7 +124,7 @@ def _tips(device: Device, tip: str) -> list[Device]:
     return [device.shaped(angle_deg, length_mm)]
 
 
-def _limits(device: Device) -> str:
+def _limits(device: Wire) -> str:
     shaping = device.tip_shaping
     if shaping is None:
         return "its tip keeps its shape"
@@ -132,7 +132,7 @@ def _limits(device: Device) -> str:
     return f"a hand bends its tip by {least:g} to {largest:g} degrees over {shortest:g} to {longest:g} mm"
 
 
-def _choose(navigation: Navigation, devices: list[Device]) -> tuple[int, dict[int, Count]]:
+def _choose(navigation: Navigation, devices: list[Wire]) -> tuple[int, dict[int, Count]]:
     """Return the first wire that suffices, else the best one, and the counts of those that were tried."""
     counts: dict[int, Count] = {}
     for index, device in enumerate(devices):
@@ -184,7 +184,7 @@ def _refused(places: tuple[Fork, ...], count: Count) -> Fork | None:
     return next((fork for fork, entering in zip(places, count.tolist(), strict=True) if not entering), None)
 
 
-def _why(device: Device, places: tuple[Fork, ...], counts: dict[int, Count], best: int) -> str:
+def _why(device: Wire, places: tuple[Fork, ...], counts: dict[int, Count], best: int) -> str:
     """Return why a tip was taken of those that were tried, the wire's own or the only one first."""
     shape = f"tip {tip_name(device)} (reach {lateral_reach(device.tip_bend_rad, device.tip_bend_length_mm):.1f} mm)"
     if not places:

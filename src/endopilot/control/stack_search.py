@@ -20,7 +20,7 @@ from endopilot.control.course import Copies, Course
 from endopilot.control.halt import SPARE_SHARE
 from endopilot.control.search import SearchConfig
 from endopilot.control.sweep import TURN_PERIODS, middle
-from endopilot.devices.device import Device
+from endopilot.devices.device import Wire
 from endopilot.devices.drive_limits import SPARE_MM, DriveLimits
 from endopilot.errors import InputError
 from endopilot.progress import Advance
@@ -73,7 +73,7 @@ class Stacks(Copies):
         farthest: how far along the route each wire came in the last push, mm.
     """
 
-    def __init__(self, navigation: Navigation, wires: list[Device], like: Simulator) -> None:
+    def __init__(self, navigation: Navigation, wires: list[Wire], like: Simulator) -> None:
         """Lay them out; the arguments are those of `Copies`."""
         super().__init__(navigation, wires, like)
         limits = [DriveLimits.of(device, navigation.anatomy) for device in navigation.devices]

@@ -8,11 +8,32 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float, Int
 
+from endopilot.anatomy.io import read_anatomy
 from endopilot.dataset.loader import Dataset
+from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.simulate import simulate
 from endopilot.simulation.trajectory import Trajectory
 from endopilot.types import Anatomy
+
+
+def episode_trajectory(data: Dataset, number: int, *, record_shape: bool = False) -> Trajectory:
+    """Return an episode as a trajectory: it is simulated again, which gives the recorded one to the bit.
+
+    Args:
+        data: the dataset.
+        number: of the episode.
+        record_shape: record the positions of all nodes too.
+
+    Raises:
+        InputError: there is no such episode, or its anatomy is missing or another.
+    """
+    if not 0 <= number < len(data):
+        raise InputError(f"world: {number}; {data.folder} has episodes 0 to {len(data) - 1}")
+    one = data.select(np.array([number]))
+    anatomy = read_anatomy(data.anatomy_folder(str(one.anatomy[0])))
+    ((_, trajectory),) = simulate_again(one, anatomy, one.command, record_shape=record_shape)
+    return trajectory
 
 
 def simulate_again(
@@ -43,7 +64,7 @@ def simulate_again(
     for kind, (bend, factor) in enumerate(tips.astype(float)):
         chosen = np.flatnonzero(tip_of.ravel() == kind)
         wire = stack.wire.with_tip(bend_rad=float(bend), stiffness_factor=float(factor))
-        around = [np.full(len(chosen), each.device.friction) for each in stack.catheters]
+        around = [np.full(len(chosen), each.friction) for each in stack.catheters]
         yield (
             chosen,
             simulate(

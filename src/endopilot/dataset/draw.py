@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.dataset.config import DatasetConfig
-from endopilot.devices.device import Device
+from endopilot.devices.device import Wire
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.devices.stack import Stack
 from endopilot.simulation.controls import free_wire_load, random_controls
@@ -57,12 +57,12 @@ class Draw:
 
     def frictions(self, given: Stack) -> Float[np.ndarray, "n devices"]:
         """Return each device's friction coefficient; that of the catheters is their own."""
-        around = [each.device.friction for each in given.catheters]
+        around = [each.friction for each in given.catheters]
         return np.column_stack([self.friction, *(np.full(len(self.friction), value) for value in around)])
 
 
 def draw_navigations(
-    config: DatasetConfig, device: Device, anatomy: Anatomy, sequences: range, *, devices: int = 1
+    config: DatasetConfig, device: Wire, anatomy: Anatomy, sequences: range, *, devices: int = 1
 ) -> Draw:
     """Draw some navigations of an anatomy; each is the same whatever the number of the others.
 
@@ -127,7 +127,7 @@ def _within(bounds: tuple[float, float] | None, share: Float[np.ndarray, "n"]) -
 
 
 def _loads(
-    config: DatasetConfig, device: Device, velocity: Float[np.ndarray, "n samples 1 2"]
+    config: DatasetConfig, device: Wire, velocity: Float[np.ndarray, "n samples 1 2"]
 ) -> Float[np.ndarray, "n samples 1 2"]:
     """Return the drive's loads (N, N·mm) that would move a free wire at these velocities, within the drive's limits."""
     fastest = DriveLimits.of(device).fastest

@@ -20,7 +20,7 @@ from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.layout import Block, Layout, make_layout
 from endopilot.dataset.splits import SPLITS
 from endopilot.dataset.workers import run_locally, run_on_cluster
-from endopilot.devices.device import Device
+from endopilot.devices.device import Wire
 from endopilot.devices.stack import Stack
 from endopilot.files import manifest, read_json, write_json, writing
 from endopilot.progress import progress
@@ -33,7 +33,7 @@ _WORK_PATH = "meta/work.json"
 def generate_dataset(
     anatomy_folders: Sequence[str | Path],
     output: str | Path,
-    device: Device | Stack,
+    device: Wire | Stack,
     config: DatasetConfig | None = None,
     *,
     scheduler: str | None = None,

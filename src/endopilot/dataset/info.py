@@ -102,7 +102,7 @@ def _described(folder: Path, manifest: dict[str, Any], info: dict[str, Any]) -> 
     branch_visits = np.array([visits[n] / total for n in range(max(visits, default=0) + 1)])
     reasons = Counter(re.sub(r" after .*", "", reason) for reason in episodes["invalid_reason"] if reason)
     files = [file for file in folder.rglob("*") if file.is_file()]
-    catheters = [catheter["device"]["name"] for catheter in manifest.get("catheters", ())]
+    catheters = [catheter["name"] for catheter in manifest.get("catheters", ())]
     figures = {
         "anatomies": len(manifest["anatomies"]),
         "navigations": info["total_episodes"],

@@ -20,7 +20,7 @@ from endopilot.dataset.schema import (
     signals,
 )
 from endopilot.devices.catheter import Catheter
-from endopilot.devices.device import Device
+from endopilot.devices.device import Wire
 from endopilot.devices.stack import Stack, column_prefixes
 from endopilot.errors import InputError
 from endopilot.extras import extra_named
@@ -112,7 +112,7 @@ class Dataset:
     def stack(self) -> Stack:
         """The wire as it was given, and the catheters around it."""
         catheters = tuple(from_record(Catheter, record) for record in self.manifest["catheters"])
-        return Stack(from_record(Device, self.manifest["device"]), catheters)
+        return Stack(from_record(Wire, self.manifest["device"]), catheters)
 
     def check_wire_alone(self, what: str) -> None:
         """Check that the dataset's wire has no catheter around it, for what takes a wire alone.

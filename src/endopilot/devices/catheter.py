@@ -18,7 +18,7 @@ import yaml
 from jaxtyping import Float
 from pydantic import model_validator
 
-from endopilot.devices.device import Device, Sourced
+from endopilot.devices.device import Device, Sourced, Wire
 from endopilot.devices.device_files import there
 from endopilot.devices.device_ranges import (
     MOST_VALUES,
@@ -43,26 +43,23 @@ MOST_CATHETERS = 2
 
 
 @settings
-class Catheter:
+class Catheter(Device):
     """A catheter around a wire.
 
     Attributes:
-        device: what it has in common with a wire: outer diameter, EI and GJ by distance from the tip, friction on the
-            vessel's wall, its drive. Its tip bend is not used.
         inner_diameter_mm: diameter of its bore, mm.
         bore_friction: Coulomb coefficient between its bore and what lies in it.
         shape: arcs of constant curvature that it was formed to, from the tip on: length (mm) and angle (rad); straight
             beyond them.
     """
 
-    device: Device
     inner_diameter_mm: Positive
     bore_friction: NonNegative
     shape: tuple[tuple[Positive, Annotated[float, Within(-4 * math.pi, 4 * math.pi)]], ...] = ()
 
     @model_validator(mode="after")
     def _consistent(self) -> Catheter:
-        outer = self.device.diameter_mm
+        outer = self.diameter_mm
         if self.inner_diameter_mm >= outer:
             raise ValueError(
                 f"inner_diameter_mm: {self.inner_diameter_mm:g}; give less than the outer diameter, {outer:g} mm"
@@ -70,11 +67,6 @@ class Catheter:
         if len(self.shape) > MOST_VALUES:
             raise ValueError(f"shape: {len(self.shape)} arcs; give at most {MOST_VALUES}")
         return self
-
-    @property
-    def name(self) -> str:
-        """Short name."""
-        return self.device.name
 
     def turned(self, abscissa_mm: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
         """Return the angle by which the unloaded catheter turns from its tip to distances from it, rad."""
@@ -92,7 +84,7 @@ class _Shape:
 
 @settings
 class _CatheterFile:
-    """What a catheter's file holds; `Device` and `Catheter` say what each constant means."""
+    """What a catheter's file holds; `Wire` and `Catheter` say what each constant means."""
 
     name: Text
     diameter_mm: Sourced[Width]
@@ -129,21 +121,14 @@ def read_catheter(name_or_path: str | Path) -> Catheter:
     content = read_settings(path, _CatheterFile)
     entries = {field.name: getattr(content, field.name) for field in fields(content)}
     constants = {name: entry.value for name, entry in entries.items() if isinstance(entry, Sourced)}
-    own = {name: constants.pop(name) for name in ("inner_diameter_mm", "bore_friction")}
     try:
         catheter = Catheter(
-            device=Device(
-                name=content.name,
-                **constants,
-                tip_bend_rad=0.0,
-                tip_bend_length_mm=0.0,
-                tip_load_n=None,
-                sources={name: entry.source for name, entry in entries.items() if name != "name"},
-            ),
+            name=content.name,
+            **constants,
+            sources={name: entry.source for name, entry in entries.items() if name != "name"},
             shape=tuple((length, math.radians(angle)) for length, angle in content.shape.arcs),
-            **own,
         )
-        check_built(catheter.device, bore_mm=catheter.inner_diameter_mm, arcs=catheter.shape, catheter=True)
+        check_built(catheter, bore_mm=catheter.inner_diameter_mm, arcs=catheter.shape, catheter=True)
         return catheter
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
@@ -156,22 +141,19 @@ def write_catheter(catheter: Catheter, path: Path) -> None:
         InputError: the file cannot be written.
     """
 
-    def sourced(owner: Device | Catheter, name: str) -> dict[str, Any]:
-        value = getattr(owner, name)
-        return {"value": list(value) if isinstance(value, tuple) else value, "source": catheter.device.sources[name]}
+    def sourced(name: str) -> dict[str, Any]:
+        value = getattr(catheter, name)
+        return {"value": list(value) if isinstance(value, tuple) else value, "source": catheter.sources[name]}
 
-    content: dict[str, Any] = {"name": catheter.name}
-    for field in fields(_CatheterFile):
-        if field.name not in ("name", "shape"):
-            owner = catheter if hasattr(catheter, field.name) else catheter.device
-            content[field.name] = sourced(owner, field.name)
+    names = [field.name for field in fields(_CatheterFile) if field.name not in ("name", "shape")]
+    content: dict[str, Any] = {"name": catheter.name} | {name: sourced(name) for name in names}
     arcs = [[length, round(math.degrees(angle), 10)] for length, angle in catheter.shape]
-    content["shape"] = {"arcs": arcs, "source": catheter.device.sources["shape"]}
+    content["shape"] = {"arcs": arcs, "source": catheter.sources["shape"]}
     with writing(path) as partial:
         partial.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")
 
 
-def check_nested(wire: Device, catheters: Sequence[Catheter]) -> None:
+def check_nested(wire: Wire, catheters: Sequence[Catheter]) -> None:
     """Check that a wire and catheters, from the inside out, fit into each other.
 
     Raises:
@@ -179,11 +161,11 @@ def check_nested(wire: Device, catheters: Sequence[Catheter]) -> None:
     """
     if len(catheters) > MOST_CATHETERS:
         raise InputError(f"catheters: {len(catheters)}; give at most {MOST_CATHETERS}")
-    inner = wire
+    inner: Device = wire
     for catheter in catheters:
         if inner.diameter_mm >= catheter.inner_diameter_mm:
             raise InputError(
                 f"device {inner.name}: diameter_mm = {inner.diameter_mm:g} is too wide for the bore of catheter "
                 f"{catheter.name}, {catheter.inner_diameter_mm:g} mm; choose a thinner device or a wider catheter"
             )
-        inner = catheter.device
+        inner = catheter

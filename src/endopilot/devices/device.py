@@ -36,6 +36,7 @@ from endopilot.devices.device_ranges import (
     Velocity,
     Width,
     check_built,
+    check_tip,
 )
 from endopilot.errors import InputError
 from endopilot.files import writing
@@ -73,7 +74,7 @@ class TipShaping:
 
 @settings
 class Device:
-    """A guidewire, or another slender device driven at its proximal end.
+    """A slender device that is driven at its proximal end: what a wire and a catheter have in common.
 
     Attributes:
         name: short name.
@@ -81,18 +82,14 @@ class Device:
         abscissa_mm: distances from the tip at which the profiles are given, mm, increasing from 0.
         bend_stiffness_n_mm2: bending stiffness EI at those distances, N·mm².
         twist_stiffness_n_mm2: torsional stiffness GJ at those distances, N·mm².
-        tip_bend_rad: angle by which the unloaded tip is bent, rad.
-        tip_bend_length_mm: length from the tip over which it is bent, with constant curvature, mm.
-        tip_load_n: load at which the tip buckles, as in catalogues, N; None where the maker states none.
         friction: Coulomb friction coefficient on the vessel's wall.
         max_velocity_mm_s: fastest translation of the drive, mm/s.
         max_rotation_rad_s: fastest rotation of the drive, rad/s.
-        push_limit_n: force at which the drive slips rather than push the wire harder, N; a wire whose tip is caught
+        push_limit_n: force at which the drive slips rather than push the device harder, N; a wire whose tip is caught
             is not folded up in the vessel then.
         pull_limit_n: force at which it slips rather than pull harder, N.
-        torque_limit_n_mm: torque at which it slips rather than turn the wire harder, in either direction, N·mm.
+        torque_limit_n_mm: torque at which it slips rather than turn the device harder, in either direction, N·mm.
         sources: where each constant comes from.
-        tip_shaping: the bends that a hand can give its tip; None where the tip keeps the bend that it has.
     """
 
     name: Text
@@ -100,9 +97,6 @@ class Device:
     abscissa_mm: tuple[NonNegative, ...]
     bend_stiffness_n_mm2: tuple[Positive, ...]
     twist_stiffness_n_mm2: tuple[Positive, ...]
-    tip_bend_rad: Annotated[float, Within(-2 * math.pi, 2 * math.pi)]
-    tip_bend_length_mm: NonNegative
-    tip_load_n: Positive | None
     friction: NonNegative
     max_velocity_mm_s: Positive
     max_rotation_rad_s: Positive
@@ -110,10 +104,9 @@ class Device:
     pull_limit_n: Positive
     torque_limit_n_mm: Positive
     sources: dict[str, str]
-    tip_shaping: TipShaping | None = None
 
     @model_validator(mode="after")
-    def _consistent(self) -> Device:
+    def _profiles_fit(self) -> Device:
         at = self.abscissa_mm
         if at[:1] != (0.0,) or any(after <= before for before, after in pairwise(at)):
             raise ValueError(f"abscissa_mm: {list(at)}; begin at 0, the tip, and increase")
@@ -123,8 +116,6 @@ class Device:
             count = len(getattr(self, name))
             if count != len(at):
                 raise ValueError(f"{name}: {count} values, but abscissa_mm has {len(at)}; give one for each")
-        if self.tip_bend_rad and not self.tip_bend_length_mm:
-            raise ValueError(f"tip_bend: length_mm is {self.tip_bend_length_mm:g}; give a bent tip a positive length")
         return self
 
     @property
@@ -146,7 +137,30 @@ class Device:
         """Return GJ in N·mm² at distances from the tip."""
         return np.interp(abscissa_mm, self.abscissa_mm, self.twist_stiffness_n_mm2)
 
-    def with_tip(self, *, bend_rad: float, stiffness_factor: float) -> Device:
+
+@settings
+class Wire(Device):
+    """A guidewire.
+
+    Attributes:
+        tip_bend_rad: angle by which the unloaded tip is bent, rad.
+        tip_bend_length_mm: length from the tip over which it is bent, with constant curvature, mm.
+        tip_load_n: load at which the tip buckles, as in catalogues, N; None where the maker states none.
+        tip_shaping: the bends that a hand can give its tip; None where the tip keeps the bend that it has.
+    """
+
+    tip_bend_rad: Annotated[float, Within(-2 * math.pi, 2 * math.pi)]
+    tip_bend_length_mm: NonNegative
+    tip_load_n: Positive | None
+    tip_shaping: TipShaping | None = None
+
+    @model_validator(mode="after")
+    def _bend_has_a_length(self) -> Wire:
+        if self.tip_bend_rad and not self.tip_bend_length_mm:
+            raise ValueError(f"tip_bend: length_mm is {self.tip_bend_length_mm:g}; give a bent tip a positive length")
+        return self
+
+    def with_tip(self, *, bend_rad: float, stiffness_factor: float) -> Wire:
         """Return the device with another tip.
 
         Args:
@@ -166,7 +180,7 @@ class Device:
             twist_stiffness_n_mm2=tuple(twist.tolist()),
         )
 
-    def shaped(self, angle_deg: float, length_mm: float) -> Device:
+    def shaped(self, angle_deg: float, length_mm: float) -> Wire:
         """Return the device with its tip bent by an angle (degrees) over a length (mm)."""
         return replace(self, tip_bend_rad=math.radians(angle_deg), tip_bend_length_mm=float(length_mm))
 
@@ -220,7 +234,7 @@ class _Shaping(TipShaping):
 
 @settings
 class _DeviceFile:
-    """What a device's file holds; `Device` says what each constant means."""
+    """What a device's file holds; `Wire` says what each constant means."""
 
     name: Text
     diameter_mm: Sourced[Width]
@@ -238,7 +252,7 @@ class _DeviceFile:
     tip_shaping: _Shaping | None = None
 
 
-def read_device(name_or_path: str | Path) -> Device:
+def read_device(name_or_path: str | Path) -> Wire:
     """Read a device by its name (`endopilot.devices.device_files`), or from a YAML file.
 
     Raises:
@@ -251,7 +265,7 @@ def read_device(name_or_path: str | Path) -> Device:
     shaping = content.tip_shaping
     constants = {name: entry.value for name, entry in entries.items() if isinstance(entry, Sourced)}
     try:
-        device = Device(
+        device = Wire(
             name=content.name,
             **constants,
             tip_bend_rad=math.radians(content.tip_bend.angle_deg),
@@ -260,12 +274,13 @@ def read_device(name_or_path: str | Path) -> Device:
             tip_shaping=shaping and TipShaping(angle_deg=shaping.angle_deg, length_mm=shaping.length_mm),
         )
         check_built(device)
+        check_tip(device)
         return device
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 
 
-def write_device(device: Device, path: Path) -> None:
+def write_device(device: Wire, path: Path) -> None:
     """Write a device as a file that `read_device` reads, with the same constants.
 
     Raises:

@@ -16,7 +16,7 @@ from endopilot.errors import InputError
 from endopilot.settings import Within
 
 if TYPE_CHECKING:
-    from endopilot.devices.device import Device
+    from endopilot.devices.device import Device, Wire
 
 GRAM_FORCE_N = 9.80665e-3
 """One gram-force in N, by the standard acceleration of gravity; catalogues give tip loads in it."""
@@ -91,11 +91,22 @@ def check_built(
         InputError: two of them contradict each other; the line names field, value and what to give.
     """
     _check_stiffness(device, bore_mm, catheter)
+    _check_bends("shape", [each for each in arcs if each[1]], device)
+
+
+def check_tip(device: Wire) -> None:
+    """Check that the tip of a wire can be one: its load, its bend, and the bends that a hand can give it.
+
+    Args:
+        device: what its file says.
+
+    Raises:
+        InputError: it cannot; the line names field, value and what to give.
+    """
     if device.tip_load_n is not None:
         _check_tip_load(device.tip_load_n, device)
-    bend = (device.tip_bend_length_mm, device.tip_bend_rad)
-    for name, bends in (("tip_bend", [bend]), ("shape", arcs)):
-        _check_bends(name, [each for each in bends if each[1]], device)
+    if device.tip_bend_rad:
+        _check_bends("tip_bend", [(device.tip_bend_length_mm, device.tip_bend_rad)], device)
     shaping = device.tip_shaping
     if shaping is not None and 0 < shaping.angle_deg[1] <= _LEAST_DEG:
         high = shaping.angle_deg[1]

@@ -68,7 +68,7 @@ class DriveLimits:
 
     @staticmethod
     def of(device: Device, anatomy: Anatomy | None = None) -> DriveLimits:
-        """Return the limits of a wire in a vessel: the drive's speed, the ostium and the far end (`far_end_mm`).
+        """Return the limits of a device in a vessel: the drive's speed, the ostium and the far end (`far_end_mm`).
 
         Without an anatomy the travel has no far end.
         """

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot.devices.catheter import Catheter, check_nested
-from endopilot.devices.device import Device, check_fits
+from endopilot.devices.device import Device, Wire, check_fits
 from endopilot.types import Anatomy
 
 SHOWN_BEHIND_MM = 20.0
@@ -24,11 +24,11 @@ Proximals = tuple[tuple[float, float], ...]
 class Stack:
     """A wire, and the catheters around it from the inside out; a wire alone is a stack of one."""
 
-    wire: Device
+    wire: Wire
     catheters: tuple[Catheter, ...] = ()
 
     @staticmethod
-    def of(device: Device | Stack) -> Stack:
+    def of(device: Wire | Stack) -> Stack:
         """Return a stack as it is, and a wire as a stack of one."""
         return device if isinstance(device, Stack) else Stack(device)
 
@@ -38,8 +38,8 @@ class Stack:
 
     @property
     def devices(self) -> tuple[Device, ...]:
-        """The wire, and what each catheter has in common with one."""
-        return (self.wire, *(catheter.device for catheter in self.catheters))
+        """The wire, then the catheters around it."""
+        return (self.wire, *self.catheters)
 
     @property
     def outer_radius_mm(self) -> float:
@@ -64,8 +64,7 @@ class Stack:
     @property
     def constants(self) -> tuple[Any, ...]:
         """All numbers of the devices: stacks with the same constants behave the same."""
-        bores = tuple((each.inner_diameter_mm, each.bore_friction, each.shape) for each in self.catheters)
-        return self.wire.constants + tuple(each.device.constants for each in self.catheters) + bores
+        return self.wire.constants + tuple(each.constants for each in self.catheters)
 
     def check(self, anatomy: Anatomy) -> None:
         """Check that the devices fit into each other, and into an anatomy.

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from endopilot.anatomy.io import read_anatomy
 from endopilot.dataset.again import simulate_again
 from endopilot.dataset.loader import Dataset
-from endopilot.devices.device import Device
+from endopilot.devices.device import Wire
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.evaluation.results import REPLAYED, TipSeries
 from endopilot.models.config import WINDOW
@@ -39,7 +39,7 @@ class Recorded:
     names: tuple[str, ...]
     anatomies: tuple[Anatomy, ...]
     anatomy_of: Int[np.ndarray, "episodes"]
-    device: Device
+    device: Wire
 
     @staticmethod
     def of(data: Dataset) -> Recorded:

@@ -124,11 +124,20 @@ def repeat(recording: Recording, navigation: Navigation, *, seed: int) -> dict[s
     Raises:
         InputError: the recording is longer or shorter than the navigation.
     """
-    record = _drive(navigation, Repeated(recording), seed, None)
+    record = driven(recording, navigation, seed=seed)
     given, needed = len(recording.control), len(record.control) - 1
     if given != needed:
         raise InputError(f"control: holds {given} decisions, and the navigation ends after {needed}")
     return _figures(navigation, record, recording)
+
+
+def driven(recording: Recording, navigation: Navigation, *, seed: int) -> NavigationRecord:
+    """Return how a navigation goes under what was recorded: its trajectory is the recorded one to the bit.
+
+    Raises:
+        InputError: the recording is shorter than the navigation.
+    """
+    return _drive(navigation, Repeated(recording), seed, None)
 
 
 def _drive(navigation: Navigation, policy: Policy, seed: int, mismatch: ModelMismatch | None) -> NavigationRecord:

@@ -20,9 +20,10 @@ from endopilot.devices.catheter import read_catheter
 from endopilot.devices.device import read_device
 from endopilot.errors import InputError
 from endopilot.files import json_text, manifest, read_json, write_json
-from endopilot.ladder.attempt import Recording, navigation_seed, repeat
+from endopilot.ladder.attempt import Recording, driven, navigation_seed, repeat
 from endopilot.ladder.scores import score
 from endopilot.navigation.policies import POLICIES
+from endopilot.navigation.record import NavigationRecord
 from endopilot.parallel import each
 from endopilot.settings import CountOrZero, Seed, read_settings, settings
 from endopilot.tasks.task import LadderVersion, Task, find_task, ladder_tasks
@@ -233,6 +234,38 @@ def _first_difference(submission: Submission, folder: Path) -> str | None:
         if remark is not None:
             return f"scores, {again.get('task') or given.get('task')}: {remark}"
     return None
+
+
+def read_navigation(path: Path, name: str | None, place: int) -> tuple[Task, int, NavigationRecord]:
+    """Return one navigation of a submission, or of a result file of a ladder's folder, driven again by its recording.
+
+    Args:
+        path: a submission.json or TASK/NUMBER.json.
+        name: of the task, in a submission.
+        place: of the patient in the task's list, likewise.
+
+    Returns:
+        The task, the patient's place in its list, and the navigation.
+
+    Raises:
+        InputError: the file is none of the ladder, or has no such navigation.
+    """
+    content = read_json(path)
+    if isinstance(content, dict) and "navigations" in content:
+        if name is None or name not in content["navigations"]:
+            raise InputError(f"task: {name!r}; {path} has {', '.join(content['navigations'])}")
+        entries = content["navigations"][name]
+        if not 0 <= place < len(entries):
+            raise InputError(f"world: {place}; {path} has patients 0 to {len(entries) - 1} of this task")
+        entry = entries[place]
+    elif isinstance(content, dict) and "recording" in content and path.stem.isdecimal():
+        name, place, entry = path.parent.name, int(path.stem), content
+    else:
+        raise InputError(f"{path}: is no file of the ladder; give a submission.json or TASK/NUMBER.json")
+    task = find_task(name, content.get("ladder") or 1)
+    navigation = task.ladder_navigation(place)
+    recording = Recording.unpacked(entry["recording"], len(navigation.devices))
+    return task, place, driven(recording, navigation, seed=navigation_seed(task, place))
 
 
 def _repeat(path: Path, *, version: LadderVersion) -> None:

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.devices.device import Device
+from endopilot.devices.device import Wire
 from endopilot.devices.stack import Stack
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion
@@ -39,7 +39,7 @@ class Ensemble:
     def __init__(
         self,
         anatomy: Anatomy,
-        device: Device | Stack,
+        device: Wire | Stack,
         parameters: Float[np.ndarray, "members 3"],
         *,
         start: Float[np.ndarray, "members devices 2"],

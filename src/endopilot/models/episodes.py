@@ -16,7 +16,7 @@ from jaxtyping import Float, Int, Shaped
 
 from endopilot.anatomy.io import read_anatomy
 from endopilot.dataset.loader import Dataset
-from endopilot.devices.device import Device
+from endopilot.devices.device import Wire
 from endopilot.errors import InputError
 from endopilot.files import reading
 from endopilot.models.config import WINDOW
@@ -45,14 +45,14 @@ class EpisodeSetUp:
     """
 
     anatomies: Mapping[str, Callable[[], Anatomy]]
-    device: Device
+    device: Wire
     simulator: SimulatorConfig
     patients_folder: Path | None = None
     identities: Mapping[str, str] | None = None
     known_motions: Mapping[str, Motion | None] = field(default_factory=dict)
 
     @staticmethod
-    def of_anatomy(anatomy: Anatomy, device: Device, simulator: SimulatorConfig) -> EpisodeSetUp:
+    def of_anatomy(anatomy: Anatomy, device: Wire, simulator: SimulatorConfig) -> EpisodeSetUp:
         """Return the setup of navigations in one vessel that is in memory."""
         return EpisodeSetUp({anatomy.name: lambda: anatomy}, device, simulator)
 
@@ -67,7 +67,7 @@ class EpisodeSetUp:
             return read_anatomy(dataset.anatomy_folder(name))
 
         with reading(dataset.folder, "make the dataset again"):
-            device = from_record(Device, dataset.manifest["device"])
+            device = from_record(Wire, dataset.manifest["device"])
             simulator = SimulatorConfig(**dataset.manifest["config"]["simulator"])
         return EpisodeSetUp(
             anatomies={name: partial(read, name) for name in dataset.patients},

@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int
 
 from endopilot.anatomy.tree import curvature_torsion, make_centerline
 from endopilot.dataset.navigations import CAUGHT, STOP_SHORT_MM
-from endopilot.devices.device import Device
+from endopilot.devices.device import Wire
 from endopilot.errors import InputError
 from endopilot.files import json_text, writing
 from endopilot.simulation.config import SimulatorConfig
@@ -75,7 +75,7 @@ class Patient:
     branch: Int[np.ndarray, "leaves places"]
 
 
-def prepare(anatomy: Anatomy, device: Device, config: SimulatorConfig) -> Patient:
+def prepare(anatomy: Anatomy, device: Wire, config: SimulatorConfig) -> Patient:
     """Push nominal wires into a vessel until each nears the end of a branch or is caught, and pull them out.
 
     A wire that the vessel holds against the drive's pull limit stays where it is.
@@ -194,7 +194,7 @@ def first_normal(insertion: Insertion) -> Float[np.ndarray, "3"]:
 
 
 def read_or_prepare(
-    folder: Path, name: str, identity: str, device: Device, config: SimulatorConfig, read: Callable[[], Anatomy]
+    folder: Path, name: str, identity: str, device: Wire, config: SimulatorConfig, read: Callable[[], Anatomy]
 ) -> Patient:
     """Return a patient prepared for a device: read from a folder, or prepared now and kept there.
 

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from endopilot.devices.device import Device
+from endopilot.devices.device import Wire
 from endopilot.models.patient import STEP_MM, Patient
 
 Direction = Literal["forward", "inverse"]
@@ -69,7 +69,7 @@ class Vessels:
     wire_radius_mm: float
 
     @staticmethod
-    def of(patients: Sequence[Patient], device: Device) -> Vessels:
+    def of(patients: Sequence[Patient], device: Wire) -> Vessels:
         """Return the tables of patients that were prepared for a device."""
         motions = ("push", "pull")
         push, pull = ([getattr(p, f"{motion}_tip") for p in patients] for motion in motions)

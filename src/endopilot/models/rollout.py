@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from endopilot.devices.device import Device
+from endopilot.devices.device import Wire
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.errors import InputError
 from endopilot.files import reading
@@ -113,7 +113,7 @@ def load_model(run_folder: str | Path = PRETRAINED) -> Predictor:
 
 
 def _predictor(record: dict[str, Any], run_folder: Path) -> Predictor:
-    device = from_record(Device, record["device"])
+    device = from_record(Wire, record["device"])
     if record["config"]["model"] == "twin":
         return TwinPredictor(
             device=device,

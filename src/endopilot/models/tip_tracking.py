@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.devices.device import Device
+from endopilot.devices.device import Wire
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.models.open_loop import Steps2
 from endopilot.simulation.config import SimulatorConfig
@@ -23,7 +23,7 @@ ROTATIONS_RAD_S = (-2.0, 0.0, 2.0)
 
 def track(
     anatomy: Anatomy,
-    wires: Sequence[Device],
+    wires: Sequence[Wire],
     *,
     friction: Float[np.ndarray, "episodes"],
     start: Float[np.ndarray, "episodes 2"],

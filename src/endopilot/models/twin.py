@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.stats import qmc
 
-from endopilot.devices.device import Device
+from endopilot.devices.device import Wire
 from endopilot.models.config import WINDOW, TwinConfig
 from endopilot.models.ensemble import NOMINAL, Ensemble, likelihoods
 from endopilot.models.episodes import Episodes
@@ -64,7 +64,7 @@ class TwinPredictor:
         tracked: controls that lead the tip along the desired one, likewise.
     """
 
-    device: Device
+    device: Wire
     simulator: SimulatorConfig
     config: TwinConfig
     predicted: WeakKeyDictionary[Episodes, TwinPrediction] = field(default_factory=WeakKeyDictionary, repr=False)
@@ -181,7 +181,7 @@ class TwinPredictor:
         members[..., 1] = level[np.abs(members[..., 1, None] - level).argmin(axis=-1)]
         return members
 
-    def _wire(self, stiffness: float) -> Device:
+    def _wire(self, stiffness: float) -> Wire:
         return self.device.with_tip(bend_rad=self.device.tip_bend_rad, stiffness_factor=float(stiffness))
 
     def _simulate(

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -39,7 +40,9 @@ class NavigationRecord:
         half_width: of the adviser's bands around it, mm, likewise; NaN where there is none.
         asks: why the policy asked at this moment for X-ray at the next one; empty where it did not, or does not tell.
         cycles: what the drives asked for in each of their cycles and what the devices did, without shapes; replayed it
-            gives the same navigation to the bit. None where no period is over.
+            gives the same navigation to the bit. Its columns repeat over a period's cycles what was `decided`, and
+            what was `measured`, `believed` and the `half_width` at its begin, NaN where that is nothing; `about` has
+            the target, why it ended, when X-ray was on, s, and why it was asked for. None where no period is over.
         success: the tip reached the target in time, at the end of a period.
         safe: the wall force never exceeded the navigation's limit.
         seconds: how long it took, s.
@@ -160,6 +163,20 @@ class Track:
         exposures = np.array([*self._exposures[:periods], 0])
         believed = [_NOTHING if tip is None else tip for tip in self._believed[:periods]] + [_NOTHING]
         tells = any(tip is not None for tip in self._believed)
+        seen = [(np.nan, np.nan) if tip is None else (tip.abscissa, tip.offset) for tip in self._measured[:periods]]
+        decisions = {
+            "decided": np.array(self._control[:periods]),
+            "measured": np.array(seen),
+            "believed": np.array([(tip.abscissa, tip.offset) for tip in believed[:-1]]),
+            "half_width": np.array([tip.half_width for tip in believed[:-1]]),
+        }
+        about = {
+            "target": asdict(navigation.target),
+            "reason": reason,
+            "gives_up": gives_up,
+            "exposures_s": (DECISION_PERIOD_S * np.flatnonzero(exposures)).tolist(),
+            "asks_for_xray": [tip.asks for tip in believed[:-1]],
+        }
         return NavigationRecord(
             time_s=DECISION_PERIOD_S * np.arange(samples),
             inserted_length=proximal[..., 0],
@@ -174,7 +191,7 @@ class Track:
             believed=np.array([(tip.abscissa, tip.offset) for tip in believed]) if tells else None,
             half_width=np.array([tip.half_width for tip in believed]) if tells else None,
             asks=tuple(tip.asks for tip in believed),
-            cycles=recorder.trajectory().samples(slice(cycles)) if cycles else None,
+            cycles=_made(recorder, cycles, decisions, about) if cycles else None,
             success=reason == "reached",
             safe=bool(is_safe(force.max(), navigation.force_limit_n)),
             seconds=DECISION_PERIOD_S * periods,
@@ -185,6 +202,11 @@ class Track:
             reason=reason,
             gives_up=gives_up,
         )
+
+
+def _made(recorder: Recorder, cycles: int, decisions: dict[str, np.ndarray], about: dict[str, Any]) -> Trajectory:
+    columns = {name: np.repeat(values, cycles // len(values), axis=0)[None] for name, values in decisions.items()}
+    return replace(recorder.trajectory().samples(slice(cycles)), columns=columns, about=about)
 
 
 _NOTHING = BelievedTip(abscissa=np.nan, offset=np.nan)

@@ -1,10 +1,10 @@
-"""A navigation in one patient, in a folder: page, picture, table, controls, episode, manifest; `navigate_into`."""
+"""A navigation in one patient, in a folder: page, picture, table, trajectory, episode, manifest; `navigate_into`."""
 
 from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,11 +30,11 @@ from endopilot.extras import require_extras
 from endopilot.files import manifest, read_json, write_json, writing
 from endopilot.navigation.policies import POLICIES
 from endopilot.runs import claim
-from endopilot.simulation.controls import write_controls_csv
+from endopilot.simulation.trajectory_file import TRAJECTORY, write_trajectory
 from endopilot.tasks.targets import section_at
 
 PAGE_FILE, PICTURE_FILE, TABLE_FILE = "navigation.html", "navigation.png", "navigation.csv"
-CONTROLS_FILE, WIRE_FILE, EPISODE_FOLDER, ANATOMY_FOLDER = "controls.csv", "wire.yaml", "episode", "anatomy"
+WIRE_FILE, EPISODE_FOLDER, ANATOMY_FOLDER = "wire.yaml", "episode", "anatomy"
 CATHETER_FILE, MANIFEST_FILE = "catheter-{}.yaml", "manifest.json"
 
 
@@ -94,10 +94,11 @@ def _write(found: PatientNavigation, folder: Path, target: str, output: Path) ->
         navigation_table(found).to_csv(partial, index=False)
     cycles = found.record.cycles
     assert cycles is not None  # a navigation has a period at least
-    write_controls_csv(output / CONTROLS_FILE, cycles.command[0], cycles.proximal[0], cycles.period_s)
+    about = {"policy": set_up.config.policy, "seed": set_up.config.seed, "truth": asdict(set_up.truth)}
+    write_trajectory(replace(cycles, about=cycles.about | about), output / TRAJECTORY)
     write_device(set_up.true_wire, output / WIRE_FILE)
-    for path, catheter in zip(_catheter_files(set_up, output), set_up.true_catheters, strict=True):
-        write_catheter(catheter, path)
+    for number, catheter in enumerate(set_up.true_catheters, start=1):
+        write_catheter(catheter, output / CATHETER_FILE.format(number))
     _write_episode(found, driven_in, output / EPISODE_FOLDER)
     picture = png(navigation_figure(found))
     with writing(output / PICTURE_FILE) as partial:
@@ -209,25 +210,14 @@ def _manifest(found: PatientNavigation, target: str, output: Path) -> dict[str, 
 def _commands(found: PatientNavigation, folder: Path, driven_in: Path, target: str, output: Path) -> Mapping[str, str]:
     changed = _changed(found.set_up)
     line = ["endopilot", "navigate", str(folder), f"--target={target}", "-o", str(output), *changed]
-    again = ["endopilot", "simulate", str(driven_in), "--device", str(output / WIRE_FILE)]
-    files = _catheter_files(found.set_up, output)
-    again += ["--catheter", *map(str, files)] if files else []
-    config = found.set_up.config
-    if config.motion != "still":
-        again += ["--motion", config.motion]
-        again += [] if config.motion_seed is None else ["--motion-seed", str(config.motion_seed)]
-    again += ["--controls", str(output / CONTROLS_FILE), "-o", "again.csv"]
+    again = ["endopilot", "simulate", str(driven_in), "--controls", str(output / TRAJECTORY), "-o", "again.csv"]
+    alone = not found.set_up.navigation.catheters
     beside = ["endopilot", "train", "runs/dataset", str(output / EPISODE_FOLDER), "-o", "runs/training"]
     return {
         "The navigation": shlex.join(line),
-        f"The same {'motion' if files else 'wire'} from the recorded controls, without the policy": shlex.join(again),
-        **({} if files else {"Train on it beside a dataset of the same wire": shlex.join(beside)}),
+        f"The same {'wire' if alone else 'motion'} from the recorded controls, without the policy": shlex.join(again),
+        **({"Train on it beside a dataset of the same wire": shlex.join(beside)} if alone else {}),
     }
-
-
-def _catheter_files(set_up: SetUp, output: Path) -> list[Path]:
-    """Return where the catheters, as they truly were, are written."""
-    return [output / CATHETER_FILE.format(k + 1) for k in range(len(set_up.navigation.catheters))]
 
 
 def _changed(set_up: SetUp) -> list[str]:

@@ -24,9 +24,10 @@ from endopilot.anatomy.extract import AnatomyConfig, extract_anatomy, read_sourc
 from endopilot.anatomy.io import read_anatomy, write_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
 from endopilot.control.navigate_patient import NavigatePatientConfig
+from endopilot.dataset.again import episode_trajectory
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.loader import load_dataset
-from endopilot.devices.device import Device, read_device
+from endopilot.devices.device import Wire, read_device
 from endopilot.evaluation.anatomy_score import score_anatomy
 from endopilot.evaluation.results import REPORT_FILE
 from endopilot.extras import require_extras
@@ -40,8 +41,6 @@ from endopilot.pipeline.stages import Stages
 from endopilot.progress import progress
 from endopilot.runs import claim
 from endopilot.settings import Seconds, Seed, Within, settings
-from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.simulate import simulate
 from endopilot.simulation.trajectory import Trajectory
 from endopilot.types import Volume
 
@@ -125,7 +124,7 @@ class _Run:
     output: Path
     config: StudyConfig
     segmentation: SegmentConfig
-    device: Device
+    device: Wire
     stages: Stages
     origin: str
     command: str
@@ -354,7 +353,7 @@ def _report(run: _Run, names: Sequence[str]) -> None:
     from endopilot.report.report import PatientContent, ReportContent, write_report  # matplotlib and plotly
 
     output = run.output
-    anatomy, replay = _replay(output, run.device) if run.evaluates else (None, None)
+    anatomy, replay = _replay(output) if run.evaluates else (None, None)
     scores = _scores(output, names)
     patients = tuple(
         PatientContent(
@@ -400,19 +399,13 @@ def _scores(output: Path, names: Sequence[str]) -> dict[str, dict[str, float]]:
     return scores
 
 
-def _replay(output: Path, device: Device) -> tuple[Path, Trajectory]:
+def _replay(output: Path) -> tuple[Path, Trajectory]:
     """Simulate one test navigation again with the wire's shape, that in which the tip travelled farthest."""
     dataset = load_dataset(output / "dataset")
     held_out = dataset.of_split("test" if "test" in dataset.split else "seen_test")
     best = int(np.ptp(held_out.tip_abscissa[:, :, 0], axis=1).argmax())
-    one = held_out.select(np.array([best]))
-    folder = dataset.anatomy_folder(str(one.anatomy[0]))
-    anatomy = read_anatomy(folder)
-    wire = device.with_tip(bend_rad=float(one.tip_bend[0]), stiffness_factor=float(one.tip_stiffness_factor[0]))
-    settings = SimulatorConfig(**dataset.manifest["config"]["simulator"])
-    options = {"initial": one.initial, "config": settings, "friction": one.friction, "record_shape": True}
-    options["motion"] = dataset.motion(anatomy.name)
-    return folder, simulate(anatomy, wire, one.command, **options)
+    folder = dataset.anatomy_folder(str(held_out.anatomy[best]))
+    return folder, episode_trajectory(held_out, best, record_shape=True)
 
 
 def _finish(run: _Run) -> dict[str, Any]:

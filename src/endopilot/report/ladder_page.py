@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +18,12 @@ from plotly.offline import get_plotlyjs
 
 from endopilot.files import read_json, writing
 from endopilot.ladder.ladder import SCORES_FILE
+from endopilot.ladder.submission import read_navigation
 from endopilot.plotting import BLACK, BLUE, GREEN, ORANGE, STYLE, VERMILLION, png
 from endopilot.report.report import image, template_text
 from endopilot.report.scene import mark_target, navigation_scene
-from endopilot.simulation.simulate import simulate
-from endopilot.simulation.trajectory import Trajectory
 from endopilot.tasks.navigation import Navigation
-from endopilot.tasks.task import CORE, Task, find_task, ladder_tasks
-from endopilot.types import SAMPLE_PERIOD_S
+from endopilot.tasks.task import Task, find_task, ladder_tasks
 
 PAGE_FILE = "index.html"
 SHOWN = 5
@@ -81,7 +78,7 @@ def _section(output: Path, task: Task, patients: int) -> dict[str, Any]:
     picture = image(png(_courses(navigations, results)), f"{task.title}: the tip's path in {shown}")
     replay = output / f"replay-{task.name}.html"
     if not replay.exists():
-        figure = _replay_scene(task, navigations[0], results[0])
+        figure = _replay_scene(task, navigations[0], results[0], output / task.name / "00.json")
         with writing(replay) as partial:
             figure.write_html(
                 partial,
@@ -93,10 +90,11 @@ def _section(output: Path, task: Task, patients: int) -> dict[str, Any]:
     return {"task": task, "picture": picture, "replay": replay.name, "first": results[0]}
 
 
-def _replay_scene(task: Task, navigation: Navigation, result: dict[str, Any]) -> go.Figure:
+def _replay_scene(task: Task, navigation: Navigation, result: dict[str, Any], path: Path) -> go.Figure:
     """Return a navigation replayed in space, with its target, what X-ray showed, and what came of it."""
     course = result["course"]
-    figure = navigation_scene(navigation.anatomy, _replay(navigation, course), devices=navigation.devices)
+    *_, record = read_navigation(path, task.name, 0)
+    figure = navigation_scene(navigation.anatomy, record.trajectory, devices=navigation.devices)
     exposed = np.array(course["exposed"])
     observed, seconds = np.array(course["tip_position"])[exposed], np.array(course["time_s"])[exposed]
     mark_target(figure, navigation.target.position(navigation.anatomy), observed, seconds)
@@ -111,21 +109,6 @@ def _outcome(result: dict[str, Any]) -> str:
     if not result["success"]:
         return "not reached"
     return "safe success" if result["safe"] else "success, but too large a force"
-
-
-def _replay(navigation: Navigation, course: dict[str, Any]) -> Trajectory:
-    """Return wire and catheters over a navigation, by driving its proximal end along the same course again."""
-    inserted = np.column_stack([course["inserted_length"], course["catheter_inserted_length"]])
-    turned = np.column_stack([course["rotation"], course["catheter_rotation"]])
-    proximal = np.stack([inserted, turned], axis=-1)
-    return simulate(
-        navigation.anatomy,
-        navigation.stack,
-        (np.diff(proximal, axis=0) / SAMPLE_PERIOD_S)[None],
-        initial=proximal[:1],
-        config=replace(CORE, threads=1),
-        record_shape=True,
-    )
 
 
 def _courses(navigations: list[Navigation], results: list[dict[str, Any]]) -> Figure:

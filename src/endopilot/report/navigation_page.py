@@ -87,7 +87,7 @@ def _facts(found: PatientNavigation) -> list[tuple[str, str]]:
     facts = [
         ("Policy", set_up.config.policy),
         ("Wire", f"{device.name}, {device.diameter_mm:g} mm"),
-        *(("Catheter", f"{each.name}, {each.device.diameter_mm:g} mm") for each in navigation.catheters),
+        *(("Catheter", f"{each.name}, {each.diameter_mm:g} mm") for each in navigation.catheters),
         *((("Arrives", "the catheter's tip"),) if navigation.arriving else ()),
         ("Tip", set_up.choice.why),
         ("Friction in reality", f"{device.friction * truth.friction_factor:.3g}, given {device.friction:g}"),

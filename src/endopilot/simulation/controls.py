@@ -18,7 +18,6 @@ from pydantic import model_validator
 from endopilot.devices.drive_limits import within_travel
 from endopilot.devices.stack import column_prefixes
 from endopilot.errors import InputError, Remark
-from endopilot.files import writing
 from endopilot.settings import LONGEST_S, Share, Within, settings
 from endopilot.simulation.checks import check_memory
 from endopilot.simulation.csv_file import Columns, read_columns
@@ -254,29 +253,3 @@ def _period(table: Columns, worlds: Int[np.ndarray, "worlds samples"]) -> float:
         rule = f"each world's rows end periods of one length and count {period_s:.10g}, {2 * period_s:.10g}, ..."
         raise table.fault(int(worlds[tuple(late[0])]), "time_s", f"; {rule}")
     return period_s
-
-
-def write_controls_csv(
-    path: Path,
-    control: Float[np.ndarray, "samples devices 2"],
-    proximal: Float[np.ndarray, "samples devices 2"],
-    period_s: float,
-) -> None:
-    """Write controls so that `read_controls_csv` reads them.
-
-    Args:
-        path: where to.
-        control: mm/s and rad/s of each device.
-        proximal: (Δ mm, φ rad) at the end of each, likewise.
-        period_s: time that each holds, s.
-    """
-    import pandas as pd
-
-    time_s = period_s * np.arange(1, len(control) + 1)
-    prefixes = column_prefixes(control.shape[1])
-    names = [_COLUMNS[0], *(prefix + name for prefix in prefixes for name in _COLUMNS[1:])]
-    names += [prefix + name for prefix in prefixes for name in ("inserted_length_mm", "rotation_rad")]
-    with writing(path) as partial:
-        pd.DataFrame(
-            np.column_stack([time_s, *(each.reshape(len(time_s), -1) for each in (control, proximal))]), columns=names
-        ).to_csv(partial, index=False)

@@ -208,7 +208,7 @@ def core_options(
     options.wall_stiffness = wall_stiffness(config, push_limit_n)
     options.foundation = config.compliant_wall_n_mm2 or 0.0
     options.foundation_stiffening = COMPLIANT_WALL_STIFFENING_MM2
-    options.tip_takes_along = COMPLIANT_WALL_AT_TIP_MM
+    options.foundation_at_tip = COMPLIANT_WALL_AT_TIP_MM
     options.tolerance = config.tolerance_mm
     options.sample_tolerance = min(config.sample_tolerance_mm, config.tolerance_mm)
     options.largest_step = _LARGEST_NEWTON_STEP

@@ -43,10 +43,7 @@ class ModelMismatch:
 
     def catheters(self, given: Sequence[Catheter]) -> tuple[Catheter, ...]:
         """Return catheters as they are in reality: their friction on the wall differs as the wire's does."""
-        return tuple(
-            replace(each, device=replace(each.device, friction=each.device.friction * self.friction_factor))
-            for each in given
-        )
+        return tuple(replace(each, friction=each.friction * self.friction_factor) for each in given)
 
 
 def drawn_sides(share: float, random: np.random.Generator) -> dict[str, float]:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import brentq
 
-from endopilot.devices.device import Device
+from endopilot.devices.device import Wire
 from endopilot.simulation.processor import Processor, RodModel, core_for
 
 POISSON_RATIO = 0.3
@@ -65,7 +65,7 @@ class RodLayout:
         )
 
 
-def lay_out(device: Device, *, element_mm: float, length_mm: float) -> RodLayout:
+def lay_out(device: Wire, *, element_mm: float, length_mm: float) -> RodLayout:
     """Lay a device out as a rod, with shorter elements near the tip.
 
     The nodes depend on the device and on `element_mm` alone; a longer `length_mm` only adds nodes at the base. So

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.devices.device import Device
+from endopilot.devices.device import Wire
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError, Remark
 from endopilot.progress import progress
@@ -44,7 +44,7 @@ class WallForceEvent:
 
 def simulate(
     anatomy: Anatomy,
-    device: Device | Stack,
+    device: Wire | Stack,
     control: Float[np.ndarray, "worlds samples *devices 2"],
     *,
     actuation: Actuation = "velocity",

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from endopilot.devices.device import Device
+from endopilot.devices.device import Wire
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.progress import Advance
@@ -55,7 +55,7 @@ class Simulator(Readout):
     def __init__(
         self,
         anatomy: Anatomy | Sequence[Anatomy],
-        device: Device | Stack | Sequence[Device | Stack],
+        device: Wire | Stack | Sequence[Wire | Stack],
         *,
         worlds: int = 1,
         actuation: Actuation = "velocity",
@@ -89,7 +89,7 @@ class Simulator(Readout):
             raise InputError(f"actuation: {actuation!r}; give 'velocity' or 'force'")
         config = config or SimulatorConfig()
         check_memory(worlds * _LEAST_BYTES, f"worlds: {worlds}", "give fewer")
-        one = isinstance(device, Device | Stack)
+        one = isinstance(device, Wire | Stack)
         anatomies = [anatomy] * worlds if isinstance(anatomy, Anatomy) else list(anatomy)
         stacks = [Stack.of(device)] * len(anatomies) if one else [Stack.of(each) for each in device]
         if isinstance(anatomy, Anatomy) and not one:

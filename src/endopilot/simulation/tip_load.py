@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Float
 
 from endopilot import _core
-from endopilot.devices.device import GRAM_FORCE_N, Device
+from endopilot.devices.device import GRAM_FORCE_N, Wire
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.core import run_core
 from endopilot.simulation.rod import POISSON_RATIO, SHEAR_CORRECTION, RodLayout
@@ -61,7 +61,7 @@ class TipLoadTest:
     load_n: float
 
 
-def simulate_tip_load(device: Device) -> TipLoadTest:
+def simulate_tip_load(device: Wire) -> TipLoadTest:
     """Push the distal 10 mm of a device, straight, against a smooth plate until it buckles.
 
     Args:
@@ -105,7 +105,7 @@ def simulate_tip_load(device: Device) -> TipLoadTest:
     return TipLoadTest(pushed, force, result["shape"][0, -1], float(force.max()))
 
 
-def tip_load_row(device: Device) -> dict[str, Any]:
+def tip_load_row(device: Wire) -> dict[str, Any]:
     """Return what `endopilot devices --tip-load` shows of a device.
 
     The keys: `name`, `ei_tip_n_mm2`, the catalogue's `tip_load_n` and `tip_load_gf`, the simulated test's
@@ -125,7 +125,7 @@ def tip_load_row(device: Device) -> dict[str, Any]:
     }
 
 
-def _distal_rod(device: Device) -> RodLayout:
+def _distal_rod(device: Wire) -> RodLayout:
     """Return the distal 10 mm, straight and in elements of one length, with the held nodes behind."""
     size = HELD_MM / (_ELEMENTS - 0.5)  # the clamped element fixes a direction over its length: half of it is held
     abscissa = size * np.arange(_ELEMENTS + 1)

@@ -138,10 +138,11 @@ class Trajectory:
         seconds = self.period_s * float(np.argmin(self.valid[world]))
         return f"{_REASONS[int(self.reason[world])]} after {seconds:g} s"
 
-    def replay(self, **changed: Any) -> Trajectory:
+    def replay(self, *, record_shape: bool | None = None, **changed: Any) -> Trajectory:
         """Simulate the same commands again from the same start; what nothing changes comes out the same to the bit.
 
         Args:
+            record_shape: record the positions of all nodes too; if not given, where they were recorded before.
             changed: attributes of `SimulationSetUp` that are to be others, such as `config`, `motion` or `friction`.
 
         Raises:
@@ -154,7 +155,8 @@ class Trajectory:
             raise InputError("replay: a world was on its way when the recording began; record from its start")
         if not set_up.anatomies:
             raise InputError("replay: the vessel is not given; read the trajectory with its anatomy")
-        again = run_set_up(set_up, self.command, period_s=self.period_s, record_shape=self.shape is not None)
+        shape = self.shape is not None if record_shape is None else record_shape
+        again = run_set_up(set_up, self.command, period_s=self.period_s, record_shape=shape)
         return replace(again, columns=self.columns, about=self.about)
 
     def plot(self, *, world: int = 0) -> Figure:

@@ -23,7 +23,7 @@ import numpy as np
 
 from endopilot import _core
 from endopilot.devices.catheter import Catheter
-from endopilot.devices.device import Device
+from endopilot.devices.device import Wire
 from endopilot.devices.stack import Stack, column_prefixes
 from endopilot.errors import InputError
 from endopilot.extras import extra_named
@@ -36,6 +36,8 @@ from endopilot.types import Anatomy, TipProjection
 if TYPE_CHECKING:
     import pandas as pd
 
+TRAJECTORY = "trajectory.npz"
+"""Name of the file in a folder that holds one navigation or plan."""
 FORMAT_VERSION = 1
 """Of the .npz file: raised when an array comes to mean something else."""
 _MEANING = {
@@ -151,7 +153,7 @@ def read_trajectory(path: Path | str, anatomy: Anatomy | Sequence[Anatomy] | Non
             arrays = {name: stored[name] for name in stored.files if name != "about"}
         if about.get("format") != _FORMAT:
             raise KeyError("format")
-    except (OSError, ValueError, KeyError, BadZipFile, AttributeError) as error:
+    except (OSError, ValueError, KeyError, BadZipFile, AttributeError, TypeError) as error:
         raise InputError(f"{path}: no trajectory ({error}); give a file that Trajectory.write made") from None
     if about["version"] != FORMAT_VERSION:
         raise InputError(f"{path}: format version {about['version']}, not {FORMAT_VERSION}; simulate it again")
@@ -192,7 +194,7 @@ def _about(trajectory: Trajectory, arrays: Mapping[str, np.ndarray]) -> str:
     set_up, meaning = trajectory.set_up, dict(_MEANING)
     for name, of, numbers, unit, words in _core.OUTPUTS:
         if name in arrays and name not in meaning:
-            meaning[name] = (_AXES[of] + (f" {numbers}" if numbers > 1 else ""), unit, words)
+            meaning[name] = (_AXES[of] + (f" {numbers}" if numbers > 1 else ""), unit.replace("N mm", "N·mm"), words)
     stacks = list({id(stack): stack for stack in set_up.stacks}.values())
     number = {id(stack): k for k, stack in enumerate(stacks)}
     content = {
@@ -216,8 +218,7 @@ def _about(trajectory: Trajectory, arrays: Mapping[str, np.ndarray]) -> str:
 
 
 def _stack(described: Mapping[str, Any]) -> Stack:
-    catheters = [Catheter(**{**each, "device": Device(**each["device"])}) for each in described["catheters"]]
-    return Stack(Device(**described["wire"]), tuple(catheters))
+    return Stack(Wire(**described["wire"]), tuple(Catheter(**each) for each in described["catheters"]))
 
 
 def _vessels(path: Path | str, about: Mapping[str, Any], anatomy: Anatomy | Sequence[Anatomy] | None) -> list[Anatomy]:

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from pydantic import InstanceOf, model_validator
 
 from endopilot.devices.catheter import Catheter, check_nested
-from endopilot.devices.device import Device
+from endopilot.devices.device import Device, Wire
 from endopilot.devices.drive_limits import Numbers
 from endopilot.devices.stack import Stack
 from endopilot.settings import CountOrZero, Finite, NonNegative, Positive, Seconds, Within, settings
@@ -83,7 +83,7 @@ class Navigation:
     """
 
     anatomy: InstanceOf[Anatomy]
-    device: Device
+    device: Wire
     target: Target
     catheters: tuple[Catheter, ...] = ()
     arrives: Arrives = "wire"
@@ -105,8 +105,8 @@ class Navigation:
 
     @property
     def devices(self) -> tuple[Device, ...]:
-        """The wire, and what each catheter has in common with one."""
-        return (self.device, *(catheter.device for catheter in self.catheters))
+        """The wire, then the catheters around it."""
+        return self.stack.devices
 
     @property
     def arriving(self) -> int:

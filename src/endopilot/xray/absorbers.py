@@ -178,7 +178,7 @@ def driven_catheter_points(
         catheter: its diameters.
         nodes: of its axis from the tip on, LPS mm.
     """
-    outer, inner = catheter.device.tip_radius_mm, catheter.inner_diameter_mm / 2
+    outer, inner = catheter.tip_radius_mm, catheter.inner_diameter_mm / 2
     radius = (outer + inner) / 2
     wall, sizes = _tube(nodes, radius, outer - inner, _STEP_MM, CATHETER_MM)
     if 2 * outer > _MARKED_MM:

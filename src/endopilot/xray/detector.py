@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float32
 from scipy.ndimage import gaussian_filter
 
-from endopilot.devices.device import Device
+from endopilot.devices.device import Wire
 from endopilot.settings import Finite, NonNegative, OpenShare, Share, settings
 from endopilot.types import Anatomy
 from endopilot.xray.absorbers import catheter_lumen_points, lumen_points
@@ -67,7 +67,7 @@ class TipDetector:
     def __init__(
         self,
         anatomy: Anatomy,
-        device: Device,
+        device: Wire,
         config: DetectorConfig | None = None,
         evidence: RidgeEvidence | None = None,
     ) -> None:

@@ -18,7 +18,7 @@ from jaxtyping import Float, Float32, UInt8
 from scipy.ndimage import gaussian_filter, zoom
 
 from endopilot.devices.catheter import Catheter
-from endopilot.devices.device import Device
+from endopilot.devices.device import Wire
 from endopilot.settings import Finite, Positive, Share, Within, settings
 from endopilot.simulation.motion import place
 from endopilot.types import Anatomy, Volume
@@ -119,7 +119,7 @@ class XrayImager:
     def __init__(
         self,
         anatomy: Anatomy,
-        device: Device,
+        device: Wire,
         ct: Volume | None = None,
         config: ImageConfig | None = None,
         *,
@@ -267,7 +267,7 @@ class XrayImager:
         """
         catheter = self.catheters[number]
         points, size = driven_catheter_points(catheter, in_catheter(self.anatomy, nodes))
-        wall_mm = catheter.device.tip_radius_mm - catheter.inner_diameter_mm / 2
+        wall_mm = catheter.tip_radius_mm - catheter.inner_diameter_mm / 2
         blur = self._blur_px(plane.zoom)
         points = place(plane.placed, points)
         return splat(plane.view, self.config.pixels, points, size, width_mm=wall_mm / np.sqrt(12), blur_px=blur)

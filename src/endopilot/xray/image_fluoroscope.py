@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from endopilot.anatomy.projection import project_tip
-from endopilot.devices.device import Device
+from endopilot.devices.device import Wire
 from endopilot.errors import InputError
 from endopilot.simulation.motion import Motion, published_mean
 from endopilot.simulation.simulator import Simulator
@@ -47,7 +47,7 @@ class ImageFluoroscope:
     def __init__(
         self,
         anatomy: Anatomy,
-        device: Device,
+        device: Wire,
         config: FluoroscopeConfig | None = None,
         seed: int = 0,
         *,

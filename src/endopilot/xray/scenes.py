@@ -12,7 +12,7 @@ from jaxtyping import Float, Float32
 
 from endopilot.anatomy.io import read_anatomy
 from endopilot.atlas.atlas import AtlasConfig, make_patient
-from endopilot.devices.device import Device, read_device
+from endopilot.devices.device import Wire, read_device
 from endopilot.progress import progress
 from endopilot.settings import Finite, Seed, Within, settings
 from endopilot.simulation.controls import ControlConfig, random_controls
@@ -63,7 +63,7 @@ class Scene:
     """
 
     anatomy: Anatomy
-    device: Device
+    device: Wire
     imager: XrayImager
     angles_deg: tuple[tuple[float, float], tuple[float, float]]
     pose: Pose
@@ -120,7 +120,7 @@ def draw_scenes(config: SceneConfig, image: ImageConfig | None = None) -> Iterat
             advance()
 
 
-def _wires(anatomy: Anatomy, device: Device, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _wires(anatomy: Anatomy, device: Wire, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return nodes and velocities of the wires of random navigations, and their inserted lengths, mixed up."""
     deepest = _DEEPEST_SHARE * float(anatomy.tree.longest_path().abscissa[-1])
     initial, control = random_controls(
