@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -29,7 +29,7 @@ class NavigateEnv(gymnasium.Env):
     - v0: first version.
     """
 
-    metadata: ClassVar[dict[str, Any]] = NavigateVectorEnv.metadata
+    metadata: dict[str, Any] = NavigateVectorEnv.metadata  # noqa: RUF012, as Gymnasium declares it
 
     def __init__(
         self,

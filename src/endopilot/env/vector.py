@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from gymnasium.spaces import Box
@@ -182,7 +182,7 @@ class NavigateVectorEnv(VectorEnv):
     - v0: first version.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 1.0 / CONTROL_PERIOD_S}
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 1.0 / CONTROL_PERIOD_S}  # noqa: RUF012, as Gymnasium declares it
 
     def __init__(
         self,
