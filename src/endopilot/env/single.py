@@ -29,7 +29,7 @@ class NavigateEnv(gymnasium.Env):
     - v0: first version.
     """
 
-    metadata: dict[str, Any] = NavigateVectorEnv.metadata  # noqa: RUF012, as Gymnasium declares it
+    metadata: dict[str, Any] = NavigateVectorEnv.metadata
 
     def __init__(
         self,

@@ -182,7 +182,10 @@ class NavigateVectorEnv(VectorEnv):
     - v0: first version.
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 1.0 / CONTROL_PERIOD_S}  # noqa: RUF012, as Gymnasium declares it
+    metadata: dict[str, Any] = {  # noqa: RUF012, as Gymnasium declares it
+        "render_modes": ["rgb_array"],
+        "render_fps": 1.0 / CONTROL_PERIOD_S,
+    }
 
     def __init__(
         self,
