@@ -28,7 +28,8 @@ def test_an_anatomy_is_seen_across_its_largest_extents(fork) -> None:
 
 def test_an_anatomy_is_drawn_into_given_axes(fork) -> None:
     figure, (left, right) = plt.subplots(1, 2)
-    assert fork.plot(axes=right, view="above") is figure
+    assert fork.plot(axes=right, view="above", color="red") is figure
+    assert right.get_legend() is None
     assert not left.collections
     assert right.get_xlabel().startswith("x") and right.get_ylabel().startswith("y")
 

@@ -75,11 +75,10 @@ route = endopilot.plan(anatomy, "4", endopilot.PlanConfig(force_limit_n=0.3))
 print(f"reached: {route.reached}, peak wall force {route.force.max():.3f} N, planned in {route.seconds_to_plan:.1f} s")
 
 # %%
-# Driven in a simulator, the planned controls bring the tip, Δtip, to the target. A trajectory plots itself too.
+# A plan keeps what the rod core makes of its controls: Δtip reaches the target, the dotted line. A trajectory plots
+# itself too.
 
-navigation = route.navigation
-driven = endopilot.simulate(navigation.anatomy, navigation.device, route.control[None], initial=navigation.start[None])
-driven.plot().axes[0].axhline(navigation.target.abscissa, color="C3", ls=":", lw=1)
+route.trajectory.plot().axes[0].axhline(route.navigation.target.abscissa, color="C3", ls=":", lw=1)
 plt.show()
 
 # %%

@@ -89,7 +89,7 @@ rollouts = {
 
 figure, panels = plt.subplots(1, 2, figsize=(11.5, 4.4), layout="constrained")
 for axes, (name, rollout) in zip(panels, rollouts.items(), strict=True):
-    anatomy.plot(axes=axes, view="front")
+    anatomy.plot(axes=axes, view="front", color="0.85")
     for nodes in rollout.shape[:, -1]:
         axes.plot(nodes[:, 0], nodes[:, 2], color="black", lw=1)
         axes.plot(nodes[0, 0], nodes[0, 2], "o", color="black", ms=4)

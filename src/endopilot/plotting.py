@@ -69,6 +69,7 @@ def draw_vessel(
     radius: Float[np.ndarray, "n"],
     section: Int[np.ndarray, "n"],
     names: Sequence[str],
+    one_color: str | None = None,
 ) -> None:
     """Draw straight pieces of a vessel's centerlines with the sections by colour, and a legend beside them.
 
@@ -78,14 +79,16 @@ def draw_vessel(
         radius: of its lumen; lines are as thick as the vessel is wide, the widest some points.
         section: index of its section.
         names: of the sections.
+        one_color: of all, without a legend.
     """
     present = np.unique(section)
     palette, width = section_colors(len(present)), _THICKEST * radius / radius.max()
     for number, index in enumerate(present):
-        own, color = section == index, palette(number)
+        own, color = section == index, one_color or palette(number)
         lines = LineCollection(list(pieces[own]), linewidths=width[own].tolist(), colors=[color], capstyle="round")
         axes.add_collection(lines)
-        axes.plot([], [], color=color, lw=4, label=plain_text(names[index]))
+        axes.plot([], [], color=color, lw=4, label=plain_text(names[int(index)]))
     axes.set_aspect("equal")
     axes.autoscale_view()
-    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), ncols=1 + len(present) // 20)
+    if one_color is None:
+        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), ncols=1 + len(present) // 20)

@@ -205,6 +205,11 @@ class VesselTree:
         """Return the path from the ostium to the farthest distal end."""
         return self.path(self.longest_leaf())
 
+    def widest_axes(self) -> tuple[int, int]:
+        """Return the world axes to the right and up for an eye that looks along the one of least extent."""
+        points = np.concatenate([branch.centerline.points for branch in self.branches])
+        return list(_VIEWS.values())[int(np.argmin(np.ptp(points, axis=0)))]
+
     def rotation_zero(self, insertion: Insertion) -> Float[np.ndarray, "3"]:
         """Return where a tip's bend points at φ = 0: to the side of the catheter's axis on which the vessel lies.
 
@@ -270,12 +275,19 @@ class Anatomy:
         sections = ", ".join(self.tree.sections_present)
         return f"Anatomy(name={self.name!r}, branches={branches}, longest_path_mm={length:.1f}, sections={sections!r})"
 
-    def plot(self, *, axes: Axes | None = None, view: Literal["front", "side", "above"] | None = None) -> Figure:
+    def plot(
+        self,
+        *,
+        axes: Axes | None = None,
+        view: Literal["front", "side", "above"] | None = None,
+        color: str | None = None,
+    ) -> Figure:
         """Draw the centerlines, as thick as the vessel is wide, with the sections by colour, and the ostium.
 
         Args:
             axes: where; in a new figure of pyplot if not given. The figure's axes are LPS mm.
             view: from where one looks; across the vessel's largest extents if not given.
+            color: of the whole vessel, for what is drawn over it, in place of the sections and their legend.
         """
         import matplotlib.pyplot as plt
 
@@ -283,12 +295,12 @@ class Anatomy:
 
         lines = [(branch.centerline, branch.section) for branch in self.tree.branches]
         pieces = np.concatenate([np.stack([line.points[:-1], line.points[1:]], axis=1) for line, _ in lines])
-        across, up = _VIEWS[view or list(_VIEWS)[int(np.argmin(np.ptp(pieces, axis=(0, 1))))]]
+        across, up = _VIEWS[view] if view else self.tree.widest_axes()
         axes = axes or plt.figure(figsize=(7, 5.5), layout="constrained").subplots()
         radius = np.concatenate([line.radius[1:] for line, _ in lines])
         section = np.concatenate([own[1:] for _, own in lines])
         axes.plot(*self.insertion.position[[across, up]], "k^", zorder=3, label="ostium")
-        draw_vessel(axes, pieces[..., [across, up]], radius, section, self.tree.section_names)
+        draw_vessel(axes, pieces[..., [across, up]], radius, section, self.tree.section_names, color)
         axes.set(xlabel=_AXES[across], ylabel=_AXES[up], title=self.name)
         return axes.figure  # pyright: ignore[reportReturnType]
 

@@ -7,7 +7,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from numpy.typing import ArrayLike
 
 from endopilot.env.vector import NavigateVectorEnv, NavigationState
@@ -29,6 +29,8 @@ class NavigateEnv(gymnasium.Env):
     - v0: first version.
     """
 
+    metadata: dict[str, Any] = NavigateVectorEnv.metadata
+
     def __init__(
         self,
         *,
@@ -38,6 +40,7 @@ class NavigateEnv(gymnasium.Env):
         catheter: str | None = None,
         motion: Motion | None = None,
         config: SimulatorConfig = CORE,
+        render_mode: str | None = None,
     ) -> None:
         """Lay the wire out; `reset` starts the first episode.
 
@@ -48,6 +51,7 @@ class NavigateEnv(gymnasium.Env):
             catheter: name of a catheter around the wire, or a YAML file; its tip is to arrive then.
             motion: how heart and breath move the vessel and its guiding catheter; they lie still if not given.
             config: settings of the rod core.
+            render_mode: "rgb_array" lets `render` return pictures.
         """
         self._worlds = NavigateVectorEnv(
             navigations=navigation,
@@ -57,8 +61,9 @@ class NavigateEnv(gymnasium.Env):
             autoreset_mode=AutoresetMode.DISABLED,
             motion=motion,
             config=config,
+            render_mode=render_mode,
         )
-        self.metadata = {"render_modes": []}
+        self.render_mode = render_mode
         self.action_space = self._worlds.single_action_space
         self.observation_space = self._worlds.single_observation_space
 
@@ -76,6 +81,11 @@ class NavigateEnv(gymnasium.Env):
         row = np.asarray(action, dtype=float)[None]
         observations, rewards, terminations, truncations, infos = self._worlds.step(row)
         return observations[0], float(rewards[0]), bool(terminations[0]), bool(truncations[0]), _first(infos)
+
+    def render(self) -> UInt8[np.ndarray, "256 256 3"] | None:
+        """Return a picture with `render_mode="rgb_array"`: vessel, target, wire and catheters."""
+        pictures = self._worlds.render()
+        return None if pictures is None else pictures[0]
 
     @property
     def simulator(self) -> Simulator:

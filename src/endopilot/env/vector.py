@@ -12,11 +12,12 @@ from gymnasium.spaces import Box
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from numpy.typing import ArrayLike
 
 from endopilot.devices.drive_limits import DriveLimits, within_travel
 from endopilot.env.observation import Measured, observe, space
+from endopilot.env.picture import Picture
 from endopilot.env.route_tables import RouteTables
 from endopilot.errors import InputError
 from endopilot.simulation.config import SimulatorConfig
@@ -181,6 +182,11 @@ class NavigateVectorEnv(VectorEnv):
     - v0: first version.
     """
 
+    metadata: dict[str, Any] = {  # noqa: RUF012, as Gymnasium declares it
+        "render_modes": ["rgb_array"],
+        "render_fps": 1.0 / CONTROL_PERIOD_S,
+    }
+
     def __init__(
         self,
         num_envs: int = 1,
@@ -193,6 +199,7 @@ class NavigateVectorEnv(VectorEnv):
         autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
         motion: Motion | None = None,
         config: SimulatorConfig = CORE,
+        render_mode: str | None = None,
     ) -> None:
         """Lay the wires out; `reset` starts the first episodes.
 
@@ -206,6 +213,7 @@ class NavigateVectorEnv(VectorEnv):
             autoreset_mode: whether an ended world is reset at the next step.
             motion: how heart and breath move all vessels and their guiding catheters; they lie still if not given.
             config: settings of the rod core.
+            render_mode: "rgb_array" lets `render` return pictures.
 
         Raises:
             InputError: no world, no such task or catheter, a catheter for navigations of one's own; a device that is
@@ -213,6 +221,8 @@ class NavigateVectorEnv(VectorEnv):
         """
         if num_envs < 1:
             raise InputError(f"num_envs: {num_envs}; give at least 1")
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise InputError(f"render_mode: {render_mode!r}; give 'rgb_array' or None")
         if autoreset_mode not in (AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED):
             raise InputError(f"autoreset_mode: {autoreset_mode}; give AutoresetMode.NEXT_STEP or DISABLED")
         if navigations is None:
@@ -222,6 +232,7 @@ class NavigateVectorEnv(VectorEnv):
             raise InputError(f"catheter: {catheter}; give it to the navigations")
         given = [navigations] if isinstance(navigations, Navigation) else list(navigations)
         self._prepare([given[world % len(given)] for world in range(num_envs)], autoreset_mode, motion, config)
+        self.render_mode = render_mode
 
     def _prepare(
         self,
@@ -242,7 +253,8 @@ class NavigateVectorEnv(VectorEnv):
                 )
         count = len(navigations)
         self.navigations, self._motion, self._config = tuple(navigations), motion, config
-        self.metadata = {"autoreset_mode": autoreset_mode, "render_modes": []}
+        self.metadata = type(self).metadata | {"autoreset_mode": autoreset_mode}
+        self._pictures: dict[int, Picture] = {}
         self.num_envs = count
         self._drives, self._counted = len(first.devices), 1 + first.arriving
         self._fastest = np.tile([TRANSLATION_MM_S, ROTATION_RAD_S], self._drives)
@@ -326,7 +338,7 @@ class NavigateVectorEnv(VectorEnv):
         fresh = self._ended & (self.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP)
         control = np.minimum(np.maximum(control, -1.0), 1.0) * self._fastest
         control[fresh] = 0.0
-        travel_mm = (-np.inf, self._far_ends[:, None])  # it stops by itself at the ostium
+        travel_mm = (-np.inf, self._far_ends)  # it stops by itself at the ostium
         control, simulator = control.reshape(self.num_envs, self._drives, 2), self._simulator
         inserted = simulator.inserted_length
         control[..., 0] = within_travel(control[..., 0], inserted, CONTROL_PERIOD_S, travel_mm=travel_mm)
@@ -419,6 +431,16 @@ class NavigateVectorEnv(VectorEnv):
         for generator, kept in zip(self._generators, state.generators, strict=True):
             generator.bit_generator.state = copy.deepcopy(kept)
 
+    def render(self) -> tuple[UInt8[np.ndarray, "256 256 3"], ...] | None:
+        """Return a picture of each world with `render_mode="rgb_array"`: vessel, target, wire and catheters."""
+        if self.render_mode is None:
+            return None
+        for navigation in self.navigations:
+            if id(navigation) not in self._pictures:
+                self._pictures[id(navigation)] = Picture(navigation)
+        pictures = (self._pictures[id(navigation)] for navigation in self.navigations)
+        return tuple(picture.of(self._simulator, world) for world, picture in enumerate(pictures))
+
     @property
     def simulator(self) -> Simulator:
         """The worlds, for pictures of the wires; stepping it bypasses the environment."""
@@ -433,9 +455,10 @@ class NavigateVectorEnv(VectorEnv):
             "config": self._config,
             "state": self.state,
             "spec": self.spec,
+            "render_mode": self.render_mode,
         }
 
     def __setstate__(self, kept: dict[str, Any]) -> None:
         self._prepare(kept["navigations"], kept["autoreset_mode"], kept["motion"], kept["config"])
         self.set_state(kept["state"])
-        self.spec = kept["spec"]
+        self.spec, self.render_mode = kept["spec"], kept["render_mode"]
