@@ -161,7 +161,7 @@ def test_a_catheter_follows_its_wire_and_both_are_written(patient, capsys, tmp_p
     lengths = episode.inserted_length[0, : len(table) - 1, 1]
     np.testing.assert_allclose(lengths, table["catheter_1_inserted_length_mm"][1:], atol=1e-4)
     assert true.friction == 1.1 * given.friction
-    assert true == replace(given, device=replace(given.device, friction=true.friction))
+    assert true == replace(given, friction=true.friction)
     assert episode.stack.catheters == (given,) and episode.initial[0, 1].tolist() == [0.0, 0.0]
     again = run(capsys, "simulate", patient, "--controls", folder / "trajectory.npz", "-o", tmp_path / "again.csv")
     assert again["valid_worlds"] == 1
