@@ -93,7 +93,7 @@ def _navigations(count: int, seconds: float, *, first: int) -> Float[np.ndarray,
         ControlConfig(), n_sequences=count, n_samples=samples, seed=0, max_inserted_length_mm=longest, first=first
     )
     at = (np.arange(round(seconds / CONTROL_PERIOD_S)) * CONTROL_PERIOD_S / SAMPLE_PERIOD_S).astype(int)
-    return control[:, at] / (TRANSLATION_MM_S, ROTATION_RAD_S)
+    return control[:, at, 0] / (TRANSLATION_MM_S, ROTATION_RAD_S)
 
 
 def _tips(config: SimulatorConfig) -> Float[np.ndarray, "steps worlds 3"]:

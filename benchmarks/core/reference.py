@@ -168,7 +168,7 @@ def _marks(scenes: Iterable[Scene]) -> dict[str, Any]:
                 [np.column_stack([line.points, line.radius]) for line in lines]
             ),
             f"distance_map_{scene.name}": scene.anatomy.distance_map.values[step, step, step],
-            f"initial_states_{scene.name}": scene.initial,
-            f"controls_{scene.name}": scene.control,
+            f"initial_states_{scene.name}": scene.initial[:, 0],
+            f"controls_{scene.name}": scene.control[:, :, 0],
         }
     return {name: values.astype(np.float32) for name, values in marks.items()}

@@ -227,9 +227,9 @@ def order_in_a_beating_heart() -> list[Case]:
     The wire is pushed and turned at different speeds.
     """
     speed = np.column_stack([np.linspace(4, 10, ORDER_WORLDS), np.linspace(-2, 2, ORDER_WORLDS)])
-    control = np.repeat(speed[:, None], ORDER_SAMPLES, axis=1)
+    control = np.repeat(speed[:, None, None], ORDER_SAMPLES, axis=1)
     initial = np.column_stack([np.linspace(20, 50, ORDER_WORLDS), np.zeros(ORDER_WORLDS)])
-    return [navigation_order("motion: order in time step, beating and breathing", initial, control, Motion())]
+    return [navigation_order("motion: order in time step, beating and breathing", initial[:, None], control, Motion())]
 
 
 CASES = (rigid_motion, power_balance, order_in_a_beating_heart)

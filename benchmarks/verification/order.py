@@ -104,8 +104,8 @@ def patient() -> Anatomy:
 
 def navigation_order(
     case: str,
-    initial: Float[np.ndarray, "worlds 2"],
-    control: Float[np.ndarray, "worlds samples 2"],
+    initial: Float[np.ndarray, "worlds 1 2"],
+    control: Float[np.ndarray, "worlds samples 1 2"],
     motion: Motion | None = None,
 ) -> Case:
     """Return the order in time of the tip's mean distance (mm) from that at the finest time step.

@@ -75,8 +75,8 @@ def test_the_manoeuvres_push_beyond_the_end_and_pull_fully_out(patient) -> None:
 def test_wire_and_catheter_have_manoeuvres_of_their_own_and_go_in_again(patient) -> None:
     stack = Stack(DEVICE, (read_catheter("microcatheter-2.4f"),))
     initial, control = paired_controls(patient, stack, rollouts=16, samples=120, seed=0)
-    assert initial.shape == (16, 4) and control.shape == (16, 120, 4)
-    inserted = initial[:, None, ::2] + 0.5 * np.cumsum(control[..., ::2], axis=1)
+    assert initial.shape == (16, 2, 2) and control.shape == (16, 120, 2, 2)
+    inserted = initial[:, None, :, 0] + 0.5 * np.cumsum(control[..., 0], axis=1)
     assert inserted.min() > -1e-9
     out = (inserted[:, 101] < 1e-9) & (inserted[:, -1] > 10)  # pulled out, and in again
     np.testing.assert_array_equal(out.sum(axis=0), [8, 8])
@@ -119,11 +119,11 @@ def test_non_finite_numbers_in_valid_worlds_are_counted(patient) -> None:
 def test_a_device_wider_than_a_lumen_that_it_has_passed_is_wedged(patient) -> None:
     catheter = read_catheter("microcatheter-2.4f")
     stack = Stack(DEVICE, (catheter,))
-    initial, control = np.array([[20.0, 0.0, 5.0, 0.0]]), np.zeros((1, 40, 4))
-    control[0, :, 2] = 2.0  # the catheter goes in, over the wire and beyond
-    rollout = simulate(patient, DEVICE, control, catheters=[catheter], initial=initial)
-    assert rollout.catheters is not None
-    path = patient.tree.path(int(rollout.tip.branch[0, -1]))
+    initial, control = np.array([[[20.0, 0.0], [5.0, 0.0]]]), np.zeros((1, 40, 2, 2))
+    control[0, :, 1, 0] = 2.0  # the catheter goes in, over the wire and beyond
+    rollout = simulate(patient, stack, control, initial=initial)
+    alone = simulate(patient, DEVICE, control[:, :, 0], initial=initial[:, 0])
+    path = patient.tree.path(int(rollout.tip.branch[0, -1, 0]))
     behind = np.flatnonzero(path.abscissa < 15)
     tree = patient.tree
     at = path.abscissa[behind[-1]]
@@ -133,10 +133,10 @@ def test_a_device_wider_than_a_lumen_that_it_has_passed_is_wedged(patient) -> No
 
     narrow = tuple(replace(branch, centerline=narrowed(branch.centerline)) for branch in tree.branches)
     stenosed = replace(patient, tree=replace(tree, branches=narrow))
-    inserted = rollout.catheters.inserted_length[0, :, 0]
+    inserted = rollout.inserted_length[0, :, 1]
     wedged = robustness._wedged(stenosed, stack, rollout)[0]  # 0.3 mm: wider than the wire, narrower than the catheter
     assert not wedged[inserted < 12].any() and wedged[inserted > 20].all() and (inserted > 20).any()
-    assert not robustness._wedged(stenosed, Stack(DEVICE), replace(rollout, catheters=None)).any()
+    assert not robustness._wedged(stenosed, Stack(DEVICE), alone).any()
     assert not robustness._wedged(patient, stack, rollout).any()
 
 

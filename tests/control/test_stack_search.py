@@ -173,6 +173,6 @@ def test_a_ladder_counts_the_events_that_the_agent_misses(side_branch) -> None:
 
 def test_the_agent_drives_one_catheter(side_branch) -> None:
     outer = read_catheter("straight-5f")
-    wide = replace(outer, device=replace(outer.device, diameter_mm=1.25))
+    wide = replace(outer, diameter_mm=1.25)
     with pytest.raises(InputError, match="catheter: 2; the search drives one"):
         navigate(replace(side_branch, catheters=(*side_branch.catheters, wide)), "agent")

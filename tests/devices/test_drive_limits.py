@@ -63,6 +63,6 @@ def test_a_simulator_takes_what_has_been_clipped():
     begin = end - np.linspace(0.1, 0.9, 8)
     simulator.reset(inserted_length=begin, rotation=np.zeros(8))
     for _ in range(12):
-        control = np.column_stack([np.linspace(3.3, 9.7, 8), np.zeros(8)])
+        control = np.column_stack([np.linspace(3.3, 9.7, 8), np.zeros(8)])[:, None]
         simulator.step(DriveLimits.of(wire, vessel).clip(control, simulator.inserted_length, 0.07), 0.07)
     np.testing.assert_allclose(simulator.inserted_length, end, atol=1e-9)

@@ -48,7 +48,7 @@ def test_the_push_balances_the_wall() -> None:
     held = np.concatenate([held, held[:, 1:]], axis=1)  # the element that joins the base touches nothing
     pressed = np.where(held, 0.0, config.wall_stiffness_n_mm * depth)
     wall = (pressed[..., None] * slope).sum(axis=1) @ anatomy.insertion.direction
-    push = rollout.base_force[:, -1]
+    push = rollout.base_force[:, -1, 0]
     assert np.abs(pressed.sum(axis=1) - rollout.contact_force_sum[:, -1]).max() < 0.05 * rollout.contact_force_sum.max()
     assert np.abs(push).max() > 5e-3
     assert np.abs(push + wall).max() < 0.01 * np.abs(push).max() + 1e-4, (push, wall)

@@ -153,7 +153,7 @@ def read_trajectory(path: Path | str, anatomy: Anatomy | Sequence[Anatomy] | Non
             arrays = {name: stored[name] for name in stored.files if name != "about"}
         if about.get("format") != _FORMAT:
             raise KeyError("format")
-    except (OSError, ValueError, KeyError, BadZipFile, AttributeError) as error:
+    except (OSError, ValueError, KeyError, BadZipFile, AttributeError, TypeError) as error:
         raise InputError(f"{path}: no trajectory ({error}); give a file that Trajectory.write made") from None
     if about["version"] != FORMAT_VERSION:
         raise InputError(f"{path}: format version {about['version']}, not {FORMAT_VERSION}; simulate it again")
@@ -194,7 +194,7 @@ def _about(trajectory: Trajectory, arrays: Mapping[str, np.ndarray]) -> str:
     set_up, meaning = trajectory.set_up, dict(_MEANING)
     for name, of, numbers, unit, words in _core.OUTPUTS:
         if name in arrays and name not in meaning:
-            meaning[name] = (_AXES[of] + (f" {numbers}" if numbers > 1 else ""), unit, words)
+            meaning[name] = (_AXES[of] + (f" {numbers}" if numbers > 1 else ""), unit.replace("N mm", "N·mm"), words)
     stacks = list({id(stack): stack for stack in set_up.stacks}.values())
     number = {id(stack): k for k, stack in enumerate(stacks)}
     content = {

@@ -1,0 +1,237 @@
+"""Trajectories: driven again to the bit, thinned, written and read back, and gathered step by step."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import endopilot
+from endopilot.atlas.atlas import AtlasConfig, make_patient
+from endopilot.devices.catheter import read_catheter
+from endopilot.devices.device import read_device
+from endopilot.devices.stack import Stack
+from endopilot.errors import InputError
+from endopilot.simulation.config import SimulatorConfig
+from endopilot.simulation.motion import Motion
+from endopilot.simulation.recorder import Recorder
+from endopilot.simulation.trajectory import Trajectory
+from endopilot.simulation.trajectory_file import read_trajectory, write_trajectory
+from endopilot.types import Anatomy, TipProjection
+
+WIRE, CATHETER = read_device("workhorse-014"), read_catheter("microcatheter-1.7f")
+PAIR = Stack(WIRE, (CATHETER,))
+SAMPLES = 6
+BY_DEVICE = "worlds samples devices"
+
+
+@pytest.fixture(scope="module")
+def vessel() -> Anatomy:
+    return make_patient(AtlasConfig(count=1), 0)
+
+
+def drives(worlds: int, devices: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return starts and controls of random drives."""
+    draw = np.random.default_rng(3)
+    start = draw.uniform([0.0, -3.0], [40.0, 3.0], (worlds, devices, 2))
+    return start, draw.uniform(-1, 1, (worlds, SAMPLES, devices, 2)) * [15.0, 3.0]
+
+
+def driven(vessel: Anatomy, stack: Stack, **settings) -> Trajectory:
+    start, control = drives(2, len(stack))
+    friction = np.linspace(0.05, 0.2, 2 * len(stack)).reshape(2, -1)
+    return endopilot.simulate(vessel, stack, control, initial=start, friction=friction, **settings)
+
+
+@pytest.fixture(scope="module")
+def wire_alone(vessel: Anatomy) -> Trajectory:
+    return driven(vessel, Stack(WIRE))
+
+
+@pytest.fixture(scope="module")
+def moving_pair(vessel: Anatomy) -> Trajectory:
+    """Return all that a trajectory can hold: two devices, motion, shapes, further signals and notes."""
+    made = driven(vessel, PAIR, motion=Motion(), record_shape=True, config=SimulatorConfig(element_mm=1.0))
+    return replace(made, columns={"exposed": np.arange(2 * SAMPLES).reshape(2, SAMPLES) % 3 == 0}, about={"seed": 3})
+
+
+def arrays_of(trajectory: Trajectory) -> dict[str, np.ndarray]:
+    """Return every array of a trajectory, by name."""
+    set_up, tip = trajectory.set_up, trajectory.tip
+    found = {each.name: getattr(trajectory, each.name) for each in fields(trajectory)}
+    found |= {f"tip_{name}": getattr(tip, name) for name in TipProjection.__dataclass_fields__}
+    found |= {f"column.{name}": values for name, values in trajectory.columns.items()}
+    found |= {"initial": set_up.initial, "friction": set_up.friction}
+    return {name: values for name, values in found.items() if isinstance(values, np.ndarray)}
+
+
+def assert_same(first: Trajectory, second: Trajectory) -> None:
+    """Assert that two trajectories hold the same bits."""
+    one, other = arrays_of(first), arrays_of(second)
+    assert one.keys() == other.keys() and len(one) > 20
+    for name, values in one.items():
+        assert values.dtype == other[name].dtype, name
+        np.testing.assert_array_equal(values, other[name], err_msg=name)
+    assert (first.period_s, first.about) == (second.period_s, second.about)
+
+
+def test_a_wire_and_a_wire_in_a_catheter_that_moves_are_driven_again_to_the_bit(wire_alone, moving_pair) -> None:
+    assert wire_alone.valid.all() and moving_pair.valid.all()
+    assert_same(wire_alone.replay(), wire_alone)
+    assert_same(moving_pair.replay(), moving_pair)
+
+
+def test_friction_of_each_world_and_motion_are_those_of_the_recording(vessel, wire_alone, moving_pair) -> None:
+    other = wire_alone.set_up.friction * [[1.0], [0.25]]  # of the second world alone
+    changed = wire_alone.replay(friction=other)
+    np.testing.assert_array_equal(changed.tip_position[0], wire_alone.tip_position[0])
+    assert (changed.base_force[1] != wire_alone.base_force[1]).any()
+    still = moving_pair.replay(motion=None)
+    assert still.vessel_to_laboratory is None
+    assert (still.base_force != moving_pair.base_force).any()
+
+
+def test_a_recording_that_began_on_the_way_is_not_replayed(vessel) -> None:
+    start, control = drives(2, 1)
+    simulator = endopilot.Simulator(vessel, WIRE, worlds=2)
+    simulator.reset(inserted_length=start[..., 0], rotation=start[..., 1])
+    simulator.step(control[:, 0], 0.5)
+    later = simulator.run(control[:, 1:])
+    assert np.isnan(later.set_up.initial).all()
+    with pytest.raises(InputError, match="a world was on its way when the recording began; record from its start"):
+        later.replay()
+
+
+def test_every_third_sample_has_the_means_and_sums_of_its_period(vessel) -> None:
+    weak = replace(CATHETER, device=replace(CATHETER.device, push_limit_n=0.03, pull_limit_n=0.02))
+    fine = driven(vessel, Stack(WIRE, (weak,)), motion=Motion(), record_shape=True)
+    assert np.abs(fine.slip).max() > 0
+    coarse = fine.every(3)
+    assert coarse.period_s == 1.5 and coarse.valid.shape == (2, 2)
+    for name in ("inserted_length", "rotation", "tip_position", "base_force", "wall_force", "shape"):
+        np.testing.assert_array_equal(getattr(coarse, name), getattr(fine, name)[:, [2, 5]])
+    np.testing.assert_array_equal(coarse.vessel_to_laboratory, fine.vessel_to_laboratory[:, [2, 5]])
+    np.testing.assert_array_equal(coarse.tip.abscissa, fine.tip.abscissa[:, [2, 5]])
+    for name, take in (("command", np.mean), ("control", np.mean), ("iterations", np.mean)):
+        fine_values = getattr(fine, name)
+        parts = [take(fine_values[:, first : first + 3], axis=1) for first in (0, 3)]
+        np.testing.assert_allclose(getattr(coarse, name), np.stack(parts, axis=1), rtol=1e-12, atol=1e-12)
+    for name in ("slip", "rotation_slip", "node_iterations"):
+        parts = [getattr(fine, name)[:, first : first + 3].sum(axis=1) for first in (0, 3)]
+        np.testing.assert_allclose(getattr(coarse, name), np.stack(parts, axis=1), rtol=1e-12, atol=1e-12)
+    moved = np.diff(coarse.proximal, axis=1, prepend=coarse.start[:, None])
+    np.testing.assert_allclose(coarse.control * 1.5, moved, atol=1e-9)
+    assert fine.every(4).valid.shape == (2, 1)  # a period that did not end is left out
+    assert_same(fine.every(1), fine)
+
+
+def test_a_file_gives_every_array_back_to_the_bit_and_is_replayed(vessel, moving_pair, tmp_path) -> None:
+    write_trajectory(moving_pair, tmp_path / "pair.npz")
+    read = read_trajectory(tmp_path / "pair.npz", vessel)
+    assert_same(read, moving_pair)
+    assert [each.identity for each in read.set_up.anatomies] == [vessel.identity] * 2
+    for name in ("stacks", "actuation", "motion", "config"):
+        assert getattr(read.set_up, name) == getattr(moving_pair.set_up, name)
+    assert_same(read.replay(), moving_pair)
+
+
+def test_a_trajectory_without_its_vessel_is_read_and_not_replayed(wire_alone, tmp_path) -> None:
+    write_trajectory(wire_alone, tmp_path / "wire.npz")
+    read = read_trajectory(tmp_path / "wire.npz")
+    assert_same(read, wire_alone)
+    with pytest.raises(InputError, match="the vessel is not given; read the trajectory with its anatomy"):
+        read.replay()
+
+
+def test_a_file_says_what_its_arrays_mean(moving_pair, tmp_path) -> None:
+    write_trajectory(moving_pair, tmp_path / "pair.npz")
+    with np.load(tmp_path / "pair.npz", allow_pickle=False) as stored:
+        about = json.loads(str(stored["about"]))
+        shapes = {name: stored[name].shape for name in stored.files if name != "about"}
+    described = {name for name in shapes if not name.startswith("column.")}
+    assert about["arrays"].keys() == described
+    sizes = {"worlds": 2, "samples": SAMPLES, "devices": 2, "nodes": moving_pair.shape.shape[2]}
+    for name, each in about["arrays"].items():
+        axes = each["axes"].split()
+        assert tuple(sizes.get(axis) or int(axis) for axis in axes) == shapes[name], name
+        assert each["meaning"] and isinstance(each["unit"], str), name
+    assert about["arrays"]["inserted_length"]["unit"] == "mm"
+    assert about["arrays"]["base_torque"] == about["arrays"]["base_torque"] | {"axes": BY_DEVICE, "unit": "N·mm"}
+    assert about["arrays"]["wall_force"]["axes"] == "worlds samples"
+
+
+def test_what_is_no_trajectory_of_the_vessel_is_refused_in_one_line(vessel, wire_alone, tmp_path) -> None:
+    path = tmp_path / "wire.npz"
+    write_trajectory(wire_alone, path)
+    with np.load(path) as stored:
+        arrays = dict(stored)
+    newer = json.loads(str(arrays["about"])) | {"version": 99}
+    np.savez(tmp_path / "newer.npz", **(arrays | {"about": np.array(json.dumps(newer))}))  # pyright: ignore[reportArgumentType]
+    np.savez(tmp_path / "other.npz", values=np.zeros(3))
+    (tmp_path / "text.npz").write_text("nothing")
+    np.save(tmp_path / "array.npy", np.zeros(3))
+    np.savez(tmp_path / "list.npz", about=np.array("[1]"))
+    for name in ("none.npz", "other.npz", "text.npz", "array.npy", "list.npz"):
+        _refused(tmp_path / name, vessel, "no trajectory")
+    _refused(tmp_path / "newer.npz", vessel, "format version 99, not 1; simulate it again")
+    _refused(path, make_patient(AtlasConfig(count=2), 1), f"world 0 is of another vessel, '{vessel.name}'")
+    _refused(path, [vessel], f"world 1 is of another vessel, '{vessel.name}'")
+    with pytest.raises(InputError, match=r"written as \.parquet, \.csv or \.npz"):
+        write_trajectory(wire_alone, tmp_path / "wire.txt")
+
+
+def _refused(path: Path, anatomy, message: str) -> None:
+    with pytest.raises(InputError) as error:
+        read_trajectory(path, anatomy)
+    assert str(error.value).startswith(f"{path}: ") and message in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("devices", [1, 2])
+def test_a_recorder_gives_what_a_run_gives_to_the_bit(vessel, devices) -> None:
+    stack, (start, control) = Stack(WIRE, PAIR.catheters[: devices - 1]), drives(2, devices)
+
+    def begun() -> endopilot.Simulator:
+        simulator = endopilot.Simulator(vessel, stack, worlds=2, motion=Motion())
+        simulator.reset(inserted_length=start[..., 0], rotation=start[..., 1])
+        return simulator
+
+    recorder = Recorder(begun(), 0.5)
+    for sample in range(SAMPLES):
+        recorder.step(control[:, sample])
+    gathered = recorder.trajectory()
+    assert_same(gathered, begun().run(control))
+    assert_same(gathered.replay(), gathered)
+
+
+def test_a_wire_alone_needs_no_axis_of_devices(vessel, wire_alone) -> None:
+    start, control = drives(2, 1)
+    without = endopilot.simulate(
+        vessel, WIRE, control[:, :, 0], initial=start[:, 0], friction=wire_alone.set_up.friction[:, 0]
+    )
+    assert_same(without, wire_alone)
+    simulator = endopilot.Simulator(vessel, WIRE, worlds=2)
+    simulator.reset(inserted_length=start[:, 0, 0], rotation=start[:, 0, 1], friction=without.set_up.friction[:, 0])
+    simulator.step(control[:, 0, 0], 0.5)
+    np.testing.assert_array_equal(simulator.tip_position, wire_alone.tip_position[:, 0])
+
+
+def test_a_stack_needs_its_axis_of_devices(vessel) -> None:
+    start, control = drives(2, 2)
+    with pytest.raises(InputError, match=r"^control: shape \(2, 6, 2\); give \(2, 6, 2, 2\)$"):
+        endopilot.simulate(vessel, PAIR, control[:, :, 0])
+    with pytest.raises(InputError, match=r"^initial: shape \(2, 2\); give \(2, 2, 2\)$"):
+        endopilot.simulate(vessel, PAIR, control, initial=start[:, 0])
+    simulator = endopilot.Simulator(vessel, PAIR, worlds=2)
+    with pytest.raises(InputError, match=r"^control: shape \(2, 2\); give \(2, 2, 2\)$"):
+        simulator.step(control[:, 0, 0], 0.5)
+    with pytest.raises(InputError, match=r"^inserted_length: shape \(2,\); give \(2, 2\)$"):
+        simulator.reset(inserted_length=start[:, 0, 0], rotation=start[..., 1])
+
+
+def test_stacks_of_different_numbers_are_refused(vessel) -> None:
+    with pytest.raises(InputError, match="device: stacks of 1 and of 2 devices; give worlds of one number"):
+        endopilot.Simulator(vessel, [WIRE, PAIR])
