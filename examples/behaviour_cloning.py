@@ -17,56 +17,46 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from endopilot.anatomy.io import write_anatomy
-from endopilot.cockpit.episode import write_session_episode
-from endopilot.cockpit.recording import SUFFIX, Recorder, Where
-from endopilot.cockpit.world import World
-from endopilot.dataset.loader import load_dataset
-from endopilot.navigation.navigate import navigate
-from endopilot.navigation.policy import Decision, Observation
-from endopilot.tasks.navigation import Navigation
-from endopilot.tasks.task import find_task
+import endopilot
 
-TASK, SESSIONS, SCALE = find_task("straight"), 10, np.array([10.0, 3.0])  # mm/s, rad/s
+TASK, SESSIONS, SCALE = endopilot.find_task("straight"), 10, np.array([10.0, 3.0])  # mm/s, rad/s
 
 
-def hand(left_mm: float, time_s: float) -> tuple[float, float]:
-    """Push fast from afar and slowly near the target, and turn to and fro."""
-    return float(np.clip(0.6 * left_mm, 0.0, 9.0)), 0.8 * float(np.sin(2 * time_s))
+class ScriptedHand:
+    """Pushes fast from afar and slowly near the target, and turns to and fro, with X-ray always on."""
+
+    def start(self, navigation: endopilot.Navigation, seed: int) -> None:
+        self._target_mm = navigation.target.abscissa
+
+    def decide(self, observation: endopilot.Observation) -> endopilot.Decision:
+        assert observation.tip is not None
+        translation = np.clip(0.6 * (self._target_mm - observation.tip.abscissa), 0.0, 9.0)
+        return endopilot.Decision(((float(translation), 0.8 * float(np.sin(2 * observation.time_s))),), expose=True)
 
 
-def drive_session(number: int, folder: Path) -> Path:
-    """Let the scripted hand drive one training patient, recorded as the cockpit records."""
+def drive_session(number: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return what the scripted hand saw in one training patient, and what it did."""
     navigation = TASK.navigation(TASK.patient(TASK.training, number), start_rotation=0.6 * number)
-    patient = folder / f"patient-{number}"
-    write_anatomy(navigation.anatomy, patient)
-    world = World(navigation, seed=number)
-    path = folder / f"{number}{SUFFIX}"
-    recorder = Recorder(path, world, Where(patient=patient), number)
-    while world.time_s < 20.0:
-        if world.cycle % 20 == 0:
-            left_mm = navigation.target.abscissa - float(world.snapshot().tip.abscissa[0])
-            recorder.event(move=world.command((hand(left_mm, world.time_s),))[0])
-        world.advance()
-        recorder.cycle()
-    recorder.close()
-    return path
+    record = endopilot.navigate(replace(navigation, seconds=20.0), ScriptedHand(), seed=number)
+    left_mm = navigation.target.abscissa - record.tip.abscissa[:-1, 0]
+    return features(left_mm, record.tip.offset[:-1, 0]), torch.tensor(record.control[:-1, 0] / SCALE).float()
+
+
+def read_session(session: Path, folder: Path) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return what a hand at the cockpit saw, and what it did."""
+    endopilot.write_session_episode(session, folder)
+    data = endopilot.load_dataset(folder)
+    left_mm = data.manifest["settings"]["target_mm"] - data.tip_abscissa[0, :-1, 0]
+    return features(left_mm, data.tip_offset[0, :-1, 0]), torch.tensor(data.control[0, 1:, 0] / SCALE).float()
 
 
 def features(left_mm: np.ndarray, offset_mm: np.ndarray) -> torch.Tensor:
     return torch.tensor(np.stack([left_mm / 50.0, np.tanh(left_mm / 10.0), offset_mm], axis=-1), dtype=torch.float32)
 
 
-def clone(sessions: list[Path], folder: Path) -> torch.nn.Module:
+def clone(sessions: list[tuple[torch.Tensor, torch.Tensor]]) -> torch.nn.Module:
     """Return a network that does what the hand did."""
-    seen, done = [], []
-    for number, session in enumerate(sessions):
-        write_session_episode(session, folder / f"episode-{number}")
-        data = load_dataset(folder / f"episode-{number}")
-        target_mm = data.manifest["settings"]["target_mm"]
-        seen.append(features(target_mm - data.tip_abscissa[0, :-1, 0], data.tip_offset[0, :-1, 0]))
-        done.append(torch.tensor(data.control[0, 1:, 0] / SCALE, dtype=torch.float32))
-    inputs, wanted = torch.cat(seen), torch.cat(done)
+    inputs, wanted = (torch.cat(each) for each in zip(*sessions, strict=True))
     torch.manual_seed(0)
     network = torch.nn.Sequential(torch.nn.Linear(3, 32), torch.nn.Tanh(), torch.nn.Linear(32, 2))
     optimizer = torch.optim.Adam(network.parameters(), lr=0.01)
@@ -87,25 +77,23 @@ class Clone:
     def __init__(self, network: torch.nn.Module) -> None:
         self._network = network
 
-    def start(self, navigation: Navigation, seed: int) -> None:
+    def start(self, navigation: endopilot.Navigation, seed: int) -> None:
         self._target_mm = navigation.target.abscissa
 
-    def decide(self, observation: Observation) -> Decision:
+    def decide(self, observation: endopilot.Observation) -> endopilot.Decision:
         assert observation.tip is not None
         left_mm, offset_mm = self._target_mm - observation.tip.abscissa, observation.tip.offset
         with torch.no_grad():
             translation, rotation = self._network(features(np.array(left_mm), np.array(offset_mm))).numpy() * SCALE
-        return Decision(((float(translation), float(rotation)),), expose=True)
+        return endopilot.Decision(((float(translation), float(rotation)),), expose=True)
 
 
 def main() -> None:
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        given = [Path(path) for path in sys.argv[1:]]
-        sessions = given or [drive_session(number, folder) for number in range(SESSIONS)]
-        network = clone(sessions, folder)
+        given = [read_session(Path(path), Path(name) / str(k)) for k, path in enumerate(sys.argv[1:])]
+    network = clone(given or [drive_session(number) for number in range(SESSIONS)])
     navigation = replace(TASK.ladder_navigation(0), seconds=60.0)
-    record = navigate(navigation, Clone(network), seed=1)
+    record = endopilot.navigate(navigation, Clone(network), seed=1)
     print(
         f"in a new patient: {record.reason} after {record.seconds:g} s, largest wall force {record.peak_force_n:.3f} N"
     )

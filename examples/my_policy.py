@@ -11,11 +11,7 @@ from __future__ import annotations
 
 import math
 
-from endopilot.navigation.navigate import navigate
-from endopilot.navigation.policies import make_policy
-from endopilot.navigation.policy import Decision, Observation
-from endopilot.tasks.navigation import Navigation
-from endopilot.tasks.task import find_task
+import endopilot
 
 PUSH_MM_S, PULL_MM_S, TURN_RAD_S = 5.0, -5.0, 3.0
 BEFORE_FORK_MM = 4.0
@@ -24,13 +20,13 @@ BEFORE_FORK_MM = 4.0
 class TurnBack:
     """Pushes; after a wrong branch it pulls back to before the fork, turns the wire by 120° and pushes again."""
 
-    def start(self, navigation: Navigation, seed: int) -> None:
+    def start(self, navigation: endopilot.Navigation, seed: int) -> None:
         # Where each branch leaves the route to the target, mm from the ostium; infinite on the route itself.
         self.fork_mm = navigation.anatomy.tree.departures(navigation.target.branch)
         self.pull_to_mm: float | None = None
         self.turn_to_rad: float | None = None
 
-    def decide(self, observation: Observation) -> Decision:
+    def decide(self, observation: endopilot.Observation) -> endopilot.Decision:
         tip, (inserted_mm, rotation_rad) = observation.tip, observation.devices[0]  # of the wire
         if tip is not None and math.isfinite(fork := float(self.fork_mm[tip.branch])):
             # The wire lies in a wrong branch: this much of it has to come out.
@@ -38,22 +34,22 @@ class TurnBack:
             self.turn_to_rad = rotation_rad + 2 * math.pi / 3
         if self.pull_to_mm is not None:
             if inserted_mm > max(self.pull_to_mm, 0.0):
-                return Decision(((PULL_MM_S, 0.0),))
+                return endopilot.Decision(((PULL_MM_S, 0.0),))
             self.pull_to_mm = None
         if self.turn_to_rad is not None:
             if rotation_rad < self.turn_to_rad - 0.1:
-                return Decision(((0.0, min(TURN_RAD_S, 2 * (self.turn_to_rad - rotation_rad))),))
+                return endopilot.Decision(((0.0, min(TURN_RAD_S, 2 * (self.turn_to_rad - rotation_rad))),))
             self.turn_to_rad = None
         look = observation.time_s % 1.0 == 0.5
-        return Decision(((PUSH_MM_S, 0.0),), expose=look)
+        return endopilot.Decision(((PUSH_MM_S, 0.0),), expose=look)
 
 
 def main() -> None:
     # The second diagonal branch in the first of the ladder's patients, which pushing alone does not reach.
-    navigation = find_task("diagonal", 1).ladder_navigation(0)
-    policy = make_policy("my_policy:TurnBack")  # as `endopilot ladder --policy` finds it
-    record = navigate(navigation, policy, seed=1)
-    pushed = navigate(navigation, make_policy("forward"), seed=1)
+    navigation = endopilot.find_task("diagonal", 1).ladder_navigation(0)
+    policy = endopilot.make_policy("my_policy:TurnBack")  # as `endopilot ladder --policy` finds it
+    record = endopilot.navigate(navigation, policy, seed=1)
+    pushed = endopilot.navigate(navigation, endopilot.make_policy("forward"), seed=1)
     print(f"TurnBack: {record.reason} after {record.seconds:g} s and {record.exposures} exposures")
     print(f"forward: {pushed.reason}")
     assert record.success and record.safe and not pushed.success

@@ -13,24 +13,22 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from endopilot.errors import InputError
-from endopilot.imaging.segment import SegmentationMethod, SegmentConfig, segment
-from endopilot.types import LumenMask, Volume
+import endopilot
 
 OPTIONS = {"above": "200"}
 
 
-def above_threshold(volume: Volume, config: SegmentConfig) -> LumenMask:
+def above_threshold(volume: endopilot.Volume, config: endopilot.SegmentConfig) -> endopilot.LumenMask:
     if not config.seeds:
-        raise InputError("seeds: none given; give a point inside the lumen, LPS mm")
+        raise endopilot.InputError("seeds: none given; give a point inside the lumen, LPS mm")
     bright = volume.voxels > float(config.settings(OPTIONS)["above"])
     label, _ = ndimage.label(bright)
     x, y, z = np.rint(volume.world_to_index(np.array(config.seeds[0]))).astype(int)
     inside = bright & (label == label[z, y, x])
-    return LumenMask(Volume(inside, volume.spacing_mm, volume.origin_mm, volume.direction))
+    return endopilot.LumenMask(endopilot.Volume(inside, volume.spacing_mm, volume.origin_mm, volume.direction))
 
 
-threshold = SegmentationMethod(segment_lumen=above_threshold, options=OPTIONS)
+threshold = endopilot.SegmentationMethod(segment_lumen=above_threshold, options=OPTIONS)
 
 
 def main() -> None:
@@ -38,13 +36,13 @@ def main() -> None:
     _, y, x = np.indices((60, 50, 50))
     tube, other = np.hypot(x - 15, y - 25) < 8, np.hypot(x - 38, y - 25) < 6
     hu = np.where(tube | other, 350.0, -90.0)
-    volume = Volume(hu, spacing_mm=np.full(3, 0.5), origin_mm=np.zeros(3), direction=np.eye(3))
-    config = SegmentConfig(
+    volume = endopilot.Volume(hu, spacing_mm=np.full(3, 0.5), origin_mm=np.zeros(3), direction=np.eye(3))
+    config = endopilot.SegmentConfig(
         method="my_segmentation:threshold",  # as `endopilot segment --method` finds it
         seeds=((7.5, 12.5, 15.0),),
         options=("above=250",),
     )
-    mask = segment(volume, config)
+    mask = endopilot.segment(volume, config)
     found_ml = mask.volume.voxels.sum() * 0.5**3 / 1000
     true_ml = np.pi * 4.0**2 * 30.0 / 1000
     print(f"found {found_ml:.3f} ml, the tube holds {true_ml:.3f} ml")

@@ -21,16 +21,18 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from endopilot.env.vector import TRANSLATION_MM_S, NavigateVectorEnv
+import endopilot
 
 ENVIRONMENTS, STEPS = 64, 64
+MOST_MM_S = 12.0
+"""Of an action of 1."""
 
 
 class WireVecEnv(VecEnv):
     """A `NavigateVectorEnv` as Stable-Baselines3 wants it: a world that has ended is reset in the same step."""
 
     def __init__(self, count: int) -> None:
-        self.worlds = NavigateVectorEnv(count, autoreset_mode=AutoresetMode.DISABLED)
+        self.worlds = endopilot.NavigateVectorEnv(count, autoreset_mode=AutoresetMode.DISABLED)
         super().__init__(count, self.worlds.single_observation_space, self.worlds.single_action_space)
         self.returns = np.zeros(count)
 
@@ -92,11 +94,11 @@ class Clock(BaseCallback):
 
 def pushing() -> float:
     """Return the share of safe successes of an agent that only pushes, at 5 mm/s, for comparison."""
-    worlds = NavigateVectorEnv(ENVIRONMENTS, autoreset_mode=AutoresetMode.DISABLED)
+    worlds = endopilot.NavigateVectorEnv(ENVIRONMENTS, autoreset_mode=AutoresetMode.DISABLED)
     worlds.reset(seed=0)
     ended, safe = np.zeros(ENVIRONMENTS, dtype=bool), np.zeros(ENVIRONMENTS, dtype=bool)
     for _ in range(300):
-        push = np.where(ended, 0.0, 5.0 / TRANSLATION_MM_S)
+        push = np.where(ended, 0.0, 5.0 / MOST_MM_S)
         _, _, terminations, truncations, infos = worlds.step(np.column_stack([push, np.zeros(ENVIRONMENTS)]))
         safe |= ~ended & infos["success"] & infos["safe"]
         ended |= terminations | truncations

@@ -6,9 +6,15 @@ import inspect
 import re
 import subprocess
 import sys
+import types
+import typing
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 import endopilot
 
@@ -17,6 +23,8 @@ LARGE = {
     "SimpleITK", "gymnasium", "jinja2", "matplotlib", "numpy", "pandas", "plotly", "pyarrow", "pydantic", "pydicom",
     "pyvista", "scipy", "skimage", "torch", "tyro", "vtk", "vtkmodules", "yaml",
 }  # fmt: skip
+SLOW = {"Axes": Axes, "Figure": Figure}
+"""Of other libraries, which a module imports only to be type-checked."""
 ASKED = {
     "Anatomy", "read_anatomy", "extract_anatomy", "segment", "Wire", "read_device", "Simulator", "simulate", "plan",
     "make_atlas", "generate_dataset", "train", "load_model", "navigate", "evaluate", "InputError", "read_volume",
@@ -53,6 +61,47 @@ def test_the_reference_describes_exactly_these_names() -> None:
     page = (ROOT / "docs" / "reference.md").read_text(encoding="utf-8")
     described = re.findall(r"^\.\. auto(?:function|class|exception):: (\w+)$", page, re.MULTILINE)
     assert sorted(described) == sorted(endopilot.__all__)
+
+
+def types_of(annotation: object) -> Iterator[type]:
+    """Yield the classes that an annotation is made of."""
+    if inspect.isclass(annotation) and not isinstance(annotation, types.GenericAlias):
+        yield annotation
+    for part in () if typing.get_origin(annotation) is typing.Literal else typing.get_args(annotation):
+        for each in part if isinstance(part, list) else (part,):
+            yield from types_of(each)
+
+
+def annotations_of(thing: Any, name: str) -> Iterator[tuple[str, object]]:
+    """Yield what a function takes and returns, or what a class's public attributes and methods are, by name."""
+    own = {
+        field: each
+        for field, each in inspect.get_annotations(thing, locals=SLOW, eval_str=True).items()
+        if field[0] != "_"
+    }
+    yield from ((f"{name}.{field}", each) for field, each in own.items() if field[0] != "_")
+    for field, member in vars(thing).items() if inspect.isclass(thing) else ():
+        if field.startswith("_") and field not in ("__init__", "__call__"):
+            continue
+        for holder in ("__func__", "fget", "func", "__wrapped__"):  # of a class method, properties, a decorator
+            member = getattr(member, holder, member)
+        if inspect.isfunction(member) and member.__globals__["__name__"].startswith("endopilot."):
+            yield from annotations_of(member, f"{name}.{field}")
+    for base in thing.__bases__ if inspect.isclass(thing) else ():
+        if base.__module__.startswith("endopilot."):
+            yield from annotations_of(base, name)
+
+
+def test_every_type_in_a_public_signature_is_public() -> None:
+    public = {name: getattr(endopilot, name) for name in endopilot.__all__}
+    hidden = {
+        f"{where}: {each.__module__}.{each.__name__}"
+        for name, thing in public.items()
+        for where, annotation in annotations_of(thing, name)
+        for each in types_of(annotation)
+        if each.__module__.startswith("endopilot.") and each not in public.values()
+    }
+    assert not hidden
 
 
 def test_another_name_is_no_attribute() -> None:

@@ -9,7 +9,7 @@ from endopilot.devices.device import read_device
 from endopilot.devices.stack import Stack
 from endopilot.evaluation.results import SplitResult, TipSeries
 from endopilot.simulation.config import SimulatorConfig
-from endopilot.simulation.trajectory import SetUp, Trajectory
+from endopilot.simulation.trajectory import SimulationSetUp, Trajectory
 from endopilot.types import (
     Anatomy,
     Branch,
@@ -55,7 +55,7 @@ def make_trajectory(samples: int = 6) -> Trajectory:
     inserted = depth[None, :, None]
     stack, friction = Stack(read_device("workhorse-014")), np.full((1, 1), 0.1)
     return Trajectory(
-        set_up=SetUp([make_anatomy()], [stack], start, friction, "velocity", None, SimulatorConfig()),
+        set_up=SimulationSetUp([make_anatomy()], [stack], start, friction, "velocity", None, SimulatorConfig()),
         period_s=0.5,
         start=start,
         command=np.tile([8.0, 0.0], (1, samples, 1, 1)),

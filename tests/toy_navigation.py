@@ -19,7 +19,7 @@ from endopilot.dataset.generate import generate_dataset
 from endopilot.devices.device import read_device
 from endopilot.devices.stack import Stack
 from endopilot.files import read_json, write_json
-from endopilot.simulation.trajectory import SetUp, Trajectory
+from endopilot.simulation.trajectory import SimulationSetUp, Trajectory
 from endopilot.types import (
     SAMPLE_PERIOD_S,
     Anatomy,
@@ -72,7 +72,7 @@ def toy_simulate(
     force, still = 0.01 * slack, np.zeros_like(slack)
     branch = np.zeros((worlds, samples, 1), dtype=np.int64)
     return Trajectory(
-        set_up=SetUp([anatomy] * worlds, [stack] * worlds, initial, friction, "velocity", motion, config),
+        set_up=SimulationSetUp([anatomy] * worlds, [stack] * worlds, initial, friction, "velocity", motion, config),
         period_s=SAMPLE_PERIOD_S,
         start=initial,
         command=control,

@@ -23,9 +23,8 @@ rollout = endopilot.simulate(anatomy, device, push, initial=start, record_shape=
 figure, panels = plt.subplots(1, 3, figsize=(11, 4.6), sharex=True, sharey=True, layout="constrained")
 colors = plt.cm.hsv(np.linspace(0, 1, worlds, endpoint=False))
 for axes, sample in zip(panels, (7, 15, 23), strict=True):
-    for branch in anatomy.tree.branches:
-        x, _, z = branch.centerline.points.T
-        axes.plot(x, z, color="0.88", lw=5, solid_capstyle="round", zorder=0)
+    anatomy.plot(axes=axes, view="front")
+    axes.get_legend().remove()
     for nodes, color in zip(rollout.shape[:, sample], colors, strict=True):
         axes.plot(nodes[:, 0], nodes[:, 2], color=color, lw=1)
     axes.set(title=f"after {(sample + 1) * 0.5:g} s", xlabel="x (to the patient's left), mm")

@@ -6,13 +6,10 @@ Expose the same tip 400 times and look at the errors: with two views the tip is 
 with one view depth is known only through the vessel.
 """
 
-from dataclasses import replace
-
 import matplotlib.pyplot as plt
 import numpy as np
 
 import endopilot
-from endopilot.xray.fluoroscope import Fluoroscope, FluoroscopeConfig
 
 anatomy = next(endopilot.make_atlas(endopilot.AtlasConfig(anatomy="rca", seed=0, population="textbook")))
 device = endopilot.read_device("workhorse-014")
@@ -24,7 +21,8 @@ length = float(rollout.inserted_length[0, -1, 0])
 figure, axes = plt.subplots(figsize=(6.4, 3.8), layout="constrained")
 medians = {}
 for name, biplane, color in (("two views", True, "C0"), ("one view", False, "C1")):
-    c_arm = Fluoroscope(anatomy, device.tip_radius_mm, replace(FluoroscopeConfig(), biplane=biplane))
+    config = endopilot.FluoroscopeConfig(biplane=biplane)
+    c_arm = endopilot.Fluoroscope(anatomy, device.tip_radius_mm, config)
     random = np.random.default_rng(0)
     shown = np.array([c_arm.measure(tip, direction, length, random).position for _ in range(400)])
     error_mm = np.linalg.norm(shown - tip, axis=1)

@@ -21,11 +21,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import endopilot
-from endopilot.phantom.phantom import PhantomConfig, make_phantom
 
 folder = Path(tempfile.mkdtemp())
 patient = next(endopilot.make_atlas(endopilot.AtlasConfig(anatomy="rca", seed=0, population="textbook")))
-ct = make_phantom(patient, PhantomConfig(), seed=0)
+ct = endopilot.make_phantom(patient, endopilot.PhantomConfig(), seed=0)
 print(f"{patient.name}: {ct.voxels.shape[::-1]} voxels of {ct.spacing_mm} mm")
 
 # %%
@@ -50,7 +49,7 @@ endopilot.write_anatomy(anatomy, folder / "patient")
 print(f"{len(anatomy.tree.branches)} branches, sections {', '.join(anatomy.tree.section_names)}")
 
 # %%
-# Two views of the same vessel: a slice of the CT with the mask, and the extracted tree over the true one.
+# Two views of the same vessel: a slice of the CT with the mask, and the extracted tree. An anatomy plots itself.
 
 k = int(mask.volume.voxels.sum(axis=(1, 2)).argmax())
 left, top = ct.index_to_world(np.array([0, 0, k]))[:2]
@@ -61,17 +60,7 @@ figure, (slice_axes, tree_axes) = plt.subplots(1, 2, figsize=(10, 4.6), layout="
 slice_axes.imshow(ct.voxels[k], cmap="gray", vmin=-150, vmax=650, extent=extent)
 slice_axes.contour(mask.volume.voxels[k], levels=[0.5], colors="lime", linewidths=1.2, extent=extent, origin="upper")
 slice_axes.set(xlabel="x (to the patient's left), mm", ylabel="y (to the back), mm", title="Axial slice and mask")
-for tree, style, label in (
-    (patient.tree, {"color": "0.75", "lw": 5}, "true"),
-    (anatomy.tree, {"color": "C0"}, "extracted"),
-):
-    for number, branch in enumerate(tree.branches):
-        x, _, z = branch.centerline.points.T
-        tree_axes.plot(x, z, **style, label=label if number == 0 else None)
-tree_axes.plot(*anatomy.insertion.position[[0, 2]], "k^", label="ostium")
-tree_axes.set(xlabel="x (to the patient's left), mm", ylabel="z (to the head), mm", title="Centerlines from the front")
-tree_axes.set_aspect("equal")
-tree_axes.legend()
+anatomy.plot(axes=tree_axes, view="front")
 plt.show()
 
 # %%
@@ -86,24 +75,11 @@ route = endopilot.plan(anatomy, "4", endopilot.PlanConfig(force_limit_n=0.3))
 print(f"reached: {route.reached}, peak wall force {route.force.max():.3f} N, planned in {route.seconds_to_plan:.1f} s")
 
 # %%
-# The plan says where the tip is and how hard the wire presses at every half second.
+# Driven in a simulator, the planned controls bring the tip, Δtip, to the target. A trajectory plots itself too.
 
-time_s = 0.5 * np.arange(1, len(route.control) + 1)
-figure, (tip_axes, force_axes, control_axes) = plt.subplots(3, 1, figsize=(8, 6.2), sharex=True, layout="constrained")
-tip_axes.plot(time_s, route.desired[:, 0], color="0.6", label="desired")
-tip_axes.plot(time_s, route.simulated.abscissa, color="C0", label="in the rod core")
-tip_axes.axhline(route.navigation.target.abscissa, color="C3", ls="--", lw=1, label="target")
-tip_axes.set(ylabel="Δtip, mm")
-tip_axes.legend()
-force_axes.plot(time_s, route.force, color="C3", label="largest force on a node")
-force_axes.axhline(route.navigation.force_limit_n, color="0.4", ls="--", lw=1, label="limit")
-force_axes.set(ylabel="wall force, N", ylim=(0, None))
-force_axes.legend()
-edges = np.append(0, time_s)
-control_axes.stairs(route.control[:, 0], edges, baseline=None, label="translation, mm/s")
-control_axes.stairs(route.control[:, 1], edges, baseline=None, label="rotation, rad/s")
-control_axes.set(xlabel="time, s", ylabel="control")
-control_axes.legend()
+navigation = route.navigation
+driven = endopilot.simulate(navigation.anatomy, navigation.device, route.control[None], initial=navigation.start[None])
+driven.plot().axes[0].axhline(navigation.target.abscissa, color="C3", ls=":", lw=1)
 plt.show()
 
 # %%

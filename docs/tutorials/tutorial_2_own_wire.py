@@ -22,10 +22,9 @@ import numpy as np
 import yaml
 
 import endopilot
-from endopilot.devices.device_files import device_yaml
 
 folder = Path(tempfile.mkdtemp())
-content = yaml.safe_load(device_yaml("workhorse-014")[1])
+content = yaml.safe_load(endopilot.device_yaml("workhorse-014")[1])
 content["name"] = "my-wire"
 content["bend_stiffness_n_mm2"] = {"value": [0.2, 0.2, 1.2, 8, 30, 80], "source": "three-point bending, our bench"}
 content["twist_stiffness_n_mm2"] = {"value": [0.154, 0.154, 0.92, 6.2, 23, 62], "source": "EI / 1.3, round section"}
@@ -56,11 +55,9 @@ except endopilot.InputError as error:
 # buckles at :math:`\pi^2 EI/4L^2`. The simulated test should agree with your data sheet; if it does not, one of the two
 # numbers is wrong. On the command line: ``endopilot devices my-wire.yaml --tip-load``.
 
-from endopilot.simulation.tip_load import simulate_tip_load
-
 figure, axes = plt.subplots(figsize=(6.4, 3.6), layout="constrained")
 for device, color in ((shipped, "C0"), (mine, "C1")):
-    test = simulate_tip_load(device)
+    test = endopilot.simulate_tip_load(device)
     euler = np.pi**2 * device.bend_stiffness_n_mm2[0] / (4 * 10.0**2)
     axes.plot(1e3 * test.pushed_mm, 1e3 * test.force_n, ".-", color=color, label=f"{device.name}, simulated")
     axes.axhline(1e3 * euler, color=color, ls="--", lw=1, label=f"{device.name}, π²EI/4L²")
@@ -87,28 +84,30 @@ rollouts = {
 }
 
 # %%
-# Each line is one world after 12 s, its tip the dot. The longer bend enters the circumflex artery, which the shipped
-# wire never does. The push hardly changes: most of it bends the shaft, and both wires have the same.
+# Each black line is one world after 12 s, its tip the dot. The longer bend enters the circumflex artery, which the
+# shipped wire never does.
 
-figure, panels = plt.subplots(1, 3, figsize=(11.5, 4.4), layout="constrained", width_ratios=(1, 1, 1.15))
-for axes, (name, rollout), color in zip(panels[:2], rollouts.items(), ("C0", "C1"), strict=True):
-    for branch in anatomy.tree.branches:
-        x, _, z = branch.centerline.points.T
-        axes.plot(x, z, color="0.85", lw=4, solid_capstyle="round", zorder=0)
+figure, panels = plt.subplots(1, 2, figsize=(11.5, 4.4), layout="constrained")
+for axes, (name, rollout) in zip(panels, rollouts.items(), strict=True):
+    anatomy.plot(axes=axes, view="front")
     for nodes in rollout.shape[:, -1]:
-        axes.plot(nodes[:, 0], nodes[:, 2], color=color, lw=1)
-        axes.plot(nodes[0, 0], nodes[0, 2], "o", color=color, ms=4)
+        axes.plot(nodes[:, 0], nodes[:, 2], color="black", lw=1)
+        axes.plot(nodes[0, 0], nodes[0, 2], "o", color="black", ms=4)
     axes.set(title=f"{name}: tips in {len(set(rollout.tip.branch[:, -1, 0]))} branches")
-    axes.set(xlabel="x (to the patient's left), mm", ylabel="z (to the head), mm")
-    axes.set(xlim=(0, 80), ylim=(-75, 25))
-    axes.set_aspect("equal")
-for (name, rollout), color in zip(rollouts.items(), ("C0", "C1"), strict=True):
-    length, push = rollout.inserted_length[0, :, 0], rollout.base_force[:, :, 0]
-    panels[2].plot(length, 1e3 * np.median(push, axis=0), color=color, label=f"{name}, median")
-    panels[2].fill_between(length, 1e3 * push.min(axis=0), 1e3 * push.max(axis=0), color=color, alpha=0.15, lw=0)
-panels[2].set(title="Push at the ostium", xlabel="inserted length, mm", ylabel="force, mN", ylim=(0, None))
-panels[2].legend(loc="upper left")
 plt.show()
+
+# %%
+# One world over time: how far the wire is in, where its tip lies, and how hard it presses on the wall.
+
+rollouts["my-wire"].plot(world=5)
+plt.show()
+
+# %%
+# The push at the ostium hardly changes: most of it bends the shaft, and both wires have the same.
+
+push = {name: float(np.median(rollout.base_force[:, -1])) for name, rollout in rollouts.items()}
+for name, force in push.items():
+    print(f"{name}: pushed with {1e3 * force:.1f} mN after 12 s, the median")
 
 # %%
 # What to take home
@@ -117,9 +116,8 @@ plt.show()
 # ``--device``. The tasks of the ladder state their own wires.
 
 branches = {name: set(rollout.tip.branch[:, -1, 0].tolist()) for name, rollout in rollouts.items()}
-push = {name: float(np.median(rollout.base_force[:, -1])) for name, rollout in rollouts.items()}
 print(f"branches entered: {branches}")
 assert all(rollout.valid.all() for rollout in rollouts.values())
-assert abs(simulate_tip_load(mine).load_n / mine.tip_load_n - 1) < 0.05
+assert abs(endopilot.simulate_tip_load(mine).load_n / mine.tip_load_n - 1) < 0.05
 assert branches["my-wire"] - branches["workhorse-014"], "the shaped tip enters a branch of its own"
 assert abs(push["my-wire"] / push["workhorse-014"] - 1) < 0.1

@@ -34,12 +34,10 @@ for anatomy in endopilot.make_atlas(endopilot.AtlasConfig(anatomy="rca", count=1
 # train, calibrate or test. On the command line: ``endopilot dataset patients/* -o dataset --sequences 12``. Several
 # processes simulate: in a script of your own, make the call under ``if __name__ == "__main__":``.
 
-from endopilot.dataset.loader import load_dataset
-
 endopilot.generate_dataset(
     patients, folder / "dataset", endopilot.read_device("workhorse-014"), endopilot.DatasetConfig(sequences=12, seed=7)
 )
-dataset = load_dataset(folder / "dataset")
+dataset = endopilot.load_dataset(folder / "dataset")
 for split in ("train", "seen_test", "calibrate", "test"):
     part = dataset.of_split(split)
     print(f"{split}: {len(part)} navigations of {len(set(part.anatomy))} patients")
@@ -82,16 +80,15 @@ endopilot.train(
 # predictions of the test patients: our small model; the packaged one (``"pretrained"``, trained on 116 patients of the
 # atlas, none of them here); and a baseline that holds slack and offset as they were last given.
 
-from endopilot.evaluation.prediction_baselines import hold_slack
-from endopilot.models.episodes import Episodes
-
 given = 30
 models = {"trained here": folder / "run", "pretrained": Path("pretrained")}
-episodes = Episodes.of_dataset(test)
+episodes = endopilot.Episodes.of_dataset(test)
 predicted = {name: endopilot.load_model(run).rollout_forward(episodes).tip for name, run in models.items()}
-predicted["hold slack"] = hold_slack(test, given)
-truth = np.stack([test.tip_abscissa, test.tip_offset], axis=-1)[:, given:]
-error_mm = {name: np.abs(tip - truth).mean(axis=0) for name, tip in predicted.items()}
+offset, slack = test.tip_offset[:, :, 0], length - tip
+held = np.broadcast_to(offset[:, [given - 1]], offset.shape)
+predicted["hold slack"] = np.stack([length - slack[:, [given - 1]], held], axis=-1)[:, given:]
+truth = np.stack([tip, offset], axis=-1)[:, given:]
+error_mm = {name: np.abs(guess - truth).mean(axis=0) for name, guess in predicted.items()}
 for name, error in error_mm.items():
     print(f"{name}: mean error {error[:, 0].mean():.2f} mm along the vessel, {error[:, 1].mean():.3f} mm across")
 
@@ -100,9 +97,10 @@ for name, error in error_mm.items():
 
 colors = {"trained here": "C0", "pretrained": "C2", "hold slack": "0.6"}
 figure, (tip_axes, error_axes) = plt.subplots(1, 2, figsize=(10, 3.8), layout="constrained")
-for name, tip in predicted.items():
-    tip_axes.plot(time_s[given:] - time_s[given - 1], tip[one, :, 0] - truth[one, :, 0], color=colors[name], label=name)
-    error_axes.plot(time_s[given:] - time_s[given - 1], error_mm[name][:, 0], color=colors[name], label=name)
+since_s = time_s[given:] - time_s[given - 1]
+for name, guess in predicted.items():
+    tip_axes.plot(since_s, guess[one, :, 0] - truth[one, :, 0], color=colors[name], label=name)
+    error_axes.plot(since_s, error_mm[name][:, 0], color=colors[name], label=name)
 tip_axes.axhline(0, color="black", lw=0.8)
 tip_axes.set(xlabel="time since the last given state, s", ylabel="error of Δtip, mm", title="One navigation")
 tip_axes.legend()

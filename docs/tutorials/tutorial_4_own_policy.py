@@ -38,33 +38,27 @@ print(inspect.getsource(TurnBack))
 # Try a policy on one navigation first. The task ``diagonal`` asks for the second diagonal branch of a left coronary
 # artery within 90 s and below 0.2 N. The shipped policy ``forward`` pushes and nothing else.
 
-from endopilot.navigation.baseline_policies import Forward
-from endopilot.tasks.task import find_task
-
-navigation = find_task("diagonal", 1).ladder_navigation(0)
+navigation = endopilot.find_task("diagonal", 1).ladder_navigation(0)
 records = {
-    policy.__class__.__name__: endopilot.navigate(navigation, policy, seed=1) for policy in (Forward(), TurnBack())
+    name: endopilot.navigate(navigation, policy, seed=1)
+    for name, policy in (("forward", endopilot.make_policy("forward")), ("TurnBack", TurnBack()))
 }
 for name, record in records.items():
     print(f"{name}: {record.reason} after {record.seconds:g} s, {record.exposures} exposures")
 
-figure, (map_axes, time_axes) = plt.subplots(1, 2, figsize=(10, 4.4), layout="constrained")
-for branch in navigation.anatomy.tree.branches:
-    x, _, z = branch.centerline.points.T
-    map_axes.plot(x, z, color="0.85", lw=5, solid_capstyle="round", zorder=0)
-for (name, record), color in zip(records.items(), ("0.4", "C0"), strict=True):
+axes = navigation.anatomy.plot(view="front").axes[0]
+for (name, record), color in zip(records.items(), ("0.4", "black"), strict=True):
     x, _, z = record.tip_position[:, 0].T  # of the wire
-    map_axes.plot(x, z, ".-", color=color, lw=1, ms=3, label=name)
-    time_axes.plot(record.time_s, record.tip.abscissa[:, 0], color=color, label=name)
-    shown = record.exposed
-    time_axes.plot(record.time_s[shown], record.tip.abscissa[shown, 0], "o", color=color, ms=3)
+    axes.plot(x, z, ".-", color=color, lw=1, ms=3, label=f"{name}'s tip")
 goal = navigation.target.position(navigation.anatomy)
-map_axes.plot(goal[0], goal[2], "*", color="C3", ms=13, label="target")
-map_axes.set(xlabel="x (to the patient's left), mm", ylabel="z (to the head), mm", title="Tip from the front")
-map_axes.set_aspect("equal")
-map_axes.legend()
-time_axes.set(xlabel="time, s", ylabel="Δtip, mm", title="Tip along the vessel; dots: X-ray exposures")
-time_axes.legend()
+axes.plot(goal[0], goal[2], "*", color="C3", ms=13, label="target")
+axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+plt.show()
+
+# %%
+# What ``TurnBack`` did over time: it draws the wire back once and tries again.
+
+records["TurnBack"].trajectory.plot()
 plt.show()
 
 # %%
@@ -76,13 +70,11 @@ plt.show()
 # patients take some minutes. Several processes drive the navigations: in a script of your own, make the call under
 # ``if __name__ == "__main__":``.
 
-from endopilot.ladder.ladder import LadderConfig, climb
-
 folder = Path(tempfile.mkdtemp())
 safe_success = {}
 for policy in ("forward", "my_policy:TurnBack"):
-    config = LadderConfig(policy=policy, tasks=("diagonal",), patients=4, version=1)
-    row = climb(folder / policy.replace(":", "-"), config)[0]
+    config = endopilot.LadderConfig(policy=policy, tasks=("diagonal",), patients=4, version=1)
+    row = endopilot.climb(folder / policy.replace(":", "-"), config)[0]
     safe_success[policy] = row["safe_success"]
     print(f"{policy}: safe success {100 * row['safe_success']:.0f} %, {row['exposures']:.1f} exposures on average")
 
@@ -93,9 +85,7 @@ for policy in ("forward", "my_policy:TurnBack"):
 # can drive these controls again, without the policy, and compare every figure to the bit. On the command line:
 # ``endopilot ladder --check submission.json``.
 
-from endopilot.ladder.submission import check_submission
-
-checked = check_submission(folder / "my_policy-TurnBack" / "submission.json")
+checked = endopilot.check_submission(folder / "my_policy-TurnBack" / "submission.json")
 print(f"{checked.policy}: {checked.navigations} navigations, first difference: {checked.difference}")
 
 # %%
@@ -105,6 +95,6 @@ print(f"{checked.policy}: {checked.navigations} navigations, first difference: {
 # ``endopilot.policies``. The page on the ladder lists the twelve tasks and the scores of the shipped policies.
 
 assert records["TurnBack"].success and records["TurnBack"].safe
-assert not records["Forward"].success
+assert not records["forward"].success
 assert safe_success["my_policy:TurnBack"] > safe_success["forward"]
 assert checked.difference is None

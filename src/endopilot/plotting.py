@@ -1,16 +1,27 @@
-"""Colours and matplotlib style of all pictures, and a figure as PNG."""
+"""Colours and matplotlib style of all pictures, a vessel's sections as lines, and a figure as PNG."""
 
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from typing import Any
 
+import matplotlib as mpl
+import numpy as np
+from jaxtyping import Float, Int
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
 # Okabe & Ito, "Color universal design" (2008): distinguishable with any kind of colour vision.
 BLACK, ORANGE, SKY, GREEN = "#1a1a1a", "#E69F00", "#56B4E9", "#009E73"
 YELLOW, BLUE, VERMILLION, PURPLE, GREY = "#F0E442", "#0072B2", "#D55E00", "#CC79A7", "#8a8f98"
 CATHETER_COLORS = ("#19b5c8", "#8e6cf0")  # from the inside out; the first is that of the cockpit
+_SECTION_COLORS = ListedColormap(mpl.colormaps["tab10"]([0, 1, 2, 3, 4, 5, 6, 8, 9]))
+"""Without grey, which is the catheter's."""
+_THICKEST = 9.0
+"""Of the line of a vessel, points."""
 
 STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
@@ -37,3 +48,44 @@ def png(figure: Figure) -> bytes:
     stream = io.BytesIO()
     figure.savefig(stream, format="png", dpi=STYLE["figure.dpi"])
     return stream.getvalue()
+
+
+def section_colors(count: int) -> Any:
+    """Return a colour for each of so many sections; of many, neighbours in the list have similar ones."""
+    if count <= _SECTION_COLORS.N:
+        return _SECTION_COLORS
+    return mpl.colormaps["tab20"] if count <= 20 else mpl.colormaps["turbo"].resampled(count)
+
+
+def plain_text(name: str) -> str:
+    """Return a name that matplotlib shows as it is: no formula, no line break, and not left out for its underscore."""
+    text = "".join(letter if letter.isprintable() else "?" for letter in name).replace("$", r"\$")
+    return f"\u200b{text}" if text.startswith("_") else text
+
+
+def draw_vessel(
+    axes: Axes,
+    pieces: Float[np.ndarray, "n 2 2"],
+    radius: Float[np.ndarray, "n"],
+    section: Int[np.ndarray, "n"],
+    names: Sequence[str],
+) -> None:
+    """Draw straight pieces of a vessel's centerlines with the sections by colour, and a legend beside them.
+
+    Args:
+        axes: where.
+        pieces: both ends of each piece in the picture, mm.
+        radius: of its lumen; lines are as thick as the vessel is wide, the widest some points.
+        section: index of its section.
+        names: of the sections.
+    """
+    present = np.unique(section)
+    palette, width = section_colors(len(present)), _THICKEST * radius / radius.max()
+    for number, index in enumerate(present):
+        own, color = section == index, palette(number)
+        lines = LineCollection(list(pieces[own]), linewidths=width[own].tolist(), colors=[color], capstyle="round")
+        axes.add_collection(lines)
+        axes.plot([], [], color=color, lw=4, label=plain_text(names[index]))
+    axes.set_aspect("equal")
+    axes.autoscale_view()
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), ncols=1 + len(present) // 20)

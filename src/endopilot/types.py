@@ -24,14 +24,21 @@ import hashlib
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from jaxtyping import Float, Int, Shaped
 
+if TYPE_CHECKING:  # slow to import
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
 SAMPLE_PERIOD_S = 0.5
 """Time between two recorded samples, s: the paper records at 2 Hz."""
 
+_AXES = ("x (to the patient's left), mm", "y (to the back), mm", "z (to the head), mm")
+_VIEWS = {"side": (1, 2), "front": (0, 2), "above": (0, 1)}
+"""World axes to the right and up of each view, in the order of the axis along which one looks."""
 _ON_AXIS = 0.05
 """A vessel whose mean lies off the catheter's axis by less than this share of its distance from the ostium lies to no
 side. In atlas patients of all kinds it lies off by 0.12 at least (0.2 to 0.8 in the median of each kind)."""
@@ -262,6 +269,28 @@ class Anatomy:
         branches, length = len(self.tree.branches), float(self.tree.longest_path().abscissa[-1])
         sections = ", ".join(self.tree.sections_present)
         return f"Anatomy(name={self.name!r}, branches={branches}, longest_path_mm={length:.1f}, sections={sections!r})"
+
+    def plot(self, *, axes: Axes | None = None, view: Literal["front", "side", "above"] | None = None) -> Figure:
+        """Draw the centerlines, as thick as the vessel is wide, with the sections by colour, and the ostium.
+
+        Args:
+            axes: where; in a new figure of pyplot if not given. The figure's axes are LPS mm.
+            view: from where one looks; across the vessel's largest extents if not given.
+        """
+        import matplotlib.pyplot as plt
+
+        from endopilot.plotting import draw_vessel
+
+        lines = [(branch.centerline, branch.section) for branch in self.tree.branches]
+        pieces = np.concatenate([np.stack([line.points[:-1], line.points[1:]], axis=1) for line, _ in lines])
+        across, up = _VIEWS[view or list(_VIEWS)[int(np.argmin(np.ptp(pieces, axis=(0, 1))))]]
+        axes = axes or plt.figure(figsize=(7, 5.5), layout="constrained").subplots()
+        radius = np.concatenate([line.radius[1:] for line, _ in lines])
+        section = np.concatenate([own[1:] for _, own in lines])
+        axes.plot(*self.insertion.position[[across, up]], "k^", zorder=3, label="ostium")
+        draw_vessel(axes, pieces[..., [across, up]], radius, section, self.tree.section_names)
+        axes.set(xlabel=_AXES[across], ylabel=_AXES[up], title=self.name)
+        return axes.figure  # pyright: ignore[reportReturnType]
 
     @cached_property
     def identity(self) -> str:

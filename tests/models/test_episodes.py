@@ -11,7 +11,7 @@ import pytest
 from endopilot.dataset.loader import load_dataset
 from endopilot.errors import InputError
 from endopilot.models import patient
-from endopilot.models.episodes import PATIENTS_FOLDER, Episodes, Setup
+from endopilot.models.episodes import PATIENTS_FOLDER, Episodes, EpisodeSetUp
 from endopilot.models.open_loop import given_states
 from endopilot.models.rollout import load_model
 from endopilot.simulation.config import SimulatorConfig
@@ -70,7 +70,7 @@ def test_another_motion_of_the_drive_changes_the_last_samples_alone(dataset):
 
 def test_planned_controls_are_made_exactly(fork, wire):
     control = np.random.default_rng(0).normal(size=(2, 5, 2))
-    setup = Setup.of_anatomy(fork, wire, SimulatorConfig())
+    setup = EpisodeSetUp.of_anatomy(fork, wire, SimulatorConfig())
     episodes = Episodes.of_controls(setup, initial=np.array([2.0, 0.5]), control=control, tip=np.zeros((2, 5, 2)))
     np.testing.assert_allclose(episodes.proximal[:, -1], [2.0, 0.5] + 0.5 * control.sum(axis=1))
     np.testing.assert_array_equal(episodes.command, control)
@@ -84,7 +84,7 @@ def test_a_vessel_in_memory_needs_no_folder_and_is_prepared_once(fork, wire, mon
     monkeypatch.setattr("endopilot.models.episodes.prepare", lambda *args: prepared.append(args) or real(*args))
     control = np.tile([1.0, 0.0], (1, 40, 1))
     tip = np.tile([2.0, 0.1], (1, 40, 1))
-    setup = Setup.of_anatomy(fork, wire, SimulatorConfig(threads=1))
+    setup = EpisodeSetUp.of_anatomy(fork, wire, SimulatorConfig(threads=1))
     episodes = Episodes.of_controls(setup, initial=np.array([2.0, 0.0]), control=control, tip=tip)
     predictor = load_model(Path("pretrained"))
     found = predictor.predict(episodes, given_states(episodes))
@@ -102,7 +102,7 @@ def test_a_dataset_keeps_its_prepared_patients(dataset, fork, wire, monkeypatch,
         return one
 
     monkeypatch.setattr(patient, "prepare", prepare)
-    setup = replace(Setup.of_dataset(dataset), patients_folder=tmp_path / PATIENTS_FOLDER)
+    setup = replace(EpisodeSetUp.of_dataset(dataset), patients_folder=tmp_path / PATIENTS_FOLDER)
     name = str(dataset.anatomy[0])
     for _ in range(2):
         np.testing.assert_array_equal(setup.patient(name).push_tip, one.push_tip)

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PolyCollection
-from matplotlib.colors import ListedColormap, Normalize
+from matplotlib.colors import Normalize
 from matplotlib.patches import Patch
 from scipy.ndimage import map_coordinates, zoom
 from skimage.measure import marching_cubes
@@ -23,14 +23,13 @@ from endopilot.anatomy.distance import sample
 from endopilot.anatomy.projection import project_tip
 from endopilot.anatomy.tree import tangents
 from endopilot.files import writing
+from endopilot.plotting import plain_text, section_colors
 from endopilot.types import Anatomy, Centerline, Volume
 
 SECTIONS = 6
 """Cross-sections that are drawn, evenly along the longest path."""
 
 WINDOW_HU = (-150.0, 650.0)
-_SECTION_COLOURS = ListedColormap(plt.get_cmap("tab10")([0, 1, 2, 3, 4, 5, 6, 8, 9]))
-"""Without grey, which is the catheter's."""
 _WIDTH = 15.0
 """Of the picture, inches."""
 _LONGEST_NAME, _MOST_LISTED = 24, 120
@@ -78,7 +77,7 @@ def _draw_tree(anatomy: Anatomy, figure: Any) -> None:
     shade = 0.45 + 0.55 * np.abs(normal @ _LIGHT)
     order = np.argsort(-corners[:, :, 1].mean(axis=1))  # from the back (large y) to the front
     present = np.unique(section)
-    palette = _palette(len(present))
+    palette = section_colors(len(present))
     scale = Normalize(float(radius.min()), float(radius.max()))
     number = np.searchsorted(present, section)
     for axes, title in zip(figure.subplots(1, 2), ("sections", "radius, mm"), strict=True):
@@ -95,29 +94,16 @@ def _draw_tree(anatomy: Anatomy, figure: Any) -> None:
             figure.colorbar(ScalarMappable(scale, "viridis"), cax=axes.inset_axes((1.03, 0.0, 0.03, 1.0)))
 
 
-def _palette(count: int) -> Any:
-    """Return a colour for each of so many sections; of many, neighbours in the list have similar ones."""
-    if count <= _SECTION_COLOURS.N:
-        return _SECTION_COLOURS
-    return plt.get_cmap("tab20") if count <= 20 else plt.get_cmap("turbo").resampled(count)
-
-
 def _list_sections(figure: Any, names: Sequence[str], palette: Any) -> None:
     """List the sections' colours below the tree, in as many columns as fit beside each other."""
     shown = [name if len(name) <= _LONGEST_NAME else f"{name[: _LONGEST_NAME - 1]}…" for name in names[:_MOST_LISTED]]
-    handles = [Patch(color=palette(i), label=_plain(name)) for i, name in enumerate(shown)]
+    handles = [Patch(color=palette(i), label=plain_text(name)) for i, name in enumerate(shown)]
     if len(names) > len(shown):
         handles.append(Patch(color="none", label=f"and {len(names) - len(shown)} more"))
     handles.append(Patch(color="0.75", label="catheter"))
     width = 0.45 + 0.075 * max(len("catheter"), *map(len, shown))  # of a column, inches
     columns = min(len(handles), int(_WIDTH / width))
     figure.legend(handles=handles, fontsize=8, loc="outside lower center", ncols=columns, columnspacing=1.0)
-
-
-def _plain(name: str) -> str:
-    """Return a name that matplotlib shows as it is: no formula, no line break, and not left out for its underscore."""
-    text = "".join(letter if letter.isprintable() else "?" for letter in name).replace("$", r"\$")
-    return f"\u200b{text}" if text.startswith("_") else text
 
 
 def _wall(anatomy: Anatomy) -> tuple[Float[np.ndarray, "n 3"], Any]:

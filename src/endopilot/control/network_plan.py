@@ -17,7 +17,7 @@ from endopilot.anatomy.projection import safety_ratio
 from endopilot.control.plan_config import PlanConfig, Steps
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.models.config import WINDOW, read_run
-from endopilot.models.episodes import Episodes, Setup
+from endopilot.models.episodes import Episodes, EpisodeSetUp
 from endopilot.models.open_loop import Predictor
 from endopilot.models.rollout import load_model
 from endopilot.progress import progress
@@ -126,7 +126,7 @@ class RestingStart:
         """
         self.navigation = navigation
         config = SimulatorConfig(**read_run(model).get("simulator", {}))
-        self._setup = Setup.of_anatomy(navigation.anatomy, navigation.device, config)
+        self._setup = EpisodeSetUp.of_anatomy(navigation.anatomy, navigation.device, config)
         simulator = Simulator(navigation.anatomy, navigation.device, config=SimulatorConfig(threads=1))
         simulator.reset(inserted_length=[navigation.start_inserted_mm], rotation=[navigation.start_rotation])
         tip = simulator.project()[:, 0]

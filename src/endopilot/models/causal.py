@@ -31,7 +31,7 @@ from torch import Tensor, nn
 from endopilot.devices.drive_limits import DriveLimits
 from endopilot.errors import InputError
 from endopilot.models.config import WINDOW, CausalConfig
-from endopilot.models.episodes import Episodes, Setup
+from endopilot.models.episodes import Episodes, EpisodeSetUp
 from endopilot.models.open_loop import EachObserved, Observed, OpenLoop, Prediction, Steps2, begin_after, given_states
 from endopilot.models.play import Direction, Vessels
 from endopilot.models.sequences import N_INPUTS, N_WIRE_INPUTS, prepare_vessels, unfold
@@ -205,7 +205,7 @@ class CausalPredictor:
     forward: CausalNetwork | None
     inverse: CausalNetwork | None
     limits: DriveLimits
-    prepared: WeakKeyDictionary[Setup, tuple[tuple[str, ...], Vessels]] = field(
+    prepared: WeakKeyDictionary[EpisodeSetUp, tuple[tuple[str, ...], Vessels]] = field(
         default_factory=WeakKeyDictionary, repr=False
     )
     wires: SimulatedWires = field(default_factory=SimulatedWires, repr=False)

@@ -20,7 +20,7 @@ from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulate import run_set_up
 from endopilot.simulation.simulator import Simulator
-from endopilot.simulation.trajectory import SetUp
+from endopilot.simulation.trajectory import SimulationSetUp
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
 NOMINAL = np.array([1.0, 1.0, 0.0])
@@ -64,7 +64,7 @@ class Ensemble:
         }
         friction = np.tile([each.friction for each in stack.devices], (len(parameters), 1))
         friction[:, 0] *= parameters[:, 0]
-        self.set_up = SetUp(
+        self.set_up = SimulationSetUp(
             anatomies=[anatomy] * len(parameters),
             stacks=[replace(stack, wire=self.wires[factor]) for factor in parameters[:, 1]],
             initial=np.stack([self._deeper(start[..., 0]), start[..., 1]], axis=-1),

@@ -1,7 +1,7 @@
 """What a predictor is given of navigations: `Episodes`.
 
 A dataset gives them by `Episodes.of_dataset`, a plan by `Episodes.of_controls`. A navigation under way fills the fields
-with what its encoder and its X-ray images have measured so far; `Setup.of_anatomy` holds its vessel in memory.
+with what its encoder and its X-ray images have measured so far; `EpisodeSetUp.of_anatomy` holds its vessel in memory.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ PATIENTS_FOLDER = "patients"
 
 
 @dataclass(frozen=True, eq=False)
-class Setup:
+class EpisodeSetUp:
     """What episodes have in common: the vessels that they may lie in, and the wire.
 
     Attributes:
@@ -52,12 +52,12 @@ class Setup:
     known_motions: Mapping[str, Motion | None] = field(default_factory=dict)
 
     @staticmethod
-    def of_anatomy(anatomy: Anatomy, device: Wire, simulator: SimulatorConfig) -> Setup:
+    def of_anatomy(anatomy: Anatomy, device: Wire, simulator: SimulatorConfig) -> EpisodeSetUp:
         """Return the setup of navigations in one vessel that is in memory."""
-        return Setup({anatomy.name: lambda: anatomy}, device, simulator)
+        return EpisodeSetUp({anatomy.name: lambda: anatomy}, device, simulator)
 
     @staticmethod
-    def of_dataset(dataset: Dataset) -> Setup:
+    def of_dataset(dataset: Dataset) -> EpisodeSetUp:
         """Return the setup of a dataset, which keeps its prepared patients in its folder.
 
         Of patients who move the published mean is known, with the phase of heart and breath.
@@ -69,7 +69,7 @@ class Setup:
         with reading(dataset.folder, "make the dataset again"):
             device = from_record(Wire, dataset.manifest["device"])
             simulator = SimulatorConfig(**dataset.manifest["config"]["simulator"])
-        return Setup(
+        return EpisodeSetUp(
             anatomies={name: partial(read, name) for name in dataset.patients},
             device=device,
             simulator=simulator,
@@ -114,7 +114,7 @@ class Episodes:
         tip_sd: standard deviations of (Δtip, γtip) as whatever measured them states them, mm; 0 where it states none.
     """
 
-    setup: Setup
+    setup: EpisodeSetUp
     anatomy: Shaped[np.ndarray, "episodes"]
     initial: Float[np.ndarray, "episodes 2"]
     control: Float[np.ndarray, "episodes samples 2"]
@@ -140,7 +140,7 @@ class Episodes:
                 f"make the dataset with seconds of {seconds:g} or more"
             )
         return Episodes(
-            setup=Setup.of_dataset(dataset),
+            setup=EpisodeSetUp.of_dataset(dataset),
             anatomy=dataset.anatomy,
             initial=dataset.initial[:, 0],
             control=dataset.control[:, :, 0],
@@ -153,7 +153,7 @@ class Episodes:
 
     @staticmethod
     def of_controls(
-        setup: Setup,
+        setup: EpisodeSetUp,
         *,
         initial: Float[np.ndarray, "2"],
         control: Float[np.ndarray, "episodes samples 2"],

@@ -21,7 +21,7 @@ from jaxtyping import Float
 
 from endopilot.files import json_text, writing
 from endopilot.models.ensemble import NOMINAL, Ensemble
-from endopilot.models.episodes import Episodes, Setup
+from endopilot.models.episodes import Episodes, EpisodeSetUp
 from endopilot.parallel import CORES
 from endopilot.progress import progress
 
@@ -42,7 +42,9 @@ class SimulatedWires:
         known: tips of navigations that were simulated before, by setup and by a digest of patient and controls.
     """
 
-    known: WeakKeyDictionary[Setup, dict[bytes, np.ndarray]] = field(default_factory=WeakKeyDictionary, repr=False)
+    known: WeakKeyDictionary[EpisodeSetUp, dict[bytes, np.ndarray]] = field(
+        default_factory=WeakKeyDictionary, repr=False
+    )
 
     def tips(self, episodes: Episodes) -> WireTips:
         """Return the tips of the wires that follow the controls of each episode.

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from endopilot.simulation.groups import Group
-from endopilot.simulation.trajectory import SetUp
+from endopilot.simulation.trajectory import SimulationSetUp
 from endopilot.types import TipProjection
 
 
@@ -20,7 +20,7 @@ class Readout:
     """
 
     _groups: Sequence[Group]
-    _set_up: SetUp
+    _set_up: SimulationSetUp
     _devices: int
     _rows: Int[np.ndarray, "worlds"]
 

@@ -16,7 +16,7 @@ from endopilot.simulation.checks import check_memory, with_device_axis
 from endopilot.simulation.config import Actuation, SimulatorConfig
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulator import Simulator
-from endopilot.simulation.trajectory import SetUp, Trajectory
+from endopilot.simulation.trajectory import SimulationSetUp, Trajectory
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
 WALL_FORCE_LIMIT_N = 0.7
@@ -93,7 +93,7 @@ def simulate(
         initial = np.zeros((worlds, len(stack), 2))
     if friction is None:
         friction = np.tile([each.friction for each in stack.devices], (worlds, 1))
-    set_up = SetUp(
+    set_up = SimulationSetUp(
         anatomies=[anatomy] * worlds,
         stacks=[stack] * worlds,
         initial=with_device_axis("initial", np.asarray(initial, dtype=float), (worlds, len(stack), 2)),
@@ -108,7 +108,11 @@ def simulate(
 
 
 def run_set_up(
-    set_up: SetUp, command: Float[np.ndarray, "worlds samples devices 2"], *, period_s: float, record_shape: bool
+    set_up: SimulationSetUp,
+    command: Float[np.ndarray, "worlds samples devices 2"],
+    *,
+    period_s: float,
+    record_shape: bool,
 ) -> Trajectory:
     """Drive worlds from their start with a sequence of commands each, as long as it may take.
 

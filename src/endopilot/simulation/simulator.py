@@ -28,7 +28,7 @@ from endopilot.simulation.motion import Motion
 from endopilot.simulation.processor import gpu_errors
 from endopilot.simulation.readout import Readout
 from endopilot.simulation.state import SimulatorState, Step, SupportsDLPack
-from endopilot.simulation.trajectory import SetUp, Trajectory
+from endopilot.simulation.trajectory import SimulationSetUp, Trajectory
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy, TipProjection
 
 _DEEPEST_START = 0.8
@@ -113,7 +113,7 @@ class Simulator(Readout):
         self._largest = np.full_like(fastest, np.finfo(float).max) if actuation == "force" else fastest * (1 + 1e-6)
         self._longest = self._merge([np.full(len(group.index), group.longest_mm) for group in self._groups])
         own = np.array([[each.friction for each in stack.devices] for stack in stacks])
-        self._set_up = SetUp(anatomies, stacks, np.zeros((*own.shape, 2)), own, actuation, motion, config)
+        self._set_up = SimulationSetUp(anatomies, stacks, np.zeros((*own.shape, 2)), own, actuation, motion, config)
         self._own_friction = own
         self.reset(inserted_length=np.zeros(own.shape), rotation=np.zeros(own.shape))
 
@@ -253,7 +253,7 @@ class Simulator(Readout):
 
     def made(
         self,
-        set_up: SetUp,
+        set_up: SimulationSetUp,
         start: Float[np.ndarray, "worlds devices 2"],
         command: Float[np.ndarray, "worlds samples devices 2"],
         period_s: float,
@@ -359,7 +359,7 @@ class Simulator(Readout):
         self._set_up = replace(self._set_up, initial=np.full_like(self._set_up.initial, np.nan))
 
     @property
-    def set_up(self) -> SetUp:
+    def set_up(self) -> SimulationSetUp:
         """What the worlds are simulated with, and where they started.
 
         Example:

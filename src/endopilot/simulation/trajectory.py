@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
@@ -16,12 +16,15 @@ from endopilot.simulation.config import Actuation, SimulatorConfig
 from endopilot.simulation.motion import Motion
 from endopilot.types import Anatomy, TipProjection
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure  # slow to import
+
 _REASONS = {1: "left the finite numbers", 2: "did not converge", 3: "went through the wall"}
 """Meaning of `Trajectory.reason` for an invalid world."""
 
 
 @dataclass(frozen=True, eq=False)
-class SetUp:
+class SimulationSetUp:
     """What worlds are simulated with. A `Simulator` made of it and the same commands give the same bits.
 
     Attributes:
@@ -86,7 +89,7 @@ class Trajectory:
         about: what else is to be known, as plain JSON values.
     """
 
-    set_up: SetUp
+    set_up: SimulationSetUp
     period_s: float
     start: Float[np.ndarray, "worlds devices 2"]
     command: Float[np.ndarray, "worlds samples devices 2"]
@@ -140,7 +143,7 @@ class Trajectory:
 
         Args:
             record_shape: record the positions of all nodes too; if not given, where they were recorded before.
-            changed: attributes of `SetUp` that are to be others, such as `config`, `motion` or `friction`.
+            changed: attributes of `SimulationSetUp` that are to be others, such as `config`, `motion` or `friction`.
 
         Raises:
             InputError: a world was on its way already when the recording began, or its vessel is not given.
@@ -155,6 +158,30 @@ class Trajectory:
         shape = self.shape is not None if record_shape is None else record_shape
         again = run_set_up(set_up, self.command, period_s=self.period_s, record_shape=shape)
         return replace(again, columns=self.columns, about=self.about)
+
+    def plot(self, *, world: int = 0) -> Figure:
+        """Draw Δ, Δtip, γtip and the wall force of one world over time, in a new figure of pyplot."""
+        import matplotlib.pyplot as plt
+
+        from endopilot.plotting import BLUE, CATHETER_COLORS, STYLE, VERMILLION  # slow to import
+
+        colors = (BLUE, *CATHETER_COLORS)
+        names = [device.name for device in self.set_up.stacks[world].devices]
+        time_s = self.period_s * np.arange(1, self.command.shape[1] + 1)
+        with plt.rc_context(STYLE):
+            figure = plt.figure(figsize=(9, 6), layout="constrained")
+            length, offset, force = figure.subplots(3, 1, sharex=True, height_ratios=(2, 1, 1))
+            for k, (name, color) in enumerate(zip(names, colors, strict=False)):
+                length.plot(time_s, self.inserted_length[world, :, k], color=color, ls="--", lw=1, label=f"Δ, {name}")
+                length.plot(time_s, self.tip.abscissa[world, :, k], color=color, label=f"Δtip, {name}")
+                offset.plot(time_s, self.tip.offset[world, :, k], color=color, label=f"γtip, {name}")
+            force.plot(time_s, self.wall_force[world], color=VERMILLION, label="on 2 mm of the line")
+            length.set(ylabel="inserted length Δ and\ntip along the vessel Δtip, mm")
+            offset.set(ylabel="tip off the\ncenterline γtip, mm", ylim=(0, None))
+            force.set(xlabel="time, s", ylabel="wall force, N", ylim=(0, None), xlim=(0, time_s[-1]))
+            for axes in (length, offset, force):
+                axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+        return figure
 
     def samples(self, chosen: slice) -> Trajectory:
         """Return the trajectory with some of its samples; the first of them must be kept for it to be replayed."""

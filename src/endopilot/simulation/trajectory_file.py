@@ -30,7 +30,7 @@ from endopilot.extras import extra_named
 from endopilot.files import json_text, writing
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.motion import Motion, place
-from endopilot.simulation.trajectory import SetUp, Trajectory
+from endopilot.simulation.trajectory import SimulationSetUp, Trajectory
 from endopilot.types import Anatomy, TipProjection
 
 if TYPE_CHECKING:
@@ -159,7 +159,7 @@ def read_trajectory(path: Path | str, anatomy: Anatomy | Sequence[Anatomy] | Non
         raise InputError(f"{path}: format version {about['version']}, not {FORMAT_VERSION}; simulate it again")
     vessels = _vessels(path, about, anatomy)
     made = [_stack(each) for each in about["stacks"]]
-    set_up = SetUp(
+    set_up = SimulationSetUp(
         anatomies=vessels,
         stacks=[made[k] for k in about["stack_of_world"]],
         initial=arrays.pop("initial"),
