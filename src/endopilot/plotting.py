@@ -87,7 +87,7 @@ def draw_vessel(
         own, color = section == index, one_color or palette(number)
         lines = LineCollection(list(pieces[own]), linewidths=width[own].tolist(), colors=[color], capstyle="round")
         axes.add_collection(lines)
-        axes.plot([], [], color=color, lw=4, label=plain_text(names[int(index)]))
+        axes.plot([], [], color=color, lw=4, label=plain_text(str(names[int(index)])))
     axes.set_aspect("equal")
     axes.autoscale_view()
     if one_color is None:

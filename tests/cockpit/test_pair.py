@@ -242,7 +242,8 @@ def test_a_navigation_of_a_pair_is_shown(vessel, tmp_path):
     table = np.genfromtxt(tmp_path / "navigation" / "navigation.csv", delimiter=",", names=True)
     assert last.inserted_mm == table["inserted_length_mm"][-1]
     assert last.catheters[0].inserted_mm == table["catheter_1_inserted_length_mm"][-1]
-    assert [frame.snapshot.time_s for frame in film.frames if frame.exposed] == table["time_s"][table["xray"] == 1]
+    shown = [frame.snapshot.time_s for frame in film.frames if frame.exposed]
+    assert shown == table["time_s"][table["xray"] == 1].tolist()
     assert film.navigation.target.abscissa == pytest.approx(15.0, abs=1.0)
 
 

@@ -102,6 +102,7 @@ def open_film(path: Path, patient: Path | None = None, *, world: int = 0, task: 
     if path.suffix == ".json":
         with reading(path, "give a file of the ladder as it was written"):
             of, place, record = read_navigation(path, task, world)
+            assert record.cycles is not None  # a recording has a decision at least
             return _film(record.cycles, 0, f"{of.title}, patient {place}")
     recorded = path / TRAJECTORY if path.is_dir() else path
     if recorded.suffix != ".npz" or not recorded.exists():

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -182,6 +183,17 @@ class Trajectory:
             for axes in (length, offset, force):
                 axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
         return figure
+
+    def write(self, path: Path | str) -> None:
+        """Write it as .npz, which `read_trajectory` reads back to the bit, or as a table, .csv or .parquet.
+
+        Raises:
+            InputError: another suffix, or shapes for a table.
+            ModuleNotFoundError: .parquet without the extra `learn`.
+        """
+        from endopilot.simulation.trajectory_file import write_trajectory  # which reads trajectories too
+
+        write_trajectory(self, Path(path))
 
     def samples(self, chosen: slice) -> Trajectory:
         """Return the trajectory with some of its samples; the first of them must be kept for it to be replayed."""
