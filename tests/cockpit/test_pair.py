@@ -175,12 +175,6 @@ def test_a_policy_drives_both(session):
     assert session.autopilot.status == "drives" or session.autopilot.status == "thinking"
 
 
-def test_a_policy_for_a_wire_alone_says_so(session):
-    start(session, "agent")
-    drive_alone(session, lambda: session.autopilot.status == "failed")
-    assert "takes a wire alone, and there is " + NAME in session.autopilot.failure
-
-
 def test_a_curved_catheter_is_turned_back_before_a_policy_begins(navigation, xray):
     curved = replace(navigation.catheters[0], shape=((10.0, 0.5),))
     session = Session(World(replace(navigation, catheters=(curved,))), xray)

@@ -12,7 +12,7 @@ from endopilot.devices.device import Wire
 from endopilot.devices.stack import Stack
 from endopilot.errors import InputError, Remark
 from endopilot.progress import progress
-from endopilot.simulation.checks import check_memory, with_device_axis
+from endopilot.simulation.checks import check_control, check_memory, with_device_axis
 from endopilot.simulation.config import Actuation, SimulatorConfig
 from endopilot.simulation.motion import Motion
 from endopilot.simulation.simulator import Simulator
@@ -127,9 +127,14 @@ def run_set_up(
     """
     worlds, samples = command.shape[:2]
     check_memory(8 * worlds * samples * 20, f"control: {worlds} worlds of {samples} samples", "simulate fewer at once")
+    if not 0 < period_s < np.inf:
+        raise InputError(f"period_s: {period_s}; give a positive number of seconds")
+    check_control(command, set_up.largest, set_up.stacks, set_up.actuation)
+    if not np.isfinite(set_up.initial).all():
+        raise InputError(f"initial: world {int(np.argwhere(~np.isfinite(set_up.initial))[0][0])}: not a finite number")
     start = set_up.initial[..., 0]
     reach_mm = 0.0
-    if set_up.actuation == "velocity" and 0 < period_s < np.inf:
+    if set_up.actuation == "velocity":
         # A drive that slips leaves in the vessel what it did not pull back, and pushes on from there.
         ahead = np.maximum(command[..., 0], 0.0).sum(axis=1) * period_s
         reach_mm = float(np.max(ahead)) + float(np.max(start, initial=0.0))

@@ -109,12 +109,10 @@ class Simulator(Readout):
                 anatomies, stacks, motion, config, sharing._groups if sharing else (), reach_mm=reach_mm
             )
         self._rows = np.argsort(np.concatenate([group.index for group in self._groups]))
-        fastest = np.array([stack.fastest for stack in stacks])
-        self._largest = np.full_like(fastest, np.finfo(float).max) if actuation == "force" else fastest * (1 + 1e-6)
         self._longest = self._merge([np.full(len(group.index), group.longest_mm) for group in self._groups])
         own = np.array([[each.friction for each in stack.devices] for stack in stacks])
         self._set_up = SimulationSetUp(anatomies, stacks, np.zeros((*own.shape, 2)), own, actuation, motion, config)
-        self._own_friction = own
+        self._own_friction, self._largest = own, self._set_up.largest
         self.reset(inserted_length=np.zeros(own.shape), rotation=np.zeros(own.shape))
 
     def reset(

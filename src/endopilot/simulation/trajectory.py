@@ -47,6 +47,12 @@ class SimulationSetUp:
     motion: Motion | None
     config: SimulatorConfig
 
+    @property
+    def largest(self) -> Float[np.ndarray, "worlds devices 2"]:
+        """Largest magnitudes that commands may have: mm/s and rad/s, or N and N·mm, with a hair for rounding."""
+        fastest = np.array([stack.fastest for stack in self.stacks]) * (1 + 1e-6)
+        return np.full_like(fastest, np.finfo(float).max) if self.actuation == "force" else fastest
+
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
