@@ -74,10 +74,10 @@ def test_tips_are_given_as_x_ray_measures_them_and_lengths_as_the_encoder_does(s
     error = split.episodes.tip[..., 0] - split.truth[..., 0]
     assert 0.1 < error.std() < 0.8
     truth = load_dataset(folder / "dataset").of_split("calibrate")
-    ostium = truth.inserted_length - split.episodes.proximal[..., 0]
+    ostium = truth.inserted_length[..., 0] - split.episodes.proximal[..., 0]
     assert np.ptp(ostium, axis=1).max() < 1e-4 and 0.1 < np.abs(ostium).max() <= 0.3
-    np.testing.assert_allclose(truth.initial_inserted_length - split.episodes.initial[:, 0], ostium[:, 0], atol=1e-4)
-    np.testing.assert_array_equal(split.episodes.proximal[..., 1], truth.rotation)
+    np.testing.assert_allclose(truth.initial[:, 0, 0] - split.episodes.initial[:, 0], ostium[:, 0], atol=1e-4)
+    np.testing.assert_array_equal(split.episodes.proximal[..., 1], truth.rotation[..., 0])
 
 
 def test_imaging_often_enough_shows_every_event_and_none_shows_no_event(split) -> None:

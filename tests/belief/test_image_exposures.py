@@ -64,13 +64,13 @@ def test_each_sample_is_measured_by_the_wire_driven_again_and_kept_for_the_next_
     assert left_out == ("patient-1x",) and sorted(found) == ["patient-0", "patient-2xx"]
     for name, shown in found.items():
         truth = dataset.select(dataset.anatomy == name)
-        assert shown.found.shape == truth.branch.shape
+        assert shown.found.shape == truth.valid.shape
         assert shown.found[:, :5].tolist() == [[True, True, False, True, False]] * 2
         seen = [0, 1, 3]
-        np.testing.assert_allclose(shown.tip[:, seen, 0], truth.tip_abscissa[:, seen], atol=1e-4)
-        np.testing.assert_allclose(shown.tip[:, seen, 1], truth.tip_offset[:, seen], atol=1e-4)
+        np.testing.assert_allclose(shown.tip[:, seen, 0], truth.tip_abscissa[:, seen, 0], atol=1e-4)
+        np.testing.assert_allclose(shown.tip[:, seen, 1], truth.tip_offset[:, seen, 0], atol=1e-4)
         assert (shown.sd_mm[:, seen] == (0.2, 0.1)).all() and (shown.sd_mm[:, 2] == 0).all()
-        slack = truth.inserted_length - deeper_ostium_mm(name, 0.3, 2) - shown.tip[..., 0]
+        slack = truth.inserted_length[..., 0] - deeper_ostium_mm(name, 0.3, 2) - shown.tip[..., 0]
         np.testing.assert_allclose(slack[:, 2], slack[:, 1], atol=1e-4)
         np.testing.assert_allclose(slack[:, 4:], slack[:, 3:4] + np.zeros((1, 36)), atol=1e-4)
     assert all(Arm.refined)  # the first 15 s refine the pose
@@ -91,7 +91,7 @@ def test_where_the_patient_moves_the_wire_is_seen_displaced_by_what_was_not_meas
     assert still["patient-0"].known_motion is None and known == replace(motion, breathing_caudal_mm=6.5)
     maps = seen_in_episodes(motion, known, np.zeros(3), 4, 0.5)
     assert maps is not None
-    before = dataset.select(dataset.anatomy == "patient-0").tip_position[:, 3].astype(float)
+    before = dataset.select(dataset.anatomy == "patient-0").tip_position[:, 3, 0].astype(float)
     after = before @ maps[3, :, :3].T + maps[3, :, 3]
     np.testing.assert_allclose(moving["patient-0"].tip[:, 3, 0], after[:, 0], atol=1e-4)
     assert np.abs(moving["patient-0"].tip[:, 3] - still["patient-0"].tip[:, 3]).max() > 1e-3

@@ -150,6 +150,6 @@ def test_the_cockpits_catheters(patient, tmp_path, capsys):
     assert "is too wide for the bore of catheter microcatheter-1.7f" in narrow
     assert "no such catheter" in refused(capsys, "cockpit", patient, "--catheter", "nonesuch", *recordings)
     brought = refused(capsys, "cockpit", "--task", "follow", "--catheter", "microcatheter-1.7f", *recordings)
-    assert brought.endswith("catheter: a task and a session have theirs; leave it out")
+    assert brought.endswith("catheter: a replay, a task and a session have theirs; leave it out")
     assert "follow" in refused(capsys, "cockpit", "--task", "nonesuch", *recordings)
     assert not (tmp_path / "recordings").exists()

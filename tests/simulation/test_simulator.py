@@ -146,7 +146,7 @@ def test_restored_state_goes_on_with_the_same_bits(anatomy: Anatomy, tmp_path: P
 
     np.save(tmp_path / "control.npy", control)
     script = f"""
-import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})
+import sys; sys.path[:0] = [{str(Path(__file__).parent)!r}, {str(Path(__file__).parents[2])!r}]
 import numpy as np
 from bend import vessel
 from endopilot.devices.device import read_device

@@ -106,7 +106,7 @@ def test_a_recording_that_began_on_the_way_is_not_replayed(vessel) -> None:
 
 
 def test_every_third_sample_has_the_means_and_sums_of_its_period(vessel) -> None:
-    weak = replace(CATHETER, device=replace(CATHETER.device, push_limit_n=0.03, pull_limit_n=0.02))
+    weak = replace(CATHETER, push_limit_n=0.03, pull_limit_n=0.02)
     fine = driven(vessel, Stack(WIRE, (weak,)), motion=Motion(), record_shape=True)
     assert np.abs(fine.slip).max() > 0
     coarse = fine.every(3)

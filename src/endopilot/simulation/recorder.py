@@ -58,6 +58,6 @@ class Recorder:
             count = like.size // len(like)
             values = rows[:, :, at : at + count].reshape(*rows.shape[:2], *like.shape[1:])
             recorded[name], at = values.astype(like.dtype), at + count
-        return self.simulator.made(
+        return self.simulator._made(
             self._set_up, self._start, np.stack(self._commands, axis=1), self.period_s, self._began_s, recorded
         )

@@ -247,9 +247,9 @@ class Simulator(Readout):
         set_up, start, began_s = self._set_up, self.proximal, self.time
         steps = self.config.steps_of(period_s)
         result = self._run_all(command, period_s / steps, steps, record_shape=record_shape, advance=advance)
-        return self.made(set_up, start, command, period_s, began_s, result)
+        return self._made(set_up, start, command, period_s, began_s, result)
 
-    def made(
+    def _made(
         self,
         set_up: SimulationSetUp,
         start: Float[np.ndarray, "worlds devices 2"],
