@@ -85,6 +85,6 @@ def test_the_command_line_answers(clean: Path) -> None:
 
 
 def test_a_command_without_its_extra_says_so_in_one_line(clean: Path) -> None:
-    result = run(clean, "endopilot", "train", "dataset", "-o", "run")
+    result = run(clean, "endopilot", "train", clean.parent, "-o", "run")
     assert result.returncode == 2
     assert result.stderr == "endopilot train: needs torch; install it with: pip install 'endopilot[learn]'\n"
