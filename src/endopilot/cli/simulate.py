@@ -25,7 +25,7 @@ from endopilot.simulation.controls import ControlConfig, random_controls, read_c
 from endopilot.simulation.motion import Motion, MotionName, motion_named
 from endopilot.simulation.simulate import simulate, wall_force_events
 from endopilot.simulation.trajectory import Trajectory
-from endopilot.simulation.trajectory_file import read_trajectory, write_trajectory
+from endopilot.simulation.trajectory_file import read_trajectory
 from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
 
@@ -117,7 +117,7 @@ def command(
             period_s=period_s,
             motion=moves,
         )
-    write_trajectory(trajectory if shape else replace(trajectory, shape=None), output)
+    (trajectory if shape else replace(trajectory, shape=None)).write(output)
     valid, force, torque = trajectory.valid, np.abs(trajectory.base_force), np.abs(trajectory.base_torque)
     figures = {
         "rollout": output,
@@ -176,7 +176,7 @@ def _stopped_short(
             [stack] * worlds,
             initial,
             control,
-            np.tile([each.friction for each in stack.devices], (worlds, 1)),
+            stack.frictions(np.full(worlds, stack.wire.friction)),
             config,
             motion=motion,
             advance=advance,

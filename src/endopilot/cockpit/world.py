@@ -84,11 +84,6 @@ class Snapshot:
     catheters: tuple[ShownCatheter, ...] = ()
 
     @property
-    def tips(self) -> tuple[TipProjection, ...]:
-        """Those of the wire and of each catheter, as `Navigation.reached` takes them."""
-        return (self.tip, *(catheter.tip for catheter in self.catheters))
-
-    @property
     def deepest_mm(self) -> float:
         """Largest inserted length, mm."""
         return max([self.inserted_mm, *(catheter.inserted_mm for catheter in self.catheters)])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int
 
+from endopilot.devices.stack import column_prefixes
 from endopilot.types import TipProjection
 
 
@@ -35,5 +36,5 @@ def device_columns(
         "lumen_radius_mm": tip.radius,
         **{f"tip_{axis}_mm": position[:, k] for k, axis in enumerate("xyz")},
     }
-    prefix = f"catheter_{device}_" if device else ""
+    prefix = column_prefixes(device + 1)[device]
     return {f"{prefix}{name}": values for name, values in columns.items()}

@@ -45,7 +45,7 @@ from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.files import json_text, manifest, read_json, reading, sha256, writing
 from endopilot.settings import from_record
-from endopilot.simulation.trajectory_file import TRAJECTORY, read_trajectory, write_trajectory
+from endopilot.simulation.trajectory_file import TRAJECTORY, read_trajectory
 from endopilot.tasks.navigation import DECISION_PERIOD_S, Navigation, Target
 from endopilot.types import Anatomy
 
@@ -94,7 +94,7 @@ def write_plan(plan: Plan, folder: Path, xray: PlannedXray | None = None) -> dic
         columns = {"desired": plan.desired[None], "predicted": plan.predicted[None]}
         about = {"target": asdict(navigation.target), "method": plan.config.method}
         about |= {"exposures_s": figures["xray_due_s"]} if xray is not None else {}
-        write_trajectory(replace(plan.trajectory, columns=columns, about=about), partial / TRAJECTORY)
+        replace(plan.trajectory, columns=columns, about=about).write(partial / TRAJECTORY)
         draw_plan(plan, partial / PICTURE, xray)
         record = manifest(
             config=plan.config,

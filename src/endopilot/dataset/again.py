@@ -64,7 +64,6 @@ def simulate_again(
     for kind, (bend, factor) in enumerate(tips.astype(float)):
         chosen = np.flatnonzero(tip_of.ravel() == kind)
         wire = stack.wire.with_tip(bend_rad=float(bend), stiffness_factor=float(factor))
-        around = [np.full(len(chosen), each.friction) for each in stack.catheters]
         yield (
             chosen,
             simulate(
@@ -74,7 +73,7 @@ def simulate_again(
                 initial=data.initial[chosen],
                 config=config,
                 record_shape=record_shape,
-                friction=np.column_stack([friction[chosen], *around]),
+                friction=stack.frictions(friction[chosen]),
                 motion=data.motion(anatomy.name),
             ),
         )

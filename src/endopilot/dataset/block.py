@@ -44,7 +44,7 @@ def write_block(
             draw.stacks(stack),
             draw.initial,
             draw.control,
-            draw.frictions(stack),
+            stack.frictions(draw.friction),
             replace(config.simulator, threads=threads),
             actuation=config.control,
             motion=patient_motion(config, anatomy.name),

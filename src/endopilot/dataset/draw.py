@@ -55,11 +55,6 @@ class Draw:
                 made[bend_rad, factor] = replace(given, wire=wire)
         return [made[tip] for tip in tips]
 
-    def frictions(self, given: Stack) -> Float[np.ndarray, "n devices"]:
-        """Return each device's friction coefficient; that of the catheters is their own."""
-        around = [each.friction for each in given.catheters]
-        return np.column_stack([self.friction, *(np.full(len(self.friction), value) for value in around)])
-
 
 def draw_navigations(
     config: DatasetConfig, device: Wire, anatomy: Anatomy, sequences: range, *, devices: int = 1

@@ -61,6 +61,11 @@ class Stack:
         """Fastest translation (mm/s) and rotation (rad/s) of each drive."""
         return np.array([[each.max_velocity_mm_s, each.max_rotation_rad_s] for each in self.devices])
 
+    def frictions(self, of_wire: Float[np.ndarray, "worlds"]) -> Float[np.ndarray, "worlds devices"]:
+        """Return the Coulomb coefficients of the devices on the wall: the wire's as given, the catheters' own."""
+        around = [np.full(len(of_wire), catheter.friction) for catheter in self.catheters]
+        return np.column_stack([of_wire, *around])
+
     @property
     def constants(self) -> tuple[Any, ...]:
         """All numbers of the devices: stacks with the same constants behave the same."""

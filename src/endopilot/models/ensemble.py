@@ -62,13 +62,11 @@ class Ensemble:
             factor: wire.with_tip(bend_rad=wire.tip_bend_rad, stiffness_factor=float(factor))
             for factor in np.unique(parameters[:, 1])
         }
-        friction = np.tile([each.friction for each in stack.devices], (len(parameters), 1))
-        friction[:, 0] *= parameters[:, 0]
         self.set_up = SimulationSetUp(
             anatomies=[anatomy] * len(parameters),
             stacks=[replace(stack, wire=self.wires[factor]) for factor in parameters[:, 1]],
             initial=np.stack([self._deeper(start[..., 0]), start[..., 1]], axis=-1),
-            friction=friction,
+            friction=stack.frictions(wire.friction * parameters[:, 0]),
             actuation="velocity",
             motion=motion,
             config=config,

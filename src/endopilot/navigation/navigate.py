@@ -325,12 +325,11 @@ def start_world(
     wire = device.with_tip(bend_rad=device.tip_bend_rad, stiffness_factor=truth.stiffness_factor)
     stack = Stack(wire, truth.catheters(navigation.catheters))
     simulator = Simulator(truth.anatomy(navigation.anatomy), stack, motion=motion, config=config)
-    friction, start = simulator.set_up.friction.copy(), navigation.start
-    friction[:, 0] = device.friction * truth.friction_factor
+    start = navigation.start
     simulator.reset(
         inserted_length=np.maximum(start[None, :, 0] + truth.ostium_mm, 0.0),
         rotation=start[None, :, 1],
-        friction=friction,
+        friction=stack.frictions(np.array([device.friction * truth.friction_factor])),
     )
     return simulator
 

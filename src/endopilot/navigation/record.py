@@ -157,18 +157,19 @@ class Track:
         anatomy, force = navigation.anatomy, np.array(self._force)
         proximal, position = np.array(self._proximal), np.array(self._position)
         samples, devices, _ = proximal.shape
-        flat = project_tip(anatomy.tree, anatomy.insertion, position.reshape(-1, 3))
         periods = samples - 1  # a decision whose period is not over does not count
         cycles = periods * round(DECISION_PERIOD_S / recorder.period_s)
         exposures = np.array([*self._exposures[:periods], 0])
         believed = [_NOTHING if tip is None else tip for tip in self._believed[:periods]] + [_NOTHING]
         tells = any(tip is not None for tip in self._believed)
+        where = np.array([(tip.abscissa, tip.offset) for tip in believed])
+        half_width = np.array([tip.half_width for tip in believed])
         seen = [(np.nan, np.nan) if tip is None else (tip.abscissa, tip.offset) for tip in self._measured[:periods]]
         decisions = {
             "decided": np.array(self._control[:periods]),
             "measured": np.array(seen),
-            "believed": np.array([(tip.abscissa, tip.offset) for tip in believed[:-1]]),
-            "half_width": np.array([tip.half_width for tip in believed[:-1]]),
+            "believed": where[:-1],
+            "half_width": half_width[:-1],
         }
         about = {
             "target": asdict(navigation.target),
@@ -182,14 +183,14 @@ class Track:
             inserted_length=proximal[..., 0],
             rotation=proximal[..., 1],
             tip_position=position,
-            tip=TipProjection(*(getattr(flat, name).reshape(samples, devices) for name in _PROJECTED)),
+            tip=project_tip(anatomy.tree, anatomy.insertion, position),
             shape=np.array(self._shape),
             contact_force_max=force,
             exposed=exposures > 0,
             control=np.array([*self._control[:periods], np.zeros((devices, 2))]),
             measured=(*self._measured[:periods], None),
-            believed=np.array([(tip.abscissa, tip.offset) for tip in believed]) if tells else None,
-            half_width=np.array([tip.half_width for tip in believed]) if tells else None,
+            believed=where if tells else None,
+            half_width=half_width if tells else None,
             asks=tuple(tip.asks for tip in believed),
             cycles=_made(recorder, cycles, decisions, about) if cycles else None,
             success=reason == "reached",
@@ -210,4 +211,3 @@ def _made(recorder: Recorder, cycles: int, decisions: dict[str, np.ndarray], abo
 
 
 _NOTHING = BelievedTip(abscissa=np.nan, offset=np.nan)
-_PROJECTED = ("abscissa", "offset", "branch", "radius")

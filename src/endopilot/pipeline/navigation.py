@@ -30,7 +30,7 @@ from endopilot.extras import require_extras
 from endopilot.files import manifest, read_json, write_json, writing
 from endopilot.navigation.policies import POLICIES
 from endopilot.runs import claim
-from endopilot.simulation.trajectory_file import TRAJECTORY, write_trajectory
+from endopilot.simulation.trajectory_file import TRAJECTORY
 from endopilot.tasks.targets import section_at
 
 PAGE_FILE, PICTURE_FILE, TABLE_FILE = "navigation.html", "navigation.png", "navigation.csv"
@@ -95,7 +95,7 @@ def _write(found: PatientNavigation, folder: Path, target: str, output: Path) ->
     cycles = found.record.cycles
     assert cycles is not None  # a navigation has a period at least
     about = {"policy": set_up.config.policy, "seed": set_up.config.seed, "truth": asdict(set_up.truth)}
-    write_trajectory(replace(cycles, about=cycles.about | about), output / TRAJECTORY)
+    replace(cycles, about=cycles.about | about).write(output / TRAJECTORY)
     write_device(set_up.true_wire, output / WIRE_FILE)
     for number, catheter in enumerate(set_up.true_catheters, start=1):
         write_catheter(catheter, output / CATHETER_FILE.format(number))

@@ -62,9 +62,7 @@ class Readout:
             >>> bool((tip.offset < tip.radius).all())
             True
         """
-        tips = [group.project(np.ascontiguousarray(group.simulation.tips())) for group in self._groups]
-        names = TipProjection.__dataclass_fields__
-        return TipProjection(**{name: self._merge([getattr(tip, name) for tip in tips]) for name in names})
+        return self._projected([group.simulation.tips() for group in self._groups])
 
     @property
     def inserted_length(self) -> Float[np.ndarray, "worlds devices"]:
@@ -232,6 +230,12 @@ class Readout:
             array([0, 0, 0, 0])
         """
         return self._gather("reason").astype(int)
+
+    def _projected(self, points: Sequence[Float[np.ndarray, "_ *n 3"]]) -> TipProjection:
+        """Return where points of each group's worlds, LPS mm, lie with respect to their centerlines."""
+        found = [group.project(each) for group, each in zip(self._groups, points, strict=True)]
+        names = TipProjection.__dataclass_fields__
+        return TipProjection(**{name: self._merge([getattr(tip, name) for tip in found]) for name in names})
 
     def _placements(self, times: Float[np.ndarray, "worlds samples"]) -> Float[np.ndarray, "worlds samples 3 4"]:
         """Return where each vessel lies at some times, s."""

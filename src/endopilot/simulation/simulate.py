@@ -92,7 +92,7 @@ def simulate(
     if initial is None:
         initial = np.zeros((worlds, len(stack), 2))
     if friction is None:
-        friction = np.tile([each.friction for each in stack.devices], (worlds, 1))
+        friction = stack.frictions(np.full(worlds, stack.wire.friction))
     set_up = SimulationSetUp(
         anatomies=[anatomy] * worlds,
         stacks=[stack] * worlds,

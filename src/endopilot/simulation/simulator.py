@@ -29,7 +29,7 @@ from endopilot.simulation.processor import gpu_errors
 from endopilot.simulation.readout import Readout
 from endopilot.simulation.state import SimulatorState, Step, SupportsDLPack
 from endopilot.simulation.trajectory import SimulationSetUp, Trajectory
-from endopilot.types import SAMPLE_PERIOD_S, Anatomy, TipProjection
+from endopilot.types import SAMPLE_PERIOD_S, Anatomy
 
 _DEEPEST_START = 0.8
 """Share of the longest path that a random start may lie at."""
@@ -268,8 +268,6 @@ class Simulator(Readout):
             began_s: `time` before the first sample, s.
             result: the arrays of `Step`, with an axis of samples, and of `shape` if it was recorded.
         """
-        tips = [group.project(each) for group, each in self._of_groups(result["tip_position"])]
-        names = TipProjection.__dataclass_fields__
         recorded: dict[str, Any] = {name: result[name] for name in Step.__dataclass_fields__}
         times = began_s[:, None] + period_s * np.arange(1, command.shape[1] + 1)
         return Trajectory(
@@ -277,7 +275,7 @@ class Simulator(Readout):
             period_s=period_s,
             start=start,
             command=command,
-            tip=TipProjection(**{name: self._merge([getattr(tip, name) for tip in tips]) for name in names}),
+            tip=self._projected([each for _, each in self._of_groups(result["tip_position"])]),
             reason=self.reason,
             shape=result.get("shape"),
             vessel_to_laboratory=None if set_up.motion is None else self._placements(times),
@@ -314,7 +312,7 @@ class Simulator(Readout):
             )
         for group, values in zip(self._groups, state.values, strict=True):
             group.simulation.set_state(np.ascontiguousarray(values))
-        self._set_up = replace(self._set_up, initial=np.full_like(self._set_up.initial, np.nan))
+        self._go_on_their_way()
 
     def copy_worlds(self, source: ArrayLike, *, of: Simulator | None = None) -> None:
         """Put every world where another one, of the same anatomy and device, is now; friction goes with it.
@@ -354,7 +352,7 @@ class Simulator(Readout):
             states.append(np.ascontiguousarray(original.simulation.state()[rows]))
         for group, state in zip(self._groups, states, strict=True):
             group.simulation.set_state(state)
-        self._set_up = replace(self._set_up, initial=np.full_like(self._set_up.initial, np.nan))
+        self._go_on_their_way()
 
     @property
     def set_up(self) -> SimulationSetUp:
@@ -421,7 +419,7 @@ class Simulator(Readout):
             for group in self._groups
         ]
         if control.size and not np.isnan(self._set_up.initial).all():
-            self._set_up = replace(self._set_up, initial=np.full_like(self._set_up.initial, np.nan))
+            self._go_on_their_way()
         if record_shape:  # of the wires that were needed
             for group, result in zip(self._groups, results, strict=True):
                 needed = max(group.path_mm, float(result["inserted_length"].max())) + FREE_BEHIND_MM
@@ -457,6 +455,10 @@ class Simulator(Readout):
                 lanes=LANES,
                 progress=advance,
             )
+
+    def _go_on_their_way(self) -> None:
+        """Note that the worlds are no longer at their start: what follows is not replayed from there."""
+        self._set_up = replace(self._set_up, initial=np.full_like(self._set_up.initial, np.nan))
 
     def _of_devices_given(self, name: str, values: ArrayLike) -> Float[np.ndarray, "worlds devices"]:
         array = with_device_axis(name, np.asarray(values, dtype=float), (self.worlds, self._devices))
