@@ -46,10 +46,10 @@ class TurnBack:
 
 def main() -> None:
     # The second diagonal branch in the first of the ladder's patients, which pushing alone does not reach.
-    navigation = endopilot.find_task("diagonal", 1).ladder_navigation(0)
+    navigation = endopilot.find_task("diagonal", version=1).ladder_navigation(0)
     policy = endopilot.make_policy("my_policy:TurnBack")  # as `endopilot ladder --policy` finds it
-    record = endopilot.navigate(navigation, policy, seed=1)
-    pushed = endopilot.navigate(navigation, endopilot.make_policy("forward"), seed=1)
+    record = endopilot.NavigationLoop(navigation, policy, seed=1).run()
+    pushed = endopilot.NavigationLoop(navigation, endopilot.make_policy("forward"), seed=1).run()
     print(f"TurnBack: {record.reason} after {record.seconds:g} s and {record.exposures} exposures")
     print(f"forward: {pushed.reason}")
     assert record.success and record.safe and not pushed.success

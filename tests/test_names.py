@@ -26,7 +26,7 @@ LARGE = {
 SLOW = {"Axes": Axes, "Figure": Figure}
 """Of other libraries, which a module imports only to be type-checked."""
 ASKED = {
-    "Anatomy", "read_anatomy", "extract_anatomy", "segment", "Wire", "read_device", "Simulator", "simulate", "plan",
+    "Anatomy", "read_anatomy", "extract_anatomy", "segment", "Wire", "read_wire", "Simulator", "simulate", "plan",
     "make_atlas", "generate_dataset", "train", "load_model", "navigate", "evaluate", "InputError", "read_volume",
 }  # fmt: skip
 
@@ -43,7 +43,7 @@ def test_the_import_brings_no_library() -> None:
     assert imported_by("import endopilot; endopilot.__version__; dir(endopilot)") == set()
 
 
-@pytest.mark.parametrize("name", ["simulate", "Simulator", "read_device", "read_anatomy"])
+@pytest.mark.parametrize("name", ["simulate", "Simulator", "read_wire", "read_anatomy"])
 def test_the_rod_core_brings_no_large_library(name: str) -> None:
     assert imported_by(f"import endopilot; endopilot.{name}") <= {"numpy", "scipy", "yaml", "pydantic"}
 

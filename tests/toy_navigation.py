@@ -16,7 +16,7 @@ import numpy as np
 from endopilot.anatomy.io import write_anatomy
 from endopilot.dataset.config import DatasetConfig
 from endopilot.dataset.generate import generate_dataset
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
 from endopilot.devices.stack import Stack
 from endopilot.files import read_json, write_json
 from endopilot.simulation.trajectory import SimulationSetUp, Trajectory
@@ -111,7 +111,7 @@ def write_toy_anatomies(folder: Path, patients: int) -> list[Path]:
         if not where.exists():
             vessel = toy_anatomy(f"patient-{i}{'x' * i}")
             catheter_mm = vessel.catheter_radius_mm + 1e-3 * i  # the toy wire does not feel it
-            write_anatomy(replace(vessel, catheter_radius_mm=catheter_mm), where)
+            write_anatomy(replace(vessel, catheter_radius_mm=catheter_mm), output=where)
     return folders
 
 
@@ -142,7 +142,7 @@ def make_toy_dataset(
     config = DatasetConfig(**({"sequences": sequences, "anatomy_shares": shares} | settings))
     with patch("endopilot.dataset.block.simulate_navigations", toy_navigate(simulate)):
         anatomies = write_toy_anatomies(folder.parent / "anatomies", patients)
-        generate_dataset(anatomies, folder, read_device(device), config, scheduler=scheduler)
+        generate_dataset(anatomies, output=folder, device=read_wire(device), config=config, scheduler=scheduler)
 
 
 def make_untrained_run(dataset_folder, run_folder):

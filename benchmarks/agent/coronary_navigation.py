@@ -10,7 +10,7 @@ import numpy as np
 from tyro.conf import Positional
 
 from endopilot.anatomy.io import read_anatomy
-from endopilot.control.navigate_patient import NavigatePatientConfig, navigate_patient, set_up_navigation
+from endopilot.control.navigate import NavigateConfig, navigate_patient, set_up_navigation
 from endopilot.types import Anatomy
 
 ARTERIES = {"LAD": ("6", "7", "8"), "LCx": ("11", "13"), "RCA": ("1", "2", "3")}
@@ -45,7 +45,7 @@ def navigate_coronaries(
     patients: Positional[tuple[Path, ...]],
     /,
     *,
-    config: NavigatePatientConfig = NavigatePatientConfig(mismatch=0.2),
+    config: NavigateConfig = NavigateConfig(mismatch=0.2),
 ) -> None:
     """Drive a policy into the distal thirds of coronary arteries; print each navigation, and the share that was safe.
 
@@ -62,7 +62,7 @@ def navigate_coronaries(
         anatomy = read_anatomy(folder)
         for artery, place in targets(anatomy):
             began = time.process_time()
-            record = navigate_patient(set_up_navigation(anatomy, place, config)).record
+            record = navigate_patient(set_up_navigation(anatomy, place, config=config)).record
             spent = time.process_time() - began
             safe.append(record.success and record.safe)
             print(

@@ -32,7 +32,7 @@ from endopilot.tasks.task import (
     NEWEST,
     LadderVersion,
     Task,
-    ladder_tasks,
+    list_tasks,
     without_catheter,
 )
 from endopilot.types import TipProjection, VesselTree
@@ -222,7 +222,7 @@ def choose_patients(
         version: of the ladder: 1, 2 or coaxial.
         write: write the numbers into the tasks' files.
     """
-    for task in ladder_tasks(version):
+    for task in list_tasks(version):
         if tasks and task.name not in tasks:
             continue
         path = TASKS / f"ladder_{task.version}" / f"{task.name}.yaml"

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from scipy.integrate import solve_ivp
 from scipy.spatial import KDTree
 
-from endopilot.devices.device import read_device
+from endopilot.devices.device import read_wire
 from endopilot.simulation.config import SimulatorConfig
 from endopilot.simulation.core import make_lumen
 from endopilot.simulation.rod import RodLayout, lay_out
@@ -181,7 +181,7 @@ def stick_slip(*, friction: float = 0.1) -> Pushed:
     Args:
         friction: Coulomb coefficient.
     """
-    device = read_device("workhorse-014")
+    device = read_wire("workhorse-014")
     axis, radius = ridged_vessel()
     speed, samples, start = 0.5, 120, 35.0
     path = np.pi / 2 * CURVE_RADIUS_MM + 60.0
@@ -210,7 +210,7 @@ def push_against_a_plate(*, friction: float, tip_bend_deg: float) -> Pushed:
         friction: Coulomb coefficient of the plate.
         tip_bend_deg: angle by which the last 3 mm are bent, degrees; no wire is perfectly straight.
     """
-    device = replace(read_device("workhorse-014"), tip_bend_rad=float(np.deg2rad(tip_bend_deg)), tip_bend_length_mm=3.0)
+    device = replace(read_wire("workhorse-014"), tip_bend_rad=float(np.deg2rad(tip_bend_deg)), tip_bend_length_mm=3.0)
     start, speed, samples = PLATE_GAP_MM - 0.3, 0.1, 60
     result = _drive(
         lay_out(device, element_mm=0.15, length_mm=20.0),

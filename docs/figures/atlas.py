@@ -260,7 +260,7 @@ def draw_trees() -> None:
 def draw_phantom() -> None:
     """Draw four views of one phantom."""
     figure = plt.figure(figsize=(12, 3.2), layout="constrained")
-    volume = make_phantom(make_patient(AtlasConfig(seed=1), 0), PhantomConfig(), 1)
+    volume = make_phantom(make_patient(AtlasConfig(seed=1), 0), config=PhantomConfig(), seed=1)
     voxels, (dx, dy, dz), (x, y, z) = volume.voxels, volume.spacing_mm, volume.origin_mm
     (nz, ny, nx), rows = voxels.shape, [round((at - y) / dy) for at in (-8, -24, 20)]
     axial, coronal = (x, x + nx * dx, y + ny * dy, y), (x, x + nx * dx, z, z + nz * dz)

@@ -43,7 +43,7 @@ def opened(catheter: str | None = None) -> Iterator[Page]:
     """Serve the cockpit in the reference patient, with a catheter if one is named, and give its page in a browser."""
     with tempfile.TemporaryDirectory() as name, sync_playwright() as driver:
         folder = Path(name)
-        write_anatomy(reference_navigation().anatomy, folder / "patient")
+        write_anatomy(reference_navigation().anatomy, output=folder / "patient")
         browser = driver.chromium.launch(executable_path=find_browser(), args=list(BROWSER_FLAGS))
         page = browser.new_page(viewport=SIZE)
         with serving(folder / "patient", folder / "recordings", catheter) as address:

@@ -47,7 +47,7 @@ def main() -> None:
 
 def _dissection() -> str:
     """Return where the J wire goes in the dissected aorta, pushed and driven."""
-    aorta, wire = endopilot.read_anatomy(CTA / "anatomy"), endopilot.read_device("j-035")
+    aorta, wire = endopilot.read_anatomy(CTA / "anatomy"), endopilot.read_wire("j-035")
     lumens = [_lumen(name) for name in ("true", "false")]
     rows = ["| section | from, to, mm | in the true lumen, % | in the false lumen, % |", "| --- " * 4 + "|"]
     for branch in aorta.tree.branches:

@@ -34,7 +34,7 @@ content["friction"] = {"value": 0.06, "source": "hydrophilic coating, pulled ove
 my_file = folder / "my-wire.yaml"
 my_file.write_text(yaml.safe_dump(content, allow_unicode=True), encoding="utf-8")
 
-mine, shipped = endopilot.read_device(my_file), endopilot.read_device("workhorse-014")
+mine, shipped = endopilot.read_wire(my_file), endopilot.read_wire("workhorse-014")
 for device in (shipped, mine):
     print(f"{device.name}: EI at the tip {device.bend_stiffness_n_mm2[0]} N·mm², friction {device.friction}")
 
@@ -44,7 +44,7 @@ for device in (shipped, mine):
 wrong = folder / "wrong.yaml"
 wrong.write_text(my_file.read_text(encoding="utf-8").replace("0.06", "-0.06"), encoding="utf-8")
 try:
-    endopilot.read_device(wrong)
+    endopilot.read_wire(wrong)
 except endopilot.InputError as error:
     print(str(error).replace(str(folder), "FOLDER"))
 
@@ -74,7 +74,7 @@ plt.show()
 # start with the tip bend turned to a side each, then push on at 5 mm/s for 12 s. All worlds run side by side, and no
 # result depends on another world.
 
-anatomy = next(endopilot.make_atlas(endopilot.AtlasConfig(anatomy="lca", seed=41, population="textbook")))
+anatomy = next(endopilot.make_atlas(config=endopilot.AtlasConfig(anatomy="lca", seed=41, population="textbook")))
 worlds, samples = 12, 24
 control = np.tile([5.0, 0.0], (worlds, samples, 1))
 start = np.column_stack([np.full(worlds, 2.0), np.linspace(0, 2 * np.pi, worlds, endpoint=False)])

@@ -21,7 +21,7 @@ _COARSE = ("--in-plane-mm", "1.0", "--slice-mm", "1.2", "--margin-mm", "8")
 @pytest.fixture(scope="module")
 def patient(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("patient") / "rca"
-    write_anatomy(make_patient(AtlasConfig(seed=7), 0), folder)
+    write_anatomy(make_patient(AtlasConfig(seed=7), 0), output=folder)
     return folder
 
 

@@ -16,7 +16,7 @@ from endopilot.xray.take_image import TakeImageConfig, take_image
 
 
 def shown(fork, **changes):
-    return take_image(fork, TakeImageConfig(view_deg=(0.0, 0.0), inserted_mm=12.0, **changes))
+    return take_image(fork, config=TakeImageConfig(view_deg=(0.0, 0.0), inserted_mm=12.0, **changes))
 
 
 def darker(image, row: int, column: int) -> float:
@@ -46,7 +46,7 @@ def test_dsa_and_roadmap_show_the_vessel_and_take_two_frames(fork):
 
 
 def test_the_command_writes_the_image(fork, tmp_path, capsys):
-    write_anatomy(fork, tmp_path / "fork")
+    write_anatomy(fork, output=tmp_path / "fork")
     path = tmp_path / "image.png"
     with pytest.raises(SystemExit) as left:
         main(["xray", str(tmp_path / "fork"), "-o", str(path), "--view-deg", "0", "0", "--inserted-mm", "12", "--json"])

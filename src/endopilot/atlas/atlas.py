@@ -66,8 +66,9 @@ class AtlasConfig:
         return self
 
 
-def make_atlas(config: AtlasConfig = AtlasConfig()) -> Iterator[Anatomy]:
+def make_atlas(*, config: AtlasConfig | None = None) -> Iterator[Anatomy]:
     """Yield the patients of an atlas, one after another."""
+    config = config or AtlasConfig()
     for index in range(config.count):
         yield make_patient(config, index)
 

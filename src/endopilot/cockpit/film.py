@@ -17,7 +17,7 @@ from endopilot.cockpit.recording import SUFFIX, read_recording, replayed
 from endopilot.cockpit.world import Snapshot, take_snapshot
 from endopilot.control.plan_file import read_plan
 from endopilot.dataset.again import episode_trajectory
-from endopilot.dataset.loader import load_dataset
+from endopilot.dataset.loader import read_dataset
 from endopilot.errors import InputError
 from endopilot.files import reading
 from endopilot.ladder.submission import read_navigation
@@ -98,7 +98,7 @@ def open_film(path: Path, patient: Path | None = None, *, world: int = 0, task: 
         return _session(path)
     if (path / "meta").is_dir():
         with reading(path, "make the data set again"):
-            return _film(episode_trajectory(load_dataset(path), world), 0, f"episode {world} of {path.name}")
+            return _film(episode_trajectory(read_dataset(path), world), 0, f"episode {world} of {path.name}")
     if path.suffix == ".json":
         with reading(path, "give a file of the ladder as it was written"):
             of, place, record = read_navigation(path, task, world)
@@ -115,7 +115,7 @@ def open_film(path: Path, patient: Path | None = None, *, world: int = 0, task: 
     vessel = read_anatomy(patient)
     if (path / "plan.csv").exists():
         return _film(read_plan(path, vessel).trajectory, world, f"plan {path.name}")
-    trajectory = read_trajectory(recorded, vessel)
+    trajectory = read_trajectory(recorded, anatomy=vessel)
     worlds = len(trajectory.valid)
     if not 0 <= world < worlds:
         raise InputError(f"world: {world}; {path} has worlds 0 to {worlds - 1}")

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from endopilot.devices.stack import Proximals, lines_from_tips, shown_part
 from endopilot.errors import InputError
-from endopilot.navigation.navigate import NavigateConfig, NavigationLoop
+from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.navigation.policy import Hand, Observation
 from endopilot.simulation.mismatch import ModelMismatch
 from endopilot.simulation.simulator import Simulator
@@ -22,7 +22,7 @@ from endopilot.simulation.state import Step
 from endopilot.tasks.navigation import Navigation
 from endopilot.types import TipProjection
 
-BY_HAND = NavigateConfig(cycle_s=0.0125)
+BY_HAND = LoopConfig(cycle_s=0.0125)
 """A hand's commands act sooner than a policy's, and pages show as many pictures."""
 
 
@@ -107,7 +107,7 @@ class World:
     def __init__(
         self,
         navigation: Navigation,
-        config: NavigateConfig = BY_HAND,
+        config: LoopConfig = BY_HAND,
         *,
         seed: int = 0,
         truth: ModelMismatch | None = None,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,13 +16,13 @@ from endopilot.control.course import Controls
 from endopilot.control.desired import last_place, read_tips, tips_along
 from endopilot.control.plan_config import NETWORK_METHODS, Plan, PlanConfig, Steps
 from endopilot.control.set_up import TipChoice, choose_tip
-from endopilot.devices.catheter import Catheter
-from endopilot.devices.device import Wire, read_device
+from endopilot.devices.device import Wire, read_wire
 from endopilot.devices.drive_limits import DriveLimits
+from endopilot.devices.stack import Stack
 from endopilot.errors import InputError
 from endopilot.extras import extra_named
 from endopilot.models.config import read_run
-from endopilot.navigation.navigate import NavigateConfig, navigate
+from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.progress import progress
 from endopilot.robot.robot import RobotConfig
 from endopilot.settings import from_record
@@ -45,22 +45,21 @@ _TRIALS = 3
 def plan(
     anatomy: Anatomy | str | Path,
     target: str,
-    config: PlanConfig | None = None,
     *,
+    device: Wire | Stack | str | Path | None = None,
     model: str | Path | None = None,
-    device: Wire | str | Path | None = None,
-    catheters: Sequence[Catheter] = (),
+    config: PlanConfig | None = None,
 ) -> Plan:
     """Plan a navigation.
 
     Args:
         anatomy: the vessel, or its folder.
         target: a section such as "4" or "PDA", a point "X,Y,Z" in LPS mm, or the path of a CSV of desired tips.
-        config: method, time, limits and cost.
+        device: the wire, its name or its YAML file; or the wire and a catheter, which is then planned for too, by the
+            method search. The model's wire if not given, the workhorse if there is no model.
         model: run made by `endopilot train`, or "pretrained", the model of the package; needed for the methods inverse
             and mppi.
-        device: the wire, its name or its YAML file; the model's if not given, the workhorse if there is none.
-        catheters: one around the wire, which is then planned for too, by the method search.
+        config: method, time, limits and cost.
 
     Raises:
         InputError: a target outside the tree, behind an occlusion or too far for the time; a model of another device or
@@ -71,6 +70,7 @@ def plan(
     config = config or PlanConfig()
     vessel = anatomy if isinstance(anatomy, Anatomy) else read_anatomy(anatomy)
     model = None if model is None else Path(model)
+    catheters = device.catheters if isinstance(device, Stack) else ()
     if catheters:
         _check_for_stack(config, target, model)
     wire = _wire(model, device, config.method)
@@ -82,7 +82,7 @@ def plan(
         anatomy=vessel,
         device=wire,
         target=goal,
-        catheters=tuple(catheters),
+        catheters=catheters,
         arrives=config.arrives,
         start_inserted_mm=config.start_inserted_mm,
         start_rotation=config.start_rotation,
@@ -94,7 +94,7 @@ def plan(
         check_passable(route, each)
     choice, began = None, _clock()
     if model is None:
-        choice = choose_tip(navigation, config.tip, catheter_tilt_deg=config.catheter_tilt_deg)
+        choice = choose_tip(navigation, tip=config.tip, catheter_tilt_deg=config.catheter_tilt_deg)
         navigation = choice.navigation
         route = Route.to(navigation.anatomy, goal)
     elif config.tip not in ("auto", "own"):
@@ -168,15 +168,15 @@ def _check_for_stack(config: PlanConfig, target: str, model: Path | None) -> Non
         )
 
 
-def _wire(model: Path | None, device: Wire | str | Path | None, method: str) -> Wire:
+def _wire(model: Path | None, device: Wire | Stack | str | Path | None, method: str) -> Wire:
     """Return the wire: the one that is asked for, else the model's; both must be the same."""
-    asked = device if isinstance(device, Wire | None) else read_device(device)
+    asked = None if device is None else Stack.of(device).wire
     if model is None:
         if method in NETWORK_METHODS:
             raise InputError(
                 f"--model: none given, and method {method} needs one; give a run of `endopilot train`, or pretrained"
             )
-        return asked or read_device("workhorse-014")
+        return asked or read_wire("workhorse-014")
     trained = from_record(Wire, read_run(model)["device"])
     if asked is not None and asked.constants != trained.constants:
         raise InputError(
@@ -269,7 +269,9 @@ def _by_policy(navigation: Navigation, config: PlanConfig) -> tuple[Steps, Steps
     """Let a policy drive the rod core with an ideal drive, and record what it did."""
     from endopilot.navigation.policies import make_policy
 
-    record = navigate(navigation, make_policy(config.method), config=NavigateConfig(robot=_IDEAL), seed=config.seed)
+    record = NavigationLoop(
+        navigation, make_policy(config.method), config=LoopConfig(robot=_IDEAL), seed=config.seed
+    ).run()
     proximal, tip = np.column_stack([record.inserted_length[:, 0], record.rotation[:, 0]]), record.tip[:, 0]
     control = np.diff(proximal, axis=0) / DECISION_PERIOD_S
     return control, np.column_stack([tip.abscissa, tip.offset])[1:]

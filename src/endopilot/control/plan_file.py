@@ -52,12 +52,12 @@ from endopilot.types import Anatomy
 _TABLE, _RECORD, PICTURE = "plan.csv", "manifest.json", "plan.png"
 
 
-def write_plan(plan: Plan, folder: Path, xray: PlannedXray | None = None) -> dict[str, Any]:
+def write_plan(plan: Plan, *, output: str | Path, xray: PlannedXray | None = None) -> dict[str, Any]:
     """Write a plan as a folder, whole or not at all; a plan that stands there already is replaced. Return its figures.
 
     Args:
         plan: the plan.
-        folder: where to.
+        output: the folder.
         xray: the X-ray that it will need, if that is known.
 
     Raises:
@@ -65,7 +65,7 @@ def write_plan(plan: Plan, folder: Path, xray: PlannedXray | None = None) -> dic
     """
     from endopilot.control.plan_picture import draw_plan  # matplotlib is slow to import
 
-    folder = Path(folder)
+    folder = Path(output)
     if folder.exists() and not (folder.is_dir() and ((folder / _TABLE).exists() or not any(folder.iterdir()))):
         raise InputError(f"{folder}: exists and is not a plan; choose another output folder")
     navigation = plan.navigation
@@ -189,7 +189,7 @@ def _plan_in(folder: Path, anatomy: Anatomy, stack: Stack | None) -> Plan:
     path = folder / TRAJECTORY
     if not path.exists() or sha256(path) != record["trajectory_sha256"]:
         raise InputError(f"{path}: is missing or differs from what {_RECORD} records; plan anew")
-    trajectory = read_trajectory(path, anatomy)
+    trajectory = read_trajectory(path, anatomy=anatomy)
     return Plan(
         navigation=Navigation(
             anatomy=anatomy,

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from endopilot.devices.catheter import Catheter, check_nested
-from endopilot.devices.device import Device, Wire, check_fits
+from endopilot.devices.catheter import Catheter, check_nested, read_catheter
+from endopilot.devices.device import Device, Wire, check_fits, read_wire
 from endopilot.types import Anatomy
 
 SHOWN_BEHIND_MM = 20.0
@@ -28,9 +29,21 @@ class Stack:
     catheters: tuple[Catheter, ...] = ()
 
     @staticmethod
-    def of(device: Wire | Stack) -> Stack:
-        """Return a stack as it is, and a wire as a stack of one."""
-        return device if isinstance(device, Stack) else Stack(device)
+    def of(device: Wire | Stack | str | Path, *catheters: Catheter | str | Path) -> Stack:
+        """Return the stack of a wire and catheters, each given itself, by its name or by its YAML file.
+
+        Args:
+            device: the wire, or a stack that the catheters are put around.
+            catheters: from the inside out.
+
+        Raises:
+            InputError: no such wire or catheter.
+        """
+        stack = (
+            device if isinstance(device, Stack) else Stack(device if isinstance(device, Wire) else read_wire(device))
+        )
+        around = tuple(each if isinstance(each, Catheter) else read_catheter(each) for each in catheters)
+        return replace(stack, catheters=stack.catheters + around) if around else stack
 
     def __len__(self) -> int:
         """Return the number of devices."""

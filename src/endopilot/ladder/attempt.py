@@ -16,7 +16,7 @@ from endopilot.anatomy.projection import safety_ratio
 from endopilot.belief.adviser import AdviserConfig, count_events, near_exposures
 from endopilot.control.agent import AgentPolicy
 from endopilot.errors import InputError
-from endopilot.navigation.navigate import NavigateConfig, navigate
+from endopilot.navigation.loop import LoopConfig, NavigationLoop
 from endopilot.navigation.policies import make_policy
 from endopilot.navigation.policy import Decision, Observation, Policy
 from endopilot.navigation.record import NavigationRecord
@@ -141,8 +141,8 @@ def driven(recording: Recording, navigation: Navigation, *, seed: int) -> Naviga
 
 
 def _drive(navigation: Navigation, policy: Policy, seed: int, mismatch: ModelMismatch | None) -> NavigationRecord:
-    config = NavigateConfig(simulator=replace(CORE, threads=1))
-    return navigate(navigation, policy, config=config, seed=seed, truth=mismatch)
+    config = LoopConfig(simulator=replace(CORE, threads=1))
+    return NavigationLoop(navigation, policy, config=config, seed=seed, truth=mismatch).run()
 
 
 class Repeated:

@@ -16,7 +16,7 @@ from endopilot.ladder.submission import MOST_PATIENTS, SUBMISSION_FILE, task_dig
 from endopilot.navigation.policies import POLICIES, make_policy
 from endopilot.runs import claim, make_missing
 from endopilot.settings import Within, settings
-from endopilot.tasks.task import NEWEST, LadderVersion, Task, find_task, ladder_tasks
+from endopilot.tasks.task import NEWEST, LadderVersion, Task, find_task, list_tasks
 
 SCORES_FILE = "ladder.json"
 
@@ -41,16 +41,16 @@ class LadderConfig:
     def _consistent(self) -> LadderConfig:
         POLICIES.check(self.policy)
         for name in self.tasks:
-            find_task(name, self.version)
+            find_task(name, version=self.version)
         return self
 
     @property
     def chosen(self) -> list[Task]:
         """The tasks named, or all."""
-        return [task for task in ladder_tasks(self.version) if not self.tasks or task.name in self.tasks]
+        return [task for task in list_tasks(self.version) if not self.tasks or task.name in self.tasks]
 
 
-def climb(output: Path, config: LadderConfig) -> list[dict[str, Any]]:
+def climb(*, output: str | Path, config: LadderConfig | None = None) -> list[dict[str, Any]]:
     """Let a policy do the tasks in their patients, and score it.
 
     Each navigation leaves one file, `output`/TASK/PATIENT.json; an interrupted run goes on with the others.
@@ -66,6 +66,8 @@ def climb(output: Path, config: LadderConfig) -> list[dict[str, Any]]:
     Raises:
         InputError: the folder belongs to another run, such as that of another policy, or a navigation cannot be begun.
     """
+    config = config or LadderConfig()
+    output = Path(output)
     make_policy(config.policy)
     tasks = config.chosen
     claim(output, "endopilot ladder", **identity(config.policy, config.version))
@@ -81,13 +83,13 @@ def climb(output: Path, config: LadderConfig) -> list[dict[str, Any]]:
 
 def identity(policy: str, version: LadderVersion) -> dict[str, Any]:
     """Return what a policy's results follow from: its source, every task with its device, and the package's version."""
-    tasks = {task.name: task_digest(task) for task in ladder_tasks(version)}
+    tasks = {task.name: task_digest(task) for task in list_tasks(version)}
     return {"policy": policy, "origin": POLICIES.origin(policy), "tasks": tasks, "version": __version__}
 
 
 def _navigate(path: Path, *, policy: str, version: LadderVersion) -> None:
     """Do one navigation and write what came of it."""
-    task, place = find_task(path.parent.name, version), int(path.stem)
+    task, place = find_task(path.parent.name, version=version), int(path.stem)
     navigation = task.ladder_navigation(place)
     result = attempt(policy, navigation, seed=navigation_seed(task, place))
     write_json(path, {"task": task.name, "ladder": version, "patient": navigation.anatomy.name} | result)

@@ -79,7 +79,7 @@ def mismatch_of(case: str, share: float, navigation: Navigation, task: Task, pla
 
 
 def _navigate(path: Path, *, policy: str, version: LadderVersion, share: float) -> None:
-    case, task, place = path.parents[1].name, find_task(path.parent.name, version), int(path.stem)
+    case, task, place = path.parents[1].name, find_task(path.parent.name, version=version), int(path.stem)
     navigation = task.ladder_navigation(place)
     mismatch = mismatch_of(case, share, navigation, task, place)
     result = attempt(policy, navigation, seed=navigation_seed(task, place), mismatch=mismatch)

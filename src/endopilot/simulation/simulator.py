@@ -287,7 +287,7 @@ class Simulator(Readout):
         """The worlds' state, to be kept and given to `set_state`.
 
         Example:
-            >>> kept = simulator.state  # kept.save(path) writes it to a file
+            >>> kept = simulator.state  # kept.write(path) writes it to a file
         """
         return SimulatorState(tuple(group.simulation.state() for group in self._groups), self._fingerprint)
 

@@ -14,8 +14,8 @@ from pydantic import Field, model_validator
 from endopilot.anatomy.catheter_axis import with_world_zero
 from endopilot.atlas.atlas import ANATOMIES, AtlasConfig, make_patient
 from endopilot.devices.catheter import list_catheters, read_catheter
-from endopilot.devices.device import read_device
-from endopilot.devices.device_files import list_devices
+from endopilot.devices.device import read_wire
+from endopilot.devices.device_files import list_wires
 from endopilot.errors import InputError
 from endopilot.settings import CountOrZero, NonNegative, Positive, Seconds, Seed, Share, Within, read_settings, settings
 from endopilot.simulation.config import SimulatorConfig
@@ -97,7 +97,7 @@ class Task:
     @model_validator(mode="after")
     def _consistent(self) -> Task:
         known_catheters = (*list_catheters(), None)
-        for name, known in (("anatomy", ANATOMIES), ("device", list_devices()), ("catheter", known_catheters)):
+        for name, known in (("anatomy", ANATOMIES), ("device", list_wires()), ("catheter", known_catheters)):
             if getattr(self, name) not in known:
                 raise ValueError(f"{name}: {getattr(self, name)!r}; choose from {', '.join(filter(None, known))}")
         return self
@@ -134,7 +134,7 @@ class Task:
         bend = {"tip_bend_rad": float(np.deg2rad(self.tip_bend_deg)), "tip_bend_length_mm": self.tip_bend_mm}
         return Navigation(
             anatomy=anatomy,
-            device=replace(read_device(self.device), **bend),
+            device=replace(read_wire(self.device), **bend),
             target=find_target(anatomy.tree, self.section, depth_mm=self.depth_mm),
             start_inserted_mm=self.start_inserted_mm,
             start_rotation=start_rotation,
@@ -147,19 +147,19 @@ class Task:
 
 
 @cache
-def ladder_tasks(version: LadderVersion = NEWEST) -> tuple[Task, ...]:
+def list_tasks(version: LadderVersion = NEWEST) -> tuple[Task, ...]:
     """Return the tasks of a version of the ladder, the lowest first."""
     tasks = (read_settings(path, Task) for path in _FOLDERS[version].glob("*.yaml"))
     return tuple(sorted(tasks, key=lambda task: task.level))
 
 
-def find_task(name: str, version: LadderVersion = NEWEST) -> Task:
+def find_task(name: str, *, version: LadderVersion = NEWEST) -> Task:
     """Return a task of a version of the ladder by its name.
 
     Raises:
         InputError: the ladder has no such task.
     """
-    return _named(name, ladder_tasks(version))
+    return _named(name, list_tasks(version))
 
 
 def task_by_hand(name: str) -> Task:
@@ -168,7 +168,7 @@ def task_by_hand(name: str) -> Task:
     Raises:
         InputError: there is no such task.
     """
-    return _named(name, ladder_tasks(NEWEST) + ladder_tasks("coaxial"))
+    return _named(name, list_tasks(NEWEST) + list_tasks("coaxial"))
 
 
 def _named(name: str, tasks: Sequence[Task]) -> Task:
@@ -186,7 +186,7 @@ def training_navigations(name: str, first: int, count: int) -> list[Navigation]:
     Raises:
         InputError: the ladder has no such task, or the task fewer patients.
     """
-    task = find_task(name, 1)
+    task = find_task(name, version=1)
     return [task.navigation(task.patient(task.training, first + place)) for place in range(count)]
 
 
@@ -215,7 +215,7 @@ def reference_navigation() -> Navigation:
     anatomy = with_world_zero(make_patient(AtlasConfig(population="textbook"), 0))
     return Navigation(
         anatomy=anatomy,
-        device=read_device("workhorse-014"),
+        device=read_wire("workhorse-014"),
         target=find_target(anatomy.tree, "4", depth_mm=15.0),
         start_inserted_mm=5.0,
         seconds=60.0,

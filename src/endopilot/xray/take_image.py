@@ -10,8 +10,6 @@ import numpy as np
 import SimpleITK as sitk
 from jaxtyping import Float, UInt8
 
-from endopilot.devices.catheter import read_catheter
-from endopilot.devices.device import read_device
 from endopilot.devices.stack import Stack, lines_from_tips
 from endopilot.errors import InputError
 from endopilot.files import writing
@@ -97,7 +95,7 @@ class XrayImage:
             sitk.WriteImage(sitk.GetImageFromArray(self.grey), str(partial), useCompression=True)
 
 
-def take_image(anatomy: Anatomy, config: TakeImageConfig | None = None, ct: Volume | None = None) -> XrayImage:
+def take_image(anatomy: Anatomy, *, config: TakeImageConfig | None = None, ct: Volume | None = None) -> XrayImage:
     """Push a wire into a vessel, and take an X-ray image of it.
 
     Args:
@@ -109,11 +107,11 @@ def take_image(anatomy: Anatomy, config: TakeImageConfig | None = None, ct: Volu
         InputError: no such device, or it does not fit the vessel.
     """
     config = config or TakeImageConfig()
-    stack = Stack(read_device(config.device), tuple(read_catheter(name) for name in config.catheter))
+    stack = Stack.of(config.device, *config.catheter)
     motion = motion_named(config.motion, config.motion_seed)
     nodes, *catheters = _pushed(anatomy, stack, config, motion)
     patient = surroundings(anatomy) if ct is None else ct
-    imager = XrayImager(anatomy, stack.wire, patient, config.image, catheters=stack.catheters)
+    imager = XrayImager(anatomy, stack, ct=patient, config=config.image)
     placed, before = np.eye(3, 4), np.eye(3, 4)  # at the end of the pulse and at its start
     if motion is not None:
         times = np.array([config.time_s, config.time_s - config.image.pulse_s])
